@@ -20,7 +20,7 @@ from appliance.core import config
 from appliance.core.clock import SystemClock
 from appliance.core.config import Config
 from appliance.core.errors import ApplianceError, ConfigError
-from appliance.core.log import log, to_stderr
+from appliance.core.log import log, printable, to_stderr
 from appliance.core.menu import CommandParser
 from appliance.core.patience import patiently
 
@@ -153,7 +153,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         return run(args)
     except ApplianceError as e:
-        print(f"palpate: {e}", file=sys.stderr)
+        print(printable(f"palpate: {e}"), file=sys.stderr)
         return e.exit_code
     except KeyboardInterrupt:
         return 130

@@ -11,7 +11,7 @@ from importlib import import_module
 from appliance.cli import parser
 from appliance.core.errors import ApplianceError
 from appliance.core.interrupts import INTERRUPTED, during_imports
-from appliance.core.log import to_stderr
+from appliance.core.log import printable, to_stderr
 
 COMMANDS: Mapping[str, str] = {
     "run": "cli.run_command.run",
@@ -48,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         _flush()
         return code
     except ApplianceError as e:
-        print(f"palpate: {e}", file=sys.stderr)
+        print(printable(f"palpate: {e}"), file=sys.stderr)
         return e.exit_code
     except KeyboardInterrupt:
         print("palpate: interrupted", file=sys.stderr)

@@ -44,6 +44,9 @@ COMMANDS = (
 )
 TEXT_COMMANDS = ("LABEL", "MATERIAL", "POSITION", "SESSION")
 """The commands that need a text after a comma. START may have one: speed and force of the slide."""
+OWN = ("RES", "STA", "ANS", "REC")
+"""Kinds of sentences that the box sends. A line that sends them back, an echo, must not be
+answered: the answer would come back as well, without end."""
 RETRY_NS = 1_000_000_000
 """Time between two attempts to open a port that is gone."""
 
@@ -126,10 +129,12 @@ def result(v: Verdict, source: str, *, loss_known: bool = True) -> bytes:
 
 def parse(data: bytes, rest: bytes = b"") -> tuple[list[Command], bytes]:
     """The commands in `data`, which continues `rest`, and the new unfinished rest (see
-    `sentences.parse`)."""
+    `sentences.parse`). Sentences of the box itself, from a line that echoes, are left out."""
     found, rest = sentences.parse(data, rest)
     return [
-        Command(s.kind, error=s.error) if s.error else command(s.kind, s.text) for s in found
+        Command(s.kind, error=s.error) if s.error else command(s.kind, s.text)
+        for s in found
+        if s.kind not in OWN
     ], rest
 
 

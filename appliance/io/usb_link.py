@@ -24,6 +24,7 @@ from appliance.core.errors import (
     SensorMismatch,
     SensorOverflow,
 )
+from appliance.core.log import printable
 from appliance.io import packets
 from appliance.io.link import REPLY_MS, reply_to
 
@@ -195,7 +196,7 @@ def _let_go(device: usb.core.Device) -> None:
 
 def _serial(device: usb.core.Device) -> str:
     try:
-        return device.serial_number or ""
+        return printable(device.serial_number or "")
     except usb.core.USBError as e:
         raise _explain(e) from e
     except UnicodeDecodeError as e:

@@ -40,10 +40,13 @@ class NotFollowed(Exception):
 
 @dataclass(frozen=True, slots=True)
 class SystemCall:
-    """One system call. process, thread: numbers of its process and thread, 0 for the first. nth: its
-    number among the calls of this name in its thread, from 1, as strace counts. paths: its absolute
-    paths. data: the bytes that it writes, or the target of a symlink. words: its arguments as
-    strace prints them. result: None if the process was killed in it."""
+    """One system call.
+
+    process, thread: numbers of its process and thread, 0 for the first. nth: its number among the
+    calls of this name in its thread, from 1, as strace counts. paths: its absolute paths. data: the
+    bytes that it writes, or the target of a symlink. words: its arguments as strace prints them.
+    result: None if the process was killed in it.
+    """
 
     process: int
     thread: int

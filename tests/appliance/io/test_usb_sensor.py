@@ -418,9 +418,11 @@ def test_a_board_whose_clock_starts_anew(replugged: bool):
 )
 @pytest.mark.parametrize(
     "call",
-    ["enumerate_devices", "get_device_descriptor", "open_device", "get_configuration", "bulk_read"]
-    + ["get_configuration_descriptor", "claim_interface", "is_kernel_driver_active"]
-    + ["ctrl_transfer"],
+    [
+        *("enumerate_devices", "get_device_descriptor", "open_device", "get_configuration"),
+        *("get_configuration_descriptor", "claim_interface", "is_kernel_driver_active"),
+        *("ctrl_transfer", "bulk_read"),
+    ],
 )
 def test_no_error_of_a_usb_call_leaves_read(
     monkeypatch: pytest.MonkeyPatch, call: str, error: Exception
