@@ -88,7 +88,7 @@ def _good_sweeps(args: argparse.Namespace, settings: Config, current: Bundle) ->
     settings = replace(settings, classifier=replace(settings.classifier, early=False))
     devices = open_devices(args, lambda: current.format)
     stopped = stop_flag()
-    taken = SweepCollector(args.good)
+    taken = SweepCollector(args.good, enrolment.slide_check(current))
     with ExitStack() as stack:
         port = assembly.port(settings, devices)
         box = assembly.box(

@@ -25,6 +25,7 @@ from appliance.core.config import Config
 from appliance.core.devices import Devices
 from appliance.core.errors import BundleError, ConfigError, FormatError, SensorError
 from appliance.core.log import TroubleLog, log
+from appliance.core.patience import patiently
 from appliance.io import skins
 from appliance.io.usb_sensor import fits
 from appliance.runtime.replay import replay
@@ -136,7 +137,8 @@ def run_watch(args: argparse.Namespace) -> int:
         from appliance.watch.access import Access
         from appliance.watch.web import PageWatcher
 
-        watcher = PageWatcher(path, Access.configured(settings.watch, args.web), clock.now_ns)
+        access = Access.configured(settings.watch, args.web)
+        watcher = patiently(lambda: PageWatcher(path, access, clock.now_ns), clock, stopped)
         log.info(f"page: {watcher.server.address}")
         watcher.run(stopped)
         return 0

@@ -16,6 +16,7 @@ from appliance.cli.reporting import capture, done, feed, status
 from appliance.core.clock import SystemClock
 from appliance.core.config import Config
 from appliance.core.devices import Devices
+from appliance.core.disk_thread import DiskThread
 from appliance.core.errors import ConfigError, SensorError
 from appliance.core.log import log
 from appliance.core.observer import Observer
@@ -40,9 +41,9 @@ def run(args: argparse.Namespace) -> int:
         # reads the output
         sentences = settings.serial.port or not sys.stdout.isatty()
         port = assembly.port(settings, devices) if sentences else None
-        folder = args.out or Path(settings.store.folder) / "sweeps"
+        folder, disk = args.out or Path(settings.store.folder) / "sweeps", DiskThread()
         recording = RecordingSession(
-            folder, format, labels, devices.clock, _sentences(port), args.target
+            folder, format, labels, devices.clock, _sentences(port), args.target, disk
         )
         stack.callback(recording.close)
         page = _record_page(
@@ -56,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
             port,
             stack,
             capture=capture(args, settings, format, stack),
-            observers=[*_observers(settings, format, devices.source, recording), *page],
+            observers=[disk, *_observers(settings, format, devices.source, recording), *page],
             commands=recording.commands,
             ordered=bool(page),
         )

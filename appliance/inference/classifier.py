@@ -9,7 +9,6 @@ a label.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +21,10 @@ from appliance.core.errors import BundleError
 from appliance.core.observer import Observer
 from appliance.core.types import Frames, Status, Sweep, SweepFormat, Verdict
 from appliance.inference.novelty import ClassDistances, UnknownSweeps
-from appliance.inference.objects import FusedSweeps, ObjectRule, contradicts
+from appliance.inference.objects import LEAST_PROBABILITY as LEAST_PROBABILITY
+from appliance.inference.objects import Evidence, FusedSweeps, ObjectRule, contradicts
+from appliance.inference.objects import fuse as fuse
+from appliance.inference.objects import softmax as softmax
 from appliance.inference.session import ModelRunner
 from appliance.inference.taxel_watch import TaxelWatch
 from appliance.signal import features
@@ -36,34 +38,6 @@ if TYPE_CHECKING:
 
 
 _NONE, _NO_SLIDE, _IN_PLACE = np.empty(0), Slide(), Displacement()
-LEAST_PROBABILITY = 1e-12
-"""Lower bound of probabilities in a fusion, so that one sweep with a probability of 0 cannot veto
-all others."""
-
-
-def softmax(logits: NDArray[Any]) -> NDArray[np.float64]:
-    """Probabilities of logits along the last axis, in float64 (paper, eq. 10)."""
-    z = np.asarray(logits, np.float64)
-    e = np.exp(z - z.max(axis=-1, keepdims=True))
-    result: NDArray[np.float64] = e / e.sum(axis=-1, keepdims=True)
-    return result
-
-
-def fuse(scores: list[NDArray[np.float64]], fusion: str) -> NDArray[np.float64]:
-    """Fuse the probabilities float64 [K] of several sweeps of one object into one array [K].
-
-    fusion: "product" (Bayes with independent sweeps; Tulbure and Baeuml 2018), or "vote" (paper,
-    sec. V.D): the most frequent label wins. If two labels are equally frequent, the label
-    that occurred first wins, so with two sweeps the first decides.
-    """
-    if fusion == "product":
-        return softmax(np.log(np.maximum(scores, LEAST_PROBABILITY)).sum(axis=0))
-    labels = [int(np.argmax(s)) for s in scores]
-    votes = np.bincount(labels, minlength=len(scores[0])) / len(labels)
-    votes[max(labels, key=lambda k: votes[k])] += (
-        1e-9  # max() keeps the first of equals; argmax must agree
-    )
-    return votes
 
 
 def _degraded(finding: Finding) -> str:
@@ -299,22 +273,22 @@ class Classifier(Observer):
         earlier = self._sweeps
         if sweep.object == 0 or sweep.object != earlier.object or self._fusion == "none":
             earlier = FusedSweeps(sweep.object)
-        before = () if earlier.ended(sweep.start_ns, self._ends) else earlier.scores
+        before = None if earlier.ended(sweep.start_ns, self._ends) else earlier.evidence
         conflict = self._conflict(scores, before)
         if conflict and self._ends.conflict == "refuse":
             self._sweeps = replace(earlier, last=sweep.id, end_ns=sweep.stop_ns)
             finding = Finding(Status.CONFLICT, conflict, degraded)
             return self._verdict(sweep, finding, own=scores, touch=touch, after=earlier.last)
-        kept = (scores,) if conflict else (*before, scores)
+        kept = Evidence.of(scores, self._fusion, None if conflict else before)
         self._sweeps = FusedSweeps(sweep.object, kept, sweep.id, sweep.stop_ns)
-        fused = self._fuse(kept)
+        fused = kept.probabilities
         status, rule = Status.OK, self.bundle.manifest.displacement
         least = rule.unsure if touch.displacement.text and rule else 0
         if fused.max() < max(self.min_probability, least):
-            final = 0 < self._ends.max_sweeps <= len(kept)
+            final = 0 < self._ends.max_sweeps <= kept.sweeps
             status = Status.UNDECIDED if final else Status.UNSURE
         finding = Finding(status, conflict, degraded)
-        return self._verdict(sweep, finding, fused, len(kept), scores, touch, earlier.last)
+        return self._verdict(sweep, finding, fused, kept.sweeps, scores, touch, earlier.last)
 
     def forget(self) -> None:
         """Forget the sweeps of the present object; the next sweep begins another object."""
@@ -332,16 +306,12 @@ class Classifier(Observer):
         self._sweeps = before
         return None
 
-    def _fuse(self, scores: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-        """The probabilities float64 [K] of several sweeps; a single sweep keeps its own."""
-        return fuse(list(scores), self._fusion) if len(scores) > 1 else scores[0]
-
-    def _conflict(self, own: NDArray[np.float64], before: Sequence[NDArray[np.float64]]) -> str:
+    def _conflict(self, own: NDArray[np.float64], before: Evidence | None) -> str:
         """A message if `own` [K] contradicts the sweeps `before`, "" if it can be fused with
         them."""
         if not before or self._ends.conflict == "fuse":
             return ""
-        fused, labels = self._fuse(before), self.bundle.manifest.labels
+        fused, labels = before.probabilities, self.bundle.manifest.labels
         if not contradicts(own, fused):
             return ""
         return f"another object: {labels[own.argmax()]} after {labels[fused.argmax()]}"
