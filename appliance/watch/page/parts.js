@@ -14,6 +14,19 @@ export function made(name, classes, text, parent) {
   return one;
 }
 
+/* Draws the head of a page. state: of the skin, in words; fine: whether it streams. source: of the frames, if known. why: why
+   what is shown is not of this moment, "" where it is. */
+export function frame({state, fine, source, why = ""}) {
+  put("state", state);
+  byId("state").className = fine ? "pill fine" : "pill";
+  if (source) {
+    byId("simulated").hidden = source === "usb";
+    put("simulated", source === "replay" ? "REPLAYED" : "SIMULATED");
+  }
+  byId("banner").hidden = !why;
+  put("banner", why);
+}
+
 /* Writes a sweep's status, in the colour of what it means. */
 export function mark(chip, status) {
   chip.textContent = status;

@@ -1,7 +1,7 @@
 /* The page beside the robot: the box's last verdict first, then the skin, the sweep, the shift, and the box itself. */
 
 import {listen} from "/events.js";
-import {ago, byId, clock, count, made, mark, percent, put} from "/parts.js";
+import {ago, byId, clock, count, frame, made, mark, percent, put} from "/parts.js";
 import {SkinPicture, wayBack} from "/skin.js";
 import {course, signal, spectrogram} from "/plots.js";
 
@@ -74,8 +74,6 @@ function choose() {
 
 function drawHeader() {
   const source = (known.hello ?? known.view)?.source ?? "usb", {health, view} = known;
-  byId("simulated").hidden = source === "usb";
-  put("simulated", source === "replay" ? "REPLAYED" : "SIMULATED");
   byId("unsigned").hidden = !health?.unsigned;
   const bundle = known.box ? health?.model ?? "" : view?.bundle ?? "";
   byId("bundle").hidden = !bundle;
@@ -83,11 +81,8 @@ function drawHeader() {
   const skin = known.box ? health?.skin : view?.skin;
   const said = reached !== true ? "no connection" : known.box && !known.box.there ? "box away" : !skin ? "waiting" :
     skin !== "streaming" || !known.box ? `skin ${skin}` : health.sweeping ? "sweeping" : health.ready ? "ready" : "not ready";
-  put("state", said);
-  byId("state").className = live() ? "pill fine" : "pill";
   const why = trouble();
-  byId("banner").hidden = !why || sees("align"); // there the words say it
-  put("banner", why);
+  frame({state: said, fine: live(), source, why: sees("align") ? "" : why}); // there the words say it
   document.body.classList.toggle("stale", Boolean(why));
 }
 
