@@ -1,6 +1,7 @@
 /* What the pages' scripts share: elements, and figures in words. */
 
-const TONES = {ok: "good", recorded: "good", unsure: "warn", undecided: "warn", unknown: "warn", aborted: "plain"};
+const TONES = {ok: "good", recorded: "good", unsure: "warn", undecided: "warn", unknown: "warn", conflict: "warn",
+  displaced: "warn", aborted: "plain", off: "plain"};
 
 export const byId = (id) => document.getElementById(id);
 
@@ -42,6 +43,6 @@ export function ago(ms) {
   return s < 86400 ? `${Math.floor(s / 3600)} h ${Math.floor(s / 60) % 60} min` : `${Math.floor(s / 86400)} d ${Math.floor(s / 3600) % 24} h`;
 }
 
-export function percent(p) { return `${(100 * p).toFixed(1)} %`; }
+export function percent(p) { return `${(100 * p).toFixed(1)}\u00a0%`; }
 
 export function count(n) { return n.toLocaleString("en"); }
