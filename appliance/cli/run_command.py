@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from appliance.bundle.bundle import Bundle
-from appliance.cli.common import Facts, load_bundle, load_settings, stop_flag
+from appliance.cli.common import Facts, StopFlag, load_bundle, load_settings
 from appliance.cli.devices import open_devices
 from appliance.cli.reporting import capture, done, feed, status
 from appliance.core.clock import SystemClock
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 def run(args: argparse.Namespace) -> int:
     """Classify sweeps until SIGTERM, or with --sim until all sweeps of the script are answered."""
-    settings, stopped = load_settings(args), stop_flag()
+    settings, stopped = load_settings(args), StopFlag()
     choice = None if settings.classifier.bundle else assembly.store(settings).choose()
     with ExitStack() as stack:
         trial = stack.enter_context(choice.trial) if choice and choice.trial else None
@@ -58,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
             observers=[o for o in observers if o],
         )
         box.run(done(args, box, devices, stopped))
-    return 0
+    return stopped.exit_code
 
 
 def _reports(
