@@ -36,13 +36,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; its exit code."""
     _fill_streams()
     words = sys.argv[1:] if argv is None else list(argv)
-    answered = parser.MENU.answer(words)
-    if answered is not None:
-        return answered
-    args = parser.arguments(words[0], words[1:])
-    to_stderr()
     try:
+        if (answered := parser.MENU.answer(words)) is not None:
+            sys.stdout.flush()
+            return answered
         with during_imports("palpate"):
+            args = parser.arguments(words[0], words[1:])
+            to_stderr()
             run = _function(words[0])
         code = run(args)
         _flush()

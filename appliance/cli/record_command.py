@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from appliance.cli.common import Facts, load_settings, stop_flag
+from appliance.cli.common import Facts, StopFlag, load_settings
 from appliance.cli.devices import open_devices
 from appliance.cli.reporting import capture, done, feed, status
 from appliance.core.clock import SystemClock
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 def run(args: argparse.Namespace) -> int:
     """Keep each sweep with its label. No bundle is needed: the skin announces its format."""
     labels = Labels(args.material, args.position, args.session)
-    settings, stopped = load_settings(args), stop_flag()
+    settings, stopped = load_settings(args), StopFlag()
     with ExitStack() as stack:
         devices, format = _skin(args, settings)
         # a person at a terminal reads the log; sentences are for a robot, or for a program that
@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
         for shown in page:
             stack.enter_context(shown)
         box.run(done(args, box, devices, stopped))
-    return 0
+    return stopped.exit_code
 
 
 def _skin(args: argparse.Namespace, settings: Config) -> tuple[Devices, SweepFormat]:

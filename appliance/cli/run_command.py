@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from appliance.bundle.bundle import Bundle
-from appliance.cli.common import Facts, load_bundle, load_settings, stop_flag
+from appliance.cli.common import Facts, StopFlag, load_bundle, load_settings
 from appliance.cli.devices import open_devices
 from appliance.cli.reporting import capture, done, feed, status
 from appliance.core.clock import SystemClock
@@ -30,12 +30,11 @@ def run(args: argparse.Namespace) -> int:
     """Classify sweeps until SIGTERM, or with --sim until all sweeps of the script are answered."""
     settings = load_settings(args)
     with ended.noted(None if args.sim else settings.store.runtime_folder, SystemClock()):
-        _classify(args, settings)
-    return 0
+        return _classify(args, settings)
 
 
-def _classify(args: argparse.Namespace, settings: Config) -> None:
-    stopped = stop_flag()
+def _classify(args: argparse.Namespace, settings: Config) -> int:
+    stopped = StopFlag()
     choice = None if settings.classifier.bundle else assembly.store(settings).choose()
     with ExitStack() as stack:
         trial = stack.enter_context(choice.trial) if choice and choice.trial else None
@@ -72,6 +71,7 @@ def _classify(args: argparse.Namespace, settings: Config) -> None:
             observers=[o for o in observers if o],
         )
         box.run(done(args, box, devices, stopped))
+    return stopped.exit_code
 
 
 def _reports(

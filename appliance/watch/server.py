@@ -33,6 +33,7 @@ try:
     from tornado.ioloop import PeriodicCallback
     from tornado.iostream import StreamClosedError
     from tornado.netutil import bind_sockets
+    from tornado.template import Loader
     from tornado.web import Application, HTTPError, RequestHandler
 except ImportError as e:
     raise ConfigError(
@@ -153,11 +154,7 @@ class PageServer:
         self.queues: set[asyncio.Queue[bytes]] = set()
         self.answering: set[asyncio.Task[Any]] = set()
         self.wrong = TroubleLog("page")
-        self.files = {
-            f"/{f.name}": (KINDS[f.suffix], f.read_bytes())
-            for f in FOLDER.iterdir()
-            if f.suffix in KINDS
-        }
+        self.files = page_files()
         self.files["/"] = self.files[f"/{name}"]
         self._stop = asyncio.Event()
         self.server: LimitedServer | None = None
@@ -244,6 +241,20 @@ class PageServer:
         server.stop()
         await server.close_all_connections()
         await asyncio.sleep(0)  # cancelled handlers end
+
+
+def page_files() -> dict[str, tuple[str, bytes]]:
+    """Type and content of each file of FOLDER, by its path. Pages are in the frame that all of them
+    share, frame.html."""
+    frames = Loader(str(FOLDER), autoescape=None, whitespace="all")
+    return {
+        f"/{f.name}": (
+            KINDS[f.suffix],
+            frames.load(f.name).generate() if f.suffix == ".html" else f.read_bytes(),
+        )
+        for f in FOLDER.iterdir()
+        if f.suffix in KINDS and f.name != "frame.html"
+    }
 
 
 def _checked(port: int) -> int:
