@@ -159,6 +159,12 @@ class Protocol:
             )
         )
 
+    def left_out(self, sweeps: Dataset, test: Array) -> dict[str, list[Any]]:
+        """The values that the tested sweeps have of the group that the protocol leaves out; {} for
+        random folds. test: numbers of sweeps."""
+        found = LEAVE.fullmatch(self.text) or SPLIT.fullmatch(self.text)
+        return {found[1]: np.unique(sweeps.group(found[1])[test]).tolist()} if found else {}
+
     def clusters(self, sweeps: Dataset) -> Array | None:
         """A cluster number for each sweep [N], for intervals: sweeps of a cluster succeed or fail
         together. Clusters are the left-out groups, or else recordings of several windows. None if
