@@ -172,7 +172,7 @@ def run(args: argparse.Namespace) -> None:
     unfinished.unlink(missing_ok=True)
     print(f"fit: {len(made.train)} sweeps, {made.train.format}; {args.out}")
     _print_held_out(made)
-    if beside := trivial.beside_a_fit(sweeps):
+    if beside := trivial.beside_a_fit(sweeps, args.varies):
         told = "; ".join(f"{name} {formatting.counted(figure)}" for name, figure in beside.items())
         print(f"trivial baselines on held-out parts: {told}")
     if args.rest and rest:

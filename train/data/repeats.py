@@ -61,9 +61,9 @@ def digests(sweeps: Dataset) -> Array:
     )
 
 
-def sketch(sweeps: Dataset) -> str:
-    """The lowest MOST_KEPT of the digests of `sweeps` as text, for a manifest."""
-    lowest = np.unique(digests(sweeps))[:MOST_KEPT]
+def sketch(*sets: Dataset) -> str:
+    """The lowest MOST_KEPT of the digests of all sweeps as text, for a manifest."""
+    lowest = np.unique(np.concatenate([digests(sweeps) for sweeps in sets]))[:MOST_KEPT]
     return base64.b64encode(lowest.astype("<u8").tobytes()).decode()
 
 
@@ -74,6 +74,8 @@ def seen(sweeps: Dataset, kept: str) -> tuple[int, int]:
     a random part of the sweeps. Raises ValueError if `kept` is not a sketch.
     """
     known = np.frombuffer(base64.b64decode(kept, validate=True), "<u8")
+    if not len(known):
+        return 0, len(sweeps)
     own = digests(sweeps)
     possible = own if len(known) < MOST_KEPT else own[own <= known.max()]
     return int(np.isin(possible, known).sum()), len(possible)

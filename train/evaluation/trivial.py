@@ -66,11 +66,11 @@ def figures(sweeps: Dataset, folds: Sequence[tuple[Array, Array]]) -> Json:
     return found
 
 
-def beside_a_fit(sweeps: Dataset) -> Json:
-    """The accuracy of each baseline on the parts that chose the model; {} if nothing can be left
-    out."""
+def beside_a_fit(sweeps: Dataset, varies: Sequence[str] = ()) -> Json:
+    """The accuracy of each baseline on the parts that chose the model, see inner_parts; {} if
+    nothing can be left out."""
     try:
-        parts = inner_parts(sweeps)
+        parts = inner_parts(sweeps, varies=varies)
     except FormatError:
         return {}
     return figures(sweeps, [(~part.out, part.out) for part in parts])
