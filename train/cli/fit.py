@@ -17,6 +17,7 @@ from train.arguments.types import Add
 from train.data import labels
 from train.data.sets import Dataset, digest
 from train.data.transforms import WHOLE, Change
+from train.evaluation import trivial
 from train.evaluation.evaluate import CACHE
 from train.evaluation.fold import fingerprint
 from train.metrics import score
@@ -171,6 +172,9 @@ def run(args: argparse.Namespace) -> None:
     unfinished.unlink(missing_ok=True)
     print(f"fit: {len(made.train)} sweeps, {made.train.format}; {args.out}")
     _print_held_out(made)
+    if beside := trivial.beside_a_fit(sweeps, args.varies):
+        told = "; ".join(f"{name} {formatting.counted(figure)}" for name, figure in beside.items())
+        print(f"trivial baselines on held-out parts: {told}")
     if args.rest and rest:
         command = f"palpate-train score BUNDLE --set {shlex.quote(str(args.rest))}"
         print(

@@ -122,7 +122,7 @@ def run(args: argparse.Namespace) -> None:
         print(*_left_out(left_out), sep="\n", end="\n" * bool(left_out))
         if args.report:
             put(args.report, _report(taken, left_out).encode())
-    print("\n".join([*_taken(made), *summary.description(made.sweeps, {}), f"set: {args.out}"]))
+    print("\n".join([*_taken(made), *summary.description(made.sweeps), f"set: {args.out}"]))
     if broken := sum(one.broken for one in left_out):
         raise FormatError(
             f"{broken} of {broken + len(taken)} files could not be used, as said above; "

@@ -7,15 +7,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
-from train.data.readers import NUMBER, numbered
+from train.data.group_values import declared, measured, unit_after, unit_in_name
 
 FIELD = re.compile(r"\{(\w*)(?::([^{}]*))?\}")
 KINDS = {"": r"[^/]+", "d": r"-?\d+", "f": r"-?\d+(?:\.\d+)?"}
@@ -65,6 +63,15 @@ class NamePattern:
     def names(self) -> list[str]:
         return [name for name, _ in FIELD.findall(self.text) if name]
 
+    def kind(self, name: str) -> str:
+        """The kind of the field `name`, of KINDS."""
+        return next(found[2] or "" for found in FIELD.finditer(self.text) if found[1] == name)
+
+    def behind(self, name: str) -> str:
+        """The text of the pattern behind the field `name`, up to the next field."""
+        end = next(found.end() for found in FIELD.finditer(self.text) if found[1] == name)
+        return self.text[end:].partition("{")[0]
+
     def read(self, path: str) -> dict[str, str] | None:
         """The fields of a path, or None if it does not match the pattern.
 
@@ -99,18 +106,15 @@ class NamePattern:
         return "".join([*parts, re.escape(self.text[end:])])
 
 
-def group(texts: Sequence[str]) -> tuple[NDArray[Any], str]:
-    """A number for each text [N], and an explanation of the numbers.
+def group(pattern: NamePattern, name: str, texts: Sequence[str]) -> tuple[NDArray[Any], str]:
+    """The values [N] of the field `name` of a pattern, whose `texts` stand in N names, and their
+    unit, "" if no name gives one.
 
-    Whole numbers keep their value, and the explanation is "". Other texts get their rank: by
-    value if all are numbers, else by alphabet.
+    The unit stands behind the field in the pattern, as in {force:d}N, in every text, as in 5N, or
+    at the end of the field's name, as in speed_mm_s.
     """
-    different = sorted(set(texts))
-    if all(map(NUMBER.fullmatch, different)):
-        return numbered(texts), ""
-    with suppress(ValueError):  # some are not numbers
-        different = sorted(different, key=float)
-    rank = {text: i for i, text in enumerate(different)}
-    return np.array([rank[text] for text in texts]), ", ".join(
-        f"{i} = {text}" for text, i in rank.items()
-    )
+    kind = pattern.kind(name)
+    values, unit = (declared(texts, kind), "") if kind else measured(texts)
+    if values.dtype.kind == "U":
+        return values, ""
+    return values, unit or unit_after(pattern.behind(name)) or unit_in_name(name)

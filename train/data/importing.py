@@ -441,7 +441,7 @@ def _why_not(counts: Array, dtype: str) -> str:
 def _set(
     folder: Path, cuts: Sequence[Cut], rate_hz: float, dtype: str, plan: ImportPlan
 ) -> tuple[Dataset, list[str]]:
-    """All windows as one set, and notes that explain the numbers of its groups."""
+    """All windows as one set, and notes about the units of its groups."""
     shapes = {cut.windows.shape[2:] for cut in cuts}
     if len(shapes) > 1:
         raise FormatError(
@@ -451,14 +451,21 @@ def _set(
     count = [len(cut.windows) for cut in cuts]
     materials = sorted({cut.recording.fields["material"] for cut in cuts})
     numbers = np.array([materials.index(cut.recording.fields["material"]) for cut in cuts])
-    groups, notes = {"recording": np.repeat(np.arange(len(cuts)), count)}, []
+    groups, units = {"recording": np.repeat(np.arange(len(cuts)), count)}, dict[str, str]()
     for name in plan.pattern.names:
         if name != "material":
-            values, meaning = group([cut.recording.fields[name] for cut in cuts])
+            texts = [cut.recording.fields[name] for cut in cuts]
+            values, unit = group(plan.pattern, name, texts)
             groups[name] = np.repeat(values, count)
-            notes += [f"{name}: {meaning}"] if meaning else []
+            units |= {name: unit} if unit else {}
     samples = np.concatenate([cut.windows.astype(dtype) for cut in cuts])
     sweeps = Dataset(
-        samples, np.repeat(numbers, count), tuple(materials), rate_hz, groups, str(folder)
+        samples,
+        np.repeat(numbers, count),
+        tuple(materials),
+        rate_hz,
+        groups,
+        str(folder),
+        units=units,
     )
-    return sweeps, notes
+    return sweeps, [f"{name} is in {unit}, as its name says" for name, unit in units.items()]

@@ -31,6 +31,7 @@ from appliance.inference.classifier import Classifier, softmax
 from appliance.inference.novelty import shaped_distances
 from train.calibration.contact import Contacts
 from train.calibration.slide_speeds import trained_speeds
+from train.data import repeats
 from train.data.readers import counted
 from train.data.sets import Dataset
 from train.export import (
@@ -217,6 +218,7 @@ def _made(content: Content, commit: str, unknown: dict[str, str]) -> dict[str, A
     made = {
         "commit": commit,
         "set": content.train.source,
+        "sweeps": repeats.sketch(content.train, content.held_out),
         "machine": platform.machine(),
         "cpus": os.cpu_count(),
         "torch": metadata.version("torch") if find_spec("torch") else None,

@@ -23,6 +23,7 @@ from appliance.core.errors import FormatError
 from appliance.core.sweep_set import Array
 from appliance.core.types import SweepFormat
 from train.data import readers, sets
+from train.data.group_values import text_of
 from train.data.readers import RecordedSweep
 from train.reports.plot_style import (
     ACCENT,
@@ -176,7 +177,10 @@ def of_set(labelled: sets.Dataset, number: int) -> ShownSweep:
     """A sweep of a set with its groups."""
     named = [
         labelled.materials[labelled.labels[number]],
-        *(f"{by} {v[number]}" for by, v in sorted(labelled.groups.items())),
+        *(
+            f"{by} {text_of(v[number])} {labelled.units.get(by, '')}".rstrip()
+            for by, v in sorted(labelled.groups.items())
+        ),
     ]
     taxels = labelled.samples[number]
     notes = (f"{labelled.source}, sweep {number} of {len(labelled)}", str(labelled.format))

@@ -144,6 +144,7 @@ class Fit:
             "materials": self.train.materials,
             "rate_hz": self.train.rate_hz,
             "source": self.train.source,
+            "units": self.train.units,
             "trained_on": len(self.train),
             "about": self.about,
             "plan": self.plan.json(),
@@ -188,6 +189,7 @@ class Fit:
             groups,
             meta["source"],
             arrays.get("set_unloaded"),
+            meta.get("units", {}),
         )
         first = np.arange(len(sweeps)) < meta["trained_on"]
         return cls(
