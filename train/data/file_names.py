@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
+from train.data.files.table import normal
 from train.data.readers import NUMBER, numbered
 
 FIELD = re.compile(r"\{(\w*)(?::([^{}]*))?\}")
@@ -28,19 +29,21 @@ EXAMPLE = "'{material}_{force:d}N_{trial}.csv'"
 class NamePattern:
     """A pattern over paths below a folder; `{}` matches text that is ignored.
 
-    Raises FormatError if the pattern cannot be read.
+    elsewhere: names of fields that stand elsewhere, so that the pattern need not hold them. Raises FormatError if the pattern cannot be read.
     """
 
     text: str
+    elsewhere: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "text", normal(self.text))
         names = self.names
         rest = FIELD.sub("", self.text)
         if "{" in rest or "}" in rest:
             raise FormatError(
                 f"--pattern {self.text!r} has an unmatched brace; write e.g. {EXAMPLE}"
             )
-        if "material" not in names:
+        if "material" not in (*names, *self.elsewhere):
             raise FormatError(
                 f"--pattern {self.text!r} does not say where the material stands; "
                 f"write e.g. {EXAMPLE}"
@@ -70,7 +73,7 @@ class NamePattern:
 
         Raises FormatError if it matches in several ways.
         """
-        short, long = (re.fullmatch(self._expression(how), path) for how in ("+?", "+"))
+        short, long = (re.fullmatch(self._expression(how), normal(path)) for how in ("+?", "+"))
         if not (short and long):
             return None
         if short.groups() != long.groups():

@@ -34,9 +34,15 @@ SLIDE_GROUPS = {"speed": "speed_mm_s", "force": "force_n"}
 """Groups of the speed and the force of the slide, in thousandths: um/s and mN."""
 REFUSED = tuple(status for status in Status if status.faulty)
 """The box's answers to windows that it does not classify."""
-FRAMES = (".csv", ".tsv", ".txt", ".dat", ".mat", ".npy")
+FRAMES = (
+    ".csv", ".tsv", ".txt", ".dat", ".mat", ".npy", ".asf", ".lvm", ".tdms", ".jsonl", ".xlsx",
+    ".parquet", ".bag", ".mcap", ".db3",
+)  # fmt: skip
 """Suffixes of files that hold the frames of one recording. importing.py makes a set of a folder of
 such files."""
+JUNK = ("__MACOSX", "Thumbs.db", "desktop.ini", "Icon\r")
+"""Names of files and folders that systems leave beside recordings. Names that begin with . or ~$ are
+passed over too."""
 IMPORT = "palpate-train import {} makes a set of such files"
 NUMBER = re.compile(r"0|[1-9][0-9]{0,8}")
 """A name that is a whole number. 07 is not, or it would equal 7."""
@@ -213,7 +219,7 @@ def read_recorded(folder: Path) -> list[RecordedSweep]:
     holds no recorded sweep.
     """
     check_folder(folder)
-    paths = sorted(folder.rglob("*.npy"))
+    paths = [path for path in files_below(folder) if path.suffix == ".npy"]
     if not any(path.with_suffix(".json").exists() for path in paths):
         raise FormatError(
             f"{folder}: not a sweep set: no sweep of `palpate record` is in it; {_advice(folder)}"
@@ -232,11 +238,24 @@ def check_folder(folder: Path) -> None:
         ) from e
 
 
+def files_below(folder: Path) -> list[Path]:
+    """All files in and below a folder, in the order of their names, without those of JUNK."""
+    return sorted(
+        path
+        for path in folder.rglob("*")
+        if not any(
+            part in JUNK or part.startswith((".", "~$"))
+            for part in path.relative_to(folder).parts
+        )
+        and path.is_file()
+    )
+
+
 def _advice(folder: Path) -> str:
     """The advice for a folder that holds no recordings of the box."""
     others = Counter(
         path.suffix.lower()
-        for path in folder.rglob("*")
+        for path in files_below(folder)
         if path.suffix.lower() in (*FRAMES, *HDF5, ".npz")
     )
     if sets := others[".npz"] + sum(others[suffix] for suffix in HDF5):
