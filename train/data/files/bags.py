@@ -32,7 +32,11 @@ def read(path: Path, wanted: Wanted) -> Table:
     each. Raises FormatError that lists the topics."""
     highlevel = library("rosbags.highlevel", WHAT)
     stores = library("rosbags.typesys", WHAT)
-    source = path.parent if path.suffix == ".db3" and (path.parent / "metadata.yaml").exists() else path
+    source = path
+    if path.suffix.lower() == ".db3":
+        source = path.parent
+        if not (source / "metadata.yaml").exists():
+            raise FormatError("lacks metadata.yaml beside it; run `ros2 bag reindex` on its folder")
     store = stores.get_typestore(stores.Stores.ROS2_JAZZY)
     with highlevel.AnyReader([source], default_typestore=store) as bag:
         topics: dict[str, list[Any]] = {}

@@ -38,13 +38,14 @@ def read(lines: Sequence[str], wanted: Wanted, notes: Sequence[str]) -> Table:
     head = dict(found.groups() for line in lines[:start] if (found := KEY.match(line.strip())))
     blocks, said = _blocks(list(enumerate(lines, 1))[start + 1 :])
     shape = _shape(head, blocks)
-    said = [*notes, *said]
-    if blocks[-1][1] and len(blocks[-1][1]) < shape[0]:
-        said.append(f"read up to frame {blocks[-1][0]}, which is cut off")
+    last, rows = blocks[-1]
+    if said and (len(rows) < shape[0] or len(_cells(rows[-1][1])) < shape[1]):
+        said.append(f"read up to frame {last}, which is cut off")
         blocks = blocks[:-1]
     if not blocks:
         raise FormatError("holds no whole frame")
     frames = np.stack([_frame(number, rows, shape) for number, rows in blocks])
+    said = [*notes, *said]
     numbers = [number for number, _ in blocks]
     for before, after in zip(numbers, numbers[1:], strict=False):
         if after != before + 1:
