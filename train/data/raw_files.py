@@ -5,12 +5,16 @@ Nothing is unpickled. An ambiguous file is refused, and the message names the op
 
 from __future__ import annotations
 
+import csv
+import zipfile
+import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import h5py
 
 from appliance.core.errors import FormatError
+from appliance.core.types import UNREADABLE
 from train.data.files import (
     bags,
     hdf5,
@@ -38,6 +42,11 @@ BINARY: Mapping[tuple[str, ...], Reader] = {
     bags.SUFFIXES: bags.read,
 }
 """Readers by the suffixes of their files. Other files are HDF5 or text."""
+LIBRARIES = (sheets.read, parquet.read, tdms.read, bags.read)
+DAMAGED = (
+    *UNREADABLE, OSError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error, csv.Error,
+)  # fmt: skip
+"""Exceptions that NumPy, h5py and Python's own libraries raise for damaged files."""
 REMEDIES = {
     (".pkl", ".pickle", ".joblib"): "a pickle, which can run any program; save arrays with numpy.savez",
     (".pt", ".pth"): "a file of PyTorch; save the tensor with numpy.save(path, tensor.numpy())",
@@ -76,19 +85,22 @@ MAGIC = {
 
 def read(path: Path, wanted: Wanted | None = None) -> Table:
     """The recording in a file. Raises FormatError whose message does not repeat the file's name."""
-    wanted = wanted or Wanted()
     try:
-        return _read(path, wanted)
-    except FormatError:
-        raise
-    except Exception as e:  # libraries raise errors of any type for damaged files
-        said = " ".join(str(e).split()) or type(e).__name__
-        raise FormatError(f"cannot be read: {said}") from e
+        return _read(path, wanted or Wanted())
+    except DAMAGED as e:
+        raise FormatError(f"cannot be read: {' '.join(str(e).split())}") from e
 
 
 def _read(path: Path, wanted: Wanted) -> Table:
     suffix = path.suffix.lower()
     reader = next((read for suffixes, read in BINARY.items() if suffix in suffixes), None)
+    if reader in LIBRARIES:
+        try:
+            return reader(path, wanted)
+        except FormatError:
+            raise
+        except Exception as e:  # libraries raise errors of any type for damaged files
+            raise FormatError(f"cannot be read: {' '.join(str(e).split()) or repr(e)}") from e
     if reader:
         return reader(path, wanted)
     if remedy := next((why for suffixes, why in REMEDIES.items() if suffix in suffixes), ""):

@@ -19,7 +19,7 @@ import numpy as np
 
 from appliance.core.errors import FormatError
 from appliance.core.sweep_set import Array, Set, build, load_file
-from appliance.core.types import Status, Sweep, SweepFormat, sidecar
+from appliance.core.types import LARGEST_READING, Status, Sweep, SweepFormat, sidecar
 from appliance.core.types import load as load_recording
 from appliance.signal.unloaded import UnloadedSkin
 
@@ -399,6 +399,14 @@ def _check(one: RecordedSweep, wanted: SweepFormat) -> None:
         raise FormatError(
             f"{path}: {n} frames of {one.format}; others have {wanted}: "
             "keep each format in a folder of its own"
+        )
+    taxels = one.sweep.frames.taxels
+    if taxels.dtype.kind == "f" and (bad := ~(np.abs(taxels) <= LARGEST_READING)).any():
+        frame, *taxel = (int(i) + 1 for i in np.argwhere(bad)[0])
+        raise FormatError(
+            f"{path}: frame {frame}, taxel {', '.join(map(str, taxel))} reads "
+            f"{taxels[bad][0]:g}, and no skin reads more than {LARGEST_READING:g}; "
+            "move the sweep and its .json away"
         )
     if not one.sweep.material:
         raise FormatError(
