@@ -142,7 +142,9 @@ def inspect_readings(taxels: NDArray[Any]) -> Finding:
         return Finding(Status.OK)
     shape = (*taxels.shape[1:], 1)[:3]
     unreadable = TaxelStatistics.of(taxels).unreadable.reshape(shape)
-    return Finding(Status.DEAD_TAXEL, _taxels(unreadable)) if unreadable.any() else Finding(Status.OK)
+    return (
+        Finding(Status.DEAD_TAXEL, _taxels(unreadable)) if unreadable.any() else Finding(Status.OK)
+    )
 
 
 def inspect_bare(taxels: NDArray[Any], unloaded: UnloadedSkin) -> Finding:

@@ -41,8 +41,9 @@ def frames(table: Table, plan: ImportPlan) -> tuple[Array, Array | None, list[st
     bad = ~np.isfinite(chosen) if chosen.dtype.kind == "f" else np.zeros(0, bool)
     what = "fill it in or cut it away"
     if chosen.dtype.kind == "f" and not bad.any():
-        bad, what = np.abs(chosen) > LARGEST_READING, (
-            f"no skin reads more than {LARGEST_READING:g}: fill it in or cut it away"
+        bad, what = (
+            np.abs(chosen) > LARGEST_READING,
+            (f"no skin reads more than {LARGEST_READING:g}: fill it in or cut it away"),
         )
     if bad.any():
         index = np.argwhere(bad)[0]
@@ -98,7 +99,7 @@ def _fits(values: Array, axis: int, table: Table, plan: ImportPlan) -> bool:
         return False
     if plan.rate_hz is None:
         return bool(name) or values.shape[axis] == max(values.shape)
-    return values.shape[axis] >= plan.window.frames(plan.rate_hz)
+    return bool(values.shape[axis] >= plan.window.frames(plan.rate_hz))
 
 
 def _ordered(values: Array, plan: ImportPlan) -> Array:
@@ -193,9 +194,9 @@ def _taxels(values: Array, table: Table, plan: ImportPlan, time_column: int | No
         numbers = [
             i for i in range(wide) if i not in (time_column, *others) and i not in table.texts
         ]
+    _check_numbers(table, numbers)
     if len(numbers) != want:
         raise FormatError(_mismatch(len(numbers), len(values), plan, time_column))
-    _check_numbers(table, numbers)
     return values[:, numbers].reshape(len(values), *shape)
 
 
@@ -275,7 +276,11 @@ def _named(name: str, names: Sequence[str], option: str) -> int:
             f"{option}: columns {listed} are all called {name!r}; use their numbers, "
             f"such as {where[0] + 1}"
         )
-    if RANGE.fullmatch(name) and name != str(where[0] + 1) and int(name.split("-")[0]) <= len(names):
+    if (
+        RANGE.fullmatch(name)
+        and name != str(where[0] + 1)
+        and int(name.split("-")[0]) <= len(names)
+    ):
         raise FormatError(
             f"{option}: {name!r} is the name of column {where[0] + 1} and the number of another; "
             f"give the range {where[0] + 1}-{where[0] + 1}, or rename the columns"

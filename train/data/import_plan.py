@@ -136,7 +136,11 @@ class ImportPlan:
     @property
     def order(self) -> tuple[str, ...]:
         """The axes that --axes or --transpose gives, () without them."""
-        return ("taxel", "frame") if self.transpose else tuple(self.axes.split(","))[: 8 * bool(self.axes)]
+        return (
+            ("taxel", "frame")
+            if self.transpose
+            else tuple(self.axes.split(","))[: 8 * bool(self.axes)]
+        )
 
     @property
     def names(self) -> list[str]:

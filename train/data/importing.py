@@ -164,22 +164,23 @@ def _without_copies(
     """
     kept: list[Recording] = []
     doubts: list[str] = []
-    first: dict[bytes, Recording] = {}
+    seen: dict[bytes, dict[str, Recording]] = {}
     for one in recordings:
         content = np.ascontiguousarray(one.frames, np.float64)
         key = hashlib.sha256(repr(content.shape).encode() + content.tobytes()).digest()
-        other = first.setdefault(key, one)
-        if other is one:
-            kept.append(one)
-        elif other.fields["material"] == one.fields["material"]:
-            why = f"holds the same frames as {other.name}, which counts once"
+        same = seen.setdefault(key, {})
+        material = one.fields["material"]
+        if material in same:
+            why = f"holds the same frames as {same[material].name}, which counts once"
             left_out.append(LeftOut(one.name, why))
-        else:
-            kept.append(one)
-            doubts.append(
-                f"warning: {one.name} holds the same frames as {other.name}, "
-                f"of {other.fields['material']}: one of the two names is wrong"
-            )
+            continue
+        doubts += [
+            f"warning: {one.name} holds the same frames as {other.name}, of {name}: "
+            "one of the two names is wrong"
+            for name, other in same.items()
+        ]
+        same[material] = one
+        kept.append(one)
     return kept, doubts
 
 

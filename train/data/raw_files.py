@@ -48,7 +48,11 @@ DAMAGED = (
 )  # fmt: skip
 """Exceptions that NumPy, h5py and Python's own libraries raise for damaged files."""
 REMEDIES = {
-    (".pkl", ".pickle", ".joblib"): "a pickle, which can run any program; save arrays with numpy.savez",
+    (
+        ".pkl",
+        ".pickle",
+        ".joblib",
+    ): "a pickle, which can run any program; save arrays with numpy.savez",
     (".pt", ".pth"): "a file of PyTorch; save the tensor with numpy.save(path, tensor.numpy())",
     (".rds", ".rdata", ".rda"): "a file of R; save the table with write.csv",
     (".zip", ".gz", ".bz2", ".xz", ".zst", ".7z", ".tar", ".tgz", ".rar"): "packed; unpack it",

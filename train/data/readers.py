@@ -41,8 +41,8 @@ FRAMES = (
 """Suffixes of files that hold the frames of one recording. importing.py makes a set of a folder of
 such files."""
 JUNK = ("__MACOSX", "Thumbs.db", "desktop.ini", "Icon\r")
-"""Names of files and folders that systems leave beside recordings. Names that begin with . or ~$ are
-passed over too."""
+"""Names of files and folders that systems leave beside recordings. Names that begin with . or ~$
+are passed over too."""
 IMPORT = "palpate-train import {} makes a set of such files"
 NUMBER = re.compile(r"0|[1-9][0-9]{0,8}")
 """A name that is a whole number. 07 is not, or it would equal 7."""
@@ -244,8 +244,7 @@ def files_below(folder: Path) -> list[Path]:
         path
         for path in folder.rglob("*")
         if not any(
-            part in JUNK or part.startswith((".", "~$"))
-            for part in path.relative_to(folder).parts
+            part in JUNK or part.startswith((".", "~$")) for part in path.relative_to(folder).parts
         )
         and path.is_file()
     )

@@ -49,7 +49,9 @@ def stored(path: Path, values: np.ndarray, how: str) -> Table:
 
 
 @pytest.mark.parametrize("how", ["npy", "mat", "v7.3", "h5", "h5 of MATLAB"])
-@pytest.mark.parametrize(("rows", "columns", "axes"), [(4, 4, 0), (2, 5, 0), (4, 4, 3), (16, 16, 0)])
+@pytest.mark.parametrize(
+    ("rows", "columns", "axes"), [(4, 4, 0), (2, 5, 0), (4, 4, 3), (16, 16, 0)]
+)
 @pytest.mark.parametrize("grid", [True, False])
 def test_the_last_axis_is_the_time_if_only_it_fits(
     tmp_path: Path, how: str, rows: int, columns: int, axes: int, grid: bool
@@ -59,7 +61,10 @@ def test_the_last_axis_is_the_time_if_only_it_fits(
     last = np.moveaxis(x, 0, -1)
     name = f"{rows}x{columns}x{axes}" if axes else f"{rows}x{columns}"
     asked = plan(grid=name if grid else "")
-    for values, notes in ((x, []), (last, [f"its last axis is the time: frames of {[*x.shape[1:]]}"])):
+    for values, notes in (
+        (x, []),
+        (last, [f"its last axis is the time: frames of {[*x.shape[1:]]}"]),
+    ):
         found, time_s, said = frames.frames(stored(tmp_path / "a", values, how), asked)
         np.testing.assert_array_equal(found, x)
         assert (time_s, said) == (None, notes)
@@ -77,7 +82,9 @@ def test_the_last_axis_is_the_time_if_only_it_fits(
 def test_what_both_axes_could_be_is_asked_for(shape: tuple[int, ...], grid: str, answer: str):
     """The message shows the shape and both answers, and each of them works."""
     x = np.arange(np.prod(shape)).reshape(shape)
-    what = "the first and the last axis could both be" if answer == "first" else "neither end can be"
+    what = (
+        "the first and the last axis could both be" if answer == "first" else "neither end can be"
+    )
     with pytest.raises(FormatError) as e:
         frames.frames(Table(x), plan(grid=grid))
     assert str(e.value) == (
@@ -94,7 +101,9 @@ def test_what_both_axes_could_be_is_asked_for(shape: tuple[int, ...], grid: str,
 def test_square_arrays_of_taxels_and_frames_are_asked_for():
     """16 frames of 16 taxels: no axis shows what it is."""
     x = np.arange(256).reshape(16, 16)
-    with pytest.raises(FormatError, match="both axes could be the 16 taxels; say which with --axes"):
+    with pytest.raises(
+        FormatError, match="both axes could be the 16 taxels; say which with --axes"
+    ):
         frames.frames(Table(x), plan(grid="4x4"))
     asked = plan(grid="4x4", axes="taxel,frame")
     np.testing.assert_array_equal(frames.frames(Table(x), asked)[0], x.T.reshape(16, 4, 4))

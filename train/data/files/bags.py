@@ -89,7 +89,9 @@ def _table(bag: Any, connections: list[Any]) -> Table:
                 f"message {len(rows) + 1} holds {len(row)} numbers, message 1 holds {len(rows[0])}"
             )
         names = names or [
-            k if np.ndim(v) == 0 else f"{k}.{i}" for k, v in found.items() for i in range(np.size(v))
+            k if np.ndim(v) == 0 else f"{k}.{i}"
+            for k, v in found.items()
+            for i in range(np.size(v))
         ]
         rows.append(row)
         received.append(at)

@@ -15,7 +15,9 @@ TOKEN = re.compile(r"(?<![^\s;\"])[+-]?\d[\d.,]*(?:[eE][+-]?\d+)?(?![^\s;\"])")
 """A number in a text whose columns are separated by tabs, semicolons or blanks."""
 QUOTED = re.compile(r'"\s*([+-]?\d[\d.,]*(?:[eE][+-]?\d+)?)\s*"')
 """A number in quotes. In a text with commas between its columns only these can hold a comma."""
-DECISIVE_DOT = re.compile(r"(?<![\d.,])(?:0+|[1-9]\d{3,})\.\d|(?<=\d)\.(?:\d{1,2}|\d{4,})(?![\d.,])")
+DECISIVE_DOT = re.compile(
+    r"(?<![\d.,])(?:0+|[1-9]\d{3,})\.\d|(?<=\d)\.(?:\d{1,2}|\d{4,})(?![\d.,])"
+)
 """A dot that can only be a decimal sign."""
 GROUPS = r"[+-]?[1-9]\d{{0,2}}(?:\{0}\d{{3}})+"
 Row = tuple[int, str]

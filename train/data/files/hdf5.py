@@ -15,7 +15,12 @@ from train.data.readers import array_in
 CLASS = "MATLAB_class"
 INTERNAL = ("#refs#", "#subsystem#")
 """Groups in which MATLAB keeps the contents of cells and objects."""
-NUMERIC = ("double", "single", "logical", *(f"{u}int{n}" for u in ("", "u") for n in (8, 16, 32, 64)))
+NUMERIC = (
+    "double",
+    "single",
+    "logical",
+    *(f"{u}int{n}" for u in ("", "u") for n in (8, 16, 32, 64)),
+)
 """MATLAB's classes of numeric arrays."""
 
 

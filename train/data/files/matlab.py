@@ -68,6 +68,7 @@ def _lines(node: Any) -> Iterator[tuple[Array, Array]]:
         if str(one.get("type")).endswith(("line", "lineseries")) and isinstance(y, np.ndarray):
             x = values.get("XData")
             given = isinstance(x, np.ndarray) and x.size == y.size
-            yield np.ravel(x) if given else np.arange(1.0, y.size + 1), np.ravel(y)
+            at = np.asarray(x).ravel() if given else np.arange(1.0, y.size + 1)
+            yield at, y.ravel()
         if values.get("Tag") != "legend":
             yield from _lines(one.get("children"))

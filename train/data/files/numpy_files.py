@@ -12,6 +12,9 @@ import numpy as np
 from appliance.core.errors import FormatError
 from train.data.files.table import Array, Entry, Table, Wanted, chosen, records
 
+FORMAT: Any = np.lib.format
+"""NumPy's reader of headers; it has no types."""
+
 
 def read_npy(path: Path, wanted: Wanted) -> Table:
     """The array of an .npy file. Raises FormatError or what NumPy raises for a damaged file."""
@@ -35,12 +38,8 @@ def read_npz(path: Path, wanted: Wanted) -> Table:
 def _header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]] | None:
     """Shape and type of an array, None for a member that is not an array of numbers or text."""
     try:
-        version = np.lib.format.read_magic(file)
-        reader = (
-            np.lib.format.read_array_header_1_0
-            if version == (1, 0)
-            else np.lib.format.read_array_header_2_0
-        )
+        version = FORMAT.read_magic(file)
+        reader = FORMAT.read_array_header_1_0 if version == (1, 0) else FORMAT.read_array_header_2_0
         shape, _, dtype = reader(file)
     except ValueError:
         return None
@@ -50,7 +49,7 @@ def _header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]] | None:
 def _member(archive: zipfile.ZipFile, member: str) -> Array:
     try:
         with archive.open(member) as file:
-            values: Array = np.lib.format.read_array(file, allow_pickle=False)
+            values: Array = FORMAT.read_array(file, allow_pickle=False)
             return values
     except zipfile.BadZipFile as e:
         raise FormatError(f"{member} is damaged: {e}") from e

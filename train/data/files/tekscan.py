@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -35,7 +36,8 @@ def read(lines: Sequence[str], wanted: Wanted, notes: Sequence[str]) -> Table:
     Rows and columns without a sensel are left out. Raises FormatError that names the line.
     """
     start = next(i for i, line in enumerate(lines) if START.match(line))
-    head = dict(found.groups() for line in lines[:start] if (found := KEY.match(line.strip())))
+    matches = [found for line in lines[:start] if (found := KEY.match(line.strip()))]
+    head = {str(found[1]): str(found[2]) for found in matches}
     blocks, said = _blocks(list(enumerate(lines, 1))[start + 1 :])
     shape = _shape(head, blocks)
     last, rows = blocks[-1]
@@ -47,7 +49,7 @@ def read(lines: Sequence[str], wanted: Wanted, notes: Sequence[str]) -> Table:
     frames = np.stack([_frame(number, rows, shape) for number, rows in blocks])
     said = [*notes, *said]
     numbers = [number for number, _ in blocks]
-    for before, after in zip(numbers, numbers[1:], strict=False):
+    for before, after in pairwise(numbers):
         if after != before + 1:
             raise FormatError(f"frame {after} follows frame {before}; export all frames")
     frames, dropped = _without_empty(frames)
@@ -114,7 +116,7 @@ def _frame(number: int, rows: Sequence[Row], shape: tuple[int, int]) -> Array:
 def _without_empty(frames: Array) -> tuple[Array, str]:
     """Frames without the rows and columns that have no sensel; 0 at other places without one."""
     empty = np.isnan(frames)
-    missing = empty.all(axis=0)
+    missing: Array = empty.all(axis=0)
     if (empty.any(axis=0) != missing).any():
         r, c = np.argwhere(empty.any(axis=0) != missing)[0]
         raise FormatError(f"row {r + 1}, column {c + 1} is {NO_SENSEL} in some of the frames only")

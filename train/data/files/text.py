@@ -47,7 +47,7 @@ Row = tuple[int, str]
 
 def decoded(data: bytes) -> tuple[str, list[str]]:
     """The text, and remarks on what was dropped at its end."""
-    notes = []
+    notes: list[str] = []
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
         return data.decode("utf-16", "replace").lstrip("\ufeff"), notes
     if data[:400].count(0) > len(data[:400]) // 3:
@@ -264,7 +264,9 @@ def _heads(lines: Sequence[str], before: Sequence[Row], layout: Layout) -> tuple
     plain_lines = [line for _, line in before if not line.lstrip().startswith(COMMENTS)]
     for wide in (layout.wide, layout.wide - 1):
         for group in (plain_lines, comments):
-            heads = [[c.strip().strip('"') for c in cells(line, layout.delimiter)] for line in group]
+            heads = [
+                [c.strip().strip('"') for c in cells(line, layout.delimiter)] for line in group
+            ]
             heads = [h[:-1] if len(h) == wide + 1 and not h[-1] else h for h in heads]
             heads = [h for h in heads if len(h) == wide and not all(map(is_number, h))]
             if named := [h for h in heads if not all(map(UNIT.fullmatch, h))] or heads:
@@ -335,7 +337,10 @@ def _columns(
             continue
         bad = _into(values[:, c], column, convert)
         if bad is not None:
-            faults[c] = f"line {rows[bad][0]}, column {c + 1} is {excerpt(column[bad])}, which is not a number"
+            faults[c] = (
+                f"line {rows[bad][0]}, column {c + 1} is {excerpt(column[bad])}, "
+                "which is not a number"
+            )
     return values, texts, faults
 
 

@@ -22,7 +22,9 @@ FIELDS["t"], FIELDS["taxels"], FIELDS["who"] = np.arange(40) / 10, SKIN, b"wood"
 
 def test_an_npz_with_objects_is_read_beside_them(tmp_path: Path):
     """Dictionaries and None are passed over, without being unpickled."""
-    np.savez(tmp_path / "a.npz", skin=SKIN, info={"who": "Ada"}, none=None, name="wood", t=SKIN[:, 0])
+    np.savez(
+        tmp_path / "a.npz", skin=SKIN, info={"who": "Ada"}, none=None, name="wood", t=SKIN[:, 0]
+    )
     found = raw_files.read(tmp_path / "a.npz", Wanted(time="t"))
     np.testing.assert_array_equal(found.values, SKIN)
     np.testing.assert_array_equal(found.vectors["t"], SKIN[:, 0])
@@ -86,7 +88,10 @@ def lines(*rows: object) -> bytes:
     [
         lines(*({"t": k / 10, "skin": r} for k, r in enumerate(SKIN.tolist()))),
         lines(
-            *({"t": k / 10, "skin": {"a": r[:2], "b": [r[2:]]}} for k, r in enumerate(SKIN.tolist()))
+            *(
+                {"t": k / 10, "skin": {"a": r[:2], "b": [r[2:]]}}
+                for k, r in enumerate(SKIN.tolist())
+            )
         ),
         json.dumps([{"t": k / 10, "skin": r} for k, r in enumerate(SKIN.tolist())]).encode(),
         json.dumps({"t": [k / 10 for k in range(40)], "skin": SKIN.tolist()}).encode(),
@@ -109,7 +114,7 @@ def test_json_is_read(tmp_path: Path, content: bytes):
     [
         (lines({"a": 1, "b": 2}, {"a": 1}), "line 2 lacks 'b', unlike line 1"),
         (b'{"a": 1, "a": 2}\n', "the key 'a' occurs twice in one object"),
-        (b'{"a": 1}\n{"a": \n{"a": 2}\n', 'line 2 is \'{"a":\', which is not JSON'),
+        (b'{"a": 1}\n{"a": \n{"a": 2}\n', "line 2 is '{\"a\":', which is not JSON"),
         (lines({"a": 1, "b": [1, 2]}, {"a": 1, "b": [1]}), "line 2 lacks 'b.1', unlike line 1"),
     ],
 )

@@ -48,7 +48,10 @@ def book(path: Path, sheets: dict[str, list[list[object]]]) -> Path:
     return path
 
 
-ROWS = [["t", "label", *"abcd"], *([t, "wood", *r] for t, r in zip(TIMES, SKIN.tolist(), strict=True))]
+ROWS = [
+    ["t", "label", *"abcd"],
+    *([t, "wood", *r] for t, r in zip(TIMES, SKIN.tolist(), strict=True)),
+]
 
 
 def test_a_spreadsheet_is_read_as_a_text(tmp_path: Path):

@@ -48,7 +48,9 @@ def read(text: str) -> Table:
         movie().replace("\n", "\r\n"),
         movie(tail=","),
         movie(head=HEAD.replace("\n", ",,,\n")),
-        "".join(f'"{line}"\n' if line[:1].isupper() else f"{line}\n" for line in movie().split("\n")),
+        "".join(
+            f'"{line}"\n' if line[:1].isupper() else f"{line}\n" for line in movie().split("\n")
+        ),
     ],
 )
 def test_each_block_is_a_frame(text: str):

@@ -113,7 +113,10 @@ def test_quoted_thousands_between_commas_are_refused():
         ("@@\n", "read up to line 32, which is '@@'"),
         ('"@@"\n', "read up to line 32, which is '\"@@\"'"),
         ("End of recording\n", "read up to line 32, which is 'End of recording'"),
-        ("\nMean of column a: 12.5\nby hand\n", "read up to line 33, which is 'Mean of column a: 12.5'"),
+        (
+            "\nMean of column a: 12.5\nby hand\n",
+            "read up to line 33, which is 'Mean of column a: 12.5'",
+        ),
         ("310,31", "read up to line 32, which is cut off: 2 of 4 columns"),
         ("310,311,", "read up to line 32, which is cut off: 2 of 4 columns"),
         ("3", "read up to line 32, which is cut off: 1 of 4 columns"),
@@ -135,8 +138,10 @@ def test_text_between_frames_is_refused():
 
 def test_bytes_in_the_middle_are_a_fault():
     """A block of NULs, as a full disk leaves it; a cell of 256 kB."""
-    assert read(HEAD + BODY + "1,\0\0\0\0,3,4\n" + BODY).faults[1].startswith(
-        "line 32, column 2 is '\\x00\\x00"
+    assert (
+        read(HEAD + BODY + "1,\0\0\0\0,3,4\n" + BODY)
+        .faults[1]
+        .startswith("line 32, column 2 is '\\x00\\x00")
     )
     with pytest.raises(FormatError, match="line 32: the line .* cannot be divided into cells"):
         read(HEAD + BODY + f"1,{'x' * 262144},3,4\n" + BODY)
@@ -226,4 +231,7 @@ def test_a_mark_shows_utf_16():
 def test_blanks_and_decimal_commas_go_together():
     """1,5 2,5: blanks separate, not the comma."""
     assert read("1,5 2,5 3,25\n" * 5).values[0].tolist() == [1.5, 2.5, 3.25]
-    assert read("1_000,2\n1,2\n1,2\n").faults[0] == "line 1, column 1 is '1_000', which is not a number"
+    assert (
+        read("1_000,2\n1,2\n1,2\n").faults[0]
+        == "line 1, column 1 is '1_000', which is not a number"
+    )
