@@ -12,7 +12,7 @@ from appliance.core.storage import put
 from appliance.core.types import DATA_TYPES
 from train.arguments import numbers, options
 from train.arguments.types import Add
-from train.data import labels, summary
+from train.data import labels, lerobot, summary
 from train.data.file_names import EXAMPLE, GROUP, NamePattern
 from train.data.import_plan import ImportPlan, Length
 from train.data.importing import Cut, Imported, LeftOut, import_folder
@@ -135,13 +135,17 @@ def run(args: argparse.Namespace) -> None:
 
 
 def _plan(args: argparse.Namespace) -> ImportPlan:
+    """The options as a plan. A LeRobot data set states its frame rate."""
     fields = dict(_field(text) for text in args.field)
+    rate = args.rate
+    if not (args.pattern or args.time or rate) and lerobot.is_data_set(args.folder):
+        rate = lerobot.rate_hz(args.folder)
     return ImportPlan(
         NamePattern(args.pattern, tuple(fields)) if args.pattern else None,
         args.grid,
         args.columns,
         args.time,
-        args.rate,
+        rate,
         Length(args.window, "--window"),
         Length(args.every, "--every") if args.every else None,
         args.dtype,

@@ -29,7 +29,8 @@ EXAMPLE = "'{material}_{force:d}N_{trial}.csv'"
 class NamePattern:
     """A pattern over paths below a folder; `{}` matches text that is ignored.
 
-    elsewhere: names of fields that stand elsewhere, so that the pattern need not hold them. Raises FormatError if the pattern cannot be read.
+    elsewhere: names of fields that stand elsewhere, so that the pattern need not hold them.
+    Raises FormatError if the pattern cannot be read.
     """
 
     text: str

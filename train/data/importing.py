@@ -7,8 +7,9 @@ with missing or ambiguous information is left out, and the report says why.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,15 +18,17 @@ from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
 from appliance.core.types import DATA_TYPES
-from train.data import frames, labels, raw_files, readers, sampling
+from train.data import frames, labels, lerobot, raw_files, readers, sampling
 from train.data.file_names import group
-from train.data.files.table import Wanted, normal
+from train.data.files.table import Table, Wanted, normal
 from train.data.import_plan import ImportPlan
 from train.data.progress import Progress
 from train.data.sets import Dataset
 
 Array = NDArray[Any]
 Fields = dict[str, str]
+Source = tuple[str, Fields, Callable[[], Table]]
+"""Name of a recording, its fields that are known already, and a function that reads it."""
 
 
 @dataclass(frozen=True)
@@ -78,23 +81,27 @@ def import_folder(
     even after an error. Raises FormatError if the box cannot send a material's name, or if no file
     remains.
     """
-    named = _named(folder, plan, left_out)
-    recordings, progress = [], Progress(len(named), log)
-    for name, (path, fields) in named.items():
-        progress.begin(name)
+    if plan.pattern is None and lerobot.is_data_set(folder):
+        plan = lerobot.with_grid(folder, plan)
+        sources = _episodes(folder, plan)
+    else:
+        sources = _files(_named(folder, plan, left_out), plan, log)
+    recordings, count = [], 0
+    for name, known, read in sources:
+        count += 1
         try:
-            recordings += _recordings(path, name, fields, plan)
+            recordings += _recordings(read(), name, known, plan)
         except FormatError as e:
             left_out.append(LeftOut(name, str(e), broken=True))
     if "material" in plan.fields and recordings:
         _name_materials(folder, [one.fields for one in recordings], plan)
-    recordings, doubts = _without_copies(recordings, left_out)
     cuts, rate_hz = _cuts(recordings, plan, left_out)
+    cuts, doubts = _without_copies(cuts, left_out)
     dtype, about = _common_type(cuts, plan.dtype, left_out)
     cuts = [cut for cut in cuts if cut.recording.name not in {file.name for file in left_out}]
     if not cuts:
         raise FormatError(
-            f"{folder}: none of {len(named)} files could be imported; the messages above say why"
+            f"{folder}: none of {count} files could be imported; the messages above say why"
         )
     sweeps, notes = _set(folder, cuts, rate_hz, dtype, plan)
     return Imported(sweeps, cuts, left_out, [about, *doubts, *notes])
@@ -141,9 +148,24 @@ def _name_materials(folder: Path, known: Sequence[Fields], plan: ImportPlan) -> 
         raise FormatError(f"{folder}: {why}; {labels.REMEDY}")
 
 
-def _recordings(path: Path, name: str, known: Fields, plan: ImportPlan) -> list[Recording]:
-    """The recordings in a file; several if a column of --field changes its value."""
-    table = raw_files.read(path, Wanted(plan.variable, plan.time.rpartition(":")[0], plan.decimal))
+def _files(
+    named: Mapping[str, tuple[Path, Fields]], plan: ImportPlan, log: Callable[[str], None]
+) -> Iterator[Source]:
+    """The files of a folder; each is read when it is its turn."""
+    progress = Progress(len(named), log)
+    wanted = Wanted(plan.variable, plan.time.rpartition(":")[0], plan.decimal)
+    for name, (path, fields) in named.items():
+        progress.begin(name)
+        yield name, fields, partial(raw_files.read, path, wanted)
+
+
+def _episodes(folder: Path, plan: ImportPlan) -> Iterator[Source]:
+    for name, table in lerobot.episodes(folder, plan):
+        yield name, {}, partial(replace, table)
+
+
+def _recordings(table: Table, name: str, known: Fields, plan: ImportPlan) -> list[Recording]:
+    """The recordings in a table; several if a column of --field changes its value."""
     counts, time_s, notes = frames.frames(table, plan)
     parts = frames.fields(table, plan.fields, len(counts))
     made = []
@@ -155,17 +177,16 @@ def _recordings(path: Path, name: str, known: Fields, plan: ImportPlan) -> list[
     return made
 
 
-def _without_copies(
-    recordings: Sequence[Recording], left_out: list[LeftOut]
-) -> tuple[list[Recording], list[str]]:
-    """The recordings without those that repeat the frames of another one of their material.
+def _without_copies(cuts: Sequence[Cut], left_out: list[LeftOut]) -> tuple[list[Cut], list[str]]:
+    """The windows without those of recordings that repeat the frames of another of their material.
 
     A copy under another material stays, with a remark: only the user knows which name is wrong.
     """
-    kept: list[Recording] = []
+    kept: list[Cut] = []
     doubts: list[str] = []
     seen: dict[bytes, dict[str, Recording]] = {}
-    for one in recordings:
+    for cut in cuts:
+        one = cut.recording
         content = np.ascontiguousarray(one.frames, np.float64)
         key = hashlib.sha256(repr(content.shape).encode() + content.tobytes()).digest()
         same = seen.setdefault(key, {})
@@ -180,7 +201,7 @@ def _without_copies(
             for name, other in same.items()
         ]
         same[material] = one
-        kept.append(one)
+        kept.append(cut)
     return kept, doubts
 
 

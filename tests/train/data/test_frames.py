@@ -137,8 +137,9 @@ def test_a_name_that_occurs_twice_needs_numbers(option: str):
         "field": {"fields": {"session": "s"}},
     }[option]
     with pytest.raises(FormatError, match="columns 2 and 4 are all called 's'; use their numbers"):
-        found = frames.frames(table, plan(grid="2x2", **asked))
-        frames.fields(table, {"session": "s"}, len(found[0]))
+        frames.frames(table, plan(grid="2x2", **asked))
+    with pytest.raises(FormatError, match="columns 2 and 4 are all called 's'; use their numbers"):
+        frames.fields(table, {"session": "s"}, 40)
     found, _, _ = frames.frames(table, plan(grid="2x2", columns="2-5"))
     np.testing.assert_array_equal(found.reshape(40, 4), table.values[:, 1:])
 

@@ -76,12 +76,12 @@ FORMS = {
 def test_every_format_gives_the_same_sweeps(tmp_path: Path, suffix: str):
     """The middle ten frames of each file as a sweep [10, 2, 2] of the smallest type, with its
     groups."""
-    for name in ("cork_1", "felt_1", "felt_2"):
+    for name in ("cork_1", "felt_1", "wool_2"):
         FORMS[suffix](tmp_path / f"{name}.{suffix}")
     s = taken(tmp_path).sweeps
     assert str(s.format) == "2x2 uint8 at 100 Hz, window 10"
     np.testing.assert_array_equal(s.samples, np.tile(COUNTS[15:25].reshape(10, 2, 2), (3, 1, 1, 1)))
-    assert (s.materials, s.labels.tolist()) == (("cork", "felt"), [0, 1, 1])
+    assert (s.materials, s.labels.tolist()) == (("cork", "felt", "wool"), [0, 1, 2])
     assert s.groups["trial"].tolist() == [1, 1, 2]
     assert s.groups["recording"].tolist() == [0, 1, 2]
     s.save(tmp_path / "set.npz")

@@ -152,7 +152,7 @@ def _matrix(data: bytes, order: str, depth: int = 0) -> tuple[str, Any]:
     Raises FormatError if its shape, type and content do not fit together.
     """
     parts = list(_elements(data, order))
-    if parts and len(parts) < 3 and len(parts[0][1]) >= 4 or depth > DEEPEST:
+    if (parts and len(parts) < 3 and len(parts[0][1]) >= 4) or depth > DEEPEST:
         return "", None
     if len(parts) < 3 or len(parts[0][1]) < 4:
         raise FormatError("is damaged: an array lacks its shape or name")

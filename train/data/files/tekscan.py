@@ -1,8 +1,8 @@
 """Reads movies of pressure that Tekscan's programs export as text (.asf, .csv, .txt).
 
-Layout, as published readers of such files describe it: lines KEY VALUE up to ASCII_DATA @@, then for
-each frame a line "Frame N" and ROWS lines of COLS cells, with commas between them; @@ at the end. B
-stands where the sensor has no sensel.
+Layout, as published readers of such files describe it: lines KEY VALUE up to ASCII_DATA @@, then
+for each frame a line "Frame N" and ROWS lines of COLS cells, with commas between them; @@ at the
+end. B stands where the sensor has no sensel.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ def _frame(number: int, rows: Sequence[Row], shape: tuple[int, int]) -> Array:
 def _without_empty(frames: Array) -> tuple[Array, str]:
     """Frames without the rows and columns that have no sensel; 0 at other places without one."""
     empty = np.isnan(frames)
-    missing: Array = empty.all(axis=0)
+    missing: Array = np.all(empty, axis=0)
     if (empty.any(axis=0) != missing).any():
         r, c = np.argwhere(empty.any(axis=0) != missing)[0]
         raise FormatError(f"row {r + 1}, column {c + 1} is {NO_SENSEL} in some of the frames only")

@@ -29,7 +29,7 @@ def test_an_npz_with_objects_is_read_beside_them(tmp_path: Path):
     np.testing.assert_array_equal(found.values, SKIN)
     np.testing.assert_array_equal(found.vectors["t"], SKIN[:, 0])
     np.savez(tmp_path / "b.npz", info={"skin": SKIN})
-    with pytest.raises(FormatError, match="holds 0 arrays of frames; .* it holds nothing"):
+    with pytest.raises(FormatError, match=r"holds 0 arrays of frames; .* it holds nothing"):
         raw_files.read(tmp_path / "b.npz")
 
 
@@ -68,7 +68,7 @@ def test_a_camera_beside_the_skin_is_not_read(tmp_path: Path):
     assert peak < 2e6
     with pytest.raises(FormatError, match=r"holds 2 arrays of frames; .*camera \[4000, 480, 640\]"):
         raw_files.read(tmp_path / "a.h5")
-    with pytest.raises(FormatError, match="camera .* was not written to its end"):
+    with pytest.raises(FormatError, match=r"camera .* was not written to its end"):
         raw_files.read(tmp_path / "a.h5", Wanted("camera"))
 
 

@@ -190,7 +190,7 @@ def test_recordings_of_ros_are_read(tmp_path: Path, kind: str, messages: str):
         raw_files.read(path, Wanted("skin"))
     moved = path.rename(tmp_path / f"moved{path.suffix}")
     if kind == "db3":
-        with pytest.raises(FormatError, match="lacks metadata.yaml"):
+        with pytest.raises(FormatError, match=r"lacks metadata.yaml"):
             raw_files.read(moved)
     else:
         np.testing.assert_array_equal(raw_files.read(moved).values, SKIN)

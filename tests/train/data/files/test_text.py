@@ -143,7 +143,7 @@ def test_bytes_in_the_middle_are_a_fault():
         .faults[1]
         .startswith("line 32, column 2 is '\\x00\\x00")
     )
-    with pytest.raises(FormatError, match="line 32: the line .* cannot be divided into cells"):
+    with pytest.raises(FormatError, match=r"line 32: the line .* cannot be divided into cells"):
         read(HEAD + BODY + f"1,{'x' * 262144},3,4\n" + BODY)
 
 
