@@ -6,6 +6,7 @@ All shapes and types are checked here, so that no other module has to.
 
 from __future__ import annotations
 
+import unicodedata
 import zipfile
 import zlib
 from dataclasses import dataclass, field
@@ -16,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
-from appliance.core.types import DATA_TYPES, SweepFormat
+from appliance.core.types import DATA_TYPES, LARGEST_READING, SweepFormat
 
 Array = NDArray[Any]
 Set = TypeVar("Set", bound="SweepSet")
@@ -70,6 +71,13 @@ class SweepSet:
         if x.dtype.kind == "f" and not np.isfinite(x).all():
             at = tuple(int(i) for i in np.argwhere(~np.isfinite(x))[0])
             raise self._error(f"samples{list(at)} is {x[at]}; drop sweep {at[0]} or fill it in")
+        if x.dtype.kind == "f" and max(x.max(), -x.min()) > LARGEST_READING:
+            sweep, frame, *taxel = (int(i) for i in np.argwhere(np.abs(x) > LARGEST_READING)[0])
+            raise self._error(
+                f"sweep {sweep}, frame {frame}, taxel {', '.join(map(str, taxel))} reads "
+                f"{x[(sweep, frame, *taxel)]:g} (counted from 0), and no skin reads more than "
+                f"{LARGEST_READING:g}; drop sweep {sweep} or fill the reading in"
+            )
 
     def _check_numbers(self) -> None:
         """Check the arrays with an entry for each sweep."""
@@ -191,7 +199,7 @@ def build(arrays: dict[str, Array], source: str, kind: type[Set]) -> Set:
         {k.removeprefix(part): v for k, v in native.items() if k.startswith(part)}
         for part in ("group_", "unit_")
     )
-    materials = tuple(str(m) for m in arrays["materials"])
+    materials = tuple(unicodedata.normalize("NFC", str(m)) for m in arrays["materials"])
     return kind(
         native["samples"],
         native["labels"],

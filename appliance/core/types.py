@@ -28,6 +28,8 @@ from appliance.core.status import Status as Status
 DATA_TYPES = ("uint8", "int16", "uint16", "float32")
 """Data types of a taxel's raw count; the position in this tuple is its code in packets
 (PROTOCOL.md)."""
+LARGEST_READING = 1e12
+"""Largest magnitude of a raw count. Larger ones come from a fault, and their squares overflow."""
 MOST_AXES = 8
 """Largest number of values of a taxel."""
 

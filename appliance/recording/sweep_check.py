@@ -15,7 +15,7 @@ from appliance.core.errors import ApplianceError
 from appliance.core.observer import Observer
 from appliance.core.types import EPOCH_BITS, Frames, Status, Sweep, SweepFormat, Verdict
 from appliance.signal.unloaded import UnloadedTracker
-from appliance.signal.window_check import Finding, inspect_bare
+from appliance.signal.window_check import Finding, inspect_bare, inspect_readings
 
 UNCHECKED = Finding(
     Status.RECORDED, "contact not checked: the skin was not both touched and let go so far"
@@ -53,7 +53,8 @@ class SweepCheck(Observer):
 
     def _checked(self, taxels: NDArray[Any]) -> Finding:
         if not (self._unloaded.skin and self._unloaded.certain):
-            return UNCHECKED
+            readings = inspect_readings(taxels)
+            return UNCHECKED if readings.status is Status.OK else readings
         finding = inspect_bare(taxels, self._unloaded.skin)
         return Finding(Status.RECORDED) if finding.status is Status.OK else finding
 

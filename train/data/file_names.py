@@ -13,6 +13,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
+from train.data.files.table import normal
 from train.data.group_values import declared, measured, unit_after, unit_in_name
 
 FIELD = re.compile(r"\{(\w*)(?::([^{}]*))?\}")
@@ -26,19 +27,22 @@ EXAMPLE = "'{material}_{force:d}N_{trial}.csv'"
 class NamePattern:
     """A pattern over paths below a folder; `{}` matches text that is ignored.
 
+    elsewhere: names of fields that stand elsewhere, so that the pattern need not hold them.
     Raises FormatError if the pattern cannot be read.
     """
 
     text: str
+    elsewhere: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "text", normal(self.text))
         names = self.names
         rest = FIELD.sub("", self.text)
         if "{" in rest or "}" in rest:
             raise FormatError(
                 f"--pattern {self.text!r} has an unmatched brace; write e.g. {EXAMPLE}"
             )
-        if "material" not in names:
+        if "material" not in (*names, *self.elsewhere):
             raise FormatError(
                 f"--pattern {self.text!r} does not say where the material stands; "
                 f"write e.g. {EXAMPLE}"
@@ -77,7 +81,7 @@ class NamePattern:
 
         Raises FormatError if it matches in several ways.
         """
-        short, long = (re.fullmatch(self._expression(how), path) for how in ("+?", "+"))
+        short, long = (re.fullmatch(self._expression(how), normal(path)) for how in ("+?", "+"))
         if not (short and long):
             return None
         if short.groups() != long.groups():
@@ -106,15 +110,17 @@ class NamePattern:
         return "".join([*parts, re.escape(self.text[end:])])
 
 
-def group(pattern: NamePattern, name: str, texts: Sequence[str]) -> tuple[NDArray[Any], str]:
-    """The values [N] of the field `name` of a pattern, whose `texts` stand in N names, and their
-    unit, "" if no name gives one.
+def group(pattern: NamePattern | None, name: str, texts: Sequence[str]) -> tuple[NDArray[Any], str]:
+    """The values [N] of the field `name`, whose `texts` stand in N names if the pattern has it, and
+    their unit, "" if no name gives one.
 
     The unit stands behind the field in the pattern, as in {force:d}N, in every text, as in 5N, or
     at the end of the field's name, as in speed_mm_s.
     """
-    kind = pattern.kind(name)
+    of_name = pattern if pattern and name in pattern.names else None
+    kind = of_name.kind(name) if of_name else ""
     values, unit = (declared(texts, kind), "") if kind else measured(texts)
     if values.dtype.kind == "U":
         return values, ""
-    return values, unit or unit_after(pattern.behind(name)) or unit_in_name(name)
+    behind = unit_after(of_name.behind(name)) if of_name else ""
+    return values, unit or behind or unit_in_name(name)

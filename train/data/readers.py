@@ -18,7 +18,7 @@ import numpy as np
 
 from appliance.core.errors import FormatError
 from appliance.core.sweep_set import Array, Set, build, load_file
-from appliance.core.types import Status, Sweep, SweepFormat, sidecar
+from appliance.core.types import LARGEST_READING, Status, Sweep, SweepFormat, sidecar
 from appliance.core.types import load as load_recording
 from appliance.signal.unloaded import UnloadedSkin
 from train.data.group_values import typed
@@ -35,9 +35,15 @@ SLIDE_GROUPS = {"speed": "speed_mm_s", "force": "force_n"}
 SLIDE_UNITS = {"speed": "um/s", "force": "mN"}
 REFUSED = tuple(status for status in Status if status.faulty)
 """The box's answers to windows that it does not classify."""
-FRAMES = (".csv", ".tsv", ".txt", ".dat", ".mat", ".npy")
+FRAMES = (
+    ".csv", ".tsv", ".txt", ".dat", ".mat", ".npy", ".asf", ".lvm", ".tdms", ".jsonl", ".xlsx",
+    ".parquet", ".bag", ".mcap", ".db3",
+)  # fmt: skip
 """Suffixes of files that hold the frames of one recording. importing.py makes a set of a folder of
 such files."""
+JUNK = ("__MACOSX", "Thumbs.db", "desktop.ini", "Icon\r")
+"""Names of files and folders that systems leave beside recordings. Names that begin with . or ~$
+are passed over too."""
 IMPORT = "palpate-train import {} makes a set of such files"
 
 
@@ -214,7 +220,7 @@ def read_recorded(folder: Path) -> list[RecordedSweep]:
     holds no recorded sweep.
     """
     check_folder(folder)
-    paths = sorted(folder.rglob("*.npy"))
+    paths = [path for path in files_below(folder) if path.suffix == ".npy"]
     if not any(path.with_suffix(".json").exists() for path in paths):
         raise FormatError(
             f"{folder}: not a sweep set: no sweep of `palpate record` is in it; {_advice(folder)}"
@@ -233,11 +239,23 @@ def check_folder(folder: Path) -> None:
         ) from e
 
 
+def files_below(folder: Path) -> list[Path]:
+    """All files in and below a folder, in the order of their names, without those of JUNK."""
+    return sorted(
+        path
+        for path in folder.rglob("*")
+        if not any(
+            part in JUNK or part.startswith((".", "~$")) for part in path.relative_to(folder).parts
+        )
+        and path.is_file()
+    )
+
+
 def _advice(folder: Path) -> str:
     """The advice for a folder that holds no recordings of the box."""
     others = Counter(
         path.suffix.lower()
-        for path in folder.rglob("*")
+        for path in files_below(folder)
         if path.suffix.lower() in (*FRAMES, *HDF5, ".npz")
     )
     if sets := others[".npz"] + sum(others[suffix] for suffix in HDF5):
@@ -381,6 +399,14 @@ def _check(one: RecordedSweep, wanted: SweepFormat) -> None:
         raise FormatError(
             f"{path}: {n} frames of {one.format}; others have {wanted}: "
             "keep each format in a folder of its own"
+        )
+    taxels = one.sweep.frames.taxels
+    if taxels.dtype.kind == "f" and (bad := ~(np.abs(taxels) <= LARGEST_READING)).any():
+        frame, *taxel = (int(i) + 1 for i in np.argwhere(bad)[0])
+        raise FormatError(
+            f"{path}: frame {frame}, taxel {', '.join(map(str, taxel))} reads "
+            f"{taxels[bad][0]:g}, and no skin reads more than {LARGEST_READING:g}; "
+            "move the sweep and its .json away"
         )
     if not one.sweep.material:
         raise FormatError(

@@ -22,6 +22,7 @@ from appliance.core.errors import FormatError
 from appliance.core.sweep_set import Array
 from appliance.sim import skin
 from train.data import group_values, published, readers
+from train.data.files.table import normal
 from train.data.group_values import text_of
 
 SIMULATED = re.compile(
@@ -97,6 +98,7 @@ class Dataset(sweep_set.SweepSet):
 
     def _matches(self, condition: str) -> Array:
         """The sweeps that meet one condition, bool [N]."""
+        condition = normal(condition)
         if not (found := CONDITION.fullmatch(condition)):
             raise self._error(
                 f"condition {condition!r} cannot be read; write a group, one of = <= >=, and values"

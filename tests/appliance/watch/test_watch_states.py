@@ -112,7 +112,7 @@ def test_each_state_is_told_from_two_metres(
     browser: Any, shown: Shown, width: int, height: int, scheme: str
 ):
     """Colour, shape and word differ between an answer, a refusal, a fault and a box that is off;
-    what to do stands beside it. All text can be read (WCAG 2.1, 1.4.3), also on the whole screen."""
+    what to do stands beside it. All text can be read (WCAG 2.1, 1.4.3), on the whole screen too."""
     size = {"width": width, "height": height}
     context = browser.new_context(viewport=size, color_scheme=scheme)
     seen = BrowsedPage(context, shown.server.address)
