@@ -312,7 +312,7 @@ def test_columns_give_material_and_session(tmp_path: Path):
     assert imported(folder, *given) == 0
     made = sets.load(str(tmp_path / "s.npz"))
     assert [made.materials[k] for k in made.labels] == ["wood", "felt", "wood"]
-    assert made.groups["session"].tolist() == [0, 0, 1]
+    assert made.groups["session"].tolist() == ["2026-01-10", "2026-01-10", "2026-01-11"]
     assert made.groups["recording"].tolist() == [0, 1, 2]
     np.testing.assert_array_equal(made.samples[0, :, 0, 0], np.arange(15, 25))
 

@@ -79,7 +79,7 @@ def test_tactile_columns_become_sweeps(tmp_path: Path, version: str):
     made = sets.load(str(tmp_path / "s.npz"))
     assert str(made.format) == "2x3 int16 at 30 Hz, window 20"
     assert [made.materials[k] for k in made.labels] == ["wood", "felt", "wood", "felt"]
-    assert made.groups["session"].tolist() == [0, 0, 1, 1]
+    assert made.groups["session"].tolist() == ["Ada", "Ada", "Bob", "Bob"]
     assert made.groups["trial"].tolist() == [0, 1, 2, 3]
     np.testing.assert_array_equal(made.samples, COUNTS[:, 20:40])
 
