@@ -13,7 +13,7 @@ from typing import Any
 
 from appliance.core.errors import FormatError
 from train.arguments import numbers
-from train.data import labels, sets
+from train.data import labels, readers, sets
 from train.data.progress import ProgressLine
 from train.data.summary import warnings_of
 from train.evaluation import evaluate, traps
@@ -23,6 +23,8 @@ SET = (
     f"FILE (.npz, .h5), a folder of recordings, {sets.SIMULATED_FORM} or aeon:NAME; "
     "several are joined"
 )
+SET_FILES = (".npz", *readers.HDF5)
+"""Endings of a sweep set."""
 LOG_EVERY_S = 30
 
 
@@ -133,10 +135,16 @@ def writable(path: Path, option: str = "--out") -> None:
         ) from e
 
 
-def writable_file(path: Path, option: str = "--out") -> None:
-    """As `writable`; also raises FormatError if `path` is a folder."""
+def writable_file(path: Path, option: str = "--out", *endings: str) -> None:
+    """As `writable`; also raises FormatError if `path` is a folder, or has an ending other than
+    `endings`, if there are any: the file would be of another kind than its name says."""
     if path.is_dir():
         raise FormatError(f"{option} {path} is a folder; name a file")
+    if endings and path.suffix.lower() not in ("", *endings):
+        raise FormatError(
+            f"{option} {path} would not be a {path.suffix} file; name one that ends in "
+            f"{' or '.join(endings)}"
+        )
     writable(path, option)
 
 

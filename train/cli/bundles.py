@@ -128,7 +128,7 @@ def run_pack(args: argparse.Namespace) -> None:
 def run_score(args: argparse.Namespace) -> None:
     """Run the set through the box's classifier; print the figures, and write them."""
     if args.json:
-        options.writable_file(args.json, "--json")
+        options.writable_file(args.json, "--json", ".json")
     loaded, sweeps = bundle.load(args.bundle), options.load(args)
     found = bundle_score.score(Classifier(loaded, SystemClock()), sweeps)
     seen = _seen(loaded.manifest, sweeps)

@@ -98,6 +98,8 @@ def run_evaluate(args: argparse.Namespace) -> None:
 
     Raises FormatError at the end if a method was left out.
     """
+    if args.json:
+        options.writable_file(args.json, "--json", ".json")
     sweeps = options.load(args)
     names = options.names(args)
     if args.each < 0:

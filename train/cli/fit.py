@@ -192,9 +192,9 @@ def _check(args: argparse.Namespace) -> None:
         raise FormatError("--rest needs --split; without it nothing is left over")
     if args.slower and not args.budget_ms:
         raise FormatError("--slower needs --budget-ms; without a limit of time it changes nothing")
-    for option in ("out", "rest"):
+    for option, endings in (("out", (".npz",)), ("rest", options.SET_FILES)):
         if path := getattr(args, option):
-            options.writable_file(path, f"--{option}")
+            options.writable_file(path, f"--{option}", *endings)
 
 
 def _fitted(args: argparse.Namespace, sweeps: Dataset) -> tuple[Fit, Change, Path]:

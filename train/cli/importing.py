@@ -113,9 +113,9 @@ def run(args: argparse.Namespace) -> None:
     Raises FormatError at the end if a file was broken.
     """
     plan = _plan(args)
-    for option in ("out", "report"):
+    for option, endings in (("out", options.SET_FILES), ("report", ())):
         if path := getattr(args, option):
-            options.writable_file(path, f"--{option}")
+            options.writable_file(path, f"--{option}", *endings)
     left_out: list[LeftOut] = []
     taken: Sequence[Cut] = ()
     try:

@@ -85,6 +85,14 @@ def test_the_command_splits_and_keeps_the_rest(tmp_path: Path, capsys: pytest.Ca
         ),
         (["--set", "sim:T-LAB:1:1", "--out", "/"], "--out / is a folder; name a file"),
         (
+            ["--set", "sim:T-LAB:1:1", "--out", "f.csv"],
+            "--out f.csv would not be a .csv file; name one that ends in .npz",
+        ),
+        (
+            ["--set", "x.npz", "--split", "recording:0.5", "--rest", "r.pdf"],
+            "--rest r.pdf would not be a .pdf file; name one that ends in .npz or .h5 or .hdf5",
+        ),
+        (
             ["--set", "sim:T-LAB:1:1", "--rename", "wood"],
             "--rename 'wood' cannot be read; write OLD=NEW",
         ),

@@ -228,11 +228,14 @@ def calibration_inputs(fit: Fit) -> CalibrationInputs:
     (faulty,) = copies(train.take(shuffled[::ONE_IN]), FAULTS, seed + FAULTS_SEED, 1)
     of_all = train, held, faulty
     role = np.repeat(np.arange(3), [len(sweeps) for sweeps in of_all])
-    conditions = dict.fromkeys([by, *fit.about["conditions"]])
+    conditions = {
+        name: np.unique(np.concatenate([s.group(name) for s in of_all]), return_inverse=True)[1]
+        for name in (by, *fit.about["conditions"])
+    }
     return CalibrationInputs(
         run(fit.trunk(prefixes=True), np.concatenate([s.samples for s in of_all])),
         np.concatenate([s.labels for s in of_all]),
-        {name: np.concatenate([s.group(name) for s in of_all]) for name in conditions},
+        conditions,
         role == 1,
         bool(fit.architecture.channels),
         fit.bands,
