@@ -20,8 +20,9 @@ from appliance.core import config
 from appliance.core.clock import SystemClock
 from appliance.core.config import Config
 from appliance.core.errors import ApplianceError, ConfigError
-from appliance.core.log import log, to_stderr
+from appliance.core.log import log, printable, to_stderr
 from appliance.core.menu import CommandParser
+from appliance.core.patience import patiently
 
 EVERY_S = 1.0
 
@@ -91,7 +92,9 @@ def run_modbus(args: argparse.Namespace) -> int:
             source.close()
         return stop.code
 
-    return asyncio.run(serve())
+    codes: list[int] = []
+    patiently(lambda: codes.append(asyncio.run(serve())), SystemClock())
+    return codes[-1]
 
 
 def run_tcp(args: argparse.Namespace) -> int:
@@ -116,7 +119,9 @@ def run_tcp(args: argparse.Namespace) -> int:
             bridge.close()
         return stop.code
 
-    return asyncio.run(serve())
+    codes: list[int] = []
+    patiently(lambda: codes.append(asyncio.run(serve())), SystemClock())
+    return codes[-1]
 
 
 def run_ros(args: argparse.Namespace) -> int:
@@ -162,7 +167,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         return run(args)
     except ApplianceError as e:
-        print(f"palpate: {e}", file=sys.stderr)
+        print(printable(f"palpate: {e}"), file=sys.stderr)
         return e.exit_code
     except KeyboardInterrupt:
         return 130

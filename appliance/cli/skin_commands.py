@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from appliance.cli.common import load_settings, local_page, stop_flag
+from appliance.cli.common import StopFlag, load_settings, local_page
 from appliance.cli.devices import open_devices
 from appliance.core import storage
 from appliance.core.clock import SystemClock
@@ -134,7 +134,7 @@ def run_show(args: argparse.Namespace) -> int:
     format = devices.format or skins.announced(settings, devices)
     if slow := skin_profile.warning(format):
         log.warning(f"warning: {slow}")
-    stopped = stop_flag()
+    stopped = StopFlag()
     with ExitStack() as stack:
         pages = local_page("skin.html", args.web, stack)
         screen = stack.enter_context(
@@ -145,7 +145,7 @@ def run_show(args: argparse.Namespace) -> int:
         unit = skins.profile(settings).unit
         name, source = settings.skin.profile, devices.source
         skin_show.run(sensor, format, name, source, devices.clock, shown_on, stopped, unit)
-    return 0
+    return stopped.exit_code
 
 
 def run_new(args: argparse.Namespace) -> int:

@@ -11,7 +11,6 @@ import json
 import os
 from collections import deque
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -25,6 +24,7 @@ from appliance.core.log import TroubleLog
 from appliance.core.observer import Observer
 from appliance.core.status import REASONS
 from appliance.core.types import Status, Verdict
+from appliance.service import ended
 
 SCHEMA = 1
 VERDICTS = 20
@@ -77,7 +77,6 @@ class StatusFile(Observer):
         self._verdicts: deque[dict[str, Any]] = deque(maxlen=VERDICTS)
         self._fresh, self._skin = False, ""
         self._log = TroubleLog(f"status: {path} cannot be written", "classifying goes on")
-        self._log.attempt(lambda: _ending(path).unlink(missing_ok=True))
 
     def answered(self, verdict: Verdict) -> None:
         """Note a verdict; it is written at the end of the turn."""
@@ -104,30 +103,6 @@ class StatusFile(Observer):
         self._log.attempt(lambda: self._path.unlink(missing_ok=True))
 
 
-def _ending(path: Path) -> Path:
-    """The file with the reason for which the service did not start."""
-    return path.with_name("ended.json")
-
-
-def note_ending(path: Path | None, why: ApplianceError) -> None:
-    """Keep the reason for which the service ends, for `palpate status`, if there is a folder for
-    it."""
-    if path and os.access(path.parent, os.W_OK):
-        content = json.dumps({"code": why.exit_code, "why": str(why)}).encode()
-        with suppress(OSError):  # the log has it, too
-            storage.put(_ending(path), content, durable=False, mode=0o644)
-
-
-def _noted(path: Path) -> str:
-    """The reason for which the service did not start, "" if none was kept."""
-    try:
-        with _ending(path).open("rb") as f:
-            ended = json.loads(f.read(MOST_BYTES))
-        return f"the service ended with exit code {int(ended['code'])}: {str(ended['why'])[:1000]}"
-    except (OSError, ValueError, TypeError, KeyError, RecursionError):
-        return ""
-
-
 def read(path: Path, now_ns: int) -> dict[str, Any]:
     """The content of the file, with `running`, and `why` if the service does not run. now_ns: of
     the writer's clock.
@@ -143,8 +118,9 @@ def read(path: Path, now_ns: int) -> dict[str, Any]:
         report["verdicts"] = [v | {"status": Status(v["status"])} for v in report["verdicts"]]
         Health(**{name: report[name] for name in Health.__slots__})
     except FileNotFoundError:
-        why = f"the service does not run, or has just started (no {path})"
-        return {"running": False, "why": f"{_noted(path) or why}; {_START}"}
+        last = ended.read(path.parent)
+        why = f"the service does not run, or has just started (no {path}); {_START}"
+        return {"running": False, "why": last.text if last else why}
     except OSError as e:
         raise ApplianceError(
             f"{path} cannot be read: {e.strerror}; see store.runtime, or ask as root"
@@ -154,8 +130,8 @@ def read(path: Path, now_ns: int) -> dict[str, Any]:
     why = ""
     # a file from before the last boot can be ahead of this boot's clock
     if not _alive(pid) or age_ns < 0:
-        why = f"process {pid} has ended without closing down"
-        why = f"{_noted(path) or why}; {_START}"
+        last = ended.read(path.parent)
+        why = last.text if last else f"process {pid} has ended without closing down; {_START}"
     elif age_ns > STALE_NS:
         why = (
             f"process {pid} has written nothing for {_span(age_ns)}, so it hangs; the service's "

@@ -177,18 +177,29 @@ def _tubes(
     materials: Sequence[str],
     slide_s: float,
 ) -> Iterator[Act]:
-    rate = seen.FORMAT.rate_hz
     rounds = itertools.cycle(places)
     tubes_left: list[str] = []
     for _ in itertools.count() if sweeps is None else range(sweeps):
         if not tubes_left:
             tubes_left, place = [str(m) for m in rng.permutation(materials)], next(rounds)
-        label = tubes_left.pop()
-        off = seen.idle(max(PAUSE_FRAMES, round(rng.uniform(*PAUSE_S) * rate)), rng, world)
-        on = seen.sweep(label, place, rng, world, rest_s=REST_S, slide_s=slide_s, after_s=REST_S)
-        start = len(off) + round(REST_S * rate)
-        frames, stop = np.concatenate([off, on, off]), start + round(slide_s * rate)
-        yield Act(frames, start, stop, label, lifted=len(off))
+        yield slide(tubes_left.pop(), place, rng, world, seen, slide_s)
+
+
+def slide(
+    label: str,
+    place: skin.Placement,
+    rng: Generator,
+    world: skin.World,
+    seen: SeenTubes = skin,
+    slide_s: float = SLIDE_S,
+) -> Act:
+    """One sweep over the tube `label`, with the finger lifted before and after it."""
+    rate = seen.FORMAT.rate_hz
+    off = seen.idle(max(PAUSE_FRAMES, round(rng.uniform(*PAUSE_S) * rate)), rng, world)
+    on = seen.sweep(label, place, rng, world, rest_s=REST_S, slide_s=slide_s, after_s=REST_S)
+    start = len(off) + round(REST_S * rate)
+    frames, stop = np.concatenate([off, on, off]), start + round(slide_s * rate)
+    return Act(frames, start, stop, label, lifted=len(off))
 
 
 def rests(seed: int, world: skin.World = PLAYED, seen: SeenTubes = skin) -> Iterator[Act]:
@@ -250,6 +261,6 @@ def play(sweeps: SweepSet, order: Iterable[int]) -> Iterator[Act]:
             stop,
             sweeps.materials[sweeps.labels[i]],
             now is not None and now != before,
-            lifted,
+            lifted=lifted,
         )
         before = now
