@@ -93,12 +93,20 @@ def _add_bundles(add: Add) -> None:
                 "simulated skin)"
             ),
         )
+        command.add_argument(
+            "--licence",
+            default="",
+            metavar="NAME",
+            help="of the recordings, for card.md: CC-BY-4.0",
+        )
 
 
 def run_export(args: argparse.Namespace) -> None:
     """Pack the bundle, print its figures and how to score it."""
     pack.check_target(args.out)
     made = Fit.load(args.fit)
+    if args.licence:
+        made.about[pack.LICENCE] = args.licence
     _print(quantized_bundle.export(made, *_packing(args)), args.out)
     rest = made.about.get("rest")
     what = "the sweeps that fit --split left out" if rest else "sweeps that the fit has not seen"
@@ -112,6 +120,7 @@ def run_pack(args: argparse.Namespace) -> None:
     pack.check_target(args.out)
     (method,) = methods.find([args.method], options.effort(args))
     content = pack.trained(method, labels.check(options.load(args, args.seed)), args.seed)
+    content.about[pack.LICENCE] = args.licence
     try:
         content = quantized_bundle.checked(content, content.reference)
     except pack.ExportRefused as e:
