@@ -111,7 +111,8 @@ class PalpateClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  
     def predict(self, X: Any) -> Array:
         """The most probable of `classes_` for each sweep, [n]."""
         probability = self.predict_proba(X)
-        return self.classes_[probability.argmax(axis=1)]
+        named: Array = self.classes_[probability.argmax(axis=1)]
+        return named
 
     def save_bundle(
         self,
