@@ -122,10 +122,11 @@ def test_packages_import_downwards_only():
 
 @pytest.mark.slow
 def test_every_module_of_training_serves_a_command():
-    """All of train but the studies is imported for a command of palpate-train; a method is imported
-    by its name for `evaluate --method`. A module that only a study uses is not."""
+    """All of train but the studies is imported for a command of palpate-train or by the library; a
+    method is imported by its name for `evaluate --method`. A module that only a study uses is
+    not."""
     graph = module_imports("train")
-    commands = {name for name in graph if name.startswith("train.cli.")}
+    commands = {name for name in graph if name.startswith(("train.cli.", "train.library."))}
     found, left = set(), ["train.__main__", *commands, *methods.MODULES]
     while left:
         if (name := left.pop()) not in found:

@@ -19,7 +19,7 @@ import numpy as np
 
 from appliance.core.errors import FormatError
 from train.data.files.decimals import decimal_sign, plain
-from train.data.files.table import Array, Table, Wanted, excerpt, normal
+from train.data.files.table import Array, ReadPlan, Table, excerpt, normal
 
 COMMENTS = ("#", "%")
 DELIMITERS = ("\t", ";", ",", None)
@@ -92,7 +92,7 @@ class Layout:
 
 def table(
     lines: Sequence[str],
-    wanted: Wanted,
+    wanted: ReadPlan,
     notes: Sequence[str] = (),
     delimiter: str = "",
     decimal: str = "",
