@@ -21,7 +21,7 @@ Json = dict[str, Any]
 
 
 def data(train: Dataset, licence: str) -> Json:
-    """What a manifest's `made` says of the training sweeps."""
+    """The entry `data` of a manifest's `made`: a description of the training sweeps."""
     counted = {
         name: len(np.unique(train.groups[name]))
         for name in ("session", "position", "object")

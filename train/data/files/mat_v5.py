@@ -76,7 +76,7 @@ class CellArray:
 
 
 def variables(data: bytes) -> dict[str, Any]:
-    """The variables of a file by name: NumPy arrays, texts, Struct, CellArray, or None for an object.
+    """The variables of a file by name: NumPy arrays, texts, Struct, CellArray; None for an object.
 
     Raises FormatError if the file is damaged or has another version.
     """

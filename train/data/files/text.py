@@ -246,7 +246,7 @@ def _is_footer(line: str, layout: Layout, last: bool) -> bool:
 
 
 def _remarks(kept: Sequence[Row], start: int, end: int, layout: Layout) -> list[str]:
-    """What is said of the lines after the frames."""
+    """Remarks on the lines after the frames."""
     rest = [(i, line) for i, line in kept[end:] if not line.lstrip().startswith(COMMENTS)]
     if not rest:
         return []
