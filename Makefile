@@ -22,7 +22,7 @@ SCRATCH = $(or $(shell df -Pk /dev/shm 2>/dev/null | awk 'NR > 1 && $$4 > 100000
 PYTEST = $(BIN)/python -m pytest -q -n $(shell expr `nproc` + 1)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo desktop test test-fast test-all lint types bundle bench site deploy install clean
+.PHONY: help demo desktop test test-fast test-all lint types bundle bench site deploy install sbom clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -72,6 +72,9 @@ deploy: $(FLEET) ## put a signed BUNDLE= on HOST= or HOSTS=inventory.py; SHADOW=
 	$(BIN)/python systemd/deploy.py $(WHERE) $(if $(SIGNERS),--signers $(call quoted,SIGNERS)) \
 	  $(if $(SHADOW),--shadow) $(if $(OTHER_SKIN),--other-skin) \
 	  $(if $(value BUNDLE),$(call quoted,BUNDLE),$(error name the bundle with BUNDLE=its folder))
+
+sbom: $(RUNTIME) ## list what the box carries, with licences: dist/palpate.cdx.json
+	PYTHONPATH=. $(BIN)/python systemd/sbom.py dist/palpate.cdx.json
 
 install: $(FLEET) ## install or upgrade Debian boxes, HOST= or HOSTS=; BOARD=rpi5, SIGNERS=FILE
 	rm -rf build/lib build/bdist.* # setuptools would put leftovers of an older build into the wheel
