@@ -10,6 +10,7 @@ import re
 import subprocess
 import sys
 import zipfile
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -414,3 +415,10 @@ def test_the_lock_covers_both_processors():
         assert "--hash=sha256:" in entry
     for name in ("numpy", "onnxruntime", "gpiod"):
         assert sum(e.count("--hash") for e in entries if e.startswith(name)) >= 8, name
+
+
+def test_tests_run_on_the_numpy_of_the_box():
+    """The lock of the box and this environment have the same numpy, whatever else the desktop
+    installs."""
+    lock = (ROOT / "appliance" / "requirements.lock").read_text()
+    assert re.findall(r"(?m)^numpy==(\S+)", lock) == [metadata.version("numpy")]

@@ -38,8 +38,8 @@ class ModelError(BundleError):
     exit_code = EX_SOFTWARE
 
 
-class TemporaryError(ApplianceError):
-    """Something could not be done now, and may be possible at the next start without a person."""
+class TemporaryError(ConfigError):
+    """As ConfigError, but the cause may be gone at the next start without a person."""
 
     exit_code = EX_TEMPFAIL
 
@@ -104,7 +104,7 @@ class PortError(ApplianceError):
     exit_code = EX_UNAVAILABLE
 
 
-class AddressError(ApplianceError):
+class AddressError(ConfigError):
     """An address of this machine cannot be listened on: it is not there yet, or in use."""
 
     exit_code = EX_UNAVAILABLE

@@ -209,7 +209,7 @@ CAMPAIGNS = {
     ),
     "junk": Campaign(
         "count the answers to sweeps that no one can name, early ones too (docs/decisions/0024)",
-        _module("tests.campaigns.junk"),
+        _module("tests.campaigns.junk", "--out", "docs/data/junk.json", "--page", "docs/faults.md"),
         variables={"OMP_NUM_THREADS": "1"},
         nice=True,
     ),
