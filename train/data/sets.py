@@ -91,7 +91,7 @@ class Dataset(sweep_set.SweepSet):
 
     def listed(self, name: str, text: str) -> list[Any]:
         """The values of the group `name`, or the materials, that `text` lists with commas; see
-        group_values.listed. Raises FormatError, also if there is no such group."""
+        group_values.listed. Raises FormatError, also for an unknown group."""
         if name == "material":
             return group_values.listed(np.array(self.materials), "", text)
         return group_values.listed(self.group(name), self.units.get(name, ""), text)
