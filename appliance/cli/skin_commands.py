@@ -54,18 +54,16 @@ def run_check(args: argparse.Namespace) -> int:
 
 
 def run_list(args: argparse.Namespace) -> int:
-    """Print all profiles, one line each; 1 if a profile cannot be read."""
+    """Print all profiles as a table; 1 if a profile cannot be read."""
     from appliance.tools import skin_detect
 
-    broken = 0
-    for name, profile in _profiles(load_settings(args)):
-        broken += isinstance(profile, ConfigError)
-        print(
-            f"{name:<14} {profile}"
-            if isinstance(profile, ConfigError)
-            else skin_detect.listed(name, profile)
-        )
-    return 1 if broken else 0
+    every = dict(_profiles(load_settings(args)))
+    good = {name: one for name, one in every.items() if not isinstance(one, ConfigError)}
+    print(*skin_detect.table(good), sep="\n")
+    for name, one in every.items():
+        if isinstance(one, ConfigError):
+            print(f"{name}: {one}")
+    return 1 if len(good) < len(every) else 0
 
 
 def run_detect(args: argparse.Namespace) -> int:

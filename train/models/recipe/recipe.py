@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
 from train.calibration.heads import HeadData, HeadPart, HeadPlan
+from train.data.progress import StageLine
 from train.data.sets import Dataset
 from train.data.splitters import InnerPart, inner_parts
 from train.metrics.score import interval
@@ -59,6 +60,8 @@ LEAST_EACH, LEAST_SWEEPS = 25, 100
 few sweeps of a material and to a few batches."""
 STAGES_WEIGHT = 0.5
 """Weight of the discriminant of stages beside others; docs/decisions/0023 compares others."""
+PARTS = "features", "choice of the model", "training of stages"
+"""Parts of a fit, for its progress."""
 ENOUGH = 0.99
 """Accuracy on held-out parts from which on stages improve too little for their share of the
 bundle's size and time."""
@@ -215,7 +218,7 @@ class Setup:
         """The log of one part of the fit. The third part, the stages, takes most of the time; it is
         left out if the first two suffice."""
         parts = 3 if self.wants_stages(self.settings.size) else 2
-        return lambda line: self.log(f"part {number} of {parts}, {line}")
+        return lambda line: self.log(StageLine.of(number, parts, PARTS[number - 1], line))
 
 
 @dataclass(frozen=True)
