@@ -384,22 +384,6 @@ def test_a_box_without_rights_names_the_service_s(
     assert "sudo -u palpate palpate" in told
 
 
-def test_status_gives_the_reason_of_an_exit_78(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """A service that cannot start keeps its reason; the next good start removes it."""
-    runtime = f"store.runtime={tmp_path}"
-    wrong = ["--set", runtime, "--set", "classifier.bundle=/no/such/bundle"]
-    assert main(["run", "--sim", "skin", *wrong]) == 78
-    assert main(["status", "--set", runtime]) == 1
-    told = capsys.readouterr().out
-    assert "not running: the service ended with exit code 78: " in told
-    assert "/no/such/bundle" in told
-    good = ["run", "--sim", "skin", "--virtual", "--sweeps", "1", "--set", runtime]
-    assert main(good) == 0
-    capsys.readouterr()
-    assert main(["status", "--set", runtime]) == 1
-    assert "78" not in capsys.readouterr().out
-
-
 def test_a_full_disk_names_the_file_and_leaves_none(tmp_path: Path):
     """An error of a write has the name of its file, and no part of it stays."""
     target = tmp_path / "figures.json"
