@@ -125,6 +125,8 @@ class Setup:
     @classmethod
     def of(cls, sweeps: Dataset, seed: int, settings: Settings, log: Log) -> Setup:
         """Raises FormatError if the window is too short."""
+        groups = {"recording": sweeps.group("recording")} | sweeps.groups  # numbered before a split
+        sweeps = replace(sweeps, groups=groups)
         usual = default_augmentation(FIXED.zero_sum(sweeps.format.window))
         return cls(sweeps, seed, settings, replace(usual, **settings.use.augmentation), log)
 
@@ -313,7 +315,7 @@ def with_stages(
     """
     log, plan = setup.part(3), judged.chosen.plan
     stages, responses = setup.stages
-    scores = setup.scores(_side_by_side(responses, fixed.data), [setup.judging])
+    scores = setup.scores(responses.beside(fixed.data), [setup.judging])
     beside = _beside_stages(plan)
     joined = full = scores.score(beside)
     if setup.settings.use.reattached:
@@ -441,15 +443,6 @@ def _trained(setup: Setup) -> Trunk:
         settings.unfinished,
     )
     return Trunk(sweeps, scale, weights, architecture, ranges)
-
-
-def _side_by_side(stages: HeadData, fixed: HeadData) -> HeadData:
-    """The features of both for the same sweeps, those of stages first."""
-    return replace(
-        fixed,
-        features=np.hstack([stages.features, fixed.features]),
-        copied=np.hstack([stages.copied, fixed.copied]),
-    )
 
 
 def _beside_stages(plan: HeadPlan) -> list[HeadPart]:
