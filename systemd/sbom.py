@@ -48,12 +48,14 @@ def licence(name: str) -> str:
     except metadata.PackageNotFoundError:
         sys.exit(f"palpate: {name} is not installed here; run make desktop")
     classified = [c for c in about.get_all("Classifier") or [] if c.startswith("License ::")]
-    text = (about.get("License") or "").strip()  # a name, or the whole text
-    named = text if "\n" not in text else ""
-    stated = about.get("License-Expression") or named or "".join(classified[:1])
+    expression, text = (
+        "".join(about.get_all(key) or []).strip() for key in ("License-Expression", "License")
+    )
+    named = text if "\n" not in text else ""  # a name, or the whole text
+    stated = expression or named or "".join(classified[:1])
     if not stated:
         sys.exit(f"palpate: {name} states no licence; look it up and add it here")
-    return str(stated).rpartition(":: ")[2]
+    return stated.rpartition(":: ")[2]
 
 
 def document(lock: str) -> dict[str, Any]:
