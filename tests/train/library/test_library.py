@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib.util
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,7 @@ from sklearn.model_selection import LeaveOneGroupOut, cross_val_score
 from sklearn.utils import estimator_checks
 
 from appliance.core.errors import FormatError
+from tests.factories.paths import ROOT
 from train import PalpateClassifier, load_bundle
 from train.library.sweeps import raw_counts
 
@@ -110,3 +113,18 @@ def test_what_cannot_be_fitted_is_named(x: object, y: object, why: str):
     """Before any training."""
     with pytest.raises((FormatError, ValueError), match=why):
         small().fit(x, y)
+
+
+def test_the_library_has_the_name_of_the_project():
+    """Installed, `palpate` is this package; no other distribution or folder has the name."""
+    project = tomllib.loads((ROOT / "train" / "pyproject.toml").read_text())
+    assert project["tool"]["setuptools"]["package-dir"]["palpate"] == "library"
+    spec = importlib.util.spec_from_file_location(
+        "palpate", ROOT / "train" / "library" / "__init__.py"
+    )
+    assert spec
+    assert spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    assert module.PalpateClassifier is PalpateClassifier
+    assert not (ROOT / "palpate").exists()
