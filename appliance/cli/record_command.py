@@ -35,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
     labels = Labels(args.material, args.position, args.session)
     settings, stopped = load_settings(args), stop_flag()
     with ExitStack() as stack:
-        devices, format = _skin(args, settings)
+        devices, format = open_skin(args, settings)
         # a person at a terminal reads the log; sentences are for a robot, or for a program that
         # reads the output
         sentences = settings.serial.port or not sys.stdout.isatty()
@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _skin(args: argparse.Namespace, settings: Config) -> tuple[Devices, SweepFormat]:
+def open_skin(args: argparse.Namespace, settings: Config) -> tuple[Devices, SweepFormat]:
     """The devices, and the format of the recorded sweeps. Raises ConfigError if no sweep can be as
     long as the window."""
     asked = skins.described(args.format) if args.format else None

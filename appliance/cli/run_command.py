@@ -7,7 +7,8 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from appliance.bundle.bundle import Bundle
+from appliance.bundle.bundle import DEFAULT, Bundle
+from appliance.cli import teach_command
 from appliance.cli.common import Facts, load_bundle, load_settings, stop_flag
 from appliance.cli.devices import open_devices
 from appliance.cli.reporting import capture, done, feed, status
@@ -17,6 +18,8 @@ from appliance.core.devices import Devices
 from appliance.core.errors import ApplianceError
 from appliance.core.log import in_journal, log
 from appliance.core.observer import Observer
+from appliance.io import skins
+from appliance.io.usb_sensor import fits
 from appliance.runtime import assembly
 from appliance.service.systemd import Notifier, VerdictLog
 
@@ -33,6 +36,8 @@ def run(args: argparse.Namespace) -> int:
         current = choice.bundle if choice else load_bundle(settings, answers=not args.sim)
         if settings.classifier.allow_unsigned:
             log.warning(f"unsigned {assembly.UNSIGNED}")
+        if choice and choice.folder == DEFAULT and untaught(args, settings, current):
+            return teach_command.until_taught(args, settings)
         devices = open_devices(args, lambda: current.format)
         port = assembly.port(settings, devices)
         # not beside a trial: if the program dies, it must be clear which bundle was the cause
@@ -59,6 +64,18 @@ def run(args: argparse.Namespace) -> int:
         )
         box.run(done(args, box, devices, stopped))
     return 0
+
+
+def untaught(args: argparse.Namespace, settings: Config, packaged: Bundle) -> bool:
+    """Whether there is no bundle for the skin: none was delivered or taught, and the packaged one
+    is for another skin. A skin of PROTOCOL.md announces its format later, so it does not count."""
+    profile = skins.profile(settings)
+    return (
+        not args.sim
+        and settings.teach.allow
+        and profile.codec != "palpate"
+        and not fits(profile.format, packaged.format)
+    )
 
 
 def _reports(

@@ -38,7 +38,7 @@ from appliance.core.config import StoreConfig
 from appliance.core.errors import ApplianceError, BundleError, ConfigError
 from appliance.core.log import log
 from appliance.deployment import signature
-from appliance.deployment.enrolment_key import EnrolmentKey
+from appliance.deployment.enrolment_key import TAUGHT, EnrolmentKey
 from appliance.deployment.sandbox import run_limited
 from appliance.deployment.state import (
     MOST_CUTS,
@@ -53,8 +53,8 @@ from appliance.deployment.trial import Trial
 BOOT = Path("/proc/sys/kernel/random/boot_id")
 """The kernel's id of this boot (random(4))."""
 SHA = re.compile(r"[0-9a-f]{64}")
-PACKAGER = "palpate"
-"""Name of the signer that is shown for the packaged bundle."""
+PACKAGER, HERE = "palpate", "taught here"
+"""Shown as the signer of the packaged bundle, and of a bundle that this box has taught."""
 INCOMPLETE = "."
 """First character of a folder's name while the folder is written or removed."""
 LOCK_S, STEP_NS = 10.0, 20_000_000
@@ -74,6 +74,12 @@ class SignedBundle:
     def sha(self) -> str:
         """The bundle's name in the store."""
         return bundle.name(self.files)
+
+    @property
+    def taught(self) -> bool:
+        """Whether this box has taught the bundle. A bundle that is signed as well counts as
+        delivered."""
+        return bundle.TAUGHT_SIGNATURE in self.files and bundle.SIGNATURE not in self.files
 
     @property
     def base(self) -> str:
@@ -125,6 +131,9 @@ class BundleFolder:
             signer = signature.verify(
                 files[bundle.MANIFEST], files[bundle.SIGNATURE], self._signers
             )
+        elif bundle.TAUGHT_SIGNATURE in files:
+            self._key.verify(files[bundle.MANIFEST], files[bundle.TAUGHT_SIGNATURE], TAUGHT)
+            signer = HERE
         elif not enrolled:
             raise BundleError(f"{folder} is not signed; sign the bundle (palpate-train sign)")
         elif files[bundle.MANIFEST] != (bundle.DEFAULT / bundle.MANIFEST).read_bytes():
@@ -261,9 +270,9 @@ class Store:
         """
         return self._install(self.examine(incoming), shadow, admit)
 
-    def enrol(self, files: Mapping[str, bytes]) -> str:
-        """Install, as `install`, the files of a bundle into which this box has enrolled a label.
-        Returns its name."""
+    def learn(self, files: Mapping[str, bytes]) -> str:
+        """Install, as `install`, the files of a bundle that this box has taught, or into which it
+        has enrolled a label. Returns its name."""
         return self._install(self._proven(self.bundles.checked(files, self.folder)))
 
     def _install(
@@ -436,7 +445,10 @@ class Store:
 
     def _admit(self, signed: SignedBundle, state: StoreState) -> None:
         """Raises BundleError if the bundle is older than a committed bundle. The current bundle
-        with other enrolled labels is always accepted."""
+        with other enrolled labels is always accepted, and so is a bundle that was taught here: it
+        has no counter."""
+        if signed.taught:
+            return
         with suppress(BundleError, ConfigError):  # a damaged current bundle may be replaced
             running = self.running()
             if signed.base == running.base and (signed.bundle.added or running.bundle.added):

@@ -37,8 +37,11 @@ COMMANDS = (
     "SESSION",
     "NEXT",
     "DISCARD",
+    "TEACH",
+    "USE",
+    "FORGET",
 )
-TEXT_COMMANDS = ("LABEL", "MATERIAL", "POSITION", "SESSION")
+TEXT_COMMANDS = ("LABEL", "MATERIAL", "POSITION", "SESSION", "TEACH", "FORGET")
 """The commands that need a text after a comma. START may have one: speed and force of the slide."""
 RETRY_NS = 1_000_000_000
 """Time between two attempts to open a port that is gone."""

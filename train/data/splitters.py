@@ -75,7 +75,11 @@ def _spread_evenly(labels: Array, groups: Array, folds: int, seed: int) -> Array
     order = np.arange(len(values))
     np.random.RandomState(seed).shuffle(order)
     order = order[np.argsort(-counts[order].std(axis=1), kind="stable")]
-    totals, held, fold = counts.sum(axis=0), np.zeros((folds, len(kinds))), np.empty(len(values), int)
+    totals, held, fold = (
+        counts.sum(axis=0),
+        np.zeros((folds, len(kinds))),
+        np.empty(len(values), int),
+    )
     for group in order:
         best, least, size = 0, np.inf, np.inf
         for k in range(folds):
@@ -253,6 +257,12 @@ def inner_parts(sweeps: Dataset, most: int = 3) -> list[InnerPart]:
     ]
     if any(of_all):
         return [part for turn in zip_longest(*of_all) for part in turn if part]
+    return recording_parts(sweeps)
+
+
+def recording_parts(sweeps: Dataset) -> list[InnerPart]:
+    """Parts of recordings, with materials spread evenly; each sweep is in one of them. Raises
+    FormatError if a material has one recording."""
     fewest = min(
         len(np.unique(sweeps.group("recording")[sweeps.labels == k]))
         for k in np.unique(sweeps.labels)

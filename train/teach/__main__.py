@@ -27,6 +27,8 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("folder", type=Path, help="of recorded sweeps")
     parser.add_argument("--out", type=Path, help="write a bundle there; else only assess")
     parser.add_argument("--version", default="1", help="of the bundle")
+    parser.add_argument("--by", default="", help="who teaches, for the manifest")
+    parser.add_argument("--at", default="", help="when, for the manifest")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--forgotten", type=json.loads, default={}, help="JSON, see Lesson.read")
     parser.add_argument("--memory-mb", type=int, default=0, help="limit of private memory")
@@ -60,7 +62,8 @@ def _run(args: argparse.Namespace) -> None:
     def tell(step: str, done: float, left_s: float | None) -> None:
         _say("step", step=step, done=round(done, 2), left_s=left_s and round(left_s, 1))
 
-    manifest = teach(lesson, args.out, args.version, args.seed, tell)
+    about = {"by": args.by, "at": args.at}
+    manifest = teach(lesson, args.out, args.version, about, args.seed, tell)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
     _say("taught", labels=manifest.labels, figures=manifest.figures, peak_mb=peak)
 

@@ -7,6 +7,7 @@ is slightly too high.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from appliance.core.statistics import wilson
 from appliance.inference.classifier import softmax
+from train.data.splitters import InnerPart, recording_parts
 from train.metrics.score import interval
 from train.models.methods import Log, no_log
 from train.models.recipe import recipe
@@ -159,25 +161,31 @@ def assess(lesson: Lesson, seed: int = 0, log: Log = no_log) -> Assessment:
     lesson = lesson.repeated()
     setup = recipe.Setup.of(lesson.sweeps, seed, recipe.Settings(steps=0), log)
     fixed = recipe.features(setup)
-    return judged(lesson, setup, recipe.judge(recipe.candidates(fixed, setup), fixed, setup))
+    choice = recipe.judge(recipe.candidates(fixed, setup), fixed, setup)
+    parts, scores, chosen = setup.parts, choice.scores, choice.chosen
+    if not np.any([part.out for part in parts], axis=0).all():
+        # some materials are of one place: their sweeps are judged by others of that place
+        parts = recording_parts(lesson.sweeps)
+        scores = setup.scores(fixed.data, parts)
+        chosen = scores.score(chosen.plan.parts)
+    return judged(lesson, parts, softmax(chosen.logits[scores.own]))
 
 
-def judged(lesson: Lesson, setup: recipe.Setup, choice: recipe.HeadChoice) -> Assessment:
-    """The assessment by the scores of a choice of heads."""
-    scores, n = choice.scores, len(lesson.sweeps)
-    numbers = np.concatenate([np.flatnonzero(part.out) for part in setup.parts])
-    p = softmax(choice.chosen.logits[scores.own])
-    named, chances, cluster = np.zeros((n, p.shape[1])), np.zeros((n, p.shape[1])), np.zeros(n, int)
+def judged(lesson: Lesson, parts: Sequence[InnerPart], p: Array) -> Assessment:
+    """The assessment by probabilities [n, K] of the sweeps of all parts, one part after another;
+    each sweep is in one part or more."""
+    shape, cluster = (len(lesson.sweeps), p.shape[1]), np.zeros(len(lesson.sweeps), int)
+    numbers = np.concatenate([np.flatnonzero(part.out) for part in parts])
+    named, chances = np.zeros(shape), np.zeros(shape)
     np.add.at(named, (numbers, p.argmax(axis=1)), 1)
     np.add.at(chances, numbers, p)
-    cluster[numbers] = scores.clusters[scores.own]
-    times = np.bincount(numbers, minlength=n)
-    seen = np.flatnonzero(times)
-    named[seen] /= times[seen, None]
-    chances[seen] /= times[seen, None]
-    groups = tuple(sorted({part.group for part in setup.parts}))
-    right = named[seen, lesson.sweeps.labels[seen]]
-    low, high = interval(right, None if groups == ("recording",) else cluster[seen])
+    times = np.bincount(numbers)[:, None]
+    named, chances = named / times, chances / times
+    for k, part in enumerate(parts):
+        cluster[part.out] = k
+    groups = tuple(sorted({part.group for part in parts}))
+    right = named[np.arange(len(named)), lesson.sweeps.labels]
+    low, high = interval(right, None if groups == ("recording",) else cluster)
     return Assessment(lesson, named, groups, low, high, _suspects(lesson, named, chances))
 
 

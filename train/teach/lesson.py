@@ -60,8 +60,8 @@ class Lesson:
         many = np.flatnonzero(counts >= 2)
         if len(many) < 2:
             raise FormatError(
-                f"{len(many)} materials have two sweeps; a model tells at least two apart: record "
-                "two of another material"
+                f"{len(many)} of the materials have two sweeps or more, and a model tells at least "
+                "two apart; record two of another material"
             )
         kept = np.isin(self.sweeps.labels, many)
         part = self.sweeps.take(kept)

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -46,8 +47,11 @@ class StepTimes:
         self._done += SHARES[step]
 
 
-def teach(lesson: Lesson, out: Path, version: str, seed: int, tell: Tell) -> Manifest:
-    """Fit a model to the lesson and write its bundle to `out`, whole or not at all.
+def teach(
+    lesson: Lesson, out: Path, version: str, about: dict[str, Any], seed: int, tell: Tell
+) -> Manifest:
+    """Fit a model to the lesson and write its bundle to `out`, whole or not at all. about: who
+    teaches and when, for the manifest.
 
     Raises FormatError if there are too few sweeps or materials, and ExportRefused if a check of the
     bundle fails.
@@ -65,6 +69,7 @@ def teach(lesson: Lesson, out: Path, version: str, seed: int, tell: Tell) -> Man
     every = recipe.features(setup)
     times.begin("heads")
     fit = recipe.fit_size(every, setup, setup.settings.size)
-    fit = replace(fit, about=fit.about | {"taught": dict(zip(sweeps.materials, counts.tolist(), strict=True))})
+    held = dict(zip(sweeps.materials, counts.tolist(), strict=True))
+    fit = replace(fit, about=fit.about | {"taught": about | {"sweeps": held}})
     times.begin("bundle")
     return quantized_bundle.export(fit, out, NAME, version, commit())
