@@ -213,7 +213,7 @@ class Session:
 
     def _try(self, devices: Devices, pages: list[RecordPage]) -> None:
         """Classify with the new bundle, on trial as in the service."""
-        args, settings = self._args, self._settings
+        settings = self._settings
         choice = assembly.store(settings).choose()
         with ExitStack() as stack:
             trial = [stack.enter_context(choice.trial)] if choice.trial else []

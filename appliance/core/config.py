@@ -242,7 +242,8 @@ class WatchConfig:
 class TeachConfig:
     """Teaching at the robot (`palpate teach`).
 
-    allow: whether this box may learn materials by itself. serial: whether the robot may teach it,
+    allow: whether this box may learn materials by itself, and run a bundle that it has taught.
+    serial: whether the robot may teach it,
     by the commands TEACH, USE and FORGET of the serial line.
     """
 

@@ -90,11 +90,14 @@ class SignedBundle:
 class BundleFolder:
     """Complete, verified bundles in `folder`, each under its name.
 
-    signers: the file of trusted signers. key: this box's key for labels that it enrolled.
+    signers: the file of trusted signers. key: this box's key for what it has learnt. taught:
+    whether bundles that it has taught are accepted.
     """
 
-    def __init__(self, folder: Path, signers: Path, key: EnrolmentKey) -> None:
-        self.folder, self._signers, self._key = folder, signers, key
+    def __init__(
+        self, folder: Path, signers: Path, key: EnrolmentKey, *, taught: bool = True
+    ) -> None:
+        self.folder, self._signers, self._key, self._taught = folder, signers, key, taught
 
     def at(self, sha: str) -> Path:
         """The folder of the bundle `sha`."""
@@ -132,6 +135,11 @@ class BundleFolder:
                 files[bundle.MANIFEST], files[bundle.SIGNATURE], self._signers
             )
         elif bundle.TAUGHT_SIGNATURE in files:
+            if not self._taught:
+                raise BundleError(
+                    f"{folder} was taught on this box, which teach.allow = false forbids; deploy a "
+                    "bundle, or set it to true"
+                )
             self._key.verify(files[bundle.MANIFEST], files[bundle.TAUGHT_SIGNATURE], TAUGHT)
             signer = HERE
         elif not enrolled:
@@ -190,7 +198,7 @@ class Store:
     """The bundles on this box, and the choice of the bundle that runs.
 
     prove: raises if a bundle fails its golden sweeps on this machine or does not fit the settings.
-    boot: the file with the id of this boot. The methods raise OSError for trouble with the disk,
+    boot: the file with the id of this boot. taught: as in BundleFolder. The methods raise OSError for trouble with the disk,
     BundleError for a bundle that must not run, ConfigError if the settings have no trusted signers,
     and ApplianceError if another command holds the lock.
     """
@@ -201,10 +209,12 @@ class Store:
         prove: Callable[[Bundle], object],
         clock: Clock | None = None,
         boot: Path = BOOT,
+        *,
+        taught: bool = True,
     ) -> None:
         self.settings, self.folder, self._prove = settings, Path(settings.folder), prove
         key = EnrolmentKey(settings.enrolment_key)
-        self.bundles = BundleFolder(self.folder / "bundles", settings.signers, key)
+        self.bundles = BundleFolder(self.folder / "bundles", settings.signers, key, taught=taught)
         self._link, self._state_file = self.folder / "current", self.folder / STATE_FILE
         self._old_state_file = self.folder / OLD_STATE_FILE
         self._clock, self._boot_file = clock or SystemClock(), boot

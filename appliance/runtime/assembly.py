@@ -278,7 +278,9 @@ def prove(settings: Config, bundle: Bundle) -> None:
 
 def store(settings: Config) -> Store:
     """The store of bundles that the settings name."""
-    return Store(settings.store, lambda bundle: prove(settings, bundle))
+    return Store(
+        settings.store, lambda bundle: prove(settings, bundle), taught=settings.teach.allow
+    )
 
 
 def running(settings: Config, *, answers: bool = True) -> SignedBundle:

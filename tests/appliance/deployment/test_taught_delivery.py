@@ -11,6 +11,7 @@ from appliance.bundle import bundle
 from appliance.bundle.manifest import Manifest
 from appliance.core.errors import BundleError, ConfigError
 from appliance.deployment.enrolment_key import NAMESPACE, SIGNER, TAUGHT
+from appliance.deployment.store import Store
 from tests.factories import deliveries, install_scripts
 from tests.factories.deliveries import Delivery
 
@@ -95,6 +96,16 @@ def test_the_key_of_an_earlier_install_learns_to_teach(box: Delivery):
     install_scripts.enrolment_key(folder)
     box.enrolment_key.check(TAUGHT)
     box.enrolment_key.check()
+
+
+def test_a_setting_refuses_it(box: Delivery):
+    """With teach.allow = false the key of the box can bring no model, and one that runs stops."""
+    box.store.learn(taught(box))
+    strict = Store(box.how, lambda bundle: None, taught=False)
+    with pytest.raises(BundleError, match=r"which teach.allow = false forbids; deploy a bundle"):
+        strict.learn(taught(box, "2"))
+    with pytest.raises(BundleError, match="teach.allow = false"):
+        strict.running()
 
 
 def test_a_label_is_enrolled_into_a_taught_bundle(box: Delivery):

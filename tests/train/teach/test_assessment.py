@@ -9,8 +9,8 @@ import pytest
 
 from tests.factories.sweep_sets import easy
 from train.data.sets import Dataset
-from train.teach.assessment import Assessment, assess, judged
 from train.data.splitters import InnerPart
+from train.teach.assessment import Assessment, assess, judged
 from train.teach.lesson import Lesson
 
 

@@ -69,7 +69,7 @@ def test_a_single_sweep_is_not_judged_yet(tmp_path: Path):
     sweeps(tmp_path, "a", "a", "b", "b", "c")
     lesson = Lesson.read(tmp_path).repeated()
     assert lesson.sweeps.materials == ("a", "b")
-    assert FORMAT == lesson.sweeps.format
+    assert lesson.sweeps.format == FORMAT
     sweeps(tmp_path / "one", "a", "a", "b")
     with pytest.raises(FormatError, match="1 of the materials have two sweeps or more"):
         Lesson.read(tmp_path / "one").repeated()
