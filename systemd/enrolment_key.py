@@ -1,4 +1,4 @@
-"""Commands that make the key with which a box signs what it has learnt itself, and the file of its
+"""Commands that make the key with which a box signs what it has learnt, and the file of its
 signer, if they are missing (appliance/deployment/enrolment_key.py)."""
 
 from __future__ import annotations
@@ -30,8 +30,7 @@ if [ -s key ] && [ ! -s signer ]; then
   chmod 644 signer.new && sync -f signer.new && mv signer.new signer
 fi
 if grep -q '^box namespaces="palpate-enrolment" ' signer; then # of a version that taught nothing
-  sed 's/^box namespaces="palpate-enrolment" /box namespaces="palpate-enrolment,palpate-taught" /' \\
-    signer > signer.new
+  sed '/^box /s/"palpate-enrolment"/"palpate-enrolment,palpate-taught"/' signer > signer.new
   chmod 644 signer.new && sync -f signer.new && mv signer.new signer
 fi
 )"""

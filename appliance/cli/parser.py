@@ -311,6 +311,13 @@ def _labels(command: CommandParser) -> None:
         )
 
 
+def _places(add: Callable[..., argparse.Action]) -> None:
+    add("--position", default="1", metavar="TEXT", help="place on the object (default 1)")
+    add(
+        "--session", default="", metavar="TEXT", help="name of the session, if the skin is put back"
+    )
+
+
 def _teach(command: CommandParser) -> None:
     _devices(command.add_argument)
     _skin_port(command.add_argument)
@@ -333,10 +340,7 @@ def _teach(command: CommandParser) -> None:
         metavar="N",
         help="number of good sweeps of each --label (default 8)",
     )
-    add("--position", default="1", metavar="TEXT", help="place on the object (default 1)")
-    add(
-        "--session", default="", metavar="TEXT", help="name of the session, if the skin is put back"
-    )
+    _places(add)
     add("--format", metavar="RxC:TYPE:HZ", help="format of the skin, as for record")
     add(
         "--window",

@@ -200,14 +200,8 @@ class Session:
             orders = {**recording.commands, **session.commands, "DONE": self._finish}
             self._obey = self._orders(orders, box.obey)
             session.by = "the page" if pages else args.by or getpass.getuser()
-            box.run(
-                lambda: (
-                    self._ended
-                    or bool(session.taught)
-                    or teacher.done
-                    or devices.finished(box.answered)
-                )
-            )
+            over = (lambda: self._ended, lambda: session.taught, lambda: teacher.done)
+            box.run(lambda: any(end() for end in over) or devices.finished(box.answered))
             self._obey = _not_now
             return bool(session.taught)
 

@@ -19,7 +19,8 @@ from appliance.core.errors import ApplianceError, ConfigError, FormatError
 from appliance.core.log import in_journal, log
 from appliance.core.observer import Observer
 from appliance.core.types import SweepFormat
-from appliance.deployment.store import SignedBundle, Store
+from appliance.deployment.signed import SignedBundle
+from appliance.deployment.store import Store
 from appliance.inference.classifier import Classifier
 from appliance.inference.early_exit import EarlyExit
 from appliance.io import skins
@@ -151,15 +152,11 @@ def _assembled(
     announce: Callable[[str], object] = log.info,
 ) -> Box:
     """Put the components together. codes: number of labels that the class bits hold."""
-    watching = [*observers, *([capture] if capture else [])]
     commands = {**commands, "LABEL": partial(_label, codes)}
     trigger = _trigger(
         settings.trigger, answerer.format, devices, port, stack, announce, ordered=ordered
     )
-    if isinstance(trigger, KeyTrigger):
-        watching.append(AnswerWatch(trigger))
-    if isinstance(trigger, TimedTrigger):
-        watching.append(StreamWatch(trigger))
+    watching = [*observers, *([capture] if capture else []), *_watches(trigger)]
     if isinstance(trigger, CommandTrigger):
         commands = {**commands, **trigger.commands}
     lines = _outputs(settings, devices, stack)
@@ -180,6 +177,13 @@ def _assembled(
         source=devices.source,
         state_s=settings.serial.state_s,
     )
+
+
+def _watches(trigger: Trigger) -> list[Observer]:
+    """The observers that a trigger without lines needs."""
+    if isinstance(trigger, KeyTrigger):
+        return [AnswerWatch(trigger)]
+    return [StreamWatch(trigger)] if isinstance(trigger, TimedTrigger) else []
 
 
 def _trigger(

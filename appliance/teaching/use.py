@@ -15,7 +15,8 @@ from appliance.core.clock import Clock
 from appliance.core.config import Config
 from appliance.core.errors import ApplianceError, ConfigError
 from appliance.deployment.enrolment_key import TAUGHT, EnrolmentKey
-from appliance.deployment.store import SignedBundle, Store
+from appliance.deployment.signed import SignedBundle
+from appliance.deployment.store import Store
 from appliance.teaching.process import News, TeachingProcess, check_installed, learning
 from appliance.teaching.state import TeachingState
 

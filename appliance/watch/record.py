@@ -141,13 +141,8 @@ class RecordPage(Observer):
         self._about, self._obey, self._clock = about, obey, clock
         self._tracker = ContactTracker(Expected(format), source)
         self._rate_hz = format.rate_hz
-        self._commands = (
-            *LABELS,
-            "NEXT",
-            "DISCARD",
-            *(("START", "STOP") if trigger.mode == "serial" else ()),
-            *(TEACHING if teaching else ()),
-        )
+        by_page = ("START", "STOP") if trigger.mode == "serial" else ()
+        self._commands = (*LABELS, "NEXT", "DISCARD", *by_page, *(TEACHING if teaching else ()))
         self._known = {
             "source": source,
             "format": str(format),

@@ -65,7 +65,17 @@ class TaughtBox:
     def start(self, *more: str) -> None:
         """Start `palpate teach` with its page."""
         words = ["teach", *self.options(), "--skin", "matrix", "--port", str(self.player.path)]
-        words += ["--trigger", "serial", "--window", str(WINDOW_S), "--web", "0", *more]
+        words += [
+            "--set",
+            "skin.grid=4x4",
+            "--trigger",
+            "serial",
+            "--window",
+            str(WINDOW_S),
+            "--web",
+            "0",
+            *more,
+        ]
         self.process = subprocess.Popen(
             [sys.executable, "-m", "appliance", *words],
             cwd=ROOT,

@@ -12,6 +12,7 @@ import json
 import os
 import resource
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -70,14 +71,10 @@ def _run(args: argparse.Namespace) -> None:
 
 def _restrict(memory_mb: int) -> None:
     """Take the lowest priority and the limit of memory; a system that forbids it has its own."""
-    for limit in (
-        lambda: os.nice(NICE),
-        lambda: Path("/proc/self/oom_score_adj").write_text("1000"),
-    ):
-        try:
-            limit()
-        except OSError:
-            continue
+    with suppress(OSError):
+        os.nice(NICE)
+    with suppress(OSError):
+        Path("/proc/self/oom_score_adj").write_text("1000")
     if memory_mb:
         resource.setrlimit(resource.RLIMIT_DATA, (memory_mb << 20, memory_mb << 20))
 

@@ -103,13 +103,17 @@ def _of_one_format(kept: Sequence[RecordedSweep], left_out: Counter[str]) -> lis
 
 def _named(kept: Sequence[RecordedSweep]) -> list[RecordedSweep]:
     """The sweeps, each with a name of every group that any of them has."""
-    named = list(kept)
-    for name in NAMED_GROUPS:
-        if any(getattr(one.sweep, name) for one in named):
-            named = [
-                one
-                if getattr(one.sweep, name)
-                else replace(one, sweep=replace(one.sweep, **{name: NOWHERE}))
-                for one in named
-            ]
-    return named
+    position, session = (
+        NOWHERE if any(getattr(one.sweep, name) for one in kept) else "" for name in NAMED_GROUPS
+    )
+    return [
+        replace(
+            one,
+            sweep=replace(
+                one.sweep,
+                position=one.sweep.position or position,
+                session=one.sweep.session or session,
+            ),
+        )
+        for one in kept
+    ]

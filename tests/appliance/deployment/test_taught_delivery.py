@@ -104,7 +104,7 @@ def test_a_setting_refuses_it(box: Delivery):
     strict = Store(box.how, lambda bundle: None, taught=False)
     with pytest.raises(BundleError, match=r"which teach.allow = false forbids; deploy a bundle"):
         strict.learn(taught(box, "2"))
-    with pytest.raises(BundleError, match="teach.allow = false"):
+    with pytest.raises(BundleError, match=r"teach.allow = false"):
         strict.running()
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
@@ -16,7 +16,7 @@ from tests.factories.taught_skin import PITCHES, SLIDE_S, TaughtBox, taught_box
 
 pytestmark = [deliveries.NEEDED, pytest.mark.slow, pytest.mark.thorough]  # a fit, in minutes
 EACH = 5
-WAIT_MS = 300_000
+WAIT_MS = 240_000
 
 
 @pytest.fixture
@@ -46,7 +46,7 @@ class Hand:
         """Name a material."""
         self.page.fill("#name", material)
         self.press("#add button")
-        self.page.wait_for_function(f"document.querySelector('#what').innerText == '{material}'")
+        self.until("#what", lambda text: text == material)
 
     def slide(self, material: str) -> None:
         """One sweep, by the pedal (the space bar), while the robot slides."""
@@ -59,9 +59,14 @@ class Hand:
         self.page.keyboard.press("Space")
         self.box.skin.material = ""
         number = 1 if before == "Last sweep" else int(before.split()[1].strip(",")) + 1
-        self.page.wait_for_function(
-            f"document.querySelector('#sweep-title').innerText.startsWith('Sweep {number},')"
-        )
+        self.until("#sweep-title", lambda text: text.startswith(f"Sweep {number},"))
+
+    def until(self, where: str, done: Callable[[str], bool]) -> None:
+        """Wait until the text of an element is as wanted."""
+        end = time.monotonic() + WAIT_MS / 1000
+        while not done(self.seen.text(where)):
+            assert time.monotonic() < end, (where, self.seen.text(where), self.box.log[-2000:])
+            self.page.wait_for_timeout(50)
 
 
 def test_from_nothing_to_right_verdicts_on_four_materials(browser: Any, box: TaughtBox):
@@ -72,9 +77,7 @@ def test_from_nothing_to_right_verdicts_on_four_materials(browser: Any, box: Tau
         hand.add(material)
         for _ in range(EACH):
             hand.slide(material)
-    hand.page.wait_for_function(
-        "document.querySelector('#learnt').innerText.includes(' of 20 sweeps ')"
-    )
+    hand.until("#learnt", lambda text: " of 20 sweeps " in text)
     assert "right, between" in hand.seen.text("#accuracy")
     begun = time.monotonic()
     hand.press("#use")
@@ -100,7 +103,7 @@ def test_browsers_and_skin_come_and_go(browser: Any, box: TaughtBox):
     hand, other = Hand(browser, box), Hand(browser, box)
     hand.add("oak")
     hand.slide("oak")
-    other.page.wait_for_function("document.querySelector('#count').innerText == 'sweep 2 of 5'")
+    other.until("#count", lambda text: text == "sweep 2 of 5")
     other.context.close()
     hand.slide("oak")
     box.player.unplug()
@@ -125,5 +128,5 @@ def test_the_page_refuses_what_cannot_be(browser: Any, box: TaughtBox):
     hand = Hand(browser, box)
     hand.page.fill("#name", "käse")
     hand.press("#add button")
-    hand.page.wait_for_function("document.querySelector('#said').innerText.includes('cannot be')")
+    hand.until("#said", lambda text: "cannot be used" in text)
     assert hand.page.get_attribute("#use", "aria-disabled") == "true"

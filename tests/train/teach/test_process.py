@@ -96,7 +96,7 @@ def test_too_little_is_refused_with_the_remedy(tmp_path: Path, materials: int, e
 def test_too_little_memory_is_said(tmp_path: Path):
     """The limit holds: the process ends with a reason and leaves nothing."""
     lessons.write(tmp_path / "sweeps", easy(12))
-    words = [tmp_path / "sweeps", "--out", tmp_path / "bundle", "--memory-mb", "40"]
+    words = [tmp_path / "sweeps", "--out", tmp_path / "bundle", "--memory-mb", "100"]
     done = subprocess.run(
         [sys.executable, "-m", "train.teach", *map(str, words)],
         cwd=ROOT,
@@ -105,4 +105,5 @@ def test_too_little_memory_is_said(tmp_path: Path):
         check=False,
     )
     assert done.returncode
+    assert "100 MB are too few for these sweeps; use a desktop" in done.stdout
     assert not (tmp_path / "bundle").exists()
