@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from appliance.bundle.bundle import DEFAULT, Bundle
-from appliance.cli import teach_command
 from appliance.cli.common import Facts, load_bundle, load_settings, stop_flag
 from appliance.cli.devices import open_devices
 from appliance.cli.reporting import capture, done, feed, status
@@ -37,6 +36,8 @@ def run(args: argparse.Namespace) -> int:
         if settings.classifier.allow_unsigned:
             log.warning(f"unsigned {assembly.UNSIGNED}")
         if choice and choice.folder == DEFAULT and untaught(args, settings, current):
+            from appliance.cli import teach_command  # here: a box in service does without it
+
             return teach_command.until_taught(args, settings)
         devices = open_devices(args, lambda: current.format)
         port = assembly.port(settings, devices)
@@ -93,7 +94,7 @@ def _reports(
         stack.callback(black_box.close)
         observers.append(black_box)
     m = current.manifest
-    model = f"{m.name} {m.version}, {len(m.labels)} labels"
+    model = f"{m.name} {m.version}, {len(m.labels)} labels{f', {m.taught}' if m.taught else ''}"
     facts = {"model": lambda: model, **facts}
     from appliance.alignment.live import Expected
 

@@ -216,10 +216,10 @@ class Session:
             shown = {
                 "model": f"{m.name} {m.version}",
                 "labels": m.labels,
-                "taught": use.words(m),
+                "taught": m.taught,
             }
             self._about = lambda: self._shown({"trying": shown})
-            facts: Facts = {"model": lambda: f"{m.name} {m.version}, {use.words(m)}"}
+            facts: Facts = {"model": lambda: f"{m.name} {m.version}, {m.taught}"}
             box = assembly.box(
                 settings,
                 choice.bundle,

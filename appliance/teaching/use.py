@@ -10,12 +10,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 from appliance.bundle import bundle
-from appliance.bundle.bundle import Manifest
 from appliance.core.clock import Clock
 from appliance.core.config import Config
 from appliance.core.errors import ApplianceError, ConfigError
 from appliance.deployment.enrolment_key import TAUGHT, EnrolmentKey
-from appliance.deployment.signed import SignedBundle
 from appliance.deployment.store import Store
 from appliance.teaching.process import News, TeachingProcess, check_installed, learning
 from appliance.teaching.state import TeachingState
@@ -99,18 +97,6 @@ def version(store: Store) -> str:
         return "1"
     held = running.bundle.manifest.version
     return str(int(held) + 1) if running.taught and held.isdecimal() else "1"
-
-
-def by_whom(signed: SignedBundle | None) -> str:
-    """Who has taught a bundle and when, for a person; "" for a delivered bundle."""
-    return words(signed.bundle.manifest) if signed and signed.taught else ""
-
-
-def words(manifest: Manifest) -> str:
-    """The entry `taught` of a manifest in words."""
-    made = manifest.made.get("taught")
-    about = made if isinstance(made, dict) else {}
-    return f"taught here by {about.get('by', '?')}, {about.get('at', '?')} UTC by the box's clock"
 
 
 def command(options: list[str], by: str) -> list[str]:

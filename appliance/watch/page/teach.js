@@ -204,7 +204,7 @@ byId("add").addEventListener("submit", async (event) => {
   const name = byId("name").value.trim();
   if (name && live() && !(await send("TEACH", name))) {
     byId("name").value = "";
-    byId("name").blur();
+    document.activeElement?.blur(); // field or button: so that the pedal starts a sweep
   }
 });
 document.addEventListener("keydown", (event) => { // a USB pedal is a keyboard with one key

@@ -105,7 +105,7 @@ def test_recorded_sweeps_become_the_bundle_of_the_box(
     settings = config.load(None, [*options[1::2]], site=ROOT / "tests/factories/no-site.toml")
     running = assembly.store(settings).running()
     assert running.signer == "taught here"
-    assert use.by_whom(running).startswith("taught here by anna, 20")
+    assert running.bundle.manifest.taught.startswith("taught here by anna, 20")
     assert use.version(assembly.store(settings)) == "2"
     left = {path.name for path in (tmp_path / "store").iterdir()}
     assert left == {"sweeps", "bundles", "bundles.json", "current"}

@@ -107,3 +107,18 @@ def test_too_little_memory_is_said(tmp_path: Path):
     assert done.returncode
     assert "100 MB are too few for these sweeps; use a desktop" in done.stdout
     assert not (tmp_path / "bundle").exists()
+
+
+def test_up_to_twenty_sweeps_the_desktop_makes_the_same_model():
+    """`palpate-train fit` at its default trains stages from 25 sweeps of each material on. Below,
+    its model is the taught one, bit for bit."""
+    sweeps = easy(20)
+    plain = replace(sweeps, groups={"recording": np.arange(len(sweeps))})
+    assert recipe.Settings().steps > 0
+    default, taught = (
+        recipe.fit(plain, 0, settings) for settings in (recipe.Settings(), recipe.Settings(steps=0))
+    )
+    assert default.weights.keys() == taught.weights.keys()
+    for name, values in taught.weights.items():
+        np.testing.assert_array_equal(default.weights[name], values, err_msg=name)
+    assert default.plan == taught.plan
