@@ -109,7 +109,8 @@ def main(argv: list[str] | None = None) -> int:
         help="without the program and libraries of palpate teach (make install TEACH=0)",
     )
     args = parser.parse_args(argv)
-    wheels = [args.wheel, *([] if args.no_teach else [TEACHING])]
+    # make install builds both wheels
+    wheels = [args.wheel, *([TEACHING] if TEACHING.is_file() and not args.no_teach else [])]
     for file in (*wheels, *([args.signers] if args.signers else [])):
         if not file.is_file():
             sys.exit(f"palpate: no file {file}; check the path (make install builds the wheel)")

@@ -125,7 +125,11 @@ function drawLearnt() {
 
 function drawSweep() {
   byId("status").hidden = !last;
-  if (!last) return signal(byId("signal"), null, "no sweep yet");
+  if (!last) {
+    put("sweep-title", "Last sweep");
+    put("outcome", "no sweep yet");
+    return signal(byId("signal"), null, "no sweep yet");
+  }
   mark(byId("status"), last.status);
   put("sweep-title", `Sweep ${last.sweep}, ${ago(Date.now() - wallMs - last.time_ns / 1e6)} ago`);
   const wrong = last.faulty ? `${last.reason}; it does not count` : "";

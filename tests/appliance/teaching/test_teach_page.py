@@ -15,7 +15,9 @@ from tests.factories.browser import BrowsedPage
 from tests.factories.taught_skin import PITCHES, SLIDE_S, TaughtBox, taught_box
 
 pytestmark = [deliveries.NEEDED, pytest.mark.slow, pytest.mark.thorough]  # a fit, in minutes
-EACH = 5
+EACH, TRIES = 8, 3
+"""Sweeps of each material, and slides until its name has to come: a model of few sweeps calls some
+unknown."""
 WAIT_MS = 240_000
 
 
@@ -77,23 +79,27 @@ def test_from_nothing_to_right_verdicts_on_four_materials(browser: Any, box: Tau
         hand.add(material)
         for _ in range(EACH):
             hand.slide(material)
-    hand.until("#learnt", lambda text: " of 20 sweeps " in text)
+    hand.until("#learnt", lambda text: f" of {4 * EACH} sweeps " in text)
     assert "right, between" in hand.seen.text("#accuracy")
     begun = time.monotonic()
     hand.press("#use")
     hand.page.wait_for_selector("#done:visible")
     waited = time.monotonic() - begun
     assert "taught here by the page" in hand.seen.text("#learnt")
-    named = {}
+    slides = {}
     for material in PITCHES:
-        hand.slide(material)
-        named[material] = hand.seen.text("#what")
-    assert named == {material: material for material in PITCHES}
+        for slide in range(1, TRIES + 1):
+            hand.slide(material)
+            if (said := hand.seen.text("#what")) == material:
+                slides[material] = slide
+                break
+            assert said not in PITCHES  # unknown or unsure, not another name
+    assert slides.keys() == PITCHES.keys()
     hand.press("#done")
     assert box.process
     assert box.process.wait(60) == 0
     assert not [e for e in hand.seen.errors if "ERR_" not in e and "Failed to load" not in e]
-    print(json.dumps({"clicks": hand.clicks, "waited_s": round(waited, 1)}))
+    print(json.dumps({"clicks": hand.clicks, "waited_s": round(waited, 1), "slides": slides}))
 
 
 def test_browsers_and_skin_come_and_go(browser: Any, box: TaughtBox):
@@ -103,14 +109,14 @@ def test_browsers_and_skin_come_and_go(browser: Any, box: TaughtBox):
     hand, other = Hand(browser, box), Hand(browser, box)
     hand.add("oak")
     hand.slide("oak")
-    other.until("#count", lambda text: text == "sweep 2 of 5")
+    other.until("#count", lambda text: text == f"sweep 2 of {EACH}")
     other.context.close()
     hand.slide("oak")
     box.player.unplug()
     hand.page.wait_for_selector("#banner:visible")
     assert "no skin" in hand.seen.text("#banner")
     box.player.plug()
-    hand.page.wait_for_selector("#banner:hidden", state="attached")
+    hand.page.wait_for_selector("#banner", state="hidden")
     hand.slide("oak")
     box.stop(kill=True)
     hand.page.wait_for_selector("#banner:visible")
