@@ -8,6 +8,7 @@ import json
 import sys
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -121,15 +122,23 @@ def _use(args: argparse.Namespace, settings: Config) -> int:
     return 0
 
 
+def by_page(args: argparse.Namespace, settings: Config) -> Config:
+    """The settings of a session: where no GPIO line is wired, the page starts and stops sweeps."""
+    wired = args.sim or settings.trigger.start or not settings.trigger.by_lines
+    if args.web is None or wired:
+        return settings
+    return replace(settings, trigger=replace(settings.trigger, mode="serial"))
+
+
 class Session:
     """Records and assesses until a bundle is made; with a page, then tries it until DONE."""
 
     def __init__(self, args: argparse.Namespace, settings: Config) -> None:
-        self._args, self._settings, self._stopped = args, settings, stop_flag()
+        self._args, self._settings, self._stopped = args, by_page(args, settings), stop_flag()
         self._store = Path(settings.store.folder)
         self._obey: Callable[[Command], list[object]] = _not_now
         self._about: Callable[[], Mapping[str, Any]] = dict
-        self._announced, self._done, self._again = "", False, ""
+        self._announced, self._done, self._again, self._address = "", False, "", ""
 
     def run(self) -> None:
         """Run until all sweeps are recorded; with a page until DONE."""
@@ -166,7 +175,8 @@ class Session:
             SystemClock(),
             teaching=True,
         )
-        log.info(f"page: {page.server.address}")
+        self._address = page.server.address
+        log.info(f"page: {self._address}")
         return [page]
 
     def _teach(self, devices: Devices, format: SweepFormat, pages: list[RecordPage]) -> bool:
@@ -247,6 +257,7 @@ class Session:
             "model": lambda: NOTHING,
             "recorded": lambda: recording.about()["missing"],
             "teach": session.about,
+            "page": lambda: self._address,
         }
         settings = self._settings
         return [

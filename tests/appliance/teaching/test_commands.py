@@ -7,8 +7,10 @@ from pathlib import Path
 import pytest
 
 from appliance.bundle import bundle
-from appliance.cli import run_command
+from appliance.cli import run_command, teach_command
+from appliance.cli.common import load_settings
 from appliance.cli.main import main
+from appliance.cli.parser import arguments
 from appliance.core import config
 from appliance.io.robot_link import command
 from appliance.runtime import assembly
@@ -74,12 +76,24 @@ def test_nothing_recorded_yet(options: list[str], capsys: pytest.CaptureFixture[
 )
 def test_a_box_without_a_bundle_for_its_skin_is_taught_first(words: list[str], untaught: bool):
     """Only where the profile says that the packaged bundle is for another skin."""
-    from appliance.cli.common import load_settings
-    from appliance.cli.parser import arguments
-
     args = arguments("run", words)
     packaged = bundle.load(bundle.DEFAULT)
     assert run_command.untaught(args, load_settings(args), packaged) is untaught
+
+
+@pytest.mark.parametrize(
+    ("words", "mode"),
+    [
+        (["--web"], "serial"),
+        ([], "two-lines"),
+        (["--web", "--board", "rpi5"], "two-lines"),
+        (["--web", "--trigger", "timed"], "timed"),
+    ],
+)
+def test_the_page_triggers_where_no_line_is_wired(words: list[str], mode: str):
+    """With lines, or another trigger by choice, the page waits for it."""
+    args = arguments("teach", words)
+    assert teach_command.by_page(args, load_settings(args)).trigger.mode == mode
 
 
 def test_its_commands_are_commands_of_the_line():
