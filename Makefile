@@ -107,7 +107,7 @@ $(DESKTOP): $(RUNTIME) train/pyproject.toml
 
 # The same with tests, studies, and the tools that check the code.
 $(TOOLS): $(DESKTOP)
-	$(INSTALL) -e '.[dev]' -e 'train[studies,dask]'
+	$(INSTALL) -e '.[dev]' -e 'train[studies,dask,files]'
 	@touch $@
 
 # The same with what builds the site.

@@ -286,6 +286,8 @@ def _attempt(box: FleetBox, work: Callable[[FleetBox], str], limit_s: int) -> st
         return with_remedy(f"cannot be reached: {e}")
     except (Failed, OSError, EOFError, SSHException, PyinfraError) as e:
         return str(e) or type(e).__name__
+    except Exception as e:  # an answer that nobody thought of must not end the work on other boxes
+        return f"{type(e).__name__}: {e}"
     print(f"{box.name}: {line}", flush=True)
     return ""
 

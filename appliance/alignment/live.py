@@ -150,7 +150,7 @@ class ContactTracker:
         (None: no contact)."""
         trained = self._expected.contact
         shown: dict[str, Any] = {
-            "load": tuple(map(tuple, load.round(1).tolist())),
+            "load": tuple(map(tuple, load.round(2).tolist())),
             "full": self._full,
         }
         lowest = self._lowest - self._expected.unloaded

@@ -20,8 +20,9 @@ from appliance.core import config
 from appliance.core.clock import SystemClock
 from appliance.core.config import Config
 from appliance.core.errors import ApplianceError, ConfigError
-from appliance.core.log import log, to_stderr
+from appliance.core.log import log, printable, to_stderr
 from appliance.core.menu import CommandParser
+from appliance.core.patience import patiently
 
 EVERY_S = 1.0
 
@@ -81,7 +82,7 @@ def run_modbus(args: argparse.Namespace) -> int:
         finally:
             source.close()
 
-    asyncio.run(serve())
+    patiently(lambda: asyncio.run(serve()), SystemClock())
     return 0
 
 
@@ -105,7 +106,7 @@ def run_tcp(args: argparse.Namespace) -> int:
         finally:
             bridge.close()
 
-    asyncio.run(serve())
+    patiently(lambda: asyncio.run(serve()), SystemClock())
     return 0
 
 
@@ -152,7 +153,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         return run(args)
     except ApplianceError as e:
-        print(f"palpate: {e}", file=sys.stderr)
+        print(printable(f"palpate: {e}"), file=sys.stderr)
         return e.exit_code
     except KeyboardInterrupt:
         return 130

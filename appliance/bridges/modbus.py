@@ -24,7 +24,7 @@ from appliance.client.answers import Answer
 from appliance.core.clock import Clock
 from appliance.core.directions import DIRECTIONS
 from appliance.core.errors import ApplianceError, FormatError
-from appliance.core.log import log
+from appliance.core.log import SparseLog
 from appliance.core.status import Status
 
 VERSION = 1
@@ -168,6 +168,7 @@ class ModbusBridge:
     sent at a time."""
 
     def __init__(self, source: Source, clock: Clock, *, writes: bool) -> None:
+        self._log = SparseLog(clock.now_ns)
         self._source, self._clock, self._writes = source, clock, writes
         self._commanding = asyncio.Lock()
 
@@ -245,5 +246,5 @@ class ModbusBridge:
         try:
             await asyncio.to_thread(self._source.send, name, **values)
         except ApplianceError as e:
-            log.warning(f"modbus: {name}: {e}")
+            self._log.warning(f"modbus: {name}: {e}")
             raise RequestRefused(ExceptionCode.DEVICE) from e

@@ -12,7 +12,7 @@ import socket
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
 
-from appliance.core.errors import ConfigError
+from appliance.core.errors import AddressError, ConfigError
 from appliance.core.log import log
 
 QUIET_S = 5.0
@@ -79,12 +79,14 @@ class TcpServer:
         self._serve, self._most = serve, most
 
     async def open(self, host: str, port: int) -> None:
-        """Listen. Raises ConfigError if that fails."""
+        """Listen. Raises AddressError if the address is in use or not there yet, ConfigError if
+        this program may not listen there or the address is impossible."""
         try:
             server = await asyncio.start_server(self._connected, host, port, limit=8192, backlog=64)
-        except (OSError, OverflowError) as e:
+        except (OSError, OverflowError, ValueError) as e:
             why = str(getattr(e, "strerror", None) or e).lower()
-            raise ConfigError(
+            passing = isinstance(e, OSError) and not isinstance(e, PermissionError)
+            raise (AddressError if passing else ConfigError)(
                 f"--listen {host}:{port}: {why}; name an address of this machine and a free port"
             ) from e
         self.address = server.sockets[0].getsockname()[:2]

@@ -22,7 +22,8 @@ from appliance.client.box import BAUD, Heard, Palpate
 from appliance.client.feed import Feed
 from appliance.client.line import READ_S
 from appliance.core.clock import Clock, SystemClock
-from appliance.core.errors import ApplianceError, CommandRefused, ConfigError
+from appliance.core.errors import ApplianceError, CommandRefused, ConfigError, TemporaryError
+from appliance.core.patience import passes
 from appliance.core.status import Status
 from appliance.tools import pseudo_terminal
 
@@ -282,7 +283,7 @@ class LinkPort:
             path.symlink_to(name)
         except OSError as e:
             self._stack.close()
-            raise ConfigError(
+            raise (TemporaryError if passes(e) else ConfigError)(
                 f"--link {path}: {str(e.strerror).lower()}; name a path that is free"
             ) from e
         self._stack.callback(path.unlink, missing_ok=True)

@@ -54,7 +54,8 @@ from appliance.bundle.manifest import (
     Thresholds,
 )
 from appliance.bundle.onnx_check import check
-from appliance.core.errors import BundleError
+from appliance.core.errors import BundleError, TemporaryError
+from appliance.core.patience import passes
 from appliance.signal import features
 
 try:  # not from hashlib, which loads OpenSSL (4 MB) although Python has this function built in
@@ -144,11 +145,13 @@ def files(folder: Path) -> dict[str, bytes]:
     files of OPTIONAL that exist.
 
     Other files are ignored. Links are not followed, and no file is read beyond the size in the
-    manifest. Raises BundleError if a file cannot be read or is larger.
+    manifest. Raises BundleError if a file cannot be read or is larger, TemporaryError if
+    it may be read at the next attempt.
     """
     try:
         found = {MANIFEST: _read(folder / MANIFEST, MOST_SMALL)}
     except OSError as e:
+        _raise_if_passing(folder, e)
         raise BundleError(
             f"no bundle at {folder}: {MANIFEST}: {e.strerror}; name the folder of a bundle"
         ) from e
@@ -158,6 +161,7 @@ def files(folder: Path) -> dict[str, bytes]:
         except OSError as e:
             if name in OPTIONAL and e.errno == errno.ENOENT:
                 continue
+            _raise_if_passing(folder, e)
             what = "was altered" if e.errno == errno.EFBIG else "cannot be read"
             raise BundleError(
                 f"{folder}: {name} {what}: {e.strerror}; copy the bundle again"
@@ -170,6 +174,12 @@ def _named(manifest: bytes) -> dict[str, int]:
     return OPTIONAL | {
         name: entry["bytes"] for name, entry in Manifest.parse(manifest).files.items()
     }
+
+
+def _raise_if_passing(folder: Path, e: OSError) -> None:
+    """Raises TemporaryError if the error says nothing about the bundle."""
+    if passes(e):
+        raise TemporaryError(f"{folder} cannot be read now: {e.strerror}; try again") from e
 
 
 def _read(path: Path, most: int) -> bytes:

@@ -15,6 +15,7 @@ from appliance.core import config
 from appliance.core.clock import SystemClock
 from appliance.core.config import Config
 from appliance.core.errors import ConfigError
+from appliance.core.interrupts import INTERRUPTED
 from appliance.runtime import assembly
 
 if TYPE_CHECKING:
@@ -59,12 +60,21 @@ def load_bundle(settings: Config, *, answers: bool = True) -> Bundle:
     return assembly.running(settings, answers=answers).bundle
 
 
-def stop_flag() -> Callable[[], bool]:
+class StopFlag:
     """A function that is true once SIGTERM or SIGINT came. The loop then ends within one turn."""
-    received: list[int] = []
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda n, frame: received.append(n))
-    return lambda: bool(received)
+
+    def __init__(self) -> None:
+        self._received: list[int] = []
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, lambda n, frame: self._received.append(n))
+
+    def __call__(self) -> bool:
+        return bool(self._received)
+
+    @property
+    def exit_code(self) -> int:
+        """130 after Ctrl-C, otherwise 0: SIGTERM ends a service in order."""
+        return INTERRUPTED if self._received[:1] == [signal.SIGINT] else 0
 
 
 def local_page(name: str, port: int | None, stack: ExitStack) -> list[PageServer]:

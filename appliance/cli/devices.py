@@ -42,15 +42,17 @@ def simulated(
     *,
     remember: bool = True,
     spread: bool = False,
+    touring: bool = False,
 ) -> RobotDevices:
     """A simulated robot with the skin of the settings: a readout board on USB, or a skin on a
-    terminal."""
-    from appliance.sim import devices, rig, script
+    terminal. touring: the robot plays the tour of `palpate demo`; on a readout board only."""
+    from appliance.sim import devices, rig, script, tour
 
     clock = rig.VirtualClock() if args.virtual else SystemClock()
     profile = skins.profile(settings)
     if profile.codec == "palpate":
         acts, source, format = script.named(name, format, args.seed, spread=spread)
+        acts = tour.tour(format, args.seed) if touring else acts
         return devices.build(format, islice(acts, args.sweeps), clock, source, remember=remember)
     from appliance.sim.skins import devices as terminal
     from appliance.sim.skins import sweeps

@@ -10,7 +10,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from appliance.bundle.bundle import Bundle
-from appliance.cli.common import load_settings, stop_flag
+from appliance.cli.common import StopFlag, load_settings
 from appliance.cli.devices import open_devices
 from appliance.core.config import Config
 from appliance.core.errors import BundleError, ConfigError
@@ -87,8 +87,8 @@ def _good_sweeps(args: argparse.Namespace, settings: Config, current: Bundle) ->
     """The windows of `--sweeps` good sweeps. Raises ApplianceError if there are too few."""
     settings = replace(settings, classifier=replace(settings.classifier, early=False))
     devices = open_devices(args, lambda: current.format)
-    stopped = stop_flag()
-    taken = SweepCollector(args.good)
+    stopped = StopFlag()
+    taken = SweepCollector(args.good, enrolment.slide_check(current))
     with ExitStack() as stack:
         port = assembly.port(settings, devices)
         box = assembly.box(

@@ -12,11 +12,11 @@ from appliance.alignment.live import Expected
 from appliance.alignment.terminal import Screen
 from appliance.alignment.view import Display
 from appliance.cli.common import (
+    StopFlag,
     load_bundle,
     load_settings,
     local_page,
     status_file,
-    stop_flag,
 )
 from appliance.cli.devices import open_devices
 from appliance.core import config
@@ -25,6 +25,7 @@ from appliance.core.config import Config
 from appliance.core.devices import Devices
 from appliance.core.errors import BundleError, ConfigError, FormatError, SensorError
 from appliance.core.log import TroubleLog, log
+from appliance.core.patience import patiently
 from appliance.io import skins
 from appliance.io.usb_sensor import fits
 from appliance.runtime.replay import replay
@@ -66,7 +67,7 @@ def run_align(args: argparse.Namespace) -> int:
     settings = load_settings(args)
     devices = _open_any(args, settings)
     expected = _expected(devices.wire(settings), devices)
-    stopped = stop_flag()  # before anybody can read the page's address
+    stopped = StopFlag()  # before anybody can read the page's address
     with ExitStack() as stack:
         pages = local_page("watch.html", args.web, stack)
         screen = stack.enter_context(
@@ -74,7 +75,7 @@ def run_align(args: argparse.Namespace) -> int:
         )
         displays: list[Display] = [screen, *pages]
         live.run(devices.wire(settings), expected, devices, displays, stopped)
-    return 0
+    return stopped.exit_code
 
 
 def _expected(settings: Config, devices: Devices) -> Expected:
@@ -125,7 +126,7 @@ def run_status(args: argparse.Namespace) -> int:
 def run_watch(args: argparse.Namespace) -> int:
     """Show the running box until Ctrl-C or SIGTERM."""
     settings, clock = load_settings(args), SystemClock()
-    socket, stopped = settings.store.feed, stop_flag()
+    socket, stopped = settings.store.feed, StopFlag()
     if not socket:
         raise ConfigError(
             'store.runtime = "" turns the feed off, so there is nothing to watch; set it to a'
@@ -136,10 +137,11 @@ def run_watch(args: argparse.Namespace) -> int:
         from appliance.watch.access import Access
         from appliance.watch.web import PageWatcher
 
-        watcher = PageWatcher(path, Access.configured(settings.watch, args.web), clock.now_ns)
+        access = Access.configured(settings.watch, args.web)
+        watcher = patiently(lambda: PageWatcher(path, access, clock.now_ns), clock, stopped)
         log.info(f"page: {watcher.server.address}")
         watcher.run(stopped)
-        return 0
+        return stopped.exit_code
     from appliance.watch import terminal
 
     if args.json:
@@ -147,4 +149,4 @@ def run_watch(args: argparse.Namespace) -> int:
         terminal.pass_on(path, sys.stdout, clock, stopped, trouble.update)
     else:
         terminal.TerminalWatch(path, sys.stdout, clock).run(stopped)
-    return 0
+    return stopped.exit_code

@@ -9,31 +9,47 @@ robot acts on them.
 
 from __future__ import annotations
 
+import os
 import sys
+from collections.abc import Mapping
 from typing import Any
 
 import gpiod
 
 from appliance.cli.parser import add_settings
 from appliance.core import config
-from appliance.core.clock import SystemClock
-from appliance.core.errors import ApplianceError
+from appliance.core.clock import Clock, SystemClock
+from appliance.core.errors import EX_CONFIG, ApplianceError
 from appliance.core.menu import CommandParser
 from appliance.io.gpio_lines import Lines
+from appliance.service import ended
 
 
-def main(argv: list[str] | None = None, gpio: Any = gpiod) -> int:
-    """Drive all configured outputs low and release them. Exit codes as of `palpate`."""
+def main(
+    argv: list[str] | None = None,
+    gpio: Any = gpiod,
+    clock: Clock | None = None,
+    environ: Mapping[str, str] = os.environ,
+) -> int:
+    """Drive all configured outputs low and release them. Exit codes as of `palpate`.
+
+    If the program has failed several times in a row, wait before systemd starts it again.
+    """
     about = "Sets all output lines low. Options as for palpate run."
     parser = CommandParser("python -m appliance.cli.lower_outputs", description=about)
     add_settings(parser)
     args = parser.parse_args(argv)
     try:
         loaded = config.load(args.board, args.set, folder=args.config_dir)
-        Lines(loaded.output, gpio, SystemClock()).close()  # requested as low, then released
+        clock = clock or SystemClock()
+        Lines(loaded.output, gpio, clock).close()  # requested as low, then released
     except ApplianceError as e:
         print(f"palpate: outputs may not be low: {e}", file=sys.stderr)
         return e.exit_code
+    last = ended.read(loaded.store.runtime_folder)
+    # systemd sets EXIT_STATUS (systemd.exec(5)); a stop by hand is not delayed
+    if last and environ.get("EXIT_STATUS") == str(last.code) and last.code != EX_CONFIG:
+        clock.sleep_until(clock.now_ns() + round(last.pause_s * 1e9))
     return 0
 
 

@@ -11,7 +11,7 @@ from importlib import import_module
 from appliance.cli import parser
 from appliance.core.errors import ApplianceError
 from appliance.core.interrupts import INTERRUPTED, during_imports
-from appliance.core.log import to_stderr
+from appliance.core.log import printable, to_stderr
 
 COMMANDS: Mapping[str, str] = {
     "run": "cli.run_command.run",
@@ -35,27 +35,28 @@ COMMANDS: Mapping[str, str] = {
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; its exit code."""
+    _fill_streams()
     words = sys.argv[1:] if argv is None else list(argv)
-    answered = parser.MENU.answer(words)
-    if answered is not None:
-        return answered
-    args = parser.arguments(words[0], words[1:])
-    to_stderr()
     try:
+        if (answered := parser.MENU.answer(words)) is not None:
+            sys.stdout.flush()
+            return answered
         with during_imports("palpate"):
+            args = parser.arguments(words[0], words[1:])
+            to_stderr()
             run = _function(words[0])
         code = run(args)
-        sys.stdout.flush()
+        _flush()
         return code
     except ApplianceError as e:
-        print(f"palpate: {e}", file=sys.stderr)
+        print(printable(f"palpate: {e}"), file=sys.stderr)
         return e.exit_code
     except KeyboardInterrupt:
         print("palpate: interrupted", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:
-        # the reader of standard output has closed it: write nothing more to it, not even at exit
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        print("palpate: the reader of standard output has closed it", file=sys.stderr)
+        _give_up_output()
         return 1
     except OSError as e:
         print(
@@ -63,6 +64,36 @@ def main(argv: Sequence[str] | None = None) -> int:
             file=sys.stderr,
         )
         return 1
+
+
+def _fill_streams() -> None:
+    """Open /dev/null for each standard stream that is closed. Otherwise the next file that is
+    opened, a device for example, would take its number, and Python would have no stream."""
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
+
+
+def _flush() -> None:
+    """Write the rest of standard output; what a full disk or a slow reader does not take is
+    lost."""
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        raise
+    except (OSError, ValueError) as e:
+        print(f"palpate: standard output: {e}; the rest of it is lost", file=sys.stderr)
+        _give_up_output()
+
+
+def _give_up_output() -> None:
+    """Write nothing more to standard output, not even at the end of the interpreter."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 
 
 def _function(name: str) -> Callable[[argparse.Namespace], int]:

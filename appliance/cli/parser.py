@@ -18,9 +18,9 @@ from appliance.core.menu import CommandParser, Menu
 
 EXIT_CODES = """\
 exit codes: 0 done, and all is well; 1 another error or a failed check; 2 wrong
-arguments; 65 a file of another format; 69 hardware is missing; 78 settings or
-bundle; 130 interrupted. `run` waits for a skin or a serial port without limit;
-`check` names what is missing"""
+arguments; 65 a file of another format; 69 hardware, an address or a port is missing;
+70 the model failed; 75 not possible now; 78 settings or bundle; 130 interrupted. `run`
+waits for a skin or a serial port without limit; `check` names what is missing"""
 MENU = Menu(
     "palpate",
     "Names the material that a robot has just touched.",

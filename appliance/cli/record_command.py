@@ -10,12 +10,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from appliance.cli.common import Facts, load_settings, stop_flag
+from appliance.cli.common import Facts, StopFlag, load_settings
 from appliance.cli.devices import open_devices
 from appliance.cli.reporting import capture, done, feed, status
 from appliance.core.clock import SystemClock
 from appliance.core.config import Config
 from appliance.core.devices import Devices
+from appliance.core.disk_thread import DiskThread
 from appliance.core.errors import ConfigError, SensorError
 from appliance.core.log import log
 from appliance.core.observer import Observer
@@ -33,16 +34,16 @@ if TYPE_CHECKING:
 def run(args: argparse.Namespace) -> int:
     """Keep each sweep with its label. No bundle is needed: the skin announces its format."""
     labels = Labels(args.material, args.position, args.session)
-    settings, stopped = load_settings(args), stop_flag()
+    settings, stopped = load_settings(args), StopFlag()
     with ExitStack() as stack:
         devices, format = open_skin(args, settings)
         # a person at a terminal reads the log; sentences are for a robot, or for a program that
         # reads the output
         sentences = settings.serial.port or not sys.stdout.isatty()
         port = assembly.port(settings, devices) if sentences else None
-        folder = args.out or Path(settings.store.folder) / "sweeps"
+        folder, disk = args.out or Path(settings.store.folder) / "sweeps", DiskThread()
         recording = RecordingSession(
-            folder, format, labels, devices.clock, _sentences(port), args.target
+            folder, format, labels, devices.clock, _sentences(port), args.target, disk
         )
         stack.callback(recording.close)
         page = _record_page(
@@ -56,14 +57,14 @@ def run(args: argparse.Namespace) -> int:
             port,
             stack,
             capture=capture(args, settings, format, stack),
-            observers=[*_observers(settings, format, devices.source, recording), *page],
+            observers=[disk, *_observers(settings, format, devices.source, recording), *page],
             commands=recording.commands,
             ordered=bool(page),
         )
         for shown in page:
             stack.enter_context(shown)
         box.run(done(args, box, devices, stopped))
-    return 0
+    return stopped.exit_code
 
 
 def open_skin(args: argparse.Namespace, settings: Config) -> tuple[Devices, SweepFormat]:

@@ -62,6 +62,7 @@ def feed(
     from appliance.service.feed import FeedServer
 
     known = {"source": source, "skin": settings.skin.profile, **model}
+    known["unit"] = skins.profile(settings).unit
     return [
         FeedServer(
             path,

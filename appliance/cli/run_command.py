@@ -8,51 +8,65 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from appliance.bundle.bundle import DEFAULT, Bundle
-from appliance.cli.common import Facts, load_bundle, load_settings, stop_flag
+from appliance.cli.common import Facts, StopFlag, load_bundle, load_settings
 from appliance.cli.devices import open_devices
 from appliance.cli.reporting import capture, done, feed, status
 from appliance.core.clock import SystemClock
 from appliance.core.config import Config
 from appliance.core.devices import Devices
+from appliance.core.disk_thread import DiskThread
 from appliance.core.errors import ApplianceError
 from appliance.core.log import in_journal, log
 from appliance.core.observer import Observer
 from appliance.io import skins
 from appliance.io.usb_sensor import fits
 from appliance.runtime import assembly
+from appliance.service import ended
 from appliance.service.systemd import Notifier, VerdictLog
 
 if TYPE_CHECKING:
     from appliance.deployment.shadow import Shadow
+    from appliance.deployment.store import Choice
 
 
 def run(args: argparse.Namespace) -> int:
     """Classify sweeps until SIGTERM, or with --sim until all sweeps of the script are answered."""
-    settings, stopped = load_settings(args), stop_flag()
-    choice = None if settings.classifier.bundle else assembly.store(settings).choose()
+    settings = load_settings(args)
+    with ended.noted(None if args.sim else settings.store.runtime_folder, SystemClock()):
+        choice = None if settings.classifier.bundle else assembly.store(settings).choose()
+        if choice and choice.folder == DEFAULT and untaught(args, settings, choice.bundle):
+            from appliance.cli import teach_command  # here: a box in service does without it
+
+            return teach_command.until_taught(args, settings)
+        return _classify(args, settings, choice)
+
+
+def _classify(args: argparse.Namespace, settings: Config, choice: Choice | None) -> int:
+    stopped = StopFlag()
     with ExitStack() as stack:
         trial = stack.enter_context(choice.trial) if choice and choice.trial else None
         current = choice.bundle if choice else load_bundle(settings, answers=not args.sim)
         if settings.classifier.allow_unsigned:
             log.warning(f"unsigned {assembly.UNSIGNED}")
-        if choice and choice.folder == DEFAULT and untaught(args, settings, current):
-            from appliance.cli import teach_command  # here: a box in service does without it
-
-            return teach_command.until_taught(args, settings)
         devices = open_devices(args, lambda: current.format)
         port = assembly.port(settings, devices)
+        disk = DiskThread()
+        if trial:
+            trial.disk = disk
         # not beside a trial: if the program dies, it must be clear which bundle was the cause
-        shadow = None if trial else _shadow(args, settings, current, devices)
+        shadow = None if trial else _shadow(args, settings, current, devices, disk)
         facts = {
             "trial": lambda: trial.text if trial else "",
             "shadow": lambda: shadow.agreement.text if shadow else "",
+            "disk": lambda: disk.text,
             "unsigned": lambda: assembly.UNSIGNED if settings.classifier.allow_unsigned else "",
         }
         observers: list[Observer | None] = [
+            disk,
             Notifier(SystemClock()),
             trial,
             shadow,
-            *_reports(settings, current, devices.source, facts, stack),
+            *_reports(settings, current, devices.source, facts, stack, disk),
         ]
         box = assembly.box(
             settings,
@@ -64,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
             observers=[o for o in observers if o],
         )
         box.run(done(args, box, devices, stopped))
-    return 0
+    return stopped.exit_code
 
 
 def untaught(args: argparse.Namespace, settings: Config, packaged: Bundle) -> bool:
@@ -80,7 +94,12 @@ def untaught(args: argparse.Namespace, settings: Config, packaged: Bundle) -> bo
 
 
 def _reports(
-    settings: Config, current: Bundle, source: str, facts: Facts, stack: ExitStack
+    settings: Config,
+    current: Bundle,
+    source: str,
+    facts: Facts,
+    stack: ExitStack,
+    disk: DiskThread,
 ) -> list[Observer]:
     """The observers that the settings ask for: log, black box, status file, feed with `facts`.
     source: origin of the frames."""
@@ -88,9 +107,8 @@ def _reports(
     if settings.store.black_box:
         from appliance.recording.black_box import BlackBox
 
-        black_box = BlackBox(
-            Path(settings.store.folder) / "black-box", current.format, settings.store.black_box
-        )
+        folder = Path(settings.store.folder) / "black-box"
+        black_box = BlackBox(folder, current.format, settings.store.black_box, disk)
         stack.callback(black_box.close)
         observers.append(black_box)
     m = current.manifest
@@ -108,7 +126,11 @@ def _reports(
 
 
 def _shadow(
-    args: argparse.Namespace, settings: Config, current: Bundle, devices: Devices
+    args: argparse.Namespace,
+    settings: Config,
+    current: Bundle,
+    devices: Devices,
+    disk: DiskThread,
 ) -> Shadow | None:
     """The candidate of `--shadow`, which classifies beside the current bundle. None without a
     candidate, and for a candidate that cannot run."""
@@ -128,6 +150,7 @@ def _shadow(
             Path(settings.store.folder) / "shadow",
             devices.clock,
             lambda bundle: assembly.classifier(settings, bundle, devices.clock),
+            disk,
         )
     except (
         ApplianceError,

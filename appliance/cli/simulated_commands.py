@@ -12,17 +12,25 @@ from typing import TYPE_CHECKING
 
 from appliance.bundle import bundle as bundles
 from appliance.bundle.bundle import Bundle
-from appliance.cli.common import load_bundle, load_settings, stop_flag
+from appliance.cli.common import StopFlag, load_bundle, load_settings
 from appliance.cli.devices import simulated
 from appliance.core.config import Config
 from appliance.core.log import log
 from appliance.core.observer import Observer
+from appliance.io import skins
 from appliance.io.robot_link import SerialSink
 from appliance.runtime import assembly
 from appliance.runtime.loop import Box
 
 if TYPE_CHECKING:
     from appliance.sim.devices import SimDevices
+
+
+TOUR = 8
+"""Sweeps of the tour."""
+NEXT = """\
+next: palpate demo --raw     the sentences that the robot reads
+      make desktop           then docs/tutorials/first-model.md: your first model in 15 minutes"""
 
 
 def _played_bundle(settings: Config) -> Bundle:
@@ -39,14 +47,17 @@ def _played_bundle(settings: Config) -> Bundle:
 
 
 def run_demo(args: argparse.Namespace) -> int:
-    """Show a dozen sweeps through a pseudo-terminal, from both ends."""
+    """Show sweeps through a pseudo-terminal, from both ends: a tour of what a box meets, or the
+    sweeps of --sim."""
     from appliance.tools import demo, pseudo_terminal
 
     settings = load_settings(args)
     bundle = _played_bundle(settings)
-    args.sweeps = args.sweeps or 12
-    devices = simulated(args.sim or "skin", bundle.format, args, settings, spread=True)
-    stopped = stop_flag()
+    touring = not args.sim and skins.profile(settings).codec == "palpate"
+    args.sweeps = args.sweeps or (TOUR if touring else 12)
+    name = args.sim or "skin"
+    devices = simulated(name, bundle.format, args, settings, spread=True, touring=touring)
+    stopped = StopFlag()
     with ExitStack() as stack:
         far_end, name = stack.enter_context(pseudo_terminal.pair())
         port = SerialSink(replace(settings.serial, port=name), devices.clock, devices.source)
@@ -60,7 +71,9 @@ def run_demo(args: argparse.Namespace) -> int:
         )
         box = assembly.box(_on_lines(settings), bundle, devices, port, stack)
         show.run(box, args.sweeps, lambda: stopped() or devices.finished(box.answered))
-    return 0
+    if not args.raw and not stopped():
+        print(f"\n{NEXT}")
+    return stopped.exit_code
 
 
 def run_bench(args: argparse.Namespace) -> int:

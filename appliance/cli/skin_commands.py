@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from appliance.cli.common import load_settings, local_page, stop_flag
+from appliance.cli.common import StopFlag, load_settings, local_page
 from appliance.cli.devices import open_devices
 from appliance.core import storage
 from appliance.core.clock import SystemClock
@@ -133,7 +133,7 @@ def run_show(args: argparse.Namespace) -> int:
     format = devices.format or skins.announced(settings, devices)
     if slow := skin_profile.warning(format):
         log.warning(f"warning: {slow}")
-    stopped = stop_flag()
+    stopped = StopFlag()
     with ExitStack() as stack:
         pages = local_page("skin.html", args.web, stack)
         screen = stack.enter_context(
@@ -144,7 +144,7 @@ def run_show(args: argparse.Namespace) -> int:
         skin_show.run(
             sensor, format, name, devices.source, devices.clock, [screen, *pages], stopped
         )
-    return 0
+    return stopped.exit_code
 
 
 def run_new(args: argparse.Namespace) -> int:

@@ -13,11 +13,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from appliance.cli import record_command
-from appliance.cli.common import Facts, load_settings, stop_flag
+from appliance.cli.common import Facts, StopFlag, load_settings
 from appliance.cli.reporting import capture, feed, status
 from appliance.core.clock import SystemClock
 from appliance.core.config import Config
 from appliance.core.devices import Devices
+from appliance.core.disk_thread import DiskThread
 from appliance.core.errors import ApplianceError, ConfigError
 from appliance.core.log import log
 from appliance.core.observer import Observer
@@ -134,7 +135,7 @@ class Session:
     """Records and assesses until a bundle is made; with a page, then tries it until DONE."""
 
     def __init__(self, args: argparse.Namespace, settings: Config) -> None:
-        self._args, self._settings, self._stopped = args, by_page(args, settings), stop_flag()
+        self._args, self._settings, self._stopped = args, by_page(args, settings), StopFlag()
         self._store = Path(settings.store.folder)
         self._obey: Callable[[Command], list[object]] = _not_now
         self._about: Callable[[], Mapping[str, Any]] = dict
@@ -183,11 +184,11 @@ class Session:
         """Record and assess; returns whether a bundle was made."""
         args, settings = self._args, self._settings
         with ExitStack() as stack:
-            port = self._port(devices)
+            port, disk = self._port(devices), DiskThread()
             say = port.say if port else lambda line: None
             labels = Labels(self._again, args.position, args.session)
             recording = RecordingSession(
-                self._store / "sweeps", format, labels, devices.clock, say, args.good
+                self._store / "sweeps", format, labels, devices.clock, say, args.good, disk
             )
             stack.callback(recording.close)
             session = TeachingSession(recording, self._store, settings.teach, self._command, say)
@@ -201,7 +202,12 @@ class Session:
                 port,
                 stack,
                 capture=capture(args, settings, format, stack),
-                observers=[*self._observers(recording, session, format, devices), teacher, *pages],
+                observers=[
+                    disk,
+                    *self._observers(recording, session, format, devices),
+                    teacher,
+                    *pages,
+                ],
                 commands={**recording.commands, **self._by_robot(session.commands)},
                 ordered=bool(pages),
                 serving=False,
@@ -220,7 +226,9 @@ class Session:
         settings = self._settings
         choice = assembly.store(settings).choose()
         with ExitStack() as stack:
-            trial = [stack.enter_context(choice.trial)] if choice.trial else []
+            trial, disk = [stack.enter_context(choice.trial)] if choice.trial else [], DiskThread()
+            for one in trial:
+                one.disk = disk
             port = self._port(devices)
             m = choice.bundle.manifest
             shown = {
@@ -236,7 +244,7 @@ class Session:
                 devices,
                 port,
                 stack,
-                observers=[Notifier(SystemClock()), *trial, *status(settings, facts), *pages],
+                observers=[disk, Notifier(SystemClock()), *trial, *status(settings, facts), *pages],
                 commands=self._by_robot({"TEACH": self._teach_again}),
                 ordered=bool(pages),
                 announce=self._announce,

@@ -16,7 +16,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal, get_type_hints
 
-from appliance.core.errors import ConfigError
+from appliance.core.errors import ConfigError, TemporaryError
+from appliance.core.patience import passes
 from appliance.core.schema import (
     Key,
     closest,
@@ -221,6 +222,11 @@ class StoreConfig:
         return Path(self.runtime) / "status.json" if self.runtime else None
 
     @property
+    def runtime_folder(self) -> Path | None:
+        """The folder of the status file, None for none."""
+        return Path(self.runtime) if self.runtime else None
+
+    @property
     def feed(self) -> Path | None:
         """The socket of the feed."""
         return Path(self.runtime) / "feed.sock" if self.runtime else None
@@ -367,7 +373,7 @@ def _read(path: Path, *, needed: bool) -> dict[str, Any]:
             return {}
         raise ConfigError(f"{path}: no such file; check the path") from e
     except OSError as e:
-        raise ConfigError(
+        raise (TemporaryError if passes(e) else ConfigError)(
             f"{path}: cannot be read: {str(e.strerror).lower()}; check who may read it"
         ) from e
     except (ValueError, RecursionError) as e:  # no TOML or no UTF-8; deeply nested brackets

@@ -4,11 +4,8 @@ line.
 Messages are lower case, name the wrong value and the remedy. Exit codes are those of sysexits.h.
 """
 
-EX_DATAERR, EX_UNAVAILABLE, EX_CONFIG = (
-    65,
-    69,
-    78,
-)  # `os` has them on Unix only, but the client also runs elsewhere
+# `os` has them on Unix only, but the client also runs elsewhere
+EX_DATAERR, EX_UNAVAILABLE, EX_SOFTWARE, EX_TEMPFAIL, EX_CONFIG = 65, 69, 70, 75, 78
 
 
 class ApplianceError(Exception):
@@ -28,6 +25,19 @@ class BundleError(ApplianceError):
     """A model bundle is incomplete, altered, or fails its golden sweeps."""
 
     exit_code = EX_CONFIG
+
+
+class ModelError(BundleError):
+    """The model cannot be run on an input, or not with the memory that is left. The next start may
+    succeed, so the service is started again."""
+
+    exit_code = EX_SOFTWARE
+
+
+class TemporaryError(ApplianceError):
+    """Something could not be done now, and may be possible at the next start without a person."""
+
+    exit_code = EX_TEMPFAIL
 
 
 class SensorError(ApplianceError):
@@ -86,6 +96,12 @@ class LineError(ApplianceError):
 
 class PortError(ApplianceError):
     """The serial port cannot be opened."""
+
+    exit_code = EX_UNAVAILABLE
+
+
+class AddressError(ApplianceError):
+    """An address of this machine cannot be listened on: it is not there yet, or in use."""
 
     exit_code = EX_UNAVAILABLE
 

@@ -17,6 +17,8 @@ log = logging.getLogger("palpate")
 """The only logger of the box."""
 log.setLevel(logging.INFO)
 
+EVERY_NS = 10_000_000_000
+"""Least time between two lines of a SparseLog."""
 PRIORITIES = ((logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6))
 """Levels of `logging` with their priorities of sd-daemon(3), each for this level and above; lower
 levels have 7, debug."""
@@ -31,6 +33,12 @@ def in_journal(environ: Mapping[str, str] = os.environ, stream: int = 2) -> bool
     return environ.get("JOURNAL_STREAM") == f"{status.st_dev}:{status.st_ino}"
 
 
+def printable(text: str) -> str:
+    """`text` with "?" for each character that is not printable: a device may send characters that
+    control a terminal."""
+    return "".join(c if c.isprintable() else "?" for c in text)
+
+
 class LineHandler(logging.Handler):
     """Prints each record as one line: with its priority for the journal, after the program's name
     for a terminal."""
@@ -42,7 +50,7 @@ class LineHandler(logging.Handler):
     def format(self, record: logging.LogRecord) -> str:
         """The line of a record. The text of a device may contain line breaks, which must not begin
         a line with another priority."""
-        line = " ".join(record.getMessage().splitlines())
+        line = printable(" ".join(record.getMessage().splitlines()))
         priority = next((n for level, n in PRIORITIES if record.levelno >= level), 7)
         return f"<{priority}>{line}" if self._journal else f"palpate: {line}"
 
@@ -50,6 +58,24 @@ class LineHandler(logging.Handler):
         """Print the record; it is lost if the disk behind standard error is full."""
         with suppress(OSError):
             print(self.format(record), file=sys.stderr, flush=True)
+
+
+class SparseLog:
+    """Logs warnings that others can cause as often as they like: at most one every EVERY_NS, with
+    the number of those left out. now_ns: the clock."""
+
+    def __init__(self, now_ns: Callable[[], int]) -> None:
+        self._now_ns, self._next_ns, self._left_out = now_ns, 0, 0
+
+    def warning(self, text: str) -> None:
+        """Log a warning, or count it."""
+        now_ns = self._now_ns()
+        if now_ns < self._next_ns:
+            self._left_out += 1
+            return
+        more = f" ({self._left_out} more since the last line)" if self._left_out else ""
+        log.warning(text + more)
+        self._next_ns, self._left_out = now_ns + EVERY_NS, 0
 
 
 def to_stderr() -> None:

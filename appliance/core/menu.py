@@ -10,6 +10,7 @@ import argparse
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from io import TextIOWrapper
 from typing import Any, NoReturn
 
 from appliance.core.schema import closest
@@ -51,8 +52,10 @@ class Menu:
     def answer(self, words: Sequence[str]) -> int | None:
         """Answer arguments that name no command, with help, the version or advice.
 
+        From here on, characters that the output cannot show are replaced.
         Returns the exit code, or None where the first word is a command.
         """
+        _replace_unprintable()
         if not words or words[0] in HELP:
             print(self.help())
         elif words[0] == "--version" and self.version:
@@ -150,3 +153,10 @@ def one_of(kind: str, known: Sequence[str]) -> Callable[[str], str]:
         return text
 
     return read
+
+
+def _replace_unprintable() -> None:
+    """Show ? for a character that the terminal's encoding lacks: it must not end the program."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="replace")

@@ -31,6 +31,7 @@ class Status(StrEnum):
     RECORDED = "recorded"
     CONFLICT = "conflict"
     NO_SLIDE = "no-slide"
+    FAILED = "failed"
 
     @property
     def classified(self) -> bool:
@@ -62,6 +63,7 @@ REASONS: Mapping[Status, str] = MappingProxyType(
         Status.ABORTED: "by command, or because the box was stopping",
         Status.RECORDED: "sweeps are recorded, not classified",
         Status.NO_SLIDE: "the finger rests in a part of the window; slide through all of it",
+        Status.FAILED: "the box could not compute an answer; sweep again",
         Status.CONFLICT: "it contradicts the sweeps before it; signal NEW OBJECT for each object",
     }
 )

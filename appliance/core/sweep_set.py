@@ -6,6 +6,7 @@ All shapes and types are checked here, so that no other module has to.
 
 from __future__ import annotations
 
+import unicodedata
 import zipfile
 import zlib
 from dataclasses import dataclass, field
@@ -16,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
-from appliance.core.types import DATA_TYPES, SweepFormat
+from appliance.core.types import DATA_TYPES, LARGEST_READING, SweepFormat
 
 Array = NDArray[Any]
 Set = TypeVar("Set", bound="SweepSet")
@@ -27,11 +28,12 @@ class SweepSet:
     """N sweeps with their labels and groups.
 
     samples: raw counts [N, T, R, C] or [N, T, R, C, A] of one of DATA_TYPES. labels: int [N],
-    indices into `materials`. rate_hz: frames per second. groups: int [N] each; sweeps with the same
-    number in `recording` are parts of one recording. source: the name used in messages. unloaded:
-    float [N, 2, R, C] or [N, 2, R, C, A], mean and standard deviation of the skin without contact
-    when each sweep was recorded, NaN for a sweep where it is unknown; None if it is unknown for
-    all. Raises FormatError naming `source` and the fault.
+    indices into `materials`. rate_hz: frames per second. groups: numbers or names [N] each; sweeps
+    with the same whole number in `recording` are parts of one recording. source: the name used in
+    messages. unloaded: float [N, 2, R, C] or [N, 2, R, C, A], mean and standard deviation of the
+    skin without contact when each sweep was recorded, NaN for a sweep where it is unknown; None if
+    it is unknown for all. units: of the groups of numbers that have one. Raises FormatError naming
+    `source` and the fault.
     """
 
     samples: Array
@@ -41,6 +43,7 @@ class SweepSet:
     groups: dict[str, Array] = field(default_factory=dict)
     source: str = "sweep set"
     unloaded: Array | None = None
+    units: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._check_samples()
@@ -68,25 +71,41 @@ class SweepSet:
         if x.dtype.kind == "f" and not np.isfinite(x).all():
             at = tuple(int(i) for i in np.argwhere(~np.isfinite(x))[0])
             raise self._error(f"samples{list(at)} is {x[at]}; drop sweep {at[0]} or fill it in")
+        if x.dtype.kind == "f" and max(x.max(), -x.min()) > LARGEST_READING:
+            sweep, frame, *taxel = (int(i) for i in np.argwhere(np.abs(x) > LARGEST_READING)[0])
+            raise self._error(
+                f"sweep {sweep}, frame {frame}, taxel {', '.join(map(str, taxel))} reads "
+                f"{x[(sweep, frame, *taxel)]:g} (counted from 0), and no skin reads more than "
+                f"{LARGEST_READING:g}; drop sweep {sweep} or fill the reading in"
+            )
 
     def _check_numbers(self) -> None:
         """Check the arrays with an entry for each sweep."""
         x = self.samples
-        for name, values in {
-            "labels": self.labels,
-            **{f"group_{k}": v for k, v in self.groups.items()},
-        }.items():
-            if values.shape != (len(x),) or values.dtype.kind not in "iu":
-                what = f"{values.dtype} {list(values.shape)}"
-                raise self._error(
-                    f"{name} holds {what}; give one whole number for each of {len(x)} sweeps"
-                )
+        self._check_values("labels", self.labels, "iu", "whole number")
+        for name, values in self.groups.items():
+            whole = name == "recording"
+            kinds, what = ("iu", "whole number") if whole else ("iufU", "number or name")
+            self._check_values(f"group_{name}", values, kinds, what)
         level, wanted = self.unloaded, (len(x), 2, *x.shape[2:])
         if level is not None and (level.shape != wanted or level.dtype.kind != "f"):
             raise self._error(
                 f"unloaded holds {level.dtype} {list(level.shape)}; give floats {list(wanted)}: "
                 "mean and standard deviation "
                 "of the unloaded skin for each sweep, or leave it out"
+            )
+
+    def _check_values(self, name: str, values: Array, kinds: str, wanted: str) -> None:
+        """Check an array with a value for each sweep."""
+        n = len(self.samples)
+        if values.shape != (n,) or values.dtype.kind not in kinds:
+            what = f"{values.dtype} {list(values.shape)}"
+            raise self._error(f"{name} holds {what}; give one {wanted} for each of {n} sweeps")
+        bad = ~np.isfinite(values) if values.dtype.kind == "f" else values == ""
+        if np.any(bad):
+            i = int(np.flatnonzero(bad)[0])
+            raise self._error(
+                f"{name} of sweep {i} is {values[i].item()!r}; give a value, or leave the group out"
             )
 
     def _check_materials(self) -> None:
@@ -116,7 +135,7 @@ class SweepSet:
         return SweepFormat(rows, cols, self.rate_hz, window, self.samples.dtype.name, *axes)
 
     def group(self, name: str) -> Array:
-        """Group `name`, int [N]; without a group `recording` each sweep is its own. Raises
+        """Values [N] of the group `name`; without a group `recording` each sweep is its own. Raises
         FormatError."""
         if name in self.groups:
             return self.groups[name]
@@ -176,17 +195,31 @@ def build(arrays: dict[str, Array], source: str, kind: type[Set]) -> Set:
         )
     # torch and onnxruntime accept only this machine's byte order
     native = {k: v.astype(v.dtype.newbyteorder("="), copy=False) for k, v in arrays.items()}
-    groups = {k.removeprefix("group_"): v for k, v in native.items() if k.startswith("group_")}
-    materials = tuple(str(m) for m in arrays["materials"])
+    groups, units = (
+        {k.removeprefix(part): v for k, v in native.items() if k.startswith(part)}
+        for part in ("group_", "unit_")
+    )
+    materials = tuple(unicodedata.normalize("NFC", str(m)) for m in arrays["materials"])
     return kind(
         native["samples"],
         native["labels"],
         materials,
         arrays["rate_hz"].item(),
-        groups,
+        {name: _group(name, values) for name, values in groups.items()},
         source,
         native.get("unloaded"),
+        {name: str(unit) for name, unit in units.items() if name in groups},
     )
+
+
+def _group(name: str, values: Array) -> Array:
+    """The values of a group as a set keeps them: recordings as whole numbers, and short floats as
+    the decimal numbers that they were written as."""
+    if name == "recording" and values.dtype.kind in "fU" and values.ndim == 1:
+        return np.unique(values, return_inverse=True)[1]
+    if values.dtype.kind == "f" and values.itemsize < 8:
+        return np.array([float(str(value)) for value in values.ravel()]).reshape(values.shape)
+    return values
 
 
 def _numbered(arrays: dict[str, Array], source: str) -> dict[str, Array]:

@@ -28,12 +28,16 @@ from appliance.core.status import Status as Status
 DATA_TYPES = ("uint8", "int16", "uint16", "float32")
 """Data types of a taxel's raw count; the position in this tuple is its code in packets
 (PROTOCOL.md)."""
+LARGEST_READING = 1e12
+"""Largest magnitude of a raw count. Larger ones come from a fault, and their squares overflow."""
 MOST_AXES = 8
 """Largest number of values of a taxel."""
 
 EPOCH_BITS = 40
 """An unwrapped sequence number is `(enumeration << EPOCH_BITS) + frame`, so that frames of two
 enumerations of the skin are never adjacent."""
+EPOCHS = 1 << 22
+"""Enumerations are counted modulo this number, so that a frame number always fits int64."""
 SCHEMA = 3
 """Version of a recorded sweep's sidecar. Versions 1 and 2 are still read: version 1 holds only the
 sweep, and in version 2 the classifier's settings had other names (`runtime.replay`)."""
@@ -252,6 +256,29 @@ class Verdict:
     force_n: float | None = None
     measured_mm_s: float | None = None
     direction: str | None = None
+
+    @classmethod
+    def without_label(
+        cls, sweep: Sweep, status: Status, detail: str, now_ns: int, bundle: str
+    ) -> Verdict:
+        """The answer to a sweep that was not classified."""
+        return cls(
+            sweep=sweep.id,
+            time_ns=now_ns,
+            status=status,
+            label="",
+            probability=0.0,
+            margin=0.0,
+            scores=np.empty(0),
+            fused=0,
+            lost=sweep.lost,
+            latency_ns=now_ns - sweep.complete_ns,
+            bundle=bundle,
+            detail=detail,
+            share=sweep.share,
+            speed_mm_s=sweep.speed_mm_s,
+            force_n=sweep.force_n,
+        )
 
     def as_dict(self, *, arrays: bool = True) -> dict[str, Any]:
         """All fields by name, for JSON, which keeps numbers bit for bit; without fields that are

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ import numpy as np
 from appliance.bundle.bundle import Bundle
 from appliance.core import storage
 from appliance.core.clock import Clock
+from appliance.core.disk_thread import AtOnce, DiskWork
 from appliance.core.errors import ApplianceError, BundleError, FormatError
 from appliance.core.health import Health
 from appliance.core.log import TroubleLog, log
@@ -151,8 +153,8 @@ class Shadow(Observer):
     and counts the agreement.
 
     current: the bundle in service. folder: for agreement and kept sweeps; files of another pair of
-    bundles are removed. classifier: makes a bundle's classifier from the settings. Raises
-    ApplianceError if the candidate or the folder cannot be used.
+    bundles are removed. classifier: makes a bundle's classifier from the settings. disk: writes the
+    files. Raises ApplianceError if the candidate or the folder cannot be used.
     """
 
     def __init__(
@@ -162,7 +164,9 @@ class Shadow(Observer):
         folder: Path,
         clock: Clock,
         classifier: Callable[[Bundle], Classifier],
+        disk: DiskWork | None = None,
     ) -> None:
+        self._disk, self._busy = disk or AtOnce(), False
         if candidate.format != current.format:
             raise BundleError(
                 f"candidate {candidate.id} wants {candidate.format}, the bundle in service "
@@ -231,19 +235,21 @@ class Shadow(Observer):
 
     def turn(self, health: Health) -> None:
         """At the end of a turn: write one file that is due, unless a sweep is open."""
-        if health.sweeping:
+        if health.sweeping or self._busy:
             return
-        if self._waiting:
-            self._log.attempt(self._keep)
-        elif self._clock.now_ns() >= self._due_ns:
-            self._log.attempt(self._write)
+        if self._waiting and self._beside(partial(self._sweeps.put, *self._waiting[0])):
+            self._waiting.pop(0)
+        elif not self._waiting and self._clock.now_ns() >= self._due_ns:
+            self._beside(self._writing())
 
     def stopping(self) -> None:
         """At an orderly end of the loop: write all pending files, and do not count this start."""
+        self._disk.settle()
         self.agreement.starts = 0
         while self._waiting:
-            self._log.attempt(self._keep)
-        self._log.attempt(self._write)
+            self._log.attempt(partial(self._sweeps.put, *self._waiting.pop(0)))
+            self.agreement.kept = len(self._sweeps.numbers)
+        self._log.attempt(self._writing())
         self._sweeps.close()
 
     def _begin(self, candidate: str, current: str) -> Agreement:
@@ -282,12 +288,20 @@ class Shadow(Observer):
                 f"times in a row: {why}; classifying goes on"
             )
 
-    def _keep(self) -> None:
-        self._sweeps.put(*self._waiting.pop(0))
-        self.agreement.kept = len(self._sweeps.numbers)
+    def _beside(self, act: Callable[[], object]) -> bool:
+        """Do `act` beside the loop; False if that is not possible now."""
 
-    def _write(self) -> None:
+        def done(succeeded: bool) -> None:
+            self._busy, self.agreement.kept = False, len(self._sweeps.numbers)
+
+        self._busy = True
+        accepted = self._disk(lambda: self._log.attempt(act), done)
+        self._busy = self._busy and accepted
+        return accepted
+
+    def _writing(self) -> Callable[[], None]:
+        """The write of the counts as they are now."""
         self._due_ns = NEVER_NS
         if self._clock.now_ns() >= self._settled_ns:
             self.agreement.starts = 0
-        storage.put(self._sweeps.folder / FILE, self.agreement.json())
+        return partial(storage.put, self._sweeps.folder / FILE, self.agreement.json())

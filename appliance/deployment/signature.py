@@ -16,7 +16,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from appliance.core.errors import BundleError, ConfigError
+from appliance.core.errors import BundleError, ConfigError, TemporaryError
+from appliance.core.patience import passes
 
 if TYPE_CHECKING:
     from subprocess import CompletedProcess
@@ -46,7 +47,8 @@ def verify(message: bytes, signature: bytes, signers: Path, namespace: str = NAM
     bundle's manifest.
 
     Raises BundleError if none of the signers did. Raises ConfigError if this cannot be checked: the
-    file of signers is missing, empty or has an invalid line, or ssh-keygen fails.
+    file of signers is missing, empty or has an invalid line, or ssh-keygen is missing. Raises
+    TemporaryError if ssh-keygen took too long or could not be run now.
     """
     if len(signature) > MOST_SIGNATURE:
         raise BundleError(f"signature has more than {MOST_SIGNATURE} bytes; sign the bundle again")
@@ -96,7 +98,7 @@ def _trusted(signers: Path) -> bytes:
             data = f.read(MOST_SIGNERS + 1)
         lines = data.decode().split("\n")
     except (OSError, ValueError) as e:
-        raise ConfigError(
+        raise (TemporaryError if passes(e) else ConfigError)(
             f"{signers} cannot be read: {e}; put a line `NAME KEY` there for each who signs"
         ) from e
     if len(data) > MOST_SIGNERS:
@@ -144,7 +146,10 @@ def _as_file(data: bytes) -> Iterator[str]:
     bytes that were checked here, and no disk is needed."""
     at = os.memfd_create("palpate", 0)  # children inherit it
     try:
-        os.write(at, data)
+        try:
+            os.write(at, data)
+        except OSError as e:  # a limit on the size of files (RLIMIT_FSIZE)
+            raise TemporaryError(f"a file in memory cannot be written: {e.strerror}") from e
         yield f"/proc/self/fd/{at}"
     finally:
         os.close(at)
@@ -154,11 +159,11 @@ def _keygen(
     action: str, *options: str, message: bytes = b"", interactive: bool = False
 ) -> CompletedProcess[bytes]:
     """Run `ssh-keygen -Y action` on `message`. interactive: it may ask a person on the terminal.
-    Raises ConfigError."""
+    Raises ConfigError, and TemporaryError if it may run at the next attempt."""
     import subprocess  # 200 kB, needed only if a bundle was deployed
 
     try:
-        return subprocess.run(
+        done = subprocess.run(
             ["ssh-keygen", "-Y", action, *options],
             input=message,
             timeout=INTERACTIVE_S if interactive else DEADLINE_S,
@@ -171,10 +176,15 @@ def _keygen(
         raise ConfigError(
             "ssh-keygen is missing, so no signature can be checked: apt install openssh-client"
         ) from e
+    except PermissionError as e:
+        raise ConfigError(f"ssh-keygen may not be run: {e}; check its permissions") from e
     except (OSError, subprocess.TimeoutExpired) as e:
-        raise ConfigError(
-            f"ssh-keygen cannot be run: {e}; try `ssh-keygen -Y {action}` by hand"
+        raise TemporaryError(
+            f"ssh-keygen cannot be run now: {e}; try again, and `ssh-keygen -Y {action}` by hand"
         ) from e
+    if done.returncode < 0:  # by the kernel, when memory is short
+        raise TemporaryError(f"ssh-keygen was ended by signal {-done.returncode}; try again")
+    return done
 
 
 def _output(done: CompletedProcess[bytes]) -> str:

@@ -32,7 +32,7 @@ from appliance.bundle.bundle import Bundle
 from appliance.core import storage
 from appliance.core.clock import Clock, SystemClock
 from appliance.core.config import StoreConfig
-from appliance.core.errors import ApplianceError, BundleError, ConfigError
+from appliance.core.errors import ApplianceError, BundleError, ConfigError, TemporaryError
 from appliance.core.log import log
 from appliance.deployment.enrolment_key import EnrolmentKey
 from appliance.deployment.sandbox import run_limited
@@ -162,6 +162,7 @@ class Store:
         admit: Callable[[Bundle], object] = lambda bundle: None,
     ) -> str:
         admit(signed.bundle)
+        self._warn_of_removed_state()
         self.bundles.folder.mkdir(parents=True, exist_ok=True)
         with self._locked() as state:
             self._admit(signed, state)
@@ -201,6 +202,7 @@ class Store:
         """The checked bundle for this start. A bundle on trial that was started MOST_STARTS times,
         or is refused, is replaced by the bundle that it goes back to."""
         sha = self.current
+        self._warn_of_removed_state()
         if self.state.of(sha).committed:
             return self._committed(sha)
         try:
@@ -208,6 +210,9 @@ class Store:
             if not why:
                 try:
                     return self._on_trial(sha)
+                except TemporaryError:
+                    self._uncount(sha)
+                    raise
                 except BundleError as e:
                     why = str(e)
             self._go_back(sha, why)
@@ -307,6 +312,21 @@ class Store:
                 state.changed(sha, starts=standing.starts + 1, boot=self._boot, cuts=standing.cuts)
             )
         return ""
+
+    def _warn_of_removed_state(self) -> None:
+        """Say so if bundles were deployed and their state is gone."""
+        files = (self._state_file, self._old_state_file)
+        if os.path.lexists(self._link) and not any(map(os.path.lexists, files)):
+            log.warning(
+                f"{self._state_file} is missing although bundles were deployed: it is not known"
+                " which counters were committed, so older bundles are accepted again; find out who"
+                " removed it"
+            )
+
+    def _uncount(self, sha: str) -> None:
+        """Do not count this start, which says nothing about the bundle."""
+        with self._locked() as state:
+            self._write(state.changed(sha, starts=max(0, state.of(sha).starts - 1), boot=""))
 
     @property
     def _boot(self) -> str:

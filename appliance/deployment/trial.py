@@ -8,12 +8,16 @@ start if the computer was booted in between.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from types import TracebackType
 from typing import TYPE_CHECKING, Protocol
 
+from appliance.core.disk_thread import AtOnce, DiskWork
 from appliance.core.errors import ApplianceError, BundleError
 from appliance.core.log import TroubleLog, log
 from appliance.core.observer import Observer
+from appliance.core.status import Status
 from appliance.deployment.state import STATE_FILE
 
 if TYPE_CHECKING:
@@ -47,16 +51,20 @@ class TrialStore(Protocol):
 class Trial(Observer):
     """Observes one bundle's trial; also a context around the run.
 
-    standing: state of the bundle with this start counted. Trouble with the disk raises no error: a
-    failed write is logged once and tried again after RETRY_NS, and classifying goes on.
+    standing: state of the bundle with this start counted. disk: writes the state. Trouble with it
+    raises no error: a failed write is logged once and tried again after RETRY_NS, and classifying
+    goes on.
     """
+
+    disk: DiskWork = AtOnce()
 
     def __init__(self, store: TrialStore, sha: str, standing: Standing) -> None:
         self._store, self._sha = store, sha
         self._starts, self._counted = standing.starts, True
         self._sweeps, self._streamed_ns = standing.sweeps, round(standing.streamed_s * 1e9)
+        self._done = False  # the commit has ended the trial
         self._last_ns: int | None = None  # time of the last turn if it had frames
-        self._next_ns, self._over = 0, False
+        self._next_ns, self._over, self._stale, self._busy = 0, False, False, False
         self._log = TroubleLog(
             f"trial of bundle {sha[:8]}: {STATE_FILE} cannot be written", "it is tried again"
         )
@@ -73,8 +81,11 @@ class Trial(Observer):
         )
 
     def answered(self, verdict: Verdict) -> None:
-        """Count a sweep to which the bundle gave a label."""
+        """Count a sweep to which the bundle gave a label. A sweep on which it failed begins the
+        trial anew."""
         self._sweeps += bool(verdict.label)
+        if verdict.status is Status.FAILED:
+            self._sweeps, self._streamed_ns, self._stale = 0, 0, True
 
     def turn(self, health: Health) -> None:
         """Add the time in which the skin streamed. Record changes, or commit after enough sweeps
@@ -84,13 +95,15 @@ class Trial(Observer):
         if health.streams and self._last_ns is not None:
             self._streamed_ns += health.time_ns - self._last_ns
         self._last_ns = health.time_ns if health.streams else None
-        if health.time_ns >= self._next_ns and not self._record(health):
-            self._next_ns = health.time_ns + RETRY_NS
+        if health.time_ns >= self._next_ns and not self._busy:
+            self._record(health)
 
     def stopping(self) -> None:
         """At an orderly end of the program: do not count this start."""
+        self.disk.settle()
         if not self._over and self._counted:
-            self._log.attempt(lambda: self._note(False), ERRORS)
+            self._log.attempt(self._note(False), ERRORS)
+            self._counted = False
 
     def __enter__(self) -> Trial:
         return self
@@ -106,25 +119,44 @@ class Trial(Observer):
         if kind is None or not issubclass(kind, Exception) or _is_hardware_or_settings(error):
             self.stopping()
 
-    def _record(self, health: Health) -> bool:
-        """Record or commit if needed. Returns whether the store is up to date. A commit waits until
-        no sweep is open."""
-        settings = self._store.settings
+    def _record(self, health: Health) -> None:
+        """Record or commit if needed. A commit waits until no sweep is open."""
+        settings, counted = self._store.settings, health.streams
         if self._sweeps >= settings.trial_sweeps or self._streamed_ns >= settings.trial_s * 1e9:
-            return health.sweeping or self._log.attempt(self._commit, ERRORS)
-        return health.streams == self._counted or self._log.attempt(
-            lambda: self._note(health.streams), ERRORS
-        )
+            if not health.sweeping:
+                self._write(health, self._commit, self._end)
+        elif counted != self._counted or self._stale:
+            self._stale = False
+            self._write(health, self._note(counted), lambda: self._set_counted(counted))
 
-    def _note(self, counts: bool) -> None:
-        starts = self._starts - (not counts)
-        self._store.note(self._sha, starts, counts, self._sweeps, self._streamed_ns / 1e9)
-        self._counted = counts
+    def _write(self, health: Health, act: Callable[[], object], done: Callable[[], object]) -> None:
+        """Write to the store; `done` follows a success, another attempt a failure."""
+
+        def written(succeeded: bool) -> None:
+            self._busy = False
+            if succeeded:
+                done()
+            else:
+                self._stale, self._next_ns = True, health.time_ns + RETRY_NS
+
+        self._busy = True
+        if not self.disk(lambda: self._log.attempt(act, ERRORS), written):
+            written(False)
+
+    def _note(self, counts: bool) -> Callable[[], object]:
+        """The write of the present progress."""
+        starts, s = self._starts - (not counts), self._streamed_ns / 1e9
+        return partial(self._store.note, self._sha, starts, counts, self._sweeps, s)
+
+    def _set_counted(self, counted: bool) -> None:
+        self._counted = counted
 
     def _commit(self) -> None:
-        done = self._store.commit(self._sha, 0.0)
+        self._done = self._store.commit(self._sha, 0.0)
+
+    def _end(self) -> None:
         self._over = True
-        if done:
+        if self._done:
             log.info(f"bundle {self._sha[:8]} has passed its trial and is committed")
 
 

@@ -9,7 +9,6 @@ a label.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -21,8 +20,11 @@ from appliance.bundle.manifest import MEANS
 from appliance.core.errors import BundleError
 from appliance.core.observer import Observer
 from appliance.core.types import Frames, Status, Sweep, SweepFormat, Verdict
-from appliance.inference.novelty import ClassDistances
-from appliance.inference.objects import FusedSweeps, ObjectRule, contradicts
+from appliance.inference.novelty import ClassDistances, UnknownSweeps
+from appliance.inference.objects import LEAST_PROBABILITY as LEAST_PROBABILITY
+from appliance.inference.objects import Evidence, FusedSweeps, ObjectRule, contradicts
+from appliance.inference.objects import fuse as fuse
+from appliance.inference.objects import softmax as softmax
 from appliance.inference.session import ModelRunner
 from appliance.inference.taxel_watch import TaxelWatch
 from appliance.signal import features
@@ -36,34 +38,6 @@ if TYPE_CHECKING:
 
 
 _NONE, _NO_SLIDE, _IN_PLACE = np.empty(0), Slide(), Displacement()
-LEAST_PROBABILITY = 1e-12
-"""Lower bound of probabilities in a fusion, so that one sweep with a probability of 0 cannot veto
-all others."""
-
-
-def softmax(logits: NDArray[Any]) -> NDArray[np.float64]:
-    """Probabilities of logits along the last axis, in float64 (paper, eq. 10)."""
-    z = np.asarray(logits, np.float64)
-    e = np.exp(z - z.max(axis=-1, keepdims=True))
-    result: NDArray[np.float64] = e / e.sum(axis=-1, keepdims=True)
-    return result
-
-
-def fuse(scores: list[NDArray[np.float64]], fusion: str) -> NDArray[np.float64]:
-    """Fuse the probabilities float64 [K] of several sweeps of one object into one array [K].
-
-    fusion: "product" (Bayes with independent sweeps; Tulbure and Baeuml 2018), or "vote" (paper,
-    sec. V.D): the most frequent label wins. If two labels are equally frequent, the label
-    that occurred first wins, so with two sweeps the first decides.
-    """
-    if fusion == "product":
-        return softmax(np.log(np.maximum(scores, LEAST_PROBABILITY)).sum(axis=0))
-    labels = [int(np.argmax(s)) for s in scores]
-    votes = np.bincount(labels, minlength=len(scores[0])) / len(labels)
-    votes[max(labels, key=lambda k: votes[k])] += (
-        1e-9  # max() keeps the first of equals; argmax must agree
-    )
-    return votes
 
 
 def _degraded(finding: Finding) -> str:
@@ -122,6 +96,7 @@ class Classifier(Observer):
         self._means = (
             ClassDistances(classes, known, bundle.manifest.labels) if known and classes else None
         )
+        self._unknown = UnknownSweeps(self._means) if self._means else None
         rule, place = bundle.manifest.displacement, bundle.manifest.contact
         self._slide = SlideMeter(bundle.format, place.pitch_mm if place and slides else None)
         self._displaced_means = (
@@ -185,7 +160,7 @@ class Classifier(Observer):
 
     def logits(self, taxels: NDArray[Any]) -> NDArray[np.float32]:
         """Logits float32 [K] of one window of raw counts [T, R, C] or [T, R, C, A]."""
-        return self._classify(taxels)[0]
+        return self._logits_of(self._run(self._outputs, taxels), self._means)
 
     def early(self, taxels: NDArray[Any]) -> NDArray[np.float32]:
         """Logits float32 [D, K0] after each step of one window of raw counts [T, R, C] or [T, R, C,
@@ -260,7 +235,7 @@ class Classifier(Observer):
             return self._verdict(sweep, finding)
         touch, rule = self._touch(sweep, finding.mean), self.bundle.manifest.displacement
         displaced = bool(touch.displacement.text)
-        logits, novelty = self._classify(sweep.frames.taxels, displaced)
+        logits, novelty = self._classify(sweep, displaced)
         if novelty:
             finding = replace(finding, status=Status.UNKNOWN, detail=novelty)
             return self._verdict(sweep, finding, touch=touch)
@@ -298,22 +273,22 @@ class Classifier(Observer):
         earlier = self._sweeps
         if sweep.object == 0 or sweep.object != earlier.object or self._fusion == "none":
             earlier = FusedSweeps(sweep.object)
-        before = () if earlier.ended(sweep.start_ns, self._ends) else earlier.scores
+        before = None if earlier.ended(sweep.start_ns, self._ends) else earlier.evidence
         conflict = self._conflict(scores, before)
         if conflict and self._ends.conflict == "refuse":
             self._sweeps = replace(earlier, last=sweep.id, end_ns=sweep.stop_ns)
             finding = Finding(Status.CONFLICT, conflict, degraded)
             return self._verdict(sweep, finding, own=scores, touch=touch, after=earlier.last)
-        kept = (scores,) if conflict else (*before, scores)
+        kept = Evidence.of(scores, self._fusion, None if conflict else before)
         self._sweeps = FusedSweeps(sweep.object, kept, sweep.id, sweep.stop_ns)
-        fused = self._fuse(kept)
+        fused = kept.probabilities
         status, rule = Status.OK, self.bundle.manifest.displacement
         least = rule.unsure if touch.displacement.text and rule else 0
         if fused.max() < max(self.min_probability, least):
-            final = 0 < self._ends.max_sweeps <= len(kept)
+            final = 0 < self._ends.max_sweeps <= kept.sweeps
             status = Status.UNDECIDED if final else Status.UNSURE
         finding = Finding(status, conflict, degraded)
-        return self._verdict(sweep, finding, fused, len(kept), scores, touch, earlier.last)
+        return self._verdict(sweep, finding, fused, kept.sweeps, scores, touch, earlier.last)
 
     def forget(self) -> None:
         """Forget the sweeps of the present object; the next sweep begins another object."""
@@ -331,16 +306,12 @@ class Classifier(Observer):
         self._sweeps = before
         return None
 
-    def _fuse(self, scores: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-        """The probabilities float64 [K] of several sweeps; a single sweep keeps its own."""
-        return fuse(list(scores), self._fusion) if len(scores) > 1 else scores[0]
-
-    def _conflict(self, own: NDArray[np.float64], before: Sequence[NDArray[np.float64]]) -> str:
+    def _conflict(self, own: NDArray[np.float64], before: Evidence | None) -> str:
         """A message if `own` [K] contradicts the sweeps `before`, "" if it can be fused with
         them."""
         if not before or self._ends.conflict == "fuse":
             return ""
-        fused, labels = self._fuse(before), self.bundle.manifest.labels
+        fused, labels = before.probabilities, self.bundle.manifest.labels
         if not contradicts(own, fused):
             return ""
         return f"another object: {labels[own.argmax()]} after {labels[fused.argmax()]}"
@@ -352,21 +323,31 @@ class Classifier(Observer):
         )
         return self._model(outputs, graph_input)
 
-    def _classify(
-        self, taxels: NDArray[Any], displaced: bool = False
-    ) -> tuple[NDArray[np.float32], str]:
+    def _classify(self, sweep: Sweep, displaced: bool) -> tuple[NDArray[np.float32], str]:
         """Logits [K] of one window, and a message with its distance from the known materials, ""
         if the material is known.
 
         displaced: whether the contact is displaced. Changes caused by a displacement then do not
         make a material unknown.
         """
-        values = self._run(self._outputs, taxels)
+        values = self._run(self._outputs, sweep.frames.taxels)
         means = self._displaced_means if displaced and self._displaced_means else self._means
         if means is None:
-            return values[0], ""
-        logits = means.logits(means.distances(values[-1])) if len(self._outputs) == 1 else values[0]
-        return logits, means.novelty(values[-1])
+            return self._logits_of(values), ""
+        novelty = means.novelty(values[-1])
+        if novelty and means is self._means and self._unknown:
+            alike = self._unknown.put(sweep.id, values[-1])
+            novelty += f"; as sweep {alike}" * (alike > 0)
+        return self._logits_of(values, means), novelty
+
+    def _logits_of(
+        self, values: list[NDArray[np.float32]], means: ClassDistances | None = None
+    ) -> NDArray[np.float32]:
+        """Logits [K] from the outputs of the graph, or from class means once a label is
+        enrolled."""
+        if means and len(self._outputs) == 1:
+            return means.logits(means.distances(values[-1]))
+        return values[0]
 
     def _touch(self, sweep: Sweep, mean: NDArray[np.float64] | None) -> Touched:
         """The displacement of the contact from its positions in training, and the slide, which is

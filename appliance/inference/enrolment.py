@@ -8,7 +8,7 @@ change; the new mean is stored in enrolment.npz (bundle/enrolled.py).
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,7 @@ from appliance.core.observer import Observer
 from appliance.core.types import Status, Sweep, Verdict
 from appliance.inference.classifier import Classifier, softmax
 from appliance.inference.novelty import ClassDistances
+from appliance.signal.slide_check import SlideCheck
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +69,7 @@ def enrol(old: Bundle, label: str, sweeps: NDArray[Any]) -> Enrolment:
     The early heads do not have the label, so the new bundle gives no early answers. The figures of
     `old` no longer hold and are removed. Further problems do not prevent the enrolment; they are
     listed in the result. Raises BundleError as `admit`, FormatError if `sweeps` do not have the
-    bundle's format or give no embedding.
+    bundle's format, give no embedding, or are not slides.
     """
     admit(old, label)
     m, f = old.manifest, old.format
@@ -80,6 +81,12 @@ def enrol(old: Bundle, label: str, sweeps: NDArray[Any]) -> Enrolment:
         )
     run = Classifier(old, SystemClock())
     sweeps = np.stack([run.taxels.repaired(sweep, run.tare)[0] for sweep in sweeps])
+    is_no_slide = slide_check(old)
+    for number, sweep in enumerate(sweeps, 1):
+        if why := is_no_slide(sweep):
+            raise FormatError(
+                f"sweep {number} of {len(sweeps)} is not a slide over {label!r}: {why}; take others"
+            )
     z, golden = (
         np.stack([run.embedding(s) for s in of]).astype(np.float64) for of in (sweeps, old.golden)
     )
@@ -101,6 +108,14 @@ def enrol(old: Bundle, label: str, sweeps: NDArray[Any]) -> Enrolment:
             "classifier.early = false"
         )
     return Enrolment(new, file, tuple(warnings), _disagreement(trained, label, z))
+
+
+def slide_check(old: Bundle) -> SlideCheck:
+    """The check whether a window is a slide, on the skin of a bundle. Patterns are expected where
+    training measured them."""
+    m = old.manifest
+    limits, patterned = m.sliding, m.speeds is not None
+    return SlideCheck(m.format, m.tare, m.thresholds.contact, limits, patterned=patterned)
 
 
 def extended(classes: Classes, z: NDArray[np.float64]) -> Classes:
@@ -208,10 +223,11 @@ def _closeness(means: ClassDistances, label: str, z: NDArray[np.float64]) -> str
 
 
 class SweepCollector(Observer):
-    """Collects `wanted` good sweeps of a running box, and logs each sweep."""
+    """Collects `wanted` good sweeps of a running box, and logs each sweep. check: the reason why a
+    window is not a slide, "" if it is one."""
 
-    def __init__(self, wanted: int) -> None:
-        self._wanted = wanted
+    def __init__(self, wanted: int, check: Callable[[NDArray[Any]], str] = lambda x: "") -> None:
+        self._wanted, self._check = wanted, check
         self._windows: list[NDArray[Any]] = []
 
     @property
@@ -222,11 +238,14 @@ class SweepCollector(Observer):
         """Collect the sweep's window if the box found no fault in it."""
         if self.enough:
             return
+        why = f"{verdict.status} {verdict.detail}".rstrip()
         if verdict.status.classified or verdict.status in (Status.UNKNOWN, Status.CONFLICT):
+            why = self._check(sweep.frames.taxels)
+        if not why:
             self._windows.append(sweep.frames.taxels)
             log.info(f"sweep {sweep.id} taken: {len(self._windows)} of {self._wanted}")
         else:
-            log.info(f"sweep {sweep.id} not taken: {verdict.status} {verdict.detail}".rstrip())
+            log.info(f"sweep {sweep.id} not taken: {why}")
 
     def windows(self) -> NDArray[Any]:
         """The raw counts [n, T, R, C]. Raises ApplianceError if there are too few."""

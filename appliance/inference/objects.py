@@ -1,9 +1,10 @@
-"""Finds where an object ends without NEW OBJECT. It holds the sweeps that are fused so far, and
-decides whether the next sweep begins another object."""
+"""Fuses the sweeps of one object, and finds where an object ends without NEW OBJECT."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,9 @@ from numpy.typing import NDArray
 STRONG = 10.0
 """Least Bayes factor for another object: strong evidence (Jeffreys 1961, appendix B). Decision 20
 compares it with other rules."""
+LEAST_PROBABILITY = 1e-12
+"""Lower bound of probabilities in a fusion, so that one sweep with a probability of 0 cannot veto
+all others."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,17 +27,76 @@ class ObjectRule:
     object_s: float = 0.0
 
 
+def softmax(logits: NDArray[Any]) -> NDArray[np.float64]:
+    """Probabilities of logits along the last axis, in float64 (paper, eq. 10)."""
+    z = np.asarray(logits, np.float64)
+    e = np.exp(z - z.max(axis=-1, keepdims=True))
+    result: NDArray[np.float64] = e / e.sum(axis=-1, keepdims=True)
+    return result
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evidence:
+    """Sums over the sweeps of one object. Time and memory do not depend on the number of sweeps.
+
+    sweeps: their number. probabilities: float64 [K], fused; a single sweep keeps its own. sums:
+    float64 [K], of log probabilities, or the votes for each label. order: labels in the order of
+    their first vote.
+    """
+
+    sweeps: int
+    probabilities: NDArray[np.float64]
+    sums: NDArray[np.float64]
+    order: tuple[int, ...] = ()
+
+    @classmethod
+    def of(cls, own: NDArray[np.float64], fusion: str, before: Evidence | None = None) -> Evidence:
+        """The evidence `before`, if there is any, and one more sweep with the probabilities `own`
+        float64 [K].
+
+        fusion: "product" (Bayes with independent sweeps; Tulbure and Baeuml 2018), or "vote"
+        (paper, sec. V.D): the most frequent label wins. If two labels are equally frequent, the
+        label that occurred first wins, so with two sweeps the first decides.
+        """
+        sweeps, order = (before.sweeps if before else 0) + 1, before.order if before else ()
+        if fusion == "product":
+            sums = np.log(np.maximum(own, LEAST_PROBABILITY))
+        else:
+            label = int(own.argmax())
+            sums = (np.arange(len(own)) == label).astype(np.float64)
+            order = order if label in order else (*order, label)
+        if not before:
+            return cls(sweeps, own, sums, order)
+        sums = before.sums + sums
+        if fusion == "product":
+            return cls(sweeps, softmax(sums), sums)
+        votes = sums / sweeps
+        # max() keeps the first of equals; argmax must agree
+        votes[max(order, key=lambda k: votes[k])] += 1e-9
+        return cls(sweeps, votes, sums, order)
+
+
+def fuse(scores: Iterable[NDArray[np.float64]], fusion: str) -> NDArray[np.float64]:
+    """Fuse the probabilities float64 [K] of several sweeps of one object, at least one, into one
+    array [K]. fusion: as for `Evidence.of`."""
+    evidence = None
+    for own in scores:
+        evidence = Evidence.of(own, fusion, evidence)
+    assert evidence
+    return evidence.probabilities
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class FusedSweeps:
     """The sweeps of the present object.
 
-    object: its number, as in Sweep; 0 before the first NEW OBJECT. scores: float64 [K]
-    probabilities of each fused sweep. last, end_ns: number and end of the last sweep that had
-    probabilities, whether it was fused or refused.
+    object: its number, as in Sweep; 0 before the first NEW OBJECT. evidence: of the fused sweeps.
+    last, end_ns: number and end of the last sweep that had probabilities, whether it was fused or
+    refused.
     """
 
     object: int = 0
-    scores: tuple[NDArray[np.float64], ...] = ()
+    evidence: Evidence | None = None
     last: int = 0
     end_ns: int = 0
 
@@ -41,8 +104,9 @@ class FusedSweeps:
         """Whether a sweep that starts at `start_ns` comes after a pause, or after `max_sweeps`
         sweeps."""
         paused = 0 < rule.object_s * 1e9 < start_ns - self.end_ns
-        full = rule.conflict != "fuse" and 0 < rule.max_sweeps <= len(self.scores)
-        return paused or full
+        if rule.conflict == "fuse" or not (rule.max_sweeps and self.evidence):
+            return paused
+        return paused or rule.max_sweeps <= self.evidence.sweeps
 
 
 def contradicts(own: NDArray[np.float64], fused: NDArray[np.float64]) -> bool:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from onnxruntime.capi import onnxruntime_pybind11_state
 
 from appliance.bundle.pruning import prune
-from appliance.core.errors import BundleError
+from appliance.core.errors import BundleError, ModelError
 from appliance.inference.code_pages import give_back
 
 
@@ -32,9 +32,10 @@ def session(model: bytes) -> ort.InferenceSession:
     try:
         return ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])
     except Exception as e:  # the classes of onnxruntime have no other base in common
-        raise BundleError(
-            f"onnxruntime {ort.__version__} refuses the model: {str(e).strip()[:200]}"
-        ) from e
+        why = str(e).strip()[:200]
+        if _lacks_memory(e):
+            raise ModelError(f"no memory for the model: {why}; end other programs") from e
+        raise BundleError(f"onnxruntime {ort.__version__} refuses the model: {why}") from e
 
 
 class ModelRunner:
@@ -62,19 +63,23 @@ class ModelRunner:
 
     def __call__(self, outputs: tuple[str, ...], given: NDArray[Any]) -> list[NDArray[Any]]:
         """The named outputs for one input `given`, without the leading axis of length 1. Raises
-        BundleError as `run`."""
+        ModelError as `run`."""
         opened = self._sessions.get(outputs) or self.prepare(*outputs)
         return [out[0] for out in run(opened, outputs, {self._input: given[None]})]
 
 
 def run(opened: ort.InferenceSession, outputs: Sequence[str], given: dict[str, Any]) -> list[Any]:
-    """The graph's `outputs` for the input arrays `given` by name. Raises BundleError if they cannot
+    """The graph's `outputs` for the input arrays `given` by name. Raises ModelError if they cannot
     be computed."""
     try:
         values: list[Any] = opened.run(outputs, given)
     except Exception as e:  # as above
         why = str(e).strip()[:200]
-        raise BundleError(
+        raise ModelError(
             f"onnxruntime {ort.__version__} cannot run the model: {why}; export the bundle again"
         ) from e
     return values
+
+
+def _lacks_memory(e: Exception) -> bool:
+    return isinstance(e, MemoryError) or "bad_alloc" in str(e) or "allocate memory" in str(e)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
-from appliance.core.types import DATA_TYPES, EPOCH_BITS, MOST_AXES, shape, shown
+from appliance.core.types import DATA_TYPES, EPOCH_BITS, EPOCHS, MOST_AXES, shape, shown
 
 MAGIC = b"\x50\xc1"
 VERSION = 1
@@ -249,7 +249,7 @@ def follow(
             stale += n
             continue
         if ahead < 0:
-            position = StreamPosition(position.epoch + 1)
+            position = StreamPosition((position.epoch + 1) % EPOCHS)
         if position.next is None:
             first = (position.epoch << EPOCH_BITS) + p.seq
         else:

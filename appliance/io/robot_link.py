@@ -6,12 +6,16 @@ sentences are dropped and counted, and no frame is lost.
 
 from __future__ import annotations
 
+import errno
+import io
 import os
+import select
 import sys
+import termios
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, TextIO
 
 import serial
 
@@ -43,6 +47,9 @@ COMMANDS = (
 )
 TEXT_COMMANDS = ("LABEL", "MATERIAL", "POSITION", "SESSION", "TEACH", "FORGET")
 """The commands that need a text after a comma. START may have one: speed and force of the slide."""
+OWN = ("RES", "STA", "ANS", "REC")
+"""Kinds of sentences that the box sends. A line that sends them back, an echo, must not be
+answered: the answer would come back as well, without end."""
 RETRY_NS = 1_000_000_000
 """Time between two attempts to open a port that is gone."""
 
@@ -125,10 +132,12 @@ def result(v: Verdict, source: str, *, loss_known: bool = True) -> bytes:
 
 def parse(data: bytes, rest: bytes = b"") -> tuple[list[Command], bytes]:
     """The commands in `data`, which continues `rest`, and the new unfinished rest (see
-    `sentences.parse`)."""
+    `sentences.parse`). Sentences of the box itself, from a line that echoes, are left out."""
     found, rest = sentences.parse(data, rest)
     return [
-        Command(s.kind, error=s.error) if s.error else command(s.kind, s.text) for s in found
+        Command(s.kind, error=s.error) if s.error else command(s.kind, s.text)
+        for s in found
+        if s.kind not in OWN
     ], rest
 
 
@@ -159,21 +168,51 @@ class StdoutPort:
             source,
             commands,
         )
+        self._gone = False  # the reader of a pipe
 
     def send(self, verdict: Verdict, *, loss_known: bool = True) -> None:
         """Print a verdict's sentence."""
         self.say(result(verdict, self._source, loss_known=loss_known))
 
     def say(self, line: bytes) -> None:
-        """Print a sentence."""
-        sys.stdout.buffer.write(line)
-        sys.stdout.buffer.flush()
+        """Print a sentence. It is dropped and counted if nobody reads the output, or the disk
+        behind it is full.
+
+        Raises BrokenPipeError once if the reader has gone, as for any program in a pipeline.
+        """
+        if self._gone:
+            self.dropped += 1
+            return
+        try:
+            if not _can_be_written(sys.stdout):
+                raise BlockingIOError(errno.EAGAIN, "nobody reads it")
+            sys.stdout.buffer.write(line)
+            sys.stdout.buffer.flush()
+            self.trouble = ""
+        except BrokenPipeError:
+            self._gone = True
+            raise
+        except (OSError, ValueError, AttributeError) as e:  # closed: no stream, or a closed one
+            self.dropped += 1
+            why = getattr(e, "strerror", None) or "it is closed"
+            self.trouble = f"standard output cannot be written: {why}; sentences are dropped"
 
     def commands(self) -> list[Command]:
         return self._commands()
 
     def close(self) -> None:
         """Does nothing: standard output stays open."""
+
+
+def _can_be_written(stream: TextIO) -> bool:
+    """Whether a sentence can be written without waiting. A pipe that is ready takes PIPE_BUF bytes,
+    which is more."""
+    try:
+        poll = select.poll()
+        poll.register(stream.fileno(), select.POLLOUT)
+    except io.UnsupportedOperation:  # a stream in memory
+        return True
+    return bool(poll.poll(0))
 
 
 class SerialSink:
@@ -255,7 +294,7 @@ class SerialSink:
         self._retry_ns = now + RETRY_NS
         try:
             port = serial_port.open_alone(self._config.port, self._config.baud, self._opener)
-        except (OSError, ValueError) as e:  # SerialException is an OSError
+        except (OSError, ValueError, termios.error) as e:  # SerialException is an OSError
             held = serial_port.is_held(e)
             advice = (
                 "end the program that has it (fuser shows it)"

@@ -50,7 +50,7 @@ class SerialLink:
         self._next_ns = 0  # time of the next read
         try:
             self._port = serial_port.open_alone(path, baud, opener)
-        except (OSError, ValueError) as e:  # SerialException is an OSError
+        except (OSError, ValueError, termios.error) as e:  # SerialException is an OSError
             raise _refused(path, e) from e
         _be_prompt(self._port)
 

@@ -14,6 +14,8 @@ from typing import Any
 
 import serial
 
+from appliance.core.log import printable
+
 PSEUDO_TERMINALS = range(136, 144)
 """Major device numbers of pseudo-terminals."""
 
@@ -46,8 +48,8 @@ def ports() -> list[PortInfo]:
             p.device,
             p.vid or 0,
             p.pid or 0,
-            p.serial_number or "",
-            p.product or p.description or "",
+            printable(p.serial_number or ""),
+            printable(p.product or p.description or ""),
         )
         for p in sorted(comports(), key=lambda p: str(p.device))
     ]

@@ -106,7 +106,7 @@ class SerialSensor(LinkSensor):
                 for command in self._profile.commands(self._profile.tare, self._format.rate_hz):
                     port.write(command)
                 self._tared_ns = self._clock.now_ns() + round(self._profile.tare_s * 1e9)
-        except SensorError:
+        except Exception:
             port.close()
             raise
         link = ProfileLink(port, self._profile.commands(self._profile.stop, self._format.rate_hz))

@@ -93,9 +93,10 @@ class SkinProfile:
     with a device, "" for nobody. usb_ids: "vvvv:pppp" of its port. baud: bits per second. start,
     stop: commands sent after opening and before closing. tare: command that zeroes the unloaded
     skin, which takes tare_s. codec: how frames are recognized. marker, trailer: bytes before and
-    after a frame ("fixed"). lines: content of a line of text. number, byte_order: a number on the
-    wire. values: numbers of one taxel on the wire. take: indices of those that are used, in this
-    order; the last is the axis along the skin's normal. rows, cols: grid on the wire. orientation:
+    after a frame ("fixed"). lines: content of a line of text. number, byte_order: a number on
+    the wire. unit: "N" if the used values are newtons. values: numbers of one taxel on the
+    wire. take: indices of those that are used, in this order; the last is the axis along the
+    skin's normal. rows, cols: grid on the wire. orientation:
     turns after which the rows lie along the direction of sliding. sequence: type of a frame count
     after the marker. rate_hz: frames per second; rates_hz: those that `start` can set with {rate}
     or {period_ms}.
@@ -118,6 +119,7 @@ class SkinProfile:
     sequence: Literal["", "uint8", "uint16", "uint32"] = ""
     lines: Literal["rows", "frames"] = "rows"
     number: NUMBERS = "uint8"
+    unit: Literal["", "N"] = ""
     byte_order: Literal["little", "big"] = "little"
     rows: int = limited(4, 1, 255)
     cols: int = limited(4, 1, 255)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from appliance.core.clock import DeviceClock
 from appliance.core.errors import SensorMismatch
-from appliance.core.types import EPOCH_BITS, Frames, SweepFormat
+from appliance.core.types import EPOCH_BITS, EPOCHS, Frames, SweepFormat
 from appliance.io import packets, skin_codecs
 from appliance.io.link import TTY_BYTES
 from appliance.io.skin_codecs import Codec, Decoded, Rest
@@ -140,7 +140,7 @@ class CountedStream:
 
     def _anew(self) -> None:
         """Begin a new epoch: numbers and times start again."""
-        self._epoch += 1
+        self._epoch = (self._epoch + 1) % EPOCHS
         self._next, self._last_ns = 0, 0
         self._fit = DeviceClock(**_FIT)
         self._watch = ArrivalWatch(self._format.period_ns)

@@ -24,6 +24,7 @@ from appliance.core.errors import (
     SensorMismatch,
     SensorOverflow,
 )
+from appliance.core.log import printable
 from appliance.io import packets
 from appliance.io.link import REPLY_MS, reply_to
 
@@ -160,6 +161,9 @@ def open_readout(config: SkinConfig, backend: Any, clock: Clock) -> VendorLink:
         raise SensorAbsent(
             "libusb-1.0 is not installed, so no skin can be found; apt install libusb-1.0-0"
         ) from e
+    except usb.core.USBError as e:
+        Context.newest = None  # the next search uses a new context
+        raise _explain(e) from e
     device = next((d for d in found if not config.serial or _serial(d) == config.serial), None)
     if device is None:
         serial = f" with serial number {config.serial}" if config.serial else ""
@@ -178,17 +182,21 @@ def open_readout(config: SkinConfig, backend: Any, clock: Clock) -> VendorLink:
     except usb.core.USBError as e:
         _let_go(device)
         raise _explain(e) from e
+    except Exception:  # a descriptor that pyusb cannot read, for example
+        _let_go(device)
+        raise
 
 
 def _let_go(device: usb.core.Device) -> None:
     """Release a device. The next search uses a new context."""
-    usb.util.dispose_resources(device)
     Context.newest = None
+    with contextlib.suppress(usb.core.USBError):  # it is gone
+        usb.util.dispose_resources(device)
 
 
 def _serial(device: usb.core.Device) -> str:
     try:
-        return device.serial_number or ""
+        return printable(device.serial_number or "")
     except usb.core.USBError as e:
         raise _explain(e) from e
     except UnicodeDecodeError as e:

@@ -8,7 +8,9 @@ give the reason, and it tries again.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -19,11 +21,12 @@ from appliance.core.config import SkinConfig
 from appliance.core.errors import (
     FormatError,
     SensorError,
+    SensorLost,
     SensorMismatch,
     SensorOverflow,
     SensorSilent,
 )
-from appliance.core.types import EPOCH_BITS, Frames, SweepFormat, shown
+from appliance.core.types import EPOCH_BITS, EPOCHS, Frames, SweepFormat, shown
 from appliance.io import packets
 from appliance.io.link import SkinLink
 
@@ -38,6 +41,9 @@ PROOF_NS = 5_000_000_000
 """Time in which a skin that announces nothing can turn out to be the wrong skin. If it does, it
 must then send frames for as long without a fault before it counts as streaming. Otherwise READY
 would come and go with a wrong skin."""
+
+MOST_RESTARTS, RESTARTS_NS = 8, 1_000_000_000
+"""A readout board that begins its count anew so often within this time is faulty."""
 
 _COUNT = np.arange(packets.MAX_FRAMES, dtype=np.int64)
 
@@ -160,6 +166,8 @@ class Stream:
         self._position = packets.StreamPosition(-1)
         self._device = DeviceClock()
         self._leftover = b""
+        # times at which the board restarted its count, the newest MOST_RESTARTS
+        self._begun_ns: deque[int] = deque(maxlen=MOST_RESTARTS)
         # (number, device ns) of a frame at most a second ago
         self._mark: tuple[int, int] | None = None
 
@@ -167,7 +175,8 @@ class Stream:
         """Begin an enumeration, also the first: frame numbers get the next epoch, and the device
         clock starts again."""
         self._counters.enumerations += 1
-        self._position = packets.StreamPosition(self._position.epoch + 1)
+        self._position = packets.StreamPosition((self._position.epoch + 1) % EPOCHS)
+        self._begun_ns.clear()
         self._device, self._mark = DeviceClock(), None
         self._leftover = b""
 
@@ -193,9 +202,11 @@ class Stream:
                 )
             self._counters.fifo_overflows += bool(p.flags & packets.Flag.OVERFLOW.value)
         fresh, position, lost, stale = packets.follow(unpacked.packets, self._position)
-        if position.epoch != self._position.epoch:
-            self._device, self._mark = DeviceClock(), None
+        restarts = (position.epoch - self._position.epoch) % EPOCHS
         self._position = position
+        if restarts:
+            self._device, self._mark = DeviceClock(), None
+            self._check_restarts(restarts, arrival_ns)
         now = [item for item in fresh if item[0] >> EPOCH_BITS == position.epoch]
         # frames from before a restart within the same transfer have no host time and count as lost
         self._counters.lost_frames += (
@@ -203,6 +214,16 @@ class Stream:
         )
         self._counters.stale_frames += stale
         return self._stamp(now, arrival_ns)
+
+    def _check_restarts(self, restarts: int, now_ns: int) -> None:
+        """Raises SensorMismatch if the count of frames begins anew again and again."""
+        self._begun_ns.extend([now_ns] * min(restarts, MOST_RESTARTS))
+        full = len(self._begun_ns) == MOST_RESTARTS
+        if full and now_ns - self._begun_ns[0] < RESTARTS_NS:
+            raise SensorMismatch(
+                f"the skin began its count of frames anew {MOST_RESTARTS} times within a second;"
+                " check its firmware"
+            )
 
     def _stamp(self, fresh: list[tuple[int, packets.Packet]], arrival_ns: int) -> Frames:
         """Give numbers and host times to packets [(number of the first frame, packet)] of one
@@ -276,7 +297,8 @@ class LinkSensor(ABC):
         self._stream = stream(self.counters)
         self._link: SkinLink | None = None
         self._retry_ns = clock.now_ns()
-        self._quiet_ns = 0  # time spent reading since the last frame
+        self._quiet_ns = 0  # time since the last frame, or since the skin was opened
+        self._read_ns = 0  # end of the last read
         self._unheard = 0  # bytes since then
         self._opened_ns = 0
         self._proof_ns = 0  # frames must come for this long before the skin counts as streaming
@@ -295,12 +317,12 @@ class LinkSensor(ABC):
         """The frames since the last call; waits at most `timeout_ms`."""
         if self._link is None and not self._connect():
             return Frames.empty(self._format)
-        begun = self._clock.now_ns()
         data = self._transfer()
         now = self._clock.now_ns()
-        # a read that took longer than its timeout was not scheduled, and the skin may have been
-        # sending
-        self._quiet_ns += min(now - begun, self._config.timeout_ms * 1_000_000)
+        # since the last read: the examination of garbage takes time, too. A turn that took longer
+        # than the timeout was not scheduled, and the skin may have been sending
+        self._quiet_ns += min(now - self._read_ns, self._config.timeout_ms * 1_000_000)
+        self._read_ns = now
         frames, before = Frames.empty(self._format), self.counters.frames
         wrong: SensorMismatch | None = None
         if data:
@@ -309,6 +331,8 @@ class LinkSensor(ABC):
                 frames = self._stream.feed(data, now)
             except SensorMismatch as e:
                 wrong = e
+            except Exception as e:  # bytes that nobody thought of
+                wrong = SensorMismatch(f"the skin's bytes cannot be read ({_named(e)})")
         if self.counters.frames > before and not wrong:
             self._quiet_ns = self._unheard = 0
             if self.state != "streaming" and self._proven(now):
@@ -355,9 +379,12 @@ class LinkSensor(ABC):
         except SensorError as e:
             self._drop(e)
             return False
+        except Exception as e:  # of libusb, pyserial or the system, which have many
+            self._drop(SensorLost(f"the skin cannot be opened ({_named(e)}); trying again"))
+            return False
         self._stream.restart()
         self._quiet_ns = self._unheard = 0
-        self._opened_ns = self._clock.now_ns()
+        self._opened_ns = self._read_ns = self._clock.now_ns()
         if self._tap:
             self._tap.state(self._opened_ns, OPENED)
         return True
@@ -371,6 +398,8 @@ class LinkSensor(ABC):
             self.counters.overflows += 1  # sequence numbers show how many frames it held
         except SensorError as e:
             self._drop(e)
+        except Exception as e:  # as in _connect
+            self._drop(SensorLost(f"the skin cannot be read ({_named(e)}); trying again"))
         return b""
 
     def _check_silence(self) -> None:
@@ -382,7 +411,8 @@ class LinkSensor(ABC):
         """Release the skin, keep the reason, and try again after `retry_ms`. proof_ns: the skin
         then counts as streaming only after it has sent frames for this long; 0: with its first
         frame."""
-        self.close()
+        with suppress(Exception):  # the device is gone, and with it what closing would tell it
+            self.close()
         self._proof_ns = proof_ns
         self._retry_ns = self._clock.now_ns() + self._config.retry_ms * 1_000_000
         self._set_state(why.state, why)
@@ -391,6 +421,10 @@ class LinkSensor(ABC):
         if self._tap and state != self.state:
             self._tap.state(self._clock.now_ns(), state)
         self.state, self.trouble = state, trouble
+
+
+def _named(e: Exception) -> str:
+    return f"{type(e).__name__}: {e}"
 
 
 def fits(skin: packets.SkinFormat | SweepFormat, wanted: SweepFormat) -> bool:
@@ -426,7 +460,7 @@ class UsbSensor(LinkSensor):
                     "bundle for this one"
                 )
             link.request(packets.Request.START, 0)
-        except SensorError:
+        except Exception:
             link.close()
             raise
         return link, who

@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from appliance.core.disk_thread import AtOnce, DiskWork
 from appliance.core.log import TroubleLog
 from appliance.core.observer import Observer
 from appliance.core.types import Sweep, SweepFormat, Verdict
@@ -19,11 +20,15 @@ from appliance.recording.recording import FULL, SweepFolder
 class BlackBox(Observer):
     """Keeps the last `most` sweeps in `folder`, also over restarts.
 
-    The oldest sweep is removed after the new sweep was written, on a full disk before.
+    The oldest sweep is removed after the new sweep was written, on a full disk before. disk: does
+    that; a sweep that it refuses is not kept.
     """
 
-    def __init__(self, folder: Path, format: SweepFormat, most: int) -> None:
+    def __init__(
+        self, folder: Path, format: SweepFormat, most: int, disk: DiskWork | None = None
+    ) -> None:
         self._path, self._format, self._most = folder, format, most
+        self._disk = disk or AtOnce()
         self._folder: SweepFolder | None = None
         self._log = TroubleLog(
             "black box: no sweep is kept",
@@ -37,10 +42,15 @@ class BlackBox(Observer):
     def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
         """Write the sweep if it has a window, and remove the oldest sweep beyond `most`."""
         if len(sweep.frames):
-            self._with_folder(lambda folder: self._put(folder, sweep, verdict, circumstances))
+            self._disk(
+                lambda: self._with_folder(
+                    lambda folder: self._put(folder, sweep, verdict, circumstances)
+                )
+            )
 
     def close(self) -> None:
-        """Release the folder."""
+        """Finish writing, and release the folder."""
+        self._disk.settle()
         if self._folder:
             self._folder.close()
 

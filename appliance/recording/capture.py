@@ -16,9 +16,16 @@ from enum import IntEnum
 from pathlib import Path
 from typing import IO
 
-from appliance.core.errors import ConfigError, FormatError, SensorError, SensorMismatch
+from appliance.core.errors import (
+    ConfigError,
+    FormatError,
+    SensorError,
+    SensorMismatch,
+    TemporaryError,
+)
 from appliance.core.log import TroubleLog, log
 from appliance.core.observer import Observer
+from appliance.core.patience import passes
 from appliance.core.schema import typed
 from appliance.core.types import Edge, EdgeKind, Frames, SweepFormat
 from appliance.io import skin_profile, skin_stream
@@ -75,7 +82,7 @@ class CaptureWriter(Observer):
             _set_aside(path)
             self._file: IO[bytes] = path.open("wb")
         except OSError as e:
-            raise ConfigError(
+            raise (TemporaryError if passes(e) else ConfigError)(
                 f"--capture {path}: {e.strerror}; name a file that can be written"
             ) from e
         self._put(lambda: self._file.write(MAGIC + len(head).to_bytes(4, "little") + head))

@@ -21,9 +21,11 @@ from typing import Any
 from appliance.bundle.manifest import LABEL
 from appliance.core import storage
 from appliance.core.clock import Clock
-from appliance.core.errors import ApplianceError, ConfigError, FormatError
+from appliance.core.disk_thread import AtOnce, DiskWork
+from appliance.core.errors import ApplianceError, ConfigError, FormatError, TemporaryError
 from appliance.core.log import TroubleLog, log
 from appliance.core.observer import Observer
+from appliance.core.patience import passes
 from appliance.core.sentences import sentence
 from appliance.core.types import Status, Sweep, SweepFormat, Verdict, save, sidecar
 from appliance.recording.progress import RecordingProgress
@@ -155,8 +157,9 @@ class RecordingSession(Observer):
     """Records each sweep that has a window, with the labels that applied at its start edge, and
     logs the missing sweeps.
 
-    say: called with REC sentences. target: wanted number of sweeps of each material at each
-    position; sweeps of earlier runs in the folder count. Raises ConfigError if the folder cannot be
+    say: called with REC sentences. disk: writes the sweeps; a REC sentence follows once its sweep
+    is on the disk. target: wanted number of sweeps of each material at each position; sweeps of
+    earlier runs in the folder count. Raises ConfigError if the folder cannot be
     used, or has sweeps of another format.
     """
 
@@ -168,11 +171,13 @@ class RecordingSession(Observer):
         clock: Clock,
         say: Callable[[bytes], None],
         target: int = TARGET,
+        disk: DiskWork | None = None,
     ) -> None:
+        self._disk, self._writing = disk or AtOnce(), 0
         try:
             self._folder = SweepFolder(folder, format)
         except OSError as e:
-            raise ConfigError(
+            raise (TemporaryError if passes(e) else ConfigError)(
                 f"--out {folder}: {e.strerror}; name a folder that can be written"
             ) from e
         self._progress = RecordingProgress(target)
@@ -240,28 +245,32 @@ class RecordingSession(Observer):
         sweep = replace(
             sweep, material=labels.material, position=labels.position, session=labels.session
         )
-        outcome, detail = "skipped", f"{verdict.status}"
+        self._writing += 1
+        report = partial(self._report_outcome, sweep, verdict, labels)
+        if not self._disk(partial(self._write, sweep, verdict, circumstances), report):
+            report(("failed", "the disk is too slow"))
+
+    def _report_outcome(
+        self, sweep: Sweep, verdict: Verdict, labels: Labels, written: tuple[str, str] | int
+    ) -> None:
+        """Count, log and send the outcome of a sweep. written: as returned by `_write`."""
+        self._writing -= 1
+        if isinstance(written, int):
+            outcome, detail = "stored", self._count_stored(written, labels, verdict.status)
+        else:
+            outcome, detail = written
         if len(sweep.frames):
-            outcome, detail = self._store(sweep, verdict, circumstances)
             trouble = "" if outcome == "stored" else outcome
             self._log.update(trouble, _report(outcome, sweep.id, detail, self._folder.folder))
         self._tell(verdict, outcome, labels)
         self._last = {"sweep": sweep.id, "outcome": outcome, "detail": detail, **asdict(labels)}
-        self._say(
-            sentence(
-                "REC",
-                sweep.id,
-                outcome,
-                self.stored,
-                labels.material,
-                labels.position,
-                labels.session,
-                detail,
-            )
-        )
+        said = outcome, self.stored, labels.material, labels.position, labels.session, detail
+        self._say(sentence("REC", sweep.id, *said))
 
     def close(self) -> None:
-        """Release the folder. Log the number of stored sweeps if there was a sweep to store."""
+        """Finish writing, and release the folder. Log the number of stored sweeps if there was a
+        sweep to store."""
+        self._disk.settle()
         self._folder.close()
         if not self._answered:
             return
@@ -306,26 +315,29 @@ class RecordingSession(Observer):
         else:
             log.info(f"{words(verdict)}; {self._progress.line(labels.material, labels.position)}")
 
-    def _store(
+    def _write(
         self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]
-    ) -> tuple[str, str]:
-        """The outcome ("stored", "full" or "failed") and details for a person."""
+    ) -> tuple[str, str] | int:
+        """Write a sweep; its number in the folder, or the outcome ("skipped", "full" or "failed")
+        and details for a person."""
+        if not len(sweep.frames):
+            return "skipped", f"{verdict.status}"
         try:
             disk = os.statvfs(self._folder.folder)
             least = min(LEAST_FREE[0] // disk.f_frsize, disk.f_blocks // LEAST_FREE[1])
             if disk.f_bavail < least:
                 left, wanted = (n * disk.f_frsize / 1e6 for n in (disk.f_bavail, least))
                 return "full", f"{left:.1f} MB left of {wanted:.1f} for the system"
-            number = self._folder.put(sweep, verdict, circumstances)
+            return self._folder.put(sweep, verdict, circumstances)
         except OSError as e:
             return "full" if e.errno in FULL else "failed", str(e.strerror)
-        labels = Labels(sweep.material, sweep.position, sweep.session)
-        self._stored.append((number, labels, verdict.status))
-        self._count(number, labels, verdict.status)
-        fault = f" {verdict.status}" if verdict.status.faulty else ""
-        return "stored", self._folder.path(number).stem + fault + " no material" * (
-            not sweep.material
-        )
+
+    def _count_stored(self, number: int, labels: Labels, status: Status) -> str:
+        """Count a stored sweep; its file's name with remarks, for a person."""
+        self._stored.append((number, labels, status))
+        self._count(number, labels, status)
+        fault = f" {status}" if status.faulty else ""
+        return self._folder.path(number).stem + fault + " no material" * (not labels.material)
 
     def _change(self, name: str, text: str) -> list[object]:
         """Set a label for sweeps that start from now on; returns the labels that then apply."""
@@ -347,6 +359,8 @@ class RecordingSession(Observer):
 
         which: the expected number, so that a later sweep is not removed by mistake; "" for any.
         """
+        if self._writing:
+            raise ApplianceError("a sweep is still being written; wait for its REC sentence")
         if not self._stored:
             raise ApplianceError("no sweep of this run is left to discard")
         number, labels, _ = self._stored[-1]

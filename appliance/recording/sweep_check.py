@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from appliance.core.clock import Clock
@@ -16,7 +15,7 @@ from appliance.core.errors import ApplianceError
 from appliance.core.observer import Observer
 from appliance.core.types import EPOCH_BITS, Frames, Status, Sweep, SweepFormat, Verdict
 from appliance.signal.unloaded import UnloadedTracker
-from appliance.signal.window_check import Finding, inspect_bare
+from appliance.signal.window_check import Finding, inspect_bare, inspect_readings
 
 UNCHECKED = Finding(
     Status.RECORDED, "contact not checked: the skin was not both touched and let go so far"
@@ -49,28 +48,13 @@ class SweepCheck(Observer):
         finding = Finding(sweep.status)
         if sweep.status is Status.OK:
             finding = self._checked(sweep.frames.taxels)
-        now = self._clock.now_ns()
-        return Verdict(
-            sweep=sweep.id,
-            time_ns=now,
-            status=finding.status,
-            label="",
-            probability=0.0,
-            margin=0.0,
-            scores=np.empty(0),
-            fused=0,
-            lost=sweep.lost,
-            latency_ns=now - sweep.complete_ns,
-            bundle=self.model,
-            detail=finding.detail,
-            share=sweep.share,
-            speed_mm_s=sweep.speed_mm_s,
-            force_n=sweep.force_n,
-        )
+        now_ns = self._clock.now_ns()
+        return Verdict.without_label(sweep, finding.status, finding.detail, now_ns, self.model)
 
     def _checked(self, taxels: NDArray[Any]) -> Finding:
         if not (self._unloaded.skin and self._unloaded.certain):
-            return UNCHECKED
+            readings = inspect_readings(taxels)
+            return UNCHECKED if readings.status is Status.OK else readings
         finding = inspect_bare(taxels, self._unloaded.skin)
         return Finding(Status.RECORDED) if finding.status is Status.OK else finding
 

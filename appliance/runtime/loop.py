@@ -6,7 +6,8 @@ answers.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from types import MappingProxyType
 from typing import Any, Protocol
@@ -14,9 +15,9 @@ from typing import Any, Protocol
 from numpy.typing import NDArray
 
 from appliance.core.clock import Clock
-from appliance.core.errors import ApplianceError
+from appliance.core.errors import ApplianceError, ModelError
 from appliance.core.health import Health
-from appliance.core.log import TroubleLog
+from appliance.core.log import TroubleLog, log
 from appliance.core.observer import Observer
 from appliance.core.sentences import sentence
 from appliance.core.types import Status, Sweep, SweepFormat, Verdict
@@ -28,6 +29,9 @@ from appliance.recording.sweep_window import SweepCutter
 
 TARE_S = 0.5
 """Length of the latest signal that a tare averages."""
+FAILURES, SOUND = 3, 20
+"""The program ends after this many `failed` sweeps, each less than SOUND sweeps after the last. It
+is started again, and the end counts against a bundle on trial."""
 
 CommandHandler = Callable[[str], list[object]]
 """Carries out a command: its text -> the fields of its answer. An ApplianceError becomes the
@@ -116,6 +120,9 @@ class Box:
         state_s: float = 1.0,
     ) -> None:
         self.answered = 0
+        self._unanswered: deque[Sweep] = deque()  # cut, but not sent yet
+        self._asked: deque[Command] = deque()  # commands that were not carried out yet
+        self._failures, self._sound, self._failure = 0, 0, ""
         self._sensor, self._trigger, self._cutter = (
             pipeline.sensor,
             pipeline.trigger,
@@ -139,6 +146,8 @@ class Box:
         self._decided = False
         self._next_state_ns = self._turn_ns = clock.now_ns()
         self._skin_log = TroubleLog("skin", end="skin: streaming", known=False)
+        self._observer_log = TroubleLog("a part of the program failed", "the answers go on")
+        self._early_log = TroubleLog("early answers failed", "the whole sweeps are answered")
         self._port_log = TroubleLog(
             "serial", end=f"serial: {port.name} open" if port else "", known=False
         )
@@ -159,40 +168,85 @@ class Box:
         return None if frames is None else frames[0]
 
     def run(self, stopped: Callable[[], bool]) -> None:
-        """Take turns until `stopped()`; then answer an open sweep with `aborted`."""
-        while not stopped():
-            self.step()
-        for stopping in self._on_stopping:
-            stopping()
-        self._cutter.interrupt(Status.ABORTED, self._clock.now_ns())
-        self._answer(self._cutter.finished(self._clock.now_ns()))
+        """Take turns until `stopped()`. At the end, also after an exception, answer an open sweep
+        with `aborted`."""
+        try:
+            while not stopped():
+                self.step()
+        finally:
+            self._end()
+        self._notify(self._on_stopping)
 
     def step(self) -> list[Verdict]:
-        """One turn, which takes at most the sensor's timeout. Returns the verdicts that were
-        sent."""
+        """One turn, which takes at most the sensor's timeout. Returns the verdicts that were sent.
+
+        Raises ModelError after FAILURES sweeps that could not be classified; they are answered.
+        """
         frames = self._sensor.read()
         now = self._turn_ns = self._clock.now_ns()
         self._cutter.put(frames, now)
         if len(frames):
-            for come in self._on_frames:
-                come(frames)
+            self._notify(self._on_frames, frames)
         # before the edges of this turn: a capture gives frames and edges in turns of their own
         verdicts = self._decide(now)
-        edges = self._trigger.edges(now)
-        if edges:
-            for note in self._on_edges:
-                note(now, edges)
-        self._cutter.trigger(edges, self._able, now)
+        self._take_edges(now, ready=self._able)
         if self._sensor.state != "streaming":
             self._cutter.interrupt(Status.SENSOR_LOST, now)
         self._show()
         verdicts += self._answer(self._cutter.finished(now))
         self._report(now)
         if self._on_turn:
-            health = self.health
-            for turn in self._on_turn:
-                turn(health)
+            self._notify(self._on_turn, self.health)
+        if self._failures >= FAILURES:
+            raise ModelError(f"{self._failures} sweeps could not be classified: {self._failure}")
         return verdicts
+
+    def _take_edges(self, now_ns: int, *, ready: bool) -> None:
+        edges = self._trigger.edges(now_ns)
+        # first into the cutter: no edge may be lost between the two
+        self._cutter.trigger(edges, ready, now_ns)
+        if edges:
+            self._notify(self._on_edges, now_ns, edges)
+
+    def _end(self) -> None:
+        """Answer each sweep that is still open, whatever has failed. What fails is tried twice."""
+        now = self._turn_ns
+        for what, act in (
+            ("the last commands", self._obey_asked),
+            ("the last edges", lambda: self._take_edges(self._clock.now_ns(), ready=True)),
+            ("the open sweep", lambda: self._abort_all(now)),
+        ):
+            _succeeds(what, act) or _succeeds(what, act)
+        for _ in range(len(self._unanswered) + 1):
+            _succeeds("the last answers", lambda: self._send_aborted(now))
+
+    def _abort_all(self, now_ns: int) -> None:
+        self._cutter.interrupt(Status.ABORTED, now_ns)
+        self._unanswered.extend(self._cutter.finished(now_ns))
+
+    def _send_aborted(self, now_ns: int) -> None:
+        while self._unanswered:
+            sweep = self._unanswered[0]
+            verdict = self._aborted(sweep, now_ns)
+            self._send(verdict)
+            self._pass_on([sweep], [verdict])
+
+    def _aborted(self, sweep: Sweep, now_ns: int) -> Verdict:
+        """The answer to a sweep that was cut but not classified."""
+        status = Status.ABORTED if sweep.status is Status.OK else sweep.status
+        return Verdict.without_label(sweep, status, "", now_ns, self._answerer.model)
+
+    def _notify(self, calls: Iterable[Callable[..., None]], *event: Any) -> None:
+        """Call the observers. A fault in one must not stop the classifying, so only expected errors
+        of the box's own outputs are raised."""
+        for call in calls:
+            try:
+                call(*event)
+            except ApplianceError:
+                raise
+            except Exception as e:
+                of = getattr(call, "__qualname__", call)
+                self._observer_log.update(f"{of}: {type(e).__name__}: {e}")
 
     @property
     def _able(self) -> bool:
@@ -212,8 +266,9 @@ class Box:
         if not self._early:
             return []
         for sweep in self._cutter.so_far(self._early.steps, now_ns):
-            if verdict := self._early(sweep):
+            if verdict := self._early_verdict(self._early, sweep):
                 self._cutter.settle()
+                self._unanswered.append(sweep)
                 self._send(verdict)
                 self._decided = True
                 self._show()
@@ -221,29 +276,53 @@ class Box:
                 return [verdict]
         return []
 
+    def _early_verdict(self, early: EarlyExit, sweep: Sweep) -> Verdict | None:
+        try:
+            verdict = early(sweep)
+        except Exception as e:  # the classes of onnxruntime have no other base in common
+            self._early_log.update(f"{type(e).__name__}: {e}")
+            return None
+        self._early_log.update("")
+        return verdict
+
     def _answer(self, sweeps: list[Sweep]) -> list[Verdict]:
-        verdicts = [self._answerer(sweep) for sweep in sweeps]
+        self._unanswered.extend(sweeps)
+        verdicts = [self._classified(sweep) for sweep in sweeps]
         for verdict in verdicts:
             self._send(verdict)
         self._pass_on(sweeps, verdicts)
         return verdicts
 
-    def _pass_on(self, sweeps: Sequence[Sweep], verdicts: Sequence[Verdict]) -> None:
+    def _classified(self, sweep: Sweep) -> Verdict:
+        """The verdict on one sweep; `failed` with the reason if it cannot be computed."""
+        try:
+            verdict = self._answerer(sweep)
+        except Exception as e:  # as in _early_verdict
+            self._failures, self._sound = self._failures + 1, 0
+            self._failure = str(e) or type(e).__name__
+            now_ns, model = self._clock.now_ns(), self._answerer.model
+            return Verdict.without_label(sweep, Status.FAILED, self._failure, now_ns, model)
+        self._sound += sweep.status is Status.OK
+        if self._sound >= SOUND:
+            self._failures = self._sound = 0
+        return verdict
+
+    def _pass_on(self, sweeps: Iterable[Sweep], verdicts: Sequence[Verdict]) -> None:
         """Give answered sweeps to the observers that keep them. This comes after all answers,
         because disks are slow."""
-        if not (sweeps and self._on_sweep):
+        if not (verdicts and self._on_sweep):
             return
         circumstances = self.circumstances()
         for sweep, verdict in zip(sweeps, verdicts, strict=True):
-            for keep in self._on_sweep:
-                keep(sweep, verdict, circumstances)
+            self._notify(self._on_sweep, sweep, verdict, circumstances)
 
     def _send(self, verdict: Verdict) -> None:
         if self._port:
             self._port.send(verdict, loss_known=self._sensor.loss_known)
-        for answered in self._on_answered:
-            answered(verdict)
+        if self._unanswered:
+            self._unanswered.popleft()
         self.answered += 1
+        self._notify(self._on_answered, verdict)
 
     def _report(self, now_ns: int) -> None:
         """Log changes, answer commands, and send the state every `state_s`."""
@@ -252,8 +331,8 @@ class Box:
             self._skin_log.update(trouble)
         if not self._port:
             return
-        for command in self._port.commands():
-            self._port.say(self._answer_to(command))
+        self._asked.extend(self._port.commands())
+        self._obey_asked()
         self._port_log.update(self._port.trouble)
         if now_ns >= self._next_state_ns:
             self._next_state_ns = now_ns + self._state_ns
@@ -329,14 +408,18 @@ class Box:
             *_last_fields(h),
         ]
 
+    def _obey_asked(self) -> None:
+        while self._port and self._asked:
+            self._port.say(self._answer_to(self._asked.popleft()))
+
     def _answer_to(self, command: Command) -> bytes:
         """Carry out a command; returns its ANS sentence."""
         if command.error:
             return sentence("ANS", command.name, "error", command.error)
         try:
             return sentence("ANS", command.name, "ok", *self.obey(command))
-        except ApplianceError as e:
-            return sentence("ANS", command.name, "error", e)
+        except Exception as e:  # also one that nobody expected: the robot waits for an answer
+            return sentence("ANS", command.name, "error", str(e) or type(e).__name__)
 
     def obey(self, command: Command) -> list[object]:
         """Carry out a command of any origin; returns the fields of its answer.
@@ -344,8 +427,7 @@ class Box:
         To be called between two turns or in an observer's `turn`. Raises ApplianceError with the
         reason for a refusal.
         """
-        for note in self._on_command:
-            note(self._turn_ns, command.line)
+        self._notify(self._on_command, self._turn_ns, command.line)
         if command.name in self._commands:
             return self._commands[command.name](command.text)
         if command.name in ("START", "STOP"):
@@ -379,6 +461,17 @@ class Box:
         if not self._cutter.interrupt(Status.ABORTED, self._clock.now_ns()):
             raise ApplianceError("no sweep is open, so there is nothing to abort")
         return []
+
+
+def _succeeds(what: str, act: Callable[[], object]) -> bool:
+    """Whether `act` raises no exception. One is logged, because what comes after must be done as
+    well."""
+    try:
+        act()
+    except Exception as e:
+        log.error(f"{what}: {type(e).__name__}: {e}")
+        return False
+    return True
 
 
 def _last_fields(h: Health) -> list[object]:

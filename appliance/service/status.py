@@ -24,6 +24,7 @@ from appliance.core.log import TroubleLog
 from appliance.core.observer import Observer
 from appliance.core.status import REASONS
 from appliance.core.types import Status, Verdict
+from appliance.service import ended
 
 SCHEMA = 1
 VERDICTS = 20
@@ -117,10 +118,9 @@ def read(path: Path, now_ns: int) -> dict[str, Any]:
         report["verdicts"] = [v | {"status": Status(v["status"])} for v in report["verdicts"]]
         Health(**{name: report[name] for name in Health.__slots__})
     except FileNotFoundError:
-        return {
-            "running": False,
-            "why": f"the service does not run, or has just started (no {path}); {_START}",
-        }
+        last = ended.read(path.parent)
+        why = f"the service does not run, or has just started (no {path}); {_START}"
+        return {"running": False, "why": last.text if last else why}
     except OSError as e:
         raise ApplianceError(
             f"{path} cannot be read: {e.strerror}; see store.runtime, or ask as root"
@@ -130,7 +130,8 @@ def read(path: Path, now_ns: int) -> dict[str, Any]:
     why = ""
     # a file from before the last boot can be ahead of this boot's clock
     if not _alive(pid) or age_ns < 0:
-        why = f"process {pid} has ended without closing down; {_START}"
+        last = ended.read(path.parent)
+        why = last.text if last else f"process {pid} has ended without closing down; {_START}"
     elif age_ns > STALE_NS:
         why = (
             f"process {pid} has written nothing for {_span(age_ns)}, so it hangs; the service's "

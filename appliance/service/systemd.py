@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from logging import INFO, WARNING
 
 from appliance.core.clock import Clock
-from appliance.core.errors import ConfigError
 from appliance.core.health import Health
 from appliance.core.log import log
 from appliance.core.observer import Observer
@@ -19,6 +18,8 @@ from appliance.core.types import Verdict
 FEEDS = 10
 """How often the watchdog is fed within its time, so that nearly all of it is left for one turn of
 the loop."""
+MOST_DIGITS = 18
+"""Digits of the longest watchdog time in us, some 30,000 years."""
 
 
 class Notifier(Observer):
@@ -26,8 +27,7 @@ class Notifier(Observer):
     sent again in the next turn.
 
     environ: NOTIFY_SOCKET, WATCHDOG_USEC and WATCHDOG_PID, set by systemd. clock: a real clock, as
-    systemd's watchdog does not follow a simulated clock. Raises ConfigError if WATCHDOG_USEC is not
-    a number.
+    systemd's watchdog does not follow a simulated clock.
     """
 
     def __init__(self, clock: Clock, environ: Mapping[str, str] = os.environ) -> None:
@@ -80,14 +80,15 @@ class Notifier(Observer):
 
 
 def _watchdog_us(environ: Mapping[str, str]) -> int:
-    """Microseconds of this process's watchdog, 0 if it has none."""
-    text, pid = environ.get("WATCHDOG_USEC", "0"), environ.get("WATCHDOG_PID")
-    if not text.isdecimal():
-        raise ConfigError(
-            f"WATCHDOG_USEC={text} is not a number of microseconds; leave it to systemd, or unset "
-            "it"
+    """Microseconds of this process's watchdog, 0 if it has none, or if the value is unusable."""
+    text, pid = environ.get("WATCHDOG_USEC") or "0", environ.get("WATCHDOG_PID")
+    if not (text.isdecimal() and text.isascii() and len(text) <= MOST_DIGITS):
+        log.warning(
+            f"WATCHDOG_USEC={text[:40]!a} is not a number of microseconds, so no watchdog is fed;"
+            " leave it to systemd, or unset it"
         )
-    return int(text) if pid in (None, str(os.getpid())) else 0
+        return 0
+    return int(text) if pid in (None, "", str(os.getpid())) else 0
 
 
 def words(v: Verdict) -> str:

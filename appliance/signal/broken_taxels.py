@@ -184,7 +184,7 @@ def find(
     saturated, not silent, if a direct neighbour reaches full scale, too.
     """
     noisy = compared.noise > bridging.noise * np.maximum(compared.around, bridging.quietest)
-    dark = ~np.isfinite(measured.mean)
+    dark = measured.unreadable
     if not (noisy.any() or compared.still.any() or dark.any()):
         return None
     grid = tare.shape[:2]

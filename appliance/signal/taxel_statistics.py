@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from appliance.core.types import LARGEST_READING
+
 TRIPLES = 100
 """Number of places in a stretch at which the noise is measured. More places take more time and
 change the result by less than a tenth."""
@@ -43,6 +45,14 @@ class TaxelStatistics:
         """The values that are constant, bool [V]."""
         still: NDArray[np.bool_] = self.lowest == self.highest
         return still
+
+    @property
+    def unreadable(self) -> NDArray[np.bool_]:
+        """The values with a count that is not a number, or beyond LARGEST_READING, bool [V]."""
+        with np.errstate(invalid="ignore"):
+            largest = np.maximum(np.abs(self.highest), np.abs(self.lowest))
+            unreadable: NDArray[np.bool_] = ~(largest <= LARGEST_READING)
+        return unreadable
 
     def noise(self) -> NDArray[np.float32]:
         """Mean magnitude of the second difference of three frames, float32 [V] in counts.

@@ -81,7 +81,8 @@ def inspect(
 
     A taxel is loaded by its normal axis. A loaded taxel always varies, on each axis, so a constant
     axis is stuck. A constant unloaded taxel is dead if all its direct neighbours are loaded; at the
-    edge of the contact it may be unloaded. A taxel whose counts are not numbers is always dead.
+    edge of the contact it may be unloaded. A taxel with a count that is not a number or impossibly
+    large is always dead.
     Shear has a sign, so shear axes are saturated at both ends. either_way: a load may also lower
     the counts.
     """
@@ -90,10 +91,9 @@ def inspect(
     still = measured.still.reshape(shape)
     load = measured.mean.reshape(shape) - tare.reshape(shape)
     load = np.abs(load) if either_way else load
-    if not np.isfinite(
-        load
-    ).all():  # possible with float32 counts; the network's output would then be meaningless
-        return Finding(Status.DEAD_TAXEL, _taxels(~np.isfinite(load)))
+    # possible with float32 counts; the network's output would then be meaningless
+    if (unreadable := measured.unreadable.reshape(shape) | ~np.isfinite(load)).any():
+        return Finding(Status.DEAD_TAXEL, _taxels(unreadable))
     loaded = load[..., -1:] >= (-np.inf if limits.contact is None else limits.contact)  # [R, C, 1]
     if not loaded.any():
         return Finding(Status.NO_CONTACT, f"strongest taxel {load[..., -1].max():.1f} raw counts")
@@ -135,6 +135,18 @@ def enclosed(loaded: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return enclosed
 
 
+def inspect_readings(taxels: NDArray[Any]) -> Finding:
+    """Check a window of a skin of which nothing is known: a taxel with a count that is not a number
+    or impossibly large is dead."""
+    if taxels.dtype.kind != "f":
+        return Finding(Status.OK)
+    shape = (*taxels.shape[1:], 1)[:3]
+    unreadable = TaxelStatistics.of(taxels).unreadable.reshape(shape)
+    return (
+        Finding(Status.DEAD_TAXEL, _taxels(unreadable)) if unreadable.any() else Finding(Status.OK)
+    )
+
+
 def inspect_bare(taxels: NDArray[Any], unloaded: UnloadedSkin) -> Finding:
     """As `inspect`, for a skin without a bundle, so that the strength of a contact and the highest
     count are unknown.
@@ -142,6 +154,8 @@ def inspect_bare(taxels: NDArray[Any], unloaded: UnloadedSkin) -> Finding:
     It refuses only certain cases: `no-contact` if no taxel differs from the unloaded skin, in
     either direction, and none vibrates; `saturated` if the highest count is one of FULL_SCALES.
     """
+    if (unreadable := inspect_readings(taxels)).status is not Status.OK:
+        return unreadable
     load = np.abs(normal(taxels.mean(axis=0, dtype=np.float64) - unloaded.level, 0))
     strongest = float(load.max(initial=0, where=np.isfinite(load)))
     if (

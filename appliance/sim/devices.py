@@ -100,6 +100,12 @@ def build(
     """
     robot, lines = robot_on_lines(acts, clock, stops=stops, remember=remember)
     backend = usb.RigBackend(rig.ReadoutBoard(format, robot, clock), clock, acm=acm)
+
+    def cable(out_ns: int, in_ns: int) -> None:
+        backend.at(out_ns, backend.unplug)
+        backend.at(in_ns, backend.plug)
+
+    robot.cable = cable
     return SimDevices(
         clock=clock, gpio=lines, backend=backend, source=source, robot=robot, format=format
     )

@@ -62,13 +62,21 @@ class SkippingClock:
 @dataclass(frozen=True, slots=True)
 class Act:
     """One sweep of the robot. frames: raw counts [n, R, C] or [n, R, C, A]. start, stop: frames at
-    which its edges come. label: the material. new_object: NEW OBJECT comes with the first frame."""
+    which its edges come. label: the material. new_object: NEW OBJECT comes with the first frame.
+
+    about: what is special about it, for a person. wanted: the right status; "" for `ok`, or
+    `unknown` if the bundle lacks the material. unplugged: frames [from, to) for which the
+    skin is unplugged; None for none.
+    """
 
     frames: NDArray[Any]
     start: int
     stop: int
     label: str
     new_object: bool = False
+    about: str = ""
+    wanted: str = ""
+    unplugged: tuple[int, int] | None = None
 
 
 class EdgeLines(Protocol):
@@ -89,7 +97,7 @@ class Robot:
 
     acts: number of acts that it has begun. played: the acts as they were played; without `remember`
     only the newest. skipped: frame numbers [from, to) that were omitted because it stopped early;
-    the readout board leaves them out.
+    the readout board leaves them out. cable: unplugs the skin at one time, plugs it in at another.
     """
 
     def __init__(
@@ -106,6 +114,7 @@ class Robot:
         self.played: MutableSequence[Act] = [] if remember else deque(maxlen=1)
         self.finished = False
         self.skipped: tuple[int, int] | None = None
+        self.cable: Callable[[int, int], None] | None = None
         self._script, self._lines = script, lines
         self._playing: tuple[Act, int, Callable[[int], int]] | None = None
         self._start, self._stop, self._new_object = start, stop, new_object
@@ -130,6 +139,8 @@ class Robot:
             self._pulse(self._stop, stop_ns, stop_ns + PULSE_NS)
         else:
             self._pulse(self._start, start_ns, stop_ns)
+        if act.unplugged and self.cable:
+            self.cable(*(frame_ns(first + i) for i in act.unplugged))
         self._playing = act, first, frame_ns
         return act
 

@@ -164,17 +164,23 @@ def _tubes(
     seen: SeenTubes,
     materials: Sequence[str],
 ) -> Iterator[Act]:
-    rate = seen.FORMAT.rate_hz
     rounds = itertools.cycle(places)
     tubes_left: list[str] = []
     for _ in itertools.count() if sweeps is None else range(sweeps):
         if not tubes_left:
             tubes_left, place = [str(m) for m in rng.permutation(materials)], next(rounds)
-        label = tubes_left.pop()
-        off = seen.idle(max(PAUSE_FRAMES, round(rng.uniform(*PAUSE_S) * rate)), rng, world)
-        on = seen.sweep(label, place, rng, world, rest_s=REST_S, slide_s=SLIDE_S, after_s=REST_S)
-        start = len(off) + round(REST_S * rate)
-        yield Act(np.concatenate([off, on, off]), start, start + round(SLIDE_S * rate), label)
+        yield slide(tubes_left.pop(), place, rng, world, seen)
+
+
+def slide(
+    label: str, place: skin.Placement, rng: Generator, world: skin.World, seen: SeenTubes = skin
+) -> Act:
+    """One sweep over the tube `label`, with the finger lifted before and after it."""
+    rate = seen.FORMAT.rate_hz
+    off = seen.idle(max(PAUSE_FRAMES, round(rng.uniform(*PAUSE_S) * rate)), rng, world)
+    on = seen.sweep(label, place, rng, world, rest_s=REST_S, slide_s=SLIDE_S, after_s=REST_S)
+    start = len(off) + round(REST_S * rate)
+    return Act(np.concatenate([off, on, off]), start, start + round(SLIDE_S * rate), label)
 
 
 def rests(seed: int, world: skin.World = PLAYED, seen: SeenTubes = skin) -> Iterator[Act]:

@@ -18,7 +18,6 @@ from appliance.core.health import Health
 from appliance.core.log import log
 from appliance.core.observer import Observer
 from appliance.core.sentences import sentence
-from appliance.core.types import Sweep, Verdict
 from appliance.recording.recording import Labels, RecordingSession
 from appliance.teaching.process import News, TeachingProcess, learning
 from appliance.teaching.state import TeachingState
@@ -54,7 +53,7 @@ class TeachingSession(Observer):
         self._state = TeachingState.load(store)
         self._named: dict[str, None] = {}  # materials without a sweep so far, in order
         self._process: TeachingProcess | None = None
-        self._using = False
+        self._using, self._stored = False, 0
         self._due_ns: int | None = self._clock.now_ns()
         self._learnt: News | None = None
         self._step: News | None = None
@@ -92,12 +91,12 @@ class TeachingSession(Observer):
         counts = self._recording.materials(self._state.forgotten)
         return dict.fromkeys(self._named, 0) | counts
 
-    def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
-        """Assess again, a moment after the sweep was stored."""
-        self._due_ns = self._clock.now_ns() + PAUSE_NS
-
     def turn(self, health: Health) -> None:
-        """Take the news of the process, and begin an assessment that is due."""
+        """Take the news of the process, and begin an assessment that is due: a moment after a sweep
+        was stored or discarded."""
+        if self._recording.stored != self._stored:
+            self._stored = self._recording.stored
+            self._due_ns = self._clock.now_ns() + PAUSE_NS
         if self._process:
             for one in self._process.news():
                 self._take(one)
@@ -188,7 +187,5 @@ class TeachingSession(Observer):
         return [label, number]
 
     def _discard(self, which: str) -> list[object]:
-        """As DISCARD of a recording; then assess again."""
-        answer = self._recording.commands["DISCARD"](which)
-        self._due_ns = self._clock.now_ns() + PAUSE_NS
-        return answer
+        """As DISCARD of a recording."""
+        return self._recording.commands["DISCARD"](which)

@@ -1,7 +1,7 @@
-"""`palpate demo`: the skin live in the terminal during a sweep, then the verdict with its sentence,
-at the end a table.
+"""`palpate demo`: the skin live in the terminal during a sweep, then a line with the answer, at the
+end their sum.
 
-A terminal shows pictures; other outputs get plain lines.
+A terminal shows pictures and colours; other outputs get plain lines.
 """
 
 from __future__ import annotations
@@ -9,12 +9,15 @@ from __future__ import annotations
 import os
 import select
 from collections.abc import Callable, Collection, Sequence
+from contextlib import nullcontext, redirect_stderr
+from io import StringIO
 from typing import IO, Any
 
 from numpy.typing import NDArray
 
 from appliance.client.answers import Answer
 from appliance.core.clock import Clock
+from appliance.core.status import REASONS, Status
 from appliance.core.types import normal
 from appliance.runtime.loop import Box
 from appliance.sim.rig import Act
@@ -24,16 +27,11 @@ FRAME_NS = 66_000_000
 """Time between two pictures of the skin."""
 ARRIVAL_S = 1.0
 """Longest time of a sentence from one end of the serial line to the other."""
-BAR = 30
-"""Characters of a full bar."""
+HEAD = f"{'':5}{'felt':<20}{'answer':<16}{'sure':>8}"
+"""Heads of the columns."""
+GREEN, YELLOW, RED, GREY, PLAIN = "\033[32m", "\033[33m", "\033[31m", "\033[90m", "\033[0m"
 BRIGHT = 160
 """Raw counts that are shown white; the skin seldom has more."""
-
-
-def bar(probability: float) -> str:
-    """A probability as a bar."""
-    full = round(probability * BAR)
-    return "█" * full + "·" * (BAR - full) + f" {probability:6.1%}"
 
 
 def picture(frame: NDArray[Any]) -> list[str]:
@@ -51,6 +49,20 @@ def picture(frame: NDArray[Any]) -> list[str]:
             )
         )
     return lines
+
+
+class LogLines(StringIO):
+    """Takes the log while a picture is drawn, and prints its lines above the picture."""
+
+    def __init__(self, show: Callable[[str], None]) -> None:
+        super().__init__()
+        self._show = show
+
+    def write(self, text: str) -> int:
+        """Print the lines of `text`."""
+        for line in filter(None, text.splitlines()):
+            self._show(f"     {GREY}{line}{PLAIN}")
+        return len(text)
 
 
 class Demo:
@@ -74,6 +86,7 @@ class Demo:
         self._played, self._clock, self._out = played, clock, out
         self._far_end, self._raw = far_end, raw
         self._live = not raw and out.isatty()
+        self._ticks = "✓✗" if str(getattr(out, "encoding", "")).lower().startswith("utf") else "+-"
         self._rest = b""
         self._drawn = 0
         self._next_ns = 0
@@ -81,36 +94,30 @@ class Demo:
     def run(self, box: Box, sweeps: int, stopped: Callable[[], bool]) -> None:
         """Step `box` until `sweeps` answers were read or `stopped()`."""
         sent = 0
-        while self.score.answers < sweeps and not stopped():
-            sent += len(box.step())
-            self._read(sent, sweeps)
-            if (
-                self._live
-                and self._clock.now_ns() >= self._next_ns
-                and (frame := box.newest_frame()) is not None
-            ):
-                self._next_ns = self._clock.now_ns() + FRAME_NS
-                self._draw(
-                    ["", f"  under the finger: {self._played[-1].label}", "", *picture(frame), ""]
-                )
+        if not self._raw:
+            self._print("", HEAD)
+        with redirect_stderr(LogLines(self._print)) if self._live else nullcontext():
+            while self.score.answers < sweeps and not stopped():
+                sent += len(box.step())
+                self._read(sent, sweeps)
+                if (frame := box.newest_frame()) is not None:
+                    self._draw(frame)
         if not self._raw and self.score.answers:
-            lost = (
-                f"  frames lost     {box.counters.lost_frames} of"
-                f" {box.counters.frames + box.counters.lost_frames}"
-            )
-            touch = (
-                [f"  touch time      {self.score.touch(box.format.rate_hz)}"]
-                if self.score.early
-                else []
-            )
-            self._print(
-                "",
-                *self.score.table(),
-                "",
-                lost,
-                f"  latency         {self.score.latency()}",
-                *touch,
-            )
+            self._print("", *self._ending(box))
+
+    def _ending(self, box: Box) -> list[str]:
+        """The sum of the answers: a table by material, or a sentence after a tour."""
+        counters = box.counters
+        sent = counters.frames + counters.lost_frames
+        lines = [
+            f"  frames lost     {counters.lost_frames:,} of {sent:,}",
+            f"  latency         {self.score.latency()}",
+        ]
+        if self.score.early:
+            lines.append(f"  touch time      {self.score.touch(box.format.rate_hz)}")
+        if any(act.about for act in self._played):
+            return [f"  {self.score.summary}", *lines]
+        return [*self.score.table(), "", *lines]
 
     def _read(self, sent: int, wanted: int) -> None:
         """Read the sentences at the robot's end, up to `wanted` answers. Sent answers are waited
@@ -132,22 +139,33 @@ class Demo:
             return
         act = self._played[answer.sweep - 1]
         right = self.score.add(act, answer)
-        mark = (
-            ("right" if right else "wrong")
-            if act.label in self.score.labels
-            else "not in the bundle"
-        )
         if not self._raw:
-            named = answer.label or answer.status
-            used = f"  after {answer.share:.0%} of the window" if answer.share < 1 else ""
-            text = (
-                f"{answer.sweep:>3}  {act.label:<15} -> {named:<15} {mark} "
-                f" {bar(answer.probability)}{used}"
-            )
-            self._print(text, f"     {line}")
+            self._print(self._row(act, answer, right=right))
 
-    def _draw(self, lines: list[str]) -> None:
-        """Draw over the previous picture, in one write against flicker."""
+    def _row(self, act: Act, answer: Answer, *, right: bool) -> str:
+        """A line: what the finger felt, the answer and its probability, right or wrong, and why."""
+        named = answer.label if answer.status == Status.OK else answer.status
+        sure = f"{100 * answer.probability:.1f} %" if answer.status == Status.OK else ""
+        early = f"after {answer.share:.0%} of the window" if answer.share < 1 else ""
+        told = REASONS.get(answer.status, "") if not (right or named == answer.label) else ""
+        unknown = "" if act.wanted or act.label in self.score.labels else "not in the bundle"
+        why = "; ".join(filter(None, (act.about, unknown, early, told)))
+        tone = {Status.OK: GREEN, Status.UNSURE: YELLOW, Status.UNKNOWN: YELLOW}
+        name = self._coloured(f"{named:<16}", tone.get(answer.status, RED))
+        tick = self._coloured(self._ticks[not right], GREEN if right else RED)
+        row = f"{answer.sweep:>3}  {act.label:<16} -> {name}{sure:>8}  {tick}"
+        return f"{row}  {self._coloured(why, GREY)}" if why else row
+
+    def _coloured(self, text: str, colour: str) -> str:
+        return f"{colour}{text}{PLAIN}" if self._live else text
+
+    def _draw(self, frame: NDArray[Any]) -> None:
+        """Draw a frame over the previous picture, in one write against flicker, if it is time."""
+        if not self._live or self._clock.now_ns() < self._next_ns:
+            return
+        self._next_ns = self._clock.now_ns() + FRAME_NS
+        felt = self._played[-1].label
+        lines = ["", f"  under the finger: {felt}", "", *picture(frame), ""]
         self._out.write(self._back() + "".join(f"{line}\033[K\n" for line in lines))
         self._out.flush()
         self._drawn = len(lines)

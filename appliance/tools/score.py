@@ -31,14 +31,11 @@ class AnswerScore:
     slide_frames: int = 0
 
     def add(self, act: Act, answer: Answer) -> bool:
-        """Count an answer. Returns whether it is right: the material of `act`, or `unknown` for a
-        material that the bundle does not have."""
+        """Count an answer. Returns whether it is right: the status that `act` wants, otherwise its
+        material, or `unknown` for a material that the bundle does not have."""
         known = act.label in self.labels
-        right = (
-            answer.label == act.label and answer.status == Status.OK
-            if known
-            else answer.status == Status.UNKNOWN
-        )
+        wanted = act.wanted or (Status.OK if known else Status.UNKNOWN)
+        right = answer.status == wanted and (wanted != Status.OK or answer.label == act.label)
         self.total[act.label] += 1
         self.right[act.label] += right
         self.latency_ms.append(answer.latency_ms)
@@ -55,6 +52,11 @@ class AnswerScore:
     @property
     def answers(self) -> int:
         return self.total.total()
+
+    @property
+    def summary(self) -> str:
+        """How many answers were right."""
+        return f"{self.right.total()} of {self.answers} answers are right"
 
     def table(self) -> list[str]:
         """Right answers and totals in lines: by material, of all sweeps, of all objects, of the

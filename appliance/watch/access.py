@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from appliance.core.config import WatchConfig
-from appliance.core.errors import ConfigError
+from appliance.core.errors import ConfigError, TemporaryError
+from appliance.core.patience import passes
 
 HERE = "127.0.0.1"
 NAMES = ("localhost", HERE, "[::1]")
@@ -68,7 +69,7 @@ class Access:
         try:
             context.load_cert_chain(self.certificate, self.key)
         except (OSError, ssl.SSLError) as e:
-            raise ConfigError(
+            raise (TemporaryError if passes(e) else ConfigError)(
                 f"{self.certificate} and {self.key.name} cannot be used: {e}; make install makes"
                 " them"
             ) from e
@@ -117,7 +118,7 @@ def _token(path: Path) -> str:
             f"{path} may not be read by this user; {join}, or set watch.address to {HERE}"
         ) from e
     except (OSError, ValueError) as e:
-        raise ConfigError(
+        raise (TemporaryError if passes(e) else ConfigError)(
             f"{path} cannot be read: {getattr(e, 'strerror', None) or e}; {advice}"
         ) from e
     if not LEAST_TOKEN <= len(token) <= MOST_TOKEN or not token.isalnum():

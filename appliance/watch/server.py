@@ -21,9 +21,11 @@ from concurrent.futures import Future
 from heapq import merge
 from pathlib import Path
 from typing import Any, Protocol, Self
+from weakref import WeakSet
 
-from appliance.core.errors import ApplianceError, ConfigError, FormatError, NoAnswer
+from appliance.core.errors import AddressError, ApplianceError, ConfigError, FormatError, NoAnswer
 from appliance.core.log import TroubleLog
+from appliance.watch import local_users
 from appliance.watch.access import Access
 
 try:
@@ -31,6 +33,7 @@ try:
     from tornado.ioloop import PeriodicCallback
     from tornado.iostream import StreamClosedError
     from tornado.netutil import bind_sockets
+    from tornado.template import Loader
     from tornado.web import Application, HTTPError, RequestHandler
 except ImportError as e:
     raise ConfigError(
@@ -131,7 +134,8 @@ class PageServer:
 
     kept: as for EventLog. now_ns: the clock of the events' time stamps. answers: functions for
     content on request, by the first part of its path. orders: takes the page's POSTs to /order;
-    None for a page that is read-only. Raises ConfigError if the address cannot be used.
+    None for a page that is read-only. Raises AddressError if the address is in use or not there
+    yet, ConfigError if it cannot be used at all.
     """
 
     def __init__(
@@ -150,13 +154,10 @@ class PageServer:
         self.queues: set[asyncio.Queue[bytes]] = set()
         self.answering: set[asyncio.Task[Any]] = set()
         self.wrong = TroubleLog("page")
-        self.files = {
-            f"/{f.name}": (KINDS[f.suffix], f.read_bytes())
-            for f in FOLDER.iterdir()
-            if f.suffix in KINDS
-        }
+        self.files = page_files()
         self.files["/"] = self.files[f"/{name}"]
         self._stop = asyncio.Event()
+        self.server: LimitedServer | None = None
         try:
             self._tls = access.tls()
             self._sockets = bind_sockets(
@@ -164,7 +165,10 @@ class PageServer:
             )
         except (OSError, ValueError) as e:
             where = f"port {access.port} of {access.address}"
-            raise ConfigError(f"{where} cannot be used: {e}; name another with --web PORT") from e
+            passing = isinstance(e, OSError) and not isinstance(e, PermissionError)
+            raise (AddressError if passing else ConfigError)(
+                f"{where} cannot be used: {e}; name another with --web PORT"
+            ) from e
         self.address = access.url(self._sockets[0].getsockname()[1])
 
     def __enter__(self) -> Self:
@@ -217,7 +221,7 @@ class PageServer:
             default_handler_args={"page": self},
             log_function=lambda handler: None,
         )
-        server = LimitedServer(
+        server = self.server = LimitedServer(
             application,
             ssl_options=self._tls,
             max_header_size=MOST_HEAD,
@@ -239,6 +243,20 @@ class PageServer:
         await asyncio.sleep(0)  # cancelled handlers end
 
 
+def page_files() -> dict[str, tuple[str, bytes]]:
+    """Type and content of each file of FOLDER, by its path. Pages are in the frame that all of them
+    share, frame.html."""
+    frames = Loader(str(FOLDER), autoescape=None, whitespace="all")
+    return {
+        f"/{f.name}": (
+            KINDS[f.suffix],
+            frames.load(f.name).generate() if f.suffix == ".html" else f.read_bytes(),
+        )
+        for f in FOLDER.iterdir()
+        if f.suffix in KINDS and f.name != "frame.html"
+    }
+
+
 def _checked(port: int) -> int:
     """The port. Raises ValueError for other numbers, which the resolver would take modulo 65536."""
     if not 0 <= port <= 65535:
@@ -247,25 +265,43 @@ def _checked(port: int) -> int:
 
 
 class LimitedServer(HTTPServer):
-    """tornado's server with limits for connections and for the time without reading."""
+    """tornado's server with limits for connections and for the time without reading. admitted:
+    connections that have sent an allowed request; they are not closed for others."""
 
     def initialize(self, *args: Any, **options: Any) -> None:
         """As HTTPServer.initialize."""
         super().initialize(*args, **options)
-        self._open: dict[Any, str] = {}  # stream -> address
+        self._open: dict[Any, str] = {}  # stream -> address, the oldest first
+        self.admitted: WeakSet[Any] = WeakSet()
         self._since: Counter[Any] = Counter()  # stream -> seconds without reading
 
     def handle_stream(self, stream: Any, address: Any) -> None:
-        """Accept a connection if there is room."""
+        """Accept a connection if there is room, or if another can be closed for it."""
         self._open = {one: ip for one, ip in self._open.items() if not one.closed()}
-        if (
-            len(self._open) >= MOST_OPEN
-            or sum(ip == address[0] for ip in self._open.values()) >= MOST_OF_ONE
-        ):
+        own = sum(ip == address[0] for ip in self._open.values())
+        if own >= MOST_OF_ONE and not self._close_one(address[0]):
+            stream.close()
+            return
+        if len(self._open) >= MOST_OPEN and not self._close_one(self._busiest(own)):
             stream.close()
             return
         self._open[stream] = address[0]
         super().handle_stream(stream, address)
+
+    def _busiest(self, own: int) -> str:
+        """The address with the most connections, "" if none has more than `own`."""
+        address, most = Counter(self._open.values()).most_common(1)[0]
+        return address if most > own else ""
+
+    def _close_one(self, address: str) -> bool:
+        """Close the oldest connection of an address that has sent no allowed request so far.
+        Returns whether there was one."""
+        for stream, ip in self._open.items():
+            if ip == address and stream not in self.admitted:
+                stream.close()
+                del self._open[stream]
+                return True
+        return False
 
     def drop_those_who_take_nothing(self) -> None:
         """Close connections whose other side has read nothing for TAKEN_S. It is called once a
@@ -300,6 +336,7 @@ class _Handler(RequestHandler):
         scheme, _, given = request.headers.get("Authorization", "").partition(" ")
         given = given if scheme == "Bearer" else self.get_cookie(COOKIE, "") or ""
         if access.admits(given):
+            self._admit(stream)
             return
         if given:
             self.page.wrong.update(
@@ -309,6 +346,18 @@ class _Handler(RequestHandler):
             await asyncio.sleep(WRONG_S)
             self.clear_cookie(COOKIE, path="/", secure=True)
         raise HTTPError(401)
+
+    def _admit(self, stream: Any) -> None:
+        """Note the connection of an allowed request. Without a token it must be of a user who may
+        read the feed, too."""
+        server = self.page.server
+        if not (stream and stream.socket and server) or stream in server.admitted:
+            return
+        if not self.page.access.token:
+            peer, own = stream.socket.getpeername()[:2], stream.socket.getsockname()[:2]
+            if not local_users.may_see(local_users.owner(peer, own)):
+                raise HTTPError(403, reason=f"only for root and group {local_users.GROUP}")
+        server.admitted.add(stream)
 
     def write_error(self, status_code: int, **_: Any) -> None:
         """Answer with a line of text."""

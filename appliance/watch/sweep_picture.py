@@ -56,8 +56,8 @@ def picture(one: Window) -> dict[str, Any]:
     """The content of the picture.
 
     taxels: name, lowest and highest count of each step in time, of the normal axis. spectrogram:
-    share of each band [steps][bands] (features.h_features), with `band_hz` and `step_s`; or
-    `trouble`, the reason why there is none.
+    share of each band [steps][bands] (features.h_features), with `band_hz`, `step_s` and `top_hz`,
+    the end of the last band; or `trouble`, the reason why there is none.
     """
     counts = normal(one.taxels, 1).astype(np.float64)
     counts = np.where(np.isfinite(counts), counts, 0)
@@ -93,6 +93,7 @@ def _spectrogram(taxels: NDArray[Any], rate_hz: float) -> dict[str, Any]:
     return {
         "spectrogram": shares.round(3).tolist(),
         "band_hz": 2 * rate_hz / width,
+        "top_hz": min(features.HIGH_HZ[1], rate_hz / 2),
         "step_s": features.HOP_S,
         "trouble": "",
     }

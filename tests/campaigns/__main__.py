@@ -195,6 +195,17 @@ CAMPAIGNS = {
         _module("tests.cuts"),
         nice=True,
     ),
+    "exceptions": Campaign(
+        "throw an exception at every call of the loop and count the answers (10 minutes)",
+        _module("tests.campaigns.exceptions"),
+        variables={"OMP_NUM_THREADS": "1"},
+        nice=True,
+    ),
+    "slow-disk": Campaign(
+        "record on a disk whose syncs take up to 10 s, and count lost frames (16 minutes)",
+        _module("tests.campaigns.slow_disk"),
+        variables={"OMP_NUM_THREADS": "1"},
+    ),
     "objects": Campaign(
         "count wrong answers with NEW OBJECT forgotten, by several rules (docs/decisions/0020)",
         _module("tests.campaigns.objects"),
@@ -203,6 +214,12 @@ CAMPAIGNS = {
     "junk": Campaign(
         "count the answers to sweeps that no one can name, early ones too (docs/decisions/0024)",
         _module("tests.campaigns.junk"),
+        variables={"OMP_NUM_THREADS": "1"},
+        nice=True,
+    ),
+    "promises": Campaign(
+        "compare the accuracy that fit prints with that of its bundle under a new condition",
+        _module("tests.campaigns.promises"),
         variables={"OMP_NUM_THREADS": "1"},
         nice=True,
     ),

@@ -132,7 +132,7 @@ class SpatialFold:
         self.train, self.test = trial.sweeps.take(train), trial.sweeps.take(test)
         settings = Settings(steps=steps, calibrate=False)
         self.setup = Setup.of(self.train, seed, settings, no_log)
-        self.fixed = recipe.features(self.setup)
+        self.fixed = self.setup.fixed
         ratio = trial.speeds / np.exp(np.nanmean(np.log(trial.speeds[train])))
         self.known, self.told = np.isfinite(ratio[train]), np.isfinite(ratio[test])
         ratio = np.where(np.isfinite(ratio), ratio, 1.0)

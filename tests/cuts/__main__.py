@@ -24,8 +24,10 @@ from tests.cuts.scene import ROOT, CrashPoint, CutScene, ScenePlay, stage
 
 SCENES: dict[str, Callable[[Path], CutScene]] = {
     "recording": lambda beside: recording.scene(),
+    "recording-thread": lambda beside: recording.scene(recording.THREAD),
     "palpate-record": lambda beside: recording.palpate(),
     "black-box": lambda beside: black_box.scene(),
+    "black-box-thread": lambda beside: black_box.scene("thread"),
     "delivery": lambda beside: delivery.Shop.opened(beside).scene(),
     "enrolment": lambda beside: delivery.Shop.opened(beside).enrolment(),
 }
@@ -124,9 +126,16 @@ def cut(scene: CutScene, ledger: CrashPointLog, hows: Sequence[str] = HOWS) -> I
         for how in hows:
             for moment in play.moments():
                 at = scene.steps[moment.step].name, how, moment.number
-                if at not in done and (moment.call or how == "power"):
+                if at not in done and (how == "power" or _can_kill(moment.call)):
                     ledger.add(point := getattr(play, how)(moment))
                     yield point
+
+
+def _can_kill(call: calls.SystemCall | None) -> bool:
+    """Whether strace can kill the command at this call: it counts the calls of each thread by
+    themselves, so one of a later thread is met first by the main thread. A kill leaves one of the
+    folders that a loss of power may leave."""
+    return call is not None and call.thread == 0
 
 
 def figures(points: Iterable[CrashPoint]) -> Iterator[str]:

@@ -1,8 +1,8 @@
 """The black box, cut short: a program that keeps the last sweeps in service, and a judge of losses
 beyond the sweep in progress.
 
-`python -m tests.cuts.black_box FOLDER` is this program: it continues in the folder, and reports
-each sweep that it has kept.
+`python -m tests.cuts.black_box FOLDER [thread]` is this program: it continues in the folder, and
+reports each sweep that it has kept. thread: it writes beside the loop, as the box does.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import re
 import sys
 from pathlib import Path
 
+from appliance.core.disk_thread import AtOnce, DiskThread, DiskWork
 from appliance.recording.black_box import BlackBox
 from tests.cuts import recording
 from tests.cuts.scene import CutScene, Found, SceneStep
@@ -21,12 +22,13 @@ MOST = 2
 KEPT = re.compile(r"^kept (\S+)$", re.MULTILINE)
 
 
-def keep(folder: Path) -> None:
+def keep(folder: Path, disk: DiskWork) -> None:
     """Keep three sweeps."""
     with log_lines.collected() as logged:
-        box = BlackBox(folder, recording.SHORT, MOST)
+        box = BlackBox(folder, recording.SHORT, MOST, disk)
         for number in (1, 2, 3):
             box.sweep(*recording.taken(number, recording.SHORT), {})
+            disk.settle()
             if logged:
                 sys.exit(logged[0])
             print(f"kept {max(folder.glob('*.npy')).stem}", flush=True)
@@ -56,17 +58,17 @@ def _goes_on(folder: Path, last: str) -> list[str]:
     return wrong + broken
 
 
-def scene() -> CutScene:
-    """Two runs that keep sweeps; the second continues in the folder of the first."""
+def scene(how: str = "") -> CutScene:
+    """Two runs that keep sweeps; the second continues in the folder of the first. how: "thread" to
+    write beside the loop."""
+    program = [sys.executable, "-m", "tests.cuts.black_box"]
 
     def step(name: str) -> SceneStep:
-        return SceneStep(
-            name,
-            lambda folder: [sys.executable, "-m", "tests.cuts.black_box", folder / recording.KEPT],
-        )
+        return SceneStep(name, lambda folder: [*program, folder / recording.KEPT, *how.split()])
 
-    return CutScene("black-box", lambda folder: None, (step("first"), step("second")), judge)
+    name = f"black-box-{how}" if how else "black-box"
+    return CutScene(name, lambda folder: None, (step("first"), step("second")), judge)
 
 
 if __name__ == "__main__":
-    keep(Path(sys.argv[1]))
+    keep(Path(sys.argv[1]), DiskThread() if sys.argv[2:] else AtOnce())

@@ -19,9 +19,11 @@ from pathlib import Path
 
 WATCHED = (
     "open|creat|p?write|lseek|sendfile|copy_file|splice|f?truncate|fallocate|"
-    "fsync|fdatasync|sync|rename|unlink|rmdir|mkdir|symlink|link|f?chmod|f?chown|mknod"
+    "fsync|fdatasync|sync|rename|unlink|rmdir|mkdir|symlink|link|f?chmod|f?chown|mknod|clone"
 )
 """System calls that matter, by the beginnings of their names."""
+BEGINS = ("clone", "clone3")
+"""Calls that begin a thread or a process."""
 MOST_BYTES = 1 << 24
 """Largest number of bytes of a write that strace prints."""
 DEADLINE_S = 120
@@ -38,12 +40,16 @@ class NotFollowed(Exception):
 
 @dataclass(frozen=True, slots=True)
 class SystemCall:
-    """One system call. nth: its number among the calls of this name in its process, from 1, as
-    strace counts. paths: its absolute paths. data: the bytes that it writes, or the target of a
-    symlink. words: its arguments as strace prints them. result: None if the process was killed in
-    it."""
+    """One system call.
+
+    process, thread: numbers of its process and thread, 0 for the first. nth: its number among the
+    calls of this name in its thread, from 1, as strace counts. paths: its absolute paths. data: the
+    bytes that it writes, or the target of a symlink. words: its arguments as strace prints them.
+    result: None if the process was killed in it.
+    """
 
     process: int
+    thread: int
     name: str
     nth: int
     paths: tuple[str, ...]
@@ -117,7 +123,7 @@ def run(
     )
     calls = tuple(_calls(log.read_text("ascii").splitlines(), str(log.parent)))
     if at and not any(
-        c.result is None and (c.process, c.name, c.nth) == (at.process, at.name, at.nth)
+        c.result is None and (c.thread, c.name, c.nth) == (at.thread, at.name, at.nth)
         for c in calls
     ):
         raise NotFollowed(
@@ -143,23 +149,41 @@ def _calls(lines: list[str], folder: str) -> Iterator[SystemCall]:
     was killed."""
     counts: Counter[tuple[str, str]] = Counter()
     ranks: dict[str, int] = {}
-    for line in _joined(lines):
-        found = LINE.fullmatch(line)
-        if not found:
-            raise NotFollowed(f"strace says {line[:200]!r}")
-        process, name, words, result = found.groups()
-        counts[process, name] += 1
-        rank = ranks.setdefault(process, len(ranks))
+    parsed = [_parsed(line) for line in _joined(lines)]
+    # a thread may run before the call that began it ends
+    begun = {
+        result: thread
+        for thread, name, words, result in parsed
+        if name in BEGINS and "CLONE_THREAD" in words
+    }
+    for thread, name, words, result in parsed:
+        counts[thread, name] += 1
+        rank = ranks.setdefault(thread, len(ranks))
+        process = thread
+        while process in begun:
+            process = begun[process]
+        if name in BEGINS:
+            continue
         paths, data = _arguments(name, words, folder)
         yield SystemCall(
+            ranks.setdefault(process, len(ranks)),
             rank,
             name,
-            counts[process, name],
+            counts[thread, name],
             paths,
             data,
             words,
             None if result == "?" else int(result),
         )
+
+
+def _parsed(line: str) -> tuple[str, str, str, str]:
+    """Thread, name, arguments and result of a call. Raises NotFollowed."""
+    found = LINE.fullmatch(line)
+    if not found:
+        raise NotFollowed(f"strace says {line[:200]!r}")
+    thread, name, words, result = found.groups()
+    return thread, name, words, result
 
 
 def _joined(lines: list[str]) -> Iterator[str]:

@@ -18,6 +18,7 @@ import numpy as np
 
 from appliance.core import storage
 from appliance.core.clock import SystemClock
+from appliance.core.disk_thread import AtOnce, DiskThread, DiskWork
 from appliance.core.errors import FormatError
 from appliance.core.types import Frames, Status, Sweep, SweepFormat, Verdict, load
 from appliance.recording.recording import Labels, RecordingSession
@@ -26,6 +27,8 @@ from tests.cuts.scene import CutScene, Found, SceneStep
 
 SHORT = SweepFormat(4, 4, 750, 40, "uint8")
 """Format of the sweeps of all programs except the box's."""
+THREAD = "in a thread"
+"""The way of the box: it writes beside the loop."""
 KEPT = "kept/sweeps"
 """Folder below that of the scene; it does not exist at first, so the program that makes it must
 sync it too."""
@@ -40,25 +43,32 @@ Files = Mapping[Path, bytes]
 def record(way: str, folder: Path, session: str) -> None:
     """Record two sweeps, discard the second, record a third. way: how the files are written."""
     storage.put_all = WAYS[way]
+    disk = DiskThread() if way == THREAD else AtOnce()
     running = recording(
-        folder, SHORT, session, lambda line: print(line.decode().strip(), flush=True)
+        folder, SHORT, session, lambda line: print(line.decode().strip(), flush=True), disk
     )
     running.sweep(*taken(1, SHORT), {})
     running.sweep(*taken(2, SHORT), {})
+    disk.settle()
     print(f"discarding {max(folder.glob('*.npy')).stem}", flush=True)
     print(f"discarded {running.commands['DISCARD']('')[-1]}", flush=True)
     running.sweep(*taken(3, SHORT), {})
+    disk.settle()
     if running.stored != 2:
         sys.exit(f"{running.stored} sweeps are stored instead of 2")
     running.close()
 
 
 def recording(
-    folder: Path, format: SweepFormat, session: str, say: Callable[[bytes], None]
+    folder: Path,
+    format: SweepFormat,
+    session: str,
+    say: Callable[[bytes], None],
+    disk: DiskWork | None = None,
 ) -> RecordingSession:
     """The observer of the box that records sweeps."""
     labels = Labels("plastic rough", "1", session)
-    return RecordingSession(folder, format, labels, SystemClock(), say)
+    return RecordingSession(folder, format, labels, SystemClock(), say, disk=disk)
 
 
 def taken(number: int, format: SweepFormat) -> tuple[Sweep, Verdict]:
@@ -97,6 +107,7 @@ def _late(path: Path) -> None:
 
 WAYS: dict[str, Callable[[Files], None]] = {
     "right": storage.put_all,
+    THREAD: storage.put_all,
     "no sync of the file": lambda files: _aside(
         files, Path.write_bytes, lambda path: storage.sync(path.parent)
     ),
@@ -105,7 +116,7 @@ WAYS: dict[str, Callable[[Files], None]] = {
     "under its own name": _in_place,
     "description last": lambda files, put=storage.put_all: put(dict(reversed(files.items()))),
 }
-"""Ways to write files: all but the first are wrong on purpose, and the judge must find that."""
+"""Ways to write files: all but the first two are wrong on purpose, and the judge must find that."""
 
 
 def judge(format: SweepFormat, found: Found) -> list[str]:
@@ -174,9 +185,8 @@ def _goes_on(folder: Path, format: SweepFormat) -> list[str]:
 
 def scene(way: str = "right") -> CutScene:
     """Two runs that record; the second continues in the folder of the first."""
-    return _sessions(
-        "recording", SHORT, lambda kept, name: ["tests.cuts.recording", way, kept, name]
-    )
+    title = "recording-thread" if way == THREAD else "recording"
+    return _sessions(title, SHORT, lambda kept, name: ["tests.cuts.recording", way, kept, name])
 
 
 def palpate() -> CutScene:

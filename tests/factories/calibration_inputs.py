@@ -12,7 +12,7 @@ def plain_inputs(
     prefixes: np.ndarray,
     labels: np.ndarray,
     groups: np.ndarray,
-    judged: np.ndarray,
+    held: np.ndarray,
     fixed: int = 0,
     faulty: np.ndarray | None = None,
 ) -> CalibrationInputs:
@@ -23,8 +23,9 @@ def plain_inputs(
     return CalibrationInputs(
         prefixes,
         labels,
-        groups,
-        judged,
+        {"recording": groups},
+        held,
+        True,
         fixed,
         none,
         np.zeros(len(labels), bool) if faulty is None else faulty,

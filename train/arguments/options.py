@@ -13,17 +13,18 @@ from typing import Any
 
 from appliance.core.errors import FormatError
 from train.arguments import numbers
-from train.calibration import level_check
-from train.data import labels, sets
+from train.data import labels, readers, sets
 from train.data.progress import ProgressLine
 from train.data.summary import warnings_of
-from train.evaluation import evaluate
+from train.evaluation import evaluate, traps
 from train.models import methods
 
 SET = (
     f"FILE (.npz, .h5), a folder of recordings, {sets.SIMULATED_FORM} or aeon:NAME; "
     "several are joined"
 )
+SET_FILES = (".npz", *readers.HDF5)
+"""Endings of a sweep set."""
 LOG_EVERY_S = 30
 
 
@@ -134,10 +135,16 @@ def writable(path: Path, option: str = "--out") -> None:
         ) from e
 
 
-def writable_file(path: Path, option: str = "--out") -> None:
-    """As `writable`; also raises FormatError if `path` is a folder."""
+def writable_file(path: Path, option: str = "--out", *endings: str) -> None:
+    """As `writable`; also raises FormatError if `path` is a folder, or has an ending other than
+    `endings`, if there are any: the file would be of another kind than its name says."""
     if path.is_dir():
         raise FormatError(f"{option} {path} is a folder; name a file")
+    if endings and path.suffix.lower() not in ("", *endings):
+        raise FormatError(
+            f"{option} {path} would not be a {path.suffix} file; name one that ends in "
+            f"{' or '.join(endings)}"
+        )
     writable(path, option)
 
 
@@ -145,15 +152,15 @@ def load(args: argparse.Namespace, seed: int = 1) -> sets.Dataset:
     """The sets of --set, renamed by --rename, joined and narrowed by --only. seed: of simulated
     sets without one.
 
-    Warns of materials without sweeps, which are left out, of taxels that never change, and of a
-    mean level that shows a session or another group rather than the material.
+    Warns of materials without sweeps, which are left out, of taxels that never change, and of the
+    traps of traps.of_set.
     """
     pairs = labels.parse_renames(args.rename)
     loaded = [sets.load(spec, seed) for spec in args.sets or [args.usual_set]]
     labels.check_renames(pairs, (name for sweeps in loaded for name in sweeps.materials))
     whole = sets.join([labels.renamed(sweeps, pairs) for sweeps in loaded])
     part = whole.select(args.only)
-    for line in [*warnings_of(part if args.only else whole), *level_check.warnings_of(part)]:
+    for line in [*warnings_of(part if args.only else whole), *traps.of_set(part)]:
         print(f"palpate-train: {line}", file=sys.stderr)
     return part
 

@@ -32,7 +32,8 @@ NEVER = 1.01
 
 @dataclass(frozen=True)
 class AugmentedCopies:
-    """Augmented copies of sweeps: features [M, F], labels [M], groups [M].
+    """Augmented copies of sweeps: features [M, F], labels [M], source [M], the number of the sweep
+    of each.
 
     The head that names the material learns from them how materials vary. The embedding does not see
     them, because an unknown material would then lie among the known ones. held: bool [M], copies of
@@ -41,13 +42,13 @@ class AugmentedCopies:
 
     features: Array
     labels: Array
-    groups: Array
+    source: Array
     held: Array
 
     def take(self, index: Array) -> AugmentedCopies:
         """The copies that `index` (bool [M]) selects."""
         return AugmentedCopies(
-            self.features[index], self.labels[index], self.groups[index], self.held[index]
+            self.features[index], self.labels[index], self.source[index], self.held[index]
         )
 
 
@@ -66,18 +67,24 @@ class DisplacementFit:
 
 
 def fit_displacement(
-    whole: Array, labels: Array, judged: Array, fixed: int, copied: AugmentedCopies, logits: Array
+    whole: Array,
+    labels: Array,
+    groups: Array,
+    held: Array,
+    fixed: int,
+    copied: AugmentedCopies,
+    logits: Array,
 ) -> DisplacementFit | None:
     """The rule for displaced sweeps; None without copies to fit it to and to judge it by.
 
-    whole, labels, judged: features [N, F], labels [N] and bool [N] as in CalibrationInputs. logits:
-    [m, K] of the held-out copies, calibrated for contacts that are in place, by a head that saw
-    none of their groups.
+    whole, labels, groups, held: features [N, F], int [N], int [N] and bool [N] as in
+    CalibrationInputs. logits: [m, K] of the held-out copies, calibrated for contacts that are in
+    place, by a head that saw none of their groups.
     """
     fitted, judging = copied.take(~copied.held), copied.take(copied.held)
     if (
         not len(judging.labels)
-        or min(len(np.unique(of)) for of in (fitted.labels, labels[~judged])) <= labels.max()
+        or min(len(np.unique(of)) for of in (fitted.labels, labels[~held])) <= labels.max()
     ):
         return None
 
@@ -87,10 +94,10 @@ def fit_displacement(
         z = embed(whole[fit], labels[fit], fixed)
         return z, embed(z(fitted.features), fitted.labels, z.shapes.shape[1])
 
-    across, judge = turn(~judged)
+    across, judge = turn(~held)
     novelty = judge.novelty(across(judging.features))
     beyond = limit(novelty)
-    temperature = sufficient_temperature(logits, judging.labels, judging.groups)
+    temperature = sufficient_temperature(logits, judging.labels, groups[judging.source])
     p = softmax(logits / temperature)
     wrong = (p.argmax(1) != judging.labels) & (novelty <= beyond)
     enough = [

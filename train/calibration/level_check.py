@@ -41,12 +41,15 @@ DITHER = 1e-6
 """Deviation of the noise that is added to levels whose deviation is 1. If all sweeps of a material
 had the same level, weights would be infinite without it."""
 UNTESTED = -1
+LEFT_OUT = "also where"
+"""Words of the warning about a level that names materials across values; one such line suffices."""
 
 
 def warnings_of(sweeps: Dataset) -> list[str]:
     """A warning for each group within whose values the mean level names materials far above chance,
-    and across whose values it loses most of that. If no group can be left out, a warning if the
-    level names materials far above chance.
+    and across whose values it loses most of that, and one if it names them far above chance across
+    values too. If no group can be left out, a warning if the level names materials far above
+    chance.
 
     Sets that are too small for this check have no warning.
     """
@@ -58,11 +61,13 @@ def warnings_of(sweeps: Dataset) -> list[str]:
     names = dict.fromkeys(part.group for part in parts)
     if "recording" in names:  # no group can be left out
         return _alone(levels)
-    return [
+    lines = [
         line
         for name in names
         for line in _compared(levels, name, [part for part in parts if part.group == name])
     ]
+    across = [line for line in lines if LEFT_OUT in line]
+    return [line for line in lines if line not in across] or across[:1]
 
 
 def levels_of(sweeps: Dataset) -> Dataset:
@@ -111,7 +116,8 @@ def _alone(levels: Dataset) -> list[str]:
     where = "no group can be left out" if varied else "recorded in one session"
     return [
         f"warning: {where}: the level is not used by the default recipe; alone it names "
-        f"{_percent(right.mean())} of the sweeps (chance {_percent(chance)})"
+        f"{_percent(right.mean())} of the sweeps ({right.sum()} of {len(right)}, chance "
+        f"{_percent(chance)})"
     ]
 
 
@@ -130,7 +136,13 @@ def _compared(levels: Dataset, name: str, parts: Sequence[InnerPart]) -> list[st
     inside, outside = ((found == levels.labels)[tested] for found in (within, across))
     chance = _chance(levels.labels[tested], values[tested])
     low, _ = interval(inside, clusters := _clusters(levels, tested))
-    _, high = interval(outside, clusters)
+    least, high = interval(outside, clusters)
+    if least > _between(chance, 1, FAR):
+        return [
+            f"warning: the mean of each taxel alone names {outside.sum()} of {len(outside)} sweeps "
+            f"(chance {_percent(chance)}), {LEFT_OUT} their {name} is left out; if each material "
+            "was recorded in one go, this may be the level of that day"
+        ]
     if low <= _between(chance, 1, FAR) or high >= _between(chance, low, LEFT):
         return []
     several = name if name.endswith("s") else f"{name}s"

@@ -9,7 +9,7 @@ materials that are left out. Directions that no alteration reaches count as befo
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -44,6 +44,21 @@ class AlteredSweeps:
     z: Array
     labels: Array
     copies: Mapping[str, tuple[Array, Array]]
+
+    def seen_by(self, embed: Callable[[Array], Array]) -> AlteredSweeps:
+        """The same in another embedding: of each row."""
+        copies = {kind: (embed(z), source) for kind, (z, source) in self.copies.items()}
+        return AlteredSweeps(embed(self.z), self.labels, copies)
+
+    def take(self, kept: Array, labels: Array) -> AlteredSweeps:
+        """The sweeps `kept` (bool [N]) of these labels (ascending), and their copies; a label
+        becomes its number among `labels`."""
+        kept = kept & np.isin(self.labels, labels)
+        number, copies = np.cumsum(kept) - 1, {}
+        for kind, (z, source) in self.copies.items():
+            copies[kind] = z[kept[source]], number[source[kept[source]]]
+        numbered = np.searchsorted(labels, self.labels[kept])
+        return AlteredSweeps(self.z[kept], numbered, copies)
 
 
 @dataclass(frozen=True)

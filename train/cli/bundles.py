@@ -12,12 +12,13 @@ from appliance.bundle import bundle
 from appliance.bundle.manifest import Manifest
 from appliance.core import config
 from appliance.core.clock import SystemClock
+from appliance.core.errors import FormatError
 from appliance.core.provenance import commit
 from appliance.core.storage import put
 from appliance.inference.classifier import Classifier
 from train.arguments import numbers, options
 from train.arguments.types import Add
-from train.data import labels, sets
+from train.data import labels, repeats, sets
 from train.export import (
     bridging,
     bundle_score,
@@ -127,17 +128,39 @@ def run_pack(args: argparse.Namespace) -> None:
 def run_score(args: argparse.Namespace) -> None:
     """Run the set through the box's classifier; print the figures, and write them."""
     if args.json:
-        options.writable_file(args.json, "--json")
+        options.writable_file(args.json, "--json", ".json")
     loaded, sweeps = bundle.load(args.bundle), options.load(args)
     found = bundle_score.score(Classifier(loaded, SystemClock()), sweeps)
+    seen = _seen(loaded.manifest, sweeps)
     if args.json:
-        put(args.json, (json.dumps(found.json(), indent=1) + "\n").encode())
+        put(args.json, (json.dumps(found.json() | {"trained_on": seen}, indent=1) + "\n").encode())
     print(found.text())
-    if loaded.manifest.made.get("set") == sweeps.source:
+    if seen and seen["sweeps"]:
+        print(
+            f"warning: {seen['sweeps']} of {seen['of']} sweeps are the very ones that the bundle "
+            "was fitted to; they say nothing of new ones: score sweeps that it has not seen"
+        )
+    elif not seen and loaded.manifest.made.get("set") == sweeps.source:
         print(
             f"the bundle was fitted to a set of this name, {sweeps.source}: sweeps that it "
             "has seen say nothing of new ones"
         )
+
+
+def _seen(manifest: Manifest, sweeps: sets.Dataset) -> dict[str, int] | None:
+    """The number of `sweeps` that the bundle was fitted to, of those that could be compared; None
+    for a bundle of an older version, which keeps no digests."""
+    kept = manifest.made.get("sweeps")
+    if not isinstance(kept, str):
+        return None
+    try:
+        found, of = repeats.seen(sweeps, kept)
+    except ValueError as e:
+        raise FormatError(
+            f"the digests of training sweeps in the manifest of {manifest.name} cannot be read "
+            f"({e}); export it again"
+        ) from e
+    return {"sweeps": found, "of": of}
 
 
 def run_bridge(args: argparse.Namespace) -> None:

@@ -12,7 +12,9 @@ from appliance.core.errors import FormatError
 from appliance.core.storage import put
 from train.arguments import options
 from train.arguments.types import Add
-from train.evaluation import evaluate
+from train.data.sets import Dataset
+from train.evaluation import evaluate, traps, trivial
+from train.export import box_answers
 from train.models import methods
 
 
@@ -60,6 +62,11 @@ def _add_grid(command: argparse.ArgumentParser) -> None:
         "--remove-means", action="store_true", help="subtract the mean of each taxel in each window"
     )
     command.add_argument(
+        "--label-alone",
+        action="store_true",
+        help="leave out the answers of the box, which take most of the time",
+    )
+    command.add_argument(
         "--seeds",
         type=int,
         default=1,
@@ -91,6 +98,8 @@ def run_evaluate(args: argparse.Namespace) -> None:
 
     Raises FormatError at the end if a method was left out.
     """
+    if args.json:
+        options.writable_file(args.json, "--json", ".json")
     sweeps = options.load(args)
     names = options.names(args)
     if args.each < 0:
@@ -98,20 +107,25 @@ def run_evaluate(args: argparse.Namespace) -> None:
             f"--each {args.each} is out of range; use 1 or more, or leave it out for all"
         )
     seeds, effort = options.seeds(args), options.effort(args)
-    plan = evaluate.Plan(names, tuple(args.protocols), seeds, args.remove_means, effort, args.each)
+    # the box sees raw counts
+    box = None if args.remove_means or args.label_alone else box_answers.answers
+    protocols = tuple(args.protocols)
+    plan = evaluate.Plan(names, protocols, seeds, args.remove_means, effort, args.each, box)
     results: list[dict[str, Any]] = []
     refused: dict[str, str] = {}
     log = options.Log()
-    print(evaluate.HEADER)
+    trivially = _beside(sweeps, plan, log)
     for result in evaluate.evaluate(sweeps, plan, options.where(args), log):
         if result.refused:
             if result.method not in refused:
                 log.keep(f"{result.method} cannot be used here: {result.refused}; left out")
             refused.setdefault(result.method, result.refused)
             continue
-        results.append(result.json() | {"only": args.only, "each": args.each})
+        about = {"only": args.only, "each": args.each, "baselines": trivially[result.protocol]}
+        results.append(result.json() | about)
         print(evaluate.line(results[-1]), flush=True)
         if args.json:
+            results[-1] |= {"each_fold": result.each_fold()}
             results.sort(
                 key=lambda r: (
                     args.protocols.index(r["protocol"]),
@@ -124,6 +138,21 @@ def run_evaluate(args: argparse.Namespace) -> None:
         raise FormatError(
             f"{', '.join(refused)} left out of {', '.join(names)}; the lines above say why"
         )
+
+
+def _beside(sweeps: Dataset, plan: evaluate.Plan, log: options.Log) -> dict[str, Any]:
+    """The figures of trivial baselines by protocol, with the first seed. Prints them under the
+    header, after warnings about the protocols' folds."""
+    known = sweeps.without_means() if plan.means_removed else sweeps
+    folds = {text: plan.folds(sweeps, text, plan.seeds[0]) for text in plan.protocols}
+    for text in plan.protocols:
+        for line in traps.of_protocol(sweeps, text, folds[text]):
+            log.keep(f"palpate-train: {line}")
+    found = {text: trivial.figures(known, folds[text]) for text in plan.protocols}
+    print(evaluate.HEADER)
+    for text in plan.protocols:
+        print(*trivial.lines(text, plan.means_removed, found[text]), sep="\n", flush=True)
+    return found
 
 
 def _write(path: Path, results: Iterable[dict[str, Any]]) -> None:

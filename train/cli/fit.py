@@ -17,6 +17,7 @@ from train.arguments.types import Add
 from train.data import labels
 from train.data.sets import Dataset, digest
 from train.data.transforms import WHOLE, Change
+from train.evaluation import trivial
 from train.evaluation.evaluate import CACHE
 from train.evaluation.fold import fingerprint
 from train.metrics import score
@@ -51,6 +52,14 @@ def register(add: Add) -> None:
     )
     command.add_argument(
         "--rest", type=Path, metavar="FILE", help="write what --split left out as a sweep set"
+    )
+    command.add_argument(
+        "--varies",
+        type=lambda text: tuple(text.split(",")),
+        default=(),
+        metavar="GROUP,...",
+        help="groups that will have other values in service, e.g. force,speed; each is held out "
+        "for the limits and for the printed accuracy (default: all that can be)",
     )
     _add_use(command)
     _add_dial(command)
@@ -163,6 +172,9 @@ def run(args: argparse.Namespace) -> None:
     unfinished.unlink(missing_ok=True)
     print(f"fit: {len(made.train)} sweeps, {made.train.format}; {args.out}")
     _print_held_out(made)
+    if beside := trivial.beside_a_fit(sweeps, args.varies):
+        told = "; ".join(f"{name} {formatting.counted(figure)}" for name, figure in beside.items())
+        print(f"trivial baselines on held-out parts: {told}")
     if args.rest and rest:
         command = f"palpate-train score BUNDLE --set {shlex.quote(str(args.rest))}"
         print(
@@ -180,9 +192,9 @@ def _check(args: argparse.Namespace) -> None:
         raise FormatError("--rest needs --split; without it nothing is left over")
     if args.slower and not args.budget_ms:
         raise FormatError("--slower needs --budget-ms; without a limit of time it changes nothing")
-    for option in ("out", "rest"):
+    for option, endings in (("out", (".npz",)), ("rest", options.SET_FILES)):
         if path := getattr(args, option):
-            options.writable_file(path, f"--{option}")
+            options.writable_file(path, f"--{option}", *endings)
 
 
 def _fitted(args: argparse.Namespace, sweeps: Dataset) -> tuple[Fit, Change, Path]:
@@ -191,7 +203,11 @@ def _fitted(args: argparse.Namespace, sweeps: Dataset) -> tuple[Fit, Change, Pat
     use = SkinUse(args.reattached, float(args.mains), args.displaced, args.stretch)
     unfinished = _unfinished(args, sweeps, use)
     settings = recipe.Settings(
-        args.steps, unfinished=unfinished, size=SIZES.get(args.size, UNLIMITED), use=use
+        args.steps,
+        unfinished=unfinished,
+        size=SIZES.get(args.size, UNLIMITED),
+        use=use,
+        varies=args.varies,
     )
     wish = (args.budget_ms, args.budget_kb, args.accuracy, args.reduce)
     if any(wish):
@@ -255,7 +271,7 @@ def _origin(args: argparse.Namespace, sweeps: Dataset, budget: Budget) -> Json:
 def _unfinished(args: argparse.Namespace, sweeps: Dataset, use: SkinUse) -> Path:
     """The file that keeps a training until the fit is written. Its name is a fingerprint of all
     that the training depends on."""
-    about = [digest(sweeps), args.seed, args.size, args.steps, asdict(use)]
+    about = [digest(sweeps), args.seed, args.size, args.steps, args.varies, asdict(use)]
     return (
         CACHE
         / f"{fingerprint(about, 'train.models.recipe.recipe', 'train.models.recipe.stages')}.pt"
@@ -271,18 +287,30 @@ def _print_held_out(made: Fit) -> None:
             f"{made.uncalibrated}"
         )
         return
-    by = f"held-out {made.about['held_out_by']}"
+    conditions = made.about["conditions"]
+    if conditions == ["recording"]:
+        print(
+            "recorded under one condition: expect less under another; these figures are optimistic"
+        )
     print(
-        f"{by}: sweeps of this set, by heads that did not see them; slightly too high, since "
-        "they also helped to choose the model"
+        f"held-out {', '.join(conditions)}: sweeps of this set, by heads that did not see their "
+        f"{' or '.join(conditions)}; slightly too high, since they also helped to choose the model"
     )
+    for name in conditions:
+        if name != "recording" and len(made.values(name)) == 2:
+            print(
+                f"there are two values of {name}: its figures are of heads that know only one, "
+                "so expect more"
+            )
     if made.calibration:
-        print(*formatting.figure_lines(made.held_out_figures(by)), sep="\n")
+        print(*formatting.figure_lines(figures := made.held_out_figures()), sep="\n")
+        if len(conditions) > 1:
+            mean = sum(figures[f"held-out {name}"]["accuracy"] for name in conditions)
+            share = formatting.percent(mean / len(conditions))
+            print(f"to expect where one of these is new, as the box answers: {share} (their mean)")
     else:  # too few sweeps to judge by
         alone = formatting.counted(made.about["validation"])
-        print(
-            f"{by}, network alone: {alone}; nothing judges the box's answers: {made.uncalibrated}"
-        )
+        print(f"network alone: {alone}; nothing judges the box's answers: {made.uncalibrated}")
 
 
 def _by_share(text: str) -> tuple[str, float]:

@@ -12,9 +12,10 @@ from appliance.core.storage import put
 from appliance.core.types import DATA_TYPES
 from train.arguments import numbers, options
 from train.arguments.types import Add
-from train.data import labels, summary
-from train.data.file_names import EXAMPLE, NamePattern
-from train.data.importing import Cut, Imported, ImportPlan, LeftOut, Length, import_folder
+from train.data import labels, lerobot, summary
+from train.data.file_names import EXAMPLE, GROUP, NamePattern
+from train.data.import_plan import ImportPlan, Length
+from train.data.importing import Cut, Imported, LeftOut, import_folder
 
 SHOWN = 5
 """Largest number of files with a line each that were left out for the same reason."""
@@ -28,9 +29,15 @@ def register(add: Add) -> None:
     )
     command.add_argument(
         "--pattern",
-        required=True,
         metavar="PATTERN",
         help=f"meaning of the names below FOLDER: {EXAMPLE}, '{{material}}/{{speed}}/{{}}.csv'",
+    )
+    command.add_argument(
+        "--field",
+        action="append",
+        default=[],
+        metavar="NAME=COLUMN",
+        help="a column that holds a field of each frame: material=label, session=date",
     )
     command.add_argument(
         "--out", type=Path, required=True, metavar="SET", help="the sweep set (.npz, .h5)"
@@ -56,6 +63,15 @@ def _add_layout(command: argparse.ArgumentParser) -> None:
     )
     command.add_argument(
         "--variable", default="", metavar="NAME", help="the array to read if a file holds several"
+    )
+    command.add_argument(
+        "--axes",
+        default="",
+        metavar="AXES",
+        help="the axes of an array in their order: row,column,frame",
+    )
+    command.add_argument(
+        "--decimal", default="", metavar="SIGN", help="the decimal sign of texts, . or ,"
     )
     command.add_argument("--transpose", action="store_true", help="arrays are taxels x frames")
     command.add_argument(
@@ -96,22 +112,10 @@ def run(args: argparse.Namespace) -> None:
 
     Raises FormatError at the end if a file was broken.
     """
-    plan = ImportPlan(
-        NamePattern(args.pattern),
-        args.grid,
-        args.columns,
-        args.time,
-        args.rate,
-        Length(args.window, "--window"),
-        Length(args.every, "--every") if args.every else None,
-        args.dtype,
-        args.variable,
-        args.transpose,
-        labels.parse_renames(args.rename),
-    )
-    for option in ("out", "report"):
+    plan = _plan(args)
+    for option, endings in (("out", options.SET_FILES), ("report", ())):
         if path := getattr(args, option):
-            options.writable_file(path, f"--{option}")
+            options.writable_file(path, f"--{option}", *endings)
     left_out: list[LeftOut] = []
     taken: Sequence[Cut] = ()
     try:
@@ -121,13 +125,45 @@ def run(args: argparse.Namespace) -> None:
     finally:
         print(*_left_out(left_out), sep="\n", end="\n" * bool(left_out))
         if args.report:
-            put(args.report, _report(taken, left_out).encode())
-    print("\n".join([*_taken(made), *summary.description(made.sweeps, {}), f"set: {args.out}"]))
+            put(args.report, _report(taken, left_out).encode(errors="replace"))
+    print("\n".join([*_taken(made), *summary.description(made.sweeps), f"set: {args.out}"]))
     if broken := sum(one.broken for one in left_out):
         raise FormatError(
             f"{broken} of {broken + len(taken)} files could not be used, as said above; "
             f"{args.out} is of the others"
         )
+
+
+def _plan(args: argparse.Namespace) -> ImportPlan:
+    """The options as a plan. A LeRobot data set states its frame rate."""
+    fields = dict(_field(text) for text in args.field)
+    rate = args.rate
+    if not (args.pattern or args.time or rate) and lerobot.is_data_set(args.folder):
+        rate = lerobot.rate_hz(args.folder)
+    return ImportPlan(
+        NamePattern(args.pattern, tuple(fields)) if args.pattern else None,
+        args.grid,
+        args.columns,
+        args.time,
+        rate,
+        Length(args.window, "--window"),
+        Length(args.every, "--every") if args.every else None,
+        args.dtype,
+        args.variable,
+        args.transpose,
+        labels.parse_renames(args.rename),
+        args.axes,
+        args.decimal,
+        fields,
+    )
+
+
+def _field(text: str) -> tuple[str, str]:
+    """Name and column of a text NAME=COLUMN."""
+    name, separator, column = text.partition("=")
+    if not (separator and column and GROUP.fullmatch(name)) or name == "recording":
+        raise FormatError(f"--field {text!r} cannot be read; write NAME=COLUMN: material=label")
+    return name, column
 
 
 def _left_out(left_out: Sequence[LeftOut]) -> list[str]:
@@ -152,6 +188,13 @@ def _taken(made: Imported) -> list[str]:
     for what in ("interpolated onto even times", "gaps"):
         if n := sum(what in cut.notes for cut in made.taken):
             lines.append(f"  {n} of them: {what}")
+    said = [(cut.recording.name, note) for cut in made.taken for note in cut.recording.notes]
+    notes = Counter(note for _, note in said)
+    for note, n in list(notes.items())[:SHOWN]:
+        name = next(name for name, other in said if other == note)
+        lines.append(f"  {name}: {note}" + f" ({n} files)" * (n > 1))
+    if len(notes) > SHOWN:
+        lines.append(f"  {len(notes) - SHOWN} more remarks; --report FILE lists all")
     return [*lines, *(f"  {note}" for note in made.notes)]
 
 

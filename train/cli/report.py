@@ -51,9 +51,9 @@ def register(add: Add) -> None:
 
 def run_report(args: argparse.Namespace) -> None:
     """Measure, train, write the page and print its path."""
-    for option in ("out", "json"):
+    for option, *endings in (("out", ".html", ".htm"), ("json", ".json")):
         if path := getattr(args, option):
-            options.writable_file(path, f"--{option}")
+            options.writable_file(path, f"--{option}", *endings)
     sweeps, log = options.load(args), options.Log()
     train = sets.join([sets.load(spec, 1) for spec in args.train]) if args.train else None
     with tempfile.TemporaryDirectory() as folder:

@@ -9,8 +9,8 @@ from appliance.core.errors import FormatError
 from appliance.core.storage import put
 from train.arguments import numbers, options
 from train.arguments.types import Add
-from train.calibration import level_check
 from train.data import pull, summary
+from train.evaluation import traps
 from train.reports import sweep_pages, sweep_plot
 
 
@@ -83,7 +83,7 @@ def run_known(args: argparse.Namespace) -> None:
 
 def run_describe(args: argparse.Namespace) -> None:
     """Print the content of the named sets."""
-    print("\n\n".join(summary.describe(spec, level_check.warnings_of) for spec in args.sets))
+    print("\n\n".join(summary.describe(spec, traps.of_set) for spec in args.sets))
 
 
 def run_view(args: argparse.Namespace) -> None:

@@ -7,15 +7,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
-from train.data.readers import NUMBER, numbered
+from train.data.files.table import normal
+from train.data.group_values import declared, measured, unit_after, unit_in_name
 
 FIELD = re.compile(r"\{(\w*)(?::([^{}]*))?\}")
 KINDS = {"": r"[^/]+", "d": r"-?\d+", "f": r"-?\d+(?:\.\d+)?"}
@@ -28,19 +27,22 @@ EXAMPLE = "'{material}_{force:d}N_{trial}.csv'"
 class NamePattern:
     """A pattern over paths below a folder; `{}` matches text that is ignored.
 
+    elsewhere: names of fields that stand elsewhere, so that the pattern need not hold them.
     Raises FormatError if the pattern cannot be read.
     """
 
     text: str
+    elsewhere: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "text", normal(self.text))
         names = self.names
         rest = FIELD.sub("", self.text)
         if "{" in rest or "}" in rest:
             raise FormatError(
                 f"--pattern {self.text!r} has an unmatched brace; write e.g. {EXAMPLE}"
             )
-        if "material" not in names:
+        if "material" not in (*names, *self.elsewhere):
             raise FormatError(
                 f"--pattern {self.text!r} does not say where the material stands; "
                 f"write e.g. {EXAMPLE}"
@@ -65,12 +67,21 @@ class NamePattern:
     def names(self) -> list[str]:
         return [name for name, _ in FIELD.findall(self.text) if name]
 
+    def kind(self, name: str) -> str:
+        """The kind of the field `name`, of KINDS."""
+        return next(found[2] or "" for found in FIELD.finditer(self.text) if found[1] == name)
+
+    def behind(self, name: str) -> str:
+        """The text of the pattern behind the field `name`, up to the next field."""
+        end = next(found.end() for found in FIELD.finditer(self.text) if found[1] == name)
+        return self.text[end:].partition("{")[0]
+
     def read(self, path: str) -> dict[str, str] | None:
         """The fields of a path, or None if it does not match the pattern.
 
         Raises FormatError if it matches in several ways.
         """
-        short, long = (re.fullmatch(self._expression(how), path) for how in ("+?", "+"))
+        short, long = (re.fullmatch(self._expression(how), normal(path)) for how in ("+?", "+"))
         if not (short and long):
             return None
         if short.groups() != long.groups():
@@ -99,18 +110,17 @@ class NamePattern:
         return "".join([*parts, re.escape(self.text[end:])])
 
 
-def group(texts: Sequence[str]) -> tuple[NDArray[Any], str]:
-    """A number for each text [N], and an explanation of the numbers.
+def group(pattern: NamePattern | None, name: str, texts: Sequence[str]) -> tuple[NDArray[Any], str]:
+    """The values [N] of the field `name`, whose `texts` stand in N names if the pattern has it, and
+    their unit, "" if no name gives one.
 
-    Whole numbers keep their value, and the explanation is "". Other texts get their rank: by
-    value if all are numbers, else by alphabet.
+    The unit stands behind the field in the pattern, as in {force:d}N, in every text, as in 5N, or
+    at the end of the field's name, as in speed_mm_s.
     """
-    different = sorted(set(texts))
-    if all(map(NUMBER.fullmatch, different)):
-        return numbered(texts), ""
-    with suppress(ValueError):  # some are not numbers
-        different = sorted(different, key=float)
-    rank = {text: i for i, text in enumerate(different)}
-    return np.array([rank[text] for text in texts]), ", ".join(
-        f"{i} = {text}" for text, i in rank.items()
-    )
+    of_name = pattern if pattern and name in pattern.names else None
+    kind = of_name.kind(name) if of_name else ""
+    values, unit = (declared(texts, kind), "") if kind else measured(texts)
+    if values.dtype.kind == "U":
+        return values, ""
+    behind = unit_after(of_name.behind(name)) if of_name else ""
+    return values, unit or behind or unit_in_name(name)

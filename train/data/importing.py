@@ -6,10 +6,10 @@ with missing or ambiguous information is left out, and the report says why.
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from fnmatch import fnmatchcase
+import hashlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,108 +18,29 @@ from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
 from appliance.core.types import DATA_TYPES
-from train.data import labels, raw_files, readers, sampling
-from train.data.file_names import NamePattern, group
+from train.data import frames, labels, lerobot, raw_files, readers, sampling
+from train.data.file_names import group
+from train.data.files.table import Table, Wanted, normal
+from train.data.import_plan import ImportPlan
 from train.data.progress import Progress
-from train.data.raw_files import Table
 from train.data.sets import Dataset
 
 Array = NDArray[Any]
-GRID = re.compile(r"[1-9]\d{0,2}x[1-9]\d{0,2}(x[1-8])?")
-LENGTH = re.compile(r"(\d+(?:\.\d+)?)(ms|s)|([1-9]\d*)")
-RANGE = re.compile(r"([1-9]\d*)(?:-([1-9]\d*))?")
-
-
-@dataclass(frozen=True)
-class Length:
-    """A length of time, in seconds, milliseconds or frames. option: its name in error messages.
-
-    Raises FormatError if the text is not a length.
-    """
-
-    text: str
-    option: str
-
-    def __post_init__(self) -> None:
-        if not (found := LENGTH.fullmatch(self.text)) or not float(found[1] or found[3]):
-            raise FormatError(
-                f"{self.option} {self.text} cannot be read; "
-                "write 2s, 500ms, or a number of frames, 1500"
-            )
-
-    def frames(self, rate_hz: float) -> int:
-        """The length in frames, at least 1."""
-        found = LENGTH.fullmatch(self.text)
-        assert found
-        if found[3]:
-            return int(found[3])
-        return max(round(float(found[1]) * rate_hz * (1e-3 if found[2] == "ms" else 1)), 1)
-
-
-@dataclass(frozen=True)
-class ImportPlan:
-    """How files become sweeps; each attribute is an option of `palpate-train import`.
-
-    grid: ROWSxCOLUMNS or ROWSxCOLUMNSxAXES, "" if the arrays already have that shape.
-    columns: the taxels' columns, "" for all except the time.
-    time: COLUMN:UNIT; rate_hz: frames per second. One of the two is needed.
-    every: from the start of one window to the start of the next; None takes only the middle
-    window.
-    dtype: data type of the counts, "" to keep the recorded type.
-    variable: the array to read from a file with several.
-    transpose: whether files hold taxels x frames.
-    renames: new names of materials by their old names.
-    Raises FormatError if an option cannot be read.
-    """
-
-    pattern: NamePattern
-    grid: str = ""
-    columns: str = ""
-    time: str = ""
-    rate_hz: float | None = None
-    window: Length = Length("2s", "--window")
-    every: Length | None = None
-    dtype: str = ""
-    variable: str = ""
-    transpose: bool = False
-    renames: Mapping[str, str] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        if self.grid and not GRID.fullmatch(self.grid):
-            raise FormatError(
-                f"--grid {self.grid} cannot be read; "
-                "write ROWSxCOLUMNS or ROWSxCOLUMNSxAXES: 4x4, 4x4x3"
-            )
-        if not self.time and not self.rate_hz:
-            raise FormatError(
-                "the frame rate is not known; give --rate HZ, or --time COLUMN:UNIT if a column "
-                "holds times"
-            )
-        if self.time and self.time.rpartition(":")[2] not in sampling.UNITS_S:
-            raise FormatError(
-                f"--time {self.time} names no unit; write {self.time}:s, :ms, :us or :ns"
-            )
-        if self.dtype and self.dtype not in DATA_TYPES:
-            raise FormatError(
-                f"--dtype {self.dtype} is unknown; use one of {', '.join(DATA_TYPES)}"
-            )
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Rows, columns, and axes if there are several; () without --grid."""
-        rows_columns_axes = tuple(map(int, self.grid.split("x"))) if self.grid else ()
-        return rows_columns_axes[:2] if rows_columns_axes[2:] == (1,) else rows_columns_axes
+Fields = dict[str, str]
+Source = tuple[str, Fields, Callable[[], Table]]
+"""Name of a recording, its fields that are known already, and a function that reads it."""
 
 
 @dataclass(frozen=True)
 class Recording:
     """The contents of one file. frames: [n, R, C] or [n, R, C, A], as recorded. time_s: [n], or
-    None if the file holds no times."""
+    None if the file holds no times. notes: remarks of the reader."""
 
     name: str
-    fields: Mapping[str, str]
+    fields: Fields
     frames: Array
     time_s: Array | None
+    notes: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -160,168 +81,128 @@ def import_folder(
     even after an error. Raises FormatError if the box cannot send a material's name, or if no file
     remains.
     """
-    named = _named(folder, plan, left_out)
-    recordings, progress = [], Progress(len(named), log)
-    for name, fields in named.items():
-        progress.begin(name)
+    if plan.pattern is None and lerobot.is_data_set(folder):
+        plan = lerobot.with_grid(folder, plan)
+        sources = _episodes(folder, plan)
+    else:
+        sources = _files(_named(folder, plan, left_out), plan, log)
+    recordings, count = [], 0
+    for name, known, read in sources:
+        count += 1
         try:
-            recordings.append(_recording(folder / name, name, fields, plan))
+            recordings += _recordings(read(), name, known, plan)
         except FormatError as e:
             left_out.append(LeftOut(name, str(e), broken=True))
+    if "material" in plan.fields and recordings:
+        _name_materials(folder, [one.fields for one in recordings], plan)
     cuts, rate_hz = _cuts(recordings, plan, left_out)
+    cuts, doubts = _without_copies(cuts, left_out)
     dtype, about = _common_type(cuts, plan.dtype, left_out)
     cuts = [cut for cut in cuts if cut.recording.name not in {file.name for file in left_out}]
     if not cuts:
         raise FormatError(
-            f"{folder}: none of {len(named)} files could be imported; the messages above say why"
+            f"{folder}: none of {count} files could be imported; the messages above say why"
         )
     sweeps, notes = _set(folder, cuts, rate_hz, dtype, plan)
-    return Imported(sweeps, cuts, left_out, [about, *notes])
+    return Imported(sweeps, cuts, left_out, [about, *doubts, *notes])
 
 
-def _named(folder: Path, plan: ImportPlan, left_out: list[LeftOut]) -> dict[str, dict[str, str]]:
-    """The fields of each file whose name matches the pattern, by its path below `folder`.
+def _named(
+    folder: Path, plan: ImportPlan, left_out: list[LeftOut]
+) -> dict[str, tuple[Path, Fields]]:
+    """Path and fields of each file whose name matches the pattern, by its path below `folder`.
 
-    Materials have their new names.
+    Materials have their new names. Files that only systems and editors read are passed over.
     """
     if not folder.is_dir():
         raise FormatError(f"{folder} is not a folder; name the folder that holds the recordings")
     readers.check_folder(folder)
-    paths = sorted(path for path in folder.rglob("*") if path.is_file())
-    names = [
-        name for path in paths if not (name := path.relative_to(folder).as_posix()).startswith(".")
-    ]
-    found: dict[str, dict[str, str]] = {}
-    for name in names:
+    paths = {normal(p.relative_to(folder).as_posix()): p for p in readers.files_below(folder)}
+    found: dict[str, tuple[Path, Fields]] = {}
+    for name, path in paths.items():
         try:
-            if fields := plan.pattern.read(name):
-                found[name] = fields
+            if plan.pattern is None:
+                found[name] = path, {}
+            elif fields := plan.pattern.read(name):
+                found[name] = path, fields
             else:
                 left_out.append(LeftOut(name, "its name does not match the pattern"))
         except FormatError as e:
             left_out.append(LeftOut(name, str(e), broken=True))
     if not found:
-        first = f"the first file is {names[0]!r}" if names else "it holds no files"
-        raise FormatError(f"{folder}: no file matches --pattern {plan.pattern.text!r}; {first}")
-    labels.check_renames(plan.renames, (fields["material"] for fields in found.values()))
-    for fields in found.values():
+        first = f"the first file is {next(iter(paths))!r}" if paths else "it holds no files"
+        pattern = f"matches --pattern {plan.pattern.text!r}" if plan.pattern else "is there"
+        raise FormatError(f"{folder}: no file {pattern}; {first}")
+    if "material" not in plan.fields:
+        _name_materials(folder, [fields for _, fields in found.values()], plan)
+    return found
+
+
+def _name_materials(folder: Path, known: Sequence[Fields], plan: ImportPlan) -> None:
+    """Give materials their new names. Raises FormatError for a name that does not occur, and for
+    materials that the box cannot send."""
+    labels.check_renames(plan.renames, (fields["material"] for fields in known))
+    for fields in known:
         fields["material"] = plan.renames.get(fields["material"], fields["material"])
-    if why := labels.unsendable(sorted({fields["material"] for fields in found.values()})):
+    if why := labels.unsendable(sorted({fields["material"] for fields in known})):
         raise FormatError(f"{folder}: {why}; {labels.REMEDY}")
-    return found
 
 
-def _recording(path: Path, name: str, fields: Mapping[str, str], plan: ImportPlan) -> Recording:
-    table = raw_files.read(path, plan.variable)
-    values = table.values.T if plan.transpose else table.values
-    if values.dtype.kind == "b":
-        values = values.astype(np.uint8)
-    if values.dtype.kind not in "iuf" or values.ndim < 2 or not values.size:
-        raise FormatError(
-            f"holds {values.dtype} {list(values.shape)}; give an array of frames x taxels"
-        )
-    at, time_s = _times(values, table, plan)
-    frames = _frames(values, table, plan, at)
-    if not np.isfinite(frames).all():
-        index = np.argwhere(~np.isfinite(frames))[0]
-        taxel = ", ".join(map(str, index[1:] + 1))
-        raise FormatError(
-            f"frame {index[0] + 1}, taxel {taxel} is {frames[tuple(index)]}; "
-            "fill it in or cut it away"
-        )
-    return Recording(name, fields, frames, time_s)
+def _files(
+    named: Mapping[str, tuple[Path, Fields]], plan: ImportPlan, log: Callable[[str], None]
+) -> Iterator[Source]:
+    """The files of a folder; each is read when it is its turn."""
+    progress = Progress(len(named), log)
+    wanted = Wanted(plan.variable, plan.time.rpartition(":")[0], plan.decimal)
+    for name, (path, fields) in named.items():
+        progress.begin(name)
+        yield name, fields, partial(raw_files.read, path, wanted)
 
 
-def _times(values: Array, table: Table, plan: ImportPlan) -> tuple[int | None, Array | None]:
-    """The number of the time column, None if `values` has no such column, and the times [n] in
-    seconds."""
-    if not plan.time:
-        return None, None
-    name, _, unit = plan.time.rpartition(":")
-    if name in table.vectors:
-        time_s = table.vectors[name] * sampling.UNITS_S[unit]
-        if len(time_s) != len(values):
-            raise FormatError(f"{name} holds {len(time_s)} times, there are {len(values)} frames")
-        return None, time_s
-    if values.ndim != 2:
-        raise FormatError(
-            f"has no times {name!r}; beside the frames it has "
-            f"{', '.join(table.vectors) or 'nothing'}"
-        )
-    (at,) = _columns(name, table.columns, values.shape[1], "--time", 1)
-    return at, values[:, at] * sampling.UNITS_S[unit]
+def _episodes(folder: Path, plan: ImportPlan) -> Iterator[Source]:
+    for name, table in lerobot.episodes(folder, plan):
+        yield name, {}, partial(replace, table)
 
 
-def _frames(values: Array, table: Table, plan: ImportPlan, time_column: int | None) -> Array:
-    """The counts of the taxels, [n, R, C] or [n, R, C, A]."""
-    shape = plan.shape
-    if values.ndim > 2:
-        if plan.columns or (shape and values.shape[1:] != shape):
-            raise FormatError(
-                f"holds frames of shape {list(values.shape[1:])}; "
-                "leave --columns out, and leave --grid out or give that shape"
-            )
-        return values
-    if not shape:
-        raise FormatError(
-            f"has {values.shape[1]} columns; give their layout with --grid, e.g. 4x4 for 16 taxels"
-        )
-    wide, want = values.shape[1], int(np.prod(shape))
-    if plan.columns:
-        numbers = _columns(plan.columns, table.columns, wide, "--columns")
-    else:
-        numbers = [i for i in range(wide) if i != time_column]
-    if len(numbers) != want:
-        which = (
-            "--columns names"
-            if plan.columns
-            else "it has"
-            if time_column is None
-            else "beside the time it has"
-        )
-        advice = (
-            f"it has {want} rows, so add --transpose"
-            if len(values) == want
-            else "see --columns and --grid"
-        )
-        raise FormatError(
-            f"{which} {len(numbers)} columns, but a grid of {plan.grid} needs {want}; {advice}"
-        )
-    return values[:, numbers].reshape(len(values), *shape)
+def _recordings(table: Table, name: str, known: Fields, plan: ImportPlan) -> list[Recording]:
+    """The recordings in a table; several if a column of --field changes its value."""
+    counts, time_s, notes = frames.frames(table, plan)
+    parts = frames.fields(table, plan.fields, len(counts))
+    made = []
+    for part, found in parts:
+        at = f"{name} [{part.start + 1}-{part.stop}]" if len(parts) > 1 else name
+        times = None if time_s is None else time_s[part]
+        said = (*table.notes, *notes)
+        made.append(Recording(at, {**known, **found}, counts[part], times, said))
+    return made
 
 
-def _columns(
-    text: str, names: Sequence[str], wide: int, option: str, most: int = 1 << 20
-) -> list[int]:
-    """Column numbers, from 0, for a comma-separated list `text`.
+def _without_copies(cuts: Sequence[Cut], left_out: list[LeftOut]) -> tuple[list[Cut], list[str]]:
+    """The windows without those of recordings that repeat the frames of another of their material.
 
-    Each entry is a name, a name with *, a number from 1, or a range such as 2-17.
+    A copy under another material stays, with a remark: only the user knows which name is wrong.
     """
-    found: list[int] = []
-    for part in (text,) if text in names else text.split(","):
-        if part in names:
-            found.append(names.index(part))
-        elif number := RANGE.fullmatch(part):
-            first, last = int(number[1]), int(number[2] or number[1])
-            if not first <= last <= wide:
-                raise FormatError(f"{option} {part}: it has {wide} columns")
-            found += range(first - 1, last)
-        elif matching := [
-            i for i, name in enumerate(names) if "*" in part and fnmatchcase(name, part)
-        ]:
-            found += matching
-        else:
-            known = (
-                f"its columns are {', '.join(names)}"
-                if names
-                else f"its {wide} columns have no names: use numbers"
-            )
-            raise FormatError(f"{option}: there is no column {part!r}; {known}")
-    if len(set(found)) < len(found) or len(found) > most:
-        raise FormatError(
-            f"{option} {text} names {'a column twice' if len(found) <= most else 'several columns'}"
-        )
-    return found
+    kept: list[Cut] = []
+    doubts: list[str] = []
+    seen: dict[bytes, dict[str, Recording]] = {}
+    for cut in cuts:
+        one = cut.recording
+        content = np.ascontiguousarray(one.frames, np.float64)
+        key = hashlib.sha256(repr(content.shape).encode() + content.tobytes()).digest()
+        same = seen.setdefault(key, {})
+        material = one.fields["material"]
+        if material in same:
+            why = f"holds the same frames as {same[material].name}, which counts once"
+            left_out.append(LeftOut(one.name, why))
+            continue
+        doubts += [
+            f"warning: {one.name} holds the same frames as {other.name}, of {name}: "
+            "one of the two names is wrong"
+            for name, other in same.items()
+        ]
+        same[material] = one
+        kept.append(cut)
+    return kept, doubts
 
 
 def _cuts(
@@ -373,9 +254,11 @@ def _cut(one: Recording, runs: sampling.Runs, rate_hz: float, plan: ImportPlan) 
         windows = np.rint(windows)  # whole counts stay whole
     if one.frames.dtype.kind in "iu":
         windows = windows.astype(one.frames.dtype)
-    notes = ["interpolated onto even times"] * runs.interpolated + [f"{runs.gaps} gaps"] * (
-        runs.gaps > 0
-    )
+    notes = [
+        *one.notes,
+        *["interpolated onto even times"] * runs.interpolated,
+        *[f"{runs.gaps} gaps"] * (runs.gaps > 0),
+    ]
     return Cut(one, windows, ", ".join(notes))
 
 
@@ -441,7 +324,7 @@ def _why_not(counts: Array, dtype: str) -> str:
 def _set(
     folder: Path, cuts: Sequence[Cut], rate_hz: float, dtype: str, plan: ImportPlan
 ) -> tuple[Dataset, list[str]]:
-    """All windows as one set, and notes that explain the numbers of its groups."""
+    """All windows as one set, and notes about the units of its groups."""
     shapes = {cut.windows.shape[2:] for cut in cuts}
     if len(shapes) > 1:
         raise FormatError(
@@ -451,14 +334,21 @@ def _set(
     count = [len(cut.windows) for cut in cuts]
     materials = sorted({cut.recording.fields["material"] for cut in cuts})
     numbers = np.array([materials.index(cut.recording.fields["material"]) for cut in cuts])
-    groups, notes = {"recording": np.repeat(np.arange(len(cuts)), count)}, []
-    for name in plan.pattern.names:
+    groups, units = {"recording": np.repeat(np.arange(len(cuts)), count)}, dict[str, str]()
+    for name in plan.names:
         if name != "material":
-            values, meaning = group([cut.recording.fields[name] for cut in cuts])
+            texts = [cut.recording.fields[name] for cut in cuts]
+            values, unit = group(plan.pattern, name, texts)
             groups[name] = np.repeat(values, count)
-            notes += [f"{name}: {meaning}"] if meaning else []
+            units |= {name: unit} if unit else {}
     samples = np.concatenate([cut.windows.astype(dtype) for cut in cuts])
     sweeps = Dataset(
-        samples, np.repeat(numbers, count), tuple(materials), rate_hz, groups, str(folder)
+        samples,
+        np.repeat(numbers, count),
+        tuple(materials),
+        rate_hz,
+        groups,
+        str(folder),
+        units=units,
     )
-    return sweeps, notes
+    return sweeps, [f"{name} is in {unit}, as its name says" for name, unit in units.items()]

@@ -10,6 +10,7 @@ import numpy as np
 from appliance.bundle.manifest import LABEL
 from appliance.core.errors import FormatError
 from appliance.core.schema import closest
+from train.data.files.table import normal
 from train.data.sets import Dataset
 
 ALLOWED = "1 to 24 letters, digits, spaces, '.', '_' or '-', the first a letter or a digit"
@@ -39,7 +40,7 @@ def parse_renames(texts: Sequence[str]) -> dict[str, str]:
     """
     pairs: dict[str, str] = {}
     for text in texts:
-        old, separator, new = text.rpartition("=")
+        old, separator, new = normal(text).rpartition("=")
         if not (separator and old and new):
             raise FormatError(f"--rename {text!r} cannot be read; write OLD=NEW")
         if pairs.setdefault(old, new) != new:

@@ -7,7 +7,6 @@ unpickled, and nothing outside the named file or folder is read.
 from __future__ import annotations
 
 import math
-import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,9 +17,10 @@ import numpy as np
 
 from appliance.core.errors import FormatError
 from appliance.core.sweep_set import Array, Set, build, load_file
-from appliance.core.types import Status, Sweep, SweepFormat, sidecar
+from appliance.core.types import LARGEST_READING, Status, Sweep, SweepFormat, sidecar
 from appliance.core.types import load as load_recording
 from appliance.signal.unloaded import UnloadedSkin
+from train.data.group_values import typed
 
 if TYPE_CHECKING:
     import h5py
@@ -34,14 +34,19 @@ NAMED_GROUPS = ("position", "session")
 """Names that a recording can have beside its material. Each becomes a group."""
 SLIDE_GROUPS = {"speed": "speed_mm_s", "force": "force_n"}
 """Groups of the speed and the force of the slide, in thousandths: um/s and mN."""
+SLIDE_UNITS = {"speed": "um/s", "force": "mN"}
 REFUSED = tuple(status for status in Status if status.faulty)
 """The box's answers to windows that it does not classify."""
-FRAMES = (".csv", ".tsv", ".txt", ".dat", ".mat", ".npy")
+FRAMES = (
+    ".csv", ".tsv", ".txt", ".dat", ".mat", ".npy", ".asf", ".lvm", ".tdms", ".jsonl", ".xlsx",
+    ".parquet", ".bag", ".mcap", ".db3",
+)  # fmt: skip
 """Suffixes of files that hold the frames of one recording. importing.py makes a set of a folder of
 such files."""
+JUNK = ("__MACOSX", "Thumbs.db", "desktop.ini", "Icon\r")
+"""Names of files and folders that systems leave beside recordings. Names that begin with . or ~$
+are passed over too."""
 IMPORT = "palpate-train import {} makes a set of such files"
-NUMBER = re.compile(r"0|[1-9][0-9]{0,8}")
-"""A name that is a whole number. 07 is not, or it would equal 7."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +134,7 @@ def read_hdf5(path: Path, kind: type[Set]) -> Set:
 
     try:
         with h5py.File(path, "r") as file:
-            names = [k for k in file if k in SET_ARRAYS or k.startswith("group_")]
+            names = [k for k in file if k in SET_ARRAYS or k.startswith(("group_", "unit_"))]
             arrays = {name: array_in(file, name) for name in names}
             if "rate_hz" in file.attrs:
                 arrays.setdefault("rate_hz", np.asarray(file.attrs["rate_hz"]))
@@ -214,6 +219,8 @@ def write_hdf5(path: Path, arrays: dict[str, Any]) -> None:
 
     with h5py.File(path, "w") as file:
         for name, values in arrays.items():
+            if np.asarray(values).dtype.kind == "U":
+                values = np.asarray(values).astype(h5py.string_dtype())
             file.create_dataset(
                 name, data=values, compression="gzip" if name == "samples" else None
             )
@@ -227,7 +234,7 @@ def read_recorded(folder: Path) -> list[RecordedSweep]:
     holds no recorded sweep.
     """
     check_folder(folder)
-    paths = sorted(folder.rglob("*.npy"))
+    paths = [path for path in files_below(folder) if path.suffix == ".npy"]
     if not any(path.with_suffix(".json").exists() for path in paths):
         raise FormatError(
             f"{folder}: not a sweep set: no sweep of `palpate record` is in it; {_advice(folder)}"
@@ -246,11 +253,23 @@ def check_folder(folder: Path) -> None:
         ) from e
 
 
+def files_below(folder: Path) -> list[Path]:
+    """All files in and below a folder, in the order of their names, without those of JUNK."""
+    return sorted(
+        path
+        for path in folder.rglob("*")
+        if not any(
+            part in JUNK or part.startswith((".", "~$")) for part in path.relative_to(folder).parts
+        )
+        and path.is_file()
+    )
+
+
 def _advice(folder: Path) -> str:
     """The advice for a folder that holds no recordings of the box."""
     others = Counter(
         path.suffix.lower()
-        for path in folder.rglob("*")
+        for path in files_below(folder)
         if path.suffix.lower() in (*FRAMES, *HDF5, ".npz")
     )
     if sets := others[".npz"] + sum(others[suffix] for suffix in HDF5):
@@ -268,12 +287,11 @@ def usable(recorded: Sequence[RecordedSweep]) -> list[RecordedSweep]:
 def read_folder(folder: Path, kind: type[Set]) -> Set:
     """The set of all sweeps that the box recorded in and below `folder`; each sweep is a recording.
 
-    Labels are materials. Groups are position and session: a group keeps its numbers if all its
-    names are whole numbers, else names are numbered in alphabetical order. A third group is the
-    object, if NEW OBJECT was ever signalled. Groups speed (um/s) and force (mN) exist if every
-    sweep has the value; `source` says if only some have it. Sweeps that we do not train on are
-    counted in `source`. Raises FormatError with the name of a file that is broken, lacks a name or
-    has another format.
+    Labels are materials. Groups are position and session, numbers if all their names are numbers
+    (see group_values.typed). A third group is the object, if NEW OBJECT was ever signalled. Groups
+    speed (um/s) and force (mN) exist if every sweep has the value; `source` says if only some have
+    it. Sweeps that we do not train on are counted in `source`. Raises FormatError with the name of
+    a file that is broken, lacks a name or has another format.
     """
     return from_recorded(read_recorded(folder), folder, kind)
 
@@ -316,7 +334,7 @@ def _groups(kept: Sequence[RecordedSweep]) -> dict[str, Array]:
                     f"{kept[texts.index('')].path}: has no {name} though others have; "
                     "name it in its .json"
                 )
-            groups[f"group_{name}"] = numbered(texts)
+            groups[f"group_{name}"] = typed(texts)
     if any(one.sweep.object for one in kept):  # each run of the service counts objects from 1 again
         groups["group_object"] = _ranks(
             [
@@ -336,6 +354,7 @@ def _slide_groups(kept: Sequence[RecordedSweep]) -> tuple[dict[str, Array], str]
         known = [value for value in values if value is not None]
         if len(known) == len(kept):
             groups[f"group_{name}"] = np.rint(1000 * np.array(known)).astype(np.int64)
+            groups[f"unit_{name}"] = np.array(SLIDE_UNITS[name])
         elif known:
             remark += f" ({len(known)} of {len(kept)} have {member}: no group {name})"
     return groups, remark
@@ -395,21 +414,19 @@ def _check(one: RecordedSweep, wanted: SweepFormat) -> None:
             f"{path}: {n} frames of {one.format}; others have {wanted}: "
             "keep each format in a folder of its own"
         )
+    taxels = one.sweep.frames.taxels
+    if taxels.dtype.kind == "f" and (bad := ~(np.abs(taxels) <= LARGEST_READING)).any():
+        frame, *taxel = (int(i) + 1 for i in np.argwhere(bad)[0])
+        raise FormatError(
+            f"{path}: frame {frame}, taxel {', '.join(map(str, taxel))} reads "
+            f"{taxels[bad][0]:g}, and no skin reads more than {LARGEST_READING:g}; "
+            "move the sweep and its .json away"
+        )
     if not one.sweep.material:
         raise FormatError(
             f"{path}: has no material; write it into {path.with_suffix('.json').name}, "
             '"material": "…"'
         )
-
-
-def numbered(names: Sequence[str]) -> Array:
-    """A number for each name: its value if all names are whole numbers, else its rank among the
-    different names."""
-    return (
-        np.array([int(name) for name in names])
-        if all(map(NUMBER.fullmatch, names))
-        else _ranks(names)
-    )
 
 
 def _ranks(values: Sequence[Any]) -> Array:

@@ -27,10 +27,7 @@ SAME_RATE, NEAR_RATE = 0.01, 0.05
 are interpolated."""
 FEWEST_BURSTS = 5
 """This many gaps that add up to more than half of the time show that frames came in bursts."""
-REMEDY = "if only the times are uneven, not the frames, give --rate instead of --time"
-BURSTS = (
-    "its frames come in bursts, so their times are those at which a program read them; " + REMEDY
-)
+BURSTS = "its frames come in bursts, so their times are those at which a program read them"
 
 
 @dataclass(frozen=True)
@@ -61,12 +58,22 @@ def measured_hz(time_s: Array) -> float:
     if not usual:  # a clock too coarse for the rate, or bursts
         rate_hz = float(len(steps) / steps.sum())
         if _wander(time_s, rate_hz) > MOST_ROUNDING:
-            raise FormatError(BURSTS)
+            raise FormatError(f"{BURSTS}; {remedy(time_s)}")
         return rate_hz
     gaps = steps > GAP_FRAMES * usual
     if gaps.sum() >= FEWEST_BURSTS and steps[gaps].sum() > steps[~gaps].sum():
-        raise FormatError(BURSTS)
+        raise FormatError(f"{BURSTS}; {remedy(time_s)}")
     return float(1 / np.mean(steps[~gaps]))
+
+
+def remedy(time_s: Array) -> str:
+    """The advice for a recording whose times [n] repeat or jump, with the rate that its frames have
+    if they are even."""
+    rate_hz = nominal_hz(np.array([(len(time_s) - 1) / (time_s[-1] - time_s[0])]))
+    return (
+        "if only the times are uneven, not the frames, give --rate instead of --time; "
+        f"its mean rate is --rate {rate_hz:g}"
+    )
 
 
 def nominal_hz(rates: Array) -> float:
@@ -108,9 +115,8 @@ def _wander(time_s: Array, rate_hz: float) -> float:
 def _interpolated(frames: Array, time_s: Array, rate_hz: float) -> Array:
     """Frames [m, ...] at even times, each linear between the two frames around it."""
     if len(still := np.flatnonzero(np.diff(time_s) <= 0)):
-        raise FormatError(
-            f"frames {still[0] + 1} and {still[0] + 2} of a run have the same time; {REMEDY}"
-        )
+        pair = f"{still[0] + 1} and {still[0] + 2}"
+        raise FormatError(f"frames {pair} of a run have the same time; {remedy(time_s)}")
     even = time_s[0] + np.arange(int((time_s[-1] - time_s[0]) * rate_hz * (1 + 1e-9)) + 1) / rate_hz
     flat = frames.reshape(len(frames), -1).astype(np.float64)
     columns = [np.interp(even, time_s, column) for column in flat.T]

@@ -21,7 +21,9 @@ from appliance.core import sweep_set
 from appliance.core.errors import FormatError
 from appliance.core.sweep_set import Array
 from appliance.sim import skin
-from train.data import published, readers
+from train.data import group_values, published, readers
+from train.data.files.table import normal
+from train.data.group_values import text_of
 
 SIMULATED = re.compile(
     r"sim:(?P<name>[^:/]+?)(?P<shear>x3)?(/(?P<world>[^:]+))?"
@@ -30,7 +32,7 @@ SIMULATED = re.compile(
 SIMULATED_FORM = "sim:NAME[x3][/WORLD][:SEED[-LAST][:SWEEPS]]"
 CONDITION = re.compile(r"\s*(\w+)\s*(<=|>=|=)(.*)")
 OWN_NUMBERS = ("recording", "position", "session", "object")
-"""Groups whose numbers only have a meaning within their set."""
+"""Groups whose numbers only have a meaning within their set; their names have one everywhere."""
 LIMITS: dict[str, Callable[[Array, Any], Array]] = {"<=": np.less_equal, ">=": np.greater_equal}
 
 
@@ -74,9 +76,9 @@ class Dataset(sweep_set.SweepSet):
         """The sweeps that meet all conditions, without materials that no longer occur.
 
         A condition is a group with a limit ("force<=180") or with alternative values
-        ("force=100,150"). Materials are given by name ("material=Canvas,Linen"). Raises FormatError
-        if a condition cannot be read, if its group or a value does not occur, or if fewer than two
-        classes remain.
+        ("force=100,150", "speed=slow"). Materials are given by name ("material=Canvas,Linen").
+        Raises FormatError if a condition cannot be read, if its group or a value does not occur, or
+        if fewer than two classes remain.
         """
         keep = np.ones(len(self), bool)
         for text in conditions:
@@ -87,41 +89,39 @@ class Dataset(sweep_set.SweepSet):
         present, labels = np.unique(part.labels, return_inverse=True)
         return replace(part, labels=labels, materials=tuple(self.materials[k] for k in present))
 
+    def listed(self, name: str, text: str) -> list[Any]:
+        """The values of the group `name`, or the materials, that `text` lists with commas; see
+        group_values.listed. Raises FormatError, also if there is no such group."""
+        if name == "material":
+            return group_values.listed(np.array(self.materials), "", text)
+        return group_values.listed(self.group(name), self.units.get(name, ""), text)
+
     def _matches(self, condition: str) -> Array:
         """The sweeps that meet one condition, bool [N]."""
+        condition = normal(condition)
         if not (found := CONDITION.fullmatch(condition)):
             raise self._error(
-                f"condition {condition!r} cannot be read; "
-                "write a group, one of = <= >=, whole numbers"
+                f"condition {condition!r} cannot be read; write a group, one of = <= >=, and values"
             )
         name, operator, text = found.groups()
-        if name == "material":
-            column, values = (
-                np.array(self.materials)[self.labels],
-                np.array([value.strip() for value in text.split(",")]),
-            )
-        else:
-            try:
-                column, values = (
-                    self.group(name),
-                    np.array([int(value) for value in text.split(",")]),
-                )
-            except ValueError:
-                raise self._error(
-                    f"condition {condition!r} cannot be read; "
-                    f"{text.strip()!r} is not a whole number"
-                ) from None
+        material = name == "material"
+        column = np.array(self.materials)[self.labels] if material else self.group(name)
+        try:
+            values = self.listed(name, text)
+        except FormatError as e:
+            raise self._error(f"condition {condition!r} cannot be read; {e}") from None
         if operator in LIMITS:
-            if name == "material" or len(values) > 1:
+            if column.dtype.kind == "U" or len(values) > 1:
+                holds = f"; {name} holds names" if column.dtype.kind == "U" else ""
                 raise self._error(
                     f"condition {condition!r} cannot be read; "
-                    f"{operator} takes a group and one whole number"
+                    f"{operator} takes a group of numbers and one number{holds}"
                 )
             return LIMITS[operator](column, values[0])
         for value in values:
-            if not (column == value).any():
+            if not np.any(column == value):
                 raise self._error(
-                    f"no sweep fulfils {name}={value}; "
+                    f"no sweep fulfils {name}={text_of(value)}; "
                     f"it has {shortened(np.unique(column).tolist())}"
                 )
         return np.isin(column, values)
@@ -179,13 +179,13 @@ class Dataset(sweep_set.SweepSet):
     def save(self, path: Path) -> None:
         """Write the set as HDF5 if the name ends in .h5 or .hdf5, else as a compressed .npz; `load`
         reads both."""
-        groups = {f"group_{k}": v for k, v in self.groups.items()}
-        rate = np.array(self.rate_hz)
         arrays: dict[str, Array] = {
             "samples": self.samples,
             "labels": self.labels,
-            "rate_hz": rate,
-        } | groups
+            "rate_hz": np.array(self.rate_hz),
+        }
+        arrays |= {f"group_{k}": v for k, v in self.groups.items()}
+        arrays |= {f"unit_{k}": np.array(v) for k, v in self.units.items() if k in self.groups}
         if self.unloaded is not None:
             arrays["unloaded"] = self.unloaded
         if path.suffix in readers.HDF5:
@@ -218,10 +218,10 @@ def join(sets: Sequence[Dataset]) -> Dataset:
     """Join sets that have the same format and materials. Groups are those that all sets have, and
     `set`, the index of the set.
 
-    Recordings, positions, sessions and objects are renumbered, because number 0 means another
-    position in another set; a force or a speed keeps its value. If the skin was tared between the
-    sets, they are brought to one level, as in a folder. A single set is not changed. Raises
-    FormatError if formats or materials differ.
+    The numbers of recordings, positions, sessions and objects are changed, because number 0 means
+    another position in another set. All other values stay, in the unit of the first set. If the
+    skin was tared between the sets, they are brought to one level, as in a folder. A single set is
+    not changed. Raises FormatError if formats, materials or kinds of units differ.
     """
     if len(sets) == 1:
         return sets[0]
@@ -241,13 +241,14 @@ def _joined(sets: Sequence[Dataset]) -> Dataset:
     names = set.intersection(*(set(s.groups) for s in sets))
     if any("recording" in s.groups for s in sets):
         names.add("recording")
-    groups = {}
+    groups: dict[str, Array] = {}
+    units: dict[str, str] = {}
     for name in sorted(names):
-        parts = [s.group(name).astype(np.int64) for s in sets]
+        parts = [s.group(name) for s in sets]
         if name in OWN_NUMBERS:
-            starts = np.cumsum([0] + [int(np.ptp(part)) + 1 for part in parts])
-            parts = [part - part.min() + start for part, start in zip(parts, starts, strict=False)]
-        groups[name] = np.concatenate(parts)
+            parts = _apart(parts)
+        groups[name], unit = group_values.joined(name, parts, [s.units.get(name, "") for s in sets])
+        units |= {name: unit} if unit else {}
     samples, labels = (
         np.concatenate([getattr(s, name) for s in sets]) for name in ("samples", "labels")
     )
@@ -255,7 +256,20 @@ def _joined(sets: Sequence[Dataset]) -> Dataset:
     if unloaded is not None:  # each set is consistent, but levels may differ between sets
         samples, unloaded, remark = readers.align_tare(samples, unloaded)
         source += remark
-    return Dataset(samples, labels, head.materials, head.rate_hz, groups, source, unloaded)
+    return Dataset(samples, labels, head.materials, head.rate_hz, groups, source, unloaded, units)
+
+
+def _apart(parts: Sequence[Array]) -> list[Array]:
+    """The values of a group of OWN_NUMBERS in each set, whole numbers changed so that no two sets
+    have the same."""
+    whole = [part.dtype.kind in "iu" for part in parts]
+    starts = np.cumsum(
+        [0] + [int(np.ptp(p)) + 1 if w else 0 for p, w in zip(parts, whole, strict=True)]
+    )
+    return [
+        p.astype(np.int64) - int(p.min()) + start if w else p
+        for p, w, start in zip(parts, whole, starts, strict=False)
+    ]
 
 
 def _unloaded(sets: Sequence[Dataset]) -> Array | None:
@@ -306,8 +320,11 @@ def digest(sweeps: Dataset) -> str:
     total = hashlib.sha256(
         repr((sweeps.materials, float(sweeps.rate_hz), x.dtype.name, x.shape, names)).encode()
     )
-    for numbers in (sweeps.labels, *(sweeps.groups[name] for name in names)):
-        total.update(numbers.astype("<i8").tobytes())
+    for values in (sweeps.labels, *(sweeps.groups[name] for name in names)):
+        if values.dtype.kind == "U":
+            total.update(repr(values.tolist()).encode())
+        else:
+            total.update(values.astype("<f8" if values.dtype.kind == "f" else "<i8").tobytes())
     if sweeps.unloaded is not None:
         total.update(np.ascontiguousarray(sweeps.unloaded, "<f8").data)
     total.update(np.ascontiguousarray(x, x.dtype.newbyteorder("<")).data)
@@ -316,5 +333,5 @@ def digest(sweeps: Dataset) -> str:
 
 def shortened(values: Sequence[object]) -> str:
     """Values as text; of more than nine, those in the middle are left out."""
-    texts = [str(value) for value in values]
+    texts = [text_of(value) for value in values]
     return ", ".join(texts if len(texts) <= 9 else [*texts[:8], "…", texts[-1]])

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
+from train.data.group_values import text_of
 from train.data.sets import Dataset
 
 Array = NDArray[Any]
@@ -25,7 +26,7 @@ Fold = tuple[Array, Array]
 FORMS = "random:FOLDS, leave:GROUP or split:GROUP=a,b->c"
 RANDOM = re.compile(r"random:(\d+)")
 LEAVE = re.compile(r"leave:(\w+)")
-SPLIT = re.compile(r"split:(\w+)=(-?\d+(?:,-?\d+)*)->(-?\d+(?:,-?\d+)*)")
+SPLIT = re.compile(r"split:(\w+)=(.+?)->(.+)")
 
 
 class RandomFolds:
@@ -112,19 +113,19 @@ class LeaveOneGroupOut:
         if (n := self.get_n_splits()) < 2:
             raise FormatError(
                 f"leave:{self.name} needs two values of the group {self.name!r}; "
-                f"all sweeps have {self.group[0]} "
+                f"all sweeps have {text_of(self.group[0])} "
                 f"({n} value): choose another group"
             )
         for value in np.unique(self.group):
             out = self.group == value
-            yield _checked(f"leave:{self.name}, {value} left out", ~out, out, y, groups)
+            yield _checked(f"leave:{self.name}, {text_of(value)} left out", ~out, out, y, groups)
 
 
 class TrainTest:
     """Train on some values of the group `name` and test on others, such as T-REAL and T-HARD, or
     the first and the last block."""
 
-    def __init__(self, name: str, group: Array, train: Sequence[int], test: Sequence[int]) -> None:
+    def __init__(self, name: str, group: Array, train: Sequence[Any], test: Sequence[Any]) -> None:
         self.name, self.group, self.train, self.test = name, group, tuple(train), tuple(test)
 
     def get_n_splits(self, X: Any = None, y: Any = None, groups: Any = None) -> int:
@@ -138,12 +139,12 @@ class TrainTest:
         for value in (*self.train, *self.test):
             if value not in present:
                 raise FormatError(
-                    f"group {self.name!r} has no {value}; "
-                    f"it has {', '.join(map(str, present[:20]))}"
+                    f"group {self.name!r} has no {text_of(value)}; "
+                    f"it has {', '.join(map(text_of, present[:20]))}"
                 )
         if both := set(self.train) & set(self.test):
             raise FormatError(
-                f"{self.name}={min(both)} is on both sides of the split; name it once"
+                f"{self.name}={text_of(min(both))} is on both sides of the split; name it once"
             )
         yield _checked(
             f"split:{self.name}",
@@ -175,10 +176,12 @@ class Protocol:
             return LeaveOneGroupOut(found[1], sweeps.group(found[1]))
         found = SPLIT.fullmatch(self.text)
         assert found
-        name, train, test = found.groups()
-        return TrainTest(
-            name, sweeps.group(name), *([int(v) for v in part.split(",")] for part in (train, test))
-        )
+        name, *sides = found.groups()
+        try:
+            train, test = (sweeps.listed(name, side) for side in sides)
+        except FormatError as e:
+            raise FormatError(f"protocol {self.text!r} cannot be read; {e}") from None
+        return TrainTest(name, sweeps.group(name), train, test)
 
     def folds(self, sweeps: Dataset, seed: int) -> list[Fold]:
         """All pairs (training, test) of sweep numbers. Raises FormatError if the protocol cannot
@@ -189,6 +192,12 @@ class Protocol:
                 sweeps.samples, sweeps.labels, sweeps.group("recording")
             )
         )
+
+    def left_out(self, sweeps: Dataset, test: Array) -> dict[str, list[Any]]:
+        """The values that the tested sweeps have of the group that the protocol leaves out; {} for
+        random folds. test: numbers of sweeps."""
+        found = LEAVE.fullmatch(self.text) or SPLIT.fullmatch(self.text)
+        return {found[1]: np.unique(sweeps.group(found[1])[test]).tolist()} if found else {}
 
     def clusters(self, sweeps: Dataset) -> Array | None:
         """A cluster number for each sweep [N], for intervals: sweeps of a cluster succeed or fail
@@ -244,17 +253,22 @@ class InnerPart:
     out: Array
 
 
-def inner_parts(sweeps: Dataset, most: int = 3) -> list[InnerPart]:
+def inner_parts(sweeps: Dataset, most: int = 3, varies: Sequence[str] = ()) -> list[InnerPart]:
     """The parts of each group that can be left out, at most `most` for a group. If no group can,
-    the parts are recordings, with materials spread evenly.
+    the parts are recordings, with materials spread evenly. varies: only these groups.
 
     The first part of every group comes first, then the second parts, and so on. A group can be left
     out if it does not cut recordings in two, and if the other sweeps hold every material that is
-    tested. Raises FormatError if nothing can be left out.
+    tested. Raises FormatError if nothing can be left out, or a group of `varies` cannot.
     """
-    of_all = [
-        _parts_of(sweeps, name, most) for name in sorted(sweeps.groups) if name not in OF_THE_SET
-    ]
+    names = varies or sorted(set(sweeps.groups) - set(OF_THE_SET))
+    of_all = [_parts_of(sweeps, name, most) for name in names]
+    for name, parts in zip(varies, of_all, strict=False):
+        if not parts:
+            raise FormatError(
+                f"{sweeps.source}: no value of {name!r} can be left out; it needs two values, "
+                "materials under several of them, and no recording under two"
+            )
     if any(of_all):
         return [part for turn in zip_longest(*of_all) for part in turn if part]
     return recording_parts(sweeps)
@@ -277,12 +291,13 @@ def recording_parts(sweeps: Dataset) -> list[InnerPart]:
 
 
 def _parts_of(sweeps: Dataset, name: str, most: int) -> list[InnerPart]:
-    values, recording = sweeps.group(name), sweeps.group("recording")
-    shuffled = np.random.default_rng(0).permutation(np.unique(values))
-    if len(shuffled) < 2 or len(np.unique(np.stack([recording, values]), axis=1).T) > len(
+    values, member = np.unique(sweeps.group(name), return_inverse=True)
+    recording = sweeps.group("recording")
+    shuffled = np.random.default_rng(0).permutation(len(values))
+    if len(shuffled) < 2 or len(np.unique(np.stack([recording, member]), axis=1).T) > len(
         np.unique(recording)
     ):
         return []
-    parts = [np.isin(values, some) for some in np.array_split(shuffled, min(most, len(shuffled)))]
+    parts = [np.isin(member, some) for some in np.array_split(shuffled, min(most, len(shuffled)))]
     labels = sweeps.labels
     return [InnerPart(name, out) for out in parts if set(labels[out]) <= set(labels[~out])]

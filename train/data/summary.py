@@ -6,7 +6,7 @@ reason why the folder cannot be trained on yet.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,11 +17,10 @@ from appliance.core.errors import FormatError
 from appliance.core.sweep_set import Array
 from appliance.sim import skin
 from train.data import labels, published, readers, sets
+from train.data.group_values import text_of
 from train.data.readers import RecordedSweep
 from train.data.sets import Dataset, shortened
 
-Names = Mapping[str, Mapping[int, str]]
-"""The names of each group's numbers."""
 Check = Callable[[Dataset], Sequence[str]]
 """A check of a set that can be trained on; its warnings."""
 MAX_COLUMNS = 12
@@ -37,15 +36,14 @@ def describe(spec: str, check: Check = lambda _: ()) -> str:
         whole = sets.load(spec, 1)
         return "\n".join(
             [
-                *description(whole, {}),
+                *description(whole),
                 *(f"  {line}" for line in [*warnings_of(whole), *check(whole)]),
                 *_unsendable(whole.materials),
             ]
         )
     recorded = readers.read_recorded(folder)
-    named, names = _named(recorded)
-    whole = readers.from_recorded(named, folder, Dataset)
-    lines = [*description(whole, names), *(f"  {line}" for line in partly_unknown_tare(whole))]
+    whole = readers.from_recorded(_named(recorded), folder, Dataset)
+    lines = [*description(whole), *(f"  {line}" for line in partly_unknown_tare(whole))]
     kept = [one.sweep for one in readers.usable(recorded)]
     if lost := [sweep.lost for sweep in kept if sweep.lost]:
         frames = sum(len(sweep.frames) for sweep in kept)
@@ -110,9 +108,9 @@ def _unsendable(materials: Iterable[str]) -> list[str]:
     )
 
 
-def _named(recorded: Sequence[RecordedSweep]) -> tuple[list[RecordedSweep], Names]:
-    """The recordings, with UNNAMED for each missing name, and the names of the groups' numbers."""
-    kept, names = [one.sweep for one in readers.usable(recorded)], {}
+def _named(recorded: Sequence[RecordedSweep]) -> list[RecordedSweep]:
+    """The recordings, with UNNAMED for each missing name."""
+    kept = [one.sweep for one in readers.usable(recorded)]
     groups = [by for by in readers.NAMED_GROUPS if any(getattr(sweep, by) for sweep in kept)]
 
     def name(one: RecordedSweep) -> RecordedSweep:
@@ -121,14 +119,10 @@ def _named(recorded: Sequence[RecordedSweep]) -> tuple[list[RecordedSweep], Name
         }
         return replace(one, sweep=replace(one.sweep, **missing))
 
-    named = [name(one) for one in recorded]
-    for by in groups:
-        texts = [getattr(one.sweep, by) for one in readers.usable(named)]
-        names[by] = dict(zip(readers.numbered(texts).tolist(), texts, strict=True))
-    return named, names
+    return [name(one) for one in recorded]
 
 
-def description(sweeps: Dataset, names: Names) -> list[str]:
+def description(sweeps: Dataset) -> list[str]:
     """The contents of a set as lines: sweeps and their format, materials, recordings, groups, and
     groups that are confounded with the material."""
     format = sweeps.format
@@ -150,12 +144,9 @@ def description(sweeps: Dataset, names: Names) -> list[str]:
     )
     for by in sorted(set(sweeps.groups) - {"recording"}):
         values, _, counts = sweeps.counts_by(by)
-        name_of = names.get(by, {})
-        shown = [name_of.get(value, str(value)) for value in values.tolist()]
-        both = [
-            f"{v} {text}" if text != str(v) else text for v, text in zip(values, shown, strict=True)
-        ]
-        lines.append(f"  {by}: {len(values)}: {shortened(both)}")
+        shown = [text_of(value) for value in values.tolist()]
+        unit = sweeps.units.get(by, "")
+        lines.append(f"  {by}: {len(values)}: {shortened(shown)}{f' {unit}' if unit else ''}")
         lines += [
             f"    confounded: {why}" for why in _confounded(shown, counts > 0, sweeps.materials)
         ]

@@ -120,7 +120,7 @@ def rank_taxels(sweeps: Dataset) -> list[int]:
     scaled to variance 1. W is the scatter within materials plus RIDGE. Removing a taxel updates the
     inverse in closed form; nothing is trained.
     """
-    format, powers = sweeps.format, _powers(sweeps.samples)  # [N, M, BANDS]
+    format, powers = sweeps.format, log_powers(sweeps.samples)  # [N, M, BANDS]
     n, taxels, bands = len(powers), format.rows * format.cols, format.axes * BANDS
     x = powers.reshape(n, -1)
     x = (x - x.mean(0)) / np.maximum(x.std(0), 1e-9)
@@ -146,8 +146,9 @@ def rank_taxels(sweeps: Dataset) -> list[int]:
     return removed[::-1]
 
 
-def _powers(samples: Array) -> Array:
-    """Log power [N, M, BANDS] of sweeps [N, T, R, C(, A)] without their means; M = R * C * A."""
+def log_powers(samples: Array, taxels: Array | slice = slice(None)) -> Array:
+    """Log power [N, M, BANDS] of sweeps [N, T, R, C(, A)] without their means; M = R * C * A, or
+    those of them that are named."""
     n, frames = samples.shape[:2]
     bins = np.geomspace(1, max(frames // 2 + 1, 2), BANDS + 1)
     starts = np.minimum(bins.astype(int)[:-1], frames // 2)
@@ -156,7 +157,7 @@ def _powers(samples: Array) -> Array:
     for first in range(0, n, BATCH):
         x = (
             samples[first : first + BATCH]
-            .reshape(-1, frames, samples[0, 0].size)
+            .reshape(-1, frames, samples[0, 0].size)[:, :, taxels]
             .astype(np.float64)
         )
         power = np.abs(np.fft.rfft(x - x.mean(axis=1, keepdims=True), axis=1)) ** 2 / frames
@@ -166,5 +167,5 @@ def _powers(samples: Array) -> Array:
             )
         )
     powers: Array = np.concatenate(parts)
-    log_powers: Array = np.log(powers + 1e-3 * powers.mean() + np.finfo(float).tiny)
-    return log_powers
+    logs: Array = np.log(powers + 1e-3 * powers.mean() + np.finfo(float).tiny)
+    return logs

@@ -19,7 +19,8 @@ from appliance.core.errors import FormatError
 from train.data.sets import Dataset, digest
 from train.data.splitters import Protocol, draw
 from train.evaluation import parallel
-from train.evaluation.fold import Fold, FoldTask, key, run
+from train.evaluation.fold import AsTheBox, Fold, FoldTask, key, run
+from train.metrics.answers import REFUSED, UNKNOWN
 from train.metrics.score import Score, confusion, fuse, interval, provenance
 from train.models import methods as known_methods
 from train.models.methods import FULL_EFFORT, Effort
@@ -76,6 +77,7 @@ class Result:
         ran = sorted({f.ran for f in self.folds} - {""})
         return (
             result
+            | {"box": self._box()}
             | times
             | {
                 "folds": len(self.folds),
@@ -108,6 +110,57 @@ class Result:
             )
         return counts
 
+    def _box(self) -> dict[str, Any] | None:
+        """Counts of the box's answers; None if there are none. Folds that export refuses are left
+        out and named."""
+        packed = [fold for fold in self.folds if len(fold.box)]
+        refused = [fold.not_packed for fold in self.folds if fold.not_packed]
+        if not packed and not refused:
+            return None
+        box: dict[str, Any] = {"not_packed": refused}
+        if packed:
+            test, labels, sure = (
+                np.concatenate([getattr(fold, name) for fold in packed])
+                for name in ("test", "box", "sure")
+            )
+            clusters = Protocol(self.protocol).clusters(self.sweeps)
+            right = sure & (labels == self.sweeps.labels[test])
+            box |= Score.of(right).json() | {
+                "wrong": int((sure & (labels >= 0) & ~right).sum()),
+                "unsure": int((~sure & (labels >= 0)).sum()),
+                "unknown": int((labels == UNKNOWN).sum()),
+                "refused": int((labels == REFUSED).sum()),
+                "interval": interval(right, None if clusters is None else clusters[test]),
+            }
+        return box
+
+    def each_fold(self) -> list[dict[str, Any]]:
+        """Each fold for scripts: the values that it leaves out, and every sweep's answers."""
+        return [
+            {
+                "left_out": Protocol(self.protocol).left_out(self.sweeps, fold.test),
+                "tested": len(fold.test),
+                "not_packed": fold.not_packed,
+                "answers": [self._answer(fold, i) for i in range(len(fold.test))],
+            }
+            for fold in self.folds
+        ]
+
+    def _answer(self, fold: Fold, i: int) -> dict[str, Any]:
+        materials, sweep = self.sweeps.materials, int(fold.test[i])
+        answer = {
+            "sweep": sweep,
+            "material": materials[self.sweeps.labels[sweep]],
+            "label": materials[fold.logits[i].argmax()],
+        }
+        if not len(fold.box):
+            return answer
+        label = int(fold.box[i])
+        if label < 0:
+            return answer | {"box": {UNKNOWN: "unknown", REFUSED: "refused"}[label]}
+        named = {"box_label": materials[label]}
+        return answer | {"box": "ok" if fold.sure[i] else "unsure"} | named
+
     def _form(self, name: str) -> dict[str, Any]:
         """The same models in another precision.
 
@@ -131,7 +184,7 @@ class Result:
 
 HEADER = (
     f"{'method':<20} {'protocol':<22} means  {'windows':<30} {'recordings':<30} "
-    f"{'fit s':>7} {'ms':>7}"
+    f"{'fit s':>7} {'ms':>7}  as the box answers"
 )
 
 
@@ -144,10 +197,23 @@ def line(result: dict[str, Any]) -> str:
     )
     times = f"{result['fit_s']:>7.2f} {result['ms_p50']:>7.3f}"
     names = f"{result['method']:<20} {result['protocol']:<22} {means:<6}"
-    return f"{names} {counts[0]:<30} {counts[1]:<30} {times}"
+    return f"{names} {counts[0]:<30} {counts[1]:<30} {times}  {_as_the_box(result['box'])}".rstrip()
 
 
-def _count(count: dict[str, int], ends: Sequence[float]) -> str:
+def _as_the_box(box: dict[str, Any] | None) -> str:
+    """The counts of Result.json()["box"] as text; "" if there are none."""
+    if box is None:
+        return ""
+    parts, why = [], box["not_packed"]
+    if "right" in box:
+        others = [f"{box[name]} {name}" for name in ("wrong", "unsure", "unknown", "refused")]
+        parts.append(", ".join([_count(box, box["interval"]), *others]))
+    if why:
+        parts.append(f"export refuses {len(why)} fold{'s' * (len(why) > 1)}: {why[0]}")
+    return "; ".join(parts)
+
+
+def _count(count: dict[str, Any], ends: Sequence[float]) -> str:
     right, total = count["right"], count["total"]
     return f"{right}/{total} {right / total:.3f} [{ends[0]:.3f}, {ends[1]:.3f}]"
 
@@ -157,6 +223,7 @@ class Plan:
     """The runs of an evaluation: every method under every protocol with every seed; and the effort.
 
     each: training sweeps of each material, drawn by the seed from those of a fold; 0 for all.
+    as_the_box: see FoldTask.
     """
 
     methods: Sequence[str]
@@ -165,6 +232,7 @@ class Plan:
     means_removed: bool = False
     effort: Effort = FULL_EFFORT
     each: int = 0
+    as_the_box: AsTheBox | None = None
 
     def folds(self, sweeps: Dataset, protocol: str, seed: int) -> list[tuple[Array, Array]]:
         """Pairs (training, test) of sweep numbers. Raises FormatError if the protocol does not fit
@@ -202,7 +270,7 @@ def evaluate(
     for kind in dict.fromkeys(method.input for method in known):
         same = [method.name for method in known if method.input == kind]
         tasks = {
-            (name, *split, i): FoldTask(name, plan.effort, split[1], *fold)
+            (name, *split, i): FoldTask(name, plan.effort, split[1], *fold, plan.as_the_box)
             for name in same
             for split, parts in splits.items()
             for i, fold in enumerate(parts)

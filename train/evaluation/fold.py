@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from appliance.core.errors import FormatError
+from appliance.core.errors import BundleError, FormatError
 from appliance.core.storage import put
 from appliance.inference.session import session
 from train.data.sets import Dataset
@@ -35,6 +35,8 @@ from train.models import methods
 Array = NDArray[Any]
 Answer = Callable[[Array], Array]
 """Raw counts [T, R, C] -> logits [K]."""
+BOX = ("appliance.inference.classifier", "appliance.inference.novelty")
+"""Modules of the box that its answers depend on, beside the code of COUNTED."""
 TIMED_SWEEPS = 24
 """Number of test sweeps that are classified one by one, to measure their time and to compare their
 labels. They run in an inference session of the box, or in the method's library if the method has no
@@ -56,14 +58,35 @@ with the desktop's."""
 
 
 @dataclass(frozen=True)
+class BoxAnswers:
+    """The answers of the box to n sweeps. labels: int [n], or REFUSED or UNKNOWN of
+    train.metrics.answers. sure: bool [n], whether it is certain of the label."""
+
+    labels: Array
+    sure: Array
+
+    @classmethod
+    def of(cls, labels: Sequence[int], sure: Array) -> BoxAnswers:
+        """The answers with these labels."""
+        return cls(np.array(labels, int), np.asarray(sure, bool))
+
+
+AsTheBox = Callable[[methods.Model, Dataset], BoxAnswers | None]
+"""The box's answers to sweeps by a trained model; None if it is of a method that export does not
+pack."""
+
+
+@dataclass(frozen=True)
 class FoldTask:
-    """One fold. train, test: numbers of sweeps."""
+    """One fold. train, test: numbers of sweeps. as_the_box: a function of a module, or None to
+    leave the box's answers out."""
 
     method: str
     effort: methods.Effort
     seed: int
     train: Array
     test: Array
+    as_the_box: AsTheBox | None = None
 
     def kept_in(self, path: Path) -> FoldTask:
         """The same fold with `path` as the file that keeps its unfinished training."""
@@ -78,8 +101,9 @@ class Fold:
     agreement: share of the timed sweeps that get the same label one by one from the exported graph,
     or from the library if the method has no graph. ran: name of the trained model, if the method's
     name does not state it. cost: the training's cross entropy [iterations, 2], if it has one.
-    forms: logits float32 [n, K] of the same sweeps by the same model in other precisions. refused:
-    why the method cannot work with this set; all else is empty then.
+    forms: logits float32 [n, K] of the same sweeps by the same model in other precisions. box,
+    sure: the box's answers as in BoxAnswers, empty if there are none; not_packed: why export
+    refuses the model. refused: why the method cannot work with this set; all else is empty then.
     """
 
     test: Array
@@ -91,6 +115,9 @@ class Fold:
     cost: Array = field(default_factory=lambda: np.empty((0, 2)))
     refused: str = ""
     forms: dict[str, Array] = field(default_factory=dict)
+    box: Array = field(default_factory=lambda: np.empty(0, int))
+    sure: Array = field(default_factory=lambda: np.empty(0, bool))
+    not_packed: str = ""
 
     @classmethod
     def refusal(cls, task: FoldTask, why: str) -> Fold:
@@ -153,9 +180,16 @@ def _completed(task: FoldTask, method: methods.Method, sweeps: Dataset, inputs: 
     ms, labels = _timed_labels(_alone(method, model, sweeps.rate_hz), sweeps.samples[some])
     agreement = float(np.mean(labels == logits[np.searchsorted(task.test, some)].argmax(1)))
     cost = np.asarray(getattr(model, "cost", []), float).reshape(-1, 2)
-    return Fold(
+    fold = Fold(
         task.test, logits, fit_s, ms, agreement, getattr(model, "ran", ""), cost, forms=answers
     )
+    if not task.as_the_box:
+        return fold
+    try:
+        box = task.as_the_box(model, sweeps.take(task.test))
+    except (FormatError, BundleError) as e:
+        return replace(fold, not_packed=str(e))
+    return replace(fold, box=box.labels, sure=box.sure) if box else fold
 
 
 def _timed_labels(answer: Answer, samples: Array) -> tuple[float, Array]:
@@ -186,7 +220,8 @@ def key(task: FoldTask, data: str) -> str:
     """The fingerprint of all that the fold depends on. data: the set's digest."""
     (method,) = methods.find([task.method], task.effort)
     about = [data, method.name, method.effort, task.seed, task.train.tolist(), task.test.tolist()]
-    return fingerprint(about, methods.module_of(method.name), "train.evaluation.fold")
+    box = (task.as_the_box.__module__, *BOX) if task.as_the_box else ()
+    return fingerprint(about, methods.module_of(method.name), "train.evaluation.fold", *box)
 
 
 def fingerprint(about: Any, *modules: str) -> str:

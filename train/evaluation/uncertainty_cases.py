@@ -58,10 +58,11 @@ class Case:
     features that were not trained; they are the last ones.
 
     seen: features [N, 10, F] of prefixes of the training sweeps. seen_labels [N]: their materials,
-    numbered from 0 without left_out. seen_groups [N]: positions or recordings. judged: bool
-    [N], the sweeps that the trunk did not see, on which a choice may be judged. copied: features
-    [M, F] of augmented copies, with copied_labels, copied_groups and copied_held [M]; see
-    AugmentedCopies. faulty: bool [N] of the seen sweeps; see CalibrationInputs. new, labels,
+    numbered from 0 without left_out. seen_groups [G, N]: values of the conditions, the hardest
+    first. held: bool [N], the sweeps that trained stages did not see; staged: whether there are
+    such stages. copied: features [M, F] of augmented copies, with copied_labels, copied_source and
+    copied_held [M]; see AugmentedCopies. faulty: bool [N] of the seen sweeps; see
+    CalibrationInputs. new, labels,
     places: features of the test sweeps, the set's labels, and the placements of the skin. plan:
     HeadPlan.json as text.
     """
@@ -72,10 +73,11 @@ class Case:
     seen: Array
     seen_labels: Array
     seen_groups: Array
-    judged: Array
+    held: Array
+    staged: bool
     copied: Array
     copied_labels: Array
-    copied_groups: Array
+    copied_source: Array
     copied_held: Array
     new: Array
     labels: Array
@@ -91,14 +93,15 @@ class Case:
     def calibration(self) -> Calibration:
         """The calibration that is fitted on the trunk of this training."""
         copies = AugmentedCopies(
-            self.copied, self.copied_labels, self.copied_groups, self.copied_held
+            self.copied, self.copied_labels, self.copied_source, self.copied_held
         )
         plan = HeadPlan.read(json.loads(self.plan)) if self.plan else None
         given = CalibrationInputs(
             self.seen,
             self.seen_labels,
-            self.seen_groups,
-            self.judged,
+            {str(number): values for number, values in enumerate(self.seen_groups)},
+            self.held,
+            bool(self.staged),
             self.fixed,
             copies,
             self.faulty,
@@ -140,11 +143,12 @@ def learn(task: CaseTask, sweeps: Dataset) -> Case:
         given.fixed,
         given.prefixes,
         given.labels,
-        given.groups,
-        given.judged,
+        np.stack(list(given.conditions.values())),
+        given.held,
+        given.staged,
         copies.features,
         copies.labels,
-        copies.groups,
+        copies.source,
         copies.held,
         run_graph(made.trunk(prefixes=True), sweeps.samples[task.test]),
         sweeps.labels[task.test],

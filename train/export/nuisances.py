@@ -22,17 +22,20 @@ from appliance.core.clock import SystemClock
 from appliance.core.errors import FormatError
 from appliance.core.storage import put_all
 from appliance.inference.classifier import Classifier
+from appliance.inference.novelty import shaped_distances
+from train.calibration import novelty
 from train.calibration.nuisances import AlteredSweeps, NuisanceRule, Scatters, choose
 from train.data.sets import Dataset, digest
 from train.evaluation.corruptions import TAXEL_FAULTS, Corruption, applicable
 from train.evaluation.evaluation_sweeps import EvaluationSweeps
 from train.export.bridging import measurable
+from train.models.recipe.calibrate import CalibrationInputs
 
 Array = NDArray[Any]
 Embed = Callable[[Array], Array]
-"""Raw counts [n, T, R, C] -> embeddings [n, r]."""
+"""Raw counts [n, T, R, C] -> features [n, F], or these -> embeddings [n, r]."""
 Space = tuple[Embed, Array]
-"""An embedding, and the class means [K, r] in it."""
+"""An embedding of features, and the class means [K, r] in it."""
 FIGURES = "altered sweeps"
 """Key of the figures in a manifest."""
 COPIES = 360
@@ -44,38 +47,64 @@ SEVERITIES = 6
 @dataclass(frozen=True)
 class Widened:
     """Shapes of materials that alterations have widened. shapes: float16 [K, r, r] of each
-    embedding that was given. limit: of known materials, for these shapes. figures: for the
+    embedding that was given. limit: of known materials, for these shapes. rule: gave both.
+    training: features of the training sweeps and of their altered copies. figures: for the
     manifest."""
 
     shapes: tuple[NDArray[np.float16], ...]
     limit: float
+    rule: NuisanceRule
+    training: AlteredSweeps
     figures: dict[str, Any]
 
 
 def measure(
-    train: Dataset, held_out: Dataset, judge: Space, *others: Space, seed: int = 0
+    features: Embed, train: Dataset, held_out: Dataset, judge: Space, *others: Space, seed: int = 0
 ) -> Widened | None:
     """The widened shapes in the embedding `judge`, best one that has not seen `held_out`, and in
-    others, by the rule that `judge` finds; None if it finds none."""
-    held, scatters = altered(judge[0], held_out, seed + 1), []
+    others, by the rule that `judge` finds; None if it finds none. features: of raw counts, which
+    the embeddings take."""
+    held = altered(features, held_out, seed + 1).seen_by(judge[0])
+    training, scatters = altered(features, train, seed), []
     for embed, means in (judge, *others):
-        scatters.append(Scatters.of(altered(embed, train, seed), means.astype(np.float64)))
+        scatters.append(Scatters.of(training.seen_by(embed), means.astype(np.float64)))
     rule = choose(scatters[0], held, judge[1].astype(np.float64))
     if rule is None:
         return None
-    return Widened(tuple(map(rule.shapes, scatters)), rule.limit, _figures(rule, held))
+    shapes = tuple(map(rule.shapes, scatters))
+    return Widened(shapes, rule.limit, rule, training, _figures(rule, held))
 
 
-def altered(embed: Embed, sweeps: Dataset, seed: int) -> AlteredSweeps:
-    """The embeddings of `sweeps` and of copies with each fault of CORRUPTIONS that can be applied
+def limit_of_conditions(found: Widened, given: CalibrationInputs) -> float:
+    """The limit for widened shapes, from sweeps judged by embeddings and shapes that did not see
+    their value of a condition; all conditions count."""
+    every, trained = [], len(found.training.labels)
+    for values in given.conditions.values():
+        distances = np.full(len(given.labels), np.nan)
+        for seen, judging in novelty.parts(values, given.judged):
+            embedding, present = novelty.embed_present(
+                given.whole[seen], given.labels[seen], given.fixed
+            )
+            means = embedding.means.astype(np.float64)
+            training = found.training.take(seen[:trained], present).seen_by(embedding)
+            shapes = found.rule.shapes(Scatters.of(training, means)).astype(np.float64)
+            judging = judging[np.isin(given.labels[judging], present)]
+            away = embedding(given.whole[judging])[:, None] - means
+            distances[judging] = shaped_distances(away, shapes).min(axis=1)
+        every.append(distances)
+    return novelty.limit(np.concatenate(every))
+
+
+def altered(features: Embed, sweeps: Dataset, seed: int) -> AlteredSweeps:
+    """The features of `sweeps` and of copies with each fault of CORRUPTIONS that can be applied
     to recorded counts. Broken taxels are left out, because the box bridges them."""
     every, rng = EvaluationSweeps(sweeps), np.random.default_rng(seed)
     copies = {}
     for corruption in applicable(every):
         if corruption.name not in TAXEL_FAULTS:
             source = rng.permutation(len(sweeps))[:COPIES]
-            copies[corruption.name] = embed(_copies(corruption, every, source, seed)), source
-    return AlteredSweeps(embed(sweeps.samples), sweeps.labels, copies)
+            copies[corruption.name] = features(_copies(corruption, every, source, seed)), source
+    return AlteredSweeps(features(sweeps.samples), sweeps.labels, copies)
 
 
 def _copies(corruption: Corruption, every: EvaluationSweeps, source: Array, seed: int) -> Array:
@@ -137,7 +166,7 @@ def write(folder: Path, trained_on: Dataset, fresh: Dataset) -> Manifest:
     def embed(samples: Array) -> Array:
         return np.stack([box.embedding(sweep) for sweep in samples]).astype(np.float64)
 
-    found = measure(trained_on, fresh, (embed, classes.means))
+    found = measure(embed, trained_on, fresh, (lambda z: z, classes.means))
     if found is None:
         raise FormatError(
             f"{fresh.source} does not show how altered sweeps differ from other materials; name a "

@@ -13,7 +13,6 @@ import tempfile
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from functools import partial
 from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
@@ -32,6 +31,7 @@ from appliance.inference.classifier import Classifier, softmax
 from appliance.inference.novelty import shaped_distances
 from train.calibration.contact import Contacts
 from train.calibration.slide_speeds import trained_speeds
+from train.data import repeats
 from train.data.readers import counted
 from train.data.sets import Dataset
 from train.export import (
@@ -39,7 +39,6 @@ from train.export import (
     bundle_score,
     displacement_limit,
     early_checks,
-    nuisances,
     sliding,
 )
 from train.metrics.answers import REFUSED, UNKNOWN
@@ -117,7 +116,7 @@ def pack(
     bridge, which takes most of the time; without it the box refuses them. Raises ExportRefused if a
     check fails, and BundleError if a label or the target cannot be used.
     """
-    content = _early_checked(_widened(content))
+    content = _early_checked(content)
     files = _files(content)
     manifest = _manifest(content, files, (name, version, commit), full_scale, pitch_mm)
     manifest = limited(manifest, content.train)
@@ -137,34 +136,6 @@ def pack(
 def limited(manifest: bundle.Manifest, train: Dataset) -> bundle.Manifest:
     """`manifest` with the limits that the training sweeps set: of displacement and of sliding."""
     return sliding.limited(displacement_limit.limited(manifest, train), train)
-
-
-def _widened(content: Content) -> Content:
-    """`content` with a check of unknown materials that knows how altered sweeps differ; see
-    nuisances."""
-    apart = content.unseen or content
-    if not (content.known and content.classes and apart.classes):
-        return content
-    spaces = [
-        (partial(_embedded, of), of.classes.means)
-        for of in ([apart, content] if content.unseen else [content])
-        if of.classes
-    ]
-    seed = int(content.about.get("seed", 0))
-    found = nuisances.measure(content.train, content.held_out, *spaces, seed=seed)
-    if found is None:
-        return content
-    known = replace(content.known, limit=found.limit)
-    widened = replace(
-        content,
-        known=known,
-        classes=replace(content.classes, shapes=found.shapes[-1]),
-        figures=content.figures | {nuisances.FIGURES: found.figures},
-    )
-    if not content.unseen:
-        return widened
-    classes = replace(apart.classes, shapes=found.shapes[0])
-    return replace(widened, unseen=replace(content.unseen, known=known, classes=classes))
 
 
 def _early_checked(content: Content) -> Content:
@@ -247,6 +218,7 @@ def _made(content: Content, commit: str, unknown: dict[str, str]) -> dict[str, A
     made = {
         "commit": commit,
         "set": content.train.source,
+        "sweeps": repeats.sketch(content.train, content.held_out),
         "machine": platform.machine(),
         "cpus": os.cpu_count(),
         "torch": metadata.version("torch") if find_spec("torch") else None,
@@ -429,7 +401,7 @@ def judge(folder: Path, held_out: Dataset, logits: Array, protocol: str) -> dict
             f"squared distance {known.limit:.4g}); record more positions, so that it learns how "
             "sweeps vary"
         )
-    return answers.figures(held_out, protocol)
+    return answers.figures(held_out.labels, held_out.group("recording"), protocol)
 
 
 def check_target(target: Path) -> None:

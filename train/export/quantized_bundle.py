@@ -16,12 +16,14 @@ from appliance.bundle import bundle
 from appliance.core.errors import FormatError
 from appliance.core.storage import put
 from train.calibration import novelty
+from train.calibration.novelty import Embedding
 from train.data.sets import Dataset
+from train.export import nuisances
 from train.export.bundle_graph import bundle_graph
 from train.export.pack import Content, ExportRefused, pack
 from train.metrics.score import provenance
 from train.models.methods import model_inputs
-from train.models.recipe.calibrate import Calibration
+from train.models.recipe.calibrate import Calibration, CalibrationInputs
 from train.models.recipe.fitted import Fit, calibration_inputs, finished
 from train.onnx_tools import parity
 from train.onnx_tools.graph_builder import run, with_head
@@ -101,27 +103,49 @@ def _calibrated(content: Content, fit: Fit, pitch_mm: float | None) -> Content:
         calibration = replace(calibration, displacement=None)
     rule = calibration.rule
     early = {"share": rule.share, "lost": rule.lost, "n": rule.n} if rule.early else rule.why
-    figures = fit.held_out_figures(f"held-out {content.held_out_by}")
+    figures = fit.held_out_figures()
     prefixes = fit.trunk(prefixes=True) if rule.early else None
-    content = replace(content, known=calibration.known())
-    apart = _unseen(fit, calibration)
+    content, given = replace(content, known=calibration.known()), calibration_inputs(fit)
+    apart = _unseen(given, calibration)
+    found = _widened(fit, given, apart.embedding, calibration.embedding)
+    if found:
+        content = replace(content, known=replace(calibration.known(), limit=found.limit))
+        figures |= {nuisances.FIGURES: found.figures}
+    shapes = found.shapes if found else [of.embedding.shapes for of in (apart, calibration)]
     return replace(
         content,
-        unseen=replace(content, model=bundle_graph(apart, fit.trunk()), classes=apart.classes()),
+        unseen=replace(
+            content,
+            model=bundle_graph(apart, fit.trunk()),
+            classes=replace(apart.classes(), shapes=shapes[0]),
+        ),
         model=bundle_graph(calibration, fit.trunk(), prefixes),
         early=rule.early,
         displacement=calibration.displacement_rule(),
-        classes=calibration.classes(),
+        classes=replace(calibration.classes(), shapes=shapes[1]),
         about=content.about | {"early": early},
         figures=content.figures | figures,
     )
 
 
-def _unseen(fit: Fit, calibration: Calibration) -> Calibration:
+def _widened(
+    fit: Fit, given: CalibrationInputs, apart: Embedding, whole: Embedding
+) -> nuisances.Widened | None:
+    """Shapes of known materials that know how altered sweeps differ, and their limit; see
+    nuisances. apart: an embedding that did not see the held-out
+    sweeps."""
+    trunk, spaces = fit.trunk(), [(of, of.means) for of in (apart, whole)]
+    seed = int(fit.about["seed"])
+    found = nuisances.measure(
+        lambda samples: run(trunk, samples), fit.train, fit.held, *spaces, seed=seed
+    )
+    return found and replace(found, limit=nuisances.limit_of_conditions(found, given))
+
+
+def _unseen(given: CalibrationInputs, calibration: Calibration) -> Calibration:
     """`calibration` with a head and an embedding that did not see the groups of the held-out
     sweeps."""
-    given = calibration_inputs(fit)
-    seen = ~np.isin(given.groups, given.groups[given.judged])
+    seen = ~np.isin(given.groups, given.groups[given.held])
     weight, bias = given.naming_head(seen)
     return replace(
         calibration,

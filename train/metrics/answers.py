@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from train.data.sets import Dataset
 from train.metrics.score import accuracy_figure
 
 Array = NDArray[Any]
@@ -29,24 +28,25 @@ class Answers:
     fused: Array
     network: Array
 
-    def figures(self, sweeps: Dataset, protocol: str) -> dict[str, Any]:
-        """Accuracy by sweep, and by recording if a recording has several sweeps. A refused, unknown
-        or unsure sweep does not count as right. Beside it the accuracy of the network alone."""
+    def figures(self, labels: Array, recordings: Array, protocol: str) -> dict[str, Any]:
+        """Accuracy by sweep, and by recording if a recording has several sweeps; labels,
+        recordings: int [N] of the sweeps. A refused, unknown or unsure sweep does not count as
+        right. Beside it the accuracy of the network alone."""
         named = self.labels >= 0
-        right = (self.labels == sweeps.labels) & self.ok
+        right = (self.labels == labels) & self.ok
         counts = {
             "wrong": int((named & self.ok & ~right).sum()),
             "unsure": int((named & ~self.ok).sum()),
             "unknown": int((self.labels == UNKNOWN).sum()),
             "refused": int((self.labels == REFUSED).sum()),
         }
-        network = int((self.network == sweeps.labels).sum())
+        network = int((self.network == labels).sum())
         result = {
-            protocol: accuracy_figure(int(right.sum()), len(sweeps)) | counts,
-            f"{protocol}, {NETWORK}": accuracy_figure(network, len(sweeps)),
+            protocol: accuracy_figure(int(right.sum()), len(labels)) | counts,
+            f"{protocol}, {NETWORK}": accuracy_figure(network, len(labels)),
         }
-        first = np.unique(sweeps.group("recording"), return_index=True)[1]
-        if len(first) < len(sweeps):
-            fused = int((self.fused == sweeps.labels)[first].sum())
+        first = np.unique(recordings, return_index=True)[1]
+        if len(first) < len(labels):
+            fused = int((self.fused == labels)[first].sum())
             result[f"{protocol}, by recording"] = accuracy_figure(fused, len(first))
         return result

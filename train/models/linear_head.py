@@ -6,7 +6,7 @@ found on held-out groups, calibrates its probabilities. minirocket.py and sthmp.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
@@ -52,24 +52,29 @@ class LinearHeadModel:
         return with_head(self.features, self.weight, self.bias)
 
 
-def hold_out(sweeps: Dataset, seed: int) -> tuple[Dataset, Dataset, str]:
-    """(training sweeps, held-out sweeps, name of the group): whole positions if there are several
-    and these allow it, else recordings.
+def hold_out(
+    sweeps: Dataset, seed: int, by: Sequence[str] = ("position",)
+) -> tuple[Dataset, Dataset, str]:
+    """(training sweeps, held-out sweeps, name of the group): whole values of the first group of
+    `by` that has several and can be split, else recordings.
 
     Raises FormatError if the set has too few groups, or if only one sweep of a material would be
     left to train on.
     """
-    if len(np.unique(sweeps.groups.get("position", 0))) > 1:
-        with suppress(FormatError):
-            return _split(sweeps, "position", seed)
+    for name in by:
+        if len(np.unique(sweeps.groups.get(name, 0))) > 1:
+            with suppress(FormatError):
+                return _split(sweeps, name, seed)
     return _split(sweeps, "recording", seed)
 
 
-def hold_out_or_all(sweeps: Dataset, seed: int) -> tuple[Dataset, Dataset, str]:
+def hold_out_or_all(
+    sweeps: Dataset, seed: int, by: Sequence[str] = ("position",)
+) -> tuple[Dataset, Dataset, str]:
     """As `hold_out`; if the set is too small, all of it on both sides, by "nothing". Then only
     Platt's correction bounds the temperature."""
     try:
-        return hold_out(sweeps, seed)
+        return hold_out(sweeps, seed, by)
     except FormatError:
         return sweeps, sweeps, "nothing"
 

@@ -188,11 +188,14 @@ def _examples(sweeps: Dataset) -> list[int]:
 
 
 def confusion(figures: Json) -> str:
-    """The labels that the sweeps of each material get; rows are the true materials. Answers without
-    a label are left out."""
+    """The labels that the sweeps of each material get, as shares of all its sweeps; rows are the
+    true materials. A row lacks the share of answers without a label."""
     names = figures["labels"]
-    counts = [[figures["answers"].get(of, {}).get(named, 0) for named in names] for of in names]
-    return confusion_plot.draw(np.array(counts), names, "materials by the labels that they get")
+    answers = [figures["answers"].get(of, {}) for of in names]
+    counts = np.array([[given.get(named, 0) for named in names] for given in answers])
+    totals = np.array([sum(given.values()) for given in answers])
+    about = "materials by the labels that they get"
+    return confusion_plot.draw(counts, names, about, totals=totals)
 
 
 def calibration(found: Json) -> str:

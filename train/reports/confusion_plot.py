@@ -18,11 +18,19 @@ STRONGEST = 0.6
 dark."""
 
 
-def draw(matrix: Array, names: Sequence[str], about: str, printed: Array | None = None) -> str:
+def draw(
+    matrix: Array,
+    names: Sequence[str],
+    about: str,
+    printed: Array | None = None,
+    totals: Array | None = None,
+) -> str:
     """Draw counts or shares [K, K] with the true materials as rows: each row in per cent, and the
-    printed values below in small type."""
+    printed values below in small type. totals: sweeps [K] of each material, if some of them have no
+    label; without them the sums of the rows."""
     k = len(names)
-    rows = np.asarray(matrix, float) / np.maximum(np.sum(matrix, 1, keepdims=True), 1e-9)
+    sums = np.sum(matrix, 1) if totals is None else totals
+    rows = np.asarray(matrix, float) / np.maximum(np.reshape(sums, (-1, 1)), 1e-9)
     figure, axes = single_axes(
         0.6 + (0.36 if printed is None else 0.47) * k, left=0.25, right=0.995, top=0.55, bottom=0.05
     )

@@ -23,6 +23,7 @@ from appliance.core.errors import FormatError
 from appliance.core.sweep_set import Array
 from appliance.core.types import SweepFormat
 from train.data import readers, sets
+from train.data.group_values import text_of
 from train.data.readers import RecordedSweep
 from train.reports.plot_style import (
     ACCENT,
@@ -176,7 +177,10 @@ def of_set(labelled: sets.Dataset, number: int) -> ShownSweep:
     """A sweep of a set with its groups."""
     named = [
         labelled.materials[labelled.labels[number]],
-        *(f"{by} {v[number]}" for by, v in sorted(labelled.groups.items())),
+        *(
+            f"{by} {text_of(v[number])} {labelled.units.get(by, '')}".rstrip()
+            for by, v in sorted(labelled.groups.items())
+        ),
     ]
     taxels = labelled.samples[number]
     notes = (f"{labelled.source}, sweep {number} of {len(labelled)}", str(labelled.format))
@@ -298,10 +302,12 @@ def _skin(figure: Figure, sweep: ShownSweep, taxels: Array) -> str:
     rows, columns = sweep.taxels.shape[1:3]
     lines = taxels.reshape(len(taxels), rows, columns, -1)
     tare = None if sweep.tare is None else sweep.tare.reshape(lines.shape[1:])
+    # about its own level: offsets between taxels would make flat lines of all signals
+    level = np.median(lines, axis=0) if tare is None else tare
+    lines = lines - level
     top, bottom = _ends(SKIN)
     high, wide = (top - bottom) / rows, (RIGHT - LEFT) / columns
-    shown = taxels if sweep.tare is None else np.append(taxels, sweep.tare)
-    low, up = shown.min(), shown.max()
+    low, up = min(lines.min(), 0.0), max(lines.max(), 0.0)
     # share of a plot that is free for its taxel's number
     head = NUMBER * rows / (0.88 * (SKIN[1] - SKIN[0]))
     margins = max(up - low, 1) * np.array([0.08, 1.08 * head / (1 - head)])
@@ -311,22 +317,30 @@ def _skin(figure: Figure, sweep: ShownSweep, taxels: Array) -> str:
         axes = add_axes(figure, left, left + 0.94 * wide, above, above - 0.88 * high)
         sweep.span(axes)
         axes.set_ylim(low - margins[0], up + margins[1])
-        _taxel(axes, sweep, lines[:, row, column], None if tare is None else tare[row, column])
+        _taxel(axes, sweep, lines[:, row, column], tare is not None)
         place = {"ha": "right", "xycoords": "axes fraction"}
         write(axes, 1, 1 - head / 2, f"{row + 1},{column + 1}", GREY, SMALL - 1, **place)
+        if sweep.format.axes == 1:
+            place["ha"] = "left"
+            text = f"{level[row, column, 0]:.5g}"
+            write(axes, 0, 1 - head / 2, text, GREY, SMALL - 1, **place)
         lowest, leftmost = row == rows - 1, column == 0
         for axis, ticks, outer in ((axes.xaxis, times, lowest), (axes.yaxis, counts, leftmost)):
             set_ticks(axis, ticks, bare=not outer)
         axes.set_xlabel("s" if lowest else "", color=GREY, size=SMALL, labelpad=1)
         axes.set_ylabel("counts" if leftmost else "", color=GREY, size=SMALL)
-    return f"; {sweep.format.axes} axes, the normal one dark" if sweep.format.axes > 1 else ""
+    axes_told = f"; {sweep.format.axes} axes, the normal one dark" * (sweep.format.axes > 1)
+    about = "the skin at rest" if tare is not None else "its median"
+    shown = ", which stands above it" * (sweep.format.axes == 1)
+    return f"; each taxel about {about}{shown}{axes_told}"
 
 
-def _taxel(axes: Axes, sweep: ShownSweep, counts: Array, tare: Array | None) -> None:
-    """Draw the lines of one taxel over the grid. counts: [T, A]; tare: [A]."""
+def _taxel(axes: Axes, sweep: ShownSweep, counts: Array, tared: bool) -> None:
+    """Draw the lines of one taxel over the grid. counts: [T, A] about its level; tared: whether
+    that is the level of the skin at rest."""
+    if tared:
+        axes.axhline(0.0, color=GREY, linewidth=0.8)
     for k in range(sweep.format.axes):
-        if tare is not None:
-            axes.axhline(float(tare[k]), color=GREY, linewidth=0.8)
         normal, line = k == sweep.format.axes - 1, _thinned(sweep.time_s, counts[:, k])
         axes.plot(*line, color=ACCENT, linewidth=0.7, alpha=None if normal else 0.4)
     axes.grid(color=FAINT, linewidth=0.6)
@@ -341,6 +355,7 @@ def _image(axes: Axes, sweep: ShownSweep, taxels: Array) -> str:
     means = np.add.reduceat(np.add.reduceat(taxels, times[:-1]), lines[:-1], axis=1) / np.outer(
         *map(np.diff, (times, lines))
     )
+    means = means - np.median(means, axis=0)
     ends_s = np.append(sweep.time_s[times[:-1]], sweep.time_s[-1] + 1 / sweep.format.rate_hz)
     axes.pcolormesh(
         ends_s, lines / (columns * sweep.format.axes), means.T, cmap=SHADES, rasterized=True
@@ -352,8 +367,8 @@ def _image(axes: Axes, sweep: ShownSweep, taxels: Array) -> str:
     first = np.arange(0, rows, -(-rows // 10))
     set_categories(axes.yaxis, first + 0.5, [f"row {row + 1}" for row in first])
     return (
-        f", from light, {means.min():.4g}, to dark, {means.max():.4g}; "
-        f"in each row its {columns} taxels{each}"
+        f"; each line about its median, from light, {means.min():.4g}, to dark, "
+        f"{means.max():.4g}; in each row its {columns} taxels{each}"
     )
 
 

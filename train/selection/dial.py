@@ -30,7 +30,7 @@ from train.metrics.score import confusion, interval, row_shares
 from train.models.methods import Log
 from train.models.recipe import recipe
 from train.models.recipe.fitted import Fit
-from train.models.recipe.recipe import FixedFeatures, HeadChoice, Settings, Setup, Trunk
+from train.models.recipe.recipe import HeadChoice, Settings, Setup, Trunk
 from train.models.recipe.sizes import SIZES, UNLIMITED, ModelSize
 
 Array = NDArray[Any]
@@ -163,7 +163,6 @@ class Judgement:
     """
 
     setup: Setup
-    every: FixedFeatures
     sizes: dict[str, JudgedSize]
     refused: dict[str, str]
     labels: Array
@@ -178,8 +177,18 @@ class Judgement:
     def fit(self, name: str) -> Fit:
         """The finished model of this size."""
         one = self.sizes[name]
-        trunk, plan = recipe.pruned(self.every.trunk, one.trunk, one.judged.chosen.plan)
+        trunk, plan = recipe.pruned(self.setup.fixed.trunk, one.trunk, one.judged.chosen.plan)
         return recipe.finish(trunk, plan, one.judged, self.setup)
+
+    def first_equals(self) -> dict[str, str]:
+        """For each size the first one whose model is the same, often itself: a larger size may
+        choose nothing more."""
+        first: dict[tuple[object, ...], str] = {}
+        equal = {}
+        for name, one in self.sizes.items():
+            parts = [(p.columns, p.copies, p.factor) for p in one.judged.chosen.plan.parts]
+            equal[name] = first.setdefault((one.trunk is None, *parts), name)
+        return equal
 
     def reduced(self, name: str) -> Settings:
         """The settings for a fit of this size to reduced sweeps: stages only if the size has them
@@ -238,10 +247,10 @@ def judge(
     the windows are too short for every size.
     """
     setup = Setup.of(sweeps, seed, settings, log)
-    every, found, refused = recipe.features(setup), {}, {}
+    found, refused = {}, {}
     for name in sizes:
         try:
-            fixed = every.limited(FAMILY[name])
+            fixed = setup.fixed.limited(FAMILY[name])
             found[name] = recipe.judged_size(fixed, setup, FAMILY[name])
         except FormatError as e:
             refused[name] = str(e)
@@ -249,13 +258,12 @@ def judge(
         raise FormatError("; ".join(f"{name}: {why}" for name, why in refused.items()))
     staged = staged or any(trunk for trunk, _ in found.values())
     alike = {
-        name: judged if trunk or not staged else _on_held_out(judged, every, setup)
+        name: judged if trunk or not staged else _on_held_out(judged, setup)
         for name, (trunk, judged) in found.items()
     }
     scores = next(iter(alike.values())).scores
     return Judgement(
         setup,
-        every,
         {
             name: JudgedSize(*found[name], judged.chosen.logits.argmax(axis=1))
             for name, judged in alike.items()
@@ -267,16 +275,17 @@ def judge(
     )
 
 
-def _on_held_out(judged: HeadChoice, every: FixedFeatures, setup: Setup) -> HeadChoice:
+def _on_held_out(judged: HeadChoice, setup: Setup) -> HeadChoice:
     """The same heads on the sweeps that judge stages."""
-    scores = setup.scores(every.data, [setup.judging])
+    scores = setup.scores(setup.fixed.data, [setup.judging])
     return HeadChoice(scores, scores.score(judged.chosen.plan.parts))
 
 
 def _values(setup: Setup, n: int) -> Array:
     """int [n], the value of the left-out group for each sweep that judges stages, and then for its
     copies."""
-    return np.resize(setup.sweeps.group(setup.by)[setup.out], n)
+    judging = setup.judging
+    return np.resize(setup.sweeps.group(judging.group)[judging.out], n)
 
 
 @dataclass(frozen=True)
@@ -365,15 +374,19 @@ def choose(sweeps: Dataset, seed: int, settings: Settings, wanted: SizeWish, log
     Raises NothingFits if no size can be used, and FormatError as recipe.fit.
     """
     judged = judge(sweeps, seed, settings, wanted.sizes, log)
-    fits = {name: judged.fit(name) for name in judged.sizes}
-    costs, refused = bundle_costs(fits, sweeps, log)
+    first = judged.first_equals()
+    fits = {name: judged.fit(name) for name in dict.fromkeys(first.values())}
+    measured, unpacked = bundle_costs(fits, sweeps, log)
+    costs = {name: measured[same] for name, same in first.items() if same in measured}
+    refused = {name: unpacked[same] for name, same in first.items() if same in unpacked}
     over = {name: why for name, cost in costs.items() if (why := wanted.budget.over(cost))}
     why_not = judged.refused | refused | over
-    order = sorted(costs.keys() - over.keys(), key=lambda name: costs[name].order(wanted.budget))
+    within = [name for name in costs if name not in over]
+    order = sorted(within, key=lambda name: costs[name].order(wanted.budget))
     if not order:
         raise NothingFits(_nearest(costs, why_not, wanted.budget))
     chosen = judged.choose(order, wanted.accuracy, np.ones(len(judged.labels), bool))
-    return Selection(judged, wanted, order, costs, why_not, chosen, fits[chosen])
+    return Selection(judged, wanted, order, costs, why_not, chosen, fits[first[chosen]])
 
 
 def reduced(choice: Selection, change: Change, log: Log) -> tuple[Fit, BundleCost]:

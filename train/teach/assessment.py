@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from appliance.core.statistics import wilson
 from appliance.inference.classifier import softmax
-from train.data.splitters import InnerPart, recording_parts
+from train.data.splitters import InnerPart, inner_parts, recording_parts
 from train.metrics.score import interval
 from train.models.methods import Log, no_log
 from train.models.recipe import recipe
@@ -160,9 +160,9 @@ def assess(lesson: Lesson, seed: int = 0, log: Log = no_log) -> Assessment:
     if fewer than two materials have."""
     lesson = lesson.repeated()
     setup = recipe.Setup.of(lesson.sweeps, seed, recipe.Settings(steps=0), log)
-    fixed = recipe.features(setup)
+    fixed = setup.fixed
     choice = recipe.judge(recipe.candidates(fixed, setup), fixed, setup)
-    parts, scores, chosen = setup.parts, choice.scores, choice.chosen
+    parts, scores, chosen = inner_parts(lesson.sweeps), choice.scores, choice.chosen
     if not np.any([part.out for part in parts], axis=0).all():
         # some materials are of one place: their sweeps are judged by others of that place
         parts = recording_parts(lesson.sweeps)

@@ -66,9 +66,9 @@ def teach(
     sweeps.require_materials()
     setup = recipe.Setup.of(sweeps, seed, recipe.Settings(steps=0), lambda line: None)
     times.begin("features")
-    every = recipe.features(setup)
+    _ = setup.fixed  # computed here, for the time of this step
     times.begin("heads")
-    fit = recipe.fit_size(every, setup, setup.settings.size)
+    fit = recipe.fit_size(setup, setup.settings.size)
     held = dict(zip(sweeps.materials, counts.tolist(), strict=True))
     fit = replace(fit, about=fit.about | {"taught": about | {"sweeps": held}})
     times.begin("bundle")

@@ -1,6 +1,7 @@
 /* What the pages' scripts share: elements, and figures in words. */
 
-const TONES = {ok: "good", recorded: "good", unsure: "warn", undecided: "warn", unknown: "warn", aborted: "plain"};
+const TONES = {ok: "good", recorded: "good", unsure: "warn", undecided: "warn", unknown: "warn", conflict: "warn",
+  displaced: "warn", aborted: "plain", off: "plain"};
 
 export const byId = (id) => document.getElementById(id);
 
@@ -12,6 +13,19 @@ export function made(name, classes, text, parent) {
   if (text !== undefined) one.textContent = text;
   parent?.append(one);
   return one;
+}
+
+/* Draws the head of a page. state: of the skin, in words; fine: whether it streams. source: of the frames, if known. why: why
+   what is shown is not of this moment, "" where it is. */
+export function frame({state, fine, source, why = ""}) {
+  put("state", state);
+  byId("state").className = fine ? "pill fine" : "pill";
+  if (source) {
+    byId("simulated").hidden = source === "usb";
+    put("simulated", source === "replay" ? "REPLAYED" : "SIMULATED");
+  }
+  byId("banner").hidden = !why;
+  put("banner", why);
 }
 
 /* Writes a sweep's status, in the colour of what it means. */
@@ -29,6 +43,6 @@ export function ago(ms) {
   return s < 86400 ? `${Math.floor(s / 3600)} h ${Math.floor(s / 60) % 60} min` : `${Math.floor(s / 86400)} d ${Math.floor(s / 3600) % 24} h`;
 }
 
-export function percent(p) { return `${(100 * p).toFixed(1)} %`; }
+export function percent(p) { return `${(100 * p).toFixed(1)}\u00a0%`; }
 
 export function count(n) { return n.toLocaleString("en"); }

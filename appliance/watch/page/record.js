@@ -1,7 +1,7 @@
 /* The page of a recording: what is there and what is missing, the last sweep, the skin; and the labels, which are set here. */
 
 import {listen} from "/events.js";
-import {ago, byId, count, made, mark, put} from "/parts.js";
+import {ago, byId, count, frame, made, mark, put} from "/parts.js";
 import {signal, spectrogram} from "/plots.js";
 import {SkinPicture} from "/skin.js";
 
@@ -33,14 +33,10 @@ function trouble() {
 
 function drawHeader() {
   const why = trouble();
-  byId("banner").hidden = !why;
-  put("banner", why);
   document.body.classList.toggle("stale", Boolean(why));
-  put("state", !reached ? "no connection" : !recording ? "waiting" : recording.skin !== "streaming" ? `skin ${recording.skin}`
-    : recording.sweeping ? "sweeping" : recording.ready ? "ready" : "not ready");
-  byId("state").className = live() && recording.skin === "streaming" ? "pill fine" : "pill";
-  byId("simulated").hidden = !recording || recording.source === "usb";
-  put("simulated", recording?.source === "replay" ? "REPLAYED" : "SIMULATED");
+  const state = !reached ? "no connection" : !recording ? "waiting" : recording.skin !== "streaming" ? `skin ${recording.skin}`
+    : recording.sweeping ? "sweeping" : recording.ready ? "ready" : "not ready";
+  frame({state, fine: live() && recording.skin === "streaming", source: recording?.source, why});
   byId("format").hidden = !recording;
   if (recording) put("format", recording.format);
 }

@@ -35,9 +35,11 @@ export function shades() {
 
 /* Draws views (appliance/alignment/view.py) into an element. */
 export class SkinPicture {
-  constructor(parent) { this.parent = parent; this.drawn = ""; }
+  /* pointed: [row, column] of the taxel that was pointed at last, or touched. */
+  constructor(parent) { this.parent = parent; this.drawn = ""; this.pointed = null; }
 
-  show(view) {
+  /* digits: of the loads, behind the point. */
+  show(view, digits = 0) {
     const drawn = JSON.stringify([view.shape, view.contact, view.fingertip]);
     if (drawn !== this.drawn) {
       this.parent.replaceChildren();
@@ -50,7 +52,7 @@ export class SkinPicture {
       tile.style.fill = back;
       if (!this.counts.length) return;
       this.counts[i].style.fill = front;
-      this.counts[i].textContent = loads.length ? Math.round(loads[i]) : "";
+      this.counts[i].textContent = loads.length ? loads[i].toFixed(digits) : "";
     });
     this.centre.style.visibility = view.centre ? "visible" : "hidden";
     this.way.style.visibility = "hidden";
@@ -69,7 +71,12 @@ export class SkinPicture {
     const svg = element("svg", {viewBox: `${left} ${top} ${right - left} ${bottom - top}`, role: "img",
       preserveAspectRatio: "xMidYMid"}, this.parent);
     svg.style.setProperty("--big", big);
-    element("title", {}, svg, `${rows} rows and ${cols} columns of taxels${tip && `; the fingertip is at the ${tip.replace("-", " ")}`}`);
+    svg.setAttribute("aria-label", `${rows} rows and ${cols} columns of taxels${tip && `; the fingertip is at the ${tip.replace("-", " ")}`}`);
+    for (const name of ["pointermove", "pointerdown"]) svg.addEventListener(name, (event) => {
+      const {row, col} = event.target.dataset;
+      if (row) this.pointed = [Number(row), Number(col)];
+    });
+    this.pointed = null;
     if (tip) drawTip(svg, tip, w, h, big);
     element("rect", {class: "board", x: -RIM, y: -RIM, width: w + 2 * RIM, height: h + 2 * RIM, rx: 18}, svg);
     [this.tiles, this.counts] = [[], []];
@@ -78,7 +85,7 @@ export class SkinPicture {
       if (named(r, rows)) element("text", {class: "name", x: -RIM - 24 * big, y: (r + 0.5) * TAXEL}, svg, most > NUMBERED ? r + 1 : `row ${r + 1}`);
       for (let c = 0; c < cols; c++) {
         const box = {x: c * TAXEL + 4, y: r * TAXEL + 4, width: TAXEL - 8, height: TAXEL - 8, rx: 10};
-        this.tiles.push(element("rect", {class: "tile", ...box}, svg));
+        this.tiles.push(element("rect", {class: "tile", "data-row": r, "data-col": c, ...box}, svg));
         if (most <= NUMBERED) this.counts.push(element("text", {class: "count", x: (c + 0.5) * TAXEL, y: (r + 0.82) * TAXEL}, svg));
       }
     }

@@ -1,6 +1,6 @@
 /* The page of `palpate skin show`: every axis of a skin, its noise and its faults. */
 import {listen} from "/events.js";
-import {byId, put} from "/parts.js";
+import {byId, frame, put} from "/parts.js";
 import {shades} from "/skin.js";
 
 const NUMBERED = 8;
@@ -54,10 +54,8 @@ function draw(view) {
 
 function show(view) {
   if (built !== `${view.shape}`) { build(view.shape); built = `${view.shape}`; }
-  byId("simulated").hidden = view.source !== "sim";
+  frame({state: view.state, fine: view.state === "streaming", source: view.source});
   put("skin", view.skin);
-  put("state", view.state);
-  byId("state").className = view.state === "streaming" ? "pill fine" : "pill";
   byId("trouble").hidden = !view.trouble;
   put("trouble", view.trouble);
   put("rate", view.rate_hz === null ? "–" : `${view.rate_hz.toFixed(1)} Hz`);
@@ -69,6 +67,5 @@ function show(view) {
 listen({view: show}, (there) => {
   document.body.classList.toggle("gone", !there);
   if (there) return;
-  put("state", "no connection");
-  byId("state").className = "pill";
+  frame({state: "no connection", fine: false, why: "no connection to palpate skin show; trying again"});
 });

@@ -5,13 +5,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from appliance.bundle import bundle
-from appliance.core.errors import ApplianceError, BundleError, LineError
+from appliance.core.errors import ApplianceError, BundleError, LineError, ModelError
 from appliance.core.health import Health
 from appliance.core.types import Status, Verdict
 from appliance.deployment.state import MOST_STARTS, Standing
@@ -332,3 +333,39 @@ def test_a_box_without_a_skin_takes_its_start_back(box: Trying, rigged: Callable
     running = rigged(simulated, model=bundle.load(box.store.bundles.at(box.two)), observers=[trial])
     running.seconds(1)
     assert box.standing.starts == 0
+
+
+def failed() -> Verdict:
+    """The answer to a sweep on which the bundle failed."""
+    return replace(verdict(""), status=Status.FAILED)
+
+
+def test_a_bundle_that_fails_on_sweeps_gives_way(box: Trying):
+    """The program ends after some failed sweeps; three such starts end the trial."""
+    for _ in range(MOST_STARTS):
+        trial = box.tried()
+        trial.turn(health(1))
+        trial.answered(failed())
+        trial.__exit__(ModelError, ModelError("3 sweeps could not be classified"), None)
+    assert box.start() == box.one
+
+
+def test_a_failed_sweep_begins_the_trial_anew(box: Trying):
+    """Sweeps and time before it do not count, also not those that were recorded already."""
+    trial = box.tried()
+    for _ in range(4):
+        trial.answered(verdict())
+    trial.turn(health(1))
+    trial.turn(health(500))
+    trial.turn(health(501, streams=False))
+    assert (box.standing.sweeps, box.standing.streamed_s > 400) == (4, True)
+    trial.answered(failed())
+    trial.turn(health(502, streams=False))
+    assert (box.standing.sweeps, box.standing.streamed_s) == (0, 0)
+    for _ in range(4):
+        trial.answered(verdict())
+    trial.turn(health(503))
+    assert not box.standing.committed
+    trial.answered(verdict())
+    trial.turn(health(504))
+    assert box.standing.committed

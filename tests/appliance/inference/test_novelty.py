@@ -10,6 +10,7 @@ import pytest
 
 from appliance.core.types import Status, Sweep
 from appliance.inference.classifier import Classifier, softmax
+from appliance.inference.novelty import KEPT
 from appliance.sim.rig import VirtualClock
 from tests.factories import toy_bundle
 
@@ -110,3 +111,28 @@ def test_enrolled_labels_are_compared_where_the_skin_is(tmp_path: Path):
         / toy_bundle.DISPLACEMENT.temperature
     )
     assert v.scores == pytest.approx(softmax(logits), abs=1e-3)
+
+
+def test_an_unknown_material_that_comes_again_is_noticed(displaced_box: Classifier):
+    """A sweep as near to an earlier unknown one as two of one material names it, the nearest if
+    there are several. A known sweep between them changes nothing; a third material is like none."""
+
+    def said(z1: float, z2: float, number: int) -> str:
+        verdict = displaced_box(toy_bundle.sweep(z1, z2, number))
+        assert verdict.status is Status.UNKNOWN
+        return verdict.detail
+
+    assert "as sweep" not in said(-4, 0, 1)
+    assert displaced_box(toy_bundle.sweep(0, 0, 2)).label == "a"
+    assert "as sweep" not in said(0, -9, 3)
+    assert said(-4.5, 0.5, 4).endswith("limit 9; as sweep 1")
+    assert said(0.5, -8.5, 5).endswith("; as sweep 3")
+
+
+def test_only_the_latest_unknown_sweeps_are_kept(displaced_box: Classifier):
+    """After as many others as are remembered, the first is forgotten."""
+    displaced_box(toy_bundle.sweep(-9, 0, 1))
+    for number in range(KEPT):
+        displaced_box(toy_bundle.sweep(0, -9 - 6 * number, number + 2))
+    assert "as sweep" not in displaced_box(toy_bundle.sweep(-9, 0, 99)).detail
+    assert displaced_box(toy_bundle.sweep(-9, 0, 100)).detail.endswith("as sweep 99")

@@ -3,6 +3,7 @@ max_sweeps."""
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Iterable
 from dataclasses import replace
 from itertools import islice
@@ -14,7 +15,7 @@ import pytest
 from appliance.bundle.bundle import Bundle
 from appliance.core.config import ClassifierConfig
 from appliance.core.types import Frames, Status, Sweep, Verdict
-from appliance.inference.classifier import Classifier
+from appliance.inference.classifier import LEAST_PROBABILITY, Classifier, Touched, softmax
 from appliance.inference.objects import FusedSweeps, ObjectRule, contradicts
 from appliance.runtime import assembly
 from appliance.sim import skin
@@ -288,3 +289,24 @@ def test_the_settings_reach_the_classifier(toy: Bundle):
             "object_s": chosen.object_s,
         }
     assert (rule["conflict"], rule["object_s"], rule["max_sweeps"]) == ("refuse", 7.5, 3)
+
+
+@pytest.mark.parametrize("fusion", ["product", "vote"])
+def test_an_object_without_end_takes_no_more_memory_or_time(toy: Bundle, fusion: str):
+    """After 20,000 sweeps of one object the fused sweeps are as small as after two, and the fused
+    probabilities are those of all sweeps."""
+    it = classifier(toy, UNTIL_NEW_OBJECT, fuse=fusion)
+    rng, given = np.random.default_rng(1), []
+    sizes = []
+    for n, own in enumerate(rng.dirichlet((2, 1, 1), 20_000), 1):
+        last = it.conclude(replace(toy_bundle.sweep(0, 0), id=n, object=1), own, Touched())
+        given.append(own)
+        if n in (2, 20_000):
+            sizes.append(len(pickle.dumps(it._sweeps.evidence)))
+    assert sizes[1] <= sizes[0] + 32
+    assert last.fused == 20_000
+    if fusion == "product":
+        together = softmax(np.log(np.maximum(given, LEAST_PROBABILITY)).sum(axis=0))
+    else:
+        together = np.bincount([int(p.argmax()) for p in given], minlength=3) / 20_000
+    assert last.scores == pytest.approx(together, abs=1e-8)

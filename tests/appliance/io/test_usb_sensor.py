@@ -9,7 +9,7 @@ import pytest
 import usb.core
 
 from appliance.core.config import SkinConfig
-from appliance.core.types import EPOCH_BITS, Frames, SweepFormat
+from appliance.core.types import EPOCH_BITS, EPOCHS, Frames, SweepFormat
 from appliance.io import packets
 from appliance.io.usb_sensor import UsbSensor
 from appliance.sim import rig, skin
@@ -402,3 +402,106 @@ def test_a_board_whose_clock_starts_anew(replugged: bool):
         [simulated.backend.board.frame_ns(int(s) & ((1 << EPOCH_BITS) - 1)) for s in frames.seq]
     )
     assert np.abs(frames.t_ns - truth).max() < 1_000_000
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        usb.core.USBError("Input/Output Error", -1, errno.EIO),
+        usb.core.USBError("Insufficient memory", -11, errno.ENOMEM),
+        usb.core.USBError("Other error", -99, None),
+        OSError(errno.EMFILE, "Too many open files"),
+        ValueError("Unknown langid"),
+        NotImplementedError("detach_kernel_driver"),
+        IndexError("list index out of range"),
+    ],
+)
+@pytest.mark.parametrize(
+    "call",
+    [
+        *("enumerate_devices", "get_device_descriptor", "open_device", "get_configuration"),
+        *("get_configuration_descriptor", "claim_interface", "is_kernel_driver_active"),
+        *("ctrl_transfer", "bulk_read"),
+    ],
+)
+def test_no_error_of_a_usb_call_leaves_read(
+    monkeypatch: pytest.MonkeyPatch, call: str, error: Exception
+):
+    """Whatever libusb raises, at any call, is a state of the skin with its reason, and the skin
+    streams once the error is over."""
+    simulated = idle_devices()
+    sensor = sensor_on(simulated)
+    assert len(read_for(sensor, simulated, 0.5))
+    right = getattr(simulated.backend, call)
+
+    def failing(*given: object) -> None:
+        raise error
+
+    simulated.backend.unplug()
+    read_for(sensor, simulated, 0.5)
+    monkeypatch.setattr(simulated.backend, call, failing)
+    simulated.backend.plug()
+    read_for(sensor, simulated, 1)
+    assert sensor.state != "streaming"
+    assert sensor.trouble
+    assert sensor.trouble.state == sensor.state
+    monkeypatch.setattr(simulated.backend, call, right)
+    assert len(read_for(sensor, simulated, 2))
+    assert sensor.state == "streaming"
+
+
+def test_a_count_that_begins_anew_for_ever_is_a_mismatch():
+    """Packets that restart the count again and again stop the stream. The number of an enumeration
+    never overflows, however often it is reached."""
+    simulated = idle_devices()
+    sensor = sensor_on(simulated)
+    read_for(sensor, simulated, 0.5)
+    hostile = b"".join(
+        packets.pack(seq, 0, numbered(1), 0) for seq in (1 << 31, 1 << 30, 0, 3 << 30) * 10
+    )
+    simulated.backend.mangle = lambda data: hostile
+    read_for(sensor, simulated, 0.5)
+    assert (sensor.state, "anew" in str(sensor.trouble)) == ("mismatch", True)
+    simulated.backend.mangle = lambda data: data
+    read_for(sensor, simulated, 1)
+    assert sensor.state == "streaming"
+
+
+def test_more_enumerations_than_a_number_holds():
+    """The count of enumerations wraps, frames keep their order, and nothing overflows."""
+    simulated = idle_devices()
+    sensor = sensor_on(simulated)
+    sensor._stream._position = packets.StreamPosition(EPOCHS - 2)
+    before = read_for(sensor, simulated, 0.2)
+    simulated.backend.unplug()
+    read_for(sensor, simulated, 0.5)
+    simulated.backend.plug()
+    after = read_for(sensor, simulated, 1)
+    assert set(before.seq >> EPOCH_BITS) == {EPOCHS - 1}
+    assert set(after.seq >> EPOCH_BITS) == {0}
+    assert (np.diff(after.seq) > 0).all()
+
+
+def test_garbage_that_costs_time_is_silence():
+    """Bytes without a frame whose examination takes all the time: `silent` after silence_ms, not
+    after many seconds."""
+    simulated = idle_devices()
+    sensor = sensor_on(simulated)
+    read_for(sensor, simulated, 0.5)
+    assert sensor.state == "streaming"
+    clock, link = simulated.clock, sensor._link
+    begun = clock.now_ns()
+
+    class Flood:
+        """A link whose garbage is there at once, and takes 2 ms to examine."""
+
+        close = link.close
+
+        def read(self, size: int, timeout_ms: int) -> bytes:
+            return b"PP" * (size // 2)
+
+    sensor._link = Flood()
+    while sensor.state == "streaming" and clock.now_ns() < begun + 20 * SECOND:
+        sensor.read()
+        clock.sleep_until(clock.now_ns() + 2_000_000)
+    assert clock.now_ns() - begun < SECOND

@@ -72,8 +72,7 @@ class Taught:
             self.number += 1
             sweep = replace(cut(), id=self.number, start_ns=SystemClock().now_ns())
             verdict = replace(OK, sweep=self.number, status=status, label="", scores=np.empty(0))
-            for observer in (self.recording, self.session):
-                observer.sweep(sweep, verdict, {})
+            self.recording.sweep(sweep, verdict, {})
 
     def until(self, done: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
         """Take turns until the session is in this state."""

@@ -291,7 +291,7 @@ def test_a_box_that_says_nothing_new_is_no_news(browser: Any, page: PageServer):
     seen = BrowsedPage(context, page.address)
     seen.state("off")
     seen.state("no-connection")
-    assert "no news" in seen.text("#hint")
+    assert "The box does not answer" in seen.text("#hint")
     page.show(replace(VIEW, number=8))
     seen.state("off")
     context.close()

@@ -4,83 +4,23 @@ sizes."""
 from __future__ import annotations
 
 import re
-import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import pytest
 
 from appliance.core.config import WatchConfig
 from appliance.watch.access import Access
-from appliance.watch.board import KEPT, PageBoard
-from appliance.watch.server import PageServer
 from tests.factories import feed_lines
 from tests.factories.browser import BrowsedPage, until
 from tests.factories.install_scripts import page_secrets
+from tests.factories.shown_page import NOW_S, Shown, opened
 
 pytestmark = pytest.mark.slow
 
-SIZES = [(390, 844), (1024, 768), (1920, 1080)]
-NOW_S = 400.0
-"""The box's clock when a page is opened."""
-
-
-class Shown:
-    """A page whose lines of the feed a test writes. Within its `with` block browsers learn twice a
-    second whether there is a box, as with the command, however slow the machine is."""
-
-    def __init__(self, access: Access) -> None:
-        self.server = PageServer(
-            "watch.html",
-            access,
-            lambda: round(NOW_S * feed_lines.SECOND),
-            KEPT,
-            {"sweep": self._sweep},
-        )
-        self.board = PageBoard(self._publish)
-        self._box: object = None
-        self._ended = threading.Event()
-        self._beating = threading.Thread(target=self._beat)
-
-    def __enter__(self) -> Self:
-        self.server.__enter__()
-        self._beating.start()
-        return self
-
-    def __exit__(self, *reason: object) -> None:
-        self._ended.set()
-        self._beating.join()
-        self.server.__exit__(*reason)
-
-    def _publish(self, name: str, content: object) -> None:
-        if name == "box":
-            self._box = content
-        self.server.publish(name, content)
-
-    def _beat(self) -> None:
-        while not self._ended.wait(0.5):
-            if self._box:
-                self.server.publish("box", self._box)
-
-    def _sweep(self, which: str) -> dict[str, Any] | None:
-        return self.board.sweep(which)
-
-    def shift(self) -> None:
-        """A box at work: forty sweeps, one of them `moved`, some without a label, the signals of
-        the last twenty."""
-        self.board.take(feed_lines.hello())
-        for number in range(1, 41):
-            status = {5: "unsure", 11: "gap", 17: "unsure", 23: "no-contact"}.get(number, "ok")
-            moved = "moved 2.2 mm too far towards row 1" if number == 29 else ""
-            label = feed_lines.LABELS[number % 6]
-            self.board.take(feed_lines.health(9.0 * number, lost_frames=3 * (number > 20)))
-            self.board.take(feed_lines.verdict(number, 9.0 * number, label, status, moved=moved))
-            self.board.take(feed_lines.sweep(number))
-        for i in range(40):
-            strength = 0 if i < 20 else 120
-            self.board.take(feed_lines.frame(370 + i / 20, feed_lines.load(0.7, 1.5, strength)))
+SIZES = [(390, 844), (1024, 768), (1400, 900)]
 
 
 @pytest.fixture
@@ -90,17 +30,6 @@ def shown() -> Iterator[Shown]:
     with one:
         one.shift()
         yield one
-
-
-def opened(
-    browser: Any, shown: Shown, width: int = 1024, height: int = 768, rows: int = 40
-) -> BrowsedPage:
-    """The page in a browser, with all of the shift."""
-    seen = BrowsedPage(
-        browser.new_context(viewport={"width": width, "height": height}), shown.server.address
-    )
-    until(lambda: seen.page.locator(".row").count() == rows)
-    return seen
 
 
 def test_the_verdict_comes_first_and_large(browser: Any, shown: Shown):
@@ -144,12 +73,15 @@ def test_a_name_of_any_length_fits(browser: Any, shown: Shown, label: str):
 
 
 def test_a_sweep_without_a_label_says_why(browser: Any, shown: Shown):
-    """The reason is shown in words with the status; the probabilities are gone."""
+    """The card has words for an operator, the fold the reason; the probabilities are gone."""
     seen = opened(browser, shown)
     shown.board.take(feed_lines.verdict(41, 390.0, status="sensor-lost"))
     until(lambda: seen.text("#status") == "sensor-lost")
-    assert "the skin was lost during the sweep" in seen.text("#label")
+    assert (seen.text("#label"), seen.text("#advice")) == ("Skin lost", "Check the skin's cable.")
     assert seen.text("#sure") == ""
+    assert not seen.page.is_visible("#detail")
+    seen.page.click("#why summary")
+    assert "the skin was lost during the sweep" in seen.text("#detail")
     assert seen.page.locator("#scores li").count() == 0
 
 
@@ -159,7 +91,7 @@ def test_probabilities_signal_and_spectrogram_of_a_chosen_sweep(browser: Any, sh
     seen = opened(browser, shown)
     scores = seen.page.locator("#scores li").all_inner_texts()
     assert len(scores) == 6
-    assert scores[0].split("\n") == [feed_lines.LABELS[40 % 6], "96.2 %"]
+    assert scores[0].split("\n") == [feed_lines.LABELS[40 % 6], "96.2\xa0%"]
     until(lambda: "16 taxels over 2.0 s" in str(seen.page.get_attribute("#signal", "aria-label")))
     assert re.search(
         r"strongest at about [57]0 Hz", seen.page.get_attribute("#spectrogram", "aria-label")
@@ -279,27 +211,32 @@ def test_unsigned_bundles_are_told_at_the_top(browser: Any, shown: Shown):
 
 
 def test_a_box_that_dies_and_comes_back_while_the_page_is_open(browser: Any, shown: Shown):
-    """The page says at once that the box is away, with the reason and the age of its content. It
-    shows the new box and bundle by itself."""
+    """The page says at once that the box is off, and since when; the reason is behind a fold. It
+    shows the new box and bundle by itself, and its card waits for a sweep of the new box."""
     seen = opened(browser, shown)
     assert not seen.page.is_visible("#banner")
     shown.board.take({"type": "closed", "why": "the box is stopping"})
     until(lambda: seen.page.is_visible("#banner"))
-    said = re.compile(
-        r"the box is away; last heard of it (?:(\d+) min )?(\d+) s ago: the box is stopping"
-    )
+    said = re.compile(r"The box is off or restarting, last heard (?:(\d+) min )?(\d+) s ago")
 
     def age_s() -> int:
         minutes, seconds = said.fullmatch(seen.text("#banner")).groups("0")
         return 60 * int(minutes) + int(seconds)
 
     before = age_s()
-    assert seen.text("#state") == "box away"
+    assert seen.text("#state") == "box off"
+    assert seen.text("#label") == "The box is off or restarting"
+    assert re.match(r"Last heard at \d\d:\d\d:\d\d, .* ago\.", seen.text("#advice"))
+    assert seen.text("#sure").startswith(f"Before that: {feed_lines.LABELS[40 % 6]}, sweep 40, ")
+    seen.page.click("#why summary")
+    assert seen.text("#detail") == "the box is stopping"
     until(lambda: age_s() > before)
     shown.board.take(feed_lines.hello(pid=72, bundle="aaaa0001"))
     shown.board.take(feed_lines.health(NOW_S, pid=72, bundle="aaaa0001", model="tubes 4, 6 labels"))
     until(lambda: not seen.page.is_visible("#banner"))
     assert seen.text("#state") == "ready"
+    assert seen.text("#label") == "Ready"
+    assert seen.text("#advice") == "No sweep yet since the box was started."
     assert seen.text("#bundle") == "tubes 4, 6 labels"
     assert "aaaa0001 in place of 9f3c2a1b" in seen.text(".note")
     assert seen.page.locator(".row").count() == 40
@@ -314,8 +251,9 @@ def test_a_page_program_that_dies_and_comes_back(browser: Any):
         first.shift()
         seen = opened(browser, first)
         access = Access(int(first.server.address.rsplit(":", 1)[1]))
-    until(lambda: "no connection to the box" in seen.text("#banner"))
-    assert "trying again" in seen.text("#banner")
+    until(lambda: "No connection to the box" in seen.text("#banner"))
+    seen.page.click("#why summary")
+    assert seen.text("#detail") == "The page tries again by itself."
     second = Shown(access)
     with second:
         second.board.take(feed_lines.hello())
@@ -335,7 +273,10 @@ def test_a_skin_that_is_away_is_not_a_box_that_is_away(browser: Any, shown: Show
         )
     )
     until(lambda: seen.page.is_visible("#banner"))
-    assert seen.text("#banner") == "no skin: absent; no skin on USB; check the cable"
+    assert seen.text("#banner") == "No skin: check its cable"
+    assert (seen.text("#label"), seen.text("#advice")) == ("No skin", "Check its cable.")
+    seen.page.click("#why summary")
+    assert seen.text("#detail") == "no skin on USB; check the cable"
     assert seen.text("#state") == "skin absent"
 
 
@@ -344,7 +285,7 @@ def test_it_is_used_with_the_keyboard(browser: Any, shown: Shown):
     sweep, space a status."""
     seen = opened(browser, shown)
     stops = []
-    for _ in range(8):
+    for _ in range(11):
         seen.page.keyboard.press("Tab")
         stops.append(
             seen.page.evaluate("document.activeElement.id || document.activeElement.textContent")
@@ -354,6 +295,9 @@ def test_it_is_used_with_the_keyboard(browser: Any, shown: Shown):
     assert stops == [
         "Watch",
         "Align",
+        "full",
+        "tone",
+        "save",
         "all 40",
         "ok 36",
         "unsure 2",

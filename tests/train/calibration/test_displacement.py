@@ -27,12 +27,16 @@ def made(n: int = 20, wrong: float = 0.0):
     x, labels, groups = sweeps(n, 0)
     held = groups >= 6
     copies, copied_labels, copied_groups = sweeps(n, 1, spread=10)
-    copied = AugmentedCopies(copies, copied_labels, copied_groups, copied_groups >= 6)
+    copied = AugmentedCopies(copies, copied_labels, np.arange(len(x)), copied_groups >= 6)
     truth = copied_labels[copied_groups >= 6]
     logits = 4 * np.eye(3)[truth]
     others = np.arange(len(truth)) < wrong * len(truth)
     logits[others] = 1.2 * np.eye(3)[(truth[others] + 1) % 3]
-    return novelty.embed(x, labels, 2), fit_displacement(x, labels, held, 2, copied, logits), copied
+    return (
+        novelty.embed(x, labels, 2),
+        fit_displacement(x, labels, groups, held, 2, copied, logits),
+        copied,
+    )
 
 
 def test_what_the_copies_vary_in_makes_nothing_unknown():
@@ -78,11 +82,11 @@ def test_a_moved_sweep_must_be_surer_where_copies_are_named_wrongly():
 def test_copies_that_are_surely_wrong_leave_no_sure_answer():
     """If half of the copies are certain and wrong, no probability is enough."""
     x, labels, groups = sweeps(10, 0)
-    copied = AugmentedCopies(x, labels, groups, groups >= 6)
+    copied = AugmentedCopies(x, labels, np.arange(len(x)), groups >= 6)
     truth = labels[groups >= 6]
     logits = 40.0 * np.eye(3)[(truth + (np.arange(len(truth)) % 2)) % 3]
     logits[:, :] = np.where(logits > 0, 1e6, 0)
-    fit = fit_displacement(x, labels, groups >= 6, 2, copied, logits)
+    fit = fit_displacement(x, labels, groups, groups >= 6, 2, copied, logits)
     assert fit
     assert fit.rule.unsure == displacement.NEVER
 
@@ -93,10 +97,12 @@ def test_without_copies_that_judge_there_is_no_rule():
     x, labels, groups = sweeps(10, 0)
     held = groups >= 6
     none = AugmentedCopies(x[:0], labels[:0], groups[:0], held[:0])
-    assert fit_displacement(x, labels, held, 2, none, np.zeros((0, 3))) is None
-    copied = AugmentedCopies(x, labels, groups, held)
+    assert fit_displacement(x, labels, groups, held, 2, none, np.zeros((0, 3))) is None
+    copied = AugmentedCopies(x, labels, np.arange(len(x)), held)
     logits = np.zeros((int(held.sum()), 3))
     lacking = copied.take((labels < 2) | held)
-    assert fit_displacement(x, labels, held, 2, lacking, logits) is None
+    assert fit_displacement(x, labels, groups, held, 2, lacking, logits) is None
     some = (labels < 2) | held
-    assert fit_displacement(x[some], labels[some], held[some], 2, copied, logits) is None
+    assert (
+        fit_displacement(x[some], labels[some], groups[some], held[some], 2, copied, logits) is None
+    )

@@ -25,7 +25,8 @@ SESSIONS = re.compile(
     r"leave sessions out when you evaluate \(--protocol leave:session\)"
 )
 ALONE = (
-    "the level is not used by the default recipe; alone it names 100 % of the sweeps (chance 25 %)"
+    "the level is not used by the default recipe; alone it names 100 % of the sweeps "
+    "(32 of 32, chance 25 %)"
 )
 
 
@@ -76,20 +77,23 @@ def test_a_taxel_may_have_three_axes():
     check_sessions(level_check.warnings_of(replace(sweeps, samples=samples)))
 
 
-def test_a_level_that_the_material_sets_is_not_reported():
-    """The level names the materials across sessions too, or nowhere: no line."""
+def test_a_level_that_names_the_material_everywhere_is_counted():
+    """The level names the materials across sessions and speeds too: one line, with the count. It
+    names them nowhere: no line."""
     sweeps = leveled(False)
-    assert level_check.warnings_of(sweeps) == []
+    sweeps.groups["speed"] = sweeps.groups["recording"] % 2
+    (line,) = level_check.warnings_of(sweeps)
+    assert "the mean of each taxel alone names 96 of 96 sweeps (chance 25 %), also where" in line
     drawn = np.random.default_rng(2).uniform(0, 400, len(sweeps))
     assert level_check.warnings_of(with_levels(sweeps, drawn)) == []
 
 
 def test_a_level_that_helps_across_sessions_is_not_reported():
     """The level names 100 % within sessions and 75 % across them, since one session of three is
-    moved by most of a material's distance: it depends on both, so there is no line."""
+    moved by most of a material's distance: it depends on both, so no line blames the session."""
     sweeps = leveled(False)
     moved = 100 * sweeps.labels + 75 * (sweeps.groups["session"] == 2)
-    assert level_check.warnings_of(with_levels(sweeps, moved)) == []
+    assert not any(map(SESSIONS.fullmatch, level_check.warnings_of(with_levels(sweeps, moved))))
 
 
 def test_sets_of_one_session_have_a_line_of_their_own():
@@ -122,7 +126,8 @@ def test_answers_are_materials_of_the_session():
     whole = leveled(True, each=12, sessions=6)
     sweeps = whole.take((whole.labels - whole.groups["session"]) % 2 == 0)
     rank, turn = sweeps.labels // 2, sweeps.groups["session"] // 2
-    assert level_check.warnings_of(with_levels(sweeps, 100 * rank)) == []
+    (line,) = level_check.warnings_of(with_levels(sweeps, 100 * rank))
+    assert "names 144 of 144 sweeps (chance 50 %), also where their session is left out" in line
     (line,) = level_check.warnings_of(with_levels(sweeps, 100 * ((rank + turn) % 2)))
     assert "names 100 % of the sweeps within one session and " in line
     assert "(chance 50 %)" in line

@@ -57,8 +57,8 @@ def test_the_command_splits_and_keeps_the_rest(tmp_path: Path, capsys: pytest.Ca
     assert len(made.train) + len(made.held) + len(rest) == len(whole)
     out = capsys.readouterr().out
     figure = r"\d+\.\d % \[\d+\.\d, \d+\.\d\] of \d+"
-    assert re.search(f"held-out recording, as the box answers: {figure}; ", out)
-    assert re.search(f"held-out recording, network alone: {figure}\n", out)
+    assert re.search(f"held-out speed, as the box answers: {figure}; ", out)
+    assert re.search(f"held-out speed, network alone: {figure}\n", out)
 
 
 @pytest.mark.parametrize(
@@ -84,6 +84,14 @@ def test_the_command_splits_and_keeps_the_rest(tmp_path: Path, capsys: pytest.Ca
             "--out /proc/none/fit.npz: cannot be written there",
         ),
         (["--set", "sim:T-LAB:1:1", "--out", "/"], "--out / is a folder; name a file"),
+        (
+            ["--set", "sim:T-LAB:1:1", "--out", "f.csv"],
+            "--out f.csv would not be a .csv file; name one that ends in .npz",
+        ),
+        (
+            ["--set", "x.npz", "--split", "recording:0.5", "--rest", "r.pdf"],
+            "--rest r.pdf would not be a .pdf file; name one that ends in .npz or .h5 or .hdf5",
+        ),
         (
             ["--set", "sim:T-LAB:1:1", "--rename", "wood"],
             "--rename 'wood' cannot be read; write OLD=NEW",

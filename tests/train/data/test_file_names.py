@@ -61,16 +61,32 @@ def test_what_is_no_pattern_is_refused(pattern: str, message: str):
 
 
 @pytest.mark.parametrize(
-    ("texts", "values", "meaning"),
+    ("field", "texts", "values", "unit"),
     [
-        (["10", "5", "10"], [10, 5, 10], ""),
-        (["2.5", "10", "-1"], [1, 2, 0], "0 = -1, 1 = 2.5, 2 = 10"),
-        (["slow", "fast"], [1, 0], "0 = fast, 1 = slow"),
-        (["01", "10"], [0, 1], "0 = 01, 1 = 10"),
+        ("{x}", ["10", "5", "10"], [10, 5, 10], ""),
+        ("{x}", ["2.5", "10", "-1"], [2.5, 10.0, -1.0], ""),
+        ("{x:f}", ["0", "0.5", "1", "1.5"], [0.0, 0.5, 1.0, 1.5], ""),
+        ("{x:f}N", ["0", "0.5"], [0.0, 0.5], "N"),
+        ("{x}mm_s_", ["10", "20"], [10, 20], "mm/s"),
+        ("{x}newtons", ["10", "20"], [10, 20], ""),
+        ("{x}", ["5N", "10N"], [5, 10], "N"),
+        ("{x}", ["5N", "500mN"], ["5N", "500mN"], ""),
+        ("{x}", ["5 mm", "12.5 mm"], [5.0, 12.5], "mm"),
+        ("{x}", ["slow", "fast"], ["slow", "fast"], ""),
+        ("{x}N", ["slow", "fast"], ["slow", "fast"], ""),
+        ("{x}", ["01", "10"], ["01", "10"], ""),
+        ("{x:d}", ["01", "10"], [1, 10], ""),
+        ("{x}", ["1", "1.0"], ["1", "1.0"], ""),
+        ("{x:d}", ["20261126101112123456789"], ["20261126101112123456789"], ""),
+        ("{x}", ["1", "fast"], ["1", "fast"], ""),
+        ("{x_mn:d}", ["100", "300"], [100, 300], "mN"),
     ],
 )
-def test_texts_become_numbers_that_are_told(texts: list[str], values: list[int], meaning: str):
-    """Whole numbers stay; other texts are ranked by value or by name, and the report explains each
-    rank."""
-    numbers, told = group(texts)
-    assert (numbers.tolist(), told) == (values, meaning)
+def test_values_stay_what_they_are(field: str, texts: list[str], values: list, unit: str):
+    """Numbers stay numbers and names stay names; a unit is read from the pattern, from every text,
+    or from the field's name."""
+    pattern = NamePattern("{material}_" + field + ".csv")
+    found, of = group(pattern, pattern.names[-1], texts)
+    assert found.tolist() == values
+    assert [type(value) for value in found.tolist()] == [type(value) for value in values]
+    assert of == unit

@@ -270,7 +270,7 @@ def test_recordings_are_a_set(tmp_path: Path):
     np.testing.assert_array_equal(s.labels, [1, 0, 1, 0])
     assert {k: list(v) for k, v in s.groups.items()} == {
         "recording": [0, 1, 2, 3],
-        "position": [1, 0, 0, 1],
+        "position": ["tip", "side", "side", "tip"],
         "object": [0, 1, 2, 3],
     }
     np.testing.assert_array_equal(s.samples[2], 2 + np.arange(48).reshape(8, 2, 3))
@@ -283,7 +283,7 @@ def test_a_place_that_is_a_number_keeps_it(tmp_path: Path):
         record(tmp_path / f"{i}.npy", "ab"[i % 2], position=position, session=session)
     groups = sets.load(str(tmp_path)).groups
     assert list(groups["position"]) == [12, 3, 3, 0]
-    assert list(groups["session"]) == [1, 0, 2, 1]
+    assert list(groups["session"]) == ["7", "07", "8", "7"]
 
 
 def test_what_else_a_sidecar_holds_changes_nothing(tmp_path: Path):

@@ -86,7 +86,10 @@ NAN[4, 7, 1, 2] = np.nan
         ),
         ({"rate_hz": np.array(np.nan)}, "rate_hz is nan"),
         ({"rate_hz": np.array(2e6)}, "a rate of 2000000.0 Hz is out of range"),
-        ({"group_speed": np.ones(6)}, "group_speed holds float64"),
+        ({"group_speed": np.ones(6, bool)}, "group_speed holds bool .*one number or name for each"),
+        ({"group_speed": np.array([1, 2, np.nan, 1, 2, 3])}, "group_speed of sweep 2 is nan; give"),
+        ({"group_speed": np.array([*"abcd", "", "e"])}, "group_speed of sweep 4 is ''; give a"),
+        ({"group_recording": np.full(6, 1j)}, "group_recording holds complex128 .*whole number"),
         ({"samples": NAN}, "samples\\[4, 7, 1, 2\\] is nan; drop sweep 4"),
         (
             {"labels": np.arange(5)},
@@ -201,10 +204,10 @@ def test_select_takes_any_of_several_values():
         ("speed<2", "cannot be read"),
         ("speed", "cannot be read"),
         ("force=1", "no group 'force'; it has recording, speed"),
-        ("speed=", "'' is not a whole number"),
-        ("speed=1,fast", "'1,fast' is not a whole number"),
-        ("speed<=1,2", "<= takes a group and one whole number"),
-        ("material>=low", ">= takes a group and one whole number"),
+        ("speed=", "'' is not a number"),
+        ("speed=1,fast", "'fast' is not a number"),
+        ("speed<=1,2", "<= takes a group of numbers and one number"),
+        ("material>=low", ">= takes a group of numbers and one number; material"),
         ("speed=9", "no sweep fulfils speed=9; it has 0, 1, 2, 3$"),
         ("speed=1,9", "no sweep fulfils speed=9; it has 0"),
         ("material=low,hihg", "no sweep fulfils material=hihg; it has high, low, middle"),
@@ -287,6 +290,92 @@ def test_join_keeps_recordings_apart_and_forces_together():
     assert len(np.unique(sets.join([a, b]).groups["recording"])) == 6 + 12
     with pytest.raises(FormatError, match="differ; join sets of one kind"):
         sets.join([a, easy(4, dtype="int16")])
+
+
+def grouped(**groups: object) -> sets.Dataset:
+    """A set of twelve sweeps with these groups, and their units after a colon in the names."""
+    named = {name.partition("__")[0]: np.array(v) for name, v in groups.items()}
+    units = {k.partition("__")[0]: k.partition("__")[2] for k in groups if "__" in k}
+    return replace(easy(4), groups=named, units=units, source="grouped")
+
+
+@pytest.mark.parametrize("file", ["s.npz", "s.h5"])
+def test_values_of_groups_are_kept(tmp_path: Path, file: str):
+    """Numbers with fractions, names and units are in both files, in parts, and count for the
+    digest; recordings may be named in a file."""
+    s = grouped(force__N=[0.0, 0.5, 1.0, 1.5] * 3, speed=["slow", "fast", "käse"] * 4)
+    s.save(tmp_path / file)
+    again = sets.load(str(tmp_path / file))
+    assert again.groups["force"].tolist() == [0.0, 0.5, 1.0, 1.5] * 3
+    assert again.groups["speed"].tolist() == ["slow", "fast", "käse"] * 4
+    assert again.units == {"force": "N"}
+    assert sets.digest(again) == sets.digest(s)
+    others = [grouped(force=[0.0, 0.5, 1.0, v] * 3, speed=["slow"] * 12) for v in (1.5, 1.25)]
+    assert len({sets.digest(x) for x in (s, *others)}) == 3
+    held_names = np.array(["p1", "p1", "p2", "p0", "p0", "p2"])
+    named = sets.load(write(tmp_path / "n.npz", group_recording=held_names))
+    assert named.groups["recording"].tolist() == [1, 1, 2, 0, 0, 2]
+    short = np.array([0.1, 0.2, 0.3] * 2, np.float32)
+    assert sets.load(write(tmp_path / "f.npz", group_force=short)).groups["force"][1] == 0.2
+
+
+@pytest.mark.parametrize(
+    ("condition", "kept"),
+    [
+        ("force<=1", 9),
+        ("force>=0.5", 9),
+        ("force=0.5,1.5", 6),
+        ("force=0.5N", 3),
+        ("force<=1 N", 9),
+        ("speed=slow", 4),
+        ("speed=slow, fast", 8),
+        ("speed=a, b", 4),
+        ("trial=01", 6),
+    ],
+)
+def test_conditions_speak_of_values(condition: str, kept: int):
+    """Numbers with fractions and their unit, names, a name with a comma, and a name that looks like
+    a number."""
+    speed, trial = ["slow", "fast", "a, b"] * 4, ["01", "1"] * 6
+    s = grouped(force__N=[0.0, 0.5, 1.0, 1.5] * 3, speed=speed, trial=trial)
+    assert len(s.select([condition])) == kept
+
+
+@pytest.mark.parametrize(
+    ("condition", "message"),
+    [
+        ("force<=slow", "'slow' is not a number in N"),
+        ("force<=5mN", "'5mN' is not a number in N"),
+        ("force=0.7", "no sweep fulfils force=0.7; it has 0, 0.5, 1, 1.5$"),
+        ("speed<=1", "<= takes a group of numbers and one number; speed holds names"),
+        ("speed=1", "no sweep fulfils speed=1; it has fast, slow$"),
+    ],
+)
+def test_values_that_do_not_occur_are_named(condition: str, message: str):
+    """Another unit, a limit of names, values that the group does not have."""
+    s = grouped(force__N=[0.0, 0.5, 1.0, 1.5] * 3, speed=["slow", "fast"] * 6)
+    with pytest.raises(FormatError, match=message):
+        s.select([condition])
+
+
+def test_sets_are_joined_by_values():
+    """Names stay together over sets, and so do positions that have names; units are converted; if
+    one set has names, all become names. Units of different kinds are refused."""
+    one = grouped(speed=["fast", "slow"] * 6, force__mN=[300, 1500] * 6, position=["tip"] * 12)
+    two = grouped(speed=["medium", "slow"] * 6, force__N=[0.3, 2.0] * 6, position=["tip"] * 12)
+    both = sets.join([one, two])
+    assert both.groups["speed"].tolist() == ["fast", "slow"] * 6 + ["medium", "slow"] * 6
+    assert both.groups["force"].tolist() == [300, 1500] * 6 + [300, 2000] * 6
+    assert (both.units, sets.join([two, one]).units) == ({"force": "mN"}, {"force": "N"})
+    assert sets.join([two, one]).groups["force"][12:].tolist() == [0.3, 1.5] * 6
+    assert set(both.groups["position"]) == {"tip"}
+    old = grouped(speed=[0, 1] * 6, force=[300, 1500] * 6, position=[0, 1] * 6)
+    mixed = sets.join([old, old, one])
+    assert sorted(set(mixed.groups["speed"])) == ["0", "1", "fast", "slow"]
+    assert sorted(set(mixed.groups["position"])) == ["0", "1", "2", "3", "tip"]
+    assert (mixed.groups["force"][0], mixed.units) == (300, {})
+    with pytest.raises(FormatError, match="'force' is in mN in one set and in mm in another; give"):
+        sets.join([one, grouped(force__mm=[1] * 12)])
 
 
 def test_joined_sets_are_told_apart():

@@ -12,7 +12,7 @@ from sklearn.naive_bayes import GaussianNB
 
 from appliance.core.errors import FormatError
 from train.data.sets import Dataset
-from train.data.splitters import Protocol, draw
+from train.data.splitters import Protocol, draw, inner_parts
 
 
 def a_set(labels: list[int], **groups: list[int]) -> Dataset:
@@ -148,6 +148,26 @@ def test_nothing_left_to_train_on_is_refused():
     sweeps = a_set([0, 0, 1, 1], session=[0, 0, 1, 1])
     with pytest.raises(FormatError, match="2 sweeps of fewer than two materials are left"):
         Protocol("leave:session").folds(sweeps, 1)
+
+
+def test_protocols_speak_of_values():
+    """Numbers with fractions and names; a value that the group does not have, or that is not a
+    number, is named."""
+    force, speed = [0.0, 0.5, 1.5] * 4, ["slow", "medium", "fast"] * 4
+    sweeps = a_set([0, 0, 0, 1, 1, 1] * 2, force=force, speed=speed)
+    for text, left in (("force=0,0.5->1.5", 2), ("speed=slow,medium->fast", 2)):
+        ((train, test),) = Protocol(f"split:{text}").folds(sweeps, 1)
+        assert set(test % 3) == {left}
+        assert len(train) == 8
+    assert len(Protocol("leave:speed").folds(sweeps, 1)) == 3
+    assert Protocol("leave:speed").clusters(sweeps).tolist() == speed
+    with pytest.raises(FormatError, match="'speed' has no quick; it has fast, medium, slow"):
+        Protocol("split:speed=slow->quick").folds(sweeps, 1)
+    with pytest.raises(FormatError, match="cannot be read; 'slow' is not a number"):
+        Protocol("split:force=0->slow").folds(sweeps, 1)
+    parts = inner_parts(sweeps)
+    assert {part.group for part in parts} == {"force", "speed"}
+    assert all(part.out.sum() == 4 for part in parts)
 
 
 def test_clusters_are_what_was_left_out_or_recordings():

@@ -21,7 +21,7 @@ from train.data import sets, summary
 
 def lines(s: sets.Dataset) -> list[str]:
     """The text lines of a set's description."""
-    return summary.description(s, {})
+    return summary.description(s)
 
 
 def command(*words: str) -> None:
@@ -123,7 +123,7 @@ def test_recordings_are_described_by_name(tmp_path: Path):
         f"digest {sets.digest(s)}",
         "  recordings: 6, of 1 each",
         "  materials: 2: a 3, b 3",
-        "  position: 2: 0 side, 1 tip",
+        "  position: 2: side, tip",
         "         side  tip  all",
         "    a       1    2    3",
         "    b       1    2    3",
@@ -170,7 +170,7 @@ def test_recordings_are_described_while_they_grow(tmp_path: Path):
     record(tmp_path / "1.npy", "")
     text = summary.describe(str(tmp_path)).splitlines()
     assert "  materials: 2: (none) 1, a 1" in text
-    assert "  position: 2: 0 (none), 1 2" in text
+    assert "  position: 2: (none), 2" in text
     assert not any("session" in line for line in text)
     assert text[-1].startswith(f"  cannot be trained on yet: {tmp_path / '1.npy'}: has no ")
     record(tmp_path / "2.npy", status=Status.SHORT)

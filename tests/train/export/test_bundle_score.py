@@ -15,6 +15,7 @@ from appliance.core.errors import FormatError
 from appliance.inference.classifier import Classifier
 from tests.factories import toy_bundle
 from train.cli.main import main
+from train.data import repeats, sets
 from train.data.sets import Dataset
 from train.export import bundle_score
 from train.metrics.score import interval
@@ -120,7 +121,8 @@ def test_a_set_of_another_form_is_refused(classifier: Classifier):
 def test_the_command_prints_and_writes_what_it_found(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """`palpate-train score`, with --json and --rename; a broken bundle is one line."""
+    """`palpate-train score`, with --json and --rename; sweeps of the training are counted by their
+    digests; a broken bundle is one line."""
     toy_bundle.load(tmp_path / "toy")
     sweeps(*HERE, labels=[0, 1, 2], materials="Abc").save(tmp_path / "s.npz")
     args = ["score", str(tmp_path / "toy"), "--set", str(tmp_path / "s.npz")]
@@ -137,6 +139,21 @@ def test_the_command_prints_and_writes_what_it_found(
         "fitted to a set of this name, s.npz: sweeps that it has seen say nothing of new ones"
         in capsys.readouterr().out
     )
+    three = sets.load(str(tmp_path / "s.npz"))
+    for kept, said in (
+        (repeats.sketch(three.take(np.arange(2))), "warning: 2 of 3 sweeps are the very ones that"),
+        (repeats.sketch(replace(three, samples=three.samples + np.int16(1))), ""),
+    ):
+        manifest = content["manifest.json"].replace(b'"seed": 1', f'"sweeps": "{kept}"'.encode())
+        toy_bundle.put(tmp_path / "toy", content | {"manifest.json": manifest})
+        assert main(args) == 0
+        printed = capsys.readouterr().out
+        assert said in printed
+        assert ("the very ones" in printed) == bool(said)
+    manifest = content["manifest.json"].replace(b'"seed": 1', b'"sweeps": "broken"')
+    toy_bundle.put(tmp_path / "toy", content | {"manifest.json": manifest})
+    assert main(args) == FormatError.exit_code
+    assert "digests of training sweeps" in capsys.readouterr().err
     assert main([*args, "--rename", "Q=a"]) == FormatError.exit_code
     assert "there is no material 'Q'" in capsys.readouterr().err
     assert main(["score", str(tmp_path / "none"), *args[2:]]) != 0

@@ -149,14 +149,14 @@ def test_a_bundle_passes_its_own_tests(fitted: Fit, packed: Path):
     assert it.self_test() < 1e-6
     manifest = it.bundle.manifest
     assert it.bundle.golden_logits.argmax(1).tolist() == [0, 2]
-    held = manifest.figures["held-out recording"]
+    held = manifest.figures["held-out speed"]
     assert held["n"] == len(fitted.held)
     assert held["accuracy"] + (held["wrong"] + held["unsure"] + held["unknown"]) / held[
         "n"
     ] == pytest.approx(1, abs=1e-4)
     assert held["refused"] == 0
-    assert manifest.figures["held-out recording, network alone"]["accuracy"] >= held["accuracy"]
-    assert manifest.figures["held-out recording, by recording"]["n"] == len(fitted.held) / 2
+    assert manifest.figures["held-out speed, network alone"]["accuracy"] >= held["accuracy"]
+    assert manifest.figures["held-out speed, by recording"]["n"] == len(fitted.held) / 2
     result = manifest.figures["parity"]
     assert result["agreement"] >= quantized_bundle.LEAST_AGREEMENT
     assert result["lost"] <= quantized_bundle.MOST_LOST
@@ -192,7 +192,7 @@ def test_figures_of_held_out_sweeps_are_not_of_heads_that_saw_them(fitted: Fit):
     wrong = replace(fitted.held, labels=(fitted.held.labels + 1) % 3)
     spoilt = replace(fitted, held=wrong)
     honest, misled = (
-        finished(one).held_out_figures("x")["x, network alone"]["accuracy"]
+        finished(one).held_out_figures()["held-out speed, network alone"]["accuracy"]
         for one in (fitted, spoilt)
     )
     assert honest > 0.9
@@ -419,7 +419,7 @@ def test_the_box_must_answer_as_export_did(fitted: Fit, packed: Path):
     logits = np.stack([box(packed).logits(x) for x in fitted.held.samples])
     assert "held-out" in pack.judge(packed, fitted.held, logits, "held-out")
     logits[:2] = -logits[:2]
-    with pytest.raises(ExportRefused, match="labels 2 of 24 held-out sweeps otherwise"):
+    with pytest.raises(ExportRefused, match="labels 2 of 30 held-out sweeps otherwise"):
         pack.judge(packed, fitted.held, logits, "held-out")
 
 
@@ -526,9 +526,9 @@ def test_the_command_exports_what_fit_wrote(
     lines = capsys.readouterr().out.splitlines()
     lines = [line for line in lines if not line.startswith("  ")]  # each fault, each alteration
     assert [line.split(":")[0] for line in lines] == [
-        "held-out recording, as the box answers",
-        "held-out recording, network alone",
-        "held-out recording, by recording",
+        "held-out speed, as the box answers",
+        "held-out speed, network alone",
+        "held-out speed, by recording",
         "broken taxels",
         "altered sweeps",
         "a finger that rests",
@@ -637,7 +637,9 @@ def test_fabrics_go_the_whole_way(tmp_path: Path, capsys: pytest.CaptureFixture[
         128,
     )
     logits = np.stack([it.logits(counts) for counts in rest.samples])
-    result = bundle_score.answers_to(it, rest, logits).figures(rest, "unseen")
+    result = bundle_score.answers_to(it, rest, logits).figures(
+        rest.labels, rest.group("recording"), "unseen"
+    )
     assert result["unseen"]["accuracy"] > 0.9
     assert result["unseen, by recording"]["accuracy"] > 0.9
     sentences = [

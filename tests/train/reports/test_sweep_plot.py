@@ -4,6 +4,7 @@ nothing loaded from elsewhere."""
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -15,6 +16,7 @@ from appliance.core.types import Frames, Status, Sweep, SweepFormat, load, save
 from tests.factories.recordings import record
 from tests.factories.sweep_sets import easy
 from train.cli.main import main
+from train.data import sets
 from train.reports import plot_style, sweep_plot
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -163,6 +165,24 @@ def test_the_picture_is_whole_and_needs_nothing(small: str, tmp_path: Path):
     assert drawn(tmp_path / "big.npy", format) == svg
 
 
+@pytest.mark.slow
+def test_offsets_do_not_flatten_the_lines(monkeypatch: pytest.MonkeyPatch):
+    """Taxels thousands of counts apart are drawn about their own level, which stands beside them;
+    the tare is that level if it is known."""
+    limits = []
+    monkeypatch.setattr(sweep_plot, "_taxel", lambda axes, *_: limits.append(axes.get_ylim()))
+    samples = np.random.default_rng(0).integers(0, 20, (2, 64, 2, 2)).astype(np.int16)
+    samples += np.array([[0, 1000], [2000, 5000]], np.int16)
+    made = sets.Dataset(samples, np.arange(2), ("a", "b"), 100.0, {}, "offsets")
+    shown = sweep_plot.of_set(made, 0)
+    texts = words(sweep_plot.draw(shown))
+    assert "each taxel about its median" in texts
+    assert any(f"{level}" in texts for level in range(1000, 1020))
+    tared = replace(shown, tare=np.median(samples[0], axis=0))
+    assert "each taxel about the skin at rest" in words(sweep_plot.draw(tared))
+    assert all(up - low < 60 for low, up in limits)
+
+
 def test_every_peak_is_in_the_line():
     """The thinned line keeps the first and the last step, the single peak and the order of time."""
     counts = np.zeros(5000)
@@ -233,7 +253,9 @@ def test_axes_share_the_plot_of_their_taxel(tmp_path: Path, grid: tuple[int, int
     if small:
         sweep_plot._skin(figure, seen, seen.taxels.reshape(100, -1).astype(float))
         assert [len(axes.lines) for axes in figure.axes] == [3] * 6
-        np.testing.assert_array_equal(figure.axes[1].lines[2].get_ydata(), seen.taxels[:, 0, 1, 2])
+        normal = seen.taxels[:, 0, 1, 2]
+        drawn_counts = figure.axes[1].lines[2].get_ydata()
+        np.testing.assert_array_equal(drawn_counts, normal - np.median(normal))
     with pytest.raises(FormatError, match=f"no {grid[0]} x {grid[1]} x 3 numbers"):
         sweep_plot.load(sweep(tmp_path / "c.npy", format, {"tare": np.ones(grid).tolist()}))
 

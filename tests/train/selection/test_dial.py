@@ -59,7 +59,7 @@ def judgement(**rights: np.ndarray) -> Judgement:
         name: JudgedSize(None, cast(Any, None), np.where(right, labels, 1 - labels))
         for name, right in rights.items()
     }
-    return Judgement(cast(Any, None), cast(Any, None), sizes, {}, labels, CLUSTERS, ("place",))
+    return Judgement(cast(Any, None), sizes, {}, labels, CLUSTERS, ("place",))
 
 
 EVERYTHING = np.ones(96, bool)
@@ -159,6 +159,14 @@ def test_all_sizes_are_judged_on_the_same_sweeps():
     assert (made.architecture.pools, made.architecture.relations > 0) == (0, True)
 
 
+def test_equal_models_are_fitted_once():
+    """With one taxel there are no relations: `pairs` chooses what `bands` chose, `all` more."""
+    sweeps = skin()
+    one = replace(sweeps, samples=sweeps.samples[:, :, :1])
+    judged = dial.judge(one, 1, CLOSED, ["bands", "pairs", "all"], nothing)
+    assert judged.first_equals() == {"bands": "bands", "pairs": "bands", "all": "all"}
+
+
 def test_a_size_alone_is_the_same_model():
     """The fit of a judged size has the weights of `recipe.fit` with that size."""
     alone = recipe.fit(skin(), 1, replace(CLOSED, size=dial.FAMILY["pairs"]))
@@ -185,7 +193,7 @@ def test_sizes_with_stages_are_judged_where_stages_were_not_trained(
     assert (judged.staged, len(trained)) == (True, 1)
     assert judged.sizes["bands"].trunk is None
     assert judged.sizes["stages"].trunk is not None
-    held = sweeps.take(judged.setup.out)
+    held = sweeps.take(judged.setup.judging.out)
     np.testing.assert_array_equal(judged.labels, held.labels)
     np.testing.assert_array_equal(judged.clusters, held.group("position"))
     assert judged.by == ("position",)

@@ -59,11 +59,12 @@ def case(left_out: int = NONE_LEFT_OUT, apart: float = 6.0, fold: int = 0, place
         2,
         x,
         y,
-        at,
+        at[None],
         ~seen,
+        True,
         copied,
         y,
-        at,
+        np.arange(len(y)),
         ~seen,
         new,
         labels,
@@ -107,8 +108,8 @@ def test_temperature_scaling_corrects_an_overconfident_head():
     one = case(apart=2.5, places=12)
     # sweeps of one position close together: their scatter says little of other positions
     shift = 1.5 * np.random.default_rng(3).standard_normal((200, 1, 4))
-    one = replace(one, seen=one.seen + shift[one.seen_groups], new=one.new + shift[one.places])
-    done = fit_calibration(plain_inputs(one.seen, one.seen_labels, one.seen_groups, one.judged))
+    one = replace(one, seen=one.seen + shift[one.seen_groups[0]], new=one.new + shift[one.places])
+    done = fit_calibration(plain_inputs(one.seen, one.seen_labels, one.seen_groups[0], one.held))
     figures = certainty.calibration([(one, done)])
     right = figures["accuracy"]["accuracy"]
     mean = {
@@ -196,7 +197,7 @@ def test_an_unknown_material_that_does_not_differ_is_not_seen():
     """Equal materials have an AUROC of 0.5."""
     held = [case(k, apart=0.0) for k in (0, 1)]
     done = [
-        (c, fit_calibration(plain_inputs(c.seen, c.seen_labels, c.seen_groups, c.judged)))
+        (c, fit_calibration(plain_inputs(c.seen, c.seen_labels, c.seen_groups[0], c.held)))
         for c in held
     ]
     assert abs(uncertainty.unknown(done, NAMES)["mean"]["auroc"] - 0.5) < 0.06
@@ -238,11 +239,12 @@ def test_of_two_materials_none_is_left_out():
         2,
         one.seen[two],
         one.seen_labels[two],
-        one.seen_groups[two],
-        one.judged[two],
+        one.seen_groups[:, two],
+        one.held[two],
+        one.staged,
         one.copied[also],
         one.copied_labels[also],
-        one.copied_groups[also],
+        np.cumsum(two)[one.copied_source[also]] - 1,
         one.copied_held[also],
         one.new[test],
         one.labels[test],

@@ -140,6 +140,10 @@ def test_confusion_gives_shares_of_each_row():
     assert [shown.count(text) for text in ("80", "20", "100", "90", "10")] == [1, 1, 1, 1, 1]
     assert shown.count("◇ 20") == 1
     assert not any("◇" in text for text in words(confusion_plot.draw(COUNTS, NAMES, "confusion")))
+    one = np.diag(np.ones(len(NAMES)))
+    thirty = words(confusion_plot.draw(one, NAMES, "c", totals=np.full(len(NAMES), 30)))
+    assert thirty.count("3") == len(NAMES)
+    assert "100" not in thirty
 
 
 def test_sweeps_mark_what_was_printed():

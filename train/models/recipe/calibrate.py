@@ -3,7 +3,7 @@
 It consists of the head that names the material and its temperature, a head for each early answer
 and the rule for these, the embedding and the limit of known materials, and the rule for displaced
 contacts. Temperatures, limits and rules are fitted to held-out sweeps, by heads that did not see
-their group.
+the condition under which these were taken.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ NUMBERS = ("temperature", "class_mean_temperature", "limit")
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Answers to the held-out sweeps, by heads, embedding and temperature that were fitted without
-    the sweep's group.
+    """Answers to the held-out sweeps, by heads and embedding that were fitted without the sweep's
+    value of one condition.
 
     numbers: of the sweeps [n]. probabilities: [n, K], of the network. known: bool [n], whether the
     distance is within the limit.
@@ -70,7 +70,8 @@ class Calibration:
     weight [F, K], bias [K]: the head that names the material, divided by `temperature`.
     class_mean_temperature: of logits that the box computes from class means. steps: heads of the
     early answers, with their temperatures. limit: largest squared distance of a known material, see
-    novelty. displacement: for displaced contacts; None without copies.
+    novelty. displacement: for displaced contacts; None without copies. held: for each condition,
+    the hardest first.
     """
 
     embedding: Embedding
@@ -82,7 +83,7 @@ class Calibration:
     rule: EarlyRule
     limit: float
     displacement: DisplacementFit | None
-    held: HeldOut
+    held: Mapping[str, HeldOut]
 
     def logits(self, features: Array) -> Array:
         """Features [..., F] of whole sweeps -> logits [..., K] whose softmax is calibrated."""
@@ -111,7 +112,8 @@ class Calibration:
 
     def arrays(self) -> dict[str, Array]:
         """The arrays that the file of a fit keeps."""
-        parts: Json = {"embedding": self.embedding, "steps": self.steps, "held": self.held}
+        parts: Json = {"embedding": self.embedding, "steps": self.steps}
+        parts |= {f"held {name}": held for name, held in self.held.items()}
         parts |= {"displaced": self.displacement.embedding} if self.displacement else {}
         arrays = {
             f"{of}.{k.name}": getattr(v, k.name) for of, v in parts.items() for k in fields(v)
@@ -122,6 +124,7 @@ class Calibration:
         """The rules and temperatures that the file of a fit keeps, for JSON."""
         return {name: getattr(self, name) for name in NUMBERS} | {
             "rule": asdict(self.rule),
+            "conditions": list(self.held),
             "displacement": asdict(self.displacement.rule) if self.displacement else None,
         }
 
@@ -143,7 +146,7 @@ class Calibration:
             rule=EarlyRule(**figures["rule"] | {"early": early}),
             displacement=displaced
             and DisplacementFit(part(Embedding, "displaced"), DisplacementRule(**displaced)),
-            held=part(HeldOut, "held"),
+            held={name: part(HeldOut, f"held {name}") for name in figures["conditions"]},
             **{name: figures[name] for name in NUMBERS},
         )
 
@@ -153,23 +156,37 @@ class CalibrationInputs:
     """Features that a calibration is fitted to.
 
     prefixes: [N, D + 1, F], features of the first tenth of the window, the first two tenths, and so
-    on to the whole window. labels: [N], 0 to K - 1. groups: int [N]. judged: bool [N], sweeps that
-    the trunk did not see; only these decide temperatures and rules. fixed: number of features, the
+    on to the whole window. labels: [N], 0 to K - 1. conditions: int [N] by name, the hardest first;
+    a sweep is judged without its value of each, and the hardest decides temperatures and rules.
+    held: bool [N], the sweeps of some values of the hardest, which trained stages did not see.
+    staged: whether there are such stages; if not, all sweeps judge. fixed: number of features, the
     last ones, that were not trained (see novelty.embed). If there are any, most of a distance lies
     in them; then all sweeps decide the limit, because more positions make it depend less on chance.
-    copied: augmented copies. faulty: bool [N], copies with FAULTS; the embedding and its limit see
-    them, the heads do not. plan: of the head that names the material; None for one discriminant of
-    all features.
+    copied: augmented copies. faulty: bool [N], copies with
+    FAULTS; the embedding and its limit see them, the heads do not. plan: of the head that names the
+    material; None for one discriminant of all features.
     """
 
     prefixes: Array
     labels: Array
-    groups: Array
-    judged: Array
+    conditions: Mapping[str, Array]
+    held: Array
+    staged: bool
     fixed: int
     copied: AugmentedCopies
     faulty: Array
     plan: HeadPlan | None = None
+
+    @property
+    def groups(self) -> Array:
+        """int [N], the values of the hardest condition."""
+        return next(iter(self.conditions.values()))
+
+    @property
+    def judged(self) -> Array:
+        """bool [N], the sweeps that judge."""
+        judged: Array = self.held if self.staged else ~self.faulty
+        return judged
 
     @property
     def whole(self) -> Array:
@@ -178,10 +195,10 @@ class CalibrationInputs:
 
     def naming_head(self, seen: Array) -> tuple[Array, Array]:
         """Weight [F, K] and bias [K] of the head that names the material, fitted to the sweeps
-        `seen` (bool [N]) and the copies of their groups."""
+        `seen` (bool [N]) and their copies."""
         plan = self.plan or HeadPlan((HeadPart(tuple(range(self.whole.shape[1])), copies=True),))
         seen = seen & ~self.faulty
-        also = self.copied.take(np.isin(self.copied.groups, self.groups[seen]) & ~self.copied.held)
+        also = self.copied.take(seen[self.copied.source] & ~self.copied.held)
         given = self.whole[seen], self.labels[seen], also.features, also.labels
         weight, bias = plan.fit(given, int(self.labels.max()) + 1)
         return weight.T, bias
@@ -190,16 +207,20 @@ class CalibrationInputs:
 def fit_calibration(given: CalibrationInputs) -> Calibration:
     """The calibration that is fitted to these features. Raises FormatError as novelty.embed, and if
     there is only one group or no sweep to judge by."""
-    whole, labels, groups = given.whole, given.labels, given.groups
-    logits, numbers, class_mean_temperature = _held_out_logits(given)
-    temperatures = early_exit.fit_temperatures(logits, labels[numbers], groups[numbers])
+    whole, labels = given.whole, given.labels
+    logits, numbers, class_mean_temperature = _prefix_logits(given)
+    groups = given.groups[numbers]
+    temperatures = early_exit.fit_temperatures(logits, labels[numbers], groups)
     p = softmax(logits / temperatures[:, None])
     embedding, last = novelty.embed(whole, labels, given.fixed), float(temperatures[-1])
     steps = early_exit.heads(embedding(given.prefixes), labels, int(labels.max()) + 1)
-    distances = novelty.cross_fitted_distances(
-        whole, labels, groups, (given.judged | (given.fixed > 0)) & ~given.faulty, given.fixed
-    )
-    limit = novelty.limit(distances)
+    distances = {name: _distances(given, values) for name, values in given.conditions.items()}
+    limit = novelty.limit(np.concatenate(list(distances.values())))
+    held = {}
+    for name, values in given.conditions.items():
+        judging, named = _named(given, values)
+        known = distances[name][judging] <= limit
+        held[name] = HeldOut(judging, softmax(named / last), known)
     weight, bias = given.naming_head(np.ones(len(labels), bool))
     return Calibration(
         embedding,
@@ -211,31 +232,52 @@ def fit_calibration(given: CalibrationInputs) -> Calibration:
         early_exit.find_rule(p, labels[numbers]),
         limit,
         _displacement(given, last),
-        HeldOut(numbers, p[:, -1], distances[numbers] <= limit),
+        held,
     )
 
 
-def _held_out_logits(given: CalibrationInputs) -> tuple[Array, Array, float]:
-    """Logits [n, D + 1, K] of the judged sweeps by heads that did not see their groups, at
-    temperature 1; the numbers [n] of these sweeps; the temperature of logits from class means."""
+def _distances(given: CalibrationInputs, values: Array) -> Array:
+    """Novelty [N] of sweeps to embeddings that did not see their value of one condition."""
+    limiting = (given.judged | (given.fixed > 0)) & ~given.faulty
+    return novelty.cross_fitted_distances(given.whole, given.labels, values, limiting, given.fixed)
+
+
+def _named(given: CalibrationInputs, values: Array) -> tuple[Array, Array]:
+    """The numbers [n] of the judged sweeps, and logits [n, K] by heads that did not see their value
+    of one condition, at temperature 1. Sweeps of a material that occurs in no other part are left
+    out."""
+    numbers, logits = [], []
+    for seen, judging in novelty.parts(values, given.judged):
+        judging = judging[np.isin(given.labels[judging], given.labels[seen & ~given.faulty])]
+        weight, bias = given.naming_head(seen)
+        logits.append(given.whole[judging] @ weight + bias)
+        numbers.append(judging)
+    return np.concatenate(numbers), np.concatenate(logits)
+
+
+def _prefix_logits(given: CalibrationInputs) -> tuple[Array, Array, float]:
+    """Logits [n, D + 1, K] of the judged sweeps and their prefixes by heads that did not see their
+    value of the hardest condition, at temperature 1; the numbers [n] of these sweeps; the
+    temperature of logits from class means."""
     labels, groups = given.labels, given.groups
     logits, numbers = early_exit.cross_fitted_logits(
         given.prefixes, labels, groups, given.judged, given.fixed
     )
     temperature = sufficient_temperature(logits[:, -1], labels[numbers], groups[numbers])
     row_of = {number: row for row, number in enumerate(numbers)}
-    for seen, judging in novelty.parts(groups, given.judged):
-        weight, bias = given.naming_head(seen)
-        present = [number for number in judging if number in row_of]
-        logits[[row_of[number] for number in present], -1] = given.whole[present] @ weight + bias
+    for number, named in zip(*_named(given, groups), strict=True):
+        if number in row_of:
+            logits[row_of[number], -1] = named
     return logits, numbers, temperature
 
 
 def _displacement(given: CalibrationInputs, temperature: float) -> DisplacementFit | None:
-    """The rule for displaced contacts, by a head that did not see the groups of judged sweeps."""
+    """The rule for displaced contacts, by a head that did not see the groups of held sweeps."""
     copied = given.copied
     if not copied.held.any():
         return None
-    weight, bias = given.naming_head(~np.isin(given.groups, given.groups[given.judged]))
+    weight, bias = given.naming_head(~np.isin(given.groups, given.groups[given.held]))
     logits = (copied.features[copied.held] @ weight + bias) / temperature
-    return fit_displacement(given.whole, given.labels, given.judged, given.fixed, copied, logits)
+    return fit_displacement(
+        given.whole, given.labels, given.groups, given.held, given.fixed, copied, logits
+    )

@@ -21,6 +21,7 @@ from train.data.splitters import InnerPart
 from train.metrics.temperature import weighted_platt_temperature
 from train.models.methods import Log
 from train.models.recipe import relations
+from train.models.recipe.bank import LEAST_FILTERS
 from train.models.recipe.sizes import ModelSize
 
 Array = NDArray[Any]
@@ -96,7 +97,7 @@ class HeldOutScores:
 
     def accuracy(self, scored: ScoredPlan) -> float:
         """Accuracy on held-out sweeps; every group counts the same."""
-        return float(self.weights @ self._right(scored))
+        return float(self.weights @ self.right(scored))
 
     def better(self, one: ScoredPlan, other: ScoredPlan) -> bool:
         """Whether `one` has a lower loss and a higher accuracy, by more than ERRORS standard errors
@@ -148,10 +149,11 @@ class HeldOutScores:
 
     def _lost(self, one: ScoredPlan, other: ScoredPlan) -> Array:
         """The share [n] of each sweep in the accuracy of `other` minus that of `one`."""
-        lost: Array = self.weights * (self._right(other).astype(float) - self._right(one))
+        lost: Array = self.weights * (self.right(other).astype(float) - self.right(one))
         return lost
 
-    def _right(self, scored: ScoredPlan) -> Array:
+    def right(self, scored: ScoredPlan) -> Array:
+        """bool [n], what it names rightly."""
         right: Array = scored.logits.argmax(axis=1) == self.labels
         return right
 
@@ -257,6 +259,10 @@ class Candidates:
     columns: FeatureColumns
     copies: bool = False
     loads: bool = False
+
+    def usual(self) -> Heads:
+        """The usual candidate."""
+        return next(iter(self.plain().values()))
 
     def plain(self) -> dict[str, Heads]:
         """The usual candidate, and magnitudes alone; the spectrum, if the size has no filters.
@@ -388,8 +394,8 @@ def with_fewer_filters(
     scores: HeldOutScores,
     chosen: ScoredPlan,
     filters: Array,
-    least: int,
     log: Log,
+    least: int = LEAST_FILTERS,
 ) -> ScoredPlan:
     """`chosen` with half of its filters, a quarter and so on, but at least `least`, as long as
     this `holds` on held-out parts. filters: the filter [F] of each feature, -1 if it has none."""

@@ -108,14 +108,21 @@ class Fit:
         """Weight [K, F] and bias [K] of the int8 trunk's head, the temperature folded in."""
         return self.weights["int8.weight"], self.weights["int8.bias"]
 
-    def held_out_figures(self, protocol: str) -> Json:
-        """Figures of the held-out sweeps by heads that did not see them, as a manifest holds them;
-        none without a calibration."""
-        if self.calibration is None:
-            return {}
-        held = self.calibration.held
-        sweeps = self.held.take(held.numbers - len(self.train))
-        return held.answers(sweeps.group("recording")).figures(sweeps, protocol)
+    def values(self, group: str) -> Array:
+        """The values of a group among all sweeps."""
+        return np.union1d(self.train.group(group), self.held.group(group))
+
+    def held_out_figures(self) -> Json:
+        """Figures of sweeps by heads that did not see their value of a condition, for each
+        condition, the hardest first, as a manifest holds them; none without a calibration."""
+        figures: Json = {}
+        if self.calibration:
+            labels = np.append(self.train.labels, self.held.labels)
+            recordings = np.append(self.train.group("recording"), self.held.group("recording"))
+            for name, held in self.calibration.held.items():
+                of, at = held.numbers, recordings[held.numbers]
+                figures |= held.answers(at).figures(labels[of], at, f"held-out {name}")
+        return figures
 
     def save(self, path: Path) -> None:
         """Write the fit as one .npz without pickle. Training and held-out sweeps are one set, the
@@ -137,6 +144,7 @@ class Fit:
             "materials": self.train.materials,
             "rate_hz": self.train.rate_hz,
             "source": self.train.source,
+            "units": self.train.units,
             "trained_on": len(self.train),
             "about": self.about,
             "plan": self.plan.json(),
@@ -181,6 +189,7 @@ class Fit:
             groups,
             meta["source"],
             arrays.get("set_unloaded"),
+            meta.get("units", {}),
         )
         first = np.arange(len(sweeps)) < meta["trained_on"]
         return cls(
@@ -212,28 +221,33 @@ def calibration_inputs(fit: Fit) -> CalibrationInputs:
     """Features from the trunk of `fit`: of the training sweeps, the held-out sweeps and the copies
     with faults, in this order, and of augmented copies of the first two. Raises FormatError if no
     sweep was held out."""
-    train, held, by, seed = fit.train, fit.held, fit.about["held_out_by"], fit.about["seed"]
-    if by == "nothing":
+    train, held, seed = fit.train, fit.held, fit.about["seed"]
+    if (by := fit.about["held_out_by"]) == "nothing":
         hold_out(train, seed)  # raises, with the reason
     shuffled = np.random.default_rng(seed + FAULTS_SEED).permutation(len(train))
     (faulty,) = copies(train.take(shuffled[::ONE_IN]), FAULTS, seed + FAULTS_SEED, 1)
     of_all = train, held, faulty
     role = np.repeat(np.arange(3), [len(sweeps) for sweeps in of_all])
+    conditions = {
+        name: np.unique(np.concatenate([s.group(name) for s in of_all]), return_inverse=True)[1]
+        for name in (by, *fit.about["conditions"])
+    }
     return CalibrationInputs(
         run(fit.trunk(prefixes=True), np.concatenate([s.samples for s in of_all])),
         np.concatenate([s.labels for s in of_all]),
-        np.concatenate([s.group(by) for s in of_all]),
+        conditions,
         role == 1,
+        bool(fit.architecture.channels),
         fit.bands,
-        _augmented_copies(fit, by),
+        _augmented_copies(fit),
         role == 2,
         fit.plan,
     )
 
 
-def _augmented_copies(fit: Fit, by: str) -> AugmentedCopies:
+def _augmented_copies(fit: Fit) -> AugmentedCopies:
     """Copies of the training sweeps as the heads see them, and displaced copies of the held-out
-    sweeps, in groups `by`."""
+    sweeps, whose numbers come after those of the training sweeps."""
     trunk, seed, features = fit.trunk(), fit.about["seed"], []
     for sweeps, change, drawn in (
         (fit.train, fit.augmentation, seed),
@@ -241,10 +255,11 @@ def _augmented_copies(fit: Fit, by: str) -> AugmentedCopies:
     ):
         features += [run(trunk, copy.samples) for copy in copies(sweeps, change, drawn, COPIES)]
     labels = [np.tile(sweeps.labels, COPIES) for sweeps in (fit.train, fit.held)]
-    groups = [np.tile(sweeps.group(by), COPIES) for sweeps in (fit.train, fit.held)]
+    numbers = np.arange(len(fit.train)), len(fit.train) + np.arange(len(fit.held))
+    source = [np.tile(of, COPIES) for of in numbers]
     is_held = np.repeat([False, True], [len(part) for part in labels])
     return AugmentedCopies(
-        np.concatenate(features), np.concatenate(labels), np.concatenate(groups), is_held
+        np.concatenate(features), np.concatenate(labels), np.concatenate(source), is_held
     )
 
 

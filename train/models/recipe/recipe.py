@@ -73,7 +73,8 @@ class Settings:
     steps: of the training of stages; 0 for no stages. unfinished: a file that keeps the training of
     stages from time to time; from it an interrupted training goes on with the same bits. size:
     limits the content of the model. use: of the skin. calibrate: whether the fit is finished with
-    calibration and contacts, which a bundle needs and `evaluate` does not.
+    calibration and contacts, which a bundle needs and `evaluate` does not. varies: the groups that
+    will have other values in service; without any, all that can be left out.
     """
 
     steps: int = 600
@@ -81,6 +82,7 @@ class Settings:
     size: ModelSize = UNLIMITED
     use: SkinUse = AS_RECORDED
     calibrate: bool = True
+    varies: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -109,27 +111,19 @@ class Trunk:
 
 @dataclass(frozen=True)
 class Setup:
-    """Everything that the steps of a fit share. out: bool [N], the held-out sweeps, of some values
-    of the group `by`, on which stages are not trained; `by` is "nothing" if there are too few
-    groups."""
+    """Everything that the steps of a fit share, each part computed when it is first needed."""
 
     sweeps: Dataset
     seed: int
     settings: Settings
     augmentation: Augmentation
-    out: Array
-    by: str
     log: Log
 
     @classmethod
     def of(cls, sweeps: Dataset, seed: int, settings: Settings, log: Log) -> Setup:
         """Raises FormatError if the window is too short."""
         usual = default_augmentation(FIXED.zero_sum(sweeps.format.window))
-        augmentation = replace(usual, **settings.use.augmentation)
-        numbered = replace(sweeps, groups=sweeps.groups | {"index": np.arange(len(sweeps))})
-        _, held, by = hold_out_or_all(numbered, seed)
-        out = np.isin(np.arange(len(sweeps)), held.group("index"))
-        return cls(sweeps, seed, settings, augmentation, out, by, log)
+        return cls(sweeps, seed, settings, replace(usual, **settings.use.augmentation), log)
 
     @cached_property
     def copies(self) -> list[Dataset]:
@@ -137,23 +131,62 @@ class Setup:
         return list(copies(self.sweeps, self.augmentation, self.seed, COPIES))
 
     @cached_property
-    def sides(self) -> tuple[Dataset, Dataset]:
-        """The sweeps to train stages on, and those to judge them by."""
-        if self.by == "nothing":
-            return self.sweeps, self.sweeps
-        return self.sweeps.take(~self.out), self.sweeps.take(self.out)
+    def fixed(self) -> FixedFeatures:
+        """Step 1: the features that need no training."""
+        self.part(1)(f"features of {len(self.sweeps)} sweeps and {COPIES} copies of each")
+        trunk = fixed_trunk(self.sweeps, self.seed, self.settings.use.mains_hz)
+        scales = trunk.architecture.relations
+        columns = FeatureColumns.of(trunk.layout(), Bank.of(trunk.weights).free, scales)
+        return FixedFeatures(trunk, self.data(trunk), columns)
 
     @cached_property
-    def parts(self) -> list[InnerPart]:
-        """The parts by which candidates are judged."""
-        return inner_parts(self.sweeps)
+    def held_out_scores(self) -> HeldOutScores:
+        """The scores of heads of fixed features on the parts by which candidates are judged."""
+        parts = inner_parts(self.sweeps, varies=self.settings.varies)
+        return self.scores(self.fixed.data, parts)
 
-    def may_train(self, size: ModelSize) -> bool:
-        """Whether stages can be trained for a model of this size."""
+    @cached_property
+    def conditions(self) -> tuple[str, ...]:
+        """The groups that can be left out, the hardest first: that whose sweeps the usual heads
+        name worst if they have not seen its value. Groups of two values come last: without one of
+        them, heads learn nothing of how the other varies."""
+        scores = self.held_out_scores
+        names = list(dict.fromkeys(scores.groups[scores.own].tolist()))
+        if len(names) < 2:
+            return tuple(names)
+        right = scores.right(scores.score(candidates(self.fixed, self).usual()))
+
+        def order(name: str) -> tuple[bool, float]:
+            of = scores.own & (scores.groups == name)
+            return len(np.unique(self.sweeps.group(name))) < 3, float(right[of].mean())
+
+        return tuple(sorted(names, key=order))
+
+    @cached_property
+    def judging(self) -> InnerPart:
+        """The sweeps on which stages are not trained, and which judge them: some values of the
+        hardest condition. The group is "nothing" if there are too few groups."""
+        index = np.arange(len(self.sweeps))
+        numbered = replace(self.sweeps, groups=self.sweeps.groups | {"index": index})
+        _, held, by = hold_out_or_all(numbered, self.seed, self.conditions)
+        return InnerPart(by, np.isin(index, held.group("index")))
+
+    @cached_property
+    def sides(self) -> tuple[Dataset, Dataset]:
+        """The sweeps to train stages on, and those to judge them by."""
+        if self.judging.group == "nothing":
+            return self.sweeps, self.sweeps
+        return self.sweeps.take(~self.judging.out), self.sweeps.take(self.judging.out)
+
+    def wants_stages(self, size: ModelSize) -> bool:
+        """Whether a model of this size may have stages, and there are enough sweeps for them."""
         each = np.unique(self.sweeps.labels, return_counts=True)[1]
         enough = len(self.sweeps) >= LEAST_SWEEPS and each.min() >= LEAST_EACH
-        wanted = self.settings.steps and size.stages
-        return bool(wanted and enough and self.by != "nothing" and find_spec("torch"))
+        return bool(self.settings.steps and size.stages and enough and find_spec("torch"))
+
+    def may_train(self, size: ModelSize) -> bool:
+        """Whether stages can be trained for a model of this size, and judged."""
+        return self.wants_stages(size) and self.judging.group != "nothing"
 
     @cached_property
     def stages(self) -> tuple[Trunk, HeadData]:
@@ -161,11 +194,6 @@ class Setup:
         features of all sweeps and copies."""
         trunk = _trained(self)
         return trunk, self.data(trunk)
-
-    @property
-    def judging(self) -> InnerPart:
-        """The sweeps that judge stages."""
-        return InnerPart(self.by, self.out)
 
     def data(self, trunk: Trunk, int8: bool = True) -> HeadData:
         """The features of all sweeps and copies."""
@@ -186,7 +214,7 @@ class Setup:
     def part(self, number: int) -> Log:
         """The log of one part of the fit. The third part, the stages, takes most of the time; it is
         left out if the first two suffice."""
-        parts = 3 if self.may_train(self.settings.size) else 2
+        parts = 3 if self.wants_stages(self.settings.size) else 2
         return lambda line: self.log(f"part {number} of {parts}, {line}")
 
 
@@ -234,13 +262,12 @@ def fit(sweeps: Dataset, seed: int, settings: Settings = Settings(), log: Log = 
     Raises FormatError if the window is shorter than a filter, if every taxel is constant, or if
     materials have too few recordings to hold some out.
     """
-    setup = Setup.of(sweeps, seed, settings, log)
-    return fit_size(features(setup), setup, settings.size)
+    return fit_size(Setup.of(sweeps, seed, settings, log), settings.size)
 
 
-def fit_size(every: FixedFeatures, setup: Setup, size: ModelSize) -> Fit:
+def fit_size(setup: Setup, size: ModelSize) -> Fit:
     """The model of this size. Raises FormatError if the windows are too short for it."""
-    fixed = every.limited(size)
+    fixed = setup.fixed.limited(size)
     stages, judged = judged_size(fixed, setup, size)
     trunk, plan = pruned(fixed.trunk, stages, judged.chosen.plan)
     return finish(trunk, plan, judged, setup)
@@ -257,26 +284,18 @@ def judged_size(
     return with_stages(judged, fixed, setup)
 
 
-def features(setup: Setup) -> FixedFeatures:
-    """Step 1: the features that need no training."""
-    setup.part(1)(f"features of {len(setup.sweeps)} sweeps and {COPIES} copies of each")
-    trunk = fixed_trunk(setup.sweeps, setup.seed, setup.settings.use.mains_hz)
-    scales = trunk.architecture.relations
-    columns = FeatureColumns.of(trunk.layout(), Bank.of(trunk.weights).free, scales)
-    return FixedFeatures(trunk, setup.data(trunk), columns)
-
-
 def candidates(fixed: FixedFeatures, setup: Setup) -> Candidates:
     """Step 2: the heads to choose from."""
-    groups = any(part.group != "recording" for part in setup.parts)
+    groups = bool((setup.held_out_scores.groups != "recording").any())
     return Candidates(fixed.columns, setup.settings.use.reattached, groups)
 
 
 def judge(heads: Candidates, fixed: FixedFeatures, setup: Setup) -> HeadChoice:
     """Step 3: the best candidate by held-out groups, with as few filters as suffice."""
-    scores = setup.scores(fixed.data, setup.parts)
+    scores = setup.held_out_scores
     chosen = choice.choose(scores, heads, setup.part(2))
-    return HeadChoice(scores, fewer_filters(scores, chosen, fixed.columns.filters(), setup.part(2)))
+    filters = fixed.columns.filters()
+    return HeadChoice(scores, choice.with_fewer_filters(scores, chosen, filters, setup.part(2)))
 
 
 def with_stages(
@@ -303,7 +322,7 @@ def with_stages(
         return None, judged
     if joined is full:
         filters = np.append(np.full(sum(STAGES.channels), -1), fixed.columns.filters())
-        joined = fewer_filters(scores, full, filters, log)
+        joined = choice.with_fewer_filters(scores, full, filters, log)
     return stages, HeadChoice(scores, joined)
 
 
@@ -348,7 +367,8 @@ def finish(trunk: Trunk, plan: HeadPlan, judged: HeadChoice, setup: Setup) -> Fi
             "reattached": settings.use.reattached,
             "mains_hz": settings.use.mains_hz,
         },
-        "held_out_by": setup.by,
+        "held_out_by": setup.judging.group,
+        "conditions": list(setup.conditions),
         "chosen": describe(trunk, plan),
         "validation": judged.validation(),
     }
@@ -398,13 +418,6 @@ def fixed_trunk(sweeps: Dataset, seed: int, mains_hz: float = MAINS_HZ) -> Trunk
         bank.fitted(drawn, seen, rng).weights() | distribution.fitted(some, scale, rng).weights()
     )
     return Trunk(sweeps, scale, weights, architecture, ranges)
-
-
-def fewer_filters(
-    scores: HeldOutScores, chosen: ScoredPlan, filters: Array, log: Log
-) -> ScoredPlan:
-    """See choice.with_fewer_filters."""
-    return choice.with_fewer_filters(scores, chosen, filters, bank.LEAST_FILTERS, log)
 
 
 def _trained(setup: Setup) -> Trunk:

@@ -56,7 +56,7 @@ def test_a_disturbed_sweep_of_a_known_material_stays_known():
     np.testing.assert_array_equal(
         sturdy.weight * sturdy.temperature, plain.weight * plain.temperature
     )
-    assert (sturdy.held.numbers < known.sum()).all()
+    assert (sturdy.held["recording"].numbers < known.sum()).all()
 
 
 def test_disturbed_sweeps_are_of_those_that_were_trained_on():
@@ -64,19 +64,19 @@ def test_disturbed_sweeps_are_of_those_that_were_trained_on():
     copies judges."""
     fit = recipe.fit(easy(), 1, recipe.Settings(steps=0))
     given = calibration_inputs(fit)
-    prefixes, labels, groups, judged, faulty = (
+    prefixes, labels, groups, held, faulty = (
         given.prefixes,
         given.labels,
         given.groups,
-        given.judged,
+        given.held,
         given.faulty,
     )
     assert (
         len(prefixes) == len(labels) == len(groups) == len(fit.train) + len(fit.held) + faulty.sum()
     )
     assert faulty.sum() == -(-len(fit.train) // ONE_IN)
-    assert not (judged & faulty).any()
-    assert not set(groups[faulty]) & set(groups[judged])
+    assert not (held & faulty).any()
+    assert not set(groups[faulty]) & set(groups[held])
     assert not any((prefixes[~faulty] == row).all(axis=(1, 2)).any() for row in prefixes[faulty])
 
 
@@ -88,7 +88,7 @@ def test_a_calibration_survives_its_file(early: Early | None, reattached: bool):
     x, y, at = world()
     given = plain_inputs(x, y, at, at >= 6, 1)
     if reattached:
-        copied = AugmentedCopies(x[:, -1], y, at, at >= 6)
+        copied = AugmentedCopies(x[:, -1], y, np.arange(len(y)), at >= 6)
         given = replace(given, copied=copied)
     made = replace(fit_calibration(given), rule=EarlyRule(early, "why", 0.5, 0.1, 7))
     assert (made.displacement is not None) == reattached

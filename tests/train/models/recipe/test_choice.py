@@ -157,10 +157,10 @@ def test_fewer_filters_where_held_out_parts_show_no_loss():
     full = at.score([HeadPart(tuple(range(17)), False)])
     tried: list[str] = []
     # every other of these has the same sign: a half is not enough to name the materials
-    assert choice.with_fewer_filters(at, full, number, 4, tried.append) == full
+    assert choice.with_fewer_filters(at, full, number, tried.append, 4) == full
     assert tried == ["choosing: 8 filters"]
     pairs = np.append(np.arange(16) // 2, -1)
-    less = choice.with_fewer_filters(at, full, pairs, 2, print)
+    less = choice.with_fewer_filters(at, full, pairs, print, 2)
     assert less.plan.parts[0].columns == (0, 1, 8, 9, 16)
     assert at.accuracy(less) > at.accuracy(full) - 0.01
 

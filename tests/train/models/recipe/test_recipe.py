@@ -361,6 +361,44 @@ def test_groups_that_can_be_left_out_judge():
         inner_parts(one)
 
 
+def varied() -> Dataset:
+    """Easy sweeps under three forces, with two tools. Each force shows the materials at another
+    pitch: a new one hides them."""
+    sweeps, n = easy(30), 90
+    force = np.arange(n) % 3
+    faster = np.array([1.0, 2.5, 5.0])[force]
+    frames = (np.arange(64) * faster[:, None]).astype(int) % 64
+    samples = sweeps.samples[np.arange(n)[:, None], frames]
+    groups = {"recording": np.arange(n), "tool": np.arange(n) // 3 % 2, "force": force}
+    return replace(sweeps, samples=samples, groups=groups | {"batch": np.arange(n) // 6 % 5})
+
+
+def test_the_hardest_condition_judges():
+    """The sweeps of a new force are the hardest, so some force is held out; a group of two values
+    comes last. Each condition has figures of its own."""
+    made = recipe.fit(varied(), 1, CLOSED)
+    assert made.about["conditions"] == ["force", "batch", "tool"]
+    assert made.about["held_out_by"] == "force"
+    assert not set(made.train.group("force")) & set(made.held.group("force"))
+    figures = made.held_out_figures()
+    shares = {
+        name: figures[f"held-out {name}, network alone"]["accuracy"]
+        for name in made.about["conditions"]
+    }
+    assert shares["force"] < shares["batch"] - 0.05
+    assert figures["held-out batch"]["n"] == len(varied())
+
+
+def test_only_named_conditions_judge():
+    """What varies in service may be said; a group that cannot be left out is refused by name."""
+    made = recipe.fit(varied(), 1, replace(CLOSED, varies=("batch",)))
+    assert made.about["conditions"] == ["batch"]
+    assert next(iter(made.held_out_figures())) == "held-out batch"
+    for name in ("recording ", "speed"):
+        with pytest.raises(FormatError, match=name):
+            recipe.fit(varied(), 1, replace(CLOSED, varies=(name,)))
+
+
 def test_what_cannot_be_fitted_is_named():
     """A constant skin and a window that is too short are refused at once."""
     still = replace(easy(), samples=np.full_like(easy().samples, 7))

@@ -379,7 +379,7 @@ def test_positions_are_held_out_where_there_are_several():
     s.groups["position"] = np.arange(len(s)) % 5
     setup = Setup.of(s, 1, Settings(), no_log)
     seen, held = (side.groups["position"] for side in setup.sides)
-    assert setup.by == "position"
+    assert setup.judging.group == "position"
     assert len(np.unique(held)) == 1
     assert not set(seen) & set(held)
 

@@ -1,0 +1,152 @@
+"""Compares the accuracy that `fit` prints with that of its bundle where a condition is new.
+
+`python -m tests.campaigns promises` leaves out each value of a condition in turn, fits the other
+sweeps, exports the fit, and lets the box answer the sweeps that were left out. The printed figures
+are the mean over all conditions, and that of heads that did not see this condition. Real fabrics
+need PALPATE_DATA; a condition is one of CASES. Takes two minutes for each value.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from appliance.bundle import bundle
+from appliance.core.clock import SystemClock
+from appliance.core.errors import ApplianceError
+from appliance.core.provenance import commit
+from appliance.inference.classifier import Classifier
+from train.data.sets import Dataset
+from train.export import bundle_score, quantized_bundle
+from train.metrics.answers import REFUSED, UNKNOWN
+from train.models.recipe import recipe
+from train.models.recipe.recipe import Settings
+from train.onnx_tools.graph_builder import run
+from train.studies.fabrics_experiment import FABRICS, FOUR, SEVEN
+from train.studies.study import StudyCase
+
+FABRIC_SETS = {"7 fabrics": SEVEN, "4 fabrics": FOUR}
+WORLDS = {"laboratory": "sim:T-REAL:1-3", "level-blind": "sim:T-REAL/level-blind:1-3"}
+CASES = (
+    *(("7 fabrics", name) for name in ("force", "speed", "rep")),
+    *(("4 fabrics", name) for name in ("force", "speed", "direction")),
+    *((world, "position") for world in WORLDS),
+)
+MOST_TESTED = 400
+"""Largest number of sweeps that the box answers of each value."""
+
+
+@dataclass(frozen=True)
+class Promise:
+    """The word of a fit and what became of it, in per cent. expected, of_this: printed, as the mean
+    over conditions and for the condition that is left out; NaN if it has one value left. outcomes:
+    shares of the box's answers, rightly first. network: its label alone."""
+
+    expected: float
+    of_this: float
+    network: float
+    outcomes: dict[str, float]
+
+    @property
+    def rightly(self) -> float:
+        """The share of sweeps that the box names rightly."""
+        return self.outcomes["rightly"]
+
+
+def load(name: str) -> Dataset | None:
+    """The sweeps of a case; None where real sweeps are missing."""
+    if name in WORLDS:
+        return StudyCase((WORLDS[name],)).load(None)
+    folder = os.environ.get("PALPATE_DATA")
+    case = StudyCase((FABRICS,), only=FABRIC_SETS[name], real=True)
+    return case.load(Path(folder) if folder else None)
+
+
+def promises(sweeps: Dataset, condition: str, steps: int, seed: int) -> Iterator[Promise]:
+    """One for each value of the condition."""
+    values = sweeps.group(condition)
+    for value in np.unique(values):
+        out = values == value
+        tested = np.random.default_rng(seed).permutation(np.flatnonzero(out))[:MOST_TESTED]
+        yield promise(sweeps.take(~out), sweeps.take(np.sort(tested)), condition, steps, seed)
+
+
+def promise(train: Dataset, test: Dataset, condition: str, steps: int, seed: int) -> Promise:
+    """Fit `train`, export, and let the box answer `test`."""
+    made = recipe.fit(train, seed, Settings(steps=steps))
+    figures, names = made.held_out_figures(), made.about["conditions"]
+    said = {name: 100 * figures[f"held-out {name}"]["accuracy"] for name in names}
+    with tempfile.TemporaryDirectory() as aside:
+        quantized_bundle.export(made, Path(aside) / "b", "promise", "1", commit(), proven=False)
+        box = Classifier(bundle.load(Path(aside) / "b"), SystemClock(), slides=False)
+        labels, ok = bundle_score.labels_of(box, test)
+    right, named = labels == test.labels, labels >= 0
+    outcomes = {
+        "rightly": right & ok,
+        "wrongly": named & ok & ~right,
+        "unsure": named & ~ok,
+        "unknown": labels == UNKNOWN,
+        "refused": labels == REFUSED,
+    }
+    network = run(quantized_bundle.graphs(made)[1], test.samples).argmax(axis=1) == test.labels
+    return Promise(
+        float(np.mean(list(said.values()))),
+        said.get(condition, np.nan),
+        100 * float(network.mean()),
+        {name: 100 * float(share.mean()) for name, share in outcomes.items()},
+    )
+
+
+def summary(found: list[Promise]) -> str:
+    """The means over values, and the largest difference of word and answer."""
+    rightly = np.array([one.rightly for one in found])
+    network = np.mean([one.network for one in found])
+    texts = [f"as the box answers {rightly.mean():.1f} %, label alone {network:.1f} %"]
+    for name, said in (
+        ("mean of conditions", np.array([one.expected for one in found])),
+        ("this condition", np.array([one.of_this for one in found])),
+    ):
+        apart = said - rightly
+        texts.append(
+            f"{name} said {np.nanmean(said):.1f} %: {apart.mean():+.1f} on the mean, "
+            f"{apart[np.argmax(np.abs(apart))]:+.1f} at most"
+        )
+    return "; ".join(texts)
+
+
+def main() -> None:
+    """Print a line for each value, and a summary of each condition."""
+    parser = argparse.ArgumentParser(prog="python -m tests.campaigns.promises", description=__doc__)
+    parser.add_argument("--steps", type=int, default=0, help="of trained stages (0)")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--only", help="a condition, e.g. force")
+    args = parser.parse_args()
+    for name, condition in CASES:
+        if args.only not in (None, condition):
+            continue
+        if (sweeps := load(name)) is None:
+            print(f"{name}: PALPATE_DATA does not name the folder of real sweeps")
+            continue
+        found = []
+        for one in promises(sweeps, condition, args.steps, args.seed):
+            shares = ", ".join(f"{share:.1f} % {what}" for what, share in one.outcomes.items())
+            print(
+                f"  {name}, {condition}: said {one.expected:.1f} % and {one.of_this:.1f} %; "
+                f"label alone {one.network:.1f} %; {shares}",
+                flush=True,
+            )
+            found.append(one)
+        print(f"{name}, a {condition} out, {len(found)} values: {summary(found)}", flush=True)
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except ApplianceError as e:
+        raise SystemExit(f"promises: {e}") from e

@@ -1,0 +1,27 @@
+"""The campaign that compares the printed accuracy with the answers of the box."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.campaigns import promises
+from tests.factories.sweep_sets import easy
+
+
+@pytest.mark.slow
+def test_easy_sweeps_keep_the_promise():
+    """Materials that no condition changes: word, label and answers agree, for each value."""
+    found = list(promises.promises(easy(24), "speed", 0, 1))
+    assert len(found) == 4
+    for one in found:
+        assert sum(one.outcomes.values()) == pytest.approx(100)
+        assert one.network > 95
+        assert one.of_this == pytest.approx(one.rightly, abs=12)
+        assert one.expected == pytest.approx(one.rightly, abs=12)
+    assert promises.summary(found).startswith("as the box answers ")
+
+
+def test_without_real_sweeps_a_case_is_left_out(monkeypatch: pytest.MonkeyPatch):
+    """The simulated ones run everywhere."""
+    monkeypatch.delenv("PALPATE_DATA", raising=False)
+    assert promises.load("7 fabrics") is None

@@ -1,0 +1,82 @@
+"""The page of `palpate watch --web` without a box: a test writes the lines of its feed."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any, Self
+
+from appliance.watch.access import Access
+from appliance.watch.board import KEPT, PageBoard
+from appliance.watch.server import PageServer
+from tests.factories import feed_lines
+from tests.factories.browser import BrowsedPage, until
+
+NOW_S = 400.0
+"""The box's clock when a page is opened."""
+
+
+class Shown:
+    """A page whose lines of the feed a test writes. Within its `with` block browsers learn twice a
+    second whether there is a box, as with the command, however slow the machine is."""
+
+    def __init__(self, access: Access) -> None:
+        self.server = PageServer(
+            "watch.html",
+            access,
+            lambda: round(NOW_S * feed_lines.SECOND),
+            KEPT,
+            {"sweep": self._sweep},
+        )
+        self.board = PageBoard(self._publish)
+        self._box: object = None
+        self._ended = threading.Event()
+        self._beating = threading.Thread(target=self._beat)
+
+    def __enter__(self) -> Self:
+        self.server.__enter__()
+        self._beating.start()
+        return self
+
+    def __exit__(self, *reason: object) -> None:
+        self._ended.set()
+        self._beating.join()
+        self.server.__exit__(*reason)
+
+    def _publish(self, name: str, content: object) -> None:
+        if name == "box":
+            self._box = content
+        self.server.publish(name, content)
+
+    def _beat(self) -> None:
+        while not self._ended.wait(0.5):
+            if self._box:
+                self.server.publish("box", self._box)
+
+    def _sweep(self, which: str) -> dict[str, Any] | None:
+        return self.board.sweep(which)
+
+    def shift(self) -> None:
+        """A box at work: forty sweeps, one of them `moved`, some without a label, the signals of
+        the last twenty."""
+        self.board.take(feed_lines.hello())
+        for number in range(1, 41):
+            status = {5: "unsure", 11: "gap", 17: "unsure", 23: "no-contact"}.get(number, "ok")
+            moved = "moved 2.2 mm too far towards row 1" if number == 29 else ""
+            label = feed_lines.LABELS[number % 6]
+            self.board.take(feed_lines.health(9.0 * number, lost_frames=3 * (number > 20)))
+            self.board.take(feed_lines.verdict(number, 9.0 * number, label, status, moved=moved))
+            self.board.take(feed_lines.sweep(number))
+        for i in range(40):
+            strength = 0 if i < 20 else 120
+            self.board.take(feed_lines.frame(370 + i / 20, feed_lines.load(0.7, 1.5, strength)))
+
+
+def opened(
+    browser: Any, shown: Shown, width: int = 1024, height: int = 768, rows: int = 40
+) -> BrowsedPage:
+    """The page in a browser, with all of the shift."""
+    seen = BrowsedPage(
+        browser.new_context(viewport={"width": width, "height": height}), shown.server.address
+    )
+    until(lambda: seen.page.locator(".row").count() == rows)
+    return seen

@@ -1,0 +1,18 @@
+"""Libraries that only some formats need. They come with the extra `files`."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+from appliance.core.errors import FormatError
+
+EXTRA = "pip install 'palpate-train[files]'"
+
+
+def library(name: str, what: str) -> Any:
+    """The module `name`, which reads `what`. Raises FormatError that names the extra."""
+    try:
+        return import_module(name)
+    except ImportError as e:
+        raise FormatError(f"is {what}; to read it: {EXTRA} ({e})") from e

@@ -1,0 +1,79 @@
+"""Reads Parquet and Feather files with pyarrow."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from appliance.core.errors import FormatError
+from train.data.files.optional import library
+from train.data.files.table import Array, Table, Wanted, from_columns
+
+SUFFIXES = (".parquet", ".pq", ".feather", ".arrow")
+
+
+def read(path: Path, wanted: Wanted) -> Table:
+    """The columns of a file; a column of lists becomes one column for each element. Raises
+    FormatError that names the row and the column."""
+    return table(arrow(path))
+
+
+def arrow(path: Path, columns: Sequence[str] | None = None) -> Any:
+    """pyarrow's table. columns: the names of those to read, None for all."""
+    library("pyarrow", "a Parquet or Feather file")
+    if path.suffix.lower() in (".feather", ".arrow"):
+        feather = library("pyarrow.feather", "a Feather file")
+        return feather.read_table(str(path), columns=columns)
+    parquet = library("pyarrow.parquet", "a Parquet file")
+    return parquet.ParquetFile(str(path)).read(columns=columns)
+
+
+def table(content: Any) -> Table:
+    """The numbers and texts of pyarrow's table. Columns of other types are passed over."""
+    names: list[str] = []
+    columns: list[Array] = []
+    texts: dict[int, list[str]] = {}
+    faults: dict[int, str] = {}
+    left: list[str] = []
+    for name in content.column_names:
+        values, kind = content.column(name), str(content.column(name).type)
+        if kind.startswith(("string", "large_string", "dictionary", "date", "timestamp[")):
+            texts[len(names)] = [str(v) for v in values.to_pylist()]
+            columns.append(np.zeros(len(values), np.uint8))
+            names.append(name)
+            continue
+        found = numbers(values, name)
+        if found is None:
+            left.append(name)
+            continue
+        flat = found.reshape(len(found), -1)
+        for k in range(flat.shape[1]):
+            if values.null_count:
+                row = values.to_pylist().index(None) + 1
+                faults[len(names)] = f"row {row} of {name} is empty"
+            columns.append(flat[:, k])
+            names.append(name if found.ndim == 1 else f"{name}.{k}")
+    made = from_columns(names, columns, texts, [f"column {n} is passed over" for n in left])
+    return Table(made.values, made.columns, texts=texts, faults=faults, notes=made.notes)
+
+
+def numbers(values: Any, name: str) -> Array | None:
+    """The numbers of a column, [n] or [n, ...] for lists of equal length; None for another type.
+
+    Raises FormatError if lists differ in length.
+    """
+    kind = str(values.type)
+    if "list" in kind or "extension" in kind:
+        rows = values.to_pylist()
+        try:
+            found = np.array(rows)
+        except ValueError as e:
+            raise FormatError(f"column {name} holds lists of different lengths") from e
+        return found if found.dtype.kind in "biuf" else None
+    if values.null_count and ("int" in kind or "bool" in kind):
+        values = values.cast("float64")
+    found = np.asarray(values.to_numpy())
+    return found if found.dtype.kind in "biuf" else None
