@@ -40,7 +40,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     args = parser.parse_args()
     for name in args.sets:
-        known = name.startswith("sim:") or Path(name).exists()
+        known = name.startswith(("sim:", "aeon:")) or Path(name).exists()
         path = name if known else str(Path(os.environ["PALPATE_DATA"]) / name)
         sweeps = sets.load(path)
         for each in args.each:
