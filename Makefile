@@ -12,14 +12,17 @@ DESKTOP := $(VENV)/desktop.done
 TOOLS := $(VENV)/tools.done
 SITE := $(VENV)/site.done
 NO_HOST = $(error name a box with HOST=user@box, or many with HOSTS=inventory.py)
-WHERE = $(if $(HOSTS),--hosts $(HOSTS),--host $(or $(HOST),$(NO_HOST)))
+# The value of a variable as one word for the shell, whatever is in it.
+quoted = '$(subst ','\'',$(value $(1)))'
+WHERE = $(if $(value HOSTS),--hosts $(call quoted,HOSTS),$(if $(value HOST),--host \
+  $(call quoted,HOST),$(NO_HOST))) $(if $(KNOWN),--known-hosts-only)
 # Files of tests are in memory if there is 1 GB for them: a sync to a disk takes as long as a test.
 SCRATCH = $(or $(shell df -Pk /dev/shm 2>/dev/null | awk 'NR > 1 && $$4 > 1000000 { print $$6 }'),/tmp)
 # One process more than there are cores: some tests wait for time to pass.
 PYTEST = $(BIN)/python -m pytest -q -n $(shell expr `nproc` + 1)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo desktop test test-fast test-all lint types bundle bench site deploy install clean
+.PHONY: help demo desktop test test-fast test-all lint types bundle bench site deploy install sbom clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -66,16 +69,19 @@ site: $(SITE) ## build the documents and the pages of results as a site: build/s
 	PYTHONPATH=systemd $(BIN)/python docs/site/build.py build
 
 deploy: $(FLEET) ## put a signed BUNDLE= on HOST= or HOSTS=inventory.py; SHADOW=1: as the candidate
-	$(BIN)/python systemd/deploy.py $(WHERE) $(if $(SIGNERS),--signers $(SIGNERS)) \
+	$(BIN)/python systemd/deploy.py $(WHERE) $(if $(SIGNERS),--signers $(call quoted,SIGNERS)) \
 	  $(if $(SHADOW),--shadow) $(if $(OTHER_SKIN),--other-skin) \
-	  $(or $(BUNDLE),$(error name the bundle with BUNDLE=its folder))
+	  $(if $(value BUNDLE),$(call quoted,BUNDLE),$(error name the bundle with BUNDLE=its folder))
+
+sbom: $(RUNTIME) ## list what the box carries, with licences: dist/palpate.cdx.json
+	PYTHONPATH=. $(BIN)/python systemd/sbom.py dist/palpate.cdx.json
 
 install: $(FLEET) ## install or upgrade Debian boxes, HOST= or HOSTS=; BOARD=rpi5, SIGNERS=FILE, TEACH=0
 	rm -rf build/lib build/bdist.* # setuptools would put leftovers of an older build into the wheel
 	$(PIP) wheel --no-deps -w dist .
 	$(if $(filter 0,$(TEACH)),,$(PIP) wheel --no-deps -w dist ./train)
-	$(BIN)/python systemd/install.py $(WHERE) $(if $(BOARD),--board $(BOARD)) \
-	  $(if $(SIGNERS),--signers $(SIGNERS)) $(if $(filter 0,$(TEACH)),--no-teach)
+	$(BIN)/python systemd/install.py $(WHERE) $(if $(BOARD),--board $(call quoted,BOARD)) \
+	  $(if $(SIGNERS),--signers $(call quoted,SIGNERS)) $(if $(filter 0,$(TEACH)),--no-teach)
 
 clean: ## remove everything that was built, the virtual environment too
 	rm -rf $(VENV) build dist *.egg-info train/*.egg-info

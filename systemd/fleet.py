@@ -42,6 +42,8 @@ SHORT_S = 60
 classifies."""
 SKIN_S = 10
 """Longest wait for the skin of a service that has passed its self-test."""
+STRICT = "ssh_strict_host_key_checking"
+"""pyinfra's name for the treatment of unknown host keys, by default "accept-new"."""
 PROPERTIES = (
     "ActiveState",
     "InvocationID",
@@ -66,6 +68,10 @@ REMEDIES = (
         "let the user in: USER ALL=(ALL) NOPASSWD: ALL in /etc/sudoers.d/palpate",
     ),
     ("Authentication", "let your key in: ssh-copy-id USER@HOST"),
+    (
+        "found in known_hosts",
+        "log in once with ssh, and compare its key with ssh-keygen -lf on the box",
+    ),
     ("host key", "if the box was set up anew, forget its old key: ssh-keygen -R HOST"),
     ("Could not resolve", "check the name, or use the address"),
     ("Could not connect", "check the address, and that the box is on: ssh USER@HOST must get in"),
@@ -227,6 +233,11 @@ def options(about: str, limit_s: int) -> argparse.ArgumentParser:
         metavar="SECONDS",
         help=f"time limit for each box (default {limit_s})",
     )
+    parser.add_argument(
+        "--known-hosts-only",
+        action="store_true",
+        help="refuse a box whose key is not in known_hosts; else it is stored at the first contact",
+    )
     parser.add_argument("-v", "--verbose", action="store_true", help="print each step")
     parser.add_argument(
         "--json", type=Path, metavar="FILE", help="write the result of each box to FILE"
@@ -298,6 +309,7 @@ def _inventory(args: argparse.Namespace) -> Inventory:
     logging.getLogger("paramiko").setLevel(logging.CRITICAL)
     logging.getLogger("pyinfra").addFilter(lambda record: record.levelno == logging.WARNING)
     util.getpass = _no_password
+    strict = {STRICT: "yes"} if args.known_hosts_only else {}
     if args.host:
         found = NAME.fullmatch(args.host)
         if not found:
@@ -307,11 +319,11 @@ def _inventory(args: argparse.Namespace) -> Inventory:
         }
         if "ssh_port" in data:
             data["ssh_port"] = int(data["ssh_port"])
-        return Inventory(([(args.host, data)], {}))
+        return Inventory(([(args.host, data)], {}), override_data=strict)
     if not args.hosts.is_file():
         sys.exit(f"palpate: no inventory {args.hosts}; systemd/inventory.example.py shows one")
     with ctx_state.use(State()):  # the reader notes its file there
-        inventory: Inventory = make_inventory_from_files(str(args.hosts))
+        inventory: Inventory = make_inventory_from_files(str(args.hosts), override_data=strict)
     if not len(inventory):
         sys.exit(f"palpate: {args.hosts} names no box; systemd/inventory.example.py shows how")
     return inventory

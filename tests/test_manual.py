@@ -17,6 +17,7 @@ import pytest
 
 from appliance import __version__
 from appliance.bridges import options as bridges
+from appliance.bundle import bundle
 from appliance.cli import bundle_commands, parser
 from appliance.cli.main import COMMANDS
 from appliance.cli.parser import BUNDLE_ACTIONS, MENU, SKIN_ACTIONS
@@ -40,6 +41,9 @@ CHANGES = (ROOT / "CHANGELOG.md").read_text()
 BLOCKS = re.findall(r"(?m)^    (\S.*)$", MANUAL)
 """The lines of all code blocks."""
 PICTURES = sorted(DOCS.glob("manual/*.svg"))
+_BUNDLE = bundle.load(bundle.DEFAULT)
+PACKAGED, VERSION = _BUNDLE.id, _BUNDLE.manifest.version
+"""Id and version of the packaged bundle."""
 
 
 @pytest.fixture(scope="module")
@@ -300,7 +304,7 @@ def verdict(
         "latency_ns": 1_000_000,
     } | more
     return Verdict(
-        sweep=sweep, status=what, label=label, probability=probability, bundle="d5b2b6ef", **about
+        sweep=sweep, status=what, label=label, probability=probability, bundle=PACKAGED, **about
     )
 
 
@@ -323,7 +327,7 @@ def test_samples_are_what_the_box_prints():
         "garbage_bytes": 0,
         "enumerations": 1,
         "dropped": 0,
-        "bundle": "d5b2b6ef",
+        "bundle": PACKAGED,
         "source": "usb",
         "stale_frames": 0,
         "overflows": 0,
@@ -340,7 +344,7 @@ def test_samples_are_what_the_box_prints():
         "pid": 712,
         "version": __version__,
         "since_ns": 0,
-        "model": "default 2, 6 labels",
+        "model": f"default {VERSION}, 6 labels",
         "verdicts": [
             verdict(1, Status.OK, "wood", 0.991, time_ns=now_ns - 9_000_000_000).as_dict(
                 arrays=False
@@ -357,10 +361,21 @@ def test_samples_are_what_the_box_prints():
             bundle_commands.ListedBundle(
                 "5" * 64, "5be01d77", "mine", "1", 1, "anna", "previous", ""
             ),
-            bundle_commands.ListedBundle("", "d5b2b6ef", "default", "2", 0, "palpate", "kept", ""),
+            bundle_commands.ListedBundle(
+                "", PACKAGED, "default", VERSION, 0, "palpate", "kept", ""
+            ),
         ]
     )
     assert [line for line in shown if line not in BLOCKS] == []
+
+
+def test_examples_are_of_the_packaged_bundle():
+    """Wherever a page shows the packaged bundle, it is the one of today."""
+    shown = re.findall(r"\bdefault (\d+)(?:, (?!\d+ labels)(\w{8}))?", MANUAL)
+    shown += [(n, i) for i, n in re.findall(r"\b([0-9a-f]{8})  default (\d+)", MANUAL)]
+    assert len(shown) >= 4
+    assert {version for version, _ in shown} == {VERSION}
+    assert {name for _, name in shown if name} == {PACKAGED}
 
 
 def test_the_trial_is_described_as_it_is():

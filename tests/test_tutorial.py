@@ -1,13 +1,17 @@
-"""The tutorial "Your first model": its commands run as they stand on the page, and print the lines
-that the page shows."""
+"""The tutorial "Your first model": its commands run as they stand on the page, in the time that the
+page promises, and print the lines that the page shows."""
 
 from __future__ import annotations
 
 import os
 import re
 import shlex
+import socket
 import subprocess
 import sys
+import time
+import urllib.request
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import pytest
@@ -22,6 +26,44 @@ SHOWN = (
     "named rightly: 36 of 36: 100.0 % [90.4, 100.0], 95 % interval, by position (2)",
 )
 """Lines of the page that do not depend on the machine."""
+MINUTES = 15
+BOX = re.compile(r"(?m)^    mkdir -p build/box; (palpate run .*)$")
+
+
+def check_page_of_box(folder: Path, environment: dict[str, str], watch: str) -> None:
+    """The last step: the box runs with the new bundle, and the page gets a verdict of it."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    (folder / "build" / "box").mkdir()
+    lines = [*BOX.findall(PAGE.read_text("utf-8")), watch.replace("--web", f"--web {port}")]
+    environment = environment | {"PWD": str(folder)}
+    with ExitStack() as stack:
+        for line in lines:
+            run = subprocess.Popen(
+                ["sh", "-c", f"exec {line}"],
+                cwd=folder,
+                env=environment,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+            )
+            stack.callback(run.wait)
+            stack.callback(run.terminate)
+        until_answers(port)
+        with urllib.request.urlopen(f"http://localhost:{port}/events", timeout=60) as events:
+            text = ""
+            while '"model":"first 1' not in text or "event: verdict" not in text:
+                text += events.readline().decode()
+
+
+def until_answers(port: int) -> None:
+    """Wait until a server listens at the port; fails after a minute."""
+    end = time.monotonic() + 60
+    while True:
+        with suppress(OSError), socket.create_connection(("localhost", port), timeout=1):
+            return
+        assert time.monotonic() < end, "the page does not answer"
+        time.sleep(0.1)
 
 
 @pytest.mark.slow
@@ -42,9 +84,12 @@ def test_the_commands_of_the_tutorial_run(tmp_path: Path):
         "export",
         "score",
         "demo",
+        "report",
+        "watch",
     ]
     output = ""
-    for command in commands:
+    begun = time.monotonic()
+    for command in commands[:-1]:
         done = subprocess.run(
             shlex.split(command),
             cwd=tmp_path,
@@ -55,6 +100,9 @@ def test_the_commands_of_the_tutorial_run(tmp_path: Path):
         )
         assert done.returncode == 0, done.stderr
         output += done.stdout
+    assert time.monotonic() - begun < 60 * MINUTES
+    assert "<h1" in (tmp_path / "build" / "first-fit.html").read_text()
+    check_page_of_box(tmp_path, environment, commands[-1])
     output += (tmp_path / "build" / "recordings" / "wood_p3_2.csv").read_text()
     for line in SHOWN:
         assert line in PAGE.read_text("utf-8")

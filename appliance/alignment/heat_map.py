@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from itertools import zip_longest
 
 from appliance.alignment.terminal import BLOCKS, HEAT, PLAIN
+from appliance.alignment.view import figure
 
 WIDEST = 6
 """Largest width of a taxel in characters; from five on the count is shown."""
@@ -17,12 +18,13 @@ Map = Sequence[Sequence[float]]
 
 
 def side_by_side(
-    load: Sequence[Map], full: float, width: int, signs: str = BLOCKS
+    load: Sequence[Map], full: float, width: int, signs: str = BLOCKS, unit: str = ""
 ) -> Iterator[list[str]]:
     """The maps of all axes, with as many side by side as fit in `width`. Yields the lines of one
     row of maps after another.
 
-    full: load that is shown as the strongest. signs: see alignment.terminal.
+    full: load that is shown as the strongest. signs: see alignment.terminal. unit: of the load, ""
+    for raw counts.
     """
     axes, cols = len(load), len(load[0][0]) if load else 0
     if not load:
@@ -33,7 +35,7 @@ def side_by_side(
     beside = max(1, (width + len(GAP)) // (cols * cell + len(GAP) + 1))
     for at in range(0, axes, beside):
         drawn = [
-            _map(axis, _head(at + i, axes), full, cell, signs)
+            _map(axis, _head(at + i, axes), full, cell, signs, unit)
             for i, axis in enumerate(load[at : at + beside])
         ]
         yield [" " + GAP.join(parts) for parts in zip_longest(*drawn, fillvalue="")]
@@ -50,13 +52,15 @@ def _head(axis: int, axes: int) -> str:
     return f"axis {axis + 1}{' (normal)' * (axis + 1 == axes)}" if axes > 1 else ""
 
 
-def _map(values: Map, head: str, full: float, cell: int, signs: str) -> list[str]:
+def _map(values: Map, head: str, full: float, cell: int, signs: str, unit: str) -> list[str]:
     """One axis: a shaded field for each taxel, with its count if there is room."""
-    rows = ["".join(_field(value, full, cell, signs) for value in row) + PLAIN for row in values]
+    rows = [
+        "".join(_field(value, full, cell, signs, unit) for value in row) + PLAIN for row in values
+    ]
     return [head.ljust(cell * len(values[0])), *rows] if head else rows
 
 
-def _field(value: float, full: float, cell: int, signs: str) -> str:
+def _field(value: float, full: float, cell: int, signs: str, unit: str) -> str:
     share = max(0.0, min(1.0, value / full))
-    text = f"{value:.0f}".center(cell) if cell >= 5 else signs[round(4 * share)] * cell
+    text = figure(value, full, unit).center(cell) if cell >= 5 else signs[round(4 * share)] * cell
     return f"\033[38;5;{HEAT[round(5 * share)]}m{text[:cell]}"

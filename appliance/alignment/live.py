@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from appliance.alignment.view import Display, View
+from appliance.alignment.view import Display, View, figure
 from appliance.bundle.bundle import Bundle
 from appliance.core.config import Config
 from appliance.core.devices import Devices
@@ -37,7 +37,8 @@ class Expected:
     bundle: name, version and id of a bundle with the skin's format, or NO_BUNDLE. threshold: of
     contact, raw counts. contact: contact positions in training. Both are None without a bundle,
     and where the bundle does not have them. unloaded: raw counts [R, C] of the unloaded skin along
-    the normal; 0 without a bundle. fingertip: setting `skin.fingertip`.
+    the normal; 0 without a bundle. fingertip: setting `skin.fingertip`. unit: of the counts, as in
+    the skin's profile.
     """
 
     format: SweepFormat
@@ -46,13 +47,17 @@ class Expected:
     contact: ContactPositions | None = None
     unloaded: NDArray[np.float64] | float = 0.0
     fingertip: str = ""
+    unit: str = ""
 
     @classmethod
-    def by(cls, model: Bundle, fingertip: str = "") -> Expected:
-        """The skin as `model` describes it. fingertip: setting `skin.fingertip`."""
+    def by(cls, model: Bundle, fingertip: str = "", unit: str = "") -> Expected:
+        """The skin as `model` describes it. fingertip: setting `skin.fingertip`. unit: of its
+        profile."""
         m = model.manifest
         named = f"{m.name} {m.version}, {model.id}"
-        return cls(m.format, named, m.thresholds.contact, m.contact, normal(m.tare, 0), fingertip)
+        return cls(
+            m.format, named, m.thresholds.contact, m.contact, normal(m.tare, 0), fingertip, unit
+        )
 
     def json(self) -> dict[str, Any]:
         """All but format and bundle, under the keys of the feed (PROTOCOL.md, section 4)."""
@@ -63,6 +68,7 @@ class Expected:
             "place": contact,
             "unloaded": unloaded,
             "fingertip": self.fingertip,
+            **({"unit": self.unit} if self.unit else {}),
         }
 
     @classmethod
@@ -82,6 +88,7 @@ class Expected:
             contact,
             unloaded,
             str(known["fingertip"]),
+            str(known.get("unit", "")),
         )
 
 
@@ -157,9 +164,11 @@ class ContactTracker:
         least = lowest[np.isfinite(lowest)].max(initial=-np.inf)
         if self._expected.threshold is not None and least >= self._expected.threshold:
             above = " above the unloaded skin" if np.any(self._expected.unloaded) else ""
+            unit = self._expected.unit
+            unit = self._expected.unit
             hint = (
-                f"a taxel has not read less than {least:.0f} raw counts{above} yet: something lies "
-                "on the skin"
+                f"a taxel has not read less than {figure(least, least, unit)} "
+                f"{unit or 'raw counts'}{above} yet: something lies on the skin"
             )
             return self._view("lift", "lift the finger off the skin once", hint, **shown)
         if found is None:
@@ -193,6 +202,7 @@ class ContactTracker:
             self._shape,
             contact=known.contact,
             fingertip=known.fingertip,
+            load_unit=known.unit,
             **shown,
         )
 

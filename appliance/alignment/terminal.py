@@ -10,7 +10,7 @@ import os
 from abc import ABC, abstractmethod
 from typing import Generic, Self, TextIO, TypeVar
 
-from appliance.alignment.view import View
+from appliance.alignment.view import View, figure
 from appliance.core.clock import Clock
 from appliance.signal.contact import Point
 
@@ -187,7 +187,7 @@ class Canvas:
                 self._signs[round(4 * share)] * (wide - 1),
                 f"\033[38;5;{HEAT[round(5 * share)]}m",
             )
-        number = f"{load:.0f}"
+        number = figure(load, self._view.full, self._view.load_unit)
         if wide >= len(number) + 3:
             number = f" {number} "
         self._put(top + high // 2, left + (wide - 1 - len(number)) // 2, number[: wide - 1])

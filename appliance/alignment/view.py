@@ -24,6 +24,7 @@ class View:
     nearest: the nearest trained position, in the same unit.
     contact: contact positions in training, None if unknown.
     fingertip: setting `skin.fingertip`.
+    load_unit: unit of the load, "" for raw counts.
     """
 
     number: int
@@ -40,6 +41,7 @@ class View:
     nearest: Point | None = None
     contact: ContactPositions | None = None
     fingertip: str = ""
+    load_unit: str = ""
 
     @property
     def origin(self) -> str:
@@ -54,6 +56,13 @@ class View:
     def json(self) -> dict[str, Any]:
         """The View as the page reads it."""
         return asdict(self)
+
+
+def figure(value: float, full: float, unit: str) -> str:
+    """A load in text: raw counts as whole numbers, others with up to three digits. full: the
+    strongest load on the scale."""
+    digits = 0 if not unit or full >= 100 else 1 if full >= 10 else 2
+    return f"{value:.{digits}f}"
 
 
 class Display(Protocol):

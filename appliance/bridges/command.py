@@ -54,6 +54,14 @@ def _source(args: argparse.Namespace) -> Source:
     return LineSource(*_port(args), baud=args.baud)
 
 
+def _warn(args: argparse.Namespace) -> None:
+    """Warn about a serial line that is not there: it may be plugged in later."""
+    if args.port and "://" not in args.port and not Path(args.port).exists():
+        log.warning(f"--port {args.port} does not exist; trying again until it does, or correct it")
+    if args.feed and not Path(args.feed).exists():
+        log.warning(f"--feed {args.feed} does not exist; waiting until palpate runs there")
+
+
 def _port(args: argparse.Namespace) -> tuple[str, Callable[[], Any]]:
     """Name of the box's serial line, and a function that opens it."""
     if args.link:
@@ -69,9 +77,10 @@ def run_modbus(args: argparse.Namespace) -> int:
     settle("modbus", args, config.load(None))
     host, port = address(args.listen)
 
-    async def serve() -> None:
+    async def serve() -> int:
         stop = stop_event()
         source = _source(args)
+        _warn(args)
         try:
             server = TcpServer(
                 ModbusBridge(source, SystemClock(), writes=args.allow_writes).serve, args.most
@@ -81,9 +90,11 @@ def run_modbus(args: argparse.Namespace) -> int:
             await until(stop, EVERY_S, partial(asyncio.to_thread, source.refresh))
         finally:
             source.close()
+        return stop.code
 
-    patiently(lambda: asyncio.run(serve()), SystemClock())
-    return 0
+    codes: list[int] = []
+    patiently(lambda: codes.append(asyncio.run(serve())), SystemClock())
+    return codes[-1]
 
 
 def run_tcp(args: argparse.Namespace) -> int:
@@ -93,8 +104,9 @@ def run_tcp(args: argparse.Namespace) -> int:
     settle("tcp", args, config.load(None))
     host, port = address(args.listen)
 
-    async def serve() -> None:
+    async def serve() -> int:
         stop = stop_event()
+        _warn(args)
         name, opener = _port(args)
         bridge = TcpBridge(
             name, opener, writes=args.allow_writes, most=args.most, loop=asyncio.get_running_loop()
@@ -105,9 +117,11 @@ def run_tcp(args: argparse.Namespace) -> int:
             await until(stop, EVERY_S, partial(asyncio.sleep, 0))
         finally:
             bridge.close()
+        return stop.code
 
-    patiently(lambda: asyncio.run(serve()), SystemClock())
-    return 0
+    codes: list[int] = []
+    patiently(lambda: codes.append(asyncio.run(serve())), SystemClock())
+    return codes[-1]
 
 
 def run_ros(args: argparse.Namespace) -> int:

@@ -13,6 +13,7 @@ from collections.abc import Awaitable, Callable
 from contextlib import suppress
 
 from appliance.core.errors import AddressError, ConfigError
+from appliance.core.interrupts import INTERRUPTED
 from appliance.core.log import log
 
 QUIET_S = 5.0
@@ -119,16 +120,29 @@ class TcpServer:
             await self._serve(peer)
         except (OSError, TimeoutError):
             pass  # the peer is gone or hangs; the others are not affected
+        except asyncio.CancelledError:
+            pass  # the program ends; asyncio would print a traceback for a cancelled connection
         finally:
             self.peers.discard(peer)
             await peer.close()
 
 
-def stop_event() -> asyncio.Event:
+class StopEvent(asyncio.Event):
+    """Set by a signal. code: exit code of the program that it ends."""
+
+    code = 0
+
+    def end(self, code: int) -> None:
+        """End the program with this exit code."""
+        self.code = code
+        self.set()
+
+
+def stop_event() -> StopEvent:
     """Set by SIGTERM or SIGINT from now on."""
-    stop = asyncio.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    stop, loop = StopEvent(), asyncio.get_running_loop()
+    for number, code in ((signal.SIGTERM, 0), (signal.SIGINT, INTERRUPTED)):
+        loop.add_signal_handler(number, stop.end, code)
     return stop
 
 

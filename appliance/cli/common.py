@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from appliance.bundle.bundle import Bundle
-from appliance.core import config
+from appliance.core import config, storage
 from appliance.core.clock import SystemClock
 from appliance.core.config import Config
-from appliance.core.errors import ConfigError
+from appliance.core.errors import BundleDenied, ConfigError
 from appliance.core.interrupts import INTERRUPTED
 from appliance.runtime import assembly
 
@@ -56,8 +56,21 @@ def status_file(settings: Config) -> Path:
 
 
 def load_bundle(settings: Config, *, answers: bool = True) -> Bundle:
-    """The bundle of the settings; see assembly.running."""
-    return assembly.running(settings, answers=answers).bundle
+    """The bundle of the settings; see assembly.running. Raises BundleDenied without the rights."""
+    try:
+        return assembly.running(settings, answers=answers).bundle
+    except PermissionError as e:
+        raise BundleDenied(
+            f"{e.filename}: this user may not read the deployed bundle; use the service's rights: "
+            "sudo -u palpate palpate ..., with the same command"
+        ) from e
+
+
+def check_output(path: Path) -> None:
+    """Raise ConfigError if a file cannot be written, before the work whose result it gets."""
+    why = storage.refused(path)
+    if why:
+        raise ConfigError(f"{path} cannot be written: {why}; name a file in a folder of yours")
 
 
 class StopFlag:

@@ -49,17 +49,27 @@ def simulated(
     from appliance.sim import devices, rig, script, tour
 
     clock = rig.VirtualClock() if args.virtual else SystemClock()
+    follows = settings.trigger.mode == "serial"
     profile = skins.profile(settings)
     if profile.codec == "palpate":
-        acts, source, format = script.named(name, format, args.seed, spread=spread)
-        acts = tour.tour(format, args.seed) if touring else acts
-        return devices.build(format, islice(acts, args.sweeps), clock, source, remember=remember)
+        acts, source, format = script.named(name, format, args.seed, spread=spread, follows=follows)
+        acts = islice(tour.tour(format, args.seed) if touring else acts, args.sweeps)
+        return devices.build(format, acts, clock, source, remember=remember, follows=follows)
     from appliance.sim.skins import devices as terminal
     from appliance.sim.skins import sweeps
 
     seen = sweeps.view(settings.skin.profile, profile.format)
-    acts, source, format = script.named(name, format, args.seed, spread=spread, seen=seen)
+    acts, source, format = script.named(
+        name, format, args.seed, spread=spread, seen=seen, follows=follows
+    )
     acts = islice(acts, args.sweeps)
     return terminal.build(
-        settings.skin.profile, profile, format, acts, clock, source, remember=remember
+        settings.skin.profile,
+        profile,
+        format,
+        acts,
+        clock,
+        source,
+        remember=remember,
+        follows=follows,
     )

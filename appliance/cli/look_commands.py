@@ -84,6 +84,7 @@ def _expected(settings: Config, devices: Devices) -> Expected:
     from appliance.alignment.live import Expected
 
     current, fingertip = None, settings.skin.fingertip
+    unit = skins.profile(settings).unit
     try:
         current = load_bundle(settings, answers=False)
     except BundleError as e:
@@ -93,10 +94,10 @@ def _expected(settings: Config, devices: Devices) -> Expected:
     except SensorError:
         if not current:
             raise
-        return Expected.by(current, fingertip)  # the command waits for the skin
+        return Expected.by(current, fingertip, unit)  # the command waits for the skin
     if current and fits(format, current.format):
-        return Expected.by(current, fingertip)
-    return Expected(format, fingertip=fingertip)
+        return Expected.by(current, fingertip, unit)
+    return Expected(format, fingertip=fingertip, unit=unit)
 
 
 def run_replay(args: argparse.Namespace) -> int:

@@ -136,6 +136,7 @@ def _record_page(
         recording.about,
         obey,
         SystemClock(),
+        skins.profile(settings).unit,
     )
     log.info(f"page: {page.server.address}")
     return [page]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -103,7 +104,9 @@ def _reports(
 ) -> list[Observer]:
     """The observers that the settings ask for: log, black box, status file, feed with `facts`.
     source: origin of the frames."""
-    observers: list[Observer] = [VerdictLog()] if in_journal() else []
+    # without a serial port, a terminal shows the sentences
+    shown = in_journal() or bool(settings.serial.port and sys.stderr.isatty())
+    observers: list[Observer] = [VerdictLog()] if shown else []
     if settings.store.black_box:
         from appliance.recording.black_box import BlackBox
 
@@ -116,7 +119,7 @@ def _reports(
     facts = {"model": lambda: model, **facts}
     from appliance.alignment.live import Expected
 
-    expected = Expected.by(current, settings.skin.fingertip)
+    expected = Expected.by(current, settings.skin.fingertip, skins.profile(settings).unit)
     known = {"bundle": current.id, "labels": m.labels, "alignment": expected.json()}
     return [
         *observers,

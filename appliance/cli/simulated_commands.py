@@ -12,9 +12,11 @@ from typing import TYPE_CHECKING
 
 from appliance.bundle import bundle as bundles
 from appliance.bundle.bundle import Bundle
-from appliance.cli.common import StopFlag, load_bundle, load_settings
+from appliance.cli.common import StopFlag, check_output, load_bundle, load_settings
 from appliance.cli.devices import simulated
+from appliance.core import storage
 from appliance.core.config import Config
+from appliance.core.errors import BundleDenied
 from appliance.core.log import log
 from appliance.core.observer import Observer
 from appliance.io import skins
@@ -38,11 +40,8 @@ def _played_bundle(settings: Config) -> Bundle:
     user may not read the deployed bundle."""
     try:
         return load_bundle(settings, answers=False)
-    except PermissionError as e:
-        log.warning(
-            f"{e.filename}: {e.strerror}, so the packaged bundle plays; use"
-            " sudo -u palpate for the deployed bundle"
-        )
+    except BundleDenied as e:
+        log.warning(f"{e}; the packaged bundle plays now")
         return bundles.load(bundles.DEFAULT)
 
 
@@ -80,6 +79,8 @@ def run_bench(args: argparse.Namespace) -> int:
     """Measure this machine; see appliance/tools/bench.py."""
     from appliance.tools import bench_process, pseudo_terminal
 
+    if args.json:
+        check_output(args.json)
     settings = load_settings(args)
     bundle = _played_bundle(settings)
 
@@ -101,7 +102,7 @@ def run_bench(args: argparse.Namespace) -> int:
         bundle, build, args.references, args.seed, lambda line: print(line, flush=True)
     )
     if args.json:
-        args.json.write_text(json.dumps(figures, indent=1) + "\n")
+        storage.put(args.json, (json.dumps(figures, indent=1) + "\n").encode())
     return 0
 
 

@@ -17,13 +17,14 @@ from appliance.cli.devices import open_devices
 from appliance.core import storage
 from appliance.core.clock import SystemClock
 from appliance.core.config import Config
-from appliance.core.errors import ConfigError
+from appliance.core.errors import ConfigError, SensorMismatch
 from appliance.core.log import log
 from appliance.io import serial_port, skin_profile, skins
 from appliance.io.serial_port import PortInfo
 from appliance.io.skin_profile import DEFAULT, SkinProfile
 
 if TYPE_CHECKING:
+    from appliance.tools.skin_monitor import SkinDisplay
     from appliance.tools.skin_new import PortSample
 
 CHECK_S = 10.0
@@ -53,18 +54,16 @@ def run_check(args: argparse.Namespace) -> int:
 
 
 def run_list(args: argparse.Namespace) -> int:
-    """Print all profiles, one line each; 1 if a profile cannot be read."""
+    """Print all profiles as a table; 1 if a profile cannot be read."""
     from appliance.tools import skin_detect
 
-    broken = 0
-    for name, profile in _profiles(load_settings(args)):
-        broken += isinstance(profile, ConfigError)
-        print(
-            f"{name:<14} {profile}"
-            if isinstance(profile, ConfigError)
-            else skin_detect.listed(name, profile)
-        )
-    return 1 if broken else 0
+    every = dict(_profiles(load_settings(args)))
+    good = {name: one for name, one in every.items() if not isinstance(one, ConfigError)}
+    print(*skin_detect.table(good), sep="\n")
+    for name, one in every.items():
+        if isinstance(one, ConfigError):
+            print(f"{name}: {one}")
+    return 1 if len(good) < len(every) else 0
 
 
 def run_detect(args: argparse.Namespace) -> int:
@@ -140,10 +139,10 @@ def run_show(args: argparse.Namespace) -> int:
             SkinScreen(sys.stdout, devices.clock, *(page.address for page in pages))
         )
         sensor = stack.enter_context(closing(skins.sensor(settings, format, devices)))
-        name = settings.skin.profile
-        skin_show.run(
-            sensor, format, name, devices.source, devices.clock, [screen, *pages], stopped
-        )
+        shown_on: list[SkinDisplay] = [screen, *pages]
+        unit = skins.profile(settings).unit
+        name, source = settings.skin.profile, devices.source
+        skin_show.run(sensor, format, name, source, devices.clock, shown_on, stopped, unit)
     return stopped.exit_code
 
 
@@ -163,7 +162,7 @@ def run_new(args: argparse.Namespace) -> int:
         " skin"
     )
     heard = skin_new.listen(partial(SerialLink, port, clock=clock), bauds, seconds, clock)
-    for number, proposal in enumerate(heard.proposals, 1):
+    for number, proposal in enumerate(heard.proposals[: skin_new.MOST_SHOWN], 1):
         print(f"{number}: {skin_new.words(proposal)}")
     if args.grid:
         _write(path, heard, args)
@@ -184,6 +183,11 @@ def _write(path: Path, heard: PortSample, args: argparse.Namespace) -> None:
     there = next((one for one in serial_port.ports() if one.path == port), PortInfo(port))
     text = skin_new.profile(chosen, grid, heard.baud, there)
     frames, garbage = skin_new.decoded(text, heard.reads)
+    if frames < skin_new.FEWEST:
+        raise SensorMismatch(
+            f"the profile reads {frames} frames of what the skin has just sent, so {path} is not "
+            "written; choose another --proposal or --grid, or listen longer with --seconds"
+        )
     storage.put_all({path: text.encode()}, mode=0o644)
     use = (
         f"--skin {shlex.quote(str(path))}"

@@ -315,6 +315,10 @@ def load(
     installation `/etc/palpate`. site: must exist unless it is SITE. Raises ConfigError with file,
     key, value and the allowed values.
     """
+    if folder and not folder.is_dir():
+        raise ConfigError(
+            f"--config-dir {folder}: no such folder; name that of skin.toml and the board files"
+        )
     folder = folder or _folder()
     of_site = _read(site, needed=site != SITE)
     in_site = of_site.pop("board", "")
@@ -367,7 +371,7 @@ def _folder() -> Path:
 
 def _read(path: Path, *, needed: bool) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text("utf-8"))
+        return tomllib.loads(path.read_text("utf-8-sig"))
     except FileNotFoundError as e:
         if not needed:
             return {}

@@ -34,6 +34,9 @@ class Devices:
         nothing."""
         return settings
 
+    def commanded(self, t_ns: int, *, start: bool) -> None:
+        """START or STOP has come as a command at `t_ns`. Only a simulated finger follows."""
+
     def finished(self, answered: int) -> bool:
         """Whether nothing more will happen after `answered` sweeps; never with real devices."""
         return False

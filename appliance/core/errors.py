@@ -27,6 +27,10 @@ class BundleError(ApplianceError):
     exit_code = EX_CONFIG
 
 
+class BundleDenied(BundleError):
+    """This user may not read the deployed bundle."""
+
+
 class ModelError(BundleError):
     """The model cannot be run on an input, or not with the memory that is left. The next start may
     succeed, so the service is started again."""
@@ -34,8 +38,8 @@ class ModelError(BundleError):
     exit_code = EX_SOFTWARE
 
 
-class TemporaryError(ApplianceError):
-    """Something could not be done now, and may be possible at the next start without a person."""
+class TemporaryError(ConfigError):
+    """As ConfigError, but the cause may be gone at the next start without a person."""
 
     exit_code = EX_TEMPFAIL
 
@@ -100,7 +104,7 @@ class PortError(ApplianceError):
     exit_code = EX_UNAVAILABLE
 
 
-class AddressError(ApplianceError):
+class AddressError(ConfigError):
     """An address of this machine cannot be listened on: it is not there yet, or in use."""
 
     exit_code = EX_UNAVAILABLE

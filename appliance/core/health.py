@@ -17,7 +17,7 @@ class Health:
     SensorCounters), of the serial line `dropped`, of the trigger `glitches`, `lost_edges` and
     `storms` (see EdgeCounters). loss_known: the skin counts its frames; if not, `lost_frames`
     counts only the losses that can be inferred. degraded: taxels that are broken over the stream
-    and bridged ("silent taxel 2.3"), "" for none.
+    and bridged ("silent taxel 2.3"), "" for none. foreign_frames: of other nodes on the skin's bus.
     """
 
     time_ns: int
@@ -42,6 +42,7 @@ class Health:
     loss_known: bool = True
     ready: bool = False
     degraded: str = ""
+    foreign_frames: int = 0
 
     @property
     def text(self) -> str:

@@ -12,6 +12,7 @@ import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import BinaryIO
 
 PART = ".part"
 """Suffix of an unfinished file; after a crash such a file may be removed."""
@@ -53,13 +54,44 @@ def put_all(files: Mapping[Path, bytes], *, durable: bool = True, mode: int | No
             os.replace(aside, target)
             if new:
                 taken.append(str(target))
-    except OSError:
+    except OSError as e:
         for left in (*asides.values(), *taken):
             with suppress(OSError):
                 os.unlink(left)
+        # a full disk is reported by a write, which does not know its file
+        e.filename = (e.filename or str(next(iter(files)))).removesuffix(PART)
         raise
     for folder in {target.parent for target in files} if durable else ():
         sync(folder)
+
+
+@contextmanager
+def file(path: Path) -> Iterator[BinaryIO]:
+    """A new file that gets its name when the block ends without an exception; otherwise nothing is
+    left. Raises OSError with the name of the file."""
+    aside = Path(f"{path}{PART}")
+    try:
+        with aside.open("w+b") as f:
+            yield f
+            f.flush()
+            os.fsync(f.fileno())
+        aside.replace(path)
+        sync(path.parent)
+    except BaseException as e:
+        aside.unlink(missing_ok=True)
+        if isinstance(e, OSError):  # a write to a full disk does not know its file
+            e.filename = (str(e.filename) if e.filename else str(path)).removesuffix(PART)
+        raise
+
+
+def refused(path: Path) -> str:
+    """Why `put` could not write `path` now; "" if it could. Nothing is written."""
+    folder = path.parent
+    if path.is_dir():
+        return "it is a folder"
+    if not folder.is_dir():
+        return f"there is no folder {folder}"
+    return "" if os.access(folder, os.W_OK | os.X_OK) else f"this user may not write to {folder}"
 
 
 def write(path: Path | str, data: bytes, *, durable: bool = True, mode: int | None = None) -> None:

@@ -150,8 +150,13 @@ def read(path: Path, what: str) -> dict[str, Array]:
     try:
         with np.load(path, allow_pickle=False) as z:
             return {k: _typed(z, k) for k in z.files}
-    except (OSError, ValueError, EOFError, TypeError, zipfile.BadZipFile, zlib.error) as e:
-        raise FormatError(f"{path.name}: not {what}: {e}") from e
+    except OSError as e:
+        why = f": {str(e.strerror).lower()}" if e.strerror else ""
+        raise FormatError(f"{path.name}: not {what}{why}") from e
+    except (ValueError, EOFError, TypeError, zipfile.BadZipFile, zlib.error) as e:
+        # numpy takes any other file for a pickle, and explains how to load one
+        why = "" if "pickle" in str(e) else f": {e}"
+        raise FormatError(f"{path.name}: not {what}{why}") from e
 
 
 def _typed(z: Any, name: str) -> Array:

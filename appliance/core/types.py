@@ -198,7 +198,7 @@ class Sweep:
     were interpolated. complete_ns: arrival of the last stop edge or frame that was needed. object:
     number of NEW OBJECT signals so far; 0 before the first, when sweeps are not fused. material,
     position, session: labels given while recording, "" for none. speed_mm_s, force_n: as in the
-    start edge.
+    start edge. filled: indices of the interpolated frames in `frames`; None if there are none.
     """
 
     id: int
@@ -215,6 +215,7 @@ class Sweep:
     share: float = 1.0
     speed_mm_s: float | None = None
     force_n: float | None = None
+    filled: tuple[int, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import base64
 import binascii
+import codecs
 import os
 import re
 from collections.abc import Iterator
@@ -96,7 +97,8 @@ def _trusted(signers: Path) -> bytes:
     try:
         with signers.open("rb") as f:
             data = f.read(MOST_SIGNERS + 1)
-        lines = data.decode().split("\n")
+        text = _plain(data)
+        lines = text.split("\n")
     except (OSError, ValueError) as e:
         raise (TemporaryError if passes(e) else ConfigError)(
             f"{signers} cannot be read: {e}; put a line `NAME KEY` there for each who signs"
@@ -124,7 +126,15 @@ def _trusted(signers: Path) -> bytes:
                 f"{signers}, line {n}: {why}; write NAME ssh-ed25519 AAAA..., the rest as in a "
                 ".pub file"
             )
-    return data
+    return text.encode()
+
+
+def _plain(data: bytes) -> str:
+    """The text of a file as editors of any system write it: UTF-8 or UTF-16 with a byte order mark,
+    and any ends of line. Raises UnicodeDecodeError."""
+    marked = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    text = data.decode("utf-16" if marked else "utf-8-sig")
+    return "\n".join(line.strip(" \t") for line in re.split(r"\r\n|\r|\n", text)) + "\n"
 
 
 def _is_signer(line: str) -> bool:

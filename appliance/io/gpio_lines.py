@@ -8,6 +8,7 @@ in.
 from __future__ import annotations
 
 import errno
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any, Self
@@ -26,6 +27,7 @@ MAX_CHIPS = 256
 QUEUE = 1024
 """Length of the kernel's event queue of one request, the largest that it grants. A full queue drops
 its oldest event."""
+_PLACE = re.compile(r"(?:/dev/)?(gpiochip[0-9]{1,3})[: ]([0-9]{1,4})")
 _ADVICE = {
     errno.EACCES: "add the user to group gpio, and in a unit set DeviceAllow=char-gpiochip",
     errno.EPERM: "add the user to group gpio, and in a unit set DeviceAllow=char-gpiochip",
@@ -48,18 +50,20 @@ def check_binding(gpio: Any) -> None:
 
 
 def find_lines(gpio: Any, names: Sequence[str]) -> dict[str, tuple[str, int]]:
-    """Map each name to (path of its chip, offset), searching all chips of this machine.
+    """Map each name to (path of its chip, offset), searching all chips of this machine. A line
+    without a name is given as chip and offset, such as "gpiochip0:17".
 
-    Raises LineError if a name is given twice, missing or ambiguous, if a chip may not be opened, or
+    Raises LineError if a line is given twice, missing or ambiguous, if a chip may not be opened, or
     without any chip.
     """
     if len(set(names)) < len(names):
         raise LineError(
             f"a gpio line is given two roles in {', '.join(names)}; give each role its own line"
         )
-    places, denied = _catalogue(gpio) if names else ({}, [])
-    found = {}
-    for name in names:
+    found = {name: _at_offset(gpio, *place) for name in names if (place := _place(name))}
+    named = [name for name in names if name not in found]
+    places, denied = _catalogue(gpio) if named else ({}, [])
+    for name in named:
         match places.get(name, []):
             case [place]:
                 found[name] = place
@@ -71,16 +75,42 @@ def find_lines(gpio: Any, names: Sequence[str]) -> dict[str, tuple[str, int]]:
                     )
                     raise LineError(f"{what}, where gpio line {name!r} might be; {advice}")
                 near = closest(name, places, 3) or sorted(places)[:3]
-                raise LineError(
-                    f"no gpio line is named {name!r}; nearest: {', '.join(near)}; gpioinfo lists "
-                    "them all"
+                hint = (
+                    f"nearest: {', '.join(near)}; gpioinfo lists them all"
+                    if near
+                    else "no line has a name here; give chip and offset, such as gpiochip0:17 "
+                    "(gpioinfo lists them)"
                 )
+                raise LineError(f"no gpio line is named {name!r}; {hint}")
             case several:
                 where = " and ".join(f"{path} line {offset}" for path, offset in several)
                 raise LineError(
-                    f"gpio line {name!r} is ambiguous: {where}; choose a line whose name is unique"
+                    f"gpio line {name!r} is ambiguous: {where}; choose another line, "
+                    "or give chip and offset, such as gpiochip0:17"
                 )
-    return found
+    twice = [name for name in names if list(found.values()).count(found[name]) > 1]
+    if twice:
+        raise LineError(
+            f"{' and '.join(twice)} are the same gpio line; give each role its own line"
+        )
+    return {name: found[name] for name in names}
+
+
+def _place(name: str) -> tuple[str, int] | None:
+    """Path of the chip, and offset, of a line that is given by them; None for a name."""
+    match = _PLACE.fullmatch(name)
+    return (f"/dev/{match[1]}", int(match[2])) if match else None
+
+
+def _at_offset(gpio: Any, path: str, offset: int) -> tuple[str, int]:
+    """A place, checked. Raises LineError."""
+    if not gpio.is_gpiochip_device(path):
+        raise LineError(f"{path} is not a gpio chip of this machine; gpiodetect lists them")
+    with naming("look at", [f"{path}:{offset}"]), gpio.Chip(path) as chip:
+        lines = chip.get_info().num_lines
+    if offset >= lines:
+        raise LineError(f"{path} has no line {offset}; use 0 to {lines - 1}")
+    return path, offset
 
 
 def _catalogue(gpio: Any) -> tuple[dict[str, list[tuple[str, int]]], list[str]]:

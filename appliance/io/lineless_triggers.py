@@ -15,7 +15,7 @@ import termios
 import tty
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Self
+from typing import Protocol, Self
 
 from appliance.core.clock import Clock
 from appliance.core.config import TriggerConfig
@@ -62,19 +62,29 @@ class LinelessTrigger:
         return taken
 
 
+class Told(Protocol):
+    """Is told that START or STOP has come as a command."""
+
+    def __call__(self, t_ns: int, *, start: bool) -> None: ...
+
+
 class CommandTrigger(LinelessTrigger):
     """START and STOP as commands on the serial line; `commands` has their handlers. START raises
-    ApplianceError as `slide_values` does."""
+    ApplianceError as `slide_values` does. told: is called with the time of each, for a simulated
+    finger."""
 
-    def __init__(self, clock: Clock) -> None:
+    def __init__(self, clock: Clock, told: Told | None = None) -> None:
         super().__init__("serial", "arrival of the command")
-        self._clock = clock
+        self._clock, self._told = clock, told
         self.commands: Mapping[str, Callable[[str], list[object]]] = {
             kind.name: partial(self._take, kind) for kind in (EdgeKind.START, EdgeKind.STOP)
         }
 
     def _take(self, kind: EdgeKind, text: str) -> list[object]:
-        self._edges.append(Edge(kind, self._clock.now_ns(), **slide_values(text)))
+        edge = Edge(kind, self._clock.now_ns(), **slide_values(text))
+        self._edges.append(edge)
+        if self._told:
+            self._told(edge.t_ns, start=kind is EdgeKind.START)
         return []
 
 

@@ -156,7 +156,8 @@ def _refused(path: str, e: Exception) -> SensorError:
         )
     if code == errno.EACCES:
         return SensorDenied(
-            f"{path} may not be opened by this user (errno 13); add the user to group dialout"
+            f"{path} may not be opened by this user (errno 13); add the user to group dialout, "
+            "or use the service's rights (sudo -u palpate)"
         )
     if code in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
         return SensorAbsent(

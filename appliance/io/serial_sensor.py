@@ -131,10 +131,14 @@ class SerialSensor(LinkSensor):
     def _no_frame(self, *, bytes_came: bool) -> SensorError:
         if not bytes_came:
             return super()._no_frame(bytes_came=False)
+        remedy = (
+            self._stream.misfit
+            or "correct skin.profile, skin.grid or the profile's baud; `palpate skin detect` "
+            "listens for what fits; a board that boots when it is opened needs a longer "
+            "skin.silence_ms"
+        )
         return SensorMismatch(
             f"the skin sent bytes for {self._config.silence_ms} ms, "
             f"but no frame of profile {self._config.profile} "
-            f"({shown(self._profile.format.shape)} {self._profile.number}); correct skin.profile, "
-            "skin.grid or "
-            "the profile's baud; `palpate skin detect` listens for what fits"
+            f"({shown(self._profile.format.shape)} {self._profile.number}); {remedy}"
         )

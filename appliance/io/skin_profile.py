@@ -13,11 +13,14 @@ from math import ceil
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from appliance.core.config import SkinConfig
 from appliance.core.errors import ConfigError
 from appliance.core.schema import closest, custom, keys, read_table, shown
 from appliance.core.schema import number as limited
 from appliance.core.types import MOST_AXES, SweepFormat
+from appliance.io import checksums
 
 DEFAULT = "palpate"
 """The profile of PROTOCOL.md, whose readout board announces grid, type and rate."""
@@ -81,6 +84,27 @@ def _is_channel(value: Any) -> bool:
     return type(value) is int and 0 <= value < 64
 
 
+def _is_column(value: Any) -> bool:
+    return type(value) is int and 0 <= value < 4096
+
+
+def _checksum() -> Any:
+    def read(value: Any) -> str | None:
+        fits = isinstance(value, str) and (not value or checksums.parsed(value))
+        return value if fits else None
+
+    names = ", ".join(checksums.NAMED)
+    return custom("", f'"", {names}, or parameters: "crc8 poly=1d init=ff xorout=00"', read)
+
+
+def _text(most: int) -> Any:
+    def read(value: Any) -> str | None:
+        fits = isinstance(value, str) and len(value) <= most and value.isprintable()
+        return value if fits else None
+
+    return custom("", f"up to {most} printable characters", read)
+
+
 def _is_rate(value: Any) -> bool:
     return type(value) in (int, float) and 0.1 <= value <= 100_000
 
@@ -92,19 +116,30 @@ class SkinProfile:
     about: a line of description. source: where the facts are from. measured: who has compared them
     with a device, "" for nobody. usb_ids: "vvvv:pppp" of its port. baud: bits per second. start,
     stop: commands sent after opening and before closing. tare: command that zeroes the unloaded
-    skin, which takes tare_s. codec: how frames are recognized. marker, trailer: bytes before and
-    after a frame ("fixed"). lines: content of a line of text. number, byte_order: a number on
-    the wire. unit: "N" if the used values are newtons. values: numbers of one taxel on the
-    wire. take: indices of those that are used, in this order; the last is the axis along the
-    skin's normal. rows, cols: grid on the wire. orientation:
-    turns after which the rows lie along the direction of sliding. sequence: type of a frame count
-    after the marker. rate_hz: frames per second; rates_hz: those that `start` can set with {rate}
-    or {period_ms}.
+    skin, which takes tare_s. codec: how frames are recognized. unit: of its numbers, "" for raw
+    counts.
+
+    "fixed": marker, trailer: bytes before and after a frame. skip_before, skip_after: ignored bytes
+    before and after the numbers. sequence: type of a frame count, sequence_at: its first byte,
+    counted from the end of the marker. checksum: see `checksums.parsed`; it stands behind the
+    bytes of skip_after, checksum_from: the first byte that it covers, counted from the beginning of
+    the marker; it covers all bytes up to itself. byte_order: of a number on the wire;
+    sequence_order, checksum_order: of these, "" for byte_order.
+
+    "text": lines: content of a line. skip_columns: numbers of a line that are ignored, counted from
+    0. around: the characters of a line without its numbers, separators and brackets. decimal: the
+    decimal mark. line_end: the character that ends a line.
+
+    number: type of a number. values: numbers of one taxel on the wire. take: indices of those that
+    are used, in this order; the last is the axis along the skin's normal. rows, cols: grid on the
+    wire. orientation: turns after which the rows lie along the direction of sliding. rate_hz:
+    frames per second; rates_hz: those that `start` can set with {rate} or {period_ms}.
     """
 
     about: str = ""
     source: str = ""
     measured: str = ""
+    unit: str = _text(16)
     codec: Literal["palpate", "fixed", "text", "papillarray", "xela-can", "robotiq-tsf"] = "palpate"
     usb_ids: tuple[str, ...] = _several('USB ids such as ["1a86:7523"]', _is_usb_id)
     baud: int = limited(115200, 1200, 4_000_000)
@@ -116,10 +151,20 @@ class SkinProfile:
     tare_s: float = limited(0.0, 0.0, 60.0)
     marker: bytes = _hexadecimal(16)
     trailer: bytes = _hexadecimal(16)
+    skip_before: int = limited(0, 0, 4096)
+    skip_after: int = limited(0, 0, 4096)
     sequence: Literal["", "uint8", "uint16", "uint32"] = ""
+    sequence_at: int = limited(0, 0, 1 << 20)
+    sequence_order: Literal["", "little", "big"] = ""
+    checksum: str = _checksum()
+    checksum_from: int = limited(0, 0, 4096)
+    checksum_order: Literal["", "little", "big"] = ""
     lines: Literal["rows", "frames"] = "rows"
+    skip_columns: tuple[int, ...] = _several("positions of numbers such as [0]", _is_column)
+    around: str = _text(16384)
+    decimal: Literal[".", ","] = "."
+    line_end: Literal["\n", "\r"] = "\n"
     number: NUMBERS = "uint8"
-    unit: Literal["", "N"] = ""
     byte_order: Literal["little", "big"] = "little"
     rows: int = limited(4, 1, 255)
     cols: int = limited(4, 1, 255)
@@ -144,11 +189,9 @@ class SkinProfile:
     def lacks(self) -> tuple[str, ...]:
         """The MARKS that its frames do not have. Without a sequence number, lost frames cannot be
         seen."""
-        has = {
-            "palpate": MARKS,
-            "papillarray": MARKS,
-            "fixed": MARKS[:1] if self.sequence else (),
-        }.get(self.codec, ())
+        has: tuple[str, ...] = MARKS if self.codec in ("palpate", "papillarray") else ()
+        if self.codec == "fixed":
+            has = ("sequence",) * bool(self.sequence) + ("checksum",) * bool(self.checksum)
         return tuple(mark for mark in MARKS if mark not in has)
 
     @property
@@ -182,6 +225,22 @@ class SkinProfile:
 
 
 _KEYS = keys(SkinProfile)
+_OF_CODEC = {
+    "fixed": (
+        "marker",
+        "trailer",
+        "skip_before",
+        "skip_after",
+        "sequence",
+        "sequence_at",
+        "sequence_order",
+        "checksum",
+        "checksum_from",
+        "checksum_order",
+    ),
+    "text": ("skip_columns", "around", "decimal", "line_end"),
+}
+"""Keys that belong to one codec."""
 _VALUES = {"papillarray": (6, "float32"), "xela-can": (3, "uint16"), "robotiq-tsf": (1, "uint16")}
 """Numbers of a taxel and their type, in the codecs that define them."""
 
@@ -190,11 +249,14 @@ def _contradiction(p: SkinProfile) -> str:
     """The contradiction between these values, "" for none."""
     if p.codec == "fixed" and not (p.marker or p.trailer):
         return 'codec = "fixed" needs a marker or a trailer; give one, or take "text"'
-    if p.codec != "fixed" and (p.marker or p.trailer or p.sequence):
-        return (
-            f'marker, trailer and sequence belong to codec = "fixed", not to "{p.codec}"; remove '
-            "them"
-        )
+    for codec, names in _OF_CODEC.items():
+        if codec != p.codec and (wrong := [n for n in names if getattr(p, n) != _KEYS[n].default]):
+            return (
+                f'{" and ".join(wrong)} belong{"s" * (len(wrong) == 1)} to codec = "{codec}", not '
+                f'to "{p.codec}"; remove {"it" if len(wrong) == 1 else "them"}'
+            )
+    if why := _outside(p):
+        return why
     if (
         not p.take
         or len(p.take) > MOST_AXES
@@ -224,6 +286,26 @@ def _contradiction(p: SkinProfile) -> str:
     return ""
 
 
+def _outside(p: SkinProfile) -> str:
+    """Why a part of a frame of fixed length lies where it cannot lie, "" if none does."""
+    body = p.rows * p.cols * p.values * np.dtype(p.number).itemsize
+    end = p.skip_before + body
+    if p.sequence_at and not p.sequence:
+        return (
+            'sequence_at says where the frame count is; give its type, such as sequence = "uint8"'
+        )
+    if not (p.sequence_at <= p.skip_before or end <= p.sequence_at <= end + p.skip_after):
+        return (
+            f"sequence_at = {p.sequence_at} is among the numbers; use 0 to skip_before "
+            f"({p.skip_before}), or {end} to {end + p.skip_after} behind them"
+        )
+    if p.checksum_from and not p.checksum:
+        return 'checksum_from needs a checksum; give one, such as checksum = "crc8"'
+    if p.checksum_from >= len(p.marker) + end + p.skip_after:
+        return f"checksum_from = {p.checksum_from} is behind the numbers; 0 is the whole frame"
+    return ""
+
+
 PALPATE = SkinProfile()
 """The profile that is used if no file defines another."""
 
@@ -246,7 +328,7 @@ def load(name: str, folders: Sequence[Path]) -> SkinProfile:
         )
     path = there[name]
     try:
-        table = tomllib.loads(path.read_text("utf-8"))
+        table = tomllib.loads(path.read_text("utf-8-sig"))
     except OSError as e:
         raise ConfigError(
             f"{path}: cannot be read: {str(e.strerror).lower()}; check who may read it"

@@ -90,7 +90,7 @@ class CountedStream:
 
     def __init__(self, profile: SkinProfile, format: SweepFormat, counters: SensorCounters) -> None:
         self._profile, self._format, self._counters = profile, format, counters
-        self._codec = skin_codecs.codec(profile)
+        self._codec, self.misfit = skin_codecs.codec(profile), ""
         self._wrap = 1 << 8 * np.dtype(profile.sequence).itemsize if profile.sequence else 0
         self._epoch, self._count, self._skipped = -1, 0, 0
         self._rest, self._bytes = Rest(), 0
@@ -122,6 +122,9 @@ class CountedStream:
         self._arrivals.append((self._bytes, arrival_ns))
         found = self._codec(self._rest, data)
         self._rest = found.rest
+        # the first reason stays until a frame comes, so that the log shows it once
+        self.misfit = "" if len(found) else self.misfit or found.misfit
+        self._counters.foreign_frames += found.foreign
         if found.wrong:
             raise SensorMismatch(_of_another(found.wrong))
         numbers = self._numbered(found)
@@ -239,13 +242,16 @@ class CountedStream:
         """Compare the measured rate with the expected one. Raises SensorMismatch."""
         pace = self._watch.pace
         if pace and abs(pace - 1) > RATE_WANDER:
-            wanted = self._format.rate_hz
-            raise SensorMismatch(
-                f"the skin sends {pace * wanted:.1f} frames a second, {wanted:g} are expected "
-                f"({100 * (pace - 1):+.0f} %, "
-                f"at most {100 * RATE_WANDER:g}); set skin.rate_hz for new recordings, or let "
-                f"it send {wanted:g}"
-            )
+            raise SensorMismatch(another_rate(pace * self._format.rate_hz, self._format.rate_hz))
+
+
+def another_rate(measured_hz: float, wanted_hz: float) -> str:
+    """The sentence about a skin that sends frames at another rate than expected."""
+    return (
+        f"the skin sends {measured_hz:.1f} frames a second, {wanted_hz:g} are expected "
+        f"({100 * (measured_hz / wanted_hz - 1):+.0f} %, at most {100 * RATE_WANDER:g}); set "
+        f"skin.rate_hz for new recordings, or let it send {wanted_hz:g}"
+    )
 
 
 class ArrivalWatch:

@@ -42,6 +42,8 @@ PROOF_NS = 5_000_000_000
 must then send frames for as long without a fault before it counts as streaming. Otherwise READY
 would come and go with a wrong skin."""
 
+MOST_SILENCE_MS = 8000
+"""Longest wait for the first frame of an opened skin, unless `skin.silence_ms` is longer."""
 MOST_RESTARTS, RESTARTS_NS = 8, 1_000_000_000
 """A readout board that begins its count anew so often within this time is faulty."""
 
@@ -55,7 +57,8 @@ class SensorCounters:
     frames: received. lost_frames: missing in the sequence numbers. stale_frames: repeated or late,
     and left out. garbage_bytes: bytes outside of packets. overflows: transfers larger than the
     read. fifo_overflows: packets with the flag OVERFLOW, set when the FIFO of the readout board was
-    full. enumerations: times the skin was found and started.
+    full. enumerations: times the skin was found and started. foreign_frames: of other nodes on the
+    skin's bus, left out.
     """
 
     frames: int = 0
@@ -65,6 +68,7 @@ class SensorCounters:
     overflows: int = 0
     fifo_overflows: int = 0
     enumerations: int = 0
+    foreign_frames: int = 0
 
 
 class Sensor(Protocol):
@@ -135,6 +139,11 @@ class FrameStream(Protocol):
         """Accuracy of the times: DeviceClock.quality."""
         ...
 
+    @property
+    def misfit(self) -> str:
+        """Why bytes are not frames, and the remedy, as far as it shows; "" if it does not."""
+        ...
+
     def restart(self) -> None:
         """Begin an enumeration, also the first: frame numbers get the next epoch, and the clock
         starts again."""
@@ -151,6 +160,7 @@ class Stream:
     does."""
 
     loss_known = True
+    misfit = ""
 
     def __init__(
         self,
@@ -263,8 +273,10 @@ class Stream:
         if abs(passed_ns - counted_ns) > slack_ns:
             raise SensorMismatch(
                 f"the skin's clock went on {passed_ns / 1e6:.1f} ms during frames of "
-                f"{counted_ns / 1e6:.1f} ms; "
-                "starting it again, check its firmware if this stays"
+                f"{counted_ns / 1e6:.1f} ms: "
+                f"{self._format.rate_hz * counted_ns / max(passed_ns, 1):.4g} frames a second, "
+                f"{self._format.rate_hz:g} are expected; "
+                "starting it again, check its firmware or skin.rate_hz if this stays"
             )
         if counted_ns >= 1_000_000_000:
             self._mark = first, start_ns
@@ -300,6 +312,8 @@ class LinkSensor(ABC):
         self._quiet_ns = 0  # time since the last frame, or since the skin was opened
         self._read_ns = 0  # end of the last read
         self._unheard = 0  # bytes since then
+        self._framed = False  # a frame came since it was opened
+        self._patience = 1  # a board that boots when it is opened is waited for longer each time
         self._opened_ns = 0
         self._proof_ns = 0  # frames must come for this long before the skin counts as streaming
 
@@ -334,6 +348,9 @@ class LinkSensor(ABC):
             except Exception as e:  # bytes that nobody thought of
                 wrong = SensorMismatch(f"the skin's bytes cannot be read ({_named(e)})")
         if self.counters.frames > before and not wrong:
+            if not self._framed and self._quiet_ns <= self._config.silence_ms * 1_000_000:
+                self._patience = 1
+            self._framed = True
             self._quiet_ns = self._unheard = 0
             if self.state != "streaming" and self._proven(now):
                 self._set_state("streaming", None)
@@ -362,9 +379,17 @@ class LinkSensor(ABC):
     def _no_frame(self, *, bytes_came: bool) -> SensorError:
         """The trouble of a skin that sent no frame for `silence_ms`. bytes_came: it sent other
         bytes. The message contains no measured figure, so that the log shows it once."""
+        longer = "" if self._framed else f", {self._longer}"
         return SensorSilent(
             f"the skin is there but sent no frame for {self._config.silence_ms} ms; "
-            "starting it again"
+            f"starting it again{longer}"
+        )
+
+    @property
+    def _longer(self) -> str:
+        return (
+            f"and waiting longer each time, up to {MOST_SILENCE_MS / 1000:g} s; for a board that "
+            "boots longer raise skin.silence_ms"
         )
 
     def _connect(self) -> bool:
@@ -384,6 +409,7 @@ class LinkSensor(ABC):
             return False
         self._stream.restart()
         self._quiet_ns = self._unheard = 0
+        self._framed = False
         self._opened_ns = self._read_ns = self._clock.now_ns()
         if self._tap:
             self._tap.state(self._opened_ns, OPENED)
@@ -403,8 +429,13 @@ class LinkSensor(ABC):
         return b""
 
     def _check_silence(self) -> None:
-        """Open a skin again that has sent no complete frame in `silence_ms` of reading."""
-        if self._link and self._quiet_ns > self._config.silence_ms * 1_000_000:
+        """Open a skin again that has sent no complete frame in `silence_ms` of reading. Before its
+        first frame the time is longer at each attempt: a board may boot whenever it is opened."""
+        silence_ms = self._config.silence_ms
+        most_ms = silence_ms if self._framed else silence_ms * self._patience
+        if self._link and self._quiet_ns > most_ms * 1_000_000:
+            if not self._framed and 2 * most_ms <= max(silence_ms, MOST_SILENCE_MS):
+                self._patience *= 2
             self._drop(self._no_frame(bytes_came=self._unheard > 0))
 
     def _drop(self, why: SensorError, proof_ns: int = 0) -> None:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from appliance.bundle.manifest import LABEL
-from appliance.core import storage
+from appliance.core import storage, wall_clock
 from appliance.core.clock import Clock
 from appliance.core.disk_thread import AtOnce, DiskWork
 from appliance.core.errors import ApplianceError, ConfigError, FormatError, TemporaryError
@@ -77,7 +77,7 @@ class SweepFolder:
             self.path(number),
             sweep,
             self._format,
-            {**about, "run": self.run, "verdict": verdict.as_dict()},
+            {**about, "date": wall_clock.date(), "run": self.run, "verdict": verdict.as_dict()},
         )
         self.numbers.append(number)
         return number

@@ -48,23 +48,25 @@ class _Open:
         stop_ns: int,
         status: Status,
         frames: Frames,
-        lost: int,
+        missing: tuple[int, ...],
         now_ns: int,
         share: float = 1.0,
     ) -> Sweep:
-        """The Sweep that the answer is about, complete at `now_ns`."""
+        """The Sweep that the answer is about, complete at `now_ns`. missing: indices of the frames
+        of the window that never arrived."""
         return Sweep(
             self.id,
             self.start_ns,
             stop_ns,
             status,
             frames,
-            lost,
+            len(missing),
             now_ns,
             self.object,
             share=share,
             speed_mm_s=self.start.speed_mm_s,
             force_n=self.start.force_n,
+            filled=missing if missing and len(frames) else None,
         )
 
 
@@ -185,13 +187,13 @@ class SweepCutter:
             if self._newest < sweep.first + n - 1:
                 return
             sweep.step += 1
-            frames, lost = self._window(sweep.first, n)
+            frames, missing = self._window(sweep.first, n)
             if len(frames):
                 yield sweep.sweep(
                     int(frames.t_ns[-1]),
                     Status.OK,
                     frames,
-                    lost,
+                    missing,
                     now_ns,
                     share=sweep.step / (steps + 1),
                 )
@@ -240,7 +242,7 @@ class SweepCutter:
     def _answer(self, sweep: _Open, stop_ns: int, status: Status, now_ns: int) -> None:
         """Finish a sweep with a status and without frames."""
         sweep.answered = True
-        self._done.append(sweep.sweep(stop_ns, status, Frames.empty(self._format), 0, now_ns))
+        self._done.append(sweep.sweep(stop_ns, status, Frames.empty(self._format), (), now_ns))
 
     def _cut(self, sweep: _Open, stop_ns: int, now_ns: int) -> Sweep | None:
         """The sweep with its window, or None while its frames may still arrive."""
@@ -249,13 +251,13 @@ class SweepCutter:
         late = now_ns > stop_ns + self._late_ns
         if self._newest < first + window - 1 and not late:
             return None
-        frames, lost = self._window(first, window)
+        frames, missing = self._window(first, window)
         status = Status.OK if len(frames) else Status.GAP
-        return sweep.sweep(stop_ns, status, frames, lost, now_ns)
+        return sweep.sweep(stop_ns, status, frames, missing, now_ns)
 
-    def _window(self, first: int, n: int) -> tuple[Frames, int]:
-        """Frames `first` to `first + n` with missing frames interpolated, and the number of missing
-        frames. No frames if a gap is too wide."""
+    def _window(self, first: int, n: int) -> tuple[Frames, tuple[int, ...]]:
+        """Frames `first` to `first + n` with missing frames interpolated, and the indices of the
+        missing frames. No frames if a gap is too wide."""
         pad = MAX_GAP
         seq = np.arange(first - pad, first + n + pad)
         slots = seq % self._size
@@ -263,7 +265,8 @@ class SweepCutter:
         missing = np.setdiff1d(np.arange(pad, pad + n), have, assume_unique=True)
         frames = Frames(self._t_ns[slots], seq, self._taxels[slots])
         cut = slice(pad, pad + n) if interpolate(frames, have, missing) else slice(0)
-        return Frames(frames.t_ns[cut], frames.seq[cut], frames.taxels[cut]), len(missing)
+        window = Frames(frames.t_ns[cut], frames.seq[cut], frames.taxels[cut])
+        return window, tuple((missing - pad).tolist())
 
     def _seq_at(self, t_ns: float) -> int:
         """Number of the frame at `t_ns`, computed from the nearest frame in the ring."""

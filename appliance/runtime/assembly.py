@@ -204,7 +204,7 @@ def _trigger(
                 "serial.port is not set; set it, or use --trigger key, or the page of palpate "
                 "record --web"
             )
-        return CommandTrigger(devices.clock)
+        return CommandTrigger(devices.clock, devices.commanded)
     if config.mode == "key":
         return stack.enter_context(KeyTrigger(standard_input(), devices.clock, announce))
     if config.mode == "timed":

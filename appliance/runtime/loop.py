@@ -365,6 +365,7 @@ class Box:
             loss_known=sensor.loss_known,
             ready=self._able and not self._cutter.sweeping,
             degraded=self._answerer.degraded,
+            foreign_frames=counters.foreign_frames,
         )
 
     def circumstances(self) -> dict[str, Any]:

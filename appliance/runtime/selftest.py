@@ -18,7 +18,7 @@ from appliance.io import skin_profile, skins
 from appliance.io.gpio_lines import Lines
 from appliance.io.robot_link import SerialSink
 from appliance.io.trigger import GpioTrigger
-from appliance.io.usb_sensor import fits
+from appliance.io.usb_sensor import Sensor, fits
 from appliance.runtime.assembly import UNSIGNED, gpio
 from appliance.signal.slide import SlideMeter
 
@@ -26,8 +26,11 @@ UNPROVEN = "broken taxels are refused: export it again to measure how many can b
 """Text of a bundle without `bridging`."""
 UNCHECKED = "early answers do not detect unknown materials: export it again"
 """Text of a bundle with early answers, but without limits for them."""
-LISTEN_S = 1.0
-"""Time for which frames of the skin are counted."""
+LISTEN_S, LONGEST_S, LEAST_FRAMES = 1.0, 5.0, 50
+"""Time for which frames of the skin are counted, and for a slow skin the longest time and the
+number of frames that show its rate."""
+BOOT_S = 8.0
+"""Longest wait for the first frame of a skin that was opened; many boards boot then."""
 MOST_READING = 0.5
 """Share of a core that reading a skin may take. The loop has one core; answers, recordings and
 readers of the feed need the rest."""
@@ -131,20 +134,17 @@ def _listened(
     """The frames of the skin and the share of a core for reading them, in words. Counting begins
     with the first frame, since the start takes more processor time."""
     sensor = skins.sensor(settings, format, devices)
-    now_ns = devices.clock.now_ns
-    until_ns, streams = now_ns() + round(LISTEN_S * 1e9), (0, 0)
+    clocked = "time" not in skins.profile(settings).lacks
     try:
-        while now_ns() < until_ns:
-            sensor.read()
-            if streams == (0, 0) and sensor.counters.frames:
-                streams = now_ns(), spent_ns()
-        share = (spent_ns() - streams[1]) / max(now_ns() - streams[0], 1)
-        if sensor.trouble or not sensor.counters.frames:
-            raise sensor.trouble or SensorError(
-                f"the skin sent no frame within {LISTEN_S} s; replug it"
-            )
+        first_ns = _first_frame(sensor, devices.clock.now_ns)
+        begun_ns, counters, first = spent_ns(), sensor.counters, sensor.counters.frames
+        why, passed_s = _counted(sensor, format, first_ns, devices.clock.now_ns, clocked=clocked)
+        share = (spent_ns() - begun_ns) / max(round(passed_s * 1e9), 1)
+        if sensor.trouble:
+            raise sensor.trouble
+        if why:
+            raise SensorMismatch(why)
         who = sensor.identity
-        counters = sensor.counters
         name = f"{who.board} {who.serial}" if who else ""
         sent = f"{shown(format.shape)} {format.dtype} at {format.rate_hz:g} Hz"
         lost = (
@@ -153,8 +153,10 @@ def _listened(
             else "whether frames were lost cannot be seen"
         )
         sends = (
-            f"{name.strip()}, {sent}, {counters.frames} frames in {LISTEN_S} s, {lost}, "
-            f"{100 * share:.1f} % of a core"
+            f"{name.strip()}, {sent}, {counters.frames - first} frames in {passed_s:.1f} s, "
+            + f"{lost}, "
+            + (f"{counters.foreign_frames} foreign, " if counters.foreign_frames else "")
+            + f"{100 * share:.1f} % of a core"
         )
         if share > MOST_READING:
             raise SensorError(
@@ -166,8 +168,69 @@ def _listened(
         sensor.close()
 
 
+def _counted(
+    sensor: Sensor, format: SweepFormat, first_ns: int, now_ns: Callable[[], int], *, clocked: bool
+) -> tuple[str, float]:
+    """Read frames for a while: why their rate is another one, "" if it is not, and the time in
+    seconds. clocked: the skin has a clock, so that the sensor compares the rate."""
+    counters, first = sensor.counters, sensor.counters.frames
+    seconds = max(LISTEN_S, min(LONGEST_S, LEAST_FRAMES / format.rate_hz))
+    points, why = [(0, first_ns)], ""
+    # a busy machine reads late: a rate that seems wrong is measured for longer
+    while (passed_s := (now_ns() - first_ns) / 1e9) < seconds or (why and passed_s < LONGEST_S):
+        before = counters.frames
+        sensor.read()
+        if counters.frames > before and not clocked:
+            points.append((counters.frames + counters.lost_frames - first, now_ns()))
+        if (now_ns() - first_ns) / 1e9 >= seconds and not clocked:
+            why = _another_rate(points, format.rate_hz)
+    return why, passed_s
+
+
+def _first_frame(sensor: Sensor, now_ns: Callable[[], int]) -> int:
+    """The time of the first frame. Raises SensorError if none comes within LISTEN_S, or within
+    BOOT_S from a skin that was opened: its board may boot first."""
+    begun_ns = now_ns()
+    while not sensor.counters.frames:
+        sensor.read()
+        opened = sensor.counters.enumerations and (
+            sensor.trouble is None or sensor.trouble.state in ("silent", "mismatch")
+        )
+        if now_ns() > begun_ns + (BOOT_S if opened else LISTEN_S) * 1e9:
+            raise sensor.trouble or SensorError(
+                f"the skin sent no frame within {BOOT_S} s; replug it"
+            )
+    return now_ns()
+
+
+def _another_rate(points: list[tuple[int, int]], wanted_hz: float) -> str:
+    """Why a skin without a clock sends at another rate than wanted, "" if it does not. points:
+    frames so far, and the time. One frame more or less is no evidence."""
+    from appliance.io import skin_stream  # boxes whose skin has a clock do without it
+
+    third = len(points) // 3
+    if third < 2:
+        return ""
+    # a frame may be read late, never early: compare the promptest of the first and the last third
+    late = [t_ns - frames * 1e9 / wanted_hz for frames, t_ns in points]
+    first, last = (
+        min(part, key=late.__getitem__) for part in (range(third), range(2 * third, len(points)))
+    )
+    frames, passed_ns = (points[last][i] - points[first][i] for i in (0, 1))
+    measured_hz = frames * 1e9 / max(passed_ns, 1)
+    wrong = abs(measured_hz / wanted_hz - 1) > skin_stream.RATE_WANDER + 1 / max(frames, 1)
+    return skin_stream.another_rate(measured_hz, wanted_hz) if wrong else ""
+
+
 def _triggered(settings: Config, devices: Devices) -> Iterator[CheckResult]:
-    if not settings.trigger.by_lines:
+    if settings.trigger.mode == "serial" and not settings.serial.port:
+        hint = "set serial.port, or trigger.mode to two-lines, key or timed"
+        yield CheckResult(
+            "trigger",
+            False,
+            f"serial: START and STOP come over serial.port, which is not set; {hint}",
+        )
+    elif not settings.trigger.by_lines:
         yield CheckResult("trigger", True, f"{settings.trigger.mode}, no lines")
     elif settings.trigger.start:
         yield _try("gpio lines", lambda: _lines(settings, devices))

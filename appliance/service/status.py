@@ -201,6 +201,8 @@ def _skin(report: Mapping[str, Any]) -> str:
         counted += f", {report['overflows']:,} transfers too large"
     if report["fifo_overflows"]:
         counted += f", {report['fifo_overflows']:,} times the readout board's FIFO was full"
+    if report["foreign_frames"]:
+        counted += f", {report['foreign_frames']:,} frames of other nodes on its bus"
     if report["enumerations"] > 1:
         counted += f", plugged in {report['enumerations']} times"
     return f"{report['skin']}{': ' if report['trouble'] else ''}{report['trouble']} ({counted})"

@@ -42,6 +42,10 @@ class RobotDevices(Devices):
         )
         return replace(settings, trigger=trigger, output=output)
 
+    def commanded(self, t_ns: int, *, start: bool) -> None:
+        """The robot follows START and STOP."""
+        self.robot.obey(t_ns, start=start)
+
     def finished(self, answered: int) -> bool:
         """True when the script has ended and each of its sweeps was answered."""
         return self.robot.finished and answered >= self.robot.acts
@@ -66,16 +70,27 @@ class SimDevices(RobotDevices):
 
 
 def robot_on_lines(
-    acts: Iterable[rig.Act], clock: Clock, *, stops: bool = True, remember: bool = True
+    acts: Iterable[rig.Act],
+    clock: Clock,
+    *,
+    stops: bool = True,
+    remember: bool = True,
+    follows: bool = False,
 ) -> tuple[rig.Robot, gpio.SimGpio]:
-    """A robot that plays `acts`, and the GPIO lines that it drives. stops, remember: see
+    """A robot that plays `acts`, and the GPIO lines that it drives. stops, remember, follows: see
     `build`."""
     outputs = READY, BUSY, RESULT_VALID, FAULT, DECIDED, *BITS
     lines = gpio.SimGpio(
         clock, {"/dev/gpiochip0": [START, STOP, NEW_OBJECT, *outputs]}, remember=remember
     )
     robot = rig.Robot(
-        iter(acts), lines, start=START, stop=STOP, new_object=NEW_OBJECT, remember=remember
+        iter(acts),
+        lines,
+        start=START,
+        stop=STOP,
+        new_object=NEW_OBJECT,
+        remember=remember,
+        follows=follows,
     )
     if stops:
         lines.watchers[DECIDED] = robot.react
@@ -91,14 +106,16 @@ def build(
     acm: bool = False,
     stops: bool = True,
     remember: bool = True,
+    follows: bool = False,
 ) -> SimDevices:
     """Devices on which a robot plays `acts`. source: name of the source in sentences. acm: the
-    readout board is a CDC-ACM device. stops: the robot ends its slide after DECIDED.
+    readout board is a CDC-ACM device. stops: the robot ends its slide after DECIDED. follows: the
+    finger slides from the command START to STOP, instead of in its own time.
 
     remember: keep all acts and all output levels, to examine them later; without it memory does not
     grow.
     """
-    robot, lines = robot_on_lines(acts, clock, stops=stops, remember=remember)
+    robot, lines = robot_on_lines(acts, clock, stops=stops, remember=remember, follows=follows)
     backend = usb.RigBackend(rig.ReadoutBoard(format, robot, clock), clock, acm=acm)
 
     def cable(out_ns: int, in_ns: int) -> None:

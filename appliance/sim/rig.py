@@ -23,6 +23,10 @@ from appliance.io import packets
 
 PULSE_NS = 20_000_000
 """Length of the robot's pulses."""
+SETTLED = 16
+"""A finger that follows START begins after this part of a slide: until then the skin creeps."""
+WAITING = 2
+"""Frames of a lifted finger that are played at once while it waits for START."""
 REACTION_NS = 20_000_000
 """Time for which the finger continues to slide after DECIDED has risen."""
 
@@ -63,6 +67,7 @@ class SkippingClock:
 class Act:
     """One sweep of the robot. frames: raw counts [n, R, C] or [n, R, C, A]. start, stop: frames at
     which its edges come. label: the material. new_object: NEW OBJECT comes with the first frame.
+    lifted: frames before the finger touches.
 
     about: what is special about it, for a person. wanted: the right status; "" for `ok`, or
     `unknown` if the bundle lacks the material. unplugged: frames [from, to) for which the
@@ -77,6 +82,7 @@ class Act:
     about: str = ""
     wanted: str = ""
     unplugged: tuple[int, int] | None = None
+    lifted: int = 1
 
 
 class EdgeLines(Protocol):
@@ -98,6 +104,8 @@ class Robot:
     acts: number of acts that it has begun. played: the acts as they were played; without `remember`
     only the newest. skipped: frame numbers [from, to) that were omitted because it stopped early;
     the readout board leaves them out. cable: unplugs the skin at one time, plugs it in at another.
+    follows: it waits with a lifted finger for START, then slides until STOP, both by `obey`, and
+    drives no lines.
     """
 
     def __init__(
@@ -109,8 +117,11 @@ class Robot:
         stop: str,
         new_object: str = "",
         remember: bool = True,
+        follows: bool = False,
     ) -> None:
         self.acts = 0
+        self._follows, self._sliding, self._lifting = follows, False, False
+        self._act: Act | None = None  # the act that waits for START, or slides
         self.played: MutableSequence[Act] = [] if remember else deque(maxlen=1)
         self.finished = False
         self.skipped: tuple[int, int] | None = None
@@ -125,6 +136,8 @@ class Robot:
 
         frame_ns: gives the host time at which a frame is taken.
         """
+        if self._follows:
+            return self._followed(first, frame_ns)
         act = next(self._script, None)
         if act is None:
             self.finished = True
@@ -146,7 +159,7 @@ class Robot:
 
     def react(self, t_ns: int) -> None:
         """DECIDED has risen at `t_ns`: end the slide REACTION_NS later, unless it ends before."""
-        if not self._playing:
+        if not self._playing or self._follows:
             return
         act, first, frame_ns = self._playing
         at = bisect_left(range(act.stop), t_ns + REACTION_NS, key=lambda i: frame_ns(first + i))
@@ -164,6 +177,42 @@ class Robot:
             self.played[-1] = replace(
                 act, frames=np.delete(act.frames, slice(at, act.stop), axis=0), stop=at
             )
+
+    def obey(self, t_ns: int, *, start: bool) -> None:
+        """START or STOP has come as a command at `t_ns`. START makes a finger that waits slide from
+        the next frame on; STOP lifts it."""
+        if start and not self._sliding:
+            self._sliding, self._lifting = True, False
+            self._playing = None
+        elif not start and self._sliding:
+            self._sliding, self._lifting = False, True
+            if self._playing:
+                act, first, frame_ns = self._playing
+                last = len(act.frames)
+                at = bisect_left(range(last), t_ns, key=lambda i: frame_ns(first + i))
+                self.skipped = (first + at, first + last) if at < last else None
+
+    def _followed(self, first: int, frame_ns: Callable[[int], int]) -> Act | None:
+        """The next frames of a finger that follows commands: a few lifted ones, a whole slide, or
+        the end of an act."""
+        if self._act is None:
+            self._act = next(self._script, None)
+            if self._act is None:
+                self.finished = True
+                return None
+        act, frames = self._act, self._act.frames
+        if self._sliding:
+            if not self._playing:
+                self.acts += 1
+                self.played.append(act)
+            settled = act.start + (act.stop - act.start) // SETTLED
+            part = replace(act, frames=frames[settled : act.stop])  # again, until STOP comes
+            self._playing = part, first, frame_ns
+            return part
+        if self._lifting:
+            self._lifting, self._playing, self._act = False, None, None
+            return replace(act, frames=frames[act.stop :])
+        return replace(act, frames=frames[: max(1, min(act.lifted, WAITING))])
 
     def _pulse(self, name: str, up_ns: int, down_ns: int) -> None:
         self._lines.drive(name, True, up_ns)

@@ -32,6 +32,8 @@ PAUSE_FRAMES = 12
 SLIDE_S, REST_S = 3.0, 0.1
 """Duration of the slide (paper, sec. II.B), and of the finger at rest on the tube before and after
 it."""
+FOLLOWED_S = 8.0
+"""Duration of a slide that ends with the command STOP; it is repeated if STOP comes later."""
 LEAD_S = 0.5
 """Time from an edge to a recorded window, equal to `SweepConfig.lead_ms`; the window's first and
 last frame are repeated for this time."""
@@ -61,13 +63,15 @@ def named(
     *,
     spread: bool = False,
     seen: SeenTubes | None = None,
+    follows: bool = False,
 ) -> tuple[Iterator[Act], str, SweepFormat]:
     """The script with this name after `--sim`, the name of the source in sentences, and the format
     of its sweeps.
 
     format: wanted by the bundle, None without a bundle. spread: play the sweeps of a set in a drawn
-    order, the materials in turn. seen: the skin on the finger, None for the simulator's own. Raises
-    ConfigError for an unknown name, FormatError if the bundle needs another skin.
+    order, the materials in turn. seen: the skin on the finger, None for the simulator's own.
+    follows: slides last FOLLOWED_S, since commands end them. Raises ConfigError for an unknown
+    name, FormatError if the bundle needs another skin.
     """
     kind, _, only = name.partition(":")
     if name == "rest" or kind == "skin":
@@ -88,7 +92,13 @@ def named(
         acts = (
             rests(seed, world, by)
             if name == "rest"
-            else tubes(seed, world=world, seen=by, only=only)
+            else tubes(
+                seed,
+                world=world,
+                seen=by,
+                only=only,
+                slide_s=FOLLOWED_S if follows else SLIDE_S,
+            )
         )
         return acts, "sim", format
     if name.startswith(SETS):
@@ -138,6 +148,7 @@ def tubes(
     world: skin.World = PLAYED,
     seen: SeenTubes = skin,
     only: str = "",
+    slide_s: float = SLIDE_S,
 ) -> Iterator[Act]:
     """Sweeps over the six tubes in random order; each begins at another spot of its tube.
 
@@ -153,6 +164,7 @@ def tubes(
         world,
         seen,
         materials,
+        slide_s,
     )
 
 
@@ -163,24 +175,31 @@ def _tubes(
     world: skin.World,
     seen: SeenTubes,
     materials: Sequence[str],
+    slide_s: float,
 ) -> Iterator[Act]:
     rounds = itertools.cycle(places)
     tubes_left: list[str] = []
     for _ in itertools.count() if sweeps is None else range(sweeps):
         if not tubes_left:
             tubes_left, place = [str(m) for m in rng.permutation(materials)], next(rounds)
-        yield slide(tubes_left.pop(), place, rng, world, seen)
+        yield slide(tubes_left.pop(), place, rng, world, seen, slide_s)
 
 
 def slide(
-    label: str, place: skin.Placement, rng: Generator, world: skin.World, seen: SeenTubes = skin
+    label: str,
+    place: skin.Placement,
+    rng: Generator,
+    world: skin.World,
+    seen: SeenTubes = skin,
+    slide_s: float = SLIDE_S,
 ) -> Act:
     """One sweep over the tube `label`, with the finger lifted before and after it."""
     rate = seen.FORMAT.rate_hz
     off = seen.idle(max(PAUSE_FRAMES, round(rng.uniform(*PAUSE_S) * rate)), rng, world)
-    on = seen.sweep(label, place, rng, world, rest_s=REST_S, slide_s=SLIDE_S, after_s=REST_S)
+    on = seen.sweep(label, place, rng, world, rest_s=REST_S, slide_s=slide_s, after_s=REST_S)
     start = len(off) + round(REST_S * rate)
-    return Act(np.concatenate([off, on, off]), start, start + round(SLIDE_S * rate), label)
+    frames, stop = np.concatenate([off, on, off]), start + round(slide_s * rate)
+    return Act(frames, start, stop, label, lifted=len(off))
 
 
 def rests(seed: int, world: skin.World = PLAYED, seen: SeenTubes = skin) -> Iterator[Act]:
@@ -192,7 +211,7 @@ def rests(seed: int, world: skin.World = PLAYED, seen: SeenTubes = skin) -> Iter
         place = skin.Placement(dx_mm, dy_mm, seed=seed)
         on = seen.sweep("wood", place, rng, world, rest_s=RESTS_FOR_S, slide_s=0, after_s=0)
         frames = np.concatenate([seen.idle(off, rng, world), on])
-        yield Act(frames, off, len(frames) - 1, "wood")
+        yield Act(frames, off, len(frames) - 1, "wood", lifted=off)
 
 
 def load(path: Path, format: SweepFormat | None) -> SweepSet:
@@ -242,5 +261,6 @@ def play(sweeps: SweepSet, order: Iterable[int]) -> Iterator[Act]:
             stop,
             sweeps.materials[sweeps.labels[i]],
             now is not None and now != before,
+            lifted=lifted,
         )
         before = now

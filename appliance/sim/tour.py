@@ -46,7 +46,7 @@ def _special(rng: Generator, world: skin.World) -> Iterator[Act]:
     yield over("plastic rough")
     act = over("foam")
     normal(act.frames, 1)[:, STUCK[0], STUCK[1]] = STUCK_AT
-    yield replace(act, about="a taxel of the skin is stuck: its neighbours stand in")
+    yield replace(act, about="a taxel is stuck: its neighbours stand in")
     yield replace(over("cork"), about="nobody taught it", wanted=Status.UNKNOWN)
     yield over("metal")
     first, second = over("metal"), over("wood")

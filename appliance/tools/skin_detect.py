@@ -25,6 +25,8 @@ from appliance.io.skin_profile import DEFAULT, SkinProfile
 
 LISTEN_S = 2.0
 """Time for each speed of a port: 56 frames of the slowest skin."""
+BOOT_S = 3.0
+"""Additional time for the first byte after a port was opened; many boards boot then."""
 FITS = 0.9
 """Share of the bytes that must be in frames of a profile."""
 FEWEST = 4
@@ -55,12 +57,23 @@ class HeardBytes:
         return b"".join(data for data, _ in self.reads)
 
 
-def listed(name: str, profile: SkinProfile) -> str:
-    """A profile in a line, with missing features, and whether it was compared with a device."""
-    format = "as its board says" if profile.codec == DEFAULT else described(profile.format)
-    lacks = f"lacks {', '.join(profile.lacks)}" if profile.lacks else "lacks nothing"
-    measured = f"measured: {profile.measured}" if profile.measured else "not measured on a device"
-    return f"{name:<14} {profile.about}; {format}; {lacks}; {measured}"
+def table(profiles: Mapping[str, SkinProfile]) -> list[str]:
+    """All profiles in lines: name, format, missing features, and what the skin is. A last line
+    names the profiles that nobody has compared with a device."""
+    rows = [("profile", "format", "lacks", "skin")]
+    for name, one in profiles.items():
+        format = "as its board says" if one.codec == DEFAULT else described(one.format)
+        measured = f" (measured: {one.measured})" if one.measured else ""
+        rows.append((name, format, ", ".join(one.lacks) or "nothing", one.about + measured))
+    wide = [max(len(row[i]) for row in rows) for i in range(3)]
+    lines = [
+        "  ".join(f"{cell:<{n}}" for cell, n in zip(row[:3], wide, strict=True)) + f"  {row[3]}"
+        for row in rows
+    ]
+    if not any(one.measured for one in profiles.values()):
+        return [*lines, "none was measured on a device"]
+    never = [name for name, one in profiles.items() if not one.measured]
+    return [*lines, f"not measured on a device: {', '.join(never)}"] if never else lines
 
 
 def described(format: SweepFormat) -> str:
@@ -159,11 +172,17 @@ def listen(
     return HeardBytes(reads)
 
 
-def collect(port: BytePort, clock: Clock, seconds: float) -> list[tuple[bytes, int]]:
-    """The reads of an open port within `seconds`, with their times. Raises SensorError."""
-    reads, until_ns = [], clock.now_ns() + round(seconds * 1e9)
+def collect(
+    port: BytePort, clock: Clock, seconds: float, boot_s: float = 0.0
+) -> list[tuple[bytes, int]]:
+    """The reads of an open port within `seconds` of its first byte, with their times. boot_s: time
+    beyond `seconds` in which the first byte may come. Raises SensorError."""
+    reads: list[tuple[bytes, int]] = []
+    until_ns = clock.now_ns() + round((seconds + boot_s) * 1e9)
     while (left_ns := until_ns - clock.now_ns()) > 0:
         if data := port.read(1 << 16, max(1, left_ns // 1_000_000)):
+            if not reads:
+                until_ns = clock.now_ns() + round(seconds * 1e9)
             reads.append((data, clock.now_ns()))
     return reads
 

@@ -35,7 +35,7 @@ class LiveView:
     start, [axes][rows][columns] in raw counts; empty before the first frame. full: the strongest
     load on the scale. rate_hz: measured, None without frames. noise: [axes][rows][columns] in raw
     counts. stuck, dead, saturated: names of taxels. frames, lost: since the start; lost is None if
-    it cannot be known.
+    it cannot be known. unit: of load and noise, "" for raw counts.
     """
 
     number: int
@@ -53,6 +53,7 @@ class LiveView:
     saturated: tuple[str, ...] = ()
     frames: int = 0
     lost: int | None = None
+    unit: str = ""
 
     def json(self) -> dict[str, Any]:
         """The View as JSON for the page."""

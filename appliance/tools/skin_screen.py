@@ -30,8 +30,9 @@ def figures(view: LiveView) -> str:
     rate = "" if view.rate_hz is None else f"{view.rate_hz:.1f} Hz, "
     lost = "loss cannot be known" if view.lost is None else f"{view.lost:,} lost"
     noise = sorted(value for axis in view.noise for row in axis for value in row)
+    unit = view.unit or "raw counts"
     middle = (
-        f", noise {noise[len(noise) // 2]:.2g}, at most {noise[-1]:.2g} raw counts" if noise else ""
+        f", noise {noise[len(noise) // 2]:.2g}, at most {noise[-1]:.2g} {unit}" if noise else ""
     )
     return f"{rate}{view.frames:,} frames, {lost}{middle}"
 
@@ -65,7 +66,7 @@ def picture(
     ]
     yield f" {faults(view) or ('no fault seen' if view.load else '')}"[:width]
     yield ""
-    for maps in side_by_side(view.load, view.full, width, signs):
+    for maps in side_by_side(view.load, view.full, width, signs, view.unit):
         yield from maps if colours else map(uncoloured, maps)
         yield ""
     yield f" Ctrl-C ends   {address}"

@@ -19,8 +19,10 @@ def run(
     clock: Clock,
     displays: Iterable[SkinDisplay],
     stopped: Callable[[], bool],
+    unit: str = "",
 ) -> None:
-    """Show the frames of `sensor` on `displays` until `stopped()`. name: of the skin's profile."""
+    """Show the frames of `sensor` on `displays` until `stopped()`. name, unit: of the skin's
+    profile."""
     shown_on, monitor, number = tuple(displays), SkinMonitor(format), 0
     enumerations, next_ns = sensor.counters.enumerations, clock.now_ns()
     while not stopped():
@@ -41,6 +43,7 @@ def run(
                 (format.rows, format.cols, format.axes),
                 frames=counters.frames,
                 lost=counters.lost_frames if sensor.loss_known else None,
+                unit=unit,
                 **monitor.measured(),
             )
             for display in shown_on:

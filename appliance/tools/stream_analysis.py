@@ -6,41 +6,39 @@ stream shows whether 16 values are 4 x 4 or 2 x 8.
 
 from __future__ import annotations
 
-import re
-from collections import Counter
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from appliance.io.skin_codecs.frames import MOST_PACKET
+from appliance.tools import frame_fields, text_analysis
+from appliance.tools.frame_fields import CheckField, Columns, CountField
+from appliance.tools.text_analysis import LEAST_FRAMES, SHARE
 
-LEAST_FRAMES = 8
-"""Frames in succession before a pattern counts."""
-SHARE = 0.8
-"""Least share of the bytes that the frames of a proposal explain. A wrong baud rate explains
-none."""
 CONSTANT = 0.99
 """A byte of a frame is constant if it has one value in this share of the frames."""
-MOST_MARK = 4
-"""Longest proposed marker or trailer; the known makers use two or four bytes."""
-FLOATS = 1e-6, 1e7
-"""Magnitudes of sensible numbers. Other bytes that are read as float32 are seldom within, and a
-zero does not count against them."""
-CONTRAST = 4.0
-"""Ratio of the numbers of values of two bytes from which on they are one number."""
+MOST_MARK = 8
+"""Longest proposed marker or trailer; the known makers use two or four bytes, and constant bytes
+such as a length may follow."""
+MOST_RUNS = 6
+"""Most runs of constant bytes that are tried as marks."""
 AGAIN = 0.01
 """If a shorter distance repeats as many bytes, less this share, the shorter distance is the
 frame."""
-COUNTS = 0.95
-"""A number counts the frames if it grows by one in this share of them; the rest may be lost
-frames."""
 LONGEST = 4
 """Ratio of the sides from which on a grid is unlikely."""
-_NUMBER = re.compile(rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
-_TEXT = frozenset(b"0123456789+-.eE,;:[]() \t\r\n")
+HEADER, FOOTER = 12, 8
+"""Bytes behind the marker and before the end in which a count or a clock is searched."""
+MOST_IGNORED = 8, 4
+"""Most bytes of unknown meaning before and behind the numbers."""
+STILL, MOVING, UNUSED, FLAT, SMALL = 2, 4, 3, 3, 4
+"""Reasons against a proposal: an ignored byte that never changes; one that does; a count that is
+not used; a grid that is much longer than wide; a type although a larger one fits."""
+MOST_COST = 14
+MOST_PROPOSALS = 40
 
 Grid = tuple[int, int, int]
 """Rows, columns, axes."""
@@ -59,10 +57,10 @@ class Proposal:
     """A possible format of a stream.
 
     framing: the way to find a frame: a `mark` before it, a `mark` behind it, or lines of text.
-    length: bytes of a frame with its mark; for text, lines. sequence: type of the frame count
-    behind the marker, "" for none. dtype, big_endian: type of a value on the wire. values: number
-    of values in a frame. grids: grids with as many values, the squarest first. rate_hz: frames by
-    their times of arrival. share: share of the bytes that these frames explain, 0 to 1.
+    length: bytes of a frame with its mark; for text, lines. sequence: type of the frame count, ""
+    for none. dtype, big_endian: type of a value on the wire. values: number of values in a frame.
+    grids: grids with as many values, the squarest first. rate_hz: frames by their times of arrival.
+    share: share of the bytes that these frames explain, 0 to 1. keys: further keys of the profile.
     """
 
     framing: Literal["marker", "trailer", "text"]
@@ -75,17 +73,28 @@ class Proposal:
     grids: tuple[Grid, ...]
     rate_hz: float
     share: float
+    keys: Mapping[str, Any] = field(default_factory=dict)
 
 
-def analyse(reads: Sequence[Read]) -> list[Proposal]:
-    """All possible formats of `reads`, the most likely first; empty without a pattern."""
+def analyse(reads: Sequence[Read], values: int = 0) -> list[Proposal]:
+    """All possible formats of `reads`, the most likely first; empty without a pattern. values:
+    number of values in a frame, which may have any number of other bytes; 0: unknown."""
     data = b"".join(read.data for read in reads)
     if not data:
         return []
     seconds = max((reads[-1].t_ns - reads[0].t_ns) / 1e9, 1e-9)
-    if sum(byte in _TEXT for byte in data) > 0.98 * len(data):
-        return _text(data, seconds)
-    return _binary(data, np.cumsum([len(read.data) for read in reads])[:-1], seconds)
+    if text_analysis.is_text(data):
+        found = _text(data, seconds)
+        if found or (data.isascii() and len(data.splitlines()) > LEAST_FRAMES):
+            return found  # hexadecimal digits, too, would have the pattern of a frame
+    boundaries = np.cumsum([len(read.data) for read in reads])[:-1]
+    return _binary(data, boundaries, seconds, values)
+
+
+def obstacle(reads: Sequence[Read]) -> str:
+    """Why reads without a pattern have none, as far as it shows; "" if it does not."""
+    data = b"".join(read.data for read in reads)
+    return text_analysis.obstacle(data) if data and text_analysis.is_text(data) else ""
 
 
 def grids(values: int) -> tuple[Grid, ...]:
@@ -103,88 +112,69 @@ def grids(values: int) -> tuple[Grid, ...]:
 
 
 def _text(data: bytes, seconds: float) -> list[Proposal]:
-    """Formats of lines of numbers: a line is a frame, or several lines that end with a shorter
-    line."""
-    lines = [
-        _NUMBER.findall(line) for line in data.split(b"\n")[1:-1]
-    ]  # the first and the last may be cut
-    counts = [len(line) for line in lines]
-    if len(counts) < LEAST_FRAMES or not max(counts):
-        return []
-    usual = Counter(c for c in counts if c).most_common(1)[0][0]
-    ends = [i for i, count in enumerate(counts) if count < usual]
-    spans = Counter(np.diff(ends).tolist())
-    rows = spans.most_common(1)[0][0] - 1 if spans else 0
-    height = rows if rows >= 1 and spans[rows + 1] * (rows + 1) >= SHARE * len(counts) else 1
-    share = counts.count(usual) / (len(counts) if height == 1 else max(1, len(counts) - len(ends)))
-    frames = spans[height + 1] if height > 1 else counts.count(usual)
-    if share < SHARE or frames < LEAST_FRAMES:
-        return []
-    words = [word for line in lines if len(line) == usual for word in line]
-    values = height * usual
-    known = ((height, usual, 1),) if height > 1 else ()
-    fits = known + tuple(grid for grid in grids(values) if grid not in known)
-    return [
-        Proposal(
-            "text", b"", height, "", _text_type(words), False, values, fits, frames / seconds, share
+    """Formats of lines of numbers. Their type is the widest: a skin that rests sends neither signs
+    nor decimals."""
+    made = []
+    for form in text_analysis.forms(data):
+        values = form.lines * form.values
+        known = ((form.lines, form.values, 1),) if form.lines > 1 else ()
+        fits = known + tuple(grid for grid in grids(values) if grid not in known)
+        rate = form.frames / seconds
+        made.append(
+            Proposal(
+                "text",
+                b"",
+                form.lines,
+                "",
+                "float32",
+                False,
+                values,
+                fits,
+                rate,
+                form.share,
+                form.keys,
+            )
         )
-    ]
+    return made
 
 
-def _text_type(words: Sequence[bytes]) -> str:
-    """The smallest type that leaves room for larger numbers of the same kind."""
-    if any(set(word) & set(b".eE") for word in words):
-        return "float32"
-    return "int16" if any(word.startswith(b"-") for word in words) else "uint16"
+@dataclass(frozen=True, slots=True)
+class Framing:
+    """Frames [n, bytes] whose beginning is decided. marker, trailer: bytes at both ends. check: of
+    the bytes between. columns: their statistics."""
+
+    frames: NDArray[np.uint8]
+    marker: int
+    trailer: int
+    check: CheckField | None
+    columns: Columns
+
+    @property
+    def end(self) -> int:
+        """The first byte behind the content."""
+        checked = self.check.checksum.size if self.check else 0
+        return int(self.frames.shape[1]) - self.trailer - checked
 
 
-def _binary(data: bytes, boundaries: NDArray[np.int64], seconds: float) -> list[Proposal]:
+def _binary(
+    data: bytes, boundaries: NDArray[np.int64], seconds: float, wanted: int
+) -> list[Proposal]:
     """Formats with frames of one length and the same bytes at their begin or end. boundaries:
-    offsets at which reads began."""
+    offsets at which reads began. wanted: number of values, 0 for any."""
     stream = np.frombuffer(data, np.uint8)
     found = _period(stream)
     if found is None:
         return []
     length, starts, share = found
-    table = stream[starts[:, None] + np.arange(length)]
-    usual = np.array([np.bincount(column).argmax() for column in table.T], np.uint8)
-    constant = (table == usual).mean(axis=0) >= CONSTANT
-    begin = _begin(boundaries, int(starts[0]), length)
     rate = len(stream) * share / length / seconds
-    proposals = []
-    for framing, first, size in _marks(constant, usual, begin):
-        at = first if framing == "marker" else (first + size) % length
-        whole = starts[starts + at + length <= len(stream)]
-        frames = stream[whole[:, None] + at + np.arange(length)]  # from the first byte of a frame
-        payload = frames[:, size:] if framing == "marker" else frames[:, : length - size]
-        mark = bytes(np.roll(usual, -first)[:size])
-        if not any(mark):
-            continue  # untouched taxels are zero, too
-        for sequence, behind in _sequences(payload) if framing == "marker" else [("", payload)]:
-            for dtype, big_endian in _types(behind):
-                values = behind.shape[1] // np.dtype(dtype).itemsize
-                proposals.append(
-                    Proposal(
-                        framing,
-                        mark,
-                        length,
-                        sequence,
-                        dtype,
-                        big_endian,
-                        values,
-                        grids(values),
-                        rate,
-                        share,
-                    )
-                )
-    return sorted(proposals, key=_unlikely)
-
-
-def _unlikely(proposal: Proposal) -> tuple[bool, int]:
-    """The reasons against a proposal: a grid much longer than wide; small numbers, because any
-    bytes can be read as small numbers."""
-    flat = not proposal.grids or max(proposal.grids[0][:2]) > LONGEST * min(proposal.grids[0][:2])
-    return flat, -np.dtype(proposal.dtype).itemsize
+    best: dict[tuple[int, str], tuple[tuple[float, ...], Proposal]] = {}
+    for framing in _framings(stream, starts, length, _begin(boundaries, int(starts[0]), length)):
+        for cost, proposal in _contents(framing, wanted, rate, share):
+            key = proposal.values, proposal.dtype
+            if key not in best or cost < best[key][0]:
+                best[key] = cost, proposal
+    ranked = sorted(best.values(), key=lambda one: one[0])
+    return [proposal for _, proposal in ranked[:MOST_PROPOSALS]]
 
 
 def _period(stream: NDArray[np.uint8]) -> tuple[int, NDArray[np.int64], float] | None:
@@ -215,6 +205,30 @@ def _period(stream: NDArray[np.uint8]) -> tuple[int, NDArray[np.int64], float] |
     return length, found[length][0], found[length][1]
 
 
+def _framings(
+    stream: NDArray[np.uint8], starts: NDArray[np.int64], length: int, begin: int | None
+) -> Iterator[Framing]:
+    """The stream as frames that begin and end with each of the possible marks."""
+    table = stream[starts[:, None] + np.arange(length)]
+    usual = np.array([np.bincount(column).argmax() for column in table.T], np.uint8)
+    constant = (table == usual).mean(axis=0) >= CONSTANT
+    known: dict[int, tuple[NDArray[np.uint8], Columns]] = {}
+    checks: dict[tuple[int, int], CheckField | None] = {}
+    for first, marker, trailer in _marks(constant, usual, begin):
+        at = first % length
+        if at not in known:
+            if any(checks.values()):
+                return  # no other marks explain a checksum by chance
+            whole = starts[starts + at + length <= len(stream)]
+            frames = stream[whole[:, None] + at + np.arange(length)]
+            known[at] = frames, Columns(frames)
+        frames, columns = known[at]
+        if (at, trailer) not in checks:
+            content = frames[:, : length - trailer]
+            checks[at, trailer] = frame_fields.checksum(content, marker + HEADER)
+        yield Framing(frames, marker, trailer, checks[at, trailer], columns)
+
+
 def _begin(boundaries: NDArray[np.int64], start: int, length: int) -> int | None:
     """The begin of frames after `start`, if reads begin there more often than elsewhere: a board
     sends whole frames."""
@@ -226,12 +240,12 @@ def _begin(boundaries: NDArray[np.int64], start: int, length: int) -> int | None
 
 def _marks(
     constant: NDArray[np.bool_], usual: NDArray[np.uint8], begin: int | None
-) -> Iterator[tuple[Literal["marker", "trailer"], int, int]]:
-    """(framing, first byte, bytes) of each run of constant bytes that can mark a frame, the most
-    likely first.
+) -> Iterator[tuple[int, int, int]]:
+    """(begin of frames, bytes of their marker, bytes of their trailer), the most likely first: of
+    each run of constant bytes that can mark a frame.
 
-    A run at the begin of a frame is a marker, a run at its end a trailer; if reads do not show it,
-    all are markers. Zeros at the side of the values are left out: untouched taxels are zero, too.
+    Frames begin in a run where reads show it, else at the run's first byte. Zeros at the side of
+    the values are left out: untouched taxels are zero, too.
     """
     length = len(constant)
     runs = []
@@ -239,73 +253,141 @@ def _marks(
         size = int(np.argmin(np.roll(constant, -first))) or length
         runs.append((first, size))
     runs.sort(key=lambda run: -np.count_nonzero(np.roll(usual, -run[0])[: run[1]]))
-    for first, size in runs:
+    for first, size in runs[:MOST_RUNS]:
         inner = 0 if begin is None else (begin - first) % length
+        if inner > size:
+            continue
         text = np.roll(usual, -first)[:size]
-        if (
-            inner < size
-        ):  # frames begin in this run: the bytes before it belong to the end of a frame
-            for kept in _sizes(text[inner:][::-1]):
-                yield "marker", (first + inner) % length, kept
-        if begin is not None and 0 < inner <= size:
-            for kept in _sizes(text[:inner]):
-                yield "trailer", (first + inner - kept) % length, kept
+        markers, trailers = _sizes(text[inner:][::-1]), _sizes(text[:inner])
+        for marker in markers:
+            for trailer in (*trailers[:1], 0):
+                yield first + inner, marker, trailer
+        for trailer in trailers:
+            yield first + inner, 0, trailer
 
 
 def _sizes(run: NDArray[np.uint8]) -> list[int]:
-    """Possible lengths of a mark in a run whose last byte is the mark's outer byte: all bytes, two
-    (the usual length), or three. Constant bytes of numbers can lie beside a mark."""
+    """Possible lengths of a mark in a run whose last byte is the mark's outer byte: all bytes, or
+    fewer, as constant bytes of numbers can lie beside a mark."""
     beside = np.flatnonzero(run)
     most = min(MOST_MARK, len(run) - int(beside[0])) if len(beside) else 0
-    return [most, *(size for size in (2, 3) if size < most)] if most else []
+    return [most, *(size for size in (4, 2, 3, 1) if size < most)] if most else []
 
 
-def _types(payload: NDArray[np.uint8]) -> Iterator[tuple[str, bool]]:
-    """Possible (type, big-endian) of the value bytes [frames, bytes], the most likely first."""
-    raw = np.ascontiguousarray(payload)
-    size = raw.shape[1]
-    if size % 4 == 0:
-        for order in "<>":
-            with np.errstate(invalid="ignore"):
-                numbers = np.abs(raw.view(f"{order}f4").astype(np.float64))
-            sensible = (numbers == 0) | ((numbers >= FLOATS[0]) & (numbers <= FLOATS[1]))
-            if sensible.mean() >= CONSTANT and (numbers > 0).any():
-                yield "float32", order == ">"
-    if size % 2 == 0:
-        changes = np.array([len(np.unique(column)) - 1 for column in raw.T])
-        even, odd = float(changes[::2].mean()), float(changes[1::2].mean())
-        for order, low, high in (("<", even, odd), (">", odd, even)):
-            if low > CONTRAST * high:
-                signed = raw.view(f"{order}i2").astype(np.int64)
-                yield ("int16" if _crosses_zero(signed) else "uint16"), order == ">"
-    yield "uint8", False
+def _contents(
+    framing: Framing, wanted: int, rate: float, share: float
+) -> Iterator[tuple[tuple[float, ...], Proposal]]:
+    """Possible contents of frames between their marks, each with the reasons against it. wanted:
+    number of values, 0 for any."""
+    m, end = framing.marker, framing.end
+    places = {*range(m, min(m + HEADER, end)), *range(max(m, end - FOOTER), end)}
+    counts = frame_fields.counts(framing.frames[:, :end], places)
+    for count in [*counts, None]:
+        begin, stop, clock = _between(framing, count)
+        for first, last in _spans(begin, stop, wanted):
+            cost = _ignored(framing.columns, begin, first) + _ignored(framing.columns, last, stop)
+            cost += UNUSED * (bool(counts) and count is None) + clock
+            if cost > MOST_COST and not wanted:
+                continue
+            for against, proposal in _numbers(framing, count, (first, last), cost, rate, share):
+                if proposal.values == wanted or (not wanted and against[0] <= MOST_COST):
+                    yield against, proposal
 
 
-def _crosses_zero(numbers: NDArray[Any]) -> bool:
-    """Whether a value passes from a little above zero to a little below it: then it has a sign."""
-    near = np.abs(numbers) < 1 << 13
-    return bool((near.all(axis=0) & (numbers.min(axis=0) < 0)).any())
+def _spans(begin: int, stop: int, wanted: int) -> Iterator[tuple[int, int]]:
+    """Parts of the bytes from `begin` to `stop` that may be the numbers. wanted: how many numbers
+    there are, 0 for any."""
+    if wanted:
+        for size in (4 * wanted, 2 * wanted, wanted):
+            for first in range(begin, stop - size + 1):
+                yield first, first + size
+        return
+    for before in range(MOST_IGNORED[0] + 1):
+        for behind in range(MOST_IGNORED[1] + 1):
+            if stop - behind - begin - before >= 1:
+                yield begin + before, stop - behind
 
 
-def _sequences(payload: NDArray[np.uint8]) -> Iterator[tuple[str, NDArray[np.uint8]]]:
-    """(type of the frame count in front, bytes behind it), the most likely first; "" without a
-    count.
+def _between(framing: Framing, count: CountField | None) -> tuple[int, int, bool]:
+    """The bytes between the fields at the begin and those at the end, and whether a clock is among
+    these."""
+    begin, stop = framing.marker, framing.end
+    if count and count.at < (begin + stop) / 2:
+        begin = count.end
+    elif count:
+        stop = count.at
+    for size in (8, 4, 2):
+        if stop - begin > size:
+            if frame_fields.is_clock(framing.frames, begin, size):
+                return begin + size, stop, True
+            if frame_fields.is_clock(framing.frames, stop - size, size):
+                return begin, stop - size, True
+    return begin, stop, False
 
-    The lowest byte grows by one from frame to frame. Further bytes belong to the count if they
-    carry.
-    """
-    counting = (np.diff(payload.astype(np.int16), axis=0) % 256 == 1).mean(axis=0) >= COUNTS
-    if (
-        payload.shape[1] > 4 and counting[0] and counting.mean() < 0.5
-    ):  # all taxels of a test pattern may count
-        for size in (4, 2):
-            number = payload[:, :size].copy().view(f"<u{size}")[:, 0].astype(np.int64)
-            carried = (np.diff(number) == 1)[
-                number[:-1] % 256 == 255
-            ]  # else the next byte is a taxel that stays at zero
-            if (np.diff(number) == 1).mean() >= COUNTS and (
-                not len(carried) or carried.mean() >= COUNTS
-            ):
-                yield f"uint{8 * size}", payload[:, size:]
-        yield "uint8", payload[:, 1:]
-    yield "", payload
+
+def _ignored(columns: Columns, first: int, last: int) -> float:
+    """The reasons against ignoring these bytes."""
+    still = columns.still(first, last)
+    return STILL * still + MOVING * (last - first - still)
+
+
+def _numbers(
+    framing: Framing,
+    count: CountField | None,
+    span: tuple[int, int],
+    cost: float,
+    rate: float,
+    share: float,
+) -> Iterator[tuple[tuple[float, ...], Proposal]]:
+    """Possible numbers in the bytes of `span`."""
+    first, last = span
+    frame = framing.frames[len(framing.frames) // 2]
+    marker = frame[: framing.marker].tobytes()
+    trailer = frame[len(frame) - framing.trailer :].tobytes()
+    kind: Literal["marker", "trailer"] = "marker" if marker else "trailer"
+    for rank, (dtype, big_endian) in enumerate(framing.columns.types(first, last)):
+        size = np.dtype(dtype).itemsize
+        values = (last - first) // size
+        fits = grids(values)
+        flat = not fits or max(fits[0][:2]) > LONGEST * min(fits[0][:2])
+        keys = _keys(framing, count, span, "big" if big_endian else "little")
+        keys |= {"trailer": trailer.hex(" ")} if marker and trailer else {}
+        against = (
+            cost + SMALL * rank + FLAT * flat,
+            -size,
+            -framing.marker - framing.trailer,
+            count.at - count.end if count else 0,
+            framing.columns.roughness(first, last, dtype, big_endian),
+        )
+        mark, sequence, length = marker or trailer, count.kind if count else "", len(frame)
+        yield (
+            against,
+            Proposal(
+                kind, mark, length, sequence, dtype, big_endian, values, fits, rate, share, keys
+            ),
+        )
+
+
+def _keys(
+    framing: Framing, count: CountField | None, span: tuple[int, int], order: str
+) -> dict[str, Any]:
+    """The keys of a profile for everything that is not a number, where they differ from the
+    defaults. order: of the bytes of a number."""
+    (first, last), m, end = span, framing.marker, framing.end
+    before, behind = first - m, end - last
+    keys: dict[str, Any] = {}
+    if count:
+        room = count.end - count.at
+        before, behind = (before - room, behind) if count.at < first else (before, behind - room)
+        if count.at > m:
+            keys["sequence_at"] = count.at - m
+        if room > 1 and count.order != order:
+            keys["sequence_order"] = count.order
+    keys |= {"skip_before": before} if before else {}
+    keys |= {"skip_after": behind} if behind else {}
+    if check := framing.check:
+        keys["checksum"] = check.checksum.text
+        keys |= {"checksum_from": check.first} if check.first else {}
+        if check.checksum.size > 1 and check.order != order:
+            keys["checksum_order"] = check.order
+    return keys

@@ -122,8 +122,8 @@ class RecordPage(Observer):
 
     format: of the sweeps. source: of the frames. trigger: its settings. about: see
     RecordingSession.about. obey: carries out the orders of the page, in the loop's thread. clock:
-    the host's real clock. teaching: it is the page of `palpate teach`. Raises ConfigError if the
-    address cannot be used.
+    the host's real clock. unit: of the skin's profile. teaching: it is the page of `palpate teach`.
+    Raises ConfigError if the address cannot be used.
     """
 
     def __init__(
@@ -135,11 +135,12 @@ class RecordPage(Observer):
         about: Callable[[], Mapping[str, Any]],
         obey: Obey,
         clock: Clock,
+        unit: str = "",
         *,
         teaching: bool = False,
     ) -> None:
         self._about, self._obey, self._clock = about, obey, clock
-        self._tracker = ContactTracker(Expected(format), source)
+        self._tracker = ContactTracker(Expected(format, unit=unit), source)
         self._rate_hz = format.rate_hz
         by_page = ("START", "STOP") if trigger.mode == "serial" else ()
         self._commands = (*LABELS, "NEXT", "DISCARD", *by_page, *(TEACHING if teaching else ()))

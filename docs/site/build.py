@@ -37,7 +37,11 @@ RESULT_PAGES = {
 REFERENCE = re.compile(r'(?:href|src)="([^"]+)"')
 CODE = re.compile(r"(?s)```.*?```|`[^`\n]*`")
 CHAPTERS = {
-    "Tutorials": ["docs/tutorials/first-model", "docs/tutorials/first-start"],
+    "Tutorials": [
+        "docs/tutorials/first-model",
+        "docs/tutorials/first-start",
+        "docs/tutorials/library",
+    ],
     "How-to": [
         "docs/how-to/*",
         "docs/robots/README",

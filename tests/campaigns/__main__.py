@@ -109,6 +109,10 @@ def _module(name: str, *options: str) -> tuple[str, ...]:
 
 PYTEST = ("-m", "pytest", "-q")
 CAMPAIGNS = {
+    "pictures": Campaign(
+        "draw the pictures of README: the page of a box at work, and the demo in a terminal",
+        _module("tests.campaigns.pictures"),
+    ),
     "rig": Campaign(
         "show the virtual box at work: an arm64 Debian with skin and robot, in an emulator",
         _module("tests.rig", "show"),
@@ -213,7 +217,7 @@ CAMPAIGNS = {
     ),
     "junk": Campaign(
         "count the answers to sweeps that no one can name, early ones too (docs/decisions/0024)",
-        _module("tests.campaigns.junk"),
+        _module("tests.campaigns.junk", "--out", "docs/data/junk.json", "--page", "docs/faults.md"),
         variables={"OMP_NUM_THREADS": "1"},
         nice=True,
     ),

@@ -8,21 +8,26 @@ materials, or of none, is wrong under any label. Takes some minutes.
 from __future__ import annotations
 
 import argparse
+import json
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
 from appliance.bundle import bundle
+from appliance.core import storage
+from appliance.core.provenance import commit
 from appliance.core.types import Frames, Status, Sweep, Verdict
 from appliance.inference.classifier import Classifier
 from appliance.inference.early_exit import EarlyExit
 from appliance.sim import skin
 from appliance.sim.rig import VirtualClock
+from train.studies import marked_text
 
 Counts = NDArray[np.float64]
 N, RATE = skin.FORMAT.window, skin.FORMAT.rate_hz
@@ -279,6 +284,54 @@ def walks(scene: SweepDraw, material: str) -> Counts:
     return level(scene, material) + steps / 4
 
 
+def untaught(draw: Callable[[SweepDraw], skin.Material]) -> Make:
+    """A slide over a material that no bundle knows."""
+
+    def make(scene: SweepDraw, material: str) -> Counts:
+        drawn = draw(scene)
+        place, world = scene.place(), replace(scene.world, tubes=(drawn,))
+        return skin.window(drawn.name, place, scene.rng, world).astype(float)
+
+    return make
+
+
+def near_foam(scene: SweepDraw) -> skin.Material:
+    """Foam with each parameter up to a fifth larger or smaller."""
+    foam = scene.world.tube("foam")
+    return _varied(scene, foam, foam, 0.2)
+
+
+def felt(scene: SweepDraw) -> skin.Material:
+    """A soft material with a fine, shallow pattern and low vibrations."""
+    foam, paper = scene.world.tube("foam"), scene.world.tube("paper")
+    return _varied(scene, replace(foam, pitch_mm=2.0, texture_mm=paper.texture_mm / 3), foam, 0.05)
+
+
+def random_material(scene: SweepDraw) -> skin.Material:
+    """Each parameter of another material, up to a third larger or smaller."""
+    one, other = (scene.world.tube(str(scene.rng.choice(skin.MATERIALS))) for _ in range(2))
+    return _varied(scene, one, other, 1 / 3)
+
+
+def _varied(
+    scene: SweepDraw, one: skin.Material, other: skin.Material, share: float
+) -> skin.Material:
+    """A material with each parameter of one of the two, varied by a share."""
+    values = {}
+    for part in fields(skin.Material):
+        if part.name != "name":
+            source = one if scene.rng.random() < 0.5 else other
+            factor = 1 + share * scene.rng.uniform(-1, 1)
+            values[part.name] = float(getattr(source, part.name) * factor)
+    return skin.Material("untaught", **values)
+
+
+UNTAUGHT: dict[str, tuple[Make, bool]] = {
+    "material near foam": (untaught(near_foam), False),
+    "felt": (untaught(felt), False),
+    "random material": (untaught(random_material), False),
+}
+COUNTED = "whole", "whole wrong", "early", "early wrong"
 KINDS: dict[str, tuple[Make, bool]] = {
     "finger rests": (rests, False),
     "rests, skin two rows off": (lambda s, m: s.touch(m, 1.0, 0.0, 8.0), False),
@@ -334,6 +387,7 @@ KINDS: dict[str, tuple[Make, bool]] = {
     "each tenth frame held": (held, True),
     "random phases": (phases, True),
     "one taxel loaded": (one_taxel, True),
+    **UNTAUGHT,
 }
 """By name: how to draw a sweep, and whether its material is in it, so that its name is right."""
 
@@ -361,37 +415,83 @@ def answer(box: Classifier, early: EarlyExit | None, taxels: NDArray[np.uint8]) 
     return box(whole)
 
 
-def main() -> None:
-    """Print the counts of each kind, and of all."""
-    parser = argparse.ArgumentParser(prog="python -m tests.campaigns junk", description=__doc__)
-    parser.add_argument("--each", type=int, default=EACH, help="sweeps of a kind (default: 200)")
-    parser.add_argument("--bundle", type=Path, default=bundle.DEFAULT)
-    parser.add_argument("--world", choices=skin.WORLDS, default="level-blind")
-    options = parser.parse_args()
-    box = Classifier(bundle.load(options.bundle), VirtualClock())
-    early = EarlyExit(box) if box.bundle.manifest.early else None
-    total = Counter[str]()
-    print(
-        f"{'of ' + str(options.each):32} whole: ok, wrong; early: ok, wrong; most frequent status"
-    )
+def counted(model: bundle.Bundle, world: skin.World, each: int) -> dict[str, dict[str, Any]]:
+    """The counts of each kind: sweeps, named and wrongly named whole and early, and the statuses of
+    whole sweeps. Prints a row for each."""
+    box = Classifier(model, VirtualClock())
+    early = EarlyExit(box) if model.manifest.early else None
+    print(f"{'of ' + str(each):32} whole: ok, wrong; early: ok, wrong; most frequent status")
+    kinds = {}
     for name in KINDS:
         found, statuses = Counter[str](), Counter[str]()
-        for number in range(options.each):
-            taxels, right = window(name, skin.WORLDS[options.world], number)
+        for number in range(each):
+            taxels, right = window(name, world, number)
             for how, by in (("whole", None), ("early", early)):
                 verdict = answer(box, by, taxels)
                 ok = verdict.status is Status.OK
                 found.update({how: ok, f"{how} wrong": ok and verdict.label != right})
                 statuses.update([str(verdict.status)] if by is None else [])
-        total += found
+        kinds[name] = {"sweeps": each, **found, "statuses": dict(statuses.most_common())}
         usual = ", ".join(f"{status} {n}" for status, n in statuses.most_common(2))
-        print(_row(name, found), usual, flush=True)
-    print(_row(f"all {len(KINDS)} kinds", total))
+        print(f"{name:32} {' '.join(f'{found[key]:5}' for key in COUNTED)} ", usual, flush=True)
+    return kinds
 
 
-def _row(name: str, found: Counter[str]) -> str:
-    keys = "whole", "whole wrong", "early", "early wrong"
-    return f"{name:32} {' '.join(f'{found[key]:5}' for key in keys)} "
+def group(name: str) -> str:
+    """The group of a kind, for the sums."""
+    if name in UNTAUGHT:
+        return "materials that nobody taught"
+    return "slides that were altered" if KINDS[name][1] else "no material, or no slide"
+
+
+def table(content: dict[str, Any]) -> str:
+    """The counts in Markdown: first the sum of each group, then each kind."""
+    kinds = content["kinds"]
+    sums: dict[str, Counter[str]] = {}
+    for name, found in kinds.items():
+        total = sums.setdefault(f"**{group(name)}**", Counter[str]())
+        total.update({key: found[key] for key in ("sweeps", *COUNTED)})
+    rows = [
+        f"Measured by `python -m tests.campaigns junk`, bundle {content['bundle']}, world "
+        f"{content['world']}; commit {content['commit'][:12]}.",
+        "",
+        "| kind of sweep | sweeps | whole: `ok`, of these wrong | early: `ok`, of these wrong | "
+        "most frequent answers |",
+        "|---|---|---|---|---|",
+    ]
+    for name, found in {**sums, **kinds}.items():
+        usual = [f"`{s}` {n}" for s, n in [*found.get("statuses", {}).items()][:2]]
+        whole, whole_wrong, early, early_wrong = (found[key] for key in COUNTED)
+        rows.append(
+            f"| {name} | {found['sweeps']} | {whole}, {whole_wrong} | {early}, {early_wrong} | "
+            f"{', '.join(usual)} |"
+        )
+    return "\n".join(rows)
+
+
+def main() -> None:
+    """Count, write the figures, and put the table on a page."""
+    parser = argparse.ArgumentParser(prog="python -m tests.campaigns junk", description=__doc__)
+    parser.add_argument("--each", type=int, default=EACH, help="sweeps of a kind (default: 200)")
+    parser.add_argument("--bundle", type=Path, default=bundle.DEFAULT)
+    parser.add_argument("--world", choices=skin.WORLDS, default="level-blind")
+    parser.add_argument("--out", type=Path, default=Path("build/junk.json"))
+    parser.add_argument(
+        "--page", type=Path, help="put the table there, between <!-- junk --> marks"
+    )
+    parser.add_argument("--draw", action="store_true", help="count nothing: the table of --out")
+    options = parser.parse_args()
+    if not options.draw:
+        model = bundle.load(options.bundle)
+        kinds = counted(model, skin.WORLDS[options.world], options.each)
+        content = {"commit": commit(), "bundle": model.id, "world": options.world, "kinds": kinds}
+        storage.put(options.out, json.dumps(content, indent=1).encode() + b"\n", parents=True)
+    content = json.loads(options.out.read_text("utf-8"))
+    if options.page:
+        text = options.page.read_text("utf-8")
+        page = marked_text.insert(text, "junk", table(content), str(options.page))
+        options.page.write_text(page, "utf-8")
+    print(table(content))
 
 
 if __name__ == "__main__":

@@ -201,7 +201,7 @@ class SpatialFold:
         """All three with the features of trained stages, which come first, and their
         discriminant."""
         trunk, responses = self.setup.stages
-        data = recipe._side_by_side(responses, data)
+        data = responses.beside(data)
         scores = self._scores(data, [self.setup.judging])
         chosen = {}
         for name, plan in plans.items():

@@ -83,7 +83,8 @@ def _sound(profile: SkinProfile, got: Decoded, data: bytes) -> None:
     assert got.skipped.shape == got.ends.shape == (n,)
     assert (got.skipped >= 0).all()
     assert 0 <= got.garbage <= len(data)
-    assert data.endswith(got.rest.data)
+    # of a bus with other nodes, only the skin's own lines are kept
+    assert profile.codec == "xela-can" or data.endswith(got.rest.data)
     assert len(got.rest.data) <= MOST_REST
     assert (np.diff(got.ends) > 0).all()
     assert n == 0 or (got.ends[0] > 0 and got.ends[-1] <= len(data))
@@ -108,11 +109,13 @@ def _fixed(profile: SkinProfile, before: bytes) -> Iterator[bytes]:
 
 def _text(profile: SkinProfile, before: bytes) -> Iterator[bytes]:
     """The last lines: a line that is a frame, or the rows and a shorter line, which may hold
-    numbers too."""
+    numbers too. Lists may stand in brackets, the time of day may stand before them."""
     lines = before.split(b"\n")[:-1]
     count = profile.rows if profile.lines == "rows" else 1
     for tail in (lines[-count:], lines[-count - 1 : -1]):
-        words = b" ".join(tail).replace(b",", b" ").replace(b";", b" ").split()
+        text = re.sub(rb"[0-9]{2}:[0-9]{2}:[0-9]{2}([.,][0-9]+)?Z?", b" ", b" ".join(tail))
+        text = re.sub(rb"[0-9]{4}-[0-9]{2}-[0-9]{2}[T ] ", b" ", text)
+        words = re.sub(rb"(?i:null)", b"nan", re.sub(rb"[][(){},;]", b" ", text)).split()
         try:
             wire = np.array([float(word) for word in words])
         except ValueError:
@@ -167,9 +170,14 @@ def _pillars(body: bytes, width: int) -> list[np.ndarray]:
 
 
 def _xela(profile: SkinProfile, before: bytes) -> Iterator[bytes]:
-    """The last R x C messages, one for each taxel in order; answers to commands may stand between
-    them."""
-    lines = [line for line in re.split(rb"[\r\n\a]", before)[:-1] if re.match(rb"t7", line)]
+    """The last R x C messages, one for each taxel in order; answers to commands, and messages of
+    other nodes, may stand between them."""
+    taxels = range(0x710, 0x710 + profile.rows * profile.cols)
+    lines = [
+        line
+        for line in re.split(rb"[\r\n\a]", before)[:-1]
+        if re.match(rb"t[0-9A-Fa-f]{3}[78]", line) and int(line[1:4], 16) in taxels
+    ]
     words = []
     for i, line in enumerate(lines[-profile.rows * profile.cols :]):
         match = re.fullmatch(

@@ -1,10 +1,9 @@
 """Finds sweeps that a killed box lost: compares the sentences that a robot received with the files
 on the disk.
 
-A kept sweep is written after its answer, in the same turn of the loop, and state sentences come
-later. So if the robot received an answer and a later state sentence of the same run, the sweep must
-be stored whole. Each run may lack one sweep: the sweep in progress, whose answer is the last that
-was received.
+A kept sweep is written after its answer, beside the loop, and its REC sentence follows once it is
+on the disk. So if the robot received an answer and its REC with the outcome `stored`, the sweep
+must be stored whole. Each run may lack the sweeps that were still being written.
 
 The module also holds the log of a campaign of kills, which a later run continues.
 """
@@ -85,16 +84,18 @@ def owed(heard: Iterable[tuple[int, str]]) -> tuple[list[Heard], list[Heard]]:
     of one boot."""
     must: list[Heard] = []
     may: list[Heard] = []
-    last: Heard | None = None
+    waiting: dict[int, Heard] = {}
     for _, line in heard:
         match whole(line):
             case ["PPLP", "RES", number, t_s, status, *rest] if status in ANSWERED:
-                may += [last] if last else []
-                last = Heard(int(number), float(t_s) - float(rest[5]) / 1000)
-            case ["PPLP", "STA", t_s, _, _, answered, *_] if last:
-                (must if int(answered) >= last.sweep else may).append(last)
-                last = None
-    return must, may + ([last] if last else [])
+                sweep = int(number)
+                if waiting and sweep <= max(waiting):  # another run, which counts anew
+                    may += waiting.values()
+                    waiting = {}
+                waiting[sweep] = Heard(sweep, float(t_s) - float(rest[5]) / 1000)
+            case ["PPLP", "REC", number, "stored", *_] if int(number) in waiting:
+                must.append(waiting.pop(int(number)))
+    return must, [*may, *waiting.values()]
 
 
 def lost(heard: Iterable[tuple[int, str]], kept: list[Sweep]) -> dict[str, int]:

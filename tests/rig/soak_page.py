@@ -81,7 +81,7 @@ def render(records: Json) -> tuple[str, str]:
         home=html.HOME,
         picture=html.picture(svg),
         names=list(boxes),
-        hours=[f"{_hours(box['sums']['hours'])} on {_the(name)}" for name, box in boxes.items()],
+        ran=[f"{_ran(box)} on {_the(name)}" for name, box in boxes.items()],
         left_out=[(_the(name), why) for name, why in records["left_out"].items()],
         verdicts=[f"{_the(name)}: {_verdict(box)}" for name, box in boxes.items()],
         targets=_targets(boxes),
@@ -302,6 +302,15 @@ def _scales(axes: Axes) -> None:
 
 def _the(name: str) -> str:
     return name if name.startswith("this") else f"the {name}"
+
+
+def _ran(box: Json) -> str:
+    """How long a box swept: in one run, or in several of their own start, which ran at the same
+    time and are drawn end to end."""
+    each = [run["length_s"] / 3600 for run in box["runs"]]
+    if len(each) == 1:
+        return f"one run of {_hours(each[0])}"
+    return f"{len(each)} runs side by side, of {_hours(min(each))} each, drawn end to end,"
 
 
 def _hours(hours: float) -> str:

@@ -246,17 +246,17 @@ def test_power_cut(
 
 
 def test_what_is_owed():
-    """An answer before a state sentence of the same run is owed; the last of a run, and damaged
-    lines, are not."""
+    """An answer whose sweep was reported as stored is owed; others, and damaged lines, are not."""
     heard = [
         sentence(
             "RES", 1, "5.021", "ok", "felt", "0.9", "0.8", 1, 0, "21.00", "9f", "usb", "1.00", ""
         ),
+        sentence("REC", 1, "stored", 1, "felt", "", "", "sweep-000001"),
         sentence("STA", "6.0", "streaming", 0, 1, 1, 0, 0, 1, 0, "9f", "usb"),
         sentence(
             "RES", 2, "9.021", "recorded", "", "0.0", "0.0", 1, 0, "21.00", "9f", "usb", "1.00", ""
         ),
-        b"$PPLP,ST",
+        b"$PPLP,REC,2,sto",
         sentence("STA", "12.0", "streaming", 0, 0, 1, 0, 0, 1, 0, "9f", "usb"),
         sentence("RES", 1, "15.0", "gap", "", "0.0", "0.0", 0, 9, "1.00", "9f", "usb", "1.00", ""),
         sentence("STA", "16.0", "streaming", 0, 1, 1, 0, 0, 1, 0, "9f", "usb"),

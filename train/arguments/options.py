@@ -14,7 +14,7 @@ from typing import Any
 from appliance.core.errors import FormatError
 from train.arguments import numbers
 from train.data import labels, readers, sets
-from train.data.progress import ProgressLine
+from train.data.progress import ProgressLine, StageLine, spoken
 from train.data.summary import warnings_of
 from train.evaluation import evaluate, traps
 from train.models import methods
@@ -194,21 +194,21 @@ def where(args: argparse.Namespace) -> evaluate.Where:
 
 class Log:
     """Shows progress on the error stream: on a terminal a bar and the latest line, otherwise a line
-    every LOG_EVERY_S."""
+    every LOG_EVERY_S. A stage that has ended stays as a line with its time."""
 
     def __init__(self) -> None:
-        self._last = time.monotonic()
+        self._last = self._begun = time.monotonic()
         self._bar: Any = None
+        self._stage: StageLine | None = None
 
     def __call__(self, line: str) -> None:
-        """Show `line`; for a ProgressLine also the share that is done."""
+        """Show `line`; for a ProgressLine or a StageLine also the share that is done."""
+        if isinstance(line, StageLine):
+            if self._stage and self._stage.stage != line.stage:
+                self._check()
+            self._stage = line
         if sys.stderr.isatty():
-            known = (
-                {"completed": line.done, "total": line.total}
-                if isinstance(line, ProgressLine)
-                else {"total": None}
-            )
-            self._shown().update(0, description=line, **known)
+            self._shown().update(0, description=line, **_share(line))
         elif time.monotonic() - self._last > LOG_EVERY_S:
             self._last = time.monotonic()
             print(line, file=sys.stderr, flush=True)
@@ -216,6 +216,21 @@ class Log:
     def keep(self, line: str) -> None:
         """Show `line` at once and permanently."""
         print(line, file=sys.stderr, flush=True)
+
+    def end(self) -> None:
+        """The work has ended: the last stage gets its line, and the bar disappears."""
+        if self._stage:
+            self._check()
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar = None
+
+    def _check(self) -> None:
+        assert self._stage
+        now = time.monotonic()
+        sign = "✓" if (sys.stderr.encoding or "").lower().startswith("utf") else "done:"
+        self.keep(f"{sign} {self._stage.name:<32} {spoken(now - self._begun):>7}")
+        self._stage, self._begun = None, now
 
     def _shown(self) -> Any:
         """The bar, which disappears when the process ends; other output appears above it."""
@@ -241,3 +256,12 @@ class Log:
             self._bar.start()
             atexit.register(self._bar.stop)
         return self._bar
+
+
+def _share(line: str) -> dict[str, float | None]:
+    """The share of the work that is done, for a bar; a total of None if it is unknown."""
+    if isinstance(line, ProgressLine):
+        return {"completed": line.done, "total": line.total}
+    if isinstance(line, StageLine):
+        return {"completed": line.stage - 1 + line.within, "total": line.stages}
+    return {"completed": 0, "total": None}

@@ -71,6 +71,11 @@ class HeadData:
             self.features[kept], self.labels[kept], self.copied[also], position[self.source[also]]
         )
 
+    def beside(self, other: HeadData) -> HeadData:
+        """These features, then those of `other`, for the same sweeps and copies."""
+        features = np.hstack([self.features, other.features])
+        return replace(self, features=features, copied=np.hstack([self.copied, other.copied]))
+
     def given(self) -> Given:
         """The data as HeadPart.fit takes it."""
         return self.features, self.labels, self.copied, self.labels[self.source]

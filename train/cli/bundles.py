@@ -51,10 +51,7 @@ def register(add: Add) -> None:
         "--trained-on", required=True, metavar="SET", help="its training sweeps, which are altered"
     )
     options.add_set(widen)
-    parity = add(
-        "parity",
-        lambda args: print(quantized_bundle.compared(args.model, options.load(args), args.json)),
-    )
+    parity = add("parity", run_parity)
     parity.add_argument(
         "model", type=Path, metavar="FIT|DIR", help="a fit, or a bundle, which holds no float model"
     )
@@ -96,12 +93,20 @@ def _add_bundles(add: Add) -> None:
                 "simulated skin)"
             ),
         )
+        command.add_argument(
+            "--licence",
+            default="",
+            metavar="NAME",
+            help="of the recordings, for card.md: CC-BY-4.0",
+        )
 
 
 def run_export(args: argparse.Namespace) -> None:
     """Pack the bundle, print its figures and how to score it."""
     pack.check_target(args.out)
     made = Fit.load(args.fit)
+    if args.licence:
+        made.about[pack.LICENCE] = args.licence
     _print(quantized_bundle.export(made, *_packing(args)), args.out)
     rest = made.about.get("rest")
     what = "the sweeps that fit --split left out" if rest else "sweeps that the fit has not seen"
@@ -115,6 +120,7 @@ def run_pack(args: argparse.Namespace) -> None:
     pack.check_target(args.out)
     (method,) = methods.find([args.method], options.effort(args))
     content = pack.trained(method, labels.check(options.load(args, args.seed)), args.seed)
+    content.about[pack.LICENCE] = args.licence
     try:
         content = quantized_bundle.checked(content, content.reference)
     except pack.ExportRefused as e:
@@ -123,6 +129,13 @@ def run_pack(args: argparse.Namespace) -> None:
             "float form where int8 differs"
         ) from e
     _print(pack.pack(content, *_packing(args)), args.out)
+
+
+def run_parity(args: argparse.Namespace) -> None:
+    """Compare the graphs of a model."""
+    if args.json:
+        options.writable_file(args.json, "--json")
+    print(quantized_bundle.compared(args.model, options.load(args), args.json))
 
 
 def run_score(args: argparse.Namespace) -> None:

@@ -6,6 +6,7 @@ import argparse
 import json
 import math
 import shlex
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -176,12 +177,21 @@ def run(args: argparse.Namespace) -> None:
         told = "; ".join(f"{name} {formatting.counted(figure)}" for name, figure in beside.items())
         print(f"trivial baselines on held-out parts: {told}")
     if args.rest and rest:
-        command = f"palpate-train score BUNDLE --set {shlex.quote(str(args.rest))}"
-        print(
-            f"rest: {len(rest)} sweeps in {args.rest}, which no part of the fit has seen; "
-            f"after export: {command}"
-        )
-    print(options.report_line(args.out, str(args.rest or "")))
+        print(f"rest: {len(rest)} sweeps in {args.rest}, which no part of the fit has seen")
+    print(_next_commands(args.out, [str(args.rest)] if args.rest and rest else args.sets))
+
+
+def _next_commands(out: Path, judges: Sequence[str]) -> str:
+    """The commands after a fit, as they can be pasted. judges: the sets to judge the bundle on."""
+    folder = out.with_suffix("") if out.suffix else out.with_name(f"{out.name}-bundle")
+    sets = [word for one in judges for word in ("--set", one)]
+    version = ["--name", folder.name, "--version", "1"]
+    commands = (
+        ["export", str(out), "--out", str(folder), *version],
+        ["score", str(folder), *sets],
+        ["report", str(out), *sets, "--out", str(out.with_suffix(".html"))],
+    )
+    return "\n".join(["next:", *(f"  palpate-train {shlex.join(words)}" for words in commands)])
 
 
 def _check(args: argparse.Namespace) -> None:
@@ -212,7 +222,9 @@ def _fitted(args: argparse.Namespace, sweeps: Dataset) -> tuple[Fit, Change, Pat
     wish = (args.budget_ms, args.budget_kb, args.accuracy, args.reduce)
     if any(wish):
         return *_chosen(args, sweeps, settings), unfinished
-    made = recipe.fit(sweeps, args.seed, settings, options.Log())
+    log = options.Log()
+    made = recipe.fit(sweeps, args.seed, settings, log)
+    log.end()
     held_out = formatting.counted(made.about["validation"])
     print(f"chosen: {made.about['chosen']}; {held_out} of held-out parts")
     return made, WHOLE, unfinished
@@ -236,6 +248,7 @@ def _chosen(
             made, cost = dial.reduced(choice, change, log)
         except FormatError as e:
             refused, change = str(e), WHOLE
+    log.end()
     result = choice.json() | {"less": less, "applied": asdict(change)}
     result |= {"bundle": _described(made, cost, budget, refused)} | _origin(args, sweeps, budget)
     page = args.out.with_name(f"{args.out.stem}-why") / "index.html"

@@ -201,7 +201,7 @@ def _taxels(values: Array, table: Table, plan: ImportPlan, time_column: int | No
 
 
 def _mismatch(count: int, rows: int, plan: ImportPlan, time_column: int | None) -> str:
-    """What is wrong with a number of columns that does not fill the grid."""
+    """The message about a number of columns that does not fill the grid."""
     which = (
         "--columns names"
         if plan.columns

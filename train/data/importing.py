@@ -20,7 +20,7 @@ from appliance.core.errors import FormatError
 from appliance.core.types import DATA_TYPES
 from train.data import frames, labels, lerobot, raw_files, readers, sampling
 from train.data.file_names import group
-from train.data.files.table import Table, Wanted, normal
+from train.data.files.table import ReadPlan, Table, normal
 from train.data.import_plan import ImportPlan
 from train.data.progress import Progress
 from train.data.sets import Dataset
@@ -96,7 +96,7 @@ def import_folder(
     if "material" in plan.fields and recordings:
         _name_materials(folder, [one.fields for one in recordings], plan)
     cuts, rate_hz = _cuts(recordings, plan, left_out)
-    cuts, doubts = _without_copies(cuts, left_out)
+    cuts, warnings = _without_copies(cuts, left_out)
     dtype, about = _common_type(cuts, plan.dtype, left_out)
     cuts = [cut for cut in cuts if cut.recording.name not in {file.name for file in left_out}]
     if not cuts:
@@ -104,7 +104,7 @@ def import_folder(
             f"{folder}: none of {count} files could be imported; the messages above say why"
         )
     sweeps, notes = _set(folder, cuts, rate_hz, dtype, plan)
-    return Imported(sweeps, cuts, left_out, [about, *doubts, *notes])
+    return Imported(sweeps, cuts, left_out, [about, *warnings, *notes])
 
 
 def _named(
@@ -153,7 +153,7 @@ def _files(
 ) -> Iterator[Source]:
     """The files of a folder; each is read when it is its turn."""
     progress = Progress(len(named), log)
-    wanted = Wanted(plan.variable, plan.time.rpartition(":")[0], plan.decimal)
+    wanted = ReadPlan(plan.variable, plan.time.rpartition(":")[0], plan.decimal)
     for name, (path, fields) in named.items():
         progress.begin(name)
         yield name, fields, partial(raw_files.read, path, wanted)
@@ -183,7 +183,7 @@ def _without_copies(cuts: Sequence[Cut], left_out: list[LeftOut]) -> tuple[list[
     A copy under another material stays, with a remark: only the user knows which name is wrong.
     """
     kept: list[Cut] = []
-    doubts: list[str] = []
+    warnings: list[str] = []
     seen: dict[bytes, dict[str, Recording]] = {}
     for cut in cuts:
         one = cut.recording
@@ -195,14 +195,14 @@ def _without_copies(cuts: Sequence[Cut], left_out: list[LeftOut]) -> tuple[list[
             why = f"holds the same frames as {same[material].name}, which counts once"
             left_out.append(LeftOut(one.name, why))
             continue
-        doubts += [
+        warnings += [
             f"warning: {one.name} holds the same frames as {other.name}, of {name}: "
             "one of the two names is wrong"
             for name, other in same.items()
         ]
         same[material] = one
         kept.append(cut)
-    return kept, doubts
+    return kept, warnings
 
 
 def _cuts(

@@ -17,7 +17,7 @@ import numpy as np
 from appliance.core.errors import FormatError
 from train.data.files import json_lines, parquet
 from train.data.files.optional import library
-from train.data.files.table import Table, Wanted, from_columns
+from train.data.files.table import ReadPlan, Table, from_columns
 from train.data.import_plan import ImportPlan
 
 INFO = Path("meta", "info.json")
@@ -113,7 +113,7 @@ def _tasks(folder: Path) -> dict[int, str]:
     """The text of each task by its number; version 3 keeps the texts as the index of a table."""
     lines, table = (folder / path for path in TASKS)
     if lines.is_file():
-        read = json_lines.read(lines.read_bytes(), Wanted())
+        read = json_lines.read(lines.read_bytes(), ReadPlan())
         number, text = read.columns.index(TASK_INDEX), read.columns.index(TASK)
         return dict(zip(read.values[:, number].astype(int).tolist(), read.texts[text], strict=True))
     if not table.is_file():

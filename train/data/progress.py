@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable
 
@@ -22,6 +23,25 @@ class ProgressLine(str):
             f"{done}/{total} done{'' if left_s is None else f', {spoken(left_s)} left'} ({what})"
         )
         line.done, line.total = done, total
+        return line
+
+
+class StageLine(str):
+    """A progress line of work in stages: `stage` of `stages` (counted from 1) is called `name`, and
+    its share `within` [0, 1] is done, 0 if that is unknown."""
+
+    stage: int
+    stages: int
+    name: str
+    within: float
+
+    @classmethod
+    def of(cls, stage: int, stages: int, name: str, what: str) -> StageLine:
+        """what: the present work in this stage; a training says `step 3/1200` in it."""
+        line = cls(f"part {stage} of {stages}, {what}")
+        line.stage, line.stages, line.name = stage, stages, name
+        step = re.search(r"step (\d+)/(\d+)", what)
+        line.within = int(step[1]) / int(step[2]) if step else 0.0
         return line
 
 

@@ -27,10 +27,10 @@ from train.data.files import (
     tekscan,
     text,
 )
-from train.data.files.table import Table, Wanted
+from train.data.files.table import ReadPlan, Table
 from train.data.readers import HDF5
 
-Reader = Callable[[Path, Wanted], Table]
+Reader = Callable[[Path, ReadPlan], Table]
 BINARY: Mapping[tuple[str, ...], Reader] = {
     (".npy",): numpy_files.read_npy,
     (".npz",): numpy_files.read_npz,
@@ -87,15 +87,15 @@ MAGIC = {
 """What to do with files whose content differs from their suffix, by their first bytes."""
 
 
-def read(path: Path, wanted: Wanted | None = None) -> Table:
+def read(path: Path, wanted: ReadPlan | None = None) -> Table:
     """The recording in a file. Raises FormatError whose message does not repeat the file's name."""
     try:
-        return _read(path, wanted or Wanted())
+        return _read(path, wanted or ReadPlan())
     except DAMAGED as e:
         raise FormatError(f"cannot be read: {' '.join(str(e).split())}") from e
 
 
-def _read(path: Path, wanted: Wanted) -> Table:
+def _read(path: Path, wanted: ReadPlan) -> Table:
     suffix = path.suffix.lower()
     reader = next((read for suffixes, read in BINARY.items() if suffix in suffixes), None)
     if reader in LIBRARIES:

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
@@ -212,12 +212,12 @@ def _tactmat(arrays: dict[str, Array], source: str) -> dict[str, Array]:
     }
 
 
-def write_hdf5(path: Path, arrays: dict[str, Any]) -> None:
+def write_hdf5(target: BinaryIO, arrays: dict[str, Any]) -> None:
     """Write the arrays of an .npz under the same names as an HDF5 file that `read_hdf5` reads.
-    Samples are compressed."""
+    Samples are compressed. target: opened for reading and writing."""
     import h5py
 
-    with h5py.File(path, "w") as file:
+    with h5py.File(target, "w") as file:
         for name, values in arrays.items():
             if np.asarray(values).dtype.kind == "U":
                 values = np.asarray(values).astype(h5py.string_dtype())

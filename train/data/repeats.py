@@ -99,8 +99,8 @@ def pairs(sweeps: Dataset) -> Pairs:
 
 
 def _identical(sweeps: Dataset) -> Array:
-    """(first, second, frames) int [3, P]: each sweep that is identical to the one before it with
-    the same digest."""
+    """(first, second, frames) int [3, P]: pairs of identical sweeps; several copies are a chain of
+    pairs."""
     own = digests(sweeps)
     order = np.argsort(own, kind="stable")
     same = np.flatnonzero(own[order][1:] == own[order][:-1])
@@ -152,8 +152,8 @@ def _probes(hashes: Array, run: int) -> tuple[Array, Array]:
 def _candidates(
     hashes: Array, ordered: Array, order: Array, place: Array, run: int
 ) -> Iterator[tuple[Array, Array, Array]]:
-    """(first, second, shift) [p] each: sweeps in whose run the probe of another one occurs, so that
-    frame 0 of the second may be frame `shift` of the first."""
+    """(first, second, shift) [p] each: pairs of sweeps that may overlap. The first holds the probe
+    of the second; frame 0 of the second may be frame `shift` of the first."""
     if not len(ordered):
         return
     for start in range(0, len(hashes), BATCH):

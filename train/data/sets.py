@@ -17,7 +17,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from appliance.core import sweep_set
+from appliance.core import storage, sweep_set
 from appliance.core.errors import FormatError
 from appliance.core.sweep_set import Array
 from appliance.sim import skin
@@ -91,7 +91,7 @@ class Dataset(sweep_set.SweepSet):
 
     def listed(self, name: str, text: str) -> list[Any]:
         """The values of the group `name`, or the materials, that `text` lists with commas; see
-        group_values.listed. Raises FormatError, also if there is no such group."""
+        group_values.listed. Raises FormatError, also for an unknown group."""
         if name == "material":
             return group_values.listed(np.array(self.materials), "", text)
         return group_values.listed(self.group(name), self.units.get(name, ""), text)
@@ -188,10 +188,10 @@ class Dataset(sweep_set.SweepSet):
         arrays |= {f"unit_{k}": np.array(v) for k, v in self.units.items() if k in self.groups}
         if self.unloaded is not None:
             arrays["unloaded"] = self.unloaded
-        if path.suffix in readers.HDF5:
-            readers.write_hdf5(path, arrays | {"materials": list(self.materials)})
-        else:
-            with path.open("wb") as f:
+        with storage.file(path) as f:
+            if path.suffix in readers.HDF5:
+                readers.write_hdf5(f, arrays | {"materials": list(self.materials)})
+            else:
                 np.savez_compressed(
                     f, allow_pickle=False, materials=np.array(self.materials), **arrays
                 )

@@ -27,6 +27,8 @@ from train.models.methods import FULL_EFFORT, Effort
 from train.onnx_tools import parity
 
 Array = NDArray[Any]
+PACKED = "train.models.recipe.palpate"
+"""The module of the methods whose models export packs."""
 CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "palpate"
 
 
@@ -266,11 +268,14 @@ def evaluate(
     sweeps = sweeps.without_means() if plan.means_removed else sweeps
     origin = {"digest": digest(sweeps)} | provenance()
     splits = {(p, s): plan.folds(sweeps, p, s) for p in plan.protocols for s in plan.seeds}
+    packed = [method.name for method in known if known_methods.module_of(method.name) == PACKED]
     progress = parallel.Progress(len(known) * sum(map(len, splits.values())), log)
     for kind in dict.fromkeys(method.input for method in known):
         same = [method.name for method in known if method.input == kind]
         tasks = {
-            (name, *split, i): FoldTask(name, plan.effort, split[1], *fold, plan.as_the_box)
+            (name, *split, i): FoldTask(
+                name, plan.effort, split[1], *fold, plan.as_the_box if name in packed else None
+            )
             for name in same
             for split, parts in splits.items()
             for i, fold in enumerate(parts)

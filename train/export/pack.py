@@ -37,6 +37,7 @@ from train.data.sets import Dataset
 from train.export import (
     bridging,
     bundle_score,
+    card,
     displacement_limit,
     early_checks,
     sliding,
@@ -58,6 +59,8 @@ FEWEST = 5
 COARSEST = 8
 """Largest step to which golden sweeps are rounded, in usual changes of a number from frame to
 frame. Larger steps save little more."""
+LICENCE = "licence"
+"""Entry of `about` with the licence of the data."""
 NEAR = 0.1
 """Largest change of a golden sweep's probability by rounding, so that its label stays about as
 certain."""
@@ -129,6 +132,7 @@ def pack(
         if proven:
             manifest = _tolerant(content, manifest, bundle.load(folder))
         (folder / bundle.MANIFEST).write_bytes(manifest.json())
+        (folder / card.NAME).write_text(card.text(manifest, pitch_mm), encoding="utf-8")
         bundle.load(folder)
     return manifest
 
@@ -225,7 +229,8 @@ def _made(content: Content, commit: str, unknown: dict[str, str]) -> dict[str, A
         "onnxruntime": onnxruntime.__version__,
     }
     made |= {f"{part}_unknown_because": why for part, why in unknown.items() if why}
-    return made | content.about
+    about = {name: value for name, value in content.about.items() if name != LICENCE}
+    return made | about | {"data": card.data(content.train, content.about.get(LICENCE, ""))}
 
 
 def trained(method: Method, sweeps: Dataset, seed: int) -> Content:

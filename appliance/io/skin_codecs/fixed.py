@@ -1,5 +1,5 @@
-"""Frames of a fixed length with a marker before or a trailer after each: FlexiTac, AnySkin, most
-self-made matrices."""
+"""Frames of a fixed length with a marker before or a trailer after each, and perhaps a count and a
+checksum: FlexiTac, AnySkin, most self-made matrices."""
 
 from __future__ import annotations
 
@@ -11,11 +11,15 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from appliance.io import checksums
+from appliance.io.checksums import Checksum
 from appliance.io.skin_codecs.frames import NONE, Decoded, Rest, arranged, collected
 from appliance.io.skin_profile import SkinProfile
 
 AMBIGUOUS_FRAMES = 32
 """Most frames that are kept while their beginning is ambiguous; then the oldest are dropped."""
+
+_SIGNS: dict[str, Literal["<", ">"]] = {"little": "<", "big": ">"}
 
 MOST_RIVALS = 8
 """Most places in a frame where the mark may repeat; real frames have none or one."""
@@ -25,25 +29,56 @@ MOST_RIVALS = 8
 class FixedLayout:
     """Frames of a fixed length. mark: the bytes between two frames, the end of the first and the
     beginning of the second. period: bytes from one mark to the next. tail: bytes of the mark that
-    belong to the frame before it."""
+    belong to the frame before it.
+
+    Offsets are counted from the beginning of a mark. count: of the frame count, whose type is
+    count_type (None: there is none). numbers: of the first number, whose type is number. check: of
+    the checksum; covered: of the first byte that it covers. checksum: None if there is none.
+    """
 
     profile: SkinProfile
     mark: bytes
     tail: int
     period: int
-    count: np.dtype[Any] | None
+    count: int
+    count_type: np.dtype[Any] | None
+    numbers: int
     number: np.dtype[Any]
+    check: int
+    covered: int
+    checksum: Checksum | None
+    check_order: Literal["little", "big"]
+
+    @property
+    def body(self) -> slice:
+        """The bytes of the numbers."""
+        p = self.profile
+        return slice(self.numbers, self.numbers + p.rows * p.cols * p.values * self.number.itemsize)
 
 
 @lru_cache(8)
 def _layout(p: SkinProfile) -> FixedLayout:
-    order: Literal["<", ">"] = "<" if p.byte_order == "little" else ">"
+    order, count_order = (_SIGNS[one or p.byte_order] for one in (p.byte_order, p.sequence_order))
     number = np.dtype(p.number).newbyteorder(order)
-    count = np.dtype(p.sequence).newbyteorder(order) if p.sequence else None
-    mark = p.trailer + p.marker
+    count = np.dtype(p.sequence).newbyteorder(count_order) if p.sequence else None
+    mark, room = p.trailer + p.marker, count.itemsize if count else 0
+    ahead = room if p.sequence_at <= p.skip_before else 0  # else the count is behind the numbers
     body = p.rows * p.cols * p.values * number.itemsize
+    checksum = checksums.parsed(p.checksum)
+    check = len(mark) + room + p.skip_before + body + p.skip_after
     return FixedLayout(
-        p, mark, len(p.trailer), len(mark) + (count.itemsize if count else 0) + body, count, number
+        p,
+        mark,
+        len(p.trailer),
+        check + (checksum.size if checksum else 0),
+        len(mark) + p.sequence_at,
+        count,
+        len(mark) + ahead + p.skip_before,
+        number,
+        check,
+        len(p.trailer) + p.checksum_from,
+        checksum,
+        p.checksum_order or p.byte_order,
     )
 
 
@@ -81,8 +116,40 @@ def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
         return collected(layout.profile, [], [], [], garbage, left, 0)
     table = np.concatenate(runs) if len(runs) > 1 else runs[0]
     taxels, counts = _columns(layout, table)
-    return Decoded(
+    found = Decoded(
         taxels, np.concatenate(ends), np.concatenate(skipped), layout.period, garbage, left, counts
+    )
+    return _checked(layout, table, found) if layout.checksum else found
+
+
+def _checked(layout: FixedLayout, table: NDArray[np.uint8], found: Decoded) -> Decoded:
+    """The frames whose checksum is right; the others are garbage. table: all frames as bytes [n,
+    period]."""
+    assert layout.checksum
+    right = np.array(
+        [
+            layout.checksum.of(row[layout.covered : layout.check])
+            == int.from_bytes(row[layout.check :], layout.check_order)
+            for row in map(bytes, table)
+        ]
+    )
+    if right.all():
+        return found
+    # bytes that are skipped before a frame include the damaged frames before it
+    skipped = np.cumsum(found.skipped + layout.period * ~right)[right]
+    misfit = (
+        f"the {layout.profile.checksum} of {np.count_nonzero(~right)} frames is wrong; "
+        "correct checksum, checksum_from or checksum_order in its profile, or check the cable"
+    )
+    return Decoded(
+        found.taxels[right],
+        found.ends[right],
+        np.diff(skipped, prepend=0),
+        layout.period if right.any() else 0,
+        found.garbage + layout.period * int(np.count_nonzero(~right)),
+        found.rest,
+        found.counts[right] if len(found.counts) else found.counts,
+        misfit=misfit,
     )
 
 
@@ -90,14 +157,12 @@ def _columns(
     layout: FixedLayout, table: NDArray[np.uint8]
 ) -> tuple[NDArray[Any], NDArray[np.int64]]:
     """Frames as bytes [n, period] -> raw counts, and sequence numbers if there are any."""
-    begin, counts = len(layout.mark), NONE
-    if layout.count:
-        end = begin + layout.count.itemsize
-        counts = np.ascontiguousarray(table[:, begin:end]).view(layout.count)[:, 0].astype(np.int64)
-        begin = end
-    return arranged(
-        layout.profile, np.ascontiguousarray(table[:, begin:]).view(layout.number)
-    ), counts
+    counts = NONE
+    if kind := layout.count_type:
+        raw = np.ascontiguousarray(table[:, layout.count : layout.count + kind.itemsize])
+        counts = raw.view(kind)[:, 0].astype(np.int64)
+    body = np.ascontiguousarray(table[:, layout.body])
+    return arranged(layout.profile, body.view(layout.number)), counts
 
 
 def _run(layout: FixedLayout, data: bytes, at: int) -> tuple[int, bool]:

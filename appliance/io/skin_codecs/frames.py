@@ -35,7 +35,8 @@ class Decoded:
     frame. size: bytes of a frame, 0 if there is none. counts: int64 [n], sequence numbers of 32
     bits. times_us: int64 [n], device time of 32 bits. Both are empty if the skin sends none.
     garbage: bytes outside of frames. rest: for the next bytes. wrong: why these frames do not fit
-    the profile, "" if they do.
+    the profile, "" if they do. misfit: why bytes are garbage, and the remedy, as far as it shows.
+    foreign: frames of other nodes on the same bus, which are passed over.
     """
 
     taxels: NDArray[Any]
@@ -47,6 +48,8 @@ class Decoded:
     counts: NDArray[np.int64] = field(default_factory=NONE.copy)
     times_us: NDArray[np.int64] = field(default_factory=NONE.copy)
     wrong: str = ""
+    misfit: str = ""
+    foreign: int = 0
 
     def __len__(self) -> int:
         return len(self.ends)

@@ -14,60 +14,76 @@ from appliance.io.skin_profile import SkinProfile
 
 _XELA_BASE = 0x710
 _CAN_FRAME = re.compile(rb"t([0-9A-Fa-f]{3})([0-8])((?:[0-9A-Fa-f]{2}){0,8})([0-9A-Fa-f]{4})?")
+_OTHER_FRAME = re.compile(
+    rb"(?:T[0-9A-Fa-f]{8}|[dDbB][0-9A-Fa-f]{3}(?:[0-9A-Fa-f]{5})?)[0-9A-Fa-f](?:[0-9A-Fa-f]{2})*"
+    rb"|(?:r[0-9A-Fa-f]{3}|R[0-9A-Fa-f]{8})[0-8](?:[0-9A-Fa-f]{4})?"
+)
+"""Frames that a uSkin does not send: extended ids, CAN FD, and remote frames without data. The last
+four digits may be a time stamp of the adapter."""
 _LINE_END = re.compile(rb"[\r\a\n]")
-_CAN_ANSWER = re.compile(rb"[zZ]?|V[0-9A-Fa-f]{4}|N[0-9A-Za-z]{4}")
+_CAN_ANSWER = re.compile(rb"[zZ]?|V[0-9A-Fa-f]{4}|N[0-9A-Za-z]{4}|F[0-9A-Fa-f]{2}")
 _NO_VALUE = 250
 _WRONG_TAXELS = 4
-"""This many taxel numbers beyond the grid in one read are not noise."""
+"""This many taxel numbers in succession beyond the grid are not another node."""
+_ANSWER, _FOREIGN, _DAMAGED = -1, -2, -3
+"""Instead of a taxel's number: the line is an answer of the adapter; a CAN frame of another node;
+not a CAN frame."""
 
 
 def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
     """One CAN frame for each taxel, in the order of taxel numbers. A frame of the skin is complete
-    with its last taxel."""
-    data = rest.data + new
-    taxels = profile.rows * profile.cols
+    with its last taxel. CAN frames of other nodes on the bus are passed over and counted."""
+    data, taxels = rest.data + new, profile.rows * profile.cols
     numbers: list[NDArray[Any]] = []
-    ends: list[int] = []
-    skipped: list[int] = []
+    ends, skipped = list[int](), list[int]()
     found: list[bytes] = []  # the bytes of taxels 0, 1, 2, ... of the current frame
-    at = begun = garbage = before = size = beyond = 0
+    lines: list[bytes] = []  # its lines
+    at = garbage = before = size = beyond = foreign = 0
     while match := _LINE_END.search(data, at):
-        line, at = data[at : match.start()], match.end()
-        if _CAN_ANSWER.fullmatch(line):
-            begun = begun if found else at
+        line, at = data[at : match.end()], match.end()
+        taxel, values = _taxel(line[:-1])
+        if taxel == _ANSWER:
             continue
-        taxel, values = _xela_taxel(line)
-        beyond += taxel >= taxels
-        if taxel == len(found) < taxels and values[0] < _NO_VALUE:
+        # taxels of a larger grid follow the last one of this grid
+        if taxel == taxels + beyond and not found:
+            beyond += 1
+        elif taxel >= 0 and beyond < _WRONG_TAXELS:
+            beyond = 0
+        if taxel == _FOREIGN or taxel >= taxels:
+            foreign += 1
+            continue
+        good = taxel >= 0 and values[0] < _NO_VALUE
+        if not (good and taxel == len(found)):
+            # out of order, without a value, or damaged: the current frame is incomplete
+            waste = sum(map(len, lines)) + len(line) * (not good or taxel > 0)
+            garbage, before, found, lines = garbage + waste, before + waste, [], []
+        if good and taxel == len(found):
             found.append(values)
-        else:
-            # out of order, without a value, or not a taxel: the current frame is incomplete, and
-            # taxel 0 begins another
-            fresh = taxel == 0 and values[0] < _NO_VALUE
-            upto = match.end() - len(line) - 1 if fresh else at
-            garbage, before = garbage + upto - begun, before + upto - begun
-            found, begun = ([values], upto) if fresh else ([], at)
+            lines.append(line)
         if len(found) == taxels:
             numbers.append(np.frombuffer(b"".join(found), ">u2"))
             ends.append(at)
             skipped.append(before)
-            size, before, found, begun = at - begun, 0, [], at
+            size, before, found, lines = sum(map(len, lines)), 0, [], []
+    left = b"".join(lines) + data[at:]
     if len(data) - at > MOST_PACKET:
-        garbage, begun = garbage + len(data) - begun, len(data)
-    wrong = (
-        f"it sends taxels beyond {shown((profile.rows, profile.cols))}"
-        if beyond >= _WRONG_TAXELS
-        else ""
-    )
-    return collected(
-        profile, numbers, ends, skipped, garbage, Rest(data[begun:]), size, wrong=wrong
-    )
+        garbage, left = garbage + len(left), b""
+    grid = shown((profile.rows, profile.cols))
+    more = {
+        "wrong": f"it sends taxels beyond {grid}" if beyond >= _WRONG_TAXELS else "",
+        "foreign": foreign,
+    }
+    return collected(profile, numbers, ends, skipped, garbage, Rest(left), size, **more)
 
 
-def _xela_taxel(line: bytes) -> tuple[int, bytes]:
-    """Number of the taxel and its six bytes X Y Z; (-1, b"\\xff") for any other line."""
+def _taxel(line: bytes) -> tuple[int, bytes]:
+    """Number of the taxel and its six bytes X Y Z; or _ANSWER, _FOREIGN, _DAMAGED."""
+    if _CAN_ANSWER.fullmatch(line):
+        return _ANSWER, b"\xff"
     match = _CAN_FRAME.fullmatch(line)
-    if not match or len(match[3]) != 2 * int(match[2]) or int(match[2]) < 7:
-        return -1, b"\xff"
+    if not match or len(match[3]) != 2 * int(match[2]):
+        return (_FOREIGN if _OTHER_FRAME.fullmatch(line) else _DAMAGED), b"\xff"
     taxel = int(match[1], 16) - _XELA_BASE
-    return (taxel, bytes.fromhex(match[3].decode())[1:7]) if taxel >= 0 else (-1, b"\xff")
+    if taxel < 0 or int(match[2]) < 7:
+        return _FOREIGN, b"\xff"
+    return taxel, bytes.fromhex(match[3].decode())[1:7]

@@ -68,14 +68,15 @@ def build(
     source: str,
     *,
     remember: bool = True,
+    follows: bool = False,
 ) -> PlayedDevices:
     """Devices on which a robot plays `acts`, sweeps of `format`, with the skin of this profile.
-    source, remember: see `sim.devices.build`.
+    source, remember, follows: see `sim.devices.build`.
 
     Raises ConfigError for a skin without an emulator.
     """
     playing = PlayerClock(clock)
-    robot, lines = robot_on_lines(acts, playing, remember=remember)
+    robot, lines = robot_on_lines(acts, playing, remember=remember, follows=follows)
     folder = tempfile.TemporaryDirectory()
     reel = Reel(rig.Film(format, robot), profile)
     player = Player(wire(name, format.rate_hz), reel, playing, Path(folder.name) / "ttySkin")

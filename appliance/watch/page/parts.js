@@ -45,4 +45,7 @@ export function ago(ms) {
 
 export function percent(p) { return `${(100 * p).toFixed(1)}\u00a0%`; }
 
+/* A load: raw counts as whole numbers, others with up to three digits (appliance/alignment/view.py). */
+export function figure(value, full, unit) { return value.toFixed(!unit || full >= 100 ? 0 : full >= 10 ? 1 : 2); }
+
 export function count(n) { return n.toLocaleString("en"); }

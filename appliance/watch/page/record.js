@@ -135,7 +135,7 @@ function drawSkin() {
   if (!view) return;
   SKIN.show(view);
   document.body.dataset.state = view.state;
-  put("contact", view.state === "wait" ? `${view.message}: ${view.hint}` : "raw counts above the lowest seen");
+  put("contact", view.state === "wait" ? `${view.message}: ${view.hint}` : `${view.load_unit || "raw counts"} above the lowest seen`);
 }
 
 function draw() {

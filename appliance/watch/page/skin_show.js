@@ -1,19 +1,19 @@
 /* The page of `palpate skin show`: every axis of a skin, its noise and its faults. */
 import {listen} from "/events.js";
-import {byId, frame, put} from "/parts.js";
+import {byId, figure as text, frame, put} from "/parts.js";
 import {shades} from "/skin.js";
 
 const NUMBERED = 8;
 let built = "", tiles = [];
 
-function build([rows, cols, axes]) {
+function build([rows, cols, axes], unit) {
   byId("maps").replaceChildren();
   tiles = [];
   for (let a = 0; a < axes; a++) {
     const figure = document.createElement("figure"), caption = document.createElement("figcaption");
     const grid = document.createElement("div"), here = [];
     const axis = axes > 1 ? `axis ${a + 1}${a + 1 === axes ? " (normal)" : ""}: ` : "";
-    caption.textContent = `${axis}raw counts above the lowest seen; row 1 is at the top, column 1 at the left`;
+    caption.textContent = `${axis}${unit || "raw counts"} above the lowest seen; row 1 is at the top, column 1 at the left`;
     grid.className = cols > NUMBERED ? "grid small" : "grid";
     grid.setAttribute("role", "img");
     grid.setAttribute("aria-label", `${axis}${rows} rows and ${cols} columns of taxels`);
@@ -43,17 +43,17 @@ function draw(view) {
     tile.style.color = front;
     tile.classList.toggle("faulty", faulty.has(called));
     tile.title = `taxel ${called}: ${load}, noise ${view.noise[a][r][c]}`;
-    if (cols <= NUMBERED) tile.textContent = Math.round(load);
+    if (cols <= NUMBERED) tile.textContent = text(load, view.full, view.unit);
   })));
   const noise = view.noise.flat(2).sort((a, b) => a - b);
-  put("noise", noise.length ? `${noise[noise.length >> 1].toPrecision(2)}, ${noise.at(-1).toPrecision(2)}` : "–");
+  put("noise", noise.length ? `${noise[noise.length >> 1].toPrecision(2)}, ${noise.at(-1).toPrecision(2)} ${view.unit}` : "–");
   const found = kinds.filter((kind) => view[kind].length).map((kind) => `${kind}: ${view[kind].join(", ")}`);
   put("faults", found.join("; ") || "no fault seen");
   byId("faults").className = found.length ? "" : "fine";
 }
 
 function show(view) {
-  if (built !== `${view.shape}`) { build(view.shape); built = `${view.shape}`; }
+  if (built !== `${view.shape}`) { build(view.shape, view.unit); built = `${view.shape}`; }
   frame({state: view.state, fine: view.state === "streaming", source: view.source});
   put("skin", view.skin);
   byId("trouble").hidden = !view.trouble;

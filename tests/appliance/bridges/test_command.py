@@ -3,6 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import os
+import re
+import select
+import signal
+import socket
+import subprocess
+import sys
+import tty
 from pathlib import Path
 
 import pytest
@@ -12,7 +20,7 @@ from appliance.bridges.options import LINKS, add_arguments, parse
 from appliance.core import config
 from appliance.core.errors import ConfigError
 from appliance.core.menu import CommandParser
-from tests.factories.paths import NO_SITE
+from tests.factories.paths import NO_SITE, ROOT
 
 
 def settled(kind: str, *options: str, sets: tuple[str, ...] = ()) -> argparse.Namespace:
@@ -22,6 +30,44 @@ def settled(kind: str, *options: str, sets: tuple[str, ...] = ()) -> argparse.Na
     args = parse(parser, [kind, *options])
     command.settle(kind, args, config.load(None, sets, site=NO_SITE))
     return args
+
+
+@pytest.mark.slow
+@pytest.mark.thorough  # starts processes and waits for them
+@pytest.mark.parametrize("kind", ["tcp", "modbus"])
+def test_ctrl_c_while_the_box_owes_an_answer(kind: str):
+    """A command is pending: the bridge ends at once with exit code 130 and without a traceback."""
+    far, near = os.openpty()
+    tty.setraw(near)
+    words = [sys.executable, "-m", "appliance", "bridge", kind, "--port", os.ttyname(near)]
+    with subprocess.Popen(
+        [*words, "--listen", "127.0.0.1:0", "--allow-writes"],
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+    ) as bridge:
+        assert bridge.stderr
+        told = bridge.stderr.readline()
+        port = int(re.search(r"listening on 127.0.0.1:(\d+)", told)[1])
+        with socket.create_connection(("127.0.0.1", port)) as client:
+            start = {"tcp": b"PPLP START\r\n", "modbus": bytes.fromhex("0001000000060105 0000ff00")}
+            client.sendall(start[kind])
+            assert select.select([far], [], [], 30)[0]
+            bridge.send_signal(signal.SIGINT)
+            rest = bridge.communicate(timeout=60)[1]
+    os.close(far)
+    os.close(near)
+    assert (bridge.returncode, "Traceback" in rest) == (130, False), rest
+
+
+def test_a_serial_line_that_is_not_there_gets_a_warning(caplog: pytest.LogCaptureFixture):
+    """A port that does not exist is named; sockets and existing ports are not."""
+    command._warn(settled("modbus", "--port", "/dev/nonexist"))
+    assert "--port /dev/nonexist does not exist; trying again" in caplog.text
+    caplog.clear()
+    command._warn(settled("modbus", "--port", "/dev/null"))
+    command._warn(settled("tcp", "--port", "socket://127.0.0.1:9"))
+    assert not caplog.text
 
 
 def test_the_settings_of_a_new_box():

@@ -14,6 +14,7 @@ import sys
 import termios
 import time
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -26,7 +27,7 @@ from appliance.cli import bundle_commands, parser, skin_commands
 from appliance.cli import devices as cli_devices
 from appliance.cli import main as main_module
 from appliance.cli.main import main
-from appliance.core import config, statistics
+from appliance.core import config, statistics, storage
 from appliance.core.clock import SystemClock
 from appliance.core.devices import Devices
 from appliance.core.errors import (
@@ -344,7 +345,68 @@ def test_check_needs_no_bundle(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert "palpate record" in fail
 
 
-@pytest.mark.parametrize("mode", ["serial", "key", "timed"])
+def test_check_of_commands_without_a_serial_port(capsys: pytest.CaptureFixture[str]):
+    """START and STOP as commands need a port: the trigger fails, as `run` would."""
+    assert main(["check", "--sim", "skin", "--virtual", "--set", "trigger.mode=serial"]) == 1
+    assert "FAIL  trigger        serial: START and STOP come over serial.port" in (
+        capsys.readouterr().out
+    )
+
+
+def test_folders_and_files_that_are_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """A folder of settings that does not exist is an error; a file that is no set is named without
+    advice on pickles; a result that could not be written is refused before the work."""
+    assert main(["config", "--config-dir", str(tmp_path / "none")]) == 78
+    assert f"--config-dir {tmp_path / 'none'}: no such folder" in capsys.readouterr().err
+    assert main(["run", "--sim", "replay:/etc/passwd", "--set", "store.runtime="]) == 65
+    told = capsys.readouterr().err
+    assert "passwd: not a sweep set (an .npz of samples, labels, materials, rate_hz)" in told
+    assert "pickle" not in told
+    for path, why in ((tmp_path, "it is a folder"), (tmp_path / "no" / "x.json", "no folder")):
+        assert main(["bench", "--json", str(path)]) == 78
+        assert why in capsys.readouterr().err
+    assert not (tmp_path / "no").exists()
+
+
+def test_a_box_without_rights_names_the_service_s(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    """Whoever may not read the deployed bundle is told to use the service's rights, by each
+    command."""
+
+    def refused(*_: object, **__: object) -> None:
+        raise PermissionError(13, "Permission denied", "/var/lib/palpate/state.json")
+
+    monkeypatch.setattr("appliance.runtime.assembly.running", refused)
+    assert main(["check", "--sim", "skin", "--virtual"]) == 1
+    assert "FAIL  bundle" in (told := capsys.readouterr().out)
+    assert "/var/lib/palpate/state.json: this user may not read" in told
+    assert "sudo -u palpate palpate" in told
+
+
+def test_a_full_disk_names_the_file_and_leaves_none(tmp_path: Path):
+    """An error of a write has the name of its file, and no part of it stays."""
+    target = tmp_path / "figures.json"
+    with (
+        mock.patch("os.fsync", side_effect=OSError(28, "No space left on device")),
+        pytest.raises(OSError, match=r"figures\.json"),
+    ):
+        storage.put(target, b"{}")
+
+    def half() -> None:
+        with storage.file(tmp_path / "set.npz") as f:
+            f.write(b"half")
+            raise OSError(28, "No space left on device")
+
+    with pytest.raises(OSError, match=r"set\.npz"):
+        half()
+    assert not list(tmp_path.iterdir())
+    with storage.file(target) as f:
+        f.write(b"whole")
+    assert target.read_bytes() == b"whole"
+
+
+@pytest.mark.parametrize("mode", ["key", "timed"])
 def test_check_of_a_trigger_without_lines(mode: str, capsys: pytest.CaptureFixture[str]):
     """No line is asked for."""
     assert main(["check", "--sim", "skin", "--virtual", "--set", f"trigger.mode={mode}"]) == 0

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from appliance.core.errors import ApplianceError
-from appliance.core.log import LineHandler, TroubleLog, in_journal, log, to_stderr
+from appliance.core.log import LineHandler, SparseLog, TroubleLog, in_journal, log, to_stderr
 
 
 def line(text: str, level: int = logging.INFO, *, journal: bool) -> str:
@@ -108,3 +108,23 @@ def test_an_attempt_is_repeated_in_silence(logged: list[str]):
     begin = "<4>status: cannot be written: "
     end = "; classifying goes on"
     assert logged == [f"{begin}{why}{end}" for why in ["No space left on device"] * 2 + ["in use"]]
+
+
+def test_what_a_device_sends_cannot_control_a_terminal():
+    """Escape characters of a text of a device are replaced, in both forms of a line."""
+    record = logging.LogRecord("palpate", logging.INFO, "", 0, "a\x1b[31mred\x07\x9b2J", None, None)
+    for journal in (True, False):
+        line = LineHandler(journal=journal).format(record)
+        assert line.isprintable()
+        assert "a?[31mred??2J" in line
+
+
+def test_what_others_cause_is_logged_sparsely(logged: list[str]):
+    """Refusals as fast as a peer can ask: one line in ten seconds, with the number left out."""
+    now = [0]
+    sparse = SparseLog(lambda: now[0])
+    for _ in range(749):
+        sparse.warning("modbus: START: refused")
+        now[0] += 40_000_000_000 // 749
+    assert len(logged) <= 5
+    assert "more since the last line" in logged[1]

@@ -11,7 +11,7 @@ import pytest
 from appliance.bundle import bundle
 from appliance.bundle.manifest import Manifest
 from appliance.core.clock import SystemClock
-from appliance.core.errors import BundleError, ConfigError
+from appliance.core.errors import ApplianceError, BundleError, ConfigError
 from appliance.deployment import signature
 from appliance.inference.classifier import Classifier
 from tests.factories import deliveries
@@ -56,6 +56,15 @@ def test_a_signer_is_named(tmp_path: Path, kind: str):
     )
     assert signature.verify(MESSAGE, signature.sign(MESSAGE, own), file) == "anna"
     assert signature.verify(MESSAGE, signature.sign(MESSAGE, other), file) == "ben"
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-le", "utf-16-be"])
+def test_a_file_from_another_editor_is_read(signers: Signers, encoding: str):
+    """A byte order mark, UTF-16 and CR LF, as editors on other systems write them."""
+    text = "# who may\r\n" + line(signers.ours, SIGNER).replace("\n", " \r\n")
+    mark = "" if encoding in ("utf-8-sig", "utf-16") else "\ufeff"
+    signers.file.write_bytes((mark + text).encode(encoding))
+    assert signers.verify() == SIGNER
 
 
 @pytest.mark.slow
@@ -116,7 +125,6 @@ def test_a_key_for_another_purpose_is_not_trusted(signers: Signers):
         ("anna ssh-rsa {blob}", "line 1: it is not understood"),
         ("# anna\u2028ben {key}", "has no signer"),
         ("anna\u00a0{key}", "line 1: it is not understood"),
-        ("{line}anna ssh-ed25519 {blob}\r\n", "line 2: it is not understood"),
         ("anna no-such-option {key}", "line 1: it is not understood"),
         ("\udcff\n", "cannot be read"),
         ("#" * 300_000, "more than 262144 bytes"),
@@ -214,3 +222,38 @@ def test_signing_a_bundle(tmp_path: Path, signers: Signers, capsys: pytest.Captu
     (folder / bundle.MODEL).write_bytes(b"altered")
     with pytest.raises(BundleError, match="was altered"):
         sign.sign(folder, signers.ours, 10)
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (subprocess.TimeoutExpired("ssh-keygen", 10), 75),
+        (OSError(12, "Cannot allocate memory"), 75),
+        (BlockingIOError(11, "Resource temporarily unavailable"), 75),
+        (FileNotFoundError(2, "No such file"), 78),
+        (PermissionError(13, "Permission denied"), 78),
+    ],
+)
+def test_faults_of_ssh_keygen_that_pass_are_tried_again(
+    monkeypatch: pytest.MonkeyPatch, error: Exception, code: int
+):
+    """Only what a person can mend keeps the service down."""
+
+    def fails(*words: object, **options: object) -> None:
+        raise error
+
+    monkeypatch.setattr(subprocess, "run", fails)
+    with pytest.raises(ApplianceError) as e:
+        signature._keygen("verify")
+    assert e.value.exit_code == code
+
+
+def test_ssh_keygen_that_is_killed_says_nothing_about_the_signature(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    """Killed for want of memory, it is not "signed by none"."""
+    done = subprocess.CompletedProcess("ssh-keygen", -9, b"", b"")
+    monkeypatch.setattr(subprocess, "run", lambda *words, **options: done)
+    with pytest.raises(ApplianceError, match="signal 9") as e:
+        signature._keygen("find-principals")
+    assert e.value.exit_code == 75

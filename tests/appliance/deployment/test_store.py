@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import signal
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from appliance.bundle import bundle
 from appliance.bundle.bundle import Bundle
 from appliance.cli import bundle_commands
 from appliance.core.config import StoreConfig
-from appliance.core.errors import ApplianceError, BundleError, ConfigError
+from appliance.core.errors import ApplianceError, BundleError, ConfigError, TemporaryError
 from appliance.deployment import store
 from appliance.deployment.state import MOST_STARTS, PACKAGED
 from tests.campaigns import flips
@@ -568,3 +569,40 @@ def test_no_altered_bundle_is_accepted(tmp_path: Path):
     assert not any(
         count["accepted"] or count["believed"] or count["changed"] for count in found.values()
     )
+
+
+@pytest.mark.parametrize("removed", ["bundles.json"])
+def test_a_removed_state_is_told(tmp_path: Path, removed: str, logged: list[str]):
+    """Without the state nothing is known of committed counters: each start and each delivery say
+    so. A new box says nothing."""
+    box = Delivery(tmp_path)
+    box.committed(5)
+    assert not any("is missing" in line for line in logged)
+    (Path(box.how.folder) / removed).unlink()
+    box.start()
+    assert "older bundles are accepted again" in logged[-1]
+    logged.clear()
+    box.installed(3)
+    assert any("older bundles are accepted again" in line for line in logged)
+
+
+def test_a_slow_check_does_not_count_against_a_trial(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """ssh-keygen that takes too long ends the start with an exit code that is restarted, as often
+    as it likes, and the bundle stays on trial."""
+    box = Delivery(tmp_path)
+    box.committed(1)
+    two = box.installed(2)
+
+    def slow(*words: object, **options: object) -> None:
+        raise subprocess.TimeoutExpired("ssh-keygen", 10)
+
+    with monkeypatch.context() as slowly:
+        slowly.setattr(subprocess, "run", slow)
+        for _ in range(5):
+            with pytest.raises(TemporaryError) as e:
+                box.store.choose()
+            assert e.value.exit_code == 75
+    assert box.start() == two
+    assert box.store.state.of(two).starts == 1

@@ -30,6 +30,24 @@ OUTPUTS = ("READY", "BUSY", "VALID", "FAULT", "C0", "C1", "C2")
 START, STOP, NEW_OBJECT, LOST = EdgeKind
 
 
+def test_lines_without_names_are_given_by_chip_and_offset() -> None:
+    """Chip and offset stand for a line; a chip or line that is not there, and one line for two
+    roles, are named. Without any name, the error says how."""
+    chips = SimGpio(VirtualClock(), {CHIP0: ("", "", "A"), CHIP1: ("", "")})
+    wanted = {"gpiochip0:1": (CHIP0, 1), "/dev/gpiochip1:0": (CHIP1, 0), "A": (CHIP0, 2)}
+    assert find_lines(chips, list(wanted)) == wanted
+    for names, why in (
+        (["gpiochip7:0"], "/dev/gpiochip7 is not a gpio chip"),
+        (["gpiochip0:3"], "/dev/gpiochip0 has no line 3; use 0 to 2"),
+        (["A", "gpiochip0:2"], "A and gpiochip0:2 are the same gpio line"),
+    ):
+        with pytest.raises(LineError, match=why):
+            find_lines(chips, names)
+    nameless = SimGpio(VirtualClock(), {CHIP0: ("", "")})
+    with pytest.raises(LineError, match="no line has a name here; give chip and offset"):
+        find_lines(nameless, ["START"])
+
+
 def trigger_config(**changes: Any) -> TriggerConfig:
     """Start and stop on two lines, pulled down, 500 us; with changes."""
     return TriggerConfig(**{"start": "START", "stop": "STOP"} | changes)

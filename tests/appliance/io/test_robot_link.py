@@ -2,10 +2,12 @@
 bits that settle first."""
 
 import fcntl
+import io
 import itertools
 import os
 import re
 import struct
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -329,3 +331,70 @@ def test_too_few_class_bits():
     lines, _ = lines_on(1)
     with pytest.raises(ConfigError, match="3 labels and the code 0 do not fit"):
         LineSink(lines, LABELS)
+
+
+def test_a_line_that_echoes_gets_no_answers():
+    """The box's own sentences come back, whole or in part: they are not commands, so that no answer
+    is answered. A command among them is carried out."""
+    own = [sentence(kind, 1, "ok") for kind in ("RES", "STA", "ANS", "REC")]
+    found, rest = parse(b"".join(own) + b"$PPLP,ID\r\n" + own[0][:7])
+    assert [c.name for c in found] == ["ID"]
+    found, _ = parse(own[0][7:], rest)
+    assert found == []
+    damaged = own[1].replace(b"ok", b"oj")
+    assert parse(damaged)[0] == []
+
+
+class StandardOutput:
+    """Stands for sys.stdout; writing raises an error."""
+
+    def __init__(self, error: Exception | None) -> None:
+        self.error, self.buffer, self.written = error, self, b""
+
+    def fileno(self) -> int:
+        raise io.UnsupportedOperation
+
+    def write(self, data: bytes) -> None:
+        if self.error:
+            raise self.error
+        self.written += data
+
+    def flush(self) -> None:
+        """Nothing is kept back."""
+
+
+@pytest.mark.parametrize(
+    "error",
+    [OSError(28, "No space left"), OSError(27, "File too large"), ValueError("closed file")],
+)
+def test_standard_output_that_takes_nothing(monkeypatch: pytest.MonkeyPatch, error: Exception):
+    """Sentences are dropped and counted, with the reason; they go on once it works again."""
+    output = StandardOutput(error)
+    monkeypatch.setattr(sys, "stdout", output)
+    port = StdoutPort("sim")
+    port.say(b"1")
+    port.say(b"2")
+    assert port.dropped == 2
+    assert "sentences are dropped" in port.trouble
+    output.error = None
+    port.say(b"3")
+    assert (output.written, port.trouble) == (b"3", "")
+    monkeypatch.setattr(sys, "stdout", None)
+    port.say(b"4")
+    assert port.dropped == 3
+
+
+def test_a_pipe_that_nobody_reads_does_not_hold_the_loop(monkeypatch: pytest.MonkeyPatch):
+    """When the pipe is full, sentences are dropped at once; a reader that goes ends the command."""
+    reader, writer = os.pipe()
+    with os.fdopen(writer, "w") as stream:
+        monkeypatch.setattr(sys, "stdout", stream)
+        port = StdoutPort("sim")
+        for _ in range(2000):
+            port.say(b"x" * 100)
+        assert port.dropped > 0
+        os.close(reader)
+        with pytest.raises(BrokenPipeError):
+            port.say(b"x")
+        port.say(b"x")
+        monkeypatch.undo()

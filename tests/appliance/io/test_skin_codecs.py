@@ -33,6 +33,142 @@ def test_a_matrix_byte_by_byte():
     assert (found.garbage, found.rest.data, found.rest.synced) == (0, frame, True)
 
 
+FULL = SkinProfile(
+    about="a",
+    source="s",
+    codec="fixed",
+    marker=b"\xf0\x0f",
+    trailer=b"\r\n",
+    skip_before=2,
+    skip_after=1,
+    sequence="uint16",
+    sequence_at=1,
+    sequence_order="big",
+    checksum="crc16-modbus",
+    checksum_from=2,
+    number="uint16",
+    byte_order="little",
+    checksum_order="big",
+    rows=2,
+    cols=3,
+)
+
+
+def full(i: int, wrong: int = 0) -> bytes:
+    """Frame `i` of FULL: F0 0F, an ignored byte, the count, another, six numbers, another, the
+    checksum, CR LF."""
+    body = b"\x07" + struct.pack(">H", i % 65536) + b"\x08"
+    body += struct.pack("<6H", *((i * 31 + k) % 4000 for k in range(6))) + b"\x09"
+    return b"\xf0\x0f" + body + struct.pack(">H", modbus(body) ^ wrong) + b"\r\n"
+
+
+def modbus(data: bytes) -> int:
+    """CRC-16/MODBUS bit by bit, as its specification has it."""
+    value = 0xFFFF
+    for byte in data:
+        value ^= byte
+        for _ in range(8):
+            value = value >> 1 ^ (0xA001 if value & 1 else 0)
+    return value
+
+
+def test_a_frame_with_count_checksum_and_ignored_bytes():
+    """Everything that a profile can say of a frame, in one: the numbers and the count are read,
+    and a frame with a wrong checksum is garbage before the next."""
+    frames = [full(i, wrong=i == 65533) for i in range(65530, 65540)]
+    found = decoded(FULL, b"\r\n" + b"".join(frames) + frames[0])
+    good = [i for i in range(65530, 65540) if i != 65533]
+    assert found.counts.tolist() == [i % 65536 for i in good]
+    assert found.taxels[0].tolist() == [
+        [(65530 * 31 + k + 3 * r) % 4000 for k in range(3)] for r in range(2)
+    ]
+    size = len(frames[0])
+    assert (found.garbage, found.size, found.skipped.tolist()[3]) == (size, size, size)
+    assert "the crc16-modbus of 1 frames is wrong" in found.misfit
+    # in parts, too
+    rest, counts = Rest(), []
+    for at in range(0, len(frames) * size, 17):
+        part = codec(FULL)(rest, (b"\r\n" + b"".join(frames) + frames[0])[at : at + 17])
+        rest = part.rest
+        counts += part.counts.tolist()
+    assert counts == found.counts.tolist()[: len(counts)]
+    assert len(counts) >= len(good) - 1
+
+
+def test_a_count_behind_the_numbers():
+    """The count may stand behind the numbers."""
+    p = replace(SMALL, sequence="uint8", sequence_at=6)
+    found = decoded(p, b"".join(b"\xaa\x55" + bytes([i] * 6) + bytes([i + 9]) for i in range(5)))
+    assert found.counts.tolist() == [9, 10, 11, 12]
+    assert found.taxels[1].tolist() == [[1, 1, 1], [1, 1, 1]]
+
+
+TEXT = SkinProfile(about="a", source="s", codec="text", lines="frames", number="float32", rows=1)
+
+
+@pytest.mark.parametrize(
+    ("keys", "line"),
+    [
+        ({}, b"[1, -2.5, 3e2, nan]"),
+        ({}, b"((1 -2.5) (3e2 nan))"),
+        ({"skip_columns": (0,)}, b"65538,1,-2.5,300,nan"),
+        ({"skip_columns": (0, 5)}, b"7\t1\t-2.5\t300\tnan\t9"),
+        ({"around": "S#:S#:S#:S#:"}, b"S1:1 S2:-2.5 S3:300 S4:nan"),
+        (
+            {"around": "taxel_#=taxel_#=taxel_#=taxel_#="},
+            b"taxel_1=1,taxel_2=-2.5,taxel_3=3e2,taxel_4=NaN",
+        ),
+        ({"around": '"t":"v":', "skip_columns": (0,)}, b'{"t": 5, "v": [[1, -2.5], [300, null]]}'),
+        ({"around": "#:#:#:#:"}, b"0:1 1:-2.5 2:300 3:nan"),
+        ({"around": "->"}, b"12:00:59.123 -> 1 -2.5 300 nan"),
+        ({"around": "mVmVmVmV"}, b"1mV -2.5mV 300.0mV nan mV"),
+        ({"around": "$SKIN"}, b"$SKIN,1,-2.5,300,nan*78"),
+        ({"decimal": ","}, b"1;-2,5;300,0;nan"),
+        ({"line_end": "\r"}, b"1 -2.5 300 nan"),
+    ],
+)
+def test_lines_with_other_text_around_their_numbers(keys: dict, line: bytes):
+    """Brackets, labels, JSON, units, the time of day, sums of NMEA: the numbers are read, a line
+    with other text is not."""
+    p = replace(TEXT, cols=4, **keys)
+    end = p.line_end.encode()
+    found = decoded(p, line + end + b"boot: 1 2 3 4" + end + line + end)
+    assert len(found) == 2, found.misfit
+    np.testing.assert_array_equal(found.taxels[0, 0], np.float32([1, -2.5, 300, np.nan]))
+
+
+def test_a_sentence_with_another_sum_is_refused():
+    """A damaged NMEA sentence gives no frame."""
+    p = replace(TEXT, cols=4, around="$SKIN")
+    assert len(decoded(p, b"$SKIN,1,-2.6,300,nan*78\n")) == 0
+
+
+@pytest.mark.parametrize(
+    ("number", "line", "misfit"),
+    [
+        ("uint16", b"1 -3 2 4", 'it sends -3, which uint16 cannot hold; set number = "float32"'),
+        ("uint16", b"1 2.5 2 4", "it sends 2.5, which uint16 cannot hold"),
+        ("int16", b"1 40000 2 4", "it sends 40000, which int16 cannot hold"),
+        ("float32", b"1 1e39 2 4", "it sends 1e39, which float32 cannot hold"),
+        ("uint16", b"a:1 b:2 c:3 d:4", "'a:b:c:d:' stands around its numbers, none is expected"),
+    ],
+)
+def test_the_value_that_does_not_fit_is_named(number: str, line: bytes, misfit: str):
+    """A line that is refused says why."""
+    found = decoded(replace(TEXT, cols=4, number=number), line + b"\n")
+    assert (len(found), found.garbage) == (0, len(line) + 1)
+    assert misfit in found.misfit
+
+
+def test_rows_between_other_lines():
+    """A line of other text, or the end of a printed array, ends a frame of several lines."""
+    p = replace(TEXT, lines="rows", rows=2, cols=2)
+    for text in (b"1 2\n3 4\n---\n", b"1,2\n3,4\nFrame 12\n", b"[[1 2]\n [3 4]]\n"):
+        found = decoded(p, text * 3)
+        assert found.taxels.tolist() == [[[1, 2], [3, 4]]] * 3, text
+    assert len(decoded(p, b"1 2\n3 4\n5 6x\n\n")) == 0  # a third row, damaged
+
+
 def test_anyskin_byte_by_byte():
     """Five times (t, x, y, z), CR LF: 82 bytes. The temperature is left out, z is last. The first
     frame has no mark before it and is not used."""
@@ -143,7 +279,29 @@ def test_xela_byte_by_byte():
     found = decoded(p, lines[0] + lines[0] + lines[1])
     assert (len(found), found.skipped.tolist()) == (1, [len(lines[0])])
     assert len(decoded(p, lines[1] + lines[0])) == 0
-    assert decoded(p, b"t71280000010002000300\r" * 4).wrong == "it sends taxels beyond 1x2"
+    more = b"".join(b"t71%d80000010002000300\r" % k for k in range(6))
+    assert decoded(p, more).wrong == "it sends taxels beyond 1x2"
+
+
+def test_other_nodes_on_the_bus_are_passed_over_and_counted():
+    """Data frames of other ids, extended, remote and FD frames between the taxels of a frame do not
+    break it, also where a read ends; a line that is not a CAN frame does."""
+    p = replace(profile("xela-can"), rows=1, cols=2)
+    own = [b"t7108001234567800FF00\r", b"t71180000010002000300\r"]
+    others = b"t1232AABB\rT000007102AABB\rr7108\rR000007108\rt7204AABBCCDD\r"
+    others += b"t7A08" + b"00" * 8 + b"\r" + b"d7119" + b"11" * 12 + b"\r"
+    data = (own[0] + others + own[1] + others) * 20
+    whole = decoded(p, data)
+    assert (len(whole), whole.garbage, whole.foreign, whole.wrong) == (20, 0, 280, "")
+    assert whole.size == sum(map(len, own))
+    for step in (1, 7, 50):
+        rest, frames, foreign, garbage = Rest(), 0, 0, 0
+        for at in range(0, len(data), step):
+            found = codec(p)(rest, data[at : at + step])
+            rest, frames, foreign = found.rest, frames + len(found), foreign + found.foreign
+            garbage += found.garbage
+        assert (frames, foreign, garbage) == (20, 280, 0)
+    assert len(decoded(p, own[0] + b"x12\r" + own[1])) == 0
 
 
 def test_robotiq_byte_by_byte():

@@ -3,6 +3,7 @@ content and the time at which they were taken, or the state gives a reason. In v
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from appliance.core.config import SkinConfig
 from appliance.core.types import EPOCH_BITS
 from appliance.io.serial_sensor import SerialSensor
 from tests.factories.costly import quick_first
-from tests.factories.skin_wires import NAMES, PATH, WiredSkin, profile, taxels, wire
+from tests.factories.skin_wires import NAMES, PATH, SECOND, WiredSkin, profile, taxels, wire
 
 pytestmark = pytest.mark.slow
 each = pytest.mark.parametrize("name", quick_first(NAMES))
@@ -409,6 +410,41 @@ def test_a_port_named_by_id_tells_its_serial_number(tmp_path: Path):
         skin.seconds(0.1)
         assert skin.sensor.identity
         assert skin.sensor.identity.serial == "S1"
+
+
+@pytest.mark.parametrize("name", ["flexitac", "reskin"])
+def test_a_board_that_boots_whenever_it_is_opened(name: str):
+    """It sends nothing, or a boot message, for two seconds after each opening: the box waits longer
+    each time until frames come, and the message names the setting."""
+    skin = WiredSkin(name)
+    opened_ns, open_port, read = 0, skin.port.open, skin.port.read
+
+    def opening(path: str, baud: int):
+        nonlocal opened_ns
+        opened_ns = skin.clock.now_ns()
+        return open_port(path, baud)
+
+    def reading(size: int, timeout_ms: int) -> bytes:
+        data = read(size, timeout_ms)
+        booting = skin.clock.now_ns() - opened_ns < 2 * SECOND
+        return (b"booting\n" if name == "reskin" and data else b"") if booting else data
+
+    skin.sensor._open_port, skin.port.read = opening, reading
+    skin.seconds(12)
+    assert skin.sensor.state == "streaming"
+    assert skin.sensor.counters.enumerations <= 4
+    assert any("skin.silence_ms" in trouble for trouble in skin.troubles), skin.troubles
+
+
+def test_a_text_that_stops_fitting_names_the_value():
+    """Values turn negative after some seconds: the trouble names the value and its type."""
+    skin = WiredSkin("3d-vitac")
+    skin.seconds(3)
+    assert skin.sensor.state == "streaming"
+    skin.port.mangle = lambda data: data.replace(b" ", b" -", 1)
+    skin.seconds(3)
+    assert skin.sensor.state == "mismatch"
+    assert re.search(r"it sends -\d+, which uint16 cannot hold", str(skin.sensor.trouble))
 
 
 def test_a_sequence_number_shows_each_loss():

@@ -53,7 +53,7 @@ def written(tmp_path: Path, text: str) -> Path:
         (GOOD + 'start = ["hex:9"]', "commands such as"),
         (GOOD + "start = [1]", "commands such as"),
         (GOOD.replace('marker = "aa 55"\n', ""), "needs a marker or a trailer"),
-        (GOOD.replace("fixed", "text"), 'marker, trailer and sequence belong to codec = "fixed"'),
+        (GOOD.replace("fixed", "text"), 'marker belongs to codec = "fixed"'),
         (GOOD.replace("fixed", "csv"), 'one of "palpate", "fixed", "text", "papillarray"'),
         (GOOD.replace('about = "a"', ""), "about is missing; matrix.toml explains each key"),
         (GOOD.replace('source = "s"', 'source = ""'), "source is missing"),

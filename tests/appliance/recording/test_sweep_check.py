@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from appliance.core.errors import ApplianceError
-from appliance.core.types import EPOCH_BITS, Frames, Status, Sweep
+from appliance.core.types import EPOCH_BITS, Frames, Status, Sweep, SweepFormat, Verdict
 from appliance.recording.sweep_check import SweepCheck
 from appliance.sim import devices, rig, script, skin
 from tests.factories.simulated_box import Rigged
@@ -125,3 +125,19 @@ def test_another_skin_is_judged_by_itself():
         assert certain == (epoch == 0)
     n = np.arange(1500)
     assert "not checked" in check(Sweep(1, 0, 0, Status.OK, Frames(n, n, on[:1500]))).detail
+
+
+def test_an_impossible_reading_is_no_good_sweep():
+    """Before the unloaded skin is known, too: the answer is dead-taxel instead of recorded."""
+    format = SweepFormat(4, 4, 100.0, 50, "float32")
+    taxels = np.random.default_rng(0).normal(100, 3, (50, 4, 4)).astype(np.float32)
+    check = SweepCheck(format, rig.VirtualClock())
+    t_ns = np.arange(50) * format.period_ns
+
+    def answered() -> Verdict:
+        frames = Frames(t_ns.astype(np.int64), np.arange(50), taxels)
+        return check(Sweep(1, 0, int(t_ns[-1]), Status.OK, frames))
+
+    assert answered().status is Status.RECORDED
+    taxels[30, 2, 1] = 1e20
+    assert (answered().status, answered().detail) == (Status.DEAD_TAXEL, "taxel 3.2")

@@ -127,6 +127,8 @@ def test_short_gaps_are_interpolated_and_counted(drop: tuple[int, ...]):
     sweep = sweep_of(drop)
     assert sweep.status is Status.OK
     assert sweep.lost == len(drop)
+    assert sweep.filled is not None
+    assert [sweep.frames.seq[i] for i in sweep.filled] == sorted(drop)
     whole = numbered(3000).astype(float)
     for frame in drop:
         low = max(f for f in range(frame - 3, frame) if f not in drop)

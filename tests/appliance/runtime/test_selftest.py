@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -11,9 +13,12 @@ import pytest
 from appliance.bundle import bundle
 from appliance.core import config
 from appliance.core.clock import Clock
+from appliance.io import skin_profile
 from appliance.runtime import selftest
 from appliance.signal.slide import SpeedRange
 from appliance.sim import devices, rig, script
+from appliance.sim.skins import devices as played
+from appliance.sim.skins import sweeps
 
 
 def skin_of(share: float) -> selftest.CheckResult:
@@ -88,3 +93,29 @@ def test_check_says_how_many_broken_taxels_are_bridged(proven: bool):
     assert first.ok
     wanted = "up to 4 broken taxels or one row or one column bridged" if proven else "are refused"
     assert wanted in first.detail
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("sent_hz", "ok"), [(28.0, True), (29.0, True), (100.0, False), (20.0, False)]
+)
+def test_the_rate_of_a_skin_without_a_clock(sent_hz: float, ok: bool, tmp_path: Path):
+    """Frames are counted for long enough: another rate fails with both figures."""
+    profile = skin_profile.load("anyskin", [config.load(None).folder / "skins"])
+    seen = sweeps.view("anyskin", profile.format)
+    acts, source, format = script.named("skin", profile.format, 1, seen=seen)
+    built = played.build("anyskin", profile, format, acts, rig.VirtualClock(), source)
+    built.player.wire.period_ns = 1e9 / sent_hz
+    results = selftest.check(
+        built.wire(config.load(None, ["skin.profile=anyskin"])),
+        lambda: bundle.load(tmp_path),
+        built,
+        spending(built.clock, 0.01),
+    )
+    found = next(result for result in results if result.component == "skin")
+    assert found.ok is ok, found.detail
+    if not ok:
+        assert re.search(rf"sends {sent_hz - 1:.0f}|sends {sent_hz:.0f}", found.detail), (
+            found.detail
+        )
+        assert "28 are expected" in found.detail

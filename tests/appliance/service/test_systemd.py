@@ -16,7 +16,6 @@ from typing import Any
 
 import pytest
 
-from appliance.core.errors import ConfigError
 from appliance.core.health import Health
 from appliance.core.observer import Observer
 from appliance.service.systemd import Notifier
@@ -167,10 +166,18 @@ def test_a_socket_that_is_gone_costs_nothing(socket_end: ManagerSocket, tmp_path
     assert socket_end.heard() == [["STATUS=again"]]
 
 
-def test_a_watchdog_that_is_no_number_is_named():
-    """Only a person can have set it."""
-    with pytest.raises(ConfigError, match="WATCHDOG_USEC=10s is not a number"):
-        Notifier(rig.VirtualClock(), {"WATCHDOG_USEC": "10s"})
+@pytest.mark.parametrize("text", ["10s", "-5", "1e6", "\u0663", "9" * 5000, "0x10", " "])
+def test_a_watchdog_that_is_no_number_is_told(
+    socket_end: ManagerSocket, text: str, logged: list[str]
+):
+    """The box goes on without feeding it, and a line of the log says why."""
+    sender, clock = notifier(socket_end, WATCHDOG_USEC=text)
+    for _ in range(3):
+        sender.turn(state(True, "fine"))
+        clock.sleep_until(clock.now_ns() + 100 * SECOND)
+    assert socket_end.heard() == [["STATUS=fine", "READY=1"]]
+    assert len(logged) == 1
+    assert "is not a number of microseconds, so no watchdog is fed" in logged[0]
 
 
 class TurnLog(Observer):

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from appliance.bundle.manifest import Thresholds
 from appliance.core.types import Status, shape
 from appliance.signal.unloaded import UnloadedSkin
-from appliance.signal.window_check import inspect, inspect_bare
+from appliance.signal.window_check import inspect, inspect_bare, inspect_readings
 
 LIMITS = Thresholds(contact=10, full_scale=255, saturated=0.01)
 BARE = np.zeros((4, 4))
@@ -213,3 +213,20 @@ def test_a_weak_contact_at_the_edge_is_no_fault():
     taxels = moving(120)
     taxels[:, 3] = 13
     assert inspect_bare(taxels, UNLOADED).status is Status.OK
+
+
+@pytest.mark.parametrize("value", [1e20, -3e15, np.inf, np.nan])
+def test_one_impossible_reading_kills_its_taxel(value: float):
+    """A single count beyond any skin, with a bundle, without one, and before the unloaded skin is
+    known: the taxel is named, so the sweep is not called good."""
+    taxels = moving().astype(np.float32)
+    taxels[17, 1, 2] = value
+    bare = UnloadedSkin(np.zeros((4, 4)), np.ones((4, 4)), 10.0)
+    for found in (
+        inspect(taxels, BARE, LIMITS),
+        inspect_bare(taxels, bare),
+        inspect_readings(taxels),
+    ):
+        assert (found.status, found.detail) == (Status.DEAD_TAXEL, "taxel 2.3")
+    assert inspect_readings(moving().astype(np.float32)).status is Status.OK
+    assert inspect_readings(moving()).status is Status.OK

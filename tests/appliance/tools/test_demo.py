@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -46,8 +45,8 @@ def test_the_tour_has_each_special_sweep_with_its_right_answer(capsys: pytest.Ca
     bundle is sure about two materials, tour.SEED has to be drawn again."""
     assert main(["demo", "--virtual"]) == 0
     out = capsys.readouterr().out
-    rows = [re.split(r" {2,}|-> ", line.strip()) for line in out.splitlines() if "-> " in line]
-    shown = [(row[1].strip(), row[2].strip(), "✓" in row) for row in rows]
+    rows = [line for line in out.splitlines() if "-> " in line]
+    shown = [(row[5:21].strip(), row[25:41].strip(), "✓" in row) for row in rows]
     assert shown == [
         ("wood", "wood", True),
         ("plastic rough", "plastic rough", True),
@@ -58,7 +57,7 @@ def test_the_tour_has_each_special_sweep_with_its_right_answer(capsys: pytest.Ca
         ("paper", "sensor-lost", True),
         ("paper", "paper", True),
     ]
-    for about in ("a taxel of the skin is stuck", "nobody taught it", "somebody pulled the cable"):
+    for about in ("a taxel is stuck", "nobody taught it", "somebody pulled the cable"):
         assert out.count(about) == 1
     assert "8 of 8 answers are right" in out
 

@@ -121,16 +121,17 @@ def test_a_port_that_is_held():
 def test_the_commands(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """list: a line for each profile, also for one that cannot be read; detect: --write needs
+    """list: a table of all profiles, and a line for one that cannot be read; detect: --write needs
     --port, a silent port says what to do."""
     assert main(["skin", "list"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert {line.split()[0] for line in lines} >= set(PROFILES), (
         "this computer may have others in /etc/palpate"
     )
-    assert "lacks sequence, time, checksum; not measured on a device" in next(
-        li for li in lines if "flexitac" in li
-    )
+    assert lines[0].split() == ["profile", "format", "lacks", "skin"]
+    flexitac = next(line for line in lines if line.startswith("flexitac"))
+    assert flexitac[lines[0].index("lacks") :].startswith("sequence, time, checksum  FlexiTac")
+    assert sum("measured on a device" in line for line in lines) == 1
     assert main(["skin", "detect", "--write"]) == 78
     assert "--port" in capsys.readouterr().err
     monkeypatch.setattr(skin_detect, "LISTEN_S", 0.05)

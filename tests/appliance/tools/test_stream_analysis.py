@@ -6,6 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from appliance.io.checksums import NAMED, Checksum
+from appliance.tools import skin_new
 from appliance.tools.stream_analysis import Proposal, Read, analyse, grids
 
 PERIOD_NS = 10_000_000
@@ -98,6 +100,66 @@ def test_a_count_of_the_frames_behind_the_marker_is_no_taxel(size: int) -> None:
     assert (best.mark, best.sequence, best.values) == (b"\xa5\x5a", f"uint{8 * size}", 16)
 
 
+def described(frames: list[bytes], cut: int = 64) -> tuple[Proposal, dict]:
+    """The most likely proposal of which a profile reads the frames, with its further keys."""
+    best = first(skin_new.proposals(reads(frames, cut)))
+    return best, dict(best.keys)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["crc8", "crc8-maxim", "crc8-sae-j1850", "sum8", "xor8"])
+def test_counter_order_and_checksum_are_found_by_trying(name: str) -> None:
+    """F0 0F, a count, 36 numbers with the high byte first, a checksum of 8 bits."""
+    frames = []
+    for i, frame in enumerate(matrix(21, 200, 36, 4000)):
+        data = bytes([i % 256]) + frame.astype(">u2").tobytes()
+        frames.append(b"\xf0\x0f" + data + bytes([NAMED[name].of(data)]))
+    best, keys = described(frames)
+    assert (best.mark, best.sequence, best.dtype) == (b"\xf0\x0f", "uint8", "uint16")
+    assert (best.big_endian, best.values, best.grids[0]) == (True, 36, (6, 6, 1))
+    assert keys == {"checksum": name, "checksum_from": 2}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "order"), [("crc16-modbus", "little"), ("crc16-xmodem", "big"), ("crc32", "little")]
+)
+def test_clock_count_and_wide_checksum(name: str, order: str) -> None:
+    """A clock in milliseconds, a count of the other byte order, and a checksum of 16 or 32 bits
+    before a trailer: all found."""
+    frames = []
+    for i, frame in enumerate(matrix(22, 200, 16, 900)):
+        data = b"\xaa\x55" + (5000 + 10 * i).to_bytes(4, "little") + (70_000 + i).to_bytes(4, "big")
+        data += frame.astype("<u2").tobytes()
+        frames.append(data + NAMED[name].of(data).to_bytes(NAMED[name].size, order) + b"\r\n")
+    best, keys = described(frames)
+    assert (best.values, best.sequence, best.dtype) == (16, "uint32", "uint16")
+    assert (keys["checksum"], keys["sequence_order"], keys["skip_before"]) == (name, "big", 4)
+
+
+@pytest.mark.slow
+def test_a_polynomial_without_a_name_and_a_count_behind() -> None:
+    """Any CRC of 8 bits is found from the frames alone, whatever its parameters."""
+    odd, frames = Checksum("crc8", 0xB7, 0x12, 0x34, True), []
+    for i, frame in enumerate(matrix(23, 200, 16, 900)):
+        data = b"\xa5" + frame.astype("<u2").tobytes() + (60_000 + i).to_bytes(2, "big")
+        frames.append(data + bytes([odd.of(data)]))
+    best, keys = described(frames)
+    assert (best.values, best.sequence, keys["sequence_at"]) == (16, "uint16", 32)
+    assert keys["checksum"].startswith("crc8 poly=b7 ")
+
+
+def test_bytes_of_unknown_meaning_are_found_by_the_grid() -> None:
+    """A grid that no proposal has: bytes of other sensors lie before the numbers."""
+    rng, frames = np.random.default_rng(24), []
+    for frame in matrix(24, 120, 16, 900):
+        other = rng.integers(0, 256, 14, np.uint8).tobytes()
+        frames.append(b"\xaa\x55" + other + frame.astype("<u2").tobytes())
+    heard = skin_new.PortSample(115_200, reads(frames, 64), skin_new.proposals(reads(frames, 64)))
+    chosen, grid = skin_new.choose(heard, "4x4", 0)
+    assert (grid, chosen.dtype, chosen.keys["skip_before"]) == ((4, 4, 1), "uint16", 14)
+
+
 def test_lost_and_foreign_bytes_do_not_hide_the_pattern() -> None:
     """Lost and foreign bytes do not hide the pattern."""
     frames = [b"\xaa\x55" + frame.astype("u1").tobytes() for frame in matrix(6, 200, 16, 255)]
@@ -108,17 +170,16 @@ def test_lost_and_foreign_bytes_do_not_hide_the_pattern() -> None:
 
 
 @pytest.mark.parametrize(
-    ("number", "dtype"),
-    [(lambda v: f"{v:.0f}", "uint16"), (lambda v: f"{v - 100:.0f}", "int16"), (str, "float32")],
+    "number", [lambda v: f"{v:.0f}", lambda v: f"{v - 100:.0f}", str], ids=["whole", "sign", "real"]
 )
-def test_lines_of_numbers_are_frames(number, dtype: str) -> None:
-    """Lines of numbers are frames."""
+def test_lines_of_numbers_are_frames(number) -> None:
+    """Lines of numbers are frames, of the widest type: signs and decimals may come later."""
     frames = [
         (",".join(number(float(v)) for v in frame) + "\n").encode()
         for frame in matrix(7, 50, 16, 200)
     ]
     best = first(analyse(reads(frames)))
-    assert (best.framing, best.length, best.values, best.dtype) == ("text", 1, 16, dtype)
+    assert (best.framing, best.length, best.values, best.dtype) == ("text", 1, 16, "float32")
     assert best.grids[0] == (4, 4, 1)
     assert best.rate_hz == pytest.approx(100, rel=0.1)
 

@@ -54,10 +54,12 @@ def test_the_five_commands_of_the_page_make_a_bundle(
     warned = [line for line in re.findall(".*[Ww]arning.*|.*Gemm.*", err) if "the mean" not in line]
     assert [*caplog.messages, *warned] == []
     assert "they also helped to choose the model" in out
-    assert (
-        "which no part of the fit has seen; after export: "
-        "palpate-train score BUNDLE --set build/rest.npz\n" in out
-    )
+    assert "in build/rest.npz, which no part of the fit has seen\n" in out
+    next_commands = out.partition("next:\n")[2].splitlines()[:3]
+    assert [line.split()[:2] for line in next_commands] == [
+        ["palpate-train", name] for name in ("export", "score", "report")
+    ]
+    assert all("--set build/rest.npz" in line for line in next_commands[1:])
     assert (
         f"to score it on the sweeps that fit --split left out: {shlex.join(commands[-1])}\n" in out
     )

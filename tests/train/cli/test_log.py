@@ -13,7 +13,7 @@ import pytest
 from tests.factories import terminals
 from tests.factories.paths import ROOT
 from train.arguments import options
-from train.data.progress import ProgressLine
+from train.data.progress import ProgressLine, StageLine
 
 SCRIPT = """
 import sys, time
@@ -80,3 +80,23 @@ def test_a_log_has_a_line_now_and_then(
     monkeypatch.setattr(options, "LOG_EVERY_S", -1)
     log(ProgressLine.of(1, 2, 3.0, "a fold"))
     assert capsys.readouterr().err == "kept\n1/2 done, 3 s left (a fold)\n"
+
+
+def test_a_stage_that_has_ended_stays_with_its_time(capsys: pytest.CaptureFixture[str]):
+    """A line for each stage, whatever it said meanwhile; the end checks the last one, once."""
+    log = options.Log()
+    for stage, what in ((1, "features of 9 sweeps"), (2, "choosing: a"), (2, "choosing: b")):
+        log(StageLine.of(stage, 2, ("features", "choice")[stage - 1], what))
+    log.end()
+    log.end()
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.split()[1] for line in lines] == ["features", "choice"]
+    assert all(line.endswith(" 0 s") for line in lines)
+
+
+def test_a_stage_knows_how_much_of_it_is_done():
+    """A training says its step; other work says nothing about its end."""
+    known = StageLine.of(3, 3, "training", "step 300/1200 loss 0.31, 9 s left")
+    assert (known, known.within) == ("part 3 of 3, step 300/1200 loss 0.31, 9 s left", 0.25)
+    assert options._share(known) == {"completed": 2.25, "total": 3}
+    assert options._share(StageLine.of(2, 3, "choice", "choosing: b"))["completed"] == 1

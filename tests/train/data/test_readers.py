@@ -570,3 +570,17 @@ def test_recordings_that_were_tared_alike_stay_to_the_bit(tmp_path: Path):
     np.testing.assert_array_equal(low.samples[2], low.samples[0])
     tared(tmp_path / "clipped", {"a0": 230.0, "a1": 230.0, "b0": 0.0}, "uint8")
     assert sets.load(str(tmp_path / "clipped")).samples[2].max() == 255
+
+
+def test_an_impossible_reading_of_a_recording_is_named(tmp_path: Path):
+    """File, frame and taxel of a reading whose square overflows."""
+    format = SweepFormat(2, 3, 100.0, 8, "float32")
+    taxels = np.ones((8, 2, 3), np.float32)
+    taxels[5, 1, 2] = 1e20
+    frames = Frames(np.arange(8), np.arange(8), taxels)
+    sweep = Sweep(7, 0, 8, Status.OK, frames, material="wood")
+    one = readers.RecordedSweep(tmp_path / "sweep-000007.npy", sweep, format, {})
+    with pytest.raises(
+        FormatError, match=r"sweep-000007.npy: frame 6, taxel 2, 3 reads 1e\+20, and no skin"
+    ):
+        readers.from_recorded([one], tmp_path, sets.Dataset)

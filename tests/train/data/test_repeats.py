@@ -1,4 +1,4 @@
-"""Sweeps that a set holds twice: copies, windows that share frames, and what must not count."""
+"""Sweeps that a set holds twice: copies, windows that share frames, and quiet skins."""
 
 from __future__ import annotations
 

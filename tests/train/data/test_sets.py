@@ -92,6 +92,10 @@ NAN[4, 7, 1, 2] = np.nan
         ({"group_recording": np.full(6, 1j)}, "group_recording holds complex128 .*whole number"),
         ({"samples": NAN}, "samples\\[4, 7, 1, 2\\] is nan; drop sweep 4"),
         (
+            {"samples": np.nan_to_num(NAN, nan=1e20)},
+            "sweep 4, frame 7, taxel 1, 2 reads 1e\\+20 .counted from 0., and no skin reads more",
+        ),
+        (
             {"labels": np.arange(5)},
             "labels holds int64 \\[5\\]; give one whole number for each of 6",
         ),

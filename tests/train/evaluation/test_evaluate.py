@@ -306,7 +306,7 @@ def test_the_command_writes_what_scripts_rely_on(
         assert result["fit_s"] > 0
         assert result["ms_p50"] > 0
     printed = capsys.readouterr().out.splitlines()
-    assert len(printed) == 5
+    assert len(printed) == 7  # the header, two baselines, four results
     assert "leave:session" in printed[1]
     assert " out " in printed[1]
 

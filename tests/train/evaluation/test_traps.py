@@ -52,7 +52,7 @@ def test_shared_frames_are_counted_for_the_folds():
 
 
 def test_baselines_find_what_they_look_at():
-    """Means name what differs in its offset alone, bands what differs in its pitch alone."""
+    """Means distinguish offsets, bands distinguish pitches, and neither does the other's work."""
     folds = Protocol("leave:session").folds(tones(), 1)
     found = trivial.figures(tones(), folds)
     assert found[trivial.BANDS]["right"] == 36

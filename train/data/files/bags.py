@@ -10,7 +10,7 @@ import numpy as np
 
 from appliance.core.errors import FormatError
 from train.data.files.optional import library
-from train.data.files.table import Array, Table, Wanted, from_columns, normal, printable
+from train.data.files.table import Array, ReadPlan, Table, from_columns, normal, printable
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 WHAT = "a recording of ROS"
@@ -27,7 +27,7 @@ PIXELS = {
 IMAGE = "Image"
 
 
-def read(path: Path, wanted: Wanted) -> Table:
+def read(path: Path, wanted: ReadPlan) -> Table:
     """The messages of the only topic with numbers, or of the topic `wanted.variable`, one frame
     each. Raises FormatError that lists the topics."""
     highlevel = library("rosbags.highlevel", WHAT)

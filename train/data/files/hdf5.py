@@ -9,7 +9,7 @@ from typing import Any
 
 import h5py
 
-from train.data.files.table import Array, Entry, Table, Wanted, chosen
+from train.data.files.table import Array, Entry, ReadPlan, Table, chosen
 from train.data.readers import array_in
 
 CLASS = "MATLAB_class"
@@ -24,7 +24,7 @@ NUMERIC = (
 """MATLAB's classes of numeric arrays."""
 
 
-def read(path: Path, wanted: Wanted) -> Table:
+def read(path: Path, wanted: ReadPlan) -> Table:
     """The wanted array of an HDF5 file, in whatever group it stands.
 
     Arrays that MATLAB saved with -v7.3 get MATLAB's order of axes. Raises FormatError.

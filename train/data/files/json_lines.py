@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from appliance.core.errors import FormatError
-from train.data.files.table import Array, Table, Wanted, excerpt, from_columns
+from train.data.files.table import Array, ReadPlan, Table, excerpt, from_columns
 from train.data.files.text import decoded, lines_of
 
 SUFFIXES = (".jsonl", ".ndjson", ".json", ".jsonlines")
 
 
-def read(data: bytes, wanted: Wanted) -> Table:
+def read(data: bytes, wanted: ReadPlan) -> Table:
     """The frames in a text of JSON. Raises FormatError that names the line and the key."""
     text, notes = decoded(data)
     whole = _whole(text)

@@ -69,14 +69,14 @@ class Struct:
 
 
 @dataclass(frozen=True)
-class Cell:
+class CellArray:
     """A cell array. items: its contents, in MATLAB's order."""
 
     items: tuple[Any, ...]
 
 
 def variables(data: bytes) -> dict[str, Any]:
-    """The variables of a file by name: NumPy arrays, texts, Struct, Cell, or None for an object.
+    """The variables of a file by name: NumPy arrays, texts, Struct, CellArray; None for an object.
 
     Raises FormatError if the file is damaged or has another version.
     """
@@ -108,7 +108,7 @@ def arrays_of(found: Mapping[str, Any]) -> dict[str, Array]:
 def _walk(name: str, value: Any) -> Iterator[tuple[str, Array]]:
     if isinstance(value, np.ndarray):
         yield name, value
-    elif isinstance(value, Cell):
+    elif isinstance(value, CellArray):
         for k, item in enumerate(value.items, 1):
             yield from _walk(f"{name}{{{k}}}", item)
     elif isinstance(value, Struct):
@@ -164,7 +164,7 @@ def _matrix(data: bytes, order: str, depth: int = 0) -> tuple[str, Any]:
         raise FormatError("is damaged: an array lacks its shape or name")
     shape = struct.unpack(f"{order}{len(parts[1][1]) // 4}i", parts[1][1])
     if kind == CELL:
-        return name, Cell(tuple(_matrices(parts[3:], order, depth)))
+        return name, CellArray(tuple(_matrices(parts[3:], order, depth)))
     if kind == STRUCT:
         return name, _structure(parts[3:], order, depth)
     if kind == OLD_OBJECT:

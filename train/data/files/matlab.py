@@ -17,7 +17,7 @@ import numpy as np
 from appliance.core.errors import FormatError
 from train.data.files import hdf5, mat_v5
 from train.data.files.mat_v5 import Struct
-from train.data.files.table import Array, Entry, Table, Wanted, chosen, from_columns
+from train.data.files.table import Array, Entry, ReadPlan, Table, chosen, from_columns
 
 FIGURE = "hgS_070000"
 """The structure in which a .fig keeps its axes and lines."""
@@ -27,7 +27,7 @@ REMEDY = (
 )
 
 
-def read(path: Path, wanted: Wanted) -> Table:
+def read(path: Path, wanted: ReadPlan) -> Table:
     """The wanted array of a MAT file, or the lines of a figure. Raises FormatError."""
     if h5py.is_hdf5(path):
         with h5py.File(path, "r") as file:

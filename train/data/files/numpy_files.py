@@ -10,19 +10,19 @@ from typing import IO, Any
 import numpy as np
 
 from appliance.core.errors import FormatError
-from train.data.files.table import Array, Entry, Table, Wanted, chosen, records
+from train.data.files.table import Array, Entry, ReadPlan, Table, chosen, records
 
 FORMAT: Any = np.lib.format
 """NumPy's reader of headers; it has no types."""
 
 
-def read_npy(path: Path, wanted: Wanted) -> Table:
+def read_npy(path: Path, wanted: ReadPlan) -> Table:
     """The array of an .npy file. Raises FormatError or what NumPy raises for a damaged file."""
     values = np.load(path, allow_pickle=False)
     return records(values) if values.dtype.names else Table(values)
 
 
-def read_npz(path: Path, wanted: Wanted) -> Table:
+def read_npz(path: Path, wanted: ReadPlan) -> Table:
     """The wanted array of an .npz. Members that are not arrays, such as dictionaries, are passed
     over."""
     with zipfile.ZipFile(path) as archive:

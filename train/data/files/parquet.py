@@ -10,12 +10,12 @@ import numpy as np
 
 from appliance.core.errors import FormatError
 from train.data.files.optional import library
-from train.data.files.table import Array, Table, Wanted, from_columns
+from train.data.files.table import Array, ReadPlan, Table, from_columns
 
 SUFFIXES = (".parquet", ".pq", ".feather", ".arrow")
 
 
-def read(path: Path, wanted: Wanted) -> Table:
+def read(path: Path, wanted: ReadPlan) -> Table:
     """The columns of a file; a column of lists becomes one column for each element. Raises
     FormatError that names the row and the column."""
     return table(arrow(path))

@@ -11,12 +11,12 @@ from typing import Any
 from appliance.core.errors import FormatError
 from train.data.files import text
 from train.data.files.optional import library
-from train.data.files.table import Table, Wanted, normal
+from train.data.files.table import ReadPlan, Table, normal
 
 SUFFIXES = (".xlsx", ".xlsm", ".xlsb", ".xls", ".ods")
 
 
-def read(path: Path, wanted: Wanted) -> Table:
+def read(path: Path, wanted: ReadPlan) -> Table:
     """The sheet with frames, or the sheet `wanted.variable`; its rows are read as the lines of a
     text. Raises FormatError that names the line."""
     calamine = library("python_calamine", "a spreadsheet")

@@ -20,7 +20,7 @@ LONGEST = 40
 
 
 @dataclass(frozen=True)
-class Wanted:
+class ReadPlan:
     """What to read from a file. variable: the array, sheet, group or topic. time: the name of the
     times. decimal: the decimal sign of text, "" if the text must show it."""
 
@@ -90,7 +90,7 @@ def excerpt(text: str) -> str:
     return repr(text if len(text) <= LONGEST else f"{text[: LONGEST - 1]}…")
 
 
-def chosen(entries: Mapping[str, Entry], wanted: Wanted) -> Table:
+def chosen(entries: Mapping[str, Entry], wanted: ReadPlan) -> Table:
     """The only array of frames, or the array `wanted.variable`, with the times beside it.
 
     No other array is read. Raises FormatError that lists the arrays if none or several fit.

@@ -9,12 +9,12 @@ import numpy as np
 
 from appliance.core.errors import FormatError
 from train.data.files.optional import library
-from train.data.files.table import Array, Table, Wanted, from_columns, normal
+from train.data.files.table import Array, ReadPlan, Table, from_columns, normal
 
 STEP = "wf_increment"
 
 
-def read(path: Path, wanted: Wanted) -> Table:
+def read(path: Path, wanted: ReadPlan) -> Table:
     """The channels of the only group with numbers, or of the group `wanted.variable`.
 
     The vector `time`, in seconds, exists if the channels state their interval. Raises FormatError.

@@ -14,7 +14,7 @@ from itertools import pairwise
 import numpy as np
 
 from appliance.core.errors import FormatError
-from train.data.files.table import Array, Table, Wanted, excerpt
+from train.data.files.table import Array, ReadPlan, Table, excerpt
 
 START = re.compile(r'"?ASCII_DATA[\s",]*@@')
 FRAME = re.compile(r'"?Frame\s+(\d+)', re.IGNORECASE)
@@ -30,7 +30,7 @@ def is_movie(lines: Sequence[str]) -> bool:
     return start is not None and any(FRAME.match(line) for line in lines[start : start + 10])
 
 
-def read(lines: Sequence[str], wanted: Wanted, notes: Sequence[str]) -> Table:
+def read(lines: Sequence[str], wanted: ReadPlan, notes: Sequence[str]) -> Table:
     """The frames [n, R, C] of a movie, and its times as the vector `time`, in seconds.
 
     Rows and columns without a sensel are left out. Raises FormatError that names the line.

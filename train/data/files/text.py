@@ -19,7 +19,7 @@ import numpy as np
 
 from appliance.core.errors import FormatError
 from train.data.files.decimals import decimal_sign, plain
-from train.data.files.table import Array, Table, Wanted, excerpt, normal
+from train.data.files.table import Array, ReadPlan, Table, excerpt, normal
 
 COMMENTS = ("#", "%")
 DELIMITERS = ("\t", ";", ",", None)
@@ -92,7 +92,7 @@ class Layout:
 
 def table(
     lines: Sequence[str],
-    wanted: Wanted,
+    wanted: ReadPlan,
     notes: Sequence[str] = (),
     delimiter: str = "",
     decimal: str = "",
@@ -246,7 +246,7 @@ def _is_footer(line: str, layout: Layout, last: bool) -> bool:
 
 
 def _remarks(kept: Sequence[Row], start: int, end: int, layout: Layout) -> list[str]:
-    """What is said of the lines after the frames."""
+    """Remarks on the lines after the frames."""
     rest = [(i, line) for i, line in kept[end:] if not line.lstrip().startswith(COMMENTS)]
     if not rest:
         return []

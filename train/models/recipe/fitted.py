@@ -18,6 +18,7 @@ import onnx
 from numpy.typing import NDArray
 from onnx import checker, shape_inference
 
+from appliance.core import storage
 from appliance.core.errors import BundleError, FormatError
 from appliance.core.sweep_set import read
 from train.calibration.contact import Contacts
@@ -153,7 +154,7 @@ class Fit:
             "contacts": self.contacts.figures() if self.contacts else None,
         }
         path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("wb") as f:
+        with storage.file(path) as f:
             np.savez_compressed(f, allow_pickle=False, meta=np.array(json.dumps(meta)), **arrays)
 
     @classmethod

@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
 from train.calibration.heads import HeadData, HeadPart, HeadPlan
+from train.data.progress import StageLine
 from train.data.sets import Dataset
 from train.data.splitters import InnerPart, inner_parts
 from train.metrics.score import interval
@@ -59,6 +60,8 @@ LEAST_EACH, LEAST_SWEEPS = 25, 100
 few sweeps of a material and to a few batches."""
 STAGES_WEIGHT = 0.5
 """Weight of the discriminant of stages beside others; docs/decisions/0023 compares others."""
+PARTS = "features", "choice of the model", "training of stages"
+"""Parts of a fit, for its progress."""
 ENOUGH = 0.99
 """Accuracy on held-out parts from which on stages improve too little for their share of the
 bundle's size and time."""
@@ -122,6 +125,8 @@ class Setup:
     @classmethod
     def of(cls, sweeps: Dataset, seed: int, settings: Settings, log: Log) -> Setup:
         """Raises FormatError if the window is too short."""
+        groups = {"recording": sweeps.group("recording")} | sweeps.groups  # numbered before a split
+        sweeps = replace(sweeps, groups=groups)
         usual = default_augmentation(FIXED.zero_sum(sweeps.format.window))
         return cls(sweeps, seed, settings, replace(usual, **settings.use.augmentation), log)
 
@@ -215,7 +220,7 @@ class Setup:
         """The log of one part of the fit. The third part, the stages, takes most of the time; it is
         left out if the first two suffice."""
         parts = 3 if self.wants_stages(self.settings.size) else 2
-        return lambda line: self.log(f"part {number} of {parts}, {line}")
+        return lambda line: self.log(StageLine.of(number, parts, PARTS[number - 1], line))
 
 
 @dataclass(frozen=True)
@@ -310,7 +315,7 @@ def with_stages(
     """
     log, plan = setup.part(3), judged.chosen.plan
     stages, responses = setup.stages
-    scores = setup.scores(_side_by_side(responses, fixed.data), [setup.judging])
+    scores = setup.scores(responses.beside(fixed.data), [setup.judging])
     beside = _beside_stages(plan)
     joined = full = scores.score(beside)
     if setup.settings.use.reattached:
@@ -438,15 +443,6 @@ def _trained(setup: Setup) -> Trunk:
         settings.unfinished,
     )
     return Trunk(sweeps, scale, weights, architecture, ranges)
-
-
-def _side_by_side(stages: HeadData, fixed: HeadData) -> HeadData:
-    """The features of both for the same sweeps, those of stages first."""
-    return replace(
-        fixed,
-        features=np.hstack([stages.features, fixed.features]),
-        copied=np.hstack([stages.copied, fixed.copied]),
-    )
 
 
 def _beside_stages(plan: HeadPlan) -> list[HeadPart]:

@@ -13,7 +13,7 @@ import pytest
 
 from appliance.core.errors import FormatError
 from train.data import raw_files
-from train.data.files.table import Wanted
+from train.data.files.table import ReadPlan
 
 SKIN = np.arange(40 * 4, dtype=np.uint16).reshape(40, 4)
 FIELDS = np.zeros(40, [("t", "f8"), ("who", "S5"), ("taxels", "u2", (4,)), ("note", "U3")])
@@ -25,7 +25,7 @@ def test_an_npz_with_objects_is_read_beside_them(tmp_path: Path):
     np.savez(
         tmp_path / "a.npz", skin=SKIN, info={"who": "Ada"}, none=None, name="wood", t=SKIN[:, 0]
     )
-    found = raw_files.read(tmp_path / "a.npz", Wanted(time="t"))
+    found = raw_files.read(tmp_path / "a.npz", ReadPlan(time="t"))
     np.testing.assert_array_equal(found.values, SKIN)
     np.testing.assert_array_equal(found.vectors["t"], SKIN[:, 0])
     np.savez(tmp_path / "b.npz", info={"skin": SKIN})
@@ -61,7 +61,7 @@ def test_a_camera_beside_the_skin_is_not_read(tmp_path: Path):
         file.create_dataset("camera", (4000, 480, 640), "u1", chunks=(1, 480, 640))
         file["link"] = h5py.ExternalLink("other.h5", "/camera")
     tracemalloc.start()
-    found = raw_files.read(tmp_path / "a.h5", Wanted("skin"))
+    found = raw_files.read(tmp_path / "a.h5", ReadPlan("skin"))
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     np.testing.assert_array_equal(found.values, SKIN)
@@ -69,14 +69,14 @@ def test_a_camera_beside_the_skin_is_not_read(tmp_path: Path):
     with pytest.raises(FormatError, match=r"holds 2 arrays of frames; .*camera \[4000, 480, 640\]"):
         raw_files.read(tmp_path / "a.h5")
     with pytest.raises(FormatError, match=r"camera .* was not written to its end"):
-        raw_files.read(tmp_path / "a.h5", Wanted("camera"))
+        raw_files.read(tmp_path / "a.h5", ReadPlan("camera"))
 
 
 def test_an_array_is_found_by_the_end_of_its_path(tmp_path: Path):
     """`skin` names run/skin if no other array is called so."""
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["run/skin"], file["run/camera"] = SKIN, np.zeros((3, 3))
-    np.testing.assert_array_equal(raw_files.read(tmp_path / "a.h5", Wanted("skin")).values, SKIN)
+    np.testing.assert_array_equal(raw_files.read(tmp_path / "a.h5", ReadPlan("skin")).values, SKIN)
 
 
 def lines(*rows: object) -> bytes:

@@ -11,7 +11,7 @@ import pytest
 
 from appliance.core.errors import FormatError
 from train.data import raw_files
-from train.data.files.table import Wanted
+from train.data.files.table import ReadPlan
 
 SKIN = np.arange(40 * 4, dtype=np.uint16).reshape(40, 4)
 TIMES = np.arange(40) / 10
@@ -65,7 +65,7 @@ def test_a_spreadsheet_is_read_as_a_text(tmp_path: Path):
     path = book(tmp_path / "b.xlsx", {"one": ROWS, "two": ROWS})
     with pytest.raises(FormatError, match="holds 2 sheets of frames, one, two; name one with"):
         raw_files.read(path)
-    np.testing.assert_array_equal(raw_files.read(path, Wanted("two")).values[:, 2:], SKIN)
+    np.testing.assert_array_equal(raw_files.read(path, ReadPlan("two")).values[:, 2:], SKIN)
 
 
 def test_a_hole_in_a_spreadsheet_is_a_fault(tmp_path: Path):
@@ -187,7 +187,7 @@ def test_recordings_of_ros_are_read(tmp_path: Path, kind: str, messages: str):
     if messages.endswith("Image"):
         np.testing.assert_allclose(found.vectors["time"], TIMES, atol=1e-6)
     with pytest.raises(FormatError, match=r"has no topic 'skin'; it holds /skin \(.*/note"):
-        raw_files.read(path, Wanted("skin"))
+        raw_files.read(path, ReadPlan("skin"))
     moved = path.rename(tmp_path / f"moved{path.suffix}")
     if kind == "db3":
         with pytest.raises(FormatError, match=r"lacks metadata.yaml"):

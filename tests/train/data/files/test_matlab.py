@@ -11,7 +11,7 @@ import scipy.io
 
 from appliance.core.errors import FormatError
 from train.data import raw_files
-from train.data.files.table import Wanted
+from train.data.files.table import ReadPlan
 
 SKIN = np.arange(40 * 4.0).reshape(40, 4)
 
@@ -49,7 +49,7 @@ def test_arrays_are_found_in_structures(tmp_path: Path):
     """data.skin, runs(2).skin, c{2}: beside text, which is passed over; only one array of frames
     needs no name."""
     path = old(tmp_path / "a.mat", data={"skin": SKIN, "who": "Ada", "t": np.arange(40.0)})
-    found = raw_files.read(path, Wanted(time="data.t"))
+    found = raw_files.read(path, ReadPlan(time="data.t"))
     np.testing.assert_array_equal(found.values, SKIN)
     np.testing.assert_array_equal(found.vectors["data.t"], np.arange(40))
     runs = np.zeros((1, 2), [("skin", object)])
@@ -57,8 +57,8 @@ def test_arrays_are_found_in_structures(tmp_path: Path):
     cells = np.empty(2, object)
     cells[:] = [SKIN, SKIN + 2]
     path = old(tmp_path / "b.mat", runs=runs, c=cells)
-    np.testing.assert_array_equal(raw_files.read(path, Wanted("runs(2).skin")).values, SKIN + 1)
-    np.testing.assert_array_equal(raw_files.read(path, Wanted("c{2}")).values, SKIN + 2)
+    np.testing.assert_array_equal(raw_files.read(path, ReadPlan("runs(2).skin")).values, SKIN + 1)
+    np.testing.assert_array_equal(raw_files.read(path, ReadPlan("c{2}")).values, SKIN + 2)
     with pytest.raises(FormatError, match=r"holds 4 arrays of frames; .*runs\(1\).skin \[40, 4\]"):
         raw_files.read(path)
 
@@ -67,7 +67,7 @@ def test_arrays_are_found_in_structures(tmp_path: Path):
 def test_version_7_3_is_read_beside_objects(tmp_path: Path, name: str):
     """Strings, dates, tables and cells are no arrays of frames; axes are MATLAB's; a structure is
     walked into."""
-    found = raw_files.read(new(tmp_path / "a.mat", name), Wanted(name.replace("/", ".")))
+    found = raw_files.read(new(tmp_path / "a.mat", name), ReadPlan(name.replace("/", ".")))
     np.testing.assert_array_equal(found.values, SKIN)
     np.testing.assert_array_equal(raw_files.read(tmp_path / "a.mat").values, SKIN)
     (tmp_path / "a.mat").rename(tmp_path / "a.h5")

@@ -7,7 +7,7 @@ import pytest
 
 from appliance.core.errors import FormatError
 from train.data.files import tekscan
-from train.data.files.table import Table, Wanted
+from train.data.files.table import ReadPlan, Table
 from train.data.files.text import lines_of
 
 FRAMES = np.arange(12 * 3 * 4).reshape(12, 3, 4)
@@ -38,7 +38,7 @@ def movie(frames: np.ndarray = FRAMES, head: str = HEAD, tail: str = "") -> str:
 def read(text: str) -> Table:
     lines = lines_of(text)
     assert tekscan.is_movie(lines)
-    return tekscan.read(lines, Wanted(), ())
+    return tekscan.read(lines, ReadPlan(), ())
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from appliance.core.errors import FormatError
-from train.data.files.table import Table, Wanted
+from train.data.files.table import ReadPlan, Table
 from train.data.files.text import decoded, lines_of, table
 
 ROWS = [[10 * r + c for c in range(4)] for r in range(1, 31)]
@@ -18,10 +18,10 @@ HEAD = "a,b,c,d\n"
 def read(text: str | bytes, decimal: str = "") -> Table:
     """The table in a text."""
     content, notes = decoded(text if isinstance(text, bytes) else text.encode())
-    return table(lines_of(content), Wanted(decimal=decimal), notes)
+    return table(lines_of(content), ReadPlan(decimal=decimal), notes)
 
 
-def whole(text: str | bytes, names: tuple[str, ...] = ("a", "b", "c", "d")) -> Table:
+def check_whole(text: str | bytes, names: tuple[str, ...] = ("a", "b", "c", "d")) -> Table:
     """The table in a text that holds all of ROWS; no cell is bad."""
     found = read(text)
     numbers = [i for i in range(found.values.shape[1]) if i not in found.texts]
@@ -54,7 +54,9 @@ def test_a_row_behind_a_comment_sign_does_not_vanish():
     assert read("\n".join(lines)).faults[0] == "line 6, column 1 is '#60', which is not a number"
     lines = BODY.splitlines()
     lines.insert(5, "# paused")
-    assert whole("\n".join(lines), ()).notes == ("1 comments between its frames are passed over",)
+    assert check_whole("\n".join(lines), ()).notes == (
+        "1 comments between its frames are passed over",
+    )
 
 
 @pytest.mark.parametrize("delimiter", ["\t", ";", " "])
@@ -126,7 +128,7 @@ def test_quoted_thousands_between_commas_are_refused():
 )
 def test_what_follows_the_frames_is_said(end: str, note: str):
     """A footer, a cut line, bytes without content: the frames before it are read."""
-    assert note in whole(HEAD + BODY + end).notes
+    assert note in check_whole(HEAD + BODY + end).notes
 
 
 def test_text_between_frames_is_refused():
@@ -155,7 +157,7 @@ def test_a_text_column_stands_beside_numbers(at: int, text: str):
     head.insert(at, "what")
     for k, row in enumerate(rows):
         row.insert(at, text.format(k))
-    found = whole("\n".join(",".join(row) for row in [head, *rows]))
+    found = check_whole("\n".join(",".join(row) for row in [head, *rows]))
     assert found.texts[at][7] == text.format(7).strip('"')
     assert found.columns[at] == "what"
 
@@ -164,26 +166,26 @@ def test_rs_tables_are_read():
     """write.table quotes names and rows and leaves the head one name short; write.csv leaves it
     empty; quote=FALSE leaves numbers."""
     rows = [f'"{k}" {" ".join(map(str, row))}' for k, row in enumerate(ROWS, 1)]
-    whole("\n".join(['"a" "b" "c" "d"', *rows]))
-    whole("\n".join(["a b c d", *(row.replace('"', "") for row in rows)]))
-    whole("\n".join(['"","a","b","c","d"', *(row.replace(" ", ",") for row in rows)]))
-    whole("\n".join(["a\tb\tc\td", *(row.replace(" ", "\t") for row in rows)]))
+    check_whole("\n".join(['"a" "b" "c" "d"', *rows]))
+    check_whole("\n".join(["a b c d", *(row.replace('"', "") for row in rows)]))
+    check_whole("\n".join(['"","a","b","c","d"', *(row.replace(" ", ",") for row in rows)]))
+    check_whole("\n".join(["a\tb\tc\td", *(row.replace(" ", "\t") for row in rows)]))
     names = [f'"w {k}" {" ".join(map(str, row))}' for k, row in enumerate(ROWS, 1)]
-    assert whole("\n".join(['"a" "b" "c" "d"', *names])).texts[0][0] == "w 1"
+    assert check_whole("\n".join(['"a" "b" "c" "d"', *names])).texts[0][0] == "w 1"
 
 
 def test_pandas_numbers_its_rows_and_columns():
     """A nameless frame: a head ,0,1,2,3 and a first column that counts."""
     rows = [f"{k},{','.join(map(str, row))}" for k, row in enumerate(ROWS)]
-    whole("\n".join([",0,1,2,3", *rows]), ("0", "1", "2", "3"))
+    check_whole("\n".join([",0,1,2,3", *rows]), ("0", "1", "2", "3"))
 
 
 def test_names_stand_on_the_last_line_before_the_numbers():
     """A remark with as many cells above it, and units below it, are not the names."""
-    whole("Recorded,by,hand,today\n" + HEAD + BODY)
-    whole(HEAD + "(N),(N),(N),(V)\n" + BODY)
-    whole(HEAD + "N,N,N,V\n" + BODY)
-    whole("# " + HEAD + BODY)
+    check_whole("Recorded,by,hand,today\n" + HEAD + BODY)
+    check_whole(HEAD + "(N),(N),(N),(V)\n" + BODY)
+    check_whole(HEAD + "N,N,N,V\n" + BODY)
+    check_whole("# " + HEAD + BODY)
 
 
 LVM = """LabVIEW Measurement\t
@@ -223,7 +225,7 @@ def test_labviews_measurements_are_read(sign: str, tail: str):
 
 def test_a_mark_shows_utf_16():
     """With the mark it is read; names in Latin-1 are kept."""
-    whole((HEAD + BODY).encode("utf-16"))
+    check_whole((HEAD + BODY).encode("utf-16"))
     assert read(("Größe,b,c,d\n" + BODY).encode("latin-1")).columns[0] == "Größe"
     assert read("Gro\u0308ße,b,c,d\n" + BODY).columns[0] == "Größe"
 

@@ -389,6 +389,14 @@ def test_the_hardest_condition_judges():
     assert figures["held-out batch"]["n"] == len(varied())
 
 
+def test_sweeps_without_recordings_are_numbered_before_they_are_divided():
+    """Each sweep is then a recording of its own on both sides, and counts by itself."""
+    made = recipe.fit(replace(easy(), groups={}), 1, CLOSED)
+    numbers = [side.group("recording") for side in (made.train, made.held)]
+    assert len(np.unique(np.concatenate(numbers))) == len(easy())
+    assert "held-out recording, by recording" not in made.held_out_figures()
+
+
 def test_only_named_conditions_judge():
     """What varies in service may be said; a group that cannot be left out is refused by name."""
     made = recipe.fit(varied(), 1, replace(CLOSED, varies=("batch",)))
