@@ -76,11 +76,12 @@ deploy: $(FLEET) ## put a signed BUNDLE= on HOST= or HOSTS=inventory.py; SHADOW=
 sbom: $(RUNTIME) ## list what the box carries, with licences: dist/palpate.cdx.json
 	PYTHONPATH=. $(BIN)/python systemd/sbom.py dist/palpate.cdx.json
 
-install: $(FLEET) ## install or upgrade Debian boxes, HOST= or HOSTS=; BOARD=rpi5, SIGNERS=FILE
+install: $(FLEET) ## install or upgrade Debian boxes, HOST= or HOSTS=; BOARD=rpi5, SIGNERS=FILE, TEACH=0
 	rm -rf build/lib build/bdist.* # setuptools would put leftovers of an older build into the wheel
 	$(PIP) wheel --no-deps -w dist .
+	$(if $(filter 0,$(TEACH)),,$(PIP) wheel --no-deps -w dist ./train)
 	$(BIN)/python systemd/install.py $(WHERE) $(if $(BOARD),--board $(call quoted,BOARD)) \
-	  $(if $(SIGNERS),--signers $(call quoted,SIGNERS))
+	  $(if $(SIGNERS),--signers $(call quoted,SIGNERS)) $(if $(filter 0,$(TEACH)),--no-teach)
 
 clean: ## remove everything that was built, the virtual environment too
 	rm -rf $(VENV) build dist *.egg-info train/*.egg-info
@@ -88,6 +89,7 @@ clean: ## remove everything that was built, the virtual environment too
 # A virtual environment with the locked runtime and the commands, nothing else. To lock again:
 # uv pip compile pyproject.toml --extra page --universal --generate-hashes --no-header \
 #   --python-version 3.11 -o appliance/requirements.lock
+# and with --extra teach -o appliance/teach.lock.
 $(RUNTIME): appliance/requirements.lock pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "Palpate needs Python 3.11 or later; this is `$(PYTHON) --version`."; \

@@ -1,4 +1,4 @@
-"""Commands that make the key with which a box signs its enrolled labels, and the file of its
+"""Commands that make the key with which a box signs what it has learnt, and the file of its
 signer, if they are missing (appliance/deployment/enrolment_key.py)."""
 
 from __future__ import annotations
@@ -25,8 +25,12 @@ fi
 if [ -s key ] && [ ! -s signer ]; then
   public=$(ssh-keygen -y -f key < /dev/null) \\
     || {{ echo '{folder}/key is damaged; remove it' >&2; exit 1; }}
-  printf 'box namespaces="palpate-enrolment" %s\\n' \\
+  printf 'box namespaces="palpate-enrolment,palpate-taught" %s\\n' \\
     "$(printf %s "$public" | cut -d ' ' -f 1,2)" > signer.new
+  chmod 644 signer.new && sync -f signer.new && mv signer.new signer
+fi
+if grep -q '^box namespaces="palpate-enrolment" ' signer; then # of a version that taught nothing
+  sed '/^box /s/"palpate-enrolment"/"palpate-enrolment,palpate-taught"/' signer > signer.new
   chmod 644 signer.new && sync -f signer.new && mv signer.new signer
 fi
 )"""

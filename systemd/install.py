@@ -24,6 +24,8 @@ from appliance import __version__
 from appliance.core.config import boards
 
 WHEEL = ROOT / "dist" / f"palpate-{__version__}-py3-none-any.whl"
+TEACHING = ROOT / "dist" / "palpate_train-0.1.0-py3-none-any.whl"
+"""The program that learns; the box gets it without its dependencies, see palpate[teach]."""
 PACKAGES = ("python3-venv", "libusb-1.0-0", "openssh-client", "openssl")
 """Debian packages: for a virtual environment, the skin on USB, signatures (ssh-keygen), the page's
 certificate."""
@@ -34,6 +36,7 @@ LINK = "/opt/palpate"
 PATHS = {
     "systemd/palpate.service": "/etc/systemd/system/palpate.service",
     "systemd/palpate-watch.service": "/etc/systemd/system/palpate-watch.service",
+    "systemd/palpate-teach.service": "/etc/systemd/system/palpate-teach.service",
     "systemd/palpate-bridge@.service": "/etc/systemd/system/palpate-bridge@.service",
     "systemd/palpate.sysusers": "/usr/lib/sysusers.d/palpate.conf",
     "systemd/palpate.tmpfiles": "/usr/lib/tmpfiles.d/palpate.conf",
@@ -100,8 +103,15 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         "--wheel", type=Path, default=WHEEL, help="of this checkout (make install builds it)"
     )
+    parser.add_argument(
+        "--no-teach",
+        action="store_true",
+        help="without the program and libraries of palpate teach (make install TEACH=0)",
+    )
     args = parser.parse_args(argv)
-    for file in (args.wheel, *([args.signers] if args.signers else [])):
+    # make install builds both wheels
+    wheels = [args.wheel, *([TEACHING] if TEACHING.is_file() and not args.no_teach else [])]
+    for file in (*wheels, *([args.signers] if args.signers else [])):
         if not file.is_file():
             sys.exit(f"palpate: no file {file}; check the path (make install builds the wheel)")
     try:
@@ -111,7 +121,7 @@ def main(argv: list[str] | None = None) -> int:
     signers = args.signers.read_text() if args.signers else ""
     write_manual(ROOT / "build" / "manual.md")
     with tempfile.TemporaryDirectory() as folder:
-        archives = ReleaseArchives(args.wheel, [*PATHS, SKINS], Path(folder))
+        archives = ReleaseArchives(wheels, [*PATHS, SKINS], Path(folder))
         return each(
             args,
             lambda box: install(box, archives, known_board(box.data("board", args.board)), signers),
@@ -232,6 +242,9 @@ python3 -m venv {release}
 {release}/bin/python {PIP} --find-links {release}/wheels --require-hashes \\
   -r {release}/wheels/requirements.lock
 {release}/bin/python {PIP} --no-deps {release}/wheels/palpate-*.whl
+for train in {release}/wheels/palpate_train-*.whl; do
+  ! [ -e "$train" ] || {release}/bin/python {PIP} --no-deps "$train"
+done
 rm -r {release}/wheels
 sync -f {release}
 echo {Path(release).name} > {release}/stamp

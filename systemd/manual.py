@@ -36,6 +36,7 @@ BOX_PAGES = (
     "how-to/record-with-a-page.md",
     "how-to/train.md",
     "how-to/deliver.md",
+    "how-to/teach.md",
     "how-to/enrol.md",
     "how-to/look-at-sweeps-again.md",
     "how-to/align.md",

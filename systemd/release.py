@@ -24,7 +24,8 @@ from appliance import __version__
 from appliance.core import storage
 
 ROOT = Path(__file__).resolve().parent.parent
-LOCK = ROOT / "appliance" / "requirements.lock"
+LOCK, TEACH_LOCK = (ROOT / "appliance" / name for name in ("requirements.lock", "teach.lock"))
+"""Libraries of the box, and the same with those of teaching at the robot."""
 GLIBC = 36
 """Newest glibc, 2.36 of Debian 12, that a wheel may need."""
 
@@ -33,12 +34,12 @@ class ReleaseArchives:
     """The archives for the boxes, one for each architecture and Python version. Each is made when
     the first box needs it.
 
-    wheel: of Palpate. shares: files and folders of this checkout that are packed too. folder: where
-    the archives are written.
+    wheels: of Palpate, and of palpate-train if the boxes can be taught. shares: files and folders
+    of this checkout that are packed too. folder: where the archives are written.
     """
 
-    def __init__(self, wheel: Path, shares: Sequence[str], folder: Path) -> None:
-        self._wheel = wheel
+    def __init__(self, wheels: Sequence[Path], shares: Sequence[str], folder: Path) -> None:
+        self._wheels = wheels
         self._shares = [ROOT / name for name in shares if (ROOT / name).exists()]
         self._folder = folder
         self._lock = Lock()
@@ -52,12 +53,14 @@ class ReleaseArchives:
             return self._made[machine, python]
 
     def _make(self, machine: str, python: str) -> tuple[str, Path]:
-        lock = locked(LOCK.read_text(), python, machine)
+        libraries = TEACH_LOCK if len(self._wheels) > 1 else LOCK
+        lock = locked(libraries.read_text(), python, machine)
         content = hashlib.sha256(f"{python.rpartition('.')[0]}\n{lock}".encode())
-        with zipfile.ZipFile(self._wheel) as wheel:  # not the wheel's own bytes: they contain dates
-            content.update(
-                repr([(name, wheel.read(name)) for name in sorted(wheel.namelist())]).encode()
-            )
+        for one in self._wheels:
+            with zipfile.ZipFile(one) as wheel:  # not the wheel's own bytes: they contain dates
+                content.update(
+                    repr([(name, wheel.read(name)) for name in sorted(wheel.namelist())]).encode()
+                )
         for file in sorted(
             path for share in self._shares for path in (share, *share.rglob("*")) if path.is_file()
         ):
@@ -66,7 +69,7 @@ class ReleaseArchives:
         archive = self._folder / f"{name}-{machine}.tar"
         wheels = fetch(lock, python, machine)
         with tarfile.open(archive, "w") as tar:
-            for file in (*sorted(wheels.iterdir()), self._wheel):
+            for file in (*sorted(wheels.iterdir()), *self._wheels):
                 tar.add(file, f"wheels/{file.name}", filter=_plain)
             for share in self._shares:
                 tar.add(share, f"share/palpate/{share.name}", filter=_plain)

@@ -75,6 +75,7 @@ __all__ = [
     "MEANS",
     "MODEL",
     "SIGNATURE",
+    "TAUGHT_SIGNATURE",
     "AddedLabels",
     "Bundle",
     "Classes",
@@ -97,7 +98,14 @@ DEFAULT = Path(__file__).parents[1] / "default_bundle"
 MOST_SMALL = 1 << 20
 """Largest size in bytes of a manifest or a signature, whose sizes are not given elsewhere."""
 SIGNATURE, ENROLMENT_SIGNATURE = MANIFEST + ".sig", ENROLMENT + ".sig"
-OPTIONAL = {SIGNATURE: MOST_SMALL, ENROLMENT: MOST_BYTES, ENROLMENT_SIGNATURE: MOST_SMALL}
+TAUGHT_SIGNATURE = "taught.sig"
+"""Signature of the manifest by the box that has taught the bundle itself."""
+OPTIONAL = {
+    SIGNATURE: MOST_SMALL,
+    TAUGHT_SIGNATURE: MOST_SMALL,
+    ENROLMENT: MOST_BYTES,
+    ENROLMENT_SIGNATURE: MOST_SMALL,
+}
 """Files that a manifest does not name, with the largest size of each in bytes."""
 GOLDEN_TOLERANCE = 0.02
 """Largest allowed difference of a golden sweep's probability between export and this machine.

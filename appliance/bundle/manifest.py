@@ -202,6 +202,15 @@ class Manifest:
             )
         version(self.runtime)
 
+    @property
+    def taught(self) -> str:
+        """Who has taught the bundle on a box and when, in words; "" if a desktop has trained it."""
+        about = self.made.get("taught")
+        if not isinstance(about, dict):
+            return ""
+        by, at = (str(about.get(name, "?"))[:40] for name in ("by", "at"))
+        return f"taught here by {by}, {at} UTC by the box's clock"
+
     def json(self) -> bytes:
         """The bytes of manifest.json; equal manifests give equal bytes."""
         values = {FILE_KEYS.get(name, name): value for name, value in asdict(self).items()}

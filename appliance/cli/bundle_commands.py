@@ -13,8 +13,9 @@ from appliance.bundle import bundle
 from appliance.cli.common import load_settings, status_file
 from appliance.core.clock import SystemClock
 from appliance.core.errors import ApplianceError, BundleError
+from appliance.deployment.signed import PACKAGER
 from appliance.deployment.state import MOST_STARTS, PACKAGED, StoreState
-from appliance.deployment.store import PACKAGER, SHA, Store
+from appliance.deployment.store import SHA, Store
 from appliance.io.usb_sensor import fits
 from appliance.runtime import assembly
 from appliance.service import status

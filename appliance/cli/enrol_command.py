@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
     if args.out:
         enrolment.write(files, args.out, args.replace)
     else:
-        assembly.store(settings).enrol(files)
+        assembly.store(settings).learn(files)
     m = new.bundle.manifest
     use = f"palpate bundles install {args.out}" if key else "classifier.bundle; it is not signed"
     how = (

@@ -24,6 +24,7 @@ COMMANDS: Mapping[str, str] = {
     "replay": "cli.look_commands.run_replay",
     "config": "cli.look_commands.run_config",
     "record": "cli.record_command.run",
+    "teach": "cli.teach_command.run",
     "enrol": "cli.enrol_command.run",
     "bundles": "cli.bundle_commands.run",
     "skin": "cli.skin_commands.run",

@@ -40,6 +40,7 @@ MENU = Menu(
         },
         "record and learn": {
             "record": "keep each sweep with its label, for training; needs no bundle",
+            "teach": "learn materials from sweeps beside the robot, without a desktop",
             "enrol": "learn one more material from a few sweeps, without training",
         },
         "bundles": {
@@ -68,7 +69,8 @@ SKIN_ACTIONS = {
     "show": "show the skin live: heat map, rate, noise, dead and stuck taxels",
     "new": "listen to a skin without a profile, propose one and write it; sends nothing",
 }
-WEB_PORT = 8137
+WEB_PORT, TEACH_PORT = 8137, 8138
+"""Default ports of pages. Both pages can be served side by side."""
 MOST_SWEEPS = 10
 """Most sweeps for an enrolment; a mean of more would hardly be better."""
 
@@ -130,8 +132,8 @@ def _skin_port(add: Callable[..., argparse.Action], text: str = "") -> None:
     add("--port", dest="skin_port", metavar="PATH", help=text)
 
 
-def _web(add: Callable[..., argparse.Action], text: str) -> None:
-    add("--web", nargs="?", const=WEB_PORT, type=int, metavar="PORT", help=text)
+def _web(add: Callable[..., argparse.Action], text: str, port: int = WEB_PORT) -> None:
+    add("--web", nargs="?", const=port, type=int, metavar="PORT", help=text)
 
 
 def _answers(command: argparse.ArgumentParser) -> None:
@@ -309,6 +311,55 @@ def _labels(command: CommandParser) -> None:
         )
 
 
+def _places(add: Callable[..., argparse.Action]) -> None:
+    add("--position", default="1", metavar="TEXT", help="place on the object (default 1)")
+    add(
+        "--session", default="", metavar="TEXT", help="name of the session, if the skin is put back"
+    )
+
+
+def _teach(command: CommandParser) -> None:
+    _devices(command.add_argument)
+    _skin_port(command.add_argument)
+    _trigger(command)
+    _capture(command)
+    add = command.add_argument
+    add(
+        "--label",
+        action="append",
+        default=[],
+        metavar="NAME",
+        dest="labels",
+        help="record sweeps of this material; may be repeated, then one after another",
+    )
+    add(
+        "--sweeps",
+        type=_count,
+        default=8,
+        dest="good",
+        metavar="N",
+        help="number of good sweeps of each --label (default 8)",
+    )
+    _places(add)
+    add("--format", metavar="RxC:TYPE:HZ", help="format of the skin, as for record")
+    add(
+        "--window",
+        type=partial(_seconds, least=0.01),
+        metavar="S",
+        help="seconds of each sweep that are learnt (default 2)",
+    )
+    add(
+        "--use",
+        action="store_true",
+        help="make a bundle of all sweeps, after those of --label; it runs on trial",
+    )
+    add("--forget", metavar="NAME", help="teach the sweeps of this material no longer; they stay")
+    add("--by", default="", metavar="NAME", help="who teaches, for the bundle (default: this user)")
+    add("--json", action="store_true", help="with --use alone: print its steps as JSON")
+    _web(add, f"also as a page, for a person at the robot (default port {TEACH_PORT})", TEACH_PORT)
+    command.set_defaults(sweeps=None)
+
+
 def _enrol(command: CommandParser) -> None:
     _devices(command.add_argument)
     _skin_port(command.add_argument)
@@ -408,6 +459,7 @@ _ARGUMENTS: Mapping[str, Callable[[CommandParser], None]] = {
     "align": _align,
     "replay": _replay,
     "record": _record,
+    "teach": _teach,
     "enrol": _enrol,
     "bundles": _bundles,
     "skin": _skin,

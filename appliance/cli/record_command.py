@@ -36,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
     labels = Labels(args.material, args.position, args.session)
     settings, stopped = load_settings(args), StopFlag()
     with ExitStack() as stack:
-        devices, format = _skin(args, settings)
+        devices, format = open_skin(args, settings)
         # a person at a terminal reads the log; sentences are for a robot, or for a program that
         # reads the output
         sentences = settings.serial.port or not sys.stdout.isatty()
@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
     return stopped.exit_code
 
 
-def _skin(args: argparse.Namespace, settings: Config) -> tuple[Devices, SweepFormat]:
+def open_skin(args: argparse.Namespace, settings: Config) -> tuple[Devices, SweepFormat]:
     """The devices, and the format of the recorded sweeps. Raises ConfigError if no sweep can be as
     long as the window."""
     asked = skins.described(args.format) if args.format else None

@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from appliance.bundle.bundle import Bundle
+from appliance.bundle.bundle import DEFAULT, Bundle
 from appliance.cli.common import Facts, StopFlag, load_bundle, load_settings
 from appliance.cli.devices import open_devices
 from appliance.cli.reporting import capture, done, feed, status
@@ -20,24 +20,30 @@ from appliance.core.errors import ApplianceError
 from appliance.core.log import in_journal, log
 from appliance.core.observer import Observer
 from appliance.io import skins
+from appliance.io.usb_sensor import fits
 from appliance.runtime import assembly
 from appliance.service import ended
 from appliance.service.systemd import Notifier, VerdictLog
 
 if TYPE_CHECKING:
     from appliance.deployment.shadow import Shadow
+    from appliance.deployment.store import Choice
 
 
 def run(args: argparse.Namespace) -> int:
     """Classify sweeps until SIGTERM, or with --sim until all sweeps of the script are answered."""
     settings = load_settings(args)
     with ended.noted(None if args.sim else settings.store.runtime_folder, SystemClock()):
-        return _classify(args, settings)
+        choice = None if settings.classifier.bundle else assembly.store(settings).choose()
+        if choice and choice.folder == DEFAULT and untaught(args, settings, choice.bundle):
+            from appliance.cli import teach_command  # here: a box in service does without it
+
+            return teach_command.until_taught(args, settings)
+        return _classify(args, settings, choice)
 
 
-def _classify(args: argparse.Namespace, settings: Config) -> int:
+def _classify(args: argparse.Namespace, settings: Config, choice: Choice | None) -> int:
     stopped = StopFlag()
-    choice = None if settings.classifier.bundle else assembly.store(settings).choose()
     with ExitStack() as stack:
         trial = stack.enter_context(choice.trial) if choice and choice.trial else None
         current = choice.bundle if choice else load_bundle(settings, answers=not args.sim)
@@ -76,6 +82,18 @@ def _classify(args: argparse.Namespace, settings: Config) -> int:
     return stopped.exit_code
 
 
+def untaught(args: argparse.Namespace, settings: Config, packaged: Bundle) -> bool:
+    """Whether there is no bundle for the skin: none was delivered or taught, and the packaged one
+    is for another skin. A skin of PROTOCOL.md announces its format later, so it does not count."""
+    profile = skins.profile(settings)
+    return (
+        not args.sim
+        and settings.teach.allow
+        and profile.codec != "palpate"
+        and not fits(profile.format, packaged.format)
+    )
+
+
 def _reports(
     settings: Config,
     current: Bundle,
@@ -97,7 +115,7 @@ def _reports(
         stack.callback(black_box.close)
         observers.append(black_box)
     m = current.manifest
-    model = f"{m.name} {m.version}, {len(m.labels)} labels"
+    model = f"{m.name} {m.version}, {len(m.labels)} labels{f', {m.taught}' if m.taught else ''}"
     facts = {"model": lambda: model, **facts}
     from appliance.alignment.live import Expected
 

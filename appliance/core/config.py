@@ -245,6 +245,21 @@ class WatchConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class TeachConfig:
+    """Teaching at the robot (`palpate teach`).
+
+    allow: whether this box may learn materials by itself, and run a bundle that it has taught.
+    serial: whether the robot may teach it,
+    by the commands TEACH, USE and FORGET of the serial line.
+    """
+
+    allow: bool = True
+    serial: bool = False
+    memory_mb: int = fixed(768)  # most private memory of the process that learns
+    limit_s: float = fixed(900.0)  # longest time that it may take
+
+
+@dataclass(frozen=True, slots=True)
 class BridgeConfig:
     """`palpate bridge` on the box; its options override these values.
 
@@ -271,6 +286,7 @@ class Config:
     classifier: ClassifierConfig
     store: StoreConfig
     watch: WatchConfig
+    teach: TeachConfig
     bridge: BridgeConfig
     sources: Mapping[str, str] = field(compare=False)
     folder: Path = field(default=SITE.parent, compare=False)

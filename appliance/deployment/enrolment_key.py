@@ -1,8 +1,8 @@
-"""The key with which a box signs the labels that it enrolled itself.
+"""The key with which a box signs what it has learnt itself: enrolled labels, and taught bundles.
 
 `make install` makes the key's folder. `key` is the private key, which only the user palpate may
 read. `signer` is the public key, a line of a file of signers that belongs to root. Signatures have
-a namespace of their own, so they are not valid for bundles.
+namespaces of their own, so they are not valid for delivered bundles, nor one kind for the other.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ from pathlib import Path
 from appliance.core.errors import BundleError, ConfigError
 from appliance.deployment import signature
 
-NAMESPACE = "palpate-enrolment"
+NAMESPACE, TAUGHT = "palpate-enrolment", "palpate-taught"
+"""Namespaces of enrolled labels, and of bundles that the box has taught."""
 KEY, SIGNER = "key", "signer"
 OTHERS = 0o077
 """Permission bits that a private key must not have."""
@@ -26,17 +27,23 @@ class EnrolmentKey:
 
     folder: Path
 
-    def check(self) -> None:
-        """Raises ConfigError unless this user can sign an enrolment that this box accepts."""
+    def check(self, namespace: str = NAMESPACE) -> None:
+        """Raises ConfigError unless this user can sign an enrolment, or what the namespace is for,
+        so that this box accepts it."""
         try:
-            self.verify(PROBE, self.sign(PROBE))
+            self.verify(PROBE, self.sign(PROBE, namespace), namespace)
         except BundleError as e:
+            if namespace == TAUGHT:
+                raise ConfigError(
+                    f"{self.folder / SIGNER} does not admit taught bundles; run make install, "
+                    "which adds that"
+                ) from e
             raise ConfigError(
                 f"{self.folder / KEY} is not the key of {self.folder / SIGNER}; remove both and "
                 "run make install again: then enrol all labels again"
             ) from e
 
-    def sign(self, data: bytes) -> bytes:
+    def sign(self, data: bytes, namespace: str = NAMESPACE) -> bytes:
         """The signature of an enrolment. Raises ConfigError if the key is missing, damaged or not
         private."""
         path = self.folder / KEY
@@ -55,7 +62,7 @@ class EnrolmentKey:
                 "and run make install again"
             )
         try:
-            return signature.sign(data, path, NAMESPACE, interactive=False)
+            return signature.sign(data, path, namespace, interactive=False)
         except ConfigError as e:
             if "does not sign" not in str(e):
                 raise  # ssh-keygen itself is missing or hangs
@@ -64,13 +71,19 @@ class EnrolmentKey:
                 "again"
             ) from e
 
-    def verify(self, data: bytes, signed: bytes) -> None:
-        """Raises BundleError if this box did not sign `data` as an enrolment, ConfigError if that
+    def verify(self, data: bytes, signed: bytes, namespace: str = NAMESPACE) -> None:
+        """Raises BundleError if this box did not sign `data` in the namespace, ConfigError if that
         cannot be checked."""
         signer = self.folder / SIGNER
         try:
-            signature.verify(data, signed, signer, NAMESPACE)
+            signature.verify(data, signed, signer, namespace)
         except BundleError as e:
+            if namespace == TAUGHT:
+                raise BundleError(
+                    "the bundle was not taught on this box, or altered since "
+                    f"({e.args[0].partition(';')[0]}); teach it here (palpate teach), or sign it "
+                    "on a desktop (palpate-train sign)"
+                ) from e
             raise BundleError(
                 "the labels were not enrolled on this box, or altered since "
                 f"({e.args[0].partition(';')[0]}); enrol them here (palpate enrol)"

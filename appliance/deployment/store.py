@@ -22,24 +22,21 @@ from __future__ import annotations
 import fcntl
 import os
 import re
-import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from appliance import __version__
 from appliance.bundle import bundle
 from appliance.bundle.bundle import Bundle
-from appliance.bundle.manifest import version
 from appliance.core import storage
 from appliance.core.clock import Clock, SystemClock
 from appliance.core.config import StoreConfig
 from appliance.core.errors import ApplianceError, BundleError, ConfigError, TemporaryError
 from appliance.core.log import log
-from appliance.deployment import signature
 from appliance.deployment.enrolment_key import EnrolmentKey
 from appliance.deployment.sandbox import run_limited
+from appliance.deployment.signed import PACKAGER, BundleFolder, SignedBundle
 from appliance.deployment.state import (
     MOST_CUTS,
     MOST_STARTS,
@@ -53,119 +50,9 @@ from appliance.deployment.trial import Trial
 BOOT = Path("/proc/sys/kernel/random/boot_id")
 """The kernel's id of this boot (random(4))."""
 SHA = re.compile(r"[0-9a-f]{64}")
-PACKAGER = "palpate"
-"""Name of the signer that is shown for the packaged bundle."""
-INCOMPLETE = "."
-"""First character of a folder's name while the folder is written or removed."""
 LOCK_S, STEP_NS = 10.0, 20_000_000
 """Longest wait for another command, which makes several fsyncs on a slow card; and the time between
 two attempts."""
-
-
-@dataclass(frozen=True, slots=True)
-class SignedBundle:
-    """A bundle with its signer and the checked bytes of its files."""
-
-    bundle: Bundle
-    signer: str
-    files: Mapping[str, bytes]
-
-    @property
-    def sha(self) -> str:
-        """The bundle's name in the store."""
-        return bundle.name(self.files)
-
-    @property
-    def base(self) -> str:
-        """The sha256 of the manifest, which is the name of the bundle without enrolled labels."""
-        return self.bundle.base
-
-
-class BundleFolder:
-    """Complete, verified bundles in `folder`, each under its name.
-
-    signers: the file of trusted signers. key: this box's key for labels that it enrolled.
-    """
-
-    def __init__(self, folder: Path, signers: Path, key: EnrolmentKey) -> None:
-        self.folder, self._signers, self._key = folder, signers, key
-
-    def at(self, sha: str) -> Path:
-        """The folder of the bundle `sha`."""
-        return self.folder / sha
-
-    def read(self, folder: Path) -> SignedBundle:
-        """The bundle in any `folder`, checked but not run. Raises BundleError, and ConfigError as
-        signature.verify."""
-        return self.checked(bundle.files(folder), folder)
-
-    def checked(self, files: Mapping[str, bytes], folder: Path) -> SignedBundle:
-        """The bundle of `files`, which were read in `folder`. Raises as `read`."""
-        signer = self._signer(files, folder)
-        loaded = bundle.from_files(files, str(folder))
-        if version(loaded.manifest.runtime) > version(__version__):
-            raise BundleError(
-                f"bundle needs palpate {loaded.manifest.runtime} and this is {__version__}; update "
-                "the box (make install)"
-            )
-        return SignedBundle(loaded, signer, files)
-
-    def _signer(self, files: Mapping[str, bytes], folder: Path) -> str:
-        """The signer. Enrolled labels need the signature of this box. The bundle that they were
-        enrolled into is signed, or is the packaged bundle, which is trusted like the program."""
-        enrolled = bundle.ENROLMENT in files
-        if enrolled:
-            if bundle.ENROLMENT_SIGNATURE not in files:
-                raise BundleError(
-                    f"{folder}: {bundle.ENROLMENT} is not signed; enrol again on this box "
-                    "(palpate enrol)"
-                )
-            self._key.verify(files[bundle.ENROLMENT], files[bundle.ENROLMENT_SIGNATURE])
-        if bundle.SIGNATURE in files:
-            signer = signature.verify(
-                files[bundle.MANIFEST], files[bundle.SIGNATURE], self._signers
-            )
-        elif not enrolled:
-            raise BundleError(f"{folder} is not signed; sign the bundle (palpate-train sign)")
-        elif files[bundle.MANIFEST] != (bundle.DEFAULT / bundle.MANIFEST).read_bytes():
-            raise BundleError(
-                f"{folder}: the bundle that {bundle.ENROLMENT} adds labels to is not signed, and "
-                "is not the packaged bundle of this version; enrol again"
-            )
-        else:
-            signer = PACKAGER
-        return f"{signer}, enrolled here" if enrolled else signer
-
-    def get(self, sha: str) -> SignedBundle:
-        """The bundle `sha`, checked again. Raises BundleError if its folder holds another
-        bundle."""
-        signed = self.read(self.at(sha))
-        if signed.sha != sha:
-            raise BundleError(
-                f"{self.at(sha)} holds another bundle, {signed.bundle.id}; deploy the right one "
-                "again"
-            )
-        return signed
-
-    def put(self, signed: SignedBundle) -> None:
-        """Write a bundle, completely or not at all. Raises OSError."""
-        folder = self.at(signed.sha)
-        if folder.exists() and _holds(folder, signed.files):
-            storage.sync(self.folder)  # the program that renamed it may have been killed before
-            return
-        with storage.folder(folder) as new:
-            for name, data in signed.files.items():
-                (new / name).write_bytes(data)
-
-    def keep(self, *kept: str) -> None:
-        """Remove all other bundles and incomplete folders. A bundle is renamed before its files are
-        removed."""
-        for folder in sorted(self.folder.iterdir()):  # incomplete ones first
-            if folder.name in kept:
-                continue
-            if not folder.name.startswith(INCOMPLETE):
-                folder = folder.rename(folder.with_name(INCOMPLETE + folder.name))
-            shutil.rmtree(folder)
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,9 +68,9 @@ class Store:
     """The bundles on this box, and the choice of the bundle that runs.
 
     prove: raises if a bundle fails its golden sweeps on this machine or does not fit the settings.
-    boot: the file with the id of this boot. The methods raise OSError for trouble with the disk,
-    BundleError for a bundle that must not run, ConfigError if the settings have no trusted signers,
-    and ApplianceError if another command holds the lock.
+    boot: the file with the id of this boot. taught: as in BundleFolder. The methods raise OSError
+    for trouble with the disk, BundleError for a bundle that must not run, ConfigError if the
+    settings have no trusted signers, and ApplianceError if another command holds the lock.
     """
 
     def __init__(
@@ -192,10 +79,12 @@ class Store:
         prove: Callable[[Bundle], object],
         clock: Clock | None = None,
         boot: Path = BOOT,
+        *,
+        taught: bool = True,
     ) -> None:
         self.settings, self.folder, self._prove = settings, Path(settings.folder), prove
         key = EnrolmentKey(settings.enrolment_key)
-        self.bundles = BundleFolder(self.folder / "bundles", settings.signers, key)
+        self.bundles = BundleFolder(self.folder / "bundles", settings.signers, key, taught=taught)
         self._link, self._state_file = self.folder / "current", self.folder / STATE_FILE
         self._old_state_file = self.folder / OLD_STATE_FILE
         self._clock, self._boot_file = clock or SystemClock(), boot
@@ -261,9 +150,9 @@ class Store:
         """
         return self._install(self.examine(incoming), shadow, admit)
 
-    def enrol(self, files: Mapping[str, bytes]) -> str:
-        """Install, as `install`, the files of a bundle into which this box has enrolled a label.
-        Returns its name."""
+    def learn(self, files: Mapping[str, bytes]) -> str:
+        """Install, as `install`, the files of a bundle that this box has taught, or into which it
+        has enrolled a label. Returns its name."""
         return self._install(self._proven(self.bundles.checked(files, self.folder)))
 
     def _install(
@@ -456,7 +345,10 @@ class Store:
 
     def _admit(self, signed: SignedBundle, state: StoreState) -> None:
         """Raises BundleError if the bundle is older than a committed bundle. The current bundle
-        with other enrolled labels is always accepted."""
+        with other enrolled labels is always accepted, and so is a bundle that was taught here: it
+        has no counter."""
+        if signed.taught:
+            return
         with suppress(BundleError, ConfigError):  # a damaged current bundle may be replaced
             running = self.running()
             if signed.base == running.base and (signed.bundle.added or running.bundle.added):
@@ -500,13 +392,6 @@ class Store:
             yield self.state
         finally:
             os.close(folder)
-
-
-def _holds(folder: Path, files: Mapping[str, bytes]) -> bool:
-    try:
-        return bundle.files(folder) == files
-    except BundleError:
-        return False
 
 
 def _try_lock(folder: int) -> bool:

@@ -41,8 +41,11 @@ COMMANDS = (
     "SESSION",
     "NEXT",
     "DISCARD",
+    "TEACH",
+    "USE",
+    "FORGET",
 )
-TEXT_COMMANDS = ("LABEL", "MATERIAL", "POSITION", "SESSION")
+TEXT_COMMANDS = ("LABEL", "MATERIAL", "POSITION", "SESSION", "TEACH", "FORGET")
 """The commands that need a text after a comma. START may have one: speed and force of the slide."""
 OWN = ("RES", "STA", "ANS", "REC")
 """Kinds of sentences that the box sends. A line that sends them back, an echo, must not be

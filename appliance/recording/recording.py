@@ -10,7 +10,7 @@ import errno
 import fcntl
 import os
 import re
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
@@ -181,6 +181,7 @@ class RecordingSession(Observer):
                 f"--out {folder}: {e.strerror}; name a folder that can be written"
             ) from e
         self._progress = RecordingProgress(target)
+        self._materials: dict[int, str] = {}  # of each sweep in the folder that can be trained on
         self._count_earlier(format)
         self._clock, self._say = clock, say
         # (valid from, labels): a command during a sweep does not apply to that sweep
@@ -201,6 +202,21 @@ class RecordingSession(Observer):
     def stored(self) -> int:
         """Number of stored sweeps of this run."""
         return len(self._stored)
+
+    @property
+    def last(self) -> int:
+        """The highest number of a sweep that is used in the folder."""
+        return max([self._folder.run, *self._folder.numbers])
+
+    def materials(self, forgotten: Mapping[str, int]) -> dict[str, int]:
+        """The number of sweeps in the folder of each material, without those up to the number in
+        `forgotten`."""
+        kept = (
+            name
+            for number, name in sorted(self._materials.items())
+            if name and number > forgotten.get(name, -1)
+        )
+        return dict(Counter(kept))
 
     def about(self) -> dict[str, Any]:
         """The progress of the recording, for JSON.
@@ -283,11 +299,12 @@ class RecordingSession(Observer):
                     f"{path} has another format than {format}, and a model is trained on one "
                     "format; name another folder with --out"
                 )
-            self._count(labels, status)
+            self._count(number, labels, status)
 
-    def _count(self, labels: Labels, status: Status, sweeps: int = 1) -> None:
+    def _count(self, number: int, labels: Labels, status: Status) -> None:
         if not status.faulty:  # a faulty sweep is not used in training
-            self._progress.add(labels.material, labels.position, sweeps)
+            self._progress.add(labels.material, labels.position)
+            self._materials[number] = labels.material
 
     def _tell(self, verdict: Verdict, outcome: str, labels: Labels) -> None:
         """Log the outcome of a sweep, for a person beside the robot and a person at a terminal."""
@@ -318,7 +335,7 @@ class RecordingSession(Observer):
     def _count_stored(self, number: int, labels: Labels, status: Status) -> str:
         """Count a stored sweep; its file's name with remarks, for a person."""
         self._stored.append((number, labels, status))
-        self._count(labels, status)
+        self._count(number, labels, status)
         fault = f" {status}" if status.faulty else ""
         return self._folder.path(number).stem + fault + " no material" * (not labels.material)
 
@@ -346,7 +363,7 @@ class RecordingSession(Observer):
             raise ApplianceError("a sweep is still being written; wait for its REC sentence")
         if not self._stored:
             raise ApplianceError("no sweep of this run is left to discard")
-        number, labels, status = self._stored[-1]
+        number, labels, _ = self._stored[-1]
         if which and which != str(number - self._folder.run):
             raise ApplianceError(
                 f"the last stored sweep is {number - self._folder.run}, not {which}; "
@@ -359,7 +376,8 @@ class RecordingSession(Observer):
                 f"sweep {number - self._folder.run} cannot be discarded: {e.strerror}"
             ) from e
         self._stored.pop()
-        self._count(labels, status, -1)
+        if self._materials.pop(number, None) is not None:
+            self._progress.add(labels.material, labels.position, -1)
         if self._last and self._last["sweep"] == number - self._folder.run:
             self._last["outcome"] = "discarded"
         return [number - self._folder.run, self.stored, self._folder.path(number).stem]

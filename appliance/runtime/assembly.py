@@ -3,7 +3,7 @@ imported here."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -19,7 +19,8 @@ from appliance.core.errors import ApplianceError, ConfigError, FormatError
 from appliance.core.log import in_journal, log
 from appliance.core.observer import Observer
 from appliance.core.types import SweepFormat
-from appliance.deployment.store import SignedBundle, Store
+from appliance.deployment.signed import SignedBundle
+from appliance.deployment.store import Store
 from appliance.inference.classifier import Classifier
 from appliance.inference.early_exit import EarlyExit
 from appliance.io import skins
@@ -38,7 +39,7 @@ from appliance.io.verdict_lines import LineSink, check_bits
 from appliance.recording.capture import CaptureWriter
 from appliance.recording.sweep_check import SweepCheck
 from appliance.recording.sweep_window import SweepCutter
-from appliance.runtime.loop import Answerer, Box, CommandHandler, Pipeline
+from appliance.runtime.loop import Answerer, Box, CommandHandler, Panel, Pipeline
 
 UNSIGNED = (
     "bundles are allowed: classifier.allow_unsigned = true; remove it from the settings once the "
@@ -46,6 +47,18 @@ UNSIGNED = (
 )
 """Warning text, after the word "unsigned", shown while classifier.allow_unsigned is set."""
 NO_COMMANDS: Mapping[str, CommandHandler] = MappingProxyType({})
+
+
+class NotServing:
+    """The GPIO lines of a box without a bundle: READY stays low, since no sweep gets an answer that
+    a robot could use."""
+
+    def __init__(self, lines: Panel) -> None:
+        self._lines = lines
+
+    def show(self, *, ready: bool, busy: bool, fault: bool, decided: bool = False) -> None:
+        """Drive the lines; `ready` is ignored."""
+        self._lines.show(ready=False, busy=busy, fault=fault, decided=decided)
 
 
 def box(
@@ -58,11 +71,14 @@ def box(
     capture: CaptureWriter | None = None,
     observers: Iterable[Observer] = (),
     labels: tuple[str, ...] = (),
+    commands: Mapping[str, CommandHandler] = NO_COMMANDS,
+    ordered: bool = False,
+    announce: Callable[[str], object] = log.info,
 ) -> Box:
     """The box that classifies; `stack` closes it again.
 
     capture: records all inputs. labels: labels that the class bits must hold in addition to the
-    bundle's.
+    bundle's. commands, ordered, announce: as for `recorder`.
     """
     run = classifier(settings, bundle, devices.clock)
     run.self_test()
@@ -74,9 +90,11 @@ def box(
         stack,
         capture,
         [run, *observers],
-        NO_COMMANDS,
+        commands,
         codes=(*bundle.manifest.labels, *labels),
         early=early_exit(settings, run),
+        ordered=ordered,
+        announce=announce,
     )
 
 
@@ -91,10 +109,14 @@ def recorder(
     observers: Iterable[Observer] = (),
     commands: Mapping[str, CommandHandler] = NO_COMMANDS,
     ordered: bool = False,
+    serving: bool = True,
+    announce: Callable[[str], object] = log.info,
 ) -> Box:
     """The box that records sweeps of a format and needs no bundle; the class bits stay 0.
 
-    ordered: commands also come from another source than the port. Other parameters as for `box`.
+    ordered: commands also come from another source than the port. serving: whether READY may rise.
+    announce: called with what a trigger without lines has to say to a person. Other parameters as
+    for `box`.
     """
     check = SweepCheck(format, devices.clock)
     watching = [check, *observers]
@@ -108,6 +130,8 @@ def recorder(
         watching,
         commands,
         ordered=ordered,
+        serving=serving,
+        announce=announce,
     )
 
 
@@ -124,15 +148,15 @@ def _assembled(
     codes: tuple[str, ...] = (),
     early: EarlyExit | None = None,
     ordered: bool = False,
+    serving: bool = True,
+    announce: Callable[[str], object] = log.info,
 ) -> Box:
     """Put the components together. codes: number of labels that the class bits hold."""
-    watching = [*observers, *([capture] if capture else [])]
     commands = {**commands, "LABEL": partial(_label, codes)}
-    trigger = _trigger(settings.trigger, answerer.format, devices, port, stack, ordered=ordered)
-    if isinstance(trigger, KeyTrigger):
-        watching.append(AnswerWatch(trigger))
-    if isinstance(trigger, TimedTrigger):
-        watching.append(StreamWatch(trigger))
+    trigger = _trigger(
+        settings.trigger, answerer.format, devices, port, stack, announce, ordered=ordered
+    )
+    watching = [*observers, *([capture] if capture else []), *_watches(trigger)]
     if isinstance(trigger, CommandTrigger):
         commands = {**commands, **trigger.commands}
     lines = _outputs(settings, devices, stack)
@@ -147,12 +171,19 @@ def _assembled(
         Pipeline(sensor, trigger, cutter, answerer, early),
         devices.clock,
         port=port,
-        panel=lines,
+        panel=lines if serving or lines is None else NotServing(lines),
         observers=watching,
         commands=commands,
         source=devices.source,
         state_s=settings.serial.state_s,
     )
+
+
+def _watches(trigger: Trigger) -> list[Observer]:
+    """The observers that a trigger without lines needs."""
+    if isinstance(trigger, KeyTrigger):
+        return [AnswerWatch(trigger)]
+    return [StreamWatch(trigger)] if isinstance(trigger, TimedTrigger) else []
 
 
 def _trigger(
@@ -161,6 +192,7 @@ def _trigger(
     devices: Devices,
     port: Port | None,
     stack: ExitStack,
+    announce: Callable[[str], object],
     *,
     ordered: bool,
 ) -> Trigger:
@@ -174,7 +206,7 @@ def _trigger(
             )
         return CommandTrigger(devices.clock, devices.commanded)
     if config.mode == "key":
-        return stack.enter_context(KeyTrigger(standard_input(), devices.clock, log.info))
+        return stack.enter_context(KeyTrigger(standard_input(), devices.clock, announce))
     if config.mode == "timed":
         window_s = format.window / format.rate_hz
         if config.sweep_s < window_s:
@@ -182,7 +214,7 @@ def _trigger(
                 f"a sweep of {config.sweep_s:g} s is shorter than the window of {window_s:g} s; "
                 "use a longer --sweep"
             )
-        return TimedTrigger(config, devices.clock, log.info)
+        return TimedTrigger(config, devices.clock, announce)
     missing = next((k for k in ("start", "stop") if not getattr(config, k)), None)
     if missing == "start" or (missing and config.mode == "two-lines"):
         raise ConfigError(
@@ -250,7 +282,9 @@ def prove(settings: Config, bundle: Bundle) -> None:
 
 def store(settings: Config) -> Store:
     """The store of bundles that the settings name."""
-    return Store(settings.store, lambda bundle: prove(settings, bundle))
+    return Store(
+        settings.store, lambda bundle: prove(settings, bundle), taught=settings.teach.allow
+    )
 
 
 def running(settings: Config, *, answers: bool = True) -> SignedBundle:

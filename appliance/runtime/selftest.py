@@ -65,6 +65,7 @@ def check(
         )
         return (
             f"{m.name} {m.version}, {loaded[0].id}, {m.format}, {len(m.labels)} labels{enrolled}; "
+            + (f"{m.taught}; " if m.taught else "")
             + (f"{m.bridging.text} bridged" if m.bridging else UNPROVEN)
             + (f"; {UNCHECKED}" if m.early and not m.early.limits else "")
         )

@@ -32,6 +32,8 @@ MOST_WAITING = 16
 PERIOD_NS = 1_000_000_000
 """Time between two states of the recording without changes."""
 LABELS = tuple(name.upper() for name in Labels.__slots__)
+TEACHING, MATERIALS = ("TEACH", "USE", "FORGET", "DONE"), ("TEACH", "FORGET")
+"""Commands of a page that teaches, and those of them with the name of a material."""
 TRIGGERS = {
     "two-lines": "the robot's lines START and STOP",
     "one-line": "the robot's line START",
@@ -62,8 +64,9 @@ def order(body: bytes, allowed: Sequence[str]) -> Command:
             f"unknown order; the commands are {' '.join(allowed)}, each with a text or none"
         )
     text = text.strip()
-    if name in LABELS:
-        Labels(**{name.lower(): text})  # before a capture records the order
+    if name in (*LABELS, *MATERIALS):
+        field = "material" if name in MATERIALS else name.lower()
+        Labels(**{field: text})  # before a capture records the order
     elif text and not (name == "DISCARD" and text.isascii() and text.isdecimal()):
         raise FormatError(
             f"{name} takes no text, but for DISCARD the number of a sweep; leave it out"
@@ -119,8 +122,8 @@ class RecordPage(Observer):
 
     format: of the sweeps. source: of the frames. trigger: its settings. about: see
     RecordingSession.about. obey: carries out the orders of the page, in the loop's thread. clock:
-    the host's real clock. unit: of the skin's profile. Raises ConfigError if the address cannot be
-    used.
+    the host's real clock. unit: of the skin's profile. teaching: it is the page of `palpate teach`.
+    Raises ConfigError if the address cannot be used.
     """
 
     def __init__(
@@ -133,16 +136,14 @@ class RecordPage(Observer):
         obey: Obey,
         clock: Clock,
         unit: str = "",
+        *,
+        teaching: bool = False,
     ) -> None:
         self._about, self._obey, self._clock = about, obey, clock
         self._tracker = ContactTracker(Expected(format, unit=unit), source)
         self._rate_hz = format.rate_hz
-        self._commands = (
-            *LABELS,
-            "NEXT",
-            "DISCARD",
-            *(("START", "STOP") if trigger.mode == "serial" else ()),
-        )
+        by_page = ("START", "STOP") if trigger.mode == "serial" else ()
+        self._commands = (*LABELS, "NEXT", "DISCARD", *by_page, *(TEACHING if teaching else ()))
         self._known = {
             "source": source,
             "format": str(format),
@@ -156,7 +157,12 @@ class RecordPage(Observer):
         self._state: tuple[object, ...] = ()
         self._state_ns = self._view_ns = clock.now_ns()
         self.server = PageServer(
-            "record.html", access, clock.now_ns, {}, {"sweep": self._shown}, self._ordered
+            f"{'teach' if teaching else 'record'}.html",
+            access,
+            clock.now_ns,
+            {},
+            {"sweep": self._shown},
+            self._ordered,
         )
 
     def __enter__(self) -> Self:
@@ -183,6 +189,8 @@ class RecordPage(Observer):
                 "sweep": sweep.id,
                 "time_ns": self._clock.now_ns(),
                 "status": verdict.status,
+                "label": verdict.label,
+                "probability": round(verdict.probability, 4),
                 "signal": bool(self._window),
                 "reason": REASONS.get(verdict.status, ""),
                 "detail": verdict.detail,

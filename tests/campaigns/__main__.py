@@ -172,6 +172,10 @@ CAMPAIGNS = {
         _module("tests.campaigns.full_load", "--minutes", "60", "--page", "docs/faults.md"),
         prepare=skin_bundles,
     ),
+    "taught": Campaign(
+        "compare taught bundles with palpate-train fit at 5, 10 and 20 sweeps (half an hour)",
+        _module("tests.campaigns.taught"),
+    ),
     "fuzz": Campaign(
         "fuzz all parsers of outside bytes; the options name targets and --minutes of each",
         _module("tests.fuzz", "--minutes", "10"),

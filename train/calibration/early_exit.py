@@ -12,11 +12,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
+from scipy import linalg
 
 from appliance.bundle.bundle import Early, EarlyClasses
 from appliance.inference.novelty import EarlyDistances
-from train.calibration.novelty import embed_present, limit, parts
+from train.calibration.heads import shrinkage
+from train.calibration.novelty import centred, embed_present, limit, parts
 from train.metrics.temperature import sufficient_temperature
 
 Array = NDArray[Any]
@@ -113,18 +114,28 @@ def lda(x: Array, labels: Array, classes: int) -> tuple[Array, Array]:
     without a sweep as in `heads`."""
     present = np.unique(labels)
     weight, bias = np.zeros((x.shape[1], classes), np.float32), np.full(classes, ABSENT, np.float32)
-    prior = np.full(len(present), 1 / len(present))
-    fitted = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto", priors=prior).fit(
-        x, labels
-    )
-    coefficients, intercepts = fitted.coef_, fitted.intercept_
-    if len(present) == 2:  # of two labels scikit-learn gives only the difference
-        coefficients, intercepts = (
-            np.vstack([0 * coefficients, coefficients]),
-            np.append(0, intercepts),
-        )
+    own = [x[labels == label] for label in present]
+    means = np.stack([sweeps.mean(axis=0) for sweeps in own])
+    covariance = np.mean([_covariance(sweeps) for sweeps in own], axis=0)
+    coefficients = linalg.lstsq(covariance, means.T)[0].T
+    intercepts = -0.5 * (means * coefficients).sum(axis=1) - np.log(len(present))
+    if len(present) == 2:  # only the difference counts
+        coefficients[1] -= coefficients[0]
+        intercepts[1] -= intercepts[0]
+        coefficients[0], intercepts[0] = 0, 0
     weight[:, present], bias[present] = coefficients.T, intercepts
     return weight, bias
+
+
+def _covariance(x: Array) -> Array:
+    """Ledoit and Wolf's covariance [F, F] of the sweeps of one material [n, F], shrunk at the same
+    spread of all features."""
+    away, spread = centred(x)
+    z = away / spread
+    share, mean = shrinkage(z, z.T @ z)
+    correlation = (1 - share) / len(z) * (z.T @ z) + share * mean * np.eye(z.shape[1])
+    covariance: Array = correlation * np.outer(spread, spread)
+    return covariance
 
 
 def cross_fitted_logits(

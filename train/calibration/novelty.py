@@ -210,9 +210,8 @@ def _whitening(x: Array, labels: Array) -> _Whitening:
     diagonal, rows = np.zeros(x.shape[1]), []
     for label in np.unique(labels):
         own = x[labels == label]
-        spread = own.std(axis=0)
-        spread[spread <= 10 * np.finfo(float).eps * np.abs(own).max(axis=0)] = 1
-        z = (own - own.mean(axis=0)) / spread
+        away, spread = centred(own)
+        z = away / spread
         share, mean = shrinkage(z, z @ z.T if len(z) < len(spread) else z.T @ z)
         diagonal += len(own) / len(x) * share * mean * spread**2
         rows.append(np.sqrt((1 - share) / len(x)) * z * spread)
@@ -225,6 +224,14 @@ def _whitening(x: Array, labels: Array) -> _Whitening:
     return _Whitening(
         root, scattered.T @ (vectors / np.sqrt(variances)) if few else vectors, variances
     )
+
+
+def centred(x: Array) -> tuple[Array, Array]:
+    """Differences [n, F] of features [n, F] from their means, and their spread [F]; 1 for a
+    constant feature."""
+    spread = x.std(axis=0)
+    spread[spread <= 10 * np.finfo(float).eps * np.abs(x).max(axis=0)] = 1
+    return x - x.mean(axis=0), spread
 
 
 def parts(groups: Array, judged: Array, most: int = PARTS) -> Iterator[tuple[Array, Array]]:

@@ -11,9 +11,8 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
-import h5py
 import numpy as np
 
 from appliance.core.errors import FormatError
@@ -22,6 +21,9 @@ from appliance.core.types import LARGEST_READING, Status, Sweep, SweepFormat, si
 from appliance.core.types import load as load_recording
 from appliance.signal.unloaded import UnloadedSkin
 from train.data.group_values import typed
+
+if TYPE_CHECKING:
+    import h5py
 
 HDF5 = (".h5", ".hdf5")
 TACTMAT_HZ = 750.0
@@ -110,7 +112,7 @@ def read(path: Path, kind: type[Set]) -> Set:
         raise FormatError(
             f"{path.name}: not a sweep set: the file cannot be read: {e.strerror}"
         ) from e
-    if path.suffix in HDF5 or h5py.is_hdf5(path):
+    if path.suffix in HDF5 or _is_hdf5(path):
         return read_hdf5(path, kind)
     if path.suffix.lower() in FRAMES:
         raise FormatError(
@@ -119,9 +121,17 @@ def read(path: Path, kind: type[Set]) -> Set:
     return load_file(path, kind)
 
 
+def _is_hdf5(path: Path) -> bool:
+    import h5py
+
+    return bool(h5py.is_hdf5(path))
+
+
 def read_hdf5(path: Path, kind: type[Set]) -> Set:
     """The set in an HDF5 file with the keys of an .npz, or in the TactMat layout. Raises
     FormatError."""
+    import h5py  # here, and below: the box, which reads folders alone, does not have it
+
     try:
         with h5py.File(path, "r") as file:
             names = [k for k in file if k in SET_ARRAYS or k.startswith(("group_", "unit_"))]
@@ -146,6 +156,8 @@ def read_hdf5(path: Path, kind: type[Set]) -> Set:
 def array_in(file: h5py.File, name: str) -> Array:
     """An array that is stored in this file. Links and virtual arrays are refused, because their
     data may be missing or read as zeros. Raises FormatError."""
+    import h5py
+
     link = file.get(name, getlink=True)
     if not isinstance(link, h5py.HardLink):
         raise FormatError(
@@ -203,6 +215,8 @@ def _tactmat(arrays: dict[str, Array], source: str) -> dict[str, Array]:
 def write_hdf5(target: BinaryIO, arrays: dict[str, Any]) -> None:
     """Write the arrays of an .npz under the same names as an HDF5 file that `read_hdf5` reads.
     Samples are compressed. target: opened for reading and writing."""
+    import h5py
+
     with h5py.File(target, "w") as file:
         for name, values in arrays.items():
             if np.asarray(values).dtype.kind == "U":

@@ -1,8 +1,9 @@
 """Evaluation protocols: a text such as "leave:position" says which sweeps train and which test.
 
-Each protocol is a scikit-learn splitter over the numbers of the sweeps: split(X, y, groups) yields
-pairs (training, test); `groups` are the recordings. A splitter never puts parts of one recording on
-both sides.
+Each protocol is a splitter over the numbers of the sweeps that scikit-learn can use:
+split(X, y, groups) yields pairs (training, test); `groups` are the recordings. A splitter never
+puts parts of one recording on both sides. Nothing here imports scikit-learn, because a box that is
+taught does not have it.
 """
 
 from __future__ import annotations
@@ -15,7 +16,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.model_selection import BaseCrossValidator, StratifiedGroupKFold
 
 from appliance.core.errors import FormatError
 from train.data.group_values import text_of
@@ -29,7 +29,7 @@ LEAVE = re.compile(r"leave:(\w+)")
 SPLIT = re.compile(r"split:(\w+)=(.+?)->(.+)")
 
 
-class RandomFolds(BaseCrossValidator):  # type: ignore[misc]  # scikit-learn ships no types
+class RandomFolds:
     """Whole recordings divided into `folds` parts at random, materials in equal shares. The paper's
     protocol, which overestimates accuracy."""
 
@@ -57,12 +57,46 @@ class RandomFolds(BaseCrossValidator):  # type: ignore[misc]  # scikit-learn shi
                     f"{self.materials[label]!r} has {n}: "
                     f"use random:{n} or less"
                 )
-        yield from StratifiedGroupKFold(self.folds, shuffle=True, random_state=self.seed).split(
-            y, y, groups
-        )
+        fold = _spread_evenly(y, groups, self.folds, self.seed)
+        for k in range(self.folds):
+            yield np.flatnonzero(fold != k), np.flatnonzero(fold == k)
 
 
-class LeaveOneGroupOut(BaseCrossValidator):  # type: ignore[misc]
+def _spread_evenly(labels: Array, groups: Array, folds: int, seed: int) -> Array:
+    """The fold [N] of each sweep: whole groups, with the materials in equal shares.
+
+    Groups are dealt out in random order, those of the most unequal materials first. Each goes where
+    the shares of the materials then differ least between folds, and of equal folds to the smallest.
+    The folds are those of scikit-learn's StratifiedGroupKFold with shuffling.
+    """
+    kinds, label = np.unique(labels, return_inverse=True)
+    values, member = np.unique(groups, return_inverse=True)
+    counts = np.zeros((len(values), len(kinds)))
+    np.add.at(counts, (member, label), 1)
+    order = np.arange(len(values))
+    np.random.RandomState(seed).shuffle(order)
+    order = order[np.argsort(-counts[order].std(axis=1), kind="stable")]
+    totals, held, fold = (
+        counts.sum(axis=0),
+        np.zeros((folds, len(kinds))),
+        np.empty(len(values), int),
+    )
+    for group in order:
+        best, least, size = 0, np.inf, np.inf
+        for k in range(folds):
+            tried = held.copy()
+            tried[k] += counts[group]
+            unequal = float((tried / totals).std(axis=0).mean())
+            smaller = np.isclose(unequal, least) and held[k].sum() < size
+            if unequal < least or smaller:
+                best, least, size = k, unequal, held[k].sum()
+        held[best] += counts[group]
+        fold[group] = best
+    dealt: Array = fold[member]
+    return dealt
+
+
+class LeaveOneGroupOut:
     """Test on one value of the group `name` at a time and train on all others, as in
     leave-one-position-out."""
 
@@ -87,7 +121,7 @@ class LeaveOneGroupOut(BaseCrossValidator):  # type: ignore[misc]
             yield _checked(f"leave:{self.name}, {text_of(value)} left out", ~out, out, y, groups)
 
 
-class TrainTest(BaseCrossValidator):  # type: ignore[misc]
+class TrainTest:
     """Train on some values of the group `name` and test on others, such as T-REAL and T-HARD, or
     the first and the last block."""
 
@@ -133,8 +167,8 @@ class Protocol:
         if (found := RANDOM.fullmatch(self.text)) and int(found[1]) < 2:
             raise FormatError(f"protocol {self.text!r} has too few folds; use random:2 or more")
 
-    def splitter(self, sweeps: Dataset, seed: int) -> BaseCrossValidator:
-        """The scikit-learn splitter for `sweeps`. seed: for random folds. Raises FormatError for an
+    def splitter(self, sweeps: Dataset, seed: int) -> RandomFolds | LeaveOneGroupOut | TrainTest:
+        """The splitter for `sweeps`. seed: for random folds. Raises FormatError for an
         unknown group."""
         if found := RANDOM.fullmatch(self.text):
             return RandomFolds(int(found[1]), seed, sweeps.materials)
@@ -237,6 +271,12 @@ def inner_parts(sweeps: Dataset, most: int = 3, varies: Sequence[str] = ()) -> l
             )
     if any(of_all):
         return [part for turn in zip_longest(*of_all) for part in turn if part]
+    return recording_parts(sweeps)
+
+
+def recording_parts(sweeps: Dataset) -> list[InnerPart]:
+    """Parts of recordings, with materials spread evenly; each sweep is in one of them. Raises
+    FormatError if a material has one recording."""
     fewest = min(
         len(np.unique(sweeps.group("recording")[sweeps.labels == k]))
         for k in np.unique(sweeps.labels)

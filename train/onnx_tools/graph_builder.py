@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import count
 from typing import Any
 
@@ -360,5 +361,12 @@ def run_output(model: onnx.ModelProto, name: str, inputs: Array) -> Array:
 def run(model: onnx.ModelProto, inputs: Array) -> Array:
     """The output of `model`, float32 [n, size], for each of `inputs` (raw counts or features), in
     the same kind of session as on the box."""
-    on_the_box, name = session(model.SerializeToString()), model.graph.input[0].name
+    on_the_box, name = _session(model.SerializeToString()), model.graph.input[0].name
     return np.concatenate([on_the_box.run(None, {name: one[None]})[0] for one in inputs])
+
+
+@lru_cache(maxsize=4)
+def _session(model: bytes) -> Any:
+    """The session of a serialized model. Making one takes as long as tens of sweeps, and an export
+    runs the same model on many altered copies."""
+    return session(model)

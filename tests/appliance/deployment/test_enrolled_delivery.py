@@ -33,7 +33,7 @@ def test_a_label_is_on_trial_and_gone_back_from(box: Delivery):
     """A label is enrolled into a delivered bundle. The new bundle runs on trial and is committed;
     `rollback` leads to the bundle without the label."""
     one = box.committed(1)
-    with_cork = box.store.enrol(grown(box))
+    with_cork = box.store.learn(grown(box))
     chosen = box.store.choose()
     assert chosen.trial
     assert chosen.bundle.enrolled == {"cork": 1}
@@ -47,8 +47,8 @@ def test_a_label_is_on_trial_and_gone_back_from(box: Delivery):
 def test_a_second_label_and_the_packaged_bundle(box: Delivery):
     """The packaged bundle is trusted like the program. A second label is enrolled into the same
     bundle."""
-    first = box.store.enrol(grown(box))
-    second = box.store.enrol(grown(box, "felt"))
+    first = box.store.learn(grown(box))
+    second = box.store.learn(grown(box, "felt"))
     running = box.store.running()
     assert running.bundle.enrolled == {"cork": 1, "felt": 1}
     assert running.signer == "palpate, enrolled here"
@@ -59,7 +59,7 @@ def test_a_second_label_and_the_packaged_bundle(box: Delivery):
 
 def test_three_bad_starts_lead_back_to_the_bundle_without_the_label(box: Delivery):
     """As with every bundle on trial."""
-    one, with_cork = box.committed(1), box.store.enrol(grown(box))
+    one, with_cork = box.committed(1), box.store.learn(grown(box))
     assert [box.start() for _ in range(4)] == [with_cork] * 3 + [one]
 
 
@@ -68,15 +68,15 @@ def test_the_next_delivery_counts_from_the_bundle_that_was_signed(box: Delivery)
     refused. Delivering the running bundle again may remove its label."""
     box.committed(1)
     old = grown(box)
-    with_cork = box.store.enrol(old)
+    with_cork = box.store.learn(old)
     assert box.store.commit()
     assert box.store.install(box.made(1)) != with_cork
-    assert box.store.enrol(old) == with_cork
+    assert box.store.learn(old) == with_cork
     box.committed(2)
     with pytest.raises(BundleError, match="counter 1, and 2 was committed"):
-        box.store.enrol(old)
+        box.store.learn(old)
     box.store.rollback()
-    assert box.store.enrol(grown(box, "felt"))
+    assert box.store.learn(grown(box, "felt"))
 
 
 def check_refused(
@@ -85,7 +85,7 @@ def check_refused(
     """The box refuses these files, from a folder and from its own enrolment, and continues with the
     same bundle."""
     before = box.store.current
-    for deliver in (lambda: box.store.install(box.copied(files)), lambda: box.store.enrol(files)):
+    for deliver in (lambda: box.store.install(box.copied(files)), lambda: box.store.learn(files)):
         with pytest.raises(kind, match=why):
             deliver()
     assert box.store.current == before
@@ -127,7 +127,7 @@ def test_no_part_can_be_exchanged(box: Delivery, tmp_path: Path):
         box, deliveries.enrolled(unknown, box.enrolment_key), "signed by none of the signers"
     )
     check_refused(box, good | {bundle.MEANS: good[bundle.MEANS] + b"\0"}, "means.npz was altered")
-    assert box.store.enrol(good)
+    assert box.store.learn(good)
 
 
 def test_the_key_can_add_labels_and_nothing_else(box: Delivery):
@@ -148,7 +148,7 @@ def test_a_lost_key_or_signer_does_not_end_what_runs_unless_it_must(box: Deliver
     """Without the private key the box continues. Without the signer the error says what to do, and
     the box continues after the signer was made again."""
     box.committed(1)
-    box.store.enrol(grown(box))
+    box.store.learn(grown(box))
     assert box.store.commit()
     (box.enrolment_key.folder / KEY).rename(box.folder / "kept")
     assert box.store.running().bundle.enrolled
@@ -167,7 +167,7 @@ def test_a_program_with_another_packaged_bundle_does_not_take_the_label(
 ):
     """An upgrade replaced the base: the error says what to do, and `rollback` leads to the new
     packaged bundle."""
-    box.store.enrol(grown(box))
+    box.store.learn(grown(box))
     assert box.store.commit()
     newer = deliveries.put(box.folder / "newer", deliveries.files(0, None, version="99"))
     monkeypatch.setattr(bundle, "DEFAULT", newer)
@@ -182,7 +182,7 @@ def test_a_program_with_another_packaged_bundle_does_not_take_the_label(
 
 def test_a_damaged_enrolment_is_told_and_gone_back_from(box: Delivery):
     """One byte of the enrolment has changed on the card."""
-    one, sha = box.committed(1), box.store.enrol(grown(box))
+    one, sha = box.committed(1), box.store.learn(grown(box))
     assert box.store.commit()
     path = box.store.bundles.at(sha) / bundle.ENROLMENT
     data = bytearray(path.read_bytes())

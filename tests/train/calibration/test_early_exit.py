@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
 from appliance.bundle import bundle
 from appliance.bundle.bundle import Early, Manifest, Thresholds
@@ -257,3 +258,21 @@ def test_enrolment_is_judged_as_the_box_enrols(made):
     assert np.allclose(
         have - have.mean(1, keepdims=True), want - want.mean(1, keepdims=True), atol=0.02
     )
+
+
+@pytest.mark.parametrize(("materials", "each"), [(2, 5), (3, 20), (6, 4)])
+def test_the_heads_are_scikit_learns_shrinkage_lda(materials: int, each: int):
+    """Weight and bias are those of LinearDiscriminantAnalysis to the last bits of float32; a
+    constant feature changes nothing."""
+    rng = np.random.default_rng(materials)
+    labels = np.repeat(np.arange(materials), each)
+    x = rng.normal(size=(len(labels), 12)) + 2 * rng.normal(size=(materials, 12))[labels]
+    x[:, 3] = 7
+    weight, bias = early_exit.lda(x, labels, materials)
+    prior = np.full(materials, 1 / materials)
+    theirs = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto", priors=prior)
+    wanted = theirs.fit(x, labels).decision_function(x)
+    logits = x @ weight + bias
+    if materials == 2:
+        logits = logits[:, 1] - logits[:, 0]
+    np.testing.assert_allclose(logits, wanted, rtol=1e-5, atol=1e-4)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.model_selection import LeaveOneGroupOut as Theirs
-from sklearn.model_selection import cross_val_score
+from sklearn.model_selection import StratifiedGroupKFold, cross_val_score
 from sklearn.naive_bayes import GaussianNB
 
 from appliance.core.errors import FormatError
@@ -190,3 +190,20 @@ def test_a_learning_curve_adds_to_what_was_there():
     assert more.tolist() == sorted(more)
     assert draw(train, labels, 6, 1).tolist() == more.tolist() != draw(train, labels, 6, 2).tolist()
     assert draw(train, labels, 99, 1).tolist() == train.tolist()
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(2, 5), st.integers(0, 99), st.integers(1, 4), st.booleans())
+def test_random_folds_are_scikit_learns(folds: int, seed: int, pieces: int, mixed: bool):
+    """The folds of StratifiedGroupKFold, although scikit-learn is not imported: results of earlier
+    versions stay comparable."""
+    recording = np.repeat(np.arange(20), pieces)
+    label = np.random.default_rng(seed).permutation(20)[recording] % 3 if mixed else recording % 3
+    sweeps = a_set(label.tolist(), recording=recording.tolist())
+    theirs = StratifiedGroupKFold(folds, shuffle=True, random_state=seed).split(
+        label, label, recording
+    )
+    for (_, test), (_, wanted) in zip(
+        Protocol(f"random:{folds}").folds(sweeps, seed), theirs, strict=True
+    ):
+        assert test.tolist() == wanted.tolist()

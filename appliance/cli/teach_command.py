@@ -1,0 +1,334 @@
+"""The command `palpate teach`: a session of teaching, or a single step of it."""
+
+from __future__ import annotations
+
+import argparse
+import getpass
+import json
+import sys
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from appliance.cli import record_command
+from appliance.cli.common import Facts, StopFlag, load_settings
+from appliance.cli.reporting import capture, feed, status
+from appliance.core.clock import SystemClock
+from appliance.core.config import Config
+from appliance.core.devices import Devices
+from appliance.core.disk_thread import DiskThread
+from appliance.core.errors import ApplianceError, ConfigError
+from appliance.core.log import log
+from appliance.core.observer import Observer
+from appliance.core.types import SweepFormat
+from appliance.deployment.enrolment_key import TAUGHT, EnrolmentKey
+from appliance.io.robot_link import Command, Port
+from appliance.recording.recording import Labels, RecordingSession
+from appliance.runtime import assembly
+from appliance.service.systemd import Notifier
+from appliance.teaching import use
+from appliance.teaching.process import News
+from appliance.teaching.session import TeachingSession
+from appliance.teaching.state import TeachingState
+from appliance.teaching.teacher import Teacher
+
+if TYPE_CHECKING:
+    from appliance.watch.record import RecordPage
+
+NOTHING, GOOD = "nothing taught yet", 8
+"""The model of a box that is being taught, in status and feed; and its wanted number of sweeps."""
+
+
+def run(args: argparse.Namespace) -> int:
+    """Teach the box, until its bundle is made, Ctrl-C or SIGTERM."""
+    settings = load_settings(args)
+    use.check_allowed(settings)
+    if args.forget is not None:
+        return _forget(settings, args.forget)
+    if args.use and not args.labels and args.web is None:
+        return _use(args, settings)
+    if args.sim and settings.sources["store.folder"] == "code":
+        raise ConfigError(
+            "--sim must not teach a box: name a folder for simulated sweeps with --set "
+            "store.folder=DIR"
+        )
+    if args.labels or args.web is not None:
+        EnrolmentKey(settings.store.enrolment_key).check(TAUGHT)
+        Session(args, settings).run()
+        if args.web is not None:
+            return 0
+        try:
+            print(use.assessed(settings, SystemClock()))
+        except use.TeachingFailed as e:  # the sweeps are stored; there are too few so far
+            print(f"teach: {e}")
+        return _use(args, settings) if args.use else 0
+    print(use.assessed(settings, SystemClock()))
+    return 0
+
+
+def until_taught(args: argparse.Namespace, settings: Config) -> int:
+    """The service of a box that has no bundle for its skin: it records and can be taught, and READY
+    stays low. It ends once a bundle was made, which runs from the next start on."""
+    log.warning(
+        f"{NOTHING}: READY stays low; teach the box (systemctl start palpate-teach, then its page; "
+        "or palpate teach), or deploy a bundle"
+    )
+    defaults = {"labels": [], "good": GOOD, "position": "1", "session": "", "web": None}
+    defaults |= {"use": False, "by": "", "format": None, "window": None}
+    Session(argparse.Namespace(**vars(args) | defaults), settings).run()
+    return 0
+
+
+def _forget(settings: Config, material: str) -> int:
+    folder = Path(settings.store.folder)
+    numbers = [
+        int(path.stem.rpartition("-")[2])
+        for path in (folder / "sweeps").glob("sweep-*.npy")
+        if path.stem.rpartition("-")[2].isdecimal()
+    ]
+    Labels(material=material)
+    TeachingState.load(folder).forget(folder, material, max(numbers, default=0))
+    print(f"{material}: its sweeps so far are no longer taught; they stay in {folder / 'sweeps'}")
+    return 0
+
+
+def _use(args: argparse.Namespace, settings: Config) -> int:
+    """Make a bundle of all sweeps, sign and install it."""
+
+    def tell(news: News) -> None:
+        if args.json and news["type"] == "step":
+            print(json.dumps(news), flush=True)
+        elif news["type"] == "step":
+            left = f", about {news['left_s']:.0f} s left" if news["left_s"] else ""
+            log.info(f"teach: {news['step']}: {100 * news['done']:.0f} % done{left}")
+        else:
+            told.update(news)
+
+    told: News = {}
+    try:
+        by = args.by or getpass.getuser()
+        sha = use.use(settings, assembly.store(settings), by, SystemClock(), tell)
+    except ApplianceError as e:
+        if not args.json:
+            raise
+        print(json.dumps({"type": "error", "text": str(e)}), flush=True)
+        return e.exit_code
+    text = f"bundle {sha[:8]} with {', '.join(told['labels'])} is installed, on trial"
+    if args.json:
+        print(json.dumps({**told, "type": "taught", "sha": sha, "text": text}), flush=True)
+    else:
+        print(f"{text} from the next start on: systemctl restart palpate")
+    return 0
+
+
+def by_page(args: argparse.Namespace, settings: Config) -> Config:
+    """The settings of a session: where no GPIO line is wired, the page starts and stops sweeps."""
+    wired = args.sim or settings.trigger.start or not settings.trigger.by_lines
+    if args.web is None or wired:
+        return settings
+    return replace(settings, trigger=replace(settings.trigger, mode="serial"))
+
+
+class Session:
+    """Records and assesses until a bundle is made; with a page, then tries it until DONE."""
+
+    def __init__(self, args: argparse.Namespace, settings: Config) -> None:
+        self._args, self._settings, self._stopped = args, by_page(args, settings), StopFlag()
+        self._store = Path(settings.store.folder)
+        self._obey: Callable[[Command], list[object]] = _not_now
+        self._about: Callable[[], Mapping[str, Any]] = dict
+        self._announced, self._done, self._again, self._address = "", False, "", ""
+
+    def run(self) -> None:
+        """Run until all sweeps are recorded; with a page until DONE."""
+        with ExitStack() as stack:
+            devices, format = record_command.open_skin(self._args, self._settings)
+            pages = self._page(format, devices)
+            for page in pages:
+                stack.enter_context(page)
+            made = self._teach(devices, format, pages)
+            while made and pages and not self._ended:
+                self._again = ""
+                self._try(devices, pages)
+                if self._again and not self._ended:
+                    made = self._teach(devices, format, pages)
+
+    @property
+    def _ended(self) -> bool:
+        return self._done or self._stopped()
+
+    def _page(self, format: SweepFormat, devices: Devices) -> list[RecordPage]:
+        if self._args.web is None:
+            return []
+        from appliance.watch.access import Access
+        from appliance.watch.record import RecordPage
+
+        access = Access.configured(self._settings.watch, self._args.web)
+        page = RecordPage(
+            access,
+            format,
+            devices.source,
+            devices.wire(self._settings).trigger,
+            lambda: self._about(),
+            lambda command: self._obey(command),
+            SystemClock(),
+            teaching=True,
+        )
+        self._address = page.server.address
+        log.info(f"page: {self._address}")
+        return [page]
+
+    def _teach(self, devices: Devices, format: SweepFormat, pages: list[RecordPage]) -> bool:
+        """Record and assess; returns whether a bundle was made."""
+        args, settings = self._args, self._settings
+        with ExitStack() as stack:
+            port, disk = self._port(devices), DiskThread()
+            say = port.say if port else lambda line: None
+            labels = Labels(self._again, args.position, args.session)
+            recording = RecordingSession(
+                self._store / "sweeps", format, labels, devices.clock, say, args.good, disk
+            )
+            stack.callback(recording.close)
+            session = TeachingSession(recording, self._store, settings.teach, self._command, say)
+            stack.callback(session.close)
+            teacher = Teacher(session, args.labels if not self._again else [], args.good)
+            self._about = lambda: self._shown(recording.about() | {"teach": session.about()})
+            box = assembly.recorder(
+                settings,
+                format,
+                devices,
+                port,
+                stack,
+                capture=capture(args, settings, format, stack),
+                observers=[
+                    disk,
+                    *self._observers(recording, session, format, devices),
+                    teacher,
+                    *pages,
+                ],
+                commands={**recording.commands, **self._by_robot(session.commands)},
+                ordered=bool(pages),
+                serving=False,
+                announce=self._announce,
+            )
+            orders = {**recording.commands, **session.commands, "DONE": self._finish}
+            self._obey = self._orders(orders, box.obey)
+            session.by = "the page" if pages else args.by or getpass.getuser()
+            over = (lambda: self._ended, lambda: session.taught, lambda: teacher.done)
+            box.run(lambda: any(end() for end in over) or devices.finished(box.answered))
+            self._obey = _not_now
+            return bool(session.taught)
+
+    def _try(self, devices: Devices, pages: list[RecordPage]) -> None:
+        """Classify with the new bundle, on trial as in the service."""
+        settings = self._settings
+        choice = assembly.store(settings).choose()
+        with ExitStack() as stack:
+            trial, disk = [stack.enter_context(choice.trial)] if choice.trial else [], DiskThread()
+            for one in trial:
+                one.disk = disk
+            port = self._port(devices)
+            m = choice.bundle.manifest
+            shown = {
+                "model": f"{m.name} {m.version}",
+                "labels": m.labels,
+                "taught": m.taught,
+            }
+            self._about = lambda: self._shown({"trying": shown})
+            facts: Facts = {"model": lambda: f"{m.name} {m.version}, {m.taught}"}
+            box = assembly.box(
+                settings,
+                choice.bundle,
+                devices,
+                port,
+                stack,
+                observers=[disk, Notifier(SystemClock()), *trial, *status(settings, facts), *pages],
+                commands=self._by_robot({"TEACH": self._teach_again}),
+                ordered=bool(pages),
+                announce=self._announce,
+            )
+            orders = {"TEACH": self._teach_again, "DONE": self._finish}
+            self._obey = self._orders(orders, box.obey)
+            box.run(lambda: self._ended or bool(self._again) or devices.finished(box.answered))
+            self._obey = _not_now
+
+    def _observers(
+        self,
+        recording: RecordingSession,
+        session: TeachingSession,
+        format: SweepFormat,
+        devices: Devices,
+    ) -> list[Observer]:
+        facts: Facts = {
+            "model": lambda: NOTHING,
+            "recorded": lambda: recording.about()["missing"],
+            "teach": session.about,
+            "page": lambda: self._address,
+        }
+        settings = self._settings
+        return [
+            Notifier(SystemClock()),
+            recording,
+            session,
+            *status(settings, facts),
+            *feed(settings, format, devices.source, {"bundle": "", "labels": []}, facts),
+        ]
+
+    def _orders(
+        self,
+        orders: Mapping[str, Callable[[str], list[object]]],
+        obey: Callable[[Command], list[object]],
+    ) -> Callable[[Command], list[object]]:
+        """Carries out an order of the page: those of the session, and those of the box."""
+
+        def carry_out(command: Command) -> list[object]:
+            own = orders.get(command.name)
+            return own(command.text) if own else obey(command)
+
+        return carry_out
+
+    def _by_robot(
+        self, commands: Mapping[str, Callable[[str], list[object]]]
+    ) -> dict[str, Callable[[str], list[object]]]:
+        """The commands that the serial line carries, if the settings allow them to a robot."""
+        own = {name: act for name, act in commands.items() if name != "DISCARD"}
+        return own if self._settings.teach.serial else dict.fromkeys(own, _forbidden)
+
+    def _port(self, devices: Devices) -> Port | None:
+        sentences = self._settings.serial.port or not sys.stdout.isatty()
+        return assembly.port(self._settings, devices) if sentences else None
+
+    def _shown(self, about: dict[str, Any]) -> dict[str, Any]:
+        return about | {"announced": self._announced, "good": self._args.good}
+
+    def _announce(self, text: str) -> None:
+        self._announced = text
+        log.info(text)
+
+    def _command(self, by: str) -> list[str]:
+        """The command of the process that makes a bundle, with the settings of this one."""
+        args = self._args
+        options = ["--board", args.board] if args.board else []
+        options += ["--config-dir", str(args.config_dir)] if args.config_dir else []
+        sets = [*args.set, *([f"skin.profile={args.skin}"] if args.skin else [])]
+        options += [word for one in sets for word in ("--set", one)]
+        return use.command(options, by)
+
+    def _teach_again(self, label: str) -> list[object]:
+        Labels(material=label.strip())
+        self._again = label.strip()
+        return [self._again]
+
+    def _finish(self, _: str) -> list[object]:
+        self._done = True
+        return []
+
+
+def _forbidden(_: str) -> list[object]:
+    raise ApplianceError("the robot may not teach this box; set teach.serial = true to allow it")
+
+
+def _not_now(command: Command) -> list[object]:
+    raise ApplianceError(f"{command.name} is not possible at this moment; try again")

@@ -1,0 +1,1 @@
+"""Teaching: the box learns materials from sweeps beside the robot, without a desktop."""

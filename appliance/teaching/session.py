@@ -1,0 +1,191 @@
+"""A session in which a person or a robot teaches the box: records sweeps, assesses them after each,
+and makes a bundle of them on demand.
+
+The work is done by processes beside the loop (process.py). A failure leaves the sweeps and the
+bundle in service as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from appliance.core.clock import Clock, SystemClock
+from appliance.core.config import TeachConfig
+from appliance.core.errors import ApplianceError
+from appliance.core.health import Health
+from appliance.core.log import log
+from appliance.core.observer import Observer
+from appliance.core.sentences import sentence
+from appliance.recording.recording import Labels, RecordingSession
+from appliance.teaching.process import News, TeachingProcess, learning
+from appliance.teaching.state import TeachingState
+
+FEWEST = 2
+"""Fewest sweeps of a material that can be assessed, and fewest such materials."""
+PAUSE_NS = 300_000_000
+"""Time without a new sweep before an assessment begins."""
+
+Learn = Callable[[str], list[str]]
+"""The command of a process that does all of `use`, for the person or program that asks."""
+
+
+class TeachingSession(Observer):
+    """Observes a recording and teaches what it has stored.
+
+    store: the store's folder. learn: makes the command of USE. say: called with TCH sentences.
+    clock: the real clock, because processes run in real time. It must come after `recording` among
+    the observers.
+    """
+
+    def __init__(
+        self,
+        recording: RecordingSession,
+        store: Path,
+        settings: TeachConfig,
+        learn: Learn,
+        say: Callable[[bytes], None],
+        clock: Clock | None = None,
+    ) -> None:
+        self._recording, self._store, self._settings = recording, store, settings
+        self._learn, self._clock, self._say = learn, clock or SystemClock(), say
+        self._state = TeachingState.load(store)
+        self._named: dict[str, None] = {}  # materials without a sweep so far, in order
+        self._process: TeachingProcess | None = None
+        self._using, self._stored = False, 0
+        self._due_ns: int | None = self._clock.now_ns()
+        self._learnt: News | None = None
+        self._step: News | None = None
+        self._trouble = ""
+        self.by = "the serial line"
+        self.taught: News | None = None
+        self.commands: Mapping[str, Callable[[str], list[object]]] = {
+            "TEACH": self._teach,
+            "USE": self._use,
+            "FORGET": self._forget,
+            "DISCARD": self._discard,
+        }
+
+    def about(self) -> dict[str, Any]:
+        """The session for JSON.
+
+        materials: each with its number of sweeps, forgotten ones left out. learnt: the last
+        assessment, None without one; assessing: whether the next is being made. using: the step of
+        USE with the share done and the seconds left, None if it does not run. taught: the result of
+        USE. trouble: why the last step failed, "" if it did not.
+        """
+        return {
+            "materials": self.materials(),
+            "learnt": self._learnt,
+            "assessing": (bool(self._process) and not self._using) or self._due_ns is not None,
+            "using": (self._step or {"step": "start", "done": 0.0, "left_s": None})
+            if self._using
+            else None,
+            "taught": self.taught,
+            "trouble": self._trouble,
+        }
+
+    def materials(self) -> dict[str, int]:
+        """The number of sweeps of each material, those without one included."""
+        counts = self._recording.materials(self._state.forgotten)
+        return dict.fromkeys(self._named, 0) | counts
+
+    def turn(self, health: Health) -> None:
+        """Take the news of the process, and begin an assessment that is due: a moment after a sweep
+        was stored or discarded."""
+        if self._recording.stored != self._stored:
+            self._stored = self._recording.stored
+            self._due_ns = self._clock.now_ns() + PAUSE_NS
+        if self._process:
+            for one in self._process.news():
+                self._take(one)
+            if self._process.ended:
+                self._process, self._using, self._step = None, False, None
+        elif self._due_ns is not None and self._clock.now_ns() >= self._due_ns:
+            self._due_ns = None
+            if sum(n >= FEWEST for n in self.materials().values()) >= FEWEST:
+                self._assess()
+            else:
+                self._learnt = None
+
+    def close(self) -> None:
+        """End the process. Sweeps stay as they are, and so does the bundle in service."""
+        if self._process:
+            self._process.close()
+
+    def _assess(self) -> None:
+        """Begin an assessment; a failure is shown."""
+        folder, forgotten = self._store / "sweeps", self._state.forgotten
+        try:
+            self._begin(learning(folder, forgotten, self._settings.memory_mb))
+        except ApplianceError as e:
+            self._take({"type": "error", "text": str(e)})
+
+    def _begin(self, command: list[str], *, using: bool = False) -> None:
+        self._process = TeachingProcess(command, self._settings.limit_s, self._clock, group=True)
+        self._using, self._step = using, None
+
+    def _take(self, news: News) -> None:
+        kind = news["type"]
+        if kind == "step":
+            self._step = news
+            return
+        text = str(news.get("text", ""))
+        self._trouble = text if kind == "error" else ""
+        if kind == "assessed":
+            self._learnt = news
+            log.info(f"teach: {text}; next: {news['advice']}")
+        elif kind == "taught":
+            self.taught = news
+            log.info(f"teach: {text}")
+        else:
+            log.warning(f"teach: {text}")
+        self._say(sentence("TCH", kind, text))
+
+    def _teach(self, label: str) -> list[object]:
+        """The next sweeps are of this material; returns it and the number of its sweeps."""
+        label = label.strip()
+        if not label:
+            raise ApplianceError("TEACH needs the name of a material, such as PPLP TEACH cork")
+        Labels(material=label)
+        self._named.setdefault(label)
+        self._recording.commands["MATERIAL"](label)
+        return [label, self.materials().get(label, 0)]
+
+    def _use(self, _: str) -> list[object]:
+        """Begin to teach all sweeps; returns the number of materials and of sweeps."""
+        if self._using:
+            raise ApplianceError("a bundle is being made already; wait for TCH")
+        held = {name: n for name, n in self.materials().items() if n}
+        if len(held) < FEWEST:
+            raise ApplianceError(
+                f"{len(held)} materials have sweeps; a model tells at least two apart: teach "
+                "another"
+            )
+        if self._process:
+            self._process.close()
+        self._trouble, self.taught = "", None
+        self._begin(self._learn(self.by), using=True)
+        return [len(held), sum(held.values())]
+
+    def _forget(self, label: str) -> list[object]:
+        """Teach the sweeps of a material no longer; returns it and their number. They stay in the
+        folder."""
+        label = label.strip()
+        number = self.materials().get(label)
+        if number is None:
+            raise ApplianceError(f"there is no material {label!r} to forget")
+        if self._using:
+            raise ApplianceError("a bundle is being made; forget it afterwards")
+        try:
+            self._state = self._state.forget(self._store, label, self._recording.last)
+        except OSError as e:
+            raise ApplianceError(f"{label!r} is not forgotten: {e.strerror}; make room") from e
+        self._named.pop(label, None)
+        self._due_ns = self._clock.now_ns()
+        return [label, number]
+
+    def _discard(self, which: str) -> list[object]:
+        """As DISCARD of a recording."""
+        return self._recording.commands["DISCARD"](which)

@@ -1,0 +1,31 @@
+"""Folders of recorded sweeps to teach a box from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from appliance.core.sweep_set import SweepSet
+from appliance.core.types import Frames, Status, Sweep, save
+
+
+def write(folder: Path, sweeps: SweepSet, *, first: int = 1, position: bool = False) -> None:
+    """Write the sweeps of a set as `palpate record` stores them, numbered from `first`. position:
+    with the names of the group position."""
+    folder.mkdir(parents=True, exist_ok=True)
+    window = sweeps.format.window
+    for i, taxels in enumerate(sweeps.samples):
+        number = first + i
+        frames = Frames(np.arange(window), np.arange(window), taxels)
+        sweep = Sweep(
+            id=number,
+            start_ns=0,
+            stop_ns=1,
+            status=Status.OK,
+            frames=frames,
+            material=sweeps.materials[sweeps.labels[i]],
+            position=str(sweeps.groups["position"][i]) if position else "",
+        )
+        verdict = {"status": "recorded"}
+        save(folder / f"sweep-{number:06d}.npy", sweep, sweeps.format, {"verdict": verdict})

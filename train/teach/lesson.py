@@ -1,0 +1,119 @@
+"""The sweeps that a box is taught from: a folder of its recordings.
+
+A person records beside a robot, so a folder may hold sweeps that training from a desktop would
+refuse as a whole: without a material, of another format, damaged, or without a position that others
+have. Such sweeps are left out and counted, or completed.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from appliance.core.errors import FormatError
+from train.data import labels
+from train.data.readers import NAMED_GROUPS, RecordedSweep, check_folder, counted, from_recorded
+from train.data.sets import Dataset
+
+NOWHERE = "not named"
+"""Position or session of a sweep without one, beside sweeps that have one."""
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """Sweeps to learn from. names: of the file of each sweep [N], without suffix. left_out: number
+    of sweeps that are not among them, by reason."""
+
+    sweeps: Dataset
+    names: tuple[str, ...]
+    left_out: Mapping[str, int]
+
+    @classmethod
+    def read(cls, folder: Path, forgotten: Mapping[str, int] = {}) -> Lesson:
+        """The sweeps in `folder`. forgotten: number of the last sweep of each material that is no
+        longer taught.
+
+        Raises FormatError if there is none, or if a label cannot be sent.
+        """
+        check_folder(folder)
+        left_out: Counter[str] = Counter()
+        kept = list(_usable(folder, forgotten, left_out))
+        if not kept:
+            why = f" ({counted(left_out)})" if left_out else ""
+            raise FormatError(f"{folder}: no sweep can be taught{why}; record some with a material")
+        kept = _of_one_format(kept, left_out)
+        sweeps = from_recorded(_named(kept), folder, Dataset)
+        return cls(labels.check(sweeps), tuple(one.path.stem for one in kept), left_out)
+
+    def number(self, sweep: int) -> int:
+        """The number of a sweep among those of its material, from 1."""
+        return int((self.sweeps.labels[: sweep + 1] == self.sweeps.labels[sweep]).sum())
+
+    def repeated(self) -> Lesson:
+        """Only materials with two sweeps or more, which can be judged. Raises FormatError if fewer
+        than two are left."""
+        counts = np.bincount(self.sweeps.labels)
+        many = np.flatnonzero(counts >= 2)
+        if len(many) < 2:
+            raise FormatError(
+                f"{len(many)} of the materials have two sweeps or more, and a model tells at least "
+                "two apart; record two of another material"
+            )
+        kept = np.isin(self.sweeps.labels, many)
+        part = self.sweeps.take(kept)
+        part = replace(
+            part,
+            labels=np.searchsorted(many, part.labels),
+            materials=tuple(part.materials[k] for k in many),
+        )
+        names = tuple(name for name, keep in zip(self.names, kept, strict=True) if keep)
+        return Lesson(part, names, self.left_out)
+
+
+def _usable(
+    folder: Path, forgotten: Mapping[str, int], left_out: Counter[str]
+) -> Iterator[RecordedSweep]:
+    for path in sorted(folder.glob("sweep-*.npy")):
+        try:
+            one = RecordedSweep.load(path)
+        except FormatError:
+            left_out["damaged"] += 1
+            continue
+        number = path.stem.rpartition("-")[2]
+        old = number.isdecimal() and int(number) <= forgotten.get(one.sweep.material, -1)
+        why = "no material" if not one.sweep.material else "forgotten" if old else one.exclusion
+        if not why:
+            yield one
+        else:
+            left_out[why] += 1
+
+
+def _of_one_format(kept: Sequence[RecordedSweep], left_out: Counter[str]) -> list[RecordedSweep]:
+    """The sweeps of the format of the last one."""
+    wanted = kept[-1].format
+    same = [one for one in kept if one.format == wanted]
+    if len(same) < len(kept):
+        left_out["another format"] = len(kept) - len(same)
+    return same
+
+
+def _named(kept: Sequence[RecordedSweep]) -> list[RecordedSweep]:
+    """The sweeps, each with a name of every group that any of them has."""
+    position, session = (
+        NOWHERE if any(getattr(one.sweep, name) for one in kept) else "" for name in NAMED_GROUPS
+    )
+    return [
+        replace(
+            one,
+            sweep=replace(
+                one.sweep,
+                position=one.sweep.position or position,
+                session=one.sweep.session or session,
+            ),
+        )
+        for one in kept
+    ]
