@@ -123,12 +123,12 @@ def test_packages_import_downwards_only():
 
 @pytest.mark.slow
 def test_every_module_of_training_serves_a_command():
-    """All of train but the studies is imported for a command of palpate-train or by the library; a
-    method is imported by its name for `evaluate --method`. A module that only a study uses is
-    not."""
+    """All of train but the studies is imported for a command of palpate-train, by the library or by
+    the program that teaches a box; a method is imported by its name for `evaluate --method`. A
+    module that only a study uses is not."""
     graph = module_imports("train")
     commands = {name for name in graph if name.startswith(("train.cli.", "train.library."))}
-    found, left = set(), ["train.__main__", *commands, *methods.MODULES]
+    found, left = set(), ["train.__main__", "train.teach.__main__", *commands, *methods.MODULES]
     while left:
         if (name := left.pop()) not in found:
             found.add(name)

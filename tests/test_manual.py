@@ -162,7 +162,8 @@ def test_make_targets_are_there():
     assert {"install", "deploy"} <= {target for target, _ in called}
     for target, given in called:
         assert target in targets
-        assert all(f"$({name})" in text for name in re.findall(r"([A-Z]+)=", given)), given
+        for name in re.findall(r"([A-Z]+)=", given):
+            assert re.search(rf"\$\({name}\)|\$\(call quoted,{name}\)", text), given
 
 
 def test_settings_have_default_limits_and_meaning(manual: ModuleType):
@@ -189,7 +190,7 @@ def test_settings_of_the_text_exist():
 def test_exit_codes_are_those_of_the_code():
     """The codes of `palpate --help`, of the errors, and the reaction of the unit to each."""
     shown = {int(cells[0]): cells for cells in rows("reference/exit-codes.md", "exit code")}
-    assert [*shown] == [int(n) for n in re.findall(r"(?:^|[;:] )(\d+) ", parser.EXIT_CODES)]
+    assert [*shown] == [int(n) for n in re.findall(r"(?:^|[;:]\s)(\d+) ", parser.EXIT_CODES)]
     codes = {k.exit_code for k in vars(errors).values() if isinstance(k, type)}
     assert codes <= shown.keys()
     unit = (ROOT / "systemd" / "palpate.service").read_text()
@@ -325,6 +326,7 @@ def test_samples_are_what_the_box_prints():
         "frames": 54006,
         "lost_frames": 0,
         "garbage_bytes": 0,
+        "foreign_frames": 0,
         "enumerations": 1,
         "dropped": 0,
         "bundle": PACKAGED,

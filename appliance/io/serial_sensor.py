@@ -17,11 +17,12 @@ from appliance.core.errors import SensorError, SensorMismatch
 from appliance.core.types import SweepFormat, shown
 from appliance.io import packets, serial_port, skin_stream
 from appliance.io.link import SkinLink
+from appliance.io.sensor import TransferObserver
 from appliance.io.serial_link import SerialLink, find
 from appliance.io.serial_port import PortInfo
 from appliance.io.skin_profile import SkinProfile
 from appliance.io.skin_stream import RATE_WANDER
-from appliance.io.usb_sensor import LinkSensor, TransferObserver
+from appliance.io.usb_sensor import LinkSensor
 
 
 class BytePort(Protocol):

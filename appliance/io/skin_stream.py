@@ -21,9 +21,10 @@ from appliance.core.errors import SensorMismatch
 from appliance.core.types import EPOCH_BITS, EPOCHS, Frames, SweepFormat
 from appliance.io import packets, skin_codecs
 from appliance.io.link import TTY_BYTES
+from appliance.io.sensor import FrameStream, SensorCounters
 from appliance.io.skin_codecs import Codec, Decoded, Rest
 from appliance.io.skin_profile import SkinProfile
-from appliance.io.usb_sensor import FrameStream, SensorCounters, Stream
+from appliance.io.usb_sensor import Stream
 
 RATE_WANDER = 0.05
 """Largest relative difference between the measured rate and the expected rate. Oscillators of

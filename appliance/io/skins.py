@@ -14,8 +14,9 @@ from appliance.core.errors import ConfigError, FormatError, SensorAbsent, Sensor
 from appliance.core.types import SweepFormat
 from appliance.io import skin_profile
 from appliance.io.link import SkinLink
+from appliance.io.sensor import TransferObserver
 from appliance.io.skin_profile import SkinProfile
-from appliance.io.usb_sensor import LinkSensor, TransferObserver, UsbSensor, ask, open_link
+from appliance.io.usb_sensor import LinkSensor, UsbSensor, ask, open_link
 
 OWN = SITE.parent / "skins"
 """Profiles written by the owner of the box. They replace delivered profiles of the same name."""

@@ -11,8 +11,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -29,6 +28,7 @@ from appliance.core.errors import (
 from appliance.core.types import EPOCH_BITS, EPOCHS, Frames, SweepFormat, shown
 from appliance.io import packets
 from appliance.io.link import SkinLink
+from appliance.io.sensor import OPENED, FrameStream, SensorCounters, TransferObserver
 
 RATE_TOLERANCE = 0.01
 """Largest relative difference between the rate of the readout board and that of the bundle: 1 %,
@@ -48,110 +48,6 @@ MOST_RESTARTS, RESTARTS_NS = 8, 1_000_000_000
 """A readout board that begins its count anew so often within this time is faulty."""
 
 _COUNT = np.arange(packets.MAX_FRAMES, dtype=np.int64)
-
-
-@dataclass(slots=True)
-class SensorCounters:
-    """Counts since the program started.
-
-    frames: received. lost_frames: missing in the sequence numbers. stale_frames: repeated or late,
-    and left out. garbage_bytes: bytes outside of packets. overflows: transfers larger than the
-    read. fifo_overflows: packets with the flag OVERFLOW, set when the FIFO of the readout board was
-    full. enumerations: times the skin was found and started. foreign_frames: of other nodes on the
-    skin's bus, left out.
-    """
-
-    frames: int = 0
-    lost_frames: int = 0
-    stale_frames: int = 0
-    garbage_bytes: int = 0
-    overflows: int = 0
-    fifo_overflows: int = 0
-    enumerations: int = 0
-    foreign_frames: int = 0
-
-
-class Sensor(Protocol):
-    """The source of frames for the loop."""
-
-    @property
-    def state(self) -> str:
-        """`streaming`, or the state that prevents it (PROTOCOL.md, states of the skin)."""
-        ...
-
-    @property
-    def trouble(self) -> SensorError | None:
-        """The reason why it is not streaming, with a remedy; None while it streams."""
-        ...
-
-    @property
-    def identity(self) -> packets.Identity | None:
-        """Name and version of the readout board; None before it was asked."""
-        ...
-
-    @property
-    def clock(self) -> dict[str, float] | None:
-        """Accuracy of the times: DeviceClock.quality."""
-        ...
-
-    @property
-    def loss_known(self) -> bool:
-        """Whether every lost frame is seen. If not, `lost_frames` counts only the losses that can
-        be inferred from times."""
-        ...
-
-    @property
-    def counters(self) -> SensorCounters: ...
-
-    def read(self) -> Frames:
-        """The frames since the last call; an empty Frames after a bounded wait."""
-        ...
-
-
-OPENED = "opened"
-"""Given to observers when a skin was opened, which begins a new enumeration. It is not a state: the
-skin keeps its last state until its first frame."""
-
-
-class TransferObserver(Protocol):
-    """Observes the bytes that the sensor receives, for captures."""
-
-    def transfer(self, t_ns: int, data: bytes) -> None:
-        """A bulk transfer has ended."""
-        ...
-
-    def state(self, t_ns: int, state: str) -> None:
-        """The sensor's state has changed, or the skin was opened (OPENED)."""
-        ...
-
-
-class FrameStream(Protocol):
-    """Converts the bytes of a skin to Frames with unwrapped numbers and host times. It does no
-    I/O."""
-
-    @property
-    def loss_known(self) -> bool:
-        """Whether every lost frame is seen, as the skin counts its frames."""
-        ...
-
-    @property
-    def clock(self) -> dict[str, float] | None:
-        """Accuracy of the times: DeviceClock.quality."""
-        ...
-
-    @property
-    def misfit(self) -> str:
-        """Why bytes are not frames, and the remedy, as far as it shows; "" if it does not."""
-        ...
-
-    def restart(self) -> None:
-        """Begin an enumeration, also the first: frame numbers get the next epoch, and the clock
-        starts again."""
-        ...
-
-    def feed(self, data: bytes, arrival_ns: int) -> Frames:
-        """The frames in bytes that were read until `arrival_ns`. Raises SensorMismatch."""
-        ...
 
 
 class Stream:

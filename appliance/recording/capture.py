@@ -31,9 +31,9 @@ from appliance.core.types import Edge, EdgeKind, Frames, SweepFormat
 from appliance.io import skin_profile, skin_stream
 from appliance.io.packets import Identity
 from appliance.io.robot_link import Command, command
+from appliance.io.sensor import OPENED, SensorCounters
 from appliance.io.skin_profile import PALPATE, SkinProfile
 from appliance.io.trigger import EdgeCounters
-from appliance.io.usb_sensor import OPENED, SensorCounters
 
 MAGIC = b"PPLPCAP1"
 MOST_KEPT = 99

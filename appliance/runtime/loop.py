@@ -23,8 +23,8 @@ from appliance.core.sentences import sentence
 from appliance.core.types import Status, Sweep, SweepFormat, Verdict
 from appliance.inference.early_exit import EarlyExit
 from appliance.io.robot_link import Command, Port
+from appliance.io.sensor import Sensor, SensorCounters
 from appliance.io.trigger import Trigger
-from appliance.io.usb_sensor import Sensor, SensorCounters
 from appliance.recording.sweep_window import SweepCutter
 
 TARE_S = 0.5
@@ -238,7 +238,7 @@ class Box:
 
     def _notify(self, calls: Iterable[Callable[..., None]], *event: Any) -> None:
         """Call the observers. A fault in one must not stop the classifying, so only expected errors
-        of the box's own outputs are raised."""
+        of the outputs are raised."""
         for call in calls:
             try:
                 call(*event)

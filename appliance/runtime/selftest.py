@@ -17,8 +17,9 @@ from appliance.inference.early_exit import EarlyExit
 from appliance.io import skin_profile, skins
 from appliance.io.gpio_lines import Lines
 from appliance.io.robot_link import SerialSink
+from appliance.io.sensor import Sensor
 from appliance.io.trigger import GpioTrigger
-from appliance.io.usb_sensor import Sensor, fits
+from appliance.io.usb_sensor import fits
 from appliance.runtime.assembly import UNSIGNED, gpio
 from appliance.signal.slide import SlideMeter
 

@@ -20,7 +20,8 @@ from appliance.core.types import SweepFormat, shown
 from appliance.io import packets
 from appliance.io.link import SkinLink
 from appliance.io.packets import Packet, Request, SkinFormat
-from appliance.io.usb_sensor import RATE_TOLERANCE, SensorCounters, Stream
+from appliance.io.sensor import SensorCounters
+from appliance.io.usb_sensor import RATE_TOLERANCE, Stream
 
 CLOCK_TOLERANCE = 200e-6
 """Largest relative deviation of a board's clock."""

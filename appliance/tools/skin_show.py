@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from appliance.alignment.live import VIEW_NS
 from appliance.core.clock import Clock
 from appliance.core.types import SweepFormat
-from appliance.io.usb_sensor import Sensor
+from appliance.io.sensor import Sensor
 from appliance.tools.skin_monitor import LiveView, SkinDisplay, SkinMonitor
 
 

@@ -22,10 +22,10 @@ from appliance.core.config import SkinConfig
 from appliance.core.errors import SensorBusy, SensorLost
 from appliance.core.types import Frames, SweepFormat
 from appliance.io import skin_profile
+from appliance.io.sensor import TransferObserver
 from appliance.io.serial_port import PortInfo
 from appliance.io.serial_sensor import SerialSensor
 from appliance.io.skin_profile import SkinProfile
-from appliance.io.usb_sensor import TransferObserver
 from appliance.sim.rig import VirtualClock
 from tests.factories.paths import ROOT
 

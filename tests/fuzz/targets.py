@@ -21,7 +21,7 @@ from appliance.core import sentences
 from appliance.core.errors import FormatError, SensorMismatch
 from appliance.core.types import SweepFormat
 from appliance.io import packets as wire
-from appliance.io import robot_link, usb_sensor
+from appliance.io import robot_link, sensor, usb_sensor
 from appliance.service import feed_reader
 from tests.fuzz import enrolments, far_sides, files, skins
 from tests.fuzz.files import one_line
@@ -118,7 +118,7 @@ def unpack(data: bytes, folder: Path) -> None:
 def _stream(data: bytes, cut: int, sent: int) -> None:
     """The frames that a sensor makes of the bytes: numbers rise, and each frame that came is
     returned, stale or lost."""
-    counters = usb_sensor.SensorCounters()
+    counters = sensor.SensorCounters()
     stream = usb_sensor.Stream(SKIN, counters)
     stream.restart()
     numbers = [-1]

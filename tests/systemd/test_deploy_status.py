@@ -2,44 +2,47 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
+import json
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(ROOT / "systemd"))
-deploy = pytest.importorskip("deploy")
+from tests.factories.install_scripts import run_here
 
-PACKED = deploy.BundleArchive("a" * 64, "one 1", b"")
-
-
+pytest.importorskip("pyinfra", reason="no pyinfra here; pip install -e .[deploy]")
+SHA = "a" * 64
+ASK = """
+import json, sys, deploy
 class AnsweringBox:
-    """A box that answers each question with the same text, and notes the questions."""
-
-    def __init__(self, text: str) -> None:
-        self.text, self.asked = text, list[tuple[str, str]]()
-
-    def run(self, what: str, command: str, *, user: str = "", **more: object) -> str:
-        """Answer."""
+    asked = []
+    def run(self, what, command, *, user="", **more):
         self.asked.append((command, user))
-        return self.text
+        return {answer!r}
+runs = deploy._runs(AnsweringBox(), deploy.BundleArchive("{sha}", "one 1", b""), "/s", "/r/status")
+print(json.dumps([runs, AnsweringBox.asked, deploy.MOST_STATUS]))
+"""
+
+
+def asked(answer: str) -> tuple[bool, list[list[str]], int]:
+    """Whether deploy takes the bundle for the one that runs if a box gives this answer, the
+    commands with their users, and the largest status that it reads."""
+    runs, commands, most = json.loads(run_here(ASK.format(answer=answer, sha=SHA)))
+    return runs, commands, most
 
 
 @pytest.mark.parametrize(
     "status",
     ["", "{", "[]", "3", '{"bundle": 5}', "{}", "\0" * 50, "[" * 5000, '{"bundle": "' + "b" * 8],
+    ids=["empty", "cut", "list", "number", "no text", "no bundle", "zeros", "deep", "cut text"],
 )
 def test_an_unreadable_status_counts_as_another_bundle(status: str):
     """No exception, and the bundle is delivered."""
-    box = AnsweringBox(f"bundles/{PACKED.sha}\n{status}")
-    assert deploy._runs(box, PACKED, "/s", "/r/status.json") is False
-    ((command, user),) = box.asked
+    runs, commands, most = asked(f"bundles/{SHA}\n{status}")
+    assert runs is False
+    ((command, user),) = commands
     assert user == "palpate"
-    assert f"head -c {deploy.MOST_STATUS}" in command
+    assert f"head -c {most}" in command
 
 
 def test_a_status_that_can_be_read_is_used():
     """The bundle that runs already is not delivered again."""
-    box = AnsweringBox(f'bundles/{PACKED.sha}\n{{"bundle": "{"a" * 8}"}}')
-    assert deploy._runs(box, PACKED, "/s", "/r/status.json") is True
+    assert asked(f'bundles/{SHA}\n{{"bundle": "{"a" * 8}"}}')[0] is True

@@ -109,11 +109,10 @@ def run_evaluate(args: argparse.Namespace) -> None:
     seeds, effort = options.seeds(args), options.effort(args)
     # the box sees raw counts
     box = None if args.remove_means or args.label_alone else box_answers.answers
-    protocols = tuple(args.protocols)
+    protocols, log = tuple(args.protocols), options.Log()
     plan = evaluate.Plan(names, protocols, seeds, args.remove_means, effort, args.each, box)
     results: list[dict[str, Any]] = []
     refused: dict[str, str] = {}
-    log = options.Log()
     trivially = _beside(sweeps, plan, log)
     for result in evaluate.evaluate(sweeps, plan, options.where(args), log):
         if result.refused:

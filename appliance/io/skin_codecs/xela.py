@@ -68,11 +68,8 @@ def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
     left = b"".join(lines) + data[at:]
     if len(data) - at > MOST_PACKET:
         garbage, left = garbage + len(left), b""
-    grid = shown((profile.rows, profile.cols))
-    more = {
-        "wrong": f"it sends taxels beyond {grid}" if beyond >= _WRONG_TAXELS else "",
-        "foreign": foreign,
-    }
+    wrong = f"it sends taxels beyond {shown((profile.rows, profile.cols))}"
+    more = {"wrong": wrong if beyond >= _WRONG_TAXELS else "", "foreign": foreign}
     return collected(profile, numbers, ends, skipped, garbage, Rest(left), size, **more)
 
 

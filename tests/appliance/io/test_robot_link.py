@@ -334,7 +334,7 @@ def test_too_few_class_bits():
 
 
 def test_a_line_that_echoes_gets_no_answers():
-    """The box's own sentences come back, whole or in part: they are not commands, so that no answer
+    """Sentences of the box come back, whole or in part: they are not commands, so that no answer
     is answered. A command among them is carried out."""
     own = [sentence(kind, 1, "ok") for kind in ("RES", "STA", "ANS", "REC")]
     found, rest = parse(b"".join(own) + b"$PPLP,ID\r\n" + own[0][:7])
