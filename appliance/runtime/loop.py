@@ -173,9 +173,9 @@ class Box:
         try:
             while not stopped():
                 self.step()
+            self._notify(self._on_stopping)
         finally:
             self._end()
-        self._notify(self._on_stopping)
 
     def step(self) -> list[Verdict]:
         """One turn, which takes at most the sensor's timeout. Returns the verdicts that were sent.
