@@ -26,6 +26,7 @@ from appliance.alignment.terminal import ASCII, BLOCKS, ENTER, LEAVE, Canvas, Sc
 from appliance.alignment.view import View
 from appliance.bundle import bundle
 from appliance.bundle.bundle import Bundle, Manifest
+from appliance.cli.common import StopFlag
 from appliance.cli.main import main
 from appliance.core import config
 from appliance.signal.contact import ContactPositions
@@ -216,9 +217,7 @@ def test_align_with_what_is_simulated(
         rate_hz=750.0,
     )
     turns = iter(range(1200))
-    monkeypatch.setattr(
-        "appliance.cli.look_commands.stop_flag", lambda: lambda: next(turns, None) is None
-    )
+    monkeypatch.setattr(StopFlag, "__call__", lambda flag: next(turns, None) is None)
     name = which if which == "skin" else f"replay:{tmp_path / 's.npz'}"
     assert main(["align", "--sim", name, "--virtual"]) == 0
     lines = capsys.readouterr().out.splitlines()
@@ -421,7 +420,7 @@ def test_ctrl_c_ends_it_and_leaves_the_terminal_as_it_was(
         shown = terminals.read(far, run, lambda shown: b"SIMULATED" in shown)
         run.send_signal(signal.SIGINT)
         shown += terminals.read(far, run)
-        assert terminals.ended(run, shown) == 0
+        assert terminals.ended(run, shown) == 130
     text = shown.decode()
     live = kind != "dumb"
     assert (text.startswith(ENTER), text.endswith(LEAVE)) == (live, live)
