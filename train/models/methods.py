@@ -172,12 +172,13 @@ def every(effort: Effort = FULL_EFFORT) -> dict[str, Method]:
 
 
 def module_of(name: str) -> str:
-    """The full name of the module that defines the method `name`, which must exist."""
-    return next(
+    """The full name of the module that defines the method `name`, "" if none does."""
+    modules = (
         module
         for module in MODULES
         if name in {m.name for m in _of(import_module(module), FULL_EFFORT)}
     )
+    return next(modules, "")
 
 
 def find(names: Sequence[str], effort: Effort = FULL_EFFORT) -> list[Method]:

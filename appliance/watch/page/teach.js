@@ -196,21 +196,22 @@ const PRESSED = {
 
 byId("teach").addEventListener("click", (event) => {
   const button = event.target.closest("button");
-  if (!button || button.type === "submit" || button.getAttribute("aria-disabled") === "true") return;
+  if (!button || button.id === "add-button" || button.getAttribute("aria-disabled") === "true") return;
   const {material, forget} = button.dataset;
   if (material) send("TEACH", material);
   else if (forget) send("FORGET", forget);
   else PRESSED[button.id]();
   if (!forget) button.blur(); // so that the pedal's Enter starts a sweep
 });
-byId("add").addEventListener("submit", async (event) => {
-  event.preventDefault();
+async function add() {
   const name = byId("name").value.trim();
   if (name && live() && !(await send("TEACH", name))) {
     byId("name").value = "";
     document.activeElement?.blur(); // field or button: so that the pedal starts a sweep
   }
-});
+}
+byId("add-button").addEventListener("click", add);
+byId("name").addEventListener("keydown", (event) => { if (event.key === "Enter") add(); });
 document.addEventListener("keydown", (event) => { // a USB pedal is a keyboard with one key
   if (!["Space", "Enter", "NumpadEnter"].includes(event.code) || event.repeat || event.target.closest("input, button")) return;
   event.preventDefault();

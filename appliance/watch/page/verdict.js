@@ -18,6 +18,7 @@ export const WORDS = {
   saturated: ["bad", "Too much force", "Press less."],
   "stuck-taxel": ["bad", "Skin faulty", "A taxel is stuck: check the skin."],
   "dead-taxel": ["bad", "Skin faulty", "A taxel is dead: check the skin."],
+  failed: ["bad", "Failed", "The box could not compute this sweep: sweep again."],
   "sensor-lost": ["bad", "Skin lost", "Check the skin's cable."],
   "no-start": ["bad", "No start", "A stop signal came alone: check the wire START."],
   "no-stop": ["bad", "No stop", "A second start signal came: check the wire STOP."],

@@ -546,17 +546,17 @@ def test_an_unknown_sweep_does_not_count_for_its_object(tmp_path: Path):
 
 
 def test_a_model_that_gives_no_number_is_unknown(tmp_path: Path):
-    """Huge float32 counts overflow the network: no label, no NaN, and the object's other sweeps are
-    unaffected."""
+    """Weights that overflow with large float32 counts: no label, no NaN, and the object's other
+    sweeps are unaffected."""
     format = replace(toy_bundle.FORMAT, dtype="float32")
-    made = toy_bundle.files(format=format, outputs=("logits",), known=None)
+    made = toy_bundle.files(format=format, outputs=("logits",), known=None, scale=1e28)
     limits = replace(bundle.Manifest.parse(made[bundle.MANIFEST]).thresholds, full_scale=3e38)
     made[bundle.MANIFEST] = replace(
         bundle.Manifest.parse(made[bundle.MANIFEST]), thresholds=limits
     ).json()
     it = Classifier(bundle.load(toy_bundle.put(tmp_path / "toy", made)), VirtualClock())
     far = toy_bundle.sweep(0, 0, object=1, format=format)
-    far.frames.taxels[::2, 0, :] = 2e38
+    far.frames.taxels[::2, 0, :] = 9e11
     with np.errstate(invalid="ignore"):
         v = it(far)
     assert (v.status, v.label, v.probability, v.detail) == (

@@ -169,7 +169,7 @@ def test_a_user_who_may_not_read_the_store_sees_the_packaged_bundle(
     monkeypatch.setattr(os, "readlink", refused)
     assert main(["demo", *VIRTUAL, "--set", f"store.folder={tmp_path}"]) == 0
     output = capsys.readouterr()
-    assert f"{tmp_path}/current: Permission denied, so the packaged bundle plays" in output.err
+    assert f"{tmp_path}/current: this user may not read" in output.err
     assert "sudo -u palpate" in output.err
     assert output.out.count("-> ") == 3
 

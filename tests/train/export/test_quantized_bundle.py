@@ -445,7 +445,7 @@ def test_a_bundle_is_replaced_whole_or_not_at_all(fitted: Fit, packed: Path, tmp
     quantized_bundle.export(fitted, target, "new", "2", "")
     assert bundle.load(target).manifest.name == "new"
     assert sorted(f.name for f in target.iterdir()) == sorted(
-        [bundle.MANIFEST, bundle.MODEL, bundle.GOLDEN, bundle.MEANS]
+        [bundle.MANIFEST, bundle.MODEL, bundle.GOLDEN, bundle.MEANS, "card.md"]
     )
     (tmp_path / "letters").mkdir()
     with pytest.raises(ExportRefused, match="is not a bundle and will not be replaced"):
