@@ -40,10 +40,9 @@ def test_the_guest_s_wheels_are_those_of_its_python(monkeypatch: pytest.MonkeyPa
     builds it."""
     lock = image.guest_lock()
     assert "numpy==2.3.5" in lock
-    assert "numpy==2.5" not in lock
     assert ";" not in lock
     monkeypatch.setattr(image, "GUEST_PYTHON", "3.13")
-    assert "numpy==2.5" in image.guest_lock()
+    assert "numpy==2.3.5" in image.guest_lock()
 
 
 def test_what_cannot_be_made_leaves_nothing(tmp_path: Path):

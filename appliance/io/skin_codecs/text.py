@@ -152,8 +152,11 @@ def _unfit(word: bytes, kind: str, remedy: str) -> str:
 
 
 def _strange(line: bytes, around: str, profile: SkinProfile) -> str:
+    found = line[:_SHOWN].decode("utf-8", "replace").strip()
+    if not found.isprintable() or "\ufffd" in found:
+        return ""  # no text at all: another skin, or another baud
     wanted = f"{profile.around[:_SHOWN]!r} is expected" if profile.around else "none is expected"
     return (
         f"{around[:_SHOWN]!r} stands around its numbers, {wanted}: "
-        f"{line[:_SHOWN].decode('utf-8', 'replace').strip()!r}; set around in its profile"
+        f"{found!r}; set around in its profile"
     )

@@ -54,7 +54,7 @@ def _loading(
             ["evaluate", "--list"],
             "numpy",
         ),  # while the program is imported
-        ("palpate-train", "train", ["evaluate", "--list"], "sklearn"),  # while the command is
+        ("palpate-train", "train", ["evaluate", "--list"], "scipy"),  # while the command is
     ],
 )
 def test_ctrl_c_during_the_imports_is_one_line(

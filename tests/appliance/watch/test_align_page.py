@@ -178,6 +178,8 @@ def circles(seen: BrowsedPage, which: str) -> list[dict[str, float]]:
 
 FILES = {
     "/",
+    "/tablet.js",
+    "/verdict.js",
     "/page.css",
     "/watch.js",
     "/events.js",
