@@ -180,6 +180,7 @@ FILES = {
     "/",
     "/tablet.js",
     "/verdict.js",
+    "/shift.js",
     "/page.css",
     "/watch.js",
     "/events.js",
