@@ -24,7 +24,7 @@ from appliance.core.provenance import commit
 from appliance.inference.classifier import Classifier
 from train.data.sets import Dataset
 from train.export import bundle_score, quantized_bundle
-from train.metrics.answers import REFUSED, UNKNOWN
+from train.metrics.answers import outcomes
 from train.models.recipe import recipe
 from train.models.recipe.recipe import Settings
 from train.onnx_tools.graph_builder import run
@@ -46,7 +46,7 @@ MOST_TESTED = 400
 class Promise:
     """The word of a fit and what became of it, in per cent. expected, of_this: printed, as the mean
     over conditions and for the condition that is left out; NaN if it has one value left. outcomes:
-    shares of the box's answers, rightly first. network: its label alone."""
+    shares of the box's answers, right first. network: its label alone."""
 
     expected: float
     of_this: float
@@ -56,7 +56,7 @@ class Promise:
     @property
     def rightly(self) -> float:
         """The share of sweeps that the box names rightly."""
-        return self.outcomes["rightly"]
+        return self.outcomes["right"]
 
 
 def load(name: str) -> Dataset | None:
@@ -86,20 +86,13 @@ def promise(train: Dataset, test: Dataset, condition: str, steps: int, seed: int
         quantized_bundle.export(made, Path(aside) / "b", "promise", "1", commit(), proven=False)
         box = Classifier(bundle.load(Path(aside) / "b"), SystemClock(), slides=False)
         labels, ok = bundle_score.labels_of(box, test)
-    right, named = labels == test.labels, labels >= 0
-    outcomes = {
-        "rightly": right & ok,
-        "wrongly": named & ok & ~right,
-        "unsure": named & ~ok,
-        "unknown": labels == UNKNOWN,
-        "refused": labels == REFUSED,
-    }
+    became = outcomes(labels, ok, test.labels)
     network = run(quantized_bundle.graphs(made)[1], test.samples).argmax(axis=1) == test.labels
     return Promise(
         float(np.mean(list(said.values()))),
         said.get(condition, np.nan),
         100 * float(network.mean()),
-        {name: 100 * float(share.mean()) for name, share in outcomes.items()},
+        {name: 100 * float(share.mean()) for name, share in became.items()},
     )
 
 

@@ -20,7 +20,7 @@ from train.data.sets import Dataset, digest
 from train.data.splitters import Protocol, draw
 from train.evaluation import parallel
 from train.evaluation.fold import AsTheBox, Fold, FoldTask, key, run
-from train.metrics.answers import REFUSED, UNKNOWN
+from train.metrics.answers import REFUSED, UNKNOWN, outcomes
 from train.metrics.score import Score, confusion, fuse, interval, provenance
 from train.models import methods as known_methods
 from train.models.methods import FULL_EFFORT, Effort
@@ -126,14 +126,10 @@ class Result:
                 for name in ("test", "box", "sure")
             )
             clusters = Protocol(self.protocol).clusters(self.sweeps)
-            right = sure & (labels == self.sweeps.labels[test])
-            box |= Score.of(right).json() | {
-                "wrong": int((sure & (labels >= 0) & ~right).sum()),
-                "unsure": int((~sure & (labels >= 0)).sum()),
-                "unknown": int((labels == UNKNOWN).sum()),
-                "refused": int((labels == REFUSED).sum()),
-                "interval": interval(right, None if clusters is None else clusters[test]),
-            }
+            became = outcomes(labels, sure, self.sweeps.labels[test])
+            right = became.pop("right")
+            box |= Score.of(right).json() | {name: int(of.sum()) for name, of in became.items()}
+            box["interval"] = interval(right, None if clusters is None else clusters[test])
         return box
 
     def each_fold(self) -> list[dict[str, Any]]:

@@ -17,6 +17,19 @@ NETWORK = "network alone"
 """Ends the name of the accuracy of the network's most probable labels, without the box's checks."""
 
 
+def outcomes(named: Array, sure: Array, labels: Array) -> dict[str, Array]:
+    """What became of n sweeps, bool [n] for each outcome, of which every sweep has one. named: int
+    [n], a label, REFUSED or UNKNOWN; sure: bool [n]; labels: int [n], the right ones."""
+    right = sure & (named == labels)
+    return {
+        "right": right,
+        "wrong": sure & (named >= 0) & ~right,
+        "unsure": ~sure & (named >= 0),
+        "unknown": named == UNKNOWN,
+        "refused": named == REFUSED,
+    }
+
+
 @dataclass(frozen=True)
 class Answers:
     """Answers to N sweeps. labels: int [N], a label, REFUSED or UNKNOWN. ok: bool [N], whether the
@@ -32,17 +45,12 @@ class Answers:
         """Accuracy by sweep, and by recording if a recording has several sweeps; labels,
         recordings: int [N] of the sweeps. A refused, unknown or unsure sweep does not count as
         right. Beside it the accuracy of the network alone."""
-        named = self.labels >= 0
-        right = (self.labels == labels) & self.ok
-        counts = {
-            "wrong": int((named & self.ok & ~right).sum()),
-            "unsure": int((named & ~self.ok).sum()),
-            "unknown": int((self.labels == UNKNOWN).sum()),
-            "refused": int((self.labels == REFUSED).sum()),
-        }
+        became = outcomes(self.labels, self.ok, labels)
+        counts = {name: int(of.sum()) for name, of in became.items()}
+        right = counts.pop("right")
         network = int((self.network == labels).sum())
         result = {
-            protocol: accuracy_figure(int(right.sum()), len(labels)) | counts,
+            protocol: accuracy_figure(right, len(labels)) | counts,
             f"{protocol}, {NETWORK}": accuracy_figure(network, len(labels)),
         }
         first = np.unique(recordings, return_index=True)[1]
