@@ -17,7 +17,7 @@ from scipy import linalg
 from appliance.bundle.bundle import Early, EarlyClasses
 from appliance.inference.novelty import EarlyDistances
 from train.calibration.heads import shrinkage
-from train.calibration.novelty import centred, embed_present, limit, parts
+from train.calibration.novelty import centred, cross_fitted, limit
 from train.metrics.temperature import sufficient_temperature
 
 Array = NDArray[Any]
@@ -149,9 +149,8 @@ def cross_fitted_logits(
     part are left out. Raises FormatError as novelty.parts.
     """
     classes, logits, numbers = int(labels.max()) + 1, [], []
-    for fit, judges in parts(groups, judged):
-        embedding, present = embed_present(tenths[fit, -1], labels[fit], fixed)
-        judges = judges[np.isin(labels[judges], present)]
+    parts = cross_fitted(tenths[:, -1], labels, groups, judged, fixed)
+    for fit, judges, embedding, present in parts:
         steps = heads(embedding(tenths[fit]), labels[fit], classes).logits(
             embedding(tenths[judges])
         )

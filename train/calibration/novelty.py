@@ -263,11 +263,19 @@ def cross_fitted_distances(
     and `embed`.
     """
     distances = np.full(len(labels), np.nan)
-    for fit, numbers in parts(groups, judged):
-        embedding, present = embed_present(features[fit], labels[fit], fixed)
-        numbers = numbers[np.isin(labels[numbers], present)]
+    for _, numbers, embedding, _ in cross_fitted(features, labels, groups, judged, fixed):
         distances[numbers] = embedding.novelty(features[numbers])
     return distances
+
+
+def cross_fitted(
+    features: Array, labels: Array, groups: Array, judged: Array, fixed: int = 0
+) -> Iterator[tuple[Array, Array, Embedding, Array]]:
+    """For each of `parts` the pair that it yields, the embedding of the sweeps to fit to, and the
+    labels [K] of its means. Sweeps of a material that occurs in no other part do not judge."""
+    for fit, numbers in parts(groups, judged):
+        embedding, present = embed_present(features[fit], labels[fit], fixed)
+        yield fit, numbers[np.isin(labels[numbers], present)], embedding, present
 
 
 def limit(novelty: Array, kept: float = KEPT) -> float:

@@ -81,14 +81,12 @@ def limit_of_conditions(found: Widened, given: CalibrationInputs) -> float:
     every, trained = [], len(found.training.labels)
     for values in given.conditions.values():
         distances = np.full(len(given.labels), np.nan)
-        for seen, judging in novelty.parts(values, given.judged):
-            embedding, present = novelty.embed_present(
-                given.whole[seen], given.labels[seen], given.fixed
-            )
+        for seen, judging, embedding, present in novelty.cross_fitted(
+            given.whole, given.labels, values, given.judged, given.fixed
+        ):
             means = embedding.means.astype(np.float64)
             training = found.training.take(seen[:trained], present).seen_by(embedding)
             shapes = found.rule.shapes(Scatters.of(training, means)).astype(np.float64)
-            judging = judging[np.isin(given.labels[judging], present)]
             away = embedding(given.whole[judging])[:, None] - means
             distances[judging] = shaped_distances(away, shapes).min(axis=1)
         every.append(distances)

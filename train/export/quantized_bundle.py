@@ -132,8 +132,7 @@ def _widened(
     fit: Fit, given: CalibrationInputs, apart: Embedding, whole: Embedding
 ) -> nuisances.Widened | None:
     """Shapes of known materials that know how altered sweeps differ, and their limit; see
-    nuisances. apart: an embedding that did not see the held-out
-    sweeps."""
+    nuisances. apart: an embedding that did not see the held-out sweeps."""
     trunk, spaces = fit.trunk(), [(of, of.means) for of in (apart, whole)]
     seed = int(fit.about["seed"])
     found = nuisances.measure(
