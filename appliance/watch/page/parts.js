@@ -3,6 +3,8 @@
 const TONES = {ok: "good", recorded: "good", unsure: "warn", undecided: "warn", unknown: "warn", conflict: "warn",
   displaced: "warn", aborted: "plain", off: "plain"};
 
+const ORDER_MS = 10_000;
+
 export const byId = (id) => document.getElementById(id);
 
 export function put(id, text) { if (byId(id).textContent !== text) byId(id).textContent = text; }
@@ -26,6 +28,19 @@ export function frame({state, fine, source, why = ""}) {
   }
   byId("banner").hidden = !why;
   put("banner", why);
+}
+
+/* Sends a command with the page's key, as on the serial line. What became of it: "", or why it was refused. */
+export async function order(program, key, command, text = "") {
+  try {
+    const answer = await fetch("/order", {
+      method: "POST", body: JSON.stringify({command, text}), signal: AbortSignal.timeout(ORDER_MS),
+      headers: {"Content-Type": "application/json", "X-Palpate-Key": key},
+    });
+    return answer.ok ? "" : (await answer.text()).trim() || `${program} answers ${answer.status}`;
+  } catch {
+    return `no connection to ${program}; what holds now is shown when it is back`;
+  }
 }
 
 /* Writes a sweep's status, in the colour of what it means. */

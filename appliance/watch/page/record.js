@@ -1,11 +1,11 @@
 /* The page of a recording: what is there and what is missing, the last sweep, the skin; and the labels, which are set here. */
 
 import {listen} from "/events.js";
-import {ago, byId, count, frame, made, mark, put} from "/parts.js";
+import {ago, byId, count, frame, made, mark, order, put} from "/parts.js";
 import {signal, spectrogram} from "/plots.js";
 import {SkinPicture} from "/skin.js";
 
-const FIELDS = ["material", "position", "session"], ORDER_MS = 10_000, SKIN = new SkinPicture(document.querySelector(".skin"));
+const FIELDS = ["material", "position", "session"], SKIN = new SkinPicture(document.querySelector(".skin"));
 let key, recording, last, view; // events of these names, as appliance/watch/record.py sends them
 let picture = null, drawn = {}, table = "", reached = null, answers = true, wallMs = 0, ordering = false, dirty = true;
 
@@ -146,19 +146,6 @@ function draw() {
   drawSweep();
 }
 
-/* Commands, as on the serial line. What became of one: "", or why it was refused. */
-async function order(command, text = "") {
-  try {
-    const answer = await fetch("/order", {
-      method: "POST", body: JSON.stringify({command, text}), signal: AbortSignal.timeout(ORDER_MS),
-      headers: {"Content-Type": "application/json", "X-Palpate-Key": key},
-    });
-    return answer.ok ? "" : (await answer.text()).trim() || `palpate record answers ${answer.status}`;
-  } catch {
-    return "no connection to palpate record; what holds now is shown when it is back";
-  }
-}
-
 /* Sends orders one after another, until one is refused: [command, text, what is said, its field]. */
 async function send(orders) {
   if (ordering) return;
@@ -166,7 +153,7 @@ async function send(orders) {
   for (const name of FIELDS) byId(name).removeAttribute("aria-invalid");
   let said = "";
   for (const [command, text, done, field] of orders) {
-    const why = await order(command, text);
+    const why = await order("palpate record", key, command, text);
     said = why || done;
     byId("said").className = why ? "wrong" : "";
     if (why && field) byId(field).setAttribute("aria-invalid", "true");

@@ -1,10 +1,10 @@
 /* The page of `palpate teach`: what to do next, the materials, what was learnt, and the bundle that is made of it. */
 
 import {listen} from "/events.js";
-import {ago, byId, made, mark, put} from "/parts.js";
+import {ago, byId, frame, made, mark, order, put} from "/parts.js";
 import {signal} from "/plots.js";
 
-const ORDER_MS = 10_000, STEPS = {start: "starting", features: "looking at the sweeps", heads: "learning", bundle: "checking"};
+const STEPS = {start: "starting", features: "looking at the sweeps", heads: "learning", bundle: "checking"};
 let key, recording, last; // events of these names, as appliance/watch/record.py sends them
 let picture = null, listed = "", reached = null, ordering = false, dirty = true, wallMs = 0;
 
@@ -26,12 +26,9 @@ function drawHeader() {
   const skin = recording && recording.skin !== "streaming" ? `no skin: ${recording.skin}${recording.trouble && `; ${recording.trouble}`}` : "";
   const heard = recording ? `; last heard of it ${ago(Date.now() - wallMs - recording.time_ns / 1e6)} ago` : "";
   const why = reached === false ? `no connection to palpate teach${heard}; trying again` : skin;
-  byId("banner").hidden = !why;
-  put("banner", why);
+  const state = !reached ? "no connection" : !recording ? "waiting" : skin ? `skin ${recording.skin}` : recording.sweeping ? "sweeping" : "ready";
+  frame({state, fine: live() && !skin, source: recording?.source, why});
   document.body.classList.toggle("stale", Boolean(why));
-  put("state", !reached ? "no connection" : !recording ? "waiting" : skin ? `skin ${recording.skin}` : recording.sweeping ? "sweeping" : "ready");
-  byId("state").className = live() && !skin ? "pill fine" : "pill";
-  byId("simulated").hidden = !recording || recording.source === "usb";
   byId("format").hidden = !recording;
   if (recording) put("format", recording.format);
 }
@@ -157,23 +154,10 @@ function draw() {
   drawSweep();
 }
 
-/* What became of an order: "", or why it was refused. */
-async function order(command, text = "") {
-  try {
-    const answer = await fetch("/order", {
-      method: "POST", body: JSON.stringify({command, text}), signal: AbortSignal.timeout(ORDER_MS),
-      headers: {"Content-Type": "application/json", "X-Palpate-Key": key},
-    });
-    return answer.ok ? "" : (await answer.text()).trim() || `palpate teach answers ${answer.status}`;
-  } catch {
-    return "no connection to palpate teach; what holds now is shown when it is back";
-  }
-}
-
 async function send(...words) {
   if (ordering) return "";
   ordering = true;
-  const why = await order(...words);
+  const why = await order("palpate teach", key, ...words);
   put("said", why);
   ordering = false;
   dirty = true;
