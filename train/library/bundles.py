@@ -12,7 +12,7 @@ from appliance.bundle import bundle
 from appliance.core.clock import SystemClock
 from appliance.core.errors import FormatError
 from appliance.core.types import Verdict
-from appliance.inference.classifier import Classifier, softmax
+from appliance.inference.classifier import Classifier
 from train.data.sets import Dataset
 from train.export import bundle_score
 from train.library.sweeps import raw_counts
@@ -45,7 +45,7 @@ class BundleClassifier:
         found = np.full((len(x), len(self.classes_)), np.nan)
         for i, verdict in enumerate(self.verdicts(x)):
             if len(verdict.scores):
-                found[i] = softmax(np.asarray(verdict.scores, np.float64))
+                found[i] = verdict.scores
         return found
 
     def score(self, x: Any, y: Any) -> float:

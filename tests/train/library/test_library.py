@@ -93,6 +93,11 @@ def test_a_bundle_answers_with_the_boxs_code(fitted: PalpateClassifier, tmp_path
     known = set(box.predict(SWEEPS[36:])) - {"unknown"}
     assert known == {"felt", "wood"}
     assert box.predict_proba(SWEEPS[36:]).shape == (12, 2)
+    for found, verdict in zip(
+        box.predict_proba(SWEEPS[36:]), box.verdicts(SWEEPS[36:]), strict=True
+    ):
+        if verdict.label:
+            assert found.max() == pytest.approx(verdict.probability)
     with pytest.raises(FormatError, match="the bundle takes 2x2 uint8 at 100 Hz, window 100"):
         box.predict(SWEEPS[36:, :, :50])
     with pytest.raises(FormatError, match="X holds float32, and the bundle takes uint8"):
