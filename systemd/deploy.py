@@ -128,7 +128,7 @@ def _runs(box: FleetBox, packed: BundleArchive, store: str, status: str) -> bool
     """Whether the box runs the bundle now, and will after a restart. A status that cannot be read
     counts as another bundle."""
     look = f"readlink {store}/current && head -c {MOST_STATUS} {status}"
-    # as the service's user, which owns the file: what is there may be a link
+    # as the service's user, which owns the file: the file may be a link
     seen = box.run("asking what runs", f"{{ {look}; }} 2>/dev/null || true", user="palpate")
     link, _, text = seen.partition("\n")
     try:

@@ -83,8 +83,8 @@ def _classify(args: argparse.Namespace, settings: Config, choice: Choice | None)
 
 
 def untaught(args: argparse.Namespace, settings: Config, packaged: Bundle) -> bool:
-    """Whether there is no bundle for the skin: none was delivered or taught, and the packaged one
-    is for another skin. A skin of PROTOCOL.md announces its format later, so it does not count."""
+    """Whether the skin lacks a bundle: none was delivered or taught, and the packaged bundle is for
+    another skin. A skin of PROTOCOL.md announces its format later, so it does not count."""
     profile = skins.profile(settings)
     return (
         not args.sim

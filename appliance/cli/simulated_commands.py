@@ -46,8 +46,8 @@ def _played_bundle(settings: Config) -> Bundle:
 
 
 def run_demo(args: argparse.Namespace) -> int:
-    """Show sweeps through a pseudo-terminal, from both ends: a tour of what a box meets, or the
-    sweeps of --sim."""
+    """Show sweeps through a pseudo-terminal, from both ends: a tour of good and faulty sweeps, or
+    the sweeps of --sim."""
     from appliance.tools import demo, pseudo_terminal
 
     settings = load_settings(args)

@@ -308,7 +308,7 @@ class Session:
         log.info(text)
 
     def _command(self, by: str) -> list[str]:
-        """The command of the process that makes a bundle, with the settings of this one."""
+        """The command of the process that makes a bundle, with the same settings."""
         args = self._args
         options = ["--board", args.board] if args.board else []
         options += ["--config-dir", str(args.config_dir)] if args.config_dir else []

@@ -1,4 +1,4 @@
-"""The key with which a box signs what it has learnt itself: enrolled labels, and taught bundles.
+"""The key with which a box signs its own lessons: enrolled labels, and taught bundles.
 
 `make install` makes the key's folder. `key` is the private key, which only the user palpate may
 read. `signer` is the public key, a line of a file of signers that belongs to root. Signatures have
@@ -28,8 +28,8 @@ class EnrolmentKey:
     folder: Path
 
     def check(self, namespace: str = NAMESPACE) -> None:
-        """Raises ConfigError unless this user can sign an enrolment, or what the namespace is for,
-        so that this box accepts it."""
+        """Raises ConfigError unless this user can sign an enrolment, or another file of the
+        namespace, so that this box accepts it."""
         try:
             self.verify(PROBE, self.sign(PROBE, namespace), namespace)
         except BundleError as e:

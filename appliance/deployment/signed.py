@@ -50,9 +50,8 @@ class SignedBundle:
 class BundleFolder:
     """Complete, verified bundles in `folder`, each under its name.
 
-    signers: the file of trusted signers. key: this box's key for what it has learnt. taught:
-    whether bundles that it has taught are accepted.
-    """
+    signers: the file of trusted signers. key: this box's key for its own lessons. taught: whether
+    bundles that it has taught are accepted."""
 
     def __init__(
         self, folder: Path, signers: Path, key: EnrolmentKey, *, taught: bool = True

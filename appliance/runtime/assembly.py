@@ -115,9 +115,8 @@ def recorder(
     """The box that records sweeps of a format and needs no bundle; the class bits stay 0.
 
     ordered: commands also come from another source than the port. serving: whether READY may rise.
-    announce: called with what a trigger without lines has to say to a person. Other parameters as
-    for `box`.
-    """
+    announce: called with the messages of a trigger without lines to a person. Other parameters as
+    for `box`."""
     check = SweepCheck(format, devices.clock)
     watching = [check, *observers]
     return _assembled(

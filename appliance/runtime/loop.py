@@ -211,7 +211,8 @@ class Box:
             self._notify(self._on_edges, now_ns, edges)
 
     def _end(self) -> None:
-        """Answer each sweep that is still open, whatever has failed. What fails is tried twice."""
+        """Answer each sweep that is still open, whatever has failed. A step that fails is tried
+        twice."""
         now = self._turn_ns
         for what, act in (
             ("the last commands", self._obey_asked),
@@ -467,8 +468,8 @@ class Box:
 
 
 def _succeeds(what: str, act: Callable[[], object]) -> bool:
-    """Whether `act` raises no exception. One is logged, because what comes after must be done as
-    well."""
+    """Whether `act` raises no exception. An exception is logged, because the next step must be done
+    as well."""
     try:
         act()
     except Exception as e:

@@ -172,8 +172,8 @@ def _listened(
 def _counted(
     sensor: Sensor, format: SweepFormat, first_ns: int, now_ns: Callable[[], int], *, clocked: bool
 ) -> tuple[str, float]:
-    """Read frames for a while: why their rate is another one, "" if it is not, and the time in
-    seconds. clocked: the skin has a clock, so that the sensor compares the rate."""
+    """Read frames for a while: why their rate differs, "" if it does not, and the time in seconds.
+    clocked: the skin has a clock, so that the sensor compares the rate."""
     counters, first = sensor.counters, sensor.counters.frames
     seconds = max(LISTEN_S, min(LONGEST_S, LEAST_FRAMES / format.rate_hz))
     points, why = [(0, first_ns)], ""
@@ -206,7 +206,7 @@ def _first_frame(sensor: Sensor, now_ns: Callable[[], int]) -> int:
 
 def _another_rate(points: list[tuple[int, int]], wanted_hz: float) -> str:
     """Why a skin without a clock sends at another rate than wanted, "" if it does not. points:
-    frames so far, and the time. One frame more or less is no evidence."""
+    frames so far, and the time. One frame more or less does not count."""
     from appliance.io import skin_stream  # boxes whose skin has a clock do without it
 
     third = len(points) // 3

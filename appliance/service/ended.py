@@ -38,7 +38,7 @@ class Ended:
 
     @property
     def text(self) -> str:
-        """The reason and what happens next, for a person."""
+        """The reason and the next step, for a person."""
         if self.code == EX_CONFIG:
             return (
                 f"it ended with exit code {self.code} and stays stopped: {self.why}; correct that,"

@@ -1,9 +1,8 @@
 """Whether a window is a slide over something: a material must not be learned from a finger at rest,
 from noise, or from a single taxel.
 
-Unlike the checks of an answer this one does not know the material. Over a slide a pattern passes
-from taxel to taxel, which neither a resting finger nor noise gives. docs/decisions/0027 has the
-figures.
+Unlike the checks of an answer, it does not know the material. Over a slide a pattern passes from
+taxel to taxel, which neither a resting finger nor noise gives. docs/decisions/0027 has the figures.
 """
 
 from __future__ import annotations

@@ -136,8 +136,8 @@ def enclosed(loaded: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def inspect_readings(taxels: NDArray[Any]) -> Finding:
-    """Check a window of a skin of which nothing is known: a taxel with a count that is not a number
-    or impossibly large is dead."""
+    """Check a window of an unknown skin: a taxel with a count that is not a number or impossibly
+    large is dead."""
     if taxels.dtype.kind != "f":
         return Finding(Status.OK)
     shape = (*taxels.shape[1:], 1)[:3]

@@ -32,7 +32,7 @@ Learn = Callable[[str], list[str]]
 
 
 class TeachingSession(Observer):
-    """Observes a recording and teaches what it has stored.
+    """Observes a recording and teaches the stored sweeps.
 
     store: the store's folder. learn: makes the command of USE. say: called with TCH sentences.
     clock: the real clock, because processes run in real time. It must come after `recording` among

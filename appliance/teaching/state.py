@@ -1,4 +1,4 @@
-"""What a person decided about recorded sweeps: materials that are no longer taught.
+"""Decisions of a person about recorded sweeps: materials that are no longer taught.
 
 The sweeps themselves stay, for `palpate-train pull` and for a change of mind.
 """

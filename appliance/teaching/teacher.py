@@ -23,7 +23,7 @@ class Teacher(Observer):
         self.done = False
 
     def turn(self, health: Health) -> None:
-        """Go on with the next material if this one is complete."""
+        """Go on with the next material if this material is complete."""
         if not self._complete:
             return
         if self._left:

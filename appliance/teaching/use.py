@@ -75,7 +75,7 @@ def use(
 
 
 def assessed(settings: Config, clock: Clock) -> str:
-    """What the recorded sweeps would teach, for a person. Raises TeachingFailed if they are too
+    """The lesson of the recorded sweeps, for a person. Raises TeachingFailed if they are too
     few."""
     folder = Path(settings.store.folder)
     forgotten = TeachingState.load(folder).forgotten

@@ -143,7 +143,7 @@ class Demo:
             self._print(self._row(act, answer, right=right))
 
     def _row(self, act: Act, answer: Answer, *, right: bool) -> str:
-        """A line: what the finger felt, the answer and its probability, right or wrong, and why."""
+        """A line: the touched material, the answer and its probability, right or wrong, and why."""
         named = answer.label if answer.status == Status.OK else answer.status
         sure = f"{100 * answer.probability:.1f} %" if answer.status == Status.OK else ""
         early = f"after {answer.share:.0%} of the window" if answer.share < 1 else ""

@@ -1,4 +1,4 @@
-"""The card of a bundle, card.md: what it was made of and what breaks it, for people and programs.
+"""The card of a bundle, card.md: its origin and its limits, for people and programs.
 
 It repeats the manifest and the training sweeps. The box does not read it, and the signature does
 not cover it.

@@ -33,9 +33,9 @@ class PalpateClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  
     """The recipe of `palpate-train fit`.
 
     rate_hz: frames per second of X. grid: rows, columns and axes of the channels of X [n, channels,
-    time]; None for one column. group: what the `groups` of `fit` are; whole positions are held out
-    where there are several. reattached, mains_hz: as the options of `fit`. steps: of the training
-    of stages; 0 for none. size: one of train.models.recipe.sizes.SIZES, None for no limit.
+    time]; None for one column. group: the name of the `groups` of `fit`; whole positions are held
+    out where there are several. reattached, mains_hz: as the options of `fit`. steps: of the
+    training of stages; 0 for none. size: one of train.models.recipe.sizes.SIZES, None for no limit.
     random_state: the seed, a whole number; the same seed and sweeps give the same model.
 
     After `fit`: classes_ [K], fit_ (the train.models.recipe.fitted.Fit), sweeps (its Dataset).

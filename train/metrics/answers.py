@@ -18,8 +18,8 @@ NETWORK = "network alone"
 
 
 def outcomes(named: Array, sure: Array, labels: Array) -> dict[str, Array]:
-    """What became of n sweeps, bool [n] for each outcome, of which every sweep has one. named: int
-    [n], a label, REFUSED or UNKNOWN; sure: bool [n]; labels: int [n], the right ones."""
+    """The outcome of n sweeps: for each outcome bool [n]; every sweep has a single outcome. named:
+    int [n], a label, REFUSED or UNKNOWN; sure: bool [n]; labels: int [n], the right ones."""
     right = sure & (named == labels)
     return {
         "right": right,

@@ -65,7 +65,7 @@ def _run(args: argparse.Namespace) -> None:
 
     about = {"by": args.by, "at": args.at}
     manifest = teach(lesson, args.out, args.version, about, args.seed, tell)
-    # not ru_maxrss: that begins with the memory of the program that started this one
+    # not ru_maxrss, which begins with the memory of the parent process
     status = Path("/proc/self/status").read_text()
     peak = int(status.partition("VmHWM:")[2].split()[0]) // 1024
     _say("taught", labels=manifest.labels, figures=manifest.figures, peak_mb=peak)

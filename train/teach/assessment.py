@@ -1,4 +1,4 @@
-"""What a box has learnt so far, judged by sweeps that the heads did not see.
+"""The knowledge of a box so far, judged by sweeps that the heads did not see.
 
 Each part of the sweeps is left out in turn: places, sessions or objects if there are several of
 them, else single sweeps. The candidates of the recipe are compared on the same parts, so accuracy
@@ -156,8 +156,8 @@ class Assessment:
 
 
 def assess(lesson: Lesson, seed: int = 0, log: Log = no_log) -> Assessment:
-    """Judge what can be learnt from the materials that have two sweeps or more. Raises FormatError
-    if fewer than two materials have."""
+    """Judge a model of the materials that have two sweeps or more. Raises FormatError if fewer than
+    two materials have."""
     lesson = lesson.repeated()
     setup = recipe.Setup.of(lesson.sweeps, seed, recipe.Settings(steps=0), log)
     fixed = setup.fixed

@@ -99,7 +99,7 @@ def test_what_both_axes_could_be_is_asked_for(shape: tuple[int, ...], grid: str,
 
 
 def test_square_arrays_of_taxels_and_frames_are_asked_for():
-    """16 frames of 16 taxels: no axis shows what it is."""
+    """16 frames of 16 taxels: no axis shows its kind."""
     x = np.arange(256).reshape(16, 16)
     with pytest.raises(
         FormatError, match="both axes could be the 16 taxels; say which with --axes"

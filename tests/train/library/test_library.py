@@ -77,7 +77,7 @@ def test_groups_are_left_out():
 
 
 def test_a_bundle_answers_with_the_boxs_code(fitted: PalpateClassifier, tmp_path: Path):
-    """save_bundle, load_bundle, predict; the card says what the bundle was made of."""
+    """save_bundle, load_bundle, predict; the card names the origin of the bundle."""
     manifest = fitted.save_bundle(tmp_path / "b", licence="CC-BY-4.0", proven=False)
     assert manifest.labels == ("felt", "wood")
     head = yaml.safe_load((tmp_path / "b" / "card.md").read_text().split("---")[1])

@@ -160,7 +160,7 @@ def test_all_sizes_are_judged_on_the_same_sweeps():
 
 
 def test_equal_models_are_fitted_once():
-    """With one taxel there are no relations: `pairs` chooses what `bands` chose, `all` more."""
+    """A single taxel has no relations: `pairs` chooses what `bands` chose, `all` more."""
     sweeps = skin()
     one = replace(sweeps, samples=sweeps.samples[:, :, :1])
     judged = dial.judge(one, 1, CLOSED, ["bands", "pairs", "all"], nothing)

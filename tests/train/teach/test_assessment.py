@@ -1,4 +1,4 @@
-"""What a box says it has learnt: accuracy, confusion, wrong labels, and what to record next."""
+"""The assessment of a box: accuracy, confusion, wrong labels, and what to record next."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def sure(*named: int) -> np.ndarray:
 
 
 def test_easy_materials_are_enough():
-    """All sweeps are right, and the sentence says what the interval says."""
+    """All sweeps are right, and the sentence agrees with the interval."""
     found = assess(lesson(easy(14)))
     assert found.json()["accuracy"] == 1
     assert found.low > 0.9

@@ -1,4 +1,4 @@
-"""The sweeps that a box is taught from: what is left out, and what is completed."""
+"""The sweeps that a box is taught from: omissions and completions."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_a_missing_position_is_a_place_of_its_own(tmp_path: Path):
 
 
 def test_nothing_to_teach_is_an_error_with_the_reasons(tmp_path: Path):
-    """The message counts what was left out."""
+    """The message counts the omitted sweeps."""
     sweeps(tmp_path, "", "")
     with pytest.raises(FormatError, match=r"no sweep can be taught \(2 no material\); record some"):
         Lesson.read(tmp_path)

@@ -1,4 +1,4 @@
-"""`python -m train.teach` as a process: what it imports, prints, writes, and how it fails."""
+"""`python -m train.teach` as a process: its imports, output, files and failures."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def ran(*words: str | Path) -> tuple[int, list[dict[str, Any]], set[str]]:
 
 
 def test_a_bundle_is_made_without_a_desktops_libraries(tmp_path: Path):
-    """Assessment and fit import neither torch nor scikit-learn nor pandas. The bundle is the one of
+    """Assessment and fit import neither torch nor scikit-learn nor pandas. The bundle is that of
     the recipe without stages, names its sweeps, and says who has taught it."""
     sweeps = easy(12)
     plain = replace(sweeps, groups={"recording": np.arange(len(sweeps))})

@@ -65,7 +65,7 @@ def test_arrays_are_found_in_structures(tmp_path: Path):
 
 @pytest.mark.parametrize("name", ["skin", "data/skin"])
 def test_version_7_3_is_read_beside_objects(tmp_path: Path, name: str):
-    """Strings, dates, tables and cells are no arrays of frames; axes are MATLAB's; a structure is
+    """Strings, dates, tables and cells are not arrays of frames; axes are MATLAB's; a structure is
     walked into."""
     found = raw_files.read(new(tmp_path / "a.mat", name), ReadPlan(name.replace("/", ".")))
     np.testing.assert_array_equal(found.values, SKIN)

@@ -363,7 +363,7 @@ def test_groups_that_can_be_left_out_judge():
 
 def varied() -> Dataset:
     """Easy sweeps under three forces, with two tools. Each force shows the materials at another
-    pitch: a new one hides them."""
+    pitch: a new force hides them."""
     sweeps, n = easy(30), 90
     force = np.arange(n) % 3
     faster = np.array([1.0, 2.5, 5.0])[force]
@@ -398,7 +398,7 @@ def test_sweeps_without_recordings_are_numbered_before_they_are_divided():
 
 
 def test_only_named_conditions_judge():
-    """What varies in service may be said; a group that cannot be left out is refused by name."""
+    """The varying conditions may be named; a group that cannot be left out is refused by name."""
     made = recipe.fit(varied(), 1, replace(CLOSED, varies=("batch",)))
     assert made.about["conditions"] == ["batch"]
     assert next(iter(made.held_out_figures())) == "held-out batch"
