@@ -85,6 +85,7 @@ REPORTS = (
     ResultFile(
         "bench", "data/bench.json", ("appliance", "bench", "--json", "docs/data/bench.json")
     ),
+    ResultFile("junk", "data/junk.json", ("tests.campaigns", "junk")),
     ResultFile("skins", "data/skins.json", ("tests.skins",)),
     ResultFile(
         "soak", "data/soak.json", ("tests.rig.soak", "--out", "docs/data/soak.json"), (EMULATOR,)
