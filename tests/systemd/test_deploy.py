@@ -104,8 +104,8 @@ def release(host: hosts.Host) -> str:
 def start_again(host: hosts.Host) -> None:
     """As after a power cut: systemd reads the unit on the disk again and starts the release on the
     disk."""
-    if host.service["MainPID"] != "0":
-        host.service.kill("SIGKILL")
+    kill = ("systemctl", "kill", "--kill-whom=main", "--signal=SIGKILL", "palpate")
+    host.machine.run(*kill)  # it fails where the delivery has just stopped the process
     host.machine.get("systemctl", "daemon-reload")
     host.machine.get("systemctl", "--no-block", "restart", "palpate")
     host.service.until("ActiveState", "active")

@@ -4,6 +4,7 @@ line: from a box without a bundle to right verdicts on four materials."""
 from __future__ import annotations
 
 import json
+import re
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -77,9 +78,12 @@ def test_from_nothing_to_right_verdicts_on_four_materials(browser: Any, box: Tau
     assert "two sweeps of two materials are needed" in hand.seen.text("#accuracy")
     for material in PITCHES:
         hand.add(material)
-        for _ in range(EACH):
+        for _ in range(EACH + TRIES):  # a busy machine may cut a slide short: once more
             hand.slide(material)
-    hand.until("#learnt", lambda text: f" of {4 * EACH} sweeps " in text)
+            if "enough of it" in hand.seen.text("#count"):
+                break
+    learnt = re.compile(r" of (\d+) sweeps ")
+    hand.until("#learnt", lambda text: any(int(n) >= 4 * EACH for n in learnt.findall(text)))
     assert "right, between" in hand.seen.text("#accuracy")
     begun = time.monotonic()
     hand.press("#use")
