@@ -96,8 +96,9 @@ def packed(archives: ReleaseArchives, architecture: str, out: Path) -> Path:
 
 def package_version() -> str:
     """The version, with the time of the commit, so that a later commit is an upgrade."""
-    command = ["git", "-C", ROOT, "log", "-1", "--format=%cd", "--date=format:%Y%m%d.%H%M%S"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    command = ["git", "-C", ROOT, "log", "-1", "--format=%cd", "--date=format-local:%Y%m%d.%H%M%S"]
+    zone = os.environ | {"TZ": "UTC"}
+    done = subprocess.run(command, env=zone, capture_output=True, text=True, check=False)
     return f"{__version__}+{done.stdout.strip()}" if done.stdout.strip() else __version__
 
 

@@ -110,11 +110,14 @@ def _use(args: argparse.Namespace, settings: Config) -> int:
     try:
         by = args.by or getpass.getuser()
         sha = use.use(settings, assembly.store(settings), by, SystemClock(), tell)
-    except ApplianceError as e:
+    except (ApplianceError, OSError) as e:
         if not args.json:
             raise
-        print(json.dumps({"type": "error", "text": str(e)}), flush=True)
-        return e.exit_code
+        code, text = 1, f"{e}; see to the disk (df -h), and try again"
+        if isinstance(e, ApplianceError):
+            code, text = e.exit_code, str(e)
+        print(json.dumps({"type": "error", "text": text}), flush=True)
+        return code
     text = f"bundle {sha[:8]} with {', '.join(told['labels'])} is installed, on trial"
     if args.json:
         print(json.dumps({**told, "type": "taught", "sha": sha, "text": text}), flush=True)

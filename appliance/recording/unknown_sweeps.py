@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from appliance.core.errors import FormatError
+from appliance.core.errors import ApplianceError, FormatError
 from appliance.core.log import log
 from appliance.core.types import Status, sidecar
 
@@ -18,13 +18,14 @@ ALIKE = re.compile(r"; as sweep (\d{1,9})$")
 
 @dataclass(frozen=True, slots=True)
 class UnknownGroup:
-    """Sweeps of one unknown material. numbers: of their files, in order. date: of the last one."""
+    """Sweeps of one unknown material. paths: of their files by number, in order. date: of the last
+    sweep."""
 
-    numbers: tuple[int, ...]
+    paths: dict[int, Path]
     date: str
 
     def __str__(self) -> str:
-        return f"{len(self.numbers)} sweeps, {', '.join(map(str, self.numbers))}; last {self.date}"
+        return f"{len(self.paths)} sweeps: {', '.join(map(str, self.paths))}; the last {self.date}"
 
 
 def groups(folder: Path, bundle: str) -> list[UnknownGroup]:
@@ -32,6 +33,7 @@ def groups(folder: Path, bundle: str) -> list[UnknownGroup]:
     know, the largest first. A file that cannot be used is logged and left out."""
     joined: dict[int, int] = {}
     dates: dict[int, str] = {}
+    paths: dict[int, Path] = {}
     for path in sorted(folder.glob("sweep-*.json")):
         try:
             number, before, date = _answer(path, bundle)
@@ -40,14 +42,29 @@ def groups(folder: Path, bundle: str) -> list[UnknownGroup]:
             continue
         if not number:
             continue
-        dates[number], joined[number] = date, number
+        dates[number], joined[number], paths[number] = date, number, path.with_suffix(".npy")
         if before in joined:
             joined[number] = _first(joined, before)
     found: dict[int, list[int]] = {}
     for number in sorted(joined):
         found.setdefault(_first(joined, number), []).append(number)
     large = sorted((one for one in found.values() if len(one) > 1), key=len, reverse=True)
-    return [UnknownGroup(tuple(one), dates[one[-1]]) for one in large]
+    return [UnknownGroup({n: paths[n] for n in one}, dates[one[-1]]) for one in large]
+
+
+def chosen(found: list[UnknownGroup], number: int, folder: Path) -> UnknownGroup:
+    """The group with the sweep `number`; for 0 the only group. Raises ApplianceError with the
+    groups that there are."""
+    if not found:
+        raise ApplianceError(
+            f"no unknown material was seen twice in {folder}: store.black_box = 500 keeps the last "
+            "500 sweeps; make sweeps of the material, or enrol it without --unknown"
+        )
+    fitting = [one for one in found if number in one.paths or not number]
+    if len(fitting) != 1:
+        shown = "; ".join(map(str, found))
+        raise ApplianceError(f"name one of these by a sweep of it, --unknown NUMBER: {shown}")
+    return fitting[0]
 
 
 def _answer(path: Path, bundle: str) -> tuple[int, int, str]:

@@ -23,7 +23,7 @@ from tests.factories.nspawn import PALPATE, SITE
 from tests.factories.paths import ROOT
 
 pytest.importorskip("pyinfra", reason="no pyinfra here; pip install -e .[deploy]")
-APT = ("env", "DEBIAN_FRONTEND=noninteractive", "apt-get", "-y", "-q", "--no-download")
+APT = ("env", "DEBIAN_FRONTEND=noninteractive", "apt-get", "-y", "-q")
 AS_BOX = ("setpriv", "--reuid=palpate", "--regid=palpate", "--init-groups", PALPATE)
 APART = ("--set", "store.folder=/var/lib/palpate/simulated")
 """A folder of simulated sweeps, which must not teach the box itself."""
