@@ -118,7 +118,10 @@ def main(argv: list[str] | None = None) -> int:
     )
     args = parser.parse_args(argv)
     # make install builds both wheels
-    wheels = [args.wheel, *([args.teaching] if args.teaching.is_file() and not args.no_teach else [])]
+    wheels = [
+        args.wheel,
+        *([args.teaching] if args.teaching.is_file() and not args.no_teach else []),
+    ]
     for file in (*wheels, *([args.signers] if args.signers else [])):
         if not file.is_file():
             sys.exit(f"palpate: no file {file}; check the path (make install builds the wheel)")

@@ -44,9 +44,7 @@ def _make(key: Path) -> None:
         key.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=True)
     except (OSError, subprocess.CalledProcessError) as e:
-        raise Failed(
-            f"{key} cannot be made: {e}; name a file of signers with SIGNERS=FILE"
-        ) from e
+        raise Failed(f"{key} cannot be made: {e}; name a file of signers with SIGNERS=FILE") from e
 
 
 def _name() -> str:

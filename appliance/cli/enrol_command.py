@@ -102,9 +102,7 @@ def _enrolment_key(args: argparse.Namespace, settings: Config) -> EnrolmentKey |
 def _unknown_sweeps(number: int, folder: Path, current: Bundle) -> NDArray[Any]:
     """The windows of kept sweeps of one unknown material, the last MOST_SWEEPS. Raises
     ApplianceError if fewer than two can be used."""
-    group = unknown_sweeps.chosen(
-        unknown_sweeps.groups(folder, current.id), number, folder
-    )
+    group = unknown_sweeps.chosen(unknown_sweeps.groups(folder, current.id), number, folder)
     log.info(f"taken: {group}")
     check, windows = enrolment.slide_check(current), []
     for kept, path in group.paths.items():

@@ -77,7 +77,8 @@ def until_taught(args: argparse.Namespace, settings: Config) -> int:
     )
     defaults = {"labels": [], "good": GOOD, "position": "1", "session": "", "web": None}
     defaults |= {"use": False, "by": "", "format": None, "window": None}
-    Session(argparse.Namespace(**vars(args) | defaults), settings).run()
+    # without a line it waits all the same, for the page or a robot's commands
+    Session(argparse.Namespace(**vars(args) | defaults), without_lines(args, settings)).run()
     return 0
 
 
@@ -128,8 +129,12 @@ def _use(args: argparse.Namespace, settings: Config) -> int:
 
 def by_page(args: argparse.Namespace, settings: Config) -> Config:
     """The settings of a session: where no GPIO line is wired, the page starts and stops sweeps."""
-    wired = args.sim or settings.trigger.start or not settings.trigger.by_lines
-    if args.web is None or wired:
+    return settings if args.web is None else without_lines(args, settings)
+
+
+def without_lines(args: argparse.Namespace, settings: Config) -> Config:
+    """The settings with sweeps by command where no GPIO line is wired."""
+    if args.sim or settings.trigger.start or not settings.trigger.by_lines:
         return settings
     return replace(settings, trigger=replace(settings.trigger, mode="serial"))
 

@@ -1,5 +1,5 @@
-"""Teaching, cut short. A box forgets a material, makes a bundle of its sweeps, tries and commits it,
-is taught again, and gets a delivery.
+"""Teaching, cut short. A box forgets a material, makes a bundle of its sweeps, tries it, is taught
+again, and gets a delivery.
 
 The judge finds each box that does not come back with the old or the new bundle, whole; that has
 lost a sweep or a decision; or that cannot be taught again. `python -m tests.cuts.teaching ARGUMENT

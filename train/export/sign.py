@@ -17,7 +17,6 @@ from appliance.core import storage
 from appliance.core.errors import BundleError
 from appliance.deployment import signature
 
-
 own_key = signature.own_key
 
 

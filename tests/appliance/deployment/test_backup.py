@@ -194,9 +194,7 @@ def test_a_full_disk_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert seen(new) == before
 
 
-def test_a_stopped_restore_is_completed_by_another(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_stopped_restore_is_completed_by_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """After a power cut at any rename of the swap, the same command restores the rest."""
     data = saved(old_box(tmp_path / "old"))
     for cut in range(4):

@@ -10,11 +10,11 @@ import pytest
 
 from appliance.bundle import bundle
 from appliance.cli.main import main
-from appliance.sim.rig import VirtualClock
 from appliance.core.errors import ApplianceError
 from appliance.inference.classifier import Classifier
 from appliance.recording import unknown_sweeps
 from appliance.recording.black_box import BlackBox
+from appliance.sim.rig import VirtualClock
 from tests.factories import toy_bundle
 
 FELT = [(20, 20), (20.4, 19.7), (19.8, 20.5), (20.2, 20.1), (19.9, 19.6), (20.1, 20.4)]
@@ -87,7 +87,7 @@ def test_a_damaged_sidecar_is_named_and_left_out(
 
 def test_which_group_is_never_guessed(tmp_path: Path, box: Classifier):
     """Without a number there has to be one only; the message lists what there is."""
-    with pytest.raises(ApplianceError, match="store.black_box = 500 keeps the last 500 sweeps"):
+    with pytest.raises(ApplianceError, match=r"store\.black_box = 500 keeps the last 500 sweeps"):
         unknown_sweeps.chosen([], 0, tmp_path)
     kept(tmp_path, box, *FELT[:2])
     found = unknown_sweeps.groups(tmp_path, box.bundle.id)

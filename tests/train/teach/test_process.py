@@ -102,7 +102,7 @@ def materials(kinds: int, each: int, spread: float) -> Dataset:
     phase = 2 * np.pi * (pitch[:, None] * np.arange(64) + rng.random((kinds * each, 1)))
     level = rng.uniform(80, 120, (kinds * each, 1, 2, 2))
     samples = level + 12 * np.sin(phase)[:, :, None, None]
-    samples = samples + 2 * rng.standard_normal(samples.shape[:2] + (2, 2))
+    samples = samples + 2 * rng.standard_normal((*samples.shape[:2], 2, 2))
     names = tuple(f"material {k}" for k in range(kinds))
     groups = {"recording": np.arange(kinds * each)}
     return Dataset(samples.astype(np.uint8), labels, names, 100.0, groups, "materials")
