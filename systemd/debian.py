@@ -84,7 +84,14 @@ def packed(archives: ReleaseArchives, architecture: str, out: Path) -> Path:
             if path.parent.name != "DEBIAN":
                 path.chmod(0o755 if path.is_dir() else 0o644)
         # wheels are compressed already
-        command = ["dpkg-deb", "--root-owner-group", "-Znone", "--build", folder, target]
+        command: list[str | Path] = [
+            "dpkg-deb",
+            "--root-owner-group",
+            "-Znone",
+            "--build",
+            folder,
+            target,
+        ]
         try:
             subprocess.run(command, check=True, capture_output=True, text=True)
         except FileNotFoundError as e:
@@ -96,7 +103,15 @@ def packed(archives: ReleaseArchives, architecture: str, out: Path) -> Path:
 
 def package_version() -> str:
     """The version, with the time of the commit, so that a later commit is an upgrade."""
-    command = ["git", "-C", ROOT, "log", "-1", "--format=%cd", "--date=format-local:%Y%m%d.%H%M%S"]
+    command = [
+        "git",
+        "-C",
+        str(ROOT),
+        "log",
+        "-1",
+        "--format=%cd",
+        "--date=format-local:%Y%m%d.%H%M%S",
+    ]
     zone = os.environ | {"TZ": "UTC"}
     done = subprocess.run(command, env=zone, capture_output=True, text=True, check=False)
     return f"{__version__}+{done.stdout.strip()}" if done.stdout.strip() else __version__
@@ -205,7 +220,7 @@ if ! start; then
   fi
   [ "$(systemctl show palpate --value -p ExecMainStatus)" = 78 ] || \\
     fail "the service does not come up; journalctl -u palpate says why"
-  echo "palpate: installed; the service needs a setting in {install.SETTINGS}, as the line above says"
+  echo "palpate: installed; it needs a setting in {install.SETTINGS}, see the line above"
   exit 0
 fi
 {install.tidy()}

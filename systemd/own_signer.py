@@ -39,7 +39,18 @@ def line(report: Callable[[str], None]) -> str:
 
 
 def _make(key: Path) -> None:
-    command = ["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", "palpate", "-f", key]
+    command: list[str | Path] = [
+        "ssh-keygen",
+        "-q",
+        "-t",
+        "ed25519",
+        "-N",
+        "",
+        "-C",
+        "palpate",
+        "-f",
+        key,
+    ]
     try:
         key.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=True)

@@ -90,7 +90,7 @@ def _add(tar: tarfile.TarFile, path: Path, name: str, digests: dict[str, str]) -
         with path.open("rb") as file:
             member, hashed = tar.gettarinfo(arcname=name, fileobj=file), HashedFile(file)
             member.type = tarfile.REGTYPE  # also of a file with two names
-            tar.addfile(member, hashed)  # type: ignore[arg-type]
+            tar.addfile(member, hashed)
         digests[name] = hashed.digest.hexdigest()
     except FileNotFoundError:
         return
