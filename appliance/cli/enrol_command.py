@@ -36,7 +36,8 @@ def run(args: argparse.Namespace) -> int:
     start = assembly.running(settings, answers=not args.sim)
     kept = Path(settings.store.folder) / "black-box"
     if args.label is None:
-        print(*unknown_sweeps.groups(kept, start.bundle.id) or ["none"], sep="\n")
+        found = unknown_sweeps.groups(kept, start.bundle.id)
+        print("\n".join(map(str, found)) or "no unknown material was seen twice")
         return 0
     key = _enrolment_key(args, settings)
     enrolment.admit(start.bundle, args.label)

@@ -77,8 +77,8 @@ def until_taught(args: argparse.Namespace, settings: Config) -> int:
     )
     defaults = {"labels": [], "good": GOOD, "position": "1", "session": "", "web": None}
     defaults |= {"use": False, "by": "", "format": None, "window": None}
-    # without a line it waits all the same, for the page or a robot's commands
-    Session(argparse.Namespace(**vars(args) | defaults), without_lines(args, settings)).run()
+    taught = argparse.Namespace(**vars(args) | defaults)
+    Session(taught, without_lines(args, settings), waits=True).run()
     return 0
 
 
@@ -140,9 +140,11 @@ def without_lines(args: argparse.Namespace, settings: Config) -> Config:
 
 
 class Session:
-    """Records and assesses until a bundle is made; with a page, then tries it until DONE."""
+    """Records and assesses until a bundle is made; with a page, then tries it until DONE. waits:
+    run even if nothing can start a sweep."""
 
-    def __init__(self, args: argparse.Namespace, settings: Config) -> None:
+    def __init__(self, args: argparse.Namespace, settings: Config, *, waits: bool = False) -> None:
+        self._waits = waits
         self._args, self._settings, self._stopped = args, by_page(args, settings), StopFlag()
         self._store = Path(settings.store.folder)
         self._obey: Callable[[Command], list[object]] = _not_now
@@ -217,7 +219,7 @@ class Session:
                     *pages,
                 ],
                 commands={**recording.commands, **self._by_robot(session.commands)},
-                ordered=bool(pages),
+                ordered=bool(pages) or self._waits,
                 serving=False,
                 announce=self._announce,
             )
