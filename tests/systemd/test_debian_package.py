@@ -210,7 +210,7 @@ def test_a_box_without_a_bundle_for_its_skin_starts_in_teach_mode(host: hosts.Ho
         time.sleep(0.2)
     host.service.until("StatusText", r"skin (?!streaming).*")
     assert host.service["ActiveState"] == "activating"
-    assert "nothing taught yet" in host.machine.get(PALPATE, "status")
+    assert "nothing taught yet" in host.machine.run(PALPATE, "status").stdout  # 69: no skin
     host.machine.get("rm", SITE)
     host.service.start()
 
