@@ -2,7 +2,9 @@
 
 `python systemd/debian.py dist` writes a package for each architecture. It holds the archives that
 `make install` copies to a box, one for each Python of PYTHONS; its scripts run the commands that
-`make install` runs there. So a box is the same by either way, and either way can upgrade it.
+`make install` runs there. So a box is the same by either way, and either way can upgrade it. The
+environment is built on the box because dpkg removes the files of an old package before it sets up
+the new one: a release that fails its self-test must find the old release in place.
 """
 
 from __future__ import annotations
