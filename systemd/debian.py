@@ -34,6 +34,33 @@ READY_S = 60
 """Longest wait for the service at the end of an installation, in seconds."""
 
 
+START = (
+    """\
+# whether the service comes up: runs, or waits for its skin
+start() {
+  systemctl daemon-reload
+  ! command -v udevadm > /dev/null || { udevadm control --reload && udevadm trigger; } || true
+  systemctl reset-failed palpate 2> /dev/null || true
+  systemctl --no-block restart palpate
+  tries=0
+  while [ $tries -lt """
+    + str(READY_S)
+    + """ ]; do
+    sleep 1
+    tries=$((tries + 1))
+    state=$(systemctl show palpate --value -p ActiveState)
+    text=$(systemctl show palpate --value -p StatusText)
+    [ "$state" != active ] || return 0
+    [ "$state" != failed ] && [ "$(systemctl show palpate --value -p NRestarts)" -lt 2 ] || return 1
+    case $text in "skin "*) [ $tries -lt 10 ] || return 0 ;; esac
+  done
+  return 1
+}
+"""
+)
+"""A function of the shell: the service runs, or waits for its skin."""
+
+
 def main() -> int:
     """Write the packages; the exit code."""
     parser = argparse.ArgumentParser(description="Packs Palpate as Debian packages.")
@@ -194,25 +221,12 @@ if [ ! -d /run/systemd/system ]; then
   echo "palpate: installed; it starts with the system"
   exit 0
 fi
-# whether the service comes up: runs, or waits for its skin
-start() {{
-  systemctl daemon-reload
-  ! command -v udevadm > /dev/null || {{ udevadm control --reload && udevadm trigger; }} || true
-  systemctl reset-failed palpate 2> /dev/null || true
-  systemctl --no-block restart palpate
-  tries=0
-  while [ $tries -lt {READY_S} ]; do
-    sleep 1
-    tries=$((tries + 1))
-    state=$(systemctl show palpate --value -p ActiveState)
-    text=$(systemctl show palpate --value -p StatusText)
-    [ "$state" != active ] || return 0
-    [ "$state" != failed ] && [ "$(systemctl show palpate --value -p NRestarts)" -lt 2 ] || return 1
-    case $text in "skin "*) [ $tries -lt 10 ] || return 0 ;; esac
-  done
-  return 1
-}}
-if ! start; then
+{START}{_comes_up()}"""
+
+
+def _comes_up() -> str:
+    """The end of that script: the service starts, or the old release runs again."""
+    return f"""if ! start; then
   journalctl -q -t palpate -n 5 -o cat >&2 || true
   old=$(readlink {LINK}.previous || true)
   if [ -n "$old" ] && [ "$old" != "$name" ]; then

@@ -9,6 +9,7 @@ the command again to finish. The boxes need internet only for missing Debian pac
 
 from __future__ import annotations
 
+import argparse
 import shlex
 import sys
 import tempfile
@@ -95,28 +96,7 @@ MODEL = "/proc/device-tree/model"
 
 def main(argv: list[str] | None = None) -> int:
     """Install on all boxes; the exit code."""
-    parser = options("Installs or upgrades the runtime on bare Debian boxes.", LIMIT_S)
-    parser.add_argument(
-        "--board", default="", help="board file for a box that has no settings yet: rpi4, rpi5"
-    )
-    parser.add_argument(
-        "--signers",
-        type=Path,
-        metavar="FILE",
-        help="allowed_signers: the signers whose bundles the box accepts",
-    )
-    parser.add_argument(
-        "--wheel", type=Path, default=WHEEL, help="of this checkout (make install builds it)"
-    )
-    parser.add_argument(
-        "--teaching", type=Path, default=TEACHING, help="of palpate-train (make install builds it)"
-    )
-    parser.add_argument(
-        "--no-teach",
-        action="store_true",
-        help="without the program and libraries of palpate teach (make install TEACH=0)",
-    )
-    args = parser.parse_args(argv)
+    args = _parser().parse_args(argv)
     # make install builds both wheels
     wheels = [
         args.wheel,
@@ -140,6 +120,31 @@ def main(argv: list[str] | None = None) -> int:
     with tempfile.TemporaryDirectory() as folder:
         archives = ReleaseArchives(wheels, [*PATHS, SKINS], Path(folder))
         return each(args, one)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = options("Installs or upgrades the runtime on bare Debian boxes.", LIMIT_S)
+    parser.add_argument(
+        "--board", default="", help="board file for a box that has no settings yet: rpi4, rpi5"
+    )
+    parser.add_argument(
+        "--signers",
+        type=Path,
+        metavar="FILE",
+        help="allowed_signers: the signers whose bundles the box accepts",
+    )
+    parser.add_argument(
+        "--wheel", type=Path, default=WHEEL, help="of this checkout (make install builds it)"
+    )
+    parser.add_argument(
+        "--teaching", type=Path, default=TEACHING, help="of palpate-train (make install builds it)"
+    )
+    parser.add_argument(
+        "--no-teach",
+        action="store_true",
+        help="without the program and libraries of palpate teach (make install TEACH=0)",
+    )
+    return parser
 
 
 def known_board(board: str) -> str:

@@ -21,7 +21,7 @@ from appliance.core.log import log
 from appliance.core.types import load
 from appliance.deployment.enrolment_key import EnrolmentKey
 from appliance.inference import enrolment
-from appliance.inference.enrolment import SweepCollector
+from appliance.inference.enrolment import Enrolment, SweepCollector
 from appliance.recording import unknown_sweeps
 from appliance.runtime import assembly
 
@@ -53,8 +53,7 @@ def run(args: argparse.Namespace) -> int:
             f"{new.disagreement}, or give --scattered if all are of {args.label!r}; nothing was"
             " written"
         )
-    for warning in filter(None, (new.disagreement, *new.warnings)):
-        log.warning(f"warning: {warning}")
+    _warn(new)
     files = enrolment.files(start.files, new, key.sign(new.file) if key else None)
     if args.out:
         enrolment.write(files, args.out, args.replace)
@@ -72,6 +71,11 @@ def run(args: argparse.Namespace) -> int:
         f" labels; {how}"
     )
     return 0
+
+
+def _warn(new: Enrolment) -> None:
+    for warning in filter(None, (new.disagreement, *new.warnings)):
+        log.warning(f"warning: {warning}")
 
 
 def _enrolment_key(args: argparse.Namespace, settings: Config) -> EnrolmentKey | None:
