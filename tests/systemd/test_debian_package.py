@@ -212,6 +212,7 @@ def test_a_box_without_a_bundle_for_its_skin_starts_in_teach_mode(host: hosts.Ho
     assert host.service["ActiveState"] == "activating"
     assert "nothing taught yet" in host.machine.run(PALPATE, "status").stdout  # 69: no skin
     host.machine.get("rm", SITE)
+    host.machine.get("systemctl", "stop", "palpate")  # a start would wait for this one
     host.service.start()
 
 

@@ -142,7 +142,7 @@ def test_a_full_disk_leaves_no_bundle(tmp_path: Path):
         check=False,
     )
     assert done.returncode
-    assert "nothing was changed" in json.loads(done.stdout.splitlines()[-1])["text"]
+    assert "cannot be written to" in json.loads(done.stdout.splitlines()[-1])["text"]
     assert [path.name for path in tmp_path.iterdir()] == ["sweeps"]
 
 
