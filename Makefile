@@ -22,7 +22,7 @@ SCRATCH = $(or $(shell df -Pk /dev/shm 2>/dev/null | awk 'NR > 1 && $$4 > 100000
 PYTEST = $(BIN)/python -m pytest -q -n $(shell expr `nproc` + 1)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo desktop test test-fast test-all lint types bundle bench site deploy install sbom clean
+.PHONY: help demo desktop test test-fast test-all lint types bundle bench site deploy install deb clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -73,15 +73,19 @@ deploy: $(FLEET) ## put a signed BUNDLE= on HOST= or HOSTS=inventory.py; SHADOW=
 	  $(if $(SHADOW),--shadow) $(if $(OTHER_SKIN),--other-skin) \
 	  $(if $(value BUNDLE),$(call quoted,BUNDLE),$(error name the bundle with BUNDLE=its folder))
 
-sbom: $(RUNTIME) ## list what the box carries, with licences: dist/palpate.cdx.json
-	PYTHONPATH=. $(BIN)/python systemd/sbom.py dist/palpate.cdx.json
+# setuptools would put leftovers of an older build into the wheel
+WHEELS = rm -rf build/lib build/bdist.*; $(PIP) wheel --no-deps -w dist . \
+  $(if $(filter 0,$(TEACH)),,&& $(PIP) wheel --no-deps -w dist ./train)
 
 install: $(FLEET) ## install or upgrade Debian boxes, HOST= or HOSTS=; BOARD=rpi5, SIGNERS=FILE, TEACH=0
-	rm -rf build/lib build/bdist.* # setuptools would put leftovers of an older build into the wheel
-	$(PIP) wheel --no-deps -w dist .
-	$(if $(filter 0,$(TEACH)),,$(PIP) wheel --no-deps -w dist ./train)
+	$(WHEELS)
 	$(BIN)/python systemd/install.py $(WHERE) $(if $(BOARD),--board $(call quoted,BOARD)) \
 	  $(if $(SIGNERS),--signers $(call quoted,SIGNERS)) $(if $(filter 0,$(TEACH)),--no-teach)
+
+deb: $(FLEET) ## pack the same as dist/palpate_*.deb for arm64 and amd64, with a list of what is in it
+	$(WHEELS)
+	$(BIN)/python systemd/debian.py dist
+	PYTHONPATH=. $(BIN)/python systemd/sbom.py dist/palpate.cdx.json
 
 clean: ## remove everything that was built, the virtual environment too
 	rm -rf $(VENV) build dist *.egg-info train/*.egg-info

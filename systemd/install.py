@@ -9,11 +9,13 @@ the command again to finish. The boxes need internet only for missing Debian pac
 
 from __future__ import annotations
 
+import argparse
 import shlex
 import sys
 import tempfile
 from pathlib import Path
 
+import own_signer
 from enrolment_key import make as make_enrolment_key
 from fleet import Failed, FleetBox, each, options, remedy
 from manual import write as write_manual
@@ -58,6 +60,7 @@ LINKS = {path: f"{LINK}/share/palpate/{Path(name).name}" for name, path in PATHS
     },
     "/etc/systemd/system/multi-user.target.wants/palpate.service": "../palpate.service",
     "/usr/local/bin/palpate": f"{LINK}/bin/palpate",
+    "/usr/local/bin/palpate-backup": f"{LINK}/bin/palpate-backup",
 }
 """Symlinks on a box, and their targets."""
 PIP = (
@@ -86,10 +89,40 @@ READY_S, STARTS = 40, 2
 """A release has failed if it is not READY after so many seconds, or has ended so often."""
 LIMIT_S = 1800
 """Time limit for each box."""
+SETTINGS, SIGNERS = "/etc/palpate/palpate.toml", "/etc/palpate/allowed_signers"
+MODEL = "/proc/device-tree/model"
+"""The board's name, where its firmware tells one."""
 
 
 def main(argv: list[str] | None = None) -> int:
     """Install on all boxes; the exit code."""
+    args = _parser().parse_args(argv)
+    # make install builds both wheels
+    wheels = [
+        args.wheel,
+        *([args.teaching] if args.teaching.is_file() and not args.no_teach else []),
+    ]
+    for file in (*wheels, *([args.signers] if args.signers else [])):
+        if not file.is_file():
+            sys.exit(f"palpate: no file {file}; check the path (make install builds the wheel)")
+    try:
+        known_board(args.board)
+    except Failed as e:
+        sys.exit(f"palpate: {e}")
+    signers = args.signers.read_text() if args.signers else ""
+    asks = bool(args.host) and sys.stdin.isatty()
+    write_manual(ROOT / "build" / "manual.md")
+
+    def one(box: FleetBox) -> str:
+        board = known_board(box.data("board", args.board)) or (asked_board(box) if asks else "")
+        return install(box, archives, board, signers)
+
+    with tempfile.TemporaryDirectory() as folder:
+        archives = ReleaseArchives(wheels, [*PATHS, SKINS], Path(folder))
+        return each(args, one)
+
+
+def _parser() -> argparse.ArgumentParser:
     parser = options("Installs or upgrades the runtime on bare Debian boxes.", LIMIT_S)
     parser.add_argument(
         "--board", default="", help="board file for a box that has no settings yet: rpi4, rpi5"
@@ -104,28 +137,14 @@ def main(argv: list[str] | None = None) -> int:
         "--wheel", type=Path, default=WHEEL, help="of this checkout (make install builds it)"
     )
     parser.add_argument(
+        "--teaching", type=Path, default=TEACHING, help="of palpate-train (make install builds it)"
+    )
+    parser.add_argument(
         "--no-teach",
         action="store_true",
         help="without the program and libraries of palpate teach (make install TEACH=0)",
     )
-    args = parser.parse_args(argv)
-    # make install builds both wheels
-    wheels = [args.wheel, *([TEACHING] if TEACHING.is_file() and not args.no_teach else [])]
-    for file in (*wheels, *([args.signers] if args.signers else [])):
-        if not file.is_file():
-            sys.exit(f"palpate: no file {file}; check the path (make install builds the wheel)")
-    try:
-        known_board(args.board)
-    except Failed as e:
-        sys.exit(f"palpate: {e}")
-    signers = args.signers.read_text() if args.signers else ""
-    write_manual(ROOT / "build" / "manual.md")
-    with tempfile.TemporaryDirectory() as folder:
-        archives = ReleaseArchives(wheels, [*PATHS, SKINS], Path(folder))
-        return each(
-            args,
-            lambda box: install(box, archives, known_board(box.data("board", args.board)), signers),
-        )
+    return parser
 
 
 def known_board(board: str) -> str:
@@ -137,6 +156,28 @@ def known_board(board: str) -> str:
             f"{', '.join(known)}"
         )
     return board
+
+
+def asked_board(box: FleetBox) -> str:
+    """The board whose pins a person chooses, "" for none. Nothing is asked if the box has a board
+    already or tells its own."""
+    found = box.run(
+        "looking for its board", f"grep '^board *=' {SETTINGS} 2> /dev/null || {own_board()}"
+    )
+    known = boards(ROOT / "firmware_config")
+    if found and (found.startswith("board") or found in known):
+        return ""
+    question = f"{box.name}: the pins of which board? {', '.join(known)}, or Enter for none: "
+    while (board := input(question).strip()) and board not in known:
+        print(f"there is no board {board!r}")
+    return board
+
+
+def own_board(model: str = MODEL) -> str:
+    """The command that prints the name of the box's board, such as rpi5; nothing for another
+    computer than a Raspberry Pi. model: the file with its name."""
+    pattern = r"s/^Raspberry Pi \(Compute Module \)\{0,1\}\([0-9]\{1,\}\).*/rpi\2/p"
+    return f"sed -n '{pattern}' {model} 2> /dev/null || true"
 
 
 def install(box: FleetBox, archives: ReleaseArchives, board: str, signers: str) -> str:
@@ -163,6 +204,8 @@ def install(box: FleetBox, archives: ReleaseArchives, board: str, signers: str) 
         )
     # also of an install that was interrupted after it had built
     box.run("tidying up", "rm -f .palpate-*.tar")
+    if not signers and not box.run("looking for signers", f"cat {SIGNERS} 2> /dev/null || true"):
+        signers = own_signer.line(box.report)
     setup = prepare(release, board, signers)
     said = box.run("users, folders and settings", setup, user="root", limit_s=SETUP_S).splitlines()
     for line in said:
@@ -251,18 +294,18 @@ echo {Path(release).name} > {release}/stamp
 sync -f {release}"""
 
 
-def _set_board(board: str) -> str:
-    """Write the board into the site file; all other settings stay."""
-    file, line = "/etc/palpate/palpate.toml", f'board = "{board}"'
-    new = (
-        f"{{ echo {shlex.quote(line)}; sed '/^board *=/d' {file} 2> /dev/null || true; "
-        f"}} > {file}.new"
-    )
-    return (
-        f"if ! grep -qxF {shlex.quote(line)} {file} 2> /dev/null; then {new} &&"
-        f" sync -f {file}.new && mv {file}.new {file} &&"
-        f" echo {shlex.quote(f'{line} stands in {file} now')}; fi"
-    )
+def _set_board(board: str, share: str) -> str:
+    """Write the board into the site file; all other settings stay. Without a name, a box that has
+    no board gets its own, if `share` has a file for it."""
+    return f"""board={shlex.quote(board)}
+if [ -z "$board" ] && ! grep -q '^board *=' {SETTINGS} 2> /dev/null; then
+  board=$({own_board()}); [ -e "{share}/board-$board.toml" ] || board=
+fi
+line="board = \\"$board\\""
+if [ -n "$board" ] && ! grep -qxF "$line" {SETTINGS} 2> /dev/null; then
+  {{ echo "$line"; sed '/^board *=/d' {SETTINGS} 2> /dev/null || true; }} > {SETTINGS}.new
+  sync -f {SETTINGS}.new && mv {SETTINGS}.new {SETTINGS} && echo "$line stands in {SETTINGS} now"
+fi"""
 
 
 def prepare(release: str, board: str, signers: str) -> str:
@@ -278,15 +321,14 @@ def prepare(release: str, board: str, signers: str) -> str:
         make_enrolment_key(),
     ]
     if signers:
-        file, text = "/etc/palpate/allowed_signers", shlex.quote(signers)
+        file, text = SIGNERS, shlex.quote(signers)
         lines += [
             f'if [ ! -e {file} ]; then {_put(file, text)}; elif [ "$(cat {file}; echo .)" != '
             f"{text}. ]; then"
             f" echo '{file} differs from this file there, and stays; change it on the box' >&2; "
             "exit 1; fi"
         ]
-    if board:
-        lines.append(_set_board(board))
+    lines.append(_set_board(board, share))
     for path, target in LINKS.items():
         settings = path.startswith("/etc/palpate/")
         own = (
@@ -339,15 +381,19 @@ def switch(box: FleetBox, name: str, release: str, *, restart: bool) -> str:
         "systemctl try-restart palpate-watch 'palpate-bridge@*'",
         user="root",
     )
-    keep = f"$(readlink -e {LINK}) $(readlink -e {LINK}.previous || true)"
-    tidy = (
-        f'for one in {LINK}-*; do case " {keep} " in *" $one "*) ;; *) rm -rf "$one";; esac; done'
-    )
-    box.run("removing older releases", tidy, user="root", limit_s=120)
+    box.run("removing older releases", tidy(), user="root", limit_s=120)
     if not ready:
         return f"{name} installed; it waits: {box.result['waits']}"
     lost = f", {box.result['lost_s']} s without classifying" if "lost_s" in box.result else ""
     return f"{name} is READY {box.result['ready_s']} s after the command{lost}"
+
+
+def tidy() -> str:
+    """The command that removes all releases but the present and the previous one."""
+    keep = f"$(readlink -e {LINK}) $(readlink -e {LINK}.previous || true)"
+    return (
+        f'for one in {LINK}-*; do case " {keep} " in *" $one "*) ;; *) rm -rf "$one";; esac; done'
+    )
 
 
 def _swap_back(box: FleetBox, release: str) -> str:

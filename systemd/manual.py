@@ -25,6 +25,7 @@ from appliance.core.storage import put
 ROOT = Path(__file__).resolve().parent.parent
 BOX_PAGES = (
     "explanation/what-it-is.md",
+    "tutorials/first-day.md",
     "tutorials/first-start.md",
     "how-to/wire.md",
     "reference/pins.md",
@@ -43,6 +44,7 @@ BOX_PAGES = (
     "how-to/use-your-own-skin.md",
     "how-to/watch.md",
     "how-to/update.md",
+    "how-to/back-up.md",
     "how-to/find-a-fault.md",
     "reference/settings.md",
     "reference/commands.md",

@@ -247,7 +247,7 @@ def test_the_box_gets_the_manual(manual: ModuleType):
     assert len(titles) == len(manual.BOX_PAGES)
     assert "<!--" not in text
     assert "](" not in text
-    assert "wire it (section 3)" in text
+    assert "wire it (section 4)" in text
     assert "| `classifier.fuse` |" in text
     assert len(re.findall(r"[_~]{4}", text)) >= 30
     copied = (ROOT / "systemd" / "install.py").read_text()

@@ -5,20 +5,28 @@ from __future__ import annotations
 import argparse
 from contextlib import ExitStack
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from appliance.bundle.bundle import Bundle
 from appliance.cli.common import StopFlag, load_settings
 from appliance.cli.devices import open_devices
+from appliance.cli.parser import MOST_SWEEPS
 from appliance.core.config import Config
-from appliance.core.errors import BundleError, ConfigError
+from appliance.core.errors import ApplianceError, BundleError, ConfigError, FormatError
 from appliance.core.log import log
+from appliance.core.types import load
 from appliance.deployment.enrolment_key import EnrolmentKey
 from appliance.inference import enrolment
-from appliance.inference.enrolment import SweepCollector
+from appliance.inference.enrolment import Enrolment, SweepCollector
+from appliance.recording import unknown_sweeps
 from appliance.runtime import assembly
+
+FEWEST = 2
+"""Fewest kept sweeps of an unknown material: one does not come again."""
 
 
 def run(args: argparse.Namespace) -> int:
@@ -26,18 +34,26 @@ def run(args: argparse.Namespace) -> int:
     folder."""
     settings = load_settings(args)
     start = assembly.running(settings, answers=not args.sim)
+    kept = Path(settings.store.folder) / "black-box"
+    if args.label is None:
+        found = unknown_sweeps.groups(kept, start.bundle.id)
+        print("\n".join(map(str, found)) or "no unknown material was seen twice")
+        return 0
     key = _enrolment_key(args, settings)
     enrolment.admit(start.bundle, args.label)
     if args.out:
         enrolment.check_target(args.out, args.replace)
-    new = enrolment.enrol(start.bundle, args.label, _good_sweeps(args, settings, start.bundle))
+    if args.unknown is None:
+        sweeps = _good_sweeps(args, settings, start.bundle)
+    else:
+        sweeps = _unknown_sweeps(args.unknown, kept, start.bundle)
+    new = enrolment.enrol(start.bundle, args.label, sweeps)
     if new.disagreement and not args.scattered:
         raise BundleError(
             f"{new.disagreement}, or give --scattered if all are of {args.label!r}; nothing was"
             " written"
         )
-    for warning in filter(None, (new.disagreement, *new.warnings)):
-        log.warning(f"warning: {warning}")
+    _warn(new)
     files = enrolment.files(start.files, new, key.sign(new.file) if key else None)
     if args.out:
         enrolment.write(files, args.out, args.replace)
@@ -55,6 +71,11 @@ def run(args: argparse.Namespace) -> int:
         f" labels; {how}"
     )
     return 0
+
+
+def _warn(new: Enrolment) -> None:
+    for warning in filter(None, (new.disagreement, *new.warnings)):
+        log.warning(f"warning: {warning}")
 
 
 def _enrolment_key(args: argparse.Namespace, settings: Config) -> EnrolmentKey | None:
@@ -81,6 +102,31 @@ def _enrolment_key(args: argparse.Namespace, settings: Config) -> EnrolmentKey |
     key = EnrolmentKey(settings.store.enrolment_key)
     key.check()
     return key
+
+
+def _unknown_sweeps(number: int, folder: Path, current: Bundle) -> NDArray[Any]:
+    """The windows of kept sweeps of one unknown material, the last MOST_SWEEPS. Raises
+    ApplianceError if fewer than two can be used."""
+    group = unknown_sweeps.chosen(unknown_sweeps.groups(folder, current.id), number, folder)
+    log.info(f"taken: {group}")
+    check, windows = enrolment.slide_check(current), []
+    for kept, path in group.paths.items():
+        try:
+            sweep, format = load(path)
+        except FormatError as e:
+            log.warning(f"sweep {kept} not taken: {e}")
+            continue
+        taxels, wanted = sweep.frames.taxels, (current.format.window, *current.format.shape)
+        why = "" if taxels.shape == wanted and format == current.format else "of another format"
+        if why := why or check(taxels):
+            log.warning(f"sweep {kept} not taken: {why}")
+        else:
+            windows.append(taxels)
+    if len(windows) < FEWEST:
+        raise ApplianceError(
+            f"{len(windows)} of these sweeps can be used, and {FEWEST} are needed; make others"
+        )
+    return np.stack(windows[-MOST_SWEEPS:])
 
 
 def _good_sweeps(args: argparse.Namespace, settings: Config, current: Bundle) -> NDArray[Any]:

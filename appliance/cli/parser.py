@@ -94,6 +94,8 @@ def arguments(name: str, words: list[str]) -> argparse.Namespace:
     if name == "bridge":
         return bridges.parse(command, words)
     args = command.parse(words)
+    if name == "enrol" and args.label is None and args.unknown is None:
+        command.error("enrol needs LABEL, the name of the new material")
     if name == "skin" and args.action == "new" and not args.skin_port:
         command.error("new needs --port")
     return args
@@ -365,7 +367,19 @@ def _enrol(command: CommandParser) -> None:
     _skin_port(command.add_argument)
     _trigger(command)
     command.add_argument(
-        "label", metavar="LABEL", help="name of the new material; all sweeps are of this material"
+        "label",
+        nargs="?",
+        metavar="LABEL",
+        help="name of the new material; all sweeps are of this material",
+    )
+    command.add_argument(
+        "--unknown",
+        nargs="?",
+        const=0,
+        type=_count,
+        metavar="NUMBER",
+        help="learn it from kept sweeps (store.black_box) that were answered `unknown, as sweep N`:"
+        " those that sweep NUMBER belongs to. Without LABEL, list them",
     )
     command.add_argument(
         "--out",

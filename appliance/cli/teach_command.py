@@ -77,7 +77,8 @@ def until_taught(args: argparse.Namespace, settings: Config) -> int:
     )
     defaults = {"labels": [], "good": GOOD, "position": "1", "session": "", "web": None}
     defaults |= {"use": False, "by": "", "format": None, "window": None}
-    Session(argparse.Namespace(**vars(args) | defaults), settings).run()
+    taught = argparse.Namespace(**vars(args) | defaults)
+    Session(taught, without_lines(args, settings), waits=True).run()
     return 0
 
 
@@ -110,11 +111,14 @@ def _use(args: argparse.Namespace, settings: Config) -> int:
     try:
         by = args.by or getpass.getuser()
         sha = use.use(settings, assembly.store(settings), by, SystemClock(), tell)
-    except ApplianceError as e:
+    except (ApplianceError, OSError) as e:
         if not args.json:
             raise
-        print(json.dumps({"type": "error", "text": str(e)}), flush=True)
-        return e.exit_code
+        code, text = 1, f"{e}; see to the disk (df -h), and try again"
+        if isinstance(e, ApplianceError):
+            code, text = e.exit_code, str(e)
+        print(json.dumps({"type": "error", "text": text}), flush=True)
+        return code
     text = f"bundle {sha[:8]} with {', '.join(told['labels'])} is installed, on trial"
     if args.json:
         print(json.dumps({**told, "type": "taught", "sha": sha, "text": text}), flush=True)
@@ -125,16 +129,22 @@ def _use(args: argparse.Namespace, settings: Config) -> int:
 
 def by_page(args: argparse.Namespace, settings: Config) -> Config:
     """The settings of a session: where no GPIO line is wired, the page starts and stops sweeps."""
-    wired = args.sim or settings.trigger.start or not settings.trigger.by_lines
-    if args.web is None or wired:
+    return settings if args.web is None else without_lines(args, settings)
+
+
+def without_lines(args: argparse.Namespace, settings: Config) -> Config:
+    """The settings with sweeps by command where no GPIO line is wired."""
+    if args.sim or settings.trigger.start or not settings.trigger.by_lines:
         return settings
     return replace(settings, trigger=replace(settings.trigger, mode="serial"))
 
 
 class Session:
-    """Records and assesses until a bundle is made; with a page, then tries it until DONE."""
+    """Records and assesses until a bundle is made; with a page, then tries it until DONE. waits:
+    run even if nothing can start a sweep."""
 
-    def __init__(self, args: argparse.Namespace, settings: Config) -> None:
+    def __init__(self, args: argparse.Namespace, settings: Config, *, waits: bool = False) -> None:
+        self._waits = waits
         self._args, self._settings, self._stopped = args, by_page(args, settings), StopFlag()
         self._store = Path(settings.store.folder)
         self._obey: Callable[[Command], list[object]] = _not_now
@@ -209,7 +219,7 @@ class Session:
                     *pages,
                 ],
                 commands={**recording.commands, **self._by_robot(session.commands)},
-                ordered=bool(pages),
+                ordered=bool(pages) or self._waits,
                 serving=False,
                 announce=self._announce,
             )

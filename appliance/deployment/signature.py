@@ -91,6 +91,12 @@ def sign(
     return bytes(done.stdout)
 
 
+def own_key() -> Path:
+    """The private key of the person at a desktop, if no other is named; `make install` makes it."""
+    folder = os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config"
+    return Path(folder) / "palpate" / "signing-key"
+
+
 def _trusted(signers: Path) -> bytes:
     """The content of the file of signers, with each line checked, because ssh-keygen skips invalid
     lines silently. Raises ConfigError."""

@@ -39,6 +39,7 @@ CODE = re.compile(r"(?s)```.*?```|`[^`\n]*`")
 CHAPTERS = {
     "Tutorials": [
         "docs/tutorials/first-model",
+        "docs/tutorials/first-day",
         "docs/tutorials/first-start",
         "docs/tutorials/library",
     ],

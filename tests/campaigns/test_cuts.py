@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.cuts import __main__ as campaign
-from tests.cuts import black_box, calls, delivery, recording, scene, tree
+from tests.cuts import black_box, calls, delivery, recording, scene, teaching, tree
 from tests.cuts.calls import NotFollowed
 from tests.cuts.scene import CrashPoint, CutScene, Found, ScenePlay, SceneStep
 
@@ -273,14 +273,28 @@ def test_an_enrolment_that_is_cut_short_leaves_the_bundle_with_the_label_or_with
     assert wrong(points) == []
 
 
+@pytest.mark.thorough  # a minute of kills and power cuts
+def test_teaching_that_is_cut_short_leaves_the_old_bundle_or_the_new(
+    shop: delivery.Shop, work: Path
+):
+    """Before each rename of FORGET and USE: sweeps and decisions are there, the box starts with one
+    bundle or the other, and can be taught again."""
+    played = ScenePlay(teaching.TeachingShop(shop.folder).once(), work)
+    points = cut_at_renames(played)
+    assert len(points) >= 5
+    assert wrong(points) == []
+
+
 @pytest.mark.thorough  # kills a box at every call that changes a file
-@pytest.mark.parametrize("name", ["delivery", "enrolment"])
+@pytest.mark.parametrize("name", ["delivery", "enrolment", "teaching"])
 def test_what_happens_to_a_box_in_between_is_as_the_scene_says(
     shop: delivery.Shop, work: Path, name: str
 ):
     """The power fails after each command: the bundle that the scene expects answers, and the next
     is taken."""
-    played = ScenePlay({"delivery": shop.scene, "enrolment": shop.enrolment}[name](), work)
+    taught = teaching.TeachingShop(shop.folder).teaching
+    scenes = {"delivery": shop.scene, "enrolment": shop.enrolment, "teaching": taught}
+    played = ScenePlay(scenes[name](), work)
     points = [played.power(moment) for moment in played.moments() if not moment.call]
     assert wrong(points) == []
     assert len(points) == len(played.scene.steps)

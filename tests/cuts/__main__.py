@@ -19,7 +19,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from tests.cuts import black_box, calls, delivery, recording, tree
+from tests.cuts import black_box, calls, delivery, recording, teaching, tree
 from tests.cuts.scene import ROOT, CrashPoint, CutScene, Moment, ScenePlay, stage
 
 SCENES: dict[str, Callable[[Path], CutScene]] = {
@@ -30,6 +30,7 @@ SCENES: dict[str, Callable[[Path], CutScene]] = {
     "black-box-thread": lambda beside: black_box.scene("thread"),
     "delivery": lambda beside: delivery.Shop.opened(beside).scene(),
     "enrolment": lambda beside: delivery.Shop.opened(beside).enrolment(),
+    "teaching": lambda beside: teaching.TeachingShop.opened(beside).teaching(),
 }
 """Makes each scene; the argument is an empty folder for the files that it needs."""
 HOWS = ("kill", "power", "kill_then_power")

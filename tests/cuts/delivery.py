@@ -39,7 +39,7 @@ from tests.factories.paths import ROOT
 STORE, INCOMING = "store", "store/incoming"
 ENROLMENT = "enrolment"
 """Folder of this box's key, beside the shop's bundles."""
-APART = re.compile(r"store/(incoming/.+|bundles/\.[^/]+/.+)")
+APART = re.compile(r"store/(incoming/.+|teaching/.+|bundles/\.[^/]+/.+)")
 """Copies before they are installed, and contents of incomplete folders: nobody reads these."""
 PROBATION = 2
 """Number of sweeps on probation."""
@@ -47,6 +47,7 @@ ANSWER = re.compile(r"\$PPLP,RES,\d+,[\d.]+,(?:ok|unsure|undecided),(?:[^,]*,){6
 PROMISE = re.compile(
     r"bundle ([0-9a-f]{8}) (?:is installed; it )?runs (?:on trial )?from the next start on.*"
     r"|palpate: installed: .*, ([0-9a-f]{8}), \d+ labels; it runs on trial from the next start on.*"
+    r"|bundle ([0-9a-f]{8}) with .* is installed, on trial from the next start on.*"
 )
 DIED = 3
 LABELS = ("cork", "felt")
@@ -284,7 +285,7 @@ def _promised(output: str) -> str:
     """The bundle that must run from the next start on, if the command that is cut has just
     announced it."""
     reported = PROMISE.fullmatch(output.splitlines()[-1])
-    return reported[1] or reported[2] if reported else ""
+    return next(filter(None, reported.groups())) if reported else ""
 
 
 def _end(output: str) -> str:

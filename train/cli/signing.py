@@ -22,9 +22,9 @@ def register(add: Add) -> None:
     command.add_argument(
         "--key",
         type=Path,
-        required=True,
         metavar="KEY",
-        help="your private key: ssh-keygen -t ed25519 makes one",
+        help="your private key (default: the key that `make install` has made, "
+        "~/.config/palpate/signing-key)",
     )
     command.add_argument(
         "--counter",
@@ -36,7 +36,7 @@ def register(add: Add) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Sign the bundle; print its name, version, counter and identity."""
-    signed = sign.sign(args.bundle, args.key, args.counter)
+    signed = sign.sign(args.bundle, args.key or sign.own_key(), args.counter)
     print(
         f"signed: {signed.name} {signed.version}, counter {signed.counter}, "
         f"{bundle.identity(signed.json())} in {args.bundle}"

@@ -17,6 +17,8 @@ from appliance.core import storage
 from appliance.core.errors import BundleError
 from appliance.deployment import signature
 
+own_key = signature.own_key
+
 
 def sign(folder: Path, key: Path, counter: int | None = None) -> Manifest:
     """Sign the bundle in `folder` and return its manifest. counter: is written into the manifest

@@ -4,12 +4,13 @@ checks."""
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from appliance.bundle.bundle import Manifest
 from appliance.core.errors import FormatError
@@ -53,8 +54,8 @@ def teach(
     """Fit a model to the lesson and write its bundle to `out`, whole or not at all. about: who
     teaches and when, for the manifest.
 
-    Raises FormatError if there are too few sweeps or materials, and ExportRefused if a check of the
-    bundle fails.
+    Raises FormatError if there are too few sweeps or materials, or if chance would name them as
+    well, and ExportRefused if a check of the bundle fails.
     """
     sweeps, times = lesson.sweeps, StepTimes(tell)
     counts = np.bincount(sweeps.labels)
@@ -69,7 +70,19 @@ def teach(
     _ = setup.fixed  # computed here, for the time of this step
     times.begin("heads")
     fit = recipe.fit_size(setup, setup.settings.size)
+    _check_useful(fit.about["validation"], counts, sweeps.materials)
     held = dict(zip(sweeps.materials, counts.tolist(), strict=True))
     fit = replace(fit, about=fit.about | {"taught": about | {"sweeps": held}})
     times.begin("bundle")
     return quantized_bundle.export(fit, out, NAME, version, commit())
+
+
+def _check_useful(validation: dict[str, Any], counts: NDArray[Any], names: Sequence[str]) -> None:
+    """Raises FormatError if the most frequent material, named always, is right as often."""
+    chance = counts.max() / counts.sum()
+    if validation["accuracy"] <= chance:
+        raise FormatError(
+            f"{', '.join(names[:3])} cannot be told apart: {100 * validation['accuracy']:.0f} % of "
+            f"left-out sweeps are named rightly, by chance {100 * chance:.0f} %; slide differently "
+            "(faster, harder, longer), or teach them as one material"
+        )

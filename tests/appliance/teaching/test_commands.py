@@ -96,6 +96,20 @@ def test_the_page_triggers_where_no_line_is_wired(words: list[str], mode: str):
     assert teach_command.by_page(args, load_settings(args)).trigger.mode == mode
 
 
+@pytest.mark.parametrize(("board", "mode"), [([], "serial"), (["--board", "rpi5"], "two-lines")])
+def test_a_box_without_lines_waits_to_be_taught(
+    board: list[str], mode: str, monkeypatch: pytest.MonkeyPatch
+):
+    """It does not end because no line can start a sweep: the page or a command does later."""
+    modes = []
+    monkeypatch.setattr(
+        teach_command.Session, "run", lambda self: modes.append(self._settings.trigger.mode)
+    )
+    args = arguments("run", ["--skin", "flexitac", *board])
+    assert teach_command.until_taught(args, load_settings(args)) == 0
+    assert modes == [mode]
+
+
 def test_its_commands_are_commands_of_the_line():
     """TEACH and FORGET need a name, USE none."""
     assert command("TEACH", "cork").line == "TEACH,cork"

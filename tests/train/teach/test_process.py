@@ -18,6 +18,7 @@ from appliance.inference.classifier import Classifier
 from tests.factories import lessons
 from tests.factories.paths import ROOT
 from tests.factories.sweep_sets import easy
+from train.data.sets import Dataset
 from train.models.recipe import recipe
 from train.teach.lesson import Lesson
 
@@ -91,6 +92,58 @@ def test_too_little_is_refused_with_the_remedy(tmp_path: Path, materials: int, e
     assert code
     assert why in lines[-1]["text"]
     assert not (tmp_path / "bundle").exists()
+
+
+def materials(kinds: int, each: int, spread: float) -> Dataset:
+    """Sweeps of materials whose pitches lie apart by `spread` periods per frame."""
+    rng = np.random.default_rng(0)
+    labels = np.repeat(np.arange(kinds), each)
+    pitch = 0.15 + spread * labels * rng.uniform(0.98, 1.02, kinds * each)
+    phase = 2 * np.pi * (pitch[:, None] * np.arange(64) + rng.random((kinds * each, 1)))
+    level = rng.uniform(80, 120, (kinds * each, 1, 2, 2))
+    samples = level + 12 * np.sin(phase)[:, :, None, None]
+    samples = samples + 2 * rng.standard_normal((*samples.shape[:2], 2, 2))
+    names = tuple(f"material {k}" for k in range(kinds))
+    groups = {"recording": np.arange(kinds * each)}
+    return Dataset(samples.astype(np.uint8), labels, names, 100.0, groups, "materials")
+
+
+def test_materials_that_chance_would_name_as_well_are_refused(tmp_path: Path):
+    """One material under two names: no bundle is made, and the reason says what to do."""
+    lessons.write(tmp_path / "sweeps", materials(2, 8, 0.0))
+    code, lines, _ = ran(tmp_path / "sweeps", "--out", tmp_path / "bundle")
+    assert code
+    assert "material 0, material 1 cannot be told apart: " in lines[-1]["text"]
+    assert "or teach them as one material" in lines[-1]["text"]
+    assert not (tmp_path / "bundle").exists()
+
+
+@pytest.mark.thorough  # a fit of minutes
+def test_forty_materials_are_a_bundle(tmp_path: Path):
+    """With three sweeps of each: all of them are its labels, and it says how often it is right."""
+    lessons.write(tmp_path / "sweeps", materials(40, 3, 0.008))
+    code, lines, _ = ran(tmp_path / "sweeps", "--out", tmp_path / "bundle")
+    assert code == 0, lines
+    assert len(lines[-1]["labels"]) == 40
+    assert lines[-1]["figures"]["held-out recording"]["n"] == 120
+    assert len(bundle.load(tmp_path / "bundle").manifest.labels) == 40
+
+
+@pytest.mark.thorough  # a fit with all checks of an export
+def test_a_full_disk_leaves_no_bundle(tmp_path: Path):
+    """The model does not fit: the reason is on a line, and nothing is left."""
+    lessons.write(tmp_path / "sweeps", easy(8))
+    limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (9000, 9000))\n"
+    done = subprocess.run(
+        [sys.executable, "-c", limit + WATCHED, tmp_path / "sweeps", "--out", tmp_path / "bundle"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode
+    assert "cannot be written to" in json.loads(done.stdout.splitlines()[-1])["text"]
+    assert [path.name for path in tmp_path.iterdir()] == ["sweeps"]
 
 
 def test_too_little_memory_is_said(tmp_path: Path):

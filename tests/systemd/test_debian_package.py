@@ -1,0 +1,246 @@
+"""The Debian package on a bare host, from `apt install` to a box that is taught; and `make install`
+with a host's name alone. One host, one test after another: each begins where the last has ended.
+
+It takes minutes, so it runs only with PALPATE_SYSTEMD=1.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tarfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.factories import emulated_machines, hosts
+from tests.factories.install_scripts import SCRIPTS
+from tests.factories.nspawn import PALPATE, SITE, WAIT_S
+from tests.factories.paths import ROOT
+
+pytest.importorskip("pyinfra", reason="no pyinfra here; pip install -e .[deploy]")
+APT = ("env", "DEBIAN_FRONTEND=noninteractive", "apt-get", "-y", "-q")
+AS_BOX = ("setpriv", "--reuid=palpate", "--regid=palpate", "--init-groups", PALPATE)
+APART = ("--set", "store.folder=/var/lib/palpate/simulated")
+"""A folder of simulated sweeps, which must not teach the box itself."""
+BACKUP = "/usr/local/bin/palpate-backup"
+LONG_S = 900
+"""Longest wait for an installation or a fit on a busy machine."""
+
+
+@pytest.fixture(scope="session")
+def wheels(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """The wheels of palpate and palpate-train."""
+    folder, source = (tmp_path_factory.mktemp(name) for name in ("wheels", "source"))
+    emulated_machines.wheel(folder, source)
+    shutil.copytree(ROOT / "train", source / "train", ignore=shutil.ignore_patterns("build"))
+    emulated_machines.run(
+        *emulated_machines.PIP, "wheel", "--no-deps", "-w", folder, source / "train"
+    )
+    return sorted(folder.glob("*.whl"))
+
+
+def packed(folder: Path, wheels: list[Path], *architectures: str) -> list[Path]:
+    """The packages for these architectures."""
+    command = [sys.executable, SCRIPTS / "debian.py", folder, "--wheels", *wheels]
+    done = subprocess.run(
+        [*command, "--architectures", *architectures],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return [Path(line) for line in done.stdout.split()]
+
+
+@pytest.fixture(scope="session")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hosts.Hosts]:
+    """One bare host, and a desktop that may log in there."""
+    if os.environ.get("PALPATE_SYSTEMD") != "1":
+        pytest.skip("installs on real hosts take minutes; run python -m tests.campaigns systemd")
+    with hosts.Hosts(1, tmp_path_factory.mktemp("hosts") / "work", "bare") as made:
+        yield made
+
+
+@pytest.fixture(scope="session")
+def said(site: hosts.Hosts, wheels: list[Path], tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Installs the package with apt; the output of that."""
+    (package,) = packed(tmp_path_factory.mktemp("deb"), wheels, "amd64")
+    (parcel,) = site.work.glob("host-*/parcel")
+    shutil.copy(package, parcel / "palpate.deb")
+    done = site.hosts[0].machine.run(
+        *APT, "install", "--no-install-recommends", "/parcel/palpate.deb", limit_s=LONG_S
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.fixture
+def host(site: hosts.Hosts, said: str) -> hosts.Host:
+    """The host that had the package."""
+    return site.hosts[0]
+
+
+def test_both_architectures_hold_the_same(wheels: list[Path], tmp_path: Path, said: str):
+    """A package for arm64 has the libraries of arm64 for both Pythons, and otherwise the files and
+    scripts of that for amd64."""
+    found = {}
+    for package, machine in zip(
+        packed(tmp_path, wheels, "amd64", "arm64"), ("x86_64", "aarch64"), strict=True
+    ):
+        folder = tmp_path / machine
+        subprocess.run(["dpkg-deb", "-R", package, folder], check=True)
+        control = (folder / "DEBIAN/control").read_text()
+        assert f"Architecture: {package.stem.rpartition('_')[2]}\n" in control
+        names = set()
+        archives = sorted((folder / "usr/lib/palpate").iterdir())
+        assert len(archives) == 2
+        for python, archive in zip(("cp311", "cp313"), _by_python(archives), strict=True):
+            with tarfile.open(archive) as tar:
+                members = tar.getnames()
+            binary = [name for name in members if "linux" in name]
+            assert binary
+            assert all(machine in name for name in binary)
+            assert any("onnxruntime-1" in name and python in name for name in binary)
+            names |= {re.sub(r"-(cp3|py3).*", "", name) for name in members}
+        found[machine] = names
+    assert found["x86_64"] == found["aarch64"]
+    assert {"share/palpate/palpate-teach.service", "share/palpate/skins/flexitac.toml"} <= found[
+        "aarch64"
+    ]
+
+
+def _by_python(archives: list[Path]) -> list[Path]:
+    def python(archive: Path) -> bool:
+        with tarfile.open(archive) as tar:
+            return any("cp313-cp313" in name for name in tar.getnames())
+
+    return sorted(archives, key=python)
+
+
+def test_apt_ends_with_a_ready_box(host: hosts.Host, said: str):
+    """From a Debian without Python to an active, enabled service, with users, keys, settings and
+    units; the last lines are those of `palpate status`."""
+    assert re.search(r"(?m)^running for .*\(process \d+, palpate ", said)
+    assert re.search(r"(?m)^model +default ", said)
+    assert (host.service["ActiveState"], host.service["UnitFileState"]) == ("active", "enabled")
+    name = host.machine.get("readlink", "/opt/palpate")
+    assert name in host.machine.get("cat", f"/proc/{host.service['MainPID']}/maps")
+    assert host.machine.get("stat", "-c", "%U %a", "/etc/palpate/enrolment/key") == "palpate 400"
+    assert host.machine.run("systemd-analyze", "verify", "palpate-teach.service").stderr == ""
+    assert host.machine.get("dpkg", "--verify", "palpate") == ""
+    assert host.machine.get("/usr/local/bin/palpate", "--version").startswith("palpate ")
+
+
+def test_the_same_package_again_changes_nothing(host: hosts.Host):
+    """The release is the same, settings and keys stay, the service is ready again."""
+    before = host.machine.get("readlink", "/opt/palpate")
+    key = host.machine.get("sha256sum", "/etc/palpate/enrolment/key")
+    host.machine.put(SITE, "# mine\n")
+    again = host.machine.run(*APT, "install", "--reinstall", "/parcel/palpate.deb", limit_s=LONG_S)
+    assert again.returncode == 0, again.stdout + again.stderr
+    assert host.machine.get("readlink", "/opt/palpate") == before
+    assert host.machine.get("sha256sum", "/etc/palpate/enrolment/key") == key
+    assert host.machine.get("cat", SITE) == "# mine"
+    assert host.service["ActiveState"] == "active"
+
+
+def test_make_install_takes_over_the_release_of_the_package(
+    site: hosts.Hosts, host: hosts.Host, wheels: list[Path]
+):
+    """With a host's name alone: the release is the same, so nothing is built or restarted; the
+    signer that the box lacks is made on the desktop, with its key."""
+    pid = host.service["MainPID"]
+    box, train = wheels
+    at = ("--host", f"{hosts.USER}@{host.address}", "--wheel", box, "--teaching", train)
+    done = site.desktop("install", *at)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.endswith(" runs already\n")
+    assert host.service["MainPID"] == pid
+    key = site.work / ".config/palpate/signing-key"
+    assert f"made {key}, with which you sign bundles" in done.stderr
+    signers = host.machine.get("cat", "/etc/palpate/allowed_signers")
+    assert signers.split()[1:] == key.with_suffix(".pub").read_text().split()[:2]
+    again = site.desktop("install", *at)
+    assert again.returncode == 0
+    assert "made " not in again.stderr
+
+
+def test_the_installed_box_is_taught(host: hosts.Host):
+    """The libraries of palpate[teach] are there: simulated sweeps of two materials become a bundle
+    that the box's key has signed. The unit of the page starts, and the service after it."""
+    host.machine.get("install", "-d", "-o", "palpate", "/var/lib/palpate/simulated")
+    for material in ("wood", "metal"):
+        words = ("--label", material, "--sim", f"skin:{material}", "--virtual", "--sweeps", "4")
+        done = host.machine.run(*AS_BOX, "teach", *APART, *words, limit_s=LONG_S)
+        assert done.returncode == 0, done.stdout + done.stderr
+    done = host.machine.run(*AS_BOX, "teach", *APART, "--use", "--by", "anna", limit_s=LONG_S)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "with metal, wood is installed, on trial" in done.stdout
+    words = " ".join((*APART, "--sim", "skin"))
+    host.machine.put(
+        "/run/systemd/system/palpate-teach.service.d/test.conf",
+        f"[Service]\nExecStart=\nExecStart={PALPATE} teach --web {words}\n",
+    )
+    host.machine.get("systemctl", "daemon-reload")
+    host.machine.get("systemctl", "start", "palpate-teach")
+    ask = "import urllib.request; print(urllib.request.urlopen('http://127.0.0.1:8138').status)"
+    wait = f'for i in $(seq 60); do /opt/palpate/bin/python -c "{ask}" && exit; sleep 1; done'
+    assert host.machine.get("sh", "-c", wait) == "200"
+    assert host.service["ActiveState"] == "inactive"
+    host.machine.get("systemctl", "stop", "palpate-teach")
+    host.machine.get("rm", "-r", "/run/systemd/system/palpate-teach.service.d")
+    host.service.until("ActiveState", "active")
+
+
+def test_a_box_without_a_bundle_for_its_skin_starts_in_teach_mode(host: hosts.Host):
+    """By itself, after its restart: the log and `palpate status` say so, and READY stays low."""
+    host.machine.put(SITE, '[skin]\nprofile = "flexitac"\nport = "/dev/ttyUSB0"\n')
+    host.machine.get("rm", "-r", "/run/systemd/system/palpate.service.d")
+    host.machine.get("systemctl", "daemon-reload")
+    host.machine.get("systemctl", "--no-block", "restart", "palpate")
+    end_s = time.monotonic() + 2 * WAIT_S
+    while not any("nothing taught yet: READY stays low" in one for one in host.service.log_lines()):
+        assert time.monotonic() < end_s, host.service.journal()
+        time.sleep(0.2)
+    host.service.until("StatusText", r"skin (?!streaming).*")
+    assert host.service["ActiveState"] == "activating"
+    assert "nothing taught yet" in host.machine.run(PALPATE, "status").stdout  # 69: no skin
+    host.machine.get("rm", SITE)
+    host.machine.get("systemctl", "stop", "palpate")  # a start would wait for this one
+    host.service.start()
+
+
+def test_a_backup_comes_back_by_one_command(host: hosts.Host):
+    """Over the running box, as root: what was changed since is as it was, owners included."""
+    host.machine.put(SITE, "# saved\n")
+    owner = ("stat", "-c", "%U:%G %a", "/etc/palpate/enrolment/key", "/var/lib/palpate/bundles")
+    before = host.machine.get(*owner)
+    host.machine.get("sh", "-c", f"{BACKUP} save - > /root/box.tar")
+    host.machine.put(SITE, "# changed\n")
+    host.machine.get("rm", "-r", "/etc/palpate/enrolment", "/var/lib/palpate/bundles")
+    done = host.machine.run(BACKUP, "restore", "/root/box.tar")
+    assert done.returncode == 0, done.stderr
+    assert host.machine.get("cat", SITE) == "# saved"
+    assert host.machine.get(*owner) == before
+    host.service.until("ActiveState", "active")
+
+
+def test_a_removed_package_leaves_settings_and_sweeps(host: hosts.Host):
+    """Program, units and links go; a purge takes the settings, and never the sweeps."""
+    host.machine.get("mkdir", "-p", "/var/lib/palpate/sweeps")
+    done = host.machine.run(*APT, "remove", "palpate", limit_s=LONG_S)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "sweeps and bundles stay in /var/lib/palpate, settings in /etc/palpate" in done.stdout
+    assert host.machine.get("ls", "/opt") == ""
+    for gone in ("/usr/local/bin/palpate", "/etc/systemd/system/palpate.service"):
+        assert host.machine.run("test", "-L", gone).returncode
+    assert host.machine.get("cat", SITE) == "# saved"
+    assert host.machine.run(*APT, "purge", "palpate", limit_s=LONG_S).returncode == 0
+    assert host.machine.run("test", "-e", "/etc/palpate").returncode
+    assert host.machine.get("ls", "-d", "/var/lib/palpate/sweeps")

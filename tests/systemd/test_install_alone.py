@@ -1,0 +1,122 @@
+"""`make install` with a host's name alone: the board and the signer that it finds or makes."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from tests.factories.install_scripts import run_here
+
+pytest.importorskip("pyinfra", reason="no pyinfra here; pip install -e .[deploy]")
+
+
+def shell(script: str) -> str:
+    """The output of a script of the box, run here."""
+    done = subprocess.run(["sh", "-c", script], capture_output=True, text=True, check=True)
+    return done.stdout.strip()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("model", "board"),
+    [
+        ("Raspberry Pi 5 Model B Rev 1.0\0", "rpi5"),
+        ("Raspberry Pi 4 Model B Rev 1.5\0", "rpi4"),
+        ("Raspberry Pi Compute Module 4 Rev 1.0\0", "rpi4"),
+        ("Raspberry Pi 400 Rev 1.0\0", "rpi400"),
+        ("Raspberry Pi Model B Plus\0", ""),
+        ("Radxa ROCK 5B\0", ""),
+        (None, ""),
+    ],
+)
+def test_the_firmware_tells_the_board(tmp_path: Path, model: str | None, board: str):
+    """By the name that the kernel passes on; another computer tells none."""
+    file = tmp_path / "model"
+    if model is not None:
+        file.write_text(model)
+    assert shell(run_here(f"import install; print(install.own_board({str(file)!r}))")) == board
+
+
+def set_board(folder: Path, board: str, before: str, model: str) -> str:
+    """The settings file after an install of `board` on a box of this model."""
+    for name, text in (("site", before), ("model", model), ("board-rpi5.toml", "")):
+        (folder / name).write_text(text)
+    shell(
+        run_here(
+            f"import install; from pathlib import Path; f = Path({str(folder)!r}); "
+            "install.SETTINGS = str(f / 'site'); own = install.own_board; "
+            "install.own_board = lambda: own(str(f / 'model')); "
+            f"print('set -e'); print(install._set_board({board!r}, str(f)))"
+        )
+    )
+    return (folder / "site").read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("board", "before", "model", "after"),
+    [
+        ("", "# mine\n", "Raspberry Pi 5", 'board = "rpi5"\n# mine\n'),
+        ("", 'board = "own"\n', "Raspberry Pi 5", 'board = "own"\n'),
+        ("", "# mine\n", "Raspberry Pi 3", "# mine\n"),
+        ("", "# mine\n", "Other", "# mine\n"),
+        ("rpi4", 'board = "own"\n# mine\n', "Raspberry Pi 5", 'board = "rpi4"\n# mine\n'),
+    ],
+)
+def test_a_box_without_a_board_gets_its_own(
+    tmp_path: Path, board: str, before: str, model: str, after: str
+):
+    """Only if there is a file for it; a board that was named, now or before, stays."""
+    assert set_board(tmp_path, board, before, model) == after
+
+
+ASKED = """
+import install, builtins
+answers = iter(["rpi9", "rpi4"])
+builtins.input = lambda question: (print(question), next(answers))[1]
+class Box:
+    name = "box"
+    def __init__(self, found): self.found = found
+    def run(self, what, command): return self.found
+print([install.asked_board(Box(found)) for found in ('board = "rpi5"', "rpi5", "rpi3")])
+"""
+
+
+@pytest.mark.slow
+def test_the_pins_are_asked_for_where_nothing_tells_them():
+    """Not if the settings or the firmware tell them; a name without a file is asked for again."""
+    said = run_here(ASKED).splitlines()
+    assert said[0] == "box: the pins of which board? rpi4, rpi5, or Enter for none: "
+    assert said[1] == "there is no board 'rpi9'"
+    assert said[-1] == "['', '', 'rpi4']"
+
+
+SIGNER = """
+import own_signer; from fleet import Failed
+told = []
+try:
+    print([own_signer.line(told.append) for _ in range(2)], len(told))
+except Failed as e:
+    print(e)
+"""
+
+
+@pytest.mark.slow
+def test_a_signer_is_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The key is for this person alone; a damaged public key, or a folder that cannot be written,
+    is an error with the remedy."""
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    key = tmp_path / "palpate" / "signing-key"
+    made = run_here(SIGNER)
+    assert made.endswith("] 1")
+    assert made.count(key.with_suffix(".pub").read_text().split()[1]) == 2
+    assert key.stat().st_mode & 0o777 == 0o600
+    assert os.stat(key.parent).st_mode & 0o777 == 0o700
+    key.with_suffix(".pub").write_text("")
+    assert "signing-key.pub cannot be read" in run_here(SIGNER)
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "file"))
+    assert "name a file of signers with SIGNERS=FILE" in run_here(SIGNER)
