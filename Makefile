@@ -6,6 +6,8 @@ SUDO = $$( [ `id -u` = 0 ] || echo sudo )
 PIP := $(BIN)/python -m pip --disable-pip-version-check -q
 # Python compiles a module when it is first imported: compiling all of them here takes 30 s.
 INSTALL := $(PIP) install --no-compile
+# A wheel of another hash is refused, and nothing is built from sources.
+LOCKED := $(INSTALL) --require-hashes --only-binary :all:
 RUNTIME := $(VENV)/runtime.done
 FLEET := $(VENV)/fleet.done
 DESKTOP := $(VENV)/desktop.done
@@ -22,7 +24,8 @@ SCRATCH = $(or $(shell df -Pk /dev/shm 2>/dev/null | awk 'NR > 1 && $$4 > 100000
 PYTEST = $(BIN)/python -m pytest -q -n $(shell expr `nproc` + 1)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo desktop test test-fast test-all lint types bundle bench site deploy install deb clean
+.PHONY: help demo desktop test test-fast test-all lint types bundle bench site deploy install deb \
+  lock clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -69,20 +72,20 @@ site: $(SITE) ## build the documents and the pages of results as a site: build/s
 	PYTHONPATH=systemd $(BIN)/python docs/site/build.py build
 
 deploy: $(FLEET) ## put a signed BUNDLE= on HOST= or HOSTS=inventory.py; SHADOW=1: as the candidate
-	$(BIN)/python systemd/deploy.py $(WHERE) $(if $(SIGNERS),--signers $(call quoted,SIGNERS)) \
+	$(BIN)/python systemd/deploy.py $(WHERE) $(if $(value SIGNERS),--signers $(call quoted,SIGNERS)) \
 	  $(if $(SHADOW),--shadow) $(if $(OTHER_SKIN),--other-skin) \
 	  $(if $(value BUNDLE),$(call quoted,BUNDLE),$(error name the bundle with BUNDLE=its folder))
 
 # setuptools would put leftovers of an older build into the wheel
-WHEELS = rm -rf build/lib build/bdist.*; $(PIP) wheel --no-deps -w dist . \
-  $(if $(filter 0,$(TEACH)),,&& $(PIP) wheel --no-deps -w dist ./train)
+WHEELS = rm -rf build/lib build/bdist.*; $(PIP) wheel --no-deps --no-build-isolation -w dist . \
+  $(if $(filter 0,$(TEACH)),,&& $(PIP) wheel --no-deps --no-build-isolation -w dist ./train)
 
 install: $(FLEET) ## install or upgrade Debian boxes, HOST= or HOSTS=; BOARD=rpi5, SIGNERS=FILE, TEACH=0
 	$(WHEELS)
-	$(BIN)/python systemd/install.py $(WHERE) $(if $(BOARD),--board $(call quoted,BOARD)) \
-	  $(if $(SIGNERS),--signers $(call quoted,SIGNERS)) $(if $(filter 0,$(TEACH)),--no-teach)
+	$(BIN)/python systemd/install.py $(WHERE) $(if $(value BOARD),--board $(call quoted,BOARD)) \
+	  $(if $(value SIGNERS),--signers $(call quoted,SIGNERS)) $(if $(filter 0,$(TEACH)),--no-teach)
 
-deb: $(FLEET) ## pack the same as dist/palpate_*.deb for arm64 and amd64, with a list of what is in it
+deb: $(FLEET) $(DESKTOP) ## pack the same as dist/palpate_*.deb for arm64 and amd64, with a list of what is in it
 	$(WHEELS)
 	$(BIN)/python systemd/debian.py dist
 	PYTHONPATH=. $(BIN)/python systemd/sbom.py dist/palpate.cdx.json
@@ -90,39 +93,56 @@ deb: $(FLEET) ## pack the same as dist/palpate_*.deb for arm64 and amd64, with a
 clean: ## remove everything that was built, the virtual environment too
 	rm -rf $(VENV) build dist *.egg-info train/*.egg-info
 
-# A virtual environment with the locked runtime and the commands, nothing else. To lock again:
-# uv pip compile pyproject.toml --extra page --universal --generate-hashes --no-header \
-#   --python-version 3.11 -o appliance/requirements.lock
-# and with --extra teach -o appliance/teach.lock.
-$(RUNTIME): appliance/requirements.lock pyproject.toml
+# All locks again, the box's first; the others keep to its versions. PyTorch is in none of them: its build
+# depends on the graphics card (docs/security.md).
+CUDA := torch triton cuda-toolkit cuda-bindings cuda-pathfinder $(addprefix nvidia-,cublas cuda-cupti \
+  cuda-nvrtc cuda-runtime cudnn-cu13 cufft cufile curand cusolver cusparse cusparselt-cu13 nccl-cu13 \
+  nvjitlink nvshmem-cu13 nvtx)
+COMPILE = uv pip compile -q --universal --generate-hashes --no-header --python-version 3.11 \
+  --allow-unsafe $(addprefix --no-emit-package ,palpate palpate-train $(CUDA))
+OF_BOX := -c appliance/requirements.lock -c appliance/teach.lock
+lock: # lock all versions again with uv, which has to be installed
+	$(COMPILE) pyproject.toml --extra page -o appliance/requirements.lock
+	$(COMPILE) pyproject.toml --extra page --extra teach -c appliance/requirements.lock \
+	  -o appliance/teach.lock
+	printf '%s\n' '-e .[dev]' '-e train[studies,dask,files]' 'setuptools>=77' | \
+	  $(COMPILE) - $(OF_BOX) -o tests/tools.lock
+	echo 'setuptools>=77' | $(COMPILE) - -c tests/tools.lock -o systemd/build.lock
+	echo '-e .[deploy]' | $(COMPILE) - -c tests/tools.lock -o systemd/fleet.lock
+	printf '%s\n' '-e .' '-e train' | $(COMPILE) - -c tests/tools.lock -o train/desktop.lock
+	echo '-e .[site]' | $(COMPILE) - -c tests/tools.lock -o docs/site/site.lock
+
+# A virtual environment with the locked runtime and the commands, nothing else.
+$(RUNTIME): appliance/requirements.lock systemd/build.lock pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "Palpate needs Python 3.11 or later; this is `$(PYTHON) --version`."; \
 	    echo "Name another with make PYTHON=python3.12"; exit 1; }
 	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { echo "installing python3-venv"; \
 	  $(SUDO) apt-get install -y -q python3-venv; }
 	$(PYTHON) -m venv $(VENV)
-	$(INSTALL) --require-hashes -r appliance/requirements.lock
-	$(INSTALL) --no-deps -e .
+	$(LOCKED) -r appliance/requirements.lock -r systemd/build.lock
+	$(INSTALL) --no-deps --no-build-isolation -e .
 	@touch $@
 
 # The same with the tools that reach boxes.
-$(FLEET): $(RUNTIME)
-	$(INSTALL) -e '.[deploy]'
+$(FLEET): $(RUNTIME) systemd/fleet.lock
+	$(LOCKED) -r systemd/fleet.lock
 	@touch $@
 
-# The same with training and export.
-$(DESKTOP): $(RUNTIME) train/pyproject.toml
-	$(INSTALL) -e train
+# The same with training and export. Only PyTorch is left to the second line.
+$(DESKTOP): $(RUNTIME) train/pyproject.toml train/desktop.lock
+	$(LOCKED) -r train/desktop.lock
+	$(INSTALL) --no-build-isolation -e train
 	@touch $@
 
-# The same with tests, studies, and the tools that check the code.
-$(TOOLS): $(DESKTOP)
-	$(INSTALL) -e '.[dev]' -e 'train[studies,dask,files]'
+# The same with tests, studies, and the tools that check the code. flexitac has no wheel.
+$(TOOLS): $(DESKTOP) tests/tools.lock
+	$(LOCKED) --no-binary flexitac --no-build-isolation -r tests/tools.lock
 	@touch $@
 
 # The same with what builds the site.
-$(SITE): $(DESKTOP)
-	$(INSTALL) -e '.[site]'
+$(SITE): $(DESKTOP) docs/site/site.lock
+	$(LOCKED) -r docs/site/site.lock
 	@touch $@
 
 # ROS 2 with palpate_msgs, in a virtual environment of its own.

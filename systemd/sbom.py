@@ -1,7 +1,7 @@
 """The list of all that the box carries beside Debian, with licences: a software bill of materials.
 
 `python systemd/sbom.py OUT.json` writes CycloneDX 1.5 (ECMA-424). Versions and hashes are those of
-appliance/requirements.lock, licences those that the installed packages state.
+appliance/teach.lock, which has all of the box, licences those that the installed packages state.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
-LOCK = ROOT / "appliance" / "requirements.lock"
+LOCK = ROOT / "appliance" / "teach.lock"
 ENTRY = re.compile(
     r"(?m)^([a-z0-9-]+)==(\S+?)(?: ;[^\\\n]*)? \\\n((?:    --hash=sha256:\w+(?: \\)?\n)+)"
 )

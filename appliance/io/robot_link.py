@@ -50,6 +50,9 @@ TEXT_COMMANDS = ("LABEL", "MATERIAL", "POSITION", "SESSION", "TEACH", "FORGET")
 OWN = ("RES", "STA", "ANS", "REC")
 """Kinds of sentences that the box sends. A line that sends them back, an echo, must not be
 answered: the answer would come back as well, without end."""
+MOST_REFUSED, REFUSAL_NS = 8, 1_000_000_000
+"""After so many bad lines without a command, one in this time is answered. A line that echoes with
+changes would otherwise be answered without end."""
 RETRY_NS = 1_000_000_000
 """Time between two attempts to open a port that is gone."""
 
@@ -235,6 +238,8 @@ class SerialSink:
         self._queue: deque[bytes] = deque()
         self._begun = 0  # sent bytes of the first sentence in the queue
         self._rest = b""
+        self._refused = 0  # bad lines since the last command
+        self._refusal_ns = clock.now_ns()
 
     def send(self, verdict: Verdict, *, loss_known: bool = True) -> None:
         """Queue a verdict's sentence and send as many as the port accepts now."""
@@ -262,13 +267,25 @@ class SerialSink:
             self._lose(e)
             return []
         found, self._rest = parse(data, self._rest)
-        return found
+        return [command for command in found if self._is_answered(command)]
 
     def close(self) -> None:
         """Close the port; unsent sentences are lost."""
         if self._port:
             port, self._port = self._port, None
             serial_port.close(port)
+
+    def _is_answered(self, command: Command) -> bool:
+        """Whether a command, or a bad line, gets an answer."""
+        if not command.error:
+            self._refused = 0
+            return True
+        self._refused += 1
+        now_ns = self._clock.now_ns()
+        if self._refused > MOST_REFUSED and now_ns < self._refusal_ns:
+            return False
+        self._refusal_ns = now_ns + REFUSAL_NS
+        return True
 
     def _flush(self) -> None:
         if not self._port and not self._open():

@@ -192,10 +192,37 @@ def test_recording_loses_no_more_than_the_sweep_in_progress(work: Path):
 
 @pytest.mark.thorough  # kills a command at every call
 def test_the_command_that_records_loses_no_more_than_the_sweep_in_progress(work: Path):
-    """`palpate record` itself, without power before some of its last calls. It is not killed there:
-    strace counts the calls of each thread by itself."""
+    """`palpate record` itself, killed and without power before some of its last calls."""
     played = ScenePlay(recording.palpate(), work)
-    assert wrong([played.power(moment) for moment in list(played.moments())[-8::2]]) == []
+    last = list(played.moments())[-8:-1:2]
+    assert wrong([how(moment) for how in (played.power, played.kill) for moment in last]) == []
+
+
+@pytest.mark.thorough  # kills a program at every call that changes a file
+@pytest.mark.parametrize(
+    "scene",
+    [recording.scene(recording.THREAD), black_box.scene("thread")],
+    ids=lambda scene: scene.name,
+)
+def test_a_kill_at_each_call_of_the_disk_thread_loses_no_more(work: Path, scene: CutScene):
+    """Killed before each sync and each other call that changes a file, in either thread. Other
+    threads make calls of the same names, so the threads have to be told apart."""
+    played = ScenePlay(scene, work)
+    moments = [moment for moment in played.moments() if moment.call]
+    syncs = [m for m in moments if m.call.name == "fsync" and m.call.thread]
+    assert len(syncs) >= 18
+    assert wrong([played.kill(moment) for moment in moments]) == []
+
+
+def test_a_kill_meets_the_disk_thread_and_not_the_main_thread(work: Path):
+    """The first sync of the disk thread, before which the main thread has synced as often: the
+    sweep's file is there under its temporary name, with all its bytes."""
+    played = ScenePlay(recording.scene(recording.THREAD), work)
+    moment = next(m for m in played.moments() if m.call.name == "fsync" and m.call.thread)
+    assert played.scene.steps[0].cut(moment.call, played.runs[0]).ahead
+    assert played.kill(moment).wrong == ()
+    files = [played.folder / name for name, held in tree.read(played.folder).items() if held]
+    assert list(map(str, files)) == list(moment.call.paths)
 
 
 def test_a_kill_and_then_a_loss_of_power_lose_no_more(work: Path):

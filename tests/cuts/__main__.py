@@ -20,7 +20,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from tests.cuts import black_box, calls, delivery, recording, teaching, tree
-from tests.cuts.scene import ROOT, CrashPoint, CutScene, Moment, ScenePlay, stage
+from tests.cuts.scene import ROOT, CrashPoint, CutScene, ScenePlay, stage
 
 SCENES: dict[str, Callable[[Path], CutScene]] = {
     "recording": lambda beside: recording.scene(),
@@ -127,18 +127,9 @@ def cut(scene: CutScene, ledger: CrashPointLog, hows: Sequence[str] = HOWS) -> I
         for how in hows:
             for moment in play.moments():
                 at = scene.steps[moment.step].name, how, moment.number
-                if at not in done and (how == "power" or _can_kill(play, moment)):
+                if at not in done and (how == "power" or moment.call):
                     ledger.add(point := getattr(play, how)(moment))
                     yield point
-
-
-def _can_kill(play: ScenePlay, moment: Moment) -> bool:
-    """Whether strace can kill the command at the moment's call: it counts the calls of each thread
-    by themselves, so the same call of another thread may be met first. A kill leaves one of the
-    folders that a loss of power may leave, which are judged in any case."""
-    call = moment.call
-    others = (c for c in play.runs[moment.step].calls if call and c.thread != call.thread)
-    return call is not None and all(c.name != call.name for c in others)
 
 
 def figures(points: Iterable[CrashPoint]) -> Iterator[str]:

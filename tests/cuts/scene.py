@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import re
 import shutil
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -26,6 +27,8 @@ MEMORY = Path("/dev/shm")
 time."""
 BETWEEN = "\n"
 """Printed before each command, so that the last line is its own."""
+SPARE_CALLS = 300
+"""More calls than the wrapper of a command makes in its main thread."""
 ENVIRONMENT = {"PYTHONPATH": str(ROOT)}
 
 
@@ -47,12 +50,36 @@ class Found:
 @dataclass(frozen=True, slots=True)
 class SceneStep:
     """A command for a given folder. code: its exit code, None for any. killed: the call at which it
-    is killed."""
+    is killed. ahead: number of calls of that name with which its thread begins."""
 
     name: str
     command: Callable[[Path], Sequence[str | Path]]
     code: int | None = 0
     killed: SystemCall | None = None
+    ahead: int = 0
+
+    def arguments(self, folder: Path) -> Sequence[str | Path]:
+        """The whole command. It is `python -m MODULE ...` if calls are to be made ahead."""
+        command = self.command(folder)
+        if not (self.killed and self.ahead):
+            return command
+        words = (str(self.killed.thread), self.killed.name, str(self.ahead))
+        return [*command[:2], "tests.cuts.counted", *words, *command[2:]]
+
+    def cut(self, call: SystemCall | None, run: TracedRun) -> SceneStep:
+        """The same command, killed at this call of a recorded run.
+
+        strace counts the calls of each thread separately. Where another thread has as many calls of
+        this name, the thread of the call begins with more.
+        """
+        others = Counter(
+            c.thread for c in run.calls if call and c.name == call.name and c.thread != call.thread
+        )
+        most = max(others.values(), default=0)
+        if not call or most < call.nth:
+            return replace(self, killed=call)
+        ahead = most + SPARE_CALLS
+        return replace(self, killed=replace(call, nth=call.nth + ahead), ahead=ahead)
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +141,7 @@ class ScenePlay:
         self.scene.prepare(self.folder)
         for step in self.scene.steps:
             self.before.append(tree.read(self.folder))
-            run = self._run(step, step.killed)
+            run = self._run(step)
             if not step.killed and step.code not in (None, run.code):
                 raise NotFollowed(f"{step.name} ended with {run.code}: {run.output[-2000:]}")
             self.runs.append(run)
@@ -153,7 +180,7 @@ class ScenePlay:
         """The command is killed as it enters the moment's call. Raises NotFollowed."""
         step = self.scene.steps[moment.step]
         self._restore(self.before[moment.step])
-        run = self._run(step, moment.call)
+        run = self._run(step.cut(moment.call, self.runs[moment.step]))
         output = "".join(BETWEEN + run.output for run in (*self.runs[: moment.step], run))
         return self._point("kill", moment, 1, self._judged(tree.read(self.folder), step, output))
 
@@ -161,7 +188,7 @@ class ScenePlay:
         """The command is killed there and started again in the same folder; at each moment of this
         second run the power fails. Raises NotFollowed."""
         step, before = self.scene.steps[moment.step], self.before[moment.step]
-        steps = replace(step, killed=moment.call), replace(step, code=None)
+        steps = step.cut(moment.call, self.runs[moment.step]), replace(step, code=None)
         twice = replace(self.scene, prepare=lambda folder: tree.write(before, folder), steps=steps)
         wrong, states = [], 0
         with stage() as work:
@@ -179,11 +206,11 @@ class ScenePlay:
                 ]
         return self._point("kill_then_power", moment, states, wrong)
 
-    def _run(self, step: SceneStep, at: SystemCall | None) -> TracedRun:
+    def _run(self, step: SceneStep) -> TracedRun:
         """Run a command, and compare the folder that it leaves with the modelled effect of its
         calls."""
         disk = Disk(self.folder, tree.read(self.folder))
-        run = calls.run(step.command(self.folder), self.work / "log", at, ENVIRONMENT)
+        run = calls.run(step.arguments(self.folder), self.work / "log", step.killed, ENVIRONMENT)
         disk.follow(run.calls)
         if (seen := disk.seen()) != (there := tree.read(self.folder)):
             differ = sorted(

@@ -47,6 +47,7 @@ TOOLS = {
 PLACES = {
     "palpate.service": "/etc/systemd/system/palpate.service",
     "palpate-watch.service": "/etc/systemd/system/palpate-watch.service",
+    "palpate-teach.service": "/etc/systemd/system/palpate-teach.service",
     "palpate-bridge@.service": "/etc/systemd/system/palpate-bridge@.service",
     "palpate.sysusers": "/usr/lib/sysusers.d/palpate.conf",
     "palpate.tmpfiles": "/usr/lib/tmpfiles.d/palpate.conf",
@@ -184,6 +185,7 @@ class Machine:
                 "--keep-unit",
                 "--console=pipe",
                 "--private-network",
+                "--system-call-filter=bpf",  # IPAddressDeny= of the units
                 "--volatile=overlay",
                 "--notify-ready=yes",
                 f"--bind-ro={parcel}:/parcel",

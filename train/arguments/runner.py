@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from importlib import import_module
 
 from appliance.core.errors import ApplianceError
-from appliance.core.interrupts import INTERRUPTED, during_imports
+from appliance.core.interrupts import INTERRUPTED, during_imports, during_work
 from appliance.core.menu import Menu
 from train.arguments.types import Run
 
@@ -75,7 +75,8 @@ class Program:
             args = parser.parse_args(words)
             args.words = words
             score.provenance()  # read now: a later commit is not of the code that runs
-            args.run(args)
+            with during_work():
+                args.run(args)
             sys.stdout.flush()
         except ApplianceError as e:
             print(f"{self.name}: {e}", file=sys.stderr)

@@ -67,6 +67,16 @@ def test_ctrl_c_during_the_imports_is_one_line(
     assert (process.returncode, err) == (130, f"{program}: interrupted before anything was done\n")
 
 
+def test_ctrl_c_during_a_late_import_is_one_line(tmp_path: Path):
+    """A library that a command imports during its work: exit code 130 without a traceback, although
+    the command takes the library's error for a missing library."""
+    process = _loading("train", ["sets", "describe", "aeon:GunPoint"], "aeon", tmp_path)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    line = "palpate-train: interrupted; the same command begins anew\n"
+    assert (process.returncode, err) == (130, line)
+
+
 def test_ctrl_c_that_is_ignored_stays_ignored(tmp_path: Path):
     """A program in the background of a script goes on importing; SIGTERM ends it."""
     process = _loading("appliance", ["skin", "list"], "onnxruntime", tmp_path, ignored=True)

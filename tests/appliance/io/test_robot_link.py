@@ -8,6 +8,7 @@ import os
 import re
 import struct
 import sys
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -344,6 +345,42 @@ def test_a_line_that_echoes_gets_no_answers():
     assert found == []
     damaged = own[1].replace(b"ok", b"oj")
     assert parse(damaged)[0] == []
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        bytes.lower,
+        lambda line: line[3:],
+        lambda line: b'"' + line.strip() + b'"\r\n',
+        lambda line: line.replace(b"ANS", b"AMS"),
+        lambda line: bytes(c for each in line for c in (each, each)),
+    ],
+    ids=["lower case", "cut", "quoted", "damaged", "doubled"],
+)
+def test_an_echo_with_changes_is_not_answered_without_end(change: Callable[[bytes], bytes]):
+    """Each answer comes back changed, for a minute: eight answers, and then one a second. A command
+    in between is carried out, and a bad line after it is answered at once."""
+    clock = rig.VirtualClock()
+    with pseudo_terminal.pair() as (robot, name):
+        sink = sink_on(name, clock)
+        sink.commands()
+        os.write(robot, change(sentence("ANS", "ID", "ok")))
+        answers = 0
+        for _ in range(600):
+            for bad in sink.commands():
+                answers += 1
+                os.write(robot, change(sentence("ANS", bad.name, "error", bad.error)))
+            os.write(robot, change(sentence("STA", 1, "lost")))
+            clock.sleep_until(clock.now_ns() + 10**8)
+        assert 8 <= answers <= 8 + 60 + 1
+        os.write(robot, b"PPLP ID\r\nPPLP NO\r\n")
+        found = [command for command in sink.commands() if command.name in ("ID", "NO")]
+        assert [(command.name, bool(command.error)) for command in found] == [
+            ("ID", False),
+            ("NO", True),
+        ]
+        sink.close()
 
 
 class StandardOutput:
