@@ -85,7 +85,7 @@ class Dataset(sweep_set.SweepSet):
             keep &= self._matches(text)
         if not keep.any():
             raise self._error(f"no sweep fulfils {' and '.join(conditions)}; use fewer conditions")
-        part = self.take(keep).require_materials()
+        part = (self if keep.all() else self.take(keep)).require_materials()
         present, labels = np.unique(part.labels, return_inverse=True)
         return replace(part, labels=labels, materials=tuple(self.materials[k] for k in present))
 
