@@ -28,6 +28,8 @@ from train.data.progress import Progress
 from train.data.sets import Dataset
 
 Array = NDArray[Any]
+DISPLAY = "display name"
+"""Field of a recording whose material has a display name beside the name that is sent."""
 BATCH = 4096
 """Number of frames that are converted at a time."""
 Fields = dict[str, str]
@@ -167,13 +169,20 @@ def _named(
 
 
 def _name_materials(folder: Path, known: Sequence[Fields], plan: ImportPlan) -> None:
-    """Give materials their new names. Raises FormatError for a name that does not occur, and for
-    materials that the box cannot send."""
+    """Give materials their new names, and a name in place of those that the box cannot send: what
+    the file says then is the display name. Raises FormatError for a new name that the box cannot
+    send, or for an old name that does not occur."""
     labels.check_renames(plan.renames, (fields["material"] for fields in known))
-    for fields in known:
-        fields["material"] = plan.renames.get(fields["material"], fields["material"])
-    if why := labels.unsendable(sorted({fields["material"] for fields in known})):
+    if why := labels.unsendable(plan.renames.values()):
         raise FormatError(f"{folder}: {why}; {labels.REMEDY}")
+    names = {fields["material"] for fields in known}
+    new = {name: plan.renames.get(name, name) for name in names}
+    sent = labels.sendable(new.values())
+    for fields in known:
+        written = fields["material"]
+        fields["material"] = sent[new[written]]
+        if labels.unsendable([written]):
+            fields[DISPLAY] = written
 
 
 def _files(
@@ -398,18 +407,41 @@ def _set(
             values, unit = group(plan.pattern, name, texts)
             groups[name] = np.repeat(values, count)
             units |= {name: unit} if unit else {}
-    samples, end = np.empty((sum(count), *cuts[0].windows.shape[1:]), dtype), sum(count)
-    while cuts:  # the memory of each recording is free once it is copied
-        windows = cuts.pop().windows
-        samples[end - len(windows) : end] = windows
-        end -= len(windows)
+    displays = _displays([cut.recording.fields for cut in cuts])
     sweeps = Dataset(
-        samples,
+        _moved(cuts, sum(count), dtype),
         np.repeat(numbers, count),
         tuple(materials),
         rate_hz,
         groups,
         str(folder),
         units=units,
+        displays={name: texts[0] for name, texts in displays.items() if len(texts) == 1},
     )
-    return sweeps, [f"{name} is in {unit}, as its name says" for name, unit in units.items()]
+    return sweeps, [
+        *(
+            f"{text!r} is sent as {name!r}; --rename changes that"
+            for name, texts in displays.items()
+            for text in texts
+        ),
+        *(f"{name} is in {unit}, as its name says" for name, unit in units.items()),
+    ]
+
+
+def _displays(known: Sequence[Fields]) -> dict[str, list[str]]:
+    """What the files call materials that have another name in the set, by that name."""
+    found: dict[str, list[str]] = {}
+    for name, text in sorted({(f["material"], f[DISPLAY]) for f in known if DISPLAY in f}):
+        found.setdefault(name, []).append(text)
+    return found
+
+
+def _moved(cuts: list[Cut], count: int, dtype: str) -> Array:
+    """All windows [count, T, R, C(, A)], from the last on; the memory of each recording is free
+    once it is copied."""
+    samples, end = np.empty((count, *cuts[0].windows.shape[1:]), dtype), count
+    while cuts:
+        windows = cuts.pop().windows
+        samples[end - len(windows) : end] = windows
+        end -= len(windows)
+    return samples
