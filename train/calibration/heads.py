@@ -27,6 +27,8 @@ ABSENT = -1e4
 LEAST_SHRINKAGE = 1e-4
 """Least shrinkage: even if the scatter is known well, equations with equal features need a
 solution."""
+BATCH = 512
+"""Number of features, or of sweeps, of which temporary results are held at a time."""
 Given = tuple[Array, Array, Array, Array]
 """The data that a head is fitted to: features [N, F] and labels [N] of sweeps, features [M, F] and
 labels [M] of augmented copies."""
@@ -146,7 +148,8 @@ def fit_discriminant(features: Array, labels: Array, classes: int) -> tuple[Arra
     means = np.stack([x[member == k].mean(axis=0) for k in range(len(present))])
     for k in range(len(present)):  # in place: features of many sweeps fill the memory
         x[member == k] -= means[k]
-    spread = x.std(axis=0)
+    columns = range(0, x.shape[1], BATCH)
+    spread = np.concatenate([x[:, first : first + BATCH].std(axis=0) for first in columns])
     spread = np.maximum(spread, max(1e-6 * float(spread.max(initial=0)), 1e-12))
     middle = means.mean(axis=0)
     wanted = (means - middle) / spread
@@ -184,7 +187,8 @@ def shrinkage(z: Array, gram: Array) -> tuple[float, float]:
     """
     n, size = z.shape
     trace, squares = float(np.trace(gram)) / n, float((gram**2).sum()) / n**2
-    fourth = float(((z**2).sum(axis=1) ** 2).sum())
+    norms = [(z[first : first + BATCH] ** 2).sum(axis=1) for first in range(0, n, BATCH)]
+    fourth = float((np.concatenate(norms) ** 2).sum())
     mean = trace / size
     distance = (squares - 2 * mean * trace + size * mean**2) / size
     noise = min(max((fourth / n - squares) / (size * n), 0.0), distance)

@@ -364,7 +364,7 @@ def run(model: onnx.ModelProto, inputs: Array) -> Array:
     on_the_box, name = _session(model.SerializeToString()), model.graph.input[0].name
     outputs: Array | None = None
     for i, one in enumerate(inputs):
-        (output,) = on_the_box.run(None, {name: one[None]})
+        output = on_the_box.run(None, {name: one[None]})[0]
         if outputs is None:  # a list to join at the end would hold everything twice
             outputs = np.empty((len(inputs), *output.shape[1:]), output.dtype)
         outputs[i] = output[0]

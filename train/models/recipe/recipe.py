@@ -59,7 +59,7 @@ Array = NDArray[Any]
 LEAST_EACH, LEAST_SWEEPS = 25, 100
 """Smallest numbers of sweeps for training stages, of each material and of all. Stages overfit to a
 few sweeps of a material and to a few batches."""
-MOST_SWEEPS = 5000
+MOST_SWEEPS = 4000
 """Usual largest number of sweeps of a fit. It bounds memory and time: features of each sweep and of
 its copies are held, and candidates are fitted to them (docs/recipe.md)."""
 STAGES_WEIGHT = 0.5
