@@ -17,7 +17,11 @@ def uneven() -> Dataset:
     its number as its first count."""
     labels = np.repeat([0, 1, 2], [3, 40, 200])
     recording = np.concatenate(
-        [np.arange(3), 3 + np.repeat(np.arange(4), 10), 7 + np.repeat(np.arange(5), [100, 50, 30, 16, 4])]
+        [
+            np.arange(3),
+            3 + np.repeat(np.arange(4), 10),
+            7 + np.repeat(np.arange(5), [100, 50, 30, 16, 4]),
+        ]
     )
     base = easy(1)
     samples = np.zeros((len(labels), *base.samples.shape[1:]), np.int16)

@@ -7,7 +7,7 @@ from pathlib import Path
 from appliance.core.errors import FormatError
 from train.data.sets import Dataset
 
-COPIED, FEATURES, FIXED = 4, 80_000, 0.3e9
+COPIED, FEATURES, FIXED = 4, 150_000, 0.3e9
 """Bytes that a fit needs beside its set: COPIED times those of the used sweeps, FEATURES for each
 of them, and FIXED for the program (measured, docs/recipe.md)."""
 MEMINFO, CGROUP = Path("/proc/meminfo"), Path("/sys/fs/cgroup")
