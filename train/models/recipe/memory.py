@@ -15,7 +15,7 @@ MEMINFO, CGROUP = Path("/proc/meminfo"), Path("/sys/fs/cgroup")
 
 def needed(sweeps: Dataset, used: int) -> float:
     """About how many bytes a fit to `used` of these sweeps needs beside the set."""
-    return FIXED + used * (FEATURES + COPIED * sweeps.samples[0].nbytes)
+    return FIXED + float(used * (FEATURES + COPIED * sweeps.samples[0].nbytes))
 
 
 def available() -> float:
