@@ -372,7 +372,7 @@ def test_too_little_memory_is_one_line(
         raise MemoryError("Unable to allocate 9.00 TiB")
 
     monkeypatch.setattr("train.data.sets.load", load)
-    assert main(["sets", "describe", "sim:T-LAB:1:1"]) == FormatError.exit_code
+    assert main(["sets", "describe", "sim:T-LAB:1:1"]) == 1
     said = capsys.readouterr().err
     assert said.startswith(
         "palpate-train: not enough memory: Unable to allocate 9.00 TiB; use fewer"
