@@ -32,8 +32,9 @@ class SweepSet:
     with the same whole number in `recording` are parts of one recording. source: the name used in
     messages. unloaded: float [N, 2, R, C] or [N, 2, R, C, A], mean and standard deviation of the
     skin without contact when each sweep was recorded, NaN for a sweep where it is unknown; None if
-    it is unknown for all. units: of the groups of numbers that have one. Raises FormatError naming
-    `source` and the fault.
+    it is unknown for all. units: of the groups of numbers that have one. displays: names of
+    materials for people, in any language, by the names that the box sends. Raises FormatError
+    naming `source` and the fault.
     """
 
     samples: Array
@@ -44,6 +45,7 @@ class SweepSet:
     source: str = "sweep set"
     unloaded: Array | None = None
     units: dict[str, str] = field(default_factory=dict)
+    displays: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._check_samples()
@@ -214,7 +216,21 @@ def build(arrays: dict[str, Array], source: str, kind: type[Set]) -> Set:
         source,
         native.get("unloaded"),
         {name: str(unit) for name, unit in units.items() if name in groups},
+        _displays(materials, native.get("displays"), source),
     )
+
+
+def _displays(materials: tuple[str, ...], given: Array | None, source: str) -> dict[str, str]:
+    """Display names by material; one that is empty or equal to the name is none."""
+    if given is None:
+        return {}
+    if given.dtype.kind != "U" or given.shape != (len(materials),):
+        raise FormatError(
+            f"{source}: displays hold {given.dtype} {list(given.shape)}; give one text for each of "
+            f"{len(materials)} materials, or leave them out"
+        )
+    pairs = zip(materials, map(str, given), strict=True)
+    return {name: text for name, text in pairs if text not in ("", name)}
 
 
 def _group(name: str, values: Array) -> Array:

@@ -172,7 +172,7 @@ def _make_references(folder: Path) -> None:
     program."""
     if folder.is_dir() or not Path(sys.executable).with_name("palpate-train").exists():
         return
-    command = [sys.executable, "-m", "train.studies", "references", "--out", str(folder)]
+    command = [sys.executable, "-P", "-m", "train.studies", "references", "--out", str(folder)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         raise BundleError(f"train.studies references failed: {done.stderr.strip()[-300:]}")
@@ -183,7 +183,8 @@ def _child(name: str, seed: int) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         acts = Path(folder) / "acts.npz"
         bench_process.write_acts(acts, script.tubes(seed, 6))
-        command = [sys.executable, "-m", "appliance", "bench", "--part", name, "--acts", str(acts)]
+        words = ["bench", "--part", name, "--acts", str(acts)]
+        command = [sys.executable, "-P", "-m", "appliance", *words]
         done = subprocess.run(command, capture_output=True, text=True, check=True)
     result: dict[str, Any] = json.loads(done.stdout)
     return result
@@ -193,7 +194,7 @@ def _cold_start() -> dict[str, Any]:
     """Seconds from the start of the process to READY with a streaming skin, as the first state
     sentence reports it."""
     took = []
-    command = [sys.executable, "-m", "appliance", "run", "--sim", "skin"]
+    command = [sys.executable, "-P", "-m", "appliance", "run", "--sim", "skin"]
     for _ in range(STARTS):
         start = time.monotonic()
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as box:

@@ -227,6 +227,12 @@ CAMPAIGNS = {
         variables={"OMP_NUM_THREADS": "1"},
         nice=True,
     ),
+    "fit-memory": Campaign(
+        "measure peak memory and time of fit on 1,000 to 100,000 windows (docs/recipe.md)",
+        _module("tests.campaigns.fit_memory"),
+        variables={"OMP_NUM_THREADS": "1"},
+        nice=True,
+    ),
     "slide-speed": Campaign(
         "measure how well the speed of a slide is measured from the counts (docs/decisions/0021)",
         _module("tests.campaigns.slide_speed"),

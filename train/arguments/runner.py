@@ -86,10 +86,8 @@ class Program:
             # the process ends
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 1
-        except OSError as e:
-            # an error of a library may name neither file nor cause
-            text = e if e.filename is None else f"{e.filename}: {e.strerror}"
-            print(f"{self.name}: {text}", file=sys.stderr)
+        except (OSError, MemoryError) as e:
+            print(f"{self.name}: {_fault(e)}", file=sys.stderr)
             return ApplianceError.exit_code
         except KeyboardInterrupt:
             resumes = getattr(args, "resumes", hasattr(args, "cache"))
@@ -97,3 +95,12 @@ class Program:
             print(f"{self.name}: interrupted; the same command {kept}", file=sys.stderr)
             return INTERRUPTED
         return 0
+
+
+def _fault(e: OSError | MemoryError) -> str:
+    """What the system could not do, with a remedy where there is one."""
+    if isinstance(e, MemoryError):
+        cause = f": {e}" if str(e) else ""
+        return f"not enough memory{cause}; use fewer sweeps (--only), or a machine with more"
+    # an error of a library may name neither file nor cause
+    return str(e) if e.filename is None else f"{e.filename}: {e.strerror}"

@@ -151,9 +151,8 @@ def cross_fitted_logits(
     classes, logits, numbers = int(labels.max()) + 1, [], []
     parts = cross_fitted(tenths[:, -1], labels, groups, judged, fixed)
     for fit, judges, embedding, present in parts:
-        steps = heads(embedding(tenths[fit]), labels[fit], classes).logits(
-            embedding(tenths[judges])
-        )
+        z = embedding(tenths)
+        steps = heads(z[fit], labels[fit], classes).logits(z[judges])
         whole = np.full((len(judges), 1, classes), ABSENT)
         whole[:, 0, present] = embedding.logits(tenths[judges, -1])
         logits.append(np.concatenate([steps, whole], axis=1))

@@ -27,6 +27,8 @@ ABSENT = -1e4
 LEAST_SHRINKAGE = 1e-4
 """Least shrinkage: even if the scatter is known well, equations with equal features need a
 solution."""
+BATCH = 512
+"""Number of features, or of sweeps, of which temporary results are held at a time."""
 Given = tuple[Array, Array, Array, Array]
 """The data that a head is fitted to: features [N, F] and labels [N] of sweeps, features [M, F] and
 labels [M] of augmented copies."""
@@ -46,10 +48,10 @@ class HeadPart:
     def fit(self, given: Given, classes: int) -> tuple[Array, Array]:
         """Weight [K, F] over all features, and bias [K]; see fit_discriminant."""
         columns, (x, y, copied, of) = np.array(self.columns), given
+        weight, seen = np.zeros((classes, x.shape[1]), np.float32), x[:, columns]
         if self.copies:
-            x, y = np.concatenate([x, copied]), np.append(y, of)
-        weight = np.zeros((classes, x.shape[1]), np.float32)
-        weight[:, columns], bias = fit_discriminant(x[:, columns], y, classes)
+            seen, y = np.concatenate([seen, copied[:, columns]]), np.append(y, of)
+        weight[:, columns], bias = fit_discriminant(seen, y, classes)
         return weight * np.float32(self.factor), bias * np.float32(self.factor)
 
 
@@ -137,20 +139,23 @@ def fit_discriminant(features: Array, labels: Array, classes: int) -> tuple[Arra
     sweep of each material, which does not show how materials vary.
     """
     present, member = np.unique(labels, return_inverse=True)
-    x = np.asarray(features, np.float64)
+    x = np.array(features, np.float64)
     if len(x) <= len(present):
         raise FormatError(
             f"{len(x)} sweeps of as many materials are too few for a linear discriminant; record "
             "more"
         )
     means = np.stack([x[member == k].mean(axis=0) for k in range(len(present))])
-    scatter = x - means[member]
-    spread = scatter.std(axis=0)
+    for k in range(len(present)):  # in place: features of many sweeps fill the memory
+        x[member == k] -= means[k]
+    columns = range(0, x.shape[1], BATCH)
+    spread = np.concatenate([x[:, first : first + BATCH].std(axis=0) for first in columns])
     spread = np.maximum(spread, max(1e-6 * float(spread.max(initial=0)), 1e-12))
     middle = means.mean(axis=0)
     wanted = (means - middle) / spread
-    solved = _solve(scatter / spread, wanted)
-    weight, bias = np.zeros((classes, x.shape[1])), np.full(classes, ABSENT)
+    x /= spread
+    solved = _solve(x, wanted)
+    weight, bias = np.zeros((classes, len(spread))), np.full(classes, ABSENT)
     weight[present] = solved / spread
     bias[present] = -0.5 * (wanted * solved).sum(axis=1) - weight[present] @ middle
     return weight.astype(np.float32), bias.astype(np.float32)
@@ -182,7 +187,8 @@ def shrinkage(z: Array, gram: Array) -> tuple[float, float]:
     """
     n, size = z.shape
     trace, squares = float(np.trace(gram)) / n, float((gram**2).sum()) / n**2
-    fourth = float(((z**2).sum(axis=1) ** 2).sum())
+    norms = [(z[first : first + BATCH] ** 2).sum(axis=1) for first in range(0, n, BATCH)]
+    fourth = float((np.concatenate(norms) ** 2).sum())
     mean = trace / size
     distance = (squares - 2 * mean * trace + size * mean**2) / size
     noise = min(max((fourth / n - squares) / (size * n), 0.0), distance)

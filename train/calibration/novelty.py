@@ -68,6 +68,8 @@ class Embedding:
 
     def __call__(self, features: Array) -> Array:
         """Features [..., F] -> z, float64 [..., r]."""
+        if features.ndim > 2:  # in float64, prefixes of all sweeps would not fit into memory
+            return np.stack([self(one) for one in features])
         z: Array = np.asarray(features, np.float64) @ self.projection + self.offset
         return z
 

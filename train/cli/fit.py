@@ -23,7 +23,7 @@ from train.evaluation.evaluate import CACHE
 from train.evaluation.fold import fingerprint
 from train.metrics import score
 from train.models.methods import SkinUse
-from train.models.recipe import recipe
+from train.models.recipe import memory, recipe
 from train.models.recipe.fitted import Fit
 from train.models.recipe.sizes import SIZES, UNLIMITED
 from train.reports import formatting, selection_report
@@ -33,7 +33,7 @@ from train.selection.dial import Budget, SizeWish
 Json = dict[str, Any]
 MAINS = (50, 60)
 """Frequencies of the mains in Hz: public grids have no others."""
-STEPS = recipe.Settings().steps
+STEPS, MOST = recipe.Settings().steps, recipe.MOST_SWEEPS
 
 
 def register(add: Add) -> None:
@@ -61,6 +61,14 @@ def register(add: Add) -> None:
         metavar="GROUP,...",
         help="groups that will have other values in service, e.g. force,speed; each is held out "
         "for the limits and for the printed accuracy (default: all that can be)",
+    )
+    command.add_argument(
+        "--most-sweeps",
+        type=numbers.whole("--most-sweeps", 1),
+        default=MOST,
+        metavar="N",
+        help="largest number of sweeps that the model is fitted to; of more, some of each "
+        f"recording are drawn (default {MOST}); memory and time grow with it",
     )
     _add_use(command)
     _add_dial(command)
@@ -165,6 +173,7 @@ def run(args: argparse.Namespace) -> None:
     if args.split:
         by, share = _by_share(args.split)
         sweeps, rest = sweeps.split(by, share, args.seed)
+    memory.check(sweeps, min(len(sweeps), args.most_sweeps))
     made, change, unfinished = _fitted(args, sweeps)
     if args.rest and rest:
         change.of(rest).save(args.rest)
@@ -172,6 +181,11 @@ def run(args: argparse.Namespace) -> None:
     made.save(args.out)
     unfinished.unlink(missing_ok=True)
     print(f"fit: {len(made.train)} sweeps, {made.train.format}; {args.out}")
+    if len(sweeps) > args.most_sweeps:
+        print(
+            f"used: {args.most_sweeps} of {len(sweeps)} sweeps, some of each recording; "
+            "--most-sweeps N uses more, with more memory and time"
+        )
     _print_held_out(made)
     if beside := trivial.beside_a_fit(sweeps, args.varies):
         told = "; ".join(f"{name} {formatting.counted(figure)}" for name, figure in beside.items())
@@ -218,6 +232,7 @@ def _fitted(args: argparse.Namespace, sweeps: Dataset) -> tuple[Fit, Change, Pat
         size=SIZES.get(args.size, UNLIMITED),
         use=use,
         varies=args.varies,
+        most=args.most_sweeps,
     )
     wish = (args.budget_ms, args.budget_kb, args.accuracy, args.reduce)
     if any(wish):
@@ -285,6 +300,7 @@ def _unfinished(args: argparse.Namespace, sweeps: Dataset, use: SkinUse) -> Path
     """The file that keeps a training until the fit is written. Its name is a fingerprint of all
     that the training depends on."""
     about = [digest(sweeps), args.seed, args.size, args.steps, args.varies, asdict(use)]
+    about += [args.most_sweeps] * (len(sweeps) > args.most_sweeps)
     return (
         CACHE
         / f"{fingerprint(about, 'train.models.recipe.recipe', 'train.models.recipe.stages')}.pt"

@@ -15,7 +15,7 @@ from train.arguments.types import Add
 from train.data import labels, lerobot, summary
 from train.data.file_names import EXAMPLE, GROUP, NamePattern
 from train.data.import_plan import ImportPlan, Length
-from train.data.importing import Cut, Imported, LeftOut, import_folder
+from train.data.importing import Imported, LeftOut, Taken, import_folder
 
 SHOWN = 5
 """Largest number of files with a line each that were left out for the same reason."""
@@ -117,7 +117,7 @@ def run(args: argparse.Namespace) -> None:
         if path := getattr(args, option):
             options.writable_file(path, f"--{option}", *endings)
     left_out: list[LeftOut] = []
-    taken: Sequence[Cut] = ()
+    taken: Sequence[Taken] = ()
     try:
         made = import_folder(args.folder, plan, options.Log(), left_out)
         taken = made.taken
@@ -186,9 +186,9 @@ def _taken(made: Imported) -> list[str]:
     """How the taken files became sweeps, in lines."""
     lines = [f"taken: {len(made.taken)} files; left out: {len(made.left_out)}"]
     for what in ("interpolated onto even times", "gaps"):
-        if n := sum(what in cut.notes for cut in made.taken):
+        if n := sum(what in one.notes for one in made.taken):
             lines.append(f"  {n} of them: {what}")
-    said = [(cut.recording.name, note) for cut in made.taken for note in cut.recording.notes]
+    said = [(one.name, note) for one in made.taken for note in one.said]
     notes = Counter(note for _, note in said)
     for note, n in list(notes.items())[:SHOWN]:
         name = next(name for name, other in said if other == note)
@@ -198,12 +198,10 @@ def _taken(made: Imported) -> list[str]:
     return [*lines, *(f"  {note}" for note in made.notes)]
 
 
-def _report(taken: Sequence[Cut], left_out: Sequence[LeftOut]) -> str:
+def _report(taken: Sequence[Taken], left_out: Sequence[LeftOut]) -> str:
     """A line for each file, in the order of their names."""
     lines = {one.name: f"left out: {one.why}" for one in left_out}
-    for cut in taken:
-        notes = f"; {cut.notes}" if cut.notes else ""
-        lines[cut.recording.name] = (
-            f"taken: {len(cut.windows)} windows of {len(cut.recording.frames)} frames{notes}"
-        )
+    for one in taken:
+        notes = f"; {one.notes}" if one.notes else ""
+        lines[one.name] = f"taken: {one.windows} windows of {one.frames} frames{notes}"
     return "".join(f"{name}\t{line}\n" for name, line in sorted(lines.items()))

@@ -23,6 +23,10 @@ DAY = re.compile(r"(\d{4}-\d\d-\d\d|\d{1,2}[./]\d{1,2}[./]\d{2,4})[T ].*")
 """A date with a clock time; the first group is the day."""
 
 
+class GridMissing(FormatError):
+    """Columns of taxels without --grid, which says how they lie."""
+
+
 def frames(table: Table, plan: ImportPlan) -> tuple[Array, Array | None, list[str]]:
     """The frames [n, R, C] or [n, R, C, A] of a table, as recorded; their times [n] in seconds, or
     None without --time; and remarks.
@@ -184,7 +188,7 @@ def _taxels(values: Array, table: Table, plan: ImportPlan, time_column: int | No
     ]
     if not shape:
         count = values.shape[1] - len(table.texts)
-        raise FormatError(
+        raise GridMissing(
             f"has {count} columns; give their layout with --grid, e.g. 4x4 for 16 taxels"
         )
     wide, want = values.shape[1], int(np.prod(shape))

@@ -10,10 +10,12 @@ import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
@@ -26,6 +28,10 @@ from train.data.progress import Progress
 from train.data.sets import Dataset
 
 Array = NDArray[Any]
+DISPLAY = "display name"
+"""Field of a recording whose material has a display name beside the name that is sent."""
+BATCH = 4096
+"""Number of frames that are converted at a time."""
 Fields = dict[str, str]
 Source = tuple[str, Fields, Callable[[], Table]]
 """Name of a recording, its fields that are known already, and a function that reads it."""
@@ -54,10 +60,28 @@ class LeftOut:
 
 @dataclass(frozen=True)
 class Cut:
-    """Windows [k, T, R, C(, A)] of one recording. notes: how its frames were changed."""
+    """Windows [k, T, R, C(, A)] of one recording, most of them views of its frames. notes: how its
+    frames were changed."""
 
     recording: Recording
     windows: Array
+    notes: str
+
+    def counted(self) -> Taken:
+        """What is still known once the windows are in the set."""
+        one = self.recording
+        return Taken(one.name, len(self.windows), len(one.frames), one.notes, self.notes)
+
+
+@dataclass(frozen=True)
+class Taken:
+    """A recording that was imported: its numbers of windows and frames. said: remarks of the
+    reader. notes: how its frames were changed."""
+
+    name: str
+    windows: int
+    frames: int
+    said: Sequence[str]
     notes: str
 
 
@@ -67,7 +91,7 @@ class Imported:
     set."""
 
     sweeps: Dataset
-    taken: Sequence[Cut]
+    taken: Sequence[Taken]
     left_out: Sequence[LeftOut]
     notes: Sequence[str]
 
@@ -91,11 +115,16 @@ def import_folder(
         count += 1
         try:
             recordings += _recordings(read(), name, known, plan)
+        except frames.GridMissing as e:
+            if not recordings:  # the other files would fail, too, after the time to read them
+                raise FormatError(f"{folder}: {name} {e}") from e
+            left_out.append(LeftOut(name, str(e), broken=True))
         except FormatError as e:
             left_out.append(LeftOut(name, str(e), broken=True))
     if "material" in plan.fields and recordings:
         _name_materials(folder, [one.fields for one in recordings], plan)
     cuts, rate_hz = _cuts(recordings, plan, left_out)
+    del recordings  # their frames go as soon as they are in the set
     cuts, warnings = _without_copies(cuts, left_out)
     dtype, about = _common_type(cuts, plan.dtype, left_out)
     cuts = [cut for cut in cuts if cut.recording.name not in {file.name for file in left_out}]
@@ -103,8 +132,9 @@ def import_folder(
         raise FormatError(
             f"{folder}: none of {count} files could be imported; the messages above say why"
         )
+    taken = [cut.counted() for cut in cuts]
     sweeps, notes = _set(folder, cuts, rate_hz, dtype, plan)
-    return Imported(sweeps, cuts, left_out, [about, *warnings, *notes])
+    return Imported(sweeps, taken, left_out, [about, *warnings, *notes])
 
 
 def _named(
@@ -139,13 +169,20 @@ def _named(
 
 
 def _name_materials(folder: Path, known: Sequence[Fields], plan: ImportPlan) -> None:
-    """Give materials their new names. Raises FormatError for a name that does not occur, and for
-    materials that the box cannot send."""
+    """Give materials their new names, and a name in place of those that the box cannot send: what
+    the file says then is the display name. Raises FormatError for a new name that the box cannot
+    send, or for an old name that does not occur."""
     labels.check_renames(plan.renames, (fields["material"] for fields in known))
-    for fields in known:
-        fields["material"] = plan.renames.get(fields["material"], fields["material"])
-    if why := labels.unsendable(sorted({fields["material"] for fields in known})):
+    if why := labels.unsendable(plan.renames.values()):
         raise FormatError(f"{folder}: {why}; {labels.REMEDY}")
+    names = {fields["material"] for fields in known}
+    new = {name: plan.renames.get(name, name) for name in names}
+    sent = labels.sendable(new.values())
+    for fields in known:
+        written = fields["material"]
+        fields["material"] = sent[new[written]]
+        if labels.unsendable([written]):
+            fields[DISPLAY] = written
 
 
 def _files(
@@ -167,6 +204,7 @@ def _episodes(folder: Path, plan: ImportPlan) -> Iterator[Source]:
 def _recordings(table: Table, name: str, known: Fields, plan: ImportPlan) -> list[Recording]:
     """The recordings in a table; several if a column of --field changes its value."""
     counts, time_s, notes = frames.frames(table, plan)
+    counts = _compact(counts)
     parts = frames.fields(table, plan.fields, len(counts))
     made = []
     for part, found in parts:
@@ -175,6 +213,16 @@ def _recordings(table: Table, name: str, known: Fields, plan: ImportPlan) -> lis
         said = (*table.notes, *notes)
         made.append(Recording(at, {**known, **found}, counts[part], times, said))
     return made
+
+
+def _compact(counts: Array) -> Array:
+    """Whole counts in float64, as of text, as int32, which is not a type of a set: _common_type
+    still chooses that. Other counts stay as they are."""
+    limits = np.iinfo(np.int32)
+    if counts.dtype != np.float64 or counts.min() < limits.min or counts.max() > limits.max:
+        return counts
+    whole = counts.astype(np.int32)
+    return whole if np.array_equal(whole, counts) else counts
 
 
 def _without_copies(cuts: Sequence[Cut], left_out: list[LeftOut]) -> tuple[list[Cut], list[str]]:
@@ -187,9 +235,7 @@ def _without_copies(cuts: Sequence[Cut], left_out: list[LeftOut]) -> tuple[list[
     seen: dict[bytes, dict[str, Recording]] = {}
     for cut in cuts:
         one = cut.recording
-        content = np.ascontiguousarray(one.frames, np.float64)
-        key = hashlib.sha256(repr(content.shape).encode() + content.tobytes()).digest()
-        same = seen.setdefault(key, {})
+        same = seen.setdefault(_digest(one.frames), {})
         material = one.fields["material"]
         if material in same:
             why = f"holds the same frames as {same[material].name}, which counts once"
@@ -203,6 +249,14 @@ def _without_copies(cuts: Sequence[Cut], left_out: list[LeftOut]) -> tuple[list[
         same[material] = one
         kept.append(cut)
     return kept, warnings
+
+
+def _digest(counts: Array) -> bytes:
+    """The SHA-256 of frames as float64, a part at a time."""
+    total = hashlib.sha256(repr(counts.shape).encode())
+    for first in range(0, len(counts), BATCH):
+        total.update(np.ascontiguousarray(counts[first : first + BATCH], np.float64).data)
+    return total.digest()
 
 
 def _cuts(
@@ -249,17 +303,27 @@ def _cut(one: Recording, runs: sampling.Runs, rate_hz: float, plan: ImportPlan) 
             np.empty(0),
             f"has {len(longest)} frames{between}, but a window needs {window}; see --window",
         )
-    windows = np.stack([part[start : start + window] for part, start in starts])
+    windows = _windows(starts, window)
     if runs.interpolated and not (one.frames % 1).any():
         windows = np.rint(windows)  # whole counts stay whole
     if one.frames.dtype.kind in "iu":
-        windows = windows.astype(one.frames.dtype)
+        windows = windows.astype(one.frames.dtype, copy=False)
     notes = [
         *one.notes,
         *["interpolated onto even times"] * runs.interpolated,
         *[f"{runs.gaps} gaps"] * (runs.gaps > 0),
     ]
     return Cut(one, windows, ", ".join(notes))
+
+
+def _windows(starts: Sequence[tuple[Array, int]], window: int) -> Array:
+    """The windows [k, T, ...] at these starts; a view of the frames if all are of one array and at
+    equal distances."""
+    (part, first), hops = starts[0], {b - a for (_, a), (_, b) in pairwise(starts)}
+    if len(hops) <= 1 and all(one is part for one, _ in starts):
+        every = sliding_window_view(part, window, axis=0)[first :: min(hops, default=1)]
+        return np.moveaxis(every[: len(starts)], -1, 1)
+    return np.stack([part[start : start + window] for part, start in starts])
 
 
 def _common_type(cuts: Sequence[Cut], wanted: str, left_out: list[LeftOut]) -> tuple[str, str]:
@@ -301,6 +365,8 @@ def _why_not(counts: Array, dtype: str) -> str:
     float32 may round fractions, but must hold whole numbers exactly.
     """
     kind = np.dtype(dtype)
+    if counts.dtype == kind:
+        return ""
     low, high = (
         (-np.finfo(kind).max, np.finfo(kind).max)
         if kind.kind == "f"
@@ -322,9 +388,9 @@ def _why_not(counts: Array, dtype: str) -> str:
 
 
 def _set(
-    folder: Path, cuts: Sequence[Cut], rate_hz: float, dtype: str, plan: ImportPlan
+    folder: Path, cuts: list[Cut], rate_hz: float, dtype: str, plan: ImportPlan
 ) -> tuple[Dataset, list[str]]:
-    """All windows as one set, and notes about the units of its groups."""
+    """All windows as one set, and notes about the units of its groups. `cuts` is emptied."""
     shapes = {cut.windows.shape[2:] for cut in cuts}
     if len(shapes) > 1:
         raise FormatError(
@@ -341,14 +407,41 @@ def _set(
             values, unit = group(plan.pattern, name, texts)
             groups[name] = np.repeat(values, count)
             units |= {name: unit} if unit else {}
-    samples = np.concatenate([cut.windows.astype(dtype) for cut in cuts])
+    displays = _displays([cut.recording.fields for cut in cuts])
     sweeps = Dataset(
-        samples,
+        _moved(cuts, sum(count), dtype),
         np.repeat(numbers, count),
         tuple(materials),
         rate_hz,
         groups,
         str(folder),
         units=units,
+        displays={name: texts[0] for name, texts in displays.items() if len(texts) == 1},
     )
-    return sweeps, [f"{name} is in {unit}, as its name says" for name, unit in units.items()]
+    return sweeps, [
+        *(
+            f"{text!r} is sent as {name!r}; --rename changes that"
+            for name, texts in displays.items()
+            for text in texts
+        ),
+        *(f"{name} is in {unit}, as its name says" for name, unit in units.items()),
+    ]
+
+
+def _displays(known: Sequence[Fields]) -> dict[str, list[str]]:
+    """What the files call materials that have another name in the set, by that name."""
+    found: dict[str, list[str]] = {}
+    for name, text in sorted({(f["material"], f[DISPLAY]) for f in known if DISPLAY in f}):
+        found.setdefault(name, []).append(text)
+    return found
+
+
+def _moved(cuts: list[Cut], count: int, dtype: str) -> Array:
+    """All windows [count, T, R, C(, A)], from the last on; the memory of each recording is free
+    once it is copied."""
+    samples, end = np.empty((count, *cuts[0].windows.shape[1:]), dtype), count
+    while cuts:
+        windows = cuts.pop().windows
+        samples[end - len(windows) : end] = windows
+        end -= len(windows)
+    return samples

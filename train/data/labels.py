@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
@@ -14,6 +16,12 @@ from train.data.files.table import normal
 from train.data.sets import Dataset
 
 ALLOWED = "1 to 24 letters, digits, spaces, '.', '_' or '-', the first a letter or a digit"
+MOST_LETTERS = 24
+SPELT_OUT = str.maketrans(
+    {"ä": "ae", "ö": "oe", "ü": "ue", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue", "ß": "ss"}
+    | {"æ": "ae", "Æ": "Ae", "œ": "oe", "ø": "o", "Ø": "O", "ł": "l", "Ł": "L", "đ": "d", "ı": "i"}
+)
+"""Letters that Unicode does not take apart, and German umlauts, in ASCII."""
 REMEDY = "give each another name with --rename OLD=NEW"
 
 
@@ -23,6 +31,25 @@ def unsendable(names: Iterable[str]) -> str:
         return ""
     listed = ", ".join(f"{name!r} ({len(name)} characters)" for name in bad)
     return f"the box cannot send {listed}; a label is {ALLOWED}"
+
+
+def sendable(names: Iterable[str]) -> dict[str, str]:
+    """For each of `names` the name that the box sends: the same if it can, else one like it in
+    ASCII, of at most MOST_LETTERS, that no other has."""
+    names = sorted(set(names))
+    found = {name: name for name in names if LABEL.fullmatch(name)}
+    for number, name in enumerate(names, 1):
+        if name in found:
+            continue
+        letters = unicodedata.normalize("NFKD", name.translate(SPELT_OUT))
+        plain = " ".join(re.findall(r"[A-Za-z0-9_.-]+", letters.encode("ascii", "ignore").decode()))
+        proposal = plain.lstrip("_.- ")[:MOST_LETTERS].rstrip() or f"material {number}"
+        taken, k = set(found.values()), 1
+        found[name] = proposal
+        while found[name] in taken:
+            k += 1
+            found[name] = f"{proposal[: MOST_LETTERS - len(f' {k}')].rstrip()} {k}"
+    return found
 
 
 def check(sweeps: Dataset) -> Dataset:
@@ -63,11 +90,12 @@ def check_renames(pairs: Mapping[str, str], names: Iterable[str]) -> None:
 def renamed(sweeps: Dataset, pairs: Mapping[str, str]) -> Dataset:
     """The set with new names of materials, in the same order.
 
-    Materials that get the same name are merged.
+    Materials that get the same name are merged. Display names stay.
     """
     if not set(pairs) & set(sweeps.materials):
         return sweeps
     names = [pairs.get(name, name) for name in sweeps.materials]
     materials = tuple(dict.fromkeys(names))
     labels = np.array([materials.index(name) for name in names])[sweeps.labels]
-    return replace(sweeps, labels=labels, materials=materials)
+    displays = {pairs.get(name, name): text for name, text in sweeps.displays.items()}
+    return replace(sweeps, labels=labels, materials=materials, displays=displays)

@@ -29,7 +29,7 @@ HDF5 = (".h5", ".hdf5")
 TACTMAT_HZ = 750.0
 """Frame rate of the TactMat data. Neither the file nor its page states it, so we use the rate of
 the same laboratory's skin in the paper (sec. II.A). A `rate_hz` in the file takes precedence."""
-SET_ARRAYS = ("samples", "labels", "materials", "rate_hz", "unloaded")
+SET_ARRAYS = ("samples", "labels", "materials", "displays", "rate_hz", "unloaded")
 NAMED_GROUPS = ("position", "session")
 """Names that a recording can have beside its material. Each becomes a group."""
 SLIDE_GROUPS = {"speed": "speed_mm_s", "force": "force_n"}

@@ -85,7 +85,7 @@ class Dataset(sweep_set.SweepSet):
             keep &= self._matches(text)
         if not keep.any():
             raise self._error(f"no sweep fulfils {' and '.join(conditions)}; use fewer conditions")
-        part = self.take(keep).require_materials()
+        part = (self if keep.all() else self.take(keep)).require_materials()
         present, labels = np.unique(part.labels, return_inverse=True)
         return replace(part, labels=labels, materials=tuple(self.materials[k] for k in present))
 
@@ -186,6 +186,9 @@ class Dataset(sweep_set.SweepSet):
         }
         arrays |= {f"group_{k}": v for k, v in self.groups.items()}
         arrays |= {f"unit_{k}": np.array(v) for k, v in self.units.items() if k in self.groups}
+        if self.displays:
+            names = [self.displays.get(name, "") for name in self.materials]
+            arrays["displays"] = np.array(names, dtype=str)
         if self.unloaded is not None:
             arrays["unloaded"] = self.unloaded
         with storage.file(path) as f:
@@ -256,7 +259,8 @@ def _joined(sets: Sequence[Dataset]) -> Dataset:
     if unloaded is not None:  # each set is consistent, but levels may differ between sets
         samples, unloaded, remark = readers.align_tare(samples, unloaded)
         source += remark
-    return Dataset(samples, labels, head.materials, head.rate_hz, groups, source, unloaded, units)
+    made = Dataset(samples, labels, head.materials, head.rate_hz, groups, source, unloaded, units)
+    return replace(made, displays={k: v for s in reversed(sets) for k, v in s.displays.items()})
 
 
 def _apart(parts: Sequence[Array]) -> list[Array]:

@@ -142,6 +142,9 @@ def description(sweeps: Dataset) -> list[str]:
     lines.append(
         f"  materials: {len(sweeps.materials)}: {', '.join(f'{name} {n}' for name, n in each)}"
     )
+    if sweeps.displays:
+        shown = [f"{name}: {text}" for name, text in sweeps.displays.items()]
+        lines.append(f"  display names: {'; '.join(shown)}")
     for by in sorted(set(sweeps.groups) - {"recording"}):
         values, _, counts = sweeps.counts_by(by)
         shown = [text_of(value) for value in values.tolist()]

@@ -27,7 +27,8 @@ def data(train: Dataset, licence: str) -> Json:
         for name in ("session", "position", "object")
         if name in train.groups
     }
-    return {
+    displays = {"displays": train.displays} if train.displays else {}
+    return displays | {
         "digest": digest(train),
         "sweeps": np.bincount(train.labels, minlength=len(train.materials)).tolist(),
         "groups": counted,

@@ -362,7 +362,15 @@ def run(model: onnx.ModelProto, inputs: Array) -> Array:
     """The output of `model`, float32 [n, size], for each of `inputs` (raw counts or features), in
     the same kind of session as on the box."""
     on_the_box, name = _session(model.SerializeToString()), model.graph.input[0].name
-    return np.concatenate([on_the_box.run(None, {name: one[None]})[0] for one in inputs])
+    outputs: Array | None = None
+    for i, one in enumerate(inputs):
+        output = on_the_box.run(None, {name: one[None]})[0]
+        if outputs is None:  # a list to join at the end would hold everything twice
+            outputs = np.empty((len(inputs), *output.shape[1:]), output.dtype)
+        outputs[i] = output[0]
+    if outputs is None:
+        raise ValueError("no inputs; give at least one sweep")
+    return outputs
 
 
 @lru_cache(maxsize=4)

@@ -159,7 +159,8 @@ def assess(lesson: Lesson, seed: int = 0, log: Log = no_log) -> Assessment:
     """Judge a model of the materials that have two sweeps or more. Raises FormatError if fewer than
     two materials have."""
     lesson = lesson.repeated()
-    setup = recipe.Setup.of(lesson.sweeps, seed, recipe.Settings(steps=0), log)
+    settings = recipe.Settings(steps=0, most=len(lesson.sweeps))
+    setup = recipe.Setup.of(lesson.sweeps, seed, settings, log)
     fixed = setup.fixed
     choice = recipe.judge(recipe.candidates(fixed, setup), fixed, setup)
     parts, scores, chosen = inner_parts(lesson.sweeps), choice.scores, choice.chosen

@@ -361,3 +361,20 @@ def test_an_error_of_a_library_without_a_file_is_told_in_its_words(
     monkeypatch.setattr(sets, "load", fails)
     assert main(["evaluate", "--set", "x", "--protocol", "random:2", "--method", "H"]) == 1
     assert capsys.readouterr().err == "palpate-train: the disk is on fire\n"
+
+
+def test_too_little_memory_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """The cause of the library and a remedy in place of a traceback."""
+
+    def load(*_: object) -> None:
+        raise MemoryError("Unable to allocate 9.00 TiB")
+
+    monkeypatch.setattr("train.data.sets.load", load)
+    assert main(["sets", "describe", "sim:T-LAB:1:1"]) == 1
+    said = capsys.readouterr().err
+    assert said.startswith(
+        "palpate-train: not enough memory: Unable to allocate 9.00 TiB; use fewer"
+    )
+    assert said.count("\n") == 1

@@ -386,14 +386,15 @@ def test_a_length_is_seconds_or_frames(length: str):
 
 
 def test_names_of_materials_are_checked_before_anything_is_read(tmp_path: Path):
-    """All bad names at once; --rename changes names and joins materials; renaming an unknown
+    """All bad new names at once; --rename changes names and joins materials; renaming an unknown
     material is refused."""
     for name in ("a,b", "x" * 30, "felt"):
         (tmp_path / f"{name}_1.csv").write_text("nothing to read")
+    bad = {"a,b": "c,d", "felt": "y" * 30}
     with pytest.raises(
-        FormatError, match=r"cannot send 'a,b' \(3 characters\), 'x+' \(30 characters\)"
+        FormatError, match=r"cannot send 'c,d' \(3 characters\), 'y+' \(30 characters\)"
     ):
-        taken(tmp_path)
+        taken(tmp_path, renames=bad)
     for k, name in enumerate(("a,b", "x" * 30, "felt")):
         text(tmp_path / f"{name}_1.csv", COUNTS + k)
     s = taken(tmp_path, renames={"a,b": "ab", "x" * 30: "ab"}).sweeps
@@ -425,3 +426,34 @@ def test_axes_are_the_last_of_a_frame(tmp_path: Path):
     s = taken(tmp_path, grid="2x2x3").sweeps
     np.testing.assert_array_equal(s.samples[0], counts[5:15].reshape(10, 2, 2, 3))
     assert taken(tmp_path, grid="3x4x1").sweeps.samples.shape == (2, 10, 3, 4)
+
+
+def test_a_name_that_cannot_be_sent_becomes_a_display_name(tmp_path: Path):
+    """The import goes on, proposes a name in ASCII that no other material has, and keeps what the
+    file says in the set, in .npz and HDF5; two that become one material have no display name."""
+    names = ("felt", "Filz, weiß", "Filz weiss", "木", "x" * 30, "a,b")
+    for k, name in enumerate(names):
+        text(tmp_path / "in" / f"{name}_1.csv", COUNTS + k)
+    made = taken(tmp_path / "in", renames={"a,b": "felt"})
+    displays = {
+        "Filz weiss 2": "Filz, weiß",
+        "material 5": "木",
+        "x" * 24: "x" * 30,
+        "felt": "a,b",
+    }
+    assert made.sweeps.displays == displays
+    assert set(made.sweeps.materials) == {"Filz weiss", *displays}
+    assert "'木' is sent as 'material 5'; --rename changes that" in made.notes
+    for name in ("set.npz", "set.h5"):
+        made.sweeps.save(tmp_path / name)
+        assert sets.load(str(tmp_path / name)).displays == displays
+
+
+def test_a_missing_grid_ends_the_import_at_the_first_file(tmp_path: Path):
+    """The other files are not read: they would need it, too."""
+    text(tmp_path / "a_1.csv")
+    (tmp_path / "b_2.csv").write_text("not read")
+    left_out: list[LeftOut] = []
+    with pytest.raises(FormatError, match=r"a_1.csv has 4 columns; give their layout with --grid"):
+        import_folder(tmp_path, plan(grid=""), lambda line: None, left_out)
+    assert left_out == []

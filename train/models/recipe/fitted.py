@@ -146,6 +146,7 @@ class Fit:
             "rate_hz": self.train.rate_hz,
             "source": self.train.source,
             "units": self.train.units,
+            "displays": self.train.displays,
             "trained_on": len(self.train),
             "about": self.about,
             "plan": self.plan.json(),
@@ -191,6 +192,7 @@ class Fit:
             meta["source"],
             arrays.get("set_unloaded"),
             meta.get("units", {}),
+            meta.get("displays", {}),
         )
         first = np.arange(len(sweeps)) < meta["trained_on"]
         return cls(

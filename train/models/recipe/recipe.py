@@ -35,6 +35,7 @@ from train.calibration.heads import HeadData, HeadPart, HeadPlan
 from train.data.progress import StageLine
 from train.data.sets import Dataset
 from train.data.splitters import InnerPart, inner_parts
+from train.data.thinning import thinned
 from train.metrics.score import interval
 from train.models.linear_head import hold_out_or_all
 from train.models.methods import AS_RECORDED, Log, SkinUse, no_log
@@ -58,6 +59,9 @@ Array = NDArray[Any]
 LEAST_EACH, LEAST_SWEEPS = 25, 100
 """Smallest numbers of sweeps for training stages, of each material and of all. Stages overfit to a
 few sweeps of a material and to a few batches."""
+MOST_SWEEPS = 4000
+"""Usual largest number of sweeps of a fit. It bounds memory and time: features of each sweep and of
+its copies are held, and candidates are fitted to them (docs/recipe.md)."""
 STAGES_WEIGHT = 0.5
 """Weight of the discriminant of stages beside others; docs/decisions/0023 compares others."""
 PARTS = "features", "choice of the model", "training of stages"
@@ -77,7 +81,8 @@ class Settings:
     stages from time to time; from it an interrupted training goes on with the same bits. size:
     limits the content of the model. use: of the skin. calibrate: whether the fit is finished with
     calibration and contacts, which a bundle needs and `evaluate` does not. varies: the groups that
-    will have other values in service; without any, all that can be left out.
+    will have other values in service; without any, all that can be left out. most: largest number
+    of sweeps that are used; of more, some are drawn, see thinning.thinned.
     """
 
     steps: int = 600
@@ -86,6 +91,7 @@ class Settings:
     use: SkinUse = AS_RECORDED
     calibrate: bool = True
     varies: tuple[str, ...] = ()
+    most: int = MOST_SWEEPS
 
 
 @dataclass(frozen=True)
@@ -126,7 +132,7 @@ class Setup:
     def of(cls, sweeps: Dataset, seed: int, settings: Settings, log: Log) -> Setup:
         """Raises FormatError if the window is too short."""
         groups = {"recording": sweeps.group("recording")} | sweeps.groups  # numbered before a split
-        sweeps = replace(sweeps, groups=groups)
+        sweeps = thinned(replace(sweeps, groups=groups), settings.most)
         usual = default_augmentation(FIXED.zero_sum(sweeps.format.window))
         return cls(sweeps, seed, settings, replace(usual, **settings.use.augmentation), log)
 

@@ -1,0 +1,90 @@
+"""Peak memory and time of `palpate-train fit` on sets of growing size.
+
+`python -m tests.campaigns fit-memory` prints a line for each number of windows: the bytes of the
+set, the peak memory of the process, that without the set, and processor time. Sets are drawn from
+ten materials at four speeds in five sessions, 128 frames of 16 taxels in int16, 20 windows a
+recording. Options after `--` go to fit.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from train.data.sets import Dataset
+
+WINDOWS = (1_000, 10_000, 50_000, 100_000)
+MATERIALS, EACH, SPEEDS, SESSIONS = 10, 20, 4, 5
+FRAMES, TAXELS, RATE_HZ = 128, 16, 500.0
+BATCH = 1000
+
+
+def drawn(count: int, seed: int = 0) -> Dataset:
+    """A set of `count` windows: noise in a band that the material and a little the speed set."""
+    rng, numbers = np.random.default_rng(seed), np.arange(count)
+    labels, turn = numbers % MATERIALS, numbers // MATERIALS // EACH
+    speed, session = turn % SPEEDS, turn // SPEEDS % SESSIONS
+    samples = np.empty((count, FRAMES, 4, 4), np.int16)
+    frequency = np.fft.rfftfreq(FRAMES)
+    for first in range(0, count, BATCH):
+        part = slice(first, min(first + BATCH, count))
+        n = part.stop - first
+        centre = (0.05 + 0.03 * labels[part]) * (1 + 0.1 * speed[part])
+        passed = 0.3 + np.exp(-((frequency - centre[:, None]) ** 2) / 0.008)
+        noise = np.fft.rfft(rng.standard_normal((n, TAXELS, FRAMES))) * passed[:, None]
+        x = np.fft.irfft(noise, FRAMES) + 0.7 * rng.standard_normal((n, TAXELS, FRAMES))
+        x *= 300 * np.exp(0.3 * rng.standard_normal((n, TAXELS, 1)))
+        x += 2000 + 50 * session[part, None, None]
+        samples[part] = np.rint(x.transpose(0, 2, 1)).reshape(n, FRAMES, 4, 4).clip(0, 32_000)
+    groups = {"recording": turn * MATERIALS + labels, "speed": speed, "session": session}
+    names = tuple(f"m{k}" for k in range(MATERIALS))
+    return Dataset(samples, labels, names, RATE_HZ, groups, f"{count} windows")
+
+
+def peak(command: list[str]) -> tuple[float, float]:
+    """Peak resident memory in bytes and processor time in seconds of a command, by a process of
+    its own, because a process only knows the peak of all its children."""
+    words = [sys.executable, "-m", "tests.campaigns.fit_memory", "--child", *command]
+    done = subprocess.run(words, stdout=subprocess.PIPE, text=True, check=True)
+    bytes_, seconds = done.stdout.splitlines()[-1].split()
+    return float(bytes_), float(seconds)
+
+
+def child(command: list[str]) -> None:
+    """Run a command, and print its peak and its time."""
+    subprocess.run(command, stdout=sys.stderr, check=True)
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    print(used.ru_maxrss * 1024, used.ru_utime + used.ru_stime)
+
+
+def main(arguments: list[str]) -> None:
+    """Print the table."""
+    if arguments[:1] == ["--child"]:
+        return child(arguments[1:])
+    parser = argparse.ArgumentParser("python -m tests.campaigns fit-memory")
+    parser.add_argument("--windows", nargs="+", type=int, default=WINDOWS)
+    parser.add_argument("fit", nargs="*", default=["--steps", "0"], help="options of fit")
+    args = parser.parse_args(arguments)
+    print("windows  set MB  peak MB  without the set  CPU s")
+    for count in args.windows:
+        with tempfile.TemporaryDirectory() as folder:
+            path, out = Path(folder) / "set.h5", Path(folder) / "fit.npz"
+            sweeps = drawn(count)
+            sweeps.save(path)
+            size = sweeps.samples.nbytes
+            del sweeps
+            words = ["fit", "--set", str(path), "--seed", "1", "--out", str(out), *args.fit]
+            most, seconds = peak([sys.executable, "-m", "train", *words])
+        mega = [f"{x / 1e6:.0f}" for x in (size, most, most - size)]
+        print(f"{count:>7}  {mega[0]:>6}  {mega[1]:>7}  {mega[2]:>15}  {seconds:>5.0f}", flush=True)
+    return None
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
