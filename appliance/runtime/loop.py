@@ -369,6 +369,7 @@ class Box:
             ready=self._able and not self._cutter.sweeping,
             degraded=self._answerer.degraded,
             foreign_frames=counters.foreign_frames,
+            due_ns=self._trigger.due_ns,
         )
 
     def circumstances(self) -> dict[str, Any]:
