@@ -59,9 +59,9 @@ class View:
 
 
 def figure(value: float, full: float, unit: str) -> str:
-    """A load in text: raw counts as whole numbers, others with up to three digits. full: the
-    strongest load on the scale."""
-    digits = 0 if not unit or full >= 100 else 1 if full >= 10 else 2
+    """A load in text: raw counts as whole numbers, newtons with two digits, other units with up to
+    three digits in all. full: the strongest load on the scale."""
+    digits = 2 if unit == "N" else 0 if not unit or full >= 100 else 1 if full >= 10 else 2
     return f"{value:.{digits}f}"
 
 

@@ -24,6 +24,7 @@ from appliance.core.log import log
 from appliance.core.observer import Observer
 from appliance.core.types import SweepFormat
 from appliance.deployment.enrolment_key import TAUGHT, EnrolmentKey
+from appliance.io import skins
 from appliance.io.robot_link import Command, Port
 from appliance.recording.recording import Labels, RecordingSession
 from appliance.runtime import assembly
@@ -149,7 +150,7 @@ class Session:
         self._store = Path(settings.store.folder)
         self._obey: Callable[[Command], list[object]] = _not_now
         self._about: Callable[[], Mapping[str, Any]] = dict
-        self._announced, self._done, self._again, self._address = "", False, "", ""
+        self._done, self._again, self._address = False, "", ""
 
     def run(self) -> None:
         """Run until all sweeps are recorded; with a page until DONE."""
@@ -184,6 +185,7 @@ class Session:
             lambda: self._about(),
             lambda command: self._obey(command),
             SystemClock(),
+            skins.profile(self._settings).unit,
             teaching=True,
         )
         self._address = page.server.address
@@ -221,7 +223,6 @@ class Session:
                 commands={**recording.commands, **self._by_robot(session.commands)},
                 ordered=bool(pages) or self._waits,
                 serving=False,
-                announce=self._announce,
             )
             orders = {**recording.commands, **session.commands, "DONE": self._finish}
             self._obey = self._orders(orders, box.obey)
@@ -257,7 +258,6 @@ class Session:
                 observers=[disk, Notifier(SystemClock()), *trial, *status(settings, facts), *pages],
                 commands=self._by_robot({"TEACH": self._teach_again}),
                 ordered=bool(pages),
-                announce=self._announce,
             )
             orders = {"TEACH": self._teach_again, "DONE": self._finish}
             self._obey = self._orders(orders, box.obey)
@@ -311,11 +311,7 @@ class Session:
         return assembly.port(self._settings, devices) if sentences else None
 
     def _shown(self, about: dict[str, Any]) -> dict[str, Any]:
-        return about | {"announced": self._announced, "good": self._args.good}
-
-    def _announce(self, text: str) -> None:
-        self._announced = text
-        log.info(text)
+        return about | {"good": self._args.good}
 
     def _command(self, by: str) -> list[str]:
         """The command of the process that makes a bundle, with the same settings."""

@@ -18,6 +18,7 @@ class Health:
     `storms` (see EdgeCounters). loss_known: the skin counts its frames; if not, `lost_frames`
     counts only the losses that can be inferred. degraded: taxels that are broken over the stream
     and bridged ("silent taxel 2.3"), "" for none. foreign_frames: of other nodes on the skin's bus.
+    due_ns: see Trigger.due_ns.
     """
 
     time_ns: int
@@ -43,6 +44,7 @@ class Health:
     ready: bool = False
     degraded: str = ""
     foreign_frames: int = 0
+    due_ns: int = 0
 
     @property
     def text(self) -> str:

@@ -9,7 +9,7 @@ a label.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from appliance.bundle.bundle import GOLDEN_TOLERANCE, Bundle
 from appliance.bundle.manifest import MEANS
 from appliance.core.errors import BundleError
 from appliance.core.observer import Observer
-from appliance.core.types import Frames, Status, Sweep, SweepFormat, Verdict
+from appliance.core.types import Frames, Status, Sweep, SweepFormat, Verdict, entries
 from appliance.inference.novelty import ClassDistances, UnknownSweeps
 from appliance.inference.objects import LEAST_PROBABILITY as LEAST_PROBABILITY
 from appliance.inference.objects import Evidence, FusedSweeps, ObjectRule, contradicts
@@ -117,7 +117,7 @@ class Classifier(Observer):
         return {
             "fuse": self._fusion,
             "min_probability": self.min_probability,
-            **asdict(self._ends),
+            **entries(self._ends),
         }
 
     @property

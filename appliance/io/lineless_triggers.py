@@ -51,6 +51,7 @@ class LinelessTrigger:
     """
 
     blind = False
+    due_ns: int = 0
 
     def __init__(self, mode: str, times: str) -> None:
         self.edge_counters = EdgeCounters()
@@ -202,30 +203,32 @@ class TimedTrigger(LinelessTrigger):
             round(config.sweep_s * SECOND),
         )
         self._say = say
-        self._due_ns = clock.now_ns() + self._every_ns - self._sweep_ns
+        self._next_ns = clock.now_ns() + self._every_ns - self._sweep_ns
         self._sweeping, self._announced = False, COUNTDOWN + 1
         self.held = False
 
     def edges(self, now_ns: int) -> list[Edge]:
         """START and STOP that are due, with the time at which each was due."""
         if self.held and not self._sweeping:
-            self._due_ns, self._announced = now_ns + self._every_ns - self._sweep_ns, COUNTDOWN + 1
+            self._next_ns, self._announced = now_ns + self._every_ns - self._sweep_ns, COUNTDOWN + 1
+            self.due_ns = 0
             return super().edges(now_ns)
         # after a pause of the program, the starts that it missed are left out
-        if not self._sweeping and now_ns - self._due_ns > self._every_ns:
-            self._due_ns = now_ns
-        while now_ns >= self._due_ns:
+        if not self._sweeping and now_ns - self._next_ns > self._every_ns:
+            self._next_ns = now_ns
+        while now_ns >= self._next_ns:
             kind = EdgeKind.STOP if self._sweeping else EdgeKind.START
-            self._edges.append(Edge(kind, self._due_ns))
-            self._due_ns += self._every_ns - self._sweep_ns if self._sweeping else self._sweep_ns
+            self._edges.append(Edge(kind, self._next_ns))
+            self._next_ns += self._every_ns - self._sweep_ns if self._sweeping else self._sweep_ns
             self._sweeping, self._announced = not self._sweeping, COUNTDOWN + 1
             self._say(
                 f"{kind}: slide for {self._sweep_ns / 1e9:g} s" if self._sweeping else str(kind)
             )
-        left = -(-(self._due_ns - now_ns) // SECOND)
+        left = -(-(self._next_ns - now_ns) // SECOND)
         if not (self._sweeping or self.held) and left < self._announced:
             self._announced = left
             self._say(f"start in {left} s")
+        self.due_ns = self._next_ns
         return super().edges(now_ns)
 
 

@@ -53,6 +53,11 @@ class Trigger(Protocol):
         """True after LOST, until the levels are known again."""
         ...
 
+    @property
+    def due_ns(self) -> int:
+        """Time at which a timed trigger starts or stops a sweep next; 0 if that is not planned."""
+        ...
+
 
 _Meaning = tuple[EdgeKind | None, EdgeKind | None]
 """The meaning of a falling and of a rising edge of a GPIO line; None: no meaning."""
@@ -88,6 +93,8 @@ class GpioTrigger:
     A call reads at most `storm_edges` events. Raises LineError if lines cannot be found, requested
     or read.
     """
+
+    due_ns = 0
 
     def __init__(self, config: TriggerConfig, gpio: Any) -> None:
         check_binding(gpio)

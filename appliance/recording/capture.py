@@ -197,6 +197,8 @@ class Playback:
     def sleep_until(self, t_ns: int) -> None:
         """Clock: does nothing, since only records advance the time."""
 
+    due_ns = 0  # the edges are in the capture
+
     @property
     def blind(self) -> bool:
         """Trigger: never, since a capture holds all edges that the box received."""

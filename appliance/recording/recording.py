@@ -13,7 +13,7 @@ import re
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from appliance.core.log import TroubleLog, log
 from appliance.core.observer import Observer
 from appliance.core.patience import passes
 from appliance.core.sentences import sentence
-from appliance.core.types import Status, Sweep, SweepFormat, Verdict, save, sidecar
+from appliance.core.types import Status, Sweep, SweepFormat, Verdict, entries, save, sidecar
 from appliance.recording.progress import RecordingProgress
 from appliance.service.systemd import words
 
@@ -226,7 +226,7 @@ class RecordingSession(Observer):
         in REC, and the number of the sweep that DISCARD would remove (None: no sweep).
         """
         return {
-            **asdict(self._labels[-1][1]),
+            **entries(self._labels[-1][1]),
             "stored": self.stored,
             "counts": self._progress.counts,
             "target": self._progress.target,
@@ -263,7 +263,7 @@ class RecordingSession(Observer):
             trouble = "" if outcome == "stored" else outcome
             self._log.update(trouble, _report(outcome, sweep.id, detail, self._folder.folder))
         self._tell(verdict, outcome, labels)
-        self._last = {"sweep": sweep.id, "outcome": outcome, "detail": detail, **asdict(labels)}
+        self._last = {"sweep": sweep.id, "outcome": outcome, "detail": detail, **entries(labels)}
         said = outcome, self.stored, labels.material, labels.position, labels.session, detail
         self._say(sentence("REC", sweep.id, *said))
 

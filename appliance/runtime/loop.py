@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Protocol
 
@@ -20,7 +20,7 @@ from appliance.core.health import Health
 from appliance.core.log import TroubleLog, log
 from appliance.core.observer import Observer
 from appliance.core.sentences import sentence
-from appliance.core.types import Edge, Status, Sweep, SweepFormat, Verdict
+from appliance.core.types import Edge, Status, Sweep, SweepFormat, Verdict, entries
 from appliance.inference.early_exit import EarlyExit
 from appliance.io.robot_link import Command, Port
 from appliance.io.sensor import Sensor, SensorCounters
@@ -369,6 +369,7 @@ class Box:
             ready=self._able and not self._cutter.sweeping,
             degraded=self._answerer.degraded,
             foreign_frames=counters.foreign_frames,
+            due_ns=self._trigger.due_ns,
         )
 
     def circumstances(self) -> dict[str, Any]:
@@ -380,7 +381,7 @@ class Box:
         """
         who = self._sensor.identity
         return {
-            "device": asdict(who) if who else None,
+            "device": entries(who) if who else None,
             "clock": self._sensor.clock,
             "loss_known": self._sensor.loss_known,
             "trigger": self._trigger.about,

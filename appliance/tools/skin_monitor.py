@@ -158,6 +158,6 @@ class SkinMonitor:
 
 
 def _nested(values: NDArray[np.float64]) -> tuple[tuple[tuple[float, ...], ...], ...]:
-    """[R, C, A] as tuples [A][R][C], rounded for display."""
-    shown = np.moveaxis(values, -1, 0).round(2).tolist()
+    """[R, C, A] as tuples [A][R][C], rounded for display: noise of a skin in newtons is small."""
+    shown = np.moveaxis(values, -1, 0).round(4).tolist()
     return tuple(tuple(tuple(row) for row in axis) for axis in shown)

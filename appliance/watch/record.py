@@ -147,6 +147,7 @@ class RecordPage(Observer):
         self._known = {
             "source": source,
             "format": str(format),
+            "unit": unit,
             "trigger": trigger_words(trigger),
             "commands": self._commands,
         }
@@ -208,7 +209,7 @@ class RecordPage(Observer):
         if health.enumerations != self._enumerations:
             self._enumerations = health.enumerations
             self._tracker.reset()
-        state = health.skin, health.trouble, health.sweeping, health.ready
+        state = health.skin, health.trouble, health.sweeping, health.ready, health.due_ns
         if state != self._state or now_ns - self._state_ns >= PERIOD_NS:
             self._state, self._state_ns = state, now_ns
             self.server.publish(
@@ -221,6 +222,7 @@ class RecordPage(Observer):
                     "trouble": health.trouble,
                     "sweeping": health.sweeping,
                     "ready": health.ready,
+                    "due_ns": health.due_ns,
                     "frames": health.frames,
                     "lost_frames": health.lost_frames if health.loss_known else None,
                 },

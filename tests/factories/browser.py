@@ -39,11 +39,11 @@ def launched() -> Iterator[Any]:
         one.close()
 
 
-def until(done: Callable[[], bool]) -> None:
-    """Wait for `done()`; fails after WAIT_S."""
-    end = time.monotonic() + WAIT_S
+def until(done: Callable[[], bool], wait_s: float = WAIT_S) -> None:
+    """Wait for `done()`; fails after `wait_s`."""
+    end = time.monotonic() + wait_s
     while not done():
-        assert time.monotonic() < end, f"the condition did not hold within {WAIT_S} s"
+        assert time.monotonic() < end, f"the condition did not hold within {wait_s} s"
         time.sleep(0.02)
 
 

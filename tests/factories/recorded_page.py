@@ -24,6 +24,17 @@ from tests.factories.feeds import HEALTH, OK, cut
 from tests.factories.page_client import EventReader, Page, ask, port
 
 KIND = "application/json"
+TAUGHT = {
+    "teach": {
+        "materials": {"metal": 4},
+        "learnt": None,
+        "assessing": False,
+        "using": None,
+        "trouble": "",
+    },
+    "good": 8,
+}
+"""State of a session of teaching."""
 
 
 def ordered(page: Page, key: str, body: bytes | Mapping[str, str], **changed: str | None) -> bytes:
@@ -49,10 +60,17 @@ def key_of(page: Page) -> str:
 
 
 class RecordedPage:
-    """A recording in `folder` and its page, without a box. In a `with` a thread takes its turns."""
+    """A recording in `folder` and its page, without a box. In a `with` a thread takes its turns.
+    teaching: the page is that of `palpate teach`."""
 
     def __init__(
-        self, folder: Path, labels: Labels, target: int = 3, access: Access | None = None
+        self,
+        folder: Path,
+        labels: Labels,
+        target: int = 3,
+        access: Access | None = None,
+        *,
+        teaching: bool = False,
     ) -> None:
         clock = SystemClock()
         self.health, self.sweeps = replace(HEALTH, bundle="", source="sim"), 0
@@ -65,9 +83,10 @@ class RecordedPage:
             skin.FORMAT,
             "sim",
             TriggerConfig(mode="serial"),
-            self.recording.about,
+            lambda: self.recording.about() | (TAUGHT if teaching else {}),
             self.obey,
             clock,
+            teaching=teaching,
         )
         self._lock, self._ended = threading.Lock(), threading.Event()
         self._going = threading.Thread(target=self._go)

@@ -58,9 +58,28 @@ export function ago(ms) {
   return s < 86400 ? `${Math.floor(s / 3600)} h ${Math.floor(s / 60) % 60} min` : `${Math.floor(s / 86400)} d ${Math.floor(s / 3600) % 24} h`;
 }
 
+/* What a person does now, and for how many seconds where sweeps are timed; "" where nothing is planned. recording: as record.py
+   sends it. nowNs: by the box's clock. */
+export function call(recording, nowNs) {
+  if (recording.skin !== "streaming") return ["", ""];
+  const left = recording.due_ns ? Math.max(0, recording.due_ns - nowNs) / 1e9 : null;
+  if (recording.sweeping) return ["Slide now", left === null ? "" : left.toFixed(1)];
+  if (left !== null) return ["Next sweep in", `${Math.ceil(left)}`];
+  return [recording.commands.includes("START") ? "Press Start, Space or the pedal" : `Waiting for ${recording.trigger}`, ""];
+}
+
+/* A USB pedal is a keyboard with one key; it starts and stops a sweep unless a field or a button has the focus. */
+export function listenToPedal(press) {
+  document.addEventListener("keydown", (event) => {
+    if (!["Space", "Enter", "NumpadEnter"].includes(event.code) || event.target.closest("input, button")) return;
+    event.preventDefault();
+    if (!event.repeat) press();
+  });
+}
+
 export function percent(p) { return `${(100 * p).toFixed(1)}\u00a0%`; }
 
-/* A load: raw counts as whole numbers, others with up to three digits (appliance/alignment/view.py). */
-export function figure(value, full, unit) { return value.toFixed(!unit || full >= 100 ? 0 : full >= 10 ? 1 : 2); }
+/* A load in text, as `figure` of appliance/alignment/view.py. */
+export function figure(value, full, unit) { return value.toFixed(unit === "N" ? 2 : !unit || full >= 100 ? 0 : full >= 10 ? 1 : 2); }
 
 export function count(n) { return n.toLocaleString("en"); }

@@ -1,7 +1,7 @@
 /* The page of a recording: what is there and what is missing, the last sweep, the skin; and the labels, which are set here. */
 
 import {listen} from "/events.js";
-import {ago, byId, count, frame, made, mark, order, put} from "/parts.js";
+import {ago, byId, call, frame, listenToPedal, made, mark, order, put} from "/parts.js";
 import {signal, spectrogram} from "/plots.js";
 import {SkinPicture} from "/skin.js";
 
@@ -53,6 +53,12 @@ function drawLabels() {
   byId("sweeps").hidden = !recording.commands.includes("START");
   enable(byId("start"), live() && recording.ready);
   enable(byId("stop"), live() && recording.sweeping);
+}
+
+function drawCall() {
+  const [words, seconds] = live() ? call(recording, (Date.now() - wallMs) * 1e6) : ["", ""];
+  put("call", words);
+  put("countdown", seconds);
 }
 
 function sorted(values) { return [...new Set(values)].sort((a, b) => a.localeCompare(b, "en", {numeric: true})); }
@@ -116,7 +122,9 @@ function drawSweep() {
   put("check", [wrong, last.detail, lost].filter(Boolean).join("; ") || "checked: contact, saturation, stuck and dead taxels; nothing is wrong");
   const drawing = picture?.sweep === last.sweep ? picture : null;
   const why = !last.signal ? "it has no window" : drawing?.asked ? "asking palpate record" : "its signal is not kept";
-  for (const draw of [signal, spectrogram]) draw(byId(draw.name), drawing?.taxels ? drawing : null, why);
+  const drawn = drawing?.taxels ? drawing : null;
+  signal(byId("signal"), drawn, why, recording?.unit || undefined);
+  spectrogram(byId("spectrogram"), drawn, why);
   if (last.signal && !drawing && reached) fetchPicture(last.sweep);
 }
 
@@ -181,11 +189,17 @@ const PRESSED = {
 byId("record").addEventListener("click", (event) => {
   const button = event.target.closest("button");
   if (!button || button.getAttribute("aria-disabled") === "true") return;
+  if (event.detail) button.blur(); // not after a key: so that the pedal starts a sweep
   const {material, position} = button.dataset;
   if (!material) return PRESSED[button.id]();
   send([["MATERIAL", material, "", "material"], ["POSITION", position, `now ${named(material, position)}`, "position"]]);
 });
 byId("fields").addEventListener("keydown", (event) => { if (event.key === "Enter" && live()) setLabels(); });
+
+listenToPedal(() => {
+  const button = byId(recording?.sweeping ? "stop" : "start");
+  if (recording?.commands.includes("START") && button.getAttribute("aria-disabled") === "false") PRESSED[button.id]();
+});
 
 listen({
   now(ns) { wallMs = Date.now() - ns / 1e6; },
@@ -211,6 +225,7 @@ listen({
 
 function tick() {
   if (dirty) draw();
+  drawCall();
   requestAnimationFrame(tick);
 }
 for (const [what, name] of [[window, "resize"], [matchMedia("(prefers-color-scheme: dark)"), "change"]]) {

@@ -1,5 +1,7 @@
 /* The skin as a picture: the load of each taxel, the contact, where it lay in training, and the way back. */
 
+import {figure} from "/parts.js";
+
 const SVG = "http://www.w3.org/2000/svg", TAXEL = 100, RING = 21, TIP = 90, RIM = 14, SIDE = 62;
 const NUMBERED = 8; // a larger skin gets no numbers, and names every fourth row and column
 const PLAIN = 5; // signs and letters grow with a larger skin
@@ -38,8 +40,8 @@ export class SkinPicture {
   /* pointed: [row, column] of the taxel that was pointed at last, or touched. */
   constructor(parent) { this.parent = parent; this.drawn = ""; this.pointed = null; }
 
-  /* digits: of the loads, behind the point. */
-  show(view, digits = 0) {
+  /* unit: of the loads, where the view says none. */
+  show(view, unit = view.load_unit) {
     const drawn = JSON.stringify([view.shape, view.contact, view.fingertip]);
     if (drawn !== this.drawn) {
       this.parent.replaceChildren();
@@ -52,7 +54,7 @@ export class SkinPicture {
       tile.style.fill = back;
       if (!this.counts.length) return;
       this.counts[i].style.fill = front;
-      this.counts[i].textContent = loads.length ? loads[i].toFixed(digits) : "";
+      this.counts[i].textContent = loads.length ? figure(loads[i], view.full, unit) : "";
     });
     this.centre.style.visibility = view.centre ? "visible" : "hidden";
     this.way.style.visibility = "hidden";

@@ -42,7 +42,7 @@ function draw(view) {
     tile.style.backgroundColor = back;
     tile.style.color = front;
     tile.classList.toggle("faulty", faulty.has(called));
-    tile.title = `taxel ${called}: ${load}, noise ${view.noise[a][r][c]}`;
+    tile.title = `taxel ${called}: ${text(load, view.full, view.unit)}, noise ${view.noise[a][r][c].toPrecision(2)} ${view.unit}`;
     if (cols <= NUMBERED) tile.textContent = text(load, view.full, view.unit);
   })));
   const noise = view.noise.flat(2).sort((a, b) => a - b);

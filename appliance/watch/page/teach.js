@@ -1,7 +1,7 @@
 /* The page of `palpate teach`: what to do next, the materials, what was learnt, and the bundle that is made of it. */
 
 import {listen} from "/events.js";
-import {ago, byId, frame, made, mark, order, put} from "/parts.js";
+import {ago, byId, call, frame, listenToPedal, made, mark, order, put} from "/parts.js";
 import {signal} from "/plots.js";
 
 const STEPS = {start: "starting", features: "looking at the sweeps", heads: "learning", bundle: "checking"};
@@ -33,11 +33,11 @@ function drawHeader() {
   if (recording) put("format", recording.format);
 }
 
-function call() {
-  if (recording.skin !== "streaming") return "";
-  if (recording.sweeping) return "slide now";
-  if (recording.announced) return recording.announced;
-  return byPage() ? "press Start, Space or the pedal" : `waiting for ${recording.trigger}`;
+function drawCall() {
+  const wanted = live() && (recording.trying || recording.material);
+  const [words, seconds] = wanted ? call(recording, (Date.now() - wallMs) * 1e6) : ["", ""];
+  put("call", words);
+  put("countdown", seconds);
 }
 
 function drawTask() {
@@ -51,7 +51,6 @@ function drawTask() {
     put("what", name || "Name a material");
     put("count", !name ? "" : n < recording.good ? `sweep ${n + 1} of ${recording.good}` : `${n} sweeps: enough of it, or go on`);
   }
-  put("call", trying || name ? call() : "");
   byId("sweep-button").hidden = !byPage();
   put("sweep-button", recording.sweeping ? "Stop" : "Start");
   enable(byId("sweep-button"), live() && recording.skin === "streaming" && (trying || Boolean(name)));
@@ -132,7 +131,7 @@ function drawSweep() {
   const wrong = last.faulty ? `${last.reason}; it does not count` : "";
   put("outcome", [wrong, last.detail].filter(Boolean).join("; ") || "nothing is wrong with it");
   const drawing = picture?.sweep === last.sweep ? picture : null;
-  signal(byId("signal"), drawing?.taxels ? drawing : null, last.signal ? "asking palpate teach" : "it has no window");
+  signal(byId("signal"), drawing?.taxels ? drawing : null, last.signal ? "asking palpate teach" : "it has no window", recording?.unit || undefined);
   if (last.signal && !drawing && reached) fetchPicture(last.sweep);
 }
 
@@ -196,9 +195,7 @@ async function add() {
 }
 byId("add-button").addEventListener("click", add);
 byId("name").addEventListener("keydown", (event) => { if (event.key === "Enter") add(); });
-document.addEventListener("keydown", (event) => { // a USB pedal is a keyboard with one key
-  if (!["Space", "Enter", "NumpadEnter"].includes(event.code) || event.repeat || event.target.closest("input, button")) return;
-  event.preventDefault();
+listenToPedal(() => {
   if (byPage() && byId("sweep-button").getAttribute("aria-disabled") === "false") PRESSED["sweep-button"]();
 });
 
@@ -223,6 +220,7 @@ listen({
 
 function tick() {
   if (dirty) draw();
+  drawCall();
   requestAnimationFrame(tick);
 }
 window.addEventListener("resize", () => { dirty = true; });

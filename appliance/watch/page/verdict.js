@@ -102,7 +102,10 @@ export function drawCard(shown) {
   mark(byId("status"), shown.status);
   byId("status").hidden = !shown.status;
   put("which", shown.of ?? "");
-  if (label.textContent !== shown.words) label.style.setProperty("--wide", widest(shown.words).toFixed(2));
+  if (label.textContent !== shown.words) {
+    label.style.setProperty("--wide", widest(shown.words).toFixed(2));
+    label.style.setProperty("--whole", Math.max(1, width(shown.words)).toFixed(2));
+  }
   put("label", shown.words);
   put("advice", shown.advice);
   put("sure", shown.small);

@@ -1,7 +1,7 @@
 /* The page beside the robot: the box's last verdict first, then the skin, the sweep, the shift, and the box itself. */
 
 import {listen} from "/events.js";
-import {ago, byId, clock, count, frame, made, percent, put} from "/parts.js";
+import {ago, byId, clock, count, figure, frame, made, percent, put} from "/parts.js";
 import {course, signal, spectrogram} from "/plots.js";
 import {drawShift, key, listenToShift, save} from "/shift.js";
 import {SkinPicture, wayBack} from "/skin.js";
@@ -112,7 +112,7 @@ function unit() { return known.hello?.unit || "raw counts"; }
 function drawSkin() {
   const {view} = known;
   if (!view) return;
-  SKIN.show(view, known.hello?.unit ? 2 : 0);
+  SKIN.show(view, known.hello?.unit);
   const axes = known.hello?.format.axes > 1 ? "; the axis along the normal" : "";
   put("contact", `${unit()} above the lowest seen${axes}`);
   for (const one of document.querySelectorAll(".key")) {
@@ -120,7 +120,7 @@ function drawSkin() {
     for (const name of ["t", "h"]) one.querySelector(`.${name}`).hidden = !view.contact;
   }
   const at = SKIN.pointed;
-  if (at && view.load.length) put("taxel", `row ${at[0] + 1}, column ${at[1] + 1}: ${view.load[at[0]][at[1]].toFixed(known.hello?.unit ? 2 : 0)} ${unit()}`);
+  if (at && view.load.length) put("taxel", `row ${at[0] + 1}, column ${at[1] + 1}: ${figure(view.load[at[0]][at[1]], view.full, known.hello?.unit)} ${unit()}`);
   document.body.dataset.state = view.state;
 }
 

@@ -299,6 +299,17 @@ def test_a_long_pause_is_counted_down_at_its_end():
     assert said == ["start in 3 s", "start in 2 s", "start in 1 s", "start: slide for 3 s"]
 
 
+def test_it_says_when_the_next_edge_is_due():
+    """For the countdown of a page; not while it is held, but for a sweep that has begun."""
+    trigger, _, _ = timed()
+    due = []
+    for t, held in ((0, False), (1, True), (2, False), (4, False), (5, True), (7, True), (8, True)):
+        trigger.held = held
+        trigger.edges(t * SECOND)
+        due.append(trigger.due_ns / SECOND)
+    assert due == [2, 0, 3, 6, 6, 8, 0]
+
+
 def test_no_sweep_is_made_up_for_a_pause_of_the_program():
     """A program that was stopped for a minute does not report the sweeps of that minute."""
     trigger, _, _ = timed()

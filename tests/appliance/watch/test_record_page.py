@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 
+from appliance.core.clock import SystemClock
 from appliance.core.types import Status, sidecar
 from appliance.recording.recording import Labels
 from appliance.watch.access import Access
@@ -25,6 +26,7 @@ from tests.factories.recorded_page import RecordedPage
 
 pytestmark = pytest.mark.slow
 
+SECOND = 1_000_000_000
 SIZES = [(390, 844), (1024, 768), (1920, 1080)]
 
 
@@ -125,13 +127,13 @@ def test_labels_are_set_with_the_keyboard(browser: Any, recorded: RecordedPage, 
         outline = seen.page.evaluate("getComputedStyle(document.activeElement).outlineWidth")
         assert float(outline.removesuffix("px")) >= 2
     assert stops == [
+        "start",
+        "stop",
         "material",
         "position",
         "session",
         "set",
         "next",
-        "start",
-        "stop",
         "4 of 3",
         "3 of 3",
         "1 of 3",
@@ -222,6 +224,56 @@ def test_start_and_stop(browser: Any, recorded: RecordedPage):
     seen.page.click("#stop")
     until(lambda: seen.text("#state") == "ready")
     assert recorded.done == ["START", "STOP"]
+
+
+def test_space_starts_and_stops(browser: Any, recorded: RecordedPage):
+    """Also after a button was pressed with the mouse; in a field it is a space."""
+    seen = opened(browser, recorded)
+    until(lambda: seen.text("#call") == "Press Start, Space or the pedal")
+    seen.page.click("#counts button[aria-label='metal at 2: 3 of 3']")
+    until(lambda: seen.text("#said") == "now metal at 2")
+    for state, words in (
+        ("sweeping", "Slide now"),
+        ("ready", "Press Start, Space or the pedal"),
+    ):
+        seen.page.keyboard.press("Space")
+        until(lambda state=state: seen.text("#state") == state)
+        assert seen.text("#call") == words
+    seen.page.focus("#material")
+    seen.page.keyboard.type("a b")
+    assert "a b" in seen.page.input_value("#material")
+    assert recorded.done[-2:] == ["START", "STOP"]
+    assert not seen.errors
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize(("width", "height"), [(390, 844), (1024, 768), (1400, 900)])
+@pytest.mark.parametrize("teaching", [False, True], ids=["record", "teach"])
+def test_timed_sweeps_are_counted_down(
+    browser: Any, tmp_path: Path, width: int, height: int, scheme: str, teaching: bool
+):
+    """In sight, in letters of 96 px or more, for recording and teaching; a skin that is away has no
+    countdown."""
+    with RecordedPage(tmp_path, Labels("metal", "1"), teaching=teaching) as one:
+        context = browser.new_context(
+            viewport={"width": width, "height": height}, color_scheme=scheme
+        )
+        seen = BrowsedPage(context, one.page.server.address)
+        for sweeping, words in ((False, "Next sweep in"), (True, "Slide now")):
+            due_ns = SystemClock().now_ns() + 20 * SECOND
+            one.health = replace(one.health, due_ns=due_ns, sweeping=sweeping, ready=not sweeping)
+            until(lambda words=words: seen.text("#call") == words)
+            before = float(seen.text("#countdown"))
+            assert 5 < before < 21  # the page learns the clock late by the delay of an event
+            until(lambda before=before: float(seen.text("#countdown")) < before)
+            box = seen.page.locator("#countdown").bounding_box()
+            assert box["height"] >= 96
+            assert box["y"] + box["height"] <= height
+            assert seen.legibility()[1] == []
+        one.health = replace(one.health, skin="lost", trouble="unplugged", due_ns=0)
+        until(lambda: seen.text("#call") == seen.text("#countdown") == "")
+        assert not seen.errors
+        context.close()
 
 
 def test_only_the_sweep_that_was_seen_is_discarded(
@@ -361,6 +413,13 @@ def test_no_other_site_sets_a_label(
         seen.page.context.close()
 
 
+CUT = """() => [...document.querySelectorAll("main :not(svg *, #counts)")]
+  .filter((e) => getComputedStyle(e).display !== "inline")
+  .filter((e) => e.scrollWidth > e.clientWidth + 1)
+  .map((e) => e.outerHTML.slice(0, 60))"""
+"""Elements whose content is cut; the table may scroll within itself."""
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize(("width", "height"), SIZES)
 def test_every_text_of_it_can_be_read(
@@ -368,7 +427,7 @@ def test_every_text_of_it_can_be_read(
 ):
     """Text, an error and a banner have a contrast of 4.5 with their background (WCAG 2.1, 1.4.3).
     The longest names and more positions than fit stay within the page."""
-    recorded.recording.commands["MATERIAL"]("a material of 24 letters")
+    recorded.recording.commands["MATERIAL"]("corrugated cardboard 2mm")
     for position in range(3, 15):
         recorded.recording.commands["POSITION"](f"{position}")
         recorded.sweep()
@@ -389,6 +448,7 @@ def test_every_text_of_it_can_be_read(
         assert texts > 60
         assert faint == []
         assert seen.page.evaluate("document.documentElement.scrollWidth") <= width
+        assert seen.page.evaluate(CUT) == []
     assert [one for one in seen.errors if "409" not in one] == []
     seen.page.context.close()
 

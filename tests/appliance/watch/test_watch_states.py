@@ -92,6 +92,17 @@ def shows(seen: BrowsedPage, tone: str, status: str, words: str, advice: str) ->
     assert (seen.text("#advice") if advice else "").startswith(advice)
 
 
+OVERLAPS = """() => {
+  const parts = [...document.querySelectorAll("#verdict > *")].filter((e) => e.checkVisibility());
+  const inner = (e) => [e, ...e.querySelectorAll("svg, span")].map((one) => one.getBoundingClientRect());
+  const ends = parts.map((e) => Math.max(...inner(e).map((box) => box.bottom)));
+  const below = parts.filter((e, i) => i && e.getBoundingClientRect().top < ends[i - 1] - 1);
+  const end = document.querySelector("#verdict").getBoundingClientRect().bottom;
+  return [...below, ...parts.filter((e, i) => ends[i] > end)].map((e) => e.id);
+}"""  # noqa: E501
+"""Parts of the card that lie on the part above, or beyond the card's end."""
+
+
 def fits(seen: BrowsedPage, width: int, height: int) -> None:
     """The card is in sight without scrolling, its words are large enough and whole."""
     assert seen.page.evaluate("document.documentElement.scrollWidth") <= width
@@ -101,6 +112,7 @@ def fits(seen: BrowsedPage, width: int, height: int) -> None:
     if advice.is_visible():
         assert advice.evaluate(size) >= 22
         assert advice.bounding_box()["y"] + advice.bounding_box()["height"] <= height
+    assert seen.page.evaluate(OVERLAPS) == []
     cut = "e => Math.max(e.scrollWidth - e.clientWidth, e.scrollHeight - e.clientHeight)"
     assert label.evaluate(cut) <= 12  # the descent of letters with a line height of 1
     assert label.evaluate("e => e.scrollWidth - e.clientWidth") <= 1

@@ -16,6 +16,7 @@ from tests.factories import rendered
 from tests.factories.paths import ROOT
 from tests.factories.study_pages import RESULTS
 from tests.rig import soak, soak_page
+from train.metrics import score
 from train.reports import html, provenance
 from train.studies import pages, reports
 
@@ -70,6 +71,19 @@ def test_every_result_about_a_default_is_listed():
     assert len(results) >= 5
     listed = {*CURVES, *(DOCS / report.file for report in reports.REPORTS)}
     assert [name(path) for path in results if path not in listed] == []
+
+
+PACKAGED = re.compile(
+    r"box ships (?:now, )?bundle (?P<ships>[0-9a-f]{8})|default \d+, (?P<shown>[0-9a-f]{8})"
+    r"|(?P<listed>[0-9a-f]{8})  default \d"
+)
+
+
+@pytest.mark.parametrize("path", MARKDOWN, ids=name)
+def test_no_page_shows_another_bundle_as_the_packaged_one(path: Path):
+    """Examples come from today's bundle, and warnings of older results name it."""
+    found = {found[found.lastgroup or 0] for found in PACKAGED.finditer(path.read_text("utf-8"))}
+    assert found <= {score.shipped()}
 
 
 def test_every_picture_is_shown_once_at_least():
