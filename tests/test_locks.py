@@ -65,7 +65,8 @@ def test_every_package_is_locked_with_hashes(lock: str):
 
 
 def test_all_locks_agree():
-    """A package has the same version in every lock, so tests and desktop have what a box has."""
+    """A package has the same version in every lock. Tests and desktop run on the versions of a
+    box."""
     versions: dict[str, set[tuple[str, ...]]] = {}
     for lock in LOCKS:
         for name, of_it in entries(lock).items():

@@ -372,7 +372,7 @@ def test_samples_are_what_the_box_prints():
 
 
 def test_examples_are_of_the_packaged_bundle():
-    """Wherever a page shows the packaged bundle, it is the one of today."""
+    """Each page that shows the packaged bundle shows the present one."""
     shown = re.findall(r"\bdefault (\d+)(?:, (?!\d+ labels)(\w{8}))?", MANUAL)
     shown += [(n, i) for i, n in re.findall(r"\b([0-9a-f]{8})  default (\d+)", MANUAL)]
     assert len(shown) >= 4

@@ -182,7 +182,7 @@ class PlayedScene:
     error: type[Exception]
 
     def faults(self) -> Iterator[str]:
-        """What is wrong with the answers."""
+        """The faults of the answers."""
         numbers = [number for number, _ in self.answers]
         if numbers != sorted(set(numbers)) or len(numbers) != self.triggers:
             yield f"{self.triggers} triggers, answers {self.answers}"
@@ -259,7 +259,7 @@ def _stand_before(box: Box, calls: ThrowingCalls) -> EdgeLog:
 
 
 def sound(played: PlayedScene) -> None:
-    """Fail if the scene without an exception is not what the campaign needs."""
+    """Fail if the scene goes wrong without any exception."""
     statuses = [Status(status) for _, status in played.answers]
     assert not played.ended
     assert not list(played.faults()), played

@@ -229,7 +229,7 @@ def mosaic(scene: SweepDraw, material: str) -> Counts:
 
 
 def halves(scene: SweepDraw, material: str) -> Counts:
-    """Half of a slide over a material, half of a slide over another one."""
+    """Half of a slide over each of two materials."""
     return np.where(TIMES * 2 < N, scene.slide(material), scene.slide(scene.other(material)))
 
 
@@ -249,7 +249,7 @@ def shuffled(scene: SweepDraw, material: str) -> Counts:
 
 
 def held(scene: SweepDraw, material: str) -> Counts:
-    """A slide of which each tenth frame is repeated ten times."""
+    """A slide that repeats each tenth frame ten times."""
     return scene.slide(material)[::10].repeat(10, axis=0)
 
 

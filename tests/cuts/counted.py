@@ -1,5 +1,5 @@
 """`python -m tests.cuts.counted THREAD NAME COUNT MODULE ...` runs a module. One of its threads
-begins with COUNT system calls NAME, all of which fail and change nothing.
+begins with COUNT system calls NAME. All of them fail and change nothing.
 
 strace kills at a number of a call, and counts the calls of each thread separately. With these calls
 the thread is the first to reach a number. THREAD 0 is the main thread; any other is the thread that

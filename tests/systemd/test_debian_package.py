@@ -217,7 +217,7 @@ def test_a_box_without_a_bundle_for_its_skin_starts_in_teach_mode(host: hosts.Ho
 
 
 def test_a_backup_comes_back_by_one_command(host: hosts.Host):
-    """Over the running box, as root: what was changed since is as it was, owners included."""
+    """Over the running box, as root: later changes are undone, owners included."""
     host.machine.put(SITE, "# saved\n")
     owner = ("stat", "-c", "%U:%G %a", "/etc/palpate/enrolment/key", "/var/lib/palpate/bundles")
     before = host.machine.get(*owner)

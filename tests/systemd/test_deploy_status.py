@@ -23,8 +23,8 @@ print(json.dumps([runs, AnsweringBox.asked, deploy.MOST_STATUS]))
 
 
 def asked(answer: str) -> tuple[bool, list[list[str]], int]:
-    """Whether deploy takes the bundle for the one that runs if a box gives this answer, the
-    commands with their users, and the largest status that it reads."""
+    """The verdict of deploy about the running bundle for this answer of a box, the commands with
+    their users, and the largest status that it reads."""
     runs, commands, most = json.loads(run_here(ASK.format(answer=answer, sha=SHA)))
     return runs, commands, most
 

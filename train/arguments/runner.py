@@ -98,7 +98,7 @@ class Program:
 
 
 def _fault(e: OSError | MemoryError) -> str:
-    """What the system could not do, with a remedy where there is one."""
+    """A message about an error of the system. It has a remedy if there is one."""
     if isinstance(e, MemoryError):
         cause = f": {e}" if str(e) else ""
         return f"not enough memory{cause}; use fewer sweeps (--only), or a machine with more"

@@ -68,7 +68,7 @@ class Cut:
     notes: str
 
     def counted(self) -> Taken:
-        """What is still known once the windows are in the set."""
+        """The counts and remarks, without windows and frames."""
         one = self.recording
         return Taken(one.name, len(self.windows), len(one.frames), one.notes, self.notes)
 
@@ -169,9 +169,9 @@ def _named(
 
 
 def _name_materials(folder: Path, known: Sequence[Fields], plan: ImportPlan) -> None:
-    """Give materials their new names, and a name in place of those that the box cannot send: what
-    the file says then is the display name. Raises FormatError for a new name that the box cannot
-    send, or for an old name that does not occur."""
+    """Give materials their new names. A name that the box cannot send is replaced, and stays as the
+    display name. Raises FormatError for a new name that the box cannot send, or for an old name
+    that does not occur."""
     labels.check_renames(plan.renames, (fields["material"] for fields in known))
     if why := labels.unsendable(plan.renames.values()):
         raise FormatError(f"{folder}: {why}; {labels.REMEDY}")
@@ -429,7 +429,7 @@ def _set(
 
 
 def _displays(known: Sequence[Fields]) -> dict[str, list[str]]:
-    """What the files call materials that have another name in the set, by that name."""
+    """The names in the files of renamed materials, by the new name."""
     found: dict[str, list[str]] = {}
     for name, text in sorted({(f["material"], f[DISPLAY]) for f in known if DISPLAY in f}):
         found.setdefault(name, []).append(text)

@@ -42,8 +42,8 @@ def _counts(values: Array) -> Array:
 
 
 def _quotas(counts: Array, total: int) -> Array:
-    """What each of `counts` [k] gets of `total`: the same level, or its count if that is smaller.
-    What the level leaves over goes to some of the larger ones, evenly spaced among them."""
+    """The share of each of `counts` [k] in `total`: the same level, or its count if that is
+    smaller. The rest goes to some of the larger ones, evenly spaced."""
     if counts.sum() <= total:
         return counts
     ascending, k = np.sort(counts), len(counts)

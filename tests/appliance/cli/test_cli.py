@@ -354,8 +354,9 @@ def test_check_of_commands_without_a_serial_port(capsys: pytest.CaptureFixture[s
 
 
 def test_folders_and_files_that_are_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """A folder of settings that does not exist is an error; a file that is no set is named without
-    advice on pickles; a result that could not be written is refused before the work."""
+    """A folder of settings that does not exist is an error; the message names a file that is no
+    set, without advice on pickles; a result that could not be written is refused before the
+    work."""
     assert main(["config", "--config-dir", str(tmp_path / "none")]) == 78
     assert f"--config-dir {tmp_path / 'none'}: no such folder" in capsys.readouterr().err
     assert main(["run", "--sim", "replay:/etc/passwd", "--set", "store.runtime="]) == 65

@@ -68,9 +68,9 @@ def seen(root: Path) -> dict[str, str]:
 
 
 def test_a_box_comes_back_on_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """By one command each: settings, keys, bundles and sweeps are those of the old box, the
-    certificate and the program's links those of the new one; what the new box had stays beside
-    them. The service stands still meanwhile."""
+    """By one command each: settings, keys, bundles and sweeps come from the old box. The
+    certificate and the links of the program stay; the former files of the new box stay beside them.
+    The service stands still meanwhile."""
     old = old_box(tmp_path / "old")
     has = {"etc/palpate/watch/key.pem": "new", "etc/palpate/palpate.toml": "# new\n"}
     has |= {"var/lib/palpate/sweeps/sweep-000009.npy": "its own"}
@@ -91,7 +91,7 @@ def test_a_box_comes_back_on_another(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert there["etc/palpate.before-restore/palpate.toml"] == "# new\n"
     assert (new / "etc/palpate/enrolment/key").stat().st_mode & 0o777 == 0o400
     assert not [name for name in there if ".new" in name]
-    # again, with what is there now
+    # again, with the present files
     assert command.main(["restore", str(tmp_path / "box.tar")], new) == 0
     assert {name: seen(new)[name] for name in SAVED} == SAVED
 
@@ -171,7 +171,7 @@ def test_a_missing_current_bundle_and_another_schema_are_refused(
 
 
 def test_a_computer_without_palpate_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """Both ways; the message says what is missing."""
+    """Both ways; the message names the missing part."""
     with pytest.raises(ApplianceError, match="Palpate is not installed here"):
         backup.save(io.BytesIO(), tmp_path)
     with pytest.raises(ApplianceError, match="install Palpate on this box first"):

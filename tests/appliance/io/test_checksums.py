@@ -67,8 +67,8 @@ def test_a_checksum_is_read_from_its_text(checksum: Checksum) -> None:
 
 
 def test_parameters_describe_a_checksum_without_a_name() -> None:
-    """A polynomial, initial value and final exclusive or in hexadecimal; anything else is no
-    checksum."""
+    """A polynomial, initial value and final exclusive or in hexadecimal; other values are
+    refused."""
     icode = Checksum("crc8", 0x1D, 0xFD)
     assert parsed("crc8 poly=1d init=fd xorout=00") == icode
     assert icode.of(b"123456789") == 0x7E  # CRC-8/I-CODE

@@ -46,8 +46,8 @@ def numbers(folder: Path, box: Classifier) -> list[list[int]]:
 
 
 def test_sweeps_of_a_material_that_comes_again_are_a_group(tmp_path: Path, box: Classifier):
-    """Over runs, each of which counts from 1; a material that was seen once is none, nor is a known
-    one, nor an answer of another bundle."""
+    """Each run counts from 1; a material that was seen once is none, nor is a known one, nor an
+    answer of another bundle."""
     folder = tmp_path / "black-box"
     said = kept(folder, box, FELT[0], CORK[0], (0, 0), FELT[1], (60, -60), CORK[1], FELT[2])
     assert [one.rpartition("; ")[2] for one in said if "; as" in one] == [

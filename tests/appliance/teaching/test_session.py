@@ -197,7 +197,7 @@ def test_a_process_that_hangs_is_killed():
 
 
 def test_use_needs_two_materials(taught: Taught):
-    """One material cannot be told from another; the message names the remedy."""
+    """A single material has nothing to be confused with; the message names the remedy."""
     taught.sweeps("cork", 5)
     with pytest.raises(ApplianceError, match=r"1 materials have sweeps; .*: teach another"):
         taught.order("USE")

@@ -46,7 +46,7 @@ def store(words: list[str]) -> Any:
 
 
 def full(act: Callable[..., Any], count: list[int], at: int) -> Callable[..., Any]:
-    """A write that fails when it is the one with the number `at` of all."""
+    """A write that fails at its call number `at`."""
 
     def run(*args: Any, **more: Any) -> Any:
         count[0] += 1

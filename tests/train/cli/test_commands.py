@@ -366,7 +366,7 @@ def test_an_error_of_a_library_without_a_file_is_told_in_its_words(
 def test_too_little_memory_is_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    """The cause of the library and a remedy in place of a traceback."""
+    """A message with cause and remedy, and no traceback."""
 
     def load(*_: object) -> None:
         raise MemoryError("Unable to allocate 9.00 TiB")

@@ -429,8 +429,8 @@ def test_axes_are_the_last_of_a_frame(tmp_path: Path):
 
 
 def test_a_name_that_cannot_be_sent_becomes_a_display_name(tmp_path: Path):
-    """The import goes on, proposes a name in ASCII that no other material has, and keeps what the
-    file says in the set, in .npz and HDF5; two that become one material have no display name."""
+    """The import goes on and proposes an ASCII name that no other material has. The set keeps the
+    name of the file, in .npz and HDF5; two that become one material have no display name."""
     names = ("felt", "Filz, weiß", "Filz weiss", "木", "x" * 30, "a,b")
     for k, name in enumerate(names):
         text(tmp_path / "in" / f"{name}_1.csv", COUNTS + k)

@@ -1,4 +1,5 @@
-"""The memory of a fit: it does not grow with the set, and what is too much is told before."""
+"""The memory of a fit: it does not grow with the set. A fit that needs too much is refused
+first."""
 
 from __future__ import annotations
 
@@ -72,7 +73,7 @@ def test_a_set_under_the_cap_is_used_whole():
 def test_what_cannot_be_held_is_told_before(
     kilobytes: int, limit: str, advice: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """The message has what is needed, what is free and a number that fits; the limit of a
+    """The message has the needed and the free memory, and a number that fits; the limit of a
     container counts."""
     (tmp_path / "meminfo").write_text(f"MemTotal: 1 kB\nMemAvailable: {kilobytes} kB\n")
     (tmp_path / "memory.max").write_text(limit + "\n")
