@@ -24,8 +24,7 @@ SCRATCH = $(or $(shell df -Pk /dev/shm 2>/dev/null | awk 'NR > 1 && $$4 > 100000
 PYTEST = $(BIN)/python -m pytest -q -n $(shell expr `nproc` + 1)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo desktop test test-fast test-all lint types bundle bench site deploy install deb \
-  lock clean
+.PHONY: help demo desktop test test-fast test-all lint types bundle bench site deploy install deb clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -92,25 +91,6 @@ deb: $(FLEET) $(DESKTOP) ## pack the same as dist/palpate_*.deb for arm64 and am
 
 clean: ## remove everything that was built, the virtual environment too
 	rm -rf $(VENV) build dist *.egg-info train/*.egg-info
-
-# All locks again, the box's first; the others keep to its versions. PyTorch is in none of them: its build
-# depends on the graphics card (docs/security.md).
-CUDA := torch triton cuda-toolkit cuda-bindings cuda-pathfinder $(addprefix nvidia-,cublas cuda-cupti \
-  cuda-nvrtc cuda-runtime cudnn-cu13 cufft cufile curand cusolver cusparse cusparselt-cu13 nccl-cu13 \
-  nvjitlink nvshmem-cu13 nvtx)
-COMPILE = uv pip compile -q --universal --generate-hashes --no-header --python-version 3.11 \
-  --allow-unsafe $(addprefix --no-emit-package ,palpate palpate-train $(CUDA))
-OF_BOX := -c appliance/requirements.lock -c appliance/teach.lock
-lock: # lock all versions again with uv, which has to be installed
-	$(COMPILE) pyproject.toml --extra page -o appliance/requirements.lock
-	$(COMPILE) pyproject.toml --extra page --extra teach -c appliance/requirements.lock \
-	  -o appliance/teach.lock
-	printf '%s\n' '-e .[dev]' '-e train[studies,dask,files]' 'setuptools>=77' | \
-	  $(COMPILE) - $(OF_BOX) -o tests/tools.lock
-	echo 'setuptools>=77' | $(COMPILE) - -c tests/tools.lock -o systemd/build.lock
-	echo '-e .[deploy]' | $(COMPILE) - -c tests/tools.lock -o systemd/fleet.lock
-	printf '%s\n' '-e .' '-e train' | $(COMPILE) - -c tests/tools.lock -o train/desktop.lock
-	echo '-e .[site]' | $(COMPILE) - -c tests/tools.lock -o docs/site/site.lock
 
 # A virtual environment with the locked runtime and the commands, nothing else.
 $(RUNTIME): appliance/requirements.lock systemd/build.lock pyproject.toml

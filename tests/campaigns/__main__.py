@@ -158,6 +158,10 @@ CAMPAIGNS = {
         paths=("tests/campaigns/test_machines.py",),
         variables={"PALPATE_MACHINES": "1"},
     ),
+    "lock": Campaign(
+        "lock the versions of all packages again, with uv, which has to be installed",
+        _module("tests.campaigns.lock"),
+    ),
     "soak": Campaign(
         "sweep without pause on the virtual box and on this machine: docs/data/soak.json",
         _module("tests.rig.soak", "--out", "docs/data/soak.json"),

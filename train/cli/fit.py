@@ -33,7 +33,7 @@ from train.selection.dial import Budget, SizeWish
 Json = dict[str, Any]
 MAINS = (50, 60)
 """Frequencies of the mains in Hz: public grids have no others."""
-STEPS, MOST = recipe.Settings().steps, recipe.MOST_SWEEPS
+STEPS, MOST = recipe.Settings().steps, memory.MOST_SWEEPS
 
 
 def register(add: Add) -> None:

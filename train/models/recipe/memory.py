@@ -7,6 +7,9 @@ from pathlib import Path
 from appliance.core.errors import FormatError
 from train.data.sets import Dataset
 
+MOST_SWEEPS = 4000
+"""Usual largest number of sweeps of a fit. It bounds memory and time: features of each sweep and of
+its copies are held, and candidates are fitted to them (docs/recipe.md)."""
 COPIED, FEATURES, FIXED = 4, 150_000, 0.3e9
 """Bytes that a fit needs beside its set: COPIED times those of the used sweeps, FEATURES for each
 of them, and FIXED for the program (measured, docs/recipe.md)."""

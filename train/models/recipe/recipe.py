@@ -51,6 +51,7 @@ from train.models.recipe.augment import (
 from train.models.recipe.bank import Bank
 from train.models.recipe.choice import Candidates, FeatureColumns, HeldOutScores, ScoredPlan
 from train.models.recipe.fitted import Fit, finished
+from train.models.recipe.memory import MOST_SWEEPS
 from train.models.recipe.sizes import UNLIMITED, ModelSize
 from train.onnx_tools.graph_builder import run
 from train.onnx_tools.quantize import calibration_sweeps
@@ -59,9 +60,6 @@ Array = NDArray[Any]
 LEAST_EACH, LEAST_SWEEPS = 25, 100
 """Smallest numbers of sweeps for training stages, of each material and of all. Stages overfit to a
 few sweeps of a material and to a few batches."""
-MOST_SWEEPS = 4000
-"""Usual largest number of sweeps of a fit. It bounds memory and time: features of each sweep and of
-its copies are held, and candidates are fitted to them (docs/recipe.md)."""
 STAGES_WEIGHT = 0.5
 """Weight of the discriminant of stages beside others; docs/decisions/0023 compares others."""
 PARTS = "features", "choice of the model", "training of stages"
