@@ -22,7 +22,11 @@ KEPT = 0.99
 def limited(manifest: Manifest, train: Dataset, seed: int = 0) -> Manifest:
     """`manifest` with the largest displacement in copies of `train`, which are displaced as far as
     those that the model was trained with; unchanged if it has no rule for displaced sweeps, or if
-    its taxels stand in one column, which training does not displace."""
+    its taxels stand in one column, which training does not displace.
+
+    A skin that was put back has other gains, which shift the measured place as well. Among trained
+    positions this error is `limit_mm` at most, which is added.
+    """
     rule, place, contact = manifest.displacement, manifest.contact, manifest.thresholds.contact
     if rule is None or place is None or contact is None or train.format.cols < 2:
         return manifest
@@ -36,7 +40,7 @@ def limited(manifest: Manifest, train: Dataset, seed: int = 0) -> Manifest:
     )
     means = moved.reshape(loads.shape) + manifest.tare
     mm = [displacement(mean, manifest.tare, contact, place).mm for mean in means]
-    farthest = max(float(np.quantile(mm, KEPT)), place.limit_mm)
+    farthest = float(np.quantile(mm, KEPT)) + place.limit_mm
     return replace(manifest, displacement=replace(rule, farthest_mm=round(farthest, 3)))
 
 
