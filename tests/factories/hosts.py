@@ -37,6 +37,8 @@ PACKAGES = ("systemd", "systemd-sysv", "openssh-server", "sudo", "dbus")
 WANTED = ("python3-venv", "libusb-1.0-0", "openssh-client")
 """Packages that an install gets by apt-get."""
 USER = "robot"
+_NUMBERS = count(os.getpid() * 8)
+"""Numbers of hosts: another one for each that this process starts, away from other processes."""
 NET = "10.213"
 
 
@@ -181,12 +183,12 @@ class Hosts:
         self._stack = ExitStack()
         self.work = work
         key = key_of(work)
-        root, first = set_up() / kind, 1 + os.getpid() * 8 % 240
+        root = set_up() / kind
         _fetch_wheels()
         with self._stack:
             self.hosts = [
                 self._stack.enter_context(Host(root, number, work / f"host-{number}", key))
-                for number in range(first, first + count)
+                for number in (1 + next(_NUMBERS) % 240 for _ in range(count))
             ]
             self._stack = self._stack.pop_all()
 
