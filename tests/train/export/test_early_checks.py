@@ -89,8 +89,8 @@ def test_an_older_bundle_gets_the_check_and_keeps_its_answers(older: Path):
         older, train, lambda held: displacement_limit.limited(held, train)
     )
     assert manifest.displacement
-    assert manifest.place
-    copies_mm = manifest.displacement.farthest_mm - manifest.place.limit_mm
+    assert manifest.contact
+    copies_mm = manifest.displacement.farthest_mm - manifest.contact.limit_mm
     assert copies_mm == pytest.approx(1.9, abs=0.4)  # of a pitch of 4 mm
     assert "named up to" in displacement_limit.text(manifest)
     assert displacement_limit.text(was.manifest).endswith("named at any distance")
