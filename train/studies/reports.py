@@ -82,10 +82,10 @@ REPORTS = (
     _study("stress"),
     _study("paper"),
     ResultFile("overview", "overview.svg", ("train.studies", "overview")),
+    ResultFile("junk", "data/junk.json", ("tests.campaigns", "junk")),
     ResultFile(
         "bench", "data/bench.json", ("appliance", "bench", "--json", "docs/data/bench.json")
     ),
-    ResultFile("junk", "data/junk.json", ("tests.campaigns", "junk")),
     ResultFile("skins", "data/skins.json", ("tests.skins",)),
     ResultFile(
         "soak", "data/soak.json", ("tests.rig.soak", "--out", "docs/data/soak.json"), (EMULATOR,)
