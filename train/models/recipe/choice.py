@@ -95,6 +95,11 @@ class HeldOutScores:
         """Mean cross entropy; every group counts the same."""
         return float(self.weights @ scored.losses)
 
+    def error_then_loss(self, scored: ScoredPlan) -> tuple[float, float]:
+        """An order of candidates: the most accurate first, of equals that with the lowest loss. In
+        sums of different discriminants the loss depends on the size of their logits as well."""
+        return -self.accuracy(scored), self.loss(scored)
+
     def accuracy(self, scored: ScoredPlan) -> float:
         """Accuracy on held-out sweeps; every group counts the same."""
         return float(self.weights @ self.right(scored))
@@ -139,12 +144,15 @@ class HeldOutScores:
     def holds(self, one: ScoredPlan, other: ScoredPlan) -> bool:
         """Whether held-out sweeps show that `one` has at most MOST_LOST less accuracy than `other`
         and at most MOST_WORSE more cross entropy. One standard error of the paired difference is
-        added to the lost accuracy, or one sweep if that is more."""
+        added to the lost accuracy, or one sweep if that is more. No group may lose more than
+        MOST_LOST either: an easier group does not make up for what a new force would lose."""
         lost = self._lost(one, other)
         worse = self.loss(one) - self.loss(other)
+        of_groups = [self.groups == name for name in np.unique(self.groups)]
         return bool(
             max(lost.sum(), 0) + max(_error(lost), 1 / len(lost)) <= MOST_LOST
             and worse <= MOST_WORSE
+            and all(lost[of].sum() <= MOST_LOST * self.weights[of].sum() for of in of_groups)
         )
 
     def _lost(self, one: ScoredPlan, other: ScoredPlan) -> Array:
@@ -348,8 +356,9 @@ class Candidates:
 
 def choose(scores: HeldOutScores, candidates: Candidates, log: Log) -> ScoredPlan:
     """The candidate with the lowest loss if it is `better` than the usual candidate, else the
-    latter. Plain candidates are compared first, then extensions of the best of them; relations and
-    loads join last, where they help."""
+    latter. Plain candidates are compared first, then extensions of the best of them; the more
+    accurate form of relations and the form of loads with the lower loss join last, where they
+    help."""
 
     def scored(heads: Mapping[str, Heads]) -> Iterator[ScoredPlan]:
         for name, parts in heads.items():
@@ -365,9 +374,10 @@ def choose(scores: HeldOutScores, candidates: Candidates, log: Log) -> ScoredPla
     extended = list(scored(candidates.extended(best.plan.parts)))
     best = min([usual, *others, *extended], key=scores.loss)
     chosen = best if scores.better(best, usual) else usual
-    for joining in (candidates.related, candidates.loaded):
+    joinings = (candidates.related, scores.error_then_loss), (candidates.loaded, scores.loss)
+    for joining, order in joinings:
         joined = list(scored(joining(chosen.plan.parts)))
-        if joined and scores.helps(best := min(joined, key=scores.loss), chosen):
+        if joined and scores.helps(best := min(joined, key=order), chosen):
             chosen = best
     return chosen
 

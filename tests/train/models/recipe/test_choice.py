@@ -178,6 +178,44 @@ def test_too_few_sweeps_show_nothing():
     assert not at.holds(at.score([HeadPart(NOISE, False)]), sure)
 
 
+def test_no_group_loses_for_the_gain_of_another():
+    """Wrong answers under a new force are not made up by right ones at a new place."""
+    given, parts = known(600)
+    forces = [InnerPart("force", part.out) for part in parts]
+    at = HeldOutScores([given] * 6, [*parts, *forces], 3)
+    full = at.score([HeadPart(GOOD, False)])
+    force, right = at.groups == "force", at.right(full)
+    better = np.where(force[:, None], full.logits, np.eye(3)[at.labels])
+    less = replace(full, logits=better)
+    assert at.holds(less, full)
+    lost = np.flatnonzero(force & right)[:6]  # a hundredth of the group
+    better[lost] = -np.eye(3)[at.labels[lost]]
+    assert at.accuracy(less) > at.accuracy(full)
+    assert not at.holds(less, full)
+
+
+def test_the_more_accurate_form_of_relations_joins(monkeypatch: pytest.MonkeyPatch):
+    """Not that with the lower loss: a certain answer that is wrong costs much, and no more."""
+    at = scores()
+    usual = at.score([HeadPart(GOOD, False)])
+    wrong = np.flatnonzero(~at.right(usual))
+    one = np.eye(3)[at.labels] * 9
+    other = one.copy()
+    other[wrong[:3]] = usual.logits[wrong[:3]]
+    accurate = replace(usual, logits=one, losses=np.full(len(one), 0.02))
+    certain = replace(usual, logits=other, losses=np.full(len(one), 0.01))
+    assert at.loss(certain) < at.loss(accurate)
+    assert min([certain, accurate], key=at.error_then_loss) is accurate
+    forms = {"one": certain, "other": accurate, "usual": usual}
+    heads = candidates([[0]], GOOD, GOOD)
+    monkeypatch.setattr(Candidates, "related", lambda self, best: {k: k for k in ("one", "other")})
+    score = at.score
+    monkeypatch.setattr(
+        at, "score", lambda parts: forms[parts] if isinstance(parts, str) else score(parts)
+    )
+    assert choice.choose(at, heads, print) is accurate
+
+
 def test_no_sweep_is_judged_by_a_head_that_saw_its_part():
     """A head that overfits scores far from perfect on held-out sweeps."""
     given, parts = known()
