@@ -1,4 +1,5 @@
-"""Invented results of the study stress: six methods and a bundle under three corruptions."""
+"""Invented results of the study stress: six methods and a bundle under three corruptions, and
+under two pairs of them."""
 
 from __future__ import annotations
 
@@ -11,6 +12,7 @@ SEVERITIES = {
     "hum": ("50 Hz hum", "deviations", [0.0, 1.0, 2.0]),
     "gain-up": ("higher gain", "share", [0.0, 0.2, 0.5]),
 }
+PAIRS = {"hum+dead": "50 Hz hum and dead taxels", "gain-up+hum": "higher gain and 50 Hz hum"}
 METHODS = {
     "palpate": {"dead": (98, 96, 80), "hum": (98, 90, 60), "gain-up": (98, 97, 97)},
     "minirocket": {"dead": (96, 50, 30), "hum": (96, 96, 40), "gain-up": (96, 95, 95)},
@@ -20,7 +22,7 @@ METHODS = {
     "L-knn": {"dead": (80, 80, 79), "hum": (80, 79, 79), "gain-up": (80, 79, 10)},
 }
 BOX = {
-    "rightly": {"dead": (95, 0, 0), "hum": (95, 40, 10), "gain-up": (95, 95, 94)},
+    "rightly": {"dead": (95, 5, 0), "hum": (95, 40, 10), "gain-up": (95, 95, 94)},
     "wrongly": {"dead": (1, 0, 0), "hum": (1, 2, 3), "gain-up": (1, 1, 7)},
     "unsure": {"dead": (2, 0, 0), "hum": (2, 8, 7), "gain-up": (2, 2, 0)},
     "unknown": {"dead": (2, 0, 0), "hum": (2, 50, 80), "gain-up": (2, 2, 0)},
@@ -48,6 +50,7 @@ def figures() -> dict[str, Any]:
             "made": {"set": "sim:T-REAL:1-6", "recipe": {"reattached": True}},
             "uninformative": {"silent": "no-contact"},
             "curves": {name: entry["curves"] for name, entry in box.items()},
+            "pairs": {name: entry["pairs"] for name, entry in box.items()},
         },
         "train": "sim:T-REAL:1",
         "train_sweeps": 540,
@@ -66,18 +69,14 @@ def figures() -> dict[str, Any]:
 def task(name: str, right: dict[str, tuple[int, ...]]) -> dict[str, Any]:
     """A result of robustness.evaluate_method."""
     curves = {
-        key: {
-            "title": title,
-            "unit": unit,
-            "about": f"about {key}",
-            "severities": severities,
-            "right": list(right[key]),
-            "low": [n / 100 - 0.05 for n in right[key]],
-            "high": [n / 100 + 0.01 for n in right[key]],
-            "broken": [0] * 3,
-        }
+        key: curve(key, title, unit, severities, right[key])
         for key, (title, unit, severities) in SEVERITIES.items()
     }
+    pairs = {}
+    for key, title in PAIRS.items():
+        parts = [right[part] for part in key.split("+")]
+        both = (parts[0][0], min(part[1] for part in parts) - 5 * ("dead" in key))
+        pairs[key] = curve(key, title, "", [0.0, 1.0], both)
     return {
         "method": name,
         "seed": 1,
@@ -86,5 +85,22 @@ def task(name: str, right: dict[str, tuple[int, ...]]) -> dict[str, Any]:
         "total": 100,
         "ran": "",
         "curves": curves,
+        "pairs": pairs,
         "trouble": {"silent": "finite"},
+    }
+
+
+def curve(
+    key: str, title: str, unit: str, severities: list[float], right: tuple[int, ...]
+) -> dict[str, Any]:
+    """The counts of one corruption, of 100 sweeps."""
+    return {
+        "title": title,
+        "unit": unit,
+        "about": f"about {key}",
+        "severities": severities,
+        "right": list(right),
+        "low": [n / 100 - 0.05 for n in right],
+        "high": [n / 100 + 0.01 for n in right],
+        "broken": [0] * len(right),
     }

@@ -265,3 +265,14 @@ def _share(line: str) -> dict[str, float | None]:
     if isinstance(line, StageLine):
         return {"completed": line.stage - 1 + line.within, "total": line.stages}
     return {"completed": 0, "total": None}
+
+
+def group_share(text: str) -> tuple[str, float]:
+    """GROUP:SHARE of --split. Raises FormatError if it cannot be read."""
+    by, _, share = text.partition(":")
+    try:
+        return by, float(share)
+    except ValueError:
+        raise FormatError(
+            f"split {text!r} cannot be read; write GROUP:SHARE, e.g. recording:0.7"
+        ) from None

@@ -171,8 +171,7 @@ def run(args: argparse.Namespace) -> None:
     _check(args)
     sweeps, rest = labels.check(options.load(args, args.seed)), None
     if args.split:
-        by, share = _by_share(args.split)
-        sweeps, rest = sweeps.split(by, share, args.seed)
+        sweeps, rest = sweeps.split(*options.group_share(args.split), args.seed)
     memory.check(sweeps, min(len(sweeps), args.most_sweeps))
     made, change, unfinished = _fitted(args, sweeps)
     if args.rest and rest:
@@ -340,13 +339,3 @@ def _print_held_out(made: Fit) -> None:
     else:  # too few sweeps to judge by
         alone = formatting.counted(made.about["validation"])
         print(f"network alone: {alone}; nothing judges the box's answers: {made.uncalibrated}")
-
-
-def _by_share(text: str) -> tuple[str, float]:
-    by, _, share = text.partition(":")
-    try:
-        return by, float(share)
-    except ValueError:
-        raise FormatError(
-            f"split {text!r} cannot be read; write GROUP:SHARE, e.g. recording:0.7"
-        ) from None

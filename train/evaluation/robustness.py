@@ -25,7 +25,7 @@ from appliance.recording.sweep_window import SweepCutter
 from appliance.sim.rig import VirtualClock
 from train.data.sets import Dataset, digest
 from train.evaluation import parallel
-from train.evaluation.corruptions import Corruption, applicable
+from train.evaluation.corruptions import Corruption, applicable, pairs
 from train.evaluation.evaluate import Where
 from train.evaluation.evaluation_sweeps import EvaluationSweeps
 from train.evaluation.fold import fingerprint
@@ -76,20 +76,18 @@ def evaluate_model(
 ) -> Json:
     """The result of `evaluate_method` for a trained model. The sweeps depend only on test,
     corruption, severity and seed."""
-    trials = CorruptionCounts(test)
+    single, paired = CorruptionCounts(test), CorruptionCounts(test)
     clean = _right(method, model, test.sweeps, test.sweeps.samples)
-    for corruption in applicable(test) if corruptions is None else corruptions:
-        trials.add(
-            corruption,
-            [
-                clean,
-                *(
-                    _right(method, model, test.sweeps, corruption.apply(test, severity, seed))
-                    for severity in corruption.severities[1:]
-                ),
-            ],
-        )
-    return trials.task(method.name, seed) | {
+    every = (applicable(test), pairs()) if corruptions is None else (corruptions, ())
+    for trials, those in zip((single, paired), every, strict=True):
+        for corruption in those:
+            answers = [
+                _right(method, model, test.sweeps, corruption.apply(test, severity, seed))
+                for severity in corruption.severities[1:]
+            ]
+            trials.add(corruption, [clean, *answers])
+    return single.task(method.name, seed) | {
+        "pairs": paired.curves,
         "ran": getattr(model, "ran", ""),
         "trouble": uninformative_answers(method, model, test),
     }
@@ -129,6 +127,7 @@ class CorruptionCounts:
             "total": len(sweeps),
             "ran": "",
             "curves": self.curves,
+            "pairs": {},
             "trouble": {},
         }
 
@@ -187,11 +186,12 @@ def _run_task(
 def merge(tasks: Iterable[Json]) -> Json:
     """Join tasks in any order: {"sets": [...], "methods": {name: entry}}.
 
-    An entry holds seeds, refused ("" or the reason), ran, clean (accuracy), curves and trouble. A
-    curve holds title, unit, about, severities, right and total (sums), accuracy, low and high,
-    broken (number of answers that were not finite; they count as wrong), falls and lost. low and
-    high are the means of the tasks' 95 % intervals, extended to the spread of the tasks: seeds
-    share their sweeps, and the interval of their sum would be too narrow.
+    An entry holds seeds, refused ("" or the reason), ran, clean (accuracy), curves, pairs and
+    trouble; pairs are curves of two corruptions at once. A curve holds title, unit, about,
+    severities, right and total (sums), accuracy, low and high, broken (number of answers that were
+    not finite; they count as wrong), falls and lost. low and high are the means of the tasks' 95 %
+    intervals, extended to the spread of the tasks: seeds share their sweeps, and the interval of
+    their sum would be too narrow.
     """
     tasks = sorted(tasks, key=lambda t: (t["set"], t["seed"]))
     names = sorted({t["method"] for t in tasks})
@@ -290,14 +290,15 @@ def _entry(tasks: list[Json]) -> Json:
         "refused": refused,
         "clean": None,
         "curves": {},
+        "pairs": {},
         "ran": next((t["ran"] for t in done), ""),
         "trouble": {},
     }
-    for name in done[0]["curves"] if done else ():
-        entry["curves"][name] = _curve(
-            [t["curves"][name] for t in done], np.array([t["total"] for t in done])
-        )
-        entry["clean"] = entry["curves"][name]["accuracy"][0]
+    totals = np.array([t["total"] for t in done])
+    for kind in ("curves", "pairs"):
+        for name in done[0][kind] if done else ():
+            entry[kind][name] = _curve([t[kind][name] for t in done], totals)
+            entry["clean"] = entry[kind][name]["accuracy"][0]
     for t in done:  # the worst of several answers counts
         for name, status in t["trouble"].items():
             entry["trouble"][name] = max(entry["trouble"].get(name, status), status, key=_badness)

@@ -16,7 +16,7 @@ from appliance.inference.classifier import Classifier
 from train.data.progress import Progress
 from train.data.sets import Dataset
 from train.evaluation import robustness
-from train.evaluation.corruptions import applicable
+from train.evaluation.corruptions import Corruption, applicable
 from train.evaluation.evaluation_sweeps import EvaluationSweeps
 from train.export import bundle_score
 
@@ -32,12 +32,13 @@ def under_corruptions(
     test: EvaluationSweeps,
     seeds: Sequence[int],
     log: Callable[[str], None] = lambda line: None,
+    corruptions: Sequence[Corruption] | None = None,
 ) -> Json:
     """Curves by answer (ANSWERS) and corruption, see robustness.merge; those of `falls` are of the
     sweeps named rightly.
 
-    seeds: of the corruptions. Raises FormatError if the sweeps are not of the bundle's format, or
-    have a material that it lacks.
+    seeds: of the corruptions. corruptions: None for all that apply. Raises FormatError if the
+    sweeps are not of the bundle's format, or have a material that it lacks.
     """
     manifest, sweeps = box.bundle.manifest, test.sweeps
     lacking = sorted({sweeps.materials[k] for k in np.unique(sweeps.labels)} - set(manifest.labels))
@@ -48,10 +49,11 @@ def under_corruptions(
             f"cannot answer {sweeps.source} ({sweeps.format}); name another with --bundle"
         )
     clean, tasks = answers(box, sweeps), []
-    progress = Progress(len(seeds) * len(applicable(test)), log)
+    corruptions = applicable(test) if corruptions is None else corruptions
+    progress = Progress(len(seeds) * len(corruptions), log)
     for seed in seeds:
         trials = {answer: robustness.CorruptionCounts(test) for answer in ANSWERS}
-        for corruption in applicable(test):
+        for corruption in corruptions:
             progress.begin(f"{corruption.name} as the box answers, seed {seed}")
             found = [clean]
             for severity in corruption.severities[1:]:

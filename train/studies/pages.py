@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +59,9 @@ PAGES: Mapping[str, Page] = {
     "development": Page(
         ("methods", "runs", "cases", "results", "left_out"),
         _development,
+    ),
+    "stress-fabrics": Page(
+        ("methods", "box"), _single(partial(stress_report.render, name="stress-fabrics"))
     ),
     "stress": Page(("methods", "box"), _single(stress_report.render)),
     "certainty": Page(("calibration", "early"), _single(uncertainty_report.render)),

@@ -91,24 +91,61 @@ def matrix(columns: Mapping[str, Json]) -> str:
 
     columns: curves by corruption, by the name of the method; the box comes first.
     """
-    about = {name: curve for curves in columns.values() for name, curve in curves.items()}
-    names = sorted(about, key=lambda name: _endurance(columns, name))
+    about = _every(columns)
+    rows = {
+        name: f"{about[name]['title']}, to {level(about[name], about[name]['severities'][-1])}"
+        for name in sorted(about, key=lambda name: _endurance(columns, name))
+    }
+    said = "severity of each corruption at which a method loses five points"
+    return _table(columns, rows, _cell, said)
+
+
+def pairs(columns: Mapping[str, Json]) -> str:
+    """Pairs of corruptions by methods: the sweeps that are named rightly in per cent, in a deeper
+    colour the more are lost. columns: as of `matrix`."""
+    about = _every(columns)
+    order = sorted(about, key=lambda name: -_lost(columns, name))
+    rows = {name: about[name]["title"] for name in order}
+    said = "share of sweeps that each method names rightly under two corruptions at once"
+    return _table(columns, rows, _share, said)
+
+
+def _every(columns: Mapping[str, Json]) -> Json:
+    """One curve of each name, of any column."""
+    return {name: curve for curves in columns.values() for name, curve in curves.items()}
+
+
+def _table(
+    columns: Mapping[str, Json], rows: Mapping[str, str], cell: Callable[..., None], said: str
+) -> str:
+    """Tiles of corruptions by methods. rows: the text of each corruption, by its name. cell: draws
+    a tile of (axes, row, column, curve). said: what the picture shows, in words."""
     above = 1.5
     figure, axes = single_axes(
-        above + 0.24 * len(names) + 0.05, left=0.43, right=0.93, top=above, bottom=0.05
+        above + 0.24 * len(rows) + 0.05, left=0.43, right=0.93, top=above, bottom=0.05
     )
-    for i, name in enumerate(names):
-        curve = about[name]
-        label = f"{curve['title']}, to {level(curve, curve['severities'][-1])}"
+    for i, (name, label) in enumerate(rows.items()):
         write(axes, -0.15, i + 0.5, label, size=SMALL, ha="right")
         for j, curves in enumerate(columns.values()):
             if name in curves:
-                _cell(axes, i, j, curves[name])
+                cell(axes, i, j, curves[name])
     for j, method in enumerate(columns):
         look: dict[str, Any] = {"rotation": 60, "ha": "left", "va": "bottom"}
         write(axes, j + 0.3, -0.15, method, BLACK if j > 1 else ACCENT, SMALL, **look)
-    tiles(axes, len(names), len(columns))
-    return to_svg(figure, "severity of each corruption at which a method loses five points")
+    tiles(axes, len(rows), len(columns))
+    return to_svg(figure, said)
+
+
+def _lost(columns: Mapping[str, Json], name: str) -> float:
+    """The mean loss of accuracy of all methods under one pair."""
+    those = [curves[name] for curves in columns.values() if name in curves]
+    return float(np.mean([curve["lost"] for curve in those]))
+
+
+def _share(axes: Axes, i: int, j: int, curve: Json) -> None:
+    """Row i, column j: the accuracy on its shade, which is full where half is lost."""
+    shade(axes, i, j, min(max(2 * curve["lost"], 0), 1))
+    write(axes, j + 0.5, i + 0.5, f"{100 * curve['accuracy'][1]:.0f}", BLACK, SMALL)
 
 
 def _reach(curve: Json) -> float:

@@ -18,15 +18,14 @@ from train.studies.method_names import about, plain_name, short_name
 from train.studies.stress_targets import TARGETS, at_targets
 
 Json = Mapping[str, Any]
-PACKAGED = "the packaged bundle, as the box answers"
 BOX, NETWORK = "the box, as it answers", "its network alone"
 SHOWN = 3
 """Corruptions of each method in the table of the first losses."""
 
 
-def render(result: Json) -> tuple[str, dict[str, str]]:
-    """The page (HTML) and its pictures (SVG) by name. Raises FormatError if no method has a
-    result."""
+def render(result: Json, name: str = "stress") -> tuple[str, dict[str, str]]:
+    """The page (HTML) and its pictures (SVG) by name. name: of the file of results. Raises
+    FormatError if no method has a result."""
     entries = {
         plain_name(name): entry for name, entry in result["methods"].items() if entry["curves"]
     }
@@ -36,7 +35,9 @@ def render(result: Json) -> tuple[str, dict[str, str]]:
         )
     curves = {name: entry["curves"] for name, entry in entries.items()}
     ours, box = next(iter(curves)), result["box"]["curves"]
-    pictures = {"matrix": stress_plots.matrix(_columns(result))}
+    paired = _columns(result, "pairs")
+    pictures = {"matrix": stress_plots.matrix(_columns(result, "curves"))}
+    pictures |= {"pairs": stress_plots.pairs(paired)} if paired else {}
     pictures |= {"curves": stress_plots.methods(curves)}
     pictures |= {"box": stress_plots.box(box)} if box else {}
     page = html.render(
@@ -45,12 +46,15 @@ def render(result: Json) -> tuple[str, dict[str, str]]:
         header=provenance.of(result),
         home=html.HOME,
         r=result,
+        name=name,
+        command=command(result, name),
+        worst_pair=worst_pair(paired),
         ours=ours,
         points=exact_percent(POINTS).removesuffix(" %"),
         clean={name: _of(next(iter(those.values())), 0) for name, those in curves.items()},
         pictures={name: html.picture(svg) for name, svg in pictures.items()},
         headline=headline(curves[ours]),
-        first=[[name, *first(those)] for name, those in _with_box(curves, box).items()],
+        first=[[name, *first(those)] for name, those in _with_box(curves, result["box"]).items()],
         most_wrong=most_wrong(box["wrongly"]) if box else None,
         lines=list(target_lines(curves, ours, box)),
         falls=fall_lines(curves, box),
@@ -64,15 +68,39 @@ def render(result: Json) -> tuple[str, dict[str, str]]:
 
 def _with_box(curves: Json, box: Json) -> Json:
     """The curves of methods, and those of the box's right answers if there are any."""
-    return {**curves, **({PACKAGED: box["rightly"]} if box else {})}
+    which = "the packaged bundle" if box["bundle"]["name"] == "default" else "its bundle"
+    answered = {f"{which}, as the box answers": box["curves"]["rightly"]} if box["curves"] else {}
+    return {**curves, **answered}
 
 
-def _columns(result: Json) -> Json:
-    """The columns of the matrix: the box as it answers, its network alone, and the methods."""
-    box = result["box"]["curves"]
+def _columns(result: Json, kind: str) -> Json:
+    """The columns of a matrix: the box as it answers, its network alone, and the methods. kind:
+    "curves", or "pairs" of corruptions, which older results lack."""
+    box = result["box"].get(kind)
     own = {BOX: box["rightly"], NETWORK: box["network"]} if box else {}
-    methods = {short_name(name): entry["curves"] for name, entry in result["methods"].items()}
+    methods = {short_name(name): entry.get(kind) for name, entry in result["methods"].items()}
     return own | {name: curves for name, curves in methods.items() if curves}
+
+
+def worst_pair(columns: Json) -> Json | None:
+    """The pair of corruptions that costs the first column most, and what it leaves; None without
+    pairs."""
+    for curves in columns.values():
+        curve = min(curves.values(), key=lambda one: one["accuracy"][1])
+        return {"title": curve["title"], "share": _of(curve, 1)}
+    return None
+
+
+def command(result: Json, name: str) -> str:
+    """The command line that measures the result again."""
+    words = ["python -m train.studies stress --set", result["train"]]
+    if only := result.get("only"):
+        words += ["--only", *(f"'{one}'" for one in only)]
+    words += ["--split", result["split"]] if result.get("split") else ["--test", result["test"]]
+    words += ["--method", ",".join(result["methods"]), "--seeds", str(len(result["seeds"]))]
+    if name != "stress":
+        words += ["--bundle", "BUNDLE", "--out", f"docs/data/{name}.json"]
+    return " ".join(words)
 
 
 def _refused(methods: Json) -> Json:

@@ -429,6 +429,7 @@ def task(method: str, seed: int, right: list[int], **more) -> dict:
         "ran": "",
         "trouble": {},
         "curves": {"dead": curve},
+        "pairs": {},
     } | more
 
 
@@ -528,11 +529,25 @@ def test_all_applicable_corruptions_by_default():
     trial = EvaluationSweeps(small())
     done = robustness.evaluate_method(method, small(), trial, None, 6)
     assert list(done["curves"]) == [s.name for s in corruptions.applicable(trial)]
+    assert list(done["pairs"]) == [s.name for s in corruptions.pairs()]
     assert seen[0].shape == (12, 3)
     first = corruptions.applicable(trial)[0]
     mild = replace(small(), samples=first.apply(trial, first.severities[1], 6))
     assert (seen[1] == model_inputs("L", mild)).all()
     assert (seen[1] != seen[0]).any()
+
+
+def test_a_pair_is_both_corruptions_at_once():
+    """One dead taxel of each sweep reads 0 and the others have noise; severity 0 changes nothing."""
+    trial = EvaluationSweeps(small())
+    both = {pair.name: pair for pair in corruptions.pairs()}
+    assert len(both) == 10
+    changed = both["noise+dead"].apply(trial, 1, 0)
+    dead = (changed == 0).all(axis=1)
+    assert (dead.sum(axis=(1, 2)) == 1).all()
+    moved = (changed != trial.sweeps.samples).any(axis=1)
+    assert moved[~dead].all()
+    assert (both["noise+dead"].apply(trial, 0, 0) == trial.sweeps.samples).all()
 
 
 def test_what_cannot_be_done_is_said():

@@ -85,7 +85,7 @@ def test_the_matrix_shows_where_each_method_fails_and_the_box_first():
     """Columns: the box, its network, then every method. A cell has the severity of the loss; a dot
     stands for none. The corruption that is endured least is on top.
     """
-    shown = words(stress_plots.matrix(stress_report._columns(stress_data.figures())))
+    shown = words(stress_plots.matrix(stress_report._columns(stress_data.figures(), "curves")))
     own = ["the box, as it answers", "its network alone"]
     columns = shown[shown.index(own[0]) :]
     assert columns[:4] == [*own, "all views", "MiniRocket"]
@@ -94,6 +94,44 @@ def test_the_matrix_shows_where_each_method_fails_and_the_box_first():
         ["50 Hz hum, to 2 deviations", "0.091", "0.62", "0.62", "1.1", "0.42", "·", "0.5", "·"],
         ["dead taxels, to 2 taxels", "1", "2", "2", "1", "2", "·", "·", "·"],
     ]
+
+
+def test_pairs_show_what_is_left_of_each_method():
+    """The pair that costs most is on top; a tile has per cent; older results have none."""
+    columns = stress_report._columns(stress_data.figures(), "pairs")
+    shown = words(stress_plots.pairs(columns))
+    assert shown[:9] == [
+        "50 Hz hum and dead taxels",
+        "0",
+        "85",
+        "85",
+        "45",
+        "80",
+        "74",
+        "65",
+        "74",
+    ]
+    assert shown[9] == "higher gain and 50 Hz hum"
+    page, pictures = stress_report.render(stress_data.figures())
+    assert "The hardest for the first column is 50 Hz hum and dead taxels" in PageReader(page).text
+    assert "pairs" in pictures
+    old = stress_data.figures()
+    old["box"].pop("pairs")
+    for entry in old["methods"].values():
+        entry.pop("pairs")
+    assert "pairs" not in stress_report.render(old)[1]
+
+
+def test_the_command_makes_the_result_again():
+    """Of recorded sweeps with their conditions, the part that is tested, and the bundle."""
+    figures = stress_data.figures()
+    simulated = stress_report.command(figures, "stress")
+    assert "--set sim:T-REAL:1 --test sim:T-REAL:101:2 --method palpate," in simulated
+    assert "--bundle" not in simulated
+    recorded = figures | {"train": "f.npz", "only": ["force<=180"], "split": "rep:0.67"}
+    assert "--set f.npz --only 'force<=180' --split rep:0.67 --method" in stress_report.command(
+        recorded, "stress-fabrics"
+    )
 
 
 def test_methods_of_an_earlier_run_join_if_it_was_of_the_same_sweeps():
@@ -169,11 +207,11 @@ def test_without_a_box_and_with_nothing_that_breaks():
     A method that withstands all corruptions says so.
     """
     figures = stress_data.figures()
-    figures["box"]["curves"] = {}
+    figures["box"]["curves"] = figures["box"]["pairs"] = {}
     figures["methods"] = {"H-svm": figures["methods"]["H-svm"]}
     page, pictures = stress_report.render(figures)
     text = PageReader(page).text
-    assert set(pictures) == {"matrix", "curves"}
+    assert set(pictures) == {"matrix", "pairs", "curves"}
     assert "None of 3 things that can go wrong costs it 5 percentage points" in text
     assert "As the box answers" not in text
     assert "box, rightly" not in text
@@ -191,6 +229,7 @@ def test_the_page_is_drawn_from_its_results(tmp_path: Path):
         "curves.svg",
         "box.svg",
         "matrix.svg",
+        "pairs.svg",
     }
     assert json.loads((page.parent / "stress.json").read_text())["test_sweeps"] == 100
     assert "stress.json" in PageReader(page.read_text()).links

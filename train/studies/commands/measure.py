@@ -22,6 +22,7 @@ from train.arguments.types import Add
 from train.data import sets
 from train.data.progress import Progress
 from train.evaluation import robustness
+from train.evaluation.corruptions import applicable, pairs
 from train.evaluation.evaluation_sweeps import EvaluationSweeps
 from train.export import bundle_stress
 from train.metrics import score
@@ -33,7 +34,9 @@ STRESSED = "sim:T-REAL/level-blind:101-104:1"
 """At 36 attachments at which neither the methods nor the packaged bundle are trained."""
 TAXEL_SWEEPS = 216
 """Sweeps of a file whose taxels are broken, as many as the simulated set has."""
-STRESSED_METHODS = "palpate-reattached,palpate,minirocket,minirocket-augmented,H-svm"
+STRESSED_METHODS = (
+    "palpate-reattached,palpate,minirocket,minirocket-augmented,multirocket-hydra,ds-cnn,H-svm"
+)
 """First the recipe of the packaged bundle."""
 
 
@@ -171,11 +174,17 @@ def _add_stress(add: Add) -> None:
         help=f"the set that is corrupted; a simulated one is drawn anew ({STRESSED})",
     )
     command.add_argument(
+        "--split",
+        metavar="GROUP:SHARE",
+        help="train on this share of the set's groups, as `fit --split` with seed 1, and corrupt "
+        "the rest instead of --test",
+    )
+    command.add_argument(
         "--method",
         default=STRESSED_METHODS,
         metavar="NAME[,NAME...]",
         help="ours first; the first five are drawn; or all; "
-        f"see palpate-train methods ({STRESSED_METHODS})",
+        f"see palpate-train evaluate --list ({STRESSED_METHODS})",
     )
     command.add_argument(
         "--seeds", type=int, default=1, metavar="N", help="of training and corruptions: 1 to N (1)"
@@ -228,11 +237,13 @@ def _add_certainty(add: Add) -> None:
 def run_stress(args: argparse.Namespace) -> None:
     """Write the results; print their path."""
     train, seeds, log = options.load(args), options.seeds(args), options.Log()
-    test = (
-        EvaluationSweeps.simulated(args.test)
-        if args.test.startswith("sim:")
-        else EvaluationSweeps.of(sets.load(args.test).select(args.only))
-    )
+    if args.split:
+        train, rest = train.split(*options.group_share(args.split), 1)
+        test = EvaluationSweeps.of(rest)
+    elif args.test.startswith("sim:"):
+        test = EvaluationSweeps.simulated(args.test)
+    else:
+        test = EvaluationSweeps.of(sets.load(args.test).select(args.only))
     box = _box_under_stress(args.bundle, test, seeds, log)
     result = robustness.run(
         options.names(args),
@@ -246,6 +257,8 @@ def run_stress(args: argparse.Namespace) -> None:
     positions = test.sweeps.groups.get("position")
     result |= {
         "box": box,
+        "only": list(args.only),
+        "split": args.split or "",
         "train": train.source,
         "train_sweeps": len(train),
         "train_digest": sets.digest(train),
@@ -285,17 +298,21 @@ def _box_under_stress(
     sweeps; for the packaged one (None) the curves are then missing."""
     box = Classifier(bundle.load(folder or bundle.DEFAULT), SystemClock(), slides=False)
     try:
-        curves = bundle_stress.under_corruptions(box, test, seeds, log)
+        curves, paired = (
+            bundle_stress.under_corruptions(box, test, seeds, log, those)
+            for those in (applicable(test), pairs())
+        )
     except FormatError:
         if folder:
             raise
-        curves = {}
+        curves, paired = {}, {}
     manifest = box.bundle.manifest
     return {
         "bundle": {"name": manifest.name, "version": manifest.version, "id": box.bundle.id},
         "made": dict(manifest.made),
         "uninformative": robustness.box_answers(box.bundle),
         "curves": curves,
+        "pairs": paired,
     }
 
 
