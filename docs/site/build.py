@@ -29,6 +29,7 @@ RESULTS, SOAK = "results.md", "docs/data/soak.json"
 RESULT_PAGES = {
     "development": "Speed against accuracy: our methods and their peers",
     "paper": "The paper's experiment, run again (simulated)",
+    "stress-fabrics": "Robustness: accuracy on corrupted sweeps of recorded fabrics",
     "stress": "Robustness: accuracy on corrupted sweeps (simulated)",
     "certainty": "Calibration, unknown materials, several sweeps, enrolment (simulated)",
     "soak": "Hours of sweeps without a pause",

@@ -7,6 +7,7 @@ results of today's default is not made twice.
 from __future__ import annotations
 
 import os
+import shlex
 import shutil
 import subprocess
 import sys
@@ -33,9 +34,9 @@ COMMANDS = {"appliance": "palpate"}
 
 @dataclass(frozen=True, slots=True)
 class ResultFile:
-    """One file of results, or a picture with its own header. file: below docs/. words: what
-    `python -m` runs. needs: keys of NEEDS. folds: whether the command has the options that say
-    where folds run and are cached."""
+    """One file of results, or a picture with its own header. file: below docs/. words: a module and
+    its arguments; $PALPATE_DATA in them is the folder of real sweeps. needs: keys of NEEDS.
+    folds: whether the command has the options that say where folds run and are cached."""
 
     name: str
     file: str
@@ -45,8 +46,8 @@ class ResultFile:
 
     @property
     def command(self) -> str:
-        """The command line."""
-        first, *rest = self.words
+        """The command line, for a shell."""
+        first, *rest = (shlex.quote(w) if w.strip("$") == w else w for w in self.words)
         return " ".join([COMMANDS.get(first, f"python -m {first}"), *rest])
 
     def lacks(self) -> list[str]:
@@ -65,6 +66,12 @@ def _study(name: str, *words: str, needs: tuple[str, ...] = (), folds: bool = Tr
     return ResultFile(name, f"data/{name}.json", ("train.studies", name, *words), needs, folds)
 
 
+FABRICS_STRESSED = (
+    *("--set", "$PALPATE_DATA/fabricslide/fabricslide.npz"),
+    *("--only", "direction=0", "force<=180", "--split", "rep:0.67"),
+    *("--method", "palpate,palpate-reattached,minirocket,multirocket-hydra,ds-cnn,H-svm"),
+    *("--out", "docs/data/stress-fabrics.json"),
+)
 REPORTS = (
     _study("development", needs=(REAL,)),
     _study("alignment", folds=False),
@@ -79,6 +86,13 @@ REPORTS = (
     ),
     _study("fabrics", needs=(REAL,)),
     _study("recipe", needs=(REAL,), folds=False),
+    ResultFile(
+        "stress-fabrics",
+        "data/stress-fabrics.json",
+        ("train.studies", "stress", *FABRICS_STRESSED),
+        (REAL,),
+        folds=True,
+    ),
     _study("stress"),
     _study("paper"),
     ResultFile("overview", "overview.svg", ("train.studies", "overview")),
@@ -150,7 +164,8 @@ def make(
             left |= {report.name: "is left out"} if wanted else {}
             continue
         log(f"{number}/{len(reports)} {report.name}: {report.stale() or 'named'}")
-        code = (run or _run)([*report.words, *(where if report.folds else ())])
+        words = map(os.path.expandvars, report.words)
+        code = (run or _run)([*words, *(where if report.folds else ())])
         if code:
             left[report.name] = f"ended with exit code {code}"
     if left:

@@ -98,8 +98,7 @@ def command(result: Json, name: str) -> str:
         words += ["--only", *(f"'{one}'" for one in only)]
     words += ["--split", result["split"]] if result.get("split") else ["--test", result["test"]]
     words += ["--method", ",".join(result["methods"]), "--seeds", str(len(result["seeds"]))]
-    if name != "stress":
-        words += ["--bundle", "BUNDLE", "--out", f"docs/data/{name}.json"]
+    words += ["--out", f"docs/data/{name}.json"] if name != "stress" else []
     return " ".join(words)
 
 

@@ -538,7 +538,7 @@ def test_all_applicable_corruptions_by_default():
 
 
 def test_a_pair_is_both_corruptions_at_once():
-    """One dead taxel of each sweep reads 0 and the others have noise; severity 0 changes nothing."""
+    """One dead taxel of each sweep reads 0, the others have noise; severity 0 changes nothing."""
     trial = EvaluationSweeps(small())
     both = {pair.name: pair for pair in corruptions.pairs()}
     assert len(both) == 10

@@ -11,11 +11,12 @@ from xml.etree import ElementTree
 import pytest
 
 from appliance.core.errors import FormatError
-from tests.factories import rendered, stress_data
+from tests.factories import rendered, stress_data, sweep_sets
 from tests.factories.page_reader import PageReader
 from tests.factories.study_pages import published
 from train.reports import formatting, html, provenance
 from train.studies import stress_plots, stress_report
+from train.studies.command import main
 from train.studies.commands import measure
 from train.studies.method_names import plain_name
 
@@ -123,15 +124,34 @@ def test_pairs_show_what_is_left_of_each_method():
 
 
 def test_the_command_makes_the_result_again():
-    """Of recorded sweeps with their conditions, the part that is tested, and the bundle."""
+    """Of recorded sweeps the conditions that were kept and the part that is tested."""
     figures = stress_data.figures()
     simulated = stress_report.command(figures, "stress")
     assert "--set sim:T-REAL:1 --test sim:T-REAL:101:2 --method palpate," in simulated
-    assert "--bundle" not in simulated
+    assert "--split" not in simulated
     recorded = figures | {"train": "f.npz", "only": ["force<=180"], "split": "rep:0.67"}
     assert "--set f.npz --only 'force<=180' --split rep:0.67 --method" in stress_report.command(
         recorded, "stress-fabrics"
     )
+
+
+@pytest.mark.slow  # fits a model and packs its bundle
+def test_a_recorded_set_is_split_and_its_own_bundle_answers(tmp_path: Path):
+    """One session of three is corrupted; methods and bundle learnt the others. A share that cannot
+    be read ends it before any work."""
+    sweep_sets.tones(12).save(tmp_path / "tones.npz")
+    out = tmp_path / "out.json"
+    words = ["stress", "--set", str(tmp_path / "tones.npz"), "--method", "H-svm", "--jobs", "1"]
+    words += ["--cache", str(tmp_path / "cache"), "--out", str(out), "--split"]
+    assert main([*words, "session:0.67"]) == 0
+    result = json.loads(out.read_text())
+    assert (result["train_sweeps"], result["test_sweeps"]) == (48, 24)
+    assert result["split"] == "session:0.67"
+    assert result["box"]["bundle"]["name"] == "stressed"
+    assert result["box"]["curves"]["rightly"]["noise"]["right"][0] >= 20
+    assert result["box"]["pairs"].keys() == result["box"]["curves"].keys()
+    assert result["methods"]["H-svm"]["pairs"]["noise+dead"]["total"] == 24
+    assert main([*words, "session:most"]) == 65
 
 
 def test_methods_of_an_earlier_run_join_if_it_was_of_the_same_sweeps():

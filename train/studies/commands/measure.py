@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ import numpy as np
 from appliance.bundle import bundle
 from appliance.core.clock import SystemClock
 from appliance.core.errors import FormatError
+from appliance.core.provenance import commit
 from appliance.core.storage import put
 from appliance.inference.classifier import Classifier
 from appliance.sim import skin
@@ -21,12 +23,16 @@ from train.arguments import numbers, options
 from train.arguments.types import Add
 from train.data import sets
 from train.data.progress import Progress
+from train.data.sets import Dataset
 from train.evaluation import robustness
 from train.evaluation.corruptions import applicable, pairs
 from train.evaluation.evaluation_sweeps import EvaluationSweeps
 from train.export import bundle_stress
+from train.export.quantized_bundle import export
 from train.metrics import score
 from train.models import methods
+from train.models.methods import Log
+from train.models.recipe import recipe
 from train.studies import alignment, broken_taxels, certainty, references, sim_calibration
 from train.studies.study import read, results_file, save
 
@@ -190,7 +196,11 @@ def _add_stress(add: Add) -> None:
         "--seeds", type=int, default=1, metavar="N", help="of training and corruptions: 1 to N (1)"
     )
     command.add_argument(
-        "--bundle", type=Path, metavar="DIR", help="that answers as the box does (the packaged one)"
+        "--bundle",
+        type=Path,
+        metavar="DIR",
+        help="that answers as the box does (the packaged one; with --split that of `fit` and "
+        "`export` at their defaults)",
     )
     _add_out(command, "stress")
     command.add_argument(
@@ -244,7 +254,9 @@ def run_stress(args: argparse.Namespace) -> None:
         test = EvaluationSweeps.simulated(args.test)
     else:
         test = EvaluationSweeps.of(sets.load(args.test).select(args.only))
-    box = _box_under_stress(args.bundle, test, seeds, log)
+    with tempfile.TemporaryDirectory() as own:
+        folder = _made_of(train, Path(own), log) if args.split and not args.bundle else args.bundle
+        box = _box_under_stress(folder, test, seeds, log)
     result = robustness.run(
         options.names(args),
         train,
@@ -289,6 +301,12 @@ def _joined(result: dict[str, Any], earlier: dict[str, Any]) -> dict[str, Any]:
         "methods": earlier["methods"] | result["methods"],
         "earlier": [*earlier.get("earlier", []), {"methods": lacks} | origin],
     }
+
+
+def _made_of(train: Dataset, folder: Path, log: Log) -> Path:
+    """The bundle that `fit` and `export` make of these sweeps at their defaults."""
+    export(recipe.fit(train, 1, log=log), folder / "bundle", "stressed", "1", commit())
+    return folder / "bundle"
 
 
 def _box_under_stress(
