@@ -218,8 +218,9 @@ class Manifest:
         for name in ("unloaded", "speeds", "bridging", "sliding"):
             if not values[name]:
                 del values[name]
-        for name, added in (("early", "limits"), ("moved", "farthest_mm")):
-            if values[name] and not values[name][added]:
+        added_later = ("early", "limits"), ("moved", "farthest_mm"), ("bridging", "loads")
+        for name, added in added_later:
+            if values.get(name) and not values[name][added]:
                 del values[name][added]
         return (json.dumps(values, indent=1, sort_keys=True) + "\n").encode()
 
@@ -277,6 +278,12 @@ def _check_parts(manifest: Manifest) -> None:
         raise BundleError(
             f"manifest bridges {manifest.bridging.taxels} of {taxels} taxels, which leaves none; "
             "export the bundle again"
+        )
+    loads = manifest.bridging and manifest.bridging.loads
+    if loads and len(loads.mean) != manifest.format.channels:
+        raise BundleError(
+            f"manifest has {len(loads.mean)} loads in `bridging` for {manifest.format.channels} "
+            "values of a frame; export the bundle again"
         )
     if manifest.sliding and len(manifest.sliding.least) > len(manifest.labels):
         raise BundleError(

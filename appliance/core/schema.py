@@ -162,7 +162,7 @@ def _nested(hint: Any, value: Any) -> Any:
     """A JSON value for a field of type `hint`: lists become tuples and objects dataclasses as the
     type requires."""
     if get_origin(hint) is tuple and isinstance(value, list):
-        return tuple(value)
+        return tuple(_nested(get_args(hint)[0], v) for v in value)
     if get_origin(hint) is dict and isinstance(value, dict):
         return {name: _nested(get_args(hint)[1], v) for name, v in value.items()}
     alternatives = get_args(hint) if get_origin(hint) is UnionType else (hint,)

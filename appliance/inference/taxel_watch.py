@@ -94,7 +94,7 @@ class TaxelWatch:
             return taxels, inspect(taxels, tare, m.thresholds, measured=measured)
         if not m.bridging.allows(broken.mask):
             return taxels, self._too_many(broken, measured, tare)
-        taxels = bridged(taxels, broken.mask, m.tare)
+        taxels = bridged(taxels, broken.mask, m.tare, m.bridging.loads)
         return taxels, replace(inspect(taxels, tare, m.thresholds), degraded=broken.text)
 
     def _in_window(

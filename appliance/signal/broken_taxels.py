@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from appliance.core.errors import BundleError
 from appliance.core.types import SweepFormat, normal
+from appliance.signal.load_modes import LoadModes
 from appliance.signal.taxel_statistics import TaxelStatistics
 from appliance.signal.window_check import WindowLimits, enclosed
 
@@ -41,7 +42,8 @@ class Bridging:
     taxels: largest number of broken taxels at any places. row, column: whether all broken taxels
     may also lie in one row, or in one column. noise: a taxel is noisy from this many times the
     noise of its neighbours. quietest: noise in counts of the quietest neighbours in training.
-    still: whether sound taxels were constant in training.
+    still: whether sound taxels were constant in training. loads: tell the load of a broken taxel;
+    without them its direct neighbours do.
     """
 
     taxels: int
@@ -50,6 +52,7 @@ class Bridging:
     noise: float
     quietest: float
     still: bool
+    loads: LoadModes | None = None
 
     def __post_init__(self) -> None:
         if type(self.taxels) is not int or not 0 <= self.taxels <= MOST_TAXELS:
@@ -74,7 +77,8 @@ class Bridging:
     def text(self) -> str:
         """The broken taxels that may be bridged, in words."""
         lines = " or ".join(["one row"] * self.row + ["one column"] * self.column)
-        taxels = f"up to {self.taxels} broken taxels" if self.taxels else ""
+        many = "one broken taxel" if self.taxels == 1 else f"up to {self.taxels} broken taxels"
+        taxels = many if self.taxels else ""
         return " or ".join(filter(None, (taxels, lines))) or "no broken taxel"
 
 
@@ -227,26 +231,41 @@ def _beside(mask: Mask) -> Mask:
     return beside
 
 
-def bridged(taxels: NDArray[Any], broken: Mask, unloaded: NDArray[np.float64]) -> NDArray[Any]:
+def bridged(
+    taxels: NDArray[Any],
+    broken: Mask,
+    unloaded: NDArray[np.float64],
+    loads: LoadModes | None = None,
+) -> NDArray[Any]:
     """A copy of raw counts [T, R, C] or [T, R, C, A] with the taxels of the mask `broken` [R, C]
-    replaced: the load of each is the mean of its direct neighbours.
+    replaced: each by what `loads` tell of it, or else by the mean load of its direct neighbours.
 
     unloaded: [R, C] or [R, C, A] raw counts of the unloaded skin in training, since taxels without
     load differ. At least one taxel must not be broken.
     """
     filled = taxels.copy()
     flat = filled.reshape(len(taxels), broken.size, -1)  # [T, R * C, A]
+    if loads:
+        values = np.repeat(broken.ravel(), flat.shape[2])
+        frames = flat.reshape(len(taxels), -1)
+        frames[:, values] = _counts(loads.expected(frames, values), taxels.dtype)
+        return filled
     base = unloaded.reshape(broken.size, -1)
     targets, sources, weights = _weights(*broken.shape, broken.tobytes())
     offset = (base[targets] - weights @ base[sources]).astype(np.float32)
     part = flat[:, sources].astype(np.float32)
     # [T, A, targets] of [T, sources, A]
     new = np.tensordot(part, weights.astype(np.float32), axes=(1, 1)).swapaxes(1, 2) + offset
-    if taxels.dtype.kind != "f":
-        limits = np.iinfo(taxels.dtype)
-        new = np.clip(np.rint(new), limits.min, limits.max)
-    flat[:, targets] = new
+    flat[:, targets] = _counts(new, taxels.dtype)
     return filled
+
+
+def _counts(x: NDArray[np.float32], kind: np.dtype[Any]) -> NDArray[Any]:
+    """`x` within the range of the type, whole numbers if it holds such."""
+    if kind.kind == "f":
+        return x
+    limits = np.iinfo(kind)
+    return np.clip(np.rint(x), limits.min, limits.max)
 
 
 @lru_cache(maxsize=4)

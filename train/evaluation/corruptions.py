@@ -1,10 +1,9 @@
-"""Corruptions of test sweeps: one fault at a time, in steps from none to severe, or two at once.
+"""Corruptions of test sweeps: one fault at a time, in steps from none to severe.
 
-Each corruption is an entry of CORRUPTIONS; `pairs` joins two of raw counts. A physical corruption
-of simulated sweeps draws them again with another placement of the skin, another force or another
-window, each sweep from its own random stream. All other corruptions change the raw counts, which
-are then digitized again. The random draws do not depend on the severity, so that a corruption only
-grows with it.
+Each corruption is an entry of CORRUPTIONS. A physical corruption of simulated sweeps draws them
+again with another placement of the skin, another force or another window, each sweep from its own
+random stream. All other corruptions change the raw counts, which are then digitized again. The
+random draws do not depend on the severity, so that a corruption only grows with it.
 """
 
 from __future__ import annotations
@@ -12,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -452,41 +450,6 @@ CORRUPTIONS = (
         _noise,
     ),
 )
-
-
-PAIRED = {"gain-down": 0.2, "hum": 0.5, "noise": 0.3, "dead": 1, "lost": 0.05}
-"""Faults that occur together, each at one severity, in the order in which a signal meets them."""
-
-
-def pairs() -> tuple[Corruption, ...]:
-    """Each two of PAIRED at once, for any sweeps. Severity 1 means both, 0 none."""
-    those = zip(find(list(PAIRED)), PAIRED.values(), strict=True)
-    return tuple(_pair(*first, *second) for first, second in combinations(those, 2))
-
-
-def _pair(one: Corruption, much: float, other: Corruption, more: float) -> Corruption:
-    both = partial(_both, one.change, much, other.change, more)
-    return Corruption(
-        f"{one.name}+{other.name}",
-        f"{one.title} and {other.title}",
-        "",
-        (0, 1),
-        f"{one.about}; {other.about}",
-        both,
-    )
-
-
-def _both(
-    one: Change,
-    much: float,
-    other: Change,
-    more: float,
-    x: Array,
-    severity: float,
-    rng: Generator,
-    test: EvaluationSweeps,
-) -> Array:
-    return other(one(x, much * severity, rng, test), more * severity, rng, test)
 
 
 def applicable(test: EvaluationSweeps) -> tuple[Corruption, ...]:

@@ -25,7 +25,8 @@ from appliance.recording.sweep_window import SweepCutter
 from appliance.sim.rig import VirtualClock
 from train.data.sets import Dataset, digest
 from train.evaluation import parallel
-from train.evaluation.corruptions import Corruption, applicable, pairs
+from train.evaluation.corruption_pairs import pairs
+from train.evaluation.corruptions import Corruption, applicable
 from train.evaluation.evaluate import Where
 from train.evaluation.evaluation_sweeps import EvaluationSweeps
 from train.evaluation.fold import fingerprint

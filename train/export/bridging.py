@@ -1,14 +1,17 @@
 """Measures how many broken taxels a bundle tolerates if the box bridges them.
 
-The limits of a noisy and of a silent taxel are learned from sound sweeps. Then taxels are broken at
-their worst places, one more at a time, and the box answers the held-out sweeps. The manifest gets
-the largest number at which it names about as many as with a sound skin.
+The limits of a noisy and of a silent taxel are learned from sound sweeps, and how the loads of
+taxels move together. Direct neighbours tell what a broken taxel would read; loads do if they leave
+the true material more probable at the worst place. Then taxels are broken at their worst places,
+one more at a time, and the box answers the held-out sweeps. The manifest gets the largest number at
+which it names about as many as with a sound skin.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +26,7 @@ from appliance.core.storage import put
 from appliance.core.types import Status
 from appliance.inference.classifier import Classifier
 from appliance.signal.broken_taxels import Bridging, Comparison, places
+from appliance.signal.load_modes import LoadModes
 from appliance.signal.taxel_statistics import TaxelStatistics
 from train.data.sets import Dataset, digest
 from train.evaluation.corruptions import TAXEL_FAULTS, digitized
@@ -45,7 +49,13 @@ CANDIDATES = 32
 """Taxels among which the worst places are searched: those with the strongest signal."""
 SEARCHED, JUDGED = 40, 240
 """Number of sweeps that find the worst places, and that judge the answers there."""
-LOST, WRONG = 0.02, 0.01
+MODES, MOST_VALUES = 2, 256
+"""Number of modes of loads, and the largest number of values of a frame for which they are learned:
+a manifest holds three numbers for each."""
+GAIN = 0.02
+"""Probability of the true material at the worst place by which loads have to be better than
+neighbours, on the mean; neighbours need no training, so they hold for any attachment."""
+LOST, WRONG = 0.1, 0.01
 """Accepted loss of accuracy, and accepted rise of wrong answers, as shares; one sweep is always
 accepted."""
 
@@ -66,13 +76,8 @@ def measure(bundle: Bundle, sound: Dataset, held_out: Dataset, seed: int = 0) ->
     limits = learned(sound)
     trial = replace(limits, taxels=rows * cols - 1, row=True, column=True)
     test = EvaluationSweeps.of(held_out, JUDGED, seed)
-    box = Classifier(
-        replace(bundle, manifest=replace(bundle.manifest, bridging=trial)),
-        SystemClock(),
-        slides=False,
-    )
-    sample = EvaluationSweeps.of(test.sweeps, SEARCHED, seed)
-    bench = _Bench(box, test, sample, seed)
+    bench = _better(bundle, [trial, replace(trial, loads=load_modes(sound))], test, seed)
+    limits = replace(limits, loads=bench.loads)
     figures: dict[str, Any] = {"sweeps": len(test.sweeps), "sound": bench.clean}
     taxels = 0
     for mask in _worst_places(bench, min(MOST, rows * cols // 4)):
@@ -80,13 +85,50 @@ def measure(bundle: Bundle, sound: Dataset, held_out: Dataset, seed: int = 0) ->
         if not holds:
             break
         taxels += 1
-    lines = {}
+    lines: dict[str, bool] = {}
     for name, count, others in (("row", rows, cols), ("column", cols, rows)):
         lines[name] = False
         if min(count, others) > 1:
-            mask = bench.worst(_lines(rows, cols, name))
+            mask, _ = bench.worst(_lines(rows, cols, name))
             lines[name], figures[f"one {name}"] = bench.judged(mask)
-    return Tolerance(replace(limits, taxels=taxels, **lines), figures)
+    row, column = lines["row"], lines["column"]
+    return Tolerance(replace(limits, taxels=taxels, row=row, column=column), figures)
+
+
+def _better(bundle: Bundle, rules: Sequence[Bridging], test: EvaluationSweeps, seed: int) -> _Bench:
+    """The second of two rules where its worst single taxel leaves the true material more probable
+    than that of the first, by GAIN."""
+    sample = EvaluationSweeps.of(test.sweeps, SEARCHED, seed)
+    first, second = (_Bench.of(bundle, rule, test, sample, seed) for rule in rules)
+    if second.loads is None:
+        return first
+    single = np.zeros(first.signal.shape, bool)
+    worst = [bench.worst(map(_with(single), bench.places()))[1] for bench in (first, second)]
+    return second if worst[1] > worst[0] + GAIN * len(sample.sweeps) else first
+
+
+def load_modes(sound: Dataset) -> LoadModes | None:
+    """How the loads of taxels move together in sweeps of a sound skin; None for large skins, and
+    for sweeps that do not show it."""
+    loads = sound.samples.mean(axis=1, dtype=np.float64).reshape(len(sound), -1)
+    if not MODES + 1 < loads.shape[1] <= MOST_VALUES or len(loads) <= MODES + 1:
+        return None
+    away = loads - loads.mean(axis=0)
+    variances, axes = np.linalg.eigh(away.T @ away / len(away))
+    rest = float(variances[:-MODES].mean())
+    if not rest > 0:
+        return None
+    modes = np.sqrt(variances[-MODES:] - rest) * axes[:, -MODES:]
+    return LoadModes(
+        tuple(_short(loads.mean(axis=0))),
+        tuple(map(tuple, map(_short, modes.T))),
+        _short([rest])[0],
+    )
+
+
+def _short(values: Any) -> list[float]:
+    """With five digits, as the manifest holds them."""
+    return [float(f"{value:.5g}") for value in values]
 
 
 def learned(sound: Dataset) -> Bridging:
@@ -120,15 +162,44 @@ class _Bench:
     ) -> None:
         self._box, self._test, self._sample, self._seed = box, test, sample, seed
         self.signal = test.deviation.reshape(*test.deviation.shape[:2], -1).sum(axis=2)
-        self.clean = self._counts(test.sweeps)[:2]
 
-    def worst(self, masks: Iterable[Array]) -> Array:
-        """The mask [R, C] whose taxels, dead, leave the true materials the least probability."""
+    @classmethod
+    def of(
+        cls,
+        bundle: Bundle,
+        rule: Bridging,
+        test: EvaluationSweeps,
+        sample: EvaluationSweeps,
+        seed: int,
+    ) -> _Bench:
+        """With the box that bridges by `rule`."""
+        manifest = replace(bundle.manifest, bridging=rule)
+        box = Classifier(replace(bundle, manifest=manifest), SystemClock(), slides=False)
+        return cls(box, test, sample, seed)
+
+    @property
+    def loads(self) -> LoadModes | None:
+        """The loads by which the box bridges."""
+        rule = self._box.bundle.manifest.bridging
+        return rule.loads if rule else None
+
+    @cached_property
+    def clean(self) -> list[int]:
+        return self._counts(self._test.sweeps)[:2]
+
+    def places(self) -> list[int]:
+        """Numbers of the taxels that are tried: those with the strongest signal."""
+        strongest: list[int] = np.argsort(-self.signal, axis=None)[:CANDIDATES].tolist()
+        return strongest
+
+    def worst(self, masks: Iterable[Array]) -> tuple[Array, float]:
+        """The mask [R, C] whose taxels, dead, leave the true materials the least probability, and
+        its sum over the sample."""
 
         def likely(mask: Array) -> float:
             return float(self._counts(self._broken("dead", mask, self._sample))[2])
 
-        return min(masks, key=likely)
+        return min(((mask, likely(mask)) for mask in masks), key=lambda found: found[1])
 
     def judged(self, mask: Array) -> tuple[bool, dict[str, Any]]:
         """Whether the box answers as with a sound skin while the taxels of `mask` [R, C] are dead
@@ -170,10 +241,9 @@ def _worst_places(bench: _Bench, most: int) -> Iterable[Array]:
     """Masks [R, C] of one broken taxel, two, and so on: to the worst places so far the worst other
     one is added."""
     mask = np.zeros(bench.signal.shape, bool)
-    strongest = np.argsort(-bench.signal, axis=None)[:CANDIDATES]
     for _ in range(most):
-        left = [at for at in strongest if not mask.flat[at]]
-        mask = bench.worst(map(_with(mask), left))
+        left = [at for at in bench.places() if not mask.flat[at]]
+        mask, _ = bench.worst(map(_with(mask), left))
         yield mask
 
 

@@ -19,7 +19,7 @@ from appliance.core.errors import FormatError
 from appliance.core.types import Status, SweepFormat
 from appliance.sim import skin
 from train.data.sets import Dataset
-from train.evaluation import corruptions, robustness
+from train.evaluation import corruption_pairs, corruptions, robustness
 from train.evaluation.evaluate import Where
 from train.evaluation.evaluation_sweeps import EvaluationSweeps
 from train.models import methods
@@ -529,7 +529,7 @@ def test_all_applicable_corruptions_by_default():
     trial = EvaluationSweeps(small())
     done = robustness.evaluate_method(method, small(), trial, None, 6)
     assert list(done["curves"]) == [s.name for s in corruptions.applicable(trial)]
-    assert list(done["pairs"]) == [s.name for s in corruptions.pairs()]
+    assert list(done["pairs"]) == [s.name for s in corruption_pairs.pairs()]
     assert seen[0].shape == (12, 3)
     first = corruptions.applicable(trial)[0]
     mild = replace(small(), samples=first.apply(trial, first.severities[1], 6))
@@ -540,7 +540,7 @@ def test_all_applicable_corruptions_by_default():
 def test_a_pair_is_both_corruptions_at_once():
     """One dead taxel of each sweep reads 0, the others have noise; severity 0 changes nothing."""
     trial = EvaluationSweeps(small())
-    both = {pair.name: pair for pair in corruptions.pairs()}
+    both = {pair.name: pair for pair in corruption_pairs.pairs()}
     assert len(both) == 10
     changed = both["noise+dead"].apply(trial, 1, 0)
     dead = (changed == 0).all(axis=1)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from appliance.core.clock import SystemClock
 from appliance.core.errors import BundleError, FormatError
 from appliance.core.types import Status
 from appliance.inference.classifier import Classifier
+from appliance.signal.broken_taxels import bridged
 from tests.factories import toy_bundle
 from train.cli.main import main
 from train.data import sets
@@ -78,6 +80,62 @@ def test_a_bundle_that_needs_no_single_taxel_tolerates_a_quarter(tmp_path: Path)
     assert (rule.taxels, rule.row, rule.column) == (4, True, True)
     assert found.figures["4 taxels"]["stuck"] == [5, 0]
     bundle.Manifest.parse(replace(loaded.manifest, bridging=rule).json())
+
+
+def pressed(n: int = 40) -> Dataset:
+    """Two materials that differ in the load of row 1, whose taxels are pressed four times as hard
+    as their neighbours and together, by different forces."""
+    rng = np.random.default_rng(0)
+    labels, force = np.arange(n) % 2, rng.uniform(0.8, 1.2, n)
+    hard = np.array([4.0, 1.0, 1.0, 1.0])[:, None] * np.array([1.0, 1.2, 0.8, 1.1])
+    level = force[:, None, None] * (60 * hard + 60 * labels[:, None, None] * (hard > 2))
+    level = np.repeat(level[:, None], 100, axis=1)
+    samples = np.rint(level + rng.standard_normal(level.shape)).astype(np.int16)
+    return Dataset(samples, labels, ("a", "b"), 100.0, {}, "pressed")
+
+
+class Weighed:
+    """A box that names a material by the load of taxel 1.1."""
+
+    def __init__(self, told: bundle.Bundle, *rest: Any, **more: Any) -> None:
+        self.bundle = told
+
+
+def test_loads_that_differ_in_every_sweep_bridge_better_than_neighbours(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    """Of a skin whose taxels are pressed differently the loads tell a broken taxel; the manifest
+    keeps them. Where neighbours do as well, these stay."""
+    sweeps = pressed()
+
+    def counts(self: Any, given: Dataset) -> list[Any]:
+        rule, right = self._box.bundle.manifest.bridging, 0
+        for window, label in zip(given.samples, given.labels, strict=True):
+            broken = (window == 0).all(axis=0)
+            filled = (
+                bridged(window, broken, np.zeros((4, 4)), rule.loads) if broken.any() else window
+            )
+            right += int((filled[:, 0, 0].mean() / filled[:, 2, 0].mean() > 4.5) == label)
+        return [right, len(given) - right, float(right)]
+
+    monkeypatch.setattr(bridging, "Classifier", Weighed)
+    monkeypatch.setattr(bridging._Bench, "_counts", counts)
+    loaded = bundle.load(toy(tmp_path))
+    found = bridging.measure(loaded, sweeps, sweeps).bridging
+    assert found.loads is not None
+    assert found.taxels >= 1
+    even = replace(sweeps, samples=np.tile(sweeps.samples[:, :, :1, :1], (1, 1, 4, 4)))
+    assert bridging.measure(loaded, even, even).bridging.loads is None
+    kept = replace(loaded.manifest, bridging=found)
+    assert bundle.Manifest.parse(kept.json()).bridging == found
+
+
+@pytest.mark.parametrize("shape", [(9, 20, 1, 3), (9, 20, 20, 20), (3, 20, 4, 4)])
+def test_skins_and_sets_that_show_no_modes(shape: tuple[int, ...]):
+    """Too few values of a frame, too many for a manifest, and too few sweeps."""
+    labels = np.arange(shape[0]) % 2
+    samples = np.random.default_rng(0).integers(0, 99, shape).astype(np.int16)
+    assert bridging.load_modes(Dataset(samples, labels, ("a", "b"), 100.0, {}, "x")) is None
 
 
 def test_the_packaged_bundle_bridges_what_its_manifest_says():

@@ -25,7 +25,8 @@ from train.data import sets
 from train.data.progress import Progress
 from train.data.sets import Dataset
 from train.evaluation import robustness
-from train.evaluation.corruptions import applicable, pairs
+from train.evaluation.corruption_pairs import pairs
+from train.evaluation.corruptions import applicable
 from train.evaluation.evaluation_sweeps import EvaluationSweeps
 from train.export import bundle_stress
 from train.export.quantized_bundle import export
@@ -173,18 +174,7 @@ def _add_taxels(add: Add) -> None:
 def _add_stress(add: Add) -> None:
     command = add("stress", run_stress)
     options.add_set(command, "sim:T-REAL/level-blind:1")
-    command.add_argument(
-        "--test",
-        default=STRESSED,
-        metavar="SET",
-        help=f"the set that is corrupted; a simulated one is drawn anew ({STRESSED})",
-    )
-    command.add_argument(
-        "--split",
-        metavar="GROUP:SHARE",
-        help="train on this share of the set's groups, as `fit --split` with seed 1, and corrupt "
-        "the rest instead of --test",
-    )
+    _add_corrupted(command)
     command.add_argument(
         "--method",
         default=STRESSED_METHODS,
@@ -216,6 +206,22 @@ def _add_stress(add: Add) -> None:
     )
     options.add_effort(command)
     options.add_where(command)
+
+
+def _add_corrupted(command: argparse.ArgumentParser) -> None:
+    """The options that say what is corrupted."""
+    command.add_argument(
+        "--test",
+        default=STRESSED,
+        metavar="SET",
+        help=f"the set that is corrupted; a simulated one is drawn anew ({STRESSED})",
+    )
+    command.add_argument(
+        "--split",
+        metavar="GROUP:SHARE",
+        help="train on this share of the set's groups, as `fit --split` with seed 1, and corrupt "
+        "the rest instead of --test",
+    )
 
 
 def _add_certainty(add: Add) -> None:
