@@ -1,10 +1,10 @@
 """Measures how many broken taxels a bundle tolerates if the box bridges them.
 
 The limits of a noisy and of a silent taxel are learned from sound sweeps, and how the loads of
-taxels move together. Direct neighbours tell what a broken taxel would read; loads do if they leave
-the true material more probable at the worst place. Then taxels are broken at their worst places,
-one more at a time, and the box answers the held-out sweeps. The manifest gets the largest number at
-which it names about as many as with a sound skin.
+taxels move together. The box bridges a broken taxel by its direct neighbours. It uses the loads
+instead if the true material is then more probable at the worst place. Then taxels are broken at
+their worst places, one more at a time, and the box answers the held-out sweeps. The manifest gets
+the largest number at which it names about as many as with a sound skin.
 """
 
 from __future__ import annotations

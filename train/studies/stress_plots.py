@@ -119,7 +119,7 @@ def _table(
     columns: Mapping[str, Json], rows: Mapping[str, str], cell: Callable[..., None], said: str
 ) -> str:
     """Tiles of corruptions by methods. rows: the text of each corruption, by its name. cell: draws
-    a tile of (axes, row, column, curve). said: what the picture shows, in words."""
+    a tile of (axes, row, column, curve). said: a description of the picture."""
     above = 1.5
     figure, axes = single_axes(
         above + 0.24 * len(rows) + 0.05, left=0.43, right=0.93, top=above, bottom=0.05

@@ -83,7 +83,7 @@ def _columns(result: Json, kind: str) -> Json:
 
 
 def worst_pair(columns: Json) -> Json | None:
-    """The pair of corruptions that costs the first column most, and what it leaves; None without
+    """The hardest pair of corruptions for the first column, with its accuracy; None without
     pairs."""
     for curves in columns.values():
         curve = min(curves.values(), key=lambda one: one["accuracy"][1])

@@ -209,7 +209,7 @@ def _add_stress(add: Add) -> None:
 
 
 def _add_corrupted(command: argparse.ArgumentParser) -> None:
-    """The options that say what is corrupted."""
+    """The options of the corrupted set."""
     command.add_argument(
         "--test",
         default=STRESSED,
