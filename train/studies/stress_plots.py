@@ -52,6 +52,8 @@ AREA = 8.0
 NETWORK: Mapping[str, Any] = {"color": BLACK, "linewidth": 1.0, "linestyle": (0, (3, 1.5))}
 COLUMNS, HEIGHT = 3, 1.42
 """Small pictures in a row; height of each in inches, with title and labels."""
+LONGEST_CELL = 4
+"""Letters that fit into a tile."""
 LINE, LONGEST = 0.2, 16
 """In a legend: length of a line in inches, and the letters of a text if three fit in a row."""
 
@@ -163,6 +165,7 @@ def _cell(axes: Axes, i: int, j: int, curve: Json) -> None:
     falls = curve["falls"]
     shade(axes, i, j, 1 - _reach(curve))
     text = "·" if falls is None else level(curve, falls).partition(" ")[0]
+    text = f"{falls:.1g}" if len(text) > LONGEST_CELL else text
     write(axes, j + 0.5, i + 0.5, text, GREY if falls is None else BLACK, SMALL)
 
 

@@ -110,10 +110,8 @@ def stress_facts(result: Any) -> Facts:
         for mean, low, high in at_targets(those).values():
             yield f"{number(mean)} % {number(low)} – {number(high)} %"
     yield f"{result['test_sweeps']} of {result['test']} ({result['test_digest']})"
-    yield (
-        f"bundle {result['box']['bundle']['name']} {result['box']['bundle']['version']},"
-        f" {result['box']['bundle']['id']}"
-    )
+    bundle = result["box"]["bundle"]
+    yield ", ".join(filter(None, [f"bundle {bundle['name']} {bundle['version']}", bundle["id"]]))
 
 
 def soak_facts(records: Any) -> Facts:
@@ -180,6 +178,10 @@ PAGES: dict[str, tuple[Callable[[], str], Callable[[], Facts]]] = {
     "stress": (
         lambda: stress_report.render(committed("stress"))[0],
         lambda: stress_facts(committed("stress")),
+    ),
+    "stress-fabrics": (
+        lambda: stress_report.render(committed("stress-fabrics"), "stress-fabrics")[0],
+        lambda: stress_facts(committed("stress-fabrics")),
     ),
     "soak": (
         lambda: soak_page.render(committed("soak"))[0],

@@ -39,6 +39,8 @@ from train.studies.study import read, results_file, save
 
 STRESSED = "sim:T-REAL/level-blind:101-104:1"
 """At 36 attachments at which neither the methods nor the packaged bundle are trained."""
+OWN = "stressed"
+"""Name of a bundle that the study makes for itself."""
 TAXEL_SWEEPS = 216
 """Sweeps of a file whose taxels are broken, as many as the simulated set has."""
 STRESSED_METHODS = (
@@ -311,7 +313,7 @@ def _joined(result: dict[str, Any], earlier: dict[str, Any]) -> dict[str, Any]:
 
 def _made_of(train: Dataset, folder: Path, log: Log) -> Path:
     """The bundle that `fit` and `export` make of these sweeps at their defaults."""
-    export(recipe.fit(train, 1, log=log), folder / "bundle", "stressed", "1", commit())
+    export(recipe.fit(train, 1, log=log), folder / "bundle", OWN, "1", commit())
     return folder / "bundle"
 
 
@@ -331,8 +333,9 @@ def _box_under_stress(
             raise
         curves, paired = {}, {}
     manifest = box.bundle.manifest
+    number = box.bundle.id if manifest.name != OWN else ""  # this file is gone after the run
     return {
-        "bundle": {"name": manifest.name, "version": manifest.version, "id": box.bundle.id},
+        "bundle": {"name": manifest.name, "version": manifest.version, "id": number},
         "made": dict(manifest.made),
         "uninformative": robustness.box_answers(box.bundle),
         "curves": curves,
