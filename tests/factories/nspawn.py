@@ -72,7 +72,7 @@ CABLED = "ExecStart=\nExecStart=/opt/palpate/bin/python /opt/palpate/cable.py ru
 PALPATE = "/opt/palpate/bin/palpate"
 SITE = "/etc/palpate/palpate.toml"
 STREAMS = r"skin streaming\. Sweeps answered: \d+"
-WAIT_S = 30
+WAIT_S = 60
 """Longest wait for an action of a second or two. Other programs may keep this machine busy."""
 PATH = "PATH=/usr/sbin:/usr/bin:/sbin:/bin"
 BOOT_S = 60
