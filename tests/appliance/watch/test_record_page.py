@@ -260,11 +260,11 @@ def test_timed_sweeps_are_counted_down(
         )
         seen = BrowsedPage(context, one.page.server.address)
         for sweeping, words in ((False, "Next sweep in"), (True, "Slide now")):
-            due_ns = SystemClock().now_ns() + 20 * SECOND
+            due_ns = SystemClock().now_ns() + 60 * SECOND
             one.health = replace(one.health, due_ns=due_ns, sweeping=sweeping, ready=not sweeping)
             until(lambda words=words: seen.text("#call") == words and seen.text("#countdown"))
             before = float(seen.text("#countdown"))
-            assert 5 < before < 30  # the page learns the clock late by the delay of an event
+            assert 5 < before < 70  # the page learns the clock late by the delay of an event
             until(lambda before=before: float(seen.text("#countdown")) < before)
             box = seen.page.locator("#countdown").bounding_box()
             assert box["height"] >= 96
