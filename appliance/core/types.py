@@ -128,6 +128,16 @@ def normal(counts: NDArray[Any], before: int) -> NDArray[Any]:
     return counts[..., -1] if counts.ndim == before + 3 else counts
 
 
+def digitized(x: NDArray[Any], kind: np.dtype[Any]) -> NDArray[Any]:
+    """Counts as the converter gives them: whole numbers within the range of their type. float32
+    stays unchanged."""
+    if kind.kind == "f":
+        return x.astype(kind)
+    limits = np.iinfo(kind)
+    counts: NDArray[Any] = np.clip(np.rint(x), limits.min, limits.max).astype(kind)
+    return counts
+
+
 def shown(shape: Sequence[int]) -> str:
     """A shape for a person: "3x3", "3x3x3"."""
     return "x".join(map(str, shape))

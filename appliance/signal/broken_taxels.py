@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appliance.core.errors import BundleError
-from appliance.core.types import SweepFormat, normal
+from appliance.core.types import SweepFormat, digitized, normal
 from appliance.signal.load_modes import LoadModes
 from appliance.signal.taxel_statistics import TaxelStatistics
 from appliance.signal.window_check import WindowLimits, enclosed
@@ -248,7 +248,7 @@ def bridged(
     if loads:
         values = np.repeat(broken.ravel(), flat.shape[2])
         frames = flat.reshape(len(taxels), -1)
-        frames[:, values] = _counts(loads.expected(frames, values), taxels.dtype)
+        frames[:, values] = digitized(loads.expected(frames, values), taxels.dtype)
         return filled
     base = unloaded.reshape(broken.size, -1)
     targets, sources, weights = _weights(*broken.shape, broken.tobytes())
@@ -256,16 +256,8 @@ def bridged(
     part = flat[:, sources].astype(np.float32)
     # [T, A, targets] of [T, sources, A]
     new = np.tensordot(part, weights.astype(np.float32), axes=(1, 1)).swapaxes(1, 2) + offset
-    flat[:, targets] = _counts(new, taxels.dtype)
+    flat[:, targets] = digitized(new, taxels.dtype)
     return filled
-
-
-def _counts(x: NDArray[np.float32], kind: np.dtype[Any]) -> NDArray[Any]:
-    """`x` within the range of the type, whole numbers if it holds such."""
-    if kind.kind == "f":
-        return x
-    limits = np.iinfo(kind)
-    return np.clip(np.rint(x), limits.min, limits.max)
 
 
 @lru_cache(maxsize=4)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from appliance.core.errors import FormatError
-from appliance.core.types import Frames
+from appliance.core.types import Frames, digitized
 from appliance.recording import sweep_window
 from appliance.sim import skin
 from train.evaluation.evaluation_sweeps import EvaluationSweeps, SimulatedScene
@@ -77,15 +77,6 @@ class Corruption:
         return digitized(
             self.change(samples.astype(np.float32), severity, rng, test), samples.dtype
         )
-
-
-def digitized(x: Array, kind: np.dtype[Any]) -> Array:
-    """Counts as the converter gives them: whole numbers within the range of their type. float32
-    stays unchanged."""
-    if kind.kind == "f":
-        return x.astype(kind)
-    limits = np.iinfo(kind)
-    return np.clip(np.rint(x), limits.min, limits.max).astype(kind)
 
 
 def _scene(test: EvaluationSweeps) -> SimulatedScene:

@@ -17,6 +17,7 @@ from pathlib import Path
 
 from appliance.core.errors import FormatError
 from train.reports import provenance
+from train.studies.fabrics_experiment import FABRICS, SEVEN
 
 DOCS = Path("docs")
 Run = Callable[[Sequence[str]], int]
@@ -67,8 +68,7 @@ def _study(name: str, *words: str, needs: tuple[str, ...] = (), folds: bool = Tr
 
 
 FABRICS_STRESSED = (
-    *("--set", "$PALPATE_DATA/fabricslide/fabricslide.npz"),
-    *("--only", "direction=0", "force<=180", "--split", "rep:0.67"),
+    *("--set", f"$PALPATE_DATA/{FABRICS}", "--only", *SEVEN, "--split", "rep:0.67"),
     *("--method", "palpate,palpate-reattached,minirocket,multirocket-hydra,ds-cnn,H-svm"),
     *("--out", "docs/data/stress-fabrics.json"),
 )
