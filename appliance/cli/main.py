@@ -36,6 +36,9 @@ COMMANDS: Mapping[str, str] = {
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; its exit code."""
     _fill_streams()
+    # One loop, one thread. Otherwise OpenBLAS starts a thread for each core when numpy is imported,
+    # and a product in the loop waits for a thread that a busy processor does not run.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     words = sys.argv[1:] if argv is None else list(argv)
     try:
         if (answered := parser.MENU.answer(words)) is not None:

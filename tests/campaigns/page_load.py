@@ -91,16 +91,14 @@ def main() -> int:
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         feed = ["--set", f"store.runtime={folder}"]
-        environ = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
         box = subprocess.Popen(
-            [*RUN, "run", "--sim", "skin", *feed], stdout=subprocess.DEVNULL, cwd=ROOT, env=environ
+            [*RUN, "run", "--sim", "skin", *feed], stdout=subprocess.DEVNULL, cwd=ROOT
         )
         watch = subprocess.Popen(
             [*RUN, "watch", "--web", "0", *feed],
             stderr=subprocess.PIPE,
             text=True,
             cwd=ROOT,
-            env=environ,
         )
         try:
             page = PageAddress(watch.stderr.readline().split("page: ")[1].strip())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 import tempfile
@@ -83,7 +82,6 @@ class TaughtBox:
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             text=True,
-            env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
         )
         threading.Thread(target=self._listen, args=(self.process,), daemon=True).start()
         end = time.monotonic() + START_S

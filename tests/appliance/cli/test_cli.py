@@ -44,6 +44,7 @@ from appliance.io import packets
 from appliance.sim import skin
 from appliance.tools import pseudo_terminal
 from tests.factories import terminals, toy_bundle
+from tests.factories.paths import ROOT
 
 VIRTUAL = ["--virtual", "--sweeps", "3", "--seed", "7"]
 
@@ -55,6 +56,18 @@ def test_run_prints_sentences_and_ends_with_its_script(capsysbinary: pytest.Capt
     results = [line for line in lines if ",RES," in line]
     assert len(results) == 3
     assert all(",sim," in line for line in results)
+
+
+def test_numpy_starts_no_threads_in_a_command():
+    """OpenBLAS threads of a process that has run a command and imported numpy: none. In an emulated
+    box a product in the loop once waited for one until the watchdog ended the service."""
+    code = (
+        "import os; from appliance.cli.main import main; main(['config']); import numpy; "
+        "print(len(os.listdir('/proc/self/task')))"
+    )
+    env = {k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")}
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=env, capture_output=True)
+    assert done.stdout.split()[-1] == b"1"
 
 
 @pytest.mark.slow
