@@ -64,6 +64,7 @@ FIGURES = (
     DocumentFigure(ALIGNMENT, "in short", "alignment", contact_table.headline),
     DocumentFigure(ALIGNMENT, "alignment", "alignment", contact_table.table),
     DocumentFigure(RECIPE, "recipe", "recipe", recipe_page.table),
+    DocumentFigure(RECIPE, "loads", "recipe", recipe_page.loads),
     DocumentFigure(FABRICS, "matrix", "fabrics", matrix_table.headline),
     *(
         DocumentFigure(FIGURES_PAGE, f"quotes {study}", study, partial(quotes.table, study))

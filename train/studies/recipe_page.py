@@ -72,6 +72,26 @@ def table(results: Json) -> str:
     return "\n".join(rows)
 
 
+def loads(results: Json) -> str:
+    """A row for each world and condition, with the figures with and without the view."""
+    rows = [
+        "| world | condition | sweeps | with loads: label, box, wrong | "
+        "without: label, box, wrong |",
+        "|---|---|---|---|---|",
+    ]
+    for row in results["loads"]:
+        told = [
+            ", ".join(f"{row[which][name]:.1f} %" for name in ("label", "right", "wrong"))
+            if row[which]
+            else "not chosen"
+            for which in ("with", "without")
+        ]
+        rows.append(
+            f"| {row['world']} | {row['condition']} | {row['sweeps']} | {told[0]} | {told[1]} |"
+        )
+    return "\n".join(rows)
+
+
 def draw(results: Json) -> str:
     """The way from raw counts to the answer, with the time of each view."""
     figure = Figure((WIDTH, WIDTH * 0.42))

@@ -20,6 +20,7 @@ from train.models.recipe.augment import default_augmentation
 from train.models.recipe.bank import Bank
 from train.models.recipe.recipe import FIXED, Settings, Trunk
 from train.onnx_tools.graph_builder import slim, with_head
+from train.studies import loads_table
 from train.studies.development_experiment import CASES
 from train.studies.study import NO_DATA, StudyRun
 
@@ -33,12 +34,14 @@ FILTERS = 256
 
 
 def results(run: StudyRun) -> Json:
-    """`views` with their cost, and `sets` with the views that the recipe chose there."""
+    """`views` with their cost, `sets` with the views that the recipe chose there, and `loads`, see
+    loads_table.rows."""
     sweeps = sets.load(TIMED)
     return {
         "format": str(sweeps.format),
         "views": list(costs(sweeps)),
         "sets": list(choices(run)),
+        "loads": list(loads_table.rows(run.log)),
         "left_out": run.left_out,
         "seeds": [SEED],
     } | score.provenance()

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from train.data import sets
+from train.data.sets import Dataset
 from train.evaluation.evaluate import Where
 from train.export import measure
+from train.models.recipe import recipe
 from train.models.recipe.architectures import Architecture
-from train.studies import recipe_page, recipe_views
+from train.models.recipe.recipe import Settings
+from train.models.recipe.sizes import UNLIMITED
+from train.studies import loads_table, recipe_page, recipe_views
 from train.studies.study import StudyCase, StudyRun
 
 RESULTS: dict[str, Any] = {
@@ -95,3 +100,62 @@ def test_results_without_a_view_are_refused():
         recipe_page.table(
             {"views": [v for v in RESULTS["views"] if v["view"] != "stages"], "sets": []}
         )
+
+
+class LoadsFits:
+    """Stands for fits of one position each: a fit may have chosen loads, and its answers say so."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, chosen: bool) -> None:
+        self.made: list[tuple[int, bool]] = []
+        self._chosen = chosen
+        monkeypatch.setattr(loads_table.recipe, "fit", self.fit)
+        monkeypatch.setattr(loads_table, "answers", self.answers)
+
+    def fit(self, sweeps: Dataset, seed: int, settings: Settings) -> Any:
+        self.made.append((len(sweeps), settings.size.loads))
+        loads = settings.size.loads and self._chosen
+        return SimpleNamespace(architecture=replace(Architecture(()), loads=loads))
+
+    def answers(self, made: Any, test: Dataset) -> dict[str, np.ndarray]:
+        right = np.full(len(test), made.architecture.loads)
+        return {"label": np.ones(len(test), bool), "right": right, "wrong": ~right}
+
+
+def test_loads_are_compared_in_both_worlds(monkeypatch: pytest.MonkeyPatch):
+    """Each world has a skin that was put back and positions left out; a fit without loads stands
+    beside each fit that chose them, and the answers of all positions are counted together."""
+    fits = LoadsFits(monkeypatch, chosen=True)
+    monkeypatch.setattr(loads_table, "ATTACHMENTS", "1-2")
+    found = list(loads_table.rows(lambda line: None))
+    assert [(row["world"], row["condition"], row["sweeps"]) for row in found] == [
+        (world, condition, sweeps)
+        for world in ("laboratory", "level-blind")
+        for condition, sweeps in (("skin put back", 12), ("new position", 180))
+    ]
+    assert fits.made == 2 * ([(540, True), (540, False)] + 3 * [(480, True), (480, False)])
+    for row in found:
+        assert row["with"] == {"label": 100, "right": 100, "wrong": 0}
+        assert row["without"] == {"label": 100, "right": 0, "wrong": 100}
+
+
+def test_loads_that_no_fit_chose_have_no_figures(monkeypatch: pytest.MonkeyPatch):
+    """Each fit is made once then, and the table says "not chosen"."""
+    fits = LoadsFits(monkeypatch, chosen=False)
+    monkeypatch.setattr(loads_table, "ATTACHMENTS", "1-2")
+    found = list(loads_table.rows(lambda line: None))
+    assert len(fits.made) == 8
+    assert all(row["with"] is None and row["without"]["wrong"] == 100 for row in found)
+    *_, last = recipe_page.loads({"loads": found}).split("\n")
+    assert last == "| level-blind | new position | 180 | not chosen | 100.0 %, 0.0 %, 100.0 % |"
+
+
+@pytest.mark.thorough  # exports a bundle; the other tests have the rows
+def test_answers_are_those_of_the_box(monkeypatch: pytest.MonkeyPatch):
+    """A fit without loads, and the box's answers to its own sweeps: most are right."""
+    tubes = sets.load("sim:T-REAL:1").select(["position<=2"])
+    made = recipe.fit(tubes, 1, Settings(steps=0, size=replace(UNLIMITED, loads=False)))
+    assert not made.architecture.loads
+    found = loads_table.answers(made, tubes)
+    assert found["label"].mean() > 0.95
+    assert found["right"].mean() > 0.9
+    assert not (found["right"] & found["wrong"]).any()

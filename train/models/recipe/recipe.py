@@ -296,7 +296,8 @@ def judged_size(
 def candidates(fixed: FixedFeatures, setup: Setup) -> Candidates:
     """Step 2: the heads to choose from."""
     groups = bool((setup.held_out_scores.groups != "recording").any())
-    return Candidates(fixed.columns, setup.settings.use.reattached, groups)
+    loads = groups and setup.settings.size.loads
+    return Candidates(fixed.columns, setup.settings.use.reattached, loads)
 
 
 def judge(heads: Candidates, fixed: FixedFeatures, setup: Setup) -> HeadChoice:

@@ -13,10 +13,10 @@ from train.models.recipe import relations
 
 @dataclass(frozen=True)
 class ModelSize:
-    """The views of a size; every size has the spectrum, and loads may join everywhere.
+    """The views of a size; every size has the spectrum.
 
     about: its content in words. filters: most filters of each kind; scales: most scales of the
-    relations; None for no limit. distribution, stages: whether they may join.
+    relations; None for no limit. distribution, stages, loads: whether they may join.
     """
 
     about: str = "all views"
@@ -24,6 +24,7 @@ class ModelSize:
     scales: int | None = None
     distribution: bool = True
     stages: bool = True
+    loads: bool = True
 
 
 SIZES = {
