@@ -147,7 +147,7 @@ class Manifest:
     speeds: range of the measured speeds in training; None if unknown, then `json` omits it.
     bridging: broken taxels that the model tolerates; None if that was not measured, then `json`
         omits it.
-    sliding: least vibration of a slide, by label; None if unknown, then `json` omits it.
+    sliding: what tells a slide from a rest; None if unknown, then `json` omits it.
     """
 
     name: str
@@ -218,7 +218,12 @@ class Manifest:
         for name in ("unloaded", "speeds", "bridging", "sliding"):
             if not values[name]:
                 del values[name]
-        added_later = ("early", "limits"), ("moved", "farthest_mm"), ("bridging", "loads")
+        added_later = (
+            ("early", "limits"),
+            ("moved", "farthest_mm"),
+            ("bridging", "loads"),
+            ("sliding", "pattern"),
+        )
         for name, added in added_later:
             if values.get(name) and not values[name][added]:
                 del values[name][added]

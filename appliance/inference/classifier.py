@@ -29,7 +29,7 @@ from appliance.inference.session import ModelRunner
 from appliance.inference.taxel_watch import TaxelWatch
 from appliance.signal import features
 from appliance.signal.contact import Displacement, displacement
-from appliance.signal.slide import Slide, SlideMeter
+from appliance.signal.slide import NO_PITCH, Slide, SlideMeter
 from appliance.signal.vibration import PARTS, vibration
 from appliance.signal.window_check import Finding
 
@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from appliance.core.clock import Clock
 
 
+STILL = "no pattern passes from taxel to taxel, as with a finger that rests"
 _NONE, _NO_SLIDE, _IN_PLACE = np.empty(0), Slide(), Displacement()
 
 
@@ -98,7 +99,11 @@ class Classifier(Observer):
         )
         self._unknown = UnknownSweeps(self._means) if self._means else None
         rule, place = bundle.manifest.displacement, bundle.manifest.contact
-        self._slide = SlideMeter(bundle.format, place.pitch_mm if place and slides else None)
+        self._pitch_mm = place.pitch_mm if place and slides else None
+        limits = bundle.manifest.sliding
+        self._pattern = limits.pattern if limits else None
+        # the height of a pattern does not depend on the pitch
+        self._slide = SlideMeter(bundle.format, self._pitch_mm or (1.0 if self._pattern else None))
         self._displaced_means = (
             ClassDistances(classes, known, bundle.manifest.labels, rule)
             if rule and known and classes
@@ -268,7 +273,9 @@ class Classifier(Observer):
             return self._verdict(sweep, finding, touch=touch)
         if far := self._too_far(touch.displacement):
             return self._verdict(sweep, Finding(Status.UNKNOWN, far, degraded), touch=touch)
-        if rests := self._rests(sweep, int(scores.argmax())):
+        # bridged taxels move with their neighbours, which hides the pattern
+        patterned = bool(degraded) or self._patterned(sweep, touch.slide)
+        if rests := self._rests(sweep, int(scores.argmax())) if patterned else STILL:
             return self._verdict(sweep, Finding(Status.NO_SLIDE, rests, degraded), touch=touch)
         earlier = self._sweeps
         if sweep.object == 0 or sweep.object != earlier.object or self._fusion == "none":
@@ -354,9 +361,16 @@ class Classifier(Observer):
         measured in whole windows only. mean: counts [R, C] or [R, C, A] of the window."""
         m, taxels = self.bundle.manifest, sweep.frames.taxels
         slide = self._slide(taxels) if len(taxels) == m.format.window else _NO_SLIDE
+        if not self._pitch_mm:
+            slide = Slide(height=slide.height, why=NO_PITCH)
         if mean is None or m.contact is None or m.thresholds.contact is None:
             return Touched(slide=slide)
         return Touched(displacement(mean, self.tare, m.thresholds.contact, m.contact), slide)
+
+    def _patterned(self, sweep: Sweep, slide: Slide) -> bool:
+        """False if a whole window lacks the pattern that passed in all training sweeps."""
+        whole = len(sweep.frames) == self.bundle.format.window and not self._slide.why
+        return not (self._pattern and whole and slide.height < self._pattern)
 
     def _rests(self, sweep: Sweep, label: int) -> str:
         """A message if the finger rests in a part of the window so far, where a slide over the

@@ -43,11 +43,15 @@ STEP = 0.04
 LEAST_TAXELS = 3
 """Fewest taxels whose counts change. The signal that all have in common is removed, and of two
 taxels nothing is left that has a direction."""
+CHANCE = 5.0
+"""Height that few windows of noise, of rests and of taxels from different slides exceed
+(docs/decisions/0024)."""
 LEAST_HEIGHT = 7.0
 """Least height of a peak, in standard deviations of a sum with random phases."""
 RATIO = 1.5
 """Least ratio of a peak to the next separate peak of its axis, and to the sum without a lag. The
 other axis is left out, because a pattern of straight ridges passes along both."""
+NO_PITCH = "the distance between taxels is unknown; export with --pitch-mm"
 APART = 9
 """Peaks further apart than this many steps of the grid are separate."""
 MARGIN = 1.2
@@ -120,7 +124,7 @@ class SlideMeter:
         slowest, fastest = LEAST_LAGS / seconds, min(MOST_LAGS, format.rate_hz)
         self.why = ""
         if pitch_mm is None:
-            self.why = "the distance between taxels is unknown; export with --pitch-mm"
+            self.why = NO_PITCH
         elif format.rows * format.cols < LEAST_TAXELS:
             self.why = f"fewer than {LEAST_TAXELS} taxels"
         elif fastest < 2 * slowest:

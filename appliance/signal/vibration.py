@@ -27,11 +27,19 @@ TINY = 1e-30
 @dataclass(frozen=True, slots=True)
 class SlideLimits:
     """least: [K], for each trained label the least `vibration` of a part in which the finger
-    slides. Raises BundleError for a number out of range."""
+    slides; empty if that is unknown. pattern: least height of the pattern that passes from taxel to
+    taxel in a slide, as signal.slide measures it; None if slides need not show one. Raises
+    BundleError for a number out of range."""
 
     least: tuple[float, ...]
+    pattern: float | None = None
 
     def __post_init__(self) -> None:
+        if self.pattern is not None and not 0 < self.pattern < math.inf:
+            raise BundleError(
+                f"sliding.pattern {self.pattern} must be a finite number above 0; export the "
+                "bundle again"
+            )
         if not all(type(v) is float and math.isfinite(v) for v in self.least):
             raise BundleError(
                 f"sliding.least {list(self.least)} must be finite numbers; export the bundle again"

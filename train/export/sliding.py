@@ -1,4 +1,5 @@
-"""The least vibration with which each material was slid over in training, for the manifest."""
+"""Limits that tell a slide from a rest: the least vibration of each material, and the least
+pattern that passes from taxel to taxel."""
 
 from __future__ import annotations
 
@@ -7,7 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from appliance.bundle.manifest import Manifest
+from appliance.signal.slide import CHANCE, SlideMeter
 from appliance.signal.vibration import PARTS, TINY, SlideLimits, vibration
+from train.calibration.slide_speeds import MOST_SWEEPS, OUTER
 from train.data.sets import Dataset
 
 MARGIN = 0.05
@@ -18,27 +21,52 @@ of n sweeps with a probability of 1 / (n + 1)."""
 STILL = 0.5 * float(np.log(TINY)) / 2
 """Below this vibration a part does not change at all."""
 
+_UNNOTICED = "a finger that rests: not noticed"
+
 
 def limited(manifest: Manifest, train: Dataset) -> Manifest:
-    """`manifest` with the least vibration of each label in the training sweeps.
+    """`manifest` with the limits of the training sweeps; unchanged if there are none."""
+    least, pattern = _least(manifest, train), _pattern(train)
+    if not least and pattern is None:
+        return manifest
+    return replace(manifest, sliding=SlideLimits(least, pattern))
 
-    Unchanged if a part of one does not change at all, so that slides cannot be told from rests, if
-    there are fewer than FEWEST of a label, or if windows are too short.
+
+def _pattern(train: Dataset) -> float | None:
+    """The least height of a pattern, where nearly all training sweeps show one of twice the height;
+    else None. So a sweep with half of the usual pattern is answered."""
+    meter = SlideMeter(train.format, 1.0)
+    if meter.why:
+        return None
+    count = min(len(train), MOST_SWEEPS)
+    chosen = np.linspace(0, len(train) - 1, count).round().astype(int)
+    heights = [meter(window).height for window in train.samples[chosen]]
+    return CHANCE if np.quantile(heights, OUTER) >= 2 * CHANCE else None
+
+
+def _least(manifest: Manifest, train: Dataset) -> tuple[float, ...]:
+    """The least vibration of each label.
+
+    Empty if there are fewer than FEWEST sweeps of a label, or if windows are too short. Also empty
+    if a part of a sweep does not change at all, since slides then resemble rests.
     """
     if train.format.window < 2 * PARTS or set(train.materials) != set(manifest.labels):
-        return manifest
+        return ()
     if np.bincount(train.labels, minlength=len(train.materials)).min() < FEWEST:
-        return manifest
+        return ()
     least = np.array([vibration(window, manifest.tare).min() for window in train.samples])
     labels = [train.materials.index(label) for label in manifest.labels]
     found = [float(least[train.labels == k].min(initial=np.inf)) for k in labels]
     if not all(np.isfinite(v) and v > STILL for v in found):
-        return manifest
-    return replace(manifest, sliding=SlideLimits(tuple(round(v - MARGIN, 3) for v in found)))
+        return ()
+    return tuple(round(v - MARGIN, 3) for v in found)
 
 
 def text(manifest: Manifest) -> str:
     """Whether a finger that rests is noticed, in words."""
-    if manifest.sliding is None:
-        return "a finger that rests: not noticed"
-    return "a finger that rests: noticed in each tenth of the window, by its lack of vibration"
+    limits, by = manifest.sliding, []
+    if limits and limits.least:
+        by.append("in each tenth of the window by its lack of vibration")
+    if limits and limits.pattern:
+        by.append("in a whole window by its lack of a pattern that passes from taxel to taxel")
+    return f"a finger that rests: noticed {' and '.join(by)}" if by else _UNNOTICED

@@ -6,15 +6,17 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from appliance.bundle import bundle
 from appliance.bundle.bundle import Bundle, Early
 from appliance.core.errors import BundleError
-from appliance.core.types import Status, Sweep
+from appliance.core.types import Frames, Status, Sweep
 from appliance.inference.classifier import Classifier
 from appliance.inference.early_exit import EarlyExit
 from appliance.signal.vibration import SlideLimits
+from appliance.sim import skin
 from appliance.sim.rig import VirtualClock
 from tests.factories import toy_bundle
 
@@ -79,3 +81,70 @@ def test_the_manifest_keeps_the_limits(toy: Bundle):
     manifest = toy.manifest
     assert bundle.Manifest.parse(manifest.json()) == manifest
     assert b"sliding" not in replace(manifest, sliding=None).json()
+
+
+@pytest.fixture(scope="module")
+def packaged() -> Bundle:
+    """The packaged bundle, whose training sweeps all show a pattern that passes."""
+    made = bundle.load(bundle.DEFAULT)
+    assert made.manifest.sliding
+    assert made.manifest.sliding.pattern
+    return made
+
+
+def swept(taxels: np.ndarray) -> Sweep:
+    """A valid sweep with this window."""
+    n = np.arange(len(taxels))
+    return Sweep(1, 0, 0, Status.OK, Frames(n, n, taxels))
+
+
+def mixed(number: int) -> tuple[Sweep, Sweep]:
+    """A slide over foam, and a window whose taxels come from slides of their own: the spectra and
+    loads of foam without a pattern that passes."""
+    rng = np.random.default_rng(number)
+    places = skin.placements("T-REAL", number)
+    slides = [skin.window("foam", places[0], rng, skin.LEVEL_BLIND) for _ in range(16)]
+    own = np.stack([slides[i].reshape(-1, 16)[:, i] for i in range(16)], axis=1)
+    return swept(slides[0]), swept(own.reshape(slides[0].shape))
+
+
+def any_material(made: Bundle, pattern: float | None) -> Classifier:
+    """A classifier to which no material is unknown, with this limit of patterns."""
+    m = made.manifest
+    assert m.known
+    assert m.sliding
+    known, sliding = replace(m.known, limit=1e9), replace(m.sliding, pattern=pattern)
+    manifest = replace(m, known=known, sliding=sliding)
+    return Classifier(replace(made, manifest=manifest), VirtualClock(), slides=False)
+
+
+def test_a_whole_window_without_a_pattern_is_no_slide(packaged: Bundle):
+    """The slide is named. Without the limit the mixed window has a label as well. An answer without
+    speeds (`slides`) is checked, too."""
+    assert packaged.manifest.sliding
+    box = any_material(packaged, packaged.manifest.sliding.pattern)
+    unlimited = any_material(packaged, None)
+    for number in range(5):
+        slide, own = mixed(number)
+        assert (box(slide).label, box(slide).measured_mm_s) == ("foam", None)
+        assert unlimited(own).label
+        verdict = box(own)
+        assert (verdict.status, verdict.label) == (Status.NO_SLIDE, "")
+        assert verdict.detail.startswith("no pattern passes from taxel to taxel")
+
+
+@pytest.mark.parametrize("pattern", [0.0, -1.0, math.inf, math.nan])
+def test_a_limit_of_patterns_out_of_range_is_refused(pattern: float):
+    """It is a number above 0."""
+    with pytest.raises(BundleError, match=r"sliding.pattern .* finite number above 0"):
+        SlideLimits((), pattern)
+
+
+def test_the_manifest_keeps_the_limit_of_patterns(packaged: Bundle):
+    """And leaves it out where there is none."""
+    manifest = packaged.manifest
+    assert manifest.sliding
+    assert bundle.Manifest.parse(manifest.json()) == manifest
+    without = replace(manifest, sliding=replace(manifest.sliding, pattern=None))
+    assert b"pattern" not in without.json()
+    assert bundle.Manifest.parse(without.json()) == without

@@ -11,16 +11,18 @@ from appliance.bundle import bundle
 from appliance.core.clock import SystemClock
 from appliance.core.types import Status
 from appliance.inference.classifier import Classifier
+from appliance.signal.slide import CHANCE
 from tests.factories import toy_bundle
 from train.data import sets
 from train.export import sliding
 
 
 def test_limits_come_from_training_sweeps(monkeypatch: pytest.MonkeyPatch):
-    """No part of a training sweep rests by them. A part that does not change gives no limits, nor
-    do sweeps of other materials, or nine of each."""
+    """No part of a training sweep rests by them. A part that does not change gives no limits of
+    vibration, nor do sweeps of other materials, or nine of each."""
     train = sets.load("sim:T-REAL/level-blind:41:1")
     bare = replace(bundle.load(bundle.DEFAULT).manifest, sliding=None)
+    monkeypatch.setattr(sliding, "_pattern", lambda train: None)
     assert sliding.limited(bare, train) is bare
     monkeypatch.setattr(sliding, "FEWEST", 9)
     found = sliding.limited(bare, train)
@@ -48,3 +50,18 @@ def test_the_packaged_bundle_sees_a_slide_that_ends_early():
         frames = replace(toy_bundle.sweep(0, 0).frames, t_ns=n, seq=n, taxels=rest)
         statuses.append(box(replace(toy_bundle.sweep(0, 0), frames=frames)).status)
     assert statuses.count(Status.OK) <= 2
+
+
+def test_slides_need_a_pattern_where_training_always_showed_one():
+    """Also with one sweep of each material. Sweeps without a pattern, and skins of two taxels, set
+    no limit."""
+    bare = replace(bundle.load(bundle.DEFAULT).manifest, sliding=None)
+    train = sets.load("sim:T-LAB/level-blind:3:1")
+    found = sliding.limited(bare, train)
+    assert found.sliding
+    assert (found.sliding.least, found.sliding.pattern) == ((), CHANCE)
+    assert "in a whole window" in sliding.text(found)
+    confused = np.random.default_rng(1).permuted(train.samples, axis=1)
+    assert sliding.limited(bare, replace(train, samples=confused)) is bare
+    few = replace(train, samples=train.samples[:, :, :1, :2])
+    assert sliding.limited(bare, few) is bare
