@@ -25,8 +25,8 @@ VERSION = "v3.0"
 TACTILE = "observation.tactile"
 INDEX = "index"
 RESERVED = (EPISODE, FRAME, TASK, TASK_INDEX, TIME, INDEX)
-FILE_MB, CHUNK = 100, 1000
-"""Largest file in megabytes, and largest number of files in a folder, as LeRobot writes them."""
+FILE_BYTES, CHUNK = 100 << 20, 1000
+"""Frames in a file, and largest number of files in a folder, as LeRobot writes them."""
 FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 INDEX_NAME = "__index_level_0__"
@@ -73,8 +73,8 @@ def _info(sweeps: Dataset) -> dict[str, Any]:
         "total_frames": count * sweeps.format.window,
         "total_tasks": len(sweeps.materials),
         "chunks_size": CHUNK,
-        "data_files_size_in_mb": FILE_MB,
-        "video_files_size_in_mb": FILE_MB,
+        "data_files_size_in_mb": FILE_BYTES >> 20,
+        "video_files_size_in_mb": FILE_BYTES >> 20,
         "fps": int(rate) if rate == int(rate) else rate,
         "splits": {"train": f"0:{count}"},
         "data_path": f"data/{FILE}",
@@ -99,8 +99,8 @@ def _columns(sweeps: Dataset, at: slice, *, texts: bool = False) -> dict[str, Ar
     columns: dict[str, Array] = {TACTILE: samples.reshape(-1, *samples.shape[2:])}
     for name, values in sweeps.groups.items():
         if texts or values.dtype.kind != "U":
-            kind = {"f": np.float64, "U": values.dtype}.get(values.dtype.kind, np.int64)
-            columns[name] = np.repeat(values[at].astype(kind), window)
+            kept = values[at].astype(np.int64) if values.dtype.kind in "iu" else values[at]
+            columns[name] = np.repeat(kept, window)
     return columns | {
         TIME: (frame / sweeps.rate_hz).astype(np.float32),
         FRAME: frame,
@@ -111,8 +111,8 @@ def _columns(sweeps: Dataset, at: slice, *, texts: bool = False) -> dict[str, Ar
 
 
 def _files(sweeps: Dataset, folder: Path) -> Iterator[list[dict[str, Any]]]:
-    """Write the frames, FILE_MB in each file; the rows of meta/episodes for each file."""
-    each = max(1, FILE_MB * 2**20 // sweeps.samples[0].nbytes)
+    """Write the frames, FILE_BYTES in each file; the rows of meta/episodes for each file."""
+    each = max(1, FILE_BYTES // sweeps.samples[0].nbytes)
     for number, first in enumerate(range(0, len(sweeps), each)):
         at = slice(first, min(first + each, len(sweeps)))
         chunk, file = divmod(number, CHUNK)
