@@ -292,7 +292,7 @@ def test_each_bad_text_gets_one_exact_line(tmp_path: Path, name: str):
         (
             "mat",
             lambda p: p.write_bytes(b"MATLAB 5.0" + bytes(200)),
-            "is not a MAT file of version 5 to 7.3; save it with -v7",
+            "is not a MAT file of version 4 to 7.3; save it with -v7",
         ),
         ("h5", lambda p: p.write_bytes(b"nothing"), "cannot be read: "),
         (
