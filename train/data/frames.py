@@ -45,6 +45,7 @@ def frames(table: Table, plan: ImportPlan) -> tuple[Array, Array | None, list[st
         raise FormatError(
             f"holds {values.dtype} {list(values.shape)}; give an array of frames x taxels"
         )
+    values = _without_single_axes(values, plan)
     values, notes = _time_first(values, table, plan)
     at, time_s = _times(values, table, plan)
     chosen = _taxels(values, table, plan, at)
@@ -62,6 +63,15 @@ def frames(table: Table, plan: ImportPlan) -> tuple[Array, Array | None, list[st
             f"frame {index[0] + 1}, taxel {taxel} is {chosen[tuple(index)]:g}; {what}"
         )
     return chosen, time_s, notes
+
+
+def _without_single_axes(values: Array, plan: ImportPlan) -> Array:
+    """The array without axes of length 1 that --grid does not have, such as the channel of
+    PyTorch."""
+    others = tuple(n for n in values.shape if n > 1)
+    if plan.order or not plan.shape or 1 in plan.shape or len(others) != len(plan.shape) + 1:
+        return values
+    return values.reshape(others)
 
 
 def _time_first(values: Array, table: Table, plan: ImportPlan) -> tuple[Array, list[str]]:

@@ -161,6 +161,17 @@ def test_only_the_columns_that_are_used_must_be_numbers():
             frames.frames(table, plan(grid=grid, **asked))
 
 
+@pytest.mark.parametrize("shape", [(1, 40, 2, 3), (40, 1, 2, 3), (40, 2, 3, 1), (1, 2, 3, 40)])
+def test_axes_of_length_one_are_left_out(shape: tuple[int, ...]):
+    """A batch, a channel, an axis: the grid does not have them. A grid with them keeps them."""
+    values = cube(2, 3, 40)
+    moved = np.moveaxis(values, 0, -1) if shape[-1] == 40 else values
+    found, _, _ = frames.frames(Table(moved.reshape(shape)), plan(grid="2x3"))
+    np.testing.assert_array_equal(found, values)
+    found, _, _ = frames.frames(Table(values.reshape(40, 6, 1)), plan(grid="6x1"))
+    np.testing.assert_array_equal(found, values.reshape(40, 6, 1))
+
+
 def test_text_columns_are_no_taxels():
     """They are passed over without --columns, and refused if --columns names them."""
     table = text(("label", "a", "b"), texts={0: ["wood"] * 40})

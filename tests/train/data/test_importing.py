@@ -234,7 +234,7 @@ BAD = {
         GOOD.encode() + b"1,nan,3,4\n",
         "frame 21, taxel 1, 2 is nan; fill it in or cut it away",
     ),
-    "UTF-16": (GOOD.encode("utf-16-le"), "is UTF-16 or not a text; save it as UTF-8"),
+    "numbers": (bytes([1, 0, 0, 0] * 99), "is not a text; save it as UTF-8"),
     "wide": (
         b"1,2,3,4,5\n" * 20,
         "it has 5 columns, but a grid of 2x2 needs 4; see --columns and --grid",
@@ -274,7 +274,7 @@ def test_each_bad_text_gets_one_exact_line(tmp_path: Path, name: str):
         (
             "npy",
             lambda p: np.save(p, np.array([{}]), allow_pickle=True),
-            "cannot be read: Object arrays cannot be loaded",
+            "holds objects of Python, which are not read; save numbers",
         ),
         ("npy", lambda p: p.write_bytes(b"\x93NUMPY"), "cannot be read: "),
         (

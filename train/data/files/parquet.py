@@ -38,6 +38,8 @@ def table(content: Any) -> Table:
     texts: dict[int, list[str]] = {}
     faults: dict[int, str] = {}
     left: list[str] = []
+    while any(str(kind).startswith("struct") for kind in content.schema.types):
+        content = content.flatten()
     for name in content.column_names:
         values, kind = content.column(name), str(content.column(name).type)
         if kind.startswith(("string", "large_string", "dictionary", "date", "timestamp[")):
@@ -71,6 +73,8 @@ def numbers(values: Any, name: str) -> Array | None:
     """
     flat, shape, there = _flat(values, name)
     kind = str(flat.type)
+    if kind.startswith("decimal"):
+        flat = flat.cast("float64")
     if flat.null_count and ("int" in kind or "bool" in kind):
         flat = flat.cast("float64")
     found = np.asarray(flat.to_numpy(zero_copy_only=False))
