@@ -457,3 +457,17 @@ def test_a_missing_grid_ends_the_import_at_the_first_file(tmp_path: Path):
     with pytest.raises(FormatError, match=r"a_1.csv has 4 columns; give their layout with --grid"):
         import_folder(tmp_path, plan(grid=""), lambda line: None, left_out)
     assert left_out == []
+
+
+def test_columns_in_another_order_are_refused_unless_they_are_named(tmp_path: Path):
+    """Taxels would change places, silently. The place of the times does not matter."""
+    timed = np.column_stack([np.arange(40) / 100, COUNTS])
+    text(tmp_path / "felt_1.csv", np.roll(timed, -1, axis=1) + 1, head="a,b,c,d,t\n")
+    text(tmp_path / "felt_2.csv", timed[:, ::-1], head="d,c,b,a,t\n")
+    text(tmp_path / "wood_1.csv", timed, head="t,a,b,c,d\n")
+    assert reasons(tmp_path, time="t:s", rate_hz=None) == {
+        "felt_2.csv": "has the column 'd' where another file has 'a'; "
+        "give the order of the taxels with --columns and their names"
+    }
+    made = taken(tmp_path, time="t:s", rate_hz=None, columns="a,b,c,d")
+    np.testing.assert_array_equal(made.sweeps.samples[1], made.sweeps.samples[2])

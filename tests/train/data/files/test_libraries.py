@@ -69,6 +69,20 @@ def test_a_spreadsheet_is_read_as_a_text(tmp_path: Path):
     np.testing.assert_array_equal(raw_files.read(path, ReadPlan("two")).values[:, 2:], SKIN)
 
 
+def test_a_table_may_stand_anywhere_on_a_sheet(tmp_path: Path):
+    """Two columns and three rows further, with a remark beside two of its rows."""
+    rows = [[], [], ["", "", "Recorded by Ada"], *[["", "", *row] for row in ROWS]]
+    rows[7].append("touched")
+    rows[9].append("let go")
+    found = raw_files.read(book(tmp_path / "a.xlsx", {"run": rows}))
+    assert found.columns == ("t", "label", *"abcd")
+    np.testing.assert_array_equal(found.values[:, 2:], SKIN)
+    assert found.notes == (
+        "its first 2 columns are empty and do not count",
+        "columns of remarks are left out: 9",
+    )
+
+
 def test_a_hole_in_a_spreadsheet_is_a_fault(tmp_path: Path):
     """An empty cell and an error of a formula; rows above the table count."""
     rows = [["Recorded by Ada"], [], *[list(row) for row in ROWS]]
