@@ -31,6 +31,7 @@ EXTRAS = {
     "watch": {"tornado"},
     "bridges/ros.py": {"rclpy", "rcl_interfaces", "diagnostic_msgs", "sensor_msgs", "std_srvs"},
     "bridges/ros_action.py": {"rclpy", "palpate_msgs"},
+    "bridges/lerobot": {"lerobot"},
 }
 """What a package or module imports beside that, of an extra; it is loaded for this alone."""
 LONGEST = 500

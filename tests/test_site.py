@@ -4,6 +4,7 @@ code, and the workflow publishes what `make site` builds."""
 from __future__ import annotations
 
 import importlib.util
+import inspect
 import re
 import sys
 from collections.abc import Iterator
@@ -13,6 +14,7 @@ from types import ModuleType
 import pytest
 
 from tests.factories.paths import ROOT
+from train import library
 
 WORKFLOW = ROOT / ".github" / "workflows" / "site.yml"
 
@@ -108,3 +110,25 @@ def test_the_workflow_publishes_what_make_builds():
     ]
     used = re.findall(r"uses: (\S+)@v\d+", text)
     assert [action for action in used if not action.startswith("actions/")] == []
+
+
+def test_the_reference_of_the_library_is_complete(sources: Path):
+    """Every public name, with its parameters, its members and their docstrings; a member without a
+    docstring of its own would show."""
+    page = (sources / "docs" / "reference" / "library.md").read_text("utf-8")
+    assert "<!-- palpate" not in page
+    for name in library.__all__:
+        what = getattr(library, name)
+        assert f"\n## {name}\n" in page
+        assert inspect.getdoc(what) in page
+        for member, value in vars(what).items() if inspect.isclass(what) else ():
+            if member.startswith("_") or not (callable(value) or isinstance(value, property)):
+                continue
+            assert inspect.getdoc(value), f"{name}.{member} has no docstring"
+            assert f"\n### {name}.{member}\n" in page
+            assert inspect.getdoc(value) in page
+            function = value.fget if isinstance(value, property) else value
+            for parameter in inspect.signature(function).parameters:
+                assert parameter == "self" or parameter in page.partition(f"### {name}.{member}")[2]
+    assert "PalpateClassifier(rate_hz=100.0, grid=None, group='position'" in page
+    assert "load_bundle(path)" in page

@@ -13,14 +13,12 @@ from math import ceil
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-
 from appliance.core.config import SkinConfig
 from appliance.core.errors import ConfigError
 from appliance.core.schema import closest, custom, keys, read_table, shown
 from appliance.core.schema import number as limited
 from appliance.core.types import MOST_AXES, SweepFormat
-from appliance.io import checksums
+from appliance.io import checksums, wire_numbers
 
 DEFAULT = "palpate"
 """The profile of PROTOCOL.md, whose readout board announces grid, type and rate."""
@@ -32,7 +30,6 @@ FEW_FRAMES = 200
 with finer textures then differ only by stiffness and shape."""
 SLIDE_MM_S = 20
 """Speed of sliding at which the warning computes the finest texture."""
-NUMBERS = Literal["uint8", "int16", "uint16", "float32"]
 MARKS = ("sequence", "time", "checksum")
 """Abilities that a skin may lack."""
 NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,31}")
@@ -130,9 +127,9 @@ class SkinProfile:
     0. around: the characters of a line without its numbers, separators and brackets. decimal: the
     decimal mark. line_end: the character that ends a line.
 
-    number: type of a number. values: numbers of one taxel on the wire. take: indices of those that
-    are used, in this order; the last is the axis along the skin's normal. rows, cols: grid on the
-    wire. orientation: turns after which the rows lie along the direction of sliding. rate_hz:
+    number: type of a number on the wire. values: numbers of one taxel there. take: indices of those
+    that are used, in this order; the last is the axis along the skin's normal. rows, cols: grid on
+    the wire. orientation: turns after which the rows lie along the direction of sliding. rate_hz:
     frames per second; rates_hz: those that `start` can set with {rate} or {period_ms}.
     """
 
@@ -164,7 +161,7 @@ class SkinProfile:
     around: str = _text(16384)
     decimal: Literal[".", ","] = "."
     line_end: Literal["\n", "\r"] = "\n"
-    number: NUMBERS = "uint8"
+    number: wire_numbers.WireNumber = "uint8"
     byte_order: Literal["little", "big"] = "little"
     rows: int = limited(4, 1, 255)
     cols: int = limited(4, 1, 255)
@@ -195,13 +192,23 @@ class SkinProfile:
         return tuple(mark for mark in MARKS if mark not in has)
 
     @property
+    def body(self) -> int:
+        """Bytes of the numbers of a frame on the wire, for "fixed"."""
+        return self.rows * self.cols * self.values * wire_numbers.size(self.number)
+
+    @property
+    def data_type(self) -> str:
+        """The type of its raw counts."""
+        return wire_numbers.data_type(self.number)
+
+    @property
     def format(self) -> SweepFormat:
         """The format of its sweeps, with rows along the direction of sliding and a window of
         WINDOW_S."""
         rows, cols = (
             (self.cols, self.rows) if "transpose" in self.orientation else (self.rows, self.cols)
         )
-        return with_window(rows, cols, self.rate_hz, self.number, len(self.take))
+        return with_window(rows, cols, self.rate_hz, self.data_type, len(self.take))
 
     def commands(self, texts: Sequence[str], rate_hz: float) -> list[bytes]:
         """Commands as bytes. {rate} becomes frames per second in decimal, {period_ms} milliseconds:
@@ -257,6 +264,8 @@ def _contradiction(p: SkinProfile) -> str:
             )
     if why := _outside(p):
         return why
+    if p.codec != "fixed" and p.number in wire_numbers.WIDE:
+        return f'number = "{p.number}" is for codec = "fixed"; write number = "float32"'
     if (
         not p.take
         or len(p.take) > MOST_AXES
@@ -288,8 +297,7 @@ def _contradiction(p: SkinProfile) -> str:
 
 def _outside(p: SkinProfile) -> str:
     """Why a part of a frame of fixed length lies where it cannot lie, "" if none does."""
-    body = p.rows * p.cols * p.values * np.dtype(p.number).itemsize
-    end = p.skip_before + body
+    end = p.skip_before + p.body
     if p.sequence_at and not p.sequence:
         return (
             'sequence_at says where the frame count is; give its type, such as sequence = "uint8"'

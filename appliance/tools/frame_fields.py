@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from appliance.io import wire_numbers
 from appliance.io.checksums import KINDS, NAMED, Checksum, mirrored
 
 Order = Literal["little", "big"]
@@ -35,6 +36,9 @@ SELDOM = 0.4
 CONTRAST = 4.0, 2.5
 """Ratio of the numbers of values of two bytes from which on they are one number, and of the numbers
 of their changes."""
+MOST_UNTOUCHED = 0.2
+"""Largest share of numbers of 24 and 32 bits that rest in the sample."""
+ORDERS: tuple[Order, ...] = ("little", "big")
 _SIGNS = {"little": "<", "big": ">"}
 
 
@@ -245,43 +249,51 @@ class Columns:
 
     def types(self, begin: int, end: int) -> Iterator[tuple[str, bool]]:
         """Possible (type, big-endian) of the numbers in these bytes, the most likely first."""
-        size = end - begin
-        raw = np.ascontiguousarray(self.frames[:, begin:end])
-        if size % 4 == 0:
-            for order in "<>":
+        raw = self.frames[:, begin:end]
+        if (end - begin) % 4 == 0:
+            for order in ORDERS:
                 with np.errstate(invalid="ignore"):
-                    numbers = np.abs(raw.view(f"{order}f4").astype(np.float64))
+                    numbers = np.abs(wire_numbers.read(raw, "float32", order).astype(np.float64))
                 sensible = (numbers == 0) | ((numbers >= FLOATS[0]) & (numbers <= FLOATS[1]))
                 if sensible.mean() >= 0.99 and (numbers > 0).any():
-                    yield "float32", order == ">"
-        if size % 2 == 0:
-            for order in "<>":
-                if self._paired(begin, end, order):
-                    signed = raw.view(f"{order}i2").astype(np.int64)
-                    yield ("int16" if _crosses_zero(signed) else "uint16"), order == ">"
+                    yield "float32", order == "big"
+        for size in (4, 3, 2):
+            for order in ORDERS:
+                if (end - begin) % size == 0 and self._grouped(begin, end, size, order):
+                    bits = 8 * size
+                    signed = wire_numbers.read(raw, f"int{bits}", order).astype(np.int64)
+                    sign = "" if _crosses_zero(signed, bits) else "u"
+                    yield f"{sign}int{bits}", order == "big"
         yield "uint8", False
 
-    def _paired(self, begin: int, end: int, order: str) -> bool:
-        """Whether one byte of each pair varies so much more than the other that they are a low and
-        a high byte."""
+    def _grouped(self, begin: int, end: int, size: int, order: str) -> bool:
+        """Whether each byte of a group of `size` varies no more than the byte below it, and the
+        highest so much less than the lowest that they are one number."""
+        if size > 2 and self._untouched(begin, end, size, order) > MOST_UNTOUCHED:
+            return False  # a few numbers of 16 bits between others that rest
         for column, contrast in ((self._values, CONTRAST[0]), (self._changes, CONTRAST[1])):
-            even, odd = (float(column[begin + i : end : 2].mean()) for i in (0, 1))
-            low, high = (even, odd) if order == "<" else (odd, even)
-            if low > contrast * high:
+            means = [float(column[begin + i : end : size].mean()) for i in range(size)]
+            rising = means if order == "big" else means[::-1]
+            if rising == sorted(rising) and rising[-1] > contrast * rising[0]:
                 return True
         return False
+
+    def _untouched(self, begin: int, end: int, size: int, order: str) -> float:
+        """The share of groups whose lowest byte never changes."""
+        lowest = begin if order == "little" else begin + size - 1
+        return float((self._values[lowest:end:size] == 0).mean())
 
     def roughness(self, begin: int, end: int, dtype: str, big_endian: bool) -> float:
         """Mean change of a number from frame to frame; bytes that belong to two numbers make it
         larger."""
-        raw = np.ascontiguousarray(self.frames[:, begin:end])
-        kind = np.dtype(dtype).newbyteorder(">" if big_endian else "<")
+        raw, order = self.frames[:, begin:end], "big" if big_endian else "little"
         with np.errstate(invalid="ignore", over="ignore"):
-            steps = np.abs(np.diff(raw.view(kind).astype(np.float64), axis=0))
+            numbers = wire_numbers.read(raw, dtype, order).astype(np.float64)
+            steps = np.abs(np.diff(numbers, axis=0))
         return float(np.nan_to_num(steps, nan=1e30, posinf=1e30).mean())
 
 
-def _crosses_zero(numbers: NDArray[Any]) -> bool:
+def _crosses_zero(numbers: NDArray[Any], bits: int) -> bool:
     """Whether a value passes from a little above zero to a little below it: then it has a sign."""
-    near = np.abs(numbers) < 1 << 13
+    near = np.abs(numbers) < 1 << (bits - 3)
     return bool((near.all(axis=0) & (numbers.min(axis=0) < 0)).any())

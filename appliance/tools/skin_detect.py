@@ -16,7 +16,7 @@ from appliance.core.clock import Clock
 from appliance.core.config import SkinConfig
 from appliance.core.errors import FormatError, SensorError
 from appliance.core.types import SweepFormat, shown
-from appliance.io import packets, skin_codecs
+from appliance.io import packets, skin_codecs, wire_numbers
 from appliance.io.link import reply_to
 from appliance.io.serial_port import PortInfo
 from appliance.io.serial_sensor import BytePort
@@ -260,11 +260,8 @@ def other_grid(profile: SkinProfile, heard: HeardBytes) -> int:
     steps = Counter(later - at for at, later in pairwise(places))
     if not steps:
         return 0
-    (step, times), size = (
-        steps.most_common(1)[0],
-        SweepFormat(1, 1, 1, 1, profile.number).numpy_type.itemsize,
-    )
-    each = size * profile.values
+    step, times = steps.most_common(1)[0]
+    each = wire_numbers.size(profile.number) * profile.values
     whole = (
         times >= FEWEST
         and times * step >= FITS * (len(data) - 2 * step)

@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from appliance.io import wire_numbers
 from appliance.io.skin_codecs.frames import MOST_PACKET
 from appliance.tools import frame_fields, text_analysis
 from appliance.tools.frame_fields import CheckField, Columns, CountField
@@ -298,7 +299,7 @@ def _spans(begin: int, stop: int, wanted: int) -> Iterator[tuple[int, int]]:
     """Parts of the bytes from `begin` to `stop` that may be the numbers. wanted: how many numbers
     there are, 0 for any."""
     if wanted:
-        for size in (4 * wanted, 2 * wanted, wanted):
+        for size in (4 * wanted, 3 * wanted, 2 * wanted, wanted):
             for first in range(begin, stop - size + 1):
                 yield first, first + size
         return
@@ -346,7 +347,7 @@ def _numbers(
     trailer = frame[len(frame) - framing.trailer :].tobytes()
     kind: Literal["marker", "trailer"] = "marker" if marker else "trailer"
     for rank, (dtype, big_endian) in enumerate(framing.columns.types(first, last)):
-        size = np.dtype(dtype).itemsize
+        size = wire_numbers.size(dtype)
         values = (last - first) // size
         fits = grids(values)
         flat = not fits or max(fits[0][:2]) > LONGEST * min(fits[0][:2])

@@ -9,17 +9,20 @@ Each broken link is printed, and the exit code is 1.
 
 from __future__ import annotations
 
+import inspect
 import re
 import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 from urllib.parse import unquote
 
 import manual
 from manual import BOX_PAGES, ROOT
 
+import train.library
 from train.cli.main import PROGRAM
 
 HERE = Path(__file__).resolve().parent
@@ -94,7 +97,8 @@ def main() -> int:
 
 def gather(out: Path) -> list[str]:
     """Write the sources of all pages into `out`; links that lead nowhere."""
-    known = manual.references() | {"training-commands": training_commands()}
+    made = {"training-commands": training_commands(), "library": library()}
+    known = manual.references() | made
     lost: list[str] = []
     names = sorted(pages())
     listed = names + [RESULTS] * (out / RESULTS).exists()
@@ -171,6 +175,32 @@ def training_commands() -> str:
             for name in commands
         ]
     return "\n".join(parts)
+
+
+def library() -> str:
+    """The reference of the library: each public name with its docstring and its members."""
+    return "\n\n".join(_entry(name, getattr(train.library, name)) for name in train.library.__all__)
+
+
+def _entry(name: str, what: Any) -> str:
+    """A class with its own public members, or a function."""
+    text = f"## {name}\n\n    {name}{_parameters(what)}\n\n{inspect.getdoc(what)}"
+    if not inspect.isclass(what):
+        return text
+    for member, value in vars(what).items():
+        function = value.fget if isinstance(value, property) else value
+        if not member.startswith("_") and inspect.isfunction(function):
+            form = "" if isinstance(value, property) else _parameters(function)
+            text += f"\n\n### {name}.{member}\n\n    {member}{form}"
+            text += f"\n\n{inspect.getdoc(function)}"
+    return text
+
+
+def _parameters(function: Any) -> str:
+    """The parameters in brackets, without `self` and types."""
+    found = inspect.signature(function).parameters.values()
+    kept = [one.replace(annotation=one.empty) for one in found if one.name != "self"]
+    return str(inspect.Signature(kept))
 
 
 def linked(page: Path, text: str, out: Path, lost: list[str]) -> str:

@@ -1,4 +1,4 @@
-"""The commands `sets`, `sets describe`, `sets view` and `pull`."""
+"""The commands `sets`, `sets describe`, `sets view`, `sets lerobot` and `pull`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from appliance.core.errors import FormatError
 from appliance.core.storage import put
 from train.arguments import numbers, options
 from train.arguments.types import Add
-from train.data import pull, summary
+from train.data import lerobot_writer, pull, sets, summary
 from train.evaluation import traps
 from train.reports import sweep_pages, sweep_plot
 
@@ -46,6 +46,10 @@ def _add_sets(add: Add) -> None:
         help="FILE.svg: the picture of one sweep; FILE.html: a page to leaf through the set",
     )
     view.set_defaults(run=run_view)
+    robot = commands.add_parser("lerobot", help="write a set as a LeRobot data set, version 3.0")
+    robot.add_argument("set", metavar="SET", help=options.SET)
+    robot.add_argument("out", type=Path, metavar="OUT", help="its folder, which is made")
+    robot.set_defaults(run=run_lerobot)
 
 
 def _add_pull(add: Add) -> None:
@@ -113,6 +117,14 @@ def run_view(args: argparse.Namespace) -> None:
             )
     put(args.out, made.encode(), parents=True)
     print(args.out)
+
+
+def run_lerobot(args: argparse.Namespace) -> None:
+    """Write the set and print its size."""
+    sweeps = sets.load(args.set)
+    lerobot_writer.write(sweeps, args.out)
+    frames = len(sweeps) * sweeps.format.window
+    print(f"{args.out}: {len(sweeps)} episodes of {len(sweeps.materials)} tasks, {frames} frames")
 
 
 def run_pull(args: argparse.Namespace) -> None:

@@ -21,6 +21,12 @@ Array = NDArray[Any]
 RANGE = re.compile(r"([1-9]\d*)(?:-([1-9]\d*))?")
 DAY = re.compile(r"(\d{4}-\d\d-\d\d|\d{1,2}[./]\d{1,2}[./]\d{2,4})[T ].*")
 """A date with a clock time; the first group is the day."""
+DAY_S = 86_400
+MOMENT = re.compile(
+    r"(?:(?P<day>\d{1,4}[-./]\d{1,2}[-./]\d{1,4})[T ]+)?(?P<hour>\d{1,2}):(?P<minute>\d\d)"
+    r"(?::(?P<second>\d\d(?:[.,]\d+)?))?\s?(?P<noon>[aApP][mM])?(?P<zone>Z|[+-]\d\d:?\d\d)?"
+)
+"""A time of the day, perhaps with its date and zone."""
 
 
 class GridMissing(FormatError):
@@ -39,6 +45,7 @@ def frames(table: Table, plan: ImportPlan) -> tuple[Array, Array | None, list[st
         raise FormatError(
             f"holds {values.dtype} {list(values.shape)}; give an array of frames x taxels"
         )
+    values = _without_single_axes(values, plan)
     values, notes = _time_first(values, table, plan)
     at, time_s = _times(values, table, plan)
     chosen = _taxels(values, table, plan, at)
@@ -56,6 +63,15 @@ def frames(table: Table, plan: ImportPlan) -> tuple[Array, Array | None, list[st
             f"frame {index[0] + 1}, taxel {taxel} is {chosen[tuple(index)]:g}; {what}"
         )
     return chosen, time_s, notes
+
+
+def _without_single_axes(values: Array, plan: ImportPlan) -> Array:
+    """The array without axes of length 1 that --grid does not have, such as the channel of
+    PyTorch."""
+    others = tuple(n for n in values.shape if n > 1)
+    if plan.order or not plan.shape or 1 in plan.shape or len(others) != len(plan.shape) + 1:
+        return values
+    return values.reshape(others)
 
 
 def _time_first(values: Array, table: Table, plan: ImportPlan) -> tuple[Array, list[str]]:
@@ -153,21 +169,50 @@ def _times(values: Array, table: Table, plan: ImportPlan) -> tuple[int | None, A
 
 
 def _dates(name: str, table: Table, at: int) -> Array:
-    """The times [n] in seconds of a column of dates, from its first on. Raises FormatError."""
+    """The times [n] in seconds of a column of dates or of times of the day, from its first on.
+    Raises FormatError."""
     if at not in table.texts:
         raise FormatError(f"column {name} holds numbers, not dates; name their unit")
-    first: np.datetime64 | None = None
-    times = []
-    for k, text in enumerate(table.texts[at], 1):
-        try:
-            moment = np.datetime64(text.strip().removesuffix("Z").replace(" ", "T", 1), "ns")
-        except ValueError as e:
-            raise FormatError(
-                f"frame {k}: {text!r} in column {name} is not a date such as 2026-01-31 12:00:00.5"
-            ) from e
-        first = moment if first is None else first
-        times.append((moment - first) / np.timedelta64(1, "s"))
-    return np.array(times, np.float64)
+    found = [MOMENT.fullmatch(text.strip()) for text in table.texts[at]]
+    if None in found:
+        k = found.index(None)
+        raise FormatError(
+            f"frame {k + 1}: {table.texts[at][k]!r} in column {name} is not a date such as "
+            "2026-01-31 12:00:00.5"
+        )
+    parts = [one.groupdict("") for one in found if one]
+    days = _days(name, [one["day"] for one in parts])
+    clock = np.array([_clock_s(one) for one in parts])
+    if not any(one["day"] for one in parts):  # times of the day begin again at midnight
+        days = np.cumsum(np.diff(clock, prepend=clock[0]) < -DAY_S / 2)
+    times: Array = (days - days[0]) * DAY_S + clock - clock[0]
+    return times
+
+
+def _days(name: str, texts: Sequence[str]) -> Array:
+    """The days [n] as numbers. Any form will do if the day does not change. Raises FormatError."""
+    if len(set(texts)) == 1:
+        return np.zeros(len(texts))
+    iso = [re.sub(r"^(\d{1,2})\.(\d{1,2})\.(\d{4})$", r"\3-\2-\1", text) for text in texts]
+    iso = [re.sub(r"-(\d)(?!\d)", r"-0\1", text.replace("/", "-")) for text in iso]
+    try:
+        return np.array(iso, "datetime64[D]").astype(np.int64)
+    except ValueError as e:
+        day = next(text for text in texts if text != texts[0])
+        raise FormatError(
+            f"the day changes from {texts[0]!r} to {day!r} in column {name}; "
+            "write days as 2026-01-31"
+        ) from e
+
+
+def _clock_s(parts: Mapping[str, str]) -> float:
+    """The time of the day in seconds, in the zone of its date."""
+    hours, noon = int(parts["hour"]), parts["noon"].lower()
+    hours = hours % 12 + 12 * (noon == "pm") if noon else hours
+    zone = re.fullmatch(r"([+-])(\d\d):?(\d\d)", parts["zone"])
+    offset = 60 * (60 * int(zone[2]) + int(zone[3])) * (1 if zone[1] == "+" else -1) if zone else 0
+    seconds = float(parts["second"].replace(",", ".") or 0)
+    return 3600 * hours + 60 * int(parts["minute"]) + seconds - offset
 
 
 def _taxels(values: Array, table: Table, plan: ImportPlan, time_column: int | None) -> Array:

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from appliance.io import checksums
+from appliance.io import checksums, wire_numbers
 from appliance.io.checksums import Checksum
 from appliance.io.skin_codecs.frames import NONE, Decoded, Rest, arranged, collected
 from appliance.io.skin_profile import SkinProfile
@@ -32,7 +32,7 @@ class FixedLayout:
     belong to the frame before it.
 
     Offsets are counted from the beginning of a mark. count: of the frame count, whose type is
-    count_type (None: there is none). numbers: of the first number, whose type is number. check: of
+    count_type (None: there is none). numbers: of the first number. check: of
     the checksum; covered: of the first byte that it covers. checksum: None if there is none.
     """
 
@@ -43,7 +43,6 @@ class FixedLayout:
     count: int
     count_type: np.dtype[Any] | None
     numbers: int
-    number: np.dtype[Any]
     check: int
     covered: int
     checksum: Checksum | None
@@ -52,20 +51,17 @@ class FixedLayout:
     @property
     def body(self) -> slice:
         """The bytes of the numbers."""
-        p = self.profile
-        return slice(self.numbers, self.numbers + p.rows * p.cols * p.values * self.number.itemsize)
+        return slice(self.numbers, self.numbers + self.profile.body)
 
 
 @lru_cache(8)
 def _layout(p: SkinProfile) -> FixedLayout:
-    order, count_order = (_SIGNS[one or p.byte_order] for one in (p.byte_order, p.sequence_order))
-    number = np.dtype(p.number).newbyteorder(order)
-    count = np.dtype(p.sequence).newbyteorder(count_order) if p.sequence else None
+    order = _SIGNS[p.sequence_order or p.byte_order]
+    count = np.dtype(p.sequence).newbyteorder(order) if p.sequence else None
     mark, room = p.trailer + p.marker, count.itemsize if count else 0
     ahead = room if p.sequence_at <= p.skip_before else 0  # else the count is behind the numbers
-    body = p.rows * p.cols * p.values * number.itemsize
     checksum = checksums.parsed(p.checksum)
-    check = len(mark) + room + p.skip_before + body + p.skip_after
+    check = len(mark) + room + p.skip_before + p.body + p.skip_after
     return FixedLayout(
         p,
         mark,
@@ -74,7 +70,6 @@ def _layout(p: SkinProfile) -> FixedLayout:
         len(mark) + p.sequence_at,
         count,
         len(mark) + ahead + p.skip_before,
-        number,
         check,
         len(p.trailer) + p.checksum_from,
         checksum,
@@ -161,8 +156,9 @@ def _columns(
     if kind := layout.count_type:
         raw = np.ascontiguousarray(table[:, layout.count : layout.count + kind.itemsize])
         counts = raw.view(kind)[:, 0].astype(np.int64)
-    body = np.ascontiguousarray(table[:, layout.body])
-    return arranged(layout.profile, body.view(layout.number)), counts
+    p = layout.profile
+    numbers = wire_numbers.read(table[:, layout.body], p.number, p.byte_order)
+    return arranged(p, numbers), counts
 
 
 def _run(layout: FixedLayout, data: bytes, at: int) -> tuple[int, bool]:

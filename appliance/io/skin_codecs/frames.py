@@ -70,7 +70,7 @@ def arranged(profile: SkinProfile, numbers: NDArray[Any]) -> NDArray[Any]:
         }[turn]
     if len(profile.take) == 1:
         grid = grid[..., 0]
-    return np.ascontiguousarray(grid, np.dtype(profile.number).newbyteorder("<"))
+    return np.ascontiguousarray(grid, np.dtype(profile.data_type).newbyteorder("<"))
 
 
 def collected(
@@ -87,7 +87,7 @@ def collected(
     table = (
         np.stack(numbers)
         if numbers
-        else np.empty((0, profile.rows * profile.cols * profile.values), profile.number)
+        else np.empty((0, profile.rows * profile.cols * profile.values), profile.data_type)
     )
     return Decoded(
         arranged(profile, table),

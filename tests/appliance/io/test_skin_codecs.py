@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from appliance.core.errors import ConfigError
 from appliance.io.skin_codecs import Decoded, Rest, arranged, codec, fixed
 from appliance.io.skin_profile import SkinProfile
 from tests.factories.skin_wires import NAMES, papillarray, profile, taxels, wire
@@ -414,3 +415,32 @@ def test_nothing_but_marks_is_passed_over(name: str, monkeypatch: pytest.MonkeyP
     found = decoded(p, data)
     assert len(found) == 0
     assert len(looked) <= len(data) // fixed._layout(p).period + 1
+
+
+@pytest.mark.parametrize(
+    ("number", "order", "wire", "values"),
+    [
+        ("uint24", "little", "010000 0000ff ffffff", [1, 0xFF0000, 0xFFFFFF]),
+        ("uint24", "big", "000001 ff0000 ffffff", [1, 0xFF0000, 0xFFFFFF]),
+        ("int24", "little", "ffffff 000080 ffff7f", [-1, -(1 << 23), (1 << 23) - 1]),
+        ("int24", "big", "ffffff 800000 7fffff", [-1, -(1 << 23), (1 << 23) - 1]),
+        ("uint32", "little", "01000000 00000080 ffffffff", [1, 1 << 31, 1 << 32]),
+        ("int32", "big", "ffffffff 80000000 00ffffff", [-1, -(1 << 31), (1 << 24) - 1]),
+    ],
+)
+def test_numbers_of_24_and_32_bits(number: str, order: str, wire: str, values: list[int]):
+    """Both byte orders and signs. They become float32; of more than 24 bits the lowest are
+    rounded, so 2**32 - 1 reads 2**32."""
+    p = replace(SMALL, number=number, byte_order=order, rows=1, sequence="uint8")
+    frames = b"".join(b"\xaa\x55" + bytes([i]) + bytes.fromhex(wire) for i in range(4))
+    found = decoded(p, frames)
+    assert found.taxels.dtype == np.float32
+    assert p.format.dtype == "float32"
+    assert found.taxels.tolist() == [[values]] * 3
+    assert found.counts.tolist() == [0, 1, 2]
+
+
+def test_wide_numbers_belong_to_frames_of_fixed_length():
+    """A text has no width."""
+    with pytest.raises(ConfigError, match='number = "uint24" is for codec = "fixed"; write number'):
+        replace(TEXT, number="uint24")

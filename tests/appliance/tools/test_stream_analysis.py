@@ -218,3 +218,36 @@ def test_grids_are_the_squarest_first_and_fit_the_format() -> None:
     assert grids(45)[:1] == ((5, 9, 1),)
     assert (3, 5, 3) in grids(45)
     assert all(max(grid) <= 255 for grid in grids(1024))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bits", [24, 32])
+@pytest.mark.parametrize("order", ["little", "big"])
+@pytest.mark.parametrize("signed", [False, True])
+@pytest.mark.parametrize("most", [3_000, 800_000])
+def test_numbers_of_24_and_32_bits_and_their_byte_order(
+    bits: int, order: str, signed: bool, most: int
+) -> None:
+    """A converter of 24 bits behind a marker and a count, with a checksum; numbers that use the
+    whole range, and numbers that leave the highest byte at rest."""
+    values = matrix(31, 200, 24, most).astype(int) - signed * most // 2
+    frames = []
+    for i, frame in enumerate(values.tolist()):
+        data = bytes([i % 256])
+        data += b"".join(v.to_bytes(bits // 8, order, signed=signed) for v in frame)  # type: ignore[arg-type]
+        frames.append(b"\xaa\x55" + data + bytes([NAMED["crc8"].of(data)]))
+    best, keys = described(frames)
+    assert (best.dtype, best.big_endian) == (f"{'' if signed else 'u'}int{bits}", order == "big")
+    assert (best.values, best.sequence, keys["checksum"]) == (24, "uint8", "crc8")
+    text = skin_new.profile(best, (4, 6, 1), 115_200, skin_new.PortInfo(""))
+    found, _ = skin_new.decoded(text, reads(frames))
+    assert found >= 198
+
+
+def test_one_touched_number_of_16_bits_is_not_one_of_32() -> None:
+    """All others are zero, and so the bytes beside it look like its high bytes."""
+    values = np.zeros((120, 16))
+    values[:, 6] = matrix(32, 120, 1, 900)[:, 0]
+    frames = [b"\xa5\x5a" + frame.astype("<u2").tobytes() for frame in values]
+    found = analyse(reads(frames))
+    assert {p.dtype for p in found} <= {"uint8", "uint16", "int16"}

@@ -3,6 +3,7 @@ be."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -160,6 +161,17 @@ def test_only_the_columns_that_are_used_must_be_numbers():
             frames.frames(table, plan(grid=grid, **asked))
 
 
+@pytest.mark.parametrize("shape", [(1, 40, 2, 3), (40, 1, 2, 3), (40, 2, 3, 1), (1, 2, 3, 40)])
+def test_axes_of_length_one_are_left_out(shape: tuple[int, ...]):
+    """A batch, a channel, an axis: the grid does not have them. A grid with them keeps them."""
+    values = cube(2, 3, 40)
+    moved = np.moveaxis(values, 0, -1) if shape[-1] == 40 else values
+    found, _, _ = frames.frames(Table(moved.reshape(shape)), plan(grid="2x3"))
+    np.testing.assert_array_equal(found, values)
+    found, _, _ = frames.frames(Table(values.reshape(40, 6, 1)), plan(grid="6x1"))
+    np.testing.assert_array_equal(found, values.reshape(40, 6, 1))
+
+
 def test_text_columns_are_no_taxels():
     """They are passed over without --columns, and refused if --columns names them."""
     table = text(("label", "a", "b"), texts={0: ["wood"] * 40})
@@ -179,6 +191,52 @@ def test_a_column_of_dates_gives_the_times():
     np.testing.assert_allclose(time_s, np.arange(40) / 10)
     dates[3] = "noon"
     with pytest.raises(FormatError, match="frame 4: 'noon' in column when is not a date"):
+        frames.frames(table, plan(grid="1x1", time="when:date", rate_hz=None))
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        "2026-01-31T12:59:{0:06.3f}+01:00",
+        "2026-01-31 12:59:{0:06.3f}Z",
+        "31.01.2026 12:59:{0:06.3f}",
+        "1/31/2026 12:59:{0:06.3f} PM",
+        "12:59:{0:06.3f}",
+        "12:59:{1:02d},{2:03d}",
+    ],
+)
+def test_dates_of_other_forms_give_the_times(form: str):
+    """With a zone, of other countries, of a clock alone, with a decimal comma."""
+    at = 40 + np.arange(40) / 4
+    dates = [form.format(s, int(s), round(s % 1 * 1000)) for s in at.tolist()]
+    table = text(("when", "a"), texts={0: dates})
+    _, time_s, _ = frames.frames(table, plan(grid="1x1", time="when:date", rate_hz=None))
+    np.testing.assert_allclose(time_s, np.arange(40) / 4)
+
+
+@pytest.mark.parametrize(
+    "form",
+    ["2026-01-{0} {1}", "{0}.1.2026 {1}", "2026/1/{0} {1}", "{1}"],
+)
+def test_dates_go_on_at_midnight(form: str):
+    """Days that change, and a clock that begins again."""
+    clock = [(23, 59, 59), (0, 0, 0), (0, 0, 1)]
+    texts = [
+        form.format(30 + (not hour), f"{hour:02}:{minute:02}:{second:02}")
+        for hour, minute, second in clock
+    ]
+    table = text(("when", "a"), texts={0: texts})
+    table = replace(table, values=table.values[:3])
+    _, time_s, _ = frames.frames(table, plan(grid="1x1", time="when:date", rate_hz=None))
+    assert time_s is not None
+    assert time_s.tolist() == [0, 1, 2]
+
+
+def test_days_that_could_be_months_are_refused():
+    """Only where they change, since the time between frames then depends on it."""
+    texts = ["01/02/2026 12:00:00"] * 39 + ["02/02/2026 12:00:00"]
+    table = text(("when", "a"), texts={0: texts})
+    with pytest.raises(FormatError, match="the day changes from '01/02/2026' to '02/02/2026'"):
         frames.frames(table, plan(grid="1x1", time="when:date", rate_hz=None))
 
 

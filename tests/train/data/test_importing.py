@@ -234,7 +234,7 @@ BAD = {
         GOOD.encode() + b"1,nan,3,4\n",
         "frame 21, taxel 1, 2 is nan; fill it in or cut it away",
     ),
-    "UTF-16": (GOOD.encode("utf-16-le"), "is UTF-16 or not a text; save it as UTF-8"),
+    "numbers": (bytes([1, 0, 0, 0] * 99), "is not a text; save it as UTF-8"),
     "wide": (
         b"1,2,3,4,5\n" * 20,
         "it has 5 columns, but a grid of 2x2 needs 4; see --columns and --grid",
@@ -274,7 +274,7 @@ def test_each_bad_text_gets_one_exact_line(tmp_path: Path, name: str):
         (
             "npy",
             lambda p: np.save(p, np.array([{}]), allow_pickle=True),
-            "cannot be read: Object arrays cannot be loaded",
+            "holds objects of Python, which are not read; save numbers",
         ),
         ("npy", lambda p: p.write_bytes(b"\x93NUMPY"), "cannot be read: "),
         (
@@ -292,7 +292,7 @@ def test_each_bad_text_gets_one_exact_line(tmp_path: Path, name: str):
         (
             "mat",
             lambda p: p.write_bytes(b"MATLAB 5.0" + bytes(200)),
-            "is not a MAT file of version 5 to 7.3; save it with -v7",
+            "is not a MAT file of version 4 to 7.3; save it with -v7",
         ),
         ("h5", lambda p: p.write_bytes(b"nothing"), "cannot be read: "),
         (
@@ -457,3 +457,17 @@ def test_a_missing_grid_ends_the_import_at_the_first_file(tmp_path: Path):
     with pytest.raises(FormatError, match=r"a_1.csv has 4 columns; give their layout with --grid"):
         import_folder(tmp_path, plan(grid=""), lambda line: None, left_out)
     assert left_out == []
+
+
+def test_columns_in_another_order_are_refused_unless_they_are_named(tmp_path: Path):
+    """Taxels would change places, silently. The place of the times does not matter."""
+    timed = np.column_stack([np.arange(40) / 100, COUNTS])
+    text(tmp_path / "felt_1.csv", np.roll(timed, -1, axis=1) + 1, head="a,b,c,d,t\n")
+    text(tmp_path / "felt_2.csv", timed[:, ::-1], head="d,c,b,a,t\n")
+    text(tmp_path / "wood_1.csv", timed, head="t,a,b,c,d\n")
+    assert reasons(tmp_path, time="t:s", rate_hz=None) == {
+        "felt_2.csv": "has the column 'd' where another file has 'a'; "
+        "give the order of the taxels with --columns and their names"
+    }
+    made = taken(tmp_path, time="t:s", rate_hz=None, columns="a,b,c,d")
+    np.testing.assert_array_equal(made.sweeps.samples[1], made.sweeps.samples[2])

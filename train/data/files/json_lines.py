@@ -19,11 +19,9 @@ def read(data: bytes, wanted: ReadPlan) -> Table:
     """The frames in a text of JSON. Raises FormatError that names the line and the key."""
     text, notes = decoded(data)
     whole = _whole(text)
-    if isinstance(whole, dict) and all(isinstance(v, list) for v in whole.values()) and whole:
-        lengths = {key: len(values) for key, values in whole.items()}
-        if len(set(lengths.values())) > 1:
-            raise FormatError(f"its columns differ in length: {lengths}")
-        whole = [dict(zip(whole, row, strict=True)) for row in zip(*whole.values(), strict=True)]
+    if isinstance(whole, dict):
+        whole, said = _unwrapped(whole, wanted)
+        notes += said
     if isinstance(whole, list) and whole and isinstance(whole[0], list | dict):
         rows, what = list(enumerate(whole, 1)), "entry"
     else:
@@ -32,7 +30,38 @@ def read(data: bytes, wanted: ReadPlan) -> Table:
     frames = [(i, dict(_flat("", value))) for i, value in rows]
     if not frames:
         raise FormatError("holds no frames; write one object or list of numbers on each line")
+    while len(frames) > 2 and frames[0][1].keys() != frames[1][1].keys() == frames[2][1].keys():
+        notes = [*notes, f"{what} {frames[0][0]} is passed over: it has other keys"]
+        frames = frames[1:]
     return _table(frames, what, notes)
+
+
+def _unwrapped(whole: dict[str, Any], wanted: ReadPlan) -> tuple[Any, list[str]]:
+    """The list of frames in an object, and remarks; the object itself if it is a frame.
+
+    An object holds a list for each column, as pandas writes them in three ways, or one list of
+    frames beside facts about them. Raises FormatError.
+    """
+    if {"columns", "data"} <= whole.keys() and isinstance(whole["columns"], list):
+        return [dict(zip(whole["columns"], row, strict=True)) for row in whole["data"]], []
+    if all(isinstance(v, dict) and _is_numbered(v) for v in whole.values()):
+        whole = {key: list(values.values()) for key, values in whole.items()}
+    lists = {k: v for k, v in whole.items() if isinstance(v, list) and len(v) > 1}
+    frames = [k for k, v in lists.items() if isinstance(v[0], list | dict)]
+    if wanted.variable in frames:
+        frames = [wanted.variable]
+    if len(frames) == 1 and (len(lists) < len(whole) or wanted.variable):
+        return lists[frames[0]], [f"its list {frames[0]!r} holds the frames"]
+    if len(lists) < len(whole):
+        return whole, []
+    lengths = {key: len(values) for key, values in whole.items()}
+    if len(set(lengths.values())) > 1:
+        raise FormatError(f"its columns differ in length: {lengths}")
+    return [dict(zip(whole, row, strict=True)) for row in zip(*whole.values(), strict=True)], []
+
+
+def _is_numbered(column: dict[str, Any]) -> bool:
+    return list(column) == [str(i) for i in range(len(column))]
 
 
 def _whole(text: str) -> Any:
@@ -53,7 +82,8 @@ def _once(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
 
 def _lines(lines: Sequence[str]) -> tuple[list[tuple[int, Any]], list[str]]:
     """The value of each line that is not blank. A last line that is cut off is dropped."""
-    kept = [(i, line) for i, line in enumerate(lines, 1) if line.strip()]
+    kept = [(i, line.strip().rstrip(",")) for i, line in enumerate(lines, 1)]
+    kept = [(i, line) for i, line in kept if line not in ("", "[", "]")]
     rows = []
     for i, line in kept:
         try:

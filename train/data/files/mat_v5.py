@@ -82,7 +82,7 @@ def variables(data: bytes) -> dict[str, Any]:
     """
     order = ENDIAN.get(data[126:128], "")
     if not order:
-        raise FormatError("is not a MAT file of version 5 to 7.3; save it with -v7")
+        raise FormatError("is not a MAT file of version 4 to 7.3; save it with -v7")
     found: dict[str, Any] = {}
     for kind, content in _elements(data[HEADER:], order):
         if kind == COMPRESSED:

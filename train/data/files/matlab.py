@@ -1,7 +1,8 @@
 """Reads MAT files of all versions and MATLAB's figures.
 
-mat_v5.py reads versions 5 to 7; version 7.3 is HDF5. Arrays are found in structures and cells too,
-by a path such as data.skin or runs{2}.skin. Texts, dates, tables and other objects are passed over.
+mat_v4.py reads version 4, mat_v5.py versions 5 to 7; version 7.3 is HDF5. Arrays are found in
+structures and cells too, by a path such as data.skin or runs{2}.skin. Texts, dates, tables and
+other objects are passed over.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import h5py
 import numpy as np
 
 from appliance.core.errors import FormatError
-from train.data.files import hdf5, mat_v5
+from train.data.files import hdf5, mat_v4, mat_v5
 from train.data.files.mat_v5 import Struct
 from train.data.files.table import Array, Entry, ReadPlan, Table, chosen, from_columns
 
@@ -35,7 +36,8 @@ def read(path: Path, wanted: ReadPlan) -> Table:
                 raise FormatError(f"is a figure of version 7.3; {REMEDY}")
             dotted = {name.replace("/", "."): e for name, e in hdf5.entries(file, True).items()}
             return chosen(dotted, wanted)
-    content = mat_v5.variables(path.read_bytes())
+    data = path.read_bytes()
+    content = mat_v4.variables(data) if mat_v4.is_version_4(data) else mat_v5.variables(data)
     if FIGURE in content:
         return _figure(content[FIGURE])
     found = mat_v5.arrays_of(content)

@@ -18,7 +18,14 @@ FORMAT: Any = np.lib.format
 
 def read_npy(path: Path, wanted: ReadPlan) -> Table:
     """The array of an .npy file. Raises FormatError or what NumPy raises for a damaged file."""
-    values = np.load(path, allow_pickle=False)
+    try:
+        values = np.load(path, allow_pickle=False)
+    except ValueError as e:
+        if "pickle" not in str(e):
+            raise
+        raise FormatError(
+            "holds objects of Python, which are not read; save numbers with numpy.save"
+        ) from e
     return records(values) if values.dtype.names else Table(values)
 
 

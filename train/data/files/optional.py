@@ -10,9 +10,9 @@ from appliance.core.errors import FormatError
 EXTRA = "pip install 'palpate-train[files]'"
 
 
-def library(name: str, what: str) -> Any:
-    """The module `name`, which reads `what`. Raises FormatError that names the extra."""
+def library(name: str, what: str, use: str = "read") -> Any:
+    """The module `name`, which can `use` `what`. Raises FormatError that names the extra."""
     try:
         return import_module(name)
     except ImportError as e:
-        raise FormatError(f"is {what}; to read it: {EXTRA} ({e})") from e
+        raise FormatError(f"is {what}; to {use} it: {EXTRA} ({e})") from e

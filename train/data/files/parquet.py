@@ -38,6 +38,8 @@ def table(content: Any) -> Table:
     texts: dict[int, list[str]] = {}
     faults: dict[int, str] = {}
     left: list[str] = []
+    while any(str(kind).startswith("struct") for kind in content.schema.types):
+        content = content.flatten()
     for name in content.column_names:
         values, kind = content.column(name), str(content.column(name).type)
         if kind.startswith(("string", "large_string", "dictionary", "date", "timestamp[")):
@@ -45,7 +47,10 @@ def table(content: Any) -> Table:
             columns.append(np.zeros(len(values), np.uint8))
             names.append(name)
             continue
-        found = numbers(values, name)
+        try:
+            found = numbers(values, name)
+        except FormatError as e:  # another column may hold the skin
+            found, faults[len(names)] = np.full(len(values), np.nan), str(e)
         if found is None:
             left.append(name)
             continue
@@ -61,19 +66,47 @@ def table(content: Any) -> Table:
 
 
 def numbers(values: Any, name: str) -> Array | None:
-    """The numbers of a column, [n] or [n, ...] for lists of equal length; None for another type.
+    """The numbers of a column in their type, [n] or [n, ...] for lists of equal length; None for
+    another type. An empty row becomes NaN.
 
     Raises FormatError if lists differ in length.
     """
-    kind = str(values.type)
-    if "list" in kind or "extension" in kind:
-        rows = values.to_pylist()
-        try:
-            found = np.array(rows)
-        except ValueError as e:
-            raise FormatError(f"column {name} holds lists of different lengths") from e
-        return found if found.dtype.kind in "biuf" else None
-    if values.null_count and ("int" in kind or "bool" in kind):
-        values = values.cast("float64")
-    found = np.asarray(values.to_numpy())
-    return found if found.dtype.kind in "biuf" else None
+    flat, shape, there = _flat(values, name)
+    kind = str(flat.type)
+    if kind.startswith("decimal"):
+        flat = flat.cast("float64")
+    if flat.null_count and ("int" in kind or "bool" in kind):
+        flat = flat.cast("float64")
+    found = np.asarray(flat.to_numpy(zero_copy_only=False))
+    if found.dtype.kind not in "biuf":
+        return None
+    found = found.reshape(-1, *shape)
+    if there.all():
+        return found
+    whole = np.full((len(there), *shape), np.nan)
+    whole[there] = found
+    return whole
+
+
+def _flat(values: Any, name: str) -> tuple[Any, tuple[int, ...], Array]:
+    """The innermost elements of a column of lists, the shape of a row, and which rows are not empty
+    lists, bool [n]. Raises FormatError."""
+    arrow, compute = library("pyarrow", ""), library("pyarrow.compute", "")
+    array = values.combine_chunks()
+    if isinstance(array, arrow.ChunkedArray):  # of no or of many gigabytes
+        array = arrow.concat_arrays(array.chunks) if array.num_chunks else arrow.array([])
+    shape: list[int] = []
+    there = np.ones(len(array), bool)
+    while True:
+        if isinstance(array, arrow.ExtensionArray):
+            array = array.storage
+        if "list" not in str(array.type).split("<")[0]:
+            return array, tuple(shape), there
+        if not shape:
+            there = np.asarray(array.is_valid().to_numpy(zero_copy_only=False))
+            array = array.drop_null()
+        lengths = compute.unique(compute.list_value_length(array)).to_pylist()
+        if len(lengths) != 1 or lengths == [None]:
+            raise FormatError(f"column {name} holds lists of different lengths")
+        shape.append(lengths[0])
+        array = array.flatten()

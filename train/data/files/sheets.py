@@ -29,8 +29,9 @@ def read(path: Path, wanted: ReadPlan) -> Table:
     why = "holds no line of numbers"
     for name in [variable] if variable else sheets:
         rows = book.get_sheet_by_name(sheets[name]).to_python(skip_empty_area=False)
+        rows, notes = _filled(rows)
         try:
-            tables[name] = text.table(_lines(rows), wanted, delimiter=",", decimal=".")
+            tables[name] = text.table(_lines(rows), wanted, notes, delimiter=",", decimal=".")
         except FormatError as e:
             if str(e) != why:
                 raise FormatError(f"sheet {name}: {e}") from e
@@ -41,6 +42,25 @@ def read(path: Path, wanted: ReadPlan) -> Table:
     if not tables:
         raise FormatError(why)
     return next(iter(tables.values()))
+
+
+def _filled(rows: Sequence[Sequence[Any]]) -> tuple[list[list[Any]], list[str]]:
+    """The rows without columns that are empty before the table, and without columns of remarks:
+    those without a number whose cells are empty in most rows. Remarks say so."""
+    wide = max(map(len, rows), default=0)
+    table = [[*row, *[""] * (wide - len(row))] for row in rows]
+    ahead = next((i for i in range(wide) if any(row[i] != "" for row in table)), 0)
+    remarks = [
+        i
+        for i in range(ahead, wide)
+        if all(isinstance(row[i], str) for row in table)
+        and 2 * sum(row[i] != "" for row in table) < len(table)
+    ]
+    kept = [[v for i, v in enumerate(row) if i >= ahead and i not in remarks] for row in table]
+    notes = [f"its first {ahead} columns are empty and do not count"] if ahead else []
+    if any(row[i] != "" for row in table for i in remarks):
+        notes.append(f"columns of remarks are left out: {', '.join(str(i + 1) for i in remarks)}")
+    return kept, notes
 
 
 def _lines(rows: Sequence[Sequence[Any]]) -> list[str]:

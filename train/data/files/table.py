@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
+import re
 import unicodedata
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +18,10 @@ from appliance.core.errors import FormatError
 Array = NDArray[Any]
 MOST_LISTED = 12
 """Largest number of arrays that an error message lists."""
+LEAST_SERIES = 20
+"""Smallest number of arrays that are the frames of one recording."""
+RUNNING = re.compile(r"(.*?)(\d+)(\D*)")
+"""A name with a running number."""
 LONGEST = 40
 """Longest excerpt of a cell in an error message."""
 
@@ -71,6 +78,11 @@ class Entry:
         return self.kind in "biuf" and sum(n > 1 for n in self.shape) > 1
 
     @property
+    def size(self) -> int:
+        """The number of elements."""
+        return math.prod(self.shape)
+
+    @property
     def is_vector(self) -> bool:
         return self.kind in "biuf" and sum(n > 1 for n in self.shape) < 2 and 0 not in self.shape
 
@@ -98,25 +110,60 @@ def chosen(entries: Mapping[str, Entry], wanted: ReadPlan) -> Table:
     entries = {normal(name): entry for name, entry in entries.items()}
     numbers = {name: e for name, e in entries.items() if e.kind in "biuf" or e.fields}
     listed = _listed(numbers)
-    name = normal(wanted.variable)
+    name, time = normal(wanted.variable), normal(wanted.time)
     if name and name not in numbers:
         found = [known for known in numbers if known.rpartition("/")[2] == name]
+        inside = {n: e for n, e in numbers.items() if re.match(rf"{re.escape(name)}[/.({{]", n)}
+        if len(found) != 1 and inside:
+            beside = {time: numbers[time]} if time in numbers else {}
+            return chosen(inside | beside, replace(wanted, variable=""))
         if len(found) != 1:
             raise FormatError(f"has no array {name!r}; it holds {listed}")
         (name,) = found
     tables = {name: numbers[name]} if name else {n: e for n, e in numbers.items() if e.holds_frames}
-    if len(tables) != 1:
+    table = _only(tables) or _series(tables) or (None if tables else _columns(numbers, time))
+    if table is None:
         raise FormatError(
             f"holds {len(tables)} arrays of frames; name one with --variable: it holds {listed}"
         )
-    ((name, entry),) = tables.items()
-    table = records(entry.read()) if entry.fields else Table(entry.read())
     vectors = {n: e for n, e in numbers.items() if e.is_vector and n != name}
-    time = normal(wanted.time)
     asked = {time: vectors[time].read().ravel()} if time in vectors else {}
-    return Table(
-        table.values, table.columns, asked, tuple(vectors), table.texts, table.faults, table.notes
-    )
+    return replace(table, vectors=asked, beside=tuple(vectors))
+
+
+def _only(tables: Mapping[str, Entry]) -> Table | None:
+    """The table of the only array."""
+    if len(tables) != 1:
+        return None
+    (entry,) = tables.values()
+    return records(entry.read()) if entry.fields else Table(entry.read())
+
+
+def _series(tables: Mapping[str, Entry]) -> Table | None:
+    """Arrays of one shape whose names differ in a running number, as the frames of a table."""
+    found = [RUNNING.fullmatch(name) for name in tables]
+    if len(tables) < LEAST_SERIES or None in found or any(e.fields for e in tables.values()):
+        return None
+    numbered = {int(one[2]): name for one, name in zip(found, tables, strict=True) if one}
+    stems = {one.group(1, 3) for one in found if one}
+    shapes = {entry.shape for entry in tables.values()}
+    order = sorted(numbered)
+    if len(stems) > 1 or len(shapes) > 1 or order[-1] - order[0] != len(tables) - 1:
+        return None
+    first, last = numbered[order[0]], numbered[order[-1]]
+    frames = np.stack([np.squeeze(tables[numbered[k]].read()) for k in order])
+    return Table(frames, notes=(f"its {len(order)} arrays {first} to {last} are its frames",))
+
+
+def _columns(numbers: Mapping[str, Entry], time: str) -> Table | None:
+    """Vectors of one length as the columns of a table, without the times."""
+    vectors = {n: e for n, e in numbers.items() if e.is_vector and e.size > 1 and n != time}
+    if len(vectors) < 2:
+        return None
+    usual = Counter(entry.size for entry in vectors.values()).most_common(1)[0][0]
+    kept = {n: e.read().ravel() for n, e in vectors.items() if e.size == usual}
+    note = f"its {len(kept)} arrays of {usual} numbers are its columns"
+    return from_columns(list(kept), list(kept.values()), {}, [note])
 
 
 def _listed(numbers: Mapping[str, Entry]) -> str:

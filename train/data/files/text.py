@@ -18,11 +18,13 @@ from itertools import pairwise
 import numpy as np
 
 from appliance.core.errors import FormatError
+from train.data.files import plain_lines
 from train.data.files.decimals import decimal_sign, plain
+from train.data.files.plain_lines import PlainText
 from train.data.files.table import Array, ReadPlan, Table, excerpt, normal
 
-COMMENTS = ("#", "%")
-DELIMITERS = ("\t", ";", ",", None)
+COMMENTS = ("#", "%", "//")
+DELIMITERS = ("\t", ";", "|", ",", None)
 """What can separate columns. Without any of the signs, blanks do."""
 SHEET_ERROR = re.compile(r"[\"']?#(N/A|N/V|NV|[A-ZÄÖÜ0-9/]+[!?])")
 """How spreadsheets write a cell without a value. It is not a comment."""
@@ -48,10 +50,10 @@ Row = tuple[int, str]
 def decoded(data: bytes) -> tuple[str, list[str]]:
     """The text, and remarks on what was dropped at its end."""
     notes: list[str] = []
-    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
-        return data.decode("utf-16", "replace").lstrip("\ufeff"), notes
+    if wide := _wide(data):
+        return data.decode(wide, "replace").lstrip("\ufeff"), notes
     if data[:400].count(0) > len(data[:400]) // 3:
-        raise FormatError("is UTF-16 or not a text; save it as UTF-8")
+        raise FormatError("is not a text; save it as UTF-8")
     whole = data.rstrip(b"\0\x1a")
     if lost := len(data) - len(whole):
         notes.append(f"read up to {lost} bytes NUL at its end")
@@ -59,6 +61,23 @@ def decoded(data: bytes) -> tuple[str, list[str]]:
         return whole.decode("utf-8-sig"), notes
     except UnicodeDecodeError:
         return whole.decode("cp1252", "replace"), notes
+
+
+def _wide(data: bytes) -> str:
+    """The encoding of a text of two or four bytes a character, "" for another: a mark at its
+    beginning shows it, or the zeros between its characters."""
+    if data.startswith((b"\xff\xfe\0\0", b"\0\0\xfe\xff")):
+        return "utf-32"
+    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return "utf-16"
+    head = data[:400]
+    for encoding, zeros, others in (
+        ("utf-16-le", head[1::2], head[::2]),
+        ("utf-16-be", head[::2], head[1::2]),
+    ):
+        if len(zeros) > 8 and not any(zeros) and all(others):
+            return encoding
+    return ""
 
 
 def lines_of(text: str) -> list[str]:
@@ -99,16 +118,19 @@ def table(
 ) -> Table:
     """The table in the lines of a text. delimiter, decimal: "" if the text must show them."""
     decimal = wanted.decimal or decimal
+    bare = PlainText(lines) if lines and lines[0].startswith(LVM) else plain_lines.plain(lines)
+    lines = bare.lines
     numbered, names, decimal = _labview(lines, decimal)
     kept = [(i, line) for i, line in numbered if line.strip()]
     layout = _layout(kept, delimiter)
     start, end = _body(kept, layout)
-    said = [*notes, *_remarks(kept, start, end, layout)]
+    said = [*notes, *bare.notes, *_remarks(kept, start, end, layout)]
     rows = [(i, line) for i, line in kept[start:end] if not _is_comment(line, layout)]
     if between := end - start - len(rows):
         said.append(f"{between} comments between its frames are passed over")
     decimal = decimal or decimal_sign(rows, layout.delimiter, layout.cells)
-    names = names or _heads(lines, kept[:start], layout)
+    named = len(bare.names) == layout.wide
+    names = names or (bare.names if named else _heads(lines, kept[:start], layout))
     names, label = _row_names(names, rows, layout)
     layout = Layout(layout.delimiter, layout.wide, layout.text_columns | label)
     whole = _plain_numbers(rows, layout, decimal)
@@ -265,7 +287,7 @@ def _heads(lines: Sequence[str], before: Sequence[Row], layout: Layout) -> tuple
     for wide in (layout.wide, layout.wide - 1):
         for group in (plain_lines, comments):
             heads = [
-                [c.strip().strip('"') for c in cells(line, layout.delimiter)] for line in group
+                [c.strip().strip("\"'") for c in cells(line, layout.delimiter)] for line in group
             ]
             heads = [h[:-1] if len(h) == wide + 1 and not h[-1] else h for h in heads]
             heads = [h for h in heads if len(h) == wide and not all(map(is_number, h))]

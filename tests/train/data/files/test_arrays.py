@@ -79,6 +79,40 @@ def test_an_array_is_found_by_the_end_of_its_path(tmp_path: Path):
     np.testing.assert_array_equal(raw_files.read(tmp_path / "a.h5", ReadPlan("skin")).values, SKIN)
 
 
+def test_vectors_are_columns(tmp_path: Path):
+    """Of one length, in one group; the times are not among them, and others are left out."""
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for k in range(4):
+            file[f"taxels/s{k}"] = SKIN[:, k]
+        file["rate"], file["t"], file["events"] = 100.0, np.arange(40) / 10, np.arange(7)
+    found = raw_files.read(tmp_path / "a.h5", ReadPlan(time="t"))
+    np.testing.assert_array_equal(found.values, SKIN)
+    assert found.columns == tuple(f"taxels/s{k}" for k in range(4))
+    assert found.vectors["t"][3] == 0.3
+    assert found.notes == ("its 4 arrays of 40 numbers are its columns",)
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        file["camera"] = np.zeros((5, 6, 6))
+    found = raw_files.read(tmp_path / "a.h5", ReadPlan("taxels", time="t"))
+    np.testing.assert_array_equal(found.values, SKIN)
+    assert found.vectors["t"][3] == 0.3
+
+
+def test_numbered_arrays_are_frames(tmp_path: Path):
+    """In the order of their numbers, not of their names; without one of them they are refused."""
+    frames = {f"frame {k}": row.reshape(2, 2) for k, row in enumerate(SKIN)}
+    np.savez(tmp_path / "a.npz", **frames)
+    found = raw_files.read(tmp_path / "a.npz")
+    np.testing.assert_array_equal(found.values.reshape(40, 4), SKIN)
+    assert found.notes == ("its 40 arrays frame 0 to frame 39 are its frames",)
+    for change in ({"frame 12": np.zeros((3, 3))}, {"frame 77": SKIN[:2, :2]}, {"x": SKIN}):
+        np.savez(tmp_path / "a.npz", **frames | change)
+        with pytest.raises(FormatError, match=r"holds 4\d arrays of frames; name one"):
+            raw_files.read(tmp_path / "a.npz")
+    np.savez(tmp_path / "a.npz", **{k: v for k, v in frames.items() if k != "frame 12"})
+    with pytest.raises(FormatError, match="holds 39 arrays of frames; name one"):
+        raw_files.read(tmp_path / "a.npz")
+
+
 def lines(*rows: object) -> bytes:
     return "".join(json.dumps(row) + "\n" for row in rows).encode()
 
@@ -107,6 +141,52 @@ def test_json_is_read(tmp_path: Path, content: bytes):
     np.testing.assert_allclose(found.values[:, 0], np.arange(40) / 10)
     cut = content.endswith(b"sk")
     assert found.notes == ("read up to line 41, which is cut off",) * cut
+
+
+FRAMES = [{"t": k / 10, "skin": r} for k, r in enumerate(SKIN.tolist())]
+
+
+@pytest.mark.parametrize(
+    ("content", "note"),
+    [
+        (json.dumps({"who": "Ada", "frames": FRAMES}).encode(), "its list 'frames' holds the fra"),
+        (lines({"type": "head", "rate": 10}, *FRAMES), "line 1 is passed over: it has other keys"),
+        (b",\n".join(json.dumps(x).encode() for x in FRAMES), ""),
+        (b"[\n" + b",\n".join(json.dumps(x).encode() for x in FRAMES) + b",\n]", ""),
+        (
+            json.dumps(
+                {"columns": ["t", *"abcd"], "data": [[x["t"], *x["skin"]] for x in FRAMES]}
+            ).encode(),
+            "",
+        ),
+        (
+            json.dumps(
+                {k: {str(i): x[k] for i, x in enumerate(FRAMES)} for k in ("t", "skin")}
+            ).encode(),
+            "",
+        ),
+    ],
+)
+def test_frames_inside_of_json_are_read(tmp_path: Path, content: bytes, note: str):
+    """In a list beside facts, behind a first line of facts, with commas between lines, and in the
+    forms of pandas."""
+    (tmp_path / "a.json").write_bytes(content)
+    found = raw_files.read(tmp_path / "a.json")
+    np.testing.assert_array_equal(found.values[:, 1:], SKIN)
+    np.testing.assert_allclose(found.values[:, 0], np.arange(40) / 10)
+    assert [said[: len(note)] for said in found.notes] == [note] * bool(note)
+
+
+def test_one_of_several_lists_is_named(tmp_path: Path):
+    """Without --variable they have to be the columns of one table."""
+    both = {"left": SKIN.tolist(), "right": SKIN[:9].tolist()}
+    (tmp_path / "a.json").write_text(json.dumps(both))
+    found = raw_files.read(tmp_path / "a.json", ReadPlan("left"))
+    np.testing.assert_array_equal(found.values, SKIN)
+    with pytest.raises(
+        FormatError, match=r"its columns differ in length: .'left': 40, 'right': 9."
+    ):
+        raw_files.read(tmp_path / "a.json")
 
 
 @pytest.mark.parametrize(

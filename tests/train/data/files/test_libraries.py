@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -68,6 +69,20 @@ def test_a_spreadsheet_is_read_as_a_text(tmp_path: Path):
     np.testing.assert_array_equal(raw_files.read(path, ReadPlan("two")).values[:, 2:], SKIN)
 
 
+def test_a_table_may_stand_anywhere_on_a_sheet(tmp_path: Path):
+    """Two columns and three rows further, with a remark beside two of its rows."""
+    rows = [[], [], ["", "", "Recorded by Ada"], *[["", "", *row] for row in ROWS]]
+    rows[7].append("touched")
+    rows[9].append("let go")
+    found = raw_files.read(book(tmp_path / "a.xlsx", {"run": rows}))
+    assert found.columns == ("t", "label", *"abcd")
+    np.testing.assert_array_equal(found.values[:, 2:], SKIN)
+    assert found.notes == (
+        "its first 2 columns are empty and do not count",
+        "columns of remarks are left out: 9",
+    )
+
+
 def test_a_hole_in_a_spreadsheet_is_a_fault(tmp_path: Path):
     """An empty cell and an error of a formula; rows above the table count."""
     rows = [["Recorded by Ada"], [], *[list(row) for row in ROWS]]
@@ -92,7 +107,9 @@ def test_parquet_is_read(tmp_path: Path):
         "fixed": pa.FixedSizeListArray.from_arrays(pa.array(SKIN.ravel()), 4),
         "who": ["Ada"] * 40,
         "hole": [None, *range(39)],
-        "image": [{"path": "x"}] * 40,
+        "image": [b"x"] * 40,
+        "both": [{"left": k, "right": {"deep": -k}} for k in range(40)],
+        "exact": [Decimal(k) / 4 for k in range(40)],
     }
     parquet.write_table(pa.table(columns), tmp_path / "a.parquet")
     found = raw_files.read(tmp_path / "a.parquet")
@@ -101,7 +118,25 @@ def test_parquet_is_read(tmp_path: Path):
         np.testing.assert_array_equal(found.values[:, start : start + 4], SKIN)
     assert found.texts[13][0] == "Ada"
     assert found.faults == {14: "row 1 of hole is empty"}
+    assert found.columns[15:] == ("both.left", "both.right.deep", "exact")
+    assert found.values[8, 15:].tolist() == [8, -8, 2]
     assert found.notes == ("column image is passed over",)
+
+
+def test_a_list_column_that_changes_its_length_is_a_fault(tmp_path: Path):
+    """Only if it is used; and an empty row has no numbers."""
+    pa = pytest.importorskip("pyarrow")
+    parquet = pytest.importorskip("pyarrow.parquet")
+    columns = {
+        "skin": [None if k == 5 else row for k, row in enumerate(SKIN.tolist())],
+        "odd": [[1] * (1 + k % 2) for k in range(40)],
+    }
+    parquet.write_table(pa.table(columns), tmp_path / "a.parquet")
+    found = raw_files.read(tmp_path / "a.parquet")
+    assert found.faults[4] == "column odd holds lists of different lengths"
+    assert found.faults[0] == "row 6 of skin is empty"
+    assert np.isnan(found.values[5, 0])
+    assert found.values[6, :4].tolist() == SKIN[6].tolist()
 
 
 def test_tdms_is_read(tmp_path: Path):

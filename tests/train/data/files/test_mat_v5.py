@@ -94,7 +94,7 @@ def test_damage_is_told(compressed: bool, cut: int, changes: list[tuple[int, int
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        (b"", "is not a MAT file of version 5 to 7.3; save it with -v7"),
+        (b"", "is not a MAT file of version 4 to 7.3; save it with -v7"),
         (WHOLE[False][:-40], "is damaged or cut off: .* bytes at .* exceed its end"),
         (WHOLE[True][:-9], "is damaged"),
         (

@@ -1,0 +1,121 @@
+"""Takes from lines of numbers what people and programs write around them: brackets, labels, units,
+the clock of a serial monitor, separators of thousands that cannot be anything else.
+
+Each rewriting holds for lines that have it. A decoration that only a few lines have stays, so that
+such a line is refused with its number.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+SAMPLED = 200
+"""Number of lines that show the decorations of a text."""
+USUAL = 0.8
+"""Share of the lines with digits that have a decoration, if it is removed."""
+CLOCK = re.compile(r"^\s*(\d\d:\d\d:\d\d(?:[.,]\d+)?)\s*->\s*(.*)$")
+"""The time that the serial monitor of Arduino writes before a line."""
+LABEL = re.compile(r"(?<![\w.])([A-Za-z_][\w.\-\[\]]*)\s*[=:]\s*(?=[-+.\d])")
+BRACKETS = re.compile(r"^\s*(?:array|tensor)?\s*[\[({].*\d")
+QUOTED = re.compile(r"'([^',;\t]*\d)'")
+HEXADECIMAL = re.compile(r"(?<![\w.])0[xX]([0-9a-fA-F]{1,8})(?![\w.])")
+FORTRAN = re.compile(r"(?<=[\d.])[dD](?=[+-]\d)")
+UNITS = re.compile(
+    r"(?<=\d)\s?(?:[kmuµn]?(?:N|V|A|Pa|g)|%|bar|psi|°C|counts?)(?=\s*(?:[,;\t|\])]|$))"
+)
+REMARK = re.compile(r"(?<=\d)\s+(?:#|//)\s.*$")
+"""A comment behind the numbers of a line."""
+THOUSANDS = re.compile(r"(?<=\d)['’](?=\d{3}(?!\d))")
+BLANK_THOUSANDS = re.compile(r"(?<=\d)[\u00a0\u202f\u2009](?=\d{3}(?!\d))")
+"""In a text whose columns other signs separate."""
+
+
+@dataclass(frozen=True)
+class PlainText:
+    """Lines with their numbers alone. names: of the columns, if labels give them. notes: remarks.
+    The lines keep their order and number."""
+
+    lines: Sequence[str]
+    names: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+def plain(lines: Sequence[str]) -> PlainText:
+    """The lines of a text without decorations."""
+    lines = [line.replace("\u2212", "-") for line in lines]
+    some = [*lines[:SAMPLED], *lines[max(SAMPLED, len(lines) - SAMPLED) :]]
+    some = [line for line in some if re.search(r"\d", line)]
+    notes = []
+    for one in _REWRITINGS:
+        found = sum(bool(one.shows(line)) for line in (lines if one.seldom else some))
+        if found and (one.seldom or found >= USUAL * len(some)):
+            lines, some = (
+                [one.rewrite(line) if one.shows(line) else line for line in part]
+                for part in (lines, some)
+            )
+            notes.append(f"{one.what} are left out")
+    names: tuple[str, ...] = ()
+    if some and sum(map(_labelled, some)) >= USUAL * len(some):
+        names = tuple(LABEL.findall(next(filter(_labelled, some))))
+        lines = [_unlabelled(line, names) for line in lines]
+    if some and sum(bool(CLOCK.match(line)) for line in some) >= USUAL * len(some):
+        lines = [CLOCK.sub(_clocked, line) for line in lines]
+        names = ("clock", *names) if names else ()
+    return PlainText(lines, names, tuple(notes))
+
+
+def _labelled(line: str) -> bool:
+    """Whether each number of a line has a label, but for the time before it."""
+    found = LABEL.findall(line)
+    rest = LABEL.sub("", CLOCK.sub(r"\2", line))
+    return len(found) > 1 and len(found) == len(re.findall(r"[-+.\w]*\d[-+.\w]*", rest))
+
+
+def _unlabelled(line: str, names: Sequence[str]) -> str:
+    """The line without its labels, if they are the usual ones in the usual order."""
+    return LABEL.sub("", line) if tuple(LABEL.findall(line)) == names else line
+
+
+def _clocked(found: re.Match[str]) -> str:
+    """The time as a cell of its own."""
+    sign = next((s for s in (";", "\t", ",") if s in found[2]), " ")
+    return f"{found[1].replace(',', '.')}{sign}{found[2]}"
+
+
+def _separated(line: str) -> bool:
+    return any(sign in line for sign in ";\t|") and bool(BLANK_THOUSANDS.search(line))
+
+
+def _unbracketed(line: str) -> str:
+    return re.sub(r"^\s*(array|tensor)", "", line).translate(_NO_BRACKETS).strip(" ,")
+
+
+@dataclass(frozen=True)
+class Rewriting:
+    """What is left out, whether a line shows it, and the line without it. seldom: it cannot be
+    anything else, so that a single line suffices."""
+
+    what: str
+    shows: Callable[[str], object]
+    rewrite: Callable[[str], str]
+    seldom: bool = False
+
+
+_NO_BRACKETS = str.maketrans("", "", "[](){}")
+_REWRITINGS = (
+    Rewriting("comments behind numbers", REMARK.search, partial(REMARK.sub, ""), True),
+    Rewriting("brackets", BRACKETS.match, _unbracketed),
+    Rewriting("single quotes", QUOTED.search, partial(QUOTED.sub, r"\1")),
+    Rewriting("units of the cells", UNITS.search, partial(UNITS.sub, "")),
+    Rewriting("separators of thousands", THOUSANDS.search, partial(THOUSANDS.sub, ""), True),
+    Rewriting("separators of thousands", _separated, partial(BLANK_THOUSANDS.sub, ""), True),
+    Rewriting("D in exponents", FORTRAN.search, partial(FORTRAN.sub, "e")),
+    Rewriting(
+        "marks of hexadecimal numbers",
+        HEXADECIMAL.search,
+        partial(HEXADECIMAL.sub, lambda found: str(int(found[1], 16))),
+    ),
+)
