@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
+from appliance.core.names import MOST_SHOWN, can_be_shown
 from appliance.core.types import DATA_TYPES, LARGEST_READING, SweepFormat
 
 Array = NDArray[Any]
@@ -230,7 +231,14 @@ def _displays(materials: tuple[str, ...], given: Array | None, source: str) -> d
             f"{len(materials)} materials, or leave them out"
         )
     pairs = zip(materials, map(str, given), strict=True)
-    return {name: text for name, text in pairs if text not in ("", name)}
+    found = {name: text for name, text in pairs if text not in ("", name)}
+    for name, text in found.items():
+        if not can_be_shown(text):
+            raise FormatError(
+                f"{source}: display name {text!r} of {name!r} cannot be shown; use 1 to "
+                f"{MOST_SHOWN} characters that are printed"
+            )
+    return found
 
 
 def _group(name: str, values: Array) -> Array:

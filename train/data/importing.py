@@ -19,6 +19,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
+from appliance.core.names import shown
 from appliance.core.types import DATA_TYPES
 from train.data import frames, labels, lerobot, raw_files, readers, sampling
 from train.data.file_names import group
@@ -181,8 +182,8 @@ def _name_materials(folder: Path, known: Sequence[Fields], plan: ImportPlan) -> 
     for fields in known:
         written = fields["material"]
         fields["material"] = sent[new[written]]
-        if labels.unsendable([written]):
-            fields[DISPLAY] = written
+        if labels.unsendable([written]) and (text := shown(written)):
+            fields[DISPLAY] = text
 
 
 def _files(

@@ -317,6 +317,9 @@ def from_recorded(recorded: Sequence[RecordedSweep], folder: Path, kind: type[Se
     source += partial + remark
     rate = np.array(kept[0].format.rate_hz)
     about = {"labels": _ranks(materials), "materials": np.unique(materials), "rate_hz": rate}
+    displays = {one.sweep.material: one.about.get("display") for one in reversed(kept)}
+    if any(displays.values()):
+        about["displays"] = np.array([str(displays[name] or "") for name in sorted(displays)])
     if np.isfinite(unloaded).any():
         about["unloaded"] = unloaded
     return build({"samples": samples} | about | groups, source, kind)

@@ -49,6 +49,7 @@ LEFT_OUT = [
 
 def page(figures: Json, sweeps: Dataset) -> str:
     """The page (HTML)."""
+    figures = _displayed(figures)
     pictures = {"calibration": html.picture(calibration(figures["calibration"]))}
     if len(figures["labels"]) <= MOST_IN_MATRIX:
         pictures["confusion"] = html.picture(confusion(figures))
@@ -82,6 +83,42 @@ def page(figures: Json, sweeps: Dataset) -> str:
             for i in _examples(sweeps)
         ],
     )
+
+
+def _displayed(figures: Json) -> Json:
+    """The figures with display names instead of labels."""
+    displays = figures.get("displays", {})
+    if not displays:
+        return figures
+
+    def shown(name: str) -> str:
+        return str(displays.get(name, name))
+
+    def given(answers: Mapping[str, int]) -> dict[str, int]:
+        return {shown(answer): n for answer, n in answers.items()}
+
+    rows = [
+        row
+        | {
+            "name": shown(row["name"]),
+            "taken_for": [shown(row["taken_for"][0]), row["taken_for"][1]]
+            if row["taken_for"]
+            else row["taken_for"],
+        }
+        for row in figures["materials"]
+    ]
+    named = {
+        "labels": [shown(name) for name in figures["labels"]],
+        "answers": {shown(name): given(of) for name, of in figures["answers"].items()},
+        "not_in_the_bundle": {
+            shown(name): given(of) for name, of in figures["not_in_the_bundle"].items()
+        },
+        "materials": rows,
+    }
+    if left_out := figures.get("left_out"):
+        materials = {shown(name): of for name, of in left_out["materials"].items()}
+        named["left_out"] = left_out | {"materials": materials}
+    return {**figures, **named}
 
 
 def _in_short(figures: Json) -> Iterator[list[str]]:

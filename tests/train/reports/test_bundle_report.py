@@ -208,3 +208,13 @@ def test_the_command_writes_page_and_figures(
     assert "<h2>What it will be bad at</h2>" in text
     assert "name the sweeps that it was fitted to with <code>--train</code>" in text
     assert json.loads((tmp_path / "f.json").read_text())["bundle"]["name"] == "default"
+
+
+def test_people_read_display_names(figures: dict, sweeps: Dataset):
+    """In tables and pictures; figures for programs keep the labels."""
+    shown = figures | {"displays": {"wood": "Holz, geölt"}}
+    page = bundle_report.page(shown, replace(sweeps, displays=shown["displays"]))
+    text = PageReader(page).text
+    assert "Holz, geölt" in text
+    assert not re.search(r"\bwood\b", text.partition("How it was made")[0])
+    assert shown["labels"] == figures["labels"]
