@@ -9,8 +9,10 @@ from __future__ import annotations
 import unicodedata
 import zipfile
 import zlib
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 import numpy as np
@@ -71,10 +73,13 @@ class SweepSet:
             raise self._error(
                 f"samples are {x.dtype}; use one of {', '.join(DATA_TYPES)}{_conversion(x)}"
             )
-        if x.dtype.kind == "f" and not np.isfinite(x).all():
+        if x.dtype.kind != "f":
+            return
+        least, most = x.min(), x.max()  # without an array of the size of a mapped set
+        if not (np.isfinite(least) and np.isfinite(most)):
             at = tuple(int(i) for i in np.argwhere(~np.isfinite(x))[0])
             raise self._error(f"samples{list(at)} is {x[at]}; drop sweep {at[0]} or fill it in")
-        if x.dtype.kind == "f" and max(x.max(), -x.min()) > LARGEST_READING:
+        if max(most, -least) > LARGEST_READING:
             sweep, frame, *taxel = (int(i) for i in np.argwhere(np.abs(x) > LARGEST_READING)[0])
             raise self._error(
                 f"sweep {sweep}, frame {frame}, taxel {', '.join(map(str, taxel))} reads "
@@ -147,12 +152,12 @@ class SweepSet:
         raise self._error(f"no group {name!r}; it has {', '.join(sorted(self.groups)) or 'none'}")
 
 
-def read(path: Path, what: str) -> dict[str, Array]:
-    """All arrays of an .npz by name; pickled objects are refused. Raises FormatError saying that it
-    is not `what`."""
+def read(path: Path, what: str, known: Collection[str] = ()) -> dict[str, Array]:
+    """All arrays of an .npz by name, but those in `known`; pickled objects are refused. Raises
+    FormatError saying that it is not `what`."""
     try:
         with np.load(path, allow_pickle=False) as z:
-            return {k: _typed(z, k) for k in z.files}
+            return {k: _typed(z, k) for k in z.files if k not in known}
     except OSError as e:
         why = f": {str(e.strerror).lower()}" if e.strerror else ""
         raise FormatError(f"{path.name}: not {what}{why}") from e
@@ -176,12 +181,13 @@ def _typed(z: Any, name: str) -> Array:
         ) from e
 
 
-def load_file(path: Path, kind: type[Set]) -> Set:
-    """The set in the .npz `path`. Raises FormatError naming the file and the missing or invalid
-    array."""
-    return build(
-        read(path, "a sweep set (an .npz of samples, labels, materials, rate_hz)"), path.name, kind
-    )
+def load_file(
+    path: Path, kind: type[Set], known: Mapping[str, Array] = MappingProxyType({})
+) -> Set:
+    """The set in the .npz `path`. known: arrays of the file that need not be read. Raises
+    FormatError naming the file and the missing or invalid array."""
+    what = "a sweep set (an .npz of samples, labels, materials, rate_hz)"
+    return build({**read(path, what, known), **known}, path.name, kind)
 
 
 def build(arrays: dict[str, Array], source: str, kind: type[Set]) -> Set:

@@ -39,6 +39,15 @@ def test_values_at_even_distances_are_tried(monkeypatch: pytest.MonkeyPatch):
     assert len([*promises.promises(sweeps, "speed", 0, 1, 9)]) == len(speeds)
 
 
+def test_a_condition_of_two_values_has_no_figure_of_its_own():
+    """Then only the mean of the other conditions is compared."""
+    one = promises.Promise(90.0, np.nan, 85.0, {"right": 80.0})
+    assert promises.summary([one]) == (
+        "as the box answers 80.0 %, label alone 85.0 %; "
+        "mean of conditions said 90.0 %: +10.0 on the mean, +10.0 at most"
+    )
+
+
 def test_without_real_sweeps_a_case_is_left_out(monkeypatch: pytest.MonkeyPatch):
     """The simulated ones run everywhere."""
     monkeypatch.delenv("PALPATE_DATA", raising=False)
