@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from appliance.core.names import MOST_LETTERS
 from train.data.sets import Dataset
 from train.reports import confusion_plot, formatting, html, provenance, sweep_plot
 from train.reports.formatting import level
@@ -227,11 +228,13 @@ def _examples(sweeps: Dataset) -> list[int]:
 def confusion(figures: Json) -> str:
     """The labels that the sweeps of each material get, as shares of all its sweeps; rows are the
     true materials. A row lacks the share of answers without a label."""
-    names = figures["labels"]
-    answers = [figures["answers"].get(of, {}) for of in names]
-    counts = np.array([[given.get(named, 0) for named in names] for given in answers])
+    labels = figures["labels"]
+    answers = [figures["answers"].get(of, {}) for of in labels]
+    counts = np.array([[given.get(named, 0) for named in labels] for given in answers])
     totals = np.array([sum(given.values()) for given in answers])
     about = "materials by the labels that they get"
+    most = MOST_LETTERS  # of a display name there is no room for more
+    names = [name if len(name) <= most else f"{name[: most - 1]}…" for name in labels]
     return confusion_plot.draw(counts, names, about, totals=totals)
 
 

@@ -218,3 +218,20 @@ def test_people_read_display_names(figures: dict, sweeps: Dataset):
     assert "Holz, geölt" in text
     assert not re.search(r"\bwood\b", text.partition("How it was made")[0])
     assert shown["labels"] == figures["labels"]
+
+
+def test_a_row_of_few_sweeps_says_how_many(figures: dict):
+    """The share is that of all sweeps, those without a label too: one of thirty is 3 %."""
+    answers = {
+        "wood": {"wood": 1, "(unknown)": 29},
+        "metal": {"metal": 2, "paper": 1},
+        "x" * 40: {"x" * 40: 1},
+    }
+    some = figures | {"labels": [*answers, "paper"], "answers": answers}
+    drawn = PageReader(bundle_report.confusion(some)).text
+    assert "wood · " not in drawn
+    assert re.search(r"\b3\b", drawn)
+    assert "metal (n = 3)" in drawn
+    assert "wood (n" not in drawn
+    assert "paper (n = 0)" in drawn
+    assert f"{'x' * 23}… (n = 1)" in drawn
