@@ -42,7 +42,6 @@ from appliance.bundle.enrolled import ENROLMENT
 from appliance.bundle.manifest import (
     GOLDEN,
     INPUTS,
-    LABEL,
     MANIFEST,
     MEANS,
     MODEL,
@@ -55,6 +54,7 @@ from appliance.bundle.manifest import (
 )
 from appliance.bundle.onnx_check import check
 from appliance.core.errors import BundleError, TemporaryError
+from appliance.core.names import LABEL
 from appliance.core.patience import passes
 from appliance.signal import features
 

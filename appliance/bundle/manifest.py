@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appliance.core.errors import BundleError, FormatError
+from appliance.core.names import LABEL, MOST_SHOWN, can_be_shown
 from appliance.core.schema import typed
 from appliance.core.types import SweepFormat
 from appliance.signal import features
@@ -30,9 +31,6 @@ FILE_KEYS = {"displacement": "moved", "contact": "place"}
 so the file keeps them. Messages use the keys, too."""
 MANIFEST, MODEL, GOLDEN, MEANS = "manifest.json", "model.onnx", "golden.npz", "means.npz"
 INPUTS = ("raw", *features.KINDS)
-LABEL = re.compile(r"[A-Za-z0-9][A-Za-z0-9 _.-]{0,23}")
-"""Pattern of a label. Labels are sent in sentences, so they have at most 24 characters and no
-comma, star or dollar sign."""
 UNSURE = 0.5
 """Least probability for status ok if the bundle does not set it."""
 MOST_BYTES = 64 << 20
@@ -148,6 +146,8 @@ class Manifest:
     bridging: broken taxels that the model tolerates; None if that was not measured, then `json`
         omits it.
     sliding: what tells a slide from a rest; None if unknown, then `json` omits it.
+    displays: names of materials for people, in any language, by label; {} if labels are shown, then
+        `json` omits it.
     """
 
     name: str
@@ -169,6 +169,7 @@ class Manifest:
     speeds: SpeedRange | None = None
     bridging: Bridging | None = None
     sliding: SlideLimits | None = None
+    displays: dict[str, str] = field(default_factory=dict)
     schema: int = SCHEMA
 
     def __post_init__(self) -> None:
@@ -184,6 +185,7 @@ class Manifest:
         _check_age(self)
         _check_files(self.files)
         _check_labels(self.labels)
+        _check_displays(self.displays, self.labels)
         _check_parts(self)
         if self.unloaded and len(self.unloaded) != self.format.channels:
             raise BundleError(
@@ -215,7 +217,7 @@ class Manifest:
         """The bytes of manifest.json; equal manifests give equal bytes."""
         values = {FILE_KEYS.get(name, name): value for name, value in asdict(self).items()}
         values["format"] = self.format.json()
-        for name in ("unloaded", "speeds", "bridging", "sliding"):
+        for name in ("unloaded", "speeds", "bridging", "sliding", "displays"):
             if not values[name]:
                 del values[name]
         added_later = (
@@ -350,4 +352,19 @@ def _check_labels(labels: tuple[str, ...]) -> None:
             raise BundleError(
                 f"label {label!r} cannot be sent; use 1 to 24 letters, digits, spaces, '.', '_' "
                 "or '-'"
+            )
+
+
+def _check_displays(displays: Mapping[str, str], labels: tuple[str, ...]) -> None:
+    """Raises BundleError for a display name that cannot be shown, or that belongs to no label."""
+    for label, text in displays.items():
+        if label not in labels:
+            raise BundleError(
+                f"manifest has a display name of {label!r}, which is not a label; export the "
+                "bundle again"
+            )
+        if not can_be_shown(text):
+            raise BundleError(
+                f"display name {text!r} of {label!r} cannot be shown; use 1 to {MOST_SHOWN} "
+                "characters that are printed"
             )

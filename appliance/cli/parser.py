@@ -13,6 +13,7 @@ from typing import get_args, get_type_hints
 
 from appliance import __version__
 from appliance.bridges import options as bridges
+from appliance.core import outputs
 from appliance.core.config import TriggerConfig
 from appliance.core.menu import CommandParser, Menu
 
@@ -273,7 +274,7 @@ def _record(command: CommandParser) -> None:
     _capture(command)
     command.add_argument(
         "--out",
-        type=Path,
+        type=outputs.folder,
         metavar="DIR",
         help="folder of the sweeps (default: sweeps/ in the store's folder)",
     )
@@ -383,7 +384,7 @@ def _enrol(command: CommandParser) -> None:
     )
     command.add_argument(
         "--out",
-        type=Path,
+        type=outputs.folder,
         metavar="DIR",
         help="write the new bundle to DIR instead of installing it; without it the bundle runs on"
         " trial from the next start on",
@@ -459,7 +460,12 @@ def _new_skin(command: CommandParser) -> None:
         metavar="N",
         help="which of the proposals (default: the first that has this grid)",
     )
-    new("--out", type=Path, metavar="DIR", help="folder of the profile (/etc/palpate/skins)")
+    new(
+        "--out",
+        type=outputs.folder,
+        metavar="DIR",
+        help="folder of the profile (/etc/palpate/skins)",
+    )
     new("--replace", action="store_true", help="replace a profile of this name")
 
 

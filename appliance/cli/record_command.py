@@ -137,6 +137,7 @@ def _record_page(
         obey,
         SystemClock(),
         skins.profile(settings).unit,
+        recording.names.label,
     )
     log.info(f"page: {page.server.address}")
     return [page]

@@ -121,6 +121,7 @@ def _reports(
 
     expected = Expected.by(current, settings.skin.fingertip, skins.profile(settings).unit)
     known = {"bundle": current.id, "labels": m.labels, "alignment": expected.json()}
+    known |= {"displays": m.displays} if m.displays else {}
     return [
         *observers,
         *status(settings, facts),

@@ -21,6 +21,7 @@ from appliance.core.devices import Devices
 from appliance.core.disk_thread import DiskThread
 from appliance.core.errors import ApplianceError, ConfigError
 from appliance.core.log import log
+from appliance.core.names import TypedNames
 from appliance.core.observer import Observer
 from appliance.core.types import SweepFormat
 from appliance.deployment.enrolment_key import TAUGHT, EnrolmentKey
@@ -149,6 +150,7 @@ class Session:
         self._args, self._settings, self._stopped = args, by_page(args, settings), StopFlag()
         self._store = Path(settings.store.folder)
         self._obey: Callable[[Command], list[object]] = _not_now
+        self._names = TypedNames()
         self._about: Callable[[], Mapping[str, Any]] = dict
         self._done, self._again, self._address = False, "", ""
 
@@ -186,6 +188,7 @@ class Session:
             lambda command: self._obey(command),
             SystemClock(),
             skins.profile(self._settings).unit,
+            self._names.label,
             teaching=True,
         )
         self._address = page.server.address
@@ -199,9 +202,8 @@ class Session:
             port, disk = self._port(devices), DiskThread()
             say = port.say if port else lambda line: None
             labels = Labels(self._again, args.position, args.session)
-            recording = RecordingSession(
-                self._store / "sweeps", format, labels, devices.clock, say, args.good, disk
-            )
+            to, names = (self._store / "sweeps", format, labels), self._names
+            recording = RecordingSession(*to, devices.clock, say, args.good, disk, names)
             stack.callback(recording.close)
             session = TeachingSession(recording, self._store, settings.teach, self._command, say)
             stack.callback(session.close)
@@ -245,6 +247,7 @@ class Session:
             shown = {
                 "model": f"{m.name} {m.version}",
                 "labels": m.labels,
+                "displays": m.displays,
                 "taught": m.taught,
             }
             self._about = lambda: self._shown({"trying": shown})

@@ -9,14 +9,17 @@ from __future__ import annotations
 import unicodedata
 import zipfile
 import zlib
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
+from appliance.core.names import MOST_SHOWN, can_be_shown
 from appliance.core.types import DATA_TYPES, LARGEST_READING, SweepFormat
 
 Array = NDArray[Any]
@@ -70,10 +73,13 @@ class SweepSet:
             raise self._error(
                 f"samples are {x.dtype}; use one of {', '.join(DATA_TYPES)}{_conversion(x)}"
             )
-        if x.dtype.kind == "f" and not np.isfinite(x).all():
+        if x.dtype.kind != "f":
+            return
+        least, most = x.min(), x.max()  # without an array of the size of a mapped set
+        if not (np.isfinite(least) and np.isfinite(most)):
             at = tuple(int(i) for i in np.argwhere(~np.isfinite(x))[0])
             raise self._error(f"samples{list(at)} is {x[at]}; drop sweep {at[0]} or fill it in")
-        if x.dtype.kind == "f" and max(x.max(), -x.min()) > LARGEST_READING:
+        if max(most, -least) > LARGEST_READING:
             sweep, frame, *taxel = (int(i) for i in np.argwhere(np.abs(x) > LARGEST_READING)[0])
             raise self._error(
                 f"sweep {sweep}, frame {frame}, taxel {', '.join(map(str, taxel))} reads "
@@ -146,12 +152,12 @@ class SweepSet:
         raise self._error(f"no group {name!r}; it has {', '.join(sorted(self.groups)) or 'none'}")
 
 
-def read(path: Path, what: str) -> dict[str, Array]:
-    """All arrays of an .npz by name; pickled objects are refused. Raises FormatError saying that it
-    is not `what`."""
+def read(path: Path, what: str, known: Collection[str] = ()) -> dict[str, Array]:
+    """All arrays of an .npz by name, but those in `known`; pickled objects are refused. Raises
+    FormatError saying that it is not `what`."""
     try:
         with np.load(path, allow_pickle=False) as z:
-            return {k: _typed(z, k) for k in z.files}
+            return {k: _typed(z, k) for k in z.files if k not in known}
     except OSError as e:
         why = f": {str(e.strerror).lower()}" if e.strerror else ""
         raise FormatError(f"{path.name}: not {what}{why}") from e
@@ -175,12 +181,13 @@ def _typed(z: Any, name: str) -> Array:
         ) from e
 
 
-def load_file(path: Path, kind: type[Set]) -> Set:
-    """The set in the .npz `path`. Raises FormatError naming the file and the missing or invalid
-    array."""
-    return build(
-        read(path, "a sweep set (an .npz of samples, labels, materials, rate_hz)"), path.name, kind
-    )
+def load_file(
+    path: Path, kind: type[Set], known: Mapping[str, Array] = MappingProxyType({})
+) -> Set:
+    """The set in the .npz `path`. known: arrays of the file that need not be read. Raises
+    FormatError naming the file and the missing or invalid array."""
+    what = "a sweep set (an .npz of samples, labels, materials, rate_hz)"
+    return build({**read(path, what, known), **known}, path.name, kind)
 
 
 def build(arrays: dict[str, Array], source: str, kind: type[Set]) -> Set:
@@ -230,7 +237,14 @@ def _displays(materials: tuple[str, ...], given: Array | None, source: str) -> d
             f"{len(materials)} materials, or leave them out"
         )
     pairs = zip(materials, map(str, given), strict=True)
-    return {name: text for name, text in pairs if text not in ("", name)}
+    found = {name: text for name, text in pairs if text not in ("", name)}
+    for name, text in found.items():
+        if not can_be_shown(text):
+            raise FormatError(
+                f"{source}: display name {text!r} of {name!r} cannot be shown; use 1 to "
+                f"{MOST_SHOWN} characters that are printed"
+            )
+    return found
 
 
 def _group(name: str, values: Array) -> Array:

@@ -18,12 +18,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from appliance.bundle.manifest import LABEL
 from appliance.core import storage, wall_clock
 from appliance.core.clock import Clock
 from appliance.core.disk_thread import AtOnce, DiskWork
 from appliance.core.errors import ApplianceError, ConfigError, FormatError, TemporaryError
 from appliance.core.log import TroubleLog, log
+from appliance.core.names import LABEL, TypedNames
 from appliance.core.observer import Observer
 from appliance.core.patience import passes
 from appliance.core.sentences import sentence
@@ -159,7 +159,8 @@ class RecordingSession(Observer):
 
     say: called with REC sentences. disk: writes the sweeps; a REC sentence follows once its sweep
     is on the disk. target: wanted number of sweeps of each material at each position; sweeps of
-    earlier runs in the folder count. Raises ConfigError if the folder cannot be
+    earlier runs in the folder count. names: of materials that were typed, to which those of earlier
+    sweeps are added; sidecars keep them. Raises ConfigError if the folder cannot be
     used, or has sweeps of another format.
     """
 
@@ -172,7 +173,9 @@ class RecordingSession(Observer):
         say: Callable[[bytes], None],
         target: int = TARGET,
         disk: DiskWork | None = None,
+        names: TypedNames | None = None,
     ) -> None:
+        self.names = names or TypedNames()
         self._disk, self._writing = disk or AtOnce(), 0
         try:
             self._folder = SweepFolder(folder, format)
@@ -221,12 +224,14 @@ class RecordingSession(Observer):
     def about(self) -> dict[str, Any]:
         """The progress of the recording, for JSON.
 
-        It has the present labels, the number of sweeps of this run, the count and the wanted number
-        of each material and position, the missing sweeps in words, the outcome of the last sweep as
-        in REC, and the number of the sweep that DISCARD would remove (None: no sweep).
+        It has the present labels, the display names of materials by label, the number of sweeps of
+        this run, the count and the wanted number of each material and position, the missing sweeps
+        in words, the outcome of the last sweep as in REC, and the number of the sweep that DISCARD
+        would remove (None: no sweep).
         """
         return {
             **entries(self._labels[-1][1]),
+            "displays": dict(self.names.displays),
             "stored": self.stored,
             "counts": self._progress.counts,
             "target": self._progress.target,
@@ -300,6 +305,7 @@ class RecordingSession(Observer):
                     "format; name another folder with --out"
                 )
             self._count(number, labels, status)
+            self.names.add(labels.material, about.get("display"))
 
     def _count(self, number: int, labels: Labels, status: Status) -> None:
         if not status.faulty:  # a faulty sweep is not used in training
@@ -328,7 +334,9 @@ class RecordingSession(Observer):
             if disk.f_bavail < least:
                 left, wanted = (n * disk.f_frsize / 1e6 for n in (disk.f_bavail, least))
                 return "full", f"{left:.1f} MB left of {wanted:.1f} for the system"
-            return self._folder.put(sweep, verdict, circumstances)
+            display = self.names.displays.get(sweep.material or "")
+            about = {**circumstances, "display": display} if display else circumstances
+            return self._folder.put(sweep, verdict, about)
         except OSError as e:
             return "full" if e.errno in FULL else "failed", str(e.strerror)
 

@@ -51,8 +51,9 @@ Publish = Callable[[str, object], None]
 class PageBoard:
     """Turns lines of the feed into events, by their type.
 
-    hello, health, state: unchanged. box: whether there is a feed. verdict: with rounded `scores`,
-    and the `reason` for a sweep without a label. minute: frames and lost frames of the last minute.
+    hello: with the `names` of its labels for people. health, state: unchanged. box: whether there
+    is a feed. verdict: with rounded `scores`, the `name` of its label, and the `reason` for a sweep
+    without a label. minute: frames and lost frames of the last minute.
     signal: a sweep's window is available. view: see alignment.view. note: another bundle or
     program.
     """
@@ -61,6 +62,7 @@ class PageBoard:
         self._publish = publish
         self._hello: dict[str, Any] = {}
         self._before: dict[str, Any] = {}  # the previous hello, until the restart was noted
+        self._names: dict[str, str] = {}  # of labels, for people
         self._skin, self._trouble = "", ""
         self._tracker: ContactTracker | None = None
         self._enumerations = 0
@@ -99,7 +101,10 @@ class PageBoard:
         rate = replace(typed(SweepFormat, dict(line["format"])), rate_hz=float(line["frames_hz"]))
         expected = Expected.read(rate, line.get("alignment") or {}, str(line["bundle"]))
         tracker = ContactTracker(expected, str(line["source"]))
+        displays = {str(k): str(v) for k, v in (line.get("displays") or {}).items()}
         hello = dict(line) | {"pid": int(line["pid"]), "labels": list(map(str, line["labels"]))}
+        hello |= {"names": [displays.get(label, label) for label in hello["labels"]]}
+        self._names = dict(zip(hello["labels"], hello["names"], strict=True))
         self._before, self._hello, self._tracker, self._minute = self._hello, hello, tracker, None
         self._publish("hello", hello)
         self._publish("box", {"there": True, "why": ""})
@@ -139,7 +144,8 @@ class PageBoard:
 
     def _take_verdict(self, line: Mapping[str, Any]) -> None:
         shown = {name: line[name] for name in FIELDS} | {
-            "scores": [round(float(p), 4) for p in line["scores"]]
+            "name": self._names.get(line["label"], line["label"]),
+            "scores": [round(float(p), 4) for p in line["scores"]],
         }
         self._publish(
             "verdict",

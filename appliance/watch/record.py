@@ -46,10 +46,11 @@ Obey = Callable[[Command], list[object]]
 """Carries out a command and returns the fields of its answer. Raises ApplianceError."""
 
 
-def order(body: bytes, allowed: Sequence[str]) -> Command:
+def order(body: bytes, allowed: Sequence[str], named: Callable[[str], str] = str.strip) -> Command:
     """The command in an order of a page, such as `{"command": "MATERIAL", "text": "wood"}`.
-    allowed: names of commands. Raises FormatError for other orders, and ConfigError, as the command
-    itself does, for a label that cannot be used."""
+    allowed: names of commands. named: finds the label for the typed name of a material. Raises
+    FormatError for other orders, and ConfigError, as the command itself does, for a label that
+    cannot be used."""
     try:
         asked = json.loads(body)
     except (ValueError, RecursionError) as e:
@@ -66,6 +67,7 @@ def order(body: bytes, allowed: Sequence[str]) -> Command:
     text = text.strip()
     if name in (*LABELS, *MATERIALS):
         field = "material" if name in MATERIALS else name.lower()
+        text = named(text) if field == "material" else text
         Labels(**{field: text})  # before a capture records the order
     elif text and not (name == "DISCARD" and text.isascii() and text.isdecimal()):
         raise FormatError(
@@ -122,8 +124,8 @@ class RecordPage(Observer):
 
     format: of the sweeps. source: of the frames. trigger: its settings. about: see
     RecordingSession.about. obey: carries out the orders of the page, in the loop's thread. clock:
-    the host's real clock. unit: of the skin's profile. teaching: it is the page of `palpate teach`.
-    Raises ConfigError if the address cannot be used.
+    the host's real clock. unit: of the skin's profile. named: as for `order`. teaching: it is the
+    page of `palpate teach`. Raises ConfigError if the address cannot be used.
     """
 
     def __init__(
@@ -136,10 +138,11 @@ class RecordPage(Observer):
         obey: Obey,
         clock: Clock,
         unit: str = "",
+        named: Callable[[str], str] = str.strip,
         *,
         teaching: bool = False,
     ) -> None:
-        self._about, self._obey, self._clock = about, obey, clock
+        self._about, self._obey, self._clock, self._named = about, obey, clock, named
         self._tracker = ContactTracker(Expected(format, unit=unit), source)
         self._rate_hz = format.rate_hz
         by_page = ("START", "STOP") if trigger.mode == "serial" else ()
@@ -232,7 +235,7 @@ class RecordPage(Observer):
             self.server.show(self._tracker.view(health.skin, health.trouble))
 
     def _ordered(self, body: bytes) -> Future[list[object]]:
-        return self._queue.put(order(body, self._commands))
+        return self._queue.put(order(body, self._commands, self._named))
 
     def _shown(self, which: str) -> dict[str, Any] | None:
         """The picture of the last sweep, if it has this number. It is computed once."""

@@ -46,6 +46,7 @@ class WatchedBox:
     def __init__(self) -> None:
         self.trouble = ""
         self.hello: dict[str, Any] = {}
+        self._displays: dict[str, str] = {}
         self.health: dict[str, Any] = {}
         self.verdicts: deque[dict[str, Any]] = deque(maxlen=status.VERDICTS)
         self.load: tuple[Map, ...] = ()
@@ -98,11 +99,12 @@ class WatchedBox:
         )
 
     def _take_hello(self, line: Mapping[str, Any]) -> None:
-        format = typed(SweepFormat, dict(line["format"]))
+        format, displays = typed(SweepFormat, dict(line["format"])), line.get("displays") or {}
+        self._displays = dict(displays)
         self.hello = {
             **line,
             "format": str(format),
-            "labels": [str(label) for label in line["labels"]],
+            "labels": [str(displays.get(label, label)) for label in line["labels"]],
         }
         self.load, self.full, self._lowest = (), 1.0, None
         self.window, self.rate_hz = None, format.rate_hz
@@ -120,6 +122,7 @@ class WatchedBox:
     def _take_verdict(self, line: Mapping[str, Any]) -> None:
         verdict = {
             **line,
+            "label": str(self._displays.get(line["label"], line["label"])),
             "status": Status(line["status"]),
             "scores": [float(p) for p in line["scores"]],
         }

@@ -1,9 +1,10 @@
 """Peak memory and time of `palpate-train fit` on sets of growing size.
 
 `python -m tests.campaigns fit-memory` prints a line for each number of windows: the bytes of the
-set, the peak memory of the process, that without the set, and processor time. Sets are drawn from
-ten materials at four speeds in five sessions, 128 frames of 16 taxels in int16, 20 windows a
-recording. Options after `--` go to fit.
+set, whether it is mapped (train/data/mapped.py), the peak memory that the process held without
+mapped files, that without a set that was read, and processor time. Sets are drawn from ten
+materials at four speeds in five sessions, 128 frames of 16 taxels in int16, 20 windows a recording.
+Options after `--` go to fit, such as `--split recording:0.9`.
 """
 
 from __future__ import annotations
@@ -13,16 +14,19 @@ import resource
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 import numpy as np
 
+from train.data import mapped
 from train.data.sets import Dataset
 
 WINDOWS = (1_000, 10_000, 50_000, 100_000)
 MATERIALS, EACH, SPEEDS, SESSIONS = 10, 20, 4, 5
 FRAMES, TAXELS, RATE_HZ = 128, 16, 500.0
 BATCH = 1000
+PERIOD_S = 0.02
 
 
 def drawn(count: int, seed: int = 0) -> Dataset:
@@ -48,30 +52,37 @@ def drawn(count: int, seed: int = 0) -> Dataset:
 
 
 def peak(command: list[str]) -> tuple[float, float]:
-    """Peak resident memory in bytes and processor time in seconds of a command, by a process of
-    its own, because a process only knows the peak of all its children."""
-    words = [sys.executable, "-m", "tests.campaigns.fit_memory", "--child", *command]
-    done = subprocess.run(words, stdout=subprocess.PIPE, text=True, check=True)
-    bytes_, seconds = done.stdout.splitlines()[-1].split()
-    return float(bytes_), float(seconds)
-
-
-def child(command: list[str]) -> None:
-    """Run a command, and print its peak and its time."""
-    subprocess.run(command, stdout=sys.stderr, check=True)
+    """Peak memory in bytes that a command holds without mapped files, and its processor time in
+    seconds. The kernel keeps no peak of this memory, so it is read every PERIOD_S."""
+    most = 0.0
+    with subprocess.Popen(command, stdout=sys.stderr) as process:
+        while process.poll() is None:
+            most = max(most, held(process.pid))
+            time.sleep(PERIOD_S)
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    print(used.ru_maxrss * 1024, used.ru_utime + used.ru_stime)
+    if process.returncode:
+        raise SystemExit(f"fit-memory: {command} ended with {process.returncode}")
+    return most, used.ru_utime + used.ru_stime
+
+
+def held(pid: int) -> float:
+    """The bytes of memory that a process holds now, without mapped files; 0 once it has ended."""
+    try:
+        text = Path(f"/proc/{pid}/status").read_text()
+    except OSError:
+        return 0.0
+    lines = (line.split() for line in text.splitlines())
+    return sum(1024.0 * int(words[1]) for words in lines if words[0] == "RssAnon:")
 
 
 def main(arguments: list[str]) -> None:
     """Print the table."""
-    if arguments[:1] == ["--child"]:
-        return child(arguments[1:])
     parser = argparse.ArgumentParser("python -m tests.campaigns fit-memory")
     parser.add_argument("--windows", nargs="+", type=int, default=WINDOWS)
     parser.add_argument("fit", nargs="*", default=["--steps", "0"], help="options of fit")
     args = parser.parse_args(arguments)
-    print("windows  set MB  peak MB  without the set  CPU s")
+    print("windows  set MB  mapped  held MB  beside the set  CPU s")
+    before = 0.0
     for count in args.windows:
         with tempfile.TemporaryDirectory() as folder:
             path, out = Path(folder) / "set.h5", Path(folder) / "fit.npz"
@@ -79,11 +90,16 @@ def main(arguments: list[str]) -> None:
             sweeps.save(path)
             size = sweeps.samples.nbytes
             del sweeps
+            is_mapped = size >= mapped.LEAST
             words = ["fit", "--set", str(path), "--seed", "1", "--out", str(out), *args.fit]
-            most, seconds = peak([sys.executable, "-m", "train", *words])
-        mega = [f"{x / 1e6:.0f}" for x in (size, most, most - size)]
-        print(f"{count:>7}  {mega[0]:>6}  {mega[1]:>7}  {mega[2]:>15}  {seconds:>5.0f}", flush=True)
-    return None
+            most, total = peak([sys.executable, "-m", "train", *words])
+        seconds, before = total - before, total
+        mega = [f"{x / 1e6:.0f}" for x in (size, most, most - size * (not is_mapped))]
+        print(
+            f"{count:>7}  {mega[0]:>6}  {'yes' if is_mapped else 'no':>6}  {mega[1]:>7}  "
+            f"{mega[2]:>14}  {seconds:>5.0f}",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from tests.campaigns import promises
 from tests.factories.sweep_sets import easy
+from train.data.sets import Dataset
 
 
 @pytest.mark.slow
@@ -19,6 +21,31 @@ def test_easy_sweeps_keep_the_promise():
         assert one.of_this == pytest.approx(one.rightly, abs=12)
         assert one.expected == pytest.approx(one.rightly, abs=12)
     assert promises.summary(found).startswith("as the box answers ")
+
+
+def test_values_at_even_distances_are_tried(monkeypatch: pytest.MonkeyPatch):
+    """Of four speeds the first and the last where two are asked for, all where more are."""
+    left_out: list[set[int]] = []
+
+    def noted(train: Dataset, test: Dataset, *_: object) -> None:
+        left_out.append({*test.group("speed").tolist()})
+        assert left_out[-1].isdisjoint(train.group("speed").tolist())
+
+    monkeypatch.setattr(promises, "promise", noted)
+    sweeps = easy(24)
+    speeds = np.unique(sweeps.group("speed")).tolist()
+    assert len([*promises.promises(sweeps, "speed", 0, 1, 2)]) == 2
+    assert left_out == [{speeds[0]}, {speeds[-1]}]
+    assert len([*promises.promises(sweeps, "speed", 0, 1, 9)]) == len(speeds)
+
+
+def test_a_condition_of_two_values_has_no_figure_of_its_own():
+    """Then only the mean of the other conditions is compared."""
+    one = promises.Promise(90.0, np.nan, 85.0, {"right": 80.0})
+    assert promises.summary([one]) == (
+        "as the box answers 80.0 %, label alone 85.0 %; "
+        "mean of conditions said 90.0 %: +10.0 on the mean, +10.0 at most"
+    )
 
 
 def test_without_real_sweeps_a_case_is_left_out(monkeypatch: pytest.MonkeyPatch):

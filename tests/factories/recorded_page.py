@@ -86,6 +86,7 @@ class RecordedPage:
             lambda: self.recording.about() | (TAUGHT if teaching else {}),
             self.obey,
             clock,
+            named=self.recording.names.label,
             teaching=teaching,
         )
         self._lock, self._ended = threading.Lock(), threading.Event()

@@ -131,13 +131,16 @@ def _usable(read: bundle.Manifest) -> None:
     for text in (read.name, read.version, read.input, *read.labels):
         assert isinstance(text, str)
         assert text.isprintable(), f"{text!r} cannot be shown"
+    for label, text in read.displays.items():
+        assert label in read.labels
+        assert text.isprintable(), f"{text!r} cannot be shown"
     for label in read.labels:
         assert f",{label},".encode("ascii") in sentences.sentence("RES", 1, label, "")
     for entry in read.files.values():
         assert isinstance(entry, dict)
     assert isinstance(read.figures, dict)
     again = read.json()
-    assert json.loads(again).keys() | {"unloaded", "speeds", "bridging", "sliding"} == {
+    assert json.loads(again).keys() | {"unloaded", "speeds", "bridging", "sliding", "displays"} == {
         FILE_KEYS.get(field.name, field.name) for field in fields(read)
     }
     assert bundle.Manifest.parse(again).json() == again, (

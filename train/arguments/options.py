@@ -172,7 +172,10 @@ def report_line(what: Path, sweeps: str = "") -> str:
 
 
 def names(args: argparse.Namespace) -> tuple[str, ...]:
-    return tuple(methods.every()) if args.method == "all" else tuple(args.method.split(","))
+    """The methods of --method, to be read before work. Raises FormatError for an unknown one."""
+    if args.method == "all":
+        return tuple(methods.every())
+    return tuple(method.name for method in methods.find(args.method.split(",")))
 
 
 def seeds(args: argparse.Namespace) -> range:

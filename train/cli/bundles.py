@@ -10,7 +10,7 @@ from pathlib import Path
 
 from appliance.bundle import bundle
 from appliance.bundle.manifest import Manifest
-from appliance.core import config
+from appliance.core import config, outputs
 from appliance.core.clock import SystemClock
 from appliance.core.errors import FormatError
 from appliance.core.provenance import commit
@@ -73,7 +73,7 @@ def _add_bundles(add: Add) -> None:
     for command in (export, pack_command):
         command.add_argument(
             "--out",
-            type=Path,
+            type=outputs.folder,
             required=True,
             metavar="DIR",
             help="the bundle; replaced if it is there",
@@ -117,8 +117,8 @@ def run_export(args: argparse.Namespace) -> None:
 
 def run_pack(args: argparse.Namespace) -> None:
     """Train, pack the bundle and print its figures."""
-    pack.check_target(args.out)
     (method,) = methods.find([args.method], options.effort(args))
+    pack.check_target(args.out)
     content = pack.trained(method, labels.check(options.load(args, args.seed)), args.seed)
     content.about[pack.LICENCE] = args.licence
     try:
@@ -134,7 +134,7 @@ def run_pack(args: argparse.Namespace) -> None:
 def run_parity(args: argparse.Namespace) -> None:
     """Compare the graphs of a model."""
     if args.json:
-        options.writable_file(args.json, "--json")
+        options.writable_file(args.json, "--json", ".json")
     print(quantized_bundle.compared(args.model, options.load(args), args.json))
 
 

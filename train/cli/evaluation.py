@@ -100,13 +100,13 @@ def run_evaluate(args: argparse.Namespace) -> None:
     """
     if args.json:
         options.writable_file(args.json, "--json", ".json")
+    names, effort = options.names(args), options.effort(args)
     sweeps = options.load(args)
-    names = options.names(args)
     if args.each < 0:
         raise FormatError(
             f"--each {args.each} is out of range; use 1 or more, or leave it out for all"
         )
-    seeds, effort = options.seeds(args), options.effort(args)
+    seeds = options.seeds(args)
     # the box sees raw counts
     box = None if args.remove_means or args.label_alone else box_answers.answers
     protocols, log = tuple(args.protocols), options.Log()

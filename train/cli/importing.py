@@ -13,7 +13,7 @@ from appliance.core.types import DATA_TYPES
 from train.arguments import numbers, options
 from train.arguments.types import Add
 from train.data import labels, lerobot, summary
-from train.data.file_names import EXAMPLE, GROUP, NamePattern
+from train.data.file_names import EXAMPLE, FIELD, GROUP, NamePattern
 from train.data.import_plan import ImportPlan, Length
 from train.data.importing import Imported, LeftOut, Taken, import_folder
 
@@ -62,7 +62,11 @@ def _add_layout(command: argparse.ArgumentParser) -> None:
         help="columns of the taxels, in the grid's order: 2-17, s0,s1, s* (all but the time)",
     )
     command.add_argument(
-        "--variable", default="", metavar="NAME", help="the array to read if a file holds several"
+        "--variable",
+        default="",
+        metavar="NAME",
+        help="the array to read if a file holds several; with a pattern, each that matches is a "
+        "recording: '{material}_{trial:d}'",
     )
     command.add_argument(
         "--axes",
@@ -137,11 +141,12 @@ def run(args: argparse.Namespace) -> None:
 def _plan(args: argparse.Namespace) -> ImportPlan:
     """The options as a plan. A LeRobot data set states its frame rate."""
     fields = dict(_field(text) for text in args.field)
+    in_variable = [name for name, _ in FIELD.findall(args.variable)]
     rate = args.rate
     if not (args.pattern or args.time or rate) and lerobot.is_data_set(args.folder):
         rate = lerobot.rate_hz(args.folder)
     return ImportPlan(
-        NamePattern(args.pattern, tuple(fields)) if args.pattern else None,
+        NamePattern(args.pattern, (*fields, *in_variable)) if args.pattern else None,
         args.grid,
         args.columns,
         args.time,

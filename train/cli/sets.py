@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from appliance.core import outputs
 from appliance.core.errors import FormatError
 from appliance.core.storage import put
 from train.arguments import numbers, options
@@ -65,7 +66,7 @@ def _add_pull(add: Add) -> None:
     )
     command.add_argument(
         "--out",
-        type=Path,
+        type=outputs.folder,
         required=True,
         metavar="DIR",
         help="here; its folders are those of the box",

@@ -25,14 +25,16 @@ EXAMPLE = "'{material}_{force:d}N_{trial}.csv'"
 
 @dataclass(frozen=True)
 class NamePattern:
-    """A pattern over paths below a folder; `{}` matches text that is ignored.
+    """A pattern over paths below a folder, or over names of arrays; `{}` matches text that is
+    ignored.
 
     elsewhere: names of fields that stand elsewhere, so that the pattern need not hold them.
-    Raises FormatError if the pattern cannot be read.
+    option: the name of the option in messages. Raises FormatError if the pattern cannot be read.
     """
 
     text: str
     elsewhere: tuple[str, ...] = ()
+    option: str = "--pattern"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "text", normal(self.text))
@@ -40,27 +42,28 @@ class NamePattern:
         rest = FIELD.sub("", self.text)
         if "{" in rest or "}" in rest:
             raise FormatError(
-                f"--pattern {self.text!r} has an unmatched brace; write e.g. {EXAMPLE}"
+                f"{self.option} {self.text!r} has an unmatched brace; write e.g. {EXAMPLE}"
             )
         if "material" not in (*names, *self.elsewhere):
             raise FormatError(
-                f"--pattern {self.text!r} does not say where the material stands; "
+                f"{self.option} {self.text!r} does not say where the material stands; "
                 f"write e.g. {EXAMPLE}"
             )
         for name, kind in FIELD.findall(self.text):
             if name and (names.count(name) > 1 or not GROUP.fullmatch(name)):
                 raise FormatError(
-                    f"--pattern: {name!r} stands twice or is not a name; "
+                    f"{self.option}: {name!r} stands twice or is not a name; "
                     "use lower-case letters, and each name once"
                 )
             if kind not in KINDS:
                 raise FormatError(
-                    f"--pattern: {kind!r} is not a kind of field; "
+                    f"{self.option}: {kind!r} is not a kind of field; "
                     f"use {{{name}}}, {{{name}:d}} (whole) or {{{name}:f}}"
                 )
         if "recording" in names:
             raise FormatError(
-                "--pattern: each file is a recording; call {recording} something else, e.g. {trial}"
+                f"{self.option}: each file or array is a recording; "
+                "call {recording} something else, e.g. {trial}"
             )
 
     @property

@@ -56,7 +56,8 @@ class ImportPlan:
     every: from the start of one window to the start of the next; None takes only the middle
     window.
     dtype: data type of the counts, "" to keep the recorded type.
-    variable: the array to read from a file with several.
+    variable: the array to read from a file with several; a pattern in braces reads each array whose
+    name matches as a recording with these fields.
     transpose: whether files hold taxels x frames.
     renames: new names of materials by their old names.
     axes: the axes of the arrays in their order, names of AXES with commas; "" if the shape must
@@ -105,6 +106,7 @@ class ImportPlan:
             raise FormatError(f"--decimal {self.decimal} is unknown; use . or ,")
         self._check_axes()
         self._check_fields()
+        _ = self.variables
 
     def _check_axes(self) -> None:
         names = self.axes.split(",") if self.axes else []
@@ -118,14 +120,20 @@ class ImportPlan:
             raise FormatError("--axes already says where the frames stand; leave --transpose out")
 
     def _check_fields(self) -> None:
-        in_names = self.pattern.names if self.pattern else []
+        in_names = self.names[: len(self.names) - len(self.fields)]
         if "material" not in (*in_names, *self.fields):
             raise FormatError(
-                "where the material stands is not known; give --pattern with {material}, or "
-                "--field material=COLUMN if a column holds it"
+                "where the material stands is not known; give --pattern or --variable with "
+                "{material}, or --field material=COLUMN if a column holds it"
+            )
+        if both := [name for name in in_names if in_names.count(name) > 1]:
+            raise FormatError(
+                f"{both[0]} stands in --pattern and in --variable; call one of them something else"
             )
         if twice := [name for name in in_names if name in self.fields]:
-            raise FormatError(f"{twice[0]} stands in --pattern and in --field; give one of them")
+            raise FormatError(
+                f"{twice[0]} stands in --pattern or --variable and in --field; give one of them"
+            )
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -145,4 +153,19 @@ class ImportPlan:
     @property
     def names(self) -> list[str]:
         """The names of all fields of a recording."""
-        return [*(self.pattern.names if self.pattern else ()), *self.fields]
+        patterns = [one for one in (self.pattern, self.variables) if one]
+        return [*(name for one in patterns for name in one.names), *self.fields]
+
+    @property
+    def variables(self) -> NamePattern | None:
+        """The pattern of --variable, None if it is a name. Raises FormatError if it cannot be
+        read."""
+        if "{" not in self.variable:
+            return None
+        elsewhere = (*(self.pattern.names if self.pattern else ()), *self.fields)
+        return NamePattern(self.variable, elsewhere, "--variable")
+
+    def pattern_of(self, name: str) -> NamePattern | None:
+        """The pattern that has the field `name`, None if a column has it."""
+        patterns = (self.pattern, self.variables)
+        return next((one for one in patterns if one and name in one.names), None)

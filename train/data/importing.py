@@ -19,10 +19,11 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
+from appliance.core.names import shown
 from appliance.core.types import DATA_TYPES
 from train.data import frames, labels, lerobot, raw_files, readers, sampling
-from train.data.file_names import group
-from train.data.files.table import ReadPlan, Table, normal
+from train.data.file_names import NamePattern, group
+from train.data.files.table import MOST_LISTED, ReadPlan, Table, normal, printable
 from train.data.import_plan import ImportPlan
 from train.data.progress import Progress
 from train.data.sets import Dataset
@@ -124,7 +125,7 @@ def import_folder(
             left_out.append(LeftOut(name, str(e), broken=True))
         except FormatError as e:
             left_out.append(LeftOut(name, str(e), broken=True))
-    if "material" in plan.fields and recordings:
+    if "material" not in (plan.pattern.names if plan.pattern else ()) and recordings:
         _name_materials(folder, [one.fields for one in recordings], plan)
     cuts, rate_hz = _cuts(recordings, plan, left_out)
     del recordings  # their frames go as soon as they are in the set
@@ -166,7 +167,7 @@ def _named(
         first = f"the first file is {next(iter(paths))!r}" if paths else "it holds no files"
         pattern = f"matches --pattern {plan.pattern.text!r}" if plan.pattern else "is there"
         raise FormatError(f"{folder}: no file {pattern}; {first}")
-    if "material" not in plan.fields:
+    if plan.pattern and "material" in plan.pattern.names:
         _name_materials(folder, [fields for _, fields in found.values()], plan)
     return found
 
@@ -184,8 +185,8 @@ def _name_materials(folder: Path, known: Sequence[Fields], plan: ImportPlan) -> 
     for fields in known:
         written = fields["material"]
         fields["material"] = sent[new[written]]
-        if labels.unsendable([written]):
-            fields[DISPLAY] = written
+        if labels.unsendable([written]) and (text := shown(written)):
+            fields[DISPLAY] = text
 
 
 def _files(
@@ -196,7 +197,45 @@ def _files(
     wanted = ReadPlan(plan.variable, plan.time.rpartition(":")[0], plan.decimal)
     for name, (path, fields) in named.items():
         progress.begin(name)
-        yield name, fields, partial(raw_files.read, path, wanted)
+        if plan.variables is None:
+            yield name, fields, partial(raw_files.read, path, wanted)
+        else:
+            yield from _arrays(name, path, fields, plan.variables, wanted)
+
+
+def _arrays(
+    name: str, path: Path, fields: Fields, pattern: NamePattern, wanted: ReadPlan
+) -> Iterator[Source]:
+    """The arrays of a file whose names match the pattern, each a recording; a file without one, or
+    a name that fits in several ways, is a recording that cannot be read."""
+    try:
+        held = raw_files.arrays_of(path)
+    except FormatError as e:
+        return (yield name, fields, partial(_refused, str(e)))
+    matched = False
+    for array in held:
+        short = array if "/" in pattern.text else array.rpartition("/")[2]
+        at = f"{name} {printable(array)}"
+        try:
+            found = pattern.read(short)
+        except FormatError as e:
+            yield at, fields, partial(_refused, str(e))
+            continue
+        if found:
+            matched, plan = True, replace(wanted, variable=array)
+            yield (
+                at,
+                {**fields, **found},
+                partial(raw_files.read, path, plan),
+            )
+    if not matched:
+        listed = ", ".join(map(printable, held[:MOST_LISTED])) or "none"
+        why = f"has no array of frames that matches --variable {pattern.text!r}; it holds {listed}"
+        yield name, fields, partial(_refused, why)
+
+
+def _refused(why: str) -> Table:
+    raise FormatError(why)
 
 
 def _episodes(folder: Path, plan: ImportPlan) -> Iterator[Source]:
@@ -426,7 +465,7 @@ def _set(
     for name in plan.names:
         if name != "material":
             texts = [cut.recording.fields[name] for cut in cuts]
-            values, unit = group(plan.pattern, name, texts)
+            values, unit = group(plan.pattern_of(name), name, texts)
             groups[name] = np.repeat(values, count)
             units |= {name: unit} if unit else {}
     displays = _displays([cut.recording.fields for cut in cuts])

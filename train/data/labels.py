@@ -2,26 +2,19 @@
 
 from __future__ import annotations
 
-import re
-import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from appliance.bundle.manifest import LABEL
+from appliance.core import names as core
 from appliance.core.errors import FormatError
+from appliance.core.names import LABEL
 from appliance.core.schema import closest
 from train.data.files.table import normal
 from train.data.sets import Dataset
 
 ALLOWED = "1 to 24 letters, digits, spaces, '.', '_' or '-', the first a letter or a digit"
-MOST_LETTERS = 24
-SPELT_OUT = str.maketrans(
-    {"ä": "ae", "ö": "oe", "ü": "ue", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue", "ß": "ss"}
-    | {"æ": "ae", "Æ": "Ae", "œ": "oe", "ø": "o", "Ø": "O", "ł": "l", "Ł": "L", "đ": "d", "ı": "i"}
-)
-"""Letters that Unicode does not take apart, and German umlauts, in ASCII."""
 REMEDY = "give each another name with --rename OLD=NEW"
 
 
@@ -34,21 +27,12 @@ def unsendable(names: Iterable[str]) -> str:
 
 
 def sendable(names: Iterable[str]) -> dict[str, str]:
-    """For each of `names` the name that the box sends: the same if it can, else one like it in
-    ASCII, of at most MOST_LETTERS, that no other has."""
+    """For each of `names` the label that the box sends; no two have the same."""
     names = sorted(set(names))
     found = {name: name for name in names if LABEL.fullmatch(name)}
     for number, name in enumerate(names, 1):
-        if name in found:
-            continue
-        letters = unicodedata.normalize("NFKD", name.translate(SPELT_OUT))
-        plain = " ".join(re.findall(r"[A-Za-z0-9_.-]+", letters.encode("ascii", "ignore").decode()))
-        proposal = plain.lstrip("_.- ")[:MOST_LETTERS].rstrip() or f"material {number}"
-        taken, k = set(found.values()), 1
-        found[name] = proposal
-        while found[name] in taken:
-            k += 1
-            found[name] = f"{proposal[: MOST_LETTERS - len(f' {k}')].rstrip()} {k}"
+        if name not in found:
+            found[name] = core.sendable(name, found.values(), f"material {number}")
     return found
 
 

@@ -95,6 +95,15 @@ def read(path: Path, wanted: ReadPlan | None = None) -> Table:
         raise FormatError(f"cannot be read: {' '.join(str(e).split())}") from e
 
 
+def arrays_of(path: Path) -> tuple[str, ...]:
+    """The names of the arrays of frames in a MAT, .npz or HDF5 file. Raises FormatError, also for a
+    file of another kind, which is not read."""
+    suffix = path.suffix.lower()
+    if not (suffix in (".npz", ".mat", *HDF5) or h5py.is_hdf5(path)):
+        raise FormatError("holds no named arrays; --variable takes a name there, and no pattern")
+    return read(path, ReadPlan(names_only=True)).beside
+
+
 def _read(path: Path, wanted: ReadPlan) -> Table:
     suffix = path.suffix.lower()
     reader = next((read for suffixes, read in BINARY.items() if suffix in suffixes), None)

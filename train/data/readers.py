@@ -20,6 +20,7 @@ from appliance.core.sweep_set import Array, Set, build, load_file
 from appliance.core.types import LARGEST_READING, Status, Sweep, SweepFormat, sidecar
 from appliance.core.types import load as load_recording
 from appliance.signal.unloaded import UnloadedSkin
+from train.data import mapped
 from train.data.group_values import typed
 
 if TYPE_CHECKING:
@@ -118,7 +119,7 @@ def read(path: Path, kind: type[Set]) -> Set:
         raise FormatError(
             f"{path.name}: not a sweep set, but a file of frames; {IMPORT.format(path.parent)}"
         )
-    return load_file(path, kind)
+    return load_file(path, kind, mapped.of_npz(path))
 
 
 def _is_hdf5(path: Path) -> bool:
@@ -135,7 +136,7 @@ def read_hdf5(path: Path, kind: type[Set]) -> Set:
     try:
         with h5py.File(path, "r") as file:
             names = [k for k in file if k in SET_ARRAYS or k.startswith(("group_", "unit_"))]
-            arrays = {name: array_in(file, name) for name in names}
+            arrays = {name: array_in(file, name, path) for name in names}
             if "rate_hz" in file.attrs:
                 arrays.setdefault("rate_hz", np.asarray(file.attrs["rate_hz"]))
     except (OSError, KeyError, RuntimeError, ValueError, TypeError) as e:
@@ -153,9 +154,12 @@ def read_hdf5(path: Path, kind: type[Set]) -> Set:
     return build(arrays, source, kind)
 
 
-def array_in(file: h5py.File, name: str) -> Array:
-    """An array that is stored in this file. Links and virtual arrays are refused, because their
-    data may be missing or read as zeros. Raises FormatError."""
+def array_in(file: h5py.File, name: str, path: Path | None = None) -> Array:
+    """An array that is stored in this file; large samples of a set at `path` are mapped.
+
+    Links and virtual arrays are refused, because their data may be missing or read as zeros. Raises
+    FormatError.
+    """
     import h5py
 
     link = file.get(name, getlink=True)
@@ -175,7 +179,8 @@ def array_in(file: h5py.File, name: str) -> Array:
         )
     if h5py.check_string_dtype(data.dtype):
         return np.array(data.asstr("utf-8")[()], dtype=str)
-    return np.asarray(data[()])
+    known = mapped.of_hdf5(path, data) if path and name == "samples" else {}
+    return known["samples"] if known else np.asarray(data[()])
 
 
 def _complete(data: h5py.Dataset) -> bool:
@@ -214,16 +219,16 @@ def _tactmat(arrays: dict[str, Array], source: str) -> dict[str, Array]:
 
 def write_hdf5(target: BinaryIO, arrays: dict[str, Any]) -> None:
     """Write the arrays of an .npz under the same names as an HDF5 file that `read_hdf5` reads.
-    Samples are compressed. target: opened for reading and writing."""
+    Samples are compressed unless they are so large that they are mapped. target: opened for reading
+    and writing."""
     import h5py
 
     with h5py.File(target, "w") as file:
         for name, values in arrays.items():
             if np.asarray(values).dtype.kind == "U":
                 values = np.asarray(values).astype(h5py.string_dtype())
-            file.create_dataset(
-                name, data=values, compression="gzip" if name == "samples" else None
-            )
+            small = name == "samples" and values.nbytes < mapped.LEAST
+            file.create_dataset(name, data=values, compression="gzip" if small else None)
 
 
 def read_recorded(folder: Path) -> list[RecordedSweep]:
@@ -317,6 +322,9 @@ def from_recorded(recorded: Sequence[RecordedSweep], folder: Path, kind: type[Se
     source += partial + remark
     rate = np.array(kept[0].format.rate_hz)
     about = {"labels": _ranks(materials), "materials": np.unique(materials), "rate_hz": rate}
+    displays = {one.sweep.material: one.about.get("display") for one in reversed(kept)}
+    if any(displays.values()):
+        about["displays"] = np.array([str(displays[name] or "") for name in sorted(displays)])
     if np.isfinite(unloaded).any():
         about["unloaded"] = unloaded
     return build({"samples": samples} | about | groups, source, kind)

@@ -21,7 +21,7 @@ from appliance.core import storage, sweep_set
 from appliance.core.errors import FormatError
 from appliance.core.sweep_set import Array
 from appliance.sim import skin
-from train.data import group_values, published, readers
+from train.data import group_values, mapped, published, readers
 from train.data.files.table import normal
 from train.data.group_values import text_of
 
@@ -66,7 +66,7 @@ class Dataset(sweep_set.SweepSet):
         unloaded = None if self.unloaded is None else self.unloaded[index]
         return replace(
             self,
-            samples=self.samples[index],
+            samples=mapped.taken(self.samples, index),
             labels=self.labels[index],
             groups=groups,
             unloaded=unloaded,
@@ -177,8 +177,8 @@ class Dataset(sweep_set.SweepSet):
         return self.take(inside), self.take(~inside)
 
     def save(self, path: Path) -> None:
-        """Write the set as HDF5 if the name ends in .h5 or .hdf5, else as a compressed .npz; `load`
-        reads both."""
+        """Write the set as HDF5 if the name ends in .h5 or .hdf5, else as an .npz; `load`
+        reads both. Both are compressed unless the samples are so large that they are mapped."""
         arrays: dict[str, Array] = {
             "samples": self.samples,
             "labels": self.labels,
@@ -195,9 +195,9 @@ class Dataset(sweep_set.SweepSet):
             if path.suffix in readers.HDF5:
                 readers.write_hdf5(f, arrays | {"materials": list(self.materials)})
             else:
-                np.savez_compressed(
-                    f, allow_pickle=False, materials=np.array(self.materials), **arrays
-                )
+                large = self.samples.nbytes >= mapped.LEAST
+                write = np.savez if large else np.savez_compressed
+                write(f, allow_pickle=False, materials=np.array(self.materials), **arrays)
 
 
 def load(spec: str, seed: int = 0) -> Dataset:
@@ -252,9 +252,8 @@ def _joined(sets: Sequence[Dataset]) -> Dataset:
             parts = _apart(parts)
         groups[name], unit = group_values.joined(name, parts, [s.units.get(name, "") for s in sets])
         units |= {name: unit} if unit else {}
-    samples, labels = (
-        np.concatenate([getattr(s, name) for s in sets]) for name in ("samples", "labels")
-    )
+    samples = mapped.joined([s.samples for s in sets])
+    labels = np.concatenate([s.labels for s in sets])
     source, unloaded = " + ".join(s.source for s in sets), _unloaded(sets)
     if unloaded is not None:  # each set is consistent, but levels may differ between sets
         samples, unloaded, remark = readers.align_tare(samples, unloaded)

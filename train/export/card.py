@@ -27,8 +27,7 @@ def data(train: Dataset, licence: str) -> Json:
         for name in ("session", "position", "object")
         if name in train.groups
     }
-    displays = {"displays": train.displays} if train.displays else {}
-    return displays | {
+    return {
         "digest": digest(train),
         "sweeps": np.bincount(train.labels, minlength=len(train.materials)).tolist(),
         "groups": counted,
@@ -48,6 +47,7 @@ def text(manifest: Manifest, pitch_mm: float | None) -> str:
         "rate_hz": manifest.format.rate_hz,
         "pitch_mm": pitch_mm or (manifest.contact.pitch_mm if manifest.contact else None),
         "materials": dict(zip(manifest.labels, about.get("sweeps", []), strict=False)),
+        "display_names": manifest.displays,
         "groups": about.get("groups", {}),
         "protocol": protocol or None,
         "accuracy": figure.get("accuracy"),

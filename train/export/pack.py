@@ -172,6 +172,7 @@ def _manifest(
         format=content.train.format,
         input=content.input,
         labels=content.train.materials,
+        displays=displays(content.train),
         thresholds=thresholds(content.train, contacts.limit.contact, full_scale),
         contact=place,
         unloaded=contacts.limit.known_tare(),
@@ -183,6 +184,11 @@ def _manifest(
         files={k: bundle.file_entry(v) for k, v in files.items()},
         made=_made(content, commit, unknown),
     )
+
+
+def displays(sweeps: Dataset) -> dict[str, str]:
+    """The display names for a manifest, which has none for materials that are not there."""
+    return {name: text for name, text in sweeps.displays.items() if name in sweeps.materials}
 
 
 def _tolerant(

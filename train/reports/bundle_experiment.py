@@ -45,6 +45,7 @@ def run(folder: Path, sweeps: Dataset, log: Log, seed: int = 0) -> Json:
     return found.json() | {
         "format": str(m.format),
         "labels": list(m.labels),
+        "displays": sweeps.displays | m.displays,
         "made": dict(m.made),
         "figures": dict(m.figures),
         "fitted_to_this": m.made.get("set") == sweeps.source,

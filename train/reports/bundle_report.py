@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from appliance.core.names import MOST_LETTERS
 from train.data.sets import Dataset
 from train.reports import confusion_plot, formatting, html, provenance, sweep_plot
 from train.reports.formatting import level
@@ -49,6 +50,7 @@ LEFT_OUT = [
 
 def page(figures: Json, sweeps: Dataset) -> str:
     """The page (HTML)."""
+    figures = _displayed(figures)
     pictures = {"calibration": html.picture(calibration(figures["calibration"]))}
     if len(figures["labels"]) <= MOST_IN_MATRIX:
         pictures["confusion"] = html.picture(confusion(figures))
@@ -82,6 +84,42 @@ def page(figures: Json, sweeps: Dataset) -> str:
             for i in _examples(sweeps)
         ],
     )
+
+
+def _displayed(figures: Json) -> Json:
+    """The figures with display names instead of labels."""
+    displays = figures.get("displays", {})
+    if not displays:
+        return figures
+
+    def shown(name: str) -> str:
+        return str(displays.get(name, name))
+
+    def given(answers: Mapping[str, int]) -> dict[str, int]:
+        return {shown(answer): n for answer, n in answers.items()}
+
+    rows = [
+        row
+        | {
+            "name": shown(row["name"]),
+            "taken_for": [shown(row["taken_for"][0]), row["taken_for"][1]]
+            if row["taken_for"]
+            else row["taken_for"],
+        }
+        for row in figures["materials"]
+    ]
+    named = {
+        "labels": [shown(name) for name in figures["labels"]],
+        "answers": {shown(name): given(of) for name, of in figures["answers"].items()},
+        "not_in_the_bundle": {
+            shown(name): given(of) for name, of in figures["not_in_the_bundle"].items()
+        },
+        "materials": rows,
+    }
+    if left_out := figures.get("left_out"):
+        materials = {shown(name): of for name, of in left_out["materials"].items()}
+        named["left_out"] = left_out | {"materials": materials}
+    return {**figures, **named}
 
 
 def _in_short(figures: Json) -> Iterator[list[str]]:
@@ -190,11 +228,13 @@ def _examples(sweeps: Dataset) -> list[int]:
 def confusion(figures: Json) -> str:
     """The labels that the sweeps of each material get, as shares of all its sweeps; rows are the
     true materials. A row lacks the share of answers without a label."""
-    names = figures["labels"]
-    answers = [figures["answers"].get(of, {}) for of in names]
-    counts = np.array([[given.get(named, 0) for named in names] for given in answers])
+    labels = figures["labels"]
+    answers = [figures["answers"].get(of, {}) for of in labels]
+    counts = np.array([[given.get(named, 0) for named in labels] for given in answers])
     totals = np.array([sum(given.values()) for given in answers])
     about = "materials by the labels that they get"
+    most = MOST_LETTERS  # of a display name there is no room for more
+    names = [name if len(name) <= most else f"{name[: most - 1]}…" for name in labels]
     return confusion_plot.draw(counts, names, about, totals=totals)
 
 

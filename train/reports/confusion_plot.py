@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from train.reports.plot_style import ACCENT, BLACK, GREY, SMALL, single_axes, tiles, to_svg, write
 
 Array = NDArray[Any]
+FEW = 30
+"""Number of sweeps below which a row says how many there are: one of three is 33 %, too."""
 STRONGEST = 0.6
 """Strongest share of the accent colour behind a number: text stays readable on it, in light and in
 dark."""
@@ -27,9 +29,10 @@ def draw(
 ) -> str:
     """Draw counts or shares [K, K] with the true materials as rows: each row in per cent, and the
     printed values below in small type. totals: sweeps [K] of each material, if some of them have no
-    label; without them the sums of the rows."""
+    label; without them the sums of the rows. Rows of few sweeps show their number."""
     k = len(names)
     sums = np.sum(matrix, 1) if totals is None else totals
+    counted = totals is not None or np.asarray(matrix).dtype.kind in "iu"
     rows = np.asarray(matrix, float) / np.maximum(np.reshape(sums, (-1, 1)), 1e-9)
     figure, axes = single_axes(
         0.6 + (0.36 if printed is None else 0.47) * k, left=0.25, right=0.995, top=0.55, bottom=0.05
@@ -48,7 +51,8 @@ def draw(
         if printed is not None and printed[i][j] > 0:
             write(axes, j + 0.5, i + 0.76, f"◇ {100 * printed[i][j]:.0f}", size=SMALL - 1)
     for i, name in enumerate(names):
-        write(axes, -0.03 * k, i + 0.5, name, size=SMALL + 0.5, ha="right")
+        few = f" (n = {sums[i]:.0f})" if counted and sums[i] < FEW else ""
+        write(axes, -0.03 * k, i + 0.5, name + few, size=SMALL + 0.5, ha="right")
         write(axes, i + 0.5, -0.12, name.replace(" ", "\n"), size=SMALL, va="bottom")
     write(axes, -0.03 * k, -0.12, "%, is ↓  named →", GREY, SMALL, ha="right", va="bottom")
     tiles(axes, k, k)

@@ -175,8 +175,9 @@ def _recorded(one: RecordedSweep) -> ShownSweep:
 
 def of_set(labelled: sets.Dataset, number: int) -> ShownSweep:
     """A sweep of a set with its groups."""
+    material = labelled.materials[labelled.labels[number]]
     named = [
-        labelled.materials[labelled.labels[number]],
+        labelled.displays.get(material, material),
         *(
             f"{by} {text_of(v[number])} {labelled.units.get(by, '')}".rstrip()
             for by, v in sorted(labelled.groups.items())

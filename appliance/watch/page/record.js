@@ -18,7 +18,10 @@ begin();
 /* A button that can do nothing now keeps the focus that it has. */
 function enable(button, can) { if (button.getAttribute("aria-disabled") !== `${!can}`) button.setAttribute("aria-disabled", `${!can}`); }
 
-function named(material, position) { return material ? material + (position && ` at ${position}`) : "no material"; }
+/* A material by the name that people read. */
+function shown(material) { return recording?.displays?.[material] ?? material; }
+
+function named(material, position) { return material ? shown(material) + (position && ` at ${position}`) : "no material"; }
 
 function live() { return reached === true && recording !== null; }
 
@@ -46,8 +49,9 @@ function drawLabels() {
   if (!recording) return;
   put("now", named(recording.material, recording.position));
   for (const name of FIELDS) { // what a person has typed and not set yet stays
-    if (byId(name).value === (drawn[name] ?? "")) byId(name).value = recording[name];
-    drawn[name] = recording[name];
+    const value = name === "material" ? shown(recording[name]) : recording[name];
+    if (byId(name).value === (drawn[name] ?? "")) byId(name).value = value;
+    drawn[name] = value;
   }
   put("trigger", recording.trigger);
   byId("sweeps").hidden = !recording.commands.includes("START");
@@ -68,12 +72,12 @@ function drawCounts() {
   const {counts, material, position, target} = recording, held = new Map(counts.map(([m, p, n]) => [JSON.stringify([m, p]), n]));
   const materials = sorted([...counts.map((one) => one[0]), ...(material ? [material] : [])]);
   const positions = sorted([...counts.map((one) => one[1]), ...(material ? [position] : [])]);
-  const content = JSON.stringify([materials, positions]), box = byId("counts");
+  const content = JSON.stringify([materials, positions, recording.displays]), box = byId("counts");
   if (content !== table) {
     table = content;
     const head = made("tr"), body = materials.map((name) => {
       const row = made("tr");
-      made("th", "", name, row).scope = "row";
+      made("th", "", shown(name), row).scope = "row";
       for (const at of positions) Object.assign(made("button", "", "", made("td", "", undefined, row)).dataset, {material: name, position: at});
       return row;
     });
@@ -81,7 +85,7 @@ function drawCounts() {
     for (const at of positions) made("th", "", at || "no position", head).scope = "col";
     box.querySelector("thead").replaceChildren(...(materials.length ? [head] : []));
     box.querySelector("tbody").replaceChildren(...body);
-    for (const [id, names] of [["materials", materials], ["positions", positions]]) {
+    for (const [id, names] of [["materials", materials.map(shown)], ["positions", positions]]) {
       byId(id).replaceChildren(...names.filter(Boolean).map((value) => Object.assign(made("option"), {value})));
     }
   }

@@ -78,9 +78,9 @@ function drawTally(verdicts) {
     for (const value of values) made("td", "", value === "" ? "" : count(value), one);
     body.push(one);
   };
-  for (const label of [...new Set(named.map((one) => one.label))].sort((a, b) => a.localeCompare(b))) {
-    const of = counted(named.filter((one) => one.label === label).map((one) => one.status));
-    line(label, [...columns.map((status) => of.get(status) ?? 0), [...of.values()].reduce((a, b) => a + b)]);
+  for (const name of [...new Set(named.map((one) => one.name))].sort((a, b) => a.localeCompare(b))) {
+    const of = counted(named.filter((one) => one.name === name).map((one) => one.status));
+    line(name, [...columns.map((status) => of.get(status) ?? 0), [...of.values()].reduce((a, b) => a + b)]);
   }
   const without = counted(nameless.map((one) => one.status));
   for (const status of common(without)) line(status, [...columns.map(() => ""), without.get(status)]);
@@ -98,7 +98,7 @@ function row(one) {
   made("span", "id number", one.sweep, made_row);
   const what = made("span", "what", "", made_row);
   if (one.status !== "ok") mark(made("span", "chip", "", what), one.status);
-  what.append(one.label || (WORDS[one.status] ?? ["", one.reason])[1]);
+  what.append(one.name || (WORDS[one.status] ?? ["", one.reason])[1]);
   if (!one.label) what.title = one.reason;
   made("span", "number", one.label ? percent(one.probability) : "", made_row);
   made("span", "ms number", one.label ? `${(one.latency_ns / 1e6).toFixed(1)} ms` : "", made_row);

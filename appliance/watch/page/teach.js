@@ -20,6 +20,9 @@ function live() { return reached === true && recording !== null; }
 
 function teach() { return recording?.teach ?? null; }
 
+/* A material by the name that people read. */
+function shown(name) { return (recording?.trying ?? recording)?.displays?.[name] ?? name; }
+
 function byPage() { return recording?.commands.includes("START"); }
 
 function drawHeader() {
@@ -44,11 +47,11 @@ function drawTask() {
   if (!recording) return;
   const trying = recording.trying, now = teach(), name = recording.material;
   if (trying) {
-    put("what", last?.label || (last ? last.reason || last.status : "Try it"));
-    put("count", last?.label ? `${(100 * last.probability).toFixed(0)} % sure` : `it knows ${trying.labels.join(", ")}`);
+    put("what", shown(last?.label) || (last ? last.reason || last.status : "Try it"));
+    put("count", last?.label ? `${(100 * last.probability).toFixed(0)} % sure` : `it knows ${trying.labels.map(shown).join(", ")}`);
   } else if (now) {
     const n = now.materials[name] ?? 0;
-    put("what", name || "Name a material");
+    put("what", shown(name) || "Name a material");
     put("count", !name ? "" : n < recording.good ? `sweep ${n + 1} of ${recording.good}` : `${n} sweeps: enough of it, or go on`);
   }
   byId("sweep-button").hidden = !byPage();
@@ -64,11 +67,11 @@ function drawTask() {
 
 function drawMaterials() {
   const held = teach()?.materials ?? Object.fromEntries((recording?.trying?.labels ?? []).map((name) => [name, null]));
-  const content = JSON.stringify([held, recording?.material, Boolean(recording?.trying), live()]);
+  const content = JSON.stringify([held, recording?.displays, recording?.material, Boolean(recording?.trying), live()]);
   if (content === listed) return;
   listed = content;
   byId("materials").replaceChildren(...Object.entries(held).map(([name, n]) => {
-    const row = made("li"), pick = made("button", "", n === null ? name : `${name}: ${n}`, row);
+    const row = made("li"), pick = made("button", "", n === null ? shown(name) : `${shown(name)}: ${n}`, row);
     pick.type = "button";
     pick.dataset.material = name;
     pick.setAttribute("aria-pressed", `${!recording.trying && name === recording.material}`);
@@ -77,7 +80,7 @@ function drawMaterials() {
       const forget = made("button", "forget", "Forget", row);
       forget.type = "button";
       forget.dataset.forget = name;
-      forget.setAttribute("aria-label", `Forget ${name}`);
+      forget.setAttribute("aria-label", `Forget ${shown(name)}`);
       enable(forget, live());
     }
     return row;

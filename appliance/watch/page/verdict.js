@@ -62,7 +62,7 @@ function widest(text) { return Math.max(1, ...text.split(" ").map(width), width(
 
 function of(sweep, now) { return `sweep ${sweep.sweep}, ${clock(sweep.at)}, ${ago(now - sweep.at)} ago`; }
 
-function before(last, now) { return last ? `Before that: ${last.label || last.status}, ${of(last, now)}.` : ""; }
+function before(last, now) { return last ? `Before that: ${last.name || last.status}, ${of(last, now)}.` : ""; }
 
 /* What the card shows. verdict: the last one with its time `at`, in ms; fresh: whether it is of the program that runs now. away:
    "" or why nothing is heard, with lastAt (0: unknown). */
@@ -87,10 +87,10 @@ function answer(verdict, windowS, next, now) {
   const status = verdict.moved && (verdict.status === "ok" || verdict.status === "unknown") ? "displaced" : verdict.status;
   let [tone, words, advice] = WORDS[status] ?? ["bad", verdict.status, verdict.reason];
   if (verdict.status === "short" && windowS) advice = `Slide for longer than ${windowS} s.`;
-  const named = verdict.status === "ok", candidate = verdict.label ? `${verdict.label}, ${percent(verdict.probability)}` : "";
+  const named = verdict.status === "ok", candidate = verdict.label ? `${verdict.name}, ${percent(verdict.probability)}` : "";
   const more = [named ? percent(verdict.probability) : candidate && `Perhaps ${candidate}`,
     verdict.fused > 1 ? `${verdict.fused} sweeps of one object` : "", verdict.share < 1 ? `early, at ${percent(verdict.share)} of the window` : ""];
-  return {tone, status: named && !verdict.moved ? "ok" : status, words: named ? verdict.label : words, advice, next, of: of(verdict, now),
+  return {tone, status: named && !verdict.moved ? "ok" : status, words: named ? verdict.name : words, advice, next, of: of(verdict, now),
     small: more.filter(Boolean).join(", "), moved: verdict.moved,
     detail: [verdict.detail === verdict.moved ? "" : verdict.detail, verdict.reason].filter(Boolean).join("; ")};
 }

@@ -26,7 +26,7 @@ function wall(ns) { return wallMs + ns / 1e6; }
 const HEARD = {
   now(ns) { wallMs = Date.now() - ns / 1e6; },
   begin(run) { begin(); known.run = run; },
-  hello(hello) { known.hello = hello; known.labels.set(hello.bundle, hello.labels); },
+  hello(hello) { known.hello = hello; known.labels.set(hello.bundle, hello.names); },
   box(box) { known.box = box; },
   health(health) { known.health = health; known.heardAt = wall(health.time_ns); },
   state(state) { if (known.health) Object.assign(known.health, state); },

@@ -16,7 +16,7 @@ import numpy as np
 import pynmea2
 import pytest
 
-from appliance.core.errors import ApplianceError, ConfigError
+from appliance.core.errors import ApplianceError, ConfigError, FormatError
 from appliance.core.types import Frames, Status, Sweep, Verdict, load, sidecar
 from appliance.recording import recording
 from appliance.recording.recording import Labels, RecordingSession, SweepFolder
@@ -24,7 +24,9 @@ from appliance.service.feed import FeedServer
 from appliance.sim import devices, rig, script, skin
 from tests.factories import toy_bundle
 from tests.factories.feeds import FeedPeer
+from tests.factories.recorded_page import RecordedPage
 from tests.factories.simulated_box import Rigged
+from train.data import sets
 
 WOOD, NONE = Labels("wood"), Labels()
 
@@ -592,3 +594,25 @@ def test_numbers_in_a_verdict_come_back_bit_for_bit():
     absent = {"displacement", "speed_mm_s", "force_n", "measured_mm_s", "direction"}
     assert again.keys() == {*Verdict.__slots__, "moved"} - absent
     assert replace(verdict, speed_mm_s=30.0).as_dict()["speed_mm_s"] == 30.0
+
+
+def test_display_names_outlast_the_run(tmp_path: Path):
+    """The sidecar keeps the typed name; the next run and the set of the folder have it; a name that
+    cannot be shown is passed over."""
+    for run in range(2):
+        one = RecordedPage(tmp_path, Labels())
+        assert one.recording.names.displays == ({"Holz geoelt": "Holz, geölt"} if run else {})
+        for typed in ("Holz, geölt", "metal"):
+            label = one.recording.names.label(typed)
+            assert one.recording.commands["MATERIAL"](label)[0] == label
+            one.recording.sweep(*one.answered(Status.RECORDED), {})
+        assert one.recording.about()["displays"] == {"Holz geoelt": "Holz, geölt"}
+        one.recording.close()
+    assert sets.load(str(tmp_path)).displays == {"Holz geoelt": "Holz, geölt"}
+    path = tmp_path / "sweep-000002.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"display": "a\nb"}))
+    one = RecordedPage(tmp_path, Labels())
+    assert one.recording.names.displays == {"Holz geoelt": "Holz, geölt"}
+    one.recording.close()
+    with pytest.raises(FormatError, match=r"'a\\nb' of 'metal' cannot be shown; use 1"):
+        sets.load(str(tmp_path))

@@ -136,7 +136,7 @@ def test_browsers_and_skin_come_and_go(browser: Any, box: TaughtBox):
 def test_the_page_refuses_what_cannot_be(browser: Any, box: TaughtBox):
     """A name that cannot be sent is refused with the reason; USE waits for two materials."""
     hand = Hand(browser, box)
-    hand.page.fill("#name", "käse")
+    hand.page.fill("#name", "-oak")
     hand.press("#add button")
     hand.until("#said", lambda text: "cannot be used" in text)
     assert hand.page.get_attribute("#use", "aria-disabled") == "true"

@@ -63,6 +63,20 @@ def test_the_first_lines_say_what_box_it_is(board: PageBoard, events: Events):
     )
 
 
+def test_people_read_display_names(events: Events):
+    """The labels stay; names beside them are those of the bundle, and labels where it has none."""
+    board = PageBoard(events)
+    board.take(feed_lines.hello(displays={"wood": "Holz, geölt", "gone": "weg"}))
+    for number, label in enumerate(("wood", "metal"), 1):
+        board.take(feed_lines.verdict(number, float(number), label))
+    board.take(feed_lines.verdict(3, 3.0, status="gap"))
+    (hello,) = events.of("hello")
+    assert hello["labels"] == list(feed_lines.LABELS)
+    assert hello["names"] == ["metal", "Holz, geölt", *feed_lines.LABELS[2:]]
+    shown = [(one["label"], one["name"]) for one in events.of("verdict")]
+    assert shown == [("wood", "Holz, geölt"), ("metal", "metal"), ("", "")]
+
+
 @pytest.mark.parametrize("status", ["ok", "unsure", "unknown", "gap", "sensor-lost"])
 def test_a_verdict_comes_with_its_probabilities_or_its_reason(
     board: PageBoard, events: Events, status: str

@@ -165,7 +165,7 @@ def test_a_bad_label_is_refused_with_its_reason(browser: Any, recorded: Recorded
     """The refusal has the command's words and stands beside the field, which keeps the text; a good
     label removes it."""
     seen = opened(browser, recorded)
-    for wrong in ("-wood", "<b>wood</b>", "Grüße"):
+    for wrong in ("-wood", "<b>wood</b>", "a,b"):
         seen.page.fill("#material", wrong)
         seen.page.click("#set")
         until(
@@ -466,3 +466,22 @@ def test_everything_on_it_has_a_role_and_a_name(browser: Any, recorded: Recorded
     assert seen.page.get_attribute("#said", "role") == "status"
     assert seen.page.get_attribute("#now", "aria-live") == "polite"
     assert json.dumps(seen.requests).count(".js") == 5
+
+
+def test_a_material_has_a_name_in_any_language(
+    browser: Any, recorded: RecordedPage, tmp_path: Path
+):
+    """It is typed and shown as it is written; the command and the sweep have a label in ASCII, and
+    the sidecar has both."""
+    seen = opened(browser, recorded)
+    seen.page.fill("#material", "Holz, geölt")
+    seen.page.press("#material", "Enter")
+    until(lambda: seen.text("#now") == "Holz, geölt at 1")
+    assert recorded.done == ["MATERIAL,Holz geoelt"]
+    assert seen.page.input_value("#material") == "Holz, geölt"
+    number = recorded.sweep()
+    until(lambda: seen.text("#outcome").startswith("Holz, geölt at 1, stored"))
+    assert "Holz, geölt" in seen.page.locator("#counts th").all_inner_texts()
+    about = sidecar(tmp_path / f"sweep-{number:06d}.npy")
+    assert (about["material"], about["display"]) == ("Holz geoelt", "Holz, geölt")
+    assert not seen.errors

@@ -72,6 +72,24 @@ def test_a_name_of_any_length_fits(browser: Any, shown: Shown, label: str):
         seen.page.context.close()
 
 
+def test_people_read_display_names_and_programs_labels(browser: Any, shown: Shown, tmp_path: Path):
+    """Card, list, counts and probabilities have the name in any language; the CSV has the label."""
+    shown.board.take(feed_lines.hello(displays={"wood": "Holz, <b>geölt</b>"}))
+    shown.board.take(feed_lines.verdict(41, 390.0, "wood"))
+    seen = opened(browser, shown, rows=41)
+    until(lambda: seen.text("#label") == "Holz, <b>geölt</b>")
+    assert "Holz, <b>geölt</b>" in seen.page.locator(".row").first.inner_text()
+    assert "Holz, <b>geölt</b>" in seen.page.locator("#tally th").all_text_contents()
+    assert seen.page.locator("#scores span").first.inner_text() == "Holz, <b>geölt</b>"
+    with seen.page.expect_download() as begun:
+        seen.page.locator("#save").click()
+    begun.value.save_as(tmp_path / "shift.csv")
+    text = (tmp_path / "shift.csv").read_text("utf-8")
+    assert ",wood," in text
+    assert "Holz" not in text
+    assert not seen.errors
+
+
 def test_a_sweep_without_a_label_says_why(browser: Any, shown: Shown):
     """The card has words for an operator, the fold the reason; the probabilities are gone."""
     seen = opened(browser, shown)

@@ -378,3 +378,20 @@ def test_too_little_memory_is_one_line(
         "palpate-train: not enough memory: Unable to allocate 9.00 TiB; use fewer"
     )
     assert said.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("evaluate", "--protocol", "random:2"),
+        ("pack", "--seed", "1", "--name", "a", "--version", "1", "--out", "b"),
+    ],
+)
+def test_an_unknown_method_is_refused_before_sets_are_read(
+    words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+):
+    """Its name and the known ones are in the message; the set, which is not there, is not."""
+    assert main([*words, "--set", "nowhere.npz", "--method", "magic"]) != 0
+    said = capsys.readouterr().err
+    assert "method 'magic' is unknown; use some of " in said
+    assert "nowhere" not in said

@@ -51,7 +51,7 @@ def test_a_name_that_fits_in_several_ways_is_refused():
         ("{material}_{A}.csv", "'A' stands twice or is not a name; use lower-case letters"),
         ("{material}_{a.csv", "has an unmatched brace"),
         ("{material}_{a:x}.csv", "'x' is not a kind of field"),
-        ("{material}_{recording}.csv", "each file is a recording"),
+        ("{material}_{recording}.csv", "each file or array is a recording"),
     ],
 )
 def test_what_is_no_pattern_is_refused(pattern: str, message: str):

@@ -3,6 +3,7 @@ one exact line."""
 
 from __future__ import annotations
 
+import re
 import zipfile
 from contextlib import suppress
 from pathlib import Path
@@ -471,3 +472,80 @@ def test_columns_in_another_order_are_refused_unless_they_are_named(tmp_path: Pa
     }
     made = taken(tmp_path, time="t:s", rate_hz=None, columns="a,b,c,d")
     np.testing.assert_array_equal(made.sweeps.samples[1], made.sweeps.samples[2])
+
+
+ARRAYS = {
+    "npz": lambda path, arrays: np.savez(path, **arrays),
+    "mat": lambda path, arrays: scipy.io.savemat(path, arrays),
+    "h5": lambda path, arrays: [
+        h5py.File(path, "a").create_dataset(f"day/{name}", data=x).file.close()
+        for name, x in arrays.items()
+    ],
+}
+
+
+@pytest.mark.parametrize("suffix", ARRAYS)
+def test_each_array_whose_name_matches_is_a_recording(tmp_path: Path, suffix: str):
+    """The name of the array has the material and the trial, that of the file the session; times and
+    other arrays are passed over."""
+    for session, first in (("mo", 1), ("tu", 3)):
+        arrays = {f"{m}_{k}": COUNTS + k for k in (first, first + 1) for m in ("felt", "wool")}
+        ARRAYS[suffix](
+            tmp_path / f"{session}.{suffix}", arrays | {"t": np.arange(40.0), "x": COUNTS}
+        )
+    made = taken(
+        tmp_path,
+        pattern=NamePattern("{session}.{}", ("material", "trial")),
+        variable="{material}_{trial:d}",
+    ).sweeps
+    assert made.materials == ("felt", "wool")
+    held = zip(
+        made.labels,
+        made.group("session"),
+        made.group("trial"),
+        made.samples[:, 0, 0, 0],
+        strict=True,
+    )
+    first = int(COUNTS[15, 0])
+    wanted = [(m, "mo" if k < 3 else "tu", k, first + k) for m in (0, 1) for k in (1, 2, 3, 4)]
+    assert sorted((int(a), str(b), int(c), int(d)) for a, b, c, d in held) == wanted
+    assert len(np.unique(made.group("recording"))) == 8
+
+
+def test_arrays_without_a_pattern_of_files(tmp_path: Path):
+    """The arrays alone say all; a label that cannot be sent gets another."""
+    np.savez(tmp_path / "all.npz", **{"Filz weiß 1": COUNTS, "wool 2": COUNTS + 1})
+    made = taken(tmp_path, pattern=None, variable="{material} {trial:d}").sweeps
+    assert made.materials == ("Filz weiss", "wool")
+    assert made.displays == {"Filz weiss": "Filz weiß"}
+
+
+def test_arrays_that_cannot_be_recordings_are_named(tmp_path: Path):
+    """A file without arrays, one without a match, and a name that fits in several ways."""
+    text(tmp_path / "a.csv")
+    np.savez(tmp_path / "b.npz", felt=COUNTS, t=np.arange(40.0))
+    np.savez(tmp_path / "c.npz", felt_a_b=COUNTS, felt_c=COUNTS, **{"wool_1": COUNTS[:3]})
+    why = reasons(tmp_path, pattern=None, variable="{material}_{trial}")
+    assert why["a.csv"].startswith("holds no named arrays; --variable takes a name there")
+    assert why["b.npz"] == (
+        "has no array of frames that matches --variable '{material}_{trial}'; it holds felt"
+    )
+    assert why["c.npz felt_a_b"].startswith("its name fits the pattern in several ways")
+    assert why["c.npz wool_1"] == "has 3 frames, but a window needs 10; see --window"
+    assert len(why) == 4
+
+
+@pytest.mark.parametrize(
+    ("variable", "pattern", "message"),
+    [
+        ("{material", "{material}.csv", "--variable '{material' has an unmatched brace"),
+        ("{trial}", None, "--variable '{trial}' does not say where the material stands"),
+        ("{material}", "{material}.csv", "material stands in --pattern and in --variable"),
+        ("{material}{recording}", None, "--variable: each file or array is a recording"),
+    ],
+)
+def test_patterns_of_arrays_that_cannot_be(variable: str, pattern: str | None, message: str):
+    """Each is refused by the name of its option."""
+    named = NamePattern(pattern) if pattern else None
+    with pytest.raises(FormatError, match=re.escape(message)):
+        plan(pattern=named, variable=variable)

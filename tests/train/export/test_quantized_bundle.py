@@ -676,3 +676,14 @@ def test_a_fit_does_not_see_offsets(tmp_path: Path):
     except ExportRefused:  # what was never learnt may not survive int8 either
         return
     assert manifest.figures["held-out recording"]["accuracy"] < 0.6
+
+
+def test_display_names_are_in_manifest_and_card(fitted: Fit, tmp_path: Path):
+    """Only those of the set's materials; the labels stay."""
+    shown = {"low": "tief, 低い", "gone": "weg"}
+    named = replace(fitted, train=replace(fitted.train, displays=shown))
+    quantized_bundle.export(named, tmp_path / "b", "easy", "1", "", proven=False)
+    manifest = bundle.load(tmp_path / "b").manifest
+    assert manifest.labels == fitted.train.materials
+    assert manifest.displays == {"low": "tief, 低い"}
+    assert 'display_names: {"low": "tief, 低い"}' in (tmp_path / "b" / "card.md").read_text("utf-8")

@@ -208,3 +208,30 @@ def test_the_command_writes_page_and_figures(
     assert "<h2>What it will be bad at</h2>" in text
     assert "name the sweeps that it was fitted to with <code>--train</code>" in text
     assert json.loads((tmp_path / "f.json").read_text())["bundle"]["name"] == "default"
+
+
+def test_people_read_display_names(figures: dict, sweeps: Dataset):
+    """In tables and pictures; figures for programs keep the labels."""
+    shown = figures | {"displays": {"wood": "Holz, geölt"}}
+    page = bundle_report.page(shown, replace(sweeps, displays=shown["displays"]))
+    text = PageReader(page).text
+    assert "Holz, geölt" in text
+    assert not re.search(r"\bwood\b", text.partition("How it was made")[0])
+    assert shown["labels"] == figures["labels"]
+
+
+def test_a_row_of_few_sweeps_says_how_many(figures: dict):
+    """The share is that of all sweeps, those without a label too: one of thirty is 3 %."""
+    answers = {
+        "wood": {"wood": 1, "(unknown)": 29},
+        "metal": {"metal": 2, "paper": 1},
+        "x" * 40: {"x" * 40: 1},
+    }
+    some = figures | {"labels": [*answers, "paper"], "answers": answers}
+    drawn = PageReader(bundle_report.confusion(some)).text
+    assert "wood · " not in drawn
+    assert re.search(r"\b3\b", drawn)
+    assert "metal (n = 3)" in drawn
+    assert "wood (n" not in drawn
+    assert "paper (n = 0)" in drawn
+    assert f"{'x' * 23}… (n = 1)" in drawn

@@ -29,11 +29,13 @@ LONGEST = 40
 @dataclass(frozen=True)
 class ReadPlan:
     """What to read from a file. variable: the array, sheet, group or topic. time: the name of the
-    times. decimal: the decimal sign of text, "" if the text must show it."""
+    times. decimal: the decimal sign of text, "" if the text must show it. names_only: read no
+    array, only the names of those that hold frames."""
 
     variable: str = ""
     time: str = ""
     decimal: str = ""
+    names_only: bool = False
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,8 @@ class Table:
 
     values: [n, ...] numbers in the file's data type, float64 from text; NaN where a cell is not a
     number. columns: names of the columns, () if unnamed. vectors: one-dimensional arrays beside
-    the values, such as times, by name. beside: names of vectors that were not read. texts: text
+    the values, such as times, by name. beside: names of vectors, or with names_only of
+    arrays of frames, that were not read. texts: text
     columns, one text for each frame, by column number from 0. faults: for each other column with a
     cell that is not a number, a message about the first. notes: remarks.
     """
@@ -109,6 +112,10 @@ def chosen(entries: Mapping[str, Entry], wanted: ReadPlan) -> Table:
     """
     entries = {normal(name): entry for name, entry in entries.items()}
     numbers = {name: e for name, e in entries.items() if e.kind in "biuf" or e.fields}
+    if wanted.names_only:
+        return Table(
+            np.empty((0, 0)), beside=tuple(n for n, e in numbers.items() if e.holds_frames)
+        )
     listed = _listed(numbers)
     name, time = normal(wanted.variable), normal(wanted.time)
     if name and name not in numbers:

@@ -9,6 +9,7 @@ import argparse
 import os
 from pathlib import Path
 
+from appliance.core import outputs
 from train.arguments import options
 from train.arguments.types import Add
 from train.models.methods import Effort
@@ -54,7 +55,11 @@ def _add_run(command: argparse.ArgumentParser, name: str) -> None:
     """Options of every study."""
     file = results_file(name)
     command.add_argument(
-        "--out", type=Path, default=file, metavar="FILE", help=f"file of results ({file})"
+        "--out",
+        type=outputs.file(".json"),
+        default=file,
+        metavar="FILE",
+        help=f"file of results ({file})",
     )
     if name in ("paper", "development"):
         command.add_argument(
@@ -141,7 +146,7 @@ def run_paper(args: argparse.Namespace) -> None:
         curves = [read(path, "points", "world") for path in args.curve]
         found = paper_experiment.with_curves(read(args.out, *keys), curves)
     else:
-        only = args.method.split(",") if args.method else ()
+        only = options.names(args) if args.method else ()
         earlier = read(args.out, *keys) if only else None
         found = paper_experiment.results(run, only, earlier)
     _done(run, save(args.out, found))
@@ -149,9 +154,9 @@ def run_paper(args: argparse.Namespace) -> None:
 
 def run_fabrics(args: argparse.Namespace) -> None:
     """Evaluate and write the results."""
-    run = _run(args)
+    names, run = options.names(args), _run(args)
     earlier = read(args.out) if args.out.exists() else ()
-    found = fabrics_experiment.results(options.names(args), run, earlier)
+    found = fabrics_experiment.results(names, run, earlier)
     _done(run, save(args.out, found))
 
 
@@ -166,7 +171,8 @@ def run_development(args: argparse.Namespace) -> None:
     run = _run(args, development_experiment.QUICK_EFFORT)
     keys = PAGES["development"].keys
     study = development_experiment.QUICK if run.quick else development_experiment.STUDY
-    names = args.method.split(",") if args.method else development_experiment.usual_methods(study)
+    usual = development_experiment.usual_methods
+    names = options.names(args) if args.method else usual(study)
     if args.times:
         figures = read(args.out, *keys)
     else:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from appliance.bundle import bundle
+from appliance.core import outputs
 from appliance.core.clock import SystemClock
 from appliance.core.errors import FormatError
 from appliance.core.provenance import commit
@@ -57,13 +58,17 @@ def register(add: Add) -> None:
     _add_taxels(add)
     _add_alignment(add)
     command = add("references", run_references)
-    command.add_argument("--out", type=Path, required=True, metavar="DIR")
+    command.add_argument("--out", type=outputs.folder, required=True, metavar="DIR")
 
 
 def _add_out(command: argparse.ArgumentParser, name: str) -> None:
     file = results_file(name)
     command.add_argument(
-        "--out", type=Path, default=file, metavar="FILE", help=f"file of results ({file})"
+        "--out",
+        type=outputs.file(".json"),
+        default=file,
+        metavar="FILE",
+        help=f"file of results ({file})",
     )
 
 
@@ -108,7 +113,7 @@ def _add_cnn_curve(add: Add) -> None:
     )
     follow.add_argument(
         "--out",
-        type=Path,
+        type=outputs.file(".json"),
         required=True,
         metavar="FILE",
         help="where the curve goes; an interrupted training goes on from there",
@@ -254,7 +259,8 @@ def _add_certainty(add: Add) -> None:
 
 def run_stress(args: argparse.Namespace) -> None:
     """Write the results; print their path."""
-    train, seeds, log = options.load(args), options.seeds(args), options.Log()
+    names, seeds, log = options.names(args), options.seeds(args), options.Log()
+    train = options.load(args)
     if args.split:
         train, rest = train.split(*options.group_share(args.split), 1)
         test = EvaluationSweeps.of(rest)
@@ -266,7 +272,7 @@ def run_stress(args: argparse.Namespace) -> None:
         folder = _made_of(train, Path(own), log) if args.split and not args.bundle else args.bundle
         box = _box_under_stress(folder, test, seeds, log)
     result = robustness.run(
-        options.names(args),
+        names,
         train,
         test,
         options.where(args),

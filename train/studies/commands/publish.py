@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from appliance.core import outputs
 from appliance.core.errors import FormatError
 from appliance.core.storage import put
 from train.arguments import options
@@ -33,7 +34,7 @@ def register(add: Add) -> None:
     )
     command.add_argument(
         "--out",
-        type=Path,
+        type=outputs.folder,
         required=True,
         metavar="DIR",
         help="a folder for each page is made there",
@@ -50,7 +51,7 @@ def register(add: Add) -> None:
     overview = add("overview", run_overview)
     overview.add_argument(
         "--out",
-        type=Path,
+        type=outputs.file(".svg"),
         default=Path("docs/overview.svg"),
         metavar="FILE.svg",
         help="(docs/overview.svg)",
@@ -67,7 +68,7 @@ def _add_matrix(add: Add) -> None:
         metavar="FILE",
         help="of evaluate --json; several are joined",
     )
-    matrix.add_argument("--out", type=Path, required=True, metavar="FILE.svg")
+    matrix.add_argument("--out", type=outputs.file(".svg"), required=True, metavar="FILE.svg")
     matrix.add_argument(
         "--recordings", action="store_true", help="count recordings instead of windows"
     )

@@ -1,0 +1,40 @@
+"""Types of options that name a new folder or file: an ending that belongs to something else is
+refused while the command line is read, before any work."""
+
+from __future__ import annotations
+
+from argparse import ArgumentTypeError
+from collections.abc import Callable
+from pathlib import Path
+
+OF_FILES = (
+    ".csv", ".h5", ".hdf5", ".html", ".json", ".jsonl", ".mat", ".md", ".npy", ".npz", ".onnx",
+    ".pdf", ".png", ".svg", ".toml", ".txt", ".xlsx", ".zip",
+)  # fmt: skip
+"""Endings that no folder has. Others may be part of its name, as in bundle-1.2."""
+
+
+def folder(text: str) -> Path:
+    """The path of a folder. Raises ArgumentTypeError for the name of a file."""
+    path = Path(text)
+    if path.suffix.lower() in OF_FILES and not path.is_dir():
+        raise ArgumentTypeError(
+            f"{text} would be a folder, not a {path.suffix} file; leave the ending out"
+        )
+    return path
+
+
+def file(*endings: str) -> Callable[[str], Path]:
+    """A reader of the path of a file with one of these endings, or none. It raises
+    ArgumentTypeError for another ending."""
+
+    def read(text: str) -> Path:
+        path = Path(text)
+        if path.suffix.lower() not in ("", *endings):
+            raise ArgumentTypeError(
+                f"{text} would not be a {path.suffix} file; name one that ends in "
+                f"{' or '.join(endings)}"
+            )
+        return path
+
+    return read
