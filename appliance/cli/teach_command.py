@@ -26,6 +26,7 @@ from appliance.core.types import SweepFormat
 from appliance.deployment.enrolment_key import TAUGHT, EnrolmentKey
 from appliance.io import skins
 from appliance.io.robot_link import Command, Port
+from appliance.io.verdict_lines import check_bits
 from appliance.recording.recording import Labels, RecordingSession
 from appliance.runtime import assembly
 from appliance.service.systemd import Notifier
@@ -151,6 +152,9 @@ class Session:
         self._obey: Callable[[Command], list[object]] = _not_now
         self._about: Callable[[], Mapping[str, Any]] = dict
         self._done, self._again, self._address = False, "", ""
+        bits = settings.output.class_bits
+        self._codes = 1 << len(bits) if bits else 0
+        self._tried: tuple[str, ...] = ()
 
     def run(self) -> None:
         """Run until all sweeps are recorded; with a page until DONE."""
@@ -203,8 +207,12 @@ class Session:
                 self._store / "sweeps", format, labels, devices.clock, say, args.good, disk
             )
             stack.callback(recording.close)
-            session = TeachingSession(recording, self._store, settings.teach, self._command, say)
+            session = TeachingSession(
+                recording, self._store, settings.teach, self._command, say, codes=self._codes
+            )
             stack.callback(session.close)
+            if args.labels:
+                session.admit(*args.labels)
             teacher = Teacher(session, args.labels if not self._again else [], args.good)
             self._about = lambda: self._shown(recording.about() | {"teach": session.about()})
             box = assembly.recorder(
@@ -242,6 +250,7 @@ class Session:
                 one.disk = disk
             port = self._port(devices)
             m = choice.bundle.manifest
+            self._tried = m.labels
             shown = {
                 "model": f"{m.name} {m.version}",
                 "labels": m.labels,
@@ -323,8 +332,11 @@ class Session:
         return use.command(options, by)
 
     def _teach_again(self, label: str) -> list[object]:
-        Labels(material=label.strip())
-        self._again = label.strip()
+        label = label.strip()
+        Labels(material=label)
+        if self._codes:
+            check_bits(self._codes, [*dict.fromkeys((*self._tried, label))])
+        self._again = label
         return [self._again]
 
     def _finish(self, _: str) -> list[object]:

@@ -13,11 +13,12 @@ from typing import Any
 
 from appliance.core.clock import Clock, SystemClock
 from appliance.core.config import TeachConfig
-from appliance.core.errors import ApplianceError
+from appliance.core.errors import ApplianceError, ConfigError
 from appliance.core.health import Health
 from appliance.core.log import log
 from appliance.core.observer import Observer
 from appliance.core.sentences import sentence
+from appliance.io.verdict_lines import check_bits
 from appliance.recording.recording import Labels, RecordingSession
 from appliance.teaching.process import News, TeachingProcess, learning
 from appliance.teaching.state import TeachingState
@@ -35,8 +36,8 @@ class TeachingSession(Observer):
     """Observes a recording and teaches the stored sweeps.
 
     store: the store's folder. learn: makes the command of USE. say: called with TCH sentences.
-    clock: the real clock, because processes run in real time. It must come after `recording` among
-    the observers.
+    clock: the real clock, because processes run in real time. codes: number of codes of the class
+    bits, 0 without class bits. It must come after `recording` among the observers.
     """
 
     def __init__(
@@ -47,8 +48,10 @@ class TeachingSession(Observer):
         learn: Learn,
         say: Callable[[bytes], None],
         clock: Clock | None = None,
+        codes: int = 0,
     ) -> None:
         self._recording, self._store, self._settings = recording, store, settings
+        self._codes = codes
         self._learn, self._clock, self._say = learn, clock or SystemClock(), say
         self._state = TeachingState.load(store)
         self._named: dict[str, None] = {}  # materials without a sweep so far, in order
@@ -57,7 +60,7 @@ class TeachingSession(Observer):
         self._due_ns: int | None = self._clock.now_ns()
         self._learnt: News | None = None
         self._step: News | None = None
-        self._trouble = ""
+        self._trouble = self._too_many()
         self.by = "the serial line"
         self.taught: News | None = None
         self.commands: Mapping[str, Callable[[str], list[object]]] = {
@@ -90,6 +93,20 @@ class TeachingSession(Observer):
         """The number of sweeps of each material, those without one included."""
         counts = self._recording.materials(self._state.forgotten)
         return dict.fromkeys(self._named, 0) | counts
+
+    def admit(self, *labels: str) -> None:
+        """Raises ConfigError if the class bits cannot hold these materials beside those of before.
+        A box without class bits admits all."""
+        if self._codes:
+            check_bits(self._codes, [*(self.materials() | dict.fromkeys(labels, 0))])
+
+    def _too_many(self) -> str:
+        """Why the materials of before cannot be sent, "" if they can: one may be forgotten."""
+        try:
+            self.admit()
+        except ConfigError as e:
+            return f"{e}, or forget a material"
+        return ""
 
     def turn(self, health: Health) -> None:
         """Take the news of the process, and begin an assessment that is due: a moment after a sweep
@@ -149,6 +166,7 @@ class TeachingSession(Observer):
         if not label:
             raise ApplianceError("TEACH needs the name of a material, such as PPLP TEACH cork")
         Labels(material=label)
+        self.admit(label)
         self._named.setdefault(label)
         self._recording.commands["MATERIAL"](label)
         return [label, self.materials().get(label, 0)]
@@ -163,6 +181,7 @@ class TeachingSession(Observer):
                 f"{len(held)} materials have sweeps; a model tells at least two apart: teach "
                 "another"
             )
+        self.admit()
         if self._process:
             self._process.close()
         self._trouble, self.taught = "", None
@@ -183,6 +202,7 @@ class TeachingSession(Observer):
         except OSError as e:
             raise ApplianceError(f"{label!r} is not forgotten: {e.strerror}; make room") from e
         self._named.pop(label, None)
+        self._trouble = self._too_many()
         self._due_ns = self._clock.now_ns()
         return [label, number]
 
