@@ -30,6 +30,7 @@ from appliance.io.verdict_lines import check_bits
 from appliance.recording.recording import Labels, RecordingSession
 from appliance.runtime import assembly
 from appliance.service.systemd import Notifier
+from appliance.signal.slide_check import SlidesAmong
 from appliance.teaching import use
 from appliance.teaching.process import News
 from appliance.teaching.session import TeachingSession
@@ -231,6 +232,7 @@ class Session:
                 commands={**recording.commands, **self._by_robot(session.commands)},
                 ordered=bool(pages) or self._waits,
                 serving=False,
+                slides=SlidesAmong(format),
             )
             orders = {**recording.commands, **session.commands, "DONE": self._finish}
             self._obey = self._orders(orders, box.obey)

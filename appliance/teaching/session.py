@@ -18,6 +18,7 @@ from appliance.core.health import Health
 from appliance.core.log import log
 from appliance.core.observer import Observer
 from appliance.core.sentences import sentence
+from appliance.core.types import Sweep, Verdict
 from appliance.io.verdict_lines import check_bits
 from appliance.recording.recording import Labels, RecordingSession
 from appliance.teaching.process import News, TeachingProcess, learning
@@ -61,6 +62,7 @@ class TeachingSession(Observer):
         self._learnt: News | None = None
         self._step: News | None = None
         self._trouble = self._too_many()
+        self._refused: set[int] = set()
         self.by = "the serial line"
         self.taught: News | None = None
         self.commands: Mapping[str, Callable[[str], list[object]]] = {
@@ -93,6 +95,14 @@ class TeachingSession(Observer):
         """The number of sweeps of each material, those without one included."""
         counts = self._recording.materials(self._state.forgotten)
         return dict.fromkeys(self._named, 0) | counts
+
+    def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
+        """Tell the robot of a sweep that is not taught; the recording tells a person."""
+        if verdict.status.faulty:
+            self._refuse(f"sweep {sweep.id}: {verdict.status} {verdict.detail}".rstrip())
+
+    def _refuse(self, text: str) -> None:
+        self._say(sentence("TCH", "refused", text))
 
     def admit(self, *labels: str) -> None:
         """Raises ConfigError if the class bits cannot hold these materials beside those of before.
@@ -150,6 +160,12 @@ class TeachingSession(Observer):
             return
         text = str(news.get("text", ""))
         self._trouble = text if kind == "error" else ""
+        for one in news.get("no_slides", ()):
+            if one["number"] not in self._refused:
+                self._refused.add(one["number"])
+                self._recording.leave_out(one["number"])
+                log.warning(f"teach: {one['text']}; it is not counted")
+                self._refuse(one["text"])
         if kind == "assessed":
             self._learnt = news
             log.info(f"teach: {text}; next: {news['advice']}")

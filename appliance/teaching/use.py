@@ -86,7 +86,7 @@ def assessed(settings: Config, clock: Clock) -> str:
 
 
 def _suspected(found: News) -> list[str]:
-    return [one["text"] for one in found["suspects"]]
+    return [one["text"] for one in (*found["no_slides"], *found["suspects"])]
 
 
 def version(store: Store) -> str:

@@ -100,7 +100,7 @@ function drawLearnt() {
     put("learnt", "");
     put("advice", "");
   }
-  const suspects = (learnt?.suspects ?? []).map((one) => one.text);
+  const suspects = [...(learnt?.no_slides ?? []), ...(learnt?.suspects ?? [])].map((one) => one.text);
   if (byId("suspects").dataset.text !== suspects.join()) {
     byId("suspects").dataset.text = suspects.join();
     byId("suspects").replaceChildren(...suspects.map((text) => made("li", "", text)));

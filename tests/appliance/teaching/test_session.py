@@ -73,7 +73,8 @@ class Taught:
             self.number += 1
             sweep = replace(cut(), id=self.number, start_ns=SystemClock().now_ns())
             verdict = replace(OK, sweep=self.number, status=status, label="", scores=np.empty(0))
-            self.recording.sweep(sweep, verdict, {})
+            for observer in (self.recording, self.session):
+                observer.sweep(sweep, verdict, {})
 
     def until(self, done: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
         """Take turns until the session is in this state."""
@@ -114,6 +115,29 @@ def test_faulty_sweeps_do_not_count(taught: Taught):
     taught.sweeps("cork", 2)
     taught.sweeps("cork", 2, Status.NO_CONTACT)
     assert taught.session.materials() == {"cork": 2}
+
+
+def test_sweeps_that_were_no_slides_are_said_and_not_counted(taught: Taught):
+    """At once if the check finds it; later if the process does, by comparing all sweeps. Each is
+    said once; files stay."""
+    taught.assess = printed(
+        ASSESSED
+        | {"no_slides": [{"number": 2, "text": "sweep 2 of cork is not learnt from: rest"}]}
+    )
+    taught.sweeps("cork", 3)
+    taught.sweeps("cork", 1, Status.NO_SLIDE)
+    taught.sweeps("pine", 2)
+    assert taught.session.materials() == {"cork": 3, "pine": 2}
+    taught.until(lambda about: about["learnt"])
+    assert taught.session.materials() == {"cork": 2, "pine": 2}
+    taught.sweeps("pine", 1)
+    taught.until(lambda about: not about["assessing"])
+    said = [line for line in map(str, taught.said) if "TCH,refused" in line]
+    assert len(said) == 2
+    assert "$PPLP,TCH,refused,sweep 4: no-slide*" in said[0]
+    assert "$PPLP,TCH,refused,sweep 2 of cork is not learnt from: rest*" in said[1]
+    assert taught.recording.about()["counts"] == [("cork", "", 2), ("pine", "", 3)]
+    assert len(list((taught.folder / "sweeps").glob("*.npy"))) == 7
 
 
 def test_use_makes_a_bundle_and_says_so(taught: Taught):
