@@ -24,6 +24,8 @@ from appliance.core.log import log
 from appliance.core.observer import Observer
 from appliance.core.types import SweepFormat
 from appliance.deployment.enrolment_key import TAUGHT, EnrolmentKey
+from appliance.deployment.signed import SignedBundle
+from appliance.inference.enrolment import slide_check
 from appliance.io import skins
 from appliance.io.robot_link import Command, Port
 from appliance.io.verdict_lines import check_bits
@@ -31,7 +33,7 @@ from appliance.recording.recording import Labels, RecordingSession
 from appliance.runtime import assembly
 from appliance.service.systemd import Notifier
 from appliance.signal.slide_check import SlidesAmong
-from appliance.teaching import use
+from appliance.teaching import into, use
 from appliance.teaching.process import News
 from appliance.teaching.session import TeachingSession
 from appliance.teaching.state import TeachingState
@@ -63,12 +65,11 @@ def run(args: argparse.Namespace) -> int:
         if args.web is not None:
             return 0
         try:
-            print(use.assessed(settings, SystemClock()))
+            _assess(args, settings)
         except use.TeachingFailed as e:  # the sweeps are stored; there are too few so far
             print(f"teach: {e}")
         return _use(args, settings) if args.use else 0
-    print(use.assessed(settings, SystemClock()))
-    return 0
+    return _in_json(args, lambda: _assess(args, settings))
 
 
 def until_taught(args: argparse.Namespace, settings: Config) -> int:
@@ -98,6 +99,27 @@ def _forget(settings: Config, material: str) -> int:
     return 0
 
 
+def _assess(args: argparse.Namespace, settings: Config) -> None:
+    """Print the assessment of the recorded sweeps."""
+    found = use.assessed(settings, assembly.store(settings), SystemClock())
+    print(json.dumps(found) if args.json else use.described(found), flush=True)
+
+
+def _in_json(args: argparse.Namespace, act: Callable[[], object]) -> int:
+    """Do something; with --json an error is a line of JSON as well."""
+    try:
+        act()
+    except (ApplianceError, OSError) as e:
+        if not args.json:
+            raise
+        code, text = 1, f"{e}; see to the disk (df -h), and try again"
+        if isinstance(e, ApplianceError):
+            code, text = e.exit_code, str(e)
+        print(json.dumps({"type": "error", "text": text}), flush=True)
+        return code
+    return 0
+
+
 def _use(args: argparse.Namespace, settings: Config) -> int:
     """Make a bundle of all sweeps, sign and install it."""
 
@@ -110,24 +132,17 @@ def _use(args: argparse.Namespace, settings: Config) -> int:
         else:
             told.update(news)
 
-    told: News = {}
-    try:
+    def teach() -> None:
         by = args.by or getpass.getuser()
         sha = use.use(settings, assembly.store(settings), by, SystemClock(), tell)
-    except (ApplianceError, OSError) as e:
-        if not args.json:
-            raise
-        code, text = 1, f"{e}; see to the disk (df -h), and try again"
-        if isinstance(e, ApplianceError):
-            code, text = e.exit_code, str(e)
-        print(json.dumps({"type": "error", "text": text}), flush=True)
-        return code
-    text = f"bundle {sha[:8]} with {', '.join(told['labels'])} is installed, on trial"
-    if args.json:
-        print(json.dumps({**told, "type": "taught", "sha": sha, "text": text}), flush=True)
-    else:
-        print(f"{text} from the next start on: systemctl restart palpate")
-    return 0
+        text = f"bundle {sha[:8]} with {', '.join(told['labels'])} is installed, on trial"
+        if args.json:
+            print(json.dumps({**told, "type": "taught", "sha": sha, "text": text}), flush=True)
+        else:
+            print(f"{text} from the next start on: systemctl restart palpate")
+
+    told: News = {}
+    return _in_json(args, teach)
 
 
 def by_page(args: argparse.Namespace, settings: Config) -> Config:
@@ -154,6 +169,7 @@ class Session:
         self._about: Callable[[], Mapping[str, Any]] = dict
         self._done, self._again, self._address = False, "", ""
         bits = settings.output.class_bits
+        self._base: SignedBundle | None = None
         self._codes = 1 << len(bits) if bits else 0
         self._tried: tuple[str, ...] = ()
 
@@ -161,6 +177,10 @@ class Session:
         """Run until all sweeps are recorded; with a page until DONE."""
         with ExitStack() as stack:
             devices, format = record_command.open_skin(self._args, self._settings)
+            self._base = use.base(assembly.store(self._settings), format)
+            if self._base:  # sweeps as long as those of its materials
+                format = self._base.bundle.format
+                into.check_settings(self._settings)
             pages = self._page(format, devices)
             for page in pages:
                 stack.enter_context(page)
@@ -200,6 +220,8 @@ class Session:
     def _teach(self, devices: Devices, format: SweepFormat, pages: list[RecordPage]) -> bool:
         """Record and assess; returns whether a bundle was made."""
         args, settings = self._args, self._settings
+        if self._base:  # it has the materials of this session by now
+            self._base = use.base(assembly.store(settings), format)
         with ExitStack() as stack:
             port, disk = self._port(devices), DiskThread()
             say = port.say if port else lambda line: None
@@ -208,12 +230,8 @@ class Session:
                 self._store / "sweeps", format, labels, devices.clock, say, args.good, disk
             )
             stack.callback(recording.close)
-            session = TeachingSession(
-                recording, self._store, settings.teach, self._command, say, codes=self._codes
-            )
+            session = self._lesson(recording, say)
             stack.callback(session.close)
-            if args.labels:
-                session.admit(*args.labels)
             teacher = Teacher(session, args.labels if not self._again else [], args.good)
             self._about = lambda: self._shown(recording.about() | {"teach": session.about()})
             box = assembly.recorder(
@@ -232,7 +250,7 @@ class Session:
                 commands={**recording.commands, **self._by_robot(session.commands)},
                 ordered=bool(pages) or self._waits,
                 serving=False,
-                slides=SlidesAmong(format),
+                slides=slide_check(self._base.bundle) if self._base else SlidesAmong(format),
             )
             orders = {**recording.commands, **session.commands, "DONE": self._finish}
             self._obey = self._orders(orders, box.obey)
@@ -241,6 +259,23 @@ class Session:
             box.run(lambda: any(end() for end in over) or devices.finished(box.answered))
             self._obey = _not_now
             return bool(session.taught)
+
+    def _lesson(self, recording: RecordingSession, say: Callable[[bytes], None]) -> TeachingSession:
+        """The session beside a recording. Raises ConfigError for a --label that cannot be taught."""
+        base = self._base.bundle if self._base else None
+        session = TeachingSession(
+            recording,
+            self._store,
+            self._settings.teach,
+            self._command,
+            say,
+            codes=self._codes,
+            base=base.manifest.labels if base else (),
+            trained=into.trained(base) if base else (),
+        )
+        if self._args.labels:
+            session.admit(*self._args.labels)
+        return session
 
     def _try(self, devices: Devices, pages: list[RecordPage]) -> None:
         """Classify with the new bundle, on trial as in the service."""
@@ -256,7 +291,7 @@ class Session:
             shown = {
                 "model": f"{m.name} {m.version}",
                 "labels": m.labels,
-                "taught": m.taught,
+                "taught": m.taught or f"taught into it: {', '.join(choice.bundle.enrolled)}",
             }
             self._about = lambda: self._shown({"trying": shown})
             facts: Facts = {"model": lambda: f"{m.name} {m.version}, {m.taught}"}

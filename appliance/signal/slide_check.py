@@ -88,7 +88,7 @@ class SlidesAmong:
         return ""
 
     def among(self, windows: Iterable[NDArray[Any]]) -> list[str]:
-        """The reason for each of these windows, all of which are judged by one another."""
+        """The reason for each of these windows. They are judged by one another."""
         for taxels in windows:
             self._heights.append(0.0 if self._meter.why else self._meter(taxels).height)
         skin = _patterned(self._heights)
