@@ -220,8 +220,6 @@ class Session:
     def _teach(self, devices: Devices, format: SweepFormat, pages: list[RecordPage]) -> bool:
         """Record and assess; returns whether a bundle was made."""
         args, settings = self._args, self._settings
-        if self._base:  # it has the materials of this session by now
-            self._base = use.base(assembly.store(settings), format)
         with ExitStack() as stack:
             port, disk = self._port(devices), DiskThread()
             say = port.say if port else lambda line: None
@@ -261,7 +259,9 @@ class Session:
             return bool(session.taught)
 
     def _lesson(self, recording: RecordingSession, say: Callable[[bytes], None]) -> TeachingSession:
-        """The session beside a recording. Raises ConfigError for a --label that cannot be taught."""
+        """The session beside a recording. Raises ConfigError for a --label that it refuses."""
+        if self._base:  # it has the materials of an earlier session by now
+            self._base = use.base(assembly.store(self._settings), self._base.bundle.format)
         base = self._base.bundle if self._base else None
         session = TeachingSession(
             recording,
