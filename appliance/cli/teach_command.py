@@ -9,11 +9,13 @@ import sys
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from appliance.cli import record_command
 from appliance.cli.common import Facts, StopFlag, load_settings
+from appliance.cli.parser import TEACH_PORT
 from appliance.cli.reporting import capture, feed, status
 from appliance.core.clock import SystemClock
 from appliance.core.config import Config
@@ -34,6 +36,7 @@ from appliance.runtime import assembly
 from appliance.service.systemd import Notifier
 from appliance.signal.slide_check import SlidesAmong
 from appliance.teaching import into, use
+from appliance.teaching.hand_over import HandOver
 from appliance.teaching.process import News
 from appliance.teaching.session import TeachingSession
 from appliance.teaching.state import TeachingState
@@ -75,15 +78,29 @@ def run(args: argparse.Namespace) -> int:
 def until_taught(args: argparse.Namespace, settings: Config) -> int:
     """The service of a box that has no bundle for its skin: it records and can be taught, and READY
     stays low. It ends once a bundle was made, which runs from the next start on."""
+    address = page_address(settings)
     log.warning(
-        f"{NOTHING}: READY stays low; teach the box (systemctl start palpate-teach, then its page; "
-        "or palpate teach), or deploy a bundle"
+        f"{NOTHING}: READY stays low; teach the box on its page, {address} (systemctl start "
+        "palpate-teach starts it at once), or by palpate teach; or deploy a bundle"
     )
     defaults = {"labels": [], "good": GOOD, "position": "1", "session": "", "web": None}
     defaults |= {"use": False, "by": "", "format": None, "window": None}
     taught = argparse.Namespace(**vars(args) | defaults)
-    Session(taught, without_lines(args, settings), waits=True).run()
+    Session(taught, without_lines(args, settings), waits=address).run()
     return 0
+
+
+def page_address(settings: Config) -> str:
+    """The address of the page of teaching, or the reason why there is none."""
+    from appliance.watch.access import Access
+
+    if not find_spec("tornado"):
+        return "no page (pages need palpate[watch])"
+    try:
+        use.check_allowed(settings)
+        return Access.configured(settings.watch, TEACH_PORT, secret=False).url(TEACH_PORT)
+    except ConfigError as e:
+        return f"no page ({e})"
 
 
 def _forget(settings: Config, material: str) -> int:
@@ -158,16 +175,19 @@ def without_lines(args: argparse.Namespace, settings: Config) -> Config:
 
 
 class Session:
-    """Records and assesses until a bundle is made; with a page, then tries it until DONE. waits:
-    run even if nothing can start a sweep."""
+    """Records and assesses until a bundle is made; with a page, then tries it until DONE.
 
-    def __init__(self, args: argparse.Namespace, settings: Config, *, waits: bool = False) -> None:
+    waits: address of the page to which the service hands over, or the reason why there is none. It
+    runs even if nothing can start a sweep; "" outside of the service.
+    """
+
+    def __init__(self, args: argparse.Namespace, settings: Config, *, waits: str = "") -> None:
         self._waits = waits
         self._args, self._settings, self._stopped = args, by_page(args, settings), StopFlag()
         self._store = Path(settings.store.folder)
         self._obey: Callable[[Command], list[object]] = _not_now
         self._about: Callable[[], Mapping[str, Any]] = dict
-        self._done, self._again, self._address = False, "", ""
+        self._done, self._again, self._address = False, "", waits
         bits = settings.output.class_bits
         self._base: SignedBundle | None = None
         self._codes = 1 << len(bits) if bits else 0
@@ -246,7 +266,7 @@ class Session:
                     *pages,
                 ],
                 commands={**recording.commands, **self._by_robot(session.commands)},
-                ordered=bool(pages) or self._waits,
+                ordered=bool(pages or self._waits),
                 serving=False,
                 slides=slide_check(self._base.bundle) if self._base else SlidesAmong(format),
             )
@@ -323,9 +343,12 @@ class Session:
             "teach": session.about,
             "page": lambda: self._address,
         }
-        settings = self._settings
+        settings, runtime = self._settings, self._settings.store.runtime_folder
+        page = self._waits.startswith("http")
+        waits = [HandOver(runtime, SystemClock())] if page and runtime else []
         return [
-            Notifier(SystemClock()),
+            Notifier(SystemClock(), note=f"; {NOTHING}: {self._address}" if self._waits else ""),
+            *waits,
             recording,
             session,
             *status(settings, facts),
