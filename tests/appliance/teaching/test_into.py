@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,10 +16,11 @@ import pytest
 from appliance.bundle import bundle
 from appliance.cli.main import main
 from appliance.core.config import load
-from appliance.core.errors import BundleError, ConfigError
+from appliance.core.errors import BundleError, ConfigError, ModelError
 from appliance.deployment.enrolment_key import EnrolmentKey
 from appliance.deployment.signed import SignedBundle
 from appliance.inference import enrolment
+from appliance.inference.classifier import Classifier
 from appliance.runtime import assembly
 from appliance.sim import skin
 from appliance.teaching import into, use
@@ -158,6 +162,43 @@ def test_sweeps_that_disagree_are_refused(box: TaughtDelivery, capsys: Any):
     assert code == 1
     assert "the sweeps of 'oak' disagree" in news["text"]
     assert "number 5 most of all" in news["text"]
+
+
+@pytest.mark.parametrize(
+    "error", [ModelError("std::bad_alloc"), OSError(errno.ENOSPC, "No space left on device")]
+)
+@pytest.mark.parametrize("more", [(), ("--use",)], ids=["assess", "use"])
+def test_a_model_or_disk_that_fails_leaves_the_bundle_in_service(
+    box: TaughtDelivery,
+    capsys: Any,
+    monkeypatch: pytest.MonkeyPatch,
+    error: Exception,
+    more: tuple[str, ...],
+):
+    """The reason is a line for the page; the next attempt succeeds."""
+    before = box.running.sha
+
+    def fail(*given: object) -> None:
+        raise error
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Classifier, "embedding", fail)
+        code, news = box.teach(capsys, *more)
+    assert code
+    assert news["type"] == "error"
+    assert news["text"].endswith("the bundle in service stays")
+    assert box.running.sha == before
+    assert box.teach(capsys, *more)[0] == 0
+
+
+def test_a_reader_that_is_gone_gets_an_exit_code(box: TaughtDelivery):
+    """Standard output is full: the result could not be told, and nothing hangs or is half done."""
+    words = [sys.executable, "-P", "-m", "appliance", "teach", *box.words, "--json", "--use"]
+    with open("/dev/full", "wb") as full:
+        done = subprocess.run(words, cwd=ROOT, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert done.returncode
+    assert "Traceback" not in done.stderr
+    assert box.running.bundle.enrolled in ({}, {"cork": 5})
 
 
 def test_a_taught_bundle_and_another_skin_are_fitted_anew(box: TaughtDelivery):
