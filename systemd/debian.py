@@ -29,7 +29,7 @@ PYTHONS = ("3.11.2", "3.13.5")
 """Python of Debian 12 and of Debian 13, and so of the Raspberry Pi OS of the same names."""
 ARCHIVES = "/usr/lib/palpate"
 """Folder of the archives on a box."""
-UNITS = "palpate palpate-teach palpate-watch 'palpate-bridge@*'"
+UNITS = "palpate-teach.path palpate palpate-teach palpate-watch 'palpate-bridge@*'"
 READY_S = 60
 """Longest wait for the service at the end of an installation, in seconds."""
 

@@ -40,6 +40,8 @@ NAME = re.compile(
 SHORT_S = 60
 """Longest wait for a command that usually takes a second. A slow board takes much longer while it
 classifies."""
+UNTAUGHT = "nothing taught yet"
+"""In the state of a box without a bundle for its skin. The address of its page follows."""
 SKIN_S = 10
 """Longest wait for the skin of a service that has passed its self-test."""
 STRICT = "ssh_strict_host_key_checking"
@@ -152,7 +154,7 @@ class FleetBox:
         return dict(line.partition("=")[::2] for line in output.splitlines())
 
     def restart(self, limit_s: float, starts: int) -> bool:
-        """Restart the service. True if it is READY, False if it only waits for its skin.
+        """Restart the service. True if it is READY, False if it waits for its skin or is untaught.
 
         `result` gets ready_s, seconds from the start of this command to READY, and lost_s, seconds
         without classification. Raises Failed if the service is in neither state within limit_s, or
@@ -164,7 +166,7 @@ class FleetBox:
         again = "systemctl reset-failed palpate; systemctl --no-block restart palpate"
         self.run("restarting the service", again, user="root")
         now = self._restarted(before, limit_s, starts)
-        if now["ActiveState"] != "active":
+        if now["ActiveState"] != "active" or UNTAUGHT in now["StatusText"]:
             self.result["waits"] = now["StatusText"]
             return False
         self.result["ready_s"] = round(time.monotonic() - BEGAN_S, 2)

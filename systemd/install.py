@@ -38,6 +38,7 @@ LINK = "/opt/palpate"
 PATHS = {
     "systemd/palpate.service": "/etc/systemd/system/palpate.service",
     "systemd/palpate-watch.service": "/etc/systemd/system/palpate-watch.service",
+    "systemd/palpate-teach.path": "/etc/systemd/system/palpate-teach.path",
     "systemd/palpate-teach.service": "/etc/systemd/system/palpate-teach.service",
     "systemd/palpate-bridge@.service": "/etc/systemd/system/palpate-bridge@.service",
     "systemd/palpate.sysusers": "/usr/lib/sysusers.d/palpate.conf",

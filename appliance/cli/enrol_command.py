@@ -24,6 +24,7 @@ from appliance.inference import enrolment
 from appliance.inference.enrolment import Enrolment, SweepCollector
 from appliance.recording import unknown_sweeps
 from appliance.runtime import assembly
+from appliance.teaching import into
 
 FEWEST = 2
 """Fewest kept sweeps of an unknown material: one does not come again."""
@@ -47,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
         sweeps = _good_sweeps(args, settings, start.bundle)
     else:
         sweeps = _unknown_sweeps(args.unknown, kept, start.bundle)
-    new = enrolment.enrol(start.bundle, args.label, sweeps)
+    new = into.taught(start, {args.label: sweeps})
     if new.disagreement and not args.scattered:
         raise BundleError(
             f"{new.disagreement}, or give --scattered if all are of {args.label!r}; nothing was"
@@ -97,8 +98,8 @@ def _enrolment_key(args: argparse.Namespace, settings: Config) -> EnrolmentKey |
                 f"with {unsigned} the enrolment is not signed, and a box refuses it; give --out DIR"
             )
         return None
-    if not args.out and settings.classifier.early:
-        raise ConfigError("early answers cannot name enrolled labels; set classifier.early = false")
+    if not args.out:
+        into.check_settings(settings)
     key = EnrolmentKey(settings.store.enrolment_key)
     key.check()
     return key

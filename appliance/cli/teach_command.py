@@ -9,11 +9,13 @@ import sys
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from appliance.cli import record_command
 from appliance.cli.common import Facts, StopFlag, load_settings
+from appliance.cli.parser import TEACH_PORT
 from appliance.cli.reporting import capture, feed, status
 from appliance.core.clock import SystemClock
 from appliance.core.config import Config
@@ -25,12 +27,17 @@ from appliance.core.names import TypedNames
 from appliance.core.observer import Observer
 from appliance.core.types import SweepFormat
 from appliance.deployment.enrolment_key import TAUGHT, EnrolmentKey
+from appliance.deployment.signed import SignedBundle
+from appliance.inference.enrolment import slide_check
 from appliance.io import skins
 from appliance.io.robot_link import Command, Port
+from appliance.io.verdict_lines import check_bits
 from appliance.recording.recording import Labels, RecordingSession
 from appliance.runtime import assembly
 from appliance.service.systemd import Notifier
-from appliance.teaching import use
+from appliance.signal.slide_check import SlidesAmong
+from appliance.teaching import into, use
+from appliance.teaching.hand_over import HandOver
 from appliance.teaching.process import News
 from appliance.teaching.session import TeachingSession
 from appliance.teaching.state import TeachingState
@@ -62,26 +69,39 @@ def run(args: argparse.Namespace) -> int:
         if args.web is not None:
             return 0
         try:
-            print(use.assessed(settings, SystemClock()))
+            _assess(args, settings)
         except use.TeachingFailed as e:  # the sweeps are stored; there are too few so far
             print(f"teach: {e}")
         return _use(args, settings) if args.use else 0
-    print(use.assessed(settings, SystemClock()))
-    return 0
+    return _in_json(args, lambda: _assess(args, settings))
 
 
 def until_taught(args: argparse.Namespace, settings: Config) -> int:
     """The service of a box that has no bundle for its skin: it records and can be taught, and READY
     stays low. It ends once a bundle was made, which runs from the next start on."""
+    address = page_address(settings)
     log.warning(
-        f"{NOTHING}: READY stays low; teach the box (systemctl start palpate-teach, then its page; "
-        "or palpate teach), or deploy a bundle"
+        f"{NOTHING}: READY stays low; teach the box on its page, {address} (systemctl start "
+        "palpate-teach starts it at once), or by palpate teach; or deploy a bundle"
     )
     defaults = {"labels": [], "good": GOOD, "position": "1", "session": "", "web": None}
     defaults |= {"use": False, "by": "", "format": None, "window": None}
     taught = argparse.Namespace(**vars(args) | defaults)
-    Session(taught, without_lines(args, settings), waits=True).run()
+    Session(taught, without_lines(args, settings), waits=address).run()
     return 0
+
+
+def page_address(settings: Config) -> str:
+    """The address of the page of teaching, or the reason why there is none."""
+    from appliance.watch.access import Access
+
+    if not find_spec("tornado"):
+        return "no page (pages need palpate[watch])"
+    try:
+        use.check_allowed(settings)
+        return Access.configured(settings.watch, TEACH_PORT, secret=False).url(TEACH_PORT)
+    except ConfigError as e:
+        return f"no page ({e})"
 
 
 def _forget(settings: Config, material: str) -> int:
@@ -97,6 +117,27 @@ def _forget(settings: Config, material: str) -> int:
     return 0
 
 
+def _assess(args: argparse.Namespace, settings: Config) -> None:
+    """Print the assessment of the recorded sweeps."""
+    found = use.assessed(settings, assembly.store(settings), SystemClock())
+    print(json.dumps(found) if args.json else use.described(found), flush=True)
+
+
+def _in_json(args: argparse.Namespace, act: Callable[[], object]) -> int:
+    """Do something; with --json an error is a line of JSON as well."""
+    try:
+        act()
+    except (ApplianceError, OSError) as e:
+        if not args.json:
+            raise
+        code, text = 1, f"{e}; see to the disk (df -h), and try again"
+        if isinstance(e, ApplianceError):
+            code, text = e.exit_code, str(e)
+        print(json.dumps({"type": "error", "text": text}), flush=True)
+        return code
+    return 0
+
+
 def _use(args: argparse.Namespace, settings: Config) -> int:
     """Make a bundle of all sweeps, sign and install it."""
 
@@ -109,24 +150,17 @@ def _use(args: argparse.Namespace, settings: Config) -> int:
         else:
             told.update(news)
 
-    told: News = {}
-    try:
+    def teach() -> None:
         by = args.by or getpass.getuser()
         sha = use.use(settings, assembly.store(settings), by, SystemClock(), tell)
-    except (ApplianceError, OSError) as e:
-        if not args.json:
-            raise
-        code, text = 1, f"{e}; see to the disk (df -h), and try again"
-        if isinstance(e, ApplianceError):
-            code, text = e.exit_code, str(e)
-        print(json.dumps({"type": "error", "text": text}), flush=True)
-        return code
-    text = f"bundle {sha[:8]} with {', '.join(told['labels'])} is installed, on trial"
-    if args.json:
-        print(json.dumps({**told, "type": "taught", "sha": sha, "text": text}), flush=True)
-    else:
-        print(f"{text} from the next start on: systemctl restart palpate")
-    return 0
+        text = f"bundle {sha[:8]} with {', '.join(told['labels'])} is installed, on trial"
+        if args.json:
+            print(json.dumps({**told, "type": "taught", "sha": sha, "text": text}), flush=True)
+        else:
+            print(f"{text} from the next start on: systemctl restart palpate")
+
+    told: News = {}
+    return _in_json(args, teach)
 
 
 def by_page(args: argparse.Namespace, settings: Config) -> Config:
@@ -142,22 +176,33 @@ def without_lines(args: argparse.Namespace, settings: Config) -> Config:
 
 
 class Session:
-    """Records and assesses until a bundle is made; with a page, then tries it until DONE. waits:
-    run even if nothing can start a sweep."""
+    """Records and assesses until a bundle is made; with a page, then tries it until DONE.
 
-    def __init__(self, args: argparse.Namespace, settings: Config, *, waits: bool = False) -> None:
+    waits: address of the page to which the service hands over, or the reason why there is none. It
+    runs even if nothing can start a sweep; "" outside of the service.
+    """
+
+    def __init__(self, args: argparse.Namespace, settings: Config, *, waits: str = "") -> None:
         self._waits = waits
         self._args, self._settings, self._stopped = args, by_page(args, settings), StopFlag()
         self._store = Path(settings.store.folder)
         self._obey: Callable[[Command], list[object]] = _not_now
         self._names = TypedNames()
         self._about: Callable[[], Mapping[str, Any]] = dict
-        self._done, self._again, self._address = False, "", ""
+        self._done, self._again, self._address = False, "", waits
+        bits = settings.output.class_bits
+        self._base: SignedBundle | None = None
+        self._codes = 1 << len(bits) if bits else 0
+        self._tried: tuple[str, ...] = ()
 
     def run(self) -> None:
         """Run until all sweeps are recorded; with a page until DONE."""
         with ExitStack() as stack:
             devices, format = record_command.open_skin(self._args, self._settings)
+            self._base = use.base(assembly.store(self._settings), format)
+            if self._base:  # sweeps as long as those of its materials
+                format = self._base.bundle.format
+                into.check_settings(self._settings)
             pages = self._page(format, devices)
             for page in pages:
                 stack.enter_context(page)
@@ -205,7 +250,7 @@ class Session:
             to, names = (self._store / "sweeps", format, labels), self._names
             recording = RecordingSession(*to, devices.clock, say, args.good, disk, names)
             stack.callback(recording.close)
-            session = TeachingSession(recording, self._store, settings.teach, self._command, say)
+            session = self._lesson(recording, say)
             stack.callback(session.close)
             teacher = Teacher(session, args.labels if not self._again else [], args.good)
             self._about = lambda: self._shown(recording.about() | {"teach": session.about()})
@@ -223,8 +268,9 @@ class Session:
                     *pages,
                 ],
                 commands={**recording.commands, **self._by_robot(session.commands)},
-                ordered=bool(pages) or self._waits,
+                ordered=bool(pages or self._waits),
                 serving=False,
+                slides=slide_check(self._base.bundle) if self._base else SlidesAmong(format),
             )
             orders = {**recording.commands, **session.commands, "DONE": self._finish}
             self._obey = self._orders(orders, box.obey)
@@ -233,6 +279,25 @@ class Session:
             box.run(lambda: any(end() for end in over) or devices.finished(box.answered))
             self._obey = _not_now
             return bool(session.taught)
+
+    def _lesson(self, recording: RecordingSession, say: Callable[[bytes], None]) -> TeachingSession:
+        """The session beside a recording. Raises ConfigError for a --label that it refuses."""
+        if self._base:  # it has the materials of an earlier session by now
+            self._base = use.base(assembly.store(self._settings), self._base.bundle.format)
+        base = self._base.bundle if self._base else None
+        session = TeachingSession(
+            recording,
+            self._store,
+            self._settings.teach,
+            self._command,
+            say,
+            codes=self._codes,
+            base=base.manifest.labels if base else (),
+            trained=into.trained(base) if base else (),
+        )
+        if self._args.labels:
+            session.admit(*self._args.labels)
+        return session
 
     def _try(self, devices: Devices, pages: list[RecordPage]) -> None:
         """Classify with the new bundle, on trial as in the service."""
@@ -244,11 +309,12 @@ class Session:
                 one.disk = disk
             port = self._port(devices)
             m = choice.bundle.manifest
+            self._tried = m.labels
             shown = {
                 "model": f"{m.name} {m.version}",
                 "labels": m.labels,
                 "displays": m.displays,
-                "taught": m.taught,
+                "taught": m.taught or f"taught into it: {', '.join(choice.bundle.enrolled)}",
             }
             self._about = lambda: self._shown({"trying": shown})
             facts: Facts = {"model": lambda: f"{m.name} {m.version}, {m.taught}"}
@@ -280,9 +346,12 @@ class Session:
             "teach": session.about,
             "page": lambda: self._address,
         }
-        settings = self._settings
+        settings, runtime = self._settings, self._settings.store.runtime_folder
+        page = self._waits.startswith("http")
+        waits = [HandOver(runtime, SystemClock())] if page and runtime else []
         return [
-            Notifier(SystemClock()),
+            Notifier(SystemClock(), note=f"; {NOTHING}: {self._address}" if self._waits else ""),
+            *waits,
             recording,
             session,
             *status(settings, facts),
@@ -326,8 +395,11 @@ class Session:
         return use.command(options, by)
 
     def _teach_again(self, label: str) -> list[object]:
-        Labels(material=label.strip())
-        self._again = label.strip()
+        label = label.strip()
+        Labels(material=label)
+        if self._codes:
+            check_bits(self._codes, [*dict.fromkeys((*self._tried, label))])
+        self._again = label
         return [self._again]
 
     def _finish(self, _: str) -> list[object]:

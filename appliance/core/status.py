@@ -40,9 +40,15 @@ class Status(StrEnum):
 
     @property
     def faulty(self) -> bool:
-        """True if there is a window, but its counts show that the skin did not measure a contact as
-        it should."""
-        return self in (Status.NO_CONTACT, Status.SATURATED, Status.STUCK_TAXEL, Status.DEAD_TAXEL)
+        """True if there is a window, but its counts show that the skin did not measure a slide as
+        it should. Nothing is learnt from such a sweep."""
+        return self in (
+            Status.NO_CONTACT,
+            Status.SATURATED,
+            Status.STUCK_TAXEL,
+            Status.DEAD_TAXEL,
+            Status.NO_SLIDE,
+        )
 
 
 REASONS: Mapping[Status, str] = MappingProxyType(

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from appliance.core.errors import BundleError, ConfigError
+from appliance.core.errors import BundleError, ConfigError, TemporaryError
 from appliance.deployment import signature
 
 NAMESPACE, TAUGHT = "palpate-enrolment", "palpate-taught"
@@ -73,7 +73,7 @@ class EnrolmentKey:
 
     def verify(self, data: bytes, signed: bytes, namespace: str = NAMESPACE) -> None:
         """Raises BundleError if this box did not sign `data` in the namespace, ConfigError if that
-        cannot be checked."""
+        cannot be checked, and TemporaryError if it may be at the next attempt."""
         signer = self.folder / SIGNER
         try:
             signature.verify(data, signed, signer, namespace)
@@ -88,6 +88,8 @@ class EnrolmentKey:
                 "the labels were not enrolled on this box, or altered since "
                 f"({e.args[0].partition(';')[0]}); enrol them here (palpate enrol)"
             ) from e
+        except TemporaryError:
+            raise  # ssh-keygen may run at the next attempt
         except ConfigError as e:
             raise ConfigError(
                 "whether this box enrolled the labels cannot be checked: "

@@ -47,7 +47,7 @@ COMMANDS = (
 )
 TEXT_COMMANDS = ("LABEL", "MATERIAL", "POSITION", "SESSION", "TEACH", "FORGET")
 """The commands that need a text after a comma. START may have one: speed and force of the slide."""
-OWN = ("RES", "STA", "ANS", "REC")
+OWN = ("RES", "STA", "ANS", "REC", "TCH")
 """Kinds of sentences that the box sends. A line that sends them back, an echo, must not be
 answered: the answer would come back as well, without end."""
 MOST_REFUSED, REFUSAL_NS = 8, 1_000_000_000

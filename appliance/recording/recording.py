@@ -184,7 +184,7 @@ class RecordingSession(Observer):
                 f"--out {folder}: {e.strerror}; name a folder that can be written"
             ) from e
         self._progress = RecordingProgress(target)
-        self._materials: dict[int, str] = {}  # of each sweep in the folder that can be trained on
+        self._counted: dict[int, Labels] = {}  # of each sweep in the folder that can be trained on
         self._count_earlier(format)
         self._clock, self._say = clock, say
         # (valid from, labels): a command during a sweep does not apply to that sweep
@@ -215,11 +215,16 @@ class RecordingSession(Observer):
         """The number of sweeps in the folder of each material, without those up to the number in
         `forgotten`."""
         kept = (
-            name
-            for number, name in sorted(self._materials.items())
-            if name and number > forgotten.get(name, -1)
+            labels.material
+            for number, labels in sorted(self._counted.items())
+            if labels.material and number > forgotten.get(labels.material, -1)
         )
         return dict(Counter(kept))
+
+    def leave_out(self, number: int) -> None:
+        """Count a stored sweep no longer: it is discarded, or was found not to be a slide."""
+        if labels := self._counted.pop(number, None):
+            self._progress.add(labels.material, labels.position, -1)
 
     def about(self) -> dict[str, Any]:
         """The progress of the recording, for JSON.
@@ -310,7 +315,7 @@ class RecordingSession(Observer):
     def _count(self, number: int, labels: Labels, status: Status) -> None:
         if not status.faulty:  # a faulty sweep is not used in training
             self._progress.add(labels.material, labels.position)
-            self._materials[number] = labels.material
+            self._counted[number] = labels
 
     def _tell(self, verdict: Verdict, outcome: str, labels: Labels) -> None:
         """Log the outcome of a sweep, for a person beside the robot and a person at a terminal."""
@@ -371,7 +376,7 @@ class RecordingSession(Observer):
             raise ApplianceError("a sweep is still being written; wait for its REC sentence")
         if not self._stored:
             raise ApplianceError("no sweep of this run is left to discard")
-        number, labels, _ = self._stored[-1]
+        number = self._stored[-1][0]
         if which and which != str(number - self._folder.run):
             raise ApplianceError(
                 f"the last stored sweep is {number - self._folder.run}, not {which}; "
@@ -384,8 +389,7 @@ class RecordingSession(Observer):
                 f"sweep {number - self._folder.run} cannot be discarded: {e.strerror}"
             ) from e
         self._stored.pop()
-        if self._materials.pop(number, None) is not None:
-            self._progress.add(labels.material, labels.position, -1)
+        self.leave_out(number)
         if self._last and self._last["sweep"] == number - self._folder.run:
             self._last["outcome"] = "discarded"
         return [number - self._folder.run, self.stored, self._folder.path(number).stem]

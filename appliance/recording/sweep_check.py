@@ -1,19 +1,22 @@
 """Answers sweeps in recordings without a bundle, by verdicts without a label.
 
 The status is `recorded`, or a fault that the raw counts show: no contact, saturation, stuck and
-dead taxels.
+dead taxels; and while the box is taught, no slide.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from appliance.core.clock import Clock
 from appliance.core.errors import ApplianceError
 from appliance.core.observer import Observer
-from appliance.core.types import EPOCH_BITS, Frames, Status, Sweep, SweepFormat, Verdict
+from appliance.core.types import EPOCH_BITS, Frames, Status, Sweep, SweepFormat, Verdict, normal
+from appliance.signal.slide_check import only_taxel
 from appliance.signal.unloaded import UnloadedTracker
 from appliance.signal.window_check import Finding, inspect_bare, inspect_readings
 
@@ -25,13 +28,19 @@ UNCHECKED = Finding(
 class SweepCheck(Observer):
     """Checks each window against the unloaded skin, which it finds by itself or takes from a TARE.
 
-    model: "", since there is no bundle. degraded: "", since nothing is bridged.
+    slides: the reason why a window is not a slide, "" if it is one; None accepts all. model: "",
+    since there is no bundle. degraded: "", since nothing is bridged.
     """
 
     model = degraded = ""
 
-    def __init__(self, format: SweepFormat, clock: Clock) -> None:
-        self.format, self._clock = format, clock
+    def __init__(
+        self,
+        format: SweepFormat,
+        clock: Clock,
+        slides: Callable[[NDArray[Any]], str] | None = None,
+    ) -> None:
+        self.format, self._clock, self._slides = format, clock, slides
         self._unloaded = UnloadedTracker(format)
         self._epoch = -1
 
@@ -48,8 +57,20 @@ class SweepCheck(Observer):
         finding = Finding(sweep.status)
         if sweep.status is Status.OK:
             finding = self._checked(sweep.frames.taxels)
+            if self._slides and not finding.status.faulty:
+                finding = self._slid(sweep.frames.taxels) or finding
         now_ns = self._clock.now_ns()
         return Verdict.without_label(sweep, finding.status, finding.detail, now_ns, self.model)
+
+    def _slid(self, taxels: NDArray[Any]) -> Finding | None:
+        """Why a window is not a slide, None if it is one."""
+        assert self._slides
+        why, bare = "", self._unloaded.skin
+        if bare and self._unloaded.certain:
+            load = np.abs(normal(taxels.mean(axis=0, dtype=np.float64) - bare.level, 0))
+            why = only_taxel(load, bare.contact)
+        why = why or self._slides(taxels)
+        return Finding(Status.NO_SLIDE, why) if why else None
 
     def _checked(self, taxels: NDArray[Any]) -> Finding:
         if not (self._unloaded.skin and self._unloaded.certain):

@@ -10,6 +10,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+from numpy.typing import NDArray
+
 from appliance.bundle import bundle as bundles
 from appliance.bundle.bundle import Bundle
 from appliance.core.clock import Clock, SystemClock
@@ -110,14 +112,16 @@ def recorder(
     commands: Mapping[str, CommandHandler] = NO_COMMANDS,
     ordered: bool = False,
     serving: bool = True,
+    slides: Callable[[NDArray[Any]], str] | None = None,
     announce: Callable[[str], object] = log.info,
 ) -> Box:
     """The box that records sweeps of a format and needs no bundle; the class bits stay 0.
 
     ordered: commands also come from another source than the port. serving: whether READY may rise.
+    slides: as for SweepCheck.
     announce: called with the messages of a trigger without lines to a person. Other parameters as
     for `box`."""
-    check = SweepCheck(format, devices.clock)
+    check = SweepCheck(format, devices.clock, slides)
     watching = [check, *observers]
     return _assembled(
         devices.wire(settings),

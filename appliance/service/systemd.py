@@ -27,11 +27,13 @@ class Notifier(Observer):
     sent again in the next turn.
 
     environ: NOTIFY_SOCKET, WATCHDOG_USEC and WATCHDOG_PID, set by systemd. clock: a real clock, as
-    systemd's watchdog does not follow a simulated clock.
+    systemd's watchdog does not follow a simulated clock. note: stands after each state.
     """
 
-    def __init__(self, clock: Clock, environ: Mapping[str, str] = os.environ) -> None:
-        self._clock = clock
+    def __init__(
+        self, clock: Clock, environ: Mapping[str, str] = os.environ, note: str = ""
+    ) -> None:
+        self._clock, self._note = clock, note
         self._address = environ.get("NOTIFY_SOCKET", "")
         if self._address.startswith("@"):  # abstract, without a place in the file system
             self._address = "\0" + self._address[1:]
@@ -41,7 +43,7 @@ class Notifier(Observer):
 
     def turn(self, health: Health) -> None:
         """Feed the watchdog, and send changes. Once READY, always READY."""
-        ready, status = health.streams, health.text
+        ready, status = health.streams, health.text + self._note
         now_ns = self._clock.now_ns()
         due = self._watchdog_us > 0 and now_ns >= self._next_ns
         ready = ready or self._ready

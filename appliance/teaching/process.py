@@ -23,6 +23,8 @@ LEARNS = "train.teach"
 """The program that learns. The box itself does not import it, nor what it needs."""
 NEEDED = ("train", "scipy", "onnx")
 """Modules of the extra palpate[teach]."""
+NICE = 19
+"""Priority of a process beside the loop: the lowest."""
 ENDED_S = 5.0
 """Longest wait for a killed process."""
 MOST_LINE = 1 << 20
@@ -68,6 +70,8 @@ class TeachingProcess:
             )
         except OSError as e:
             raise ConfigError(f"{command[0]} cannot be started: {e.strerror}") from e
+        with suppress(OSError):  # the loop comes first
+            os.setpriority(os.PRIO_PROCESS, self._process.pid, NICE)
         assert self._process.stdout
         self._output = self._process.stdout.fileno()
         os.set_blocking(self._output, False)

@@ -13,11 +13,13 @@ from typing import Any
 
 from appliance.core.clock import Clock, SystemClock
 from appliance.core.config import TeachConfig
-from appliance.core.errors import ApplianceError
+from appliance.core.errors import ApplianceError, ConfigError
 from appliance.core.health import Health
 from appliance.core.log import log
 from appliance.core.observer import Observer
 from appliance.core.sentences import sentence
+from appliance.core.types import Sweep, Verdict
+from appliance.io.verdict_lines import check_bits
 from appliance.recording.recording import Labels, RecordingSession
 from appliance.teaching.process import News, TeachingProcess, learning
 from appliance.teaching.state import TeachingState
@@ -28,15 +30,18 @@ PAUSE_NS = 300_000_000
 """Time without a new sweep before an assessment begins."""
 
 Learn = Callable[[str], list[str]]
-"""The command of a process that does all of `use`, for the person or program that asks."""
+"""The command of a process that does all of `use`, for the person or program that asks; for "" of a
+process that only assesses the sweeps."""
 
 
 class TeachingSession(Observer):
     """Observes a recording and teaches the stored sweeps.
 
     store: the store's folder. learn: makes the command of USE. say: called with TCH sentences.
-    clock: the real clock, because processes run in real time. It must come after `recording` among
-    the observers.
+    clock: the real clock, because processes run in real time. codes: number of codes of the class
+    bits, 0 without class bits. base: labels of the delivered bundle into which new materials
+    are taught, () without one. trained: those of them that it was trained on. It must come after
+    `recording` among the observers.
     """
 
     def __init__(
@@ -47,8 +52,13 @@ class TeachingSession(Observer):
         learn: Learn,
         say: Callable[[bytes], None],
         clock: Clock | None = None,
+        codes: int = 0,
+        base: tuple[str, ...] = (),
+        trained: tuple[str, ...] = (),
     ) -> None:
         self._recording, self._store, self._settings = recording, store, settings
+        self._codes, self._base, self._trained = codes, base, trained
+        self._fewest = 1 if base else FEWEST
         self._learn, self._clock, self._say = learn, clock or SystemClock(), say
         self._state = TeachingState.load(store)
         self._named: dict[str, None] = {}  # materials without a sweep so far, in order
@@ -57,7 +67,8 @@ class TeachingSession(Observer):
         self._due_ns: int | None = self._clock.now_ns()
         self._learnt: News | None = None
         self._step: News | None = None
-        self._trouble = ""
+        self._trouble = self._too_many()
+        self._refused: set[int] = set()
         self.by = "the serial line"
         self.taught: News | None = None
         self.commands: Mapping[str, Callable[[str], list[object]]] = {
@@ -70,12 +81,16 @@ class TeachingSession(Observer):
     def about(self) -> dict[str, Any]:
         """The session for JSON.
 
+        base: labels of the bundle into which materials are taught; fewest: number of materials
+        that USE needs.
         materials: each with its number of sweeps, forgotten ones left out. learnt: the last
         assessment, None without one; assessing: whether the next is being made. using: the step of
         USE with the share done and the seconds left, None if it does not run. taught: the result of
         USE. trouble: why the last step failed, "" if it did not.
         """
         return {
+            "base": [*self._base],
+            "fewest": self._fewest,
             "materials": self.materials(),
             "learnt": self._learnt,
             "assessing": (bool(self._process) and not self._using) or self._due_ns is not None,
@@ -87,9 +102,42 @@ class TeachingSession(Observer):
         }
 
     def materials(self) -> dict[str, int]:
-        """The number of sweeps of each material, those without one included."""
+        """The number of sweeps of each new material, those without one included."""
         counts = self._recording.materials(self._state.forgotten)
+        counts = {name: n for name, n in counts.items() if name not in self._trained}
         return dict.fromkeys(self._named, 0) | counts
+
+    def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
+        """Tell the robot of a sweep that is not taught; the recording tells a person."""
+        if verdict.status.faulty:
+            self._refuse(f"sweep {sweep.id}: {verdict.status} {verdict.detail}".rstrip())
+
+    def _refuse(self, text: str) -> None:
+        self._say(sentence("TCH", "refused", text))
+
+    def admit(self, *labels: str) -> None:
+        """Raises ConfigError for a material that the delivered bundle was trained on, and if the
+        class bits cannot hold these materials beside those of before. A box without class bits
+        admits any number."""
+        if known := next((name for name in labels if name in self._trained), ""):
+            raise ConfigError(
+                f"the bundle in service was trained on {known!r}; record more of it for the "
+                "desktop (palpate record), or take another name"
+            )
+        if self._codes:
+            wanted = dict.fromkeys((*self._base, *self.materials(), *labels))
+            for name in self._state.forgotten.keys() - self.materials().keys() - {*labels}:
+                if name not in self._trained:
+                    wanted.pop(name, None)
+            check_bits(self._codes, [*wanted])
+
+    def _too_many(self) -> str:
+        """Why the materials of before cannot be sent, "" if they can: one may be forgotten."""
+        try:
+            self.admit()
+        except ConfigError as e:
+            return f"{e}, or forget a material"
+        return ""
 
     def turn(self, health: Health) -> None:
         """Take the news of the process, and begin an assessment that is due: a moment after a sweep
@@ -104,7 +152,7 @@ class TeachingSession(Observer):
                 self._process, self._using, self._step = None, False, None
         elif self._due_ns is not None and self._clock.now_ns() >= self._due_ns:
             self._due_ns = None
-            if sum(n >= FEWEST for n in self.materials().values()) >= FEWEST:
+            if sum(n >= FEWEST for n in self.materials().values()) >= self._fewest:
                 self._assess()
             else:
                 self._learnt = None
@@ -118,7 +166,8 @@ class TeachingSession(Observer):
         """Begin an assessment; a failure is shown."""
         folder, forgotten = self._store / "sweeps", self._state.forgotten
         try:
-            self._begin(learning(folder, forgotten, self._settings.memory_mb))
+            own = learning(folder, forgotten, self._settings.memory_mb)
+            self._begin(self._learn("") if self._base else own)
         except ApplianceError as e:
             self._take({"type": "error", "text": str(e)})
 
@@ -133,6 +182,12 @@ class TeachingSession(Observer):
             return
         text = str(news.get("text", ""))
         self._trouble = text if kind == "error" else ""
+        for one in news.get("no_slides", ()):
+            if one["number"] not in self._refused:
+                self._refused.add(one["number"])
+                self._recording.leave_out(one["number"])
+                log.warning(f"teach: {one['text']}; it is not counted")
+                self._refuse(one["text"])
         if kind == "assessed":
             self._learnt = news
             log.info(f"teach: {text}; next: {news['advice']}")
@@ -149,6 +204,7 @@ class TeachingSession(Observer):
         if not label:
             raise ApplianceError("TEACH needs the name of a material, such as PPLP TEACH cork")
         Labels(material=label)
+        self.admit(label)
         self._named.setdefault(label)
         self._recording.commands["MATERIAL"](label)
         return [label, self.materials().get(label, 0)]
@@ -158,11 +214,10 @@ class TeachingSession(Observer):
         if self._using:
             raise ApplianceError("a bundle is being made already; wait for TCH")
         held = {name: n for name, n in self.materials().items() if n}
-        if len(held) < FEWEST:
-            raise ApplianceError(
-                f"{len(held)} materials have sweeps; a model tells at least two apart: teach "
-                "another"
-            )
+        if len(held) < self._fewest:
+            why = "teach one" if self._base else "a model tells at least two apart: teach another"
+            raise ApplianceError(f"{len(held)} materials have sweeps; {why}")
+        self.admit()
         if self._process:
             self._process.close()
         self._trouble, self.taught = "", None
@@ -183,6 +238,7 @@ class TeachingSession(Observer):
         except OSError as e:
             raise ApplianceError(f"{label!r} is not forgotten: {e.strerror}; make room") from e
         self._named.pop(label, None)
+        self._trouble = self._too_many()
         self._due_ns = self._clock.now_ns()
         return [label, number]
 

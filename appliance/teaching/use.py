@@ -1,5 +1,8 @@
-"""From recorded sweeps to a bundle of this box: fitted by a process of its own, signed with the
-box's key, installed on trial."""
+"""From recorded sweeps to a bundle of this box, signed with the box's key and installed on trial.
+
+New materials are taught into a delivered bundle (into.py). Without one, a process of its own fits
+all sweeps.
+"""
 
 from __future__ import annotations
 
@@ -12,9 +15,15 @@ from pathlib import Path
 from appliance.bundle import bundle
 from appliance.core.clock import Clock
 from appliance.core.config import Config
-from appliance.core.errors import ApplianceError, ConfigError
+from appliance.core.errors import ApplianceError, BundleError, ConfigError, FormatError
+from appliance.core.log import log
+from appliance.core.types import SweepFormat, load
 from appliance.deployment.enrolment_key import TAUGHT, EnrolmentKey
+from appliance.deployment.signed import SignedBundle
 from appliance.deployment.store import Store
+from appliance.inference import enrolment
+from appliance.io.usb_sensor import fits
+from appliance.teaching import into
 from appliance.teaching.process import News, TeachingProcess, check_installed, learning
 from appliance.teaching.state import TeachingState
 
@@ -46,14 +55,16 @@ def use(
     """Teach all recorded sweeps. The bundle runs on trial from the next start on; returns its name
     in the store.
 
-    by: the person or program that asked. tell: gets each news of the process. Raises ConfigError if
-    the box may not be taught or its key does not sign, TeachingFailed if the process gives no
-    bundle, and errors as Store.install.
+    The fit has a process of its own; materials for a delivered bundle are learnt here. by: the
+    person or program that asked. tell: gets each news of the process. Raises ConfigError if the box
+    may not be taught or its key does not sign, TeachingFailed without a new bundle, and errors as
+    Store.install.
     """
     check_allowed(settings)
-    key = EnrolmentKey(settings.store.enrolment_key)
+    folder, key = Path(settings.store.folder), EnrolmentKey(settings.store.enrolment_key)
+    if running := base(store, _format(folder / "sweeps")):
+        return _into(settings, store, running, key, tell)
     key.check(TAUGHT)
-    folder = Path(settings.store.folder)
     scratch = folder / "teaching"
     shutil.rmtree(scratch, ignore_errors=True)  # of a process that a power cut ended
     try:
@@ -74,19 +85,78 @@ def use(
         shutil.rmtree(scratch, ignore_errors=True)
 
 
-def assessed(settings: Config, clock: Clock) -> str:
-    """The lesson of the recorded sweeps, for a person. Raises TeachingFailed if they are too
-    few."""
+def base(store: Store, format: SweepFormat | None) -> SignedBundle | None:
+    """The delivered bundle in service, if it is one for a skin of this format (None: any): new
+    materials are taught into it."""
+    try:
+        running = store.running()
+    except (ApplianceError, OSError):  # a damaged bundle is replaced
+        return None
+    suits = format is None or fits(format, running.bundle.format)
+    return running if suits and into.delivered(running) else None
+
+
+def _into(
+    settings: Config,
+    store: Store,
+    running: SignedBundle,
+    key: EnrolmentKey,
+    tell: Callable[[News], object],
+) -> str:
+    """Teach the new materials among the recorded sweeps into a delivered bundle, as `use`."""
+    into.check_settings(settings)
+    key.check()
     folder = Path(settings.store.folder)
     forgotten = TeachingState.load(folder).forgotten
+    try:
+        found = into.recorded(running.bundle, folder / "sweeps", forgotten)
+        new = into.taught(running, found.windows, tuple(forgotten))
+        if new.disagreement:
+            raise BundleError(new.disagreement)
+    except (ApplianceError, OSError) as e:
+        raise TeachingFailed(f"{e}; the bundle in service stays") from e
+    for warning in new.warnings:
+        log.warning(f"teach: {warning}")
+    sha = store.learn(enrolment.files(running.files, new, key.sign(new.file)))
+    labels = [*new.bundle.manifest.labels]
+    tell({"type": "taught", "no_slides": found.no_slides, "labels": labels, "figures": {}})
+    return sha
+
+
+def _format(folder: Path) -> SweepFormat | None:
+    """The format of the last sweep in a folder, None without one."""
+    for path in sorted(folder.glob("sweep-*.npy"), reverse=True):
+        try:
+            return load(path)[1]
+        except FormatError:
+            continue  # damaged
+    return None
+
+
+def assessed(settings: Config, store: Store, clock: Clock) -> News:
+    """The assessment of the recorded sweeps, as news of type `assessed`. Raises TeachingFailed if
+    they are too few."""
+    folder = Path(settings.store.folder)
+    forgotten = TeachingState.load(folder).forgotten
+    if running := base(store, _format(folder / "sweeps")):
+        try:
+            sweeps = into.recorded(running.bundle, folder / "sweeps", forgotten)
+            return into.assessed(running, sweeps)
+        except (ApplianceError, OSError) as e:
+            raise TeachingFailed(f"{e}; the bundle in service stays") from e
     found: News = {}
     words = learning(folder / "sweeps", forgotten, settings.teach.memory_mb)
     _wait(words, settings.teach.limit_s, clock, found.update)
+    return found
+
+
+def described(found: News) -> str:
+    """An assessment for a person."""
     return "\n".join([found["text"], *_suspected(found), f"next: {found['advice']}"])
 
 
 def _suspected(found: News) -> list[str]:
-    return [one["text"] for one in found["suspects"]]
+    return [one["text"] for one in (*found["no_slides"], *found["suspects"])]
 
 
 def version(store: Store) -> str:
@@ -99,20 +169,11 @@ def version(store: Store) -> str:
     return str(int(held) + 1) if running.taught and held.isdecimal() else "1"
 
 
-def command(options: list[str], by: str) -> list[str]:
-    """The command of a process that does all of `use`. options: of the settings."""
-    return [
-        sys.executable,
-        "-P",
-        "-m",
-        "appliance",
-        "teach",
-        *options,
-        "--use",
-        "--json",
-        "--by",
-        by,
-    ]
+def command(options: list[str], by: str = "") -> list[str]:
+    """The command of a process that does all of `use`, or without `by` of `assessed`. options: of
+    the settings."""
+    asked = ["--use", "--by", by] if by else []
+    return [sys.executable, "-P", "-m", "appliance", "teach", *options, *asked, "--json"]
 
 
 def _wait(words: list[str], limit_s: float, clock: Clock, tell: Callable[[News], object]) -> None:

@@ -37,9 +37,10 @@ class Access:
     key: Path | None = None
 
     @classmethod
-    def configured(cls, settings: WatchConfig, port: int) -> Access:
+    def configured(cls, settings: WatchConfig, port: int, *, secret: bool = True) -> Access:
         """The access of the settings. An address beyond this machine needs token and certificate.
-        Raises ConfigError if they cannot be used."""
+        secret: read the token; without it the access only tells its address. Raises ConfigError if
+        they cannot be used."""
         address, *names = settings.address.lower().split() or [""]
         try:
             local = ipaddress.ip_address(address).is_loopback
@@ -55,7 +56,7 @@ class Access:
             port,
             address,
             (*_own_names(), *names),
-            _token(folder / "token"),
+            _token(folder / "token") if secret else "",
             folder / "certificate.pem",
             folder / "key.pem",
         )

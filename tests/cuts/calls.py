@@ -28,7 +28,8 @@ MOST_BYTES = 1 << 24
 """Largest number of bytes of a write that strace prints."""
 DEADLINE_S = 120
 LINE = re.compile(r"(\d+) +(\w+)\((.*)\) += (-?\d+|\?)(?:[ <].*)?")
-END = re.compile(r"\d+ +\+\+\+ .* \+\+\+")
+END = re.compile(r"\d+ +(?:\+\+\+ .* \+\+\+|\?\?\?\(\) += \?)")
+"""The end of a thread. ???: on a busy machine it was killed before strace could read its call."""
 CUT, RESUMED = " <unfinished ...>", re.compile(r"(\d+) +<\.\.\. \w+ resumed>(.*)")
 STRING = re.compile(r'"((?:\\x[0-9a-f]{2})*)"(\.\.\.)?')
 DESCRIPTOR = re.compile(r"(AT_FDCWD|\d+)<((?:\\x[0-9a-f]{2})*)>")

@@ -47,6 +47,7 @@ TOOLS = {
 PLACES = {
     "palpate.service": "/etc/systemd/system/palpate.service",
     "palpate-watch.service": "/etc/systemd/system/palpate-watch.service",
+    "palpate-teach.path": "/etc/systemd/system/palpate-teach.path",
     "palpate-teach.service": "/etc/systemd/system/palpate-teach.service",
     "palpate-bridge@.service": "/etc/systemd/system/palpate-bridge@.service",
     "palpate.sysusers": "/usr/lib/sysusers.d/palpate.conf",

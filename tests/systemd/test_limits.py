@@ -113,3 +113,28 @@ def test_the_unit_of_teaching_is_sound_and_limited(machine: Machine, before: lis
     )
     assert "0.0.0.0/0" in denied
     assert "192.168.0.0/16" in allowed
+
+
+def test_a_box_that_has_to_be_taught_shows_its_page(machine: Machine, service: Service):
+    """The file of the service starts the unit of the page, which takes its place and the file.
+    After Finish, and if there can be no page, the service is back."""
+    dropin = "/run/systemd/system/palpate-teach.service.d/test.conf"
+    service.start()
+    for end, after in (
+        ("sleep 3600", "stop palpate-teach"),
+        ("exit 78", "is-failed palpate-teach"),
+    ):
+        machine.put(dropin, f"[Service]\\nExecStart=\\nExecStart=/bin/sh -c '{end}'\\n")
+        machine.get("systemctl", "daemon-reload")
+        began = service["InvocationID"]
+        machine.put("/run/palpate/untaught", "")
+        if "sleep" in end:
+            service.until("ActiveState", "inactive")
+            assert machine.get("systemctl", "is-active", "palpate-teach") == "active"
+        service.until("InvocationID", f"(?!{began}).+") if "exit" in end else None
+        machine.run("systemctl", *after.split())
+        service.until("ActiveState", "active")
+        assert service["InvocationID"] != began
+        assert machine.run("test", "-e", "/run/palpate/untaught").returncode == 1
+    machine.get("rm", "-r", dropin)
+    machine.get("systemctl", "daemon-reload")

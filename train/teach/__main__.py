@@ -13,6 +13,7 @@ import os
 import resource
 import sys
 from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -68,7 +69,14 @@ def _run(args: argparse.Namespace) -> None:
     # not ru_maxrss, which begins with the memory of the parent process
     status = Path("/proc/self/status").read_text()
     peak = int(status.partition("VmHWM:")[2].split()[0]) // 1024
-    _say("taught", labels=manifest.labels, figures=manifest.figures, peak_mb=peak)
+    no_slides = [asdict(one) for one in lesson.no_slides]
+    _say(
+        "taught",
+        no_slides=no_slides,
+        labels=manifest.labels,
+        figures=manifest.figures,
+        peak_mb=peak,
+    )
 
 
 def _restrict(memory_mb: int) -> None:

@@ -131,6 +131,7 @@ class Assessment:
             ),
             "left_out": list(self.left_out),
             "confused": [*(materials[k] for k in pair), round(between, 1)] if pair else None,
+            "no_slides": [asdict(one) for one in self.lesson.no_slides],
             "suspects": [asdict(one) | {"text": one.text} for one in self.suspects],
             "advice": self.advice(),
             "text": self.text(),

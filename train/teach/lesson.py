@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from appliance.core.errors import FormatError
+from appliance.signal.slide_check import SlidesAmong
 from train.data import labels
 from train.data.readers import NAMED_GROUPS, RecordedSweep, check_folder, counted, from_recorded
 from train.data.sets import Dataset
@@ -23,14 +24,23 @@ NOWHERE = "not named"
 """Position or session of a sweep without one, beside sweeps that have one."""
 
 
+@dataclass(frozen=True, slots=True)
+class NoSlide:
+    """A sweep that is not a slide. number: of its file."""
+
+    number: int
+    text: str
+
+
 @dataclass(frozen=True)
 class Lesson:
     """Sweeps to learn from. names: of the file of each sweep [N], without suffix. left_out: number
-    of sweeps that are not among them, by reason."""
+    of sweeps that are not among them, by reason. no_slides: those of them that are not slides."""
 
     sweeps: Dataset
     names: tuple[str, ...]
     left_out: Mapping[str, int]
+    no_slides: tuple[NoSlide, ...] = ()
 
     @classmethod
     def read(cls, folder: Path, forgotten: Mapping[str, int] = {}) -> Lesson:
@@ -46,12 +56,19 @@ class Lesson:
             why = f" ({counted(left_out)})" if left_out else ""
             raise FormatError(f"{folder}: no sweep can be taught{why}; record some with a material")
         kept = _of_one_format(kept, left_out)
+        kept, no_slides = _slides_alone(kept)
+        left_out |= {"no slide": len(no_slides)} if no_slides else {}
         sweeps = from_recorded(_named(kept), folder, Dataset)
-        return cls(labels.check(sweeps), tuple(one.path.stem for one in kept), left_out)
+        return cls(labels.check(sweeps), tuple(one.path.stem for one in kept), left_out, no_slides)
 
     def number(self, sweep: int) -> int:
         """The number of a sweep among those of its material, from 1."""
         return int((self.sweeps.labels[: sweep + 1] == self.sweeps.labels[sweep]).sum())
+
+    @property
+    def _beside(self) -> str:
+        """The last sweep that is not a slide, as the end of a message."""
+        return f" ({self.no_slides[-1].text})" if self.no_slides else ""
 
     def repeated(self) -> Lesson:
         """Only materials with two sweeps or more, which can be judged. Raises FormatError if fewer
@@ -61,7 +78,7 @@ class Lesson:
         if len(many) < 2:
             raise FormatError(
                 f"{len(many)} of the materials have two sweeps or more, and a model tells at least "
-                "two apart; record two of another material"
+                f"two apart; record two of another material{self._beside}"
             )
         kept = np.isin(self.sweeps.labels, many)
         part = self.sweeps.take(kept)
@@ -71,7 +88,7 @@ class Lesson:
             materials=tuple(part.materials[k] for k in many),
         )
         names = tuple(name for name, keep in zip(self.names, kept, strict=True) if keep)
-        return Lesson(part, names, self.left_out)
+        return replace(self, sweeps=part, names=names)
 
 
 def _usable(
@@ -99,6 +116,24 @@ def _of_one_format(kept: Sequence[RecordedSweep], left_out: Counter[str]) -> lis
     if len(same) < len(kept):
         left_out["another format"] = len(kept) - len(same)
     return same
+
+
+def _slides_alone(
+    kept: Sequence[RecordedSweep],
+) -> tuple[list[RecordedSweep], tuple[NoSlide, ...]]:
+    """The sweeps that are slides, as far as they show it by one another, and the others."""
+    slides, no_slides, number = [], [], Counter[str]()
+    reasons = SlidesAmong(kept[0].format).among(one.sweep.frames.taxels for one in kept)
+    for one, why in zip(kept, reasons, strict=True):
+        material = one.sweep.material
+        number[material] += 1
+        if not why:
+            slides.append(one)
+            continue
+        file = one.path.stem.rpartition("-")[2]
+        text = f"sweep {number[material]} of {material} is not learnt from: {why}"
+        no_slides.append(NoSlide(int(file) if file.isdecimal() else -1, text))
+    return slides, tuple(no_slides)
 
 
 def _named(kept: Sequence[RecordedSweep]) -> list[RecordedSweep]:

@@ -99,11 +99,11 @@ function drawLearnt() {
     put("learnt", `${learnt.text}${now.assessing ? "; looking again" : ""}`);
     put("advice", learnt.advice);
   } else if (now) {
-    put("accuracy", now.assessing ? "looking at the sweeps" : "nothing yet: two sweeps of two materials are needed");
+    put("accuracy", now.assessing ? "looking at the sweeps" : now.fewest === 1 ? "nothing yet: two sweeps of a new material are needed" : "nothing yet: two sweeps of two materials are needed");
     put("learnt", "");
     put("advice", "");
   }
-  const suspects = (learnt?.suspects ?? []).map((one) => one.text);
+  const suspects = [...(learnt?.no_slides ?? []), ...(learnt?.suspects ?? [])].map((one) => one.text);
   if (byId("suspects").dataset.text !== suspects.join()) {
     byId("suspects").dataset.text = suspects.join();
     byId("suspects").replaceChildren(...suspects.map((text) => made("li", "", text)));
@@ -112,7 +112,7 @@ function drawLearnt() {
   byId("done").hidden = !trying;
   enable(byId("done"), live());
   const many = Object.values(now?.materials ?? {}).filter((n) => n > 0).length;
-  enable(byId("use"), live() && many >= 2 && !now.using);
+  enable(byId("use"), live() && now && many >= now.fewest && !now.using);
   byId("using").hidden = !now?.using;
   if (now?.using) {
     byId("progress").value = now.using.done;

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from appliance.core.errors import BundleError, ConfigError
+from appliance.core.errors import BundleError, ConfigError, TemporaryError
 from appliance.deployment import enrolment_key, signature
-from appliance.deployment.enrolment_key import KEY, NAMESPACE, SIGNER, EnrolmentKey
+from appliance.deployment.enrolment_key import KEY, NAMESPACE, SIGNER, TAUGHT, EnrolmentKey
 from tests.factories import deliveries, install_scripts
 
 pytestmark = deliveries.NEEDED
@@ -167,3 +167,27 @@ def test_a_box_without_ssh_keygen_says_so(key: EnrolmentKey, monkeypatch: pytest
     with pytest.raises(ConfigError, match="ssh-keygen is missing"):
         key.verify(DATA, b"")
     assert NAMESPACE == enrolment_key.NAMESPACE != signature.NAMESPACE
+
+
+@pytest.mark.parametrize("namespace", [NAMESPACE, TAUGHT])
+def test_an_ssh_keygen_that_dies_once_is_tried_again(
+    key: EnrolmentKey, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, namespace: str
+):
+    """At the start of a box with enrolled labels or a taught bundle, and before a lesson: the error
+    passes, so the service is restarted, not ended for good (exit code 78)."""
+    signed = key.sign(DATA, namespace)
+    (tmp_path / "bin").mkdir()
+    dying = tmp_path / "bin" / "ssh-keygen"
+    dying.write_text("#!/bin/sh\nkill -9 $$\n")
+    dying.chmod(0o755)
+    with monkeypatch.context() as patched:
+        patched.setenv("PATH", f"{dying.parent}:{os.environ['PATH']}")
+        for act in (
+            lambda: key.verify(DATA, signed, namespace),
+            lambda: key.sign(DATA, namespace),
+            lambda: key.check(namespace),
+        ):
+            with pytest.raises(TemporaryError) as e:
+                act()
+            assert e.value.exit_code != ConfigError.exit_code
+    key.verify(DATA, signed, namespace)

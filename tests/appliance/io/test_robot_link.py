@@ -338,12 +338,15 @@ def test_too_few_class_bits():
 def test_a_line_that_echoes_gets_no_answers():
     """Sentences of the box come back, whole or in part: they are not commands, so that no answer
     is answered. A command among them is carried out."""
-    own = [sentence(kind, 1, "ok") for kind in ("RES", "STA", "ANS", "REC")]
+    sources = "".join(path.read_text("utf-8") for path in (ROOT / "appliance").rglob("*.py"))
+    kinds = sorted(set(re.findall(r'sentence\(\s*"([A-Z]{3})"', sources)))
+    assert kinds == ["ANS", "REC", "RES", "STA", "TCH"]
+    own = [sentence(kind, 1, "ok") for kind in kinds]
     found, rest = parse(b"".join(own) + b"$PPLP,ID\r\n" + own[0][:7])
     assert [c.name for c in found] == ["ID"]
     found, _ = parse(own[0][7:], rest)
     assert found == []
-    damaged = own[1].replace(b"ok", b"oj")
+    damaged = own[2].replace(b"ok", b"oj")
     assert parse(damaged)[0] == []
 
 

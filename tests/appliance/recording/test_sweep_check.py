@@ -141,3 +141,30 @@ def test_an_impossible_reading_is_no_good_sweep():
     assert answered().status is Status.RECORDED
     taxels[30, 2, 1] = 1e20
     assert (answered().status, answered().detail) == (Status.DEAD_TAXEL, "taxel 3.2")
+
+
+def test_while_the_box_is_taught_a_sweep_must_be_a_slide():
+    """One loaded taxel is named; what else a slide is, the given check says. A fault of the skin
+    comes first, and without a check everything is recorded."""
+    off, on = skin.idle(RATE, np.random.default_rng(1)), slide()
+    n = np.arange(1500)
+    one = np.tile(off[:1], (1500, 1, 1))
+    one[:, 2, 1] = on[:1500].max(axis=(1, 2))
+    broken = slide(0)[:1500]
+    answers = {}
+    resting = on[:1500]
+    for given in (None, lambda taxels: "no slide: it rests" if taxels is resting else ""):
+        check = SweepCheck(skin.FORMAT, rig.VirtualClock(), given)
+        for part in (off, on):
+            seq = np.arange(len(part))
+            check.frames(Frames(seq, seq, part))
+        answers[given] = [
+            (v.status, v.detail)
+            for taxels in (one, resting, on[100:1600], broken)
+            for v in [check(Sweep(1, 0, 0, Status.OK, Frames(n, n, taxels)))]
+        ]
+    accepting, refusing = answers.values()
+    assert accepting[:3] == [(Status.RECORDED, "")] * 3
+    assert refusing[0] == (Status.NO_SLIDE, "only taxel 3.2 is loaded")
+    assert refusing[1:3] == [(Status.NO_SLIDE, "no slide: it rests"), (Status.RECORDED, "")]
+    assert refusing[3] == accepting[3] == (Status.DEAD_TAXEL, "taxel 2.2")

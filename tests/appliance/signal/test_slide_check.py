@@ -11,7 +11,7 @@ from appliance.core.errors import FormatError
 from appliance.core.types import Status, SweepFormat, Verdict
 from appliance.inference import enrolment
 from appliance.inference.enrolment import SweepCollector
-from appliance.signal.slide_check import SlideCheck
+from appliance.signal.slide_check import MANY, SlideCheck, SlidesAmong
 from appliance.sim import skin
 from tests.campaigns.junk import KINDS, window
 from tests.factories import toy_bundle
@@ -79,3 +79,33 @@ def test_only_one_loaded_taxel_is_named():
     assert "no contact" in SlideCheck(format, np.zeros((4, 4)), 90.0)(counts)
     small = SweepFormat(1, 2, 100, 200, "uint8")
     assert SlideCheck(small, np.zeros((1, 2)), 5.0)(counts[:, 1:2, 2:4]) == ""
+
+
+def slides(count: int) -> list[np.ndarray]:
+    """Windows of slides over wood."""
+    rng, place = np.random.default_rng(6), skin.placements("T-REAL", 1005)[0]
+    return [skin.window("wood", place, rng, skin.WORLDS["level-blind"]) for _ in range(count)]
+
+
+@pytest.mark.parametrize("kind", ["finger rests", "rests, noise", "load and chirp", "random bytes"])
+def test_where_slides_show_a_pattern_others_are_refused_without_a_bundle(kind: str):
+    """After MANY slides; also if the rest came first, once all are judged by one another."""
+    kind = kind.replace("chirp", "a chirp")
+    rest = window(kind, skin.WORLDS["level-blind"], 1)[0]
+    check = SlidesAmong(skin.FORMAT)
+    assert check(rest) == ""  # so far nothing shows what a slide looks like
+    assert [check(one) for one in slides(MANY)] == [""] * MANY
+    assert check(rest).startswith("no slide")
+    assert check(slides(1)[0]) == ""
+    first = SlidesAmong(skin.FORMAT).among([rest, *slides(MANY)])
+    assert first[0].startswith("no slide")
+    assert first[1:] == [""] * MANY
+
+
+def test_a_skin_without_patterns_is_not_judged_by_them():
+    """Its slides look like rests, so all are accepted; nor is a skin of two taxels judged."""
+    rests = [window("finger rests", skin.WORLDS["level-blind"], n)[0] for n in range(6)]
+    assert SlidesAmong(skin.FORMAT).among(rests) == [""] * 6
+    tiny = SlidesAmong(SweepFormat(1, 2, 100, 200, "uint8"))
+    assert tiny.among([np.zeros((200, 1, 2), np.uint8)] * MANY) == [""] * MANY
+    assert tiny(np.zeros((200, 1, 2), np.uint8)) == ""

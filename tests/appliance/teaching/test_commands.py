@@ -57,6 +57,19 @@ def test_a_box_without_a_key_says_so_before_sweeps(
     assert "make install" in text
 
 
+def test_materials_beyond_the_class_bits_are_refused_before_a_sweep(
+    options: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """Of two materials the single bit can show one; no sweep is recorded, of the first neither."""
+    install_scripts.enrolment_key(tmp_path / "enrolment")
+    bits = ["--set", 'output.class_bits=["GPIO5"]']
+    words = ["--label", "cork", "--label", "pine", "--sim", "skin", "--virtual", *bits]
+    code, text = said([*options, *words], capsys)
+    assert code == 78
+    assert "2 labels and the code 0 do not fit output.class_bits, which have 2 codes" in text
+    assert not list((tmp_path / "store" / "sweeps").glob("*.npy"))
+
+
 def test_nothing_recorded_yet(options: list[str], capsys: pytest.CaptureFixture[str]):
     """The reason, and no bundle."""
     code, text = said(options, capsys)

@@ -47,7 +47,7 @@ TAUGHT = {"type": "taught", "text": "bundle 1234 is installed", "labels": ["cork
 class Taught:
     """A recording with its session; `learn` and `assess` are the commands of its processes."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, codes: int = 0) -> None:
         self.folder, self.said, self.number = folder, [], 0
         self.learn, self.assess = printed(TAUGHT), printed(ASSESSED)
         self.recording = RecordingSession(
@@ -59,6 +59,7 @@ class Taught:
             TeachConfig(),
             lambda by: self.learn,
             lambda line: self.said.append(line.decode()),
+            codes=codes,
         )
 
     def order(self, name: str, text: str = "") -> list[object]:
@@ -72,7 +73,8 @@ class Taught:
             self.number += 1
             sweep = replace(cut(), id=self.number, start_ns=SystemClock().now_ns())
             verdict = replace(OK, sweep=self.number, status=status, label="", scores=np.empty(0))
-            self.recording.sweep(sweep, verdict, {})
+            for observer in (self.recording, self.session):
+                observer.sweep(sweep, verdict, {})
 
     def until(self, done: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
         """Take turns until the session is in this state."""
@@ -113,6 +115,29 @@ def test_faulty_sweeps_do_not_count(taught: Taught):
     taught.sweeps("cork", 2)
     taught.sweeps("cork", 2, Status.NO_CONTACT)
     assert taught.session.materials() == {"cork": 2}
+
+
+def test_sweeps_that_were_no_slides_are_said_and_not_counted(taught: Taught):
+    """At once if the check finds it; later if the process does, by comparing all sweeps. Each is
+    said once; files stay."""
+    taught.assess = printed(
+        ASSESSED
+        | {"no_slides": [{"number": 2, "text": "sweep 2 of cork is not learnt from: rest"}]}
+    )
+    taught.sweeps("cork", 3)
+    taught.sweeps("cork", 1, Status.NO_SLIDE)
+    taught.sweeps("pine", 2)
+    assert taught.session.materials() == {"cork": 3, "pine": 2}
+    taught.until(lambda about: about["learnt"])
+    assert taught.session.materials() == {"cork": 2, "pine": 2}
+    taught.sweeps("pine", 1)
+    taught.until(lambda about: not about["assessing"])
+    said = [line for line in map(str, taught.said) if "TCH,refused" in line]
+    assert len(said) == 2
+    assert "$PPLP,TCH,refused,sweep 4: no-slide*" in said[0]
+    assert "$PPLP,TCH,refused,sweep 2 of cork is not learnt from: rest*" in said[1]
+    assert taught.recording.about()["counts"] == [("cork", "", 2), ("pine", "", 3)]
+    assert len(list((taught.folder / "sweeps").glob("*.npy"))) == 7
 
 
 def test_use_makes_a_bundle_and_says_so(taught: Taught):
@@ -209,6 +234,28 @@ def test_a_label_that_cannot_be_sent_is_refused(taught: Taught, label: str):
     with pytest.raises(ApplianceError, match=r"needs the name of a material|cannot be used"):
         taught.order("TEACH", label)
     assert taught.session.materials() == {}
+
+
+def test_class_bits_that_are_too_few_are_said_before_recording(tmp_path: Path):
+    """Two bits name three materials: the fourth is refused by TEACH, before a sweep of it is made.
+    Recorded by a box with more bits, it is said at the next start, until one is forgotten."""
+    narrow = Taught(tmp_path, codes=4)
+    for material in ("cork", "pine", "felt"):
+        narrow.sweeps(material, 1)
+    assert narrow.session.about()["trouble"] == ""
+    with pytest.raises(ConfigError, match=r"4 labels and the code 0 do not fit output.class_bits"):
+        narrow.order("TEACH", "oak")
+    assert narrow.order("TEACH", "felt") == ["felt", 1]
+    assert narrow.session.materials() == {"cork": 1, "pine": 1, "felt": 1}
+    narrow.recording.close()
+    narrower = Taught(tmp_path, codes=2)
+    assert narrower.session.about()["trouble"].endswith("or none, or forget a material")
+    with pytest.raises(ConfigError, match="3 labels and the code 0 do not fit"):
+        narrower.order("USE")
+    narrower.order("FORGET", "cork")
+    narrower.order("FORGET", "pine")
+    assert narrower.session.about()["trouble"] == ""
+    narrower.recording.close()
 
 
 def test_a_forgotten_material_is_gone_and_its_sweeps_stay(taught: Taught):

@@ -344,7 +344,7 @@ def test_an_unloaded_skin_of_another_form_is_named(tmp_path: Path, known: object
 def test_what_the_box_refused_is_left_out(tmp_path: Path):
     """A skin that was not touched, or was broken, whatever the label; a window cut short by an
     early answer."""
-    for i in range(8):
+    for i in range(9):
         record(tmp_path / f"{i}.npy", "ab"[i % 2], id=i)
     for i, status in enumerate(readers.REFUSED):
         save(
@@ -355,9 +355,9 @@ def test_what_the_box_refused_is_left_out(tmp_path: Path):
     record(tmp_path / "9.npy", "a", frames=3, share=0.4)
     s = sets.load(str(tmp_path))
     assert s.source.endswith(
-        "(left out: 1 dead-taxel, 1 early, 1 no-contact, 1 saturated, 1 stuck-taxel)"
+        "(left out: 1 dead-taxel, 1 early, 1 no-contact, 1 no-slide, 1 saturated, 1 stuck-taxel)"
     )
-    assert list(s.samples[:, 0, 0, 0]) == [4, 5, 6, 7]
+    assert list(s.samples[:, 0, 0, 0]) == [5, 6, 7, 8]
 
 
 def test_objects_of_several_runs_in_one_folder_stay_apart(tmp_path: Path):

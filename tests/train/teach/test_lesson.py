@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from appliance.core.errors import FormatError
 from appliance.core.types import Status, SweepFormat
+from appliance.sim import skin
+from tests.factories import lessons
 from tests.factories.recordings import FORMAT, record
+from train.data.sets import Dataset
 from train.teach.lesson import Lesson
 
 
@@ -72,3 +77,26 @@ def test_a_single_sweep_is_not_judged_yet(tmp_path: Path):
     sweeps(tmp_path / "one", "a", "a", "b")
     with pytest.raises(FormatError, match="1 of the materials have two sweeps or more"):
         Lesson.read(tmp_path / "one").repeated()
+
+
+def test_sweeps_without_a_slide_are_not_learnt_from_and_named(tmp_path: Path):
+    """A finger at rest taught as foam, among slides: named by its number, whatever its place. A
+    material that has no slide left is said with the reason."""
+    rng, place = np.random.default_rng(2), skin.placements("T-REAL", 1005)[0]
+    windows = [skin.window(name, place, rng) for name in ("wood",) * 3 + ("foam",) * 3]
+    rest = np.broadcast_to(windows[3].mean(axis=0).round(), windows[3].shape)
+    windows[3] = (rest + rng.integers(0, 2, rest.shape)).astype(np.uint8)
+    labels = np.repeat([0, 1], 3)
+    format = skin.FORMAT
+    sweeps = Dataset(np.stack(windows), labels, ("wood", "foam"), format.rate_hz, {}, "slides")
+    lessons.write(tmp_path, sweeps)
+    lesson = Lesson.read(tmp_path)
+    assert np.bincount(lesson.sweeps.labels).tolist() == [2, 3]
+    assert dict(lesson.left_out) == {"no slide": 1}
+    (one,) = lesson.no_slides
+    assert one.number == 4
+    assert one.text.startswith("sweep 1 of foam is not learnt from: no slide: no pattern passes")
+    only = tmp_path / "only"
+    lessons.write(only, replace(sweeps.take(np.arange(4)), materials=("wood", "foam")))
+    with pytest.raises(FormatError, match=r"record two of another material \(sweep 1 of foam is"):
+        Lesson.read(only).repeated()

@@ -1,0 +1,83 @@
+"""A box without a bundle hands over to the page of teaching, and says its address."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from appliance.cli import teach_command
+from appliance.cli.common import load_settings
+from appliance.cli.parser import arguments
+from appliance.core.health import Health
+from appliance.sim.rig import VirtualClock
+from appliance.teaching import hand_over, process
+from appliance.teaching.hand_over import FILE, HandOver
+from tests.factories.feeds import HEALTH
+from tests.factories.paths import ROOT
+
+
+def test_the_file_comes_once_between_two_sweeps(tmp_path: Path):
+    """Not before an installation has seen the service run, and not during a sweep."""
+    clock = VirtualClock()
+    one, quiet = HandOver(tmp_path, clock), replace(HEALTH, sweeping=False)
+    sweeping: Health = replace(HEALTH, sweeping=True)
+    one.turn(quiet)
+    assert not (tmp_path / FILE).exists()
+    clock.sleep_until(clock.now_ns() + hand_over.AFTER_NS)
+    one.turn(sweeping)
+    assert not (tmp_path / FILE).exists()
+    one.turn(quiet)
+    assert (tmp_path / FILE).exists()
+    (tmp_path / FILE).unlink()  # the page has taken it
+    one.turn(quiet)
+    assert not (tmp_path / FILE).exists()
+
+
+def test_a_file_that_cannot_be_written_ends_nothing(tmp_path: Path, logged: list[str]):
+    """It is said once."""
+    clock = VirtualClock()
+    one = HandOver(tmp_path / "nowhere", clock)
+    clock.sleep_until(clock.now_ns() + hand_over.AFTER_NS)
+    for _ in range(2):
+        one.turn(replace(HEALTH, sweeping=False))
+    assert len(logged) == 1
+    assert "no page by itself: " in logged[0]
+
+
+def test_the_units_name_the_file():
+    """The path unit waits for it; the page removes it before it starts."""
+    path = f"/run/palpate/{FILE}"
+    assert f"PathExists={path}\n" in (ROOT / "systemd/palpate-teach.path").read_text()
+    assert f"/bin/rm -f {path}\n" in (ROOT / "systemd/palpate-teach.service").read_text()
+    wants = re.search(r"(?m)^Wants=.*", (ROOT / "systemd/palpate.service").read_text())
+    assert wants
+    assert "palpate-teach.path" in wants[0]
+
+
+@pytest.mark.parametrize(
+    ("more", "address"),
+    [
+        ([], "http://127.0.0.1:8138"),
+        (["--set", 'watch.address="0.0.0.0"'], r"https://[^:/]+:8138"),
+        (["--set", 'watch.address="box"'], r"no page \(watch\.address: 'box' is not an IP .*"),
+        (["--set", "teach.allow=false"], r"no page \(teach\.allow = false forbids .*"),
+    ],
+    ids=["this machine", "network", "wrong", "forbidden"],
+)
+def test_the_address_is_known_without_the_token(more: list[str], address: str):
+    """The service may not read the token; why there is no page is said in its place."""
+    settings = load_settings(arguments("run", more))
+    assert re.fullmatch(address, teach_command.page_address(settings))
+
+
+def test_a_box_without_the_libraries_has_no_page(monkeypatch: pytest.MonkeyPatch):
+    """It does not hand over to a program that could not run."""
+    settings = load_settings(arguments("run", []))
+    with monkeypatch.context() as patched:
+        patched.setattr(process, "find_spec", lambda name: None)
+        assert "teaching needs train" in teach_command.page_address(settings)
+    monkeypatch.setattr(teach_command, "find_spec", lambda name: None)
+    assert teach_command.page_address(settings) == "no page (pages need palpate[watch])"
