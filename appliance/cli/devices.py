@@ -52,9 +52,19 @@ def simulated(
     follows = settings.trigger.mode == "serial"
     profile = skins.profile(settings)
     if profile.codec == "palpate":
-        acts, source, format = script.named(name, format, args.seed, spread=spread, follows=follows)
+        acts, source, format = script.named(
+            name,
+            format,
+            args.seed,
+            spread=spread,
+            follows=follows,
+            fingers=len(settings.skins) or 1,
+        )
         acts = islice(tour.tour(format, args.seed) if touring else acts, args.sweeps)
-        return devices.build(format, acts, clock, source, remember=remember, follows=follows)
+        fingers = dict.fromkeys(settings.skins, format)
+        return devices.build(
+            format, acts, clock, source, remember=remember, follows=follows, fingers=fingers
+        )
     from appliance.sim.skins import devices as terminal
     from appliance.sim.skins import sweeps
 

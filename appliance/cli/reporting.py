@@ -9,6 +9,7 @@ from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
 from appliance.cli.common import Facts
+from appliance.core import fingers
 from appliance.core.clock import SystemClock
 from appliance.core.config import Config
 from appliance.core.devices import Devices
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
 def capture(
     args: argparse.Namespace, settings: Config, format: SweepFormat, stack: ExitStack
 ) -> CaptureWriter | None:
+    if args.capture:
+        fingers.refuse(settings.skins, "--capture")
     capture = CaptureWriter(args.capture, format, skins.profile(settings)) if args.capture else None
     if capture:
         stack.callback(capture.close)

@@ -12,6 +12,7 @@ from appliance.bundle.bundle import DEFAULT, Bundle
 from appliance.cli.common import Facts, StopFlag, load_bundle, load_settings
 from appliance.cli.devices import open_devices
 from appliance.cli.reporting import capture, done, feed, status
+from appliance.core import fingers
 from appliance.core.clock import SystemClock
 from appliance.core.config import Config
 from appliance.core.devices import Devices
@@ -47,6 +48,7 @@ def _classify(args: argparse.Namespace, settings: Config, choice: Choice | None)
     with ExitStack() as stack:
         trial = stack.enter_context(choice.trial) if choice and choice.trial else None
         current = choice.bundle if choice else load_bundle(settings, answers=not args.sim)
+        of_fingers = assembly.of_fingers(settings, current, answers=not args.sim)
         if settings.classifier.allow_unsigned:
             log.warning(f"unsigned {assembly.UNSIGNED}")
         devices = open_devices(args, lambda: current.format)
@@ -75,6 +77,7 @@ def _classify(args: argparse.Namespace, settings: Config, choice: Choice | None)
             devices,
             port,
             stack,
+            bundles=of_fingers,
             capture=capture(args, settings, current.format, stack),
             observers=[o for o in observers if o],
         )
@@ -87,7 +90,7 @@ def untaught(args: argparse.Namespace, settings: Config, packaged: Bundle) -> bo
     another skin. A skin of PROTOCOL.md announces its format later, so it does not count."""
     profile = skins.profile(settings)
     return (
-        not args.sim
+        not (args.sim or settings.skins)
         and settings.teach.allow
         and profile.codec != "palpate"
         and not fits(profile.format, packaged.format)
@@ -139,6 +142,8 @@ def _shadow(
     candidate, and for a candidate that cannot run."""
     try:
         candidate = None
+        if args.shadow is not None:
+            fingers.refuse(settings.skins, "--shadow")
         if args.shadow:
             candidate = assembly.named(settings, Path(args.shadow), answers=not args.sim).bundle
         elif args.shadow is not None:

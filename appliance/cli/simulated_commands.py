@@ -50,7 +50,7 @@ def run_demo(args: argparse.Namespace) -> int:
     the sweeps of --sim."""
     from appliance.tools import demo, pseudo_terminal
 
-    settings = load_settings(args)
+    settings = replace(load_settings(args), skins={})
     bundle = _played_bundle(settings)
     touring = not args.sim and skins.profile(settings).codec == "palpate"
     args.sweeps = args.sweeps or (TOUR if touring else 12)
@@ -107,5 +107,6 @@ def run_bench(args: argparse.Namespace) -> int:
 
 
 def _on_lines(settings: Config) -> Config:
-    """The settings with the trigger on GPIO lines, which the simulated robot drives."""
-    return replace(settings, trigger=replace(settings.trigger, mode="two-lines"))
+    """The settings with one skin, and the trigger on GPIO lines, which the simulated robot
+    drives."""
+    return replace(settings, trigger=replace(settings.trigger, mode="two-lines"), skins={})

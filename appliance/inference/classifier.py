@@ -275,12 +275,16 @@ class Classifier(Observer):
         if fused.refused:
             finding = Finding(Status.CONFLICT, fused.conflict, degraded)
             return self._verdict(sweep, finding, own=scores, touch=touch, after=fused.after)
-        status, rule = Status.OK, self.bundle.manifest.displacement
-        least = rule.unsure if touch.displacement.text and rule else 0
-        if fused.scores.max() < max(self.min_probability, least):
+        status = Status.OK
+        if fused.scores.max() < self.least(displaced=bool(touch.displacement.text)):
             status = Status.UNDECIDED if fused.final else Status.UNSURE
         finding = Finding(status, fused.conflict, degraded)
         return self._verdict(sweep, finding, fused.scores, fused.fused, scores, touch, fused.after)
+
+    def least(self, *, displaced: bool) -> float:
+        """Least probability for status ok. displaced: whether the contact is displaced."""
+        rule = self.bundle.manifest.displacement
+        return max(self.min_probability, rule.unsure if displaced and rule else 0)
 
     def forget(self) -> None:
         """Forget the sweeps of the present object; the next sweep begins another object."""
@@ -398,6 +402,7 @@ class Classifier(Observer):
             force_n=sweep.force_n,
             measured_mm_s=touch.slide.speed_mm_s,
             direction=touch.slide.direction or None,
+            finger=sweep.finger,
         )
 
     def _detail(self, finding: Finding, touch: Touched) -> str:

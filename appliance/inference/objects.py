@@ -171,4 +171,5 @@ class ObjectSweeps:
         fused = before.probabilities
         if not contradicts(own, fused):
             return ""
-        return f"another object: {self._labels[own.argmax()]} after {self._labels[fused.argmax()]}"
+        label, before_it = (self._labels[int(p.argmax())] for p in (own, fused))
+        return f"another object: {label} after {before_it}"
