@@ -11,6 +11,7 @@ from itertools import islice
 from typing import TYPE_CHECKING
 
 from appliance.cli.common import load_settings
+from appliance.core import fingers
 from appliance.core.clock import SystemClock
 from appliance.core.config import Config
 from appliance.core.devices import Devices
@@ -48,6 +49,9 @@ def simulated(
     terminal. touring: the robot plays the tour of `palpate demo`; on a readout board only."""
     from appliance.sim import devices, rig, script, tour
 
+    profile = skins.profile(settings)
+    if profile.codec != "palpate" or any(own.part for own in settings.skins.values()):
+        fingers.refuse(settings.skins, "--sim with this skin or with parts of a hub")
     clock = rig.VirtualClock() if args.virtual else SystemClock()
     follows = settings.trigger.mode == "serial"
     profile = skins.profile(settings)
@@ -61,9 +65,9 @@ def simulated(
             fingers=len(settings.skins) or 1,
         )
         acts = islice(tour.tour(format, args.seed) if touring else acts, args.sweeps)
-        fingers = dict.fromkeys(settings.skins, format)
+        of_fingers = dict.fromkeys(settings.skins, format)
         return devices.build(
-            format, acts, clock, source, remember=remember, follows=follows, fingers=fingers
+            format, acts, clock, source, remember=remember, follows=follows, fingers=of_fingers
         )
     from appliance.sim.skins import devices as terminal
     from appliance.sim.skins import sweeps

@@ -69,3 +69,9 @@ def build(
         observers=[OnSweep(lambda sweep, verdict: kept.append(sweep)), *observers],
     )
     return Rigged(box, simulated, far_end, port, kept=kept)
+
+
+def idle(settings: Config) -> devices.SimDevices:
+    """Devices of the fingers of these settings, on which nothing happens."""
+    formats = dict.fromkeys(settings.skins, skin.FORMAT)
+    return devices.build(skin.FORMAT, [], rig.VirtualClock(), "sim", fingers=formats)
