@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -69,7 +70,7 @@ def _classify(args: argparse.Namespace, settings: Config, choice: Choice | None)
             Notifier(SystemClock()),
             trial,
             shadow,
-            *_reports(settings, current, devices.source, facts, stack, disk),
+            *_reports(settings, current, of_fingers, devices.source, facts, stack, disk),
         ]
         box = assembly.box(
             settings,
@@ -100,23 +101,19 @@ def untaught(args: argparse.Namespace, settings: Config, packaged: Bundle) -> bo
 def _reports(
     settings: Config,
     current: Bundle,
+    bundles: Mapping[str, Bundle],
     source: str,
     facts: Facts,
     stack: ExitStack,
     disk: DiskThread,
 ) -> list[Observer]:
     """The observers that the settings ask for: log, black box, status file, feed with `facts`.
-    source: origin of the frames."""
+    bundles: by finger. source: origin of the frames."""
     # without a serial port, a terminal shows the sentences
     shown = in_journal() or bool(settings.serial.port and sys.stderr.isatty())
     observers: list[Observer] = [VerdictLog()] if shown else []
     if settings.store.black_box:
-        from appliance.recording.black_box import BlackBox
-
-        folder = Path(settings.store.folder) / "black-box"
-        black_box = BlackBox(folder, current.format, settings.store.black_box, disk)
-        stack.callback(black_box.close)
-        observers.append(black_box)
+        observers += _black_boxes(settings, current, bundles, stack, disk)
     m = current.manifest
     model = f"{m.name} {m.version}, {len(m.labels)} labels{f', {m.taught}' if m.taught else ''}"
     facts = {"model": lambda: model, **facts}
@@ -127,8 +124,27 @@ def _reports(
     return [
         *observers,
         *status(settings, facts),
-        *feed(settings, current.format, source, known, facts),
+        *feed(settings, current.format, source, known, facts, bundles),
     ]
+
+
+def _black_boxes(
+    settings: Config,
+    current: Bundle,
+    bundles: Mapping[str, Bundle],
+    stack: ExitStack,
+    disk: DiskThread,
+) -> list[Observer]:
+    """The black box; of several fingers one for each, in a folder of its name."""
+    from appliance.recording.black_box import BlackBox, FingerBox
+
+    folder, most = Path(settings.store.folder) / "black-box", settings.store.black_box
+    boxes: list[BlackBox] = [
+        FingerBox(finger, folder / finger, of.format, most, disk) for finger, of in bundles.items()
+    ] or [BlackBox(folder, current.format, most, disk)]
+    for one in boxes:
+        stack.callback(one.close)
+    return [*boxes]
 
 
 def _shadow(
