@@ -50,13 +50,13 @@ def classifier(
 def assembled(settings: Config, bundles: Mapping[str, Bundle], devices: Devices) -> Hand:
     """The parts for the fingers of the settings. Raises ConfigError, BundleError."""
     formats = {finger: bundles[finger].format for finger in settings.skins}
-    sensor = HandSensor([_skin(settings, group, formats, devices) for group in _groups(settings)])
+    sensor = HandSensor([_skin(settings, group, formats, devices) for group in groups(settings)])
     streams = {finger: partial(sensor.streams, finger) for finger in formats}
     answerer = classifier(settings, bundles, devices.clock, lambda: sensor.away)
     return Hand(sensor, HandCutter(formats, settings.sweep, streams), answerer)
 
 
-def _groups(settings: Config) -> list[tuple[str, ...]]:
+def groups(settings: Config) -> list[tuple[str, ...]]:
     """Fingers by skin: those of one hub together, in the order of their parts."""
     groups: dict[FingerConfig, list[str]] = {}
     for finger, own in settings.skins.items():
@@ -70,19 +70,20 @@ def _skin(
     settings: Config, group: tuple[str, ...], formats: Mapping[str, SweepFormat], devices: Devices
 ) -> HandSkin:
     """The skin of a finger, or the hub of several. Raises ConfigError."""
-    first, format, axis = group[0], formats[group[0]], 0
-    if settings.skins[first].part:
-        format, axis = _hub(settings, group, formats)
-    own = devices.finger(first).wire(settings.finger(first))
+    format, axis = whole(settings, group, formats)
+    there = devices.finger(group[0])
+    own = there.wire(settings.finger(group[0]))
     own = replace(own, skin=replace(own.skin, timeout_ms=TIMEOUT_MS))
-    return HandSkin(skins.sensor(own, format, devices.finger(first)), group, axis)
+    return HandSkin(skins.sensor(own, format, there), group, axis)
 
 
-def _hub(
+def whole(
     settings: Config, group: tuple[str, ...], formats: Mapping[str, SweepFormat]
 ) -> tuple[SweepFormat, int]:
-    """Format of a hub's frames, and the axis along which its parts lie. Raises ConfigError if the
-    parts are not one whole of equal forms."""
+    """Format of the frames of a finger's skin, or of the hub of several, and the axis along which
+    its parts lie. Raises ConfigError if the parts are not one whole of equal forms."""
+    if not settings.skins[group[0]].part:
+        return formats[group[0]], 0
     names = ", ".join(f"skins.{finger}" for finger in group)
     parts = [fingers.cut(settings.skins[finger].part) for finger in group]
     n, axis = len(group), parts[0][2]
