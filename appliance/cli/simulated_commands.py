@@ -15,7 +15,7 @@ from appliance.bundle.bundle import Bundle
 from appliance.cli.common import StopFlag, check_output, load_bundle, load_settings
 from appliance.cli.devices import simulated
 from appliance.core import storage
-from appliance.core.config import Config
+from appliance.core.config import Config, FingerConfig
 from appliance.core.errors import BundleDenied
 from appliance.core.log import log
 from appliance.core.observer import Observer
@@ -89,9 +89,17 @@ def run_bench(args: argparse.Namespace) -> int:
     ) -> tuple[Box, int]:
         far_end, name = stack.enter_context(pseudo_terminal.pair())
         port = SerialSink(replace(settings.serial, port=name), devices.clock, devices.source)
-        return assembly.box(
-            _on_lines(settings), bundle, devices, port, stack, observers=observers
-        ), far_end
+        fingers = {name: FingerConfig() for name in devices.buses}
+        box = assembly.box(
+            replace(_on_lines(settings), skins=fingers),
+            bundle,
+            devices,
+            port,
+            stack,
+            bundles=dict.fromkeys(fingers, bundle),
+            observers=observers,
+        )
+        return box, far_end
 
     if args.part:
         print(json.dumps(bench_process.measure(args.part, bundle.format, build, args.acts)))

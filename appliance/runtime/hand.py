@@ -58,12 +58,11 @@ def assembled(settings: Config, bundles: Mapping[str, Bundle], devices: Devices)
 
 def groups(settings: Config) -> list[tuple[str, ...]]:
     """Fingers by skin: those of one hub together, in the order of their parts."""
-    groups: dict[FingerConfig, list[str]] = {}
+    found: dict[FingerConfig | str, list[str]] = {}
     for finger, own in settings.skins.items():
-        groups.setdefault(
-            replace(own, part=own.part and "hub", bundle="", fingertip=""), []
-        ).append(finger)
-    return [tuple(sorted(group, key=lambda f: settings.skins[f].part)) for group in groups.values()]
+        hub = replace(own, part="hub", bundle="", fingertip="")
+        found.setdefault(hub if own.part else finger, []).append(finger)
+    return [tuple(sorted(group, key=lambda f: settings.skins[f].part)) for group in found.values()]
 
 
 def _skin(
