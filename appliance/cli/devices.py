@@ -18,6 +18,7 @@ from appliance.core.devices import Devices
 from appliance.core.errors import ConfigError
 from appliance.core.types import SweepFormat
 from appliance.io import skins
+from appliance.io.skin_profile import SkinProfile
 
 if TYPE_CHECKING:
     from appliance.sim.devices import RobotDevices
@@ -49,9 +50,7 @@ def simulated(
     terminal. touring: the robot plays the tour of `palpate demo`; on a readout board only."""
     from appliance.sim import devices, rig, script, tour
 
-    profile = skins.profile(settings)
-    if profile.codec != "palpate" or any(own.part for own in settings.skins.values()):
-        fingers.refuse(settings.skins, "--sim with this skin or with parts of a hub")
+    profile = _played(settings)
     clock = rig.VirtualClock() if args.virtual else SystemClock()
     follows = settings.trigger.mode == "serial"
     profile = skins.profile(settings)
@@ -87,3 +86,11 @@ def simulated(
         remember=remember,
         follows=follows,
     )
+
+
+def _played(settings: Config) -> SkinProfile:
+    """The profile of the simulated skin. Raises ConfigError for a hand that cannot be simulated."""
+    profile = skins.profile(settings)
+    if profile.codec != "palpate" or any(own.part for own in settings.skins.values()):
+        fingers.refuse(settings.skins, "--sim with this skin or with parts of a hub")
+    return profile

@@ -69,8 +69,8 @@ class HandClassifier(Observer):
 
     @property
     def model(self) -> str:
-        """The id of the bundle; of different bundles the CRC-32 of their ids, which also changes
-        with each of them, and has the room of one."""
+        """The id of the bundle; of different bundles the CRC-32 of their ids, which changes with
+        each of them and is as short as one."""
         return self._model
 
     @property

@@ -43,7 +43,7 @@ from appliance.recording.sweep_window import SweepCutter
 from appliance.runtime.loop import Answerer, Box, CommandHandler, Panel, Pipeline
 
 if TYPE_CHECKING:
-    from appliance.runtime.hand import Hand
+    from appliance.runtime.hand import HandParts
 
 UNSIGNED = (
     "bundles are allowed: classifier.allow_unsigned = true; remove it from the settings once the "
@@ -108,7 +108,7 @@ def box(
     )
 
 
-def _hand(settings: Config, bundles: Mapping[str, Bundle], devices: Devices) -> Hand:
+def _hand(settings: Config, bundles: Mapping[str, Bundle], devices: Devices) -> HandParts:
     from appliance.runtime import hand  # here: a box with one skin does without it
 
     return hand.assembled(settings, bundles, devices)
@@ -166,7 +166,7 @@ def _assembled(
     ordered: bool = False,
     serving: bool = True,
     announce: Callable[[str], object] = log.info,
-    hand: Hand | None = None,
+    hand: HandParts | None = None,
 ) -> Box:
     """Put the components together. codes: number of labels that the class bits hold. hand: the
     parts for several fingers."""

@@ -23,7 +23,7 @@ from appliance.recording.hand_window import HandCutter
 
 
 @dataclass(frozen=True, slots=True)
-class Hand:
+class HandParts:
     """The parts of the loop for all fingers."""
 
     sensor: HandSensor
@@ -47,13 +47,13 @@ def classifier(
     return HandClassifier(own, clock, away, rule.fuse, ends)
 
 
-def assembled(settings: Config, bundles: Mapping[str, Bundle], devices: Devices) -> Hand:
+def assembled(settings: Config, bundles: Mapping[str, Bundle], devices: Devices) -> HandParts:
     """The parts for the fingers of the settings. Raises ConfigError, BundleError."""
     formats = {finger: bundles[finger].format for finger in settings.skins}
     sensor = HandSensor([_skin(settings, group, formats, devices) for group in groups(settings)])
     streams = {finger: partial(sensor.streams, finger) for finger in formats}
     answerer = classifier(settings, bundles, devices.clock, lambda: sensor.away)
-    return Hand(sensor, HandCutter(formats, settings.sweep, streams), answerer)
+    return HandParts(sensor, HandCutter(formats, settings.sweep, streams), answerer)
 
 
 def groups(settings: Config) -> list[tuple[str, ...]]:
