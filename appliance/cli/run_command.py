@@ -50,6 +50,8 @@ def _classify(args: argparse.Namespace, settings: Config, choice: Choice | None)
         trial = stack.enter_context(choice.trial) if choice and choice.trial else None
         current = choice.bundle if choice else load_bundle(settings, answers=not args.sim)
         of_fingers = assembly.of_fingers(settings, current, answers=not args.sim)
+        # labels have the order of the first finger's bundle
+        current = next(iter(of_fingers.values()), current)
         if settings.classifier.allow_unsigned:
             log.warning(f"unsigned {assembly.UNSIGNED}")
         devices = open_devices(args, lambda: current.format)

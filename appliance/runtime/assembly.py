@@ -100,7 +100,7 @@ def box(
         capture,
         [run, *observers],
         commands,
-        codes=(*bundle.manifest.labels, *labels),
+        codes=(*(hand.answerer.labels if hand else bundle.manifest.labels), *labels),
         early=early_exit(settings, one) if one else None,
         ordered=ordered,
         announce=announce,

@@ -4,6 +4,8 @@ of the hand out, and what happens when a finger is unplugged or does not touch."
 from __future__ import annotations
 
 import itertools
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
@@ -193,6 +195,19 @@ def test_the_tare_of_a_finger_is_of_its_own_frames(hand: Callable[..., Rigged]):
     box = hand([still])
     box.seconds(1)
     assert ",TARE,ok,left largest 3.0 raw counts and right largest 5.0" in box.ask("$PPLP,TARE")
+
+
+def test_a_box_with_one_skin_loads_nothing_of_hands():
+    """Each import takes memory."""
+    program = """
+import sys
+from appliance.cli.main import main
+main(["run", "--sim", "skin", "--virtual", "--sweeps", "1"])
+assert not [name for name in sys.modules if "hand_" in name or name.endswith("runtime.hand")]
+print("clean")
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.stdout.endswith("clean\n"), done.stderr
 
 
 @pytest.mark.parametrize(
