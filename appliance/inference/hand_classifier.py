@@ -171,6 +171,7 @@ class HandClassifier(Observer):
             detail=_detail(found, fused.conflict if fused else ""),
             share=sweep.share,
             own=own,
+            displacement=_moved(found),
             degraded=_degraded(found),
             after=fused.after if fused else 0,
             speed_mm_s=sweep.speed_mm_s,
@@ -190,11 +191,22 @@ def _reason(found: Mapping[str, Verdict]) -> Status:
     return next((s for s in statuses if s is not Status.NO_CONTACT), Status.NO_CONTACT)
 
 
+def _moved(found: Mapping[str, Verdict]) -> str:
+    """The displacements of the fingers' contacts, "" for none."""
+    return ", ".join(f"{name} {v.displacement}" for name, v in found.items() if v.displacement)
+
+
 def _detail(found: Mapping[str, Verdict], conflict: str) -> str:
-    """The fingers that were left out, with the reason of each; bridged taxels of the others."""
+    """Displacements; the fingers that were left out, with their statuses; bridged taxels of the
+    others."""
     without = [f"{name} {v.status}" for name, v in found.items() if not len(v.own)]
     bridged = [f"{name} {v.degraded}" for name, v in found.items() if len(v.own) and v.degraded]
-    texts = conflict, ", ".join(without), bridged and f"degraded: {', '.join(bridged)}"
+    texts = (
+        _moved(found),
+        conflict,
+        ", ".join(without),
+        bridged and f"degraded: {', '.join(bridged)}",
+    )
     return "; ".join(text for text in texts if text)
 
 

@@ -121,6 +121,22 @@ def test_a_lost_finger_is_named(toy: Bundle):
     assert statuses(hand(toy, toy)(sweep(None, None)))[-1] == "sensor-lost"
 
 
+def test_a_displaced_finger_is_named(tmp_path: Path):
+    """With its own temperature and least probability, as with one skin."""
+    moved = toy_bundle.load(
+        tmp_path / "moved",
+        arrays=toy_bundle.means() | toy_bundle.displaced_arrays(),
+        displacement=toy_bundle.DISPLACEMENT,
+        contact=replace(toy_bundle.IN_PLACE, limit_mm=0.05),
+    )
+    verdict = hand(moved, moved)(sweep(A, (6.0, 0.0)))
+    left, right = verdict.fingers
+    assert left.displacement == ""
+    assert right.displacement.startswith("moved ")
+    assert verdict.displacement == f"right {right.displacement}"
+    assert verdict.detail.startswith(f"right {right.displacement}")
+
+
 def test_a_sweep_that_contradicts_its_object_is_refused(toy: Bundle):
     """By the rule of the settings, over the fused probabilities of the fingers."""
     it = hand(toy, toy, rule=ObjectRule(5, "refuse", 0))
