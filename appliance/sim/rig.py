@@ -85,6 +85,10 @@ class Act:
     lifted: int = 1
     others: tuple[NDArray[Any], ...] = ()
 
+    def part(self, of: slice) -> Act:
+        """The same act with a part of its frames, of all fingers."""
+        return replace(self, frames=self.frames[of], others=tuple(x[of] for x in self.others))
+
 
 class EdgeLines(Protocol):
     """Receives the robot's edges: SimGpio, or a list of a test."""
@@ -201,19 +205,19 @@ class Robot:
             if self._act is None:
                 self.finished = True
                 return None
-        act, frames = self._act, self._act.frames
+        act = self._act
         if self._sliding:
             if not self._playing:
                 self.acts += 1
                 self.played.append(act)
             settled = act.start + (act.stop - act.start) // SETTLED
-            part = replace(act, frames=frames[settled : act.stop])  # again, until STOP comes
+            part = act.part(slice(settled, act.stop))  # again, until STOP comes
             self._playing = part, first, frame_ns
             return part
         if self._lifting:
             self._lifting, self._playing, self._act = False, None, None
-            return replace(act, frames=frames[act.stop :])
-        return replace(act, frames=frames[: max(1, min(act.lifted, WAITING))])
+            return act.part(slice(act.stop, None))
+        return act.part(slice(max(1, min(act.lifted, WAITING))))
 
     def _pulse(self, name: str, up_ns: int, down_ns: int) -> None:
         self._lines.drive(name, True, up_ns)

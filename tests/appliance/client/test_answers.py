@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from appliance.core.status import Status
 from appliance.core.types import Verdict
 from appliance.io.robot_link import result, results
 from tests.factories import speaking_box
+from tests.factories.paths import ROOT
 
 
 def verdict(status: Status, detail: str = "", share: float = 1.0) -> Verdict:
@@ -60,6 +62,18 @@ def test_the_answer_of_a_finger_survives_its_sentence():
     assert Answer.of_finger(right.fields).finger == "right"
     with pytest.raises(FormatError, match="RES"):
         Answer.of_finger(["left"])
+
+
+@pytest.mark.parametrize(
+    "page", ["docs/how-to/use-two-fingertips.md", "docs/reference/sentences.md"]
+)
+def test_the_fingers_of_the_pages_can_be_read(page: str):
+    """Each FIN of the documents has its sum and all fields."""
+    lines = re.findall(r"\$PPLP,FIN,[^\n]*", (ROOT / page).read_text())
+    found = [sentences.read(line.encode()) for line in lines]
+    assert found
+    assert all(one.summed for one in found)
+    assert {Answer.of_finger(one.fields).finger for one in found} <= {"left", "right"}
 
 
 def test_a_finger_with_the_longest_name_keeps_all_its_fields():

@@ -17,7 +17,7 @@ import pytest
 from appliance.core.errors import ConfigError
 from appliance.core.types import Status, Verdict
 from appliance.inference.objects import fuse
-from appliance.sim import devices
+from appliance.sim import devices, rig, skin
 from tests.factories import hands
 from tests.factories.simulated_box import SECOND, Rigged
 
@@ -195,6 +195,22 @@ def test_the_tare_of_a_finger_is_of_its_own_frames(hand: Callable[..., Rigged]):
     box = hand([still])
     box.seconds(1)
     assert ",TARE,ok,left largest 3.0 raw counts and right largest 5.0" in box.ask("$PPLP,TARE")
+
+
+def test_the_simulated_fingers_follow_commands_together():
+    """Lifted, sliding twice and lifted again, the second finger has its own frames of the same
+    moments."""
+    act = hands.acts(10, 1)[0]
+    act = replace(act, others=(255 - act.frames,))
+    robot = rig.Robot(iter([act, act]), [], start="", stop="", follows=True)
+    film = rig.Film(robot, skin.FORMAT, skin.FORMAT)
+    for first, command in ((0, None), (30, True), (3000, False), (3060, True), (3400, False)):
+        if command is not None:
+            robot.obey(first * 1000, start=command)
+        one, two = (film.frames(first, 30, lambda i: i * 1000, finger) for finger in (0, 1))
+        assert len(one) == len(two) == 30
+        assert (two == 255 - one).all()
+    assert robot.acts == 2
 
 
 def test_a_box_with_one_skin_loads_nothing_of_hands():
