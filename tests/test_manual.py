@@ -173,7 +173,8 @@ def test_settings_have_default_limits_and_meaning(manual: ModuleType):
         cells[1].strip(" `"): [cell.strip() for cell in cells[2:-1]]
         for cells in (re.split(r"(?<!\\)\|", line) for line in lines if line.startswith("| `"))
     }
-    assert [*shown] == ["board", *config._KEYS]
+    of_fingers = [f"skins.NAME.{name}" for name in ("bundle", "part")]
+    assert [*shown] == ["board", *config._KEYS, *of_fingers]
     assert [name for name, (*_, meaning) in shown.items() if not meaning] == []
     assert shown["classifier.min_probability"][:2] == ["0.0", "0 to 1"]
     assert shown["classifier.fuse"][:2] == ['"product"', '"product", "vote", "none"']

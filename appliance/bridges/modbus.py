@@ -24,6 +24,7 @@ from appliance.client.answers import Answer
 from appliance.core.clock import Clock
 from appliance.core.directions import DIRECTIONS
 from appliance.core.errors import ApplianceError, FormatError
+from appliance.core.fingers import MOST
 from appliance.core.log import SparseLog
 from appliance.core.status import Status
 
@@ -118,7 +119,42 @@ MEASURED = (
     Register("measured speed", _of_answer(lambda answer: 10 * (answer.measured_mm_s or 0))),
     Register("direction", _of_answer(_direction_code)),
 )
-"""The last entries of the map, after the registers of SLIDE."""
+"""The entries after the registers of SLIDE."""
+
+
+def _of_finger(i: int, get: Callable[[BoxView, Answer], int]) -> Callable[[BoxView], int]:
+    """An entry of the finger with this index; 0 if there is none."""
+
+    def value(view: BoxView) -> int:
+        there = view.answer and i < len(view.answer.fingers)
+        return get(view, view.answer.fingers[i]) if view.answer and there else 0
+
+    return value
+
+
+def _name(view: BoxView, finger: Answer) -> int:
+    return int.from_bytes(finger.finger.encode("ascii", "replace")[:8].ljust(8, b"\0"), "big")
+
+
+FINGERS = (
+    Register("fingers", lambda view: len(view.answer.fingers) if view.answer else 0),
+    *(
+        register
+        for i in range(MOST)
+        for register in (
+            Register(f"finger {i + 1}", _of_finger(i, _name), 4),
+            Register(f"status {i + 1}", _of_finger(i, lambda view, of: STATUS_CODES[of.status])),
+            Register(
+                f"label code {i + 1}",
+                _of_finger(i, lambda view, of: view.code(of.label) if of.known else 0),
+            ),
+            Register(
+                f"probability {i + 1}", _of_finger(i, lambda view, of: round(1000 * of.probability))
+            ),
+        )
+    ),
+)
+"""The last entries of the map: the answers of the fingers."""
 COUNTERS = {
     "heartbeat",
     "answers",
@@ -206,7 +242,7 @@ class ModbusBridge:
         return (
             inputs(view, alive=alive)
             if function == pdu.READ_INPUTS
-            else [*registers(view, alive=alive), *slide, *_words(MEASURED, view)]
+            else [*registers(view, alive=alive), *slide, *_words((*MEASURED, *FINGERS), view)]
         )
 
     async def _write(self, wanted: Writing, coils: list[bool], slide: list[int]) -> None:

@@ -66,10 +66,11 @@ def values(fields: Mapping[str, Any]) -> list[KeyValue]:
 
 
 def verdict_status(answer: Answer, code: int) -> DiagnosticStatus:
-    """An answer: OK with the label, WARN if the label cannot be used, ERROR if nothing was learned
-    about the object."""
+    """An answer of the box or of a finger: OK with the label, WARN if the label cannot be used,
+    ERROR if nothing was learned about the object."""
     level = DiagnosticStatus.ERROR if answer.faulty else DiagnosticStatus.WARN
-    fields = asdict(answer) | {
+    fields = {name: v for name, v in asdict(answer).items() if name not in ("finger", "fingers")}
+    fields |= {
         "early": answer.early,
         "known": answer.known,
         "unsure": answer.unsure,
@@ -77,7 +78,7 @@ def verdict_status(answer: Answer, code: int) -> DiagnosticStatus:
     }
     return DiagnosticStatus(
         level=DiagnosticStatus.OK if answer.known else level,
-        name="palpate: verdict",
+        name=f"palpate: verdict {answer.finger}".rstrip(),
         hardware_id=answer.bundle,
         message=answer.label if answer.known else f"{answer.status}: {answer.what_to_do}",
         values=values(fields),
@@ -261,9 +262,9 @@ class PalpateNode(LifecycleNode):  # type: ignore[misc]
 
         return answer
 
-    def _array(self, status: DiagnosticStatus) -> DiagnosticArray:
-        """A status with time and frame."""
-        array = DiagnosticArray(status=[status])
+    def _array(self, *statuses: DiagnosticStatus) -> DiagnosticArray:
+        """Statuses with time and frame."""
+        array = DiagnosticArray(status=[*statuses])
         array.header.stamp = self.get_clock().now().to_msg()
         array.header.frame_id = self.setting("frame_id")
         return array
@@ -272,8 +273,9 @@ class PalpateNode(LifecycleNode):  # type: ignore[misc]
         while self._news and self._source:
             news = self._news.popleft()
             if isinstance(news, Answer):
-                code = self._source.view().code(news.label)
-                array = self._array(verdict_status(news, code))
+                code = self._source.view().code
+                each = (verdict_status(of, code(of.label)) for of in (news, *news.fingers))
+                array = self._array(*each)
                 self._verdicts.publish(array)
                 self._optional.answered(news, array.header)
             elif isinstance(news, Mapping):
@@ -282,9 +284,12 @@ class PalpateNode(LifecycleNode):  # type: ignore[misc]
                 self._show(self._source.view())
 
     def _publish_frame(self, line: Mapping[str, Any]) -> None:
-        message = image(line["taxels"], self._source.format["dtype"])  # type: ignore[union-attr]
+        source: FeedSource = self._source  # type: ignore[assignment]
+        format = source.fingers.get(str(line.get("finger")), source.format)
+        message = image(line["taxels"], format["dtype"])
         message.header.stamp = self.get_clock().now().to_msg()
-        message.header.frame_id = self.setting("frame_id")
+        finger = line.get("finger")
+        message.header.frame_id = self.setting("frame_id") + (f"/{finger}" if finger else "")
         self._frames.publish(message)
         self._optional.frame(line["taxels"], message.header)
 

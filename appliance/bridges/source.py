@@ -166,6 +166,7 @@ class FeedSource:
     ) -> None:
         self.name = path
         self.format: Mapping[str, Any] = {}
+        self.fingers: Mapping[str, Mapping[str, Any]] = {}  # format of each finger's frames
         self._clock, self._also, self._frame = clock or SystemClock(), heard, frame
         self._view = BoxView()
         self._feed = Feed(path, frames_hz=frames_hz, clock=self._clock)
@@ -212,6 +213,7 @@ class FeedSource:
         kind = line["type"]
         if kind == "hello":
             self.format = line["format"]
+            self.fingers = {name: of["format"] for name, of in line.get("fingers", {}).items()}
             self._view = replace(self._view, labels=tuple(line["labels"]), bundle=line["bundle"])
         elif kind == "lost":
             self._view = replace(self._view, missed=self._view.missed + int(line["lines"]))
@@ -237,6 +239,10 @@ class FeedSource:
                 degraded=line.get("degraded", ""),
                 **values,
             )
+        return self._answer(line)
+
+    def _answer(self, line: Mapping[str, Any]) -> Answer:
+        """The answer in a verdict line, or in that of a finger in it."""
         state = self._view.state
         return Answer(
             line["sweep"],
@@ -254,6 +260,8 @@ class FeedSource:
             line["detail"],
             measured_mm_s=line.get("measured_mm_s"),
             direction=line.get("direction", ""),
+            finger=line.get("finger", ""),
+            fingers=tuple(self._answer(of) for of in line.get("fingers", ())),
         )
 
 

@@ -11,12 +11,14 @@ from itertools import islice
 from typing import TYPE_CHECKING
 
 from appliance.cli.common import load_settings
+from appliance.core import fingers
 from appliance.core.clock import SystemClock
 from appliance.core.config import Config
 from appliance.core.devices import Devices
 from appliance.core.errors import ConfigError
 from appliance.core.types import SweepFormat
 from appliance.io import skins
+from appliance.io.skin_profile import SkinProfile
 
 if TYPE_CHECKING:
     from appliance.sim.devices import RobotDevices
@@ -48,13 +50,24 @@ def simulated(
     terminal. touring: the robot plays the tour of `palpate demo`; on a readout board only."""
     from appliance.sim import devices, rig, script, tour
 
+    profile = _played(settings)
     clock = rig.VirtualClock() if args.virtual else SystemClock()
     follows = settings.trigger.mode == "serial"
     profile = skins.profile(settings)
     if profile.codec == "palpate":
-        acts, source, format = script.named(name, format, args.seed, spread=spread, follows=follows)
+        acts, source, format = script.named(
+            name,
+            format,
+            args.seed,
+            spread=spread,
+            follows=follows,
+            fingers=len(settings.skins) or 1,
+        )
         acts = islice(tour.tour(format, args.seed) if touring else acts, args.sweeps)
-        return devices.build(format, acts, clock, source, remember=remember, follows=follows)
+        of_fingers = dict.fromkeys(settings.skins, format)
+        return devices.build(
+            format, acts, clock, source, remember=remember, follows=follows, fingers=of_fingers
+        )
     from appliance.sim.skins import devices as terminal
     from appliance.sim.skins import sweeps
 
@@ -73,3 +86,11 @@ def simulated(
         remember=remember,
         follows=follows,
     )
+
+
+def _played(settings: Config) -> SkinProfile:
+    """The profile of the simulated skin. Raises ConfigError for a hand that cannot be simulated."""
+    profile = skins.profile(settings)
+    if profile.codec != "palpate" or any(own.part for own in settings.skins.values()):
+        fingers.refuse(settings.skins, "--sim with this skin or with parts of a hub")
+    return profile

@@ -19,7 +19,7 @@ from appliance.cli.common import (
     status_file,
 )
 from appliance.cli.devices import open_devices
-from appliance.core import config
+from appliance.core import config, fingers
 from appliance.core.clock import SystemClock
 from appliance.core.config import Config
 from appliance.core.devices import Devices
@@ -29,7 +29,7 @@ from appliance.core.patience import patiently
 from appliance.io import skins
 from appliance.io.usb_sensor import fits
 from appliance.runtime.replay import replay
-from appliance.runtime.selftest import check
+from appliance.runtime.selftest import check, check_hand
 from appliance.service import status
 
 
@@ -46,10 +46,15 @@ def run_check(args: argparse.Namespace) -> int:
     """Check each component by itself; 1 if any fails."""
     settings = load_settings(args)
     devices = _open_any(args, settings)
-    failed = 0
-    for result in check(
-        devices.wire(settings), lambda: load_bundle(settings, answers=not args.sim), devices
-    ):
+    failed, answers = 0, not args.sim
+    results = check(devices.wire(settings), lambda: load_bundle(settings, answers=answers), devices)
+    if settings.skins:
+        results = check_hand(
+            devices.wire(settings),
+            lambda finger: load_bundle(settings.finger(finger), answers=answers),
+            devices,
+        )
+    for result in results:
         print(
             f"{'ok  ' if result.ok else 'FAIL'}  {result.component:<14} {result.detail}", flush=True
         )
@@ -65,6 +70,7 @@ def run_align(args: argparse.Namespace) -> int:
     ):  # a sweep lifts the finger for a tenth of a second; here the finger rests
         args.sim = "rest"
     settings = load_settings(args)
+    fingers.refuse(settings.skins, "align")
     devices = _open_any(args, settings)
     expected = _expected(devices.wire(settings), devices)
     stopped = StopFlag()  # before anybody can read the page's address

@@ -228,7 +228,7 @@ def _bench(command: CommandParser) -> None:
     )
     command.add_argument(
         "--part",
-        choices=("memory", "stream"),
+        choices=("memory", "stream", "hand"),
         help="measure a part alone, as JSON, with the sweeps of --acts",
     )
     command.add_argument("--acts", type=Path, metavar="FILE", help=argparse.SUPPRESS)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from appliance.cli.common import Facts, StopFlag, load_settings
 from appliance.cli.devices import open_devices
 from appliance.cli.reporting import capture, done, feed, status
+from appliance.core import fingers
 from appliance.core.clock import SystemClock
 from appliance.core.config import Config
 from appliance.core.devices import Devices
@@ -35,6 +36,7 @@ def run(args: argparse.Namespace) -> int:
     """Keep each sweep with its label. No bundle is needed: the skin announces its format."""
     labels = Labels(args.material, args.position, args.session)
     settings, stopped = load_settings(args), StopFlag()
+    fingers.refuse(settings.skins, "record")
     with ExitStack() as stack:
         devices, format = open_skin(args, settings)
         # a person at a terminal reads the log; sentences are for a robot, or for a program that

@@ -6,9 +6,12 @@ import argparse
 import os
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
+from appliance.bundle.bundle import Bundle
 from appliance.cli.common import Facts
+from appliance.core import fingers
 from appliance.core.clock import SystemClock
 from appliance.core.config import Config
 from appliance.core.devices import Devices
@@ -25,6 +28,8 @@ if TYPE_CHECKING:
 def capture(
     args: argparse.Namespace, settings: Config, format: SweepFormat, stack: ExitStack
 ) -> CaptureWriter | None:
+    if args.capture:
+        fingers.refuse(settings.skins, "--capture")
     capture = CaptureWriter(args.capture, format, skins.profile(settings)) if args.capture else None
     if capture:
         stack.callback(capture.close)
@@ -51,10 +56,16 @@ def status(settings: Config, facts: Facts) -> list[Observer]:
 
 
 def feed(
-    settings: Config, format: SweepFormat, source: str, model: Mapping[str, Any], facts: Facts
+    settings: Config,
+    format: SweepFormat,
+    source: str,
+    model: Mapping[str, Any],
+    facts: Facts,
+    bundles: Mapping[str, Bundle] = MappingProxyType({}),
 ) -> list[Observer]:
     """The server of the feed, if the settings name its folder. The default folder exists in a
-    service only. model: facts about the bundle for the first line of the feed."""
+    service only. model: facts about the bundle for the first line of the feed. bundles: by
+    finger."""
     path = settings.store.feed
     default = settings.sources["store.runtime"] == "code"
     if not path or (default and not os.access(path.parent, os.W_OK)):
@@ -63,6 +74,8 @@ def feed(
 
     known = {"source": source, "skin": settings.skin.profile, **model}
     known["unit"] = skins.profile(settings).unit
+    if bundles:
+        known["fingers"] = {finger: _finger(settings, finger, of) for finger, of in bundles.items()}
     return [
         FeedServer(
             path,
@@ -70,5 +83,21 @@ def feed(
             known,
             SystemClock(),
             lambda: {name: fact() for name, fact in facts.items()},
+            fingers=[of.format for of in bundles.values()],
         )
     ]
+
+
+def _finger(settings: Config, finger: str, bundle: Bundle) -> dict[str, Any]:
+    """The facts about a finger for the first line of the feed."""
+    from appliance.alignment.live import Expected
+
+    own = settings.finger(finger)
+    unit = skins.profile(own).unit
+    return {
+        "skin": own.skin.profile,
+        "unit": unit,
+        "bundle": bundle.id,
+        "format": bundle.format.json(),
+        "alignment": Expected.by(bundle, own.skin.fingertip, unit).json(),
+    }

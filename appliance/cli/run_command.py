@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,6 +13,7 @@ from appliance.bundle.bundle import DEFAULT, Bundle
 from appliance.cli.common import Facts, StopFlag, load_bundle, load_settings
 from appliance.cli.devices import open_devices
 from appliance.cli.reporting import capture, done, feed, status
+from appliance.core import fingers
 from appliance.core.clock import SystemClock
 from appliance.core.config import Config
 from appliance.core.devices import Devices
@@ -47,6 +49,9 @@ def _classify(args: argparse.Namespace, settings: Config, choice: Choice | None)
     with ExitStack() as stack:
         trial = stack.enter_context(choice.trial) if choice and choice.trial else None
         current = choice.bundle if choice else load_bundle(settings, answers=not args.sim)
+        of_fingers = assembly.of_fingers(settings, current, answers=not args.sim)
+        # labels have the order of the first finger's bundle
+        current = next(iter(of_fingers.values()), current)
         if settings.classifier.allow_unsigned:
             log.warning(f"unsigned {assembly.UNSIGNED}")
         devices = open_devices(args, lambda: current.format)
@@ -67,7 +72,7 @@ def _classify(args: argparse.Namespace, settings: Config, choice: Choice | None)
             Notifier(SystemClock()),
             trial,
             shadow,
-            *_reports(settings, current, devices.source, facts, stack, disk),
+            *_reports(settings, current, of_fingers, devices.source, facts, stack, disk),
         ]
         box = assembly.box(
             settings,
@@ -75,6 +80,7 @@ def _classify(args: argparse.Namespace, settings: Config, choice: Choice | None)
             devices,
             port,
             stack,
+            bundles=of_fingers,
             capture=capture(args, settings, current.format, stack),
             observers=[o for o in observers if o],
         )
@@ -87,7 +93,7 @@ def untaught(args: argparse.Namespace, settings: Config, packaged: Bundle) -> bo
     another skin. A skin of PROTOCOL.md announces its format later, so it does not count."""
     profile = skins.profile(settings)
     return (
-        not args.sim
+        not (args.sim or settings.skins)
         and settings.teach.allow
         and profile.codec != "palpate"
         and not fits(profile.format, packaged.format)
@@ -97,23 +103,19 @@ def untaught(args: argparse.Namespace, settings: Config, packaged: Bundle) -> bo
 def _reports(
     settings: Config,
     current: Bundle,
+    bundles: Mapping[str, Bundle],
     source: str,
     facts: Facts,
     stack: ExitStack,
     disk: DiskThread,
 ) -> list[Observer]:
     """The observers that the settings ask for: log, black box, status file, feed with `facts`.
-    source: origin of the frames."""
+    bundles: by finger. source: origin of the frames."""
     # without a serial port, a terminal shows the sentences
     shown = in_journal() or bool(settings.serial.port and sys.stderr.isatty())
     observers: list[Observer] = [VerdictLog()] if shown else []
     if settings.store.black_box:
-        from appliance.recording.black_box import BlackBox
-
-        folder = Path(settings.store.folder) / "black-box"
-        black_box = BlackBox(folder, current.format, settings.store.black_box, disk)
-        stack.callback(black_box.close)
-        observers.append(black_box)
+        observers += _black_boxes(settings, current, bundles, stack, disk)
     m = current.manifest
     model = f"{m.name} {m.version}, {len(m.labels)} labels{f', {m.taught}' if m.taught else ''}"
     facts = {"model": lambda: model, **facts}
@@ -125,8 +127,27 @@ def _reports(
     return [
         *observers,
         *status(settings, facts),
-        *feed(settings, current.format, source, known, facts),
+        *feed(settings, current.format, source, known, facts, bundles),
     ]
+
+
+def _black_boxes(
+    settings: Config,
+    current: Bundle,
+    bundles: Mapping[str, Bundle],
+    stack: ExitStack,
+    disk: DiskThread,
+) -> list[Observer]:
+    """The black box; of several fingers one for each, in a folder of its name."""
+    from appliance.recording.black_box import BlackBox, FingerBox
+
+    folder, most = Path(settings.store.folder) / "black-box", settings.store.black_box
+    boxes: list[BlackBox] = [
+        FingerBox(finger, folder / finger, of.format, most, disk) for finger, of in bundles.items()
+    ] or [BlackBox(folder, current.format, most, disk)]
+    for one in boxes:
+        stack.callback(one.close)
+    return [*boxes]
 
 
 def _shadow(
@@ -140,6 +161,8 @@ def _shadow(
     candidate, and for a candidate that cannot run."""
     try:
         candidate = None
+        if args.shadow is not None:
+            fingers.refuse(settings.skins, "--shadow")
         if args.shadow:
             candidate = assembly.named(settings, Path(args.shadow), answers=not args.sim).bundle
         elif args.shadow is not None:

@@ -15,7 +15,7 @@ from appliance.bundle.bundle import Bundle
 from appliance.cli.common import StopFlag, check_output, load_bundle, load_settings
 from appliance.cli.devices import simulated
 from appliance.core import storage
-from appliance.core.config import Config
+from appliance.core.config import Config, FingerConfig
 from appliance.core.errors import BundleDenied
 from appliance.core.log import log
 from appliance.core.observer import Observer
@@ -50,7 +50,7 @@ def run_demo(args: argparse.Namespace) -> int:
     the sweeps of --sim."""
     from appliance.tools import demo, pseudo_terminal
 
-    settings = load_settings(args)
+    settings = replace(load_settings(args), skins={})
     bundle = _played_bundle(settings)
     touring = not args.sim and skins.profile(settings).codec == "palpate"
     args.sweeps = args.sweeps or (TOUR if touring else 12)
@@ -89,9 +89,17 @@ def run_bench(args: argparse.Namespace) -> int:
     ) -> tuple[Box, int]:
         far_end, name = stack.enter_context(pseudo_terminal.pair())
         port = SerialSink(replace(settings.serial, port=name), devices.clock, devices.source)
-        return assembly.box(
-            _on_lines(settings), bundle, devices, port, stack, observers=observers
-        ), far_end
+        fingers = {name: FingerConfig() for name in devices.buses}
+        box = assembly.box(
+            replace(_on_lines(settings), skins=fingers),
+            bundle,
+            devices,
+            port,
+            stack,
+            bundles=dict.fromkeys(fingers, bundle),
+            observers=observers,
+        )
+        return box, far_end
 
     if args.part:
         print(json.dumps(bench_process.measure(args.part, bundle.format, build, args.acts)))
@@ -107,5 +115,6 @@ def run_bench(args: argparse.Namespace) -> int:
 
 
 def _on_lines(settings: Config) -> Config:
-    """The settings with the trigger on GPIO lines, which the simulated robot drives."""
-    return replace(settings, trigger=replace(settings.trigger, mode="two-lines"))
+    """The settings with one skin, and the trigger on GPIO lines, which the simulated robot
+    drives."""
+    return replace(settings, trigger=replace(settings.trigger, mode="two-lines"), skins={})

@@ -1,10 +1,10 @@
-"""Answers and states of the box as objects, read from the fields of RES, STA and ANS sentences
+"""Answers and states of the box as objects, read from the fields of RES, FIN, STA and ANS sentences
 (PROTOCOL.md, part 2)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from appliance.core import sentences
 from appliance.core.errors import FormatError
@@ -26,6 +26,8 @@ class Answer:
     whether lost frames can be seen. missed: number of answers before this one that did not arrive,
     counted by the numbers of the sweeps. measured_mm_s, direction: of the slide as the box measured
     it, `rows+`, `rows-`, `cols+` or `cols-` for the direction; None and "" if it was not measured.
+    finger: of an answer of one finger, else "". fingers: the answers that a hand's answer was fused
+    from, as far as they arrived; empty of a box with one skin.
     """
 
     sweep: int
@@ -45,6 +47,8 @@ class Answer:
     missed: int = 0
     measured_mm_s: float | None = None
     direction: str = ""
+    finger: str = ""
+    fingers: tuple[Answer, ...] = ()
 
     @classmethod
     def of(cls, fields: Sequence[str]) -> Answer:
@@ -86,6 +90,11 @@ class Answer:
             raise FormatError(
                 f"RES,{','.join(fields)}: {e}; is the client older than the box?"
             ) from e
+
+    @classmethod
+    def of_finger(cls, fields: Sequence[str]) -> Answer:
+        """The answer in the fields of a FIN sentence. Raises FormatError as `of` does."""
+        return replace(cls.of(fields[1:]), finger="".join(fields[:1]))
 
     @classmethod
     def read(cls, line: str) -> Answer | None:

@@ -23,6 +23,7 @@ from appliance.client.answers import Answer, BoxIdentity, BoxState
 from appliance.client.line import Line, open_port
 from appliance.core.clock import Clock, SystemClock
 from appliance.core.errors import CommandRefused, FormatError, LinkLost, NoAnswer
+from appliance.core.fingers import MOST
 from appliance.core.sentences import Sentence, sentence
 
 BAUD = 115200
@@ -67,6 +68,7 @@ class Palpate:
         self._asking = threading.Lock()
         self._replies: deque[list[str]] = deque(maxlen=KEPT)
         self._answers: deque[Answer] = deque()
+        self._fingers: deque[Answer] = deque(maxlen=MOST)  # of the next answer
         # the number of the newest answer, numbers of missing answers before it, and the count of
         # answers in the last STA
         self._sweep: int | None = None
@@ -276,8 +278,10 @@ class Palpate:
                     self._replies.append(heard.fields)
                 elif heard.kind == "STA":
                     news = self.newest = self._counted_state(BoxState.of(heard.fields))
+                elif heard.kind == "FIN":
+                    self._fingers.append(Answer.of_finger(heard.fields))
                 elif heard.kind == "RES":
-                    news = self._counted(Answer.of(heard.fields))
+                    news = self._counted(self._whole(Answer.of(heard.fields)))
                     self._keep(news)
             except FormatError as e:
                 self.damaged += 1
@@ -285,6 +289,12 @@ class Palpate:
             self._news.notify_all()
         if news and self._listener:
             self._listener(news)
+
+    def _whole(self, answer: Answer) -> Answer:
+        """The answer with those of its fingers, which came before it."""
+        fingers = tuple(f for f in self._fingers if f.sweep == answer.sweep)
+        self._fingers.clear()
+        return replace(answer, fingers=fingers)
 
     def _counted(self, answer: Answer) -> Answer:
         """The answer with the number of answers that are missing before it, as each sweep gets

@@ -11,11 +11,12 @@ import json
 import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, is_dataclass
+from dataclasses import dataclass, field, is_dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal, get_type_hints
 
+from appliance.core import fingers
 from appliance.core.errors import ConfigError, TemporaryError
 from appliance.core.patience import passes
 from appliance.core.schema import (
@@ -88,6 +89,18 @@ class SkinConfig:
     def serial(self) -> str:
         """Serial number of the board, "" for any."""
         return self.usb[10:]
+
+
+@dataclass(frozen=True, slots=True)
+class FingerConfig(SkinConfig):
+    """The skin of one finger, `[skins.NAME]`. A key that is missing has the value of `[skin]`.
+
+    bundle: path of the finger's own bundle; "" for the bundle of the box. part: the finger's part
+    of the frames of a hub, as in "1/2 rows"; "" for whole frames.
+    """
+
+    bundle: str = ""
+    part: str = custom("", 'a part of a hub such as "1/2 rows" or "2/2 columns"', fingers.part)
 
 
 @dataclass(frozen=True, slots=True)
@@ -275,7 +288,7 @@ class BridgeConfig:
 class Config:
     """All settings. board: the board file's name, "" for none. folder: where the files are, skins/
     among them. sources: "section.key" -> "code", the file's name or "--set"; "board" -> "code", the
-    file's name or "--board"."""
+    file's name or "--board". skins: of a box with several fingers, by name; else empty."""
 
     board: str
     skin: SkinConfig
@@ -290,11 +303,19 @@ class Config:
     bridge: BridgeConfig
     sources: Mapping[str, str] = field(compare=False)
     folder: Path = field(default=SITE.parent, compare=False)
+    skins: Mapping[str, FingerConfig] = field(default_factory=dict)
+
+    def finger(self, name: str) -> Config:
+        """The settings of a box that has the skin of this finger only."""
+        own = self.skins[name]
+        bundle = own.bundle or self.classifier.bundle
+        return replace(self, skin=own, skins={}, classifier=replace(self.classifier, bundle=bundle))
 
 
 _SECTIONS: Mapping[str, Any] = MappingProxyType(
     {n: h for n, h in get_type_hints(Config).items() if is_dataclass(h)}
 )
+_FINGER_KEYS: Mapping[str, Key] = MappingProxyType(keys(FingerConfig))
 _KEYS: Mapping[str, Key] = MappingProxyType(
     {
         f"{section}.{last}": key
@@ -332,7 +353,11 @@ def load(
     layers += [(site, of_site), *((Path("--set"), _parse_set(text)) for text in sets)]
     values = {name: key.default for name, key in _KEYS.items()}
     sources = {"board": Path(named_in).name} | dict.fromkeys(_KEYS, "code")
+    own: dict[str, dict[str, Any]] = {}  # values of the fingers
     for where, table in layers:
+        for finger, read in fingers.read(table.pop("skins", {}), str(where), _FINGER_KEYS).items():
+            own.setdefault(finger, {}).update(read)
+            sources |= {f"skins.{finger}.{key}": where.name for key in read}
         for name, value in _checked(table, str(where)):
             values[name], sources[name] = value, where.name
     _check_lines(values, sources)
@@ -340,7 +365,18 @@ def load(
         section: group(**{key: values[f"{section}.{key}"] for key in keys(group)})
         for section, group in _SECTIONS.items()
     }
-    return Config(board=board, sources=MappingProxyType(sources), folder=folder, **groups)
+    skins = _skins(groups["skin"], own)
+    return Config(
+        board=board, sources=MappingProxyType(sources), folder=folder, skins=skins, **groups
+    )
+
+
+def _skins(skin: SkinConfig, own: Mapping[str, dict[str, Any]]) -> dict[str, FingerConfig]:
+    """The skin of each finger: `skin` with the finger's own values. Raises ConfigError."""
+    common = {name: getattr(skin, name) for name in keys(SkinConfig)}
+    whole = {finger: common | {"part": ""} | values for finger, values in own.items()}
+    fingers.check(whole)
+    return {finger: FingerConfig(**values) for finger, values in whole.items()}
 
 
 def describe(config: Config) -> str:
@@ -350,6 +386,10 @@ def describe(config: Config) -> str:
     for name in _KEYS:
         section, _, last = name.partition(".")
         value = getattr(getattr(config, section), last)
+        values[name] = json.dumps(value, ensure_ascii=False)
+    for name in [n for n in config.sources if n not in values]:
+        _, finger, last = name.split(".")
+        value = getattr(config.skins[finger], last)
         values[name] = json.dumps(value, ensure_ascii=False)
     return "\n".join(
         f"{f'{name} = {value}':<36}   # {config.sources[name]}" for name, value in values.items()
@@ -407,6 +447,9 @@ def _parse_set(text: str) -> dict[str, Any]:
         (parsed,) = tomllib.loads(f"value = {value}").values()
     except (ValueError, RecursionError):
         parsed = value.strip()
+    if section == "skins":
+        finger, _, key = key.partition(".")
+        return {section: {finger: {key: parsed}}}
     return {section: {key: parsed}}
 
 
@@ -418,7 +461,7 @@ def _checked(table: Mapping[str, Any], where: str) -> Iterator[tuple[str, Any]]:
                 raise ConfigError(
                     f"{where}: board is chosen in {SITE}, or with --board; move it there"
                 )
-            raise _unknown(section, [*_SECTIONS, "board"], where)
+            raise _unknown(section, [*_SECTIONS, "skins", "board"], where)
         if not isinstance(content, dict):
             raise ConfigError(
                 f"{where}: {section} = {shown(content)} is not a section; write [{section}], its "

@@ -22,7 +22,7 @@ from appliance.core.observer import Observer
 from appliance.core.types import Frames, Status, Sweep, SweepFormat, Verdict, entries
 from appliance.inference.novelty import ClassDistances, UnknownSweeps
 from appliance.inference.objects import LEAST_PROBABILITY as LEAST_PROBABILITY
-from appliance.inference.objects import Evidence, FusedSweeps, ObjectRule, contradicts
+from appliance.inference.objects import FusedSweeps, ObjectRule, ObjectSweeps
 from appliance.inference.objects import fuse as fuse
 from appliance.inference.objects import softmax as softmax
 from appliance.inference.session import ModelRunner
@@ -88,9 +88,10 @@ class Classifier(Observer):
     ) -> None:
         self.bundle = bundle
         self.min_probability = min_probability or bundle.manifest.thresholds.unsure
-        self._clock, self._fusion = clock, fusion
-        self._ends = ObjectRule(max_sweeps, conflict, object_s)
-        self._sweeps = FusedSweeps()
+        self._clock = clock
+        self._objects = ObjectSweeps(
+            bundle.manifest.labels, fusion, ObjectRule(max_sweeps, conflict, object_s)
+        )
         self.tare = bundle.manifest.tare
         self.taxels = TaxelWatch(bundle.manifest)
         known, classes = bundle.manifest.known, bundle.classes
@@ -120,9 +121,9 @@ class Classifier(Observer):
         """The classifier's settings under their names in the site file. They are written to
         sidecars, and a replay applies them again."""
         return {
-            "fuse": self._fusion,
+            "fuse": self._objects.fusion,
             "min_probability": self.min_probability,
-            **entries(self._ends),
+            **entries(self._objects.rule),
         }
 
     @property
@@ -277,51 +278,36 @@ class Classifier(Observer):
         patterned = bool(degraded) or self._patterned(sweep, touch.slide)
         if rests := self._rests(sweep, int(scores.argmax())) if patterned else STILL:
             return self._verdict(sweep, Finding(Status.NO_SLIDE, rests, degraded), touch=touch)
-        earlier = self._sweeps
-        if sweep.object == 0 or sweep.object != earlier.object or self._fusion == "none":
-            earlier = FusedSweeps(sweep.object)
-        before = None if earlier.ended(sweep.start_ns, self._ends) else earlier.evidence
-        conflict = self._conflict(scores, before)
-        if conflict and self._ends.conflict == "refuse":
-            self._sweeps = replace(earlier, last=sweep.id, end_ns=sweep.stop_ns)
-            finding = Finding(Status.CONFLICT, conflict, degraded)
-            return self._verdict(sweep, finding, own=scores, touch=touch, after=earlier.last)
-        kept = Evidence.of(scores, self._fusion, None if conflict else before)
-        self._sweeps = FusedSweeps(sweep.object, kept, sweep.id, sweep.stop_ns)
-        fused = kept.probabilities
-        status, rule = Status.OK, self.bundle.manifest.displacement
-        least = rule.unsure if touch.displacement.text and rule else 0
-        if fused.max() < max(self.min_probability, least):
-            final = 0 < self._ends.max_sweeps <= kept.sweeps
-            status = Status.UNDECIDED if final else Status.UNSURE
-        finding = Finding(status, conflict, degraded)
-        return self._verdict(sweep, finding, fused, kept.sweeps, scores, touch, earlier.last)
+        fused = self._objects.put(sweep, scores)
+        if fused.refused:
+            finding = Finding(Status.CONFLICT, fused.conflict, degraded)
+            return self._verdict(sweep, finding, own=scores, touch=touch, after=fused.after)
+        status = Status.OK
+        if fused.scores.max() < self.least(displaced=bool(touch.displacement.text)):
+            status = Status.UNDECIDED if fused.final else Status.UNSURE
+        finding = Finding(status, fused.conflict, degraded)
+        return self._verdict(sweep, finding, fused.scores, fused.fused, scores, touch, fused.after)
+
+    def least(self, *, displaced: bool) -> float:
+        """Least probability for status ok. displaced: whether the contact is displaced."""
+        rule = self.bundle.manifest.displacement
+        return max(self.min_probability, rule.unsure if displaced and rule else 0)
 
     def forget(self) -> None:
         """Forget the sweeps of the present object; the next sweep begins another object."""
-        self._sweeps = FusedSweeps()
+        self._objects.present = FusedSweeps()
 
     def conclude_if_ok(
         self, sweep: Sweep, scores: NDArray[np.float64], degraded: str = ""
     ) -> Verdict | None:
         """The verdict of `conclude` on an unfinished sweep if its status is ok; otherwise None, and
         the sweep is not counted."""
-        before = self._sweeps
+        before = self._objects.present
         verdict = self.conclude(sweep, scores, degraded=degraded)
         if verdict.status is Status.OK:
             return verdict
-        self._sweeps = before
+        self._objects.present = before
         return None
-
-    def _conflict(self, own: NDArray[np.float64], before: Evidence | None) -> str:
-        """A message if `own` [K] contradicts the sweeps `before`, "" if it can be fused with
-        them."""
-        if not before or self._ends.conflict == "fuse":
-            return ""
-        fused, labels = before.probabilities, self.bundle.manifest.labels
-        if not contradicts(own, fused):
-            return ""
-        return f"another object: {labels[own.argmax()]} after {labels[fused.argmax()]}"
 
     def _run(self, outputs: tuple[str, ...], taxels: NDArray[Any]) -> list[NDArray[np.float32]]:
         """The named outputs of the graph for one window, without the leading axis of length 1."""
@@ -430,6 +416,7 @@ class Classifier(Observer):
             force_n=sweep.force_n,
             measured_mm_s=touch.slide.speed_mm_s,
             direction=touch.slide.direction or None,
+            finger=sweep.finger,
         )
 
     def _detail(self, finding: Finding, touch: Touched) -> str:

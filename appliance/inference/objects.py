@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from appliance.core.types import Sweep
 
 STRONG = 10.0
 """Least Bayes factor for another object: strong evidence (Jeffreys 1961, appendix B). Decision 20
@@ -118,3 +120,56 @@ def contradicts(own: NDArray[np.float64], fused: NDArray[np.float64]) -> bool:
     1 if the sweep or the sweeps before it are quite unsure.
     """
     return bool(len(own) * (fused @ own) < 1 / STRONG)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ObjectAnswer:
+    """What the sweeps of the present object say together. scores: float64 [K]; of a refused sweep
+    its own. fused: number of sweeps in them. after: number of the last sweep before. conflict: a
+    message if the sweep contradicts those before it, else "". final: no further sweep of this
+    object is wanted."""
+
+    scores: NDArray[np.float64]
+    fused: int
+    after: int
+    conflict: str
+    refused: bool
+    final: bool
+
+
+class ObjectSweeps:
+    """Fuses the sweeps of one object after the other. labels: [K], for messages. fusion: "product",
+    "vote" (see `Evidence.of`) or "none"."""
+
+    def __init__(self, labels: Sequence[str], fusion: str, rule: ObjectRule) -> None:
+        self.fusion, self.rule = fusion, rule
+        self.present = FusedSweeps()
+        self._labels = labels
+
+    def put(self, sweep: Sweep, own: NDArray[np.float64]) -> ObjectAnswer:
+        """Fuse one more sweep, with the probabilities `own` float64 [K]."""
+        earlier = self.present
+        if sweep.object == 0 or sweep.object != earlier.object or self.fusion == "none":
+            earlier = FusedSweeps(sweep.object)
+        before = None if earlier.ended(sweep.start_ns, self.rule) else earlier.evidence
+        conflict = self._conflict(own, before)
+        if conflict and self.rule.conflict == "refuse":
+            self.present = replace(earlier, last=sweep.id, end_ns=sweep.stop_ns)
+            return ObjectAnswer(own, 0, earlier.last, conflict, refused=True, final=False)
+        kept = Evidence.of(own, self.fusion, None if conflict else before)
+        self.present = FusedSweeps(sweep.object, kept, sweep.id, sweep.stop_ns)
+        final = 0 < self.rule.max_sweeps <= kept.sweeps
+        return ObjectAnswer(
+            kept.probabilities, kept.sweeps, earlier.last, conflict, refused=False, final=final
+        )
+
+    def _conflict(self, own: NDArray[np.float64], before: Evidence | None) -> str:
+        """A message if `own` [K] contradicts the sweeps `before`, "" if it can be fused with
+        them."""
+        if not before or self.rule.conflict == "fuse":
+            return ""
+        fused = before.probabilities
+        if not contradicts(own, fused):
+            return ""
+        label, before_it = (self._labels[int(p.argmax())] for p in (own, fused))
+        return f"another object: {label} after {before_it}"

@@ -47,7 +47,7 @@ COMMANDS = (
 )
 TEXT_COMMANDS = ("LABEL", "MATERIAL", "POSITION", "SESSION", "TEACH", "FORGET")
 """The commands that need a text after a comma. START may have one: speed and force of the slide."""
-OWN = ("RES", "STA", "ANS", "REC", "TCH")
+OWN = ("RES", "FIN", "STA", "ANS", "REC", "TCH")
 """Kinds of sentences that the box sends. A line that sends them back, an echo, must not be
 answered: the answer would come back as well, without end."""
 MOST_REFUSED, REFUSAL_NS = 8, 1_000_000_000
@@ -69,7 +69,7 @@ class Port(Protocol):
     trouble: str
 
     def send(self, verdict: Verdict, *, loss_known: bool = True) -> None:
-        """Send a verdict's sentence without waiting. loss_known: see `result`."""
+        """Send a verdict's sentences without waiting. loss_known: see `result`."""
         ...
 
     def say(self, line: bytes) -> None:
@@ -99,15 +99,22 @@ class Command:
         return f"{self.name},{self.text}" if with_text else self.name
 
 
+def results(v: Verdict, source: str, *, loss_known: bool = True) -> list[bytes]:
+    """The sentences of a verdict: FIN for each finger, then RES. Parameters as of `result`."""
+    return [result(of, source, loss_known=loss_known) for of in (*(v.fingers or ()), v)]
+
+
 def result(v: Verdict, source: str, *, loss_known: bool = True) -> bytes:
-    """The RES sentence of a verdict. source: of the frames (usb, sim, replay). loss_known: whether
-    lost frames of the skin can be seen.
+    """The RES sentence of a verdict; FIN of a verdict on one finger. source: of the frames (usb,
+    sim, replay). loss_known: whether lost frames of the skin can be seen.
 
     Optional fields follow the detail: that losses cannot be seen, and the measured slide. The
     detail is shortened to make room for them. If an empty detail does not suffice, the slide is
     left out.
     """
+    kind = "FIN" if v.finger else "RES"
     fields = (
+        *([v.finger] if v.finger else ()),
         v.sweep,
         f"{v.time_ns / 1e9:.3f}",
         v.status,
@@ -125,12 +132,12 @@ def result(v: Verdict, source: str, *, loss_known: bool = True) -> bytes:
     if v.measured_mm_s is not None:
         slide = [*(unseen or [""]), f"{v.measured_mm_s:.1f}", v.direction]
         # a sentence of full length may have been cut
-        if (room := MAX_LINE - len(sentence("RES", *fields, "", *slide))) > 0:
-            return sentence("RES", *fields, v.detail[:room], *slide)
+        if (room := MAX_LINE - len(sentence(kind, *fields, "", *slide))) > 0:
+            return sentence(kind, *fields, v.detail[:room], *slide)
     if loss_known:
-        return sentence("RES", *fields, v.detail)
-    room = MAX_LINE - len(sentence("RES", *fields, "", 1))
-    return sentence("RES", *fields, v.detail[: max(0, room)], 1)
+        return sentence(kind, *fields, v.detail)
+    room = MAX_LINE - len(sentence(kind, *fields, "", 1))
+    return sentence(kind, *fields, v.detail[: max(0, room)], 1)
 
 
 def parse(data: bytes, rest: bytes = b"") -> tuple[list[Command], bytes]:
@@ -174,8 +181,9 @@ class StdoutPort:
         self._gone = False  # the reader of a pipe
 
     def send(self, verdict: Verdict, *, loss_known: bool = True) -> None:
-        """Print a verdict's sentence."""
-        self.say(result(verdict, self._source, loss_known=loss_known))
+        """Print a verdict's sentences."""
+        for line in results(verdict, self._source, loss_known=loss_known):
+            self.say(line)
 
     def say(self, line: bytes) -> None:
         """Print a sentence. It is dropped and counted if nobody reads the output, or the disk
@@ -242,8 +250,9 @@ class SerialSink:
         self._refusal_ns = clock.now_ns()
 
     def send(self, verdict: Verdict, *, loss_known: bool = True) -> None:
-        """Queue a verdict's sentence and send as many as the port accepts now."""
-        self.say(result(verdict, self._source, loss_known=loss_known))
+        """Queue a verdict's sentences and send as many as the port accepts now."""
+        for line in results(verdict, self._source, loss_known=loss_known):
+            self.say(line)
 
     def say(self, line: bytes) -> None:
         """Queue a sentence. If the queue is full, the oldest sentence is dropped and counted,

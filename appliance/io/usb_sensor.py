@@ -184,10 +184,10 @@ class LinkSensor(ABC):
     States: `streaming`, from the first frame on; or `absent`, `busy`, `denied`, `mismatch`, `lost`,
     `silent`, with a remedy in `trouble`. A skin that is plugged in again begins a new enumeration:
     its frames get a new epoch in `seq` and a new clock. announced: the skin reports its format when
-    it is opened.
+    it is opened. waits: whether `read` waits for a skin that is away.
     """
 
-    announced = True
+    announced, waits = True, True
 
     def __init__(
         self,
@@ -293,7 +293,9 @@ class LinkSensor(ABC):
         result is False."""
         now = self._clock.now_ns()
         if now < self._retry_ns:
-            self._clock.sleep_until(min(self._retry_ns, now + self._config.timeout_ms * 1_000_000))
+            if self.waits:
+                timeout_ns = self._config.timeout_ms * 1_000_000
+                self._clock.sleep_until(min(self._retry_ns, now + timeout_ns))
             return False
         try:
             self._link, self.identity = self._open()

@@ -11,19 +11,15 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from appliance.core.config import SweepConfig
-from appliance.core.types import EPOCH_BITS, Edge, EdgeKind, Frames, Status, Sweep, SweepFormat
-
-MAX_GAP = 2
-"""Largest number of consecutive missing frames that are interpolated; for more the status is
-`gap`."""
+from appliance.core.types import Edge, EdgeKind, Frames, Status, Sweep, SweepFormat
+from appliance.recording.frame_ring import FrameRing
 
 
 @dataclass(slots=True)
-class _Open:
+class OpenSweep:
     """A sweep between its edges.
 
     start: its start edge, or the edge that was answered without one. answered: it was answered
@@ -70,27 +66,26 @@ class _Open:
         )
 
 
+def ring_s(config: SweepConfig) -> float:
+    """Seconds of frames that must be held: the longest sweep and a margin."""
+    return config.max_duration_s + config.late_ms / 1000 + 1
+
+
 class SweepCutter:
     """Cuts windows. It holds the frames of the last `max_duration_s` and a margin, and the sweeps
-    that were not answered yet."""
+    that were not answered yet. ring: holds the frames; None: one is made."""
 
-    def __init__(self, format: SweepFormat, config: SweepConfig) -> None:
+    def __init__(
+        self, format: SweepFormat, config: SweepConfig, ring: FrameRing | None = None
+    ) -> None:
         self._format = format
         self._max_duration_ns = round(config.max_duration_s * 1e9)
         self._late_ns, self._lead_ns = config.late_ms * 1_000_000, config.lead_ms * 1_000_000
-        self._size = (
-            format.window
-            + 2 * MAX_GAP
-            + int((config.max_duration_s + config.late_ms / 1000 + 1) * format.rate_hz)
-        )
-        # slot = seq % size: a frame is found without searching, and stays until it is overwritten
-        self._seq = np.full(self._size, -1, np.int64)
-        self._t_ns = np.zeros(self._size, np.int64)
-        self._taxels = np.zeros((self._size, *format.shape), format.numpy_type)
-        self._newest = -1
-        self._open: _Open | None = None
+        self._least_ns = format.window * format.period_ns
+        self._ring = ring or FrameRing(format, ring_s(config))
+        self._open: OpenSweep | None = None
         self._closing: list[
-            tuple[_Open, int]
+            tuple[OpenSweep, int]
         ] = []  # (sweep, stop ns) whose window may still lack frames
         self._done: list[Sweep] = []
         self._count = self._object = 0
@@ -104,19 +99,9 @@ class SweepCutter:
         """Put frames into the ring. Frames of a new enumeration end the open sweep."""
         if not len(frames):
             return
-        if self._newest >= 0 and frames.seq[-1] >> EPOCH_BITS != self._newest >> EPOCH_BITS:
+        if self._ring.restarted(frames):
             self.interrupt(Status.SENSOR_LOST, now_ns)
-        n = len(frames)
-        at = int(frames.seq[0]) % self._size
-        slots: slice | NDArray[np.int64] = slice(at, at + n)
-        if at + n > self._size or frames.seq[-1] - frames.seq[0] != n - 1:
-            slots = frames.seq % self._size
-        self._seq[slots], self._t_ns[slots], self._taxels[slots] = (
-            frames.seq,
-            frames.t_ns,
-            frames.taxels,
-        )
-        self._newest = int(frames.seq[-1])
+        self._ring.put(frames)
 
     def trigger(self, edges: Iterable[Edge], ready: bool, now_ns: int) -> None:
         """Process the trigger edges of one turn in order. ready: whether the box could take a sweep
@@ -180,14 +165,14 @@ class SweepCutter:
         while sweep and not sweep.answered and not self._closing and sweep.step < steps:
             if sweep.first is None:
                 begin_ns = sweep.start_ns + self._lead_ns
-                if self._newest < 0 or self._t_ns[self._newest % self._size] < begin_ns:
+                if self._ring.newest < 0 or self._ring.newest_ns < begin_ns:
                     return
-                sweep.first = self._seq_at(begin_ns)
+                sweep.first = self._ring.seq_at(begin_ns)
             n = -(-(sweep.step + 1) * self._format.window // (steps + 1))
-            if self._newest < sweep.first + n - 1:
+            if self._ring.newest < sweep.first + n - 1:
                 return
             sweep.step += 1
-            frames, missing = self._window(sweep.first, n)
+            frames, missing = self._ring.window(sweep.first, n)
             if len(frames):
                 yield sweep.sweep(
                     int(frames.t_ns[-1]),
@@ -206,17 +191,11 @@ class SweepCutter:
     def latest(self, n: int) -> NDArray[Any] | None:
         """The newest `n` frames as raw counts [n, R, C] or [n, R, C, A], for a tare; None if frames
         are missing."""
-        window = np.arange(self._newest - n + 1, self._newest + 1)
-        slots = window % self._size
-        return (
-            self._taxels[slots]
-            if self._newest >= 0 and (self._seq[slots] == window).all()
-            else None
-        )
+        return self._ring.latest(n)
 
-    def _begin(self, edge: Edge) -> _Open:
+    def _begin(self, edge: Edge) -> OpenSweep:
         self._count += 1
-        return _Open(self._count, self._object, edge)
+        return OpenSweep(self._count, self._object, edge)
 
     def _start(self, edge: Edge, ready: bool, now_ns: int) -> None:
         if self._open and not self._open.answered:
@@ -232,63 +211,34 @@ class SweepCutter:
             self._answer(self._begin(edge), t_ns, Status.NO_START, now_ns)
         elif not sweep.answered:
             length_ns = t_ns - sweep.start_ns
-            if length_ns < self._format.window * self._format.period_ns:
+            if length_ns < self._least_ns:
                 self._answer(sweep, t_ns, Status.SHORT, now_ns)
             elif length_ns > self._max_duration_ns:
                 self._answer(sweep, t_ns, Status.LONG, now_ns)
             else:
                 self._closing.append((sweep, t_ns))
 
-    def _answer(self, sweep: _Open, stop_ns: int, status: Status, now_ns: int) -> None:
+    def _answer(self, sweep: OpenSweep, stop_ns: int, status: Status, now_ns: int) -> None:
         """Finish a sweep with a status and without frames."""
         sweep.answered = True
-        self._done.append(sweep.sweep(stop_ns, status, Frames.empty(self._format), (), now_ns))
+        self._done.append(self._empty(sweep, stop_ns, status, now_ns))
 
-    def _cut(self, sweep: _Open, stop_ns: int, now_ns: int) -> Sweep | None:
+    def _empty(self, sweep: OpenSweep, stop_ns: int, status: Status, now_ns: int) -> Sweep:
+        return sweep.sweep(stop_ns, status, Frames.empty(self._format), (), now_ns)
+
+    def _cut(self, sweep: OpenSweep, stop_ns: int, now_ns: int) -> Sweep | None:
         """The sweep with its window, or None while its frames may still arrive."""
-        window = self._format.window
-        first = self._seq_at((sweep.start_ns + stop_ns) / 2) - window // 2
-        late = now_ns > stop_ns + self._late_ns
-        if self._newest < first + window - 1 and not late:
-            return None
-        frames, missing = self._window(first, window)
-        status = Status.OK if len(frames) else Status.GAP
-        return sweep.sweep(stop_ns, status, frames, missing, now_ns)
-
-    def _window(self, first: int, n: int) -> tuple[Frames, tuple[int, ...]]:
-        """Frames `first` to `first + n` with missing frames interpolated, and the indices of the
-        missing frames. No frames if a gap is too wide."""
-        pad = MAX_GAP
-        seq = np.arange(first - pad, first + n + pad)
-        slots = seq % self._size
-        have = np.flatnonzero((self._seq[slots] == seq) & (seq >= 0))
-        missing = np.setdiff1d(np.arange(pad, pad + n), have, assume_unique=True)
-        frames = Frames(self._t_ns[slots], seq, self._taxels[slots])
-        cut = slice(pad, pad + n) if interpolate(frames, have, missing) else slice(0)
-        window = Frames(frames.t_ns[cut], frames.seq[cut], frames.taxels[cut])
-        return window, tuple((missing - pad).tolist())
-
-    def _seq_at(self, t_ns: float) -> int:
-        """Number of the frame at `t_ns`, computed from the nearest frame in the ring."""
-        k = int(np.abs(self._t_ns - round(t_ns)).argmin())
-        return int(self._seq[k]) + round((t_ns - int(self._t_ns[k])) / self._format.period_ns)
+        return cut(self._ring, self._format, sweep, stop_ns, now_ns, self._late_ns)
 
 
-def interpolate(frames: Frames, have: NDArray[np.int64], missing: NDArray[np.int64]) -> bool:
-    """Interpolate the rows `missing` of `frames` in place from their neighbours in `have`; False if
-    a gap is too wide.
-
-    have, missing: int64, sorted row indices.
-    """
-    right = np.searchsorted(have, missing)
-    if len(missing) and (right.min() == 0 or right.max() == len(have)):
-        return False
-    lo, hi = have[right - 1], have[right % max(len(have), 1)]
-    if len(missing) and (hi - lo).max() > MAX_GAP + 1:
-        return False
-    part = (missing - lo) / (hi - lo)
-    for values in (frames.t_ns, frames.taxels):
-        a, b = values[lo].astype(np.float64), values[hi].astype(np.float64)
-        between = a + (b - a) * part.reshape(-1, *[1] * (values.ndim - 1))
-        values[missing] = between if values.dtype.kind == "f" else np.rint(between)
-    return True
+def cut(
+    ring: FrameRing, format: SweepFormat, sweep: OpenSweep, stop_ns: int, now_ns: int, late_ns: int
+) -> Sweep | None:
+    """The sweep with its window from the ring, or None while its frames may still arrive. late_ns:
+    longest wait for them after the stop edge."""
+    first = ring.seq_at((sweep.start_ns + stop_ns) / 2) - format.window // 2
+    if ring.newest < first + format.window - 1 and now_ns <= stop_ns + late_ns:
+        return None
+    frames, missing = ring.window(first, format.window)
+    status = Status.OK if len(frames) else Status.GAP
+    return sweep.sweep(stop_ns, status, frames, missing, now_ns)

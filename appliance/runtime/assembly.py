@@ -8,12 +8,13 @@ from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from numpy.typing import NDArray
 
 from appliance.bundle import bundle as bundles
 from appliance.bundle.bundle import Bundle
+from appliance.core import fingers
 from appliance.core.clock import Clock, SystemClock
 from appliance.core.config import Config, TriggerConfig
 from appliance.core.devices import Devices
@@ -43,6 +44,9 @@ from appliance.recording.sweep_check import SweepCheck
 from appliance.recording.sweep_window import SweepCutter
 from appliance.runtime.loop import Answerer, Box, CommandHandler, Panel, Pipeline
 
+if TYPE_CHECKING:
+    from appliance.runtime.hand import HandParts
+
 UNSIGNED = (
     "bundles are allowed: classifier.allow_unsigned = true; remove it from the settings once the "
     "bundle is signed"
@@ -70,6 +74,7 @@ def box(
     port: Port | None,
     stack: ExitStack,
     *,
+    bundles: Mapping[str, Bundle] = MappingProxyType({}),
     capture: CaptureWriter | None = None,
     observers: Iterable[Observer] = (),
     labels: tuple[str, ...] = (),
@@ -79,10 +84,14 @@ def box(
 ) -> Box:
     """The box that classifies; `stack` closes it again.
 
-    capture: records all inputs. labels: labels that the class bits must hold in addition to the
-    bundle's. commands, ordered, announce: as for `recorder`.
+    bundles: by finger (`of_fingers`); empty without fingers. capture: records all inputs. labels:
+    labels that the class bits must hold in addition to the bundle's. commands, ordered, announce:
+    as for `recorder`.
     """
-    run = classifier(settings, bundle, devices.clock)
+    hand = _hand(settings, bundles, devices) if settings.skins else None
+    one = None if hand else classifier(settings, bundle, devices.clock)
+    run = hand.answerer if hand else one
+    assert run
     run.self_test()
     return _assembled(
         devices.wire(settings),
@@ -93,11 +102,18 @@ def box(
         capture,
         [run, *observers],
         commands,
-        codes=(*bundle.manifest.labels, *labels),
-        early=early_exit(settings, run),
+        codes=(*(hand.answerer.labels if hand else bundle.manifest.labels), *labels),
+        early=early_exit(settings, one) if one else None,
         ordered=ordered,
         announce=announce,
+        hand=hand,
     )
+
+
+def _hand(settings: Config, bundles: Mapping[str, Bundle], devices: Devices) -> HandParts:
+    from appliance.runtime import hand  # here: a box with one skin does without it
+
+    return hand.assembled(settings, bundles, devices)
 
 
 def recorder(
@@ -121,6 +137,7 @@ def recorder(
     slides: as for SweepCheck.
     announce: called with the messages of a trigger without lines to a person. Other parameters as
     for `box`."""
+    fingers.refuse(settings.skins, "recording")
     check = SweepCheck(format, devices.clock, slides)
     watching = [check, *observers]
     return _assembled(
@@ -153,8 +170,10 @@ def _assembled(
     ordered: bool = False,
     serving: bool = True,
     announce: Callable[[str], object] = log.info,
+    hand: HandParts | None = None,
 ) -> Box:
-    """Put the components together. codes: number of labels that the class bits hold."""
+    """Put the components together. codes: number of labels that the class bits hold. hand: the
+    parts for several fingers."""
     commands = {**commands, "LABEL": partial(_label, codes)}
     trigger = _trigger(
         settings.trigger, answerer.format, devices, port, stack, announce, ordered=ordered
@@ -163,13 +182,13 @@ def _assembled(
     if isinstance(trigger, CommandTrigger):
         commands = {**commands, **trigger.commands}
     lines = _outputs(settings, devices, stack)
-    sensor = skins.sensor(settings, answerer.format, devices, capture)
+    sensor = hand.sensor if hand else skins.sensor(settings, answerer.format, devices, capture)
     stack.callback(sensor.close)
     if port:
         stack.callback(port.close)
     if lines and settings.output.class_bits:  # last: it waits for output.settle_us
         watching.append(LineSink(lines, codes))
-    cutter = SweepCutter(answerer.format, settings.sweep)
+    cutter = hand.cutter if hand else SweepCutter(answerer.format, settings.sweep)
     return Box(
         Pipeline(sensor, trigger, cutter, answerer, early),
         devices.clock,
@@ -276,9 +295,15 @@ def early_exit(settings: Config, run: Classifier) -> EarlyExit | None:
 def prove(settings: Config, bundle: Bundle) -> None:
     """Raises BundleError or ConfigError if this machine, with these settings, does not run a bundle
     correctly."""
-    run = classifier(settings, bundle, SystemClock())
-    run.self_test()
-    early_exit(settings, run)
+    if settings.skins:
+        from appliance.runtime import hand
+
+        of = of_fingers(settings, bundle, answers=True)
+        hand.classifier(settings, of, SystemClock()).self_test()
+    else:
+        run = classifier(settings, bundle, SystemClock())
+        run.self_test()
+        early_exit(settings, run)
     if settings.output.class_bits:
         check_bits(1 << len(settings.output.class_bits), bundle.manifest.labels)
 
@@ -311,6 +336,15 @@ def named(settings: Config, folder: Path, *, answers: bool) -> SignedBundle:
         raise type(e)(
             f"{e}; a bench may allow unsigned bundles, by classifier.allow_unsigned = true"
         ) from e
+
+
+def of_fingers(settings: Config, common: Bundle, *, answers: bool) -> dict[str, Bundle]:
+    """The bundle of each finger: its own, or else `common`. answers: as for `running`. Raises
+    BundleError or ConfigError."""
+    return {
+        finger: named(settings, Path(own.bundle), answers=answers).bundle if own.bundle else common
+        for finger, own in settings.skins.items()
+    }
 
 
 def port(settings: Config, devices: Devices) -> Port | None:

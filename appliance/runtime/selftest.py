@@ -5,7 +5,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
 from appliance.bundle.bundle import Bundle, Manifest
 from appliance.core.config import Config
@@ -57,6 +58,49 @@ def check(
     spent_ns: processor time that this thread has taken so far.
     """
     loaded: list[Bundle] = []
+    yield from _of_bundle(settings, load, devices, loaded)
+    if loaded:
+        yield CheckResult("speed", True, _speed(loaded[0].manifest))
+    yield _try(
+        "skin", lambda: _skin(settings, loaded[0].format if loaded else None, devices, spent_ns)
+    )
+    yield from _wiring(settings, devices)
+
+
+def check_hand(
+    settings: Config,
+    load: Callable[[str], Bundle],
+    devices: Devices,
+    spent_ns: Callable[[], int] = time.thread_time_ns,
+) -> Iterator[CheckResult]:
+    """As `check`, of a box with several fingers: bundle and skin of each. load: gives the bundle of
+    a finger."""
+    from appliance.runtime import hand
+
+    formats: dict[str, SweepFormat] = {}
+    for finger in settings.skins:
+        loaded: list[Bundle] = []
+        own = settings.finger(finger)
+        for found in _of_bundle(own, partial(load, finger), devices, loaded):
+            yield replace(found, component=f"{finger} {found.component}")
+        if loaded:
+            formats[finger] = loaded[0].format
+
+    def skin(group: tuple[str, ...]) -> str:
+        known = all(finger in formats for finger in group)
+        wanted = hand.whole(settings, group, formats)[0] if known else None
+        there = devices.finger(group[0])
+        return _skin(there.wire(settings.finger(group[0])), wanted, there, spent_ns)
+
+    for group in hand.groups(settings):
+        yield _try(f"{' '.join(group)} skin", partial(skin, group))
+    yield from _wiring(settings, devices)
+
+
+def _of_bundle(
+    settings: Config, load: Callable[[], Bundle], devices: Devices, loaded: list[Bundle]
+) -> Iterator[CheckResult]:
+    """The bundle, which is put into `loaded`, and its golden sweeps."""
 
     def bundle() -> str:
         loaded.append(load())
@@ -83,10 +127,10 @@ def check(
         yield CheckResult("signatures", True, f"warning: unsigned {UNSIGNED}")
     if loaded:
         yield _try("golden sweeps", golden)
-        yield CheckResult("speed", True, _speed(loaded[0].manifest))
-    yield _try(
-        "skin", lambda: _skin(settings, loaded[0].format if loaded else None, devices, spent_ns)
-    )
+
+
+def _wiring(settings: Config, devices: Devices) -> Iterator[CheckResult]:
+    """Trigger, GPIO lines and serial port."""
     yield from _triggered(settings, devices)
     if settings.serial.port:
         yield _try("serial port", lambda: _port(settings, devices))

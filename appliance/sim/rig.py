@@ -71,7 +71,7 @@ class Act:
 
     about: what is special about it, for a person. wanted: the right status; "" for `ok`, or
     `unknown` if the bundle lacks the material. unplugged: frames [from, to) for which the
-    skin is unplugged; None for none.
+    skin is unplugged; None for none. others: as `frames`, for the second finger and further ones.
     """
 
     frames: NDArray[Any]
@@ -83,6 +83,11 @@ class Act:
     wanted: str = ""
     unplugged: tuple[int, int] | None = None
     lifted: int = 1
+    others: tuple[NDArray[Any], ...] = ()
+
+    def part(self, of: slice) -> Act:
+        """The same act with a part of its frames, of all fingers."""
+        return replace(self, frames=self.frames[of], others=tuple(x[of] for x in self.others))
 
 
 class EdgeLines(Protocol):
@@ -200,19 +205,19 @@ class Robot:
             if self._act is None:
                 self.finished = True
                 return None
-        act, frames = self._act, self._act.frames
+        act = self._act
         if self._sliding:
             if not self._playing:
                 self.acts += 1
                 self.played.append(act)
             settled = act.start + (act.stop - act.start) // SETTLED
-            part = replace(act, frames=frames[settled : act.stop])  # again, until STOP comes
+            part = act.part(slice(settled, act.stop))  # again, until STOP comes
             self._playing = part, first, frame_ns
             return part
         if self._lifting:
             self._lifting, self._playing, self._act = False, None, None
-            return replace(act, frames=frames[act.stop :])
-        return replace(act, frames=frames[: max(1, min(act.lifted, WAITING))])
+            return act.part(slice(act.stop, None))
+        return act.part(slice(max(1, min(act.lifted, WAITING))))
 
     def _pulse(self, name: str, up_ns: int, down_ns: int) -> None:
         self._lines.drive(name, True, up_ns)
@@ -220,14 +225,22 @@ class Robot:
 
 
 class Film:
-    """The frames of a robot's acts, one after the other, as seen by a skin of this format."""
+    """The frames of a robot's acts, one after the other, as seen by the skins of the fingers.
 
-    def __init__(self, format: SweepFormat, robot: Robot) -> None:
+    formats: of each finger's frames. Boards of several fingers may be HISTORY frames apart.
+    """
+
+    HISTORY = 1500
+
+    def __init__(self, robot: Robot, *formats: SweepFormat) -> None:
         self._robot = robot
-        self._frames = np.zeros((0, *format.shape), format.numpy_type)
+        self._history = self.HISTORY if len(formats) > 1 else 0
+        self._frames = [np.zeros((0, *format.shape), format.numpy_type) for format in formats]
         self._base = 0  # number of the first frame in _frames
 
-    def frames(self, first: int, n: int, frame_ns: Callable[[int], int]) -> NDArray[Any]:
+    def frames(
+        self, first: int, n: int, frame_ns: Callable[[int], int], finger: int = 0
+    ) -> NDArray[Any]:
         """Frames `first` to `first + n` of the script [n, *shape], requested in order; after its
         end all counts are 0.
 
@@ -236,21 +249,21 @@ class Film:
         """
         if self._robot.skipped:
             begin, end = (i - self._base for i in self._robot.skipped)
-            self._frames, self._robot.skipped = (
-                np.delete(self._frames, slice(begin, end), axis=0),
-                None,
-            )
-        while first + n > self._base + len(self._frames):
-            act = self._robot.next_act(self._base + len(self._frames), frame_ns)
-            more = (
-                np.zeros((4096, *self._frames.shape[1:]), self._frames.dtype)
-                if act is None
-                else act.frames
-            )
-            keep = max(0, min(first - self._base, len(self._frames)))
-            self._frames = np.concatenate([self._frames[keep:], more])
+            self._frames = [np.delete(x, slice(begin, end), axis=0) for x in self._frames]
+            self._robot.skipped = None
+        while first + n > self._base + len(self._frames[0]):
+            act = self._robot.next_act(self._base + len(self._frames[0]), frame_ns)
+            keep = max(0, min(first - self._history - self._base, len(self._frames[0])))
+            more = (act.frames, *act.others) if act else [self._dark(x) for x in self._frames]
+            self._frames = [
+                np.concatenate([x[keep:], new]) for x, new in zip(self._frames, more, strict=True)
+            ]
             self._base += keep
-        return self._frames[first - self._base :][:n]
+        return self._frames[finger][first - self._base :][:n]
+
+    @staticmethod
+    def _dark(like: NDArray[Any]) -> NDArray[Any]:
+        return np.zeros((4096, *like.shape[1:]), like.dtype)
 
 
 class ReadoutBoard:
@@ -259,7 +272,7 @@ class ReadoutBoard:
 
     packet_frames, fifo_frames: frames per packet and in the FIFO. ppm: error of its crystal.
     latency: draws the time in ns from a packet's last frame to its arrival. first_seq: number of
-    its first frame.
+    its first frame. film, finger: of a board beside those of other fingers.
     """
 
     def __init__(
@@ -274,6 +287,8 @@ class ReadoutBoard:
         latency: Callable[[], int] = lambda: 150_000,
         serial: str = "SIM0001",
         first_seq: int = 0,
+        film: Film | None = None,
+        finger: int = 0,
     ) -> None:
         self.identity = packets.Identity(packets.VERSION, (1, 0, 0), "palpate-sim", serial)
         self.skin = packets.SkinFormat(
@@ -295,7 +310,7 @@ class ReadoutBoard:
         self._next = 0  # number of the next frame to send
         # arrival of the packet that begins with this frame, once drawn
         self._arrival_ns: int | None = None
-        self._film = Film(format, robot)
+        self._film, self._finger = film or Film(robot, format), finger
 
     def frame_ns(self, i: int) -> int:
         """Host time at which frame `i` is taken."""
@@ -339,5 +354,8 @@ class ReadoutBoard:
         device_us = round((self.frame_ns(first) - self._origin_ns) * self._rate / 1000)
         flags = packets.Flag.OVERFLOW if late else 0
         return packets.pack(
-            self._first_seq + first, device_us, self._film.frames(first, n, self.frame_ns), flags
+            self._first_seq + first,
+            device_us,
+            self._film.frames(first, n, self.frame_ns, self._finger),
+            flags,
         )

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from appliance.bundle import bundle
+from appliance.core import fingers
 from appliance.core.clock import Clock
 from appliance.core.config import Config
 from appliance.core.errors import ApplianceError, BundleError, ConfigError, FormatError
@@ -37,6 +38,7 @@ class TeachingFailed(ApplianceError):
 
 def check_allowed(settings: Config) -> None:
     """Raises ConfigError if this box may not or cannot be taught."""
+    fingers.refuse(settings.skins, "teach")
     if not settings.teach.allow:
         raise ConfigError(
             "teach.allow = false forbids teaching on this box; set it to true, or deploy a bundle"

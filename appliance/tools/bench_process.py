@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack, suppress
 from itertools import cycle
 from pathlib import Path
@@ -26,7 +26,9 @@ if TYPE_CHECKING:
     from appliance.sim import devices, rig
 
 MEMORY_SWEEPS, STREAM_S = 1000, 15.0
-NAMES = ("memory", "stream")
+NAMES = ("memory", "stream", "hand")
+HANDS = (1, 2, 4)
+"""Numbers of skins whose processor time is compared."""
 
 
 class Build(Protocol):
@@ -52,17 +54,32 @@ def write_acts(path: Path, acts: Iterable[rig.Act]) -> None:
 
 def measure(name: str, format: SweepFormat, build: Build, path: Path) -> dict[str, Any]:
     """The part `name` of NAMES, measured in this process, which repeats the acts in `path`."""
-    return {"memory": _memory, "stream": _stream}[name](format, build, path)
+    parts = {"memory": _memory, "stream": _stream, "hand": _hand}
+    return parts[name](format, build, path)
 
 
-def _board(format: SweepFormat, path: Path, clock: Clock | None = None) -> devices.SimDevices:
-    """Devices that play the acts in `path`; in virtual time without a clock."""
+def _board(
+    format: SweepFormat, path: Path, clock: Clock | None = None, fingers: Sequence[str] = ()
+) -> devices.SimDevices:
+    """Devices that play the acts in `path`; in virtual time without a clock. fingers: each has a
+    board, which plays the same frames."""
     from appliance.sim import devices, rig
 
     with np.load(path, allow_pickle=False) as z:
-        acts = [rig.Act(z[key], int(key.split()[1]), int(key.split()[2]), "") for key in z]
+        played = ((z[key], *map(int, key.split()[1:])) for key in z)
+        acts = [
+            rig.Act(frames, start, stop, "", others=(frames,) * (len(fingers) - 1))
+            for frames, start, stop in played
+        ]
     # the simulator's memory of acts is not part of the box
-    return devices.build(format, cycle(acts), clock or rig.VirtualClock(), "sim", remember=False)
+    return devices.build(
+        format,
+        cycle(acts),
+        clock or rig.VirtualClock(),
+        "sim",
+        remember=False,
+        fingers=dict.fromkeys(fingers, format),
+    )
 
 
 def drain(far_end: int) -> None:
@@ -106,19 +123,36 @@ def _rss_mb() -> float:
 def _stream(format: SweepFormat, build: Build, path: Path) -> dict[str, Any]:
     """Share of one core while the skin streams in real time, with and without the simulated readout
     board."""
-    simulated = _board(format, path, SystemClock())
+    box, whole = _shares(_board(format, path, SystemClock()), build)
+    return {"cpu_share_streaming": box, "cpu_share_with_simulated_board": whole}
+
+
+def _hand(format: SweepFormat, build: Build, path: Path) -> dict[str, Any]:
+    """Share of one core by number of skins, without the simulated readout boards."""
+    shares = {}
+    for n in HANDS:
+        fingers = [f"finger-{i}" for i in range(n)] if n > 1 else []
+        shares[str(n)] = _shares(_board(format, path, SystemClock(), fingers), build)[0]
+    return {"cpu_share_by_skins": shares}
+
+
+def _shares(simulated: devices.SimDevices, build: Build) -> tuple[float, float]:
+    """Share of one core while the skins stream, without and with the simulated readout boards."""
     board_ns = 0
-    real_read = simulated.backend.bulk_read
 
-    def timed_read(*args: Any) -> int:
-        nonlocal board_ns
-        start = time.thread_time_ns()
-        try:
-            return real_read(*args)
-        finally:
-            board_ns += time.thread_time_ns() - start
+    def timed(read: Callable[..., int]) -> Callable[..., int]:
+        def timed_read(*args: Any) -> int:
+            nonlocal board_ns
+            start = time.thread_time_ns()
+            try:
+                return read(*args)
+            finally:
+                board_ns += time.thread_time_ns() - start
 
-    simulated.backend.bulk_read = timed_read  # type: ignore[assignment]
+        return timed_read
+
+    for bus in simulated.buses.values() or [simulated.backend]:
+        bus.bulk_read = timed(bus.bulk_read)  # type: ignore[method-assign]
     with ExitStack() as stack:
         box, far_end = build(simulated, stack)
         box.step()
@@ -127,8 +161,4 @@ def _stream(format: SweepFormat, build: Build, path: Path) -> dict[str, Any]:
             box.step()
             drain(far_end)
         wall_ns, cpu_ns = wall_ns + time.monotonic_ns(), cpu_ns + time.process_time_ns()
-    box_ns = cpu_ns - board_ns
-    return {
-        "cpu_share_streaming": round(box_ns / wall_ns, 4),
-        "cpu_share_with_simulated_board": round(cpu_ns / wall_ns, 4),
-    }
+    return round((cpu_ns - board_ns) / wall_ns, 4), round(cpu_ns / wall_ns, 4)

@@ -56,7 +56,8 @@ class WatchedBox:
         """Raw counts of the last sweep, None before the first sweep."""
         self.rate_hz = 1.0
         self._latencies_ms: deque[float] = deque(maxlen=LATENCIES)
-        self._lowest: Any = None
+        self._lowest: dict[str, Any] = {}  # by finger, as _loads
+        self._loads: dict[str, tuple[Any, ...]] = {}
 
     def take(self, line: Mapping[str, Any]) -> None:
         """Take a line of the feed. Lines of an unknown type are ignored: a later version may send
@@ -106,7 +107,7 @@ class WatchedBox:
             "format": str(format),
             "labels": [str(displays.get(label, label)) for label in line["labels"]],
         }
-        self.load, self.full, self._lowest = (), 1.0, None
+        self.load, self.full, self._lowest, self._loads = (), 1.0, {}, {}
         self.window, self.rate_hz = None, format.rate_hz
 
     def _take_health(self, line: Mapping[str, Any]) -> None:
@@ -135,11 +136,12 @@ class WatchedBox:
         counts = np.array(line["taxels"], np.float64)  # None becomes NaN
         if counts.ndim not in (2, 3) or not counts.size:
             raise ValueError(f"taxels of shape {counts.shape}")
-        counts = counts.reshape(*counts.shape[:2], -1)
-        self._lowest = counts if self._lowest is None else np.fmin(self._lowest, counts)
-        load = np.nan_to_num(counts - self._lowest)
+        counts, finger = counts.reshape(*counts.shape[:2], -1), str(line.get("finger", ""))
+        lowest = self._lowest[finger] = np.fmin(self._lowest.get(finger, counts), counts)
+        load = np.nan_to_num(counts - lowest)
         self.full = max(self.full, float(load.max()))
-        self.load = tuple(np.moveaxis(load, -1, 0).tolist())
+        self._loads[finger] = tuple(np.moveaxis(load, -1, 0).tolist())
+        self.load = tuple(one for maps in self._loads.values() for one in maps)
 
     def _take_sweep(self, line: Mapping[str, Any]) -> None:
         if line["dtype"] not in DATA_TYPES or len(line["shape"]) not in (3, 4):

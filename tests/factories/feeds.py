@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import select
 import socket
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -94,9 +95,16 @@ class FeedPeer:
 
 
 class Offered:
-    """A feed whose turns a test takes. cost_ns: processor time of each look at the sockets."""
+    """A feed whose turns a test takes. cost_ns: processor time of each look at the sockets. hand:
+    formats of the fingers."""
 
-    def __init__(self, path: Path, format: SweepFormat = skin.FORMAT, **facts: Any) -> None:
+    def __init__(
+        self,
+        path: Path,
+        format: SweepFormat = skin.FORMAT,
+        hand: Sequence[SweepFormat] = (),
+        **facts: Any,
+    ) -> None:
         self.path, self.clock = path, rig.VirtualClock()
         known = {
             "source": "usb",
@@ -105,7 +113,9 @@ class Offered:
             "skin": "palpate",
         }
         self.cost_ns = self._spent_ns = 0
-        self.feed = FeedServer(path, format, known, self.clock, lambda: facts, self._spent)
+        self.feed = FeedServer(
+            path, format, known, self.clock, lambda: facts, self._spent, fingers=hand
+        )
 
     def turns(
         self, n: int = 1, health: Health = HEALTH, step_s: float = PERIOD_NS / SECOND

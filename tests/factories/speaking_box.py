@@ -56,6 +56,14 @@ def result(
     )
 
 
+def finger(
+    name: str, sweep: int, status: str = "ok", label: str = "wood", probability: str = "0.900"
+) -> bytes:
+    """A FIN sentence."""
+    fields = (name, sweep, "9.500", status, label, probability, "0.800", 1, 0, "1.25")
+    return sentence("FIN", *fields, "9f3c2a1b", "sim", "1.00", "")
+
+
 def obeying(heard: Sentence) -> list[bytes]:
     """The answers of a box without faults: STOP ends a sweep, which is answered `ok`."""
     fields: tuple[object, ...] = {"STATE": STREAMING, "ID": IDENTITY, "TARE": ("16 taxels",)}.get(

@@ -51,7 +51,7 @@ class SerialCell(Cell):
     def __init__(self, machine: Guest, folder: Path) -> None:
         super().__init__(machine, seed=5)
         self.acts = known(script.tubes(5))
-        reel = Reel(rig.Film(skin.FORMAT, self.hand), skin_profile.load("matrix", [PROFILES]))
+        reel = Reel(rig.Film(self.hand, skin.FORMAT), skin_profile.load("matrix", [PROFILES]))
         self.player = Player(wire("matrix", skin.FORMAT.rate_hz), reel, self.clock, folder / "line")
         self._hold, self._ended, self._plugged = threading.Lock(), threading.Event(), False
         self._playing = threading.Thread(target=self._play, daemon=True)

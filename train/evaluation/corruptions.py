@@ -20,7 +20,7 @@ from scipy.ndimage import map_coordinates
 
 from appliance.core.errors import FormatError
 from appliance.core.types import Frames, digitized
-from appliance.recording import sweep_window
+from appliance.recording import frame_ring
 from appliance.sim import skin
 from train.evaluation.evaluation_sweeps import EvaluationSweeps, SimulatedScene
 
@@ -233,12 +233,12 @@ def _lost(x: Array, share: float, rng: Generator, test: EvaluationSweeps) -> Arr
     lost = rng.random(x.shape[:2]) < share
     lost[:, [0, -1]] = False  # the box also has the frames around the window
     # the box refuses a sweep with more lost frames in a row
-    for t in range(sweep_window.MAX_GAP, x.shape[1]):
-        lost[:, t] &= ~lost[:, t - sweep_window.MAX_GAP : t].all(axis=1)
+    for t in range(frame_ring.MAX_GAP, x.shape[1]):
+        lost[:, t] &= ~lost[:, t - frame_ring.MAX_GAP : t].all(axis=1)
     number = np.arange(x.shape[1])
     for taxels, missing in zip(x, lost, strict=True):
         frames = Frames(number.copy(), number, taxels)
-        sweep_window.interpolate(frames, np.flatnonzero(~missing), np.flatnonzero(missing))
+        frame_ring.interpolate(frames, np.flatnonzero(~missing), np.flatnonzero(missing))
     return x
 
 

@@ -78,7 +78,7 @@ def build(
     playing = PlayerClock(clock)
     robot, lines = robot_on_lines(acts, playing, remember=remember, follows=follows)
     folder = tempfile.TemporaryDirectory()
-    reel = Reel(rig.Film(format, robot), profile)
+    reel = Reel(rig.Film(robot, format), profile)
     player = Player(wire(name, format.rate_hz), reel, playing, Path(folder.name) / "ttySkin")
     playing.player = player
     return PlayedDevices(

@@ -38,7 +38,7 @@ from appliance.core.status import Status
 from tests.factories import speaking_box
 from tests.factories.bridges import LONG_S, RawModbus, bridge, eventually, page_blocks
 from tests.factories.paths import ROOT
-from tests.factories.speaking_box import LABELS, SpeakingBox, obeying, result, state
+from tests.factories.speaking_box import LABELS, SpeakingBox, finger, obeying, result, state
 
 Address = tuple[str, int]
 START, STOP, NEW = (COILS.index(name) for name in ("START", "STOP", "NEW"))
@@ -124,12 +124,35 @@ MEASURED_AT = 42
 def test_the_measured_slide_is_read(
     box: SpeakingBox, raw: RawModbus, optional: tuple[object, ...], words: list[int]
 ):
-    """The last two registers: tenths of mm/s, and a code for each direction; 0 where RES has no
+    """Two registers: tenths of mm/s, and a code for each direction; 0 where RES has no
     speed, or a direction of a later version. They are refused to writers."""
     box.say(result(1, optional=optional))
     eventually(lambda: word(raw, "answers") == 1)
     assert raw.registers(MEASURED_AT, 2) == words
     assert modbus.SLIDE_AT + len(modbus.SLIDE) == MEASURED_AT
+
+
+FINGERS_AT = 44
+
+
+def test_the_fingers_are_read(box: SpeakingBox, raw: RawModbus):
+    """Their number, then name, status, label code and probability of each; 0 where there is none,
+    and after the next answer of a box with one skin."""
+    box.say(finger("left", 1, "ok", "paper"))
+    box.say(finger("right", 1, "no-contact", "", "0.000"))
+    box.say(result(1, label="paper"))
+    eventually(lambda: word(raw, "answers") == 1)
+    eventually(lambda: word(raw, "label code") == 2)
+    found = raw.registers(FINGERS_AT, 1 + 4 * 7)
+    assert found[0] == 2
+    assert b"".join(w.to_bytes(2, "big") for w in found[1:5]) == b"left\0\0\0\0"
+    assert found[5:8] == [STATUS_CODES[Status.OK], 2, 900]
+    assert b"".join(w.to_bytes(2, "big") for w in found[8:12]) == b"right\0\0\0"
+    assert found[12:15] == [STATUS_CODES[Status.NO_CONTACT], 0, 0]
+    assert found[15:] == [0] * 14
+    box.say(result(2))
+    eventually(lambda: word(raw, "answers") == 2)
+    assert raw.registers(FINGERS_AT, 1 + 4 * 7) == [0] * 29
 
 
 def test_another_client_sweeps(box: SpeakingBox, raw: RawModbus, address: Address):
@@ -495,7 +518,7 @@ def test_the_document_has_the_map():
     """docs/robots/modbus.md lists each register, input, coil and code as the code has them."""
     text = (ROOT / "docs" / "robots" / "modbus.md").read_text()
     rows = re.findall(
-        r"^\| (\d+)(?:, \d+| to \d+)? \| `([a-z ]+)` \|",
+        r"^\| (\d+)(?:, \d+| to \d+)? \| `([a-z0-9 ]+)` \|",
         text.partition("## Discrete inputs")[0],
         re.M,
     )
@@ -504,9 +527,14 @@ def test_the_document_has_the_map():
     ]
     last = [name.partition("_")[0] for name in modbus.SLIDE]
     last += [register.name for register in modbus.MEASURED]
-    assert [(int(at), name) for at, name in rows if name not in ADDRESSES] == [
-        (modbus.SLIDE_AT + i, name) for i, name in enumerate(last)
-    ]
+    more = [(modbus.SLIDE_AT + i, name) for i, name in enumerate(last)]
+    at = modbus.SLIDE_AT + len(last)
+    for register in modbus.FINGERS[:5]:  # of the first finger; the text has the rule for the others
+        more.append((at, register.name))
+        at += register.words
+    assert [(int(at), name) for at, name in rows if name not in ADDRESSES] == more
+    assert modbus.FINGERS[5].name == "finger 2"
+    assert f"from {at} on" in text
     assert re.findall(
         r"^\| \d+ \| `([a-z]+)` \|",
         text.partition("Discrete inputs")[2].partition("Coils")[0],

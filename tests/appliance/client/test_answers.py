@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -12,8 +13,9 @@ from appliance.core import sentences
 from appliance.core.errors import FormatError
 from appliance.core.status import Status
 from appliance.core.types import Verdict
-from appliance.io.robot_link import result
+from appliance.io.robot_link import result, results
 from tests.factories import speaking_box
+from tests.factories.paths import ROOT
 
 
 def verdict(status: Status, detail: str = "", share: float = 1.0) -> Verdict:
@@ -44,6 +46,45 @@ def test_an_answer_survives_its_sentence(status: Status):
     assert read == Answer(
         7, 1.0, status, label, 0.9, 0.8, 2, 1, 1.25, "9f3c2a1b", "usb", 1.0, "moved 2.1 mm"
     )
+
+
+def test_the_answer_of_a_finger_survives_its_sentence():
+    """FIN is RES with the finger in front of its fields; `read` takes RES alone."""
+    of = replace(verdict(Status.OK, "moved"), finger="left", measured_mm_s=30.5, direction="rows+")
+    whole = replace(verdict(Status.OK), fingers=(of, replace(of, finger="right")))
+    left, right, hand = (sentences.read(line.strip()) for line in results(whole, "usb"))
+    assert [left.kind, right.kind, hand.kind] == ["FIN", "FIN", "RES"]
+    answer = Answer.of_finger(left.fields)
+    assert (answer.finger, answer.label, answer.detail) == ("left", "wood", "moved")
+    assert (answer.measured_mm_s, answer.direction) == (30.5, "rows+")
+    assert replace(answer, finger="") == Answer.of(left.fields[1:])
+    assert Answer.read(result(of, "usb").decode()) is None
+    assert Answer.of_finger(right.fields).finger == "right"
+    with pytest.raises(FormatError, match="RES"):
+        Answer.of_finger(["left"])
+
+
+@pytest.mark.parametrize(
+    "page", ["docs/how-to/use-two-fingertips.md", "docs/reference/sentences.md"]
+)
+def test_the_fingers_of_the_pages_can_be_read(page: str):
+    """Each FIN of the documents has its sum and all fields."""
+    lines = re.findall(r"\$PPLP,FIN,[^\n]*", (ROOT / page).read_text())
+    found = [sentences.read(line.encode()) for line in lines]
+    assert found
+    assert all(one.summed for one in found)
+    assert {Answer.of_finger(one.fields).finger for one in found} <= {"left", "right"}
+
+
+def test_a_finger_with_the_longest_name_keeps_all_its_fields():
+    """A label of 24 characters, a name of 8: the sentence is not cut before the detail."""
+    longest = replace(
+        verdict(Status.UNSURE), sweep=99999, label="w" * 24, finger="f" * 8, time_ns=10**14
+    )
+    line = result(longest, "replay")
+    assert len(line) <= sentences.MAX_LINE
+    found = Answer.of_finger(sentences.read(line.strip()).fields)
+    assert (found.label, found.source, found.share) == ("w" * 24, "replay", 1.0)
 
 
 def test_a_field_more_is_the_loss_that_cannot_be_seen():

@@ -22,7 +22,7 @@ from appliance.core.errors import ApplianceError, CommandRefused, FormatError, L
 from appliance.core.sentences import Sentence, sentence
 from appliance.core.status import Status
 from tests.factories.paths import ROOT
-from tests.factories.speaking_box import LABELS, SpeakingBox, obeying, result, state
+from tests.factories.speaking_box import LABELS, SpeakingBox, finger, obeying, result, state
 
 LONG_S = 30.0
 """A deadline that nothing reaches."""
@@ -93,6 +93,24 @@ def test_an_answer_waits_until_it_is_asked_for(speaking: SpeakingBox, box: Palpa
     """Two answers that come before anyone asks are given in their order."""
     speaking.say(result(1), result(2, "unsure"))
     assert [box.result(LONG_S).status, box.result(LONG_S).status] == [Status.OK, Status.UNSURE]
+
+
+def test_the_answer_of_a_hand_has_those_of_its_fingers(speaking: SpeakingBox, box: Palpate):
+    """FIN sentences before a RES belong to it if they are of its sweep. The next answer has none of
+    them, and they do not count as answers."""
+    speaking.say(finger("left", 6))
+    speaking.say(finger("left", 7))
+    speaking.say(finger("right", 7, "no-contact", "", "0.000"))
+    speaking.say(result(7))
+    answer = box.result(LONG_S)
+    assert [(f.finger, f.sweep, f.status, f.label) for f in answer.fingers] == [
+        ("left", 7, "ok", "wood"),
+        ("right", 7, "no-contact", ""),
+    ]
+    assert answer.finger == ""
+    speaking.say(result(8))
+    assert box.result(LONG_S).fingers == ()
+    assert box.damaged == 0
 
 
 def test_an_old_answer_is_not_taken_for_a_new_one(speaking: SpeakingBox, box: Palpate):

@@ -23,6 +23,7 @@ from appliance.inference.classifier import Classifier
 from appliance.inference.early_exit import EarlyExit, decides
 from appliance.io.robot_link import StdoutPort
 from appliance.recording.capture import CaptureWriter, Playback
+from appliance.recording.frame_ring import FrameRing
 from appliance.recording.sweep_window import SweepCutter
 from appliance.runtime import assembly
 from appliance.runtime.loop import Box, Pipeline
@@ -323,10 +324,10 @@ def test_one_run_of_the_graph_at_each_step(
     """
     asked: list[int] = []
     looked: list[int] = []
-    heads, look = Classifier.unfinished, SweepCutter._seq_at
+    heads, look = Classifier.unfinished, FrameRing.seq_at
     monkeypatch.setattr(
-        SweepCutter,
-        "_seq_at",
+        FrameRing,
+        "seq_at",
         lambda self, t_ns: looked.append(box.box.answered) or look(self, t_ns),
     )
     monkeypatch.setattr(

@@ -302,7 +302,7 @@ def test_an_object_without_end_takes_no_more_memory_or_time(toy: Bundle, fusion:
         last = it.conclude(replace(toy_bundle.sweep(0, 0), id=n, object=1), own, Touched())
         given.append(own)
         if n in (2, 20_000):
-            sizes.append(len(pickle.dumps(it._sweeps.evidence)))
+            sizes.append(len(pickle.dumps(it._objects.present.evidence)))
     assert sizes[1] <= sizes[0] + 32
     assert last.fused == 20_000
     if fusion == "product":

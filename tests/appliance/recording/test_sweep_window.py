@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from appliance.core.config import SweepConfig
 from appliance.core.types import EPOCH_BITS, Edge, EdgeKind, Frames, Status, Sweep, SweepFormat
-from appliance.recording.sweep_window import MAX_GAP, SweepCutter
+from appliance.recording.frame_ring import MAX_GAP
+from appliance.recording.sweep_window import SweepCutter
 from appliance.sim import skin
 from tests.factories.simulated_box import SECOND, numbered
 
@@ -109,7 +110,7 @@ def test_every_axis_is_interpolated():
         4
     ).reshape(2, 2, 1)
     bench.put(
-        Frames(*(np.delete(getattr(whole, name), [200, 201], axis=0) for name in Frames.__slots__))
+        Frames(*(np.delete(x, [200, 201], axis=0) for x in (whole.t_ns, whole.seq, whole.taxels)))
     )
     bench.edge(EdgeKind.START, 100)
     bench.edge(EdgeKind.STOP, 300)

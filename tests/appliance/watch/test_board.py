@@ -241,3 +241,42 @@ def test_a_line_that_is_not_as_it_must_be_is_refused(board: PageBoard, line: dic
     board.take(HELLO)
     board.take(feed_lines.health(3.0))
     frames(board, 4.0, 1.5, 1.5)
+
+
+HANDS = {"left": {}, "right": {}}
+"""Of the first line of a box with two fingers; the page needs the names alone."""
+
+
+def test_a_hand_has_the_answers_of_its_fingers_and_the_skin_of_the_first(events: Events):
+    """The words for each finger stand in the verdict. Frames and windows of the second finger are
+    not drawn."""
+    board = PageBoard(events)
+    board.take(feed_lines.hello(fingers=HANDS))
+    board.take(feed_lines.health(1.0))
+    fingers = [
+        {"finger": "left", "label": "wood", "probability": 0.912, "status": "ok"},
+        {"finger": "right", "label": "", "probability": 0.0, "status": "no-contact"},
+    ]
+    board.take(feed_lines.verdict(1, 2.0, fingers=fingers))
+    assert events.of("verdict")[0]["fingers"] == "left wood 91.2 %, right no-contact"
+    at_first = feed_lines.frame(3.0, feed_lines.load(1, 1))
+    board.take(at_first | {"finger": "right", "taxels": [[1, 2]]})
+    board.take(feed_lines.sweep(1) | {"finger": "right"})
+    assert not events.of("view")
+    assert not events.of("signal")
+    board.take(at_first | {"finger": "left"})
+    board.take(feed_lines.sweep(1) | {"finger": "left"})
+    assert len(events.of("view")) == len(events.of("signal")) == 1
+
+
+def test_a_box_with_one_skin_has_no_fingers(board: PageBoard, events: Events):
+    """Neither in a verdict nor in a frame."""
+    board.take(feed_lines.verdict(1, 2.0))
+    assert "fingers" not in events.of("verdict")[0]
+
+
+@pytest.mark.parametrize("fingers", [3, [3], [{"finger": "left"}], [{"label": 3}]])
+def test_fingers_that_are_none_are_refused(board: PageBoard, fingers: object):
+    """With the type of the line."""
+    with pytest.raises(FormatError, match="'verdict' does not fit"):
+        board.take(feed_lines.verdict(1, 2.0, fingers=fingers))

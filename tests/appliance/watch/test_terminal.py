@@ -329,3 +329,20 @@ def test_a_feed_that_is_off_cannot_be_watched(capsys: pytest.CaptureFixture[str]
     """The message names the setting."""
     assert main(["watch", "--set", "store.runtime="]) == ConfigError.exit_code
     assert 'store.runtime = "" turns the feed off' in capsys.readouterr().err
+
+
+def test_the_skins_of_all_fingers_are_drawn(tmp_path: Path):
+    """Each above its own lowest counts, side by side in the order of their first frames."""
+    box = WatchedBox()
+    for line in lines_of(tmp_path):
+        if line["type"] in ("hello", "health"):
+            box.take(line)
+    low, high = [[10, 20], [30, 40]], [[11, 22], [33, 44]]
+    box.take({"type": "frame", "time_ns": 1, "taxels": low, "finger": "left"})
+    box.take({"type": "frame", "time_ns": 1, "taxels": [[5, 5, 5]], "finger": "right"})
+    box.take({"type": "frame", "time_ns": 2, "taxels": high, "finger": "left"})
+    box.take({"type": "frame", "time_ns": 2, "taxels": [[5, 6, 7]], "finger": "right"})
+    assert box.load == ([[1, 2], [3, 4]], [[0, 1, 2]])
+    assert box.full == 4
+    drawn = picture(box, 0, 100, 30, colours=False)
+    assert len(drawn) > 5
