@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from appliance.core.errors import FormatError
 from appliance.core.names import shown
 from appliance.core.types import DATA_TYPES
-from train.data import frames, labels, lerobot, raw_files, readers, sampling
+from train.data import frames, labels, lerobot, number_types, raw_files, readers, sampling
 from train.data.file_names import NamePattern, group
 from train.data.files.table import MOST_LISTED, ReadPlan, Table, normal, printable
 from train.data.import_plan import ImportPlan
@@ -246,7 +246,7 @@ def _episodes(folder: Path, plan: ImportPlan) -> Iterator[Source]:
 def _recordings(table: Table, name: str, known: Fields, plan: ImportPlan) -> list[Recording]:
     """The recordings in a table; several if a column of --field changes its value."""
     counts, time_s, notes = frames.frames(table, plan)
-    counts = _compact(counts)
+    counts = number_types.compact(counts)
     parts = frames.fields(table, plan.fields, len(counts))
     made = []
     for part, found in parts:
@@ -274,16 +274,6 @@ def _check_order(
             f"has the column {here!r} where another file has {there!r}; "
             "give the order of the taxels with --columns and their names"
         )
-
-
-def _compact(counts: Array) -> Array:
-    """Whole counts in float64, as of text, as int32, which is not a type of a set: _common_type
-    still chooses that. Other counts stay as they are."""
-    limits = np.iinfo(np.int32)
-    if counts.dtype != np.float64 or counts.min() < limits.min or counts.max() > limits.max:
-        return counts
-    whole = counts.astype(np.int32)
-    return whole if np.array_equal(whole, counts) else counts
 
 
 def _without_copies(cuts: Sequence[Cut], left_out: list[LeftOut]) -> tuple[list[Cut], list[str]]:
@@ -395,19 +385,23 @@ def _common_type(cuts: Sequence[Cut], wanted: str, left_out: list[LeftOut]) -> t
     """
     if wanted:
         for cut in cuts:
-            if why := _why_not(cut.windows, wanted):
+            if why := number_types.why_not(cut.windows, wanted):
                 left_out.append(LeftOut(cut.recording.name, why, broken=True))
         return wanted, f"counts are {wanted}, as --dtype says"
     recorded = {cut.windows.dtype.name for cut in cuts}
     if len(recorded) == 1 and recorded <= set(DATA_TYPES):
         return recorded.pop(), "counts are as recorded"
     for cut in cuts:
-        if all(reasons := [_why_not(cut.windows, name) for name in DATA_TYPES]):
+        if all(reasons := [number_types.why_not(cut.windows, name) for name in DATA_TYPES]):
             left_out.append(LeftOut(cut.recording.name, reasons[-1], broken=True))
     out = {file.name for file in left_out}
     kept = [cut.windows for cut in cuts if cut.recording.name not in out]
     name = next(
-        (name for name in DATA_TYPES if not any(_why_not(windows, name) for windows in kept)),
+        (
+            name
+            for name in DATA_TYPES
+            if not any(number_types.why_not(windows, name) for windows in kept)
+        ),
         "float32",
     )
     if not kept:
@@ -418,34 +412,6 @@ def _common_type(cuts: Sequence[Cut], wanted: str, left_out: list[LeftOut]) -> t
         f"counts from {low:g} to {high:g} fit {name}; "
         "if the skin announces another type, name it with --dtype",
     )
-
-
-def _why_not(counts: Array, dtype: str) -> str:
-    """The reason why a data type cannot hold these counts, or "" if it can.
-
-    float32 may round fractions, but must hold whole numbers exactly.
-    """
-    kind = np.dtype(dtype)
-    if counts.dtype == kind:
-        return ""
-    low, high = (
-        (-np.finfo(kind).max, np.finfo(kind).max)
-        if kind.kind == "f"
-        else (np.iinfo(kind).min, np.iinfo(kind).max)
-    )
-    bad = (counts < low) | (counts > high)
-    what = f"{dtype} holds {low:g} to {high:g}"
-    if not bad.any() and kind.kind != "f":
-        bad, what = counts % 1 != 0, f"{dtype} holds whole numbers"
-    elif not bad.any():
-        bad, what = (
-            (counts % 1 == 0) & (counts.astype(kind) != counts),
-            f"{dtype} would round it; subtract an offset",
-        )
-    if not bad.any():
-        return ""
-    value = counts[tuple(np.argwhere(bad)[0])]
-    return f"a count is {value:.17g}, and {what}"
 
 
 def _set(

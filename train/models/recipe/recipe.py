@@ -296,8 +296,8 @@ def judged_size(
 def candidates(fixed: FixedFeatures, setup: Setup) -> Candidates:
     """Step 2: the heads to choose from."""
     groups = bool((setup.held_out_scores.groups != "recording").any())
-    loads = groups and setup.settings.size.loads
-    return Candidates(fixed.columns, setup.settings.use.reattached, loads)
+    reattached, size = setup.settings.use.reattached, setup.settings.size
+    return Candidates(fixed.columns, reattached, groups and size.loads)
 
 
 def judge(heads: Candidates, fixed: FixedFeatures, setup: Setup) -> HeadChoice:
@@ -403,10 +403,7 @@ def fixed_trunk(sweeps: Dataset, seed: int, mains_hz: float = MAINS_HZ) -> Trunk
     format, rng = sweeps.format, np.random.default_rng(seed)
     some = calibration_sweeps(sweeps.samples[rng.permutation(len(sweeps))])
     if not np.ptp(sweeps.samples, axis=1).any():
-        raise FormatError(
-            "every taxel of every sweep is constant; check the skin, nothing can be learnt from "
-            "this"
-        )
+        raise FormatError("every taxel of every sweep is constant; check the skin")
     scale = texture_scale(sweeps.samples)
     architecture = replace(
         FIXED,
