@@ -67,13 +67,8 @@ def _classify(args: argparse.Namespace, settings: Config, choice: Choice | None)
             "disk": lambda: disk.text,
             "unsigned": lambda: assembly.UNSIGNED if settings.classifier.allow_unsigned else "",
         }
-        observers: list[Observer | None] = [
-            disk,
-            Notifier(SystemClock()),
-            trial,
-            shadow,
-            *_reports(settings, current, of_fingers, devices.source, facts, stack, disk),
-        ]
+        reports = _reports(settings, current, of_fingers, devices.source, facts, stack, disk)
+        observers = disk, Notifier(SystemClock()), trial, shadow, *reports
         box = assembly.box(
             settings,
             current,

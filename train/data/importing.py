@@ -396,14 +396,8 @@ def _common_type(cuts: Sequence[Cut], wanted: str, left_out: list[LeftOut]) -> t
             left_out.append(LeftOut(cut.recording.name, reasons[-1], broken=True))
     out = {file.name for file in left_out}
     kept = [cut.windows for cut in cuts if cut.recording.name not in out]
-    name = next(
-        (
-            name
-            for name in DATA_TYPES
-            if not any(number_types.why_not(windows, name) for windows in kept)
-        ),
-        "float32",
-    )
+    holds = (d for d in DATA_TYPES if not any(number_types.why_not(w, d) for w in kept))
+    name = next(holds, "float32")
     if not kept:
         return name, ""
     low, high = min(windows.min() for windows in kept), max(windows.max() for windows in kept)
