@@ -26,6 +26,10 @@ MOST_MARK = 8
 such as a length may follow."""
 MOST_RUNS = 6
 """Most runs of constant bytes that are tried as marks."""
+MOST_BEFORE = 2
+"""Most constant bytes before a marker that belong to the number before it, in frames of up to SHORT
+bytes."""
+SHORT = 256
 AGAIN = 0.01
 """If a shorter distance repeats as many bytes, less this share, the shorter distance is the
 frame."""
@@ -85,7 +89,7 @@ def analyse(reads: Sequence[Read], values: int = 0) -> list[Proposal]:
         return []
     seconds = max((reads[-1].t_ns - reads[0].t_ns) / 1e9, 1e-9)
     if text_analysis.is_text(data):
-        found = _text(data, seconds)
+        found = _text(data, seconds, values)
         if found or (data.isascii() and len(data.splitlines()) > LEAST_FRAMES):
             return found  # hexadecimal digits, too, would have the pattern of a frame
     boundaries = np.cumsum([len(read.data) for read in reads])[:-1]
@@ -112,11 +116,11 @@ def grids(values: int) -> tuple[Grid, ...]:
     return tuple(found)
 
 
-def _text(data: bytes, seconds: float) -> list[Proposal]:
+def _text(data: bytes, seconds: float, wanted: int) -> list[Proposal]:
     """Formats of lines of numbers. Their type is the widest: a skin that rests sends neither signs
-    nor decimals."""
+    nor decimals. wanted: number of values, 0 for any."""
     made = []
-    for form in text_analysis.forms(data):
+    for form in text_analysis.forms(data, wanted):
         values = form.lines * form.values
         known = ((form.lines, form.values, 1),) if form.lines > 1 else ()
         fits = known + tuple(grid for grid in grids(values) if grid not in known)
@@ -245,7 +249,8 @@ def _marks(
     """(begin of frames, bytes of their marker, bytes of their trailer), the most likely first: of
     each run of constant bytes that can mark a frame.
 
-    Frames begin in a run where reads show it, else at the run's first byte. Zeros at the side of
+    Frames begin in a run where reads show it, else at one of the run's first bytes: a number at the
+    end of the frame before may rest, too. Zeros at the side of
     the values are left out: untouched taxels are zero, too.
     """
     length = len(constant)
@@ -254,8 +259,13 @@ def _marks(
         size = int(np.argmin(np.roll(constant, -first))) or length
         runs.append((first, size))
     runs.sort(key=lambda run: -np.count_nonzero(np.roll(usual, -run[0])[: run[1]]))
-    for first, size in runs[:MOST_RUNS]:
-        inner = 0 if begin is None else (begin - first) % length
+    most = MOST_BEFORE if length <= SHORT else 0  # each place takes its time
+    starts = [
+        (first, size, inner)
+        for first, size in runs[:MOST_RUNS]
+        for inner in (range(min(size, most + 1)) if begin is None else [(begin - first) % length])
+    ]
+    for first, size, inner in starts:
         if inner > size:
             continue
         text = np.roll(usual, -first)[:size]

@@ -19,6 +19,8 @@ SHARE = 0.8
 FEW_STEPS = 0.85
 """Share of the variance of a rising column that a straight line explains. Whole seconds over a
 sample of three seconds reach 0.89."""
+JUMPS = 0.2
+"""Mean step of a column that jumps, as a part of its range; a third is expected of chance."""
 _TEXT = frozenset(range(32, 127)) | frozenset(b"\t\r\n")
 _COMMA_NUMBER = re.compile(rb"[+-]?[0-9]+(?:,[0-9]+)?")
 _SHOWN = 60
@@ -44,8 +46,9 @@ def is_text(data: bytes) -> bool:
     return others <= 0.02 * len(data) and high <= 0.1 * len(data)
 
 
-def forms(data: bytes) -> list[TextForm]:
-    """Possible forms of the lines, the most likely first."""
+def forms(data: bytes, wanted: int = 0) -> list[TextForm]:
+    """Possible forms of the lines, the most likely first. wanted: numbers of a frame that are used,
+    beside others on their lines; 0 for any."""
     found = []
     for decimal in _decimals(data):
         end = "\n" if b"\n" in data else "\r"
@@ -55,7 +58,7 @@ def forms(data: bytes) -> list[TextForm]:
             if closes(line):
                 lines.append(([], ""))
         keys: dict[str, Any] = {"decimal": decimal} if decimal != "." else {}
-        found += list(_forms(lines, keys | ({"line_end": end} if end != "\n" else {})))
+        found += list(_forms(lines, keys | ({"line_end": end} if end != "\n" else {}), wanted))
     return found
 
 
@@ -85,7 +88,9 @@ def _decimals(data: bytes) -> tuple[str, ...]:
     return (",", ".") if b";" in data or b"\t" in data else (".", ",")
 
 
-def _forms(lines: list[tuple[list[bytes], str]], keys: dict[str, Any]) -> Iterator[TextForm]:
+def _forms(
+    lines: list[tuple[list[bytes], str]], keys: dict[str, Any], wanted: int
+) -> Iterator[TextForm]:
     """Forms of lines: a line is a frame, or several lines that end with another line."""
     counted = Counter((len(words), around) for words, around in lines if words)
     if len(lines) < LEAST_FRAMES or not counted:
@@ -108,7 +113,10 @@ def _forms(lines: list[tuple[list[bytes], str]], keys: dict[str, Any]) -> Iterat
         [_floats(words) for (words, _), row in list(zip(lines, rows, strict=True))[begin:] if row]
     )
     skips = _skipped(table, height)
-    for skip in [skips, ()] if skips and len(skips) < usual else [()]:
+    ways = [skips, ()] if skips and len(skips) < usual else [()]
+    if wanted % height == 0 and 0 < wanted // height < usual:
+        ways = [_beside(table, wanted // height)]
+    for skip in ways:
         more = {"skip_columns": list(skip)} if skip else {}
         yield TextForm(height, usual - len(skip), frames, often / alike, keys | more)
 
@@ -137,6 +145,22 @@ def _skipped(table: NDArray[np.float64], height: int) -> tuple[int, ...]:
     ahead = max((i + 1 for i in range(first) if time[i]), default=0)
     behind = min((i for i in range(last + 1, columns) if time[i]), default=columns)
     return tuple(i for i in range(columns) if i < ahead or i >= behind or time[i])
+
+
+def _beside(table: NDArray[np.float64], count: int) -> tuple[int, ...]:
+    """The columns beside `count` neighbours that are the taxels: those that rest, rise as time
+    does or jump as a checksum does, as far as they fit."""
+    columns = table.shape[1]
+    strange = np.array([_is_strange(column) for column in table.T])
+    inside = [int(strange[at : at + count].sum()) for at in range(columns - count + 1)]
+    first = int(np.argmin(inside))
+    return tuple(i for i in range(columns) if not first <= i < first + count)
+
+
+def _is_strange(column: NDArray[np.float64]) -> bool:
+    """Whether a column is not like the load of a taxel, which changes a little at a time."""
+    steps = np.abs(np.diff(column)).mean()
+    return bool(_rises(column) or np.ptp(column) == 0 or steps > JUMPS * np.ptp(column))
 
 
 def _rises(column: NDArray[np.float64]) -> bool:

@@ -53,7 +53,7 @@ class Classification:
 
 @dataclass
 class PublishingNode:
-    """A node that keeps what is published, by topic."""
+    """A node that keeps its messages by topic."""
 
     heard: dict[str, list[Any]] = field(default_factory=dict)
     qualities: dict[str, Any] = field(default_factory=dict)

@@ -251,3 +251,44 @@ def test_one_touched_number_of_16_bits_is_not_one_of_32() -> None:
     frames = [b"\xa5\x5a" + frame.astype("<u2").tobytes() for frame in values]
     found = analyse(reads(frames))
     assert {p.dtype for p in found} <= {"uint8", "uint16", "int16"}
+
+
+@pytest.mark.parametrize(
+    ("line", "skipped"),
+    [
+        (lambda i, row: f"{','.join(row)},{sum(map(int, row)) % 256}\n", [16]),
+        (lambda i, row: f"{','.join(row)},3.70V\n", [16]),
+        (lambda i, row: f'{{"n":{i},"rows":4,"cols":4,"v":[{",".join(row)}]}}\n', [0, 1, 2]),
+        (lambda i, row: f"{i * 10};{22 + i % 2}.5;{';'.join(row)};{i % 7}\n", [0, 1, 18]),
+    ],
+)
+def test_numbers_beside_the_taxels_of_a_text_are_found_by_the_grid(line, skipped) -> None:
+    """A checksum, a voltage, facts in JSON, a clock and a temperature: no proposal has 16 values,
+    and the grid tells that there are 16."""
+    rows = [[f"{v:.0f}" for v in frame] for frame in matrix(33, 120, 16, 900)]
+    frames = [line(i, row).encode() for i, row in enumerate(rows)]
+    heard = skin_new.PortSample(115_200, reads(frames, 64), skin_new.proposals(reads(frames, 64)))
+    chosen, grid = skin_new.choose(heard, "4x4", 0)
+    assert (chosen.values, chosen.keys["skip_columns"]) == (16, skipped)
+    text = skin_new.profile(chosen, grid, 115_200, skin_new.PortInfo(""))
+    found, _ = skin_new.decoded(text, reads(frames))
+    assert found >= 118
+
+
+@pytest.mark.parametrize("high", [0, 1])
+def test_a_number_that_rests_before_the_marker_does_not_shift_the_frames(high: int) -> None:
+    """The high byte of the last number is constant, and so looks like the marker's first byte; a
+    clock of eight bytes follows the marker."""
+    values = matrix(34, 150, 16, 900).astype(int)
+    values[:, -1] = 256 * high + values[:, -1] % 256
+    frames = [
+        b"\xaa\x55" + (10**12 + 10_000 * i).to_bytes(8, "little") + frame.astype("<u2").tobytes()
+        for i, frame in enumerate(values)
+    ]
+    best = first(skin_new.proposals(reads(frames, 64)))
+    assert (best.mark, best.values, best.dtype, best.big_endian) == (
+        b"\xaa\x55",
+        16,
+        "uint16",
+        False,
+    )

@@ -68,14 +68,14 @@ def plain(lines: Sequence[str]) -> PlainText:
 
 
 def _labelled(line: str) -> bool:
-    """Whether each number of a line has a label, but for the time before it."""
+    """Whether each number of a line has a label. A time before them needs none."""
     found = LABEL.findall(line)
     rest = LABEL.sub("", CLOCK.sub(r"\2", line))
     return len(found) > 1 and len(found) == len(re.findall(r"[-+.\w]*\d[-+.\w]*", rest))
 
 
 def _unlabelled(line: str, names: Sequence[str]) -> str:
-    """The line without its labels, if they are the usual ones in the usual order."""
+    """The line without its labels, if these are `names` in their order."""
     return LABEL.sub("", line) if tuple(LABEL.findall(line)) == names else line
 
 
@@ -95,8 +95,8 @@ def _unbracketed(line: str) -> str:
 
 @dataclass(frozen=True)
 class Rewriting:
-    """What is left out, whether a line shows it, and the line without it. seldom: it cannot be
-    anything else, so that a single line suffices."""
+    """A decoration. what: its name. shows: whether a line has it. rewrite: removes it. seldom: it
+    cannot be anything else, so a single line suffices."""
 
     what: str
     shows: Callable[[str], object]

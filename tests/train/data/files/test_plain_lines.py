@@ -49,7 +49,7 @@ def labelled(sign: str, mark: str) -> Callable[[list[int]], str]:
     ],
 )
 def test_decorations_are_left_out(tmp_path: Path, line: Callable[[list[int]], str], what: str):
-    """The numbers are read, and the remark names what was left out."""
+    """The numbers are read, and a remark names the decoration."""
     found = read(tmp_path, line)
     np.testing.assert_array_equal(found.values, SKIN)
     assert found.notes == ((what,) if what else ())
@@ -109,7 +109,7 @@ def test_comments_behind_numbers_and_with_slashes(tmp_path: Path):
 
 
 def spoilt(folder: Path, row: str) -> Path:
-    """Bracketed lines of which the eighth is `row`."""
+    """Bracketed lines; the eighth is `row`."""
     lines = [*map(str, SKIN.tolist())]
     lines[7] = row
     (folder / "a.txt").write_text("\n".join(lines))
