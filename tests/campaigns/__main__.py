@@ -231,6 +231,10 @@ CAMPAIGNS = {
         variables={"OMP_NUM_THREADS": "1"},
         nice=True,
     ),
+    "examples": Campaign(
+        "write the examples in docs/ again with a run of the packaged bundle (3 minutes)",
+        _module("tests.campaigns.examples"),
+    ),
     "fit-memory": Campaign(
         "measure peak memory and time of fit on 1,000 to 100,000 windows (docs/recipe.md)",
         _module("tests.campaigns.fit_memory"),
