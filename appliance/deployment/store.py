@@ -32,7 +32,13 @@ from appliance.bundle.bundle import Bundle
 from appliance.core import storage
 from appliance.core.clock import Clock, SystemClock
 from appliance.core.config import StoreConfig
-from appliance.core.errors import ApplianceError, BundleError, ConfigError, TemporaryError
+from appliance.core.errors import (
+    ApplianceError,
+    BundleError,
+    ConfigError,
+    ModelError,
+    TemporaryError,
+)
 from appliance.core.log import log
 from appliance.deployment.enrolment_key import EnrolmentKey
 from appliance.deployment.sandbox import run_limited
@@ -212,6 +218,8 @@ class Store:
                     return self._on_trial(sha)
                 except TemporaryError:
                     self._uncount(sha)
+                    raise
+                except ModelError:  # memory may be there at the next start; this one counts
                     raise
                 except BundleError as e:
                     why = str(e)

@@ -16,7 +16,13 @@ from appliance.bundle import bundle
 from appliance.bundle.bundle import Bundle
 from appliance.cli import bundle_commands
 from appliance.core.config import StoreConfig
-from appliance.core.errors import ApplianceError, BundleError, ConfigError, TemporaryError
+from appliance.core.errors import (
+    ApplianceError,
+    BundleError,
+    ConfigError,
+    ModelError,
+    TemporaryError,
+)
 from appliance.deployment import store
 from appliance.deployment.state import MOST_STARTS, PACKAGED
 from tests.campaigns import flips
@@ -606,3 +612,28 @@ def test_a_slow_check_does_not_count_against_a_trial(
             assert e.value.exit_code == 75
     assert box.start() == two
     assert box.store.state.of(two).starts == 1
+
+
+def test_memory_that_is_short_at_a_start_counts_and_the_trial_goes_on(tmp_path: Path):
+    """The program ends with an exit code that is restarted. Once there is memory, the bundle on
+    trial runs; a bundle for which there never is any gives way after MOST_STARTS."""
+    short: list[str] = []
+
+    def prove(bundle: Bundle) -> None:
+        if bundle.manifest.counter == 2 and short:
+            raise ModelError(f"no memory for the model: {short.pop()}; end other programs")
+
+    box = Delivery(tmp_path, prove)
+    one = box.committed(1)
+    two = box.installed(2)
+    short.append("std::bad_alloc")
+    with pytest.raises(ModelError) as e:
+        box.start()
+    assert e.value.exit_code == 70
+    assert box.store.state.of(two).starts == 1
+    assert box.start() == two
+    short.extend(["std::bad_alloc"] * MOST_STARTS)
+    for _ in range(MOST_STARTS - 2):
+        with pytest.raises(ModelError):
+            box.start()
+    assert box.start() == one
