@@ -52,8 +52,8 @@ def _classify(args: argparse.Namespace, settings: Config, choice: Choice | None)
         of_fingers = assembly.of_fingers(settings, current, answers=not args.sim)
         # labels have the order of the first finger's bundle
         current = next(iter(of_fingers.values()), current)
-        if settings.classifier.allow_unsigned:
-            log.warning(f"unsigned {assembly.UNSIGNED}")
+        if unsigned := assembly.UNSIGNED if settings.classifier.allow_unsigned else "":
+            log.warning(f"unsigned {unsigned}")
         devices = open_devices(args, lambda: current.format)
         port = assembly.port(settings, devices)
         disk = DiskThread()
@@ -65,7 +65,7 @@ def _classify(args: argparse.Namespace, settings: Config, choice: Choice | None)
             "trial": lambda: trial.text if trial else "",
             "shadow": lambda: shadow.agreement.text if shadow else "",
             "disk": lambda: disk.text,
-            "unsigned": lambda: assembly.UNSIGNED if settings.classifier.allow_unsigned else "",
+            "unsigned": lambda: unsigned,
         }
         reports = _reports(settings, current, of_fingers, devices.source, facts, stack, disk)
         observers = disk, Notifier(SystemClock()), trial, shadow, *reports

@@ -354,10 +354,13 @@ def load(
     values = {name: key.default for name, key in _KEYS.items()}
     sources = {"board": Path(named_in).name} | dict.fromkeys(_KEYS, "code")
     own: dict[str, dict[str, Any]] = {}  # values of the fingers
+    last = ""  # layer that has named one
     for where, table in layers:
         for finger, read in fingers.read(table.pop("skins", {}), str(where), _FINGER_KEYS).items():
             own.setdefault(finger, {}).update(read)
+            last = str(where)
             sources |= {f"skins.{finger}.{key}": where.name for key in read}
+            sources.setdefault(f"skins.{finger}.part", "code")  # describe shows each finger
         for name, value in _checked(table, str(where)):
             values[name], sources[name] = value, where.name
     _check_lines(values, sources)
@@ -365,18 +368,11 @@ def load(
         section: group(**{key: values[f"{section}.{key}"] for key in keys(group)})
         for section, group in _SECTIONS.items()
     }
-    skins = _skins(groups["skin"], own)
+    common = {name: getattr(groups["skin"], name) for name in keys(SkinConfig)}
+    skins = {f: FingerConfig(**it) for f, it in fingers.whole(common, own, last).items()}
     return Config(
         board=board, sources=MappingProxyType(sources), folder=folder, skins=skins, **groups
     )
-
-
-def _skins(skin: SkinConfig, own: Mapping[str, dict[str, Any]]) -> dict[str, FingerConfig]:
-    """The skin of each finger: `skin` with the finger's own values. Raises ConfigError."""
-    common = {name: getattr(skin, name) for name in keys(SkinConfig)}
-    whole = {finger: common | {"part": ""} | values for finger, values in own.items()}
-    fingers.check(whole)
-    return {finger: FingerConfig(**values) for finger, values in whole.items()}
 
 
 def describe(config: Config) -> str:

@@ -54,7 +54,9 @@ def _values(
     def unknown(name: str) -> ConfigError:
         near = closest(name.rpartition(".")[2], known)
         hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
-        return ConfigError(f"{where}: {name} is unknown; {hint}")
+        return ConfigError(
+            f"{where}: {name if name.isprintable() else shown(name)} is unknown; {hint}"
+        )
 
     values = read_table(
         {f"{prefix}.{name}": key for name, key in known.items()},
@@ -65,23 +67,29 @@ def _values(
     return {name.removeprefix(f"{prefix}."): value for name, value in values.items()}
 
 
-def check(fingers: Mapping[str, Mapping[str, Any]]) -> None:
-    """Raises ConfigError unless there are no fingers, or 2 to MOST that differ in their skins.
-    fingers: all keys of each."""
-    if len(fingers) == 1 or len(fingers) > MOST:
+def whole(
+    common: Mapping[str, Any], own: Mapping[str, Mapping[str, Any]], where: str
+) -> dict[str, dict[str, Any]]:
+    """All values of each finger: `common`, with those of its `own`. where: the last layer that
+    names a finger. Raises ConfigError unless there are no fingers, or 2 to MOST that differ in
+    their skins."""
+    if len(own) == 1 or len(own) > MOST:
         raise ConfigError(
-            f"[skins] has {len(fingers)} finger(s), {', '.join(fingers)}; use 2 to {MOST}, or "
+            f"{where}: [skins] has {len(own)} finger(s), {', '.join(own)}; use 2 to {MOST}, or "
             "[skin] for one skin"
         )
+    fingers = {finger: {**common, "part": "", **values} for finger, values in own.items()}
     seen: dict[tuple[Any, ...], str] = {}
-    for finger, own in fingers.items():
-        skin = own["usb"], own["link"], own["port"], own["profile"], own["part"]
+    for finger, has in fingers.items():
+        skin = has["usb"], has["link"], has["port"], has["profile"], has["part"]
         if skin in seen:
             raise ConfigError(
-                f"skins.{seen[skin]} and skins.{finger} are the same skin; give each its own port, "
-                'or its own serial number in usb, or its part of a hub, as in part = "1/2 rows"'
+                f"{where}: skins.{seen[skin]} and skins.{finger} are the same skin; give each its "
+                "own port, or its own serial number in usb, or its part of a hub, as in "
+                'part = "1/2 rows"'
             )
         seen[skin] = finger
+    return fingers
 
 
 def refuse(fingers: Collection[str], what: str) -> None:

@@ -44,6 +44,14 @@ def test_a_finger_has_the_values_of_skin_unless_it_has_its_own(tmp_path: Path):
     assert c.sources["skins.left.tare"] == "--set"
 
 
+def test_a_finger_without_values_of_its_own_is_described(tmp_path: Path):
+    """Its table may be empty, as long as the others differ from [skin]."""
+    c = loaded(tmp_path, "[skins.left]\n[skins.right]\nport = 'a'\n")
+    assert list(c.skins) == ["left", "right"]
+    assert c.sources["skins.left.part"] == "code"
+    assert loaded(tmp_path, config.describe(c)).skins == c.skins
+
+
 def test_describe_shows_what_a_finger_has_of_its_own_and_loads_again(tmp_path: Path):
     """The printed text is a palpate.toml with the same fingers."""
     c = loaded(tmp_path, TWO)
@@ -65,6 +73,7 @@ def test_describe_shows_what_a_finger_has_of_its_own_and_loads_again(tmp_path: P
         ("[skins]\nleft = 3", r"skins = .* has no finger's table"),
         ("[skins.Left]\n", r"\[skins.'Left'\] is not a finger's name; use up to 8"),
         ("[skins.left]\nprot = 'x'", r"skins.left.prot is unknown; did you mean port\?"),
+        ('[skins.left]\n"\\u0001" = 2', r"'skins.left.\\x01' is unknown; known are profile"),
         ("[skins.left]\ntare = 2", "skins.left.tare = 2 is not allowed; use true or false"),
         ("[skins.left]\npart = '3/2 rows'", "skins.left.part = '3/2 rows' is not allowed; use a"),
         (
