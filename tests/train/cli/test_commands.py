@@ -161,7 +161,7 @@ def test_a_reader_that_closes_the_pipe_ends_the_command_quietly():
                 "--set",
                 "none",
                 "--method",
-                "H",
+                "H-svm",
                 "--seed",
                 "1",
                 "--out",
@@ -178,7 +178,17 @@ def test_a_reader_that_closes_the_pipe_ends_the_command_quietly():
             "--json /proc/none/x.json: cannot be",
         ),
         (
-            ["evaluate", "--set", "none", "--protocol", "random:2", "--method", "H", "--jobs", "0"],
+            [
+                "evaluate",
+                "--set",
+                "none",
+                "--protocol",
+                "random:2",
+                "--method",
+                "H-svm",
+                "--jobs",
+                "0",
+            ],
             "--jobs 0 is out of range",
         ),
         (
@@ -189,7 +199,7 @@ def test_a_reader_that_closes_the_pipe_ends_the_command_quietly():
                 "--protocol",
                 "random:2",
                 "--method",
-                "H",
+                "H-svm",
                 "--effort",
                 "0",
             ],
@@ -216,7 +226,7 @@ def test_what_cannot_be_written_or_computed_is_refused_first(
         ),
         (["score", str(bundle.DEFAULT), "--set", "x"], "the same command begins anew"),
         (
-            ["evaluate", "--set", "x", "--protocol", "random:2", "--method", "H"],
+            ["evaluate", "--set", "x", "--protocol", "random:2", "--method", "H-svm"],
             "the same command goes on where it was",
         ),
         (["pull", "user@box", "--out", "here"], "the same command goes on where it was"),
@@ -359,7 +369,7 @@ def test_an_error_of_a_library_without_a_file_is_told_in_its_words(
         raise OSError("the disk is on fire")
 
     monkeypatch.setattr(sets, "load", fails)
-    assert main(["evaluate", "--set", "x", "--protocol", "random:2", "--method", "H"]) == 1
+    assert main(["evaluate", "--set", "x", "--protocol", "random:2", "--method", "H-svm"]) == 1
     assert capsys.readouterr().err == "palpate-train: the disk is on fire\n"
 
 

@@ -272,7 +272,10 @@ def test_a_reading_that_cannot_be_is_named(value: float, shown: str):
         ({"axes": "taxel,frame", "transpose": True}, "--axes already says"),
         ({"decimal": "'"}, "--decimal ' is unknown; use . or ,"),
         ({"pattern": None}, "where the material stands is not known; give --pattern"),
-        ({"fields": {"material": "l"}}, "material stands in --pattern and in --field"),
+        (
+            {"fields": {"material": "l"}},
+            "material stands in --pattern or --variable and in --field",
+        ),
     ],
 )
 def test_an_option_that_cannot_be_read_is_named(changes: dict, why: str):
