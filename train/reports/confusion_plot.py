@@ -51,8 +51,10 @@ def draw(
         if printed is not None and printed[i][j] > 0:
             write(axes, j + 0.5, i + 0.76, f"◇ {100 * printed[i][j]:.0f}", size=SMALL - 1)
     for i, name in enumerate(names):
-        few = f" (n = {sums[i]:.0f})" if counted and sums[i] < FEW else ""
-        write(axes, -0.03 * k, i + 0.5, name + few, size=SMALL + 0.5, ha="right")
+        few = counted and sums[i] < FEW
+        write(axes, -0.03 * k, i + (0.34 if few else 0.5), name, size=SMALL + 0.5, ha="right")
+        if few:
+            write(axes, -0.03 * k, i + 0.76, f"n = {sums[i]:.0f}", GREY, SMALL - 1, ha="right")
         write(axes, i + 0.5, -0.12, name.replace(" ", "\n"), size=SMALL, va="bottom")
     write(axes, -0.03 * k, -0.12, "%, is ↓  named →", GREY, SMALL, ha="right", va="bottom")
     tiles(axes, k, k)

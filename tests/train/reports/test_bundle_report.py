@@ -231,7 +231,8 @@ def test_a_row_of_few_sweeps_says_how_many(figures: dict):
     drawn = PageReader(bundle_report.confusion(some)).text
     assert "wood · " not in drawn
     assert re.search(r"\b3\b", drawn)
-    assert "metal (n = 3)" in drawn
-    assert "wood (n" not in drawn
-    assert "paper (n = 0)" in drawn
-    assert f"{'x' * 23}… (n = 1)" in drawn
+    assert "n = 3" in drawn
+    assert "n = 30" not in drawn
+    assert "n = 0" in drawn
+    assert "n = 1" in drawn
+    assert f"{'x' * 23}…" in drawn
