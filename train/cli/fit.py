@@ -17,6 +17,7 @@ from train.arguments import numbers, options, scene_file
 from train.arguments.types import Add
 from train.data import labels
 from train.data.sets import Dataset, digest
+from train.data.splitters import OF_THE_SET
 from train.data.transforms import WHOLE, Change
 from train.evaluation import trivial
 from train.evaluation.evaluate import CACHE
@@ -330,6 +331,9 @@ def _print_held_out(made: Fit) -> None:
                 f"there are two values of {name}: its figures are of heads that know only one, "
                 "so expect more"
             )
+    for name in sorted(set(made.train.groups) - {*OF_THE_SET, *conditions}):
+        if len(made.values(name)) == 1:
+            print(f"every sweep has the same {name}: expect less at another, no figure shows it")
     if made.calibration:
         print(*formatting.figure_lines(figures := made.held_out_figures()), sep="\n")
         if len(conditions) > 1:

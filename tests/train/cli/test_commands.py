@@ -405,3 +405,19 @@ def test_an_unknown_method_is_refused_before_sets_are_read(
     said = capsys.readouterr().err
     assert "method 'magic' is unknown; use some of " in said
     assert "nowhere" not in said
+
+
+@pytest.mark.slow
+def test_a_fit_names_groups_of_one_value(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """No figure can show another direction then; a group of several values and one that says where
+    sweeps come from are not named."""
+    tubes = sets.load("sim:T-REAL/level-blind:1:2").select(["position<=2"])
+    tubes = replace(tubes, groups=tubes.groups | {"direction": np.zeros(len(tubes), int)})
+    source = tmp_path / "set.npz"
+    tubes.save(source)
+    words = "--seed 1 --steps 0 --size bands --out"
+    assert main(["fit", "--set", str(source), *words.split(), str(tmp_path / "fit.npz")]) == 0
+    told = [line for line in capsys.readouterr().out.splitlines() if "expect less" in line]
+    assert told == [
+        "every sweep has the same direction: expect less at another, no figure shows it"
+    ]
