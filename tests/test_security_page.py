@@ -54,6 +54,7 @@ def test_the_ways_in_are_those_of_the_box():
         "bridges",
         "bundle",
         "enrolled",
+        "names",
         "recordings",
     ):
         assert way in named, way

@@ -24,7 +24,7 @@ from appliance.core.clock import SystemClock
 from appliance.core.config import Config
 from appliance.core.devices import Devices
 from appliance.core.errors import BundleError, ConfigError, FormatError, SensorError
-from appliance.core.log import TroubleLog, log
+from appliance.core.log import TroubleLog, log, printable
 from appliance.core.patience import patiently
 from appliance.io import skins
 from appliance.io.usb_sensor import fits
@@ -55,9 +55,8 @@ def run_check(args: argparse.Namespace) -> int:
             devices,
         )
     for result in results:
-        print(
-            f"{'ok  ' if result.ok else 'FAIL'}  {result.component:<14} {result.detail}", flush=True
-        )
+        line = f"{'ok  ' if result.ok else 'FAIL'}  {result.component:<14} {result.detail}"
+        print(printable(line), flush=True)
         failed += not result.ok
     return 1 if failed else 0
 

@@ -60,9 +60,7 @@ def of_npz(path: Path) -> dict[str, Array]:
                 FORMAT.read_array_header_1_0 if version == (1, 0) else FORMAT.read_array_header_2_0
             )
             shape, by_columns, dtype = read(file)
-            if by_columns or dtype.hasobject:
-                return {}
-            return _samples(path, dtype, file.tell(), shape)
+            return {} if by_columns else _samples(path, dtype, file.tell(), shape)
     except (OSError, KeyError, ValueError, struct.error, zipfile.BadZipFile):
         return {}
 
@@ -77,6 +75,8 @@ def _samples(
     path: Path, dtype: np.dtype[Any], offset: int, shape: tuple[int, ...]
 ) -> dict[str, Array]:
     size = int(np.prod(shape)) * dtype.itemsize
+    if dtype.hasobject:  # the file would hold addresses, and NumPy would follow them
+        return {}
     if not dtype.isnative or size < LEAST or offset + size > path.stat().st_size:
         return {}
     return {"samples": np.memmap(path, dtype, "r", offset, shape)}

@@ -196,6 +196,7 @@ def write(
         "va": "center",
         "ha": "center",
         "annotation_clip": False,
+        "parse_math": False,  # names of materials may have dollar signs
     }
     for up, line in enumerate(reversed(text.split("\n"))):
         axes.annotate(

@@ -280,21 +280,19 @@ def _ends(inches: tuple[float, float]) -> tuple[float, float]:
 
 def _caption(page: Axes, y: float, text: str) -> None:
     """Write the caption of a plot at its left end. y: inches."""
-    write(page, LEFT * WIDE, y, text, GREY, SMALL, ha="left", parse_math=False)
+    write(page, LEFT * WIDE, y, text, GREY, SMALL, ha="left")
 
 
 def _head(page: Axes, sweep: ShownSweep) -> None:
     """Title and notes, as many as fit into three lines."""
-    style: dict[str, Any] = {"ha": "left", "parse_math": False}
-    write(
-        page, 0.12, 0.2, _cut(_printable(sweep.title), 80), size=MEDIUM + 3, weight="bold", **style
-    )
+    title = _cut(_printable(sweep.title), 80)
+    write(page, 0.12, 0.2, title, size=MEDIUM + 3, weight="bold", ha="left")
     lines = [""]
     for note in map(_printable, sweep.notes):
         together = f"{lines[-1]} · {note}" if lines[-1] else note
         lines = [*lines[:-1], together] if len(together) <= LINE else [*lines, note]
     for i, line in enumerate(lines[:3]):
-        write(page, 0.12, 0.44 + 0.18 * i, _cut(line, LINE), GREY, SMALL, **style)
+        write(page, 0.12, 0.44 + 0.18 * i, _cut(line, LINE), GREY, SMALL, ha="left")
 
 
 def _skin(figure: Figure, sweep: ShownSweep, taxels: Array) -> str:

@@ -27,6 +27,8 @@ def test_a_manifest_keeps_display_names(default_bundle: Bundle):
         ({"wood": ""}, "display name '' of 'wood' cannot be shown; use 1 to 60 characters"),
         ({"wood": "x" * 61}, "of 'wood' cannot be shown; use 1 to 60 characters"),
         ({"wood": "a\u202eb"}, "of 'wood' cannot be shown; use 1 to 60 characters"),
+        ({"wood": "a\n<3>b"}, "display name 'a\\n<3>b' of 'wood' cannot be shown"),
+        ({"wood": "a\x1b[2J"}, "display name 'a\\x1b[2J' of 'wood' cannot be shown"),
         ({"wood": 7}, "display name 7 of 'wood' cannot be shown"),
         (["wood"], "manifest cannot be read"),
     ],

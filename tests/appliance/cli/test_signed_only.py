@@ -18,7 +18,7 @@ from appliance.core.devices import Devices
 from appliance.core.types import SweepFormat
 from appliance.deployment.enrolment_key import KEY
 from appliance.service.status import StatusFile
-from tests.factories import deliveries, toy_bundle
+from tests.factories import deliveries, hands, toy_bundle
 from tests.factories.deliveries import Delivery
 
 pytestmark = deliveries.NEEDED
@@ -63,6 +63,34 @@ def test_a_robot_is_answered_by_signed_bundles_alone(
     assert f"{folder} is not signed; sign the bundle (palpate-train sign)" in text
     assert "classifier.allow_unsigned = true" in text
     assert SAID not in text
+
+
+@pytest.mark.parametrize("command", ["run", "check"])
+def test_a_finger_is_answered_by_signed_bundles_alone(
+    box: Delivery, command: str, capsys: pytest.CaptureFixture[str]
+):
+    """The bundle of one finger has to be signed as well as that of the box."""
+    folder = toy_bundle.put(box.folder / "toy", toy_bundle.files())
+    two = [*hands.of(*hands.TWO), f"skins.right.bundle={folder}"]
+    sets = [word for text in two for word in ("--set", text)]
+    assert main([command, *of(box), *sets]) == (1 if command == "check" else 78)
+    output = capsys.readouterr()
+    assert f"{folder} is not signed; sign the bundle" in output.out + output.err
+    main(["check", *of(box), *sets, *ALLOWED])
+    assert f"right signatures warning: {SAID}" in capsys.readouterr().out
+
+
+def test_words_of_a_bundle_do_not_steer_a_terminal(
+    box: Delivery, capsys: pytest.CaptureFixture[str]
+):
+    """A program that took the service over could sign a bundle whose words hold control characters;
+    a person may look at it as root."""
+    words = {"by": "anna\n\x1b[2Jok    all is well\u202e", "at": "1"}
+    one = box.copied(deliveries.files(1, box.key, made={"taught": words}))
+    main(["check", *of(box), "--set", f"classifier.bundle={one}"])
+    text = capsys.readouterr().out
+    assert "taught here by anna??[2Jok    all is well?, 1 UTC" in text
+    assert text.replace("\n", "").isprintable()
 
 
 def test_a_signed_bundle_may_be_named(box: Delivery, capsys: pytest.CaptureFixture[str]):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
 from dataclasses import replace
 from pathlib import Path
 
@@ -47,14 +49,41 @@ def test_a_file_that_cannot_be_written_ends_nothing(tmp_path: Path, logged: list
     assert "no page by itself: " in logged[0]
 
 
-def test_the_units_name_the_file():
-    """The path unit waits for it; the page removes it before it starts."""
+@pytest.mark.parametrize("kind", ["file", "folder", "link"])
+def test_the_units_name_the_file(tmp_path: Path, kind: str):
+    """The path unit waits for it; the page removes it before it starts. A service that was taken
+    over could make something else of this name."""
     path = f"/run/palpate/{FILE}"
     assert f"PathExists={path}\n" in (ROOT / "systemd/palpate-teach.path").read_text()
-    assert f"/bin/rm -f {path}\n" in (ROOT / "systemd/palpate-teach.service").read_text()
     wants = re.search(r"(?m)^Wants=.*", (ROOT / "systemd/palpate.service").read_text())
     assert wants
     assert "palpate-teach.path" in wants[0]
+    here, beside = tmp_path / FILE, tmp_path / "beside"
+    beside.mkdir()
+    (beside / "kept").touch()
+    if kind == "file":
+        here.touch()
+    elif kind == "link":
+        here.symlink_to(beside)
+    else:
+        (here / "inside").mkdir(parents=True)
+    unit = (ROOT / "systemd/palpate-teach.service").read_text()
+    remove = re.search(rf"(?m)^ExecStartPre=-(.*) {path}$", unit)
+    assert remove
+    subprocess.run([*remove[1].split(), here], check=True)
+    assert not os.path.lexists(here)
+    assert (beside / "kept").exists()
+
+
+def test_the_service_alone_can_write_the_file():
+    """Each unit with this folder runs as user palpate, and nobody else may write to the folder, its
+    group included."""
+    units = [path.read_text() for path in (ROOT / "systemd").glob("*.service")]
+    owners = [unit for unit in units if "\nRuntimeDirectory=palpate\n" in unit]
+    assert len(owners) == 2
+    for unit in owners:
+        assert "\nRuntimeDirectoryMode=0755\n" in unit
+        assert "\nUser=palpate\n" in unit
 
 
 @pytest.mark.parametrize(

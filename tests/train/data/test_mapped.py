@@ -88,6 +88,24 @@ def test_other_sets_are_read(sweeps: Dataset, tmp_path: Path, write: Callable):
 
 
 @pytest.mark.parametrize("name", FORMS)
+def test_objects_are_never_mapped(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str):
+    """The file would hold addresses, which NumPy would follow."""
+    h5py = pytest.importorskip("h5py")
+    monkeypatch.setattr(mapped, "LEAST", 8)
+    path = tmp_path / name
+    if name.endswith(".npz"):
+        np.savez(path, samples=np.array([[1], {}], dtype=object))
+        found = mapped.of_npz(path)
+    else:
+        with h5py.File(path, "w") as file:
+            data = file.create_dataset("samples", (2,), dtype=h5py.vlen_dtype(np.int32))
+            data[0] = data[1] = [1, 2, 3]
+        with h5py.File(path) as file:
+            found = mapped.of_hdf5(path, file["samples"])
+    assert found == {}
+
+
+@pytest.mark.parametrize("name", FORMS)
 def test_the_file_may_be_written_again_while_it_is_mapped(
     sweeps: Dataset, tmp_path: Path, name: str
 ):

@@ -146,6 +146,14 @@ def test_confusion_gives_shares_of_each_row():
     assert "100" not in thirty
 
 
+def test_a_name_is_text_and_no_formula_or_markup():
+    """A name that people typed may have dollar signs and angle brackets."""
+    names = ["geölt $\\frac{$ <b>", "wood"]
+    drawn = confusion_plot.draw(np.eye(2, dtype=int), names, "confusion")
+    assert names[0] in words(drawn)
+    assert "<b>" not in drawn
+
+
 def test_sweeps_mark_what_was_printed():
     """A single sweep gives the same by vote and by product, and is labelled once.
 
