@@ -110,13 +110,18 @@ def write(path: Path | str, data: bytes, *, durable: bool = True, mode: int | No
 def folder(target: Path) -> Iterator[Path]:
     """A new folder beside `target`. If the block ends without an exception, its files are synced
     and it takes the name `target` in one step, replacing an earlier folder; otherwise it is
-    removed. Raises OSError."""
+    removed. Raises OSError, with the name of the folder if a write fails."""
     import tempfile  # costs 1 MB of memory with its imports, needed only to write a bundle
 
     with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{target.name}-") as aside:
         new = Path(aside) / "new"
         new.mkdir()
-        yield new
+        try:
+            yield new
+        except OSError as e:
+            if not e.filename or str(e.filename).startswith(aside):
+                e.filename = str(target)  # a write to a full disk does not know its file
+            raise
         for path in (*new.iterdir(), new):
             sync(path)
         if target.exists():

@@ -6,9 +6,10 @@ unpickled, and nothing outside the named file or folder is read.
 
 from __future__ import annotations
 
+import io
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -220,15 +221,40 @@ def _tactmat(arrays: dict[str, Array], source: str) -> dict[str, Array]:
 def write_hdf5(target: BinaryIO, arrays: dict[str, Any]) -> None:
     """Write the arrays of an .npz under the same names as an HDF5 file that `read_hdf5` reads.
     Samples are compressed unless they are so large that they are mapped. target: opened for reading
-    and writing."""
+    and writing. Raises OSError."""
     import h5py
 
-    with h5py.File(target, "w") as file:
+    kept = _UntilAnError(target)
+    with h5py.File(kept, "w") as file:
         for name, values in arrays.items():
             if np.asarray(values).dtype.kind == "U":
                 values = np.asarray(values).astype(h5py.string_dtype())
             small = name == "samples" and values.nbytes < mapped.LEAST
             file.create_dataset(name, data=values, compression="gzip" if small else None)
+    if kept.error:
+        raise kept.error
+
+
+class _UntilAnError:
+    """A file for h5py, which dies with SIGSEGV if its file raises an error while it closes.
+
+    error: the first OSError, such as a full disk; what follows it goes to memory, so that h5py can
+    close, and is lost.
+    """
+
+    def __init__(self, target: BinaryIO) -> None:
+        self._file = target
+        self.error: OSError | None = None
+
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        def call(*args: Any) -> Any:
+            try:
+                return getattr(self._file, name)(*args)
+            except OSError as e:
+                self.error, self._file = self.error or e, io.BytesIO()
+                return getattr(self._file, name)(*args)
+
+        return call
 
 
 def read_recorded(folder: Path) -> list[RecordedSweep]:

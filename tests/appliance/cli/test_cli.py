@@ -412,8 +412,16 @@ def test_a_full_disk_names_the_file_and_leaves_none(tmp_path: Path):
             f.write(b"half")
             raise OSError(28, "No space left on device")
 
+    def half_a_folder(name: str | None) -> None:
+        with storage.folder(tmp_path / "bundle") as folder:
+            (folder / "half").write_text("half")
+            raise OSError(28, "No space left on device", name and str(folder / name))
+
     with pytest.raises(OSError, match=r"set\.npz"):
         half()
+    for name in (None, "half"):
+        with pytest.raises(OSError, match=r"bundle'"):
+            half_a_folder(name)
     assert not list(tmp_path.iterdir())
     with storage.file(target) as f:
         f.write(b"whole")

@@ -3,6 +3,7 @@ name."""
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Callable
 from dataclasses import replace
@@ -74,6 +75,23 @@ def test_every_form_is_read_back(tmp_path: Path, name: str):
     whole.save(tmp_path / name)
     assert sets.digest(sets.load(str(tmp_path / name))) == sets.digest(whole)
     assert h5py.is_hdf5(tmp_path / name) == (name != "a.npz")
+
+
+class FullDisk(io.BytesIO):
+    """A file of which 2 kB can be written."""
+
+    def write(self, data) -> int:
+        """As on a full disk."""
+        if self.tell() + len(data) > 2048:
+            raise OSError(28, "No space left on device")
+        return super().write(data)
+
+
+def test_a_full_disk_does_not_end_the_program():
+    """h5py dies if its file raises an error while it closes; the error comes after that."""
+    noise = np.random.default_rng(5).integers(0, 255, (6, 100, 4, 4))
+    with pytest.raises(OSError, match="No space left"):
+        readers.write_hdf5(FullDisk(), {"samples": noise, "materials": ["wood"]})
 
 
 NAN = np.zeros((6, 8, 2, 3), np.float32)

@@ -18,13 +18,15 @@ def test_the_code_of_the_page_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     """Each block prints the result in the text around it; new positions are named well above
-    chance."""
+    chance. The call in the text over all positions works, too."""
     pytest.importorskip("aeon")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "build").mkdir()
     names: dict[str, object] = {}
     for block in re.findall(r"```python\n(.*?)```", PAGE, re.S):
         exec(compile(block, "library.md", "exec"), names)
+    (call,) = re.findall(r"`(cross_val_score\(.*)`", PAGE)
+    assert len(eval(call, names)) == 6
     out = capsys.readouterr().out
     assert "4x4 uint8 at 750 Hz" in out
     assert float(re.findall(r"new positions: ([\d.]+)", out)[0]) > 0.6
