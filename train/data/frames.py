@@ -28,6 +28,11 @@ MOMENT = re.compile(
 )
 """A time of the day, perhaps with its date and zone."""
 
+SQUARE = (
+    "if MATLAB's h5write wrote it, rows and columns have changed places: give --axes "
+    "frame,column,row"
+)
+
 
 class GridMissing(FormatError):
     """Columns of taxels without --grid, which says how they lie."""
@@ -100,7 +105,8 @@ def _time_first(values: Array, table: Table, plan: ImportPlan) -> tuple[Array, l
             f"say with --axes frame,{names} or --axes {names},frame, or give --grid"
         )
     if first:
-        return values, []
+        square = values.ndim == 3 and values.shape[1] == values.shape[2]
+        return values, [SQUARE] if square and table.reversible else []
     moved = np.moveaxis(values, -1, 0)
     return moved, [f"its last axis is the time: frames of {list(moved.shape[1:])}"]
 

@@ -549,3 +549,22 @@ def test_patterns_of_arrays_that_cannot_be(variable: str, pattern: str | None, m
     named = NamePattern(pattern) if pattern else None
     with pytest.raises(FormatError, match=re.escape(message)):
         plan(pattern=named, variable=variable)
+
+
+def test_a_square_grid_of_hdf5_may_have_its_axes_reversed(tmp_path: Path):
+    """MATLAB's h5write leaves no sign of itself, so the import says how to turn the frames. With
+    --axes, and for an array that MATLAB itself saved, nothing is open."""
+    frames = np.arange(640, dtype=np.int16).reshape(40, 4, 4)
+    for name, kind in (("felt_1", None), ("wool_1", b"int16")):
+        with h5py.File(tmp_path / f"{name}.h5", "w") as file:
+            made = file.create_dataset("skin", data=frames if kind is None else frames.T)
+            if kind:
+                made.attrs["MATLAB_class"] = np.bytes_(kind)
+    plain = taken(tmp_path, grid="4x4")
+    notes = {one.name: one.notes for one in plain.taken}
+    assert "--axes frame,column,row" in notes["felt_1.h5"]
+    assert "h5write" not in notes["wool_1.h5"]
+    (tmp_path / "wool_1.h5").unlink()
+    turned = taken(tmp_path, grid="4x4", axes="frame,column,row")
+    assert "h5write" not in turned.taken[0].notes
+    np.testing.assert_array_equal(turned.sweeps.samples[0], plain.sweeps.samples[0].swapaxes(1, 2))

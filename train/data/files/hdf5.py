@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,10 +28,13 @@ NUMERIC = (
 def read(path: Path, wanted: ReadPlan) -> Table:
     """The wanted array of an HDF5 file, in whatever group it stands.
 
-    Arrays that MATLAB saved with -v7.3 get MATLAB's order of axes. Raises FormatError.
+    Arrays that MATLAB saved with -v7.3 get MATLAB's order of axes; those of its `h5write` carry no
+    sign of MATLAB. Raises FormatError.
     """
     with h5py.File(path, "r") as file:
-        return chosen(entries(file), wanted)
+        table = chosen(entries(file), wanted)
+        saved = file.visititems(lambda name, one: True if CLASS in one.attrs else None)
+        return replace(table, reversible=not saved)
 
 
 def entries(file: h5py.File, matlab: bool = False) -> Mapping[str, Entry]:

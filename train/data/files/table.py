@@ -48,6 +48,7 @@ class Table:
     arrays of frames, that were not read. texts: text
     columns, one text for each frame, by column number from 0. faults: for each other column with a
     cell that is not a number, a message about the first. notes: remarks.
+    reversible: whether a program may have reversed the axes, and the file does not show it.
     """
 
     values: Array
@@ -57,6 +58,7 @@ class Table:
     texts: Mapping[int, Sequence[str]] = field(default_factory=dict)
     faults: Mapping[int, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    reversible: bool = False
 
 
 @dataclass(frozen=True)
