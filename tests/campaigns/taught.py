@@ -4,6 +4,9 @@
 seed: the share of other recordings that the taught bundle names rightly and calls unknown, and the
 same of the model of `palpate-train fit` at its default, or `the same model` if all weights are
 equal. Taxels that may be bridged are not measured. Fabrics need PALPATE_DATA.
+
+With `--added N` each material in turn comes later, with N sweeps: into a bundle of the others that
+stays, as the box teaches it, and into a fit of all materials.
 """
 
 from __future__ import annotations
@@ -14,11 +17,14 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from appliance.bundle import bundle
+from appliance.bundle.bundle import Bundle
 from appliance.core.clock import SystemClock
 from appliance.core.errors import ApplianceError
 from appliance.core.types import Status
+from appliance.inference import enrolment
 from appliance.inference.classifier import Classifier
 from train.data import sets
 from train.data.sets import Dataset
@@ -27,6 +33,7 @@ from train.export import bundle_score, quantized_bundle
 from train.models.recipe import recipe
 from train.models.recipe.fitted import Fit
 
+Array = NDArray[np.bool_]
 SETS = ("sim:T-REAL:1:10", "sim:T-REAL/level-blind:1:10", "fabricslide/fabricslide.npz")
 TESTED = 600
 """Largest number of sweeps that judge."""
@@ -38,6 +45,7 @@ def main() -> None:
     parser.add_argument("--set", nargs="+", default=SETS, dest="sets")
     parser.add_argument("--each", nargs="+", type=int, default=(5, 10, 20))
     parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--added", type=int, help="sweeps of a material that comes later")
     args = parser.parse_args()
     for name in args.sets:
         known = name.startswith(("sim:", "aeon:")) or Path(name).exists()
@@ -45,9 +53,12 @@ def main() -> None:
         sweeps = sets.load(path)
         for each in args.each:
             for seed in range(args.seeds):
-                print(
-                    f"{name}, {each} each, seed {seed}: {compared(sweeps, each, seed)}", flush=True
+                told = (
+                    added(sweeps, each, args.added, seed)
+                    if args.added
+                    else compared(sweeps, each, seed)
                 )
+                print(f"{name}, {each} each, seed {seed}: {told}", flush=True)
 
 
 def compared(sweeps: Dataset, each: int, seed: int) -> str:
@@ -59,6 +70,56 @@ def compared(sweeps: Dataset, each: int, seed: int) -> str:
     if all(np.array_equal(v, default.weights.get(k)) for k, v in taught.weights.items()):
         return f"{text}; palpate-train fit: the same model"
     return f"{text}; palpate-train fit {_answers(default, others)}"
+
+
+def added(sweeps: Dataset, each: int, few: int, seed: int) -> str:
+    """Means over the materials that come later, in words."""
+    given, others = _parts(sweeps, each, seed)
+    found = np.array(
+        [_later(given, others, label, few, seed) for label in range(len(given.materials))]
+    )
+    into, of_all, before, after, together = 100 * found.mean(axis=0)
+    return (
+        f"{few} sweeps of a new material: taught into the bundle {into:.1f} %, trained with all "
+        f"{of_all:.1f} %; the other materials before {before:.1f} %, after {after:.1f} %, trained "
+        f"with all {together:.1f} %"
+    )
+
+
+def _later(
+    given: Dataset, others: Dataset, label: int, few: int, seed: int
+) -> tuple[float, float, float, float, float]:
+    """Shares that the box names rightly: of the new material, taught into a bundle and trained with
+    all; of the other materials before it came, after it, and trained with all."""
+    name = given.materials[label]
+    own, rest = np.flatnonzero(given.labels == label)[:few], given.labels != label
+    kept = ",".join(m for m in given.materials if m != name)
+    new = others.labels == label
+    with tempfile.TemporaryDirectory() as folder:
+        base = _bundle(given.select((f"material={kept}",)), Path(folder) / "a", seed)
+        every = _bundle(given.take(np.append(np.flatnonzero(rest), own)), Path(folder) / "b", seed)
+    taught = enrolment.enrol(base, name, given.samples[own]).bundle
+    before, after, together = (_right(one, others) for one in (base, taught, every))
+    return (
+        float(after[new].mean()),
+        float(together[new].mean()),
+        *(float(right[~new].mean()) for right in (before, after, together)),
+    )
+
+
+def _bundle(sweeps: Dataset, folder: Path, seed: int) -> Bundle:
+    fit = recipe.fit(sweeps, seed, recipe.Settings(steps=0))
+    quantized_bundle.export(fit, folder, "taught", "1", "", proven=False)
+    return bundle.load(folder)
+
+
+def _right(of: Bundle, others: Dataset) -> Array:
+    """Whether the box names each sweep rightly, with status ok, bool [n]."""
+    box, right = Classifier(of, SystemClock(), slides=False), np.zeros(len(others), bool)
+    for i, verdict in bundle_score.verdicts(box, others):
+        is_ok = verdict.status is Status.OK
+        right[i] = is_ok and verdict.label == others.materials[others.labels[i]]
+    return right
 
 
 def _parts(sweeps: Dataset, each: int, seed: int) -> tuple[Dataset, Dataset]:
