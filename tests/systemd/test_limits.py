@@ -124,7 +124,7 @@ def test_a_box_that_has_to_be_taught_shows_its_page(machine: Machine, service: S
         ("sleep 3600", "stop palpate-teach"),
         ("exit 78", "is-failed palpate-teach"),
     ):
-        machine.put(dropin, f"[Service]\\nExecStart=\\nExecStart=/bin/sh -c '{end}'\\n")
+        machine.put(dropin, f"[Service]\nExecStart=\nExecStart=/bin/sh -c '{end}'\n")
         machine.get("systemctl", "daemon-reload")
         began = service["InvocationID"]
         machine.put("/run/palpate/untaught", "")
