@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from appliance import __version__
@@ -229,11 +230,11 @@ def verdict_line(v: Mapping[str, Any], now_ns: int) -> str:
     )
 
 
-def fingers(v: Mapping[str, Any]) -> str:
+def fingers(v: Mapping[str, Any], names: Mapping[str, str] = MappingProxyType({})) -> str:
     """The answers of the fingers to a sweep in words, "" for one skin. v: a verdict as in the file
-    or the feed."""
+    or the feed. names: for people, of labels that have one."""
     return ", ".join(
-        f"{of['finger']} {of['label']} {100 * of['probability']:.1f} %"
+        f"{of['finger']} {names.get(of['label'], of['label'])} {100 * of['probability']:.1f} %"
         if of["label"]
         else f"{of['finger']} {of['status']}"
         for of in v.get("fingers", ())

@@ -148,7 +148,7 @@ class PageBoard:
             "name": self._names.get(line["label"], line["label"]),
             "scores": [round(float(p), 4) for p in line["scores"]],
         }
-        if fingers := status.fingers(line):
+        if fingers := status.fingers(line, self._names):
             shown["fingers"] = fingers
         self._publish(
             "verdict",
