@@ -29,7 +29,7 @@ from appliance.inference.session import ModelRunner
 from appliance.inference.taxel_watch import TaxelWatch
 from appliance.signal import features
 from appliance.signal.contact import Displacement, displacement
-from appliance.signal.slide import NO_PITCH, Slide, SlideMeter
+from appliance.signal.slide import NO_PATTERN, NO_PITCH, Slide, SlideMeter
 from appliance.signal.vibration import PARTS, vibration
 from appliance.signal.window_check import Finding
 
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from appliance.core.clock import Clock
 
 
-STILL = "no pattern passes from taxel to taxel, as with a finger that rests"
+STILL = f"{NO_PATTERN}, as with a finger that rests"
 _NONE, _NO_SLIDE, _IN_PLACE = np.empty(0), Slide(), Displacement()
 
 

@@ -51,6 +51,7 @@ LEAST_HEIGHT = 7.0
 RATIO = 1.5
 """Least ratio of a peak to the next separate peak of its axis, and to the sum without a lag. The
 other axis is left out, because a pattern of straight ridges passes along both."""
+NO_PATTERN = "no pattern passes from taxel to taxel"
 NO_PITCH = "the distance between taxels is unknown; export with --pitch-mm"
 APART = 9
 """Peaks further apart than this many steps of the grid are separate."""
@@ -217,7 +218,7 @@ class SlideMeter:
         tops = heights.max(axis=(1, 2))
         height = float(tops.max(initial=0, where=tops >= RATIO * still))
         if height < LEAST_HEIGHT:
-            return Slide(height=height, why="no pattern passes from taxel to taxel")
+            return Slide(height=height, why=NO_PATTERN)
         axis, sign, at = (int(i[0]) for i in np.nonzero(heights == height))
         if at in (0, heights.shape[2] - 1):
             limit = self.slowest_mm_s if at == 0 else self.fastest_mm_s

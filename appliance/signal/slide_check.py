@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appliance.core.types import SweepFormat, normal
-from appliance.signal.slide import LEAST_HEIGHT, SlideMeter
+from appliance.signal.slide import LEAST_HEIGHT, NO_PATTERN, SlideMeter
 from appliance.signal.vibration import PARTS, SlideLimits, vibration
 
 FEW = 4
@@ -22,7 +22,7 @@ FEW = 4
 MANY, CLEAR = 4, 2 * LEAST_HEIGHT
 """Fewest sweeps by which others are judged, and the least median height of their patterns. The
 median of simulated slides is 20, that of skins whose slides show no pattern 3 to 6."""
-NO_PATTERN = "no slide: no pattern passes from taxel to taxel, as with a resting finger"
+NO_SLIDE = f"no slide: {NO_PATTERN}, as with a resting finger"
 
 
 class SlideCheck:
@@ -66,7 +66,7 @@ class SlideCheck:
             return ""
         slide = self._meter(taxels)
         if slide.height < LEAST_HEIGHT:
-            return NO_PATTERN
+            return NO_SLIDE
         return ""
 
 
@@ -83,7 +83,7 @@ class SlidesAmong:
             return ""
         height = self._meter(taxels).height
         if _patterned(self._heights) and height < LEAST_HEIGHT:
-            return NO_PATTERN
+            return NO_SLIDE
         self._heights.append(height)
         return ""
 
@@ -92,7 +92,7 @@ class SlidesAmong:
         for taxels in windows:
             self._heights.append(0.0 if self._meter.why else self._meter(taxels).height)
         skin = _patterned(self._heights)
-        return [NO_PATTERN if skin and one < LEAST_HEIGHT else "" for one in self._heights]
+        return [NO_SLIDE if skin and one < LEAST_HEIGHT else "" for one in self._heights]
 
 
 def _patterned(heights: Sequence[float]) -> bool:

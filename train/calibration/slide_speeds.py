@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from appliance.signal.slide import SlideMeter, SpeedRange
+from appliance.signal.slide import Slide, SlideMeter, SpeedRange
 from train.data.sets import Dataset
 
 MOST_SWEEPS = 1000
@@ -16,16 +16,22 @@ OUTER = 0.02
 wrong."""
 
 
+def slides(meter: SlideMeter, sweeps: Dataset) -> list[Slide]:
+    """The slides of at most MOST_SWEEPS of the sweeps."""
+    count = min(len(sweeps), MOST_SWEEPS)
+    chosen = np.linspace(0, len(sweeps) - 1, count).round().astype(int)
+    return [meter(window) for window in sweeps.samples[chosen]]
+
+
 def trained_speeds(sweeps: Dataset, pitch_mm: float | None) -> tuple[SpeedRange | None, str]:
     """The range of the measured speeds of `sweeps`, or None and the reason. pitch_mm: distance
     between taxels, None if unknown."""
     meter = SlideMeter(sweeps.format, pitch_mm)
     if meter.why:
         return None, meter.why
-    count = min(len(sweeps), MOST_SWEEPS)
-    chosen = np.linspace(0, len(sweeps) - 1, count).round().astype(int)
-    measured = [slide.speed_mm_s for slide in map(meter, sweeps.samples[chosen])]
-    speeds = [speed for speed in measured if speed is not None]
+    measured = slides(meter, sweeps)
+    count = len(measured)
+    speeds = [slide.speed_mm_s for slide in measured if slide.speed_mm_s is not None]
     if len(speeds) < max(LEAST_SWEEPS, LEAST_SHARE * count):
         return None, f"the speed was measured in {len(speeds)} of {count} sweeps"
     ends = np.quantile(speeds, (OUTER, 1 - OUTER), method="nearest")

@@ -10,7 +10,7 @@ import numpy as np
 from appliance.bundle.manifest import Manifest
 from appliance.signal.slide import CHANCE, SlideMeter
 from appliance.signal.vibration import PARTS, TINY, SlideLimits, vibration
-from train.calibration.slide_speeds import MOST_SWEEPS, OUTER
+from train.calibration.slide_speeds import OUTER, slides
 from train.data.sets import Dataset
 
 MARGIN = 0.05
@@ -38,9 +38,7 @@ def _pattern(train: Dataset) -> float | None:
     meter = SlideMeter(train.format, 1.0)
     if meter.why:
         return None
-    count = min(len(train), MOST_SWEEPS)
-    chosen = np.linspace(0, len(train) - 1, count).round().astype(int)
-    heights = [meter(window).height for window in train.samples[chosen]]
+    heights = [slide.height for slide in slides(meter, train)]
     return CHANCE if np.quantile(heights, OUTER) >= 2 * CHANCE else None
 
 
