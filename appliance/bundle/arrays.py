@@ -85,9 +85,11 @@ def summed(planes: NDArray[Any], f: SweepFormat, file: str) -> NDArray[Any]:
     return np.cumsum(steps, axis=1, dtype=steps.dtype).view(f.numpy_type)
 
 
-def check_classes(arrays: Mapping[str, NDArray[Any]], n: int, steps: int) -> None:
-    """Raises BundleError if an array of means.npz does not have the type and shape for `n` labels
-    and `steps` early answers, or has a number out of range."""
+def check_classes(
+    arrays: Mapping[str, NDArray[Any]], n: int, steps: int, disturbances: int = 0
+) -> None:
+    """Raises BundleError if an array of means.npz does not have the type and shape for `n` labels,
+    `steps` early answers and this number of disturbances, or has a number out of range."""
     rank = arrays["means"].shape[-1] if arrays["means"].ndim else 0
     rows = {
         "means": (n, rank),
@@ -100,11 +102,13 @@ def check_classes(arrays: Mapping[str, NDArray[Any]], n: int, steps: int) -> Non
         "moved_shapes": (n, 0, 0),
         "early_means": (steps, n, rank),
         "early_shapes": (steps, rank, rank),
+        "changes": (disturbances, int((arrays["sweeps"] == 0).sum()), rank),
     }
-    halves = dict.fromkeys(("shapes", "moved_shapes", "early_shapes"), "float16")
+    halves = dict.fromkeys(("shapes", "moved_shapes", "early_shapes", "changes"), "float16")
     kinds = {"sweeps": "int64"} | halves
     for name, wanted in rows.items():
-        if name not in arrays or (name.startswith("early_") and not steps):
+        unused = not steps if name.startswith("early_") else name == "changes" and not disturbances
+        if name not in arrays or unused:
             continue
         values, kind, shape = arrays[name], kinds.get(name, "float32"), arrays[name].shape
         if name in ("shapes", "moved_shapes") and len(shape) == 3 and shape[1] <= rank:

@@ -273,10 +273,12 @@ def _classes(data: bytes, manifest: Manifest) -> Classes:
     )
     steps = len(manifest.early.limits) if manifest.early else 0
     early = [f"early_{name}" for name in EarlyClasses.__slots__] if steps else []
-    held = arrays.read(data, MEANS, "means", "bias", "sweeps", *displaced, *early)
+    allowed = len(manifest.disturbances.allowances) if manifest.disturbances else 0
+    changes = ["changes"] * bool(allowed)
+    held = arrays.read(data, MEANS, "means", "bias", "sweeps", *displaced, *early, *changes)
     held.setdefault("spread", np.ones(n, np.float32))
     held.setdefault("shapes", np.zeros((n, 0, 0), np.float16))
-    arrays.check_classes(held, n, steps)
+    arrays.check_classes(held, n, steps, allowed)
     sweeps = held["sweeps"]
     if sweeps[0] or (sweeps[1:] < np.sign(sweeps[:-1])).any():
         raise BundleError(
@@ -296,4 +298,5 @@ def _classes(data: bytes, manifest: Manifest) -> Classes:
         held["shapes"],
         DisplacedClasses(*(held[name] for name in displaced)) if displaced else None,
         EarlyClasses(*(held[name] for name in early)) if early else None,
+        **{name: held[name] for name in changes},
     )

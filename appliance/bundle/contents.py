@@ -3,7 +3,7 @@ labels."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -51,6 +51,9 @@ class Classes:
     displaced: the same for sweeps whose contact is displaced, None if the manifest has no rule for
         these.
     early: of unfinished sweeps, None if the manifest has no limits for these.
+    changes: float16 [D, K0, r], change of a mean in the embedding by a disturbance of size 1, for
+        each of the manifest's allowances and each trained label; D = 0 if the file has no such
+        array.
     """
 
     means: NDArray[np.float32]
@@ -60,18 +63,20 @@ class Classes:
     shapes: NDArray[np.float16]
     displaced: DisplacedClasses | None = None
     early: EarlyClasses | None = None
+    changes: NDArray[np.float16] = field(default_factory=lambda: np.zeros((0, 0, 0), np.float16))
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """The arrays of means.npz by name. In the file the arrays of `displaced` are named moved_*,
         those of `early` early_*."""
         parts = {"moved": self.displaced, "early": self.early}
         own = ("means", "bias", "sweeps", "spread", "shapes")
-        return {name: getattr(self, name) for name in own} | {
+        arrays = {name: getattr(self, name) for name in own} | {
             f"{prefix}_{name}": getattr(part, name)
             for prefix, part in parts.items()
             if part
             for name in part.__slots__
         }
+        return arrays | ({"changes": self.changes} if len(self.changes) else {})
 
 
 @dataclass(frozen=True, slots=True)

@@ -115,6 +115,7 @@ def extended(classes: Classes, mean: NDArray[Any], sweeps: int, spread: float) -
             np.append(classes.spread, spread).astype(np.float32),
             _one_more(classes.shapes),
             displaced,
+            changes=classes.changes,
         )
 
 

@@ -19,6 +19,7 @@ from appliance.core.types import SweepFormat
 from appliance.signal import features
 from appliance.signal.broken_taxels import Bridging
 from appliance.signal.contact import ContactPositions
+from appliance.signal.disturbances import Disturbances
 from appliance.signal.slide import SpeedRange
 from appliance.signal.vibration import SlideLimits
 from appliance.signal.window_check import WindowLimits
@@ -146,6 +147,8 @@ class Manifest:
     bridging: broken taxels that the model tolerates; None if that was not measured, then `json`
         omits it.
     sliding: what tells a slide from a rest; None if unknown, then `json` omits it.
+    disturbances: allowances for noise, load, speed, lost frames and hum; None if they were not
+        measured, then `json` omits it.
     displays: names of materials for people, in any language, by label; {} if labels are shown, then
         `json` omits it.
     """
@@ -169,6 +172,7 @@ class Manifest:
     speeds: SpeedRange | None = None
     bridging: Bridging | None = None
     sliding: SlideLimits | None = None
+    disturbances: Disturbances | None = None
     displays: dict[str, str] = field(default_factory=dict)
     schema: int = SCHEMA
 
@@ -217,7 +221,7 @@ class Manifest:
         """The bytes of manifest.json; equal manifests give equal bytes."""
         values = {FILE_KEYS.get(name, name): value for name, value in asdict(self).items()}
         values["format"] = self.format.json()
-        for name in ("unloaded", "speeds", "bridging", "sliding", "displays"):
+        for name in ("unloaded", "speeds", "bridging", "sliding", "disturbances", "displays"):
             if not values[name]:
                 del values[name]
         added_later = (
@@ -225,6 +229,7 @@ class Manifest:
             ("moved", "farthest_mm"),
             ("bridging", "loads"),
             ("sliding", "pattern"),
+            ("disturbances", "hum"),
         )
         for name, added in added_later:
             if values.get(name) and not values[name][added]:
@@ -280,6 +285,8 @@ def _check_parts(manifest: Manifest) -> None:
         raise BundleError(
             "manifest has `moved` without `known` and `place`; export the bundle again"
         )
+    if manifest.disturbances and manifest.disturbances.allowances and not manifest.known:
+        raise BundleError("manifest has `disturbances` without `known`; export the bundle again")
     taxels = manifest.format.rows * manifest.format.cols
     if manifest.bridging and manifest.bridging.taxels >= taxels:
         raise BundleError(

@@ -29,6 +29,8 @@ from appliance.inference.session import ModelRunner
 from appliance.inference.taxel_watch import TaxelWatch
 from appliance.signal import features
 from appliance.signal.contact import Displacement, displacement
+from appliance.signal.disturbances import load, noise
+from appliance.signal.hum import HumFilter
 from appliance.signal.slide import NO_PATTERN, NO_PITCH, Slide, SlideMeter
 from appliance.signal.vibration import PARTS, vibration
 from appliance.signal.window_check import Finding
@@ -47,10 +49,11 @@ def _degraded(finding: Finding) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Touched:
-    """Where and how the finger touched in a sweep."""
+    """Where and how the finger touched in a sweep, and the hum that was removed, in counts."""
 
     displacement: Displacement = _IN_PLACE
     slide: Slide = _NO_SLIDE
+    hum: float = 0.0
 
 
 class Classifier(Observer):
@@ -95,18 +98,23 @@ class Classifier(Observer):
         self.tare = bundle.manifest.tare
         self.taxels = TaxelWatch(bundle.manifest)
         known, classes = bundle.manifest.known, bundle.classes
+        allowed = bundle.manifest.disturbances
+        self._hum = HumFilter(bundle.format) if allowed and allowed.hum else None
         self._means = (
-            ClassDistances(classes, known, bundle.manifest.labels) if known and classes else None
+            ClassDistances(classes, known, bundle.manifest.labels, disturbances=allowed)
+            if known and classes
+            else None
         )
         self._unknown = UnknownSweeps(self._means) if self._means else None
         rule, place = bundle.manifest.displacement, bundle.manifest.contact
         self._pitch_mm = place.pitch_mm if place and slides else None
         limits = bundle.manifest.sliding
         self._pattern = limits.pattern if limits else None
-        # the height of a pattern does not depend on the pitch
-        self._slide = SlideMeter(bundle.format, self._pitch_mm or (1.0 if self._pattern else None))
+        # the height of a pattern, and taxels a second, do not depend on the pitch
+        measured = self._pattern or allowed
+        self._slide = SlideMeter(bundle.format, self._pitch_mm or (1.0 if measured else None))
         self._displaced_means = (
-            ClassDistances(classes, known, bundle.manifest.labels, rule)
+            ClassDistances(classes, known, bundle.manifest.labels, rule, allowed)
             if rule and known and classes
             else None
         )
@@ -239,9 +247,10 @@ class Classifier(Observer):
             sweep, finding = self.repaired(sweep)
         if finding.status is not Status.OK:
             return self._verdict(sweep, finding)
+        sweep, hum = self._without_hum(sweep)
         touch, rule = self._touch(sweep, finding.mean), self.bundle.manifest.displacement
-        displaced = bool(touch.displacement.text)
-        logits, novelty = self._classify(sweep, displaced)
+        touch, displaced = replace(touch, hum=hum), bool(touch.displacement.text)
+        logits, novelty = self._classify(sweep, touch, finding.mean)
         if novelty:
             finding = replace(finding, status=Status.UNKNOWN, detail=novelty)
             return self._verdict(sweep, finding, touch=touch)
@@ -254,6 +263,14 @@ class Classifier(Observer):
         if not finding.degraded:
             return sweep, finding
         return replace(sweep, frames=replace(sweep.frames, taxels=taxels)), finding
+
+    def _without_hum(self, sweep: Sweep) -> tuple[Sweep, float]:
+        """A sweep without the hum of the mains, and the amplitude of this in counts."""
+        allowed = self.bundle.manifest.disturbances
+        if not (self._hum and allowed and allowed.hum):
+            return sweep, 0.0
+        taxels, hum = self._hum(sweep.frames.taxels, allowed.hum)
+        return replace(sweep, frames=replace(sweep.frames, taxels=taxels)) if hum else sweep, hum
 
     def conclude(
         self,
@@ -316,22 +333,47 @@ class Classifier(Observer):
         )
         return self._model(outputs, graph_input)
 
-    def _classify(self, sweep: Sweep, displaced: bool) -> tuple[NDArray[np.float32], str]:
+    def _classify(
+        self, sweep: Sweep, touch: Touched, mean: NDArray[np.float64] | None
+    ) -> tuple[NDArray[np.float32], str]:
         """Logits [K] of one window, and a message with its distance from the known materials, ""
         if the material is known.
 
-        displaced: whether the contact is displaced. Changes caused by a displacement then do not
-        make a material unknown.
+        Changes caused by a displacement of the contact, or by disturbances of the sweep, do not
+        make a material unknown. mean: counts of the window, see Finding.
         """
         values = self._run(self._outputs, sweep.frames.taxels)
+        displaced = bool(touch.displacement.text)
         means = self._displaced_means if displaced and self._displaced_means else self._means
         if means is None:
             return self._logits_of(values), ""
-        novelty = means.novelty(values[-1])
+        disturbed = self._disturbed(sweep, touch, mean)
+        allowed = self.bundle.manifest.disturbances
+        if untried := allowed.untried(disturbed) if allowed else "":
+            return self._logits_of(values, means), untried
+        novelty = means.novelty(values[-1], disturbed)
         if novelty and means is self._means and self._unknown:
             alike = self._unknown.put(sweep.id, values[-1])
             novelty += f"; as sweep {alike}" * (alike > 0)
         return self._logits_of(values, means), novelty
+
+    def _disturbed(
+        self, sweep: Sweep, touch: Touched, mean: NDArray[np.float64] | None
+    ) -> dict[str, float]:
+        """The disturbances of a sweep by name, if the bundle allows something for them."""
+        m, taxels = self.bundle.manifest, sweep.frames.taxels
+        if not m.disturbances:
+            return {}
+        found = {
+            "lost": sweep.lost / len(taxels),
+            "hum": math.sqrt(touch.hum),
+            "noise": noise(taxels),
+        }
+        if mean is not None:
+            found["load"] = load(mean, self.tare if m.unloaded else np.zeros_like(self.tare))
+        if touch.slide.taxels_s:
+            found["speed"] = math.log(touch.slide.taxels_s)
+        return found
 
     def _logits_of(
         self, values: list[NDArray[np.float32]], means: ClassDistances | None = None
@@ -348,7 +390,7 @@ class Classifier(Observer):
         m, taxels = self.bundle.manifest, sweep.frames.taxels
         slide = self._slide(taxels) if len(taxels) == m.format.window else _NO_SLIDE
         if not self._pitch_mm:
-            slide = Slide(height=slide.height, why=NO_PITCH)
+            slide = Slide(height=slide.height, why=NO_PITCH, taxels_s=slide.taxels_s)
         if mean is None or m.contact is None or m.thresholds.contact is None:
             return Touched(slide=slide)
         return Touched(displacement(mean, self.tare, m.thresholds.contact, m.contact), slide)
@@ -424,5 +466,6 @@ class Classifier(Observer):
         trained = self.bundle.manifest.speeds
         uncertain = finding.status in (Status.UNSURE, Status.UNDECIDED, Status.UNKNOWN)
         untrained = trained.outside(touch.slide) if trained and uncertain else ""
-        texts = touch.displacement.text, untrained, finding.detail, _degraded(finding)
+        hum = f"hum of {touch.hum:.2g} counts removed" if touch.hum else ""
+        texts = touch.displacement.text, untrained, finding.detail, hum, _degraded(finding)
         return "; ".join(filter(None, texts))

@@ -8,7 +8,8 @@ gives the label. An enrolled material is one more mean; nothing is trained for i
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -16,8 +17,10 @@ from numpy.typing import NDArray
 
 from appliance.bundle.bundle import Classes, EarlyClasses
 from appliance.bundle.manifest import DisplacementRule, Known
+from appliance.signal.disturbances import Disturbances
 
 Array = NDArray[np.float64]
+UNDISTURBED: Mapping[str, float] = MappingProxyType({})
 KEPT = 16
 """Number of unknown sweeps that are remembered."""
 ALIKE = 0.5
@@ -37,6 +40,13 @@ def shaped_distances(away: NDArray[Any], shapes: NDArray[Any]) -> Array:
     own = np.einsum("...kb,kbc->...kc", away[..., common:], shapes)
     result: Array = (away[..., :common] ** 2).sum(axis=-1) + (own**2).sum(axis=-1)
     return result
+
+
+def _of_all(changes: Array, labels: int) -> Array:
+    """Changes [D, labels, r] of the means of trained labels [D, K0, r] and of the enrolled ones
+    after them, which are assumed to change as the trained ones do on average."""
+    mean = changes.mean(axis=1, keepdims=True)
+    return np.concatenate([changes, mean.repeat(labels - changes.shape[1], axis=1)], axis=1)
 
 
 class EarlyDistances:
@@ -89,6 +99,7 @@ class ClassDistances:
 
     displacement: rule for sweeps whose contact is displaced. The distances are then computed in
     `classes.displaced`, where directions that a displacement changes have little weight.
+    disturbances: the allowances for them.
     """
 
     def __init__(
@@ -97,7 +108,9 @@ class ClassDistances:
         known: Known,
         labels: Sequence[str],
         displacement: DisplacementRule | None = None,
+        disturbances: Disturbances | None = None,
     ) -> None:
+        self._disturbances = disturbances or Disturbances()
         self.labels, self.limit, self._temperature = labels, known.limit, known.temperature
         self._means, self._turn = classes.means.astype(np.float64), np.eye(classes.means.shape[1])
         # the rest of the bias, since the squared distance already contains -|m|^2 / 2; logits that
@@ -115,6 +128,8 @@ class ClassDistances:
         # a mean of n sweeps has variance 1 / n in every direction: another sweep has variance 1 + 1
         # / n around it
         self._share = np.where(n, n / (n + 1), 1.0) / classes.spread
+        changes = classes.changes.astype(np.float64)
+        self._changes = _of_all(changes, len(n)) @ self._turn if len(changes) else changes
 
     def _away(self, embedding: NDArray[Any]) -> Array:
         """Differences [..., K, r] of embeddings [..., r] from the class means."""
@@ -137,19 +152,25 @@ class ClassDistances:
         )
         return result
 
-    def novelty(self, embedding: NDArray[Any]) -> str:
+    def novelty(self, embedding: NDArray[Any], disturbed: Mapping[str, float] = UNDISTURBED) -> str:
         """A message with the distance to the nearest material if it is beyond the limit; "" for a
         known material.
 
-        embedding: [r]. Each material has its own scatter. The embedding was optimised for trained
-        labels, so the distance to an enrolled label is multiplied by n / (n + 1) / spread. About
-        the same share of sweeps is then accepted for both.
+        embedding: [r]. disturbed: values of the sweep's disturbances by name. Each material has
+        its own scatter. The embedding was optimised for trained labels, so the distance to an
+        enrolled label is multiplied by n / (n + 1) / spread. About the same share of sweeps is
+        then accepted for both.
         """
-        scaled = shaped_distances(self._away(embedding), self._shapes) * self._share
+        away, limit = self._away(embedding), self.limit
+        sizes = self._disturbances.sizes(disturbed)
+        if sizes.any():
+            away -= np.tensordot(sizes, self._changes, axes=1)
+            limit *= self._disturbances.growth(sizes)
+        scaled = shaped_distances(away, self._shapes) * self._share
         k = int(scaled.argmin())
-        if scaled[k] <= self.limit:
+        if scaled[k] <= limit:
             return ""
-        return f"squared distance {scaled[k]:.4g} from {self.labels[k]}, limit {self.limit:.4g}"
+        return f"squared distance {scaled[k]:.4g} from {self.labels[k]}, limit {limit:.4g}"
 
     def apart(self, embedding: NDArray[Any], others: NDArray[Any]) -> Array:
         """Half of the squared distance [n] of an embedding [r] from others [n, r], with the mean

@@ -71,13 +71,15 @@ class Slide:
 
     speed_mm_s: to three digits; None if it could not be measured, with the reason in `why`.
     direction: of the finger, one of DIRECTIONS; "" without a speed. height: of the highest sum, in
-    standard deviations of a sum with random phases; 0 if nothing was computed.
+    standard deviations of a sum with random phases; 0 if nothing was computed. taxels_s: the speed
+    in taxels a second, 0 without one.
     """
 
     speed_mm_s: float | None = None
     direction: str = ""
     height: float = 0.0
     why: str = ""
+    taxels_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,15 +233,18 @@ class SlideMeter:
         before, top, after = (float(h) for h in heights[axis, sign, at - 1 : at + 2])
         bend = before - 2 * top + after
         shift = (before - after) / (2 * bend) if bend else 0.0  # the vertex of a parabola
-        speed = float(self._taxels_s[at]) * math.exp(STEP * shift) * self._pitch_mm
-        return Slide(float(f"{speed:.3g}"), DIRECTIONS[2 * axis + sign], height)
+        taxels_s = float(self._taxels_s[at]) * math.exp(STEP * shift)
+        speed = float(f"{taxels_s * self._pitch_mm:.3g}")
+        return Slide(speed, DIRECTIONS[2 * axis + sign], height, taxels_s=taxels_s)
 
 
 def _transform(hz: Array, frames: int, period_s: float) -> Array:
     """float32 [2 * F, frames]: multiplies a series to give the real and then the imaginary parts
-    of its spectrum at `hz` [F], with a Hann window and without its mean."""
+    of its spectrum at `hz` [F], with a Hann window and without its mean and trend, so that a drift
+    does not hide the pattern."""
     turns = np.exp(-2j * np.pi * period_s * hz[:, None] * np.arange(frames)) * np.hanning(frames)
-    turns -= turns.mean(axis=1, keepdims=True)
+    trend = np.linalg.qr(np.stack([np.ones(frames), np.arange(frames)], axis=1))[0]
+    turns -= turns @ trend @ trend.T
     transform: Array = np.concatenate([turns.real, turns.imag]).astype(np.float32)
     return transform
 

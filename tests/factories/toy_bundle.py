@@ -19,6 +19,7 @@ from appliance.bundle import bundle
 from appliance.bundle.bundle import Bundle, DisplacementRule, Early, Known, Manifest, Thresholds
 from appliance.core.types import Frames, Status, Sweep, SweepFormat
 from appliance.signal.contact import ContactPositions
+from appliance.signal.disturbances import Disturbances
 
 FORMAT = SweepFormat(2, 2, 100.0, 20, "int16")
 THREE_AXES = replace(FORMAT, axes=3)
@@ -181,6 +182,7 @@ def files(
     arrays: dict[str, np.ndarray] | None = None,
     displacement: DisplacementRule | None = None,
     contact: ContactPositions | None = None,
+    disturbances: Disturbances | None = None,
     **graph: float,
 ) -> dict[str, bytes]:
     """The files of a toy bundle by name."""
@@ -209,6 +211,7 @@ def files(
         known=known,
         displacement=displacement,
         contact=contact,
+        disturbances=disturbances,
     )
     return content | {bundle.MANIFEST: manifest.json()}
 

@@ -140,7 +140,8 @@ def _usable(read: bundle.Manifest) -> None:
         assert isinstance(entry, dict)
     assert isinstance(read.figures, dict)
     again = read.json()
-    assert json.loads(again).keys() | {"unloaded", "speeds", "bridging", "sliding", "displays"} == {
+    optional = {"unloaded", "speeds", "bridging", "sliding", "disturbances", "displays"}
+    assert json.loads(again).keys() | optional == {
         FILE_KEYS.get(field.name, field.name) for field in fields(read)
     }
     assert bundle.Manifest.parse(again).json() == again, (

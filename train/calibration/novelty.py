@@ -23,7 +23,7 @@ from train.calibration.heads import shrinkage
 from train.onnx_tools.quantize import sixteen_bits
 
 Array = NDArray[Any]
-KEPT = 0.985
+KEPT = 0.99
 """Share of known sweeps within the limit. The robot gets no answer to the others, whatever the
 network computes (docs/decisions/0006)."""
 PARTS = 10

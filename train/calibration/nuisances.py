@@ -10,7 +10,7 @@ materials that are left out. Directions that no alteration reaches count as befo
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -38,17 +38,19 @@ class AlteredSweeps:
     """Embeddings of sweeps and of altered copies of some of them.
 
     z: [N, r], labels: int [N]. copies: by kind of alteration, the embeddings [M, r] of copies and
-    the numbers [M] of their sweeps.
+    the numbers [M] of their sweeps, with rising severity. disturbed: by kind, sizes of the
+    disturbance that it makes, of the copies [M] and of the sweeps [N].
     """
 
     z: Array
     labels: Array
     copies: Mapping[str, tuple[Array, Array]]
+    disturbed: Mapping[str, tuple[Array, Array]] = field(default_factory=dict)
 
     def seen_by(self, embed: Callable[[Array], Array]) -> AlteredSweeps:
         """The same in another embedding: of each row."""
         copies = {kind: (embed(z), source) for kind, (z, source) in self.copies.items()}
-        return AlteredSweeps(embed(self.z), self.labels, copies)
+        return AlteredSweeps(embed(self.z), self.labels, copies, self.disturbed)
 
     def take(self, kept: Array, labels: Array) -> AlteredSweeps:
         """The sweeps `kept` (bool [N]) of these labels (ascending), and their copies; a label

@@ -36,6 +36,12 @@ class SimulatedScene:
     worlds: tuple[int, ...]
     physics: skin.World = skin.WORLD
 
+    def take(self, kept: Array) -> SimulatedScene:
+        """The sweeps with the numbers `kept`."""
+        parts = self.materials, self.places, self.worlds
+        materials, places, worlds = (tuple(part[i] for i in kept) for part in parts)
+        return SimulatedScene(materials, places, worlds, self.physics)
+
     def draw(
         self,
         place: Callable[[skin.Placement], skin.Placement] = lambda p: p,
@@ -107,6 +113,21 @@ class EvaluationSweeps:
         physics = sets.simulated_world(found)
         scene = SimulatedScene(tuple(base.materials[k] for k in base.labels), places, own, physics)
         return cls(replace(base, samples=scene.draw()), scene)
+
+    @classmethod
+    def drawn_again(cls, sweeps: Dataset, seed: int = 0) -> EvaluationSweeps:
+        """A whole simulated set as `simulated` draws it; other sweeps as they are."""
+        if sets.SIMULATED.fullmatch(sweeps.source):
+            drawn = cls.simulated(sweeps.source, seed)
+            if np.array_equal(drawn.sweeps.labels, sweeps.labels):
+                return drawn
+        return cls(sweeps)
+
+    def take(self, kept: Array) -> EvaluationSweeps:
+        """The sweeps with the numbers `kept`, whose faults are as strong as among all sweeps."""
+        some = EvaluationSweeps(self.sweeps.take(kept), self.scene and self.scene.take(kept))
+        vars(some).update(deviation=self.deviation, rms=self.rms, load=self.load)
+        return some
 
     @cached_property
     def deviation(self) -> Array:

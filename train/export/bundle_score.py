@@ -27,10 +27,11 @@ the interval."""
 
 
 def verdicts(
-    classifier: Classifier, sweeps: Dataset, *, fused: bool = False
+    classifier: Classifier, sweeps: Dataset, *, fused: bool = False, lost: int = 0
 ) -> Iterator[tuple[int, Verdict]]:
     """The box's verdict on each sweep with the sweep's number, recording by recording. fused: the
-    sweeps of a recording count as sweeps of one object."""
+    sweeps of a recording count as sweeps of one object. lost: frames of each sweep that never
+    arrived."""
     format = sweeps.format
     t_ns, seq = (
         (np.arange(format.window) * format.period_ns).astype(np.int64),
@@ -39,12 +40,9 @@ def verdicts(
     recording = np.unique(sweeps.group("recording"), return_inverse=True)[1]
     for i in np.argsort(recording, kind="stable").tolist():
         frames = Frames(t_ns, seq, sweeps.samples[i])
-        yield (
-            i,
-            classifier(
-                Sweep(i, 0, int(t_ns[-1]), Status.OK, frames, object=fused * int(recording[i] + 1))
-            ),
-        )
+        object = fused * int(recording[i] + 1)
+        given = Sweep(i, 0, int(t_ns[-1]), Status.OK, frames, object=object, lost=lost)
+        yield i, classifier(given)
 
 
 def answers_to(classifier: Classifier, sweeps: Dataset, logits: Array) -> Answers:

@@ -57,21 +57,21 @@ def under_corruptions(
             progress.begin(f"{corruption.name} as the box answers, seed {seed}")
             found = [clean]
             for severity in corruption.severities[1:]:
-                found.append(
-                    answers(box, replace(sweeps, samples=corruption.apply(test, severity, seed)))
-                )
+                samples = corruption.apply(test, severity, seed)
+                lost = round(severity * sweeps.format.window) * (corruption.name == "lost")
+                found.append(answers(box, replace(sweeps, samples=samples), lost))
             for answer, counted in trials.items():
                 counted.add(corruption, [(given[answer], 0) for given in found])
         tasks += [counted.task(answer, seed) for answer, counted in trials.items()]
     return {name: entry["curves"] for name, entry in robustness.merge(tasks)["methods"].items()}
 
 
-def answers(box: Classifier, sweeps: Dataset) -> dict[str, Array]:
+def answers(box: Classifier, sweeps: Dataset, lost: int = 0) -> dict[str, Array]:
     """The sweeps that get each of ANSWERS, bool [N] each; every sweep gets exactly one of the first
-    five."""
+    five. lost: frames of each sweep that never arrived."""
     given = {answer: np.zeros(len(sweeps), bool) for answer in ANSWERS}
     labels = box.bundle.manifest.labels
-    for i, verdict in bundle_score.verdicts(box, sweeps):
+    for i, verdict in bundle_score.verdicts(box, sweeps, lost=lost):
         truth = sweeps.materials[sweeps.labels[i]]
         if verdict.status is Status.OK:
             answer = "rightly" if verdict.label == truth else "wrongly"

@@ -23,7 +23,8 @@ from appliance.core.errors import FormatError
 from appliance.core.storage import put_all
 from appliance.inference.classifier import Classifier
 from appliance.inference.novelty import shaped_distances
-from train.calibration import novelty
+from appliance.signal.disturbances import Disturbances
+from train.calibration import disturbances, novelty
 from train.calibration.nuisances import AlteredSweeps, NuisanceRule, Scatters, choose
 from train.data.sets import Dataset, digest
 from train.evaluation.corruptions import TAXEL_FAULTS, Corruption, applicable
@@ -40,8 +41,6 @@ FIGURES = "altered sweeps"
 """Key of the figures in a manifest."""
 COPIES = 360
 """Largest number of copies of each kind; of judged sweeps there are as many at most."""
-SEVERITIES = 6
-"""Number of severities of a kind, at equal distances up to the largest."""
 
 
 @dataclass(frozen=True)
@@ -49,30 +48,54 @@ class Widened:
     """Shapes of materials that alterations have widened. shapes: float16 [K, r, r] of each
     embedding that was given. limit: of known materials, for these shapes. rule: gave both.
     training: features of the training sweeps and of their altered copies. figures: for the
-    manifest."""
+    manifest. disturbances: likewise. changes: float16 [D, K, r] by these, of the class means of
+    each embedding."""
 
     shapes: tuple[NDArray[np.float16], ...]
     limit: float
     rule: NuisanceRule
     training: AlteredSweeps
     figures: dict[str, Any]
+    disturbances: Disturbances
+    changes: tuple[NDArray[np.float16], ...]
 
 
 def measure(
-    features: Embed, train: Dataset, held_out: Dataset, judge: Space, *others: Space, seed: int = 0
+    features: Embed,
+    train: Dataset,
+    held_out: Dataset,
+    judge: Space,
+    *others: Space,
+    tare: Array,
+    seed: int = 0,
+    again: bool = False,
 ) -> Widened | None:
     """The widened shapes in the embedding `judge`, best one that has not seen `held_out`, and in
     others, by the rule that `judge` finds; None if it finds none. features: of raw counts, which
-    the embeddings take."""
-    held = altered(features, held_out, seed + 1).seen_by(judge[0])
-    training, scatters = altered(features, train, seed), []
-    for embed, means in (judge, *others):
-        scatters.append(Scatters.of(training.seen_by(embed), means.astype(np.float64)))
-    rule = choose(scatters[0], held, judge[1].astype(np.float64))
+    the embeddings take. tare: counts [R, C] or [R, C, A] of the unloaded skin, 0 if unknown. again:
+    draw simulated sets again, so that their speed and force can change."""
+    meter = disturbances.DisturbanceMeter(train.format, tare, train.samples)
+    begin = EvaluationSweeps.drawn_again if again else EvaluationSweeps
+    training = altered(features, begin(train), seed, meter)
+    held = altered(features, begin(held_out), seed + 1, meter).seen_by(judge[0])
+    seen = [training.seen_by(embed) for embed, _ in (judge, *others)]
+    means = [of.astype(np.float64) for _, of in (judge, *others)]
+    scatters = [Scatters.of(one, of) for one, of in zip(seen, means, strict=True)]
+    rule = choose(scatters[0], held, means[0])
     if rule is None:
         return None
     shapes = tuple(map(rule.shapes, scatters))
-    return Widened(shapes, rule.limit, rule, training, _figures(rule, held))
+    judged = disturbances.Judge(held, means[0], shapes[0].astype(np.float64), rule.limit)
+    allowed = disturbances.fit(judged, *seen)
+    return Widened(
+        shapes,
+        rule.limit,
+        rule,
+        training,
+        _figures(rule, held) | {"disturbances": allowed.figures},
+        Disturbances(allowed.allowances, meter.hum),
+        allowed.changes,
+    )
 
 
 def limit_of_conditions(found: Widened, given: CalibrationInputs) -> float:
@@ -93,27 +116,56 @@ def limit_of_conditions(found: Widened, given: CalibrationInputs) -> float:
     return novelty.limit(np.concatenate(every))
 
 
-def altered(features: Embed, sweeps: Dataset, seed: int) -> AlteredSweeps:
-    """The features of `sweeps` and of copies with each fault of CORRUPTIONS that can be applied
-    to recorded counts. Broken taxels are left out, because the box bridges them."""
-    every, rng = EvaluationSweeps(sweeps), np.random.default_rng(seed)
-    copies = {}
-    for corruption in applicable(every):
-        if corruption.name not in TAXEL_FAULTS:
-            source = rng.permutation(len(sweeps))[:COPIES]
-            copies[corruption.name] = features(_copies(corruption, every, source, seed)), source
-    return AlteredSweeps(features(sweeps.samples), sweeps.labels, copies)
+def altered(
+    features: Embed, every: EvaluationSweeps, seed: int, meter: disturbances.DisturbanceMeter
+) -> AlteredSweeps:
+    """The features of sweeps and of copies with each fault of CORRUPTIONS that applies to them,
+    with the disturbances that `meter` measures. Broken taxels are left out, because the box
+    bridges them."""
+    sweeps, rng = every.sweeps, np.random.default_rng(seed)
+    still = replace(every, scene=None)
+    copies, disturbed, usual = {}, {}, dict[str, Array]()
+    for corruption in _corruptions(every):
+        source = rng.permutation(len(sweeps))[:COPIES]
+        scene = every if corruption.only == "simulated" else still
+        samples, severity = _copies(corruption, scene, source, seed)
+        samples, hum = meter.clean(samples)
+        copies[corruption.name] = features(samples), source
+        name = disturbances.OF_KIND.get(corruption.name)
+        if name in ("lost", "hum"):
+            disturbed[corruption.name] = (
+                {"lost": severity, "hum": np.sqrt(hum)}[name],
+                np.zeros(len(sweeps)),
+            )
+        elif name:
+            if name not in usual:
+                usual[name] = meter.values(name, sweeps.samples)
+            disturbed[corruption.name] = meter.values(name, samples), usual[name]
+    return AlteredSweeps(features(sweeps.samples), sweeps.labels, copies, disturbed)
 
 
-def _copies(corruption: Corruption, every: EvaluationSweeps, source: Array, seed: int) -> Array:
-    """Copies of the sweeps `source` (numbers [M]), a part of them at each severity."""
-    most, copies = corruption.severities[-1], []
-    for step, part in enumerate(np.array_split(source, SEVERITIES), start=1):
+def _corruptions(every: EvaluationSweeps) -> list[Corruption]:
+    """The corruptions of recorded counts, without broken taxels. Sweeps that can be drawn again
+    get another speed and force by that instead of by stretched counts."""
+    found = list(applicable(EvaluationSweeps(every.sweeps)))
+    if every.scene:
+        drawn = [c for c in applicable(every) if c.only and c.name in disturbances.OF_KIND]
+        found = [c for c in found if disturbances.OF_KIND.get(c.name) != "speed"] + drawn
+    return [corruption for corruption in found if corruption.name not in TAXEL_FAULTS]
+
+
+def _copies(
+    corruption: Corruption, every: EvaluationSweeps, source: Array, seed: int
+) -> tuple[Array, Array]:
+    """Copies of the sweeps `source` (numbers [M]), a part of them at each severity; and the
+    severities [M]."""
+    most, copies, severities = corruption.severities[-1], [], []
+    for step, part in enumerate(np.array_split(source, disturbances.SEVERITIES), start=1):
         if len(part):
-            some = EvaluationSweeps(every.sweeps.take(part))
-            vars(some).update(deviation=every.deviation, rms=every.rms, load=every.load)
-            copies.append(corruption.apply(some, min(most, most * step / SEVERITIES), seed))
-    return np.concatenate(copies)
+            some, severity = every.take(part), most * step
+            severities.append(min(most, severity / disturbances.SEVERITIES))
+            copies.append(corruption.apply(some, severities[-1], seed))
+    return np.concatenate(copies), np.repeat(severities, [len(one) for one in copies])
 
 
 def _figures(rule: NuisanceRule, held: AlteredSweeps) -> dict[str, Any]:
@@ -164,17 +216,20 @@ def write(folder: Path, trained_on: Dataset, fresh: Dataset) -> Manifest:
     def embed(samples: Array) -> Array:
         return np.stack([box.embedding(sweep) for sweep in samples]).astype(np.float64)
 
-    found = measure(embed, trained_on, fresh, (lambda z: z, classes.means))
+    space: Space = (lambda z: z, classes.means)
+    found = measure(embed, trained_on, fresh, space, tare=loaded.manifest.tare, again=True)
     if found is None:
         raise FormatError(
             f"{fresh.source} does not show how altered sweeps differ from other materials; name a "
             "larger set"
         )
-    means = arrays.packed(**replace(classes, shapes=found.shapes[0]).arrays())
+    wider = replace(classes, shapes=found.shapes[0], changes=found.changes[0])
+    means = arrays.packed(**wider.arrays())
     named = {"trained on": trained_on.source, "set": fresh.source, "digest": digest(fresh)}
     manifest = replace(
         loaded.manifest,
         known=replace(known, limit=found.limit),
+        disturbances=found.disturbances,
         files=loaded.manifest.files | {MEANS: file_entry(means)},
         figures=loaded.manifest.figures | {FIGURES: found.figures | named},
     )

@@ -29,6 +29,7 @@ from appliance.core.clock import SystemClock
 from appliance.core.errors import BundleError, FormatError
 from appliance.inference.classifier import Classifier, softmax
 from appliance.inference.novelty import shaped_distances
+from appliance.signal.disturbances import Disturbances
 from train.calibration.contact import Contacts
 from train.calibration.slide_speeds import trained_speeds
 from train.data import repeats
@@ -78,10 +79,10 @@ class Content:
     model: `sweep` or `features` -> `logits`, and the outputs that `early` and `known` need. input:
     as in the manifest. train, held_out: the training sweeps and the others, split by the group
     `held_out_by`. about: description of the training; figures: its results; both for the manifest.
-    early, known, displacement: for the manifest. classes: of the embedding, if there is `known`.
-    reference: the float model of an int8 model. contacts: of the training sweeps; None to find
-    them. unseen: the same content with heads that did not see the held-out sweeps; None if no part
-    of the model has seen them.
+    early, known, displacement, disturbances: for the manifest. classes: of the embedding, if there
+    is `known`. reference: the float model of an int8 model. contacts: of the training sweeps; None
+    to find them. unseen: the same content with heads that did not see the held-out sweeps; None if
+    no part of the model has seen them.
     """
 
     model: onnx.ModelProto
@@ -94,6 +95,7 @@ class Content:
     early: bundle.Early | None = None
     known: bundle.Known | None = None
     displacement: bundle.DisplacementRule | None = None
+    disturbances: Disturbances | None = None
     classes: bundle.Classes | None = None
     reference: onnx.ModelProto | None = None
     contacts: Contacts | None = None
@@ -181,6 +183,7 @@ def _manifest(
         early=content.early,
         known=content.known,
         displacement=content.displacement,
+        disturbances=content.disturbances,
         files={k: bundle.file_entry(v) for k, v in files.items()},
         made=_made(content, commit, unknown),
     )

@@ -16,6 +16,7 @@ from appliance.bundle import bundle
 from appliance.core.errors import FormatError
 from appliance.core.storage import put
 from train.calibration import novelty
+from train.calibration.contact import Contacts
 from train.calibration.novelty import Embedding
 from train.data.sets import Dataset
 from train.export import nuisances
@@ -108,21 +109,24 @@ def _calibrated(content: Content, fit: Fit, pitch_mm: float | None) -> Content:
     content, given = replace(content, known=calibration.known()), calibration_inputs(fit)
     apart = _unseen(given, calibration)
     found = _widened(fit, given, apart.embedding, calibration.embedding)
+    classes = [apart.classes(), calibration.classes()]
     if found:
-        content = replace(content, known=replace(calibration.known(), limit=found.limit))
+        known = replace(calibration.known(), limit=found.limit)
+        content = replace(content, known=known, disturbances=found.disturbances)
+        wider = zip(classes, found.shapes, found.changes, strict=True)
+        classes = [replace(of, shapes=shapes, changes=moved) for of, shapes, moved in wider]
         figures |= {nuisances.FIGURES: found.figures}
-    shapes = found.shapes if found else [of.embedding.shapes for of in (apart, calibration)]
     return replace(
         content,
         unseen=replace(
             content,
             model=bundle_graph(apart, fit.trunk()),
-            classes=replace(apart.classes(), shapes=shapes[0]),
+            classes=classes[0],
         ),
         model=bundle_graph(calibration, fit.trunk(), prefixes),
         early=rule.early,
         displacement=calibration.displacement_rule(),
-        classes=replace(calibration.classes(), shapes=shapes[1]),
+        classes=classes[1],
         about=content.about | {"early": early},
         figures=content.figures | figures,
     )
@@ -135,8 +139,15 @@ def _widened(
     nuisances. apart: an embedding that did not see the held-out sweeps."""
     trunk, spaces = fit.trunk(), [(of, of.means) for of in (apart, whole)]
     seed = int(fit.about["seed"])
+    contacts, shape = fit.contacts or Contacts.of(fit.train), fit.train.format.shape
+    known = contacts.limit.known_tare()
     found = nuisances.measure(
-        lambda samples: run(trunk, samples), fit.train, fit.held, *spaces, seed=seed
+        lambda samples: run(trunk, samples),
+        fit.train,
+        fit.held,
+        *spaces,
+        tare=np.array(known).reshape(shape) if known else np.zeros(shape),
+        seed=seed,
     )
     return found and replace(found, limit=nuisances.limit_of_conditions(found, given))
 

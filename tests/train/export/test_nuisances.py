@@ -13,8 +13,11 @@ from appliance.bundle import bundle
 from appliance.core.errors import FormatError
 from appliance.inference.novelty import ClassDistances
 from tests.factories import toy_bundle
+from train.calibration.disturbances import DisturbanceMeter
 from train.cli.main import main
+from train.data import sets
 from train.data.sets import Dataset
+from train.evaluation.evaluation_sweeps import EvaluationSweeps
 from train.export import nuisances
 
 FORMAT = replace(toy_bundle.FORMAT, rows=4, cols=4, window=100)
@@ -37,7 +40,10 @@ def toy(tmp_path: Path) -> Path:
 def test_copies_have_each_alteration_but_broken_taxels():
     """At several severities, of as many sweeps as there are; none is the sweep itself."""
     sweeps = windows(4)
-    found = nuisances.altered(lambda x: x.reshape(len(x), -1)[:, :2].astype(float), sweeps, 0)
+    meter = DisturbanceMeter(FORMAT, np.zeros(FORMAT.shape), sweeps.samples)
+    found = nuisances.altered(
+        lambda x: x.reshape(len(x), -1)[:, :2].astype(float), EvaluationSweeps(sweeps), 0, meter
+    )
     assert {"hum", "noise", "gain-down", "lost", "stretch"} <= found.copies.keys()
     assert not {"dead", "stuck", "noisy"} & found.copies.keys()
     for z, source in found.copies.values():
@@ -45,6 +51,26 @@ def test_copies_have_each_alteration_but_broken_taxels():
         assert sorted(source.tolist()) == list(range(12))
     z, source = found.copies["gain-down"]
     assert (z[:, 0] < found.z[source, 0]).all()
+    copied, was = found.disturbed["gain-down"]
+    assert (copied < was[source]).all()
+    assert found.disturbed["lost"][0].tolist() == sorted(found.disturbed["lost"][0])
+    assert set(found.disturbed) < set(found.copies)
+
+
+def test_simulated_sets_are_drawn_again_at_other_speeds():
+    """Instead of being stretched in time; sweeps of files are stretched."""
+    sweeps = sets.load("sim:T-REAL/level-blind:1:1")
+    meter = DisturbanceMeter(sweeps.format, np.zeros((4, 4)), sweeps.samples[:2])
+    drawn = EvaluationSweeps.drawn_again(sweeps)
+    assert drawn.scene
+    some = drawn.take(np.arange(0, len(sweeps), 9))
+    found = nuisances.altered(lambda x: x.mean(axis=(1, 2)).astype(float), some, 0, meter)
+    assert {"speed-up", "force-down", "shift-grid"} <= found.copies.keys()
+    assert not {"stretch", "shorten", "shift-rows"} & found.copies.keys()
+    copied, was = found.disturbed["speed-up"]
+    assert np.nanmedian(copied - was[found.copies["speed-up"][1]]) > 0.1
+    again = EvaluationSweeps.drawn_again(sweeps.select(("position<=2",)))
+    assert again.scene is None
 
 
 def test_the_command_changes_shapes_and_limit_and_nothing_else(
@@ -67,6 +93,8 @@ def test_the_command_changes_shapes_and_limit_and_nothing_else(
     before, after = (json.loads(m.manifest.json()) for m in (was, now))
     figures = after["figures"].pop(nuisances.FIGURES)
     assert (figures["set"], figures["trained on"]) == ("fresh.npz", "set.npz")
+    assert after.pop("disturbances")["allowances"]
+    assert len(now.classes.changes) == len(now.manifest.disturbances.allowances)
     for key in before.keys() - {"known", "files"}:
         assert after[key] == before[key]
     said = capsys.readouterr().out
