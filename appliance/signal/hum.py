@@ -1,7 +1,7 @@
 """The hum of the mains in a window: found, and subtracted before the network sees the counts.
 
-Hum is a sine of 50 or 60 Hz that all taxels have in phase. A network may not respond
-to 50 Hz and yet see other counts, because hum dithers small vibrations that are rounded. A texture can be
+Hum is a sine of 50 or 60 Hz that all taxels have in phase. A network may not respond to 50 Hz and
+yet see other counts, because hum dithers small vibrations that are rounded. A texture can be
 periodic as well. The hum of a window is therefore removed only if it stands out more than in any
 training sweep. Pure functions of raw counts; windows of one format.
 """
