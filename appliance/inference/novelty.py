@@ -39,6 +39,13 @@ def shaped_distances(away: NDArray[Any], shapes: NDArray[Any]) -> Array:
     return result
 
 
+def log_softmax(logits: NDArray[Any]) -> Array:
+    """Logarithms of the probabilities of logits along the last axis, in float64."""
+    z = np.asarray(logits, np.float64)
+    result: Array = z - np.logaddexp.reduce(z, axis=-1, keepdims=True)
+    return result
+
+
 class EarlyDistances:
     """Finds unknown materials in unfinished sweeps. limits: [D], largest squared distance of a
     known material at each step."""
@@ -88,7 +95,8 @@ class ClassDistances:
     """Computes distances and logits from a bundle's class means. labels: of the means, [K].
 
     displacement: rule for sweeps whose contact is displaced. The distances are then computed in
-    `classes.displaced`, where directions that a displacement changes have little weight.
+    `classes.displaced`, where directions that a displacement changes have little weight, and all
+    logits are divided by its temperature.
     """
 
     def __init__(
@@ -103,6 +111,8 @@ class ClassDistances:
         # the rest of the bias, since the squared distance already contains -|m|^2 / 2; logits that
         # are computed from distances do not suffer from the cancellation of large products
         self._extra = classes.bias + (self._means**2).sum(axis=1) / 2
+        self._enrolled, self._joint = classes.sweeps > 0, known.enrolled is not None
+        self._softening = displacement.temperature if displacement else 1
         shapes = classes.shapes
         if displacement and classes.displaced:
             self.limit, shapes = displacement.limit, classes.displaced.shapes
@@ -136,6 +146,25 @@ class ClassDistances:
             np.float32
         )
         return result
+
+    def joined(self, network: NDArray[Any], embedding: NDArray[Any]) -> NDArray[np.float32]:
+        """Logits float32 [..., K] of all labels of a bundle.
+
+        network: [..., K0], logits of the K0 trained labels, which come first. embedding: [..., r].
+        Without enrolled labels these are the network's own. With them, the distances give the
+        probability of each enrolled label and that of all trained labels together; the network
+        divides the latter among them. In bundles without `Known.enrolled`, all are from distances.
+        """
+        network = network / self._softening
+        if not self._enrolled.any():
+            return network
+        by_means = self.logits(self.distances(embedding)) / self._softening
+        if not self._joint:
+            return by_means
+        n, logs = network.shape[-1], log_softmax(by_means)
+        trained = np.logaddexp.reduce(logs[..., :n], axis=-1, keepdims=True)
+        logits = np.concatenate([trained + log_softmax(network), logs[..., n:]], axis=-1)
+        return logits.astype(np.float32)
 
     def novelty(self, embedding: NDArray[Any]) -> str:
         """A message with the distance to the nearest material if it is beyond the limit; "" for a

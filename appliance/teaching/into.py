@@ -27,6 +27,7 @@ from appliance.inference import enrolment
 from appliance.inference.classifier import Classifier, softmax
 from appliance.inference.enrolment import Enrolment
 from appliance.inference.novelty import ClassDistances
+from appliance.inference.objects import EnrolledLabels
 from appliance.teaching.process import News
 
 Array = NDArray[Any]
@@ -156,12 +157,9 @@ def assessed(running: SignedBundle, sweeps: NewSweeps) -> News:
     old = _without(running, {*many})
     assert old.classes
     run = Classifier(old, SystemClock())
-    z = {
-        name: np.stack([run.embedding(one) for one in of]).astype(np.float64)
-        for name, of in many.items()
-    }
-    p = {name: _left_out(old, z, name) for name in z}
-    names = [*old.manifest.labels, *z]
+    outputs = {name: enrolment.network_outputs(run, of) for name, of in many.items()}
+    p = {name: _left_out(old, outputs, name) for name in outputs}
+    names = [*old.manifest.labels, *outputs]
     answers = {name: [names[k] for k in of.argmax(axis=1)] for name, of in p.items()}
     right = sum(of.count(name) for name, of in answers.items())
     total = sum(map(len, answers.values()))
@@ -208,18 +206,21 @@ def _suspects(
     ]
 
 
-def _left_out(old: Bundle, z: Mapping[str, Array], of: str) -> Array:
-    """Probabilities [n, K] of all labels for the sweeps of a material, each left out in turn."""
+def _left_out(old: Bundle, outputs: Mapping[str, tuple[Array, Array]], of: str) -> Array:
+    """Probabilities [n, K] of all labels for the sweeps of a material, each left out in turn, as
+    the box answers. outputs: as of `enrolment.network_outputs`, of each material."""
     assert old.classes
     assert old.manifest.known
-    labels, answers = [*old.manifest.labels, *z], []
-    for i in range(len(z[of])):
+    known, labels = replace(old.manifest.known, enrolled=enrolment.LEAST), old.manifest.labels
+    network, answers = outputs[of][0], []
+    for i in range(len(network)):
         classes = old.classes
-        for name, own in z.items():
-            classes = enrolment.extended(classes, np.delete(own, i, axis=0) if name == of else own)
-        means = ClassDistances(classes, old.manifest.known, labels)
-        answers.append(softmax(means.logits(means.distances(z[of][i]))))
-    return np.stack(answers)
+        for name, (_, z) in outputs.items():
+            classes = enrolment.extended(classes, np.delete(z, i, axis=0) if name == of else z)
+        means = ClassDistances(classes, known, [*labels, *outputs])
+        answers.append(softmax(means.joined(network[i], outputs[of][1][i])))
+    rule = EnrolledLabels(classes.sweeps > 0, enrolment.LEAST)
+    return rule.decided(np.stack(answers))
 
 
 def _advice(

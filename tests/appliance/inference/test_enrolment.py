@@ -56,7 +56,7 @@ def test_a_label_is_added_by_arithmetic(old: Bundle, tmp_path: Path):
         "1+felt",
         {},
         None,
-        toy_bundle.KNOWN,
+        replace(toy_bundle.KNOWN, enrolled=enrolment.LEAST),
     )
     assert m.made == {"seed": 1, "enrolled": {"felt": 5}}
     assert new.bundle.enrolled == {"felt": 5}
