@@ -155,16 +155,16 @@ class ClassDistances:
         probability of each enrolled label and that of all trained labels together; the network
         divides the latter among them. In bundles without `Known.enrolled`, all are from distances.
         """
-        network = network / self._softening
+        softened = np.asarray(network / self._softening, np.float32)
         if not self._enrolled.any():
-            return network
-        by_means = self.logits(self.distances(embedding)) / self._softening
+            return softened
+        by_means = np.asarray(self.logits(self.distances(embedding)) / self._softening, np.float32)
         if not self._joint:
             return by_means
         n, logs = network.shape[-1], log_softmax(by_means)
         trained = np.logaddexp.reduce(logs[..., :n], axis=-1, keepdims=True)
-        logits = np.concatenate([trained + log_softmax(network), logs[..., n:]], axis=-1)
-        return logits.astype(np.float32)
+        logits = np.concatenate([trained + log_softmax(softened), logs[..., n:]], axis=-1)
+        return np.asarray(logits, np.float32)
 
     def novelty(self, embedding: NDArray[Any]) -> str:
         """A message with the distance to the nearest material if it is beyond the limit; "" for a

@@ -58,7 +58,6 @@ class EnrolledLabels:
             return p
         trained = np.where(self.which, 0, p)
         total = trained.sum(axis=-1, keepdims=True)
-        # a total that is not 0 is at least 1 - least here, so the division is exact enough
         return np.where(1 - total >= self.least, p, trained / np.maximum(total, 1 - self.least))
 
 
