@@ -23,7 +23,7 @@ from appliance.core.errors import BundleError, ConfigError, FormatError
 from appliance.core.statistics import wilson
 from appliance.core.types import Status, load, sidecar
 from appliance.deployment.signed import SignedBundle
-from appliance.inference import enrolment
+from appliance.inference import advice, enrolment
 from appliance.inference.classifier import Classifier, softmax
 from appliance.inference.enrolment import Enrolment
 from appliance.inference.novelty import ClassDistances
@@ -31,9 +31,6 @@ from appliance.inference.objects import EnrolledLabels
 from appliance.teaching.process import News
 
 Array = NDArray[Any]
-ENOUGH, SURE, MORE = 0.9, 0.8, 3
-"""As in train/teach/assessment.py: the lower end of the interval that is enough, the probability at
-which a sweep is suspected, and the number of sweeps that an advice names."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,21 +152,17 @@ def assessed(running: SignedBundle, sweeps: NewSweeps) -> News:
     if not many:
         raise BundleError("no new material has two sweeps; record another of it")
     old = _without(running, {*many})
-    assert old.classes
-    run = Classifier(old, SystemClock())
-    outputs = {name: enrolment.network_outputs(run, of) for name, of in many.items()}
-    p = {name: _left_out(old, outputs, name) for name in outputs}
-    names = [*old.manifest.labels, *outputs]
-    answers = {name: [names[k] for k in of.argmax(axis=1)] for name, of in p.items()}
+    p, answers = _judged(old, many)
     right = sum(of.count(name) for name, of in answers.items())
     total = sum(map(len, answers.values()))
     low, high = wilson(right, total)
     wrong = Counter((name, one) for name, of in answers.items() for one in of if one != name)
     suspects = _suspects(p, answers, sweeps)
     worst = max(wrong, key=wrong.__getitem__) if wrong else None
+    labels = len(old.manifest.labels) + len(many)
     said = (
         f"{100 * right / total:.0f} % of {total} sweeps of new materials are named rightly among "
-        f"{len(names)} if they are left out [{100 * low:.0f}, {100 * high:.0f}]"
+        f"{labels} if they are left out [{100 * low:.0f}, {100 * high:.0f}]"
     )
     return {
         "type": "assessed",
@@ -187,28 +180,43 @@ def assessed(running: SignedBundle, sweeps: NewSweeps) -> News:
     }
 
 
+def _judged(
+    old: Bundle, many: Mapping[str, Array]
+) -> tuple[dict[str, Array], dict[str, list[str]]]:
+    """For each new material the probabilities [n, K] of its left-out sweeps, and the answers of the
+    box to them."""
+    run, names = Classifier(old, SystemClock()), [*old.manifest.labels, *many]
+    outputs = {name: enrolment.network_outputs(run, of) for name, of in many.items()}
+    p = {name: _left_out(old, outputs, name) for name in outputs}
+    late = {*old.enrolled, *many}
+    rule = EnrolledLabels(np.array([name in late for name in names]), enrolment.LEAST)
+    return p, {name: [names[k] for k in rule.decided(of).argmax(axis=1)] for name, of in p.items()}
+
+
 def _suspects(
     p: Mapping[str, Array], answers: Mapping[str, list[str]], sweeps: NewSweeps
 ) -> list[dict[str, Any]]:
-    """Sweeps that are surely of another material, where most others of their own are named
-    rightly."""
+    """Sweeps that are surely of another material, where the others of their own are named
+    rightly. p: [n, K] of each new material, before the least probability of new labels."""
     return [
         {
             "sweep": f"sweep-{sweeps.files[name][i]:06d}",
             "number": i + 1,
             "material": name,
             "looks_like": answers[name][i],
-            "text": f"sweep {i + 1} of {name} looks like {answers[name][i]}",
+            "text": advice.suspicion(i + 1, name, answers[name][i]),
         }
         for name, of in p.items()
-        for i in np.flatnonzero(of.max(axis=1) >= SURE).tolist()
-        if answers[name][i] != name and 2 * answers[name].count(name) > len(of)
+        for i in np.flatnonzero(of.max(axis=1) >= advice.SURE).tolist()
+        if answers[name][i] != name and answers[name].count(name) >= advice.RIGHT * (len(of) - 1)
     ]
 
 
 def _left_out(old: Bundle, outputs: Mapping[str, tuple[Array, Array]], of: str) -> Array:
-    """Probabilities [n, K] of all labels for the sweeps of a material, each left out in turn, as
-    the box answers. outputs: as of `enrolment.network_outputs`, of each material."""
+    """Probabilities [n, K] of all labels for the sweeps of a material, each left out in turn.
+
+    outputs: as of `enrolment.network_outputs`, of each material.
+    """
     assert old.classes
     assert old.manifest.known
     known, labels = replace(old.manifest.known, enrolled=enrolment.LEAST), old.manifest.labels
@@ -219,22 +227,16 @@ def _left_out(old: Bundle, outputs: Mapping[str, tuple[Array, Array]], of: str) 
             classes = enrolment.extended(classes, np.delete(z, i, axis=0) if name == of else z)
         means = ClassDistances(classes, known, [*labels, *outputs])
         answers.append(softmax(means.joined(network[i], outputs[of][1][i])))
-    rule = EnrolledLabels(classes.sweeps > 0, enrolment.LEAST)
-    return rule.decided(np.stack(answers))
+    return np.stack(answers)
 
 
 def _advice(
     low: float, worst: tuple[str, str] | None, many: Mapping[str, Array], suspects: list[str]
 ) -> str:
     """What to record next, or that it is enough."""
-    if suspects:
-        return f"look at it first: {suspects[0]}; discard it if that is so"
-    if low >= ENOUGH:
-        return (
-            f"enough: at least {100 * low:.0f} % of such sweeps are named rightly "
-            "(with 97.5 % certainty)"
-        )
+    if said := advice.first(suspects, low):
+        return said
     if worst:
-        return f"{MORE} more of {worst[0]}, from another place"
+        return advice.more(worst[0])
     fewest = min(many, key=lambda name: len(many[name]))
-    return f"nothing was confused, but few sweeps are recorded: {MORE} more of {fewest}"
+    return f"nothing was confused, but few sweeps are recorded: {advice.MORE} more of {fewest}"

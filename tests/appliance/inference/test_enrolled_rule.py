@@ -18,6 +18,7 @@ from appliance.inference.hand_classifier import HandClassifier
 from appliance.inference.novelty import ClassDistances
 from appliance.inference.objects import EnrolledLabels, ObjectRule
 from appliance.sim.rig import VirtualClock
+from appliance.teaching import into
 from tests.factories import toy_bundle
 
 LABELS = ("a", "b", "c", "felt")
@@ -179,6 +180,23 @@ def test_sweeps_that_are_not_enough_are_enough_together(new: Bundle, fusion: str
         assert verdicts[2].status is Status.OK
         assert verdicts[2].probability == pytest.approx(verdicts[2].scores[3])
         assert verdicts[2].probability > enrolment.LEAST
+
+
+def test_left_out_sweeps_are_answered_as_the_box_would(new: Bundle, tmp_path: Path):
+    """Each answer of the assessment is that of a bundle without the sweep; one between b and felt is
+    b's by the least probability, and is not suspected."""
+    old, near = toy_bundle.load(tmp_path / "old"), toy_bundle.window(*near_b(new, 0.55))
+    sweeps = np.stack([*FELT, *FELT, near])
+    p, answers = into._judged(old, {"felt": sweeps})
+    for i, one in enumerate(sweeps):
+        without = enrolment.enrol(old, "felt", np.delete(sweeps, i, axis=0)).bundle
+        box = Classifier(without, VirtualClock())
+        n = np.arange(len(one))
+        verdict = box(Sweep(1, 0, 0, Status.OK, Frames(n, n, one)))
+        assert answers["felt"][i] == verdict.label
+        assert p["felt"][i] == pytest.approx(verdict.own, abs=1e-6)
+    assert answers["felt"] == ["felt"] * 4 + ["b"]
+    assert p["felt"][4].argmax() == 3
 
 
 def test_a_hand_applies_the_rule_of_its_fingers(new: Bundle):
