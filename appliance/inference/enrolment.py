@@ -121,7 +121,8 @@ def network_outputs(run: Classifier, sweeps: NDArray[Any]) -> tuple[Embedded, Em
 
 def slide_check(old: Bundle) -> SlideCheck:
     """The check whether a window is a slide, on the skin of a bundle. Patterns are expected where
-    training measured them."""
+    training measured them. They must be higher than for an answer (SlideLimits.pattern), with whose
+    limit mains hum and noise that all taxels share would be learned."""
     m = old.manifest
     limits, patterned = m.sliding, m.speeds is not None
     return SlideCheck(m.format, m.tare, m.thresholds.contact, limits, patterned=patterned)

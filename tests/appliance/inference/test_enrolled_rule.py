@@ -183,8 +183,8 @@ def test_sweeps_that_are_not_enough_are_enough_together(new: Bundle, fusion: str
 
 
 def test_left_out_sweeps_are_answered_as_the_box_would(new: Bundle, tmp_path: Path):
-    """Each answer of the assessment is that of a bundle without the sweep; one between b and felt is
-    b's by the least probability, and is not suspected."""
+    """Each answer of the assessment is that of a bundle without the sweep. A sweep between b and
+    felt gets b, because felt does not have its least probability."""
     old, near = toy_bundle.load(tmp_path / "old"), toy_bundle.window(*near_b(new, 0.55))
     sweeps = np.stack([*FELT, *FELT, near])
     p, answers = into._judged(old, {"felt": sweeps})
