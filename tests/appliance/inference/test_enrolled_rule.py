@@ -182,6 +182,29 @@ def test_sweeps_that_are_not_enough_are_enough_together(new: Bundle, fusion: str
         assert verdicts[2].probability > enrolment.LEAST
 
 
+def test_a_displaced_contact_is_named_by_the_same_rule(tmp_path: Path):
+    """Its distances are those of displaced sweeps, and network and distances are divided by its
+    temperature."""
+    arrays = toy_bundle.means(**toy_bundle.displaced_arrays())
+    rules = {"displacement": toy_bundle.DISPLACEMENT, "contact": toy_bundle.IN_PLACE}
+    old = toy_bundle.load(tmp_path / "toy", arrays=arrays, **rules)
+    new = enrolment.enrol(old, "felt", np.stack([toy_bundle.window(0, -3)])).bundle
+    it = Classifier(new, VirtualClock())
+    sweep = toy_bundle.sweep(0, -1.6)
+    sweep.frames.taxels[:, 1] -= 80  # less load in the second row
+    assert it(toy_bundle.sweep(0, -1.6)).displacement == ""
+    verdict = it(sweep)
+    assert verdict.displacement
+    means = ClassDistances(
+        new.classes, new.manifest.known, new.manifest.labels, toy_bundle.DISPLACEMENT
+    )
+    network, z = it.network(sweep.frames.taxels)
+    by_means = softmax(means.logits(means.distances(z)) / 3.0)
+    assert 0.2 < by_means[3] < enrolment.LEAST
+    assert verdict.own[3] == pytest.approx(by_means[3], rel=1e-4)
+    assert verdict.scores == pytest.approx([*softmax(network / 3.0), 0], rel=1e-4)
+
+
 def test_left_out_sweeps_are_answered_as_the_box_would(new: Bundle, tmp_path: Path):
     """Each answer of the assessment is that of a bundle without the sweep. A sweep between b and
     felt gets b, because felt does not have its least probability."""
