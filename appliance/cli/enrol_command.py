@@ -55,6 +55,10 @@ def run(args: argparse.Namespace) -> int:
             " written"
         )
     _warn(new)
+    if len(sweeps) > 1:
+        numbers = [*range(len(sweeps))]
+        alone = into.NewSweeps({args.label: sweeps}, {args.label: numbers}, [])
+        log.info(into.assessed(start, alone)["text"])
     files = enrolment.files(start.files, new, key.sign(new.file) if key else None)
     if args.out:
         enrolment.write(files, args.out, args.replace)

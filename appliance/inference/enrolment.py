@@ -219,8 +219,8 @@ def _disagreement(means: ClassDistances, label: str, z: NDArray[np.float64]) -> 
 
 
 def _closeness(means: ClassDistances, label: str, z: NDArray[np.float64]) -> str:
-    """A warning if the sweeps with the embeddings `z` [n, r] will be confused with a label of
-    `means`, "" if not."""
+    """A warning if the sweeps with the embeddings `z` [n, r] will often get a label of `means`, ""
+    if not."""
     n, r = z.shape
     to_old = (
         means.distances(z.mean(axis=0)) - r / n
@@ -230,7 +230,7 @@ def _closeness(means: ClassDistances, label: str, z: NDArray[np.float64]) -> str
         return ""
     return (
         f"{label!r} lies close to {means.labels[k]!r}: squared distance {max(to_old[k], 0):.1f}, "
-        f"limit {means.limit:.1f}; the two will be taken for each other"
+        f"limit {means.limit:.1f}; its sweeps will often be called that"
     )
 
 

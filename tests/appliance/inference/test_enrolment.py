@@ -439,6 +439,7 @@ def test_the_command_enrols(rig, old: Bundle, tmp_path: Path, capsys: pytest.Cap
     assert "sweep 6 taken: 5 of 5" in output.err
     assert "toy 1+felt, " in output.err
     assert "warning" not in output.err
+    assert "100 % of 5 sweeps of new materials are named rightly among 4" in output.err
     assert (
         main(
             [
