@@ -92,6 +92,7 @@ class AddedLabels:
     golden: raw counts [n, T, R, C] or [n, T, R, C, A], one sweep of each label.
     logits: float32 [G + n, K + n] of the bundle's G golden sweeps followed by `golden`, for the
         bundle's K labels followed by `labels`.
+    least: as Known.enrolled.
     """
 
     base: str
@@ -101,6 +102,7 @@ class AddedLabels:
     spread: NDArray[np.float32]
     golden: NDArray[Any]
     logits: NDArray[np.float32]
+    least: float | None
 
 
 @dataclass(frozen=True, slots=True)

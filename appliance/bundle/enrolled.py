@@ -20,8 +20,11 @@ from appliance.bundle.contents import AddedLabels, Bundle, Classes, DisplacedCla
 from appliance.core.errors import BundleError
 
 ENROLMENT = "enrolment.npz"
-ARRAYS = ("base", "labels", "means", "sweeps", "spread", "changes", "logits")
-"""Arrays in the file; `changes` are the packed golden sweeps (arrays.changes)."""
+COMMON = ("base", "labels", "means", "sweeps", "spread", "changes")
+"""Arrays in every file; `changes` are the packed golden sweeps (arrays.changes)."""
+ARRAYS, BY_MEANS = (*COMMON, "joint", "least"), (*COMMON, "logits")
+"""Arrays in a file, and in a file of a program that compared all labels by distances. The golden
+logits have another name there. So such a program refuses a file that it would misread."""
 MOST_SWEEPS = 1_000_000
 """Largest number of sweeps for a label that the file may give."""
 AGAIN = "enrol again (palpate enrol)"
@@ -36,7 +39,11 @@ def file(added: AddedLabels) -> bytes:
         sweeps=added.sweeps,
         spread=added.spread,
         changes=arrays.changes(added.golden),
-        logits=added.logits,
+        **(
+            {"logits": added.logits}
+            if added.least is None
+            else {"joint": added.logits, "least": np.array(added.least)}
+        ),
     )
 
 
@@ -55,7 +62,16 @@ def applied(bundle: Bundle, data: bytes, identity: str) -> Bundle:
         )
     assert bundle.classes
     arrays.check_classes(bundle.classes.arrays(), len(bundle.manifest.labels), 0)
-    return replace(bundle, golden_logits=added.logits, id=identity, added=added)
+    return replace(
+        deciding(bundle, added.least), golden_logits=added.logits, id=identity, added=added
+    )
+
+
+def deciding(bundle: Bundle, least: float | None) -> Bundle:
+    """`bundle` with this rule for enrolled labels (Known.enrolled). Raises BundleError."""
+    assert bundle.manifest.known
+    known = replace(bundle.manifest.known, enrolled=least)
+    return replace(bundle, manifest=replace(bundle.manifest, known=known))
 
 
 def with_label(
@@ -126,7 +142,7 @@ def _one_more(shapes: NDArray[np.float16]) -> NDArray[np.float16]:
 
 def _read(bundle: Bundle, data: bytes) -> AddedLabels:
     """The content of `data`, checked against `bundle`. Raises BundleError."""
-    held = arrays.read(data, ENROLMENT, *ARRAYS)
+    held = arrays.read(data, ENROLMENT, *COMMON)
     base, labels = held["base"], held["labels"]
     if (
         base.dtype.kind != "U"
@@ -146,7 +162,8 @@ def _read(bundle: Bundle, data: bytes) -> AddedLabels:
             f"{ENROLMENT} adds labels to bundle {bundle.id}, which has no class means; remove the "
             "file"
         )
-    _check(held, bundle, len(labels))
+    by_means = "logits" in held
+    _check(held, bundle, len(labels), BY_MEANS if by_means else ARRAYS)
     golden = arrays.summed(held["changes"], bundle.format, ENROLMENT)
     return AddedLabels(
         base.item(),
@@ -155,24 +172,32 @@ def _read(bundle: Bundle, data: bytes) -> AddedLabels:
         held["sweeps"],
         held["spread"],
         golden,
-        held["logits"],
+        held["logits" if by_means else "joint"],
+        None if by_means else float(held["least"]),
     )
 
 
-def _check(held: Mapping[str, NDArray[Any]], bundle: Bundle, n: int) -> None:
-    """Raises BundleError if an array has a wrong type, shape or range for `n` labels of
-    `bundle`."""
+def _check(
+    held: Mapping[str, NDArray[Any]], bundle: Bundle, n: int, names: tuple[str, ...]
+) -> None:
+    """Raises BundleError if one of the arrays `names` is missing, or has a wrong type, shape or
+    range for `n` labels of `bundle`."""
     assert bundle.classes
-    f, golden = bundle.format, len(bundle.golden) + n
+    if missing := [name for name in names if name not in held]:
+        raise BundleError(f"{ENROLMENT} has no {' and no '.join(missing)}; {AGAIN}")
+    f = bundle.format
+    logits = ("float32", (len(bundle.golden) + n, len(bundle.manifest.labels) + n))
     wanted = {
         "means": ("float32", (n, bundle.classes.means.shape[1])),
         "sweeps": ("int64", (n,)),
         "spread": ("float32", (n,)),
         "changes": ("uint8", (f.numpy_type.itemsize, n, f.window, *f.shape)),
-        "logits": ("float32", (golden, len(bundle.manifest.labels) + n)),
+        "logits": logits,
+        "joint": logits,
+        "least": ("float64", ()),
     }
-    for name, (kind, shape) in wanted.items():
-        values = held[name]
+    for name in names[2:]:
+        values, (kind, shape) = held[name], wanted[name]
         if values.dtype != kind or values.shape != shape:
             raise BundleError(
                 f"{ENROLMENT} holds {name} {values.dtype} {list(values.shape)}; {kind} "

@@ -34,6 +34,8 @@ MANIFEST, MODEL, GOLDEN, MEANS = "manifest.json", "model.onnx", "golden.npz", "m
 INPUTS = ("raw", *features.KINDS)
 UNSURE = 0.5
 """Least probability for status ok if the bundle does not set it."""
+OPTIONAL = ("farthest_mm", None), ("enrolled", None)
+"""Values of rules that need not be there."""
 MOST_BYTES = 64 << 20
 """Largest file. The largest of our models, the paper's network in int8, has 16 MB. The memory that
 a model needs is checked by onnx_check."""
@@ -85,14 +87,21 @@ class Known:
     """Rule for unknown materials. Raises BundleError for a number out of range.
 
     limit: largest squared distance from a sweep's embedding to the nearest class mean; beyond it
-    the material is unknown. temperature: divisor of the logits from class means.
+    the material is unknown. temperature: divisor of the logits from class means. enrolled: least
+    probability of all enrolled labels together at which a sweep gets one of them; None if all
+    labels are compared by distances alone, as before 0.2, then `Manifest.json` omits it.
     """
 
     limit: float
     temperature: float
+    enrolled: float | None = None
 
     def __post_init__(self) -> None:
         _check_positive(self, "known")
+        if self.enrolled is not None and not UNSURE <= self.enrolled < 1:
+            raise BundleError(
+                f"known.enrolled {self.enrolled!r} must be at least {UNSURE} and below 1"
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +128,7 @@ class DisplacementRule:
 def _check_positive(rule: Known | DisplacementRule, where: str) -> None:
     for name in rule.__slots__:
         value = getattr(rule, name)
-        if not _positive(value) and (name, value) != ("farthest_mm", None):
+        if not _positive(value) and (name, value) not in OPTIONAL:
             raise BundleError(f"{where}.{name} {value!r} must be a number above 0")
 
 
@@ -227,6 +236,7 @@ class Manifest:
         added_later = (
             ("early", "limits"),
             ("moved", "farthest_mm"),
+            ("known", "enrolled"),
             ("bridging", "loads"),
             ("sliding", "pattern"),
             ("disturbances", "hum"),

@@ -20,6 +20,7 @@ from appliance.core.errors import ApplianceError, BundleError, ConfigError, Form
 from appliance.core.log import log
 from appliance.core.types import load
 from appliance.deployment.enrolment_key import EnrolmentKey
+from appliance.deployment.signed import SignedBundle
 from appliance.inference import enrolment
 from appliance.inference.enrolment import Enrolment, SweepCollector
 from appliance.recording import unknown_sweeps
@@ -48,13 +49,7 @@ def run(args: argparse.Namespace) -> int:
         sweeps = _good_sweeps(args, settings, start.bundle)
     else:
         sweeps = _unknown_sweeps(args.unknown, kept, start.bundle)
-    new = into.taught(start, {args.label: sweeps})
-    if new.disagreement and not args.scattered:
-        raise BundleError(
-            f"{new.disagreement}, or give --scattered if all are of {args.label!r}; nothing was"
-            " written"
-        )
-    _warn(new)
+    new = _taught(args, start, sweeps)
     files = enrolment.files(start.files, new, key.sign(new.file) if key else None)
     if args.out:
         enrolment.write(files, args.out, args.replace)
@@ -74,9 +69,22 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _warn(new: Enrolment) -> None:
+def _taught(args: argparse.Namespace, start: SignedBundle, sweeps: NDArray[Any]) -> Enrolment:
+    """The enrolment of these sweeps, with its warnings and its accuracy in the log. Raises
+    BundleError if they disagree."""
+    new = into.taught(start, {args.label: sweeps})
+    if new.disagreement and not args.scattered:
+        raise BundleError(
+            f"{new.disagreement}, or give --scattered if all are of {args.label!r}; nothing was"
+            " written"
+        )
     for warning in filter(None, (new.disagreement, *new.warnings)):
         log.warning(f"warning: {warning}")
+    if len(sweeps) > 1:
+        numbers = [*range(len(sweeps))]
+        alone = into.NewSweeps({args.label: sweeps}, {args.label: numbers}, [])
+        log.info(into.assessed(start, alone)["text"])
+    return new
 
 
 def _enrolment_key(args: argparse.Namespace, settings: Config) -> EnrolmentKey | None:

@@ -39,7 +39,7 @@ from appliance.signal.slide_check import SlidesAmong
 from appliance.teaching import into, use
 from appliance.teaching.hand_over import HandOver
 from appliance.teaching.process import News
-from appliance.teaching.session import TeachingSession
+from appliance.teaching.session import TeachingSession, refuse_trained
 from appliance.teaching.state import TeachingState
 from appliance.teaching.teacher import Teacher
 
@@ -267,12 +267,12 @@ class Session:
                     teacher,
                     *pages,
                 ],
-                commands={**recording.commands, **self._by_robot(session.commands)},
+                commands={**session.recording_commands, **self._by_robot(session.commands)},
                 ordered=bool(pages or self._waits),
                 serving=False,
                 slides=slide_check(self._base.bundle) if self._base else SlidesAmong(format),
             )
-            orders = {**recording.commands, **session.commands, "DONE": self._finish}
+            orders = {**session.recording_commands, **session.commands, "DONE": self._finish}
             self._obey = self._orders(orders, box.obey)
             session.by = "the page" if pages else args.by or getpass.getuser()
             over = (lambda: self._ended, lambda: session.taught, lambda: teacher.done)
@@ -397,6 +397,7 @@ class Session:
     def _teach_again(self, label: str) -> list[object]:
         label = label.strip()
         Labels(material=label)
+        refuse_trained(into.trained(self._base.bundle) if self._base else (), [label])
         if self._codes:
             check_bits(self._codes, [*dict.fromkeys((*self._tried, label))])
         self._again = label

@@ -254,7 +254,8 @@ class Verdict:
     detail: the subject of the status ("taxel 2.3"). fused: number of sweeps in `scores`. lost: as
     in Sweep. latency_ns: from `Sweep.complete_ns` to the verdict. bundle: id of the bundle. share:
     share of the window that was used, less than 1 in an early answer. own: float64 [K]
-    probabilities of this sweep alone; empty if it has none. displacement: distance of
+    probabilities of this sweep alone, before an enrolled label needs its least probability
+    (EnrolledLabels); empty if it has none. displacement: distance of
     the contact from its positions in training ("moved 2.1 mm too far towards row 4"); "" if it is
     in place, or if the bundle does not have the positions. degraded: the broken taxels that were
     bridged ("silent taxel 2.3"); "" for none. after: number of the last sweep before

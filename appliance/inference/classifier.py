@@ -22,7 +22,7 @@ from appliance.core.observer import Observer
 from appliance.core.types import Frames, Status, Sweep, SweepFormat, Verdict, entries
 from appliance.inference.novelty import ClassDistances, UnknownSweeps
 from appliance.inference.objects import LEAST_PROBABILITY as LEAST_PROBABILITY
-from appliance.inference.objects import FusedSweeps, ObjectRule, ObjectSweeps
+from appliance.inference.objects import EnrolledLabels, FusedSweeps, ObjectRule, ObjectSweeps
 from appliance.inference.objects import fuse as fuse
 from appliance.inference.objects import softmax as softmax
 from appliance.inference.session import ModelRunner
@@ -41,6 +41,13 @@ if TYPE_CHECKING:
 
 STILL = f"{NO_PATTERN}, as with a finger that rests"
 _NONE, _NO_SLIDE, _IN_PLACE = np.empty(0), Slide(), Displacement()
+
+
+def enrolled_labels(bundle: Bundle) -> EnrolledLabels:
+    """The enrolled labels of a bundle, and its rule for them."""
+    known, names = bundle.manifest.known, bundle.enrolled
+    which = np.array([label in names for label in bundle.manifest.labels])
+    return EnrolledLabels(which, (known and known.enrolled) or 0.0)
 
 
 def _degraded(finding: Finding) -> str:
@@ -93,7 +100,10 @@ class Classifier(Observer):
         self.min_probability = min_probability or bundle.manifest.thresholds.unsure
         self._clock = clock
         self._objects = ObjectSweeps(
-            bundle.manifest.labels, fusion, ObjectRule(max_sweeps, conflict, object_s)
+            bundle.manifest.labels,
+            fusion,
+            ObjectRule(max_sweeps, conflict, object_s),
+            enrolled_labels(bundle),
         )
         self.tare = bundle.manifest.tare
         self.taxels = TaxelWatch(bundle.manifest)
@@ -118,11 +128,9 @@ class Classifier(Observer):
             if rule and known and classes
             else None
         )
-        self._outputs = ("logits",) * (not bundle.enrolled) + ("embedding",) * (
-            self._means is not None
-        )
-        # always with logits, which the self-test needs; early heads get a session of their own
-        self._model = ModelRunner(bundle.model, *{"logits", *self._outputs})
+        self._outputs = ("logits", *("embedding",) * (self._means is not None))
+        # early heads get a session of their own
+        self._model = ModelRunner(bundle.model, *self._outputs)
 
     @property
     def rule(self) -> dict[str, Any]:
@@ -174,7 +182,8 @@ class Classifier(Observer):
 
     def logits(self, taxels: NDArray[Any]) -> NDArray[np.float32]:
         """Logits float32 [K] of one window of raw counts [T, R, C] or [T, R, C, A]."""
-        return self._logits_of(self._run(self._outputs, taxels), self._means)
+        network, *z = self._run(self._outputs, taxels)
+        return self._means.joined(network, z[0]) if self._means else network
 
     def early(self, taxels: NDArray[Any]) -> NDArray[np.float32]:
         """Logits float32 [D, K0] after each step of one window of raw counts [T, R, C] or [T, R, C,
@@ -192,6 +201,12 @@ class Classifier(Observer):
     def prepare(self, *outputs: str) -> None:
         """Open the session of these outputs now, so that the first sweep does not wait for it."""
         self._model.prepare(*outputs)
+
+    def network(self, taxels: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """The model's own logits [K0] of the trained labels, and the embedding [r], of one window;
+        the model must have both outputs."""
+        logits, z = self._run(("logits", "embedding"), taxels)
+        return logits, z
 
     def embedding(self, taxels: NDArray[Any]) -> NDArray[np.float32]:
         """Embedding float32 [r] of one window of raw counts [T, R, C] or [T, R, C, A]; the model
@@ -225,8 +240,9 @@ class Classifier(Observer):
     def _test_means(self, means: ClassDistances) -> None:
         """Raises BundleError if the class means and the model's own logits give a golden sweep
         different labels: then they do not belong together."""
-        for golden in self.bundle.golden:
-            logits, z = self._run(("logits", "embedding"), golden)
+        trained = len(self.bundle.golden) - len(self.bundle.enrolled)
+        for golden in self.bundle.golden[:trained]:
+            logits, z = self.network(golden)
             by_logits, by_means = (
                 logits.argmax(),
                 means.logits(means.distances(z))[: len(logits)].argmax(),
@@ -248,14 +264,12 @@ class Classifier(Observer):
         if finding.status is not Status.OK:
             return self._verdict(sweep, finding)
         sweep, hum = self._without_hum(sweep)
-        touch, rule = self._touch(sweep, finding.mean), self.bundle.manifest.displacement
-        touch, displaced = replace(touch, hum=hum), bool(touch.displacement.text)
+        touch = replace(self._touch(sweep, finding.mean), hum=hum)
         logits, novelty = self._classify(sweep, touch, finding.mean)
         if novelty:
             finding = replace(finding, status=Status.UNKNOWN, detail=novelty)
             return self._verdict(sweep, finding, touch=touch)
-        scores = softmax(logits / (rule.temperature if displaced and rule else 1))
-        return self.conclude(sweep, scores, touch, finding.degraded)
+        return self.conclude(sweep, softmax(logits), touch, finding.degraded)
 
     def repaired(self, sweep: Sweep) -> tuple[Sweep, Finding]:
         """A sweep with frames, its broken taxels bridged, and the result of its check."""
@@ -293,7 +307,8 @@ class Classifier(Observer):
             return self._verdict(sweep, Finding(Status.UNKNOWN, far, degraded), touch=touch)
         # bridged taxels move with their neighbours, which hides the pattern
         patterned = bool(degraded) or self._patterned(sweep, touch.slide)
-        if rests := self._rests(sweep, int(scores.argmax())) if patterned else STILL:
+        named = int(self._objects.enrolled.decided(scores).argmax())
+        if rests := self._rests(sweep, named) if patterned else STILL:
             return self._verdict(sweep, Finding(Status.NO_SLIDE, rests, degraded), touch=touch)
         fused = self._objects.put(sweep, scores)
         if fused.refused:
@@ -342,20 +357,21 @@ class Classifier(Observer):
         Changes caused by a displacement of the contact, or by disturbances of the sweep, do not
         make a material unknown. mean: counts of the window, see Finding.
         """
-        values = self._run(self._outputs, sweep.frames.taxels)
-        displaced = bool(touch.displacement.text)
-        means = self._displaced_means if displaced and self._displaced_means else self._means
+        means = self._means
+        if touch.displacement.text and self._displaced_means:
+            means = self._displaced_means
         if means is None:
-            return self._logits_of(values), ""
+            return self.logits(sweep.frames.taxels), ""
+        network, z = self.network(sweep.frames.taxels)
         disturbed = self._disturbed(sweep, touch, mean)
         allowed = self.bundle.manifest.disturbances
         if untried := allowed.untried(disturbed) if allowed else "":
-            return self._logits_of(values, means), untried
-        novelty = means.novelty(values[-1], disturbed)
+            return means.joined(network, z), untried
+        novelty = means.novelty(z, disturbed)
         if novelty and means is self._means and self._unknown:
-            alike = self._unknown.put(sweep.id, values[-1])
+            alike = self._unknown.put(sweep.id, z)
             novelty += f"; as sweep {alike}" * (alike > 0)
-        return self._logits_of(values, means), novelty
+        return means.joined(network, z), novelty
 
     def _disturbed(
         self, sweep: Sweep, touch: Touched, mean: NDArray[np.float64] | None
@@ -374,15 +390,6 @@ class Classifier(Observer):
         if touch.slide.taxels_s:
             found["speed"] = math.log(touch.slide.taxels_s)
         return found
-
-    def _logits_of(
-        self, values: list[NDArray[np.float32]], means: ClassDistances | None = None
-    ) -> NDArray[np.float32]:
-        """Logits [K] from the outputs of the graph, or from class means once a label is
-        enrolled."""
-        if means and len(self._outputs) == 1:
-            return means.logits(means.distances(values[-1]))
-        return values[0]
 
     def _touch(self, sweep: Sweep, mean: NDArray[np.float64] | None) -> Touched:
         """The displacement of the contact from its positions in training, and the slide, which is

@@ -28,6 +28,10 @@ from appliance.inference.classifier import Classifier, softmax
 from appliance.inference.novelty import ClassDistances
 from appliance.signal.slide_check import SlideCheck
 
+Embedded = NDArray[np.float64]
+LEAST = 0.7
+"""Known.enrolled of an enrolment. Decision 29 compares values and rules."""
+
 
 @dataclass(frozen=True, slots=True)
 class Enrolment:
@@ -87,18 +91,16 @@ def enrol(old: Bundle, label: str, sweeps: NDArray[Any]) -> Enrolment:
             raise FormatError(
                 f"sweep {number} of {len(sweeps)} is not a slide over {label!r}: {why}; take others"
             )
-    z, golden = (
-        np.stack([run.embedding(s) for s in of]).astype(np.float64) for of in (sweeps, old.golden)
-    )
+    network, z = network_outputs(run, sweeps)
     if not np.isfinite(z).all():
         raise FormatError(
             "the model gives no number for some of the sweeps; look at the skin and take others"
         )
     classes = extended(old.classes, z)
-    means = ClassDistances(classes, m.known, (*m.labels, label))
-    median = _median(softmax(means.logits(means.distances(z))))
-    logits = means.logits(means.distances(np.vstack([golden, z[median]])))
-    new, file = _added(old, label, classes, sweeps[median], logits)
+    means = ClassDistances(classes, replace(m.known, enrolled=LEAST), (*m.labels, label))
+    median = _median(softmax(means.joined(network, z)))
+    outputs = network_outputs(run, np.append(old.golden, sweeps[median][None], axis=0))
+    new, file = _added(old, label, classes, sweeps[median], means.joined(*outputs))
     trained, warnings = ClassDistances(old.classes, m.known, m.labels), []
     if close := _closeness(trained, label, z):
         warnings.append(close)
@@ -110,9 +112,17 @@ def enrol(old: Bundle, label: str, sweeps: NDArray[Any]) -> Enrolment:
     return Enrolment(new, file, tuple(warnings), _disagreement(trained, label, z))
 
 
+def network_outputs(run: Classifier, sweeps: NDArray[Any]) -> tuple[Embedded, Embedded]:
+    """The model's own logits [n, K0] and embeddings [n, r] of windows [n, T, R, C] or [n, T, R, C,
+    A]."""
+    logits, z = zip(*map(run.network, sweeps), strict=True)
+    return np.stack(logits).astype(np.float64), np.stack(z).astype(np.float64)
+
+
 def slide_check(old: Bundle) -> SlideCheck:
     """The check whether a window is a slide, on the skin of a bundle. Patterns are expected where
-    training measured them."""
+    training measured them. They must be higher than for an answer (SlideLimits.pattern), with whose
+    limit mains hum and noise that all taxels share would be learned."""
     m = old.manifest
     limits, patterned = m.sliding, m.speeds is not None
     return SlideCheck(m.format, m.tare, m.thresholds.contact, limits, patterned=patterned)
@@ -143,7 +153,7 @@ def _added(
         classes.sweeps[-1:],
         classes.spread[-1:],
     )
-    added = AddedLabels(old.base, (label,), mean, sweeps, spread, golden[None], logits)
+    added = AddedLabels(old.base, (label,), mean, sweeps, spread, golden[None], logits, LEAST)
     if before:
         added = AddedLabels(
             old.base,
@@ -153,9 +163,11 @@ def _added(
             np.append(before.spread, spread),
             np.concatenate([before.golden, golden[None]]),
             logits,
+            LEAST,
         )
     file = enrolled.file(added)
     new = enrolled.with_label(old, label, mean[0], int(sweeps[0]), float(spread[0]), golden)
+    new = enrolled.deciding(new, LEAST)
     return replace(new, golden_logits=logits, id=bundle.identity(file), added=added), file
 
 
@@ -207,8 +219,8 @@ def _disagreement(means: ClassDistances, label: str, z: NDArray[np.float64]) -> 
 
 
 def _closeness(means: ClassDistances, label: str, z: NDArray[np.float64]) -> str:
-    """A warning if the sweeps with the embeddings `z` [n, r] will be confused with a label of
-    `means`, "" if not."""
+    """A warning if the sweeps with the embeddings `z` [n, r] will often get a label of `means`, ""
+    if not."""
     n, r = z.shape
     to_old = (
         means.distances(z.mean(axis=0)) - r / n
@@ -218,7 +230,7 @@ def _closeness(means: ClassDistances, label: str, z: NDArray[np.float64]) -> str
         return ""
     return (
         f"{label!r} lies close to {means.labels[k]!r}: squared distance {max(to_old[k], 0):.1f}, "
-        f"limit {means.limit:.1f}; the two will be taken for each other"
+        f"limit {means.limit:.1f}; its sweeps will often be called that"
     )
 
 

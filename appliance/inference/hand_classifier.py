@@ -12,8 +12,14 @@ from numpy.typing import NDArray
 from appliance.core.errors import ConfigError
 from appliance.core.observer import Observer
 from appliance.core.types import Frames, Status, Sweep, SweepFormat, Verdict
-from appliance.inference.classifier import Classifier
-from appliance.inference.objects import ObjectAnswer, ObjectRule, ObjectSweeps, fuse
+from appliance.inference.classifier import Classifier, enrolled_labels
+from appliance.inference.objects import (
+    EnrolledLabels,
+    ObjectAnswer,
+    ObjectRule,
+    ObjectSweeps,
+    fuse,
+)
 
 if TYPE_CHECKING:
     from appliance.core.clock import Clock
@@ -43,7 +49,7 @@ class HandClassifier(Observer):
         self._fingers, self._clock, self._away = fingers, clock, away
         self.labels = next(iter(fingers.values())).bundle.manifest.labels
         self._order = {name: self._places(name) for name in fingers}
-        self._objects = ObjectSweeps(self.labels, fusion, rule)
+        self._objects = ObjectSweeps(self.labels, fusion, rule, self._enrolled())
         ids = dict.fromkeys(c.model for c in fingers.values())
         self._model = next(iter(ids)) if len(ids) == 1 else f"{crc32(' '.join(ids).encode()):08x}"
         self._longest = max(
@@ -61,6 +67,12 @@ class HandClassifier(Observer):
                 "the same materials"
             )
         return np.array([own.index(label) for label in self.labels])
+
+    def _enrolled(self) -> EnrolledLabels:
+        """The labels that some finger has enrolled, with the strictest rule."""
+        own = [enrolled_labels(c.bundle) for c in self._fingers.values()]
+        which = [of.which[places] for of, places in zip(own, self._order.values(), strict=True)]
+        return EnrolledLabels(np.any(which, axis=0), max(of.least for of in own))
 
     @property
     def format(self) -> SweepFormat:

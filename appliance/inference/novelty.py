@@ -49,6 +49,13 @@ def _of_all(changes: Array, labels: int) -> Array:
     return np.concatenate([changes, mean.repeat(labels - changes.shape[1], axis=1)], axis=1)
 
 
+def log_softmax(logits: NDArray[Any]) -> Array:
+    """Logarithms of the probabilities of logits along the last axis, in float64."""
+    z = np.asarray(logits, np.float64)
+    result: Array = z - np.logaddexp.reduce(z, axis=-1, keepdims=True)
+    return result
+
+
 class EarlyDistances:
     """Finds unknown materials in unfinished sweeps. limits: [D], largest squared distance of a
     known material at each step."""
@@ -98,8 +105,8 @@ class ClassDistances:
     """Computes distances and logits from a bundle's class means. labels: of the means, [K].
 
     displacement: rule for sweeps whose contact is displaced. The distances are then computed in
-    `classes.displaced`, where directions that a displacement changes have little weight.
-    disturbances: the allowances for them.
+    `classes.displaced`, where directions that a displacement changes have little weight, and all
+    logits are divided by its temperature. disturbances: the allowances for them.
     """
 
     def __init__(
@@ -116,6 +123,8 @@ class ClassDistances:
         # the rest of the bias, since the squared distance already contains -|m|^2 / 2; logits that
         # are computed from distances do not suffer from the cancellation of large products
         self._extra = classes.bias + (self._means**2).sum(axis=1) / 2
+        self._enrolled, self._joint = classes.sweeps > 0, known.enrolled is not None
+        self._softening = displacement.temperature if displacement else 1
         shapes = classes.shapes
         if displacement and classes.displaced:
             self.limit, shapes = displacement.limit, classes.displaced.shapes
@@ -151,6 +160,25 @@ class ClassDistances:
             np.float32
         )
         return result
+
+    def joined(self, network: NDArray[Any], embedding: NDArray[Any]) -> NDArray[np.float32]:
+        """Logits float32 [..., K] of all labels of a bundle.
+
+        network: [..., K0], logits of the K0 trained labels, which come first. embedding: [..., r].
+        Without enrolled labels these are the network's own. With them, the distances give the
+        probability of each enrolled label and that of all trained labels together; the network
+        divides the latter among them. In bundles without `Known.enrolled`, all are from distances.
+        """
+        softened = np.asarray(network / self._softening, np.float32)
+        if not self._enrolled.any():
+            return softened
+        by_means = np.asarray(self.logits(self.distances(embedding)) / self._softening, np.float32)
+        if not self._joint:
+            return by_means
+        n, logs = network.shape[-1], log_softmax(by_means)
+        trained = np.logaddexp.reduce(logs[..., :n], axis=-1, keepdims=True)
+        logits = np.concatenate([trained + log_softmax(softened), logs[..., n:]], axis=-1)
+        return np.asarray(logits, np.float32)
 
     def novelty(self, embedding: NDArray[Any], disturbed: Mapping[str, float] = UNDISTURBED) -> str:
         """A message with the distance to the nearest material if it is beyond the limit; "" for a

@@ -38,6 +38,30 @@ def softmax(logits: NDArray[Any]) -> NDArray[np.float64]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class EnrolledLabels:
+    """The rule that protects trained labels from enrolled ones.
+
+    which: bool [K], the labels that were enrolled. least: as Known.enrolled; 0 for no rule.
+    """
+
+    which: NDArray[np.bool_]
+    least: float = 0.0
+
+    def decided(self, p: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The probabilities `p` [..., K] for an answer. Below the least probability the enrolled
+        labels get 0, and the trained ones are as without them.
+
+        It is applied to the sweeps of an object together: several sweeps that each are not enough
+        may be enough.
+        """
+        if not (self.least and self.which.any()):
+            return p
+        trained = np.where(self.which, 0, p)
+        total = trained.sum(axis=-1, keepdims=True)
+        return np.where(1 - total >= self.least, p, trained / np.maximum(total, 1 - self.least))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Evidence:
     """Sums over the sweeps of one object. Time and memory do not depend on the number of sweeps.
 
@@ -124,10 +148,10 @@ def contradicts(own: NDArray[np.float64], fused: NDArray[np.float64]) -> bool:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ObjectAnswer:
-    """What the sweeps of the present object say together. scores: float64 [K]; of a refused sweep
-    its own. fused: number of sweeps in them. after: number of the last sweep before. conflict: a
-    message if the sweep contradicts those before it, else "". final: no further sweep of this
-    object is wanted."""
+    """What the sweeps of the present object say together. scores: float64 [K], decided
+    (EnrolledLabels); of a refused sweep its own. fused: number of sweeps in them. after: number of
+    the last sweep before. conflict: a message if the sweep contradicts those before it, else "".
+    final: no further sweep of this object is wanted."""
 
     scores: NDArray[np.float64]
     fused: int
@@ -141,8 +165,10 @@ class ObjectSweeps:
     """Fuses the sweeps of one object after the other. labels: [K], for messages. fusion: "product",
     "vote" (see `Evidence.of`) or "none"."""
 
-    def __init__(self, labels: Sequence[str], fusion: str, rule: ObjectRule) -> None:
-        self.fusion, self.rule = fusion, rule
+    def __init__(
+        self, labels: Sequence[str], fusion: str, rule: ObjectRule, enrolled: EnrolledLabels
+    ) -> None:
+        self.fusion, self.rule, self.enrolled = fusion, rule, enrolled
         self.present = FusedSweeps()
         self._labels = labels
 
@@ -155,13 +181,17 @@ class ObjectSweeps:
         conflict = self._conflict(own, before)
         if conflict and self.rule.conflict == "refuse":
             self.present = replace(earlier, last=sweep.id, end_ns=sweep.stop_ns)
-            return ObjectAnswer(own, 0, earlier.last, conflict, refused=True, final=False)
-        kept = Evidence.of(own, self.fusion, None if conflict else before)
+            return ObjectAnswer(
+                self.enrolled.decided(own), 0, earlier.last, conflict, refused=True, final=False
+            )
+        votes = self.fusion == "vote"  # each sweep votes for the label that it is given
+        kept = Evidence.of(
+            self.enrolled.decided(own) if votes else own, self.fusion, None if conflict else before
+        )
         self.present = FusedSweeps(sweep.object, kept, sweep.id, sweep.stop_ns)
         final = 0 < self.rule.max_sweeps <= kept.sweeps
-        return ObjectAnswer(
-            kept.probabilities, kept.sweeps, earlier.last, conflict, refused=False, final=final
-        )
+        scores = kept.probabilities if votes else self.enrolled.decided(kept.probabilities)
+        return ObjectAnswer(scores, kept.sweeps, earlier.last, conflict, refused=False, final=final)
 
     def _conflict(self, own: NDArray[np.float64], before: Evidence | None) -> str:
         """A message if `own` [K] contradicts the sweeps `before`, "" if it can be fused with
@@ -171,5 +201,7 @@ class ObjectSweeps:
         fused = before.probabilities
         if not contradicts(own, fused):
             return ""
-        label, before_it = (self._labels[int(p.argmax())] for p in (own, fused))
+        label, before_it = (
+            self._labels[int(self.enrolled.decided(p).argmax())] for p in (own, fused)
+        )
         return f"another object: {label} after {before_it}"

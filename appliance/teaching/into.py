@@ -23,16 +23,14 @@ from appliance.core.errors import BundleError, ConfigError, FormatError
 from appliance.core.statistics import wilson
 from appliance.core.types import Status, load, sidecar
 from appliance.deployment.signed import SignedBundle
-from appliance.inference import enrolment
+from appliance.inference import advice, enrolment
 from appliance.inference.classifier import Classifier, softmax
 from appliance.inference.enrolment import Enrolment
 from appliance.inference.novelty import ClassDistances
+from appliance.inference.objects import EnrolledLabels
 from appliance.teaching.process import News
 
 Array = NDArray[Any]
-ENOUGH, SURE, MORE = 0.9, 0.8, 3
-"""As in train/teach/assessment.py: the lower end of the interval that is enough, the probability at
-which a sweep is suspected, and the number of sweeps that an advice names."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,24 +152,17 @@ def assessed(running: SignedBundle, sweeps: NewSweeps) -> News:
     if not many:
         raise BundleError("no new material has two sweeps; record another of it")
     old = _without(running, {*many})
-    assert old.classes
-    run = Classifier(old, SystemClock())
-    z = {
-        name: np.stack([run.embedding(one) for one in of]).astype(np.float64)
-        for name, of in many.items()
-    }
-    p = {name: _left_out(old, z, name) for name in z}
-    names = [*old.manifest.labels, *z]
-    answers = {name: [names[k] for k in of.argmax(axis=1)] for name, of in p.items()}
+    p, answers = _judged(old, many)
     right = sum(of.count(name) for name, of in answers.items())
     total = sum(map(len, answers.values()))
     low, high = wilson(right, total)
     wrong = Counter((name, one) for name, of in answers.items() for one in of if one != name)
     suspects = _suspects(p, answers, sweeps)
     worst = max(wrong, key=wrong.__getitem__) if wrong else None
+    labels = len(old.manifest.labels) + len(many)
     said = (
         f"{100 * right / total:.0f} % of {total} sweeps of new materials are named rightly among "
-        f"{len(names)} if they are left out [{100 * low:.0f}, {100 * high:.0f}]"
+        f"{labels} if they are left out [{100 * low:.0f}, {100 * high:.0f}]"
     )
     return {
         "type": "assessed",
@@ -189,36 +180,53 @@ def assessed(running: SignedBundle, sweeps: NewSweeps) -> News:
     }
 
 
+def _judged(
+    old: Bundle, many: Mapping[str, Array]
+) -> tuple[dict[str, Array], dict[str, list[str]]]:
+    """For each new material the probabilities [n, K] of its left-out sweeps, and the answers of the
+    box to them."""
+    run, names = Classifier(old, SystemClock()), [*old.manifest.labels, *many]
+    outputs = {name: enrolment.network_outputs(run, of) for name, of in many.items()}
+    p = {name: _left_out(old, outputs, name) for name in outputs}
+    late = {*old.enrolled, *many}
+    rule = EnrolledLabels(np.array([name in late for name in names]), enrolment.LEAST)
+    return p, {name: [names[k] for k in rule.decided(of).argmax(axis=1)] for name, of in p.items()}
+
+
 def _suspects(
     p: Mapping[str, Array], answers: Mapping[str, list[str]], sweeps: NewSweeps
 ) -> list[dict[str, Any]]:
-    """Sweeps that are surely of another material, where most others of their own are named
-    rightly."""
+    """Sweeps that are surely of another material, where the others of their own are named
+    rightly. p: [n, K] of each new material, before the least probability of new labels."""
     return [
         {
             "sweep": f"sweep-{sweeps.files[name][i]:06d}",
             "number": i + 1,
             "material": name,
             "looks_like": answers[name][i],
-            "text": f"sweep {i + 1} of {name} looks like {answers[name][i]}",
+            "text": advice.suspicion(i + 1, name, answers[name][i]),
         }
         for name, of in p.items()
-        for i in np.flatnonzero(of.max(axis=1) >= SURE).tolist()
-        if answers[name][i] != name and 2 * answers[name].count(name) > len(of)
+        for i in np.flatnonzero(of.max(axis=1) >= advice.SURE).tolist()
+        if answers[name][i] != name and answers[name].count(name) >= advice.RIGHT * (len(of) - 1)
     ]
 
 
-def _left_out(old: Bundle, z: Mapping[str, Array], of: str) -> Array:
-    """Probabilities [n, K] of all labels for the sweeps of a material, each left out in turn."""
+def _left_out(old: Bundle, outputs: Mapping[str, tuple[Array, Array]], of: str) -> Array:
+    """Probabilities [n, K] of all labels for the sweeps of a material, each left out in turn.
+
+    outputs: as of `enrolment.network_outputs`, of each material.
+    """
     assert old.classes
     assert old.manifest.known
-    labels, answers = [*old.manifest.labels, *z], []
-    for i in range(len(z[of])):
+    known, labels = replace(old.manifest.known, enrolled=enrolment.LEAST), old.manifest.labels
+    network, answers = outputs[of][0], []
+    for i in range(len(network)):
         classes = old.classes
-        for name, own in z.items():
-            classes = enrolment.extended(classes, np.delete(own, i, axis=0) if name == of else own)
-        means = ClassDistances(classes, old.manifest.known, labels)
-        answers.append(softmax(means.logits(means.distances(z[of][i]))))
+        for name, (_, z) in outputs.items():
+            classes = enrolment.extended(classes, np.delete(z, i, axis=0) if name == of else z)
+        means = ClassDistances(classes, known, [*labels, *outputs])
+        answers.append(softmax(means.joined(network[i], outputs[of][1][i])))
     return np.stack(answers)
 
 
@@ -226,14 +234,9 @@ def _advice(
     low: float, worst: tuple[str, str] | None, many: Mapping[str, Array], suspects: list[str]
 ) -> str:
     """What to record next, or that it is enough."""
-    if suspects:
-        return f"look at it first: {suspects[0]}; discard it if that is so"
-    if low >= ENOUGH:
-        return (
-            f"enough: at least {100 * low:.0f} % of such sweeps are named rightly "
-            "(with 97.5 % certainty)"
-        )
+    if said := advice.first(suspects, low):
+        return said
     if worst:
-        return f"{MORE} more of {worst[0]}, from another place"
+        return advice.more(worst[0])
     fewest = min(many, key=lambda name: len(many[name]))
-    return f"nothing was confused, but few sweeps are recorded: {MORE} more of {fewest}"
+    return f"nothing was confused, but few sweeps are recorded: {advice.MORE} more of {fewest}"

@@ -7,7 +7,7 @@ bundle in service as they are.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,16 @@ PAUSE_NS = 300_000_000
 Learn = Callable[[str], list[str]]
 """The command of a process that does all of `use`, for the person or program that asks; for "" of a
 process that only assesses the sweeps."""
+
+
+def refuse_trained(trained: Iterable[str], labels: Iterable[str]) -> None:
+    """Raises ConfigError for a label that the delivered bundle was trained on: its sweeps teach
+    nothing here."""
+    if known := next((name for name in labels if name in trained), ""):
+        raise ConfigError(
+            f"the bundle in service was trained on {known!r}; record more of it for the desktop "
+            "(palpate record), or take another name"
+        )
 
 
 class TeachingSession(Observer):
@@ -71,6 +81,8 @@ class TeachingSession(Observer):
         self._refused: set[int] = set()
         self.by = "the serial line"
         self.taught: News | None = None
+        self.recording_commands = {**recording.commands, "MATERIAL": self._material}
+        """Those of the recording, which here refuse what TEACH refuses."""
         self.commands: Mapping[str, Callable[[str], list[object]]] = {
             "TEACH": self._teach,
             "USE": self._use,
@@ -119,11 +131,7 @@ class TeachingSession(Observer):
         """Raises ConfigError for a material that the delivered bundle was trained on, and if the
         class bits cannot hold these materials beside those of before. A box without class bits
         admits any number."""
-        if known := next((name for name in labels if name in self._trained), ""):
-            raise ConfigError(
-                f"the bundle in service was trained on {known!r}; record more of it for the "
-                "desktop (palpate record), or take another name"
-            )
+        refuse_trained(self._trained, labels)
         if self._codes:
             wanted = dict.fromkeys((*self._base, *self.materials(), *labels))
             for name in self._state.forgotten.keys() - self.materials().keys() - {*labels}:
@@ -208,6 +216,11 @@ class TeachingSession(Observer):
         self._named.setdefault(label)
         self._recording.commands["MATERIAL"](label)
         return [label, self.materials().get(label, 0)]
+
+    def _material(self, label: str) -> list[object]:
+        """As MATERIAL of a recording."""
+        self.admit(*filter(None, [label.strip()]))
+        return self._recording.commands["MATERIAL"](label)
 
     def _use(self, _: str) -> list[object]:
         """Begin to teach all sweeps; returns the number of materials and of sweeps."""

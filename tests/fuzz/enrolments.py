@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from random import Random
@@ -74,7 +75,9 @@ def target(data: bytes, folder: Path) -> None:
         old.format,
         old.manifest.thresholds,
     )
-    assert got.manifest.known == old.manifest.known
+    assert got.added
+    assert old.manifest.known
+    assert got.manifest.known == replace(old.manifest.known, enrolled=got.added.least)
     assert got.manifest.early is None, "early heads do not know the label"
     _check_classes(old, got)
     assert set(got.enrolled) == set(labels[n:])
@@ -87,7 +90,6 @@ def target(data: bytes, folder: Path) -> None:
     assert got.golden[: len(old.golden)].tobytes() == old.golden.tobytes()
     assert got.golden_logits.shape == (len(got.golden), len(labels))
     assert np.isfinite(got.golden_logits).all()
-    assert got.added
     again = read(enrolled.file(got.added), folder)
     assert again.manifest == got.manifest, "what an enrolment writes reads as something else"
     assert again.golden.tobytes() == got.golden.tobytes()
@@ -103,8 +105,8 @@ def _right(labels: int) -> bytes:
 
 
 def seeds() -> list[bytes]:
-    """One to three labels; each array with another invalid value; the enrolment of another bundle,
-    a label that exists, no label."""
+    """One to three labels; the file of an older program; each array with another invalid value;
+    the enrolment of another bundle, a label that exists, no label."""
     right = [_right(1), _right(2), _right(3)]
     with np.load(io.BytesIO(right[0])) as z:
         arrays = dict(z.items())
@@ -116,15 +118,19 @@ def seeds() -> list[bytes]:
         ("sweeps", np.int64([0])),
         ("sweeps", np.int64([1 << 60])),
         ("changes", arrays["changes"][:1]),
-        ("logits", arrays["logits"][1:]),
+        ("joint", arrays["joint"][1:]),
+        ("least", np.array(0.4)),
+        ("least", np.array([0.7])),
         ("base", np.array("0" * 64)),
         ("labels", np.array(["a"])),
         ("labels", np.array(["a,b"])),
         ("labels", np.array([], "<U4")),
         ("labels", np.array(["cork", "cork"])),
     ]
+    older = {name: v for name, v in arrays.items() if name not in ("joint", "least")}
     return [
         *right,
+        packing.packed(**older, logits=arrays["joint"]),
         *(packing.packed(**arrays | {name: value}) for name, value in wrong),
         right[0][:200],
         b"PK",
@@ -134,7 +140,7 @@ def seeds() -> list[bytes]:
 def words() -> list[bytes]:
     """Names of arrays and words of numpy's header."""
     return [
-        *(f"{name}.npy".encode() for name in enrolled.ARRAYS),
+        *(f"{name}.npy".encode() for name in (*enrolled.ARRAYS, "logits")),
         b"'<f4'",
         b"'<U4'",
         b"'shape': (1,)",

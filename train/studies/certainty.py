@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -16,9 +17,11 @@ from numpy.typing import NDArray
 
 from appliance.bundle.bundle import Early
 from appliance.inference.classifier import LEAST_PROBABILITY, softmax
-from appliance.inference.enrolment import extended
+from appliance.inference.enrolment import LEAST
+from appliance.inference.enrolment import extended as enrolled_classes
+from appliance.inference.novelty import ClassDistances
+from appliance.inference.objects import EnrolledLabels
 from train.calibration.early_exit import LEVELS, decide
-from train.calibration.novelty import Embedding
 from train.data.sets import Dataset, digest
 from train.evaluation import uncertainty
 from train.evaluation.evaluate import Where
@@ -280,12 +283,13 @@ def _enrolled(
 ) -> Iterator[tuple[int, str, tuple[float, float, float, float]]]:
     """For each random draw: (sweeps, where, (accuracy, accuracy of the model trained on all
     materials, recall of the new material, loss of the old ones))."""
-    z, k = done.embedding(case.new[:, -1]), case.left_out
+    network, z = done.logits(case.new[:, -1]), done.embedding(case.new[:, -1])
+    k = case.left_out
     as_trained = trained.logits(whole.new[:, -1]).argmax(1)
     names = np.append(
         np.delete(np.arange(case.labels.max() + 1), k), k
     )  # the box puts the new label last
-    before = names[done.logits(case.new[:, -1]).argmax(1)]
+    before = names[network.argmax(1)]
     mine, places = np.flatnonzero(case.labels == k), np.unique(case.places)
     for n in ENROLLED:
         for _ in range(max(ORDERS // len(places), 2) if n <= len(mine) else 0):
@@ -294,7 +298,7 @@ def _enrolled(
                 if len(there) < n:
                     continue
                 drawn = rng.permutation(there)[:n]
-                named = names[enrolled_logits(done.embedding, z, z[drawn]).argmax(1)]
+                named = names[enrolled_probabilities(done, network, z, z[drawn]).argmax(1)]
                 for where, chosen in (
                     ("same place", case.places == place),
                     ("other places", case.places != place),
@@ -317,12 +321,13 @@ def _enrolled(
                         )
 
 
-def enrolled_logits(embedding: Embedding, z: Array, sweeps: Array) -> Array:
-    """Logits [n, K + 1], before temperature scaling, of embeddings z [n, r]; the last label is
-    enrolled from `sweeps` [m, r] as on the box."""
-    enrolled = extended(embedding.classes(), sweeps)
-    logits: Array = z @ enrolled.means.T + enrolled.bias
-    return logits
+def enrolled_probabilities(done: Calibration, network: Array, z: Array, sweeps: Array) -> Array:
+    """Probabilities [n, K + 1] of sweeps with these logits [n, K] and embeddings z [n, r], as the
+    box answers after the last label was enrolled from `sweeps` [m, r]."""
+    classes = enrolled_classes(done.embedding.classes(), sweeps)
+    labels = [*map(str, range(len(classes.means)))]
+    means = ClassDistances(classes, replace(done.known(), enrolled=LEAST), labels)
+    return EnrolledLabels(classes.sweeps > 0, LEAST).decided(softmax(means.joined(network, z)))
 
 
 def _balanced(named: Array, labels: Array) -> float:

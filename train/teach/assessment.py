@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appliance.core.statistics import wilson
+from appliance.inference import advice
 from appliance.inference.classifier import softmax
 from train.data.splitters import InnerPart, inner_parts, recording_parts
 from train.metrics.score import interval
@@ -23,15 +24,6 @@ from train.models.recipe import recipe
 from train.teach.lesson import Lesson
 
 Array = NDArray[Any]
-ENOUGH = 0.9
-"""Lower end of the interval from which on more sweeps are not asked for."""
-SURE = 0.8
-"""Least probability of another material at which a sweep may be mislabelled."""
-RIGHT = 0.6
-"""Least share of the other sweeps of both materials that are named rightly then. If materials are
-often confused, a single sweep says nothing about its label."""
-MORE = 3
-"""Number of further sweeps that an advice names."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +38,7 @@ class Suspect:
 
     @property
     def text(self) -> str:
-        return f"sweep {self.number} of {self.material} looks like {self.looks_like}"
+        return advice.suspicion(self.number, self.material, self.looks_like)
 
 
 @dataclass(frozen=True)
@@ -91,28 +83,25 @@ class Assessment:
     def advice(self) -> str:
         """What to record next, or that it is enough."""
         materials, counts = self.lesson.sweeps.materials, np.bincount(self.lesson.sweeps.labels)
-        if self.suspects:
-            return f"look at it first: {self.suspects[0].text}; discard it if that is so"
-        if pair := self.inseparable():
+        suspicions = [one.text for one in self.suspects]
+        pair = self.inseparable()
+        if pair and not suspicions:
             one, other = (materials[k] for k in pair)
             return (
                 f"{one} and {other} cannot be told apart so far; slide differently (faster, "
                 "harder, longer), or teach them as one material"
             )
-        if self.low >= ENOUGH:
-            return (
-                f"enough: at least {100 * self.low:.0f} % of such sweeps are named rightly "
-                "(with 97.5 % certainty)"
-            )
+        if said := advice.first(suspicions, self.low):
+            return said
         wrong = self._counts()
         np.fill_diagonal(wrong, 0)
         errors = wrong.sum(axis=0) + wrong.sum(axis=1)
         if errors.any():
-            return f"{MORE} more of {materials[int(errors.argmax())]}, from another place"
+            return advice.more(materials[int(errors.argmax())])
         fewest = materials[int(counts.argmin())]
         return (
-            f"nothing was confused, but {len(self.named)} sweeps are few: {MORE} more of each, "
-            f"of {fewest} first"
+            f"nothing was confused, but {len(self.named)} sweeps are few: {advice.MORE} more of "
+            f"each, of {fewest} first"
         )
 
     def json(self) -> dict[str, Any]:
@@ -197,11 +186,13 @@ def _suspects(lesson: Lesson, named: Array, chances: Array) -> tuple[Suspect, ..
     labels, materials = lesson.sweeps.labels, lesson.sweeps.materials
     right = named[np.arange(len(labels)), labels]
     found = []
-    for i in np.flatnonzero((chances.argmax(axis=1) != labels) & (chances.max(axis=1) >= SURE)):
+    for i in np.flatnonzero(
+        (chances.argmax(axis=1) != labels) & (chances.max(axis=1) >= advice.SURE)
+    ):
         other = int(chances[i].argmax())
         beside = (labels == labels[i]) & (np.arange(len(labels)) != i)
         of_other = labels == other
-        if beside.any() and min(right[beside].mean(), right[of_other].mean()) >= RIGHT:
+        if beside.any() and min(right[beside].mean(), right[of_other].mean()) >= advice.RIGHT:
             label = materials[labels[i]]
             found.append(Suspect(lesson.names[i], lesson.number(i), label, materials[other]))
     return tuple(found)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -59,10 +60,11 @@ def test_the_bundle_stays_as_it_is(base: dict[str, bytes], made: dict[str, bytes
     old, new = bundle.from_files(base, "old"), bundle.load(toy_bundle.put(tmp_path / "b", made))
     assert old.classes
     assert new.classes
+    assert old.manifest.known
     assert (new.model, new.manifest.thresholds, new.manifest.known) == (
         old.model,
         old.manifest.thresholds,
-        old.manifest.known,
+        replace(old.manifest.known, enrolled=enrolment.LEAST),
     )
     for name, values in old.classes.arrays().items():
         assert new.classes.arrays()[name][:3].tobytes() == values.tobytes(), name
@@ -140,14 +142,24 @@ WRONG = {
         "changes uint8",
     ),
     "logits of fewer labels": (
-        {"logits": np.zeros((4, 4), np.float32)},
-        r"logits float32 \[4, 4\]; float32 \[4, 5\]",
+        {"joint": np.zeros((4, 4), np.float32)},
+        r"joint float32 \[4, 4\]; float32 \[4, 5\]",
     ),
     "logits that are nan": (
+        {"joint": np.full((4, 5), np.nan, np.float32)},
+        "joint that are not finite",
+    ),
+    "logits of an older program that are nan": (
         {"logits": np.full((4, 5), np.nan, np.float32)},
         "logits that are not finite",
     ),
-    "no logits": ({"logits": None}, "cannot be read.*logits"),
+    "no logits": ({"joint": None}, "has no joint; enrol again"),
+    "no rule": ({"joint": None, "least": None}, "has no joint and no least; enrol again"),
+    "no means": ({"means": None}, "cannot be read.*means"),
+    "a rule of another type": ({"least": np.array([0.7])}, r"least float64 \[1\]; float64 \[\]"),
+    "a rule that is nan": ({"least": np.array(np.nan)}, "least that are not finite"),
+    "a rule that prefers new labels": ({"least": np.array(0.4)}, "known.enrolled 0.4 must be"),
+    "a rule that lets none pass": ({"least": np.array(1.0)}, "known.enrolled 1.0 must be"),
     "objects": ({"spread": np.array([1, "x"], object)}, "cannot be read"),
 }
 

@@ -13,6 +13,7 @@ from appliance.bundle.manifest import Manifest
 from appliance.core.clock import SystemClock
 from appliance.core.errors import ApplianceError, BundleError, ConfigError
 from appliance.deployment import signature
+from appliance.inference import enrolment
 from appliance.inference.classifier import Classifier
 from tests.factories import deliveries
 from tests.factories.deliveries import SIGNER, line
@@ -194,6 +195,9 @@ def test_labels_that_a_box_enrolled_are_signed_for_all_boxes(tmp_path: Path, sig
     for name, values in before.classes.arrays().items():
         assert after.classes.arrays()[name].tobytes() == values.tobytes()
     assert after.golden_logits.tobytes() == before.golden_logits.tobytes()
+    assert after.manifest.known == before.manifest.known
+    assert made.known
+    assert made.known.enrolled == enrolment.LEAST
     Classifier(after, SystemClock()).self_test()
 
 

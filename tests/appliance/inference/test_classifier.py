@@ -662,7 +662,10 @@ def test_early_logits(tmp_path: Path):
     [
         ({"known": None, "outputs": ("logits", "embedding", "early")}, ("logits",)),
         ({"outputs": ("logits", "embedding", "early")}, ("logits", "embedding")),
-        ({"arrays": toy_bundle.means(sweeps=np.array([0, 0, 5])), "labels": 2}, ("embedding",)),
+        (
+            {"arrays": toy_bundle.means(sweeps=np.array([0, 0, 5])), "labels": 2},
+            ("logits", "embedding"),
+        ),
     ],
 )
 def test_only_needed_outputs_are_requested(

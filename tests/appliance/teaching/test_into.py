@@ -14,7 +14,9 @@ import numpy as np
 import pytest
 
 from appliance.bundle import bundle
+from appliance.cli import teach_command
 from appliance.cli.main import main
+from appliance.cli.parser import arguments
 from appliance.core.config import load
 from appliance.core.errors import BundleError, ConfigError, ModelError
 from appliance.deployment.enrolment_key import EnrolmentKey
@@ -182,7 +184,7 @@ def test_a_model_or_disk_that_fails_leaves_the_bundle_in_service(
         raise error
 
     with monkeypatch.context() as patched:
-        patched.setattr(Classifier, "embedding", fail)
+        patched.setattr(Classifier, "network", fail)
         code, news = box.teach(capsys, *more)
     assert code
     assert news["type"] == "error"
@@ -239,8 +241,14 @@ def test_a_sweep_of_another_new_material_is_suspected(box: TaughtDelivery):
 def test_the_session_needs_one_material_and_refuses_trained_ones(tmp_path: Path):
     """Beside the delivered labels one material is enough; class bits count all."""
     session: TeachingSession = sessions(tmp_path, codes=8)
-    with pytest.raises(ConfigError, match="was trained on 'oak'; record more of it for the desk"):
+    with pytest.raises(ConfigError, match="was trained on 'oak'; record more of it for"):
         session.commands["TEACH"]("oak")
+    for again in ("oak", " oak"):
+        with pytest.raises(
+            ConfigError, match="was trained on 'oak'; record more of it for the desk"
+        ):
+            session.recording_commands["MATERIAL"](again)
+    assert session.materials() == {}
     with pytest.raises(Exception, match="0 materials have sweeps; teach one"):
         session.commands["USE"]("")
     assert session.about()["fewest"] == 1
@@ -249,6 +257,21 @@ def test_the_session_needs_one_material_and_refuses_trained_ones(tmp_path: Path)
     with pytest.raises(ConfigError, match="4 labels and the code 0 do not fit"):
         narrow.commands["TEACH"]("felt")
     assert narrow.commands["TEACH"]("cork") == ["cork", 0]
+
+
+def test_a_trained_material_is_refused_before_a_sweep(box: TaughtDelivery, capsys: Any):
+    """In the terminal, and on the page or the serial line after a trial: more sweeps of it would
+    teach nothing here."""
+    words = [*box.words, "--label", "foam", "--sim", "skin", "--virtual"]
+    recorded = sorted((box.store / "sweeps").iterdir())
+    assert main(["teach", *words]) == ConfigError.exit_code
+    assert "was trained on 'foam'; record more of it for the desktop" in capsys.readouterr().err
+    assert sorted((box.store / "sweeps").iterdir()) == recorded
+    session = teach_command.Session(arguments("teach", box.words), box.settings)
+    session._base = box.running
+    with pytest.raises(ConfigError, match="was trained on 'foam'"):
+        session._teach_again("foam")
+    assert session._teach_again("cork") == ["cork"]
 
 
 def sessions(folder: Path, codes: int) -> TeachingSession:

@@ -13,7 +13,6 @@ from appliance.bundle.pruning import prune
 from appliance.core.clock import SystemClock
 from appliance.inference import classifier, enrolment
 from appliance.inference import early_exit as box_early
-from appliance.inference.novelty import ClassDistances
 from tests.factories.calibration_inputs import plain_inputs
 from tests.factories.trunk import FORMAT, trunk
 from train.calibration import early_exit
@@ -246,18 +245,17 @@ def test_without_early_answers_the_box_runs_the_graph_that_has_none(made):
 
 
 def test_enrolment_is_judged_as_the_box_enrols(made):
-    """enrolled_logits equals appliance.inference.enrolment on the same sweeps, up to a term that
-    all labels share."""
+    """enrolled_probabilities equals the answers of the box with the same sweeps enrolled."""
     done, x, counts, labels, whole = made
     drawn = np.flatnonzero(labels == 1)[:3]
     new = enrolment.enrol(whole, "new", counts[drawn]).bundle
-    z = done.embedding(x[:, -1])
-    means = ClassDistances(new.classes, new.manifest.known, new.manifest.labels)
-    want = means.logits(means.distances(z)) * done.class_mean_temperature
-    have = certainty.enrolled_logits(done.embedding, z, z[drawn])
-    assert np.allclose(
-        have - have.mean(1, keepdims=True), want - want.mean(1, keepdims=True), atol=0.02
+    box, z = classifier.Classifier(new, SystemClock()), done.embedding(x[:, -1])
+    have = certainty.enrolled_probabilities(done, done.logits(x[:, -1]), z, z[drawn])
+    want = classifier.enrolled_labels(new).decided(
+        classifier.softmax(np.stack([box.logits(one) for one in counts]))
     )
+    assert np.allclose(have, want, atol=0.02)
+    assert 0 < (have[:, -1] > 0).mean() < 1
 
 
 @pytest.mark.parametrize(("materials", "each"), [(2, 5), (3, 20), (6, 4)])
