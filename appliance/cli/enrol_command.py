@@ -35,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
     folder."""
     settings = load_settings(args)
     start = assembly.running(settings, answers=not args.sim)
-    kept = Path(settings.store.folder) / "black-box"
+    kept = settings.kept("black-box")
     if args.label is None:
         found = unknown_sweeps.groups(kept, start.bundle.id)
         print("\n".join(map(str, found)) or "no unknown material was seen twice")
@@ -100,6 +100,11 @@ def _enrolment_key(args: argparse.Namespace, settings: Config) -> EnrolmentKey |
         return None
     if not args.out:
         into.check_settings(settings)
+        if name := settings.bundle_setting:
+            raise ConfigError(
+                f"{name} names the bundle that runs, so a new one in the store would not; remove "
+                "this setting, or give --out DIR"
+            )
     key = EnrolmentKey(settings.store.enrolment_key)
     key.check()
     return key

@@ -135,6 +135,14 @@ def _skin_port(add: Callable[..., argparse.Action], text: str = "") -> None:
     add("--port", dest="skin_port", metavar="PATH", help=text)
 
 
+def _finger(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--finger",
+        metavar="NAME",
+        help="of a box with several skins: the finger to use, [skins.NAME]",
+    )
+
+
 def _web(add: Callable[..., argparse.Action], text: str, port: int = WEB_PORT) -> None:
     add("--web", nargs="?", const=port, type=int, metavar="PORT", help=text)
 
@@ -258,6 +266,7 @@ def _watch(command: CommandParser) -> None:
 def _align(command: CommandParser) -> None:
     _devices(command.add_argument)
     _skin_port(command.add_argument)
+    _finger(command)
     _web(command.add_argument, f"also as a page on localhost (default port {WEB_PORT})")
     command.set_defaults(sweeps=None)
 
@@ -269,6 +278,7 @@ def _replay(command: CommandParser) -> None:
 def _record(command: CommandParser) -> None:
     _devices(command.add_argument)
     _skin_port(command.add_argument)
+    _finger(command)
     _answers(command)
     _trigger(command)
     _capture(command)
@@ -324,6 +334,7 @@ def _places(add: Callable[..., argparse.Action]) -> None:
 def _teach(command: CommandParser) -> None:
     _devices(command.add_argument)
     _skin_port(command.add_argument)
+    _finger(command)
     _trigger(command)
     _capture(command)
     add = command.add_argument
@@ -366,6 +377,7 @@ def _teach(command: CommandParser) -> None:
 def _enrol(command: CommandParser) -> None:
     _devices(command.add_argument)
     _skin_port(command.add_argument)
+    _finger(command)
     _trigger(command)
     command.add_argument(
         "label",

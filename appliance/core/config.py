@@ -288,7 +288,9 @@ class BridgeConfig:
 class Config:
     """All settings. board: the board file's name, "" for none. folder: where the files are, skins/
     among them. sources: "section.key" -> "code", the file's name or "--set"; "board" -> "code", the
-    file's name or "--board". skins: of a box with several fingers, by name; else empty."""
+    file's name or "--board". skins: of a box with several fingers, by name; else empty. alone:
+    the finger whose settings these are, "" for those of the box. hand: the settings with all
+    fingers then, else None."""
 
     board: str
     skin: SkinConfig
@@ -304,12 +306,30 @@ class Config:
     sources: Mapping[str, str] = field(compare=False)
     folder: Path = field(default=SITE.parent, compare=False)
     skins: Mapping[str, FingerConfig] = field(default_factory=dict)
+    alone: str = ""
+    hand: Config | None = field(default=None, compare=False)
 
     def finger(self, name: str) -> Config:
         """The settings of a box that has the skin of this finger only."""
         own = self.skins[name]
-        bundle = own.bundle or self.classifier.bundle
-        return replace(self, skin=own, skins={}, classifier=replace(self.classifier, bundle=bundle))
+        classifier = replace(self.classifier, bundle=own.bundle or self.classifier.bundle)
+        return replace(self, skin=own, skins={}, classifier=classifier, alone=name, hand=self)
+
+    @property
+    def part(self) -> str:
+        """The part of a hub's frames that these settings are for; "" for whole frames."""
+        return self.skin.part if isinstance(self.skin, FingerConfig) else ""
+
+    @property
+    def bundle_setting(self) -> str:
+        """The setting that names the bundle; "" if the store has it."""
+        if self.hand and self.hand.skins[self.alone].bundle:
+            return f"skins.{self.alone}.bundle"
+        return "classifier.bundle" if self.classifier.bundle else ""
+
+    def kept(self, folder: str) -> Path:
+        """A folder of sweeps in the store; that of one finger alone is below it."""
+        return Path(self.store.folder) / folder / self.alone
 
 
 _SECTIONS: Mapping[str, Any] = MappingProxyType(

@@ -120,7 +120,7 @@ def test_more_sweeps_another_material_and_a_forgotten_one(box: TaughtDelivery, c
     record(box.store, "felt", slides(FELT, 1), 20)
     assert box.teach(capsys, "--use")[0] == 0
     assert box.running.bundle.enrolled == {"cork": 7, "felt": 1}
-    TeachingState().forget(box.store, "cork", 19)
+    TeachingState().forget(box.store / "teaching.json", "cork", 19)
     assert box.teach(capsys, "--use")[0] == 0
     assert box.running.bundle.enrolled == {"felt": 1}
     assert first.enrolled == {"cork": 5}
@@ -141,7 +141,7 @@ def test_a_label_without_recorded_sweeps_stays(box: TaughtDelivery, capsys: Any)
 
 def test_nothing_new_leaves_the_bundle_in_service(box: TaughtDelivery, capsys: Any):
     """Sweeps of trained materials, of rests alone, or of another format teach nothing."""
-    TeachingState().forget(box.store, "cork", 19)
+    TeachingState().forget(box.store / "teaching.json", "cork", 19)
     record(box.store, "foam", slides(CORK, 3), 20)
     record(box.store, "oak", rests(3), 30)
     before = box.running.sha
@@ -265,7 +265,7 @@ def sessions(folder: Path, codes: int) -> TeachingSession:
     base = ("oak", "pine", "cork")
     return TeachingSession(
         recording,
-        folder,
+        folder / "teaching.json",
         TeachConfig(),
         lambda by: [],
         say,
