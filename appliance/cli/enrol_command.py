@@ -34,6 +34,11 @@ def run(args: argparse.Namespace) -> int:
     """Learn one more label from sweeps of it, and install the new bundle or write it to a
     folder."""
     settings = load_settings(args)
+    if args.label is not None and not args.out and (name := settings.bundle_setting):
+        raise ConfigError(
+            f"{name} names the bundle that runs, so a new one in the store would not; remove this "
+            "setting, or give --out DIR"
+        )
     start = assembly.running(settings, answers=not args.sim)
     kept = settings.kept("black-box")
     if args.label is None:
@@ -100,11 +105,6 @@ def _enrolment_key(args: argparse.Namespace, settings: Config) -> EnrolmentKey |
         return None
     if not args.out:
         into.check_settings(settings)
-        if name := settings.bundle_setting:
-            raise ConfigError(
-                f"{name} names the bundle that runs, so a new one in the store would not; remove "
-                "this setting, or give --out DIR"
-            )
     key = EnrolmentKey(settings.store.enrolment_key)
     key.check()
     return key
