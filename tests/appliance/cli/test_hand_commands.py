@@ -17,6 +17,7 @@ import pytest
 
 from appliance.bundle import bundle
 from appliance.bundle.bundle import Bundle
+from appliance.cli import run_command
 from appliance.cli.common import load_settings
 from appliance.cli.main import main
 from appliance.cli.parser import arguments
@@ -328,6 +329,19 @@ def test_status_and_watch_name_the_fingers(tmp_path: Path):
     assert {*hello["fingers"]["left"]} == {"skin", "unit", "bundle", "format", "alignment"}
     frames = [line["finger"] for line in lines if line["type"] == "frame"]
     assert {*frames} == {*hands.TWO}
+
+
+def test_the_bundles_of_the_fingers_are_named_if_they_differ(
+    default_bundle: Bundle, tmp_path: Path
+):
+    """For `status` and the feed: each with its finger; a bundle for all once, without."""
+    own = toy_bundle.load(tmp_path)
+    differ = run_command._model(default_bundle, {"left": default_bundle, "right": own})
+    m = default_bundle.manifest
+    assert differ.startswith(f"left: {m.name} {m.version}, 6 labels; right: ")
+    same = f"{m.name} {m.version}, 6 labels"
+    assert run_command._model(default_bundle, dict.fromkeys(hands.TWO, default_bundle)) == same
+    assert run_command._model(default_bundle, {}) == same
 
 
 @deliveries.NEEDED

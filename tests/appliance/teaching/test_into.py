@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -15,6 +16,7 @@ import pytest
 
 from appliance.bundle import bundle
 from appliance.cli.main import main
+from appliance.core.clock import SystemClock
 from appliance.core.config import load
 from appliance.core.errors import BundleError, ConfigError, ModelError
 from appliance.deployment.enrolment_key import EnrolmentKey
@@ -22,12 +24,13 @@ from appliance.deployment.signed import SignedBundle
 from appliance.inference import enrolment
 from appliance.inference.classifier import Classifier
 from appliance.runtime import assembly
+from appliance.runtime.hand import classifier
 from appliance.sim import skin
 from appliance.teaching import into, use
 from appliance.teaching.session import TeachingSession
 from appliance.teaching.state import TeachingState
 from tests.campaigns import junk
-from tests.factories import deliveries, lessons
+from tests.factories import deliveries, hands, lessons
 from tests.factories.paths import ROOT
 from train.data.sets import Dataset
 
@@ -52,11 +55,11 @@ def rests(count: int) -> list[np.ndarray]:
     return [junk.window("finger rests", WORLD, n)[0] for n in range(count)]
 
 
-def record(store: Path, material: str, of: list[np.ndarray], first: int) -> None:
+def record(store: Path, material: str, of: list[np.ndarray], first: int, finger: str = "") -> None:
     """Write recorded sweeps of a material, numbered from `first`."""
     labels = np.zeros(len(of), int)
     sweeps = Dataset(np.stack(of), labels, (material,), skin.FORMAT.rate_hz, {}, material)
-    lessons.write(store / "sweeps", sweeps, first=first)
+    lessons.write(store / "sweeps" / finger, sweeps, first=first)
 
 
 class TaughtDelivery:
@@ -201,6 +204,58 @@ def test_a_reader_that_is_gone_gets_an_exit_code(box: TaughtDelivery):
     assert box.running.bundle.enrolled in ({}, {"cork": 5})
 
 
+FINGERS = [word for text in hands.of(*hands.TWO) for word in ("--set", text)]
+
+
+@pytest.fixture
+def hand(tmp_path: Path) -> TaughtDelivery:
+    """A box with two fingers, the left one with sweeps of cork and felt, the right one of oak."""
+    box = TaughtDelivery(tmp_path)
+    for finger, material, of in (
+        ("left", "cork", slides(CORK, 5)),
+        ("left", "felt", slides(FELT, 2)),
+        ("right", "oak", slides(CORK, 5)),
+    ):
+        record(box.store, material, of, 1 if material != "felt" else 10, finger)
+    box.words += FINGERS
+    return box
+
+
+def test_a_hand_is_taught_with_one_finger(hand: TaughtDelivery, capsys: Any):
+    """By its sweeps alone; what it has forgotten the other has not. The bundle names the material
+    for all fingers without a bundle of their own."""
+    assert main(["teach", *hand.words, "--finger", "left", "--forget", "felt"]) == 0
+    assert (hand.store / "teaching-left.json").exists()
+    code, learnt = hand.teach(capsys, "--finger", "left")
+    assert code == 0
+    assert learnt["materials"] == {"cork": 5}
+    code, news = hand.teach(capsys, "--finger", "left", "--use")
+    assert code == 0, news
+    assert hand.running.bundle.enrolled == {"cork": 5}
+    settings = load(None, hand.words[1::2], site=ROOT / "tests/factories/no-site.toml")
+    both = assembly.of_fingers(settings, hand.running.bundle, answers=True)
+    run = classifier(settings, both, SystemClock())
+    assert {*run.labels} == {*skin.MATERIALS, "cork"}
+    code, news = hand.teach(capsys, "--finger", "right", "--use")
+    assert code == 0, news
+    assert hand.running.bundle.enrolled == {"cork": 5, "oak": 5}
+
+
+def test_a_bundle_that_does_not_suit_the_other_finger_is_not_used(
+    hand: TaughtDelivery, tmp_path: Path, capsys: Any
+):
+    """The right finger has a bundle of its own, which lacks the new label: the service would not
+    start with both."""
+    own = tmp_path / "own"
+    shutil.copytree(hand.store / (hand.store / "current").readlink(), own)
+    hand.words += ["--set", f"skins.right.bundle={own}"]
+    before = hand.running.sha
+    code, news = hand.teach(capsys, "--finger", "left", "--use")
+    assert code == 78, news
+    assert "the bundle of skins.right has other labels than that of the first" in news["text"]
+    assert hand.running.sha == before
+
+
 def test_a_taught_bundle_and_another_skin_are_fitted_anew(box: TaughtDelivery):
     """Only a delivered bundle for this skin is taught into; the packaged one is not."""
     store = assembly.store(box.settings)
@@ -253,7 +308,6 @@ def test_the_session_needs_one_material_and_refuses_trained_ones(tmp_path: Path)
 
 def sessions(folder: Path, codes: int) -> TeachingSession:
     """A session with a bundle of oak and pine, into which cork was taught."""
-    from appliance.core.clock import SystemClock
     from appliance.core.config import TeachConfig
     from appliance.recording.recording import Labels, RecordingSession
 
