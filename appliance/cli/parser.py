@@ -135,16 +135,19 @@ def _skin_port(add: Callable[..., argparse.Action], text: str = "") -> None:
     add("--port", dest="skin_port", metavar="PATH", help=text)
 
 
-def _finger(command: argparse.ArgumentParser) -> None:
+def _web(add: Callable[..., argparse.Action], text: str, port: int = WEB_PORT) -> None:
+    add("--web", nargs="?", const=port, type=int, metavar="PORT", help=text)
+
+
+def _one_skin(command: argparse.ArgumentParser) -> None:
+    """Add the options of a command that uses one skin, also of several."""
+    _devices(command.add_argument)
+    _skin_port(command.add_argument)
     command.add_argument(
         "--finger",
         metavar="NAME",
         help="of a box with several skins: the finger to use, [skins.NAME]",
     )
-
-
-def _web(add: Callable[..., argparse.Action], text: str, port: int = WEB_PORT) -> None:
-    add("--web", nargs="?", const=port, type=int, metavar="PORT", help=text)
 
 
 def _answers(command: argparse.ArgumentParser) -> None:
@@ -264,9 +267,7 @@ def _watch(command: CommandParser) -> None:
 
 
 def _align(command: CommandParser) -> None:
-    _devices(command.add_argument)
-    _skin_port(command.add_argument)
-    _finger(command)
+    _one_skin(command)
     _web(command.add_argument, f"also as a page on localhost (default port {WEB_PORT})")
     command.set_defaults(sweeps=None)
 
@@ -276,9 +277,7 @@ def _replay(command: CommandParser) -> None:
 
 
 def _record(command: CommandParser) -> None:
-    _devices(command.add_argument)
-    _skin_port(command.add_argument)
-    _finger(command)
+    _one_skin(command)
     _answers(command)
     _trigger(command)
     _capture(command)
@@ -332,9 +331,7 @@ def _places(add: Callable[..., argparse.Action]) -> None:
 
 
 def _teach(command: CommandParser) -> None:
-    _devices(command.add_argument)
-    _skin_port(command.add_argument)
-    _finger(command)
+    _one_skin(command)
     _trigger(command)
     _capture(command)
     add = command.add_argument
@@ -375,9 +372,7 @@ def _teach(command: CommandParser) -> None:
 
 
 def _enrol(command: CommandParser) -> None:
-    _devices(command.add_argument)
-    _skin_port(command.add_argument)
-    _finger(command)
+    _one_skin(command)
     _trigger(command)
     command.add_argument(
         "label",

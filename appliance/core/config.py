@@ -17,8 +17,7 @@ from types import MappingProxyType
 from typing import Any, Literal, get_type_hints
 
 from appliance.core import fingers
-from appliance.core.errors import ConfigError, TemporaryError
-from appliance.core.patience import passes
+from appliance.core.errors import ConfigError
 from appliance.core.schema import (
     Key,
     closest,
@@ -28,6 +27,7 @@ from appliance.core.schema import (
     keys,
     number,
     read_table,
+    read_toml,
     shown,
 )
 
@@ -361,15 +361,15 @@ def load(
             f"--config-dir {folder}: no such folder; name that of skin.toml and the board files"
         )
     folder = folder or _folder()
-    of_site = _read(site, needed=site != SITE)
+    of_site = read_toml(site, needed=site != SITE)
     in_site = of_site.pop("board", "")
     board, named_in = (
         (board, "--board") if board else (in_site, "code" if in_site == "" else str(site))
     )
-    layers = [(folder / "skin.toml", _read(folder / "skin.toml", needed=False))]
+    layers = [(folder / "skin.toml", read_toml(folder / "skin.toml", needed=False))]
     if board != "":
         path = _board_file(folder, board, named_in)
-        layers.append((path, _read(path, needed=True)))
+        layers.append((path, read_toml(path)))
     layers += [(site, of_site), *((Path("--set"), _parse_set(text)) for text in sets)]
     values = {name: key.default for name, key in _KEYS.items()}
     sources = {"board": Path(named_in).name} | dict.fromkeys(_KEYS, "code")
@@ -423,23 +423,6 @@ def boards(folder: Path | None = None) -> dict[str, Path]:
 def _folder() -> Path:
     beside = Path(__file__).resolve().parents[2] / "firmware_config"
     return beside if beside.is_dir() else SITE.parent
-
-
-def _read(path: Path, *, needed: bool) -> dict[str, Any]:
-    try:
-        return tomllib.loads(path.read_text("utf-8-sig"))
-    except FileNotFoundError as e:
-        if not needed:
-            return {}
-        raise ConfigError(f"{path}: no such file; check the path") from e
-    except OSError as e:
-        raise (TemporaryError if passes(e) else ConfigError)(
-            f"{path}: cannot be read: {str(e.strerror).lower()}; check who may read it"
-        ) from e
-    except (ValueError, RecursionError) as e:  # no TOML or no UTF-8; deeply nested brackets
-        raise ConfigError(
-            f"{path}: not TOML: {str(e).lower()}; write key = value, strings in quotes"
-        ) from e
 
 
 def _board_file(folder: Path, board: Any, where: str) -> Path:
