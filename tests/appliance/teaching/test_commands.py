@@ -165,14 +165,19 @@ def test_its_commands_are_commands_of_the_line():
 @deliveries.NEEDED
 @pytest.mark.slow
 @pytest.mark.thorough  # a fit with all checks of an export
+@pytest.mark.parametrize("finger", ["", "left"])
 def test_recorded_sweeps_become_the_bundle_of_the_box(
-    options: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    finger: str, options: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     """Signed by the box, on trial, with who has taught it; taught again, the version counts up.
-    Scratch files are gone, the sweeps are not."""
+    Scratch files are gone, the sweeps are not. The sweeps of one finger alone make a bundle of all
+    fingers."""
     install_scripts.enrolment_key(tmp_path / "enrolment")
-    lessons.write(tmp_path / "store" / "sweeps", easy(8))
-    code, text = said([*options, "--use", "--by", "anna"], capsys)
+    lessons.write(tmp_path / "store" / "sweeps" / finger, easy(8))
+    if finger:
+        options += [word for one in hands.of(*hands.TWO) for word in ("--set", one)]
+    chosen = ["--finger", finger] if finger else []
+    code, text = said([*options, *chosen, "--use", "--by", "anna"], capsys)
     assert code == 0, text
     assert "with high, low, middle is installed, on trial" in text
     settings = config.load(None, [*options[1::2]], site=ROOT / "tests/factories/no-site.toml")
