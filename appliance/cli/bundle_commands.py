@@ -138,8 +138,17 @@ def run_install(args: argparse.Namespace) -> int:
     committed = (
         "it is committed already" if store.state.of(sha).committed else f"it runs on trial {NEXT}"
     )
-    print(f"bundle {sha[:8]} is installed; {'it is the candidate' if args.shadow else committed}")
+    how = "it is the candidate" if args.shadow else committed
+    print(f"bundle {sha[:8]} is installed; {how}{_elsewhere(settings)}")
     return 0
+
+
+def _elsewhere(settings: Config) -> str:
+    """The settings that name another bundle than that of the store, as the end of a message."""
+    fingers = (settings.finger(name) for name in settings.skins)
+    each = [own.bundle_setting for own in fingers] or [settings.bundle_setting]
+    named = ", ".join(filter(None, dict.fromkeys(each)))
+    return f"; it does not run where the settings name another bundle: {named}" if named else ""
 
 
 def streaming(settings: Config, store: Store) -> SweepFormat | None:

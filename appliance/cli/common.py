@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from appliance.bundle.bundle import Bundle
-from appliance.core import config, storage
+from appliance.core import config, fingers, storage
 from appliance.core.clock import SystemClock
 from appliance.core.config import Config
 from appliance.core.errors import BundleDenied, ConfigError
@@ -26,11 +26,14 @@ Facts = Mapping[str, Callable[[], object]]
 
 
 def load_settings(args: argparse.Namespace) -> Config:
-    """The settings with the changes that a command's options make."""
-    sets = list(args.set)
-    for key, option in (("profile", "skin"), ("port", "skin_port")):
-        if value := getattr(args, option, None):
-            sets.append(f"skin.{key}={value}")
+    """The settings with the changes that a command's options make. A command with the option
+    --finger gets those of one skin. Raises ConfigError."""
+    given = {
+        key: value
+        for key, option in (("profile", "skin"), ("port", "skin_port"))
+        if (value := getattr(args, option, None))
+    }
+    sets = [*args.set, *(f"skin.{key}={value}" for key, value in given.items())]
     every, sweep = getattr(args, "every", None), getattr(args, "sweep", None)
     mode = getattr(args, "trigger", None)
     if every is not None or sweep is not None:
@@ -42,7 +45,15 @@ def load_settings(args: argparse.Namespace) -> Config:
     sets += [f"trigger.mode={mode}"] if mode else []
     settings = config.load(args.board, sets, folder=args.config_dir)
     times = {name: s for name, s in (("every_s", every), ("sweep_s", sweep)) if s is not None}
-    return replace(settings, trigger=replace(settings.trigger, **times)) if times else settings
+    if times:
+        settings = replace(settings, trigger=replace(settings.trigger, **times))
+    if "finger" not in args:
+        return settings
+    fingers.check_chosen(settings.skins, args.finger)
+    if not args.finger:
+        return settings
+    settings = settings.finger(args.finger)
+    return replace(settings, skin=replace(settings.skin, **given))
 
 
 def status_file(settings: Config) -> Path:

@@ -51,6 +51,7 @@ def simulated(
     from appliance.sim import devices, rig, script, tour
 
     profile = _played(settings)
+    format = skins.hub_format(format, settings.part) if format else None
     clock = rig.VirtualClock() if args.virtual else SystemClock()
     follows = settings.trigger.mode == "serial"
     profile = skins.profile(settings)

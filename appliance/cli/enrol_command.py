@@ -35,8 +35,10 @@ def run(args: argparse.Namespace) -> int:
     """Learn one more label from sweeps of it, and install the new bundle or write it to a
     folder."""
     settings = load_settings(args)
+    if args.label is not None and not args.out:
+        _check_store(settings)
     start = assembly.running(settings, answers=not args.sim)
-    kept = Path(settings.store.folder) / "black-box"
+    kept = settings.kept("black-box")
     if args.label is None:
         found = unknown_sweeps.groups(kept, start.bundle.id)
         print("\n".join(map(str, found)) or "no unknown material was seen twice")
@@ -55,8 +57,14 @@ def run(args: argparse.Namespace) -> int:
         enrolment.write(files, args.out, args.replace)
     else:
         assembly.store(settings).learn(files)
+    _report(args, new, signed=key is not None)
+    return 0
+
+
+def _report(args: argparse.Namespace, new: Enrolment, *, signed: bool) -> None:
+    """Log where the new bundle is, and how to use it."""
     m = new.bundle.manifest
-    use = f"palpate bundles install {args.out}" if key else "classifier.bundle; it is not signed"
+    use = f"palpate bundles install {args.out}" if signed else "classifier.bundle; it is not signed"
     how = (
         f"use it with {use}"
         if args.out
@@ -66,7 +74,15 @@ def run(args: argparse.Namespace) -> int:
         f"{args.out or 'installed'}: {m.name} {m.version}, {new.bundle.id}, {len(m.labels)}"
         f" labels; {how}"
     )
-    return 0
+
+
+def _check_store(settings: Config) -> None:
+    """Raises ConfigError if the bundle of the store does not run."""
+    if name := settings.bundle_setting:
+        raise ConfigError(
+            f"{name} names the bundle that runs, so a new one in the store would not; remove this "
+            "setting, or give --out DIR"
+        )
 
 
 def _taught(args: argparse.Namespace, start: SignedBundle, sweeps: NDArray[Any]) -> Enrolment:

@@ -19,7 +19,7 @@ from appliance.cli.common import (
     status_file,
 )
 from appliance.cli.devices import open_devices
-from appliance.core import config, fingers
+from appliance.core import config
 from appliance.core.clock import SystemClock
 from appliance.core.config import Config
 from appliance.core.devices import Devices
@@ -69,7 +69,6 @@ def run_align(args: argparse.Namespace) -> int:
     ):  # a sweep lifts the finger for a tenth of a second; here the finger rests
         args.sim = "rest"
     settings = load_settings(args)
-    fingers.refuse(settings.skins, "align")
     devices = _open_any(args, settings)
     expected = _expected(devices.wire(settings), devices)
     stopped = StopFlag()  # before anybody can read the page's address
@@ -95,7 +94,7 @@ def _expected(settings: Config, devices: Devices) -> Expected:
     except BundleError as e:
         log.warning(f"no bundle: {e}")
     try:
-        format = devices.format or skins.announced(settings, devices)
+        format = skins.part_of(settings, devices.format or skins.announced(settings, devices))
     except SensorError:
         if not current:
             raise

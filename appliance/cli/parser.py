@@ -139,6 +139,17 @@ def _web(add: Callable[..., argparse.Action], text: str, port: int = WEB_PORT) -
     add("--web", nargs="?", const=port, type=int, metavar="PORT", help=text)
 
 
+def _one_skin(command: argparse.ArgumentParser) -> None:
+    """Add the options of a command that uses one skin, also of several."""
+    _devices(command.add_argument)
+    _skin_port(command.add_argument)
+    command.add_argument(
+        "--finger",
+        metavar="NAME",
+        help="of a box with several skins: the finger to use, [skins.NAME]",
+    )
+
+
 def _answers(command: argparse.ArgumentParser) -> None:
     command.add_argument("--sweeps", type=_count, metavar="N", help="stop after N answers")
 
@@ -256,8 +267,7 @@ def _watch(command: CommandParser) -> None:
 
 
 def _align(command: CommandParser) -> None:
-    _devices(command.add_argument)
-    _skin_port(command.add_argument)
+    _one_skin(command)
     _web(command.add_argument, f"also as a page on localhost (default port {WEB_PORT})")
     command.set_defaults(sweeps=None)
 
@@ -267,8 +277,7 @@ def _replay(command: CommandParser) -> None:
 
 
 def _record(command: CommandParser) -> None:
-    _devices(command.add_argument)
-    _skin_port(command.add_argument)
+    _one_skin(command)
     _answers(command)
     _trigger(command)
     _capture(command)
@@ -322,8 +331,7 @@ def _places(add: Callable[..., argparse.Action]) -> None:
 
 
 def _teach(command: CommandParser) -> None:
-    _devices(command.add_argument)
-    _skin_port(command.add_argument)
+    _one_skin(command)
     _trigger(command)
     _capture(command)
     add = command.add_argument
@@ -364,8 +372,7 @@ def _teach(command: CommandParser) -> None:
 
 
 def _enrol(command: CommandParser) -> None:
-    _devices(command.add_argument)
-    _skin_port(command.add_argument)
+    _one_skin(command)
     _trigger(command)
     command.add_argument(
         "label",

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 from appliance.cli.common import Facts, StopFlag, load_settings
 from appliance.cli.devices import open_devices
 from appliance.cli.reporting import capture, done, feed, status
-from appliance.core import fingers
 from appliance.core.clock import SystemClock
 from appliance.core.config import Config
 from appliance.core.devices import Devices
@@ -36,16 +35,22 @@ def run(args: argparse.Namespace) -> int:
     """Keep each sweep with its label. No bundle is needed: the skin announces its format."""
     labels = Labels(args.material, args.position, args.session)
     settings, stopped = load_settings(args), StopFlag()
-    fingers.refuse(settings.skins, "record")
     with ExitStack() as stack:
         devices, format = open_skin(args, settings)
         # a person at a terminal reads the log; sentences are for a robot, or for a program that
         # reads the output
         sentences = settings.serial.port or not sys.stdout.isatty()
         port = assembly.port(settings, devices) if sentences else None
-        folder, disk = args.out or Path(settings.store.folder) / "sweeps", DiskThread()
+        folder, disk = args.out or settings.kept("sweeps"), DiskThread()
         recording = RecordingSession(
-            folder, format, labels, devices.clock, _sentences(port), args.target, disk
+            folder,
+            format,
+            labels,
+            devices.clock,
+            _sentences(port),
+            args.target,
+            disk,
+            finger=settings.alone,
         )
         stack.callback(recording.close)
         page = _record_page(
@@ -74,7 +79,7 @@ def open_skin(args: argparse.Namespace, settings: Config) -> tuple[Devices, Swee
     long as the window."""
     asked = skins.described(args.format) if args.format else None
     devices = open_devices(args, (lambda: asked) if asked else None)
-    format = asked or devices.format or _announced(devices.wire(settings), devices)
+    format = asked or skins.part_of(settings, devices.format) or _announced(settings, devices)
     if args.window is not None:
         format = replace(format, window=round(args.window * format.rate_hz))
     _check_length(format, settings)
@@ -148,7 +153,7 @@ def _record_page(
 def _announced(settings: Config, devices: Devices) -> SweepFormat:
     """The format that the skin announces. Raises SensorError with advice if it announces none."""
     try:
-        return skins.announced(settings, devices)
+        return skins.part_of(settings, skins.announced(devices.wire(settings), devices))
     except SensorError as e:
         raise type(e)(
             f"{e}; or name its format with --format 4x4:uint8:750; then the command waits for it"

@@ -15,6 +15,7 @@ from appliance.core import fingers
 from appliance.core.clock import SystemClock
 from appliance.core.config import Config
 from appliance.core.devices import Devices
+from appliance.core.errors import ConfigError
 from appliance.core.observer import Observer
 from appliance.core.types import SweepFormat
 from appliance.io import skins
@@ -30,6 +31,11 @@ def capture(
 ) -> CaptureWriter | None:
     if args.capture:
         fingers.refuse(settings.skins, "--capture")
+        if settings.part:
+            raise ConfigError(
+                f"--capture keeps the frames of the whole hub, and skins.{settings.alone}.part is "
+                f'"{settings.part}"; leave it out'
+            )
     capture = CaptureWriter(args.capture, format, skins.profile(settings)) if args.capture else None
     if capture:
         stack.callback(capture.close)

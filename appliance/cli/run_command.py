@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from appliance.bundle.bundle import DEFAULT, Bundle
+from appliance.bundle.manifest import Manifest
 from appliance.cli.common import Facts, StopFlag, load_bundle, load_settings
 from appliance.cli.devices import open_devices
 from appliance.cli.reporting import capture, done, feed, status
@@ -111,8 +112,7 @@ def _reports(
     observers: list[Observer] = [VerdictLog()] if shown else []
     if settings.store.black_box:
         observers += _black_boxes(settings, current, bundles, stack, disk)
-    m = current.manifest
-    model = f"{m.name} {m.version}, {len(m.labels)} labels{f', {m.taught}' if m.taught else ''}"
+    m, model = current.manifest, _model(current, bundles)
     facts = {"model": lambda: model, **facts}
     from appliance.alignment.live import Expected
 
@@ -124,6 +124,17 @@ def _reports(
         *status(settings, facts),
         *feed(settings, current.format, source, known, facts, bundles),
     ]
+
+
+def _model(current: Bundle, bundles: Mapping[str, Bundle]) -> str:
+    """The bundle in words; of fingers with different bundles each, with its name."""
+    if len({of.id for of in bundles.values()}) < 2:
+        return _named(current.manifest)
+    return "; ".join(f"{finger}: {_named(of.manifest)}" for finger, of in bundles.items())
+
+
+def _named(m: Manifest) -> str:
+    return f"{m.name} {m.version}, {len(m.labels)} labels{f', {m.taught}' if m.taught else ''}"
 
 
 def _black_boxes(

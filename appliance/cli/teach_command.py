@@ -10,7 +10,6 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
 from importlib.util import find_spec
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from appliance.cli import record_command
@@ -36,7 +35,7 @@ from appliance.recording.recording import Labels, RecordingSession
 from appliance.runtime import assembly
 from appliance.service.systemd import Notifier
 from appliance.signal.slide_check import SlidesAmong
-from appliance.teaching import into, use
+from appliance.teaching import into, state, use
 from appliance.teaching.hand_over import HandOver
 from appliance.teaching.process import News
 from appliance.teaching.session import TeachingSession, refuse_trained
@@ -105,15 +104,15 @@ def page_address(settings: Config) -> str:
 
 
 def _forget(settings: Config, material: str) -> int:
-    folder = Path(settings.store.folder)
+    sweeps, file = settings.kept("sweeps"), state.file(settings)
     numbers = [
         int(path.stem.rpartition("-")[2])
-        for path in (folder / "sweeps").glob("sweep-*.npy")
+        for path in sweeps.glob("sweep-*.npy")
         if path.stem.rpartition("-")[2].isdecimal()
     ]
     Labels(material=material)
-    TeachingState.load(folder).forget(folder, material, max(numbers, default=0))
-    print(f"{material}: its sweeps so far are no longer taught; they stay in {folder / 'sweeps'}")
+    TeachingState.load(file).forget(file, material, max(numbers, default=0))
+    print(f"{material}: its sweeps so far are no longer taught; they stay in {sweeps}")
     return 0
 
 
@@ -185,7 +184,6 @@ class Session:
     def __init__(self, args: argparse.Namespace, settings: Config, *, waits: str = "") -> None:
         self._waits = waits
         self._args, self._settings, self._stopped = args, by_page(args, settings), StopFlag()
-        self._store = Path(settings.store.folder)
         self._obey: Callable[[Command], list[object]] = _not_now
         self._names = TypedNames()
         self._about: Callable[[], Mapping[str, Any]] = dict
@@ -247,8 +245,10 @@ class Session:
             port, disk = self._port(devices), DiskThread()
             say = port.say if port else lambda line: None
             labels = Labels(self._again, args.position, args.session)
-            to, names = (self._store / "sweeps", format, labels), self._names
-            recording = RecordingSession(*to, devices.clock, say, args.good, disk, names)
+            to, names = (settings.kept("sweeps"), format, labels), self._names
+            recording = RecordingSession(
+                *to, devices.clock, say, args.good, disk, names, finger=settings.alone
+            )
             stack.callback(recording.close)
             session = self._lesson(recording, say)
             stack.callback(session.close)
@@ -287,7 +287,7 @@ class Session:
         base = self._base.bundle if self._base else None
         session = TeachingSession(
             recording,
-            self._store,
+            state.file(self._settings),
             self._settings.teach,
             self._command,
             say,
@@ -390,6 +390,7 @@ class Session:
         args = self._args
         options = ["--board", args.board] if args.board else []
         options += ["--config-dir", str(args.config_dir)] if args.config_dir else []
+        options += ["--finger", self._settings.alone] if self._settings.alone else []
         sets = [*args.set, *([f"skin.profile={args.skin}"] if args.skin else [])]
         options += [word for one in sets for word in ("--set", one)]
         return use.command(options, by)

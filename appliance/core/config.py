@@ -17,8 +17,7 @@ from types import MappingProxyType
 from typing import Any, Literal, get_type_hints
 
 from appliance.core import fingers
-from appliance.core.errors import ConfigError, TemporaryError
-from appliance.core.patience import passes
+from appliance.core.errors import ConfigError
 from appliance.core.schema import (
     Key,
     closest,
@@ -28,6 +27,7 @@ from appliance.core.schema import (
     keys,
     number,
     read_table,
+    read_toml,
     shown,
 )
 
@@ -288,7 +288,9 @@ class BridgeConfig:
 class Config:
     """All settings. board: the board file's name, "" for none. folder: where the files are, skins/
     among them. sources: "section.key" -> "code", the file's name or "--set"; "board" -> "code", the
-    file's name or "--board". skins: of a box with several fingers, by name; else empty."""
+    file's name or "--board". skins: of a box with several fingers, by name; else empty. alone:
+    the finger whose settings these are, "" for those of the box. hand: the settings with all
+    fingers then, else None."""
 
     board: str
     skin: SkinConfig
@@ -304,12 +306,30 @@ class Config:
     sources: Mapping[str, str] = field(compare=False)
     folder: Path = field(default=SITE.parent, compare=False)
     skins: Mapping[str, FingerConfig] = field(default_factory=dict)
+    alone: str = ""
+    hand: Config | None = field(default=None, compare=False)
 
     def finger(self, name: str) -> Config:
         """The settings of a box that has the skin of this finger only."""
         own = self.skins[name]
-        bundle = own.bundle or self.classifier.bundle
-        return replace(self, skin=own, skins={}, classifier=replace(self.classifier, bundle=bundle))
+        classifier = replace(self.classifier, bundle=own.bundle or self.classifier.bundle)
+        return replace(self, skin=own, skins={}, classifier=classifier, alone=name, hand=self)
+
+    @property
+    def part(self) -> str:
+        """The part of a hub's frames that these settings are for; "" for whole frames."""
+        return self.skin.part if isinstance(self.skin, FingerConfig) else ""
+
+    @property
+    def bundle_setting(self) -> str:
+        """The setting that names the bundle; "" if the store has it."""
+        if self.hand and self.hand.skins[self.alone].bundle:
+            return f"skins.{self.alone}.bundle"
+        return "classifier.bundle" if self.classifier.bundle else ""
+
+    def kept(self, folder: str) -> Path:
+        """A folder of sweeps in the store; that of one finger alone is below it."""
+        return Path(self.store.folder) / folder / self.alone
 
 
 _SECTIONS: Mapping[str, Any] = MappingProxyType(
@@ -341,15 +361,15 @@ def load(
             f"--config-dir {folder}: no such folder; name that of skin.toml and the board files"
         )
     folder = folder or _folder()
-    of_site = _read(site, needed=site != SITE)
+    of_site = read_toml(site, needed=site != SITE)
     in_site = of_site.pop("board", "")
     board, named_in = (
         (board, "--board") if board else (in_site, "code" if in_site == "" else str(site))
     )
-    layers = [(folder / "skin.toml", _read(folder / "skin.toml", needed=False))]
+    layers = [(folder / "skin.toml", read_toml(folder / "skin.toml", needed=False))]
     if board != "":
         path = _board_file(folder, board, named_in)
-        layers.append((path, _read(path, needed=True)))
+        layers.append((path, read_toml(path)))
     layers += [(site, of_site), *((Path("--set"), _parse_set(text)) for text in sets)]
     values = {name: key.default for name, key in _KEYS.items()}
     sources = {"board": Path(named_in).name} | dict.fromkeys(_KEYS, "code")
@@ -403,23 +423,6 @@ def boards(folder: Path | None = None) -> dict[str, Path]:
 def _folder() -> Path:
     beside = Path(__file__).resolve().parents[2] / "firmware_config"
     return beside if beside.is_dir() else SITE.parent
-
-
-def _read(path: Path, *, needed: bool) -> dict[str, Any]:
-    try:
-        return tomllib.loads(path.read_text("utf-8-sig"))
-    except FileNotFoundError as e:
-        if not needed:
-            return {}
-        raise ConfigError(f"{path}: no such file; check the path") from e
-    except OSError as e:
-        raise (TemporaryError if passes(e) else ConfigError)(
-            f"{path}: cannot be read: {str(e.strerror).lower()}; check who may read it"
-        ) from e
-    except (ValueError, RecursionError) as e:  # no TOML or no UTF-8; deeply nested brackets
-        raise ConfigError(
-            f"{path}: not TOML: {str(e).lower()}; write key = value, strings in quotes"
-        ) from e
 
 
 def _board_file(folder: Path, board: Any, where: str) -> Path:

@@ -93,9 +93,27 @@ def whole(
 
 
 def refuse(fingers: Collection[str], what: str) -> None:
-    """Raises ConfigError if there are fingers: `what` does not work with several skins yet."""
+    """Raises ConfigError if there are fingers: `what` does not work with several skins."""
     if fingers:
         raise ConfigError(
             f"{what} works with one skin only, and [skins] has {', '.join(fingers)}; leave it out, "
             "or run it with settings that have one [skin]"
         )
+
+
+def check_chosen(fingers: Collection[str], name: str | None) -> None:
+    """Raises ConfigError unless `name`, of the option --finger, is one of the fingers, or is None
+    and there are none."""
+    known = ", ".join(fingers)
+    if name is None and fingers:
+        raise ConfigError(
+            f"this command works with one skin at a time, and [skins] has {known}; give --finger "
+            f"{next(iter(fingers))}"
+        )
+    if name is None or name in fingers:
+        return
+    if not fingers:
+        raise ConfigError(
+            f"--finger {shown(name)}: this box has one skin, [skin]; leave --finger out"
+        )
+    raise ConfigError(f"--finger {shown(name)} is not among the fingers; [skins] has {known}")

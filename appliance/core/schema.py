@@ -9,11 +9,16 @@ from __future__ import annotations
 
 import json
 import sys
+import tomllib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from difflib import get_close_matches
+from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+
+from appliance.core.errors import ConfigError, TemporaryError
+from appliance.core.patience import passes
 
 _Number = TypeVar("_Number", int, float)
 _Kind = TypeVar("_Kind")
@@ -112,6 +117,25 @@ def read_table(
         if values[name] is None:
             raise refused(f"{name} = {shown(value)} is not allowed; use {known[name].allowed}")
     return values
+
+
+def read_toml(path: Path, *, needed: bool = True) -> dict[str, Any]:
+    """The table in a TOML file; {} for a missing file that is not needed. Raises ConfigError, or
+    TemporaryError if it may be readable later."""
+    try:
+        return tomllib.loads(path.read_text("utf-8-sig"))
+    except FileNotFoundError as e:
+        if not needed:
+            return {}
+        raise ConfigError(f"{path}: no such file; check the path") from e
+    except OSError as e:
+        raise (TemporaryError if passes(e) else ConfigError)(
+            f"{path}: cannot be read: {str(e.strerror).lower()}; check who may read it"
+        ) from e
+    except (ValueError, RecursionError) as e:  # no TOML or no UTF-8; deeply nested brackets
+        raise ConfigError(
+            f"{path}: not TOML: {str(e).lower()}; write key = value, strings in quotes"
+        ) from e
 
 
 def shown(value: object) -> str:

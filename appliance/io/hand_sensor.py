@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appliance.core.errors import SensorError
+from appliance.core.fingers import cut
 from appliance.core.types import Frames
 from appliance.io import packets
 from appliance.io.sensor import SensorCounters
@@ -24,17 +25,22 @@ TIMEOUT_MS = 20
 @dataclass(frozen=True, slots=True)
 class HandSkin:
     """A skin, or a hub. fingers: the finger it belongs to; of a hub each finger, in the order of
-    their parts. axis: of a frame, along which the parts lie."""
+    their parts. axis: of a frame, along which the parts lie. part: the only part that is used, for
+    a hub with one finger; "" for all."""
 
     sensor: LinkSensor
     fingers: tuple[str, ...]
     axis: int = 0
+    part: str = ""
 
     def split(self, frames: Frames) -> list[Frames]:
         """The frames of each finger."""
         parts: list[NDArray[Any]] = [frames.taxels]
         if len(self.fingers) > 1:
             parts = np.split(frames.taxels, len(self.fingers), axis=1 + self.axis)
+        elif self.part:
+            index, n, axis = cut(self.part)
+            parts = [np.split(frames.taxels, n, axis=1 + axis)[index]]
         return [
             Frames(frames.t_ns, frames.seq, part, finger)
             for finger, part in zip(self.fingers, parts, strict=True)
@@ -73,7 +79,11 @@ class HandSensor:
     @property
     def trouble(self) -> SensorError | None:
         """The troubles of all fingers, with their names."""
-        found = [f"{f}: {sensor.trouble}" for f, sensor in self._of.items() if sensor.trouble]
+        found = [
+            f"{finger}: {sensor.trouble}" if finger else str(sensor.trouble)
+            for finger, sensor in self._of.items()
+            if sensor.trouble
+        ]
         return SensorError("; ".join(found)) if found else None
 
     @property

@@ -6,7 +6,6 @@ The fields of SkinProfile are the schema; firmware_config/skins/matrix.toml expl
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from math import ceil
@@ -15,7 +14,7 @@ from typing import Any, Literal
 
 from appliance.core.config import SkinConfig
 from appliance.core.errors import ConfigError
-from appliance.core.schema import closest, custom, keys, read_table, shown
+from appliance.core.schema import closest, custom, keys, read_table, read_toml, shown
 from appliance.core.schema import number as limited
 from appliance.core.types import MOST_AXES, SweepFormat
 from appliance.io import checksums, wire_numbers
@@ -335,17 +334,7 @@ def load(name: str, folders: Sequence[Path]) -> SkinProfile:
             f"{hint}"
         )
     path = there[name]
-    try:
-        table = tomllib.loads(path.read_text("utf-8-sig"))
-    except OSError as e:
-        raise ConfigError(
-            f"{path}: cannot be read: {str(e.strerror).lower()}; check who may read it"
-        ) from e
-    except (ValueError, RecursionError) as e:
-        raise ConfigError(
-            f"{path}: not TOML: {str(e).lower()}; write key = value, strings in quotes"
-        ) from e
-    return _made(table, str(path))
+    return _made(read_toml(path), str(path))
 
 
 def from_json(table: Any, where: str) -> SkinProfile:

@@ -160,8 +160,9 @@ class RecordingSession(Observer):
     say: called with REC sentences. disk: writes the sweeps; a REC sentence follows once its sweep
     is on the disk. target: wanted number of sweeps of each material at each position; sweeps of
     earlier runs in the folder count. names: of materials that were typed, to which those of earlier
-    sweeps are added; sidecars keep them. Raises ConfigError if the folder cannot be
-    used, or has sweeps of another format.
+    sweeps are added; sidecars keep them. finger: whose skin is recorded, for the sidecars; "" for
+    the only skin. Raises ConfigError if the folder cannot be used, or has sweeps of another format
+    or of another finger.
     """
 
     def __init__(
@@ -174,8 +175,10 @@ class RecordingSession(Observer):
         target: int = TARGET,
         disk: DiskWork | None = None,
         names: TypedNames | None = None,
+        *,
+        finger: str = "",
     ) -> None:
-        self.names = names or TypedNames()
+        self.names, self._finger = names or TypedNames(), finger or None
         self._disk, self._writing = disk or AtOnce(), 0
         try:
             self._folder = SweepFolder(folder, format)
@@ -205,6 +208,11 @@ class RecordingSession(Observer):
     def stored(self) -> int:
         """Number of stored sweeps of this run."""
         return len(self._stored)
+
+    @property
+    def folder(self) -> Path:
+        """The folder of the sweeps."""
+        return self._folder.folder
 
     @property
     def last(self) -> int:
@@ -253,7 +261,11 @@ class RecordingSession(Observer):
             Labels(),
         )
         sweep = replace(
-            sweep, material=labels.material, position=labels.position, session=labels.session
+            sweep,
+            material=labels.material,
+            position=labels.position,
+            session=labels.session,
+            finger=self._finger,
         )
         self._writing += 1
         report = partial(self._report_outcome, sweep, verdict, labels)
@@ -291,16 +303,13 @@ class RecordingSession(Observer):
 
     def _count_earlier(self, format: SweepFormat) -> None:
         """Count the sweeps of earlier runs in the folder. Raises ConfigError for a sweep of another
-        format."""
+        format or finger."""
         for number in self._folder.numbers:
             path = self._folder.path(number)
             try:
                 about = sidecar(path)
-                stored, status, labels = (
-                    about["format"],
-                    Status(about["verdict"]["status"]),
-                    _labels(about),
-                )
+                status, labels = Status(about["verdict"]["status"]), _labels(about)
+                stored, finger = about["format"], about.get("finger")
             except (FormatError, ConfigError, KeyError, TypeError, ValueError):
                 continue  # not a sweep of ours, or damaged: training reports it
             if stored != format.json():
@@ -308,6 +317,12 @@ class RecordingSession(Observer):
                 raise ConfigError(
                     f"{path} has another format than {format}, and a model is trained on one "
                     "format; name another folder with --out"
+                )
+            if finger != self._finger:
+                self._folder.close()
+                raise ConfigError(
+                    f"{path} is of {f'the finger {finger}' if finger else 'a box with one skin'}; "
+                    "name another folder with --out"
                 )
             self._count(number, labels, status)
             self.names.add(labels.material, about.get("display"))

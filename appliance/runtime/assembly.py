@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from appliance.bundle import bundle as bundles
 from appliance.bundle.bundle import Bundle
-from appliance.core import fingers
 from appliance.core.clock import Clock, SystemClock
 from appliance.core.config import Config, TriggerConfig
 from appliance.core.devices import Devices
@@ -137,7 +136,6 @@ def recorder(
     slides: as for SweepCheck.
     announce: called with the messages of a trigger without lines to a person. Other parameters as
     for `box`."""
-    fingers.refuse(settings.skins, "recording")
     check = SweepCheck(format, devices.clock, slides)
     watching = [check, *observers]
     return _assembled(
@@ -182,7 +180,7 @@ def _assembled(
     if isinstance(trigger, CommandTrigger):
         commands = {**commands, **trigger.commands}
     lines = _outputs(settings, devices, stack)
-    sensor = hand.sensor if hand else skins.sensor(settings, answerer.format, devices, capture)
+    sensor = hand.sensor if hand else skins.own_sensor(settings, answerer.format, devices, capture)
     stack.callback(sensor.close)
     if port:
         stack.callback(port.close)
@@ -309,10 +307,10 @@ def prove(settings: Config, bundle: Bundle) -> None:
 
 
 def store(settings: Config) -> Store:
-    """The store of bundles that the settings name."""
-    return Store(
-        settings.store, lambda bundle: prove(settings, bundle), taught=settings.teach.allow
-    )
+    """The store of bundles that the settings name. Its bundle serves all fingers, so those of one
+    alone do not suffice to prove one."""
+    box = settings.hand or settings
+    return Store(settings.store, lambda bundle: prove(box, bundle), taught=settings.teach.allow)
 
 
 def running(settings: Config, *, answers: bool = True) -> SignedBundle:

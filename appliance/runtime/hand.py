@@ -97,6 +97,4 @@ def whole(
         raise ConfigError(
             f"{names} are parts of one hub, but their bundles are for different skins"
         )
-    if axis:
-        return replace(own, cols=own.cols * n), axis
-    return replace(own, rows=own.rows * n), axis
+    return skins.hub_format(own, settings.skins[group[0]].part), axis

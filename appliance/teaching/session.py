@@ -47,17 +47,17 @@ def refuse_trained(trained: Iterable[str], labels: Iterable[str]) -> None:
 class TeachingSession(Observer):
     """Observes a recording and teaches the stored sweeps.
 
-    store: the store's folder. learn: makes the command of USE. say: called with TCH sentences.
-    clock: the real clock, because processes run in real time. codes: number of codes of the class
-    bits, 0 without class bits. base: labels of the delivered bundle into which new materials
-    are taught, () without one. trained: those of them that it was trained on. It must come after
-    `recording` among the observers.
+    state: the file of TeachingState. learn: makes the command of USE. say: called with TCH
+    sentences. clock: the real clock, because processes run in real time. codes: number of codes of
+    the class bits, 0 without class bits. base: labels of the delivered bundle into which new
+    materials are taught, () without one. trained: those of them that it was trained on. It must
+    come after `recording` among the observers.
     """
 
     def __init__(
         self,
         recording: RecordingSession,
-        store: Path,
+        state: Path,
         settings: TeachConfig,
         learn: Learn,
         say: Callable[[bytes], None],
@@ -66,11 +66,11 @@ class TeachingSession(Observer):
         base: tuple[str, ...] = (),
         trained: tuple[str, ...] = (),
     ) -> None:
-        self._recording, self._store, self._settings = recording, store, settings
+        self._recording, self._file, self._settings = recording, state, settings
         self._codes, self._base, self._trained = codes, base, trained
         self._fewest = 1 if base else FEWEST
         self._learn, self._clock, self._say = learn, clock or SystemClock(), say
-        self._state = TeachingState.load(store)
+        self._state = TeachingState.load(state)
         self._named: dict[str, None] = {}  # materials without a sweep so far, in order
         self._process: TeachingProcess | None = None
         self._using, self._stored = False, 0
@@ -172,7 +172,7 @@ class TeachingSession(Observer):
 
     def _assess(self) -> None:
         """Begin an assessment; a failure is shown."""
-        folder, forgotten = self._store / "sweeps", self._state.forgotten
+        folder, forgotten = self._recording.folder, self._state.forgotten
         try:
             own = learning(folder, forgotten, self._settings.memory_mb)
             self._begin(self._learn("") if self._base else own)
@@ -247,7 +247,7 @@ class TeachingSession(Observer):
         if self._using:
             raise ApplianceError("a bundle is being made; forget it afterwards")
         try:
-            self._state = self._state.forget(self._store, label, self._recording.last)
+            self._state = self._state.forget(self._file, label, self._recording.last)
         except OSError as e:
             raise ApplianceError(f"{label!r} is not forgotten: {e.strerror}; make room") from e
         self._named.pop(label, None)

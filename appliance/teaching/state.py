@@ -10,9 +10,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from appliance.core import storage
+from appliance.core.config import Config
 from appliance.core.errors import FormatError
 
-FILE = "teaching.json"
+
+def file(settings: Config) -> Path:
+    """The file of the state in the store's folder; a finger has its own."""
+    name = f"teaching-{settings.alone}.json" if settings.alone else "teaching.json"
+    return Path(settings.store.folder) / name
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,10 +28,8 @@ class TeachingState:
     forgotten: dict[str, int] = field(default_factory=dict)
 
     @classmethod
-    def load(cls, folder: Path) -> TeachingState:
-        """The state in the store's folder; empty if there is none. Raises FormatError for other
-        content."""
-        path = folder / FILE
+    def load(cls, path: Path) -> TeachingState:
+        """The state in a file; empty if there is none. Raises FormatError for other content."""
         try:
             held = json.loads(path.read_bytes())["forgotten"]
             return cls({str(name): int(number) for name, number in held.items()})
@@ -37,10 +40,10 @@ class TeachingState:
                 f"{path} cannot be read: {e}; remove it, then forgotten materials are taught again"
             ) from e
 
-    def forget(self, folder: Path, material: str, last: int) -> TeachingState:
-        """The state without the sweeps of a material up to the number `last`; it is on the disk
+    def forget(self, path: Path, material: str, last: int) -> TeachingState:
+        """The state without the sweeps of a material up to the number `last`; it is in the file
         then. Raises OSError."""
         new = TeachingState(self.forgotten | {material: last})
         content = {"forgotten": new.forgotten}
-        storage.put(folder / FILE, (json.dumps(content, indent=1) + "\n").encode())
+        storage.put(path, (json.dumps(content, indent=1) + "\n").encode())
         return new

@@ -13,7 +13,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 from appliance.bundle import bundle
-from appliance.core import fingers
 from appliance.core.clock import Clock
 from appliance.core.config import Config
 from appliance.core.errors import ApplianceError, BundleError, ConfigError, FormatError
@@ -24,7 +23,7 @@ from appliance.deployment.signed import SignedBundle
 from appliance.deployment.store import Store
 from appliance.inference import enrolment
 from appliance.io.usb_sensor import fits
-from appliance.teaching import into
+from appliance.teaching import into, state
 from appliance.teaching.process import News, TeachingProcess, check_installed, learning
 from appliance.teaching.state import TeachingState
 
@@ -38,15 +37,13 @@ class TeachingFailed(ApplianceError):
 
 def check_allowed(settings: Config) -> None:
     """Raises ConfigError if this box may not or cannot be taught."""
-    fingers.refuse(settings.skins, "teach")
     if not settings.teach.allow:
         raise ConfigError(
             "teach.allow = false forbids teaching on this box; set it to true, or deploy a bundle"
         )
-    if settings.classifier.bundle:
+    if name := settings.bundle_setting:
         raise ConfigError(
-            "classifier.bundle names the bundle of this box, so a taught one would not run; remove "
-            "this setting"
+            f"{name} names the bundle that runs, so a taught one would not; remove this setting"
         )
     check_installed()
 
@@ -63,19 +60,19 @@ def use(
     Store.install.
     """
     check_allowed(settings)
-    folder, key = Path(settings.store.folder), EnrolmentKey(settings.store.enrolment_key)
-    if running := base(store, _format(folder / "sweeps")):
+    sweeps, key = settings.kept("sweeps"), EnrolmentKey(settings.store.enrolment_key)
+    if running := base(store, _format(sweeps)):
         return _into(settings, store, running, key, tell)
     key.check(TAUGHT)
-    scratch = folder / "teaching"
+    scratch = Path(settings.store.folder) / "teaching"
     shutil.rmtree(scratch, ignore_errors=True)  # of a process that a power cut ended
     try:
         out = scratch / "bundle"
         day = time.strftime("%Y-%m-%d %H:%M", time.gmtime())
         options = ("--out", str(out), "--version", version(store), "--by", by, "--at", day)
-        forgotten = TeachingState.load(folder).forgotten
+        forgotten = TeachingState.load(state.file(settings)).forgotten
         _wait(
-            learning(folder / "sweeps", forgotten, settings.teach.memory_mb, *options),
+            learning(sweeps, forgotten, settings.teach.memory_mb, *options),
             settings.teach.limit_s,
             clock,
             tell,
@@ -108,10 +105,9 @@ def _into(
     """Teach the new materials among the recorded sweeps into a delivered bundle, as `use`."""
     into.check_settings(settings)
     key.check()
-    folder = Path(settings.store.folder)
-    forgotten = TeachingState.load(folder).forgotten
+    forgotten = TeachingState.load(state.file(settings)).forgotten
     try:
-        found = into.recorded(running.bundle, folder / "sweeps", forgotten)
+        found = into.recorded(running.bundle, settings.kept("sweeps"), forgotten)
         new = into.taught(running, found.windows, tuple(forgotten))
         if new.disagreement:
             raise BundleError(new.disagreement)
@@ -138,16 +134,15 @@ def _format(folder: Path) -> SweepFormat | None:
 def assessed(settings: Config, store: Store, clock: Clock) -> News:
     """The assessment of the recorded sweeps, as news of type `assessed`. Raises TeachingFailed if
     they are too few."""
-    folder = Path(settings.store.folder)
-    forgotten = TeachingState.load(folder).forgotten
-    if running := base(store, _format(folder / "sweeps")):
+    sweeps = settings.kept("sweeps")
+    forgotten = TeachingState.load(state.file(settings)).forgotten
+    if running := base(store, _format(sweeps)):
         try:
-            sweeps = into.recorded(running.bundle, folder / "sweeps", forgotten)
-            return into.assessed(running, sweeps)
+            return into.assessed(running, into.recorded(running.bundle, sweeps, forgotten))
         except (ApplianceError, OSError) as e:
             raise TeachingFailed(f"{e}; the bundle in service stays") from e
     found: News = {}
-    words = learning(folder / "sweeps", forgotten, settings.teach.memory_mb)
+    words = learning(sweeps, forgotten, settings.teach.memory_mb)
     _wait(words, settings.teach.limit_s, clock, found.update)
     return found
 

@@ -121,7 +121,7 @@ def _lost(store: Path, *, forgotten: bool) -> list[str]:
     """Sweeps and decisions that are gone. forgotten: whether the material must be forgotten."""
     try:
         sweeps = [load(path)[0] for path in sorted((store / "sweeps").glob("*.npy"))]
-        state = TeachingState.load(store).forgotten
+        state = TeachingState.load(store / "teaching.json").forgotten
     except FormatError as e:
         return [str(e)]
     wrong = [] if len(sweeps) == len(easy(1)) else [f"{len(sweeps)} sweeps are left"]

@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import select
 import socket
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -96,13 +97,14 @@ class FeedPeer:
 
 class Offered:
     """A feed whose turns a test takes. cost_ns: processor time of each look at the sockets. hand:
-    formats of the fingers."""
+    formats of the fingers. known: more of the first line."""
 
     def __init__(
         self,
         path: Path,
         format: SweepFormat = skin.FORMAT,
         hand: Sequence[SweepFormat] = (),
+        known: Mapping[str, Any] = MappingProxyType({}),
         **facts: Any,
     ) -> None:
         self.path, self.clock = path, rig.VirtualClock()
@@ -111,6 +113,7 @@ class Offered:
             "bundle": "9f3c2a1b",
             "labels": ["plastic rough", "wood"],
             "skin": "palpate",
+            **known,
         }
         self.cost_ns = self._spent_ns = 0
         self.feed = FeedServer(

@@ -13,7 +13,7 @@ from importlib.util import find_spec
 
 import rclpy
 from action_msgs.msg import GoalStatus
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.srv import SetParameters
@@ -47,17 +47,24 @@ def tell(**fields: object) -> None:
         print(json.dumps(fields), flush=True)
 
 
+def content(one: DiagnosticStatus) -> dict:
+    """A status as printed."""
+    return {
+        "level": one.level[0],
+        "name": one.name,
+        "message": one.message,
+        "values": {pair.key: pair.value for pair in one.values},
+    }
+
+
 def status(topic: str, array: DiagnosticArray) -> None:
-    """Print the only status of an array."""
-    (one,) = array.status
-    values = {pair.key: pair.value for pair in one.values}
+    """Print the first status of an array, and those of the fingers after it."""
+    one, *others = map(content, array.status)
     stamp = array.header.stamp.sec + array.header.stamp.nanosec / 1e9
     tell(
         topic=topic,
-        level=one.level[0],
-        name=one.name,
-        message=one.message,
-        values=values,
+        **one,
+        fingers=others,
         stamp=stamp,
         frame_id=array.header.frame_id,
         monotonic_ns=time.monotonic_ns(),

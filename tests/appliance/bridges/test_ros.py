@@ -14,11 +14,11 @@ import pytest
 
 from appliance.cli.main import main
 from appliance.core.sentences import sentence
-from tests.factories import ros, ros_launch
+from tests.factories import feed_lines, ros, ros_launch
 from tests.factories.bridges import LONG_S, eventually
 from tests.factories.paths import ROOT
 from tests.factories.ros import RosPeer
-from tests.factories.speaking_box import SpeakingBox, result, state
+from tests.factories.speaking_box import SpeakingBox, finger, result, state
 
 OK, WARN, ERROR, STALE = range(4)
 PARAMETERS = ROOT / "docs" / "robots" / "palpate.yaml"
@@ -80,6 +80,26 @@ def test_an_answer_becomes_a_message(box: SpeakingBox, node: RosPeer):
         == "stuck-taxel: a loaded taxel shows a constant count; check the skin (taxel 2.3)"
     )
     assert verdict(box, node, result(5, share="0.40"))["values"]["early"] == "true"
+
+
+def test_an_answer_names_its_fingers(box: SpeakingBox, node: RosPeer):
+    """The answer of the hand, then a status for each finger under its name, with its own label and
+    probability; one without contact is an ERROR as in a box with one skin. The next answer, without
+    fingers, has its own status alone."""
+    eventually(lambda: [s.kind for s in box.heard].count("LABEL") == 3)
+    box.say(finger("left", 1, "ok", "paper"))
+    box.say(finger("right", 1, "no-contact", "", "0.000"))
+    heard = verdict(box, node, result(1, label="paper"))
+    assert (heard["name"], heard["message"]) == ("palpate: verdict", "paper")
+    left, right = heard["fingers"]
+    assert (left["name"], left["level"]) == ("palpate: verdict left", OK)
+    assert (left["message"], left["values"]["probability"]) == ("paper", "0.9")
+    assert left["values"]["code"] == "2"
+    assert (right["name"], right["level"]) == ("palpate: verdict right", ERROR)
+    assert right["message"].startswith("no-contact: ")
+    assert right["values"]["label"] == ""
+    assert "finger" not in heard["values"]
+    assert verdict(box, node, result(2))["fingers"] == []
 
 
 def test_the_box_is_unplugged_dead_and_back(box: SpeakingBox, node: RosPeer):
@@ -197,6 +217,61 @@ def test_frames_from_the_feed(tmp_path: Path):
             assert bytes(heard["data"][:8]) == b"\0\0\x80\x3f\0\0\0\x40"
             assert bytes(heard["data"][16:20]) == b"\0\0\xc0\x7f"
             assert not node.call("start")["success"]
+            connection.close()
+
+
+def test_the_fingers_of_the_feed(tmp_path: Path):
+    """Frames of skins of different forms, each with the name of its finger in the frame; a verdict
+    with those of its fingers."""
+    forms = {
+        name: {"rows": rows, "cols": 1, "dtype": dtype, "rate_hz": 100, "window": 200}
+        for name, rows, dtype in (("left", 2, "uint8"), ("right", 3, "int16"))
+    }
+    hello = {"type": "hello", "schema": 1, "labels": ["wood"], "bundle": "b1"}
+    hello |= {
+        "format": forms["left"],
+        "fingers": {name: {"format": f} for name, f in forms.items()},
+    }
+    frames = [
+        {"type": "frame", "time_ns": 1, "finger": "left", "taxels": [[1], [2]]},
+        {"type": "frame", "time_ns": 2, "finger": "right", "taxels": [[3], [4], [-5]]},
+    ]
+    path = tmp_path / "feed.sock"
+    with socket.socket(socket.AF_UNIX) as listener, ros.peer() as node:
+        listener.bind(str(path))
+        listener.listen()
+        with ros.bridge("-p", f"feed:={path}", "-p", "frames_hz:=10.0"):
+            connection, _ = listener.accept()
+
+            def send(*lines: dict) -> None:
+                connection.sendall(b"".join(json.dumps(one).encode() + b"\n" for one in lines))
+
+            def sent() -> bool:
+                send(*frames)
+                return len({heard["frame_id"] for heard in node.on("frames")}) == 2
+
+            send(hello)
+            eventually(sent)
+            of = {heard["frame_id"]: heard for heard in node.on("frames")}
+            assert of["palpate/left"]["shape"] == [2, 1]
+            assert (of["palpate/left"]["encoding"], of["palpate/left"]["data"]) == ("8UC1", [1, 2])
+            assert of["palpate/right"]["shape"] == [3, 1]
+            assert of["palpate/right"]["encoding"] == "16SC1"
+            assert bytes(of["palpate/right"]["data"]) == b"\3\0\4\0\xfb\xff"
+            fingers = [
+                {"finger": "left", "label": "wood", "probability": 0.912, "status": "ok"},
+                {"finger": "right", "label": "", "probability": 0.0, "status": "no-contact"},
+            ]
+            line = feed_lines.verdict(1, 390.0, "wood")
+            send(line | {"fingers": [line | one for one in fingers]})
+            eventually(lambda: node.on("verdict") != [])
+            heard = node.on("verdict")[0]
+            assert heard["message"] == "wood"
+            assert [one["name"] for one in heard["fingers"]] == [
+                "palpate: verdict left",
+                "palpate: verdict right",
+            ]
+            assert [one["level"] for one in heard["fingers"]] == [OK, ERROR]
             connection.close()
 
 

@@ -24,7 +24,7 @@ from appliance.core.errors import CommandRefused, ConfigError
 from appliance.core.sentences import Sentence, sentence
 from tests.factories.bridges import LONG_S, bridge, eventually
 from tests.factories.paths import ROOT
-from tests.factories.speaking_box import LABELS, SpeakingBox, result, state
+from tests.factories.speaking_box import LABELS, SpeakingBox, finger, result, state
 
 Address = tuple[str, int]
 
@@ -46,6 +46,18 @@ def test_the_client_works_through_it(box: SpeakingBox):
         assert client.result(LONG_S).label == "wood"
         assert client.labels() == LABELS
     assert [s.fields for s in box.heard if s.kind == "START"] == [["30.5", "1.5"]]
+
+
+def test_the_fingers_of_a_hand_come_through_it(box: SpeakingBox):
+    """FIN is passed on like RES, and the client beyond has the fingers of the answer."""
+    with (
+        bridge("tcp", "--port", box.path) as address,
+        Palpate(url(address), timeout_s=LONG_S) as client,
+    ):
+        client.state()
+        box.say(finger("left", 7), finger("right", 7, "no-contact", "", "0.000"), result(7))
+        answer = client.result(LONG_S)
+        assert [(of.finger, of.label) for of in answer.fingers] == [("left", "wood"), ("right", "")]
 
 
 def test_without_leave_questions_alone_are_passed_on(box: SpeakingBox):

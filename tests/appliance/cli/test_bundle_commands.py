@@ -18,7 +18,7 @@ from appliance.core.errors import BundleError
 from appliance.core.health import Health
 from appliance.deployment.store import Store
 from appliance.service.status import StatusFile
-from tests.factories import deliveries, toy_bundle
+from tests.factories import deliveries, hands, toy_bundle
 from tests.factories.deliveries import Delivery
 
 RUNNING = bundle.load(bundle.DEFAULT)
@@ -117,3 +117,29 @@ def test_the_command_refuses_it_unless_it_is_told(
     assert sorted(Path(box.how.folder).rglob("*")) == before
     assert main([*command, "--other-skin"]) == 0
     assert "is installed; it runs on trial" in capsys.readouterr().out
+
+
+@deliveries.NEEDED
+@pytest.mark.parametrize(
+    ("sets", "named"),
+    [
+        ([], ""),
+        (["classifier.bundle=/own"], "classifier.bundle"),
+        (hands.of(*hands.TWO), ""),
+        ([*hands.of(*hands.TWO), "skins.right.bundle={own}"], "skins.right.bundle"),
+    ],
+    ids=["store", "box", "hand", "finger"],
+)
+def test_a_bundle_that_the_settings_name_stays(
+    sets: list[str], named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """The message names the setting because of which the new bundle does not run there."""
+    box = Delivery(tmp_path)
+    own, new = box.made(1), box.made(2)
+    sets = [f"store.folder={box.how.folder}", f"store.keys={box.how.keys}", *sets]
+    words = [word for one in sets for word in ("--set", one.format(own=own))]
+    assert main(["bundles", "install", str(new), "--other-skin", *words]) == 0
+    said = capsys.readouterr().out
+    assert "is installed; it runs on trial" in said
+    end = f"; it does not run where the settings name another bundle: {named}\n"
+    assert said.endswith(end) if named else "does not run where" not in said

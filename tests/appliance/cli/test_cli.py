@@ -599,7 +599,7 @@ def test_config_names_sources(capsys: pytest.CaptureFixture[str]):
         (
             ["skin", "show", "--skin", "no.toml"],
             ConfigError,
-            "no.toml: cannot be read: no such file or directory",
+            "no.toml: no such file; check the path",
         ),
         (
             ["record", "--format", "4x4:uint8:750", "--out", "OUT"],

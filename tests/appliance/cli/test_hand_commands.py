@@ -12,19 +12,27 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from appliance.bundle import bundle
 from appliance.bundle.bundle import Bundle
+from appliance.cli import run_command
+from appliance.cli.common import load_settings
 from appliance.cli.main import main
+from appliance.cli.parser import arguments
 from appliance.client.answers import Answer
 from appliance.core import sentences
 from appliance.core.errors import ConfigError
+from appliance.core.types import load as load_sweep
+from appliance.core.types import sidecar
 from appliance.deployment.trial import Trial
 from appliance.runtime import assembly
 from tests.factories import deliveries, hands, toy_bundle
 from tests.factories.deliveries import Delivery
 from tests.factories.settings import load
 from tests.factories.simulated_box import Rigged
+from train.data import sets
 
 TWO = [word for text in hands.of(*hands.TWO) for word in ("--set", text)]
 VIRTUAL = ["--sim", "skin", "--virtual", "--sweeps", "3", "--seed", "7"]
@@ -84,9 +92,6 @@ def test_check_goes_through_each_finger(tmp_path: Path, capsys: pytest.CaptureFi
     [
         ["run", *VIRTUAL, "--capture", "c"],
         ["run", *VIRTUAL, "--set", "classifier.early=true"],
-        ["record", *VIRTUAL, "--out", "o"],
-        ["align", "--sim", "skin"],
-        ["teach", "--label", "cork"],
         ["run", "--sim", "skin", "--skin", "matrix"],
         [
             "run",
@@ -118,6 +123,156 @@ def test_a_shadow_is_refused_and_the_box_runs(capsys: pytest.CaptureFixture[str]
     said = capsys.readouterr()
     assert "no shadow: --shadow works with one skin only" in said.err
     assert len(answers(said.out)) == 9
+
+
+FOR_ONE = [
+    ["record", *VIRTUAL, "--out", "o"],
+    ["align", "--sim", "skin"],
+    ["teach", "--web", "0"],
+    ["teach", "--use"],
+    ["enrol", "felt", *VIRTUAL[:3], "--out", "o"],
+]
+
+
+@pytest.mark.parametrize("command", FOR_ONE, ids=" ".join)
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (TWO, "one skin at a time, and [skins] has left, right; give --finger left"),
+        ([*TWO, "--finger", "lft"], "'lft' is not among the fingers; [skins] has left, right"),
+        ([*TWO, "--finger", ""], "'' is not among the fingers"),
+        (["--finger", "left"], "--finger 'left': this box has one skin, [skin]; leave --finger"),
+    ],
+    ids=["none", "unknown", "empty", "one skin"],
+)
+def test_a_command_for_one_skin_asks_for_the_finger(
+    command: list[str],
+    options: list[str],
+    said: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    """Exit code 78 and one line with the fingers; no file is left."""
+    monkeypatch.chdir(tmp_path)
+    assert main([*command, *options]) == 78
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said in line
+    assert [*tmp_path.iterdir()] == []
+
+
+def test_sweeps_of_a_finger_lie_apart(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Each finger has a folder and a count of its own below that of the box, and its name in the
+    sidecars, so that a set of all has a group of them. Another finger, or a box with one skin, does
+    not record among them."""
+    to = ["--set", f"store.folder={tmp_path}"]
+    for finger, material in (("left", "wood"), ("right", "foam")):
+        words = ["record", *VIRTUAL, *TWO, *to, "--finger", finger, "--material", material]
+        assert main(words) == 0
+    folder = tmp_path / "sweeps"
+    assert {*folder.iterdir()} == {folder / "left", folder / "right"}
+    for finger in hands.TWO:
+        paths = sorted((folder / finger).glob("*.npy"))
+        assert [path.stem[-1] for path in paths] == ["1", "2", "3"]
+        assert {sidecar(path)["finger"] for path in paths} == {finger}
+    found = sets.load(str(folder))
+    assert found.groups["finger"].tolist() == ["left"] * 3 + ["right"] * 3
+    capsys.readouterr()
+    mixed = ["record", *VIRTUAL, "--out", str(folder / "left")]
+    for options in ([*TWO, "--finger", "right"], []):
+        assert main([*mixed, *options]) == 78
+        assert "sweep-000001.npy is of the finger left; name another folder with --out" in (
+            capsys.readouterr().err
+        )
+    assert main(["record", *VIRTUAL, "--out", str(tmp_path / "one")]) == 0
+    assert (
+        main(["record", *VIRTUAL, *TWO, "--finger", "left", "--out", str(tmp_path / "one")]) == 78
+    )
+    assert "is of a box with one skin; name another" in capsys.readouterr().err
+
+
+TSF = ["--skin", "robotiq-tsf", *VIRTUAL]
+ROWS = ["--set", "skins.left.part=1/2 rows", "--set", "skins.right.part=2/2 rows"]
+
+
+def test_a_finger_of_a_hub_records_its_part(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Both parts together are the frames of the hub, in which each sweep has the same place."""
+    kept = {}
+    for finger in ("", *hands.TWO):
+        options = [*ROWS, "--finger", finger] if finger else []
+        out = tmp_path / (finger or "hub")
+        assert main(["record", *TSF, *options, "--out", str(out), "--material", "wood"]) == 0
+        kept[finger] = [load_sweep(path) for path in sorted(out.glob("*.npy"))]
+    assert len(kept["left"]) == 3
+    assert {format.shape for _, format in kept["left"] + kept["right"]} == {(7, 4)}
+    for (hub, _), (left, _), (right, _) in zip(*kept.values(), strict=True):
+        parts = np.concatenate([left.frames.taxels, right.frames.taxels], axis=1)
+        assert np.array_equal(hub.frames.taxels, parts)
+
+
+def test_what_a_part_of_a_hub_cannot_do_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """A capture keeps the bytes of the whole hub; 14 rows are not cut into three or four."""
+    monkeypatch.chdir(tmp_path)
+    left = ["record", *TSF, "--finger", "left", "--out", "o"]
+    assert main([*left, *ROWS, "--capture", "c"]) == 78
+    assert 'skins.left.part is "1/2 rows"; leave it out' in capsys.readouterr().err
+    thirds = [word for part in (1, 2) for word in ("--set", f"skins.f{part}.part={part}/4 rows")]
+    assert main(["record", *TSF, "--finger", "f1", "--out", "o", *thirds]) == 78
+    said = capsys.readouterr().err
+    assert 'skins.f1.part = "1/4 rows" does not divide the frames of 14x4' in said
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("hub", [False, True])
+def test_align_shows_one_finger(hub: bool):
+    """With the bundle of a finger its contact positions; of a hub the part alone, which no bundle
+    here fits."""
+    options = ["--skin", "robotiq-tsf", *ROWS] if hub else TWO
+    words = ["align", "--sim", "rest", "--finger", "right", *options]
+    with subprocess.Popen(
+        [sys.executable, "-m", "appliance", *words], stdout=subprocess.PIPE, text=True
+    ) as align:
+        try:
+            wanted = "no bundle fits this skin" if hub else "row"
+            while wanted not in (line := align.stdout.readline()):
+                assert line, "it has ended"
+        finally:
+            align.terminate()
+
+
+def test_the_port_of_the_command_is_that_of_the_finger():
+    """--port and --skin override the finger's own settings, not those that it does not use."""
+    own = ["--set", "skins.left.port=/dev/a", "--set", "skins.right.port=/dev/b"]
+    args = arguments("record", [*own, "--finger", "right", "--port", "/dev/c", "--skin", "matrix"])
+    settings = load_settings(args)
+    assert (settings.skin.port, settings.skin.profile) == ("/dev/c", "matrix")
+    assert load_settings(arguments("align", [*own, "--finger", "right"])).skin.port == "/dev/b"
+
+
+def test_a_finger_is_enrolled(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """From its sweeps, into the bundle of the box."""
+    words = ["enrol", "felt", *VIRTUAL[:3], *TWO, "--sweeps", "2", "--finger", "right"]
+    assert main([*words, "--out", str(tmp_path / "felt"), "--sim", "skin:wood"]) == 0
+    made = bundle.from_files(bundle.files(tmp_path / "felt"), "")
+    assert made.enrolled == {"felt": 2}
+
+
+@pytest.mark.parametrize("command", [["teach", "--use"], ["enrol", "felt"]], ids=" ".join)
+@pytest.mark.parametrize("setting", ["skins.left.bundle", "classifier.bundle"])
+def test_a_bundle_of_the_settings_is_not_taught_into(
+    command: list[str],
+    setting: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+):
+    """The store has another bundle, which would not run: the setting is named, nothing is
+    written."""
+    keys = ["--set", f"store.folder={tmp_path / 'store'}", "--set", f"store.keys={tmp_path}"]
+    assert main([*command, *TWO, *keys, "--set", f"{setting}=/own", "--finger", "left"]) == 78
+    assert f"{setting} names the bundle that runs, so a" in capsys.readouterr().err
+    assert not (tmp_path / "store").exists()
 
 
 def test_demo_plays_one_skin(capsys: pytest.CaptureFixture[str]):
@@ -174,6 +329,19 @@ def test_status_and_watch_name_the_fingers(tmp_path: Path):
     assert {*hello["fingers"]["left"]} == {"skin", "unit", "bundle", "format", "alignment"}
     frames = [line["finger"] for line in lines if line["type"] == "frame"]
     assert {*frames} == {*hands.TWO}
+
+
+def test_the_bundles_of_the_fingers_are_named_if_they_differ(
+    default_bundle: Bundle, tmp_path: Path
+):
+    """For `status` and the feed: each with its finger; a bundle for all once, without."""
+    own = toy_bundle.load(tmp_path)
+    differ = run_command._model(default_bundle, {"left": default_bundle, "right": own})
+    m = default_bundle.manifest
+    assert differ.startswith(f"left: {m.name} {m.version}, 6 labels; right: ")
+    same = f"{m.name} {m.version}, 6 labels"
+    assert run_command._model(default_bundle, dict.fromkeys(hands.TWO, default_bundle)) == same
+    assert run_command._model(default_bundle, {}) == same
 
 
 @deliveries.NEEDED

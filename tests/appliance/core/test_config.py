@@ -64,7 +64,7 @@ def test_later_layers_win_and_each_value_knows_its_source(folder: Path) -> None:
     for name, (value, want, source) in got.items():
         assert (value, c.sources[name]) == (want, source), name
     assert len(c.sources) == 1 + sum(
-        len(schema.keys(type(getattr(c, s)))) for s in config.Config.__slots__[1:-3]
+        len(schema.keys(type(getattr(c, s)))) for s in config.Config.__slots__[1:-5]
     )
 
 
@@ -277,7 +277,11 @@ def test_usb_ids_and_serial_number(folder: Path, usb: str, ids: tuple[int, int, 
 
 @pytest.mark.parametrize(
     "section",
-    [n for n in config.Config.__slots__ if n not in ("board", "sources", "folder", "skins")],
+    [
+        n
+        for n in config.Config.__slots__
+        if n not in ("board", "sources", "folder", "skins", "alone", "hand")
+    ],
 )
 def test_each_field_is_explained(section: str) -> None:
     """The name of each setting stands in the docstring of its group."""

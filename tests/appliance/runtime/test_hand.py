@@ -112,6 +112,21 @@ def test_a_finger_that_is_unplugged_in_a_sweep_leaves_the_other(hand: Callable[.
     assert [level for t, n, level in written if n == devices.FAULT and t > begin] == []
 
 
+def test_a_finger_with_a_skin_of_another_form_leaves_the_other(hand: Callable[..., Rigged]):
+    """As when one finger has taught a bundle for all: it is in service with the finger that it
+    fits, and the state names the other, with both forms and what to do."""
+    wide = replace(skin.FORMAT, rows=8)
+    (act,) = hands.acts(3, 1)
+    act = replace(act, others=(np.tile(act.frames, (1, 2, 1)),))
+    box = hand([act], formats={"left": skin.FORMAT, "right": wide})
+    (verdict,) = box.until(lambda: box.box.answered == 1)
+    assert statuses(verdict) == ["ok", "sensor-lost", "ok"]
+    assert verdict.label == act.label
+    health = box.box.health
+    assert (health.degraded, health.streams) == ("right mismatch", True)
+    assert health.trouble.startswith("right: the skin sends 8x4 uint8 at 750 Hz, wanted is 4x4")
+
+
 def test_without_any_finger_the_box_is_not_ready(hand: Callable[..., Rigged]):
     """With both skins gone the sweep is `sensor-lost` at once, and FAULT rises; with one of them
     back the box is ready again."""

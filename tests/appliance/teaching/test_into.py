@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -17,6 +18,7 @@ from appliance.bundle import bundle
 from appliance.cli import teach_command
 from appliance.cli.main import main
 from appliance.cli.parser import arguments
+from appliance.core.clock import SystemClock
 from appliance.core.config import load
 from appliance.core.errors import BundleError, ConfigError, ModelError
 from appliance.deployment.enrolment_key import EnrolmentKey
@@ -24,12 +26,13 @@ from appliance.deployment.signed import SignedBundle
 from appliance.inference import enrolment
 from appliance.inference.classifier import Classifier
 from appliance.runtime import assembly
+from appliance.runtime.hand import classifier
 from appliance.sim import skin
 from appliance.teaching import into, use
 from appliance.teaching.session import TeachingSession
 from appliance.teaching.state import TeachingState
 from tests.campaigns import junk
-from tests.factories import deliveries, lessons
+from tests.factories import deliveries, hands, lessons
 from tests.factories.paths import ROOT
 from train.data.sets import Dataset
 
@@ -54,11 +57,11 @@ def rests(count: int) -> list[np.ndarray]:
     return [junk.window("finger rests", WORLD, n)[0] for n in range(count)]
 
 
-def record(store: Path, material: str, of: list[np.ndarray], first: int) -> None:
+def record(store: Path, material: str, of: list[np.ndarray], first: int, finger: str = "") -> None:
     """Write recorded sweeps of a material, numbered from `first`."""
     labels = np.zeros(len(of), int)
     sweeps = Dataset(np.stack(of), labels, (material,), skin.FORMAT.rate_hz, {}, material)
-    lessons.write(store / "sweeps", sweeps, first=first)
+    lessons.write(store / "sweeps" / finger, sweeps, first=first)
 
 
 class TaughtDelivery:
@@ -122,7 +125,7 @@ def test_more_sweeps_another_material_and_a_forgotten_one(box: TaughtDelivery, c
     record(box.store, "felt", slides(FELT, 1), 20)
     assert box.teach(capsys, "--use")[0] == 0
     assert box.running.bundle.enrolled == {"cork": 7, "felt": 1}
-    TeachingState().forget(box.store, "cork", 19)
+    TeachingState().forget(box.store / "teaching.json", "cork", 19)
     assert box.teach(capsys, "--use")[0] == 0
     assert box.running.bundle.enrolled == {"felt": 1}
     assert first.enrolled == {"cork": 5}
@@ -143,7 +146,7 @@ def test_a_label_without_recorded_sweeps_stays(box: TaughtDelivery, capsys: Any)
 
 def test_nothing_new_leaves_the_bundle_in_service(box: TaughtDelivery, capsys: Any):
     """Sweeps of trained materials, of rests alone, or of another format teach nothing."""
-    TeachingState().forget(box.store, "cork", 19)
+    TeachingState().forget(box.store / "teaching.json", "cork", 19)
     record(box.store, "foam", slides(CORK, 3), 20)
     record(box.store, "oak", rests(3), 30)
     before = box.running.sha
@@ -201,6 +204,58 @@ def test_a_reader_that_is_gone_gets_an_exit_code(box: TaughtDelivery):
     assert done.returncode
     assert "Traceback" not in done.stderr
     assert box.running.bundle.enrolled in ({}, {"cork": 5})
+
+
+FINGERS = [word for text in hands.of(*hands.TWO) for word in ("--set", text)]
+
+
+@pytest.fixture
+def hand(tmp_path: Path) -> TaughtDelivery:
+    """A box with two fingers, the left one with sweeps of cork and felt, the right one of oak."""
+    box = TaughtDelivery(tmp_path)
+    for finger, material, of in (
+        ("left", "cork", slides(CORK, 5)),
+        ("left", "felt", slides(FELT, 2)),
+        ("right", "oak", slides(CORK, 5)),
+    ):
+        record(box.store, material, of, 1 if material != "felt" else 10, finger)
+    box.words += FINGERS
+    return box
+
+
+def test_a_hand_is_taught_with_one_finger(hand: TaughtDelivery, capsys: Any):
+    """By its sweeps alone; what it has forgotten the other has not. The bundle names the material
+    for all fingers without a bundle of their own."""
+    assert main(["teach", *hand.words, "--finger", "left", "--forget", "felt"]) == 0
+    assert (hand.store / "teaching-left.json").exists()
+    code, learnt = hand.teach(capsys, "--finger", "left")
+    assert code == 0
+    assert learnt["materials"] == {"cork": 5}
+    code, news = hand.teach(capsys, "--finger", "left", "--use")
+    assert code == 0, news
+    assert hand.running.bundle.enrolled == {"cork": 5}
+    settings = load(None, hand.words[1::2], site=ROOT / "tests/factories/no-site.toml")
+    both = assembly.of_fingers(settings, hand.running.bundle, answers=True)
+    run = classifier(settings, both, SystemClock())
+    assert {*run.labels} == {*skin.MATERIALS, "cork"}
+    code, news = hand.teach(capsys, "--finger", "right", "--use")
+    assert code == 0, news
+    assert hand.running.bundle.enrolled == {"cork": 5, "oak": 5}
+
+
+def test_a_bundle_that_does_not_suit_the_other_finger_is_not_used(
+    hand: TaughtDelivery, tmp_path: Path, capsys: Any
+):
+    """The right finger has a bundle of its own, which lacks the new label: the service would not
+    start with both."""
+    own = tmp_path / "own"
+    shutil.copytree(hand.store / (hand.store / "current").readlink(), own)
+    hand.words += ["--set", f"skins.right.bundle={own}"]
+    before = hand.running.sha
+    code, news = hand.teach(capsys, "--finger", "left", "--use")
+    assert code == 78, news
+    assert "the bundle of skins.right has other labels than that of the first" in news["text"]
+    assert hand.running.sha == before
 
 
 def test_a_taught_bundle_and_another_skin_are_fitted_anew(box: TaughtDelivery):
@@ -276,7 +331,6 @@ def test_a_trained_material_is_refused_before_a_sweep(box: TaughtDelivery, capsy
 
 def sessions(folder: Path, codes: int) -> TeachingSession:
     """A session with a bundle of oak and pine, into which cork was taught."""
-    from appliance.core.clock import SystemClock
     from appliance.core.config import TeachConfig
     from appliance.recording.recording import Labels, RecordingSession
 
@@ -288,7 +342,7 @@ def sessions(folder: Path, codes: int) -> TeachingSession:
     base = ("oak", "pine", "cork")
     return TeachingSession(
         recording,
-        folder,
+        folder / "teaching.json",
         TeachConfig(),
         lambda by: [],
         say,

@@ -22,7 +22,7 @@ from appliance.sim import skin
 from appliance.teaching import process, session
 from appliance.teaching.process import TeachingProcess
 from appliance.teaching.session import TeachingSession
-from appliance.teaching.state import FILE, TeachingState
+from appliance.teaching.state import TeachingState
 from appliance.teaching.teacher import Teacher
 from tests.factories.feeds import HEALTH, OK, cut
 
@@ -40,6 +40,7 @@ def printed(*lines: dict[str, Any], then: str = "") -> list[str]:
     return program(f"print({text!r}, end='', flush=True)\n{then}")
 
 
+FILE = "teaching.json"
 ASSESSED = {"type": "assessed", "text": "80 % right", "advice": "3 more of cork"}
 TAUGHT = {"type": "taught", "text": "bundle 1234 is installed", "labels": ["cork", "pine"]}
 
@@ -55,7 +56,7 @@ class Taught:
         )
         self.session = TeachingSession(
             self.recording,
-            folder,
+            folder / FILE,
             TeachConfig(),
             lambda by: self.learn,
             lambda line: self.said.append(line.decode()),
@@ -265,7 +266,7 @@ def test_a_forgotten_material_is_gone_and_its_sweeps_stay(taught: Taught):
     assert taught.order("FORGET", "cork") == ["cork", 2]
     assert taught.session.materials() == {"pine": 2}
     assert len(list((taught.folder / "sweeps").glob("*.npy"))) == 4
-    assert TeachingState.load(taught.folder).forgotten == {"cork": 4}
+    assert TeachingState.load(taught.folder / FILE).forgotten == {"cork": 4}
     taught.sweeps("cork", 1)
     assert taught.session.materials() == {"pine": 2, "cork": 1}
     with pytest.raises(ApplianceError, match="there is no material 'felt' to forget"):
@@ -276,7 +277,7 @@ def test_a_damaged_state_is_named(tmp_path: Path):
     """The message says what removing the file means."""
     (tmp_path / FILE).write_text('{"forgotten": [1]}')
     with pytest.raises(FormatError, match=r"teaching.json cannot be read: .*; remove it"):
-        TeachingState.load(tmp_path)
+        TeachingState.load(tmp_path / FILE)
 
 
 def test_a_discarded_sweep_is_not_taught(taught: Taught):
