@@ -24,7 +24,7 @@ from appliance.core.clock import Clock
 from appliance.core.errors import FormatError
 from appliance.core.types import load
 from appliance.teaching import use
-from appliance.teaching.state import FILE, TeachingState
+from appliance.teaching.state import TeachingState
 from tests.cuts import delivery
 from tests.cuts.calls import NotFollowed
 from tests.cuts.delivery import STORE, Shop
@@ -50,7 +50,7 @@ class TeachingShop(Shop):
             ran = {found.heard} if found.heard else {ids[name] for name in may[found.step]}
             later = found.step != steps[0].name
             # the next forget overwrites it
-            (found.folder / STORE / f"{FILE}{storage.PART}").unlink(missing_ok=True)
+            (found.folder / STORE / f"teaching.json{storage.PART}").unlink(missing_ok=True)
             return (
                 _lost(found.folder / STORE, forgotten=later)
                 or self._comes_back(found.folder, ran)

@@ -193,6 +193,12 @@ def text(figures: Mapping[str, Any]) -> str:
     ]
     for kind, (was, now) in found["kept"].items():
         lines.append(f"  {kind}: {100 * now:.1f} %, before {100 * was:.1f} %")
+    for name, shares in found.get("disturbances", {}).items():
+        (was, now), (passed, passes) = shares["kept"], shares["left out"]
+        lines.append(
+            f"  allowed for {name}: {100 * now:.1f} % known, before {100 * was:.1f} %; of materials "
+            f"that are left out {100 * passes:.1f} %, before {100 * passed:.1f} %"
+        )
     return "\n".join(lines)
 
 
