@@ -28,6 +28,8 @@ UNPROVEN = "broken taxels are refused: export it again to measure how many can b
 """Text of a bundle without `bridging`."""
 UNCHECKED = "early answers do not detect unknown materials: export it again"
 """Text of a bundle with early answers, but without limits for them."""
+UNALLOWED = "noise, hum or another speed look like an unknown material: export it again"
+"""Text of a bundle that detects unknown materials, but has no allowances for disturbances."""
 LISTEN_S, LONGEST_S, LEAST_FRAMES = 1.0, 5.0, 50
 """Time for which frames of the skin are counted, and for a slow skin the longest time and the
 number of frames that show its rate."""
@@ -113,6 +115,7 @@ def _of_bundle(
             + (f"{m.taught}; " if m.taught else "")
             + (f"{m.bridging.text} bridged" if m.bridging else UNPROVEN)
             + (f"; {UNCHECKED}" if m.early and not m.early.limits else "")
+            + (f"; {UNALLOWED}" if m.known and not m.disturbances else "")
         )
 
     def golden() -> str:

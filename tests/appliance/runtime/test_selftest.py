@@ -95,6 +95,19 @@ def test_check_says_how_many_broken_taxels_are_bridged(proven: bool):
     assert wanted in first.detail
 
 
+@pytest.mark.parametrize("allowed", [True, False])
+def test_check_says_if_disturbances_are_not_allowed_for(allowed: bool):
+    """An older bundle passes, and answers disturbed sweeps as before."""
+    acts, source, format = script.named("skin", None, 1, spread=False)
+    built = devices.build(format, acts, rig.VirtualClock(), source)
+    packaged = bundle.load(bundle.DEFAULT)
+    found = packaged.manifest.disturbances if allowed else None
+    older = replace(packaged, manifest=replace(packaged.manifest, disturbances=found))
+    first, *_ = selftest.check(built.wire(config.load(None)), lambda: older, built)
+    assert first.ok
+    assert ("look like an unknown material" in first.detail) is not allowed
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("sent_hz", "ok"), [(28.0, True), (29.0, True), (100.0, False), (20.0, False)]
