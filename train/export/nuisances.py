@@ -129,9 +129,10 @@ def altered(
         source = rng.permutation(len(sweeps))[:COPIES]
         scene = every if corruption.only == "simulated" else still
         samples, severity = _copies(corruption, scene, source, seed)
-        samples, hum = meter.clean(samples)
+        name, hum = disturbances.OF_KIND.get(corruption.name), np.empty(0)
+        if name == "hum":
+            samples, hum = meter.clean(samples)
         copies[corruption.name] = features(samples), source
-        name = disturbances.OF_KIND.get(corruption.name)
         if name in ("lost", "hum"):
             disturbed[corruption.name] = (
                 {"lost": severity, "hum": np.sqrt(hum)}[name],
