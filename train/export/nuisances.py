@@ -197,8 +197,8 @@ def text(figures: Mapping[str, Any]) -> str:
     for name, shares in found.get("disturbances", {}).items():
         (was, now), (passed, passes) = shares["kept"], shares["left out"]
         lines.append(
-            f"  allowed for {name}: {100 * now:.1f} % known, before {100 * was:.1f} %; of materials "
-            f"that are left out {100 * passes:.1f} %, before {100 * passed:.1f} %"
+            f"  allowed for {name}: {100 * now:.1f} % known, before {100 * was:.1f} %; of left-out "
+            f"materials {100 * passes:.1f} %, before {100 * passed:.1f} %"
         )
     return "\n".join(lines)
 
