@@ -295,8 +295,6 @@ def _check_parts(manifest: Manifest) -> None:
         raise BundleError(
             "manifest has `moved` without `known` and `place`; export the bundle again"
         )
-    if manifest.disturbances and manifest.disturbances.allowances and not manifest.known:
-        raise BundleError("manifest has `disturbances` without `known`; export the bundle again")
     taxels = manifest.format.rows * manifest.format.cols
     if manifest.bridging and manifest.bridging.taxels >= taxels:
         raise BundleError(

@@ -46,7 +46,7 @@ def test_each_sweep_has_an_answer_of_each_finger_and_of_the_hand(
 ):
     """FIN of each finger in the order of the settings, then RES, whose probabilities are the
     product of theirs. No frame is lost, and each finger has its own window."""
-    acts = hands.acts(1, 3, len(fingers))
+    acts = hands.acts(2, 3, len(fingers))
     box = hand(acts, fingers)
     verdicts = box.until(lambda: box.box.answered == 3)
     box.seconds(0.1)
