@@ -431,7 +431,9 @@ def counted(model: bundle.Bundle, world: skin.World, each: int) -> dict[str, dic
                 ok = verdict.status is Status.OK
                 found.update({how: ok, f"{how} wrong": ok and verdict.label != right})
                 statuses.update([str(verdict.status)] if by is None else [])
-        kinds[name] = {"sweeps": each, **found, "statuses": dict(statuses.most_common())}
+        kinds[name] = {"group": group(name), "sweeps": each, **found} | {
+            "statuses": dict(statuses.most_common())
+        }
         usual = ", ".join(f"{status} {n}" for status, n in statuses.most_common(2))
         print(f"{name:32} {' '.join(f'{found[key]:5}' for key in COUNTED)} ", usual, flush=True)
     return kinds

@@ -26,6 +26,7 @@ from train.studies import (
     quotes,
     recipe_page,
     reports,
+    wrong_answers,
 )
 from train.studies.study import DATA, read, results_file
 
@@ -58,6 +59,8 @@ class DocumentPicture:
 
 
 FIGURES = (
+    DocumentFigure(README, "stress", "stress", wrong_answers.of_stress),
+    DocumentFigure(README, "junk", "junk", wrong_answers.of_junk),
     DocumentFigure(README, "front", "development", development_report.caption),
     DocumentFigure(SPECIFICATIONS, "bench", "bench", bench_table.table),
     DocumentFigure(ALIGN, "moved", "alignment", contact_table.sentence),
