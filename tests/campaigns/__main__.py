@@ -180,6 +180,11 @@ CAMPAIGNS = {
         "compare taught bundles with palpate-train fit at 5, 10 and 20 sweeps (half an hour)",
         _module("tests.campaigns.taught"),
     ),
+    "strangers": Campaign(
+        "leave out each material, and count its sweeps that are taken for known (5 minutes)",
+        _module("tests.campaigns.strangers"),
+        nice=True,
+    ),
     "fuzz": Campaign(
         "fuzz all parsers of outside bytes; the options name targets and --minutes of each",
         _module("tests.fuzz", "--minutes", "10"),
