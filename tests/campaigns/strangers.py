@@ -44,7 +44,7 @@ class Strangers:
     unknown: Array
 
     def shares(self, limit: float) -> tuple[float, ...]:
-        """Shares within a limit: known, unknown, and pairs of unknown sweeps of which both are."""
+        """Shares within a limit: known sweeps, unknown sweeps, and pairs of unknown sweeps."""
         passed = float((self.unknown <= limit).mean())
         half = len(self.unknown) // 2
         both = np.maximum(self.unknown[:half], self.unknown[half : 2 * half]) <= limit

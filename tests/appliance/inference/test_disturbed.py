@@ -85,7 +85,7 @@ def test_an_enrolled_label_moves_as_the_others_do_on_average(tmp_path: Path):
 
 
 def test_hum_is_removed_and_said(tmp_path: Path):
-    """The answer is the one without hum."""
+    """A sweep with hum gets the answer of a sweep without it."""
     format = SweepFormat(2, 2, 750.0, 1500, "int16")
     given, clean = toy(tmp_path, format=format), toy_bundle.sweep(6, 0, format=format)
     times = np.arange(1500)[:, None, None] / 750

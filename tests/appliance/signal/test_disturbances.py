@@ -1,4 +1,4 @@
-"""Noise and load of a sweep, and what a bundle allows for disturbances."""
+"""Noise and load of a sweep, and the allowances of a bundle."""
 
 from __future__ import annotations
 
