@@ -263,7 +263,9 @@ class Classifier(Observer):
             sweep, finding = self.repaired(sweep)
         if finding.status is not Status.OK:
             return self._verdict(sweep, finding)
-        sweep, hum = self._without_hum(sweep)
+        taxels, hum = self.without_hum(sweep.frames.taxels)
+        if hum:
+            sweep = replace(sweep, frames=replace(sweep.frames, taxels=taxels))
         touch = replace(self._touch(sweep, finding.mean), hum=hum)
         logits, novelty = self._classify(sweep, touch, finding.mean)
         if novelty:
@@ -278,13 +280,13 @@ class Classifier(Observer):
             return sweep, finding
         return replace(sweep, frames=replace(sweep.frames, taxels=taxels)), finding
 
-    def _without_hum(self, sweep: Sweep) -> tuple[Sweep, float]:
-        """A sweep without the hum of the mains, and the amplitude of this in counts."""
+    def without_hum(self, taxels: NDArray[Any]) -> tuple[NDArray[Any], float]:
+        """One window of raw counts [T, R, C] or [T, R, C, A] without the hum of the mains, and the
+        amplitude of this hum in counts."""
         allowed = self.bundle.manifest.disturbances
         if not (self._hum and allowed and allowed.hum):
-            return sweep, 0.0
-        taxels, hum = self._hum(sweep.frames.taxels, allowed.hum)
-        return replace(sweep, frames=replace(sweep.frames, taxels=taxels)) if hum else sweep, hum
+            return taxels, 0.0
+        return self._hum(taxels, allowed.hum)
 
     def conclude(
         self,

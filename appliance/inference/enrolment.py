@@ -84,7 +84,7 @@ def enrol(old: Bundle, label: str, sweeps: NDArray[Any]) -> Enrolment:
             f"sweeps {sweeps.dtype} {sweeps.shape} cannot be enrolled; the bundle wants [n] of {f}"
         )
     run = Classifier(old, SystemClock())
-    sweeps = np.stack([run.taxels.repaired(sweep, run.tare)[0] for sweep in sweeps])
+    sweeps = cleaned(run, sweeps)
     is_no_slide = slide_check(old)
     for number, sweep in enumerate(sweeps, 1):
         if why := is_no_slide(sweep):
@@ -110,6 +110,13 @@ def enrol(old: Bundle, label: str, sweeps: NDArray[Any]) -> Enrolment:
             "classifier.early = false"
         )
     return Enrolment(new, file, tuple(warnings), _disagreement(trained, label, z))
+
+
+def cleaned(run: Classifier, sweeps: NDArray[Any]) -> NDArray[Any]:
+    """Windows [n, T, R, C] or [n, T, R, C, A] as the network sees them in an answer: broken taxels
+    are bridged, and hum is removed."""
+    bridged = (run.taxels.repaired(sweep, run.tare)[0] for sweep in sweeps)
+    return np.stack([run.without_hum(window)[0] for window in bridged])
 
 
 def network_outputs(run: Classifier, sweeps: NDArray[Any]) -> tuple[Embedded, Embedded]:

@@ -186,7 +186,10 @@ def _judged(
     """For each new material the probabilities [n, K] of its left-out sweeps, and the answers of the
     box to them."""
     run, names = Classifier(old, SystemClock()), [*old.manifest.labels, *many]
-    outputs = {name: enrolment.network_outputs(run, of) for name, of in many.items()}
+    outputs = {
+        name: enrolment.network_outputs(run, enrolment.cleaned(run, of))
+        for name, of in many.items()
+    }
     p = {name: _left_out(old, outputs, name) for name in outputs}
     late = {*old.enrolled, *many}
     rule = EnrolledLabels(np.array([name in late for name in names]), enrolment.LEAST)

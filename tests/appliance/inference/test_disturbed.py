@@ -99,6 +99,20 @@ def test_hum_is_removed_and_said(tmp_path: Path):
     assert (kept.label, kept.detail) == ("b", "")
 
 
+def test_a_material_is_enrolled_without_hum(tmp_path: Path):
+    """Sweeps with hum and without it give the same mean, as they give the same answer."""
+    format = SweepFormat(2, 2, 750.0, 1500, "int16")
+    given = toy(tmp_path, format=format)
+    clean = np.stack([toy_bundle.window(20, 20, format)] * 3)
+    times = np.arange(1500)[:, None, None] / 750
+    humming = np.rint(clean + 5 * np.sin(2 * np.pi * 50 * times)).astype(np.int16)
+    plain, cleaned = (enrolment.enrol(given, "new", of).bundle for of in (clean, humming))
+    assert plain.classes
+    assert cleaned.classes
+    assert cleaned.classes.means[-1] == pytest.approx(plain.classes.means[-1], abs=0.01)
+    assert cleaned.golden[-1] == pytest.approx(plain.golden[-1], abs=1)
+
+
 @pytest.mark.parametrize("changes", [CHANGES[:1], CHANGES[:, :2], CHANGES[:, :, :1]])
 def test_changes_of_another_shape_are_refused(tmp_path: Path, changes: np.ndarray):
     """A row for each allowance, a column for each trained label."""
