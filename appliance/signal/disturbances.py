@@ -56,8 +56,10 @@ def noise(taxels: Array) -> float:
     counts = some.reshape(len(some), -1).astype(np.float32)
     with np.errstate(all="ignore"):  # float32 counts may be infinite
         steps = np.diff(counts, ORDER, axis=0)
-        power = np.median((steps * steps).mean(axis=0)) / math.comb(2 * ORDER, ORDER)
-    return math.log(max(float(np.nan_to_num(power, posinf=0)), TINY))
+        powers = np.sort(np.einsum("tv,tv->v", steps, steps))  # those that are not finite are last
+        middle = (powers[(len(powers) - 1) // 2] + powers[len(powers) // 2]) / 2
+    power = float(middle) / (len(steps) * math.comb(2 * ORDER, ORDER))
+    return math.log(max(power, TINY)) if math.isfinite(power) else math.log(TINY)
 
 
 def load(mean: Array, tare: Array) -> float:
