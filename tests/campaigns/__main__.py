@@ -180,9 +180,9 @@ CAMPAIGNS = {
         "compare taught bundles with palpate-train fit at 5, 10 and 20 sweeps (half an hour)",
         _module("tests.campaigns.taught"),
     ),
-    "strangers": Campaign(
+    "unknown-materials": Campaign(
         "leave out each material, and count its sweeps that are taken for known (5 minutes)",
-        _module("tests.campaigns.strangers"),
+        _module("tests.campaigns.unknown_materials"),
         nice=True,
     ),
     "fuzz": Campaign(

@@ -1,6 +1,6 @@
 """Unknown materials that a bundle takes for known ones, each material left out in turn.
 
-`python -m tests.campaigns strangers` fits a model without each material of the training set, and
+`python -m tests.campaigns unknown-materials` fits a model without each material of the training set, and
 exports it. It prints, for the sweeps of the test set: the share of known sweeps within the limit of
 known materials, the share of unknown ones within it, and the same if two sweeps of a material have
 to be within it. Then both for the limit that keeps 97 % of the known sweeps, and the AUROC. Real
@@ -37,7 +37,7 @@ MOST = 1200
 
 
 @dataclass(frozen=True)
-class Strangers:
+class LeftOutDistances:
     """Distances of known sweeps [n] and of unknown ones [m], as shares of the limit."""
 
     known: Array
@@ -58,7 +58,7 @@ class Strangers:
 
 def main() -> None:
     """Print a row for each material, and the means."""
-    parser = argparse.ArgumentParser("python -m tests.campaigns strangers")
+    parser = argparse.ArgumentParser("python -m tests.campaigns unknown-materials")
     parser.add_argument("--set", default="sim:T-REAL/level-blind:1-3", dest="given")
     parser.add_argument("--test", default="sim:T-REAL/level-blind:4-6:8")
     parser.add_argument("--only", nargs="*", default=(), help="of --set; its last `rep` tests")
@@ -83,13 +83,13 @@ def main() -> None:
     _print("mean", tuple(np.mean(rows, axis=0)))
 
 
-def left_out(train: Dataset, test: Dataset, name: str, steps: int, seed: int) -> Strangers:
+def left_out(train: Dataset, test: Dataset, name: str, steps: int, seed: int) -> LeftOutDistances:
     """The distances of the test sweeps from a model that has not seen a material."""
     kept = train.take(np.flatnonzero(train.labels != train.materials.index(name)))
     kept = kept.select((f"material={','.join(m for m in train.materials if m != name)}",))
     fit = recipe.fit(kept, seed, recipe.Settings(steps=steps))
     with tempfile.TemporaryDirectory() as folder:
-        quantized_bundle.export(fit, Path(folder) / "b", "strangers", "1", "", proven=False)
+        quantized_bundle.export(fit, Path(folder) / "b", "left out", "1", "", proven=False)
         box = Classifier(bundle.load(Path(folder) / "b"), SystemClock(), slides=False)
     known = box.bundle.manifest.known
     classes = box.bundle.classes
@@ -99,7 +99,7 @@ def left_out(train: Dataset, test: Dataset, name: str, steps: int, seed: int) ->
     away = z[:, None] - classes.means.astype(np.float64)
     nearest = shaped_distances(away, classes.shapes.astype(np.float64)).min(axis=1) / known.limit
     unknown = np.array([test.materials[k] == name for k in test.labels])
-    return Strangers(nearest[~unknown], nearest[unknown])
+    return LeftOutDistances(nearest[~unknown], nearest[unknown])
 
 
 def _print(name: str, row: tuple[float, ...]) -> None:
