@@ -1,11 +1,11 @@
 """Unknown materials that a bundle takes for known ones, each material left out in turn.
 
-`python -m tests.campaigns unknown-materials` fits a model without each material of the training set, and
-exports it. It prints, for the sweeps of the test set: the share of known sweeps within the limit of
-known materials, the share of unknown ones within it, and the same if two sweeps of a material have
-to be within it. Then both for the limit that keeps 97 % of the known sweeps, and the AUROC. Real
-fabrics: `--set $PALPATE_DATA/fabricslide/fabricslide.npz --only direction=0 'force<=180'`, where
-sweeps of the last repetition test.
+`python -m tests.campaigns unknown-materials` fits a model without each material of the training
+set, and exports it. It prints, for the sweeps of the test set: the share of known sweeps within the
+limit of known materials, the share of unknown ones within it, and the same if two sweeps of a
+material have to be within it. Then both for the limit that keeps 97 % of the known sweeps, and the
+AUROC. Real fabrics: `--set $PALPATE_DATA/fabricslide/fabricslide.npz --only direction=0
+'force<=180'`, where sweeps of the last repetition test.
 """
 
 from __future__ import annotations
