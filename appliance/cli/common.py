@@ -26,8 +26,8 @@ Facts = Mapping[str, Callable[[], object]]
 
 
 def load_settings(args: argparse.Namespace) -> Config:
-    """The settings with the changes that a command's options make. A command with the option
-    --finger gets those of one skin. Raises ConfigError."""
+    """The settings with the changes that a command's options make. With --finger they are those of
+    one skin; a command that needs one always has this option. Raises ConfigError."""
     given = {
         key: value
         for key, option in (("profile", "skin"), ("port", "skin_port"))

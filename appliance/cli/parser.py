@@ -9,7 +9,7 @@ import argparse
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import get_args, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 from appliance import __version__
 from appliance.bridges import options as bridges
@@ -143,11 +143,13 @@ def _one_skin(command: argparse.ArgumentParser) -> None:
     """Add the options of a command that uses one skin, also of several."""
     _devices(command.add_argument)
     _skin_port(command.add_argument)
-    command.add_argument(
-        "--finger",
-        metavar="NAME",
-        help="of a box with several skins: the finger to use, [skins.NAME]",
-    )
+    _finger(command.add_argument)
+
+
+def _finger(add: Callable[..., argparse.Action], **more: Any) -> None:
+    """Add --finger. more: `default=argparse.SUPPRESS` for a command that does not need one."""
+    text = "of a box with several skins: the finger to use, [skins.NAME]"
+    add("--finger", metavar="NAME", help=text, **more)
 
 
 def _answers(command: argparse.ArgumentParser) -> None:
@@ -274,6 +276,7 @@ def _align(command: CommandParser) -> None:
 
 def _replay(command: CommandParser) -> None:
     command.add_argument("file", type=Path, metavar="FILE")
+    _finger(command.add_argument, default=argparse.SUPPRESS)
 
 
 def _record(command: CommandParser) -> None:
@@ -434,6 +437,7 @@ def _skin(command: CommandParser) -> None:
         "serial port of the skin; detect and new open no other port",
     )
     _devices(command.only_for("check", "show"))
+    _finger(command.only_for("check", "show"), default=argparse.SUPPRESS)
     command.only_for("check", "new")(
         "--seconds",
         type=_seconds,

@@ -125,7 +125,7 @@ class CommandParser(argparse.ArgumentParser):
         args = self.parse_intermixed_args(words)
         action = getattr(args, self._kind)
         for actions, option, needed in self._some:
-            value = getattr(args, option.dest)
+            value = getattr(args, option.dest, option.default)  # absent: argparse.SUPPRESS
             name = option.option_strings[0] if option.option_strings else option.metavar
             if needed and action in actions and value is None:
                 self.error(f"{action} needs {name}")

@@ -251,6 +251,24 @@ def test_the_port_of_the_command_is_that_of_the_finger():
     assert load_settings(arguments("align", [*own, "--finger", "right"])).skin.port == "/dev/b"
 
 
+@pytest.mark.parametrize("command", [["skin", "check"], ["skin", "show"], ["replay", "x"]])
+def test_a_finger_may_be_looked_at_alone(command: list[str]):
+    """Its skin, and its kept sweeps by its own bundle. Without --finger the commands are as on a
+    box with one skin."""
+    own = ["--set", "skins.left.port=/dev/a", "--set", "skins.left.bundle=/left", *TWO]
+    settings = load_settings(arguments(command[0], [*command[1:], *own, "--finger", "left"]))
+    assert (settings.skin.port, str(settings.classifier.bundle)) == ("/dev/a", "/left")
+    assert load_settings(arguments(command[0], [*command[1:], *own])).skin.port == ""
+    with pytest.raises(ConfigError, match="'middle'"):
+        load_settings(arguments(command[0], [*command[1:], *own, "--finger", "middle"]))
+
+
+def test_skin_check_of_a_finger(capsys: pytest.CaptureFixture[str]):
+    """On the simulated board: all parts are ok."""
+    assert main(["skin", "check", "--sim", "skin", "--virtual", *TWO, "--finger", "left"]) == 0
+    assert all(line.startswith("ok ") for line in capsys.readouterr().out.splitlines())
+
+
 def test_a_finger_is_enrolled(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """From its sweeps, into the bundle of the box."""
     words = ["enrol", "felt", *VIRTUAL[:3], *TWO, "--sweeps", "2", "--finger", "right"]
