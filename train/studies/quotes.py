@@ -171,10 +171,9 @@ def _certainty(results: Json) -> Iterator[Quote]:
     more: dict[str, Any] = {"sweeps": n, "seeds": (results["seed"],)}
     words = ("[Uu]nknown", "known name|known label")
     limits = results["unknown"]["limits"]
-    at_least = np.interp(
-        FAIR, *([limit[key] for limit in limits] for key in ("kept", "false_known"))
-    )
-    for kept, known in ((FAIR, float(at_least)), (unknown["kept"], unknown["false_known"])):
+    shares = [[limit[key] for limit in limits] for key in ("kept", "false_known")]
+    fair = float(np.interp(FAIR, shares[0], shares[1]))
+    for kept, known in ((FAIR, fair), (unknown["kept"], unknown["false_known"])):
         name = (
             f"sweeps of unknown materials that get a known name, where {percent(kept)} of known "
             "sweeps count as known"
