@@ -171,8 +171,8 @@ def _certainty(results: Json) -> Iterator[Quote]:
     more: dict[str, Any] = {"sweeps": n, "seeds": (results["seed"],)}
     words = ("[Uu]nknown", "known name|known label")
     limits = results["unknown"]["limits"]
-    shares = [[limit[key] for limit in limits] for key in ("kept", "false_known")]
-    fair = float(np.interp(FAIR, shares[0], shares[1]))
+    columns = [[limit[key] for limit in limits] for key in ("kept", "false_known")]
+    fair = float(np.interp(FAIR, columns[0], columns[1]))
     for kept, known in ((FAIR, fair), (unknown["kept"], unknown["false_known"])):
         name = (
             f"sweeps of unknown materials that get a known name, where {percent(kept)} of known "
