@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from train.models.methods import PACKAGED
 from train.reports.formatting import percent, points
 from train.studies import differences
 from train.studies.development_experiment import LINE, OURS
@@ -85,6 +86,15 @@ class Spot:
         return self.accuracy[0]
 
 
+def _front(spots: Iterable[Spot]) -> list[Spot]:
+    """The spots than which none is as quick and more accurate, the quickest first."""
+    best: list[Spot] = []
+    for spot in sorted(spots, key=lambda s: (s.ms, -s.mean)):
+        if not best or spot.mean > best[-1].mean:
+            best.append(spot)
+    return best
+
+
 @dataclass(frozen=True, slots=True)
 class ChartPanel:
     """The methods on tests of one kind. cases: the tests as in the results. absent: time in ms of
@@ -103,22 +113,25 @@ class ChartPanel:
     @property
     def front(self) -> list[Spot]:
         """The spots of all forms than which none is as quick and more accurate."""
-        best: list[Spot] = []
-        for spot in sorted(self.whole, key=lambda s: (s.ms, -s.mean)):
-            if not best or spot.mean > best[-1].mean:
-                best.append(spot)
-        return best
+        return _front(self.whole)
 
     @property
-    def line(self) -> list[Spot]:
+    def sizes(self) -> list[Spot]:
         """The sizes of our family, the smallest first."""
         own = {spot.method: spot for spot in self.whole if not spot.form}
         return [own[name] for name in LINE if name in own]
 
     @property
+    def line(self) -> list[Spot]:
+        """The packaged recipe and the sizes of our family, without those than which another of them
+        is as quick and more accurate."""
+        packaged = [s for s in self.whole if s.method == PACKAGED and not s.form]
+        return _front([*self.sizes, *packaged])
+
+    @property
     def ours(self) -> Spot | None:
         """The largest of our family; None if it was not run in every test."""
-        return self.line[-1] if self.line else None
+        return self.sizes[-1] if self.sizes else None
 
     @property
     def peer(self) -> Spot | None:
@@ -130,7 +143,9 @@ class ChartPanel:
     def dominated(self) -> list[Spot]:
         """The sizes of our family than which a peer is quicker and more accurate."""
         peers = [spot for spot in self.whole if spot.method not in OURS]
-        return [one for one in self.line if any(p.ms < one.ms and p.mean > one.mean for p in peers)]
+        return [
+            one for one in self.sizes if any(p.ms < one.ms and p.mean > one.mean for p in peers)
+        ]
 
     def within(self, ms: float) -> Spot | None:
         """The most accurate model that needs at most `ms`."""

@@ -142,8 +142,9 @@ def _ends(panel: ChartPanel) -> tuple[float, float]:
 
 
 def _marks(axes: Axes, panel: ChartPanel) -> Iterator[Label]:
-    """Draw the spots; yield their names, the most important first, each method's once."""
-    named: set[str] = set()
+    """Draw the spots; yield their names, the most important first. All forms of a method have the
+    same name."""
+    names: dict[str, str] = {}
     shown = [s for s in panel.spots if not (s.method in OURS and s.form) or s in panel.front]
     bottom, _ = _ends(panel)
     for spot in shown:
@@ -157,8 +158,7 @@ def _marks(axes: Axes, panel: ChartPanel) -> Iterator[Label]:
             axes.plot(spot.ms, y, **RING)
     order = sorted(shown, key=lambda s: (s.method != PACKAGED, s not in panel.front, -s.mean))
     for spot in order:
-        text = "" if spot.method in named or spot.mean < bottom else _label(spot)
-        named.add(spot.method)
+        text = "" if spot.mean < bottom else names.setdefault(spot.method, _label(spot))
         yield spot.ms, max(spot.mean, bottom), text, _shade(panel, spot), spot.method in OURS
 
 

@@ -243,13 +243,13 @@ def targets(
                 "met": gap[0] >= -NEAREST - ROUNDING,
                 "here": comparison.shown(gap),
             }
-        elif panel.kind == TACTILE and panel.line:
+        elif panel.kind == TACTILE and panel.sizes:
             beaten = panel.dominated
             yield {
                 "what": f"sizes on {TACTILE} than which no peer is faster and more accurate",
                 "target": f"all of {SIZES} or more",
-                "met": not beaten and len(panel.line) >= SIZES,
-                "here": f"{len(panel.line) - len(beaten)} of {len(panel.line)}",
+                "met": not beaten and len(panel.sizes) >= SIZES,
+                "here": f"{len(panel.sizes) - len(beaten)} of {len(panel.sizes)}",
             }
     yield from time_targets(times)
 

@@ -46,8 +46,8 @@ Label = tuple[float, float, str, str, bool]
 
 
 def write(axes: Axes, labels: Sequence[Label], taken: Sequence[tuple[float, float]] = ()) -> None:
-    """Write names beside their marks, the most important first. A name without a free place is left
-    out.
+    """Write names beside their marks, the most important first. A name is written once, at the
+    first of its marks with a free place; without one it is left out.
 
     taken: points in the plot's units where lines run. The axes have their final limits.
     """
@@ -55,9 +55,10 @@ def write(axes: Axes, labels: Sequence[Label], taken: Sequence[tuple[float, floa
     boxes: list[Box] = [(x - MARK, y - MARK, x + MARK, y + MARK) for x, y in at]
     boxes += [(x - 1, y - 1, x + 1, y + 1) for x, y in map(axes.transData.transform, taken)]
     left, bottom, right, top = map(float, axes.get_window_extent().extents)
+    written: set[str] = set()
     for i, (x, y, text, colour, bold) in enumerate(labels):
         width = LETTER * SMALL * len(text) * (1.1 if bold else 1.0)
-        for dx, dy, side in PLACES if text else ():
+        for dx, dy, side in PLACES if text and text not in written else ():
             start = at[i][0] + dx - SIDES[side] * width
             middle = at[i][1] + dy
             box = (start, middle - 0.5 * SMALL, start + width, middle + 0.5 * SMALL)
@@ -66,6 +67,7 @@ def write(axes: Axes, labels: Sequence[Label], taken: Sequence[tuple[float, floa
             )
             if inside and not any(_meet(box, other) for k, other in enumerate(boxes) if k != i):
                 boxes.append(box)
+                written.add(text)
                 axes.annotate(
                     text,
                     (x, y),

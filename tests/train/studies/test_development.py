@@ -184,11 +184,14 @@ def test_the_front_is_over_all_forms_of_methods_that_were_run_in_every_test():
 
 
 def test_a_size_is_dominated_by_a_peer_that_is_quicker_and_more_accurate():
-    """Our other sizes do not count, and neither does the packaged recipe."""
+    """Our other sizes do not count, and neither does the packaged recipe. The line leaves out what
+    another of ours beats."""
     bands, everything = spot("palpate-bands", 0.1, 0.7), spot("palpate", 0.4, 0.9)
     peers = spot("ds-cnn", 0.05, 0.8), spot("quant", 50.0, 0.95)
-    made = panel(everything, bands, spot("palpate-reattached", 0.01, 0.85), *peers)
-    assert made.line == [bands, everything]
+    packaged = spot("palpate-reattached", 0.01, 0.85)
+    made = panel(everything, bands, packaged, *peers)
+    assert made.sizes == [bands, everything]
+    assert made.line == [packaged, everything]
     assert made.dominated == [bands]
 
 
