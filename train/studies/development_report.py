@@ -177,12 +177,16 @@ def rank(panel: ChartPanel, table: Mapping[str, Accuracies]) -> Ranking | None:
 
 
 def touch_curves(figures: Json, early: Json | None) -> dict[str, Any]:
-    """Accuracy over seconds of touch by test and method: shorter windows; and in simulation windows
-    of different length, and the early answers of the box."""
+    """Accuracy over seconds of touch by test and method: shorter windows, ours with all views
+    first, then the peers; and in simulation windows of different length, and the early answers of
+    the box."""
     found: dict[str, Any] = {}
     known = {case["case"]: case for case in figures["cases"]}
     shorter = {(e["case"], e["method"]) for e in figures["results"] if e.get("frames")}
-    for case, name in sorted(shorter, key=lambda one: one[1] not in OURS):
+    shown = [name for name in (OURS[0], *PEERS) if name in {name for _, name in shorter}]
+    for case, name in ((case, name) for case in known for name in shown):
+        if (case, name) not in shorter:
+            continue
         window = int(known[case]["format"].rpartition(" ")[2])
         line = sorted(
             ((e.get("frames") or window) / known[case]["rate_hz"], e["mean"])
