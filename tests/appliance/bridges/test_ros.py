@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -192,32 +193,39 @@ def test_a_late_node_gets_the_state(box: SpeakingBox, node: RosPeer):
         assert late.last("state")["values"]["skin"] == "streaming"
 
 
+@contextmanager
+def fed(folder: Path) -> Iterator[tuple[socket.socket, RosPeer]]:
+    """The bridge on a feed: the connection that stands for the box, and a node that listens."""
+    path = folder / "feed.sock"
+    with socket.socket(socket.AF_UNIX) as listener, ros.peer() as node:
+        listener.bind(str(path))
+        listener.listen()
+        with ros.bridge("-p", f"feed:={path}", "-p", "frames_hz:=10.0"):
+            connection, _ = listener.accept()
+            with connection:
+                yield connection, node
+
+
 def test_frames_from_the_feed(tmp_path: Path):
     """On the box: frames as images with one channel an axis, little-endian; nan where a skin gave
     no number."""
     form = {"rows": 2, "cols": 1, "axes": 3, "dtype": "float32", "rate_hz": 100, "window": 200}
     hello = {"type": "hello", "schema": 1, "labels": ["wood"], "bundle": "b1", "format": form}
     frame = {"type": "frame", "time_ns": 1, "taxels": [[[1, 2, 3]], [[4, None, 6]]]}
-    path = tmp_path / "feed.sock"
-    with socket.socket(socket.AF_UNIX) as listener, ros.peer() as node:
-        listener.bind(str(path))
-        listener.listen()
-        with ros.bridge("-p", f"feed:={path}", "-p", "frames_hz:=10.0"):
-            connection, _ = listener.accept()
-            assert json.loads(connection.recv(1000))["frames"] == 10
-            connection.sendall(json.dumps(hello).encode() + b"\n")
+    with fed(tmp_path) as (connection, node):
+        assert json.loads(connection.recv(1000))["frames"] == 10
+        connection.sendall(json.dumps(hello).encode() + b"\n")
 
-            def sent() -> bool:
-                connection.sendall(json.dumps(frame).encode() + b"\n")
-                return node.on("frames") != []
+        def sent() -> bool:
+            connection.sendall(json.dumps(frame).encode() + b"\n")
+            return node.on("frames") != []
 
-            eventually(sent)
-            heard = node.on("frames")[0]
-            assert (heard["shape"], heard["encoding"], heard["step"]) == ([2, 1], "32FC3", 12)
-            assert bytes(heard["data"][:8]) == b"\0\0\x80\x3f\0\0\0\x40"
-            assert bytes(heard["data"][16:20]) == b"\0\0\xc0\x7f"
-            assert not node.call("start")["success"]
-            connection.close()
+        eventually(sent)
+        heard = node.on("frames")[0]
+        assert (heard["shape"], heard["encoding"], heard["step"]) == ([2, 1], "32FC3", 12)
+        assert bytes(heard["data"][:8]) == b"\0\0\x80\x3f\0\0\0\x40"
+        assert bytes(heard["data"][16:20]) == b"\0\0\xc0\x7f"
+        assert not node.call("start")["success"]
 
 
 def test_the_fingers_of_the_feed(tmp_path: Path):
@@ -236,43 +244,37 @@ def test_the_fingers_of_the_feed(tmp_path: Path):
         {"type": "frame", "time_ns": 1, "finger": "left", "taxels": [[1], [2]]},
         {"type": "frame", "time_ns": 2, "finger": "right", "taxels": [[3], [4], [-5]]},
     ]
-    path = tmp_path / "feed.sock"
-    with socket.socket(socket.AF_UNIX) as listener, ros.peer() as node:
-        listener.bind(str(path))
-        listener.listen()
-        with ros.bridge("-p", f"feed:={path}", "-p", "frames_hz:=10.0"):
-            connection, _ = listener.accept()
+    with fed(tmp_path) as (connection, node):
 
-            def send(*lines: dict) -> None:
-                connection.sendall(b"".join(json.dumps(one).encode() + b"\n" for one in lines))
+        def send(*lines: dict) -> None:
+            connection.sendall(b"".join(json.dumps(one).encode() + b"\n" for one in lines))
 
-            def sent() -> bool:
-                send(*frames)
-                return len({heard["frame_id"] for heard in node.on("frames")}) == 2
+        def sent() -> bool:
+            send(*frames)
+            return len({heard["frame_id"] for heard in node.on("frames")}) == 2
 
-            send(hello)
-            eventually(sent)
-            of = {heard["frame_id"]: heard for heard in node.on("frames")}
-            assert of["palpate/left"]["shape"] == [2, 1]
-            assert (of["palpate/left"]["encoding"], of["palpate/left"]["data"]) == ("8UC1", [1, 2])
-            assert of["palpate/right"]["shape"] == [3, 1]
-            assert of["palpate/right"]["encoding"] == "16SC1"
-            assert bytes(of["palpate/right"]["data"]) == b"\3\0\4\0\xfb\xff"
-            fingers = [
-                {"finger": "left", "label": "wood", "probability": 0.912, "status": "ok"},
-                {"finger": "right", "label": "", "probability": 0.0, "status": "no-contact"},
-            ]
-            line = feed_lines.verdict(1, 390.0, "wood")
-            send(line | {"fingers": [line | one for one in fingers]})
-            eventually(lambda: node.on("verdict") != [])
-            heard = node.on("verdict")[0]
-            assert heard["message"] == "wood"
-            assert [one["name"] for one in heard["fingers"]] == [
-                "palpate: verdict left",
-                "palpate: verdict right",
-            ]
-            assert [one["level"] for one in heard["fingers"]] == [OK, ERROR]
-            connection.close()
+        send(hello)
+        eventually(sent)
+        of = {heard["frame_id"]: heard for heard in node.on("frames")}
+        assert of["palpate/left"]["shape"] == [2, 1]
+        assert (of["palpate/left"]["encoding"], of["palpate/left"]["data"]) == ("8UC1", [1, 2])
+        assert of["palpate/right"]["shape"] == [3, 1]
+        assert of["palpate/right"]["encoding"] == "16SC1"
+        assert bytes(of["palpate/right"]["data"]) == b"\3\0\4\0\xfb\xff"
+        fingers = [
+            {"finger": "left", "label": "wood", "probability": 0.912, "status": "ok"},
+            {"finger": "right", "label": "", "probability": 0.0, "status": "no-contact"},
+        ]
+        line = feed_lines.verdict(1, 390.0, "wood")
+        send(line | {"fingers": [line | one for one in fingers]})
+        eventually(lambda: node.on("verdict") != [])
+        heard = node.on("verdict")[0]
+        assert heard["message"] == "wood"
+        assert [one["name"] for one in heard["fingers"]] == [
+            "palpate: verdict left",
+            "palpate: verdict right",
+        ]
+        assert [one["level"] for one in heard["fingers"]] == [OK, ERROR]
 
 
 def test_no_box_is_named():
