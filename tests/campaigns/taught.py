@@ -96,8 +96,8 @@ def _later(
     kept = ",".join(m for m in given.materials if m != name)
     new = others.labels == label
     with tempfile.TemporaryDirectory() as folder:
-        base = _bundle(given.select((f"material={kept}",)), Path(folder) / "a", seed)
-        every = _bundle(given.take(np.append(np.flatnonzero(rest), own)), Path(folder) / "b", seed)
+        base = exported(given.select((f"material={kept}",)), Path(folder) / "a", seed)
+        every = exported(given.take(np.append(np.flatnonzero(rest), own)), Path(folder) / "b", seed)
     taught = enrolment.enrol(base, name, given.samples[own]).bundle
     before, after, together = (_right(one, others) for one in (base, taught, every))
     return (
@@ -107,8 +107,10 @@ def _later(
     )
 
 
-def _bundle(sweeps: Dataset, folder: Path, seed: int) -> Bundle:
-    fit = recipe.fit(sweeps, seed, recipe.Settings(steps=0))
+def exported(sweeps: Dataset, folder: Path, seed: int, steps: int = 0) -> Bundle:
+    """The bundle of a fit of sweeps, written to a folder. Taxels that may be bridged are not
+    measured. steps: of the training of stages."""
+    fit = recipe.fit(sweeps, seed, recipe.Settings(steps=steps))
     quantized_bundle.export(fit, folder, "taught", "1", "", proven=False)
     return bundle.load(folder)
 

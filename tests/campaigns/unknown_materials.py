@@ -19,15 +19,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from appliance.bundle import bundle
 from appliance.core.clock import SystemClock
 from appliance.inference.classifier import Classifier
 from appliance.inference.novelty import shaped_distances
+from tests.campaigns.taught import exported
 from train.calibration.novelty import auroc
 from train.data import sets
 from train.data.sets import Dataset
-from train.export import quantized_bundle
-from train.models.recipe import recipe
 
 Array = NDArray[Any]
 KEPT = 0.97
@@ -65,7 +63,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=300)
     parser.add_argument("--seed", type=int, default=1)
     args = parser.parse_args()
-    train, test = sets.load(args.given), None
+    train = sets.load(args.given)
     if args.only:
         whole = train.select(tuple(args.only))
         last = whole.group("rep") == whole.group("rep").max()
@@ -85,12 +83,10 @@ def main() -> None:
 
 def left_out(train: Dataset, test: Dataset, name: str, steps: int, seed: int) -> LeftOutDistances:
     """The distances of the test sweeps from a model that has not seen a material."""
-    kept = train.take(np.flatnonzero(train.labels != train.materials.index(name)))
-    kept = kept.select((f"material={','.join(m for m in train.materials if m != name)}",))
-    fit = recipe.fit(kept, seed, recipe.Settings(steps=steps))
+    kept = train.select((f"material={','.join(m for m in train.materials if m != name)}",))
     with tempfile.TemporaryDirectory() as folder:
-        quantized_bundle.export(fit, Path(folder) / "b", "left out", "1", "", proven=False)
-        box = Classifier(bundle.load(Path(folder) / "b"), SystemClock(), slides=False)
+        made = exported(kept, Path(folder) / "b", seed, steps)
+    box = Classifier(made, SystemClock(), slides=False)
     known = box.bundle.manifest.known
     classes = box.bundle.classes
     assert known
