@@ -27,9 +27,8 @@ from appliance.inference.objects import fuse as fuse
 from appliance.inference.objects import softmax as softmax
 from appliance.inference.session import ModelRunner
 from appliance.inference.taxel_watch import TaxelWatch
-from appliance.signal import features
+from appliance.signal import disturbances, features
 from appliance.signal.contact import Displacement, displacement
-from appliance.signal.disturbances import load, noise
 from appliance.signal.hum import HumFilter
 from appliance.signal.slide import NO_PATTERN, NO_PITCH, Slide, SlideMeter
 from appliance.signal.vibration import PARTS, vibration
@@ -365,15 +364,15 @@ class Classifier(Observer):
         if means is None:
             return self.logits(sweep.frames.taxels), ""
         network, z = self.network(sweep.frames.taxels)
-        disturbed = self._disturbed(sweep, touch, mean)
+        logits, disturbed = means.joined(network, z), self._disturbed(sweep, touch, mean)
         allowed = self.bundle.manifest.disturbances
         if untried := allowed.untried(disturbed) if allowed else "":
-            return means.joined(network, z), untried
+            return logits, untried
         novelty = means.novelty(z, disturbed)
         if novelty and means is self._means and self._unknown:
             alike = self._unknown.put(sweep.id, z)
             novelty += f"; as sweep {alike}" * (alike > 0)
-        return means.joined(network, z), novelty
+        return logits, novelty
 
     def _disturbed(
         self, sweep: Sweep, touch: Touched, mean: NDArray[np.float64] | None
@@ -384,13 +383,13 @@ class Classifier(Observer):
             return {}
         found = {
             "lost": sweep.lost / len(taxels),
-            "hum": math.sqrt(touch.hum),
-            "noise": noise(taxels),
+            "hum": disturbances.hum(touch.hum),
+            "noise": disturbances.noise(taxels),
+            "speed": disturbances.speed(touch.slide.taxels_s),
         }
         if mean is not None:
-            found["load"] = load(mean, self.tare if m.unloaded else np.zeros_like(self.tare))
-        if touch.slide.taxels_s:
-            found["speed"] = math.log(touch.slide.taxels_s)
+            tare = self.tare if m.unloaded else np.zeros_like(self.tare)
+            found["load"] = disturbances.load(mean, tare)
         return found
 
     def _touch(self, sweep: Sweep, mean: NDArray[np.float64] | None) -> Touched:

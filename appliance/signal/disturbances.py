@@ -69,13 +69,24 @@ def load(mean: Array, tare: Array) -> float:
     return math.log(max(total, TINY)) if math.isfinite(total) else math.nan
 
 
+def speed(taxels_s: float) -> float:
+    """The value of a slide that passes this many taxels in a second; NaN for 0, an unknown
+    speed."""
+    return math.log(taxels_s) if taxels_s else math.nan
+
+
+def hum(counts: float) -> float:
+    """The value of hum of this amplitude."""
+    return math.sqrt(counts)
+
+
 @dataclass(frozen=True, slots=True)
 class Allowance:
     """The allowance of a bundle for one disturbance.
 
     of: one of NAMES. start: its value at the edge of training. end: the furthest value that export
-    has tried. slope: growth of the limit of known materials, as a
-    share of it, for a size of 1. Raises BundleError for a value out of range.
+    has tried. slope: growth of the limit of known materials, as a share of it, for a size of 1.
+    Raises BundleError for a value out of range.
     """
 
     of: str

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from appliance.core.types import SweepFormat
 from appliance.inference.novelty import shaped_distances
-from appliance.signal.disturbances import TINY, Allowance, load, noise
+from appliance.signal import disturbances
+from appliance.signal.disturbances import TINY, Allowance
 from appliance.signal.hum import HumFilter
 from appliance.signal.slide import SlideMeter
 from train.calibration.nuisances import AlteredSweeps
@@ -73,19 +74,17 @@ class DisturbanceMeter:
         """The windows without hum, and the amplitude that was removed of each [n]."""
         if self.hum is None:
             return samples, np.zeros(len(samples))
-        pairs = [self._hum(window, self.hum) for window in samples]
-        return np.stack([clean for clean, _ in pairs]), np.array([hum for _, hum in pairs])
+        clean, counts = zip(*(self._hum(window, self.hum) for window in samples), strict=True)
+        return np.stack(clean), np.array(counts)
 
     def values(self, name: str, samples: Array) -> Array:
         """The values [n] of noise, load or speed; NaN where one is not known."""
         if name == "noise":
-            return np.array([noise(window) for window in samples])
+            return np.array([disturbances.noise(window) for window in samples])
         if name == "load":
             means = (window.mean(axis=0, dtype=np.float64) for window in samples)
-            return np.array([load(mean, self._tare) for mean in means])
-        passed = np.array([self._slide(window).taxels_s for window in samples])
-        known: Array = np.log(np.where(passed > 0, passed, np.nan))
-        return known
+            return np.array([disturbances.load(mean, self._tare) for mean in means])
+        return np.array([disturbances.speed(self._slide(window).taxels_s) for window in samples])
 
 
 @dataclass(frozen=True)
@@ -103,14 +102,13 @@ class _Tried:
     def of(cls, altered: AlteredSweeps, kinds: Sequence[str], sign: int, start: float) -> _Tried:
         parts = []
         for kind in kinds:
-            if kind in altered.copies:
-                z, source = altered.copies[kind]
-                copied, values = altered.disturbed[kind]
-                size, was = (
-                    np.nan_to_num(sign * (v - start)).clip(0) for v in (copied, values[source])
-                )
-                labels = altered.labels[source]
-                parts.append((labels, z, size, size - was, z - altered.z[source]))
+            z, source = altered.copies[kind]
+            copied, values = altered.disturbed[kind]
+            size, was = (
+                np.nan_to_num(sign * (v - start)).clip(0) for v in (copied, values[source])
+            )
+            labels = altered.labels[source]
+            parts.append((labels, z, size, size - was, z - altered.z[source]))
         return cls(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
     def take(self, kept: Array) -> _Tried:
@@ -154,8 +152,6 @@ class Judge:
         altered, kept = self.altered, []
         least = self.right(altered.z, altered.labels).mean() - LOSS
         for kind in kinds:
-            if kind not in altered.copies:
-                continue
             z, source = altered.copies[kind]
             right, bearable = self.right(z, altered.labels[source]), np.zeros(len(z), bool)
             for part in np.array_split(np.arange(len(z)), SEVERITIES):

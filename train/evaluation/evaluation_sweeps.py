@@ -115,13 +115,12 @@ class EvaluationSweeps:
         return cls(replace(base, samples=scene.draw()), scene)
 
     @classmethod
-    def drawn_again(cls, sweeps: Dataset, seed: int = 0) -> EvaluationSweeps:
-        """A whole simulated set as `simulated` draws it; other sweeps as they are."""
-        if sets.SIMULATED.fullmatch(sweeps.source):
-            drawn = cls.simulated(sweeps.source, seed)
-            if np.array_equal(drawn.sweeps.labels, sweeps.labels):
-                return drawn
-        return cls(sweeps)
+    def drawn_again(cls, sweeps: Dataset, seed: int = 0) -> EvaluationSweeps | None:
+        """A whole simulated set as `simulated` draws it; None for other sweeps."""
+        if not sets.SIMULATED.fullmatch(sweeps.source):
+            return None
+        drawn = cls.simulated(sweeps.source, seed)
+        return drawn if np.array_equal(drawn.sweeps.labels, sweeps.labels) else None
 
     def take(self, kept: Array) -> EvaluationSweeps:
         """The sweeps with the numbers `kept`, whose faults are as strong as among all sweeps."""

@@ -23,7 +23,7 @@ from appliance.core.errors import FormatError
 from appliance.core.storage import put_all
 from appliance.inference.classifier import Classifier
 from appliance.inference.novelty import shaped_distances
-from appliance.signal.disturbances import Disturbances
+from appliance.signal.disturbances import Disturbances, hum
 from train.calibration import disturbances, novelty
 from train.calibration.nuisances import AlteredSweeps, NuisanceRule, Scatters, choose
 from train.data.sets import Dataset, digest
@@ -75,9 +75,9 @@ def measure(
     the embeddings take. tare: counts [R, C] or [R, C, A] of the unloaded skin, 0 if unknown. again:
     draw simulated sets again, so that their speed and force can change."""
     meter = disturbances.DisturbanceMeter(train.format, tare, train.samples)
-    begin = EvaluationSweeps.drawn_again if again else EvaluationSweeps
-    training = altered(features, begin(train), seed, meter)
-    held = altered(features, begin(held_out), seed + 1, meter).seen_by(judge[0])
+    given = (drawn_again if again else _as_recorded)(train, held_out)
+    training, held = (altered(features, of, seed + i, meter) for i, of in enumerate(given))
+    held = held.seen_by(judge[0])
     seen = [training.seen_by(embed) for embed, _ in (judge, *others)]
     means = [of.astype(np.float64) for _, of in (judge, *others)]
     scatters = [Scatters.of(one, of) for one, of in zip(seen, means, strict=True)]
@@ -116,6 +116,17 @@ def limit_of_conditions(found: Widened, given: CalibrationInputs) -> float:
     return novelty.limit(np.concatenate(every))
 
 
+def drawn_again(*given: Dataset) -> list[EvaluationSweeps]:
+    """The sets as they are drawn again if all are simulated, else as they are recorded: their
+    copies then have the same kinds."""
+    drawn = [of for sweeps in given if (of := EvaluationSweeps.drawn_again(sweeps))]
+    return drawn if len(drawn) == len(given) else _as_recorded(*given)
+
+
+def _as_recorded(*given: Dataset) -> list[EvaluationSweeps]:
+    return [EvaluationSweeps(sweeps) for sweeps in given]
+
+
 def altered(
     features: Embed, every: EvaluationSweeps, seed: int, meter: disturbances.DisturbanceMeter
 ) -> AlteredSweeps:
@@ -129,15 +140,13 @@ def altered(
         source = rng.permutation(len(sweeps))[:COPIES]
         scene = every if corruption.only == "simulated" else still
         samples, severity = _copies(corruption, scene, source, seed)
-        name, hum = disturbances.OF_KIND.get(corruption.name), np.empty(0)
+        name, counts = disturbances.OF_KIND.get(corruption.name), np.empty(0)
         if name == "hum":
-            samples, hum = meter.clean(samples)
+            samples, counts = meter.clean(samples)
         copies[corruption.name] = features(samples), source
         if name in ("lost", "hum"):
-            disturbed[corruption.name] = (
-                {"lost": severity, "hum": np.sqrt(hum)}[name],
-                np.zeros(len(sweeps)),
-            )
+            value = severity if name == "lost" else np.array([hum(one) for one in counts])
+            disturbed[corruption.name] = value, np.zeros(len(sweeps))
         elif name:
             if name not in usual:
                 usual[name] = meter.values(name, sweeps.samples)

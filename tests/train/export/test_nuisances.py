@@ -61,7 +61,7 @@ def test_simulated_sets_are_drawn_again_at_other_speeds():
     """Instead of being stretched in time; sweeps of files are stretched."""
     sweeps = sets.load("sim:T-REAL/level-blind:1:1")
     meter = DisturbanceMeter(sweeps.format, np.zeros((4, 4)), sweeps.samples[:2])
-    drawn = EvaluationSweeps.drawn_again(sweeps)
+    drawn, _ = nuisances.drawn_again(sweeps, sweeps)
     assert drawn.scene
     some = drawn.take(np.arange(0, len(sweeps), 9))
     found = nuisances.altered(lambda x: x.mean(axis=(1, 2)).astype(float), some, 0, meter)
@@ -69,8 +69,16 @@ def test_simulated_sets_are_drawn_again_at_other_speeds():
     assert not {"stretch", "shorten", "shift-rows"} & found.copies.keys()
     copied, was = found.disturbed["speed-up"]
     assert np.nanmedian(copied - was[found.copies["speed-up"][1]]) > 0.1
-    again = EvaluationSweeps.drawn_again(sweeps.select(("position<=2",)))
-    assert again.scene is None
+
+
+@pytest.mark.parametrize("other", ["recorded", "part"])
+def test_two_sets_are_altered_alike(other: str):
+    """A simulated set beside recorded sweeps, or a part of a simulated set, is not drawn again: its
+    copies would have kinds that the other set lacks."""
+    sweeps = sets.load("sim:T-REAL/level-blind:1:1")
+    few = sweeps.select(("position<=2",))
+    beside = few if other == "part" else replace(sweeps, source="recorded.npz")
+    assert [of.scene for of in nuisances.drawn_again(sweeps, beside)] == [None, None]
 
 
 def test_the_command_changes_shapes_and_limit_and_nothing_else(
