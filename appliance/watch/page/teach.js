@@ -44,6 +44,7 @@ function drawCall() {
 }
 
 function drawTask() {
+  enable(byId("add-button"), live());
   if (!recording) return;
   const trying = recording.trying, now = teach(), name = recording.material;
   if (trying) {
@@ -156,8 +157,9 @@ function draw() {
   drawSweep();
 }
 
+/* Sends an order. Why it was refused, "" where it was not. */
 async function send(...words) {
-  if (ordering) return "";
+  if (ordering) return "the order before is not answered yet";
   ordering = true;
   const why = await order("palpate teach", key, ...words);
   put("said", why);
@@ -191,7 +193,8 @@ byId("teach").addEventListener("click", (event) => {
 });
 async function add() {
   const name = byId("name").value.trim();
-  if (name && live() && !(await send("TEACH", name))) {
+  if (!live()) return put("said", "no connection yet: add it again when the page has one");
+  if (name && !(await send("TEACH", name)) && byId("name").value.trim() === name) {
     byId("name").value = "";
     document.activeElement?.blur(); // field or button: so that the pedal starts a sweep
   }

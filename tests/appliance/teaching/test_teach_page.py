@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from tests.factories import deliveries
-from tests.factories.browser import BrowsedPage
+from tests.factories.browser import BrowsedPage, until
 from tests.factories.taught_skin import PITCHES, SLIDE_S, TaughtBox, taught_box
 
 pytestmark = [deliveries.NEEDED, pytest.mark.slow, pytest.mark.thorough]  # a fit, in minutes
@@ -131,6 +131,32 @@ def test_browsers_and_skin_come_and_go(browser: Any, box: TaughtBox):
     hand.press("[data-forget=oak]")
     hand.page.wait_for_selector("text=oak: 3", state="detached")
     assert len(list((box.folder / "store" / "sweeps").glob("*.npy"))) == 3
+
+
+def test_no_name_is_lost_while_the_page_cannot_send(browser: Any, box: TaughtBox):
+    """Before the first event, and while an order is not answered, a typed name stays."""
+    context = browser.new_context()
+    news = re.compile(r"/events\?")
+    context.route(news, lambda route: route.abort())
+    page = BrowsedPage(context, box.address).page
+    assert page.get_attribute("#add-button", "aria-disabled") == "true"
+    page.fill("#name", "oak")
+    page.press("#name", "Enter")
+    assert "no connection yet" in page.inner_text("#said")
+    assert page.input_value("#name") == "oak"
+    context.unroute(news)
+    held: list[Any] = []
+    context.route("**/order", lambda route: held.append(route))
+    page.wait_for_selector("#add-button:not([aria-disabled=true])")
+    page.press("#name", "Enter")
+    until(lambda: page.evaluate("1") == 1 and bool(held))
+    page.fill("#name", "cork")
+    page.press("#name", "Enter")
+    assert page.input_value("#name") == "cork"
+    held[0].continue_()
+    page.wait_for_selector("[data-material=oak]")
+    assert page.input_value("#name") == "cork"
+    context.close()
 
 
 def test_the_page_refuses_what_cannot_be(browser: Any, box: TaughtBox):
