@@ -4,7 +4,7 @@ and the growth of the limit of known materials."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -35,7 +35,7 @@ OUTER = {"noise": 0.02, "load": 0.1, "speed": 0.02}
 a lower load; hum and lost frames begin at 0."""
 MARGIN = 1.05
 """The furthest value that is allowed for is this many times the furthest of the copies."""
-KEPT = 0.985
+KEPT = 0.99
 """Share of the copies of each severity that the limit keeps."""
 LOSS = 0.15
 """Accuracy that the nearest means may lose, as a share. Copies of a severity that costs more are
@@ -166,10 +166,7 @@ def fit(judge: Judge, *training: AlteredSweeps) -> AllowanceFit:
     """The allowances that `judge` finds, and the changes in the embedding of each of `training`:
     the same sweeps, first in the embedding of the judge."""
     found, changes, figures = [], [], {}
-    for (name, sign), kinds in MADE_BY.items():
-        made = [kind for kind in kinds if kind in training[0].disturbed]
-        if not made or (start := _edge(name, sign, training[0].disturbed[made[0]][1])) is None:
-            continue
+    for (name, sign), (start, made) in _edges(training[0]).items():
         tried = judge.bearable(made, sign, start)
         tried = tried.take(tried.size > 0)
         if len(tried.size) < FEWEST:
@@ -188,6 +185,29 @@ def fit(judge: Judge, *training: AlteredSweeps) -> AllowanceFit:
         np.array([of[i] for of in changes] or none).astype(np.float16) for i in range(len(training))
     )
     return AllowanceFit(tuple(found), stacked, figures)
+
+
+def unnoticed(training: AlteredSweeps, altered: AlteredSweeps) -> AlteredSweeps:
+    """`altered` without the copies whose disturbance is beyond the edge of `training`. The box
+    notices it and allows for it; other copies have to count as known without that."""
+    copies = dict(altered.copies)
+    for (_, sign), (start, kinds) in _edges(training).items():
+        for kind in kinds:
+            within = ~(sign * (altered.disturbed[kind][0] - start) > 0)
+            z, source = copies[kind]
+            copies[kind] = z[within], source[within]
+    return replace(altered, copies={kind: of for kind, of in copies.items() if len(of[1])})
+
+
+def _edges(training: AlteredSweeps) -> dict[tuple[str, int], tuple[float, list[str]]]:
+    """Where training ends, and the kinds of copies beyond it, by disturbance and sign."""
+    edges = {}
+    for (name, sign), kinds in MADE_BY.items():
+        made = [kind for kind in kinds if kind in training.disturbed]
+        start = _edge(name, sign, training.disturbed[made[0]][1]) if made else None
+        if start is not None:
+            edges[name, sign] = start, made
+    return edges
 
 
 def _edge(name: str, sign: int, values: Array) -> float | None:

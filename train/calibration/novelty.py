@@ -23,7 +23,7 @@ from train.calibration.heads import shrinkage
 from train.onnx_tools.quantize import sixteen_bits
 
 Array = NDArray[Any]
-KEPT = 0.99
+KEPT = 0.995
 """Share of known sweeps within the limit. The robot gets no answer to the others, whatever the
 network computes (docs/decisions/0006)."""
 PARTS = 10
@@ -66,6 +66,12 @@ class Embedding:
         product[len(product) - len(rest) :] += rest
         return product.astype(np.float32)
 
+    @property
+    def untrained(self) -> Array:
+        """[r, b], multiplies differences of z to give differences of the features that `turn` takes
+        as they are; the identity if it takes none."""
+        return untrained(self.turn if self.selected else None, len(self.offset), self.selected)
+
     def __call__(self, features: Array) -> Array:
         """Features [..., F] -> z, float64 [..., r]."""
         if features.ndim > 2:  # in float64, prefixes of all sweeps would not fit into memory
@@ -103,6 +109,15 @@ class Embedding:
         means = self.means.astype(np.float64)
         logits: Array = (self(features) @ means.T - (means**2).sum(1) / 2) / temperature
         return logits
+
+
+def untrained(turn: Array | None, r: int, selected: int) -> Array:
+    """See Embedding.untrained. turn: [r, r] of an embedding with r directions; None without
+    `selected` features."""
+    if turn is None:
+        return np.eye(r)
+    view: Array = np.linalg.inv(turn.astype(np.float64))[:, r - selected :]
+    return view
 
 
 def embed(features: Array, labels: Array, fixed: int = 0) -> Embedding:
@@ -153,23 +168,67 @@ def embed(features: Array, labels: Array, fixed: int = 0) -> Embedding:
     )
 
 
+def in_two_views(features: Array, labels: Array, fixed: int = 0) -> Embedding:
+    """As `embed`, with distances that are the sum of two: in the features that were not trained,
+    and in the directions in which the means differ. Which of them shows an unknown material depends
+    on the skin (docs/decisions/0032). In both, each material has its own scatter, and the sweeps
+    lie at r from their mean on average. Without untrained features it is `embed`."""
+    z = embed(features, labels, fixed)
+    if not z.shapes.shape[1]:
+        return z
+    away = z(features) - z.means[labels]
+    each = [away[labels == k] for k in range(len(z.means))]
+    own = np.stack([own_scatter(sweeps) for sweeps in each])
+    shapes = shapes_of(within(own, z.untrained) + within(own, differing(z.means)))
+    total = sum(float(((x @ w) ** 2).sum()) for x, w in zip(each, shapes, strict=True))
+    scale = np.sqrt(away.size / max(total, FLAT))
+    return replace(z, shapes=(scale * shapes).astype(np.float16))
+
+
+def differing(means: Array) -> Array:
+    """Orthonormal directions [r, K - 1] in which class means [K, r] differ."""
+    rows = np.linalg.svd(means - means.mean(axis=0), full_matrices=False)[2]
+    directions: Array = rows[: len(means) - 1].T
+    return directions
+
+
+def within(covariances: Array, view: Array) -> Array:
+    """M [K, r, r], so that away @ M @ away is the squared Mahalanobis distance of a difference in
+    the directions `view` [r, b], by covariances [K, r, r]."""
+    seen = view.T @ covariances @ view
+    size = max(seen.shape[1], 1)
+    flat = FLAT * np.trace(seen, axis1=1, axis2=2)[:, None, None] / size
+    squares: Array = view @ np.linalg.inv(seen + flat * np.eye(seen.shape[1])) @ view.T
+    return squares
+
+
+def shapes_of(squares: Array) -> Array:
+    """W [K, r, r] with W W' = M, for the matrices M [K, r, r] of `within` or sums of them."""
+    variances, vectors = np.linalg.eigh(squares)
+    shapes: Array = vectors * np.sqrt(np.maximum(variances, 0))[:, None]
+    return shapes
+
+
+def own_scatter(away: Array) -> Array:
+    """The covariance of differences [n, r] from a mean, pulled towards 1, the covariance of all
+    materials, as if r more sweeps had it (regularized discriminant analysis; Friedman 1989)."""
+    n, r = away.shape
+    covariance: Array = (away.T @ away + r * np.eye(r)) / (n + r)
+    return covariance
+
+
 def _shape(away: Array) -> Array:
     """W float16 [b, b], so that |away @ W|^2 is the Mahalanobis distance of differences `away` [n,
-    b] from a class mean.
-
-    The covariance is that of the material's own sweeps, pulled towards 1, the covariance of all
-    materials, as if b more sweeps had it (regularized discriminant analysis; Friedman 1989).
-    """
-    n, b = away.shape
-    covariance = (away.T @ away + b * np.eye(b)) / (n + b) if b else np.eye(0)
-    shape: Array = np.linalg.cholesky(np.linalg.inv(covariance)).astype(np.float16)
+    b] from a class mean, by their own scatter."""
+    shape: Array = np.linalg.cholesky(np.linalg.inv(own_scatter(away))).astype(np.float16)
     return shape
 
 
 def embed_present(features: Array, labels: Array, fixed: int = 0) -> tuple[Embedding, Array]:
-    """The Embedding of sweeps that may lack some labels, and the labels [K] of its means."""
+    """The Embedding of sweeps that may lack some labels, in two views, and the labels [K] of its
+    means."""
     present, numbered = np.unique(labels, return_inverse=True)
-    return embed(features, numbered, fixed), present
+    return in_two_views(features, numbered, fixed), present
 
 
 @dataclass(frozen=True)

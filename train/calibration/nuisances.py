@@ -17,9 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appliance.inference.novelty import shaped_distances
-from train.calibration.novelty import limit
+from train.calibration.novelty import auroc, differing, limit, own_scatter, shapes_of, within
 
 Array = NDArray[Any]
+Embed = Callable[[Array], Array]
+"""Features [n, F], or raw counts [n, T, R, C] -> embeddings [n, r]."""
 WEIGHTS = (0.0, 0.3, 1.0, 3.0)
 """Weights of the scatter of a kind of alteration, before it is divided by the number of kinds.
 Larger weights let some materials pass that the model does not have: with 30, 72 % of plastic
@@ -31,6 +33,11 @@ ROUNDS = 3
 """Largest number of rounds over all kinds in the search of weights."""
 FEWEST = 8
 """Least number of judged sweeps of each material, below which the weights would follow chance."""
+TRAINED = (0.1, 0.3, 1.0, 3.0)
+"""Weights of the directions in which the trained materials differ, beside 1 for the features that
+were not trained. Which of the two shows an unknown material depends on the skin."""
+MOST_LEFT_OUT = 12
+"""Largest number of materials that are left out in turn to choose this weight."""
 
 
 @dataclass(frozen=True)
@@ -64,44 +71,80 @@ class AlteredSweeps:
 
 
 @dataclass(frozen=True)
-class Scatters:
-    """Scatter of each material. own: covariances [K, r, r] of its sweeps around its mean. by_kind:
-    second moments [K, r, r] of the changes by each kind of alteration."""
+class Space:
+    """An embedding with class means [K, r]. untrained: [r, b], multiplies differences of embeddings
+    to give differences of the features that were not trained; of all if it is not known."""
 
+    embed: Embed
+    means: Array
+    untrained: Array
+
+    def trained(self, without: int | None = None) -> Array:
+        """Orthonormal directions [r, K - 1] in which the class means differ. without: a material
+        that does not count."""
+        means = self.means if without is None else np.delete(self.means, without, axis=0)
+        return differing(means)
+
+
+@dataclass(frozen=True)
+class Scatters:
+    """Scatter of each material in a space. own: covariances [K, r, r] of its sweeps around its
+    mean. by_kind: second moments [K, r, r] of the changes by each kind of alteration."""
+
+    space: Space
     own: Array
     by_kind: Mapping[str, Array]
 
     @classmethod
-    def of(cls, altered: AlteredSweeps, means: Array) -> Scatters:
-        """The scatter of sweeps with the class means [K, r]."""
+    def of(cls, altered: AlteredSweeps, space: Space) -> Scatters:
+        """The scatter of sweeps in this space."""
+        means = space.means
         away = altered.z - means[altered.labels]
-        own = [_own(away[altered.labels == k]) for k in range(len(means))]
+        own = [own_scatter(away[altered.labels == k]) for k in range(len(means))]
         kinds = {}
         for kind, (z, source) in altered.copies.items():
             change, labels = z - altered.z[source], altered.labels[source]
             every = _moment(change)
             each = [_moment(change[labels == k], every) for k in range(len(means))]
             kinds[kind] = OWN * np.stack(each) + (1 - OWN) * every
-        return cls(np.stack(own), kinds)
+        return cls(space, np.stack(own), kinds)
 
-    def shapes(self, weights: Mapping[str, float]) -> Array:
-        """W [K, r, r], so that |away @ W|^2 is the squared distance of a difference `away`."""
+    def shapes(self, weights: Mapping[str, float], trained: float) -> Array:
+        """W [K, r, r], so that |away @ W|^2 is the squared distance of a difference `away`: that in
+        the features that were not trained, and `trained` times that in the trained directions."""
         added = sum(weights[kind] * scatter for kind, scatter in self.by_kind.items())
-        shapes: Array = np.linalg.cholesky(
-            np.linalg.inv(self.own + added / max(len(self.by_kind), 1))
-        )
-        return shapes
+        covariances = self.own + added / max(len(self.by_kind), 1)
+        squares = within(covariances, self.space.untrained)
+        squares += trained * within(covariances, self.space.trained())
+        return shapes_of(squares)
+
+    def weight_of_trained(self, judged: AlteredSweeps) -> float:
+        """The one of TRAINED that tells `judged` sweeps of materials that are left out in turn best
+        from the others (mean AUROC)."""
+        k, areas = len(self.own), []
+        away = judged.z[:, None] - self.space.means
+        untrained = _squares(away, within(self.own, self.space.untrained))
+        for number in np.unique(np.linspace(0, k - 1, min(k, MOST_LEFT_OUT)).round().astype(int)):
+            others, unknown = np.delete(np.arange(k), number), judged.labels == number
+            of_trained = within(self.own[others], self.space.trained(number))
+            trained = _squares(away[:, others], of_trained)
+            near = [(untrained[:, others] + w * trained).min(axis=1) for w in TRAINED]
+            areas.append([auroc(d[~unknown], d[unknown]) for d in near])
+        return TRAINED[int(np.mean(areas, axis=0).argmax())]
 
 
 @dataclass(frozen=True)
 class NuisanceRule:
-    """Weights of the kinds of alterations. scale: of the shapes, so that a held-out sweep lies r
-    from its mean on average, as it does without shapes. limit: largest squared distance of a known
-    material. kept: by kind, the shares of held-out copies within the limit, without weights and
-    with them. passed: the shares of held-out sweeps within the limit if their material is left
-    out, likewise."""
+    """Weights of the kinds of alterations, and of the trained directions.
+
+    scale: of the shapes, so that a held-out sweep lies r from its mean on average, as it does
+    without shapes. limit: largest squared distance of a known material. kept: by kind, the shares
+    of held-out copies within the limit, without weights and with them. passed: the shares of
+    held-out sweeps within the limit if their material is left out, likewise.
+    """
 
     weights: Mapping[str, float]
+    trained: float
     scale: float
     limit: float
     kept: Mapping[str, tuple[float, float]]
@@ -109,32 +152,32 @@ class NuisanceRule:
 
     def shapes(self, scatters: Scatters) -> NDArray[np.float16]:
         """The matrices [K, r, r] for a bundle."""
-        return (self.scale * scatters.shapes(self.weights)).astype(np.float16)
+        return (self.scale * scatters.shapes(self.weights, self.trained)).astype(np.float16)
 
 
-def choose(scatters: Scatters, judged: AlteredSweeps, means: Array) -> NuisanceRule | None:
+def choose(scatters: Scatters, judged: AlteredSweeps) -> NuisanceRule | None:
     """The rule with the largest sum of the share of judged copies that are kept and the share of
     judged sweeps that are refused if their material is left out.
 
-    judged: sweeps that `scatters` and the class means [K, r] have not seen. None if they are too
-    few, or if no alteration is worth a weight.
+    judged: sweeps that `scatters` and the class means have not seen. None if they are too few.
     """
+    means = scatters.space.means
     each = np.bincount(judged.labels, minlength=len(means))
     if each.min() < FEWEST or not judged.copies:
         return None
-    trial = _Trial(scatters, judged, means)
+    trial = _Trial(scatters, judged, scatters.weight_of_trained(judged))
     none = dict.fromkeys(scatters.by_kind, 0.0)
+    before = trial.shares(none)
     weights = _search(trial, dict.fromkeys(scatters.by_kind, 1.0))
-    before, after = trial.shares(none), trial.shares(weights)
-    if after.worth <= before.worth:
-        return None
-    shapes = scatters.shapes(weights)
+    if (after := trial.shares(weights)).worth <= before.worth:
+        weights, after = none, before
+    shapes = scatters.shapes(weights, trial.trained)
     own = trial.distances(judged.z, shapes)[np.arange(len(judged.z)), judged.labels]
     scale = float(np.sqrt(means.shape[1] / own.mean()))
     rounded = (scale * shapes).astype(np.float16).astype(np.float64)
     beyond = limit(trial.distances(judged.z, rounded).min(axis=1))
-    kept = {kind: (before.kept[kind], after.kept[kind]) for kind in weights}
-    return NuisanceRule(weights, scale, beyond, kept, (before.passed, after.passed))
+    kept = {kind: (share, after.kept[kind]) for kind, share in before.kept.items()}
+    return NuisanceRule(weights, trial.trained, scale, beyond, kept, (before.passed, after.passed))
 
 
 def _search(trial: _Trial, weights: dict[str, float]) -> dict[str, float]:
@@ -169,14 +212,14 @@ class _Trial:
 
     scatters: Scatters
     judged: AlteredSweeps
-    means: Array
+    trained: float
 
     def distances(self, z: Array, shapes: Array) -> Array:
         """Squared distances [n, K] of embeddings z [n, r]."""
-        return shaped_distances(z[:, None] - self.means, shapes)
+        return shaped_distances(z[:, None] - self.scatters.space.means, shapes)
 
     def shares(self, weights: Mapping[str, float]) -> _Shares:
-        shapes, labels = self.scatters.shapes(weights), self.judged.labels
+        shapes, labels = self.scatters.shapes(weights, self.trained), self.judged.labels
         distances = self.distances(self.judged.z, shapes)
         beyond = limit(distances.min(axis=1))
         kept = {
@@ -185,16 +228,14 @@ class _Trial:
         }
         distances[np.arange(len(labels)), labels] = np.inf
         near = distances.min(axis=1) <= beyond
-        passed = [near[labels == k].mean() for k in range(len(self.means))]
+        passed = [near[labels == k].mean() for k in range(distances.shape[1])]
         return _Shares(kept, float(np.mean(passed)))
 
 
-def _own(away: Array) -> Array:
-    """The covariance of differences [n, r] from a mean, pulled towards 1, the covariance of all
-    materials, as if r more sweeps had it."""
-    n, r = away.shape
-    covariance: Array = (away.T @ away + r * np.eye(r)) / (n + r)
-    return covariance
+def _squares(away: Array, of: Array) -> Array:
+    """away @ M @ away [n, K] of differences [n, K, r] and matrices M [K, r, r]."""
+    squares: Array = np.einsum("nkr,nkr->nk", np.einsum("nkr,krs->nks", away, of), away)
+    return squares
 
 
 def _moment(change: Array, otherwise: Array | None = None) -> Array:

@@ -28,7 +28,7 @@ Array = NDArray[Any]
 Json = dict[str, Any]
 BINS = 10
 """Bins of the reliability diagram and of the calibration error."""
-LIMITS = (0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.4, 1.7, 2.0)
+LIMITS = (0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0)
 """Multiples of the novelty limit at which the shares of kept and of passed sweeps are reported."""
 DRAWS = 500
 """Draws of the bootstrap."""

@@ -7,12 +7,13 @@ frames, fewer bits, displacement. Copies of held-out sweeps judge; see calibrati
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 from numpy.typing import NDArray
 
 from appliance.bundle import arrays
@@ -25,18 +26,22 @@ from appliance.inference.classifier import Classifier
 from appliance.inference.novelty import shaped_distances
 from appliance.signal.disturbances import Disturbances, hum
 from train.calibration import disturbances, novelty
-from train.calibration.nuisances import AlteredSweeps, NuisanceRule, Scatters, choose
+from train.calibration.nuisances import (
+    AlteredSweeps,
+    Embed,
+    NuisanceRule,
+    Scatters,
+    Space,
+    choose,
+)
 from train.data.sets import Dataset, digest
 from train.evaluation.corruptions import TAXEL_FAULTS, Corruption, applicable
 from train.evaluation.evaluation_sweeps import EvaluationSweeps
 from train.export.bridging import measurable
+from train.export.bundle_graph import turn_of
 from train.models.recipe.calibrate import CalibrationInputs
 
 Array = NDArray[Any]
-Embed = Callable[[Array], Array]
-"""Raw counts [n, T, R, C] -> features [n, F], or these -> embeddings [n, r]."""
-Space = tuple[Embed, Array]
-"""An embedding of features, and the class means [K, r] in it."""
 FIGURES = "altered sweeps"
 """Key of the figures in a manifest."""
 COPIES = 360
@@ -45,11 +50,13 @@ COPIES = 360
 
 @dataclass(frozen=True)
 class Widened:
-    """Shapes of materials that alterations have widened. shapes: float16 [K, r, r] of each
-    embedding that was given. limit: of known materials, for these shapes. rule: gave both.
-    training: features of the training sweeps and of their altered copies. figures: for the
-    manifest. disturbances: likewise. changes: float16 [D, K, r] by these, of the class means of
-    each embedding."""
+    """Shapes of materials that alterations have widened.
+
+    shapes: float16 [K, r, r] of each embedding that was given. limit: of known materials, for these
+    shapes. rule: gave both. training: features of the training sweeps and of their altered copies,
+    without those whose disturbance the box notices. figures: for the manifest. disturbances:
+    likewise. changes: float16 [D, K, r] by these, of the class means of each embedding.
+    """
 
     shapes: tuple[NDArray[np.float16], ...]
     limit: float
@@ -77,25 +84,31 @@ def measure(
     meter = disturbances.DisturbanceMeter(train.format, tare, train.samples)
     given = (drawn_again if again else _as_recorded)(train, held_out)
     training, held = (altered(features, of, seed + i, meter) for i, of in enumerate(given))
-    held = held.seen_by(judge[0])
-    seen = [training.seen_by(embed) for embed, _ in (judge, *others)]
-    means = [of.astype(np.float64) for _, of in (judge, *others)]
-    scatters = [Scatters.of(one, of) for one, of in zip(seen, means, strict=True)]
-    rule = choose(scatters[0], held, means[0])
+    held, spaces = held.seen_by(judge.embed), (judge, *others)
+    seen = [training.seen_by(space.embed) for space in spaces]
+    unnoticed = disturbances.unnoticed(training, training)
+    scatters = [Scatters.of(unnoticed.seen_by(space.embed), space) for space in spaces]
+    judging = disturbances.unnoticed(training, held)
+    rule = choose(scatters[0], judging)
     if rule is None:
         return None
     shapes = tuple(map(rule.shapes, scatters))
-    judged = disturbances.Judge(held, means[0], shapes[0].astype(np.float64), rule.limit)
+    judged = disturbances.Judge(held, judge.means, shapes[0].astype(np.float64), rule.limit)
     allowed = disturbances.fit(judged, *seen)
     return Widened(
         shapes,
         rule.limit,
         rule,
-        training,
-        _figures(rule, held) | {"disturbances": allowed.figures},
+        unnoticed,
+        _figures(rule, judging) | {"disturbances": allowed.figures},
         Disturbances(allowed.allowances, meter.hum),
         allowed.changes,
     )
+
+
+def space_of(embedding: novelty.Embedding) -> Space:
+    """The embedding of a fit."""
+    return Space(embedding, embedding.means.astype(np.float64), embedding.untrained)
 
 
 def limit_of_conditions(found: Widened, given: CalibrationInputs) -> float:
@@ -107,10 +120,10 @@ def limit_of_conditions(found: Widened, given: CalibrationInputs) -> float:
         for seen, judging, embedding, present in novelty.cross_fitted(
             given.whole, given.labels, values, given.judged, given.fixed
         ):
-            means = embedding.means.astype(np.float64)
+            space = space_of(embedding)
             training = found.training.take(seen[:trained], present).seen_by(embedding)
-            shapes = found.rule.shapes(Scatters.of(training, means)).astype(np.float64)
-            away = embedding(given.whole[judging])[:, None] - means
+            shapes = found.rule.shapes(Scatters.of(training, space)).astype(np.float64)
+            away = embedding(given.whole[judging])[:, None] - space.means
             distances[judging] = shaped_distances(away, shapes).min(axis=1)
         every.append(distances)
     return novelty.limit(np.concatenate(every))
@@ -185,6 +198,7 @@ def _figures(rule: NuisanceRule, held: AlteredSweeps) -> dict[str, Any]:
         "left out": [round(before, 4), round(after, 4)],
         "kept": {kind: [round(share, 4) for share in shares] for kind, shares in rule.kept.items()},
         "weights": dict(rule.weights),
+        "trained directions": rule.trained,
     }
 
 
@@ -232,7 +246,9 @@ def write(folder: Path, trained_on: Dataset, fresh: Dataset) -> Manifest:
     def embed(samples: Array) -> Array:
         return np.stack([box.embedding(sweep) for sweep in samples]).astype(np.float64)
 
-    space: Space = (lambda z: z, classes.means)
+    turn, r = turn_of(onnx.load_from_string(loaded.model)), classes.means.shape[1]
+    view = novelty.untrained(turn, r, r + 1 - len(classes.means))
+    space = Space(lambda z: z, classes.means.astype(np.float64), view)
     found = measure(embed, trained_on, fresh, space, tare=loaded.manifest.tare, again=True)
     if found is None:
         raise FormatError(

@@ -137,7 +137,7 @@ def _widened(
 ) -> nuisances.Widened | None:
     """Shapes of known materials that know how altered sweeps differ, and their limit; see
     nuisances. apart: an embedding that did not see the held-out sweeps."""
-    trunk, spaces = fit.trunk(), [(of, of.means) for of in (apart, whole)]
+    trunk, spaces = fit.trunk(), map(nuisances.space_of, (apart, whole))
     seed = int(fit.about["seed"])
     contacts, shape = fit.contacts or Contacts.of(fit.train), fit.train.format.shape
     known = contacts.limit.known_tare()
@@ -159,7 +159,7 @@ def _unseen(given: CalibrationInputs, calibration: Calibration) -> Calibration:
     weight, bias = given.naming_head(seen)
     return replace(
         calibration,
-        embedding=novelty.embed(given.whole[seen], given.labels[seen], given.fixed),
+        embedding=novelty.in_two_views(given.whole[seen], given.labels[seen], given.fixed),
         weight=weight / calibration.temperature,
         bias=bias / calibration.temperature,
     )

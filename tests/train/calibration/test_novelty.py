@@ -71,6 +71,30 @@ def test_each_material_has_its_own_shape_in_untrained_features():
     assert novelty.embed(x, y).shapes.shape == (2, 0, 0)
 
 
+def test_differences_of_untrained_features_come_back():
+    """From differences of z; of all directions, if none is selected."""
+    x, y = gaussians(200, np.random.default_rng(2).standard_normal((4, 20)))
+    one = novelty.embed(x, y, 5)
+    z = one(x)
+    np.testing.assert_allclose((z[0] - z[1]) @ one.untrained, (x[0] - x[1])[-5:], atol=1e-2)
+    assert (novelty.embed(x, y, 18).untrained == np.eye(20)).all()
+
+
+def test_the_distance_is_the_sum_of_two_views():
+    """One in the last two features, one in the direction in which the materials differ; on average
+    a sweep lies at r from its mean. An unknown material shows in either."""
+    x, y = gaussians(400, [[0, 0, 0, 0, 0, 0], [20, 0, 0, 0, 0, 0]])
+    one = novelty.in_two_views(x, y, 2)
+    r = one.means.shape[1]
+    assert one.shapes.shape == (2, r, r)
+    assert one.novelty(x).mean() == pytest.approx(r, rel=0.05)
+    near = np.zeros((1, 6))
+    away = [one.novelty(near + 8 * np.eye(6)[feature])[0] for feature in (0, 5)]
+    assert away == pytest.approx([64, 64], rel=0.2)
+    assert one.novelty(near + 8 * np.eye(6)[2])[0] < 5
+    assert novelty.in_two_views(x, y).shapes.shape == (2, 0, 0)
+
+
 def test_two_sweeps_of_a_material_and_silent_channels_are_finite():
     """K = 2, one class of two sweeps, a constant feature: no NaN."""
     x, y = gaussians(2, [[0, 0, 0], [5, 0, 0]])
@@ -118,14 +142,14 @@ def test_the_limit_knows_positions_that_were_not_seen():
         return x + 3 * np.random.default_rng(seed + 1).standard_normal((places, 2))[at], y, at
 
     (x, y, at), (new, _, _) = drawn(300, 0), drawn(400, 5)
-    one, every = novelty.embed(x, y, 2), np.ones(len(y), bool)
+    one, every = novelty.in_two_views(x, y, 2), np.ones(len(y), bool)
     across = novelty.limit(novelty.cross_fitted_distances(x, y, at, every, 2), 0.95)
     assert 0.93 < np.mean(one.novelty(new) <= across) < 0.97
     seven = (
         at < 7
     )  # with few places the covariance is too small, and what fits itself is far too narrow
     narrow, mine, them = (
-        novelty.embed(x[seven], y[seven], 2),
+        novelty.in_two_views(x[seven], y[seven], 2),
         (x[seven], y[seven], at[seven]),
         every[seven],
     )

@@ -10,10 +10,12 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from appliance.inference.novelty import shaped_distances
-from train.calibration.nuisances import AlteredSweeps, Scatters, choose
+from train.calibration.nuisances import AlteredSweeps, Scatters, Space, choose
 
 MEANS = np.array([[0.0, 0, 0, 0], [12, 0, 0, 0], [0, 12, 0, 0]])
 """Means of three materials, which differ in two of four directions."""
+SPACE = Space(lambda z: z, MEANS, np.eye(4)[:, 2:])
+"""The last two directions are features that were not trained."""
 HUM, LIKE_ANOTHER = np.array([0.0, 0, 8, 0]), np.array([-6.0, 6, 0, 0])
 
 
@@ -34,8 +36,8 @@ def rng() -> Generator:
 def test_copies_are_kept_in_the_direction_of_their_change(rng: Generator):
     """Held-out copies are within the limit, and an unknown material in a direction that no
     alteration reaches is as far beyond it as before."""
-    scatters = Scatters.of(sweeps(rng, hum=HUM), MEANS)
-    rule = choose(scatters, sweeps(rng, hum=HUM), MEANS)
+    scatters = Scatters.of(sweeps(rng, hum=HUM), SPACE)
+    rule = choose(scatters, sweeps(rng, hum=HUM))
     assert rule
     before, after = rule.kept["hum"]
     assert before < 0.7
@@ -49,7 +51,7 @@ def test_copies_are_kept_in_the_direction_of_their_change(rng: Generator):
 def test_an_alteration_that_looks_like_another_material_gets_less_weight(rng: Generator):
     """With a large weight for it, sweeps of a material that is left out would pass."""
     moves = {"hum": HUM, "other": LIKE_ANOTHER}
-    rule = choose(Scatters.of(sweeps(rng, **moves), MEANS), sweeps(rng, **moves), MEANS)
+    rule = choose(Scatters.of(sweeps(rng, **moves), SPACE), sweeps(rng, **moves))
     assert rule
     assert rule.passed[1] < 0.05
     assert rule.weights["other"] < rule.weights["hum"] or rule.weights["other"] <= 1
@@ -58,8 +60,8 @@ def test_an_alteration_that_looks_like_another_material_gets_less_weight(rng: Ge
 def test_a_sweep_lies_as_far_from_its_mean_as_without_shapes(rng: Generator):
     """On average at a squared distance of r, so that distances of enrolled labels, which have no
     shape, are comparable."""
-    scatters, judged = Scatters.of(sweeps(rng, hum=HUM), MEANS), sweeps(rng, hum=HUM)
-    rule = choose(scatters, judged, MEANS)
+    scatters, judged = Scatters.of(sweeps(rng, hum=HUM), SPACE), sweeps(rng, hum=HUM)
+    rule = choose(scatters, judged)
     assert rule
     shapes = rule.shapes(scatters).astype(np.float64)
     distances = shaped_distances(judged.z[:, None] - MEANS, shapes)
@@ -73,19 +75,45 @@ def test_a_material_without_copies_has_the_scatter_of_the_others(rng: Generator)
     given = sweeps(rng, hum=HUM)
     z, source = given.copies["hum"]
     few = given.labels[source] != 2
-    found = Scatters.of(replace(given, copies={"hum": (z[few], source[few])}), MEANS)
+    found = Scatters.of(replace(given, copies={"hum": (z[few], source[few])}), SPACE)
     assert np.isfinite(found.by_kind["hum"]).all()
     assert found.by_kind["hum"][2][2, 2] > 10
 
 
 def test_too_few_sweeps_give_no_rule(rng: Generator):
     """Seven sweeps of each material, or no copies."""
-    scatters = Scatters.of(sweeps(rng, hum=HUM), MEANS)
-    assert choose(scatters, sweeps(rng, 7, hum=HUM), MEANS) is None
-    assert choose(scatters, replace(sweeps(rng), copies={}), MEANS) is None
+    scatters = Scatters.of(sweeps(rng, hum=HUM), SPACE)
+    assert choose(scatters, sweeps(rng, 7, hum=HUM)) is None
+    assert choose(scatters, replace(sweeps(rng), copies={})) is None
 
 
-def test_alterations_that_change_nothing_give_no_rule(rng: Generator):
+def test_alterations_that_change_nothing_get_no_weight(rng: Generator):
     """Their copies are kept anyway."""
     still = np.zeros(4)
-    assert choose(Scatters.of(sweeps(rng, still=still), MEANS), sweeps(rng), MEANS) is None
+    rule = choose(Scatters.of(sweeps(rng, still=still), SPACE), sweeps(rng, still=still))
+    assert rule
+    assert rule.kept["still"][1] == pytest.approx(0.99, abs=0.015)
+
+
+def test_what_shows_an_unknown_material_counts_more(rng: Generator):
+    """Materials that differ in the trained directions alone, and such that differ in features that
+    were not trained, too."""
+    far = np.array([[0.0, 0, 0, 0], [12, 0, 9, 0], [0, 12, 0, 9]])
+
+    def weight(means: NDArray[np.float64]) -> float:
+        given = sweeps(rng, 200, hum=HUM)
+        moved = replace(given, z=given.z + (means - MEANS)[given.labels])
+        return Scatters.of(moved, replace(SPACE, means=means)).weight_of_trained(moved)
+
+    assert weight(MEANS) > weight(far)
+
+
+def test_all_directions_count_where_no_feature_is_known_as_untrained(rng: Generator):
+    """An unknown material is refused in each of them."""
+    space = replace(SPACE, untrained=np.eye(4))
+    scatters = Scatters.of(sweeps(rng, hum=HUM), space)
+    rule = choose(scatters, sweeps(rng, hum=HUM))
+    assert rule
+    for direction in np.eye(4)[[0, 1, 3]]:
+        away = MEANS[0] - 9 * direction - MEANS
+        assert shaped_distances(away, rule.shapes(scatters).astype(float)).min() > rule.limit

@@ -212,7 +212,7 @@ def fit_calibration(given: CalibrationInputs) -> Calibration:
     groups = given.groups[numbers]
     temperatures = early_exit.fit_temperatures(logits, labels[numbers], groups)
     p = softmax(logits / temperatures[:, None])
-    embedding, last = novelty.embed(whole, labels, given.fixed), float(temperatures[-1])
+    embedding, last = novelty.in_two_views(whole, labels, given.fixed), float(temperatures[-1])
     steps = early_exit.heads(embedding(given.prefixes), labels, int(labels.max()) + 1)
     distances = {name: _distances(given, values) for name, values in given.conditions.items()}
     limit = novelty.limit(np.concatenate(list(distances.values())))
