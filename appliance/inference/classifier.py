@@ -9,7 +9,8 @@ a label.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -39,6 +40,8 @@ if TYPE_CHECKING:
 
 
 STILL = f"{NO_PATTERN}, as with a finger that rests"
+MANY_FULL = 0.01
+"""A larger share of the counts at full scale is said with the answer."""
 _NONE, _NO_SLIDE, _IN_PLACE = np.empty(0), Slide(), Displacement()
 
 
@@ -55,11 +58,14 @@ def _degraded(finding: Finding) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Touched:
-    """Where and how the finger touched in a sweep, and the hum that was removed, in counts."""
+    """Where and how the finger touched in a sweep. hum: that was removed, in counts. full: share of
+    the counts at full scale. disturbed: values of the disturbances by name."""
 
     displacement: Displacement = _IN_PLACE
     slide: Slide = _NO_SLIDE
     hum: float = 0.0
+    full: float = 0.0
+    disturbed: Mapping[str, float] = field(default_factory=dict)
 
 
 class Classifier(Observer):
@@ -265,8 +271,9 @@ class Classifier(Observer):
         taxels, hum = self.without_hum(sweep.frames.taxels)
         if hum:
             sweep = replace(sweep, frames=replace(sweep.frames, taxels=taxels))
-        touch = replace(self._touch(sweep, finding.mean), hum=hum)
-        logits, novelty = self._classify(sweep, touch, finding.mean)
+        touch = replace(self._touch(sweep, finding.mean), hum=hum, full=finding.full)
+        touch = replace(touch, disturbed=self._disturbed(sweep, touch, finding.mean))
+        logits, novelty = self._classify(sweep, touch)
         if novelty:
             finding = replace(finding, status=Status.UNKNOWN, detail=novelty)
             return self._verdict(sweep, finding, touch=touch)
@@ -309,7 +316,7 @@ class Classifier(Observer):
         # bridged taxels move with their neighbours, which hides the pattern
         patterned = bool(degraded) or self._patterned(sweep, touch.slide)
         named = int(self._objects.enrolled.decided(scores).argmax())
-        if rests := self._rests(sweep, named) if patterned else STILL:
+        if rests := self._rests(sweep, touch, named) if patterned else STILL:
             return self._verdict(sweep, Finding(Status.NO_SLIDE, rests, degraded), touch=touch)
         fused = self._objects.put(sweep, scores)
         if fused.refused:
@@ -349,14 +356,12 @@ class Classifier(Observer):
         )
         return self._model(outputs, graph_input)
 
-    def _classify(
-        self, sweep: Sweep, touch: Touched, mean: NDArray[np.float64] | None
-    ) -> tuple[NDArray[np.float32], str]:
+    def _classify(self, sweep: Sweep, touch: Touched) -> tuple[NDArray[np.float32], str]:
         """Logits [K] of one window, and a message with its distance from the known materials, ""
         if the material is known.
 
         Changes caused by a displacement of the contact, or by disturbances of the sweep, do not
-        make a material unknown. mean: counts of the window, see Finding.
+        make a material unknown.
         """
         means = self._means
         if touch.displacement.text and self._displaced_means:
@@ -364,11 +369,10 @@ class Classifier(Observer):
         if means is None:
             return self.logits(sweep.frames.taxels), ""
         network, z = self.network(sweep.frames.taxels)
-        logits, disturbed = means.joined(network, z), self._disturbed(sweep, touch, mean)
-        allowed = self.bundle.manifest.disturbances
-        if untried := allowed.untried(disturbed) if allowed else "":
+        logits, allowed = means.joined(network, z), self.bundle.manifest.disturbances
+        if untried := allowed.untried(touch.disturbed) if allowed else "":
             return logits, untried
-        novelty = means.novelty(z, disturbed)
+        novelty = means.novelty(z, touch.disturbed)
         if novelty and means is self._means and self._unknown:
             alike = self._unknown.put(sweep.id, z)
             novelty += f"; as sweep {alike}" * (alike > 0)
@@ -377,7 +381,8 @@ class Classifier(Observer):
     def _disturbed(
         self, sweep: Sweep, touch: Touched, mean: NDArray[np.float64] | None
     ) -> dict[str, float]:
-        """The disturbances of a sweep by name, if the bundle allows something for them."""
+        """The disturbances of a sweep by name, if the bundle allows something for them. mean:
+        counts of the window, see Finding."""
         m, taxels = self.bundle.manifest, sweep.frames.taxels
         if not m.disturbances:
             return {}
@@ -408,14 +413,16 @@ class Classifier(Observer):
         whole = len(sweep.frames) == self.bundle.format.window and not self._slide.why
         return not (self._pattern and whole and slide.height < self._pattern)
 
-    def _rests(self, sweep: Sweep, label: int) -> str:
+    def _rests(self, sweep: Sweep, touch: Touched, label: int) -> str:
         """A message if the finger rests in a part of the window so far, where a slide over the
-        label with this number vibrates more; else ""."""
+        label with this number vibrates more; else "". A load beyond that of training counts as that
+        of training: vibrations grow less than it."""
         m, taxels = self.bundle.manifest, sweep.frames.taxels
         parts = PARTS * len(taxels) // m.format.window
         if m.sliding is None or not parts or len(taxels) < 2 * parts:
             return ""
-        found = m.sliding.resting(vibration(taxels, self.tare, parts), label)
+        beyond = m.disturbances.beyond("load", touch.disturbed) if m.disturbances else 0.0
+        found = m.sliding.resting(vibration(taxels, self.tare, parts) + beyond, label)
         if not found:
             return ""
         where = " ".join(map(str, found))
@@ -475,5 +482,6 @@ class Classifier(Observer):
         uncertain = finding.status in (Status.UNSURE, Status.UNDECIDED, Status.UNKNOWN)
         untrained = trained.outside(touch.slide) if trained and uncertain else ""
         hum = f"hum of {touch.hum:.2g} counts removed" if touch.hum else ""
-        texts = touch.displacement.text, untrained, finding.detail, hum, _degraded(finding)
+        full = f"{touch.full:.0%} of the counts at full scale" if touch.full > MANY_FULL else ""
+        texts = touch.displacement.text, untrained, finding.detail, hum, full, _degraded(finding)
         return "; ".join(filter(None, texts))

@@ -17,7 +17,7 @@ from appliance.bundle.manifest import Manifest
 from appliance.core.types import EPOCH_BITS, Frames, Status, normal
 from appliance.signal.broken_taxels import BrokenTaxels, Comparison, bridged, find, places
 from appliance.signal.taxel_statistics import TRIPLES, TaxelStatistics
-from appliance.signal.window_check import Finding, inspect
+from appliance.signal.window_check import Finding, WindowLimits, ceiling, inspect
 
 STRETCH = 3 * TRIPLES
 """Frames of a stretch of the stream, if a window has as many: its noise is then measured as
@@ -71,7 +71,7 @@ class TaxelWatch:
         m, measured = self._manifest, TaxelStatistics.of(taxels)
         assert m.bridging
         compared = Comparison.of(measured, m.format.shape[:2])
-        found = find(measured, compared, tare, m.thresholds, m.bridging)
+        found = find(measured, compared, tare, self._clipping(measured), m.bridging)
         bad = found.kinds if found else np.zeros(self._sound.shape, bool)
         lively = compared.lively(m.bridging.quietest).any(axis=1).reshape(bad.shape[1:])
         good = ~bad & np.stack([lively, np.ones_like(lively)])
@@ -87,25 +87,35 @@ class TaxelWatch:
         """Raw counts [T, R, C] or [T, R, C, A] of a window with its broken taxels bridged, and the
         result of its check. tare: raw counts [R, C] or [R, C, A]."""
         m, measured = self._manifest, TaxelStatistics.of(taxels)
-        broken = self._in_window(measured, tare)
+        limits: WindowLimits = m.thresholds
+        broken = self._in_window(measured, tare, limits)
+        if broken and m.bridging and not m.bridging.allows(broken.mask):
+            limits = self._clipping(measured)
+            broken = self._in_window(measured, tare, limits)
         if broken and m.bridging and not m.bridging.allows(broken.mask):
             broken = BrokenTaxels.of(broken.kinds & [[[True]], [[False]]])  # silent alone
         if not (broken and m.bridging):
-            return taxels, inspect(taxels, tare, m.thresholds, measured=measured)
+            return taxels, inspect(taxels, tare, limits, measured=measured)
         if not m.bridging.allows(broken.mask):
             return taxels, self._too_many(broken, measured, tare)
         taxels = bridged(taxels, broken.mask, m.tare, m.bridging.loads)
-        return taxels, replace(inspect(taxels, tare, m.thresholds), degraded=broken.text)
+        return taxels, replace(inspect(taxels, tare, limits), degraded=broken.text)
+
+    def _clipping(self, measured: TaxelStatistics) -> WindowLimits:
+        """The limits, with the count at which the amplifier clips as full scale: taxels that stay
+        there are saturated, not stuck."""
+        limits = self._manifest.thresholds
+        return replace(limits, full_scale=ceiling(measured, limits.full_scale))
 
     def _in_window(
-        self, measured: TaxelStatistics, tare: NDArray[np.float64]
+        self, measured: TaxelStatistics, tare: NDArray[np.float64], limits: WindowLimits
     ) -> BrokenTaxels | None:
         """The broken taxels of a window and of the stream."""
         m = self._manifest
         if m.bridging is None:
             return None
         compared = Comparison.of(measured, m.format.shape[:2])
-        found = find(measured, compared, tare, m.thresholds, m.bridging)
+        found = find(measured, compared, tare, limits, m.bridging)
         return found | self.broken if found and self.broken else found or self.broken
 
     def _too_many(

@@ -148,6 +148,11 @@ class Disturbances:
         is not known."""
         return np.array([a.size(values.get(a.of, math.nan)) for a in self.allowances])
 
+    def beyond(self, name: str, values: Mapping[str, float]) -> float:
+        """How far the value with this name is above training, 0 within it; see Allowance.size."""
+        above = (a for a in self.allowances if a.of == name and a.end > a.start)
+        return max((a.size(values.get(name, math.nan)) for a in above), default=0.0)
+
     def untried(self, values: Mapping[str, float]) -> str:
         """A message with the disturbances of a sweep that are beyond what export has tried, ""
         without one."""

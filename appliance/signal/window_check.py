@@ -21,6 +21,9 @@ FULL_SCALES = tuple(float(2**bits - 1) for bits in (8, 10, 12, 14, 15, 16, 24))
 SHARE = 0.1
 """A loaded taxel has at least this share of the load of the strongest taxel, as in the limits of a
 bundle (train/export/pack)."""
+STAYS = 0.02
+"""Where an amplifier clips, a value that also moves below stays at the highest count for at least
+this share of the frames."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,13 +47,15 @@ class Finding:
     """Result of the check of a window: status ok, or another status with the taxels in `detail`.
 
     degraded: the broken taxels that were bridged, "" for none. mean: counts of the window that was
-    checked, in the shape of a frame, if the check passed.
+    checked, in the shape of a frame, if the check passed. full: share of the counts at full scale,
+    likewise.
     """
 
     status: Status
     detail: str = ""
     degraded: str = ""
     mean: NDArray[np.float64] | None = field(default=None, compare=False)
+    full: float = field(default=0.0, compare=False)
 
 
 def _taxels(mask: NDArray[np.bool_]) -> str:
@@ -101,14 +106,30 @@ def inspect(
     stuck = still & loaded & (full < 1)
     if stuck.any():
         return Finding(Status.STUCK_TAXEL, _taxels(stuck))
-    if full.mean() > limits.saturated:
+    share = float(full.mean())
+    if share > limits.saturated:
         return Finding(Status.SATURATED, _taxels(full > 0))
     silent = still[..., -1:] & ~loaded
     if silent.any():
         dead = silent & enclosed(loaded[..., 0])[..., None]
         if dead.sum() > limits.dead_taxels:
             return Finding(Status.DEAD_TAXEL, _taxels(dead & still))
-    return Finding(Status.OK, mean=measured.mean.reshape(tare.shape))
+    return Finding(Status.OK, mean=measured.mean.reshape(tare.shape), full=share)
+
+
+def ceiling(measured: TaxelStatistics, full_scale: float) -> float:
+    """The count at which the amplifier clips in a window.
+
+    It is the highest count of all. One value has to be constant there, and another one has to stay
+    there for STAYS of the frames. Otherwise it is `full_scale`.
+    """
+    highest = float(measured.highest.max())
+    at = measured.highest == highest
+    constant = (at & measured.still).sum()
+    if not (highest < full_scale and constant):
+        return full_scale
+    stays = (measured.series[at & ~measured.still] == highest).mean(axis=1).max(initial=0.0)
+    return highest if constant > 1 or stays >= STAYS else full_scale
 
 
 def _at_full_scale(

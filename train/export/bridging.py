@@ -29,7 +29,7 @@ from appliance.signal.broken_taxels import Bridging, Comparison, places
 from appliance.signal.load_modes import LoadModes
 from appliance.signal.taxel_statistics import TaxelStatistics
 from train.data.sets import Dataset, digest
-from train.evaluation.corruptions import TAXEL_FAULTS
+from train.evaluation.corruptions import CORRUPTIONS, TAXEL_FAULTS
 from train.evaluation.evaluation_sweeps import EvaluationSweeps
 from train.export import bundle_score
 
@@ -58,15 +58,27 @@ neighbours, on the mean; neighbours need no training, so they hold for any attac
 LOST, WRONG = 0.1, 0.01
 """Accepted loss of accuracy, and accepted rise of wrong answers, as shares; one sweep is always
 accepted."""
+CLIPPED, LOST_CLIPPED = "clipped", 0.02
+"""Key of the figures of clipped sweeps, and their accepted loss of accuracy."""
 
 
 @dataclass(frozen=True)
 class Tolerance:
-    """The broken taxels that a bundle tolerates. bridging: for the manifest. figures: counts of
-    right and wrong answers by fault and number, for its figures."""
+    """The broken and the clipped taxels that a bundle tolerates. bridging: for the manifest.
+    saturated: largest share of counts at full scale; None if no more than usual. figures: counts
+    of right and wrong answers by fault and number, for its figures."""
 
     bridging: Bridging
+    saturated: float | None
     figures: dict[str, Any]
+
+    def written(self, manifest: Manifest, **about: Any) -> Manifest:
+        """`manifest` with all of it. about: more figures."""
+        limits = manifest.thresholds
+        if self.saturated is not None:
+            limits = replace(limits, saturated=max(limits.saturated, self.saturated))
+        figures = manifest.figures | {FIGURES: self.figures | about}
+        return replace(manifest, bridging=self.bridging, thresholds=limits, figures=figures)
 
 
 def measure(bundle: Bundle, sound: Dataset, held_out: Dataset, seed: int = 0) -> Tolerance:
@@ -92,7 +104,10 @@ def measure(bundle: Bundle, sound: Dataset, held_out: Dataset, seed: int = 0) ->
             mask, _ = bench.worst(_lines(rows, cols, name))
             lines[name], figures[f"one {name}"] = bench.judged(mask)
     row, column = lines["row"], lines["column"]
-    return Tolerance(replace(limits, taxels=taxels, row=row, column=column), figures)
+    limits = replace(limits, taxels=taxels, row=row, column=column)
+    bench = _Bench.of(bundle, limits, test, test, seed)
+    saturated, figures[CLIPPED] = bench.clipped()
+    return Tolerance(limits, saturated, figures)
 
 
 def _better(
@@ -172,9 +187,11 @@ class _Bench:
         sample: EvaluationSweeps,
         seed: int,
     ) -> _Bench:
-        """With the box that bridges by `rule`. It measures no disturbances, which would take a
-        quarter of the time: the sweeps have none but the faults."""
-        manifest = replace(bundle.manifest, bridging=rule, disturbances=None)
+        """With the box that bridges by `rule` and accepts all counts at full scale. It measures no
+        disturbances, which would take a quarter of the time: the sweeps have none but the
+        faults."""
+        limits = replace(bundle.manifest.thresholds, saturated=1.0)
+        manifest = replace(bundle.manifest, bridging=rule, thresholds=limits, disturbances=None)
         box = Classifier(replace(bundle, manifest=manifest), SystemClock(), slides=False)
         return cls(box, test, sample, seed)
 
@@ -214,14 +231,29 @@ class _Bench:
         }
         return self._holds(counts), counts | {"at": places(mask)}
 
+    def clipped(self) -> tuple[float | None, dict[str, Any]]:
+        """The share of counts at full scale up to which the box answers as without clipping, and
+        [right, wrong] by severity; None if it never does."""
+        limit, figures = None, {}
+        clipping = next(corruption for corruption in CORRUPTIONS if corruption.name == "saturation")
+        for severity in clipping.severities[1:]:
+            samples = clipping.apply(self._test, severity, self._seed)
+            right, wrong, _ = self._counts(replace(self._test.sweeps, samples=samples))
+            figures[f"{severity:g}"] = [right, wrong]
+            if not self._near(right, wrong, LOST_CLIPPED):
+                break
+            checks = (self._box.taxels.repaired(one, self._box.tare)[1] for one in samples)
+            limit = max(found.full for found in checks)
+        return limit, figures
+
+    def _near(self, right: int, wrong: int, lost: float) -> bool:
+        """Whether counts differ from those of the sound sweeps by at most the share `lost` of right
+        answers and WRONG of wrong ones."""
+        n, (clean, clean_wrong) = len(self._test.sweeps), self.clean
+        return right >= clean - max(1, lost * n) and wrong <= clean_wrong + max(1, WRONG * n)
+
     def _holds(self, counts: Mapping[str, list[int]]) -> bool:
-        n, (right, wrong) = len(self._test.sweeps), self.clean
-        lost = max(1, LOST * n)
-        more = max(1, WRONG * n)
-        return all(
-            counts[fault][0] >= right - lost and counts[fault][1] <= wrong + more
-            for fault in SILENT
-        )
+        return all(self._near(counts[fault][0], counts[fault][1], LOST) for fault in SILENT)
 
     def _broken(self, fault: str, mask: Array, test: EvaluationSweeps) -> Dataset:
         samples, rng = test.sweeps.samples, np.random.default_rng([self._seed, *fault.encode()])
@@ -286,12 +318,17 @@ def text(manifest: Manifest) -> str:
         right, wrong = figures["sound"]
         lines.append(f"  sound skin: {right} of {figures['sweeps']} named rightly, {wrong} wrongly")
     for name, counts in figures.items():
-        if isinstance(counts, dict):
+        if isinstance(counts, dict) and name != CLIPPED:
             answers = "; ".join(
                 f"{fault} {counts[fault][0]} rightly, {counts[fault][1]} wrongly"
                 for fault in TAXEL_FAULTS
             )
             lines.append(f"  {name} ({counts['at']}): {answers}")
+    if CLIPPED in figures:
+        lines.append(
+            f"clipped counts: answered up to {100 * manifest.thresholds.saturated:.1f} % at full "
+            "scale"
+        )
     return "\n".join(lines)
 
 
@@ -303,12 +340,7 @@ def write(folder: Path, sweeps: Dataset, seed: int = 0) -> Manifest:
     """
     loaded = measurable(folder, sweeps)
     found = measure(loaded, sweeps, sweeps, seed)
-    figures = found.figures | {"set": sweeps.source, "digest": digest(sweeps)}
-    manifest = replace(
-        loaded.manifest,
-        bridging=found.bridging,
-        figures=loaded.manifest.figures | {FIGURES: figures},
-    )
+    manifest = found.written(loaded.manifest, set=sweeps.source, digest=digest(sweeps))
     put(folder / MANIFEST, manifest.json())
     return manifest
 

@@ -206,8 +206,7 @@ def _tolerant(
         packed = bundle.from_files(files | {bundle.MANIFEST: text}, manifest.name)
     seed = int(content.about.get("seed", 0))
     found = bridging.measure(packed, content.train, content.held_out, seed)
-    figures = manifest.figures | {bridging.FIGURES: found.figures}
-    return replace(manifest, figures=figures, bridging=found.bridging)
+    return found.written(manifest)
 
 
 def _files(content: Content) -> dict[str, bytes]:

@@ -15,6 +15,7 @@ from appliance.core.errors import BundleError
 from appliance.core.types import Frames, Status, Sweep
 from appliance.inference.classifier import Classifier
 from appliance.inference.early_exit import EarlyExit
+from appliance.signal.disturbances import Allowance, Disturbances
 from appliance.signal.vibration import SlideLimits
 from appliance.sim import skin
 from appliance.sim.rig import VirtualClock
@@ -49,6 +50,22 @@ def test_a_rest_is_answered_no_slide(toy: Bundle):
     assert verdict.detail == "hardly any vibration in part 6 7 of 10, less than a gives"
     after = box(replace(toy_bundle.sweep(0, 0), object=1))
     assert (after.status, after.fused) == (Status.OK, 1)
+
+
+def test_a_load_beyond_training_counts_as_that_of_training(toy: Bundle):
+    """Counts around 100 that swing by 1 vibrate too little, but not for a load of 75."""
+    total = math.log(100 * toy.format.rows * toy.format.cols)
+    load = Allowance("load", total - 0.3, total + 0.5, 1.0)
+    assert toy.classes
+    changes = np.zeros((1, *toy.classes.means.shape), np.float16)
+    limits = SlideLimits((math.log(1 / 80),) * 2)
+    strict = replace(toy, manifest=replace(toy.manifest, sliding=limits))
+    assert Classifier(strict, VirtualClock())(toy_bundle.sweep(0, 0)).status is Status.NO_SLIDE
+    for start, status in ((total - 0.3, Status.OK), (total - 0.1, Status.NO_SLIDE)):
+        allowed = Disturbances((replace(load, start=start),))
+        manifest = replace(strict.manifest, disturbances=allowed)
+        pressed = replace(strict, manifest=manifest, classes=replace(toy.classes, changes=changes))
+        assert Classifier(pressed, VirtualClock())(toy_bundle.sweep(0, 0)).status is status
 
 
 def test_without_a_limit_nothing_is_checked(toy: Bundle):

@@ -76,6 +76,45 @@ def test_a_broken_taxel_is_bridged_and_named(tmp_path: Path, taxels: np.ndarray,
     assert verdict.as_dict()["degraded"] == degraded
 
 
+def clipped(place: Any) -> np.ndarray:
+    """A window of the toy whose amplifier holds some taxels at its highest count."""
+    taxels = toy_bundle.window(0, 0, FORMAT)
+    taxels[place] = taxels.max() + 20
+    return taxels
+
+
+def test_clipped_taxels_are_answered_as_far_as_the_bundle_tolerates(tmp_path: Path):
+    """Six constant taxels are more than may be bridged. They are at the ceiling, so they are not
+    broken; a bundle that tolerates as many full counts answers and says the share."""
+    place = np.s_[:, 1:3, 1:]
+    few, many = made(tmp_path), made(tmp_path)
+    limits = replace(many.manifest.thresholds, saturated=0.5)
+    many = replace(many, manifest=replace(many.manifest, thresholds=limits))
+    refused = Classifier(few, VirtualClock())(sweep(clipped(place)))
+    assert refused.status is Status.SATURATED
+    assert "2.2 2.3 2.4" in refused.detail
+    verdict = Classifier(many, VirtualClock())(sweep(clipped(place)))
+    assert (verdict.status, verdict.label) == (Status.OK, "a")
+    assert (verdict.degraded, verdict.detail) == ("", "38% of the counts at full scale")
+    below = clipped(place)
+    below[place] = 3
+    assert Classifier(many, VirtualClock())(sweep(below)).status is Status.DEAD_TAXEL
+
+
+def test_clipped_taxels_do_not_count_as_broken_over_the_stream():
+    """However long the finger presses; one that is stuck below the ceiling does."""
+    one = watch()
+    taxels = clipped(np.s_[:, 1:3, 1:])
+    for _ in range(2 * CERTAIN):
+        one.put(frames(taxels), NEVER)
+    assert one.broken is None
+    taxels[:, 0, 3] = 3
+    for _ in range(2 * CERTAIN):
+        one.put(frames(taxels), NEVER)
+    assert one.broken
+    assert one.broken.text == "silent taxel 1.4"
+
+
 def test_the_recorded_sweep_stays_as_it_was(tmp_path: Path):
     """Bridging works on a copy."""
     taxels = broken(np.s_[:, 1, 1])

@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 
 from appliance.bundle.manifest import Thresholds
 from appliance.core.types import Status, shape
+from appliance.signal.taxel_statistics import TaxelStatistics
 from appliance.signal.unloaded import UnloadedSkin
-from appliance.signal.window_check import inspect, inspect_bare, inspect_readings
+from appliance.signal.window_check import STAYS, ceiling, inspect, inspect_bare, inspect_readings
 
 LIMITS = Thresholds(contact=10, full_scale=255, saturated=0.01)
 BARE = np.zeros((4, 4))
@@ -50,6 +51,40 @@ def test_a_spoiled_window_is_named(place, value: int, status: Status, detail: st
     found = inspect(taxels, BARE, LIMITS)
     assert found.status is status
     assert detail in found.detail
+
+
+def test_the_share_of_full_counts_is_measured():
+    """Of a window that is accepted."""
+    taxels = moving()
+    taxels[:150, 0, 1] = 255
+    found = inspect(taxels, BARE, replace(LIMITS, saturated=0.1))
+    assert (found.status, found.full) == (Status.OK, 1 / 32)
+
+
+def test_an_amplifier_that_clips_below_full_scale():
+    """Its ceiling is the highest count if two taxels stay there and one of them always does. One
+    alone is stuck. A count that is reached now and then is a peak."""
+
+    def clips(taxels: np.ndarray) -> float:
+        return ceiling(TaxelStatistics.of(taxels), 255.0)
+
+    taxels = moving()
+    assert clips(taxels) == clips(np.minimum(taxels, 82)) == 255  # none is constant
+    taxels[:, 2, 2] = 90
+    assert clips(taxels) == 255
+    assert clips(np.minimum(taxels, 82)) == 82
+    brief = taxels.copy()
+    brief[: int(STAYS * len(brief)) - 1, 1, 1] = 90
+    assert clips(brief) == 255
+    brief[: int(STAYS * len(brief)), 1, 1] = 90
+    assert clips(brief) == 90
+    taxels[:, 2, 3] = 90
+    assert clips(taxels) == 90
+    taxels[:, 2, 3] = 255
+    assert clips(taxels) == 255
+    numbers = moving().astype(np.float32)
+    numbers[0, 0, 0] = np.nan
+    assert clips(numbers) == 255
 
 
 def test_without_a_threshold_every_taxel_counts_as_loaded():

@@ -120,6 +120,7 @@ def test_loads_that_differ_in_every_sweep_bridge_better_than_neighbours(
 
     monkeypatch.setattr(bridging, "Classifier", Weighed)
     monkeypatch.setattr(bridging._Bench, "_counts", counts)
+    monkeypatch.setattr(bridging._Bench, "clipped", lambda bench: (None, {}))
     loaded = bundle.load(toy(tmp_path))
     found = bridging.measure(loaded, sweeps, sweeps).bridging
     assert found.loads is not None
@@ -128,6 +129,24 @@ def test_loads_that_differ_in_every_sweep_bridge_better_than_neighbours(
     assert bridging.measure(loaded, even, even).bridging.loads is None
     kept = replace(loaded.manifest, bridging=found)
     assert bundle.Manifest.parse(kept.json()).bridging == found
+
+
+def test_a_bundle_answers_clipped_sweeps_as_far_as_it_names_them(tmp_path: Path):
+    """The toy knows "b" from the load of a taxel, which is soon lost; for "a" alone half of the
+    taxels may be clipped, and the manifest says so."""
+    loaded, all_three, one = bundle.load(toy(tmp_path)), windows("a", "b", "c"), windows("a")
+    one.samples[:, :, 2:] += 60
+    few, many = (bridging.measure(loaded, sweeps, sweeps) for sweeps in (all_three, one))
+    assert few.saturated is None
+    assert few.written(loaded.manifest).thresholds == loaded.manifest.thresholds
+    assert len(few.figures[bridging.CLIPPED]) == 1
+    counts = many.figures[bridging.CLIPPED]
+    assert counts == {"0.1": [5, 0], "0.2": [5, 0], "0.35": [5, 0], "0.5": [0, 0]}
+    assert many.saturated == pytest.approx(0.5)
+    manifest = many.written(loaded.manifest)
+    assert manifest.thresholds.saturated == many.saturated > 0.1
+    assert f"answered up to {100 * many.saturated:.1f} % at full scale" in bridging.text(manifest)
+    assert bundle.Manifest.parse(manifest.json()) == manifest
 
 
 @pytest.mark.parametrize("shape", [(9, 20, 1, 3), (9, 20, 20, 20), (3, 20, 4, 4)])

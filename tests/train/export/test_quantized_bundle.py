@@ -29,6 +29,7 @@ from tests.factories.trained_stages import with_stages
 from train.cli.main import main
 from train.data import sets
 from train.export import bundle_score, pack, quantized_bundle
+from train.export.bundle_graph import turn_of
 from train.export.pack import ExportRefused
 from train.metrics.answers import REFUSED
 from train.metrics.temperature import platt_temperature
@@ -132,6 +133,17 @@ def test_the_int8_graph_computes_its_convolutions_in_int8(fitted: Fit, packed: P
         (name, [1, size], "tensor(float)")
         for name, size in (("logits", 3), ("embedding", 2 + fitted.bands))
     ]
+
+
+def test_a_model_holds_the_matrix_of_its_embedding(fitted: Fit, packed: Path):
+    """`palpate-train widen` reads from it which directions were not trained. A model that selects
+    no features has none."""
+    assert fitted.calibration
+    embedding = fitted.calibration.embedding
+    model = onnx.load_from_string(bundle.load(packed).model)
+    assert embedding.selected == fitted.bands
+    np.testing.assert_array_equal(turn_of(model), embedding.turn.astype(np.float32))
+    assert turn_of(fitted.trunk()) is None
 
 
 def test_quantizing_leaves_its_model_alone(fitted: Fit):
@@ -530,6 +542,7 @@ def test_the_command_exports_what_fit_wrote(
         "held-out speed, network alone",
         "held-out speed, by recording",
         "broken taxels",
+        "clipped counts",
         "altered sweeps",
         "a finger that rests",
         "bundle",
