@@ -30,8 +30,8 @@ this share of the frames."""
 class WindowLimits:
     """Limits for a window.
 
-    contact: least mean over time of a loaded taxel, in counts above the tare; None if a load cannot
-    be told from the unloaded skin, so that every taxel counts as loaded. full_scale: the sensor's
+    contact: least mean over time of a loaded taxel, in counts above the tare. With None every taxel
+    counts as loaded, since loads do not differ from the unloaded skin. full_scale: the sensor's
     highest count. saturated: largest accepted share of full-scale counts. dead_taxels: largest
     accepted number of dead taxels.
     """
