@@ -244,6 +244,9 @@ class Manifest:
         for name, added in added_later:
             if values.get(name) and not values[name][added]:
                 del values[name][added]
+        for allowance in values.get("disturbances", {}).get("allowances", ()):
+            if allowance["tried"] is None:
+                del allowance["tried"]
         return (json.dumps(values, indent=1, sort_keys=True) + "\n").encode()
 
     @property

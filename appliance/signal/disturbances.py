@@ -85,14 +85,16 @@ class Allowance:
     """The allowance of a bundle for one disturbance.
 
     of: one of NAMES. start: its value at the edge of training. end: the furthest value that export
-    has tried. slope: growth of the limit of known materials, as a share of it, for a size of 1.
-    Raises BundleError for a value out of range.
+    has proven. slope: growth of the limit of known materials, as a share of it, for a size of 1.
+    tried: the furthest value that export has tried, if its copies proved less than a robot's sweeps
+    may; None if it is `end`. Raises BundleError for a value out of range.
     """
 
     of: str
     start: float
     end: float
     slope: float
+    tried: float | None = None
 
     def __post_init__(self) -> None:
         if self.of not in NAMES:
@@ -107,6 +109,14 @@ class Allowance:
                 f"disturbances have {list(numbers)} for {self.of}; start and end must be different "
                 "finite numbers and the slope at least 0: export the bundle again"
             )
+        further = self.tried is None or (
+            type(self.tried) in (int, float) and 0 <= self._way * (self.tried - self.end) < math.inf
+        )
+        if not further:
+            raise BundleError(
+                f"disturbances have tried {self.tried!r} for {self.of}, which must be a finite "
+                f"number beyond the end {self.end}: export the bundle again"
+            )
 
     @property
     def _way(self) -> int:
@@ -119,8 +129,9 @@ class Allowance:
         return min(beyond, abs(self.end - self.start)) if beyond > 0 else 0.0
 
     def untried(self, value: float) -> str:
-        """A message if `value` is beyond `end`, else ""."""
-        if not self._way * (value - self.end) > 0:
+        """A message if `value` is beyond what was tried, else ""."""
+        furthest = self.end if self.tried is None else self.tried
+        if not self._way * (value - furthest) > 0:
             return ""
         return f"{SAID[self.of, self._way]} than was tried with this bundle"
 

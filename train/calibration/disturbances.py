@@ -30,6 +30,10 @@ MADE_BY = {
 }
 """Disturbance and its sign, and the kinds of copies that have it."""
 OF_KIND = {kind: name for (name, _), kinds in MADE_BY.items() for kind in kinds}
+STRETCHED = {"stretch", "shorten"}
+"""Kinds of copies that stretch the counts in time. In them the vibrations of skin and finger change
+their frequency, too, which they do not at another speed. Such copies are harder than a real slide:
+the means must not follow them, and where they fail nothing is refused."""
 OUTER = {"noise": 0.02, "load": 0.1, "speed": 0.02}
 """Share of the training sweeps beyond each edge. Loads spread widely, and a lower gain looks like
 a lower load; hum and lost frames begin at 0."""
@@ -175,10 +179,15 @@ def fit(judge: Judge, *training: AlteredSweeps) -> AllowanceFit:
         copies = [_Tried.of(altered, made, sign, start) for altered in training]
         moved = [_changes(one.take(one.size <= end), len(judge.means)) for one in copies]
         still = [np.zeros_like(moved[0])] * len(moved)
-        choices = [(_slope(judge, tried, of[0]), of) for of in (moved, still)]
+        stretched = bool(STRETCHED & set(made))
+        ways = (still,) if stretched else (moved, still)
+        choices = [(_slope(judge, tried, of[0]), of) for of in ways]
         judged, moved = max(choices, key=lambda choice: choice[0].worth)
         slope, figures[f"{name}{'+' if sign > 0 else '-'}"] = judged.slope, judged.figures
-        found.append(Allowance(name, round(start, 4), round(start + sign * end, 4), slope))
+        every = MARGIN * float(_Tried.of(judge.altered, made, sign, start).size.max())
+        start, proven, furthest = (round(start + sign * size, 4) for size in (0.0, end, every))
+        further = furthest if stretched and furthest != proven else None
+        found.append(Allowance(name, start, proven, slope, further))
         changes.append(moved)
     none = np.zeros((0, *judge.means.shape))
     stacked = tuple(

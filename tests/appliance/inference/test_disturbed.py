@@ -84,6 +84,16 @@ def test_an_enrolled_label_moves_as_the_others_do_on_average(tmp_path: Path):
     assert answer(now, lost(moved, 4)).label == "new"
 
 
+def test_a_manifest_holds_what_was_tried_only_where_it_differs(tmp_path: Path):
+    """Programs that do not know it read the others."""
+    for tried in (None, 0.5):
+        lost = replace(ALLOWED.allowances[0], tried=tried)
+        allowed = replace(ALLOWED, allowances=(lost, *ALLOWED.allowances[1:]))
+        text = replace(toy(tmp_path).manifest, disturbances=allowed).json()
+        assert bundle.Manifest.parse(text).disturbances == allowed
+        assert (b'"tried"' in text) == (tried is not None)
+
+
 def test_hum_is_removed_and_said(tmp_path: Path):
     """A sweep with hum gets the answer of a sweep without it."""
     format = SweepFormat(2, 2, 750.0, 1500, "int16")

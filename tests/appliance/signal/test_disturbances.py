@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -67,6 +68,15 @@ def test_what_was_not_tried_is_said():
     )
 
 
+def test_between_proven_and_tried_the_limit_alone_decides():
+    """It grows no further, and the sweep is not refused for its speed."""
+    further = Disturbances((replace(SLOWER, tried=1.2),))
+    for speed in (1.5, 1.3):
+        assert further.growth(further.sizes({"speed": speed})) == pytest.approx(3)
+        assert further.untried({"speed": speed}) == ""
+    assert further.untried({"speed": 1.1}).startswith("a slower slide")
+
+
 def test_the_limit_grows_by_the_disturbance_that_allows_most():
     """Two at once do not add up."""
     allowed = Disturbances((SLOWER, LOST))
@@ -83,6 +93,10 @@ def test_the_limit_grows_by_the_disturbance_that_allows_most():
         (("lost", 0.0, math.inf, 1.0), "finite"),
         (("lost", 0.0, 1.0, -1.0), "at least 0"),
         (("lost", 0.0, 1.0, "1"), "for lost"),
+        (("lost", 0.0, 1.0, 1.0, 0.5), "tried 0.5 for lost, which must be a finite number beyond"),
+        (("lost", 0.0, 1.0, 1.0, math.inf), "tried inf"),
+        (("speed", 2.0, 1.5, 1.0, 1.6), "beyond the end 1.5"),
+        (("speed", 2.0, 1.5, 1.0, "1"), "tried '1'"),
     ],
 )
 def test_values_out_of_range_are_refused(values: tuple, why: str):

@@ -67,6 +67,21 @@ def test_a_severity_that_costs_accuracy_is_not_allowed_for(rng: Generator):
     assert found.allowances[0].end == pytest.approx(1.05 * MOST * 4 / 6)
 
 
+def test_stretched_copies_neither_move_the_means_nor_refuse(rng: Generator):
+    """They are harder than slides at another speed. The limit grows as far as they are named, and
+    up to the furthest copy it alone decides."""
+    given = sweeps(rng, kind="stretch", worst=9.0)
+    size, values = given.disturbed["stretch"]
+    given = replace(given, disturbed={"stretch": (2.0 - size, values + 2.0)})
+    found = fit(judge(given), given)
+    (allowance,) = found.allowances
+    assert (allowance.of, allowance.start) == ("speed", 2.0)
+    assert allowance.end == pytest.approx(2 - 1.05 * MOST * 4 / 6, abs=1e-3)
+    assert allowance.tried == pytest.approx(2 - 1.05 * MOST, abs=1e-3)
+    assert not found.changes[0].any()
+    assert allowance.slope > 1
+
+
 def test_nothing_is_allowed_for_what_was_not_measured(rng: Generator):
     """Kinds without a disturbance, values that are not known, and few copies."""
     other = sweeps(rng, kind="drift")
