@@ -86,8 +86,8 @@ class Allowance:
 
     of: one of NAMES. start: its value at the edge of training. end: the furthest value that export
     has proven. slope: growth of the limit of known materials, as a share of it, for a size of 1.
-    tried: the furthest value that export has tried, if its copies proved less than a robot's sweeps
-    may; None if it is `end`. Raises BundleError for a value out of range.
+    tried: the furthest value that export has tried without proof; None without such a value. Raises
+    BundleError for a value out of range.
     """
 
     of: str

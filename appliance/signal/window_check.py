@@ -120,8 +120,8 @@ def inspect(
 def ceiling(measured: TaxelStatistics, full_scale: float) -> float:
     """The count at which the amplifier clips in a window.
 
-    It is the highest count of all. One value has to be constant there, and another one has to stay
-    there for STAYS of the frames. Otherwise it is `full_scale`.
+    It is the highest count of all. A value has to be constant there. Another one has to stay there
+    for STAYS of the frames. Otherwise it is `full_scale`.
     """
     highest = float(measured.highest.max())
     at = measured.highest == highest
