@@ -167,8 +167,8 @@ def find_centres(sweeps: Dataset, limit: ContactLimit) -> ContactCentres | None:
     """The centre of contact at each position of `sweeps`, or in each recording if positions are
     unknown; None without a limit or a contact. Loads are those of a box that was not tared.
 
-    The limit of the distance keeps 97 % of positions whose own sweeps were left out, judged by
-    their farthest sweep, as novelty.limit computes it. It keeps all of 33 positions or fewer.
+    The limit of the distance keeps novelty.KEPT of positions whose own sweeps were left out, judged
+    by their farthest sweep, as novelty.limit computes it: all of a few positions.
     """
     if limit.contact is None:
         return None
