@@ -9,6 +9,9 @@ export const byId = (id) => document.getElementById(id);
 
 export function put(id, text) { if (byId(id).textContent !== text) byId(id).textContent = text; }
 
+/* A button that can do nothing now keeps the focus that it has. */
+export function enable(button, can) { if (button.getAttribute("aria-disabled") !== `${!can}`) button.setAttribute("aria-disabled", `${!can}`); }
+
 export function made(name, classes, text, parent) {
   const one = document.createElement(name);
   if (classes) one.className = classes;

@@ -1,7 +1,7 @@
 /* The page of a recording: what is there and what is missing, the last sweep, the skin; and the labels, which are set here. */
 
 import {listen} from "/events.js";
-import {ago, byId, call, frame, listenToPedal, made, mark, order, put} from "/parts.js";
+import {ago, byId, call, enable, frame, listenToPedal, made, mark, order, put} from "/parts.js";
 import {signal, spectrogram} from "/plots.js";
 import {SkinPicture} from "/skin.js";
 
@@ -14,9 +14,6 @@ function begin() {
   recording = last = view = null;
 }
 begin();
-
-/* A button that can do nothing now keeps the focus that it has. */
-function enable(button, can) { if (button.getAttribute("aria-disabled") !== `${!can}`) button.setAttribute("aria-disabled", `${!can}`); }
 
 /* A material by the name that people read. */
 function shown(material) { return recording?.displays?.[material] ?? material; }

@@ -1,7 +1,7 @@
 /* The page of `palpate teach`: what to do next, the materials, what was learnt, and the bundle that is made of it. */
 
 import {listen} from "/events.js";
-import {ago, byId, call, frame, listenToPedal, made, mark, order, put} from "/parts.js";
+import {ago, byId, call, enable, frame, listenToPedal, made, mark, order, put} from "/parts.js";
 import {signal} from "/plots.js";
 
 const STEPS = {start: "starting", features: "looking at the sweeps", heads: "learning", bundle: "checking"};
@@ -13,8 +13,6 @@ function begin() {
   recording = last = null;
 }
 begin();
-
-function enable(button, can) { if (button.getAttribute("aria-disabled") !== `${!can}`) button.setAttribute("aria-disabled", `${!can}`); }
 
 function live() { return reached === true && recording !== null; }
 
