@@ -33,15 +33,13 @@ from appliance.signal.contact import Displacement, displacement
 from appliance.signal.hum import HumFilter
 from appliance.signal.slide import NO_PATTERN, NO_PITCH, Slide, SlideMeter
 from appliance.signal.vibration import PARTS, vibration
-from appliance.signal.window_check import Finding
+from appliance.signal.window_check import MANY_FULL, Finding
 
 if TYPE_CHECKING:
     from appliance.core.clock import Clock
 
 
 STILL = f"{NO_PATTERN}, as with a finger that rests"
-MANY_FULL = 0.01
-"""A larger share of the counts at full scale is said with the answer."""
 _NONE, _NO_SLIDE, _IN_PLACE = np.empty(0), Slide(), Displacement()
 
 

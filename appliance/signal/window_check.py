@@ -21,6 +21,9 @@ FULL_SCALES = tuple(float(2**bits - 1) for bits in (8, 10, 12, 14, 15, 16, 24))
 SHARE = 0.1
 """A loaded taxel has at least this share of the load of the strongest taxel, as in the limits of a
 bundle (train/export/pack)."""
+MANY_FULL = 0.01
+"""With a larger share of the counts at full scale a window is saturated, unless export has proven
+more for the bundle."""
 STAYS = 0.02
 """Where an amplifier clips, a value that also moves below stays at the highest count for at least
 this share of the frames."""
@@ -38,7 +41,7 @@ class WindowLimits:
 
     contact: float | None
     full_scale: float
-    saturated: float = 0.01
+    saturated: float = MANY_FULL
     dead_taxels: int = 0
 
 

@@ -28,6 +28,7 @@ from appliance.inference.classifier import Classifier
 from appliance.signal.broken_taxels import Bridging, Comparison, places
 from appliance.signal.load_modes import LoadModes
 from appliance.signal.taxel_statistics import TaxelStatistics
+from appliance.signal.window_check import MANY_FULL
 from train.data.sets import Dataset, digest
 from train.evaluation.corruptions import CORRUPTIONS, TAXEL_FAULTS
 from train.evaluation.evaluation_sweeps import EvaluationSweeps
@@ -74,9 +75,8 @@ class Tolerance:
 
     def written(self, manifest: Manifest, **about: Any) -> Manifest:
         """`manifest` with all of it. about: more figures."""
-        limits = manifest.thresholds
-        if self.saturated is not None:
-            limits = replace(limits, saturated=max(limits.saturated, self.saturated))
+        saturated = max(MANY_FULL, self.saturated or 0.0)
+        limits = replace(manifest.thresholds, saturated=saturated)
         figures = manifest.figures | {FIGURES: self.figures | about}
         return replace(manifest, bridging=self.bridging, thresholds=limits, figures=figures)
 
