@@ -89,17 +89,22 @@ class TaxelWatch:
         m, measured = self._manifest, TaxelStatistics.of(taxels)
         limits: WindowLimits = m.thresholds
         broken = self._in_window(measured, tare, limits)
-        if broken and m.bridging and not m.bridging.allows(broken.mask):
+        if self._beyond(broken):
             limits = self._clipping(measured)
             broken = self._in_window(measured, tare, limits)
-        if broken and m.bridging and not m.bridging.allows(broken.mask):
+        if broken and self._beyond(broken):
             broken = BrokenTaxels.of(broken.kinds & [[[True]], [[False]]])  # silent alone
         if not (broken and m.bridging):
             return taxels, inspect(taxels, tare, limits, measured=measured)
-        if not m.bridging.allows(broken.mask):
+        if self._beyond(broken):
             return taxels, self._too_many(broken, measured, tare)
         taxels = bridged(taxels, broken.mask, m.tare, m.bridging.loads)
         return taxels, replace(inspect(taxels, tare, limits), degraded=broken.text)
+
+    def _beyond(self, broken: BrokenTaxels | None) -> bool:
+        """Whether more taxels are broken than the bundle tolerates."""
+        rule = self._manifest.bridging
+        return bool(broken and rule and not rule.allows(broken.mask))
 
     def _clipping(self, measured: TaxelStatistics) -> WindowLimits:
         """The limits, with the count at which the amplifier clips as full scale: taxels that stay

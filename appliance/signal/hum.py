@@ -98,8 +98,9 @@ class HumFilter:
                 size = np.abs(at).sum()
                 in_phase = bool(np.abs(at.sum()) >= IN_PHASE * size > 0)
                 ratio = float(size / max(near[quiet].sum(), TINY)) if in_phase else 0.0
-                found.append((ratio if np.isfinite(ratio) else 0.0, self.hz[i]))
-        return [(ratio, hz) for ratio, hz in found if ratio >= least]
+                if np.isfinite(ratio) and ratio >= least:
+                    found.append((ratio, self.hz[i]))
+        return found
 
     def _refined(self, series: Array, hz: float) -> float:
         """The frequency near `hz` at which all taxels together have most power."""

@@ -151,8 +151,9 @@ class Judge:
         nearest: Array = ((z[:, None] - self.means) ** 2).sum(axis=-1).argmin(axis=1) == labels
         return nearest
 
-    def bearable(self, kinds: Sequence[str], sign: int, start: float) -> _Tried:
-        """The copies of all severities before the first that costs more than LOSS."""
+    def bearable(self, kinds: Sequence[str]) -> NDArray[np.bool_]:
+        """Whether a copy of these kinds is of a severity before the first that costs more than
+        LOSS, bool [M] in the order of _Tried."""
         altered, kept = self.altered, []
         least = self.right(altered.z, altered.labels).mean() - LOSS
         for kind in kinds:
@@ -163,7 +164,7 @@ class Judge:
                     break
                 bearable[part] = True
             kept.append(bearable)
-        return _Tried.of(altered, kinds, sign, start).take(np.concatenate(kept))
+        return np.concatenate(kept)
 
 
 def fit(judge: Judge, *training: AlteredSweeps) -> AllowanceFit:
@@ -171,8 +172,8 @@ def fit(judge: Judge, *training: AlteredSweeps) -> AllowanceFit:
     the same sweeps, first in the embedding of the judge."""
     found, changes, figures = [], [], {}
     for (name, sign), (start, made) in _edges(training[0]).items():
-        tried = judge.bearable(made, sign, start)
-        tried = tried.take(tried.size > 0)
+        every = _Tried.of(judge.altered, made, sign, start)
+        tried = every.take(judge.bearable(made) & (every.size > 0))
         if len(tried.size) < FEWEST:
             continue
         end = MARGIN * float(tried.size.max())
@@ -184,10 +185,10 @@ def fit(judge: Judge, *training: AlteredSweeps) -> AllowanceFit:
         choices = [(_slope(judge, tried, of[0]), of) for of in ways]
         judged, moved = max(choices, key=lambda choice: choice[0].worth)
         slope, figures[f"{name}{'+' if sign > 0 else '-'}"] = judged.slope, judged.figures
-        every = MARGIN * float(_Tried.of(judge.altered, made, sign, start).size.max())
-        start, proven, furthest = (round(start + sign * size, 4) for size in (0.0, end, every))
-        further = furthest if stretched and furthest != proven else None
-        found.append(Allowance(name, start, proven, slope, further))
+        furthest = MARGIN * float(every.size.max())
+        at = [round(start + sign * size, 4) for size in (0.0, end, furthest)]
+        further = at[2] if stretched and at[2] != at[1] else None
+        found.append(Allowance(name, at[0], at[1], slope, further))
         changes.append(moved)
     none = np.zeros((0, *judge.means.shape))
     stacked = tuple(

@@ -17,7 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appliance.inference.novelty import shaped_distances
-from train.calibration.novelty import auroc, differing, limit, own_scatter, shapes_of, within
+from train.calibration.novelty import (
+    Embedding,
+    auroc,
+    differing,
+    limit,
+    own_scatter,
+    shapes_of,
+    within,
+)
 
 Array = NDArray[Any]
 Embed = Callable[[Array], Array]
@@ -79,6 +87,11 @@ class Space:
     means: Array
     untrained: Array
 
+    @classmethod
+    def of(cls, embedding: Embedding) -> Space:
+        """The embedding of a fit."""
+        return cls(embedding, embedding.means.astype(np.float64), embedding.untrained)
+
     def trained(self, without: int | None = None) -> Array:
         """Orthonormal directions [r, K - 1] in which the class means differ. without: a material
         that does not count."""
@@ -123,11 +136,11 @@ class Scatters:
         from the others (mean AUROC)."""
         k, areas = len(self.own), []
         away = judged.z[:, None] - self.space.means
-        untrained = _squares(away, within(self.own, self.space.untrained))
+        untrained = shaped_distances(away, shapes_of(within(self.own, self.space.untrained)))
         for number in np.unique(np.linspace(0, k - 1, min(k, MOST_LEFT_OUT)).round().astype(int)):
             others, unknown = np.delete(np.arange(k), number), judged.labels == number
-            of_trained = within(self.own[others], self.space.trained(number))
-            trained = _squares(away[:, others], of_trained)
+            shapes = shapes_of(within(self.own[others], self.space.trained(number)))
+            trained = shaped_distances(away[:, others], shapes)
             near = [(untrained[:, others] + w * trained).min(axis=1) for w in TRAINED]
             areas.append([auroc(d[~unknown], d[unknown]) for d in near])
         return TRAINED[int(np.mean(areas, axis=0).argmax())]
@@ -230,12 +243,6 @@ class _Trial:
         near = distances.min(axis=1) <= beyond
         passed = [near[labels == k].mean() for k in range(distances.shape[1])]
         return _Shares(kept, float(np.mean(passed)))
-
-
-def _squares(away: Array, of: Array) -> Array:
-    """away @ M @ away [n, K] of differences [n, K, r] and matrices M [K, r, r]."""
-    squares: Array = np.einsum("nkr,nkr->nk", np.einsum("nkr,krs->nks", away, of), away)
-    return squares
 
 
 def _moment(change: Array, otherwise: Array | None = None) -> Array:

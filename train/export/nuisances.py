@@ -106,11 +106,6 @@ def measure(
     )
 
 
-def space_of(embedding: novelty.Embedding) -> Space:
-    """The embedding of a fit."""
-    return Space(embedding, embedding.means.astype(np.float64), embedding.untrained)
-
-
 def limit_of_conditions(found: Widened, given: CalibrationInputs) -> float:
     """The limit for widened shapes, from sweeps judged by embeddings and shapes that did not see
     their value of a condition; all conditions count."""
@@ -120,7 +115,7 @@ def limit_of_conditions(found: Widened, given: CalibrationInputs) -> float:
         for seen, judging, embedding, present in novelty.cross_fitted(
             given.whole, given.labels, values, given.judged, given.fixed
         ):
-            space = space_of(embedding)
+            space = Space.of(embedding)
             training = found.training.take(seen[:trained], present).seen_by(embedding)
             shapes = found.rule.shapes(Scatters.of(training, space)).astype(np.float64)
             away = embedding(given.whole[judging])[:, None] - space.means

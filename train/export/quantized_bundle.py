@@ -18,6 +18,7 @@ from appliance.core.storage import put
 from train.calibration import novelty
 from train.calibration.contact import Contacts
 from train.calibration.novelty import Embedding
+from train.calibration.nuisances import Space
 from train.data.sets import Dataset
 from train.export import nuisances
 from train.export.bundle_graph import bundle_graph
@@ -137,7 +138,7 @@ def _widened(
 ) -> nuisances.Widened | None:
     """Shapes of known materials that know how altered sweeps differ, and their limit; see
     nuisances. apart: an embedding that did not see the held-out sweeps."""
-    trunk, spaces = fit.trunk(), map(nuisances.space_of, (apart, whole))
+    trunk, spaces = fit.trunk(), map(Space.of, (apart, whole))
     seed = int(fit.about["seed"])
     contacts, shape = fit.contacts or Contacts.of(fit.train), fit.train.format.shape
     known = contacts.limit.known_tare()

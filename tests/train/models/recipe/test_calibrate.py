@@ -48,9 +48,9 @@ def test_a_disturbed_sweep_of_a_known_material_stays_known():
         plain_inputs(x[known], y[known], at[known], np.ones(known.sum(), bool), 1)
     )
     sturdy = fit_calibration(plain_inputs(*more, ~faulty, 1, faulty=faulty))
-    shaken = x[known][:, -1] + NOISE / 3
+    shaken = x[known][:, -1] + NOISE / 2
     kept = [np.mean(done.embedding.novelty(shaken) <= done.limit) for done in (plain, sturdy)]
-    assert kept[0] < 0.6
+    assert kept[0] < 0.3
     assert kept[1] > 0.8
     assert np.mean(sturdy.embedding.novelty(x[~known][:, -1]) <= sturdy.limit) < 0.05
     np.testing.assert_array_equal(
