@@ -161,7 +161,7 @@ class SpatialFold:
 
     def _answers(self, scored: ScoredPlan, data: HeadData, tested: Array) -> Array:
         """Numbers of materials [n] for features [n, F]."""
-        weight, bias = scored.plan.fit(data.given(), len(self.train.materials))
+        weight, bias = scored.plan.fit(data, len(self.train.materials))
         answers: Array = (tested @ weight.T + bias).argmax(axis=1)
         return answers
 

@@ -5,6 +5,10 @@ materials are equally probable. The covariance is that of Ledoit and Wolf (2004)
 are scaled to the same scatter. If there are fewer sweeps than features, the equations are solved
 among the sweeps (Woodbury's identity): the same solution, many times as fast.
 
+Sweeps under a value of a condition that training lacks, such as a new force, scatter further than
+those of training. How the known values differ within a material shows how far: their differences
+count as in a prediction for one more value.
+
 A plan adds the logits of a few discriminants, each of some of the features. Several discriminants
 that were fitted apart name sweeps of a new condition better than a single one of all features, and
 together they are still one matrix.
@@ -12,7 +16,7 @@ together they are still one matrix.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Self
 
@@ -29,9 +33,6 @@ LEAST_SHRINKAGE = 1e-4
 solution."""
 BATCH = 512
 """Number of features, or of sweeps, of which temporary results are held at a time."""
-Given = tuple[Array, Array, Array, Array]
-"""The data that a head is fitted to: features [N, F] and labels [N] of sweeps, features [M, F] and
-labels [M] of augmented copies."""
 
 
 @dataclass(frozen=True)
@@ -45,32 +46,40 @@ class HeadPart:
     factor: float = 1.0
     weight: float = 1.0
 
-    def fit(self, given: Given, classes: int) -> tuple[Array, Array]:
+    def fit(self, data: HeadData, classes: int) -> tuple[Array, Array]:
         """Weight [K, F] over all features, and bias [K]; see fit_discriminant."""
-        columns, (x, y, copied, of) = np.array(self.columns), given
-        weight, seen = np.zeros((classes, x.shape[1]), np.float32), x[:, columns]
+        columns, y, under = np.array(self.columns), data.labels, data.conditions
+        weight = np.zeros((classes, data.features.shape[1]), np.float32)
+        seen = data.features[:, columns]
         if self.copies:
-            seen, y = np.concatenate([seen, copied[:, columns]]), np.append(y, of)
-        weight[:, columns], bias = fit_discriminant(seen, y, classes)
+            seen = np.concatenate([seen, data.copied[:, columns]])
+            y, under = np.append(y, y[data.source]), np.concatenate([under, under[data.source]])
+        weight[:, columns], bias = fit_discriminant(seen, y, classes, under)
         return weight * np.float32(self.factor), bias * np.float32(self.factor)
 
 
 @dataclass(frozen=True)
 class HeadData:
     """Sweeps that a head is fitted to. features: [N, F], labels [N]. copied: [M, F] of augmented
-    copies; source: the number [M] of the sweep of each copy."""
+    copies; source: the number [M] of the sweep of each copy. conditions: int [N, C], the value of
+    each condition that can be new in service."""
 
     features: Array
     labels: Array
     copied: Array
     source: Array
+    conditions: Array
 
     def take(self, kept: Array) -> HeadData:
         """The sweeps `kept` (mask) and their copies."""
         position = np.cumsum(kept) - 1
         also = kept[self.source]
         return HeadData(
-            self.features[kept], self.labels[kept], self.copied[also], position[self.source[also]]
+            self.features[kept],
+            self.labels[kept],
+            self.copied[also],
+            position[self.source[also]],
+            self.conditions[kept],
         )
 
     def beside(self, other: HeadData) -> HeadData:
@@ -78,9 +87,15 @@ class HeadData:
         features = np.hstack([self.features, other.features])
         return replace(self, features=features, copied=np.hstack([self.copied, other.copied]))
 
-    def given(self) -> Given:
-        """The data as HeadPart.fit takes it."""
-        return self.features, self.labels, self.copied, self.labels[self.source]
+
+def condition_values(groups: Mapping[str, Array], count: int) -> Array:
+    """int [count, C], the values of `groups` but recordings, which are no condition, numbered."""
+    found = [
+        np.unique(values, return_inverse=True)[1]
+        for name, values in groups.items()
+        if name != "recording"
+    ]
+    return np.stack(found, axis=1) if found else np.empty((count, 0), int)
 
 
 @dataclass(frozen=True)
@@ -89,9 +104,9 @@ class HeadPlan:
 
     parts: tuple[HeadPart, ...]
 
-    def fit(self, given: Given, classes: int) -> tuple[Array, Array]:
+    def fit(self, data: HeadData, classes: int) -> tuple[Array, Array]:
         """Weight [K, F] and bias [K], float32. Raises FormatError as fit_discriminant."""
-        heads = [part.fit(given, classes) for part in self.parts]
+        heads = [part.fit(data, classes) for part in self.parts]
         weight: Array = np.sum([w for w, _ in heads], axis=0)
         bias: Array = np.sum([b for _, b in heads], axis=0)
         return weight, bias
@@ -131,12 +146,16 @@ class HeadPlan:
         )
 
 
-def fit_discriminant(features: Array, labels: Array, classes: int) -> tuple[Array, Array]:
+def fit_discriminant(
+    features: Array, labels: Array, classes: int, conditions: Array | None = None
+) -> tuple[Array, Array]:
     """Weight [K, F] and bias [K], float32, from features [N, F] of sweeps with labels [N] below
     `classes`.
 
-    The logits of a material without a sweep are ABSENT. Raises FormatError if there is only one
-    sweep of each material, which does not show how materials vary.
+    conditions: int [N, C], the value of each condition; how the values differ widens the scatter to
+    what one more value is expected to add. The logits of a material without a sweep are ABSENT.
+    Raises FormatError if there is only one sweep of each material, which does not show how
+    materials vary.
     """
     present, member = np.unique(labels, return_inverse=True)
     x = np.array(features, np.float64)
@@ -154,28 +173,56 @@ def fit_discriminant(features: Array, labels: Array, classes: int) -> tuple[Arra
     middle = means.mean(axis=0)
     wanted = (means - middle) / spread
     x /= spread
-    solved = _solve(x, wanted)
+    more = np.empty((0, x.shape[1])) if conditions is None else _differences(x, member, conditions)
+    solved = _solve(x, more, wanted)
     weight, bias = np.zeros((classes, len(spread))), np.full(classes, ABSENT)
-    weight[present] = solved / spread
-    bias[present] = -0.5 * (wanted * solved).sum(axis=1) - weight[present] @ middle
+    centred = solved - solved.mean(axis=0)  # then the largest logit is above ABSENT
+    sizes = 0.5 * (wanted * solved).sum(axis=1)
+    weight[present] = centred / spread
+    bias[present] = sizes.mean() - sizes - weight[present] @ middle
     return weight.astype(np.float32), bias.astype(np.float32)
 
 
-def _solve(z: Array, wanted: Array) -> Array:
-    """`wanted` [K, F] times the inverse of the shrunk covariance of `z` [N, F], whose means are
-    0."""
+def _differences(z: Array, labels: Array, conditions: Array) -> Array:
+    """Rows [M, F] whose squares, added to those of `z` [N, F], give the scatter under one more
+    value of each condition [N, C]. The means of `z` for labels [N] are 0.
+
+    The squares of the G known values of a label hold (G - 1) / G of their variance; the distance of
+    one more value from their mean varies by (G + 1) / G of it. So 2 / (G - 1) of them are added.
+    """
+    rows = [np.empty((0, z.shape[1]))]
+    for values in conditions.T:
+        kinds, kind, counts = np.unique(
+            np.stack([labels, values]), axis=1, return_inverse=True, return_counts=True
+        )
+        known = np.bincount(kinds[0])[kinds[0]]
+        first = np.append(0, np.cumsum(counts)[:-1])
+        sums = np.add.reduceat(z[np.argsort(kind.ravel(), kind="stable")], first)
+        several = known > 1
+        share = 2 / (known[several] - 1)
+        rows.append(sums[several] * np.sqrt(share / counts[several])[:, None])
+    return np.concatenate(rows)
+
+
+def _solve(z: Array, more: Array, wanted: Array) -> Array:
+    """`wanted` [K, F] times the inverse of the shrunk covariance of `z` [N, F], whose means are 0,
+    with the squares of the rows `more` [M, F] added. These rows are no sample, so only `z` sets the
+    shrinkage."""
     n, size = z.shape
-    few = n < size
+    few = n + len(more) < size
     gram = z @ z.T if few else z.T @ z
     share, mean = shrinkage(z, gram)
+    mean += float((more**2).sum()) / n / size
     share = max(share, LEAST_SHRINKAGE)
     ridge = max(share * mean, 1e-12)
     if not few:
-        solution: Array = np.linalg.solve((1 - share) / n * gram + ridge * np.eye(size), wanted.T).T
+        covariance = (1 - share) / n * (gram + more.T @ more) + ridge * np.eye(size)
+        solution: Array = np.linalg.solve(covariance, wanted.T).T
         return solution
-    share = min(share, 1 - LEAST_SHRINKAGE)
-    inner = np.linalg.solve(gram + ridge * n / (1 - share) * np.eye(n), z @ wanted.T)
-    solution = (wanted - (z.T @ inner).T) / ridge
+    share, rows = min(share, 1 - LEAST_SHRINKAGE), np.concatenate([z, more])
+    among = (rows @ rows.T if len(more) else gram) + ridge * n / (1 - share) * np.eye(len(rows))
+    inner = np.linalg.solve(among, rows @ wanted.T)
+    solution = (wanted - (rows.T @ inner).T) / ridge
     return solution
 
 

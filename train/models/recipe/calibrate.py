@@ -21,7 +21,7 @@ from appliance.inference.classifier import LEAST_PROBABILITY, softmax
 from train.calibration import early_exit, novelty
 from train.calibration.displacement import AugmentedCopies, DisplacementFit, fit_displacement
 from train.calibration.early_exit import EarlyRule, Heads
-from train.calibration.heads import HeadPart, HeadPlan
+from train.calibration.heads import HeadData, HeadPart, HeadPlan, condition_values
 from train.calibration.novelty import Embedding
 from train.metrics.answers import UNKNOWN, Answers
 from train.metrics.score import fuse
@@ -197,10 +197,10 @@ class CalibrationInputs:
         """Weight [F, K] and bias [K] of the head that names the material, fitted to the sweeps
         `seen` (bool [N]) and their copies."""
         plan = self.plan or HeadPlan((HeadPart(tuple(range(self.whole.shape[1])), copies=True),))
-        seen = seen & ~self.faulty
-        also = self.copied.take(seen[self.copied.source] & ~self.copied.held)
-        given = self.whole[seen], self.labels[seen], also.features, also.labels
-        weight, bias = plan.fit(given, int(self.labels.max()) + 1)
+        copied = self.copied.take(~self.copied.held)
+        values = condition_values(self.conditions, len(seen))
+        every = HeadData(self.whole, self.labels, copied.features, copied.source, values)
+        weight, bias = plan.fit(every.take(seen & ~self.faulty), int(self.labels.max()) + 1)
         return weight.T, bias
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appliance.inference.classifier import softmax
-from train.calibration.heads import HeadData, HeadPart, HeadPlan
+from train.calibration.heads import ABSENT, HeadData, HeadPart, HeadPlan
 from train.data.splitters import InnerPart
 from train.metrics.temperature import weighted_platt_temperature
 from train.models.methods import Log
@@ -77,13 +77,20 @@ class HeldOutScores:
         _, member, counts = np.unique(kind, return_inverse=True, return_counts=True)
         self.weights = 1 / counts[member] / len(counts)
         self._logits: dict[tuple[Columns, bool], Array] = {}
+        self._scales: dict[tuple[Columns, bool], float] = {}
 
     def score(self, parts: Sequence[HeadPart]) -> ScoredPlan:
-        """The candidate that adds the logits of `parts`, each scaled to the size of its weight;
-        their own factors are ignored."""
+        """The candidate that adds the logits of `parts`, each scaled by its weight; their own
+        factors are ignored.
+
+        Scaled to the same size, a discriminant that is mostly wrong would outvote others. At its
+        best temperature each would count by how sure held-out sweeps let it be, but that says too
+        little of conditions that training lacks. The scale is the geometric mean of both.
+        """
         logits = [self._of(part) for part in parts]
-        sizes = [float(np.abs(x - x.mean(axis=1, keepdims=True)).mean()) for x in logits]
-        factors = [part.weight / max(size, TINY) for part, size in zip(parts, sizes, strict=True)]
+        factors = [
+            part.weight / self._scale(part, x) for part, x in zip(parts, logits, strict=True)
+        ]
         total = np.sum([x * f for x, f in zip(logits, factors, strict=True)], axis=0)
         temperature = weighted_platt_temperature(total, self.labels, self.weights)
         plan = HeadPlan(
@@ -94,11 +101,6 @@ class HeldOutScores:
     def loss(self, scored: ScoredPlan) -> float:
         """Mean cross entropy; every group counts the same."""
         return float(self.weights @ scored.losses)
-
-    def error_then_loss(self, scored: ScoredPlan) -> tuple[float, float]:
-        """An order of candidates: the most accurate first, of equals that with the lowest loss. In
-        sums of different discriminants the loss depends on the size of their logits as well."""
-        return -self.accuracy(scored), self.loss(scored)
 
     def accuracy(self, scored: ScoredPlan) -> float:
         """Accuracy on held-out sweeps; every group counts the same."""
@@ -171,6 +173,17 @@ class HeldOutScores:
         )
         return losses
 
+    def _scale(self, part: HeadPart, logits: Array) -> float:
+        """The geometric mean of the size of these logits [n, K] and of their best temperature. A
+        material that a part has no other sweeps of counts for nothing."""
+        key = part.columns, part.copies
+        if key not in self._scales:
+            x = np.where(logits == ABSENT, np.nan, logits)
+            size = float(np.nanmean(np.abs(x - np.nanmean(x, axis=1, keepdims=True))))
+            temperature = weighted_platt_temperature(logits, self.labels, self.weights)
+            self._scales[key] = float(np.sqrt(max(size, TINY) * temperature))
+        return self._scales[key]
+
     def _of(self, part: HeadPart) -> Array:
         """Logits [n, K] of one discriminant for the held-out sweeps."""
         key = part.columns, part.copies
@@ -182,7 +195,7 @@ class HeldOutScores:
 
     def _tested(self, part: HeadPart, number: int) -> Array:
         known, out = self._known[number], self._parts[number].out
-        weight, bias = replace(part, factor=1.0).fit(known.take(~out).given(), self._classes)
+        weight, bias = replace(part, factor=1.0).fit(known.take(~out), self._classes)
         return (
             np.concatenate([known.features[out], known.copied[self._copies[number]]]) @ weight.T
             + bias
@@ -314,11 +327,11 @@ class Candidates:
         return without | ({"without copies": _without_copies} if self.copies else {})
 
     def related(self, best: Heads) -> dict[str, Heads]:
-        """The relations beside the best candidate, and beside two discriminants of filters of all
-        kinds, in which they have more weight.
+        """The relations beside two discriminants of filters of all kinds; in a size without
+        filters, one discriminant of relations and spectrum.
 
         Few scales and all scales each have a discriminant: few carry over to a new speed, all to
-        a new force.
+        a new force. Beside more discriminants of filters they would have too little weight.
         """
         of = self.columns
         if not of.relations.size:
@@ -328,14 +341,13 @@ class Candidates:
             numbers = np.concatenate([view.ravel() for view in views])
             return HeadPart(tuple(numbers.tolist()), best[0].copies)
 
+        if not of.kinds:
+            return {"relations and spectrum": (head(of.relations, of.bands),)}
         filters = [head(of.magnitudes, of.shares, of.bands)]
         if len(of.levels):
             filters.append(head(of.magnitudes, of.levels, of.bands))
         views = dict.fromkeys((head(of.relations[: relations.SHORT]), head(of.relations)))
-        return {
-            "relations beside filters": (*filters, *views),
-            "relations beside the best": (*best, *views),
-        }
+        return {"relations beside filters": (*filters, *views)}
 
     def loaded(self, best: Heads) -> dict[str, Heads]:
         """The best candidate with the loads, in a discriminant of their own and in each."""
@@ -356,9 +368,8 @@ class Candidates:
 
 def choose(scores: HeldOutScores, candidates: Candidates, log: Log) -> ScoredPlan:
     """The candidate with the lowest loss if it is `better` than the usual candidate, else the
-    latter. Plain candidates are compared first, then extensions of the best of them; the more
-    accurate form of relations and the form of loads with the lower loss join last, where they
-    help."""
+    latter. Plain candidates are compared first, then extensions of the best of them; relations and
+    the form of loads with the lower loss join last, where they help."""
 
     def scored(heads: Mapping[str, Heads]) -> Iterator[ScoredPlan]:
         for name, parts in heads.items():
@@ -374,10 +385,9 @@ def choose(scores: HeldOutScores, candidates: Candidates, log: Log) -> ScoredPla
     extended = list(scored(candidates.extended(best.plan.parts)))
     best = min([usual, *others, *extended], key=scores.loss)
     chosen = best if scores.better(best, usual) else usual
-    joinings = (candidates.related, scores.error_then_loss), (candidates.loaded, scores.loss)
-    for joining, order in joinings:
+    for joining in (candidates.related, candidates.loaded):
         joined = list(scored(joining(chosen.plan.parts)))
-        if joined and scores.helps(best := min(joined, key=order), chosen):
+        if joined and scores.helps(best := min(joined, key=scores.loss), chosen):
             chosen = best
     return chosen
 

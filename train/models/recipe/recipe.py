@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
-from train.calibration.heads import HeadData, HeadPart, HeadPlan
+from train.calibration.heads import HeadData, HeadPart, HeadPlan, condition_values
 from train.data.progress import StageLine
 from train.data.sets import Dataset
 from train.data.splitters import InnerPart, inner_parts
@@ -149,10 +149,20 @@ class Setup:
         return FixedFeatures(trunk, self.data(trunk), columns)
 
     @cached_property
+    def parts(self) -> list[InnerPart]:
+        """The parts by which candidates are judged."""
+        return inner_parts(self.sweeps, varies=self.settings.varies)
+
+    @cached_property
+    def values(self) -> Array:
+        """The value [N, C] of each condition of the parts, as HeadData has them."""
+        names = dict.fromkeys(part.group for part in self.parts)
+        return condition_values({name: self.sweeps.group(name) for name in names}, len(self.sweeps))
+
+    @cached_property
     def held_out_scores(self) -> HeldOutScores:
         """The scores of heads of fixed features on the parts by which candidates are judged."""
-        parts = inner_parts(self.sweeps, varies=self.settings.varies)
-        return self.scores(self.fixed.data, parts)
+        return self.scores(self.fixed.data, self.parts)
 
     @cached_property
     def conditions(self) -> tuple[str, ...]:
@@ -213,6 +223,7 @@ class Setup:
             self.sweeps.labels,
             np.concatenate(of_copies),
             source,
+            self.values,
         )
 
     def scores(self, data: HeadData, parts: list[InnerPart]) -> HeldOutScores:
@@ -313,9 +324,10 @@ def with_stages(
 ) -> tuple[Trunk | None, HeadChoice]:
     """Step 4: trained stages and the heads beside them; None and `judged` if these are better.
 
-    If the skin will be reattached, stages and the spectrum suffice, unless held-out sweeps and
-    their copies show that more is better: a displaced contact changes the responses of filters
-    more. Sweeps of the recorded positions alone could not show it. Stages stay away where sweeps
+    If the skin will be reattached, or if there is nothing but the spectrum beside stages, each
+    stage and the spectrum suffice, unless held-out sweeps and their copies show that more is
+    better: a displaced contact changes the responses of filters more, and a spectrum alone is too
+    weak. Sweeps of the recorded positions alone could not show it. Stages stay away where sweeps
     that they were not trained on are named worse than without them.
     """
     log, plan = setup.part(3), judged.chosen.plan
@@ -323,9 +335,10 @@ def with_stages(
     scores = setup.scores(responses.beside(fixed.data), [setup.judging])
     beside = _beside_stages(plan)
     joined = full = scores.score(beside)
-    if setup.settings.use.reattached:
+    columns = _lean_columns(fixed.columns, plan)
+    if setup.settings.use.reattached or set(plan.columns()) <= set(columns):
         log("choosing: stages and the spectrum alone")
-        lean = scores.score(_stages_alone(_lean_columns(fixed.columns, plan)))
+        lean = scores.score(_stages_alone(columns))
         joined = full if scores.better(full, lean) else lean
     log("choosing: without stages")
     if scores.worse(joined, scores.score(beside[1:])):
@@ -366,7 +379,7 @@ def finish(trunk: Trunk, plan: HeadPlan, judged: HeadChoice, setup: Setup) -> Fi
     """Step 6: heads of the float and the int8 trunk, calibration and contacts."""
     settings, classes, heads = setup.settings, len(setup.sweeps.materials), {}
     for name, int8 in (("head", False), ("int8", True)):
-        weight, bias = plan.fit(setup.data(trunk, int8).given(), classes)
+        weight, bias = plan.fit(setup.data(trunk, int8), classes)
         heads[f"{name}.weight"] = weight - weight.mean(axis=0)
         heads[f"{name}.bias"] = bias - bias.mean()
     about = {

@@ -39,7 +39,9 @@ SIZES = {
         False,
         False,
     ),
-    "stages": ModelSize("the spectrum and trained stages", 0, 0, False),
+    "stages": ModelSize(
+        "the spectrum, relations of few scales and trained stages", 0, relations.SHORT, False
+    ),
     "256": ModelSize("256 filters of each kind and all views in closed form", 256, stages=False),
 }
 """By name."""

@@ -134,7 +134,7 @@ def test_the_box_opens_a_bundle_with_relations(
 
     def related(scores: HeldOutScores, candidates: Candidates, log: Log) -> ScoredPlan:
         heads = candidates.related(candidates.by_kind(shares=False))
-        return scores.score(heads["relations beside the best"])
+        return scores.score(heads["relations beside filters"])
 
     monkeypatch.setattr(choice, "choose", related)
     known, fit, out = "sim:T-REAL/level-blind:1:2", str(tmp_path / "fit.npz"), tmp_path / "bundle"
