@@ -98,12 +98,14 @@ def _front(spots: Iterable[Spot]) -> list[Spot]:
 @dataclass(frozen=True, slots=True)
 class ChartPanel:
     """The methods on tests of one kind. cases: the tests as in the results. absent: time in ms of
-    methods that were run in too few of them."""
+    methods that were run in too few of them. sweep: format of the sweeps that they were timed
+    with."""
 
     kind: str
     cases: tuple[Json, ...]
     spots: tuple[Spot, ...]
     absent: Mapping[str, float]
+    sweep: str = ""
 
     @property
     def whole(self) -> list[Spot]:
@@ -166,16 +168,20 @@ def by_case(results: Iterable[Json]) -> dict[str, dict[str, Json]]:
 
 
 def panels(figures: Json) -> list[ChartPanel]:
-    """A panel for each kind of tests that has a timed method."""
-    table, timed = by_case(figures["results"]), (figures.get("times") or {"entries": []})["entries"]
-    found = []
+    """A panel for each kind of tests that has a timed method. Its times are of sweeps of its own
+    kind; without these, of the simulated ones."""
+    table, found = by_case(figures["results"]), []
     for kind in (TACTILE, SERIES):
+        of_kind = (
+            figures.get("panel_times", {}).get(kind) or figures.get("times") or {"entries": []}
+        )
+        timed = of_kind["entries"]
         cases = tuple(case for case in figures["cases"] if kind_of(case) == kind)
         spots = _spots(timed, table, cases)
         shown = {spot.method for spot in spots}
         absent = {name: ms for name, ms in quickest(timed).items() if name not in shown}
         if spots:
-            found.append(ChartPanel(kind, cases, tuple(spots), absent))
+            found.append(ChartPanel(kind, cases, tuple(spots), absent, of_kind["format"]))
     return found
 
 

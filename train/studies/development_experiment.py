@@ -195,8 +195,9 @@ def join(run: Json, earlier: Sequence[Json]) -> Json:
             "results": [*made["results"], *more],
             "runs": [*made["runs"], *one["runs"]],
         }
-        if one.get("times"):
-            made.setdefault("times", one["times"])
+        for times in ("times", "panel_times"):
+            if one.get(times):
+                made.setdefault(times, one[times])
         done = {
             name
             for entry in made["results"]

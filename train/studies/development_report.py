@@ -116,13 +116,9 @@ def caption(figures: Json) -> str:
 
 
 def machine(figures: Json) -> str:
-    """Processor, threads and sweep of the measured times."""
-    times = _times(figures)
-    where = times.get("processor") or figures["runs"][0]["machine"]
-    return (
-        f"{where}, one thread, all methods in turns in one process; a sweep of "
-        f"{times.get('format', 'the set')}"
-    )
+    """Processor and threads of the measured times."""
+    where = _times(figures).get("processor") or figures["runs"][0]["machine"]
+    return f"{where}, one thread, all methods in turns in one process"
 
 
 def _times(figures: Json) -> Json:

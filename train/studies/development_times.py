@@ -29,7 +29,8 @@ from train.metrics import score
 from train.models import methods
 from train.models.methods import FULL_EFFORT, Effort, Method, Model, model_inputs
 from train.studies import cost, precisions
-from train.studies.development_experiment import OURS
+from train.studies.development_chart import SERIES, TACTILE
+from train.studies.development_experiment import CASES, OURS
 from train.studies.precisions import Packed
 from train.studies.study import StudyCase
 
@@ -38,6 +39,12 @@ Json = dict[str, Any]
 Log = Callable[[str], None]
 TIMED = StudyCase(("sim:T-REAL/level-blind:1",))
 """The sweeps that every method is trained on and timed with."""
+PANELS = {
+    TACTILE: CASES["7 fabrics, a repetition out"],
+    SERIES: CASES["OSULeaf, published split"],
+}
+"""For each panel of the chart the sweeps with which its methods are timed. Which views a model of
+ours has, and so its time, depends on the sweeps."""
 QUICK = StudyCase(("sim:T-REAL/level-blind:1001:3",), only=("position<=2",))
 ROUNDS = 10
 """Rounds of timing. The slowest methods take a thousand times as long as the quickest."""
@@ -92,6 +99,19 @@ def measured(
         "entries": entries,
         "left_out": left_out,
     } | score.provenance()
+
+
+def of_panels(
+    names: Sequence[str], data: Path | None, seed: int, cache: Path | None, log: Log, effort: Effort
+) -> Json:
+    """`measured` for each panel of the chart. Panels of real sweeps need the folder `data`."""
+    found = {}
+    for kind, case in PANELS.items():
+        if (sweeps := case.load(data)) is not None:
+            log(f"times of {kind}")
+            sweeps = sweeps.without_means() if case.means_removed else sweeps
+            found[kind] = measured(names, sweeps, seed, cache, log, effort)
+    return found
 
 
 def _quantiles(times: Array) -> dict[str, float]:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+import numpy as np
 import pytest
 
 from appliance.core.errors import BundleError, FormatError
@@ -19,6 +20,7 @@ from tests.factories.page_reader import PageReader
 from tests.factories.study_pages import published
 from tests.factories.sweep_sets import tones
 from train.data import sets
+from train.data.sets import Dataset
 from train.evaluation.evaluate import Where
 from train.metrics.score import Score
 from train.models import methods
@@ -497,6 +499,44 @@ def test_a_form_of_a_method_has_a_spot_of_its_own():
         ("ds-cnn", "", 0.9, 0.7),
         ("lite", "", 0.9, 0.7),
     ]
+
+
+def test_a_panel_has_the_times_of_its_own_sweeps():
+    """A model that sees more on fabrics takes longer there than on the simulated skin. The picture
+    names the sweeps; a panel without times of its own has those of the simulated skin."""
+    results = [entry(c, "palpate", 0.9) for c in ("one", SERIES)]
+    cases = [case("one"), case(SERIES)]
+    own = times(timed("palpate", 0.4)) | {"format": "16x1 of fabrics"}
+    made = figures(cases=cases, results=results, times=times(timed("palpate", 0.1)))
+    made |= {"panel_times": {development_chart.TACTILE: own}}
+    shown = {panel.kind: panel for panel in development_chart.panels(made)}
+    assert {kind: panel.whole[0].ms for kind, panel in shown.items()} == {
+        development_chart.TACTILE: 0.4,
+        development_chart.SERIES: 0.1,
+    }
+    assert any("16x1 of fabrics" in text for text in texts(development_report.front(made)))
+
+
+def test_panels_are_timed_with_their_own_sweeps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """Each with means removed where its tests remove them. Without the folder of real sweeps only
+    published series are timed."""
+    asked: list[tuple[str, float]] = []
+
+    def measured(names: list[str], sweeps: Dataset, *given: Any) -> dict[str, Any]:
+        asked.append((sweeps.source, float(np.abs(sweeps.samples.mean(axis=1)).max())))
+        return {"entries": []}
+
+    drawn = replace(tones(), samples=tones().samples + 1, source="published")
+    monkeypatch.setattr(development_times, "measured", measured)
+    monkeypatch.setattr(StudyCase, "load", lambda self, data: None if self.real else drawn)
+    found = development_times.of_panels(
+        ["quant"], None, 1, tmp_path, lambda line: None, methods.FULL_EFFORT
+    )
+    assert list(found) == [development_chart.SERIES]
+    ((source, level),) = asked
+    assert (source, level < 1) == ("published", True)
 
 
 @pytest.mark.parametrize(("mean", "met"), [(0.91, True), (0.9099, False)])

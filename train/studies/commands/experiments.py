@@ -186,5 +186,9 @@ def run_development(args: argparse.Namespace) -> None:
         figures["times"] = development_times.measured(
             figures["methods"], train, 1, run.where.cache, run.log, run.effort
         )
+        if not run.quick:
+            figures["panel_times"] = development_times.of_panels(
+                figures["methods"], run.data, 1, run.where.cache, run.log, run.effort
+            )
     run.left_out = dict(figures["left_out"])
     _done(run, save(args.out, figures))
