@@ -368,8 +368,9 @@ class Candidates:
 
 def choose(scores: HeldOutScores, candidates: Candidates, log: Log) -> ScoredPlan:
     """The candidate with the lowest loss if it is `better` than the usual candidate, else the
-    latter. Plain candidates are compared first, then extensions of the best of them; relations and
-    the form of loads with the lower loss join last, where they help."""
+    latter. Plain candidates are compared first, then extensions of the best of them; relations
+    join where they help or are better, and last the form of loads with the lower loss, where it
+    helps."""
 
     def scored(heads: Mapping[str, Heads]) -> Iterator[ScoredPlan]:
         for name, parts in heads.items():
@@ -385,9 +386,14 @@ def choose(scores: HeldOutScores, candidates: Candidates, log: Log) -> ScoredPla
     extended = list(scored(candidates.extended(best.plan.parts)))
     best = min([usual, *others, *extended], key=scores.loss)
     chosen = best if scores.better(best, usual) else usual
-    for joining in (candidates.related, candidates.loaded):
+    joinings = (
+        (candidates.related, (scores.helps, scores.better)),
+        (candidates.loaded, (scores.helps,)),
+    )
+    for joining, rules in joinings:
         joined = list(scored(joining(chosen.plan.parts)))
-        if joined and scores.helps(best := min(joined, key=scores.loss), chosen):
+        best = min(joined, key=scores.loss, default=chosen)
+        if any(rule(best, chosen) for rule in rules):
             chosen = best
     return chosen
 

@@ -426,6 +426,32 @@ def test_relations_join_where_held_out_groups_show_it():
     )
 
 
+def test_relations_join_where_they_name_more_although_one_group_is_less_sure(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    """The loss of a group depends on the size of logits as well; clearly more right answers count.
+    Loads stay away: their group may be the session whose level they know."""
+    given, parts = known(600)
+    halves = [InnerPart("speed", np.arange(600) % 2 == half) for half in (0, 1)]
+    at = HeldOutScores([given] * 5, [*parts, *halves], 3)
+    usual = at.score([HeadPart(NOISE, False)])
+    right = np.eye(3)[at.labels] * 4
+    losses = usual.losses - np.where(at.groups == "speed", -0.05, 0.8)
+    named = replace(usual, logits=right, losses=losses)
+    assert at.better(named, usual)
+    assert not at.helps(named, usual)
+    score, heads = at.score, candidates([[0]], NOISE, NOISE, loads=[4])
+    monkeypatch.setattr(
+        at, "score", lambda heads: named if isinstance(heads, str) else score(heads)
+    )
+    for view, joins in (("related", True), ("loaded", False)):
+        with monkeypatch.context() as patched:
+            patched.setattr(Candidates, view, lambda self, best: {"more": "more"})
+            if view == "related":
+                patched.setattr(Candidates, "loaded", lambda self, best: {})
+            assert (choice.choose(at, heads, print) is named) == joins
+
+
 def test_loads_that_mislead_in_another_group_stay_away():
     """The level of a session names its materials and misleads in the next."""
     heads = candidates([[0, 1]], [0, 1], [0, 1], loads=[2, 4])
