@@ -122,9 +122,9 @@ def _table(
 ) -> str:
     """Tiles of corruptions by methods. rows: the text of each corruption, by its name. cell: draws
     a tile of (axes, row, column, curve). said: a description of the picture."""
-    above = 1.5
+    above = 1.7
     figure, axes = single_axes(
-        above + 0.24 * len(rows) + 0.05, left=0.43, right=0.93, top=above, bottom=0.05
+        above + 0.24 * len(rows) + 0.05, left=0.42, right=0.88, top=above, bottom=0.05
     )
     for i, (name, label) in enumerate(rows.items()):
         write(axes, -0.15, i + 0.5, label, size=SMALL, ha="right")
@@ -166,6 +166,7 @@ def _cell(axes: Axes, i: int, j: int, curve: Json) -> None:
     shade(axes, i, j, 1 - _reach(curve))
     text = "·" if falls is None else level(curve, falls).partition(" ")[0]
     text = f"{falls:.1g}" if len(text) > LONGEST_CELL else text
+    text = text[1:] if text.startswith("0.") else text  # many methods leave little room
     write(axes, j + 0.5, i + 0.5, text, GREY if falls is None else BLACK, SMALL)
 
 

@@ -92,7 +92,7 @@ def test_the_matrix_shows_where_each_method_fails_and_the_box_first():
     assert columns[:4] == [*own, "all views", "MiniRocket"]
     rows = [shown[i : i + 1 + len(columns)] for i in (0, 9)]
     assert rows == [
-        ["50 Hz hum, to 2 deviations", "0.09", "0.62", "0.62", "1.1", "0.42", "·", "0.5", "·"],
+        ["50 Hz hum, to 2 deviations", ".09", ".62", ".62", "1.1", ".42", "·", ".5", "·"],
         ["dead taxels, to 2 taxels", "1", "2", "2", "1", "2", "·", "·", "·"],
     ]
 
