@@ -8,7 +8,7 @@ from __future__ import annotations
 
 ENOUGH = 0.9
 """Lower end of the interval of the accuracy from which on more sweeps are not asked for."""
-SURE = 0.8
+SURE = 0.9
 """Least probability of another material at which a sweep may be mislabelled."""
 RIGHT = 0.6
 """Least share of the other sweeps of its material that are named rightly then, and of the sweeps of

@@ -27,7 +27,7 @@ from train.data import sets
 from train.data.sets import Dataset
 from train.data.splitters import Fold, InnerPart, Protocol
 from train.models.methods import no_log
-from train.models.recipe import choice, recipe
+from train.models.recipe import choice, recipe, stage_heads
 from train.models.recipe.choice import HeldOutScores, ScoredPlan
 from train.models.recipe.recipe import Settings, Setup
 
@@ -205,7 +205,7 @@ class SpatialFold:
         scores = self._scores(data, [self.setup.judging])
         chosen = {}
         for name, plan in plans.items():
-            beside = recipe._beside_stages(plan.plan)
+            beside = stage_heads.beside(plan.plan)
             joined, without = scores.score(beside), scores.score(beside[1:])
             chosen[name] = without if scores.worse(joined, without) else joined
         return data, np.hstack([trunk.features(self.test), tested]), chosen

@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from appliance.core.errors import FormatError
-from train.calibration.heads import HeadData, HeadPart, HeadPlan, condition_values
+from train.calibration.heads import HeadData, HeadPlan, condition_values
 from train.data.progress import StageLine
 from train.data.sets import Dataset
 from train.data.splitters import InnerPart, inner_parts
@@ -39,7 +39,15 @@ from train.data.thinning import thinned
 from train.metrics.score import interval
 from train.models.linear_head import hold_out_or_all
 from train.models.methods import AS_RECORDED, Log, SkinUse, no_log
-from train.models.recipe import bank, choice, distribution, graph, relations, spectrum
+from train.models.recipe import (
+    bank,
+    choice,
+    distribution,
+    graph,
+    relations,
+    spectrum,
+    stage_heads,
+)
 from train.models.recipe.architectures import MAINS_HZ, STAGES, Architecture
 from train.models.recipe.augment import (
     COPIES,
@@ -60,8 +68,6 @@ Array = NDArray[Any]
 LEAST_EACH, LEAST_SWEEPS = 25, 100
 """Smallest numbers of sweeps for training stages, of each material and of all. Stages overfit to a
 few sweeps of a material and to a few batches."""
-STAGES_WEIGHT = 0.5
-"""Weight of the discriminant of stages beside others; docs/decisions/0023 compares others."""
 PARTS = "features", "choice of the model", "training of stages"
 """Parts of a fit, for its progress."""
 ENOUGH = 0.99
@@ -333,12 +339,12 @@ def with_stages(
     log, plan = setup.part(3), judged.chosen.plan
     stages, responses = setup.stages
     scores = setup.scores(responses.beside(fixed.data), [setup.judging])
-    beside = _beside_stages(plan)
+    beside = stage_heads.beside(plan)
     joined = full = scores.score(beside)
-    columns = _lean_columns(fixed.columns, plan)
+    columns = stage_heads.fixed_columns(fixed.columns, plan)
     if setup.settings.use.reattached or set(plan.columns()) <= set(columns):
         log("choosing: stages and the spectrum alone")
-        lean = scores.score(_stages_alone(columns))
+        lean = scores.score(stage_heads.alone(columns))
         joined = full if scores.better(full, lean) else lean
     log("choosing: without stages")
     if scores.worse(joined, scores.score(beside[1:])):
@@ -458,37 +464,6 @@ def _trained(setup: Setup) -> Trunk:
         settings.unfinished,
     )
     return Trunk(sweeps, scale, weights, architecture, ranges)
-
-
-def _beside_stages(plan: HeadPlan) -> list[HeadPart]:
-    """`plan` with a discriminant of trained stages, whose features come before all others. It sees
-    copies, as stages do.
-
-    Stages and fixed features are so different that they err on different sweeps. Together they name
-    sweeps of a new condition better than either alone, which held-out parts hardly show. Therefore
-    stages are added unless they are worse. They have less weight than others: where a force or a
-    direction is new, they are the weakest.
-    """
-    size = sum(STAGES.channels)
-    fixed = [replace(p, columns=tuple(np.add(p.columns, size).tolist())) for p in plan.parts]
-    return [HeadPart(tuple(range(size)), True, weight=STAGES_WEIGHT), *fixed]
-
-
-def _lean_columns(columns: FeatureColumns, plan: HeadPlan) -> Array:
-    """The spectrum, and the loads if `plan` has them."""
-    loads = np.intersect1d(columns.loads, plan.columns())
-    return np.append(loads, columns.bands)
-
-
-def _stages_alone(fixed: Array) -> list[HeadPart]:
-    """A discriminant of each stage and the features `fixed`, which come after those of stages; all
-    see copies."""
-    ends = np.cumsum(STAGES.channels).tolist()
-    spectrum = (ends[-1] + fixed).tolist()
-    return [
-        HeadPart((*range(end - channels, end), *spectrum), True)
-        for channels, end in zip(STAGES.channels, ends, strict=True)
-    ]
 
 
 def describe(trunk: Trunk, plan: HeadPlan) -> str:
