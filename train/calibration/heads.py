@@ -89,7 +89,8 @@ class HeadData:
 
 
 def condition_values(groups: Mapping[str, Array], count: int) -> Array:
-    """int [count, C], the values of `groups` but recordings, which are no condition, numbered."""
+    """int [count, C], the values of `groups` as numbers. Recordings are left out: a user does not
+    vary them."""
     found = [
         np.unique(values, return_inverse=True)[1]
         for name, values in groups.items()
@@ -206,7 +207,7 @@ def _differences(z: Array, labels: Array, conditions: Array) -> Array:
 
 def _solve(z: Array, more: Array, wanted: Array) -> Array:
     """`wanted` [K, F] times the inverse of the shrunk covariance of `z` [N, F], whose means are 0,
-    with the squares of the rows `more` [M, F] added. These rows are no sample, so only `z` sets the
+    with the squares of the rows `more` [M, F] added. Only `z` is a sample, so it alone sets the
     shrinkage."""
     n, size = z.shape
     few = n + len(more) < size
