@@ -120,7 +120,8 @@ def _panel(axes: Axes, panel: ChartPanel, ends: tuple[float, float]) -> None:
     tens = [10.0**n for n in range(-4, 5) if ends[0] <= 10.0**n <= ends[1]]
     set_ticks(axes.xaxis, tens or [float(f"{ends[0]:.1g}")], "ms")
     set_ticks(axes.yaxis, round_ticks(low - room, high + room, 6), percent=True)
-    timed = f"← faster: processor time of a sweep, {panel.sweep}"
+    shape, frames = panel.sweep.partition(" ")[0], panel.sweep.rpartition(" ")[2]
+    timed = f"← faster: processor time of a sweep of {shape} taxels, {frames} frames"
     axes.set_xlabel(timed, color=GREY, size=SMALL, labelpad=3)
     about = f"named rightly, mean of {len(panel.cases)} tests: {panel.kind}"
     axes.set_ylabel(about, color=GREY, size=SMALL, rotation=0, ha="left", va="bottom")

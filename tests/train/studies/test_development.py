@@ -506,7 +506,7 @@ def test_a_panel_has_the_times_of_its_own_sweeps():
     names the sweeps; a panel without times of its own has those of the simulated skin."""
     results = [entry(c, "palpate", 0.9) for c in ("one", SERIES)]
     cases = [case("one"), case(SERIES)]
-    own = times(timed("palpate", 0.4)) | {"format": "16x1 of fabrics"}
+    own = times(timed("palpate", 0.4)) | {"format": "16x1 int16 at 36 Hz, window 128"}
     made = figures(cases=cases, results=results, times=times(timed("palpate", 0.1)))
     made |= {"panel_times": {development_chart.TACTILE: own}}
     shown = {panel.kind: panel for panel in development_chart.panels(made)}
@@ -514,7 +514,8 @@ def test_a_panel_has_the_times_of_its_own_sweeps():
         development_chart.TACTILE: 0.4,
         development_chart.SERIES: 0.1,
     }
-    assert any("16x1 of fabrics" in text for text in texts(development_report.front(made)))
+    words = texts(development_report.front(made))
+    assert any(text.endswith("of 16x1 taxels, 128 frames") for text in words)
 
 
 def test_panels_are_timed_with_their_own_sweeps(
