@@ -180,7 +180,7 @@ def _place(entry: Json) -> tuple[str, int, int]:
 
 def join(run: Json, earlier: Sequence[Json]) -> Json:
     """`run` with the methods, entries, reasons, runs and times of `earlier` runs that it does not
-    have itself.
+    have itself. Of a method whose entries are all replaced no run is named.
 
     Raises FormatError if an earlier run was of other sweeps.
     """
@@ -190,10 +190,12 @@ def join(run: Json, earlier: Sequence[Json]) -> Json:
         there = {(_place(entry), entry["method"]) for entry in made["results"]}
         more = [entry for entry in one["results"] if (_place(entry), entry["method"]) not in there]
         names = dict.fromkeys([*made["methods"], *one["methods"]])
+        left = {entry["method"] for entry in more}
+        runs = [run | {"methods": [m for m in run["methods"] if m in left]} for run in one["runs"]]
         made |= {
             "methods": sorted(names, key=lambda name: (*OURS, *PEERS, name).index(name)),
             "results": [*made["results"], *more],
-            "runs": [*made["runs"], *one["runs"]],
+            "runs": [*made["runs"], *(run for run in runs if run["methods"])],
         }
         for times in ("times", "panel_times"):
             if one.get(times):
