@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from appliance.core.statistics import wilson
 from appliance.inference import advice
 from appliance.inference.classifier import softmax
-from train.data.splitters import InnerPart, inner_parts, recording_parts
+from train.data.splitters import InnerPart, recording_parts
 from train.metrics.score import interval
 from train.models.methods import Log, no_log
 from train.models.recipe import recipe
@@ -153,7 +153,7 @@ def assess(lesson: Lesson, seed: int = 0, log: Log = no_log) -> Assessment:
     setup = recipe.Setup.of(lesson.sweeps, seed, settings, log)
     fixed = setup.fixed
     choice = recipe.judge(recipe.candidates(fixed, setup), fixed, setup)
-    parts, scores, chosen = inner_parts(lesson.sweeps), choice.scores, choice.chosen
+    parts, scores, chosen = setup.parts, choice.scores, choice.chosen
     if not np.any([part.out for part in parts], axis=0).all():
         # some materials are of one place: their sweeps are judged by others of that place
         parts = recording_parts(lesson.sweeps)

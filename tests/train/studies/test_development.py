@@ -519,9 +519,7 @@ def test_a_panel_has_the_times_of_its_own_sweeps():
     assert any(text.endswith("of 16x1 taxels, 128 frames") for text in words)
 
 
-def test_panels_are_timed_with_their_own_sweeps(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
+def test_panels_are_timed_with_their_own_sweeps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Each with means removed where its tests remove them. Without the folder of real sweeps only
     published series are timed."""
     asked: list[tuple[str, float]] = []
@@ -691,6 +689,23 @@ def test_times_alone_are_measured_again(
     found = json.loads(file.read_text())
     assert found["times"]["format"] == "measured again"
     assert found["results"] == figures()["results"]
+
+
+def test_a_panel_that_cannot_be_timed_keeps_its_times(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Without the folder of real sweeps only published series are timed again. Else the accuracy of
+    fabrics would stand at the time of the simulated skin."""
+    before = {development_chart.TACTILE: {"format": "fabrics"}, SERIES: {"format": "before"}}
+    file = save(tmp_path / "development.json", figures() | {"panel_times": before})
+    monkeypatch.setattr(development_times, "measured", lambda *given: figures()["times"])
+    monkeypatch.setattr(StudyCase, "load", lambda self, data=None: tones())
+    monkeypatch.setattr(
+        development_times, "of_panels", lambda *given: {SERIES: {"format": "again"}}
+    )
+    assert main(["development", "--out", str(file), "--times"]) == 0
+    found = json.loads(file.read_text())["panel_times"]
+    assert found == before | {SERIES: {"format": "again"}}
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
+from functools import cached_property
 from typing import Any, TypeVar
 
 import numpy as np
@@ -193,14 +194,19 @@ class CalibrationInputs:
         """Features [N, F] of the whole window."""
         return self.prefixes[:, -1]
 
+    @cached_property
+    def head_data(self) -> HeadData:
+        """All sweeps, and the copies that heads are fitted to."""
+        copied = self.copied.take(~self.copied.held)
+        values = condition_values(self.conditions, len(self.labels))
+        return HeadData(self.whole, self.labels, copied.features, copied.source, values)
+
     def naming_head(self, seen: Array) -> tuple[Array, Array]:
         """Weight [F, K] and bias [K] of the head that names the material, fitted to the sweeps
         `seen` (bool [N]) and their copies."""
         plan = self.plan or HeadPlan((HeadPart(tuple(range(self.whole.shape[1])), copies=True),))
-        copied = self.copied.take(~self.copied.held)
-        values = condition_values(self.conditions, len(seen))
-        every = HeadData(self.whole, self.labels, copied.features, copied.source, values)
-        weight, bias = plan.fit(every.take(seen & ~self.faulty), int(self.labels.max()) + 1)
+        known = self.head_data.take(seen & ~self.faulty)
+        weight, bias = plan.fit(known, int(self.labels.max()) + 1)
         return weight.T, bias
 
 

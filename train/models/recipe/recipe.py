@@ -160,10 +160,15 @@ class Setup:
         return inner_parts(self.sweeps, varies=self.settings.varies)
 
     @cached_property
+    def left_out(self) -> tuple[str, ...]:
+        """The groups whose values the parts leave out."""
+        return tuple(dict.fromkeys(part.group for part in self.parts))
+
+    @cached_property
     def values(self) -> Array:
         """The value [N, C] of each condition of the parts, as HeadData has them."""
-        names = dict.fromkeys(part.group for part in self.parts)
-        return condition_values({name: self.sweeps.group(name) for name in names}, len(self.sweeps))
+        groups = {name: self.sweeps.group(name) for name in self.left_out}
+        return condition_values(groups, len(self.sweeps))
 
     @cached_property
     def held_out_scores(self) -> HeldOutScores:
@@ -175,17 +180,16 @@ class Setup:
         """The groups that can be left out, the hardest first: that whose sweeps the usual heads
         name worst if they have not seen its value. Groups of two values come last: without one of
         them, heads learn nothing of how the other varies."""
+        if len(self.left_out) < 2:
+            return self.left_out
         scores = self.held_out_scores
-        names = list(dict.fromkeys(scores.groups[scores.own].tolist()))
-        if len(names) < 2:
-            return tuple(names)
         right = scores.right(scores.score(candidates(self.fixed, self).usual()))
 
         def order(name: str) -> tuple[bool, float]:
             of = scores.own & (scores.groups == name)
             return len(np.unique(self.sweeps.group(name))) < 3, float(right[of].mean())
 
-        return tuple(sorted(names, key=order))
+        return tuple(sorted(self.left_out, key=order))
 
     @cached_property
     def judging(self) -> InnerPart:

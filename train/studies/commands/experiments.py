@@ -187,7 +187,8 @@ def run_development(args: argparse.Namespace) -> None:
             figures["methods"], train, 1, run.where.cache, run.log, run.effort
         )
         if not run.quick:
-            figures["panel_times"] = development_times.of_panels(
+            # without the folder of real sweeps their panel keeps its times
+            figures["panel_times"] = figures.get("panel_times", {}) | development_times.of_panels(
                 figures["methods"], run.data, 1, run.where.cache, run.log, run.effort
             )
     run.left_out = dict(figures["left_out"])
