@@ -29,7 +29,7 @@ PYTEST = $(BIN)/python -m pytest -q -n $(shell expr `nproc` + 1)
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 	@echo "Campaigns and the virtual box: $(BIN)/python -m tests.campaigns lists them."
-	@echo "Studies, result pages and figures: $(BIN)/python -m train.studies lists them."
+	@echo "Studies, result pages and figures: $(BIN)/python -m palpate_studies lists them."
 
 demo: $(RUNTIME) ## watch simulated sweeps being classified, live
 	$(BIN)/palpate demo
@@ -60,12 +60,12 @@ bundle: $(DESKTOP) ## train, quantize and pack the default bundle again
 	@mkdir -p build
 	$(BIN)/palpate-train fit --set sim:T-REAL/level-blind:1-6 --seed 1 --reattached --steps 1200 \
 	  --out build/default.npz
-	$(BIN)/palpate-train export build/default.npz --out appliance/default_bundle --name default \
+	$(BIN)/palpate-train export build/default.npz --out appliance/palpate/default_bundle --name default \
 	  --version 3
 
 bench: $(DESKTOP) ## measure this machine: docs/data/bench.json, and the tables of README and manual
 	$(BIN)/palpate bench --json docs/data/bench.json
-	$(BIN)/python -m train.studies figures
+	$(BIN)/python -m palpate_studies figures
 
 site: $(SITE) ## build the documents and the pages of results as a site: build/site/index.html
 	PYTHONPATH=systemd $(BIN)/python docs/site/build.py build
@@ -90,7 +90,7 @@ deb: $(FLEET) $(DESKTOP) ## pack the same as dist/palpate_*.deb for arm64 and am
 	PYTHONPATH=. $(BIN)/python systemd/sbom.py dist/palpate.cdx.json
 
 clean: ## remove everything that was built, the virtual environment too
-	rm -rf $(VENV) build dist *.egg-info train/*.egg-info
+	rm -rf $(VENV) build dist *.egg-info appliance/*.egg-info train/*.egg-info train/studies/*.egg-info
 
 # A virtual environment with the locked runtime and the commands, nothing else.
 $(RUNTIME): appliance/requirements.lock systemd/build.lock pyproject.toml
@@ -112,12 +112,13 @@ $(FLEET): $(RUNTIME) systemd/fleet.lock
 # The same with training and export. Only PyTorch is left to the second line.
 $(DESKTOP): $(RUNTIME) train/pyproject.toml train/desktop.lock
 	$(LOCKED) -r train/desktop.lock
-	$(INSTALL) --no-build-isolation -e train
+	$(INSTALL) --no-build-isolation -e train[stages,reports]
 	@touch $@
 
 # The same with tests, studies, and the tools that check the code. flexitac has no wheel.
 $(TOOLS): $(DESKTOP) tests/tools.lock
 	$(LOCKED) --no-binary flexitac --no-build-isolation -r tests/tools.lock
+	$(INSTALL) --no-build-isolation -e train/studies
 	@touch $@
 
 # The same with what builds the site.
@@ -126,7 +127,7 @@ $(SITE): $(DESKTOP) docs/site/site.lock
 	@touch $@
 
 # ROS 2 with palpate_msgs, in a virtual environment of its own.
-MESSAGES := appliance/bridges/palpate_msgs
+MESSAGES := appliance/plugins/palpate_msgs
 build/ros/ready: $(wildcard $(MESSAGES)/* $(MESSAGES)/*/*) tests/robots/messages.py pyproject.toml \
   | $(RUNTIME)
 	@{ command -v cmake && command -v g++ && $(PYTHON) -c 'import pathlib, sysconfig, sys; \

@@ -21,9 +21,8 @@ import install
 from fleet import Failed
 from install import LINK, LINKS, MACHINES, PACKAGES, PATHS, SKINS, TEACHING, WHEEL
 from manual import write as write_manual
+from palpate import __version__
 from release import ROOT, ReleaseArchives
-
-from appliance import __version__
 
 PYTHONS = ("3.11.2", "3.13.5")
 """Python of Debian 12 and of Debian 13, and so of the Raspberry Pi OS of the same names."""

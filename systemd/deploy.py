@@ -17,12 +17,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fleet import PALPATE, Failed, FleetBox, each, options
-
-from appliance.bundle import bundle
-from appliance.core.clock import SystemClock
-from appliance.core.errors import ApplianceError, BundleError
-from appliance.deployment import signature
-from appliance.inference.classifier import Classifier
+from palpate.bundle import bundle
+from palpate.core.clock import SystemClock
+from palpate.core.errors import ApplianceError, BundleError
+from palpate.deployment import signature
+from palpate.inference.classifier import Classifier
 
 READY_S, STARTS = 60, 5
 """Limits for READY, in seconds and in failed starts. After three failed starts a box goes back by

@@ -1,5 +1,5 @@
 """Commands that make the key with which a box signs its own lessons, and the file of its signer, if
-they are missing (appliance/deployment/enrolment_key.py)."""
+they are missing (appliance/palpate/deployment/enrolment_key.py)."""
 
 from __future__ import annotations
 

@@ -20,10 +20,9 @@ from enrolment_key import make as make_enrolment_key
 from fleet import Failed, FleetBox, each, options, remedy
 from manual import write as write_manual
 from page_secrets import make as make_page_secrets
+from palpate import __version__
+from palpate.core.config import boards
 from release import ROOT, ReleaseArchives
-
-from appliance import __version__
-from appliance.core.config import boards
 
 WHEEL = ROOT / "dist" / f"palpate-{__version__}-py3-none-any.whl"
 TEACHING = ROOT / "dist" / "palpate_train-0.1.0-py3-none-any.whl"
@@ -69,9 +68,9 @@ PIP = (
     "--root-user-action=ignore"
 )
 SELF_TEST = """
-import sys; from pathlib import Path; from appliance.bundle import bundle
-from appliance.cli.common import load_bundle; from appliance.core import clock, config, errors
-from appliance.inference import classifier
+import sys; from pathlib import Path; from palpate.bundle import bundle
+from palpate.cli.common import load_bundle; from palpate.core import clock, config, errors
+from palpate.inference import classifier
 try:
     settings = config.load(None, folder=Path(sys.argv[1]))
     for one in (bundle.load(bundle.DEFAULT), load_bundle(settings)):

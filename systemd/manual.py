@@ -16,11 +16,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args, get_origin
 
-from appliance.cli.parser import MENU, parser
-from appliance.core import config
-from appliance.core.menu import CommandParser
-from appliance.core.schema import Key
-from appliance.core.storage import put
+from palpate.cli.parser import MENU, parser
+from palpate.core import config
+from palpate.core.menu import CommandParser
+from palpate.core.schema import Key
+from palpate.core.storage import put
 
 ROOT = Path(__file__).resolve().parent.parent
 BOX_PAGES = (

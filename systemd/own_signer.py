@@ -11,8 +11,7 @@ from pathlib import Path
 from threading import Lock
 
 from fleet import Failed
-
-from appliance.deployment.signature import own_key
+from palpate.deployment.signature import own_key
 
 _LOCK = Lock()
 

@@ -17,11 +17,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from threading import Lock
 
-from fleet import Failed
 from packaging.requirements import Requirement
 
-from appliance import __version__
-from appliance.core import storage
+from fleet import Failed
+from palpate import __version__
+from palpate.core import storage
 
 ROOT = Path(__file__).resolve().parent.parent
 LOCK, TEACH_LOCK = (ROOT / "appliance" / name for name in ("requirements.lock", "teach.lock"))

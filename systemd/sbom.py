@@ -60,7 +60,7 @@ def licence(name: str) -> str:
 
 def document(lock: str) -> dict[str, Any]:
     """The whole document."""
-    from appliance import __version__
+    from palpate import __version__
 
     own = {"type": "application", "name": "palpate", "version": __version__}
     debian = [{"type": "library", "name": n, "group": "debian"} for n in OF_DEBIAN]

@@ -18,12 +18,12 @@ from typing import Any
 
 import pytest
 
-from appliance.bundle import bundle
-from appliance.core.types import Sweep
-from appliance.io.robot_link import SerialSink
-from appliance.runtime import assembly
-from appliance.sim import devices, rig, script, skin
-from appliance.tools import pseudo_terminal
+from palpate.bundle import bundle
+from palpate.core.types import Sweep
+from palpate.io.robot_link import SerialSink
+from palpate.runtime import assembly
+from palpate.sim import devices, rig, script, skin
+from palpate.tools import pseudo_terminal
 from tests.factories import browser as browsers
 from tests.factories import log_lines
 from tests.factories.settings import load as load_settings

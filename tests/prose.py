@@ -17,18 +17,18 @@ import ast
 import math
 import re
 import sys
-import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from tests.factories.paths import ROOT
 
-CEILINGS = Path(__file__).with_name("prose_ceilings.toml")
 FOLDERS = ("appliance", "train", "systemd", "firmware_config", "tests", "docs")
 PAGES = ("README.md", "CHANGELOG.md", "CONTRIBUTING.md")
-AIM = 1.0
-"""The lowest ceiling, and that of a new package: % of its clauses."""
+DEPTH = 2
+"""Folders in the name of a package."""
+CEILING = 1.0
+"""Highest share of the clauses of a package, in %."""
 SYMPTOMS = re.compile(
     r"\b[Ww]hat (?:is|are|was|were|a|an|the|it|they|one|each|no|of|comes?|goes|has|have|had|holds?"
     r"|does|ends?|needs?|can|may|must|stands?|[a-z]+s)\b"
@@ -80,7 +80,7 @@ def files(root: Path = ROOT) -> Iterator[tuple[str, Path]]:
     for folder in FOLDERS:
         for path in sorted((root / folder).rglob("*")):
             if path.suffix in (".py", ".md"):
-                yield "/".join(path.relative_to(root).parts[:-1][:2]), path
+                yield "/".join(path.relative_to(root).parts[:-1][:DEPTH]), path
     yield from ((page, root / page) for page in PAGES if (root / page).exists())
 
 
@@ -96,50 +96,29 @@ def measure(root: Path = ROOT) -> dict[str, Count]:
     return counts
 
 
-def exceeded(counts: Mapping[str, Count], ceilings: Mapping[str, float]) -> list[str]:
-    """A line for each package that exceeds its ceiling."""
+def exceeded(counts: Mapping[str, Count]) -> list[str]:
+    """A line for each package that exceeds CEILING."""
     return [
         f"{package}: {count.percent} % of {count.clauses} clauses have to be read twice;"
-        f" at most {ceilings.get(package, AIM)} % may"
+        f" at most {CEILING} % may"
         for package, count in counts.items()
-        if count.percent > ceilings.get(package, AIM)
+        if count.percent > CEILING
     ]
 
 
-def lowered(counts: Mapping[str, Count], ceilings: Mapping[str, float]) -> dict[str, float]:
-    """The ceilings of the packages that exist, each at the measured share if that is lower, and at
-    least at AIM."""
-    return {
-        package: min(max(AIM, count.percent), ceilings.get(package, AIM))
-        for package, count in sorted(counts.items())
-    }
-
-
-def written(ceilings: Mapping[str, float]) -> str:
-    """The text of a file of ceilings."""
-    head = (
-        "# Highest share of clauses that have to be read twice, in % (tests/prose.py).\n"
-        "# Only lower these: `python -m tests.prose --lower` does after a rewrite.\n"
-    )
-    return head + "".join(f'"{package}" = {value}\n' for package, value in ceilings.items())
-
-
-def main(arguments: Sequence[str], root: Path = ROOT, file: Path = CEILINGS) -> int:
-    """Check, list or lower; 1 if a package exceeds its ceiling."""
+def main(arguments: Sequence[str], root: Path = ROOT) -> int:
+    """Check or list; 1 if a package exceeds the ceiling."""
     parser = argparse.ArgumentParser(prog="python -m tests.prose", description=__doc__)
     parser.add_argument("packages", nargs="*", help="packages to list, or starts of paths")
-    parser.add_argument("--lower", action="store_true", help="lower the ceilings to the shares")
     args = parser.parse_args(arguments)
-    counts, ceilings = measure(root), tomllib.loads(file.read_text())
+    counts = measure(root)
     if args.packages:
         found = [line for count in counts.values() for line in count.matches]
         print(*(line for line in found if line.startswith(tuple(args.packages))), sep="\n")
         return 0
-    too_many = exceeded(counts, ceilings)
+    too_many = exceeded(counts)
     for line in too_many:
         print(f"{line}: python -m tests.prose {line.partition(':')[0]} lists them", file=sys.stderr)
-    if args.lower:
-        file.write_text(written(lowered(counts, ceilings)))
     clauses_in_all = sum(count.clauses for count in counts.values())
     matches = sum(len(count.matches) for count in counts.values())
     print(f"prose: {matches} of {clauses_in_all} clauses have to be read twice")

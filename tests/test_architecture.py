@@ -14,9 +14,9 @@ from pathlib import Path
 
 import pytest
 
+from palpate_train.models import methods
 from tests.factories import emulated_machines
 from tests.factories.paths import ROOT
-from train.models import methods
 
 SOURCES = sorted(
     [*ROOT.glob("appliance/**/*.py"), *ROOT.glob("train/**/*.py"), *ROOT.glob("systemd/*.py")]
@@ -24,14 +24,24 @@ SOURCES = sorted(
 TESTS = sorted(ROOT.glob("tests/**/*.py"))
 TEST_FILES = [path for path in TESTS if path.name.startswith("test_")]
 GROUNDS = [p for p in TESTS if p.parent.name in ("rig", "backends", "fuzz", "cuts")]
-BOX = [p for p in SOURCES if p.is_relative_to(ROOT / "appliance") and "sim" not in p.parts]
-ALLOWED = {"appliance", "numpy", "onnxruntime", "usb", "gpiod", "serial", "_sha2"}
+BOX = [
+    p for p in SOURCES if p.is_relative_to(ROOT / "appliance" / "palpate") and "sim" not in p.parts
+]
+PACKAGES = {
+    path.name: path
+    for path in (
+        ROOT / "appliance" / "palpate",
+        ROOT / "train" / "palpate_train",
+        ROOT / "train" / "studies" / "palpate_studies",
+    )
+}
+"""Folders of the packages by their import names."""
+ALLOWED = {"palpate", "numpy", "onnxruntime", "usb", "gpiod", "serial", "_sha2"}
 """What the box may import; the last is Python's own from 3.12 on."""
 EXTRAS = {
-    "watch": {"tornado"},
+    "web": {"tornado"},
     "bridges/ros.py": {"rclpy", "rcl_interfaces", "diagnostic_msgs", "sensor_msgs", "std_srvs"},
     "bridges/ros_action.py": {"rclpy", "palpate_msgs"},
-    "bridges/lerobot": {"lerobot"},
 }
 """What a package or module imports beside that, of an extra; it is loaded for this alone."""
 LONGEST = 500
@@ -70,10 +80,12 @@ def imports(path: Path) -> set[str]:
 def module_imports(*packages: str) -> dict[str, set[str]]:
     """For each module of the packages those of them that it imports, also under TYPE_CHECKING and
     in functions."""
-    paths = [path for name in packages for path in ROOT.glob(f"{name}/**/*.py")]
     dotted = {
-        ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
-        for path in paths
+        ".".join(path.relative_to(folder.parent).with_suffix("").parts).removesuffix(
+            ".__init__"
+        ): path
+        for folder in map(PACKAGES.__getitem__, packages)
+        for path in folder.glob("**/*.py")
     }
     found: dict[str, set[str]] = {name: set() for name in dotted}
     for name, path in dotted.items():
@@ -108,11 +120,11 @@ def circles(graph: dict[str, set[str]]) -> list[str]:
 def test_no_module_imports_itself_through_others():
     """No circle between modules, type hints and imports in functions included; one that is there
     would be found."""
-    graph = module_imports("appliance", "train")
-    assert "appliance.core.errors" in graph["appliance.deployment.store"]
+    graph = module_imports("palpate", "palpate_train", "palpate_studies")
+    assert "palpate.core.errors" in graph["palpate.deployment.store"]
     assert circles(graph) == []
-    back = graph | {"appliance.core.errors": {"appliance.deployment.store"}}
-    assert "appliance.core.errors -> appliance.deployment.store" in circles(back)
+    back = graph | {"palpate.core.errors": {"palpate.deployment.store"}}
+    assert "palpate.core.errors -> palpate.deployment.store" in circles(back)
 
 
 def test_packages_import_downwards_only():
@@ -126,23 +138,30 @@ def test_every_module_of_training_serves_a_command():
     """All of train but the studies is imported for a command of palpate-train, by the library or by
     the program that teaches a box; a method is imported by its name for `evaluate --method`. A
     module that only a study uses is not."""
-    graph = module_imports("train")
-    commands = {name for name in graph if name.startswith(("train.cli.", "train.library."))}
-    found, left = set(), ["train.__main__", "train.teach.__main__", *commands, *methods.MODULES]
+    graph = module_imports("palpate_train")
+    commands = {
+        name for name in graph if name.startswith(("palpate_train.cli.", "palpate_train.library."))
+    }
+    found, left = (
+        set(),
+        ["palpate_train.__main__", "palpate_train.teach.__main__", *commands, *methods.MODULES],
+    )
     while left:
         if (name := left.pop()) not in found:
             found.add(name)
             left += graph[name]
     packages = {path.parent for path in SOURCES}
     modules = {name for name in graph if ROOT.joinpath(*name.split(".")) not in packages}
-    studies = {name for name in modules if name.startswith("train.studies.")}
+    studies = {name for name in modules if name.startswith("palpate_studies.")}
     assert modules - found == studies
 
 
 def foreign(path: Path) -> set[str]:
     """The modules that a file of the box imports and may not import."""
     extras = (
-        names for part, names in EXTRAS.items() if path.is_relative_to(ROOT / "appliance" / part)
+        names
+        for part, names in EXTRAS.items()
+        if path.is_relative_to(ROOT / "appliance" / "palpate" / part)
     )
     allowed = ALLOWED.union(sys.stdlib_module_names, *extras)
     return {name for name in imports(path) if name.split(".")[0] not in allowed}
@@ -152,7 +171,7 @@ def test_the_box_imports_five_libraries():
     """The box imports the five libraries of the design, and itself by full names; a library of an
     extra only in the part that the extra is for."""
     assert {shown(path): names for path in BOX if (names := foreign(path))} == {}
-    assert foreign(ROOT / "train" / "models" / "training.py") >= {"torch"}
+    assert foreign(ROOT / "train" / "palpate_train" / "models" / "training.py") >= {"torch"}
 
 
 def test_no_test_imports_another():
@@ -170,18 +189,18 @@ def test_no_test_imports_another():
 def test_a_fresh_process_loads_nothing_of_the_desktop():
     """After a whole virtual run, PyTorch, scikit-learn, scipy and train are not in the process."""
     code = (
-        "import sys; from appliance.__main__ import main; "
+        "import sys; from palpate.__main__ import main; "
         "main(['run', '--sim', 'skin', '--virtual', '--sweeps', '1']);"
         "print(sorted({m.split('.')[0] for m in sys.modules} & {'torch', 'sklearn', 'scipy', "
-        "'train', 'onnx', 'pandas'}))"
+        "'palpate_train', 'onnx', 'pandas'}))"
     )
     assert run(sys.executable, "-c", code, cwd=ROOT).splitlines()[-1] == "[]"
 
 
 def test_the_simulator_is_not_loaded_unless_named():
-    """`palpate config` and everything it imports leave appliance.sim alone."""
+    """`palpate config` and everything it imports leave palpate.sim alone."""
     code = (
-        "import sys; from appliance.__main__ import main; main(['config']); "
+        "import sys; from palpate.__main__ import main; main(['config']); "
         "print([m for m in sys.modules if '.sim' in m])"
     )
     assert run(sys.executable, "-c", code, cwd=ROOT).splitlines()[-1] == "[]"
@@ -191,8 +210,8 @@ def test_onnxruntime_starts_no_thread_of_its_own():
     """Telemetry off: no uploader, no pool; a session that has run leaves the process with its one
     thread."""
     code = (
-        "import os; from appliance.bundle import bundle; from appliance.core import clock; "
-        "from appliance.inference import classifier; import onnxruntime;"
+        "import os; from palpate.bundle import bundle; from palpate.core import clock; "
+        "from palpate.inference import classifier; import onnxruntime;"
         "box = classifier.Classifier(bundle.load(bundle.DEFAULT), clock.SystemClock()); "
         "box.self_test();"
         "print(len(os.listdir('/proc/self/task')))"
@@ -353,14 +372,14 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_the_wheel_holds_the_appliance_alone(wheel: Path):
-    """appliance with its bundle and licence; no train, no tests."""
+def test_the_wheel_holds_the_box_alone(wheel: Path):
+    """palpate with its bundle and licence; no palpate_train, no tests."""
     names = zipfile.ZipFile(wheel).namelist()
-    assert {n.split("/")[0] for n in names if ".dist-info/" not in n} == {"appliance"}
+    assert {n.split("/")[0] for n in names if ".dist-info/" not in n} == {"palpate"}
     assert {
-        "appliance/default_bundle/model.onnx",
-        "appliance/default_bundle/manifest.json",
-        "appliance/watch/page/watch.html",
+        "palpate/default_bundle/model.onnx",
+        "palpate/default_bundle/manifest.json",
+        "palpate/web/page/watch.html",
     } <= set(names)
     assert any(n.endswith("licenses/LICENSE") for n in names)
 
@@ -391,7 +410,7 @@ def test_the_desktop_is_installed_without_running_tests(tmp_path: Path):
         (tmp_path / lock).parent.mkdir(exist_ok=True)
         (tmp_path / lock).touch()
     steps = run("make", "--dry-run", "desktop", cwd=tmp_path)
-    assert "install --no-compile --no-build-isolation -e train\n" in steps
+    assert "install --no-compile --no-build-isolation -e train[stages,reports]\n" in steps
     assert "tools.lock" not in steps  # tests and studies come with make test
     assert "-m pytest" not in steps  # a folder may have its name
     for page in (

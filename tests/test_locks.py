@@ -18,8 +18,8 @@ LOCKS = {
     "appliance/teach.lock": ("page", "teach"),
     "systemd/build.lock": (),
     "systemd/fleet.lock": ("deploy",),
-    "train/desktop.lock": ("train",),
-    "tests/tools.lock": ("dev", "train", "studies", "dask", "files"),
+    "train/desktop.lock": ("train", "reports"),
+    "tests/tools.lock": ("dev", "train", "reports", "peers", "dask", "files"),
     "docs/site/site.lock": ("site",),
 }
 """Each lock with the extras that it covers; "train" stands for the desktop's own distribution."""
@@ -85,7 +85,8 @@ def test_nothing_is_installed_without_a_hash():
         if line.startswith("\t") and re.search(r"\$\(INSTALL\)|\$\(PIP\)|pip install", line)
     ]
     assert [line for line in installs if "--no-deps" not in line] == [
-        "$(INSTALL) --no-build-isolation -e train",
+        "$(INSTALL) --no-build-isolation -e train[stages,reports]",
+        "$(INSTALL) --no-build-isolation -e train/studies",
         next(line for line in installs if line.startswith("build/ros/bin/python")),
     ]
 

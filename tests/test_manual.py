@@ -15,17 +15,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from appliance import __version__
-from appliance.bridges import options as bridges
-from appliance.bundle import bundle
-from appliance.cli import bundle_commands, parser
-from appliance.cli.main import COMMANDS
-from appliance.cli.parser import BUNDLE_ACTIONS, MENU, SKIN_ACTIONS
-from appliance.core import config, errors, sentences
-from appliance.core.types import Status, Verdict
-from appliance.deployment import state
-from appliance.io import robot_link
-from appliance.service import status, systemd
+from palpate import __version__
+from palpate.bridges import options as bridges
+from palpate.bundle import bundle
+from palpate.cli import bundle_commands, parser
+from palpate.cli.main import COMMANDS
+from palpate.cli.parser import BUNDLE_ACTIONS, MENU, SKIN_ACTIONS
+from palpate.core import config, errors, sentences
+from palpate.core.types import Status, Verdict
+from palpate.deployment import state
+from palpate.io import robot_link
+from palpate.service import status, systemd
 from tests.factories.paths import ROOT
 
 DOCS = ROOT / "docs"

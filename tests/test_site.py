@@ -13,8 +13,8 @@ from types import ModuleType
 
 import pytest
 
+from palpate_train import library
 from tests.factories.paths import ROOT
-from train import library
 
 WORKFLOW = ROOT / ".github" / "workflows" / "site.yml"
 
@@ -66,7 +66,7 @@ def test_pages_of_the_studies_are_listed_and_their_links_lead_into_the_site(
     """By their titles; links to Markdown lead to the pages made of it, linked files come along."""
 
     def write(command: list[str], **_: object) -> None:
-        if "train.studies" not in command:
+        if "palpate_studies" not in command:
             return
         page = command[-1] / "soak" / "index.html"
         page.parent.mkdir(parents=True)

@@ -20,7 +20,7 @@ def generate_launch_description():
                 cmd=[
                     "python3",
                     "-m",
-                    "appliance.bridges",
+                    "palpate.bridges",
                     "ros",
                     "--ros-args",
                     "--params-file",

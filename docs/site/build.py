@@ -20,10 +20,9 @@ from typing import Any
 from urllib.parse import unquote
 
 import manual
+import palpate_train.library
 from manual import BOX_PAGES, ROOT
-
-import train.library
-from train.cli.main import PROGRAM
+from palpate_train.cli.main import PROGRAM
 
 HERE = Path(__file__).resolve().parent
 
@@ -115,7 +114,7 @@ def results(out: Path) -> None:
     """Draw the pages of results into `out`/results, and list them on a page."""
     pages = (out / "results").absolute()
     drawn: tuple[list[str | Path], ...] = (
-        ["train.studies", "pages", "--out", pages],
+        ["palpate_studies", "pages", "--out", pages],
         ["tests.rig.soak", "--draw", "--work", pages, "--out", SOAK, "--page", pages / "soak"],
     )
     for words in drawn:
@@ -179,7 +178,9 @@ def training_commands() -> str:
 
 def library() -> str:
     """The reference of the library: each public name with its docstring and its members."""
-    return "\n\n".join(_entry(name, getattr(train.library, name)) for name in train.library.__all__)
+    return "\n\n".join(
+        _entry(name, getattr(palpate_train.library, name)) for name in palpate_train.library.__all__
+    )
 
 
 def _entry(name: str, what: Any) -> str:

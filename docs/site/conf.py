@@ -1,6 +1,6 @@
 """Settings of Sphinx for the site: pages in Markdown, warnings as errors (make site)."""
 
-from appliance import __version__
+from palpate import __version__
 
 project = "Palpate"
 release = __version__

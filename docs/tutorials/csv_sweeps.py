@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from train.data import sets
+from palpate_train.data import sets
 
 SWEEPS = "sim:T-REAL:1:3"
 """Six materials at nine positions, three sweeps each, world 1 of the simulator."""

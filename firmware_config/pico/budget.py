@@ -59,7 +59,7 @@ class Ticks:
         return later - earlier
 
     def start(self, period_us, callback):
-        """Does nothing: there is no timer."""
+        """Does nothing: no timer exists."""
 
 
 def pure_us(rows, cols, rate_hz, dtype):

@@ -95,7 +95,7 @@ def gray(count):
 
 
 def reading_order(rows, cols):
-    """The order in which one frame is read with the fewest switches: lists (lines, levels, taxels),
+    """The reading order of a frame with the fewest switches: lists (lines, levels, taxels),
     item by item.
 
     Set select line `lines[i]` (0 to 3: rows, 4 to 7: columns, lowest bit first) to `levels[i]`,
@@ -173,7 +173,7 @@ class Fifo:
 
     def finish(self):
         """In the interrupt: end the packet, since it is full or the next number does not follow.
-        Drops the oldest packet if there is no other room."""
+        Drops the oldest packet if the queue is full."""
         if self._filled == 0:
             return
         size = len(self._slots)

@@ -1,6 +1,6 @@
 """Backends: the layer below the drivers of the box. PALPATE_BACKEND selects one by name.
 
-tests/appliance/io/test_backends.py is the contract of Sensor, Trigger, Lines and SerialSink. It
+tests/palpate/io/test_backends.py is the contract of Sensor, Trigger, Lines and SerialSink. It
 runs over every backend.
 """
 
@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, Protocol
 
-from appliance.core.clock import Clock
-from appliance.core.config import OutputConfig, SerialConfig, SkinConfig, TriggerConfig
-from appliance.core.types import SweepFormat
-from appliance.io import packets
-from appliance.sim import skin
+from palpate.core.clock import Clock
+from palpate.core.config import OutputConfig, SerialConfig, SkinConfig, TriggerConfig
+from palpate.core.types import SweepFormat
+from palpate.io import packets
+from palpate.sim import skin
 
 VARIABLE = "PALPATE_BACKEND"
 NAMES = {

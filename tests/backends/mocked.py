@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 
-from appliance.core import config
+from palpate.core import config
 from tests import backends
 from tests.backends import Skin, mocked_gpio, mocked_usb, mocks, real, skins, tty
 from tests.factories.paths import NO_SITE

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from appliance.sim import rig, usb
+from palpate.sim import rig, usb
 from tests.backends import mocks
 
 SUBMIT, DISCARD, REAP = 0x550A, 0x550B, 0x550D

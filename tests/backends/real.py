@@ -10,10 +10,10 @@ import gpiod
 import usb.core
 import usb.util
 
-from appliance.core.clock import SystemClock
-from appliance.core.config import SkinConfig
-from appliance.core.types import SweepFormat
-from appliance.sim import skin
+from palpate.core.clock import SystemClock
+from palpate.core.config import SkinConfig
+from palpate.core.types import SweepFormat
+from palpate.sim import skin
 
 
 class Real:

@@ -18,7 +18,7 @@ from typing import IO, Any
 
 import usb.core
 
-from appliance.core import config
+from palpate.core import config
 from tests.backends import BackendMissing, Skin, real
 
 PORT = "/dev/virtio-ports/palpate.bench"

@@ -1,4 +1,4 @@
-"""The simulator as a backend: appliance.sim below the drivers, a clock that skips all waits.
+"""The simulator as a backend: palpate.sim below the drivers, a clock that skips all waits.
 
 Its serial line is a pseudo-terminal.
 """
@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 
-from appliance.core import config
-from appliance.sim import devices, rig, skin
+from palpate.core import config
+from palpate.sim import devices, rig, skin
 from tests import backends
 from tests.backends import Skin, skins, tty
 from tests.factories.paths import NO_SITE

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from appliance.core.clock import Clock
-from appliance.core.types import EPOCH_BITS, SweepFormat
-from appliance.sim import rig, skin
+from palpate.core.clock import Clock
+from palpate.core.types import EPOCH_BITS, SweepFormat
+from palpate.sim import rig, skin
 from tests.backends import Skin
 from tests.factories.simulated_box import numbered
 

@@ -8,7 +8,7 @@ import tempfile
 from contextlib import ExitStack
 from pathlib import Path
 
-from appliance.tools import pseudo_terminal
+from palpate.tools import pseudo_terminal
 
 DELIVERY_S = 0.02
 """Time in which the kernel delivers bytes. A virtual clock cannot skip this wait."""

@@ -38,7 +38,7 @@ import serial
 import usb.core
 from gpiod.line import Bias, Direction, Value
 
-from appliance.core import config
+from palpate.core import config
 from tests.backends import BackendMissing, real
 
 DRIVERS = {"GPIO17": "GPIO18", "GPIO27": "GPIO9", "GPIO22": "GPIO10"}

@@ -141,7 +141,7 @@ CAMPAIGNS = {
     "test-hw": Campaign(
         "test skin, GPIO lines and serial line of this board (docs/board-checklist.md)",
         (*PYTEST, "-rs"),
-        paths=("tests/appliance/io/test_backends.py",),
+        paths=("tests/palpate/io/test_backends.py",),
         prepare=board_tests,
         variables={"PALPATE_BACKEND": "wired"},
     ),

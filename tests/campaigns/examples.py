@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from appliance.bundle import bundle
+from palpate.bundle import bundle
 from tests.factories.paths import ROOT
 
 DOCS = ROOT / "docs"
@@ -55,7 +55,7 @@ class Example:
 
 def check() -> str:
     """`palpate check` with the packaged bundle and a simulated skin."""
-    return _output([sys.executable, "-m", "appliance", "check", "--sim", "skin"], ROOT)
+    return _output([sys.executable, "-m", "palpate", "check", "--sim", "skin"], ROOT)
 
 
 def tutorial() -> str:

@@ -20,17 +20,17 @@ from typing import Any
 
 import numpy as np
 
-from appliance.bundle import bundle
-from appliance.core import config
-from appliance.core.errors import ApplianceError, LineError, ModelError, SensorError
-from appliance.core.health import Health
-from appliance.core.log import log
-from appliance.core.observer import Observer
-from appliance.core.types import Edge, EdgeKind, Frames, Status, Sweep, Verdict
-from appliance.io.robot_link import Command
-from appliance.runtime import assembly
-from appliance.runtime.loop import FAILURES, Box
-from appliance.sim import devices, rig, skin
+from palpate.bundle import bundle
+from palpate.core import config
+from palpate.core.errors import ApplianceError, LineError, ModelError, SensorError
+from palpate.core.health import Health
+from palpate.core.log import log
+from palpate.core.observer import Observer
+from palpate.core.types import Edge, EdgeKind, Frames, Status, Sweep, Verdict
+from palpate.io.robot_link import Command
+from palpate.runtime import assembly
+from palpate.runtime.loop import FAILURES, Box
+from palpate.sim import devices, rig, skin
 from tests.factories.paths import NO_SITE
 
 ERRORS = (RuntimeError, MemoryError, OSError, ModelError, LineError, SensorError, ValueError)

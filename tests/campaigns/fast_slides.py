@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from appliance.sim import skin
-from train.data.sets import Dataset
-from train.metrics.score import interval
-from train.models.recipe import recipe
-from train.models.recipe.recipe import Settings
-from train.onnx_tools.graph_builder import run, with_head
+from palpate.sim import skin
+from palpate_train.data.sets import Dataset
+from palpate_train.metrics.score import interval
+from palpate_train.models.recipe import recipe
+from palpate_train.models.recipe.recipe import Settings
+from palpate_train.onnx_tools.graph_builder import run, with_head
 
 Array = NDArray[Any]
 FASTER = (1.0, 1.5, 2.0, 3.0, 4.0)

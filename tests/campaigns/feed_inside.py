@@ -16,8 +16,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from appliance.__main__ import main
-from appliance.service.feed import FeedServer
+from palpate.__main__ import main
+from palpate.service.feed import FeedServer
 
 CALLS = ("frames", "answered", "sweep", "turn")
 _COUNT = struct.Struct("=q")

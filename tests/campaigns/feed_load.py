@@ -28,15 +28,15 @@ from typing import Any
 
 import numpy as np
 
-from appliance.client.answers import Answer
-from appliance.core import storage
-from appliance.core.provenance import commit
-from appliance.sim import skin
+from palpate.client.answers import Answer
+from palpate.core import storage
+from palpate.core.provenance import commit
+from palpate.sim import skin
+from palpate_studies import marked_text
 from tests.campaigns.feed_inside import spent_ns
 from tests.campaigns.feed_readers import KINDS
 from tests.factories.paths import ROOT
 from tests.rig.soak_boxes import Script, ThisMachine
-from train.studies import marked_text
 
 SLOT_S, SETTLE_S = 20.0, 2.0
 WAIT_S = 0.1

@@ -20,8 +20,8 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 
-from appliance.client.feed import parse
-from appliance.core.errors import FormatError
+from palpate.client.feed import parse
+from palpate.core.errors import FormatError
 from tests.factories.paths import ROOT
 
 ALL = b'{"frames": 20, "sweeps": true}\n'
@@ -228,7 +228,7 @@ def bridged(path: str, seen: Counter[str], stack: ExitStack) -> list[Act]:
     command = [
         sys.executable,
         "-m",
-        "appliance",
+        "palpate",
         "bridge",
         "modbus",
         "--feed",

@@ -1,7 +1,7 @@
 """Peak memory and time of `palpate-train fit` on sets of growing size.
 
 `python -m tests.campaigns fit-memory` prints a line for each number of windows: the bytes of the
-set, whether it is mapped (train/data/mapped.py), the peak memory that the process held without
+set, whether it is mapped (palpate_train.data.mapped), the peak memory that the process held without
 mapped files, that without a set that was read, and processor time. Sets are drawn from ten
 materials at four speeds in five sessions, 128 frames of 16 taxels in int16, 20 windows a recording.
 Options after `--` go to fit, such as `--split recording:0.9`.
@@ -19,8 +19,8 @@ from pathlib import Path
 
 import numpy as np
 
-from train.data import mapped
-from train.data.sets import Dataset
+from palpate_train.data import mapped
+from palpate_train.data.sets import Dataset
 
 WINDOWS = (1_000, 10_000, 50_000, 100_000)
 MATERIALS, EACH, SPEEDS, SESSIONS = 10, 20, 4, 5
@@ -92,7 +92,7 @@ def main(arguments: list[str]) -> None:
             del sweeps
             is_mapped = size >= mapped.LEAST
             words = ["fit", "--set", str(path), "--seed", "1", "--out", str(out), *args.fit]
-            most, total = peak([sys.executable, "-m", "train", *words])
+            most, total = peak([sys.executable, "-m", "palpate_train", *words])
         seconds, before = total - before, total
         mega = [f"{x / 1e6:.0f}" for x in (size, most, most - size * (not is_mapped))]
         print(

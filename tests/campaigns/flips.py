@@ -24,12 +24,12 @@ from pathlib import Path
 
 import numpy as np
 
-from appliance.bundle import bundle
-from appliance.core.errors import BundleError
-from appliance.core.provenance import commit
-from appliance.core.storage import put
-from appliance.deployment import signature
-from appliance.deployment.enrolment_key import KEY
+from palpate.bundle import bundle
+from palpate.core.errors import BundleError
+from palpate.core.provenance import commit
+from palpate.core.storage import put
+from palpate.deployment import signature
+from palpate.deployment.enrolment_key import KEY
 from tests.factories import deliveries, install_scripts
 from tests.factories.deliveries import Delivery
 

@@ -34,11 +34,12 @@ from statistics import median
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from appliance.bundle import bundle
-from appliance.client.answers import Answer
-from appliance.core import storage
-from appliance.core.provenance import commit
-from appliance.deployment import shadow
+from palpate.bundle import bundle
+from palpate.client.answers import Answer
+from palpate.core import storage
+from palpate.core.provenance import commit
+from palpate.deployment import shadow
+from palpate_studies import marked_text
 from tests.campaigns.feed_load import REAL_TIME
 from tests.campaigns.full_load_judge import Phase, figures, missed, table
 from tests.factories.bridges import bridge
@@ -47,7 +48,6 @@ from tests.robots.attacked import said
 from tests.robots.shared_line import SharedLine
 from tests.robots.side_by_side import page_of
 from tests.skins import load
-from train.studies import marked_text
 
 SKINS = ("flexitac", "papillarray")
 SETTLE_S, LOOK_S, WAIT_S = 20.0, 5.0, 0.1
@@ -251,7 +251,7 @@ class FullLoad:
             *self._before,
             sys.executable,
             "-m",
-            "appliance",
+            "palpate",
             "check",
             *(f"--set={text}" for text in chosen),
         ]

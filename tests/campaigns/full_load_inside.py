@@ -18,17 +18,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from appliance.__main__ import main
-from appliance.bundle.bundle import Bundle
-from appliance.core.clock import SystemClock
-from appliance.core.config import Config
-from appliance.core.devices import Devices
-from appliance.core.health import Health
-from appliance.core.types import Edge, EdgeKind, Sweep, Verdict
-from appliance.io.robot_link import SerialSink
-from appliance.recording.recording import Labels, RecordingSession
-from appliance.runtime import assembly
-from appliance.runtime.loop import Box
+from palpate.__main__ import main
+from palpate.bundle.bundle import Bundle
+from palpate.core.clock import SystemClock
+from palpate.core.config import Config
+from palpate.core.devices import Devices
+from palpate.core.health import Health
+from palpate.core.types import Edge, EdgeKind, Sweep, Verdict
+from palpate.io.robot_link import SerialSink
+from palpate.runtime import assembly
+from palpate.runtime.loop import Box
+from palpate.sweeps.recording import Labels, RecordingSession
 from tests.skins.load import FrameCheck
 
 EVERY_NS = 500_000_000

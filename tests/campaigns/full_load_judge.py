@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from appliance.runtime.selftest import MOST_READING
+from palpate.runtime.selftest import MOST_READING
 from tests.campaigns.feed_load import LATE_MS
 
 Json = dict[str, Any]

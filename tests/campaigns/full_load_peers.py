@@ -16,7 +16,7 @@ import threading
 import time
 from collections import Counter
 
-from appliance.core.sentences import sentence
+from palpate.core.sentences import sentence
 from tests.campaigns.feed_readers import PAUSE_S, acts, asker
 from tests.campaigns.page_load import browse
 from tests.factories.page_client import PageAddress

@@ -26,19 +26,19 @@ from typing import Any
 
 import numpy as np
 
-from appliance.bundle import bundle
-from appliance.bundle.bundle import Bundle, Manifest, Thresholds
-from appliance.bundle.onnx_check import check
-from appliance.core import storage
-from appliance.core.clock import SystemClock
-from appliance.core.errors import BundleError
-from appliance.core.types import Frames, Status, Sweep
-from appliance.inference.classifier import Classifier
-from appliance.inference.session import session
+from palpate.bundle import bundle
+from palpate.bundle.bundle import Bundle, Manifest, Thresholds
+from palpate.bundle.onnx_check import check
+from palpate.core import storage
+from palpate.core.clock import SystemClock
+from palpate.core.errors import BundleError
+from palpate.core.types import Frames, Status, Sweep
+from palpate.inference.classifier import Classifier
+from palpate.inference.session import session
+from palpate_train.metrics.score import provenance
 from tests.factories import mutated_enrolments
 from tests.factories.grown_models import FORMAT, grown
 from tests.factories.mutated_models import Own, mutated, own_models
-from train.metrics.score import provenance
 
 DEADLINE_S = 10.0
 MOST_MORE = 256 << 20

@@ -19,15 +19,15 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from appliance.bundle import bundle
-from appliance.core import storage
-from appliance.core.provenance import commit
-from appliance.core.types import Frames, Status, Sweep, Verdict
-from appliance.inference.classifier import Classifier
-from appliance.inference.early_exit import EarlyExit
-from appliance.sim import skin
-from appliance.sim.rig import VirtualClock
-from train.studies import marked_text
+from palpate.bundle import bundle
+from palpate.core import storage
+from palpate.core.provenance import commit
+from palpate.core.types import Frames, Status, Sweep, Verdict
+from palpate.inference.classifier import Classifier
+from palpate.inference.early_exit import EarlyExit
+from palpate.sim import skin
+from palpate.sim.rig import VirtualClock
+from palpate_studies import marked_text
 
 Counts = NDArray[np.float64]
 N, RATE = skin.FORMAT.window, skin.FORMAT.rate_hz

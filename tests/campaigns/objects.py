@@ -16,14 +16,14 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from appliance.bundle import bundle
-from appliance.core.types import Frames, Status, Sweep, Verdict
-from appliance.inference import classifier
-from appliance.inference.classifier import Classifier, Touched
-from appliance.inference.objects import contradicts
-from appliance.signal.contact import Displacement
-from appliance.sim import skin
-from appliance.sim.rig import VirtualClock
+from palpate.bundle import bundle
+from palpate.core.types import Frames, Status, Sweep, Verdict
+from palpate.inference import classifier
+from palpate.inference.classifier import Classifier, Touched
+from palpate.inference.objects import contradicts
+from palpate.signal.contact import Displacement
+from palpate.sim import skin
+from palpate.sim.rig import VirtualClock
 
 Scores = NDArray[np.float64]
 Pool = dict[tuple[int, str], list[Verdict]]

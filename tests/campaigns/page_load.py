@@ -22,14 +22,14 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from appliance.core import storage
-from appliance.core.provenance import commit
+from palpate.core import storage
+from palpate.core.provenance import commit
 from tests.factories.page_client import EventReader, PageAddress, ask
 from tests.factories.paths import ROOT
 
 BROWSERS = (0, 1, 8)
 SETTLE_S = 5.0
-RUN = [sys.executable, "-m", "appliance"]
+RUN = [sys.executable, "-m", "palpate"]
 
 
 def used(pid: int) -> tuple[float, int, int]:

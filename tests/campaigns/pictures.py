@@ -18,8 +18,8 @@ from rich.console import Console
 from rich.terminal_theme import MONOKAI
 from rich.text import Text
 
-from appliance.bundle import bundle
-from appliance.watch.access import Access
+from palpate.bundle import bundle
+from palpate.web.access import Access
 from tests.factories import feed_lines
 from tests.factories.browser import launched, until
 from tests.factories.paths import ROOT
@@ -53,7 +53,7 @@ def page(path: Path) -> None:
 
 def demo(path: Path) -> None:
     """Write the output of `palpate demo --virtual` as SVG, which asks for nothing outside of it."""
-    command = [sys.executable, "-m", "appliance", "demo", "--virtual"]
+    command = [sys.executable, "-m", "palpate", "demo", "--virtual"]
     run = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT)
     console = Console(record=True, width=COLUMNS, file=StringIO())
     for line in ["$ make demo", *run.stdout.splitlines()]:

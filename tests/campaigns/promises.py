@@ -17,19 +17,19 @@ from pathlib import Path
 
 import numpy as np
 
-from appliance.bundle import bundle
-from appliance.core.clock import SystemClock
-from appliance.core.errors import ApplianceError
-from appliance.core.provenance import commit
-from appliance.inference.classifier import Classifier
-from train.data.sets import Dataset
-from train.export import bundle_score, quantized_bundle
-from train.metrics.answers import outcomes
-from train.models.recipe import recipe
-from train.models.recipe.recipe import Settings
-from train.onnx_tools.graph_builder import run
-from train.studies.fabrics_experiment import FABRICS, FOUR, SEVEN
-from train.studies.study import StudyCase
+from palpate.bundle import bundle
+from palpate.core.clock import SystemClock
+from palpate.core.errors import ApplianceError
+from palpate.core.provenance import commit
+from palpate.inference.classifier import Classifier
+from palpate_studies.fabrics_experiment import FABRICS, FOUR, SEVEN
+from palpate_studies.study import StudyCase
+from palpate_train.data.sets import Dataset
+from palpate_train.export import bundle_score, quantized_bundle
+from palpate_train.metrics.answers import outcomes
+from palpate_train.models.recipe import recipe
+from palpate_train.models.recipe.recipe import Settings
+from palpate_train.onnx_tools.graph_builder import run
 
 FABRIC_SETS = {"7 fabrics": SEVEN, "4 fabrics": FOUR}
 WORLDS = {"laboratory": "sim:T-REAL:1-3", "level-blind": "sim:T-REAL/level-blind:1-3"}

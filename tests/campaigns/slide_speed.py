@@ -3,7 +3,7 @@
 `python -m tests.campaigns slide-speed` prints the tables of docs/decisions/0021: simulated slides
 of two worlds at several speeds, displaced, noisy and with broken taxels; windows without a slide;
 real slides at 35.6 Hz, if PALPATE_DATA names the folder of FabricSlide; and the processor time.
-Takes two minutes. No sweep of it was used to choose the limits of `appliance/signal/slide.py`.
+Takes two minutes. No sweep of it was used to choose the limits of `palpate/signal/slide.py`.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from appliance.bundle import bundle
-from appliance.core.clock import SystemClock
-from appliance.core.types import Frames, Status, Sweep, SweepFormat
-from appliance.inference.classifier import Classifier
-from appliance.signal.slide import Slide, SlideMeter
-from appliance.sim import skin
+from palpate.bundle import bundle
+from palpate.core.clock import SystemClock
+from palpate.core.types import Frames, Status, Sweep, SweepFormat
+from palpate.inference.classifier import Classifier
+from palpate.signal.slide import Slide, SlideMeter
+from palpate.sim import skin
 
 Array = NDArray[Any]
 NEAR = 0.2

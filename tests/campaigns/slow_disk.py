@@ -18,13 +18,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from unittest.mock import patch
 
-from appliance.core import config
-from appliance.core.clock import SystemClock
-from appliance.core.disk_thread import DiskThread
-from appliance.core.log import log
-from appliance.recording.recording import Labels, RecordingSession
-from appliance.runtime import assembly
-from appliance.sim import devices, rig, script, skin
+from palpate.core import config
+from palpate.core.clock import SystemClock
+from palpate.core.disk_thread import DiskThread
+from palpate.core.log import log
+from palpate.runtime import assembly
+from palpate.sim import devices, rig, script, skin
+from palpate.sweeps.recording import Labels, RecordingSession
 from tests.factories.paths import NO_SITE
 from tests.factories.simulated_box import OnSweep
 

@@ -20,16 +20,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from appliance.signal.slide import SlideMeter
-from appliance.sim import skin
-from train.calibration.heads import HeadData, HeadPart
-from train.data import sets
-from train.data.sets import Dataset
-from train.data.splitters import Fold, InnerPart, Protocol
-from train.models.methods import no_log
-from train.models.recipe import choice, recipe, stage_heads
-from train.models.recipe.choice import HeldOutScores, ScoredPlan
-from train.models.recipe.recipe import Settings, Setup
+from palpate.signal.slide import SlideMeter
+from palpate.sim import skin
+from palpate_train.calibration.heads import HeadData, HeadPart
+from palpate_train.data import sets
+from palpate_train.data.sets import Dataset
+from palpate_train.data.splitters import Fold, InnerPart, Protocol
+from palpate_train.models.methods import no_log
+from palpate_train.models.recipe import choice, recipe, stage_heads
+from palpate_train.models.recipe.choice import HeldOutScores, ScoredPlan
+from palpate_train.models.recipe.recipe import Settings, Setup
 
 Array = NDArray[Any]
 BANDS = 12

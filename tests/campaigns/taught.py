@@ -19,19 +19,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from appliance.bundle import bundle
-from appliance.bundle.bundle import Bundle
-from appliance.core.clock import SystemClock
-from appliance.core.errors import ApplianceError
-from appliance.core.types import Status
-from appliance.inference import enrolment
-from appliance.inference.classifier import Classifier
-from train.data import sets
-from train.data.sets import Dataset
-from train.data.splitters import draw
-from train.export import bundle_score, quantized_bundle
-from train.models.recipe import recipe
-from train.models.recipe.fitted import Fit
+from palpate.bundle import bundle
+from palpate.bundle.bundle import Bundle
+from palpate.core.clock import SystemClock
+from palpate.core.errors import ApplianceError
+from palpate.core.types import Status
+from palpate.inference import enrolment
+from palpate.inference.classifier import Classifier
+from palpate_train.data import sets
+from palpate_train.data.sets import Dataset
+from palpate_train.data.splitters import draw
+from palpate_train.export import bundle_score, quantized_bundle
+from palpate_train.models.recipe import recipe
+from palpate_train.models.recipe.fitted import Fit
 
 Array = NDArray[np.bool_]
 SETS = ("sim:T-REAL:1:10", "sim:T-REAL/level-blind:1:10", "fabricslide/fabricslide.npz")

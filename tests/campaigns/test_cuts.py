@@ -40,7 +40,7 @@ def play(work: Path) -> Makes:
         does: str, before: str = "", judge: Callable[[Found], list[str]] = lambda found: []
     ) -> ScenePlay:
         code = (
-            "import os, sys; from pathlib import Path; from appliance.core import storage; "
+            "import os, sys; from pathlib import Path; from palpate.core import storage; "
             "f = Path(sys.argv[1])\n"
         )
 

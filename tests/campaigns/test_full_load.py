@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from appliance.core.clock import SystemClock
-from appliance.core.types import Frames, SweepFormat
+from palpate.core.clock import SystemClock
+from palpate.core.types import Frames, SweepFormat
 from tests.campaigns import full_load
 from tests.campaigns.full_load_judge import figures, missed, table
 from tests.factories import toy_bundle

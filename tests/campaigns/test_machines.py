@@ -18,15 +18,15 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from appliance.bundle import bundle
-from appliance.inference.classifier import softmax
+from palpate.bundle import bundle
+from palpate.inference.classifier import softmax
+from palpate_train.data import sets
+from palpate_train.export import quantized_bundle
+from palpate_train.onnx_tools import parity
+from palpate_train.onnx_tools.graph_builder import TENSOR
 from tests.factories import emulated_machines
 from tests.factories.sweep_sets import easy
 from tests.factories.trained_stages import with_stages
-from train.data import sets
-from train.export import quantized_bundle
-from train.onnx_tools import parity
-from train.onnx_tools.graph_builder import TENSOR
 
 pytestmark = [pytest.mark.slow, pytest.mark.thorough]  # emulated processors
 

@@ -9,9 +9,9 @@ import sys
 
 import pytest
 
+from palpate_studies.command import PROGRAM
 from tests.campaigns import __main__ as campaigns
 from tests.factories.paths import ROOT
-from train.studies.command import PROGRAM
 
 READ = (".md", ".py", ".toml", ".yml", ".yaml", ".html", ".j2", ".service")
 """Suffixes of files that name commands; .ci/run does, too."""
@@ -63,7 +63,7 @@ def test_files_name_campaigns_and_studies_that_exist():
     names = set(campaigns.CAMPAIGNS)
     assert unknown(r"(?:-m tests\.campaigns|\$campaign) ([a-z][a-z-]*)", names) == []
     studies = {*PROGRAM.descriptions()}
-    assert unknown(r"(?:-m train\.studies|\$study) ([a-z][a-z-]*)", studies) == []
+    assert unknown(r"(?:-m palpate_studies|\$study) ([a-z][a-z-]*)", studies) == []
 
 
 @pytest.mark.parametrize("name", campaigns.CAMPAIGNS)

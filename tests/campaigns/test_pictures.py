@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from appliance.bundle import bundle
+from palpate.bundle import bundle
 from tests.campaigns import pictures
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from palpate_train.data.sets import Dataset
 from tests.campaigns import promises
 from tests.factories.sweep_sets import easy
-from train.data.sets import Dataset
 
 
 @pytest.mark.slow

@@ -14,9 +14,9 @@ from pathlib import Path
 
 import pytest
 
-from appliance.core.clock import SystemClock
-from appliance.io import packets
-from appliance.sim import rig, skin
+from palpate.core.clock import SystemClock
+from palpate.io import packets
+from palpate.sim import rig, skin
 from tests.factories import emulated_machines
 from tests.rig import image, notes
 from tests.rig import shell as shell_lines

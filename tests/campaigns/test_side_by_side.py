@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from appliance.tools import pseudo_terminal
+from palpate.tools import pseudo_terminal
 from tests.campaigns.feed_readers import PAUSE_S
 from tests.factories.bridges import LONG_S, bridge
 from tests.factories.speaking_box import SpeakingBox, state

@@ -15,20 +15,20 @@ from contextlib import ExitStack
 import numpy as np
 import pytest
 
-from appliance.bundle import bundle
-from appliance.client.answers import Answer
-from appliance.core import config
-from appliance.core.sentences import sentence
-from appliance.io.robot_link import StdoutPort
-from appliance.runtime import assembly
-from appliance.sim import devices, script, skin
-from appliance.sim.rig import VirtualClock
+from palpate.bundle import bundle
+from palpate.client.answers import Answer
+from palpate.core import config
+from palpate.core.sentences import sentence
+from palpate.io.robot_link import StdoutPort
+from palpate.runtime import assembly
+from palpate.sim import devices, script, skin
+from palpate.sim.rig import VirtualClock
+from palpate_train.reports.plot_style import SCHEMES
 from tests.factories.page_reader import PageReader
 from tests.factories.paths import NO_SITE
 from tests.rig import soak, soak_judge, soak_page
 from tests.rig.soak_boxes import Gone, Reckoned, Script, ThisMachine, process
 from tests.rig.soak_judge import SAMPLE
-from train.reports.plot_style import SCHEMES
 
 RATE = skin.FORMAT.rate_hz
 SILENT_CPU_S, SILENT_S = 30, 300

@@ -19,13 +19,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from appliance.core.clock import SystemClock
-from appliance.inference.classifier import Classifier
-from appliance.inference.novelty import shaped_distances
+from palpate.core.clock import SystemClock
+from palpate.inference.classifier import Classifier
+from palpate.inference.novelty import shaped_distances
+from palpate_train.calibration.novelty import auroc
+from palpate_train.data import sets
+from palpate_train.data.sets import Dataset
 from tests.campaigns.taught import exported
-from train.calibration.novelty import auroc
-from train.data import sets
-from train.data.sets import Dataset
 
 Array = NDArray[Any]
 KEPT = 0.97

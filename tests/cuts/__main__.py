@@ -104,7 +104,7 @@ def _head() -> dict[str, str]:
     """The head of a log: the commit, a digest of the code itself, and the machine."""
     git = ("git", "-C", str(ROOT), "describe", "--always", "--dirty")
     commit = subprocess.run(git, capture_output=True, text=True, check=False).stdout.strip()
-    sources = (tree.read(ROOT / folder) for folder in ("appliance", "tests/cuts"))
+    sources = (tree.read(ROOT / folder) for folder in ("appliance/palpate", "tests/cuts"))
     digests = [
         tree.digest({name: held for name, held in s.items() if "__pycache__" not in name})
         for s in sources

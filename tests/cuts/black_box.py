@@ -11,8 +11,8 @@ import re
 import sys
 from pathlib import Path
 
-from appliance.core.disk_thread import AtOnce, DiskThread, DiskWork
-from appliance.recording.black_box import BlackBox
+from palpate.core.disk_thread import AtOnce, DiskThread, DiskWork
+from palpate.sweeps.black_box import BlackBox
 from tests.cuts import recording
 from tests.cuts.scene import CutScene, Found, SceneStep
 from tests.factories import log_lines

@@ -12,7 +12,7 @@ import ctypes
 import runpy
 import sys
 
-from appliance.core.disk_thread import DiskThread
+from palpate.core.disk_thread import DiskThread
 
 
 def main() -> None:

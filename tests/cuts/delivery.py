@@ -21,16 +21,16 @@ from subprocess import run
 from tempfile import TemporaryDirectory
 from types import MappingProxyType
 
-from appliance.bundle import bundle
-from appliance.bundle.manifest import SCHEMA
-from appliance.cli import enrol_command
-from appliance.cli.main import main
-from appliance.core import storage
-from appliance.core.config import Config
-from appliance.deployment import signature
-from appliance.deployment.enrolment_key import EnrolmentKey
-from appliance.deployment.store import SHA
-from appliance.deployment.trial import Trial
+from palpate.bundle import bundle
+from palpate.bundle.manifest import SCHEMA
+from palpate.cli import enrol_command
+from palpate.cli.main import main
+from palpate.core import storage
+from palpate.core.config import Config
+from palpate.deployment import signature
+from palpate.deployment.enrolment_key import EnrolmentKey
+from palpate.deployment.store import SHA
+from palpate.deployment.trial import Trial
 from tests.cuts.calls import DEADLINE_S, NotFollowed
 from tests.cuts.scene import CutScene, Found, SceneStep
 from tests.factories.install_scripts import enrolment_key
@@ -101,7 +101,7 @@ class Shop:
     def palpate(self, name: str, *words: str, way: str = "", code: int | None = None) -> SceneStep:
         """A command of the box, in one of WAYS or unchanged. code: its exit code, if it differs
         from that of its way."""
-        program = ["tests.cuts.delivery", way] if way else ["appliance"]
+        program = ["tests.cuts.delivery", way] if way else ["palpate"]
         ends = code if code is not None else DIED if way == "crash" else 0
         return SceneStep(
             name, lambda folder: [sys.executable, "-m", *program, *self.words(folder, *words)], ends

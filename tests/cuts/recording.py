@@ -16,13 +16,13 @@ from pathlib import Path
 
 import numpy as np
 
-from appliance.core import storage
-from appliance.core.clock import SystemClock
-from appliance.core.disk_thread import AtOnce, DiskThread, DiskWork
-from appliance.core.errors import FormatError
-from appliance.core.types import Frames, Status, Sweep, SweepFormat, Verdict, load
-from appliance.recording.recording import Labels, RecordingSession
-from appliance.sim import skin
+from palpate.core import storage
+from palpate.core.clock import SystemClock
+from palpate.core.disk_thread import AtOnce, DiskThread, DiskWork
+from palpate.core.errors import FormatError
+from palpate.core.types import Frames, Status, Sweep, SweepFormat, Verdict, load
+from palpate.sim import skin
+from palpate.sweeps.recording import Labels, RecordingSession
 from tests.cuts.scene import CutScene, Found, SceneStep
 
 SHORT = SweepFormat(4, 4, 750, 40, "uint8")
@@ -191,7 +191,7 @@ def scene(way: str = "right") -> CutScene:
 
 def palpate() -> CutScene:
     """The same with the box's command."""
-    words = ("appliance", "record", "--sim", "skin", "--virtual", "--sweeps", "2", "--out")
+    words = ("palpate", "record", "--sim", "skin", "--virtual", "--sweeps", "2", "--out")
     return _sessions(
         "palpate-record", skin.FORMAT, lambda kept, name: [*words, kept, "--session", name]
     )

@@ -17,14 +17,14 @@ from tempfile import TemporaryDirectory
 from typing import Any
 from unittest import mock
 
-from appliance.bundle import bundle
-from appliance.cli.main import main
-from appliance.core import storage
-from appliance.core.clock import Clock
-from appliance.core.errors import FormatError
-from appliance.core.types import load
-from appliance.teaching import use
-from appliance.teaching.state import TeachingState
+from palpate.bundle import bundle
+from palpate.cli.main import main
+from palpate.core import storage
+from palpate.core.clock import Clock
+from palpate.core.errors import FormatError
+from palpate.core.types import load
+from palpate.learn import use
+from palpate.learn.state import TeachingState
 from tests.cuts import delivery
 from tests.cuts.calls import NotFollowed
 from tests.cuts.delivery import STORE, Shop

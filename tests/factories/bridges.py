@@ -41,7 +41,7 @@ def bridge(kind: str, *options: str | Path) -> Iterator[tuple[str, int]]:
     command = [
         sys.executable,
         "-m",
-        "appliance.bridges",
+        "palpate.bridges",
         kind,
         "--listen",
         "127.0.0.1:0",

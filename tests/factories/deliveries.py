@@ -10,14 +10,14 @@ from pathlib import Path
 
 import pytest
 
-from appliance.bundle import bundle
-from appliance.bundle.bundle import Bundle
-from appliance.bundle.manifest import SCHEMA, Manifest
-from appliance.core.config import StoreConfig
-from appliance.deployment import signature
-from appliance.deployment.enrolment_key import EnrolmentKey
-from appliance.deployment.store import Store
-from appliance.inference import enrolment
+from palpate.bundle import bundle
+from palpate.bundle.bundle import Bundle
+from palpate.bundle.manifest import SCHEMA, Manifest
+from palpate.core.config import StoreConfig
+from palpate.deployment import signature
+from palpate.deployment.enrolment_key import EnrolmentKey
+from palpate.deployment.store import Store
+from palpate.inference import enrolment
 from tests.factories.install_scripts import enrolment_key
 
 SIGNER = "anna@lab"

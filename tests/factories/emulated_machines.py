@@ -228,9 +228,9 @@ def work(given: Path, target: Path) -> None:
     """
     import numpy as np
 
-    from appliance.bundle import bundle
-    from appliance.core import clock
-    from appliance.inference import classifier, session
+    from palpate.bundle import bundle
+    from palpate.core import clock
+    from palpate.inference import classifier, session
 
     outputs = {}
     for path in sorted(given.iterdir()):

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from appliance.core.health import Health
-from appliance.core.types import Frames, Status, Sweep, SweepFormat, Verdict
-from appliance.service.feed import PERIOD_NS, FeedServer
-from appliance.sim import rig, skin
+from palpate.core.health import Health
+from palpate.core.types import Frames, Status, Sweep, SweepFormat, Verdict
+from palpate.service.feed import PERIOD_NS, FeedServer
+from palpate.sim import rig, skin
 from tests.factories.simulated_box import SECOND, numbered
 
 HEALTH = Health(

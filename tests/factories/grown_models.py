@@ -13,11 +13,11 @@ import numpy as np
 import onnx
 from onnx import helper, numpy_helper
 
-from appliance.bundle.onnx_check import operators
-from appliance.bundle.onnx_check.operators import OPERATORS
-from appliance.bundle.onnx_check.shapes import INDEX, Call, Value
-from appliance.core.errors import BundleError
-from appliance.core.types import SweepFormat
+from palpate.bundle.onnx_check import operators
+from palpate.bundle.onnx_check.operators import OPERATORS
+from palpate.bundle.onnx_check.shapes import INDEX, Call, Value
+from palpate.core.errors import BundleError
+from palpate.core.types import SweepFormat
 
 FORMAT = SweepFormat(2, 2, 100.0, 24, "uint8")
 SIZES = (1, 1, 1, 2, 2, 3, 4, 6, 8, 24, 96)

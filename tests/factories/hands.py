@@ -8,15 +8,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from appliance.bundle import bundle
-from appliance.bundle.bundle import Bundle
-from appliance.core.config import Config
-from appliance.core.observer import Observer
-from appliance.core.types import Sweep, SweepFormat
-from appliance.io.robot_link import SerialSink
-from appliance.runtime import assembly
-from appliance.sim import devices, rig, script, skin
-from appliance.tools import pseudo_terminal
+from palpate.bundle import bundle
+from palpate.bundle.bundle import Bundle
+from palpate.core.config import Config
+from palpate.core.observer import Observer
+from palpate.core.types import Sweep, SweepFormat
+from palpate.io.robot_link import SerialSink
+from palpate.runtime import assembly
+from palpate.sim import devices, rig, script, skin
+from palpate.tools import pseudo_terminal
 from tests.factories.settings import load
 from tests.factories.simulated_box import OnSweep, Rigged
 

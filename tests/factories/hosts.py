@@ -28,7 +28,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any, Self
 
-from appliance.core.provenance import commit
+from palpate.core.provenance import commit
 from tests.factories import deliveries, nspawn
 from tests.factories.emulated_machines import HOME, ROOT, Missing, run, wheel, whole
 

@@ -7,7 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from appliance.deployment.enrolment_key import EnrolmentKey
+from palpate.deployment.enrolment_key import EnrolmentKey
 from tests.factories.paths import ROOT
 
 SCRIPTS = ROOT / "systemd"

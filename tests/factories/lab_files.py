@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from appliance.sim import skin
+from palpate.sim import skin
 
 LEAD_FRAMES = 300
 """Frames before and after the window of a sweep."""

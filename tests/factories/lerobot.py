@@ -25,7 +25,7 @@ PYTHON = ROOT / os.environ.get("PALPATE_LEROBOT", "build/lerobot") / "bin" / "py
 """The Python of an environment with LeRobot and the plug-in. PALPATE_LEROBOT names another; then a
 missing LeRobot is a failure.
 """
-PLUGIN = ROOT / "appliance" / "bridges" / "lerobot"
+PLUGIN = ROOT / "appliance" / "plugins" / "lerobot"
 NAME = "lerobot_camera_palpate"
 
 
@@ -37,7 +37,7 @@ def required() -> None:
         pytest.fail(f"{PYTHON} is not there")
     pytest.skip(
         "no LeRobot here (6 GB); python3 -m venv build/lerobot, then "
-        "build/lerobot/bin/pip install -e .[lerobot] -e appliance/bridges/lerobot"
+        "build/lerobot/bin/pip install -e .[lerobot] -e appliance/plugins/lerobot"
     )
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from appliance.core.sweep_set import SweepSet
-from appliance.core.types import Frames, Status, Sweep, save
+from palpate.core.sweep_set import SweepSet
+from palpate.core.types import Frames, Status, Sweep, save
 
 
 def write(folder: Path, sweeps: SweepSet, *, first: int = 1, position: bool = False) -> None:

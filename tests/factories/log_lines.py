@@ -8,7 +8,7 @@ import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from appliance.core.log import log
+from palpate.core.log import log
 
 
 class LineCollector(logging.Handler):

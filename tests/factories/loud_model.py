@@ -10,11 +10,11 @@ import numpy as np
 import onnx
 from onnx import TensorProto
 
-from appliance.core.types import SweepFormat
-from train.data.sets import Dataset
-from train.models.methods import Method
-from train.onnx_tools.graph_builder import GraphBuilder, GraphModel, run
-from train.onnx_tools.quantize import quantize
+from palpate.core.types import SweepFormat
+from palpate_train.data.sets import Dataset
+from palpate_train.models.methods import Method
+from palpate_train.onnx_tools.graph_builder import GraphBuilder, GraphModel, run
+from palpate_train.onnx_tools.quantize import quantize
 
 FORMAT = SweepFormat(2, 2, 100.0, 40, "uint8")
 

@@ -13,8 +13,8 @@ from random import Random
 
 import numpy as np
 
-from appliance.bundle import bundle
-from appliance.bundle.enrolled import ARRAYS
+from palpate.bundle import bundle
+from palpate.bundle.enrolled import ARRAYS
 from tests.factories import deliveries
 from tests.factories.mutated_models import FLOATS, NUMBERS, flip
 

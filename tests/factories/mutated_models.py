@@ -15,10 +15,10 @@ import numpy as np
 import onnx
 from onnx import helper, numpy_helper
 
-from appliance.bundle import bundle
-from appliance.bundle.bundle import Manifest, Thresholds
-from appliance.bundle.onnx_check.operators import OPERATORS
-from appliance.core.errors import FormatError
+from palpate.bundle import bundle
+from palpate.bundle.bundle import Manifest, Thresholds
+from palpate.bundle.onnx_check.operators import OPERATORS
+from palpate.core.errors import FormatError
 
 NUMBERS = (
     0,
@@ -88,8 +88,8 @@ def own_models(names: tuple[str, ...] = ()) -> list[Own]:
     """The models of the default bundle and of these methods (default: all), trained for a moment on
     a small skin.
     """
+    from palpate_train.models import methods
     from tests.factories.sweep_sets import tones
-    from train.models import methods
 
     sweeps, found = tones(), [own_default()]
     for name, method in methods.every(methods.Effort(0.02, 2)).items():

@@ -56,8 +56,8 @@ PLACES = {
 """The destinations of the files of systemd/."""
 CABLE = """
 import os, sys, time
-from appliance.__main__ import main
-from appliance.sim import usb
+from palpate.__main__ import main
+from palpate.sim import usb
 class Cable(usb.RigBackend):
     # plugged in while /run/skin is there; its bus hangs while /run/hang is
     def _touch(self, what=""):

@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
-from appliance.watch.server import PageServer
+from palpate.web.server import PageServer
 from tests.factories.browser import WAIT_S
 
 

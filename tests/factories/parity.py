@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from train.data.sets import Dataset
+from palpate_train.data.sets import Dataset
 
 
 def close(n: int = 80, dtype: str = "uint8", seed: int = 0) -> Dataset:

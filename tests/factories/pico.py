@@ -20,7 +20,7 @@ from typing import Any
 
 import pytest
 
-from appliance.tools import pseudo_terminal
+from palpate.tools import pseudo_terminal
 from tests.factories.paths import ROOT
 
 FIRMWARE = ROOT / "firmware_config" / "pico"

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from appliance.core.clock import SystemClock
-from appliance.sim.skins.player import Player
-from appliance.sim.skins.wires import wire
+from palpate.core.clock import SystemClock
+from palpate.sim.skins.player import Player
+from palpate.sim.skins.wires import wire
 
 SHAPES: dict[str, tuple[tuple[int, ...], str, float]] = {
     "flexitac": ((12, 32), "uint8", 100.0),

@@ -11,14 +11,14 @@ from typing import Any, Self
 
 import numpy as np
 
-from appliance.core.clock import SystemClock
-from appliance.core.config import TriggerConfig
-from appliance.core.types import Frames, Status, Sweep, Verdict
-from appliance.io.robot_link import Command
-from appliance.recording.recording import Labels, RecordingSession
-from appliance.sim import skin
-from appliance.watch.access import Access
-from appliance.watch.record import RecordPage
+from palpate.core.clock import SystemClock
+from palpate.core.config import TriggerConfig
+from palpate.core.types import Frames, Status, Sweep, Verdict
+from palpate.io.robot_link import Command
+from palpate.sim import skin
+from palpate.sweeps.recording import Labels, RecordingSession
+from palpate.web.access import Access
+from palpate.web.record import RecordPage
 from tests.factories.feed_lines import load
 from tests.factories.feeds import HEALTH, OK, cut
 from tests.factories.page_client import EventReader, Page, ask, port

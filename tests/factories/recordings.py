@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from appliance.core.types import Frames, Status, Sweep, SweepFormat, save
+from palpate.core.types import Frames, Status, Sweep, SweepFormat, save
 
 FORMAT = SweepFormat(2, 3, 50.0, 8, "int16")
 

@@ -117,7 +117,7 @@ def bridge(
     *parameters: str, log: int = subprocess.DEVNULL, **variables: str
 ) -> Iterator[subprocess.Popen[bytes]]:
     """Run the bridge as a node. log: file for its log. variables: environment variables."""
-    command = [PYTHON, "-m", "appliance.bridges", "ros", "--ros-args", *parameters]
+    command = [PYTHON, "-m", "palpate.bridges", "ros", "--ros-args", *parameters]
     with subprocess.Popen(command, cwd=ROOT, env=environment() | variables, stderr=log) as process:
         try:
             yield process

@@ -12,10 +12,10 @@ import threading
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
-from appliance.core.clock import SystemClock
-from appliance.io import packets
-from appliance.sim import rig
-from appliance.tools import pseudo_terminal
+from palpate.core.clock import SystemClock
+from palpate.io import packets
+from palpate.sim import rig
+from palpate.tools import pseudo_terminal
 
 TURN_S = 0.002
 

@@ -6,8 +6,8 @@ import dataclasses
 from collections.abc import Iterable
 from pathlib import Path
 
-from appliance.core import config
-from appliance.core.config import Config
+from palpate.core import config
+from palpate.core.config import Config
 
 NO_FILE = Path("/dev/null")
 

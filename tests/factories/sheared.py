@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from appliance.sim import skin
-from train.data.sets import Dataset
+from palpate.sim import skin
+from palpate_train.data.sets import Dataset
 
 PITCH_MM = 6.0
 WORLD = skin.World(rows=2, cols=2, pitch_mm=(PITCH_MM, PITCH_MM), shear=True)

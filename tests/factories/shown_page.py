@@ -5,9 +5,9 @@ from __future__ import annotations
 import threading
 from typing import Any, Self
 
-from appliance.watch.access import Access
-from appliance.watch.board import KEPT, PageBoard
-from appliance.watch.server import PageServer
+from palpate.web.access import Access
+from palpate.web.board import KEPT, PageBoard
+from palpate.web.server import PageServer
 from tests.factories import feed_lines
 from tests.factories.browser import BrowsedPage, until
 

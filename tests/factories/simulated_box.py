@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from appliance.core.observer import Observer
-from appliance.core.types import Sweep, SweepFormat, Verdict
-from appliance.io.robot_link import SerialSink
-from appliance.runtime.loop import Box
-from appliance.sim import devices, rig, skin
+from palpate.core.observer import Observer
+from palpate.core.types import Sweep, SweepFormat, Verdict
+from palpate.io.robot_link import SerialSink
+from palpate.runtime.loop import Box
+from palpate.sim import devices, rig, skin
 
 SECOND = 1_000_000_000
 SETTLE_S = 0.02

@@ -3,7 +3,7 @@
 For each skin: the expected content of its frames, their bytes after the makers' descriptions, and a
 port that delivers them with a driver's buffer and every fault.
 
-The bytes are on purpose not those of `appliance.sim.skins.wires`. The second implementation makes
+The bytes are on purpose not those of `palpate.sim.skins.wires`. The second implementation makes
 other choices where a skin allows several (width of offsets, order of fields, separators), so a
 misreading in one of them shows.
 """
@@ -18,15 +18,15 @@ from functools import cache, lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from appliance.core.config import SkinConfig
-from appliance.core.errors import SensorBusy, SensorLost
-from appliance.core.types import Frames, SweepFormat
-from appliance.io import skin_profile
-from appliance.io.sensor import TransferObserver
-from appliance.io.serial_port import PortInfo
-from appliance.io.serial_sensor import SerialSensor
-from appliance.io.skin_profile import SkinProfile
-from appliance.sim.rig import VirtualClock
+from palpate.core.config import SkinConfig
+from palpate.core.errors import SensorBusy, SensorLost
+from palpate.core.types import Frames, SweepFormat
+from palpate.io import skin_profile
+from palpate.io.sensor import TransferObserver
+from palpate.io.serial_port import PortInfo
+from palpate.io.serial_sensor import SerialSensor
+from palpate.io.skin_profile import SkinProfile
+from palpate.sim.rig import VirtualClock
 from tests.factories.paths import ROOT
 
 FOLDER = ROOT / "firmware_config" / "skins"

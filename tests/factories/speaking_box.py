@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Self
 
-from appliance.core import sentences
-from appliance.core.sentences import Sentence, sentence
+from palpate.core import sentences
+from palpate.core.sentences import Sentence, sentence
 
 LABELS = ("wood", "paper", "plastic rough")
 STREAMING = ("9.000", "streaming", 0, 0, 3000, 0, 0, 1, 0, "9f3c2a1b", "sim")

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from train.evaluation import robustness
+from palpate_train.evaluate import robustness
 
 SEVERITIES = {
     "dead": ("dead taxels", "taxels", [0.0, 1.0, 2.0]),

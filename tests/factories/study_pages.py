@@ -6,9 +6,9 @@ import json
 from pathlib import Path
 from typing import Any
 
+from palpate_studies import pages
+from palpate_studies.study import DATA, results_file, save
 from tests.factories.paths import ROOT
-from train.studies import pages
-from train.studies.study import DATA, results_file, save
 
 RESULTS = ROOT / DATA
 

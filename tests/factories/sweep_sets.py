@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from train.data.sets import Dataset
+from palpate_train.data.sets import Dataset
 
 
 def easy(n: int = 40, pieces: int = 1, dtype: str = "uint8", seed: int = 0) -> Dataset:

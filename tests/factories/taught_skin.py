@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from appliance.core.clock import SystemClock
-from appliance.sim.skins.player import Player
-from appliance.sim.skins.wires import wire
+from palpate.core.clock import SystemClock
+from palpate.sim.skins.player import Player
+from palpate.sim.skins.wires import wire
 from tests.factories import install_scripts
 from tests.factories.paths import ROOT
 
@@ -76,7 +76,7 @@ class TaughtBox:
             *more,
         ]
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "appliance", *words],
+            [sys.executable, "-m", "palpate", *words],
             cwd=ROOT,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,

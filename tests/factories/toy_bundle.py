@@ -15,11 +15,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from appliance.bundle import bundle
-from appliance.bundle.bundle import Bundle, DisplacementRule, Early, Known, Manifest, Thresholds
-from appliance.core.types import Frames, Status, Sweep, SweepFormat
-from appliance.signal.contact import ContactPositions
-from appliance.signal.disturbances import Disturbances
+from palpate.bundle import bundle
+from palpate.bundle.bundle import Bundle, DisplacementRule, Early, Known, Manifest, Thresholds
+from palpate.core.types import Frames, Status, Sweep, SweepFormat
+from palpate.signal.contact import ContactPositions
+from palpate.signal.disturbances import Disturbances
 
 FORMAT = SweepFormat(2, 2, 100.0, 20, "int16")
 THREE_AXES = replace(FORMAT, axes=3)

@@ -7,10 +7,10 @@ from contextlib import contextmanager
 
 import pytest
 
-from train.data.sets import Dataset
-from train.models.recipe import choice, recipe
-from train.models.recipe.fitted import Fit
-from train.models.recipe.sizes import SIZES
+from palpate_train.data.sets import Dataset
+from palpate_train.models.recipe import choice, recipe
+from palpate_train.models.recipe.fitted import Fit
+from palpate_train.models.recipe.sizes import SIZES
 
 
 @contextmanager

@@ -3,8 +3,8 @@
 import numpy as np
 import onnx
 
-from appliance.core.types import SweepFormat
-from train.onnx_tools.graph_builder import TENSOR, GraphBuilder
+from palpate.core.types import SweepFormat
+from palpate_train.onnx_tools.graph_builder import TENSOR, GraphBuilder
 
 FORMAT = SweepFormat(2, 2, 100.0, 163, "int16")
 

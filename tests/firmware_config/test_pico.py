@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from appliance.core import config
-from appliance.core.clock import SystemClock
-from appliance.core.types import EPOCH_BITS, Frames, SweepFormat
-from appliance.io import packets
-from appliance.io.serial_link import ReadoutLink
-from appliance.io.usb_sensor import UsbSensor
+from palpate.core import config
+from palpate.core.clock import SystemClock
+from palpate.core.types import EPOCH_BITS, Frames, SweepFormat
+from palpate.io import packets
+from palpate.io.serial_link import ReadoutLink
+from palpate.io.usb_sensor import UsbSensor
 from tests.factories import pico
 from tests.factories.paths import NO_SITE
 

@@ -9,7 +9,7 @@ import itertools
 import numpy as np
 import pytest
 
-from appliance.io import packets
+from palpate.io import packets
 from tests.factories import pico
 
 readout = pico.module()

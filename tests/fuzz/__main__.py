@@ -93,7 +93,7 @@ def fuzz(target: str, minutes: float, seed: int) -> int:
         print(
             f"{target}: {crash} breaks a promise; "
             "mend it, name the file, and explain it in BROKE of "
-            "tests/appliance/bundle/test_fuzzed_input.py"
+            "tests/palpate/bundle/test_fuzzed_input.py"
         )
     return 1 if run.crashes else 0
 

@@ -17,7 +17,7 @@ from tempfile import TemporaryDirectory
 
 import atheris
 
-with atheris.instrument_imports(include=["appliance", "tomllib", "train.data"]):
+with atheris.instrument_imports(include=["palpate", "tomllib", "palpate_train.data"]):
     from tests.fuzz import targets
 from tests.fuzz.mutators import MUTATORS
 

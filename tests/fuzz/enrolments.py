@@ -17,11 +17,11 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from appliance.bundle import arrays as packing
-from appliance.bundle import bundle, enrolled
-from appliance.bundle.bundle import Bundle
-from appliance.core.errors import BundleError
-from appliance.inference import enrolment
+from palpate.bundle import arrays as packing
+from palpate.bundle import bundle, enrolled
+from palpate.bundle.bundle import Bundle
+from palpate.core.errors import BundleError
+from palpate.inference import enrolment
 from tests.factories import toy_bundle
 from tests.factories.mutated_enrolments import changed
 from tests.fuzz.files import one_line

@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 from scipy.io import savemat
 
-from appliance.bridges import modbus_pdu
-from appliance.bridges.modbus_pdu import HEADER, MOST_PDU, ModbusRequest, Reading, RequestRefused
-from appliance.core.errors import FormatError
+from palpate.bridges import modbus_pdu
+from palpate.bridges.modbus_pdu import HEADER, MOST_PDU, ModbusRequest, Reading, RequestRefused
+from palpate.core.errors import FormatError
+from palpate_train.data import raw_files
 from tests.fuzz.files import one_line
-from train.data import raw_files
 
 REGISTERS = [0] * 100
 WORDS = {

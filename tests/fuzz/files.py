@@ -20,12 +20,12 @@ from typing import Any
 
 import numpy as np
 
-from appliance.bundle import bundle
-from appliance.bundle.manifest import FILE_KEYS
-from appliance.core import config, sentences, types
-from appliance.core.errors import BundleError, ConfigError, FormatError
-from appliance.io import robot_link
-from appliance.recording import capture
+from palpate.bundle import bundle
+from palpate.bundle.manifest import FILE_KEYS
+from palpate.core import config, sentences, types
+from palpate.core.errors import BundleError, ConfigError, FormatError
+from palpate.io import robot_link
+from palpate.sweeps import capture
 
 BOARD = '[trigger]\nstart = "GPIO5"\nstop = "GPIO6"\n'
 NPY = b"\x93NUMPY"

@@ -12,8 +12,8 @@ from collections.abc import Callable
 from random import Random
 from typing import Any
 
-from appliance.core.sentences import checksum
-from appliance.io import packets as wire
+from palpate.core.sentences import checksum
+from palpate.io import packets as wire
 from tests.fuzz import enrolments, far_sides
 from tests.fuzz.skins import GRIDS
 

@@ -13,10 +13,10 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from appliance.bundle import bundle
-from appliance.bundle.manifest import FILE_KEYS
-from appliance.core import config, schema, sentences
-from appliance.core.types import (
+from palpate.bundle import bundle
+from palpate.bundle.manifest import FILE_KEYS
+from palpate.core import config, schema, sentences
+from palpate.core.types import (
     DATA_TYPES,
     Edge,
     EdgeKind,
@@ -26,10 +26,10 @@ from appliance.core.types import (
     SweepFormat,
     save,
 )
-from appliance.io import packets, robot_link
-from appliance.io.skin_profile import SkinProfile
-from appliance.recording.capture import MAGIC, CaptureWriter
-from appliance.sim import script, skin
+from palpate.io import packets, robot_link
+from palpate.io.skin_profile import SkinProfile
+from palpate.sim import script, skin
+from palpate.sweeps.capture import MAGIC, CaptureWriter
 from tests.factories.paths import ROOT
 from tests.fuzz import enrolments, far_sides, skins
 from tests.fuzz.files import NPY

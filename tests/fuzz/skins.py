@@ -16,10 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
-from appliance.core.errors import ConfigError
-from appliance.io import skin_profile
-from appliance.io.skin_codecs import Codec, Decoded, Rest, codec
-from appliance.io.skin_profile import SkinProfile
+from palpate.core.errors import ConfigError
+from palpate.io import skin_profile
+from palpate.io.skin_codecs import Codec, Decoded, Rest, codec
+from palpate.io.skin_profile import SkinProfile
 from tests.fuzz.files import one_line
 from tests.skins.noise import FAULTS
 from tests.skins.subjects import PROFILES, subject

@@ -17,12 +17,12 @@ from operator import xor
 from pathlib import Path
 from typing import Any
 
-from appliance.core import sentences
-from appliance.core.errors import FormatError, SensorMismatch
-from appliance.core.types import SweepFormat
-from appliance.io import packets as wire
-from appliance.io import robot_link, sensor, usb_sensor
-from appliance.service import feed_reader
+from palpate.core import sentences
+from palpate.core.errors import FormatError, SensorMismatch
+from palpate.core.types import SweepFormat
+from palpate.io import packets as wire
+from palpate.io import robot_link, sensor, usb_sensor
+from palpate.service import feed_reader
 from tests.fuzz import enrolments, far_sides, files, skins
 from tests.fuzz.files import one_line
 

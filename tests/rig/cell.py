@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from appliance.client.answers import Answer
-from appliance.core.clock import Clock
-from appliance.sim import rig, script, skin
+from palpate.client.answers import Answer
+from palpate.core.clock import Clock
+from palpate.sim import rig, script, skin
 from tests.rig.machine import Guest
 
 FIFO = 22_500

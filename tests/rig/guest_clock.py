@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from appliance.core.clock import Clock, SystemClock
+from palpate.core.clock import Clock, SystemClock
 from tests.rig.qtest import Qtest
 
 SHIFT = 1
@@ -44,7 +44,7 @@ STILL_S = 120
 
 
 class GuestClock:
-    """A clock like appliance.core.clock.Clock, from a 32-bit counter with HZ ticks per second. Read
+    """A clock like palpate.core.clock.Clock, from a 32-bit counter with HZ ticks per second. Read
     it at least every 179 s.
 
     latest_ns: the newest reading, for callers that may not use the socket. host: the clock for

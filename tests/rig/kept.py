@@ -19,8 +19,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from appliance.core.sentences import checksum
-from appliance.core.types import Status, Sweep, load
+from palpate.core.sentences import checksum
+from palpate.core.types import Status, Sweep, load
 from tests.factories.emulated_machines import ROOT
 from tests.rig.machine import Guest
 

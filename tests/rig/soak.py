@@ -19,18 +19,18 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from appliance.client.answers import Answer
-from appliance.core import storage
-from appliance.core.provenance import commit
-from appliance.core.sentences import checksum
-from appliance.sim import skin
+from palpate.client.answers import Answer
+from palpate.core import storage
+from palpate.core.provenance import commit
+from palpate.core.sentences import checksum
+from palpate.sim import skin
+from palpate_train.metrics import score
+from palpate_train.reports import html, provenance
 from tests.factories.paths import ROOT
 from tests.rig import soak_judge, soak_page
 from tests.rig.soak_boxes import BoxUnderTest, Gone, Script, ThisMachine
 from tests.rig.soak_guest import VirtualBox
 from tests.rig.soak_judge import SoakRun
-from train.metrics import score
-from train.reports import html, provenance
 
 BOXES = {kind.name: kind for kind in (ThisMachine, VirtualBox)}
 WAIT_S, SAMPLE_S, MINUTE_S = 0.2, 10.0, 60.0

@@ -26,13 +26,13 @@ from typing import Any, Protocol
 import numpy as np
 import onnxruntime as ort
 
-from appliance.bundle import bundle
-from appliance.client.answers import Answer
-from appliance.core.clock import SystemClock
-from appliance.core.types import Frames, Status, Sweep
-from appliance.inference.classifier import Classifier
-from appliance.sim import rig, script, skin
-from appliance.tools import pseudo_terminal
+from palpate.bundle import bundle
+from palpate.client.answers import Answer
+from palpate.core.clock import SystemClock
+from palpate.core.types import Frames, Status, Sweep
+from palpate.inference.classifier import Classifier
+from palpate.sim import rig, script, skin
+from palpate.tools import pseudo_terminal
 from tests.rig.soak_judge import short_answer
 
 STOP_S = 30

@@ -21,8 +21,8 @@ from typing import Any
 
 import numpy as np
 
-from appliance.io import packets
-from appliance.sim import rig, script, skin
+from palpate.io import packets
+from palpate.sim import rig, script, skin
 from tests.factories.emulated_machines import LOCK
 from tests.rig import image
 from tests.rig.cell import IDLE

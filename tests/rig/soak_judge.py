@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from appliance.core.statistics import wilson
-from appliance.core.types import Status
+from palpate.core.statistics import wilson
+from palpate.core.types import Status
 
 Json = Mapping[str, Any]
 ANSWER = ("s", "number", "touched", "status", "label", "alone", "latency_ms", "lost")

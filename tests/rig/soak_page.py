@@ -15,6 +15,18 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from palpate_train.reports import formatting, html, provenance
+from palpate_train.reports.plot_style import (
+    ACCENT,
+    BLACK,
+    FAINT,
+    GREY,
+    SMALL,
+    WIDTH,
+    add_axes,
+    set_ticks,
+    to_svg,
+)
 from tests.rig.soak_judge import (
     ANSWER,
     GROWTH_KIB_H,
@@ -26,18 +38,6 @@ from tests.rig.soak_judge import (
     estimate,
     kind,
     targets,
-)
-from train.reports import formatting, html, provenance
-from train.reports.plot_style import (
-    ACCENT,
-    BLACK,
-    FAINT,
-    GREY,
-    SMALL,
-    WIDTH,
-    add_axes,
-    set_ticks,
-    to_svg,
 )
 
 Json = Mapping[str, Any]

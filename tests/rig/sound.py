@@ -11,12 +11,12 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from appliance.bundle import bundle
-from appliance.client.answers import Answer
-from appliance.core.clock import SystemClock
-from appliance.core.types import Frames, Status, Sweep
-from appliance.inference.classifier import Classifier
-from appliance.sim import rig, skin
+from palpate.bundle import bundle
+from palpate.client.answers import Answer
+from palpate.core.clock import SystemClock
+from palpate.core.types import Frames, Status, Sweep
+from palpate.inference.classifier import Classifier
+from palpate.sim import rig, skin
 from tests.rig.cell import Cell, Touch
 
 FIELDS = (

@@ -20,9 +20,9 @@ from typing import Any
 
 import pytest
 
-from appliance.bundle import bundle
-from appliance.deployment.state import MOST_STARTS
-from appliance.sim import script
+from palpate.bundle import bundle
+from palpate.deployment.state import MOST_STARTS
+from palpate.sim import script
 from tests.factories import deliveries, emulated_machines, hosts
 from tests.rig.cell import Cell
 from tests.rig.image import GUEST, Image, ground, layer

@@ -12,8 +12,8 @@ from contextlib import contextmanager
 
 import pytest
 
-from appliance.client.answers import Answer
-from appliance.sim import script
+from palpate.client.answers import Answer
+from palpate.sim import script
 from tests.rig.cell import Cell, Touch
 from tests.rig.sound import check_recovers, known, let_go, not_wrong, until
 

@@ -14,15 +14,14 @@ from tests.rig.inside import GuestControls, pack
 from tests.rig.machine import Guest
 
 PYTEST = (
-    "/opt/palpate/bin/python -m pytest -q -rs -p no:cacheprovider "
-    "tests/appliance/io/test_backends.py"
+    "/opt/palpate/bin/python -m pytest -q -rs -p no:cacheprovider tests/palpate/io/test_backends.py"
 )
 CODE = (
     "pyproject.toml",
     "tests/conftest.py",
     "tests/factories",
     "tests/backends",
-    "tests/appliance/io/test_backends.py",
+    "tests/palpate/io/test_backends.py",
 )
 """Files of this checkout that the guest needs beside the installed box."""
 

@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from appliance.bundle import bundle
-from appliance.client.answers import Answer
-from appliance.core.sentences import MAX_LINE, checksum
-from appliance.sim import script
+from palpate.bundle import bundle
+from palpate.client.answers import Answer
+from palpate.core.sentences import MAX_LINE, checksum
+from palpate.sim import script
 from tests.rig.cell import Cell, Touch
 from tests.rig.far_end import ADAPTER, FarEnd
 from tests.rig.sound import known, not_wrong

@@ -18,9 +18,9 @@ from pathlib import Path
 
 import pytest
 
-from appliance.core.sentences import sentence
-from appliance.core.types import Frames, Status, Sweep
-from appliance.sim import script, skin
+from palpate.core.sentences import sentence
+from palpate.core.types import Frames, Status, Sweep
+from palpate.sim import script, skin
 from tests.rig.cell import Cell, Touch
 from tests.rig.image import Image
 from tests.rig.kept import ANSWERED, KEPT, CampaignLog, found, lost, owed, runs_with, sweeps, whole

@@ -16,11 +16,11 @@ from pathlib import Path
 
 import pytest
 
-from appliance.io import skin_profile
-from appliance.sim import rig, script, skin
-from appliance.sim.skins.devices import Reel
-from appliance.sim.skins.player import Player
-from appliance.sim.skins.wires import wire
+from palpate.io import skin_profile
+from palpate.sim import rig, script, skin
+from palpate.sim.skins.devices import Reel
+from palpate.sim.skins.player import Player
+from palpate.sim.skins.wires import wire
 from tests.factories.emulated_machines import ROOT
 from tests.rig.cell import SEEN_S, Cell
 from tests.rig.far_end import ADAPTER

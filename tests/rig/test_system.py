@@ -16,9 +16,9 @@ from pathlib import Path
 
 import pytest
 
-from appliance.client.answers import Answer
-from appliance.recording.capture import Playback
-from appliance.sim import script
+from palpate.client.answers import Answer
+from palpate.sim import script
+from palpate.sweeps.capture import Playback
 from tests.rig.cell import Cell
 from tests.rig.image import GUEST_PYTHON
 from tests.rig.kept import DROP_IN, KEPT, runs_with
@@ -31,7 +31,7 @@ START_S = 240
 """Longest wait for a service that has to start, also where the emulator shares its processor."""
 ANSWER_S = 60
 RULES = "/etc/udev/rules.d/70-palpate.rules"
-BUNDLE = f"/opt/palpate/lib/python{GUEST_PYTHON}/site-packages/appliance/default_bundle"
+BUNDLE = f"/opt/palpate/lib/python{GUEST_PYTHON}/site-packages/appliance/palpate/default_bundle"
 SITE = "/etc/palpate/palpate.toml"
 SECOND = "echo {} > /sys/devices/system/cpu/cpu1/online"
 """Turns the guest's second processor on or off."""
@@ -41,8 +41,8 @@ needs_time = pytest.mark.skipif(
 )
 DAMAGE = """
 import pathlib, shutil
-from appliance.bundle import bundle
-from appliance.core import errors
+from palpate.bundle import bundle
+from palpate.core import errors
 whole, broken = pathlib.Path(bundle.DEFAULT), pathlib.Path("/run/broken")
 for name in sorted(p.name for p in whole.iterdir()):
     data = (whole / name).read_bytes()

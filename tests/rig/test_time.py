@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from appliance.core.types import EPOCH_BITS, Sweep, load
-from appliance.sim import rig, script, skin
+from palpate.core.types import EPOCH_BITS, Sweep, load
+from palpate.sim import rig, script, skin
 from tests.rig.cell import Cell
 from tests.rig.kept import KEPT, runs_with
 from tests.rig.machine import Guest
@@ -35,7 +35,7 @@ TRIPS, SWEEPS, ATTEMPTS = 400, 5, 3
 milliseconds in as many seconds, which looks as if the board's clock drifted.
 """
 SLOPE_PPM, SPAN_S = 200, 20
-"""What appliance.core.clock.DeviceClock takes for possible, and how far it looks back."""
+"""What palpate.core.clock.DeviceClock takes for possible, and how far it looks back."""
 LONGEST_WAY_NS = 5_000_000
 """From a frame to the program by the shortest way, in an emulator: the box cannot separate it from
 the clock's offset."""

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.sim import script
+from palpate.sim import script
 from tests.rig.cell import Cell
 from tests.rig.notes import HOW
 from tests.rig.pulled import SECOND, after, before, during

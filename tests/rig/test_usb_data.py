@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from appliance.core.clock import Clock
-from appliance.io import packets
-from appliance.sim import script
+from palpate.core.clock import Clock
+from palpate.io import packets
+from palpate.sim import script
 from tests.rig.cell import Cell
 from tests.rig.notes import HOW
 from tests.rig.sound import (

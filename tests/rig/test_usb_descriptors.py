@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from appliance.sim import script
+from palpate.sim import script
 from tests.rig.cell import Cell
 from tests.rig.notes import HOW
 from tests.rig.sound import check_recovers, known, state, until_state

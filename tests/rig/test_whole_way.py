@@ -6,7 +6,7 @@ from __future__ import annotations
 import statistics
 from collections.abc import Callable
 
-from appliance.bundle import bundle
+from palpate.bundle import bundle
 from tests.rig.cell import Cell
 
 LABELS = bundle.load(bundle.DEFAULT).manifest.labels

@@ -16,9 +16,9 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from appliance.core.clock import Clock
-from appliance.sim import rig
-from appliance.sim.usb import MAX_PACKET, PRODUCT_ID, VENDOR_ID
+from palpate.core.clock import Clock
+from palpate.sim import rig
+from palpate.sim.usb import MAX_PACKET, PRODUCT_ID, VENDOR_ID
 
 HELLO, CONNECT, DISCONNECT, RESET, INTERFACES, ENDPOINTS = 0, 1, 2, 3, 4, 5
 SET_CONFIGURATION, GET_CONFIGURATION, CONFIGURATION, SET_ALT, GET_ALT, ALT = 6, 7, 8, 9, 10, 11

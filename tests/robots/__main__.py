@@ -25,17 +25,17 @@ from statistics import median
 
 from pymodbus.client import ModbusTcpClient
 
-from appliance.bridges.modbus import ADDRESSES
-from appliance.bridges.source import LinkPort
-from appliance.bundle import bundle
-from appliance.client.answers import Answer, BoxState
-from appliance.client.box import Palpate
-from appliance.client.feed import Feed
-from appliance.core import config
-from appliance.core.clock import SystemClock
-from appliance.core.provenance import commit
-from appliance.runtime import assembly
-from appliance.sim import devices, script
+from palpate.bridges.modbus import ADDRESSES
+from palpate.bridges.source import LinkPort
+from palpate.bundle import bundle
+from palpate.client.answers import Answer, BoxState
+from palpate.client.box import Palpate
+from palpate.client.feed import Feed
+from palpate.core import config
+from palpate.core.clock import SystemClock
+from palpate.core.provenance import commit
+from palpate.runtime import assembly
+from palpate.sim import devices, script
 from tests.factories import ros
 from tests.factories.bridges import bridge
 from tests.factories.paths import NO_SITE, ROOT
@@ -97,7 +97,7 @@ def box(port: str, feed: Path) -> Iterator[None]:
     command = [
         sys.executable,
         "-m",
-        "appliance",
+        "palpate",
         "run",
         "--sim",
         "skin",

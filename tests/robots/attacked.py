@@ -22,7 +22,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from appliance.core.provenance import commit
+from palpate.core.provenance import commit
 from tests.campaigns.feed_load import REAL_TIME, SETTLE_S, SLOT_S, Kind, LatencyListener, result
 from tests.factories import ros
 from tests.factories.bridges import bridge

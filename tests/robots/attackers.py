@@ -17,7 +17,7 @@ import time
 from collections import Counter
 from functools import partial
 
-from appliance.core.sentences import sentence
+from palpate.core.sentences import sentence
 from tests.campaigns.feed_readers import (
     PAUSE_S,
     Act,

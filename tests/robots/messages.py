@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy
 
-SOURCE = Path(__file__).resolve().parents[2] / "appliance" / "bridges" / "palpate_msgs"
+SOURCE = Path(__file__).resolve().parents[2] / "appliance" / "plugins" / "palpate_msgs"
 BUILDER = "/opt/python/cp311-cp311"
 """Folder of Python on the machine that built the wheels."""
 

@@ -10,7 +10,7 @@ import os
 import select
 from contextlib import suppress
 
-from appliance.tools import pseudo_terminal
+from palpate.tools import pseudo_terminal
 from tests.rig.soak_boxes import ThisMachine
 
 

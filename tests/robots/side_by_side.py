@@ -29,9 +29,9 @@ from typing import Any
 
 import numpy as np
 
-from appliance.core import storage
-from appliance.core.provenance import commit
-from appliance.sim import skin
+from palpate.core import storage
+from palpate.core.provenance import commit
+from palpate.sim import skin
 from tests.campaigns.feed_load import LATE_MS, REAL_TIME, Kind, LatencyListener
 from tests.factories.bridges import bridge
 from tests.factories.paths import ROOT
@@ -156,7 +156,7 @@ def page_of(feed: Path) -> Iterator[int]:
     command = [
         sys.executable,
         "-m",
-        "appliance",
+        "palpate",
         "watch",
         "--web",
         "0",

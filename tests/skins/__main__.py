@@ -16,11 +16,11 @@ from dataclasses import asdict
 from shutil import rmtree
 from typing import Any
 
-from appliance.core.provenance import commit
+from palpate.core.provenance import commit
+from palpate_train.metrics import score
 from tests.factories.paths import ROOT
 from tests.skins import load, noise, page, way
 from tests.skins.subjects import NAMES, subject
-from train.metrics import score
 
 WORK = ROOT / "build" / "skins"
 RESULTS = ROOT / "docs" / "data" / "skins.json"

@@ -25,24 +25,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from appliance.bundle import bundle
-from appliance.core import config
-from appliance.core.clock import Clock, SystemClock
-from appliance.core.devices import Devices
-from appliance.core.observer import Observer
-from appliance.core.types import Frames, Sweep, SweepFormat, Verdict
-from appliance.io import skin_profile
-from appliance.io.robot_link import SerialSink
-from appliance.io.skin_profile import SkinProfile
-from appliance.runtime import assembly
-from appliance.runtime.loop import Box
-from appliance.sim import script
-from appliance.sim.skins import sweeps
-from appliance.sim.skins.devices import on_wire
-from appliance.sim.skins.player import Player
-from appliance.sim.skins.wires import wire
-from appliance.tools import pseudo_terminal
-from appliance.tools.bench_process import drain
+from palpate.bundle import bundle
+from palpate.core import config
+from palpate.core.clock import Clock, SystemClock
+from palpate.core.devices import Devices
+from palpate.core.observer import Observer
+from palpate.core.types import Frames, Sweep, SweepFormat, Verdict
+from palpate.io import skin_profile
+from palpate.io.robot_link import SerialSink
+from palpate.io.skin_profile import SkinProfile
+from palpate.runtime import assembly
+from palpate.runtime.loop import Box
+from palpate.sim import script
+from palpate.sim.skins import sweeps
+from palpate.sim.skins.devices import on_wire
+from palpate.sim.skins.player import Player
+from palpate.sim.skins.wires import wire
+from palpate.tools import pseudo_terminal
+from palpate.tools.bench_process import drain
 from tests.skins.subjects import PROFILES
 
 SETTLE_S = 3.0

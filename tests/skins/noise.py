@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from numpy.random import Generator, default_rng
 
-from appliance.io.skin_codecs import Rest, codec
+from palpate.io.skin_codecs import Rest, codec
 from tests.skins.subjects import Subject
 
 READ_BYTES = 701

@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from appliance.core.storage import put
-from train.reports import provenance
-from train.studies import marked_text
+from palpate.core.storage import put
+from palpate_studies import marked_text
+from palpate_train.reports import provenance
 
 Json = dict[str, Any]
 

@@ -9,10 +9,10 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from appliance.io import skin_profile
-from appliance.io.skin_profile import SkinProfile
-from appliance.sim.skins.devices import on_wire
-from appliance.sim.skins.wires import WIRES, Wire, wire
+from palpate.io import skin_profile
+from palpate.io.skin_profile import SkinProfile
+from palpate.sim.skins.devices import on_wire
+from palpate.sim.skins.wires import WIRES, Wire, wire
 from tests.factories.paths import ROOT
 
 PROFILES = ROOT / "firmware_config" / "skins"

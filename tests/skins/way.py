@@ -12,9 +12,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from appliance.bundle.bundle import load
-from appliance.core.statistics import wilson
-from appliance.sim import skin
+from palpate.bundle.bundle import load
+from palpate.core.statistics import wilson
+from palpate.sim import skin
 
 TRAINED, TESTED = range(1, 7), range(101, 105)
 """Seeds of the skin's positions, in recordings and in the last command."""
@@ -27,12 +27,12 @@ LIMIT_S = 600
 
 def box(*arguments: object) -> str:
     """Run `palpate ARGUMENTS`; returns its output."""
-    return _command("appliance", *arguments)
+    return _command("palpate", *arguments)
 
 
 def desktop(*arguments: object) -> str:
     """Run `palpate-train ARGUMENTS`; returns its output."""
-    return _command("train", *arguments)
+    return _command("palpate_train", *arguments)
 
 
 def _command(package: str, *arguments: object) -> str:

@@ -20,8 +20,8 @@ TCP, MODBUS = "palpate-bridge@tcp", "palpate-bridge@modbus"
 LINE = "/run/palpate-tcp/line"
 ASK_TCP = """
 import json, sys
-from appliance.client.box import Palpate
-from appliance.core.errors import CommandRefused
+from palpate.client.box import Palpate
+from palpate.core.errors import CommandRefused
 with Palpate("socket://127.0.0.1:1503", timeout_s=30) as box:
     box.wait_ready(30)  # what is said before the box has opened the line is lost
     found = {"labels": list(box.labels()), "state": box.state().skin}

@@ -257,7 +257,7 @@ def upgraded(
     at = ("--host", f"{hosts.USER}@{site.hosts[0].address}")
     for i in range(2):
         done = site.desktop(
-            "install", *at, "--wheel", changed(wheel, folder, "appliance/more.py", f"# {i}\n")
+            "install", *at, "--wheel", changed(wheel, folder, "palpate/more.py", f"# {i}\n")
         )
         outputs.append((release(site.hosts[0]), done.stdout + done.stderr))
     return outputs
@@ -282,7 +282,7 @@ def test_a_release_that_does_not_start_gives_way_to_the_old_one(
     """It passes its self-test and then does not start: the link is swapped back, and the old
     release classifies."""
     before = release(host)
-    broken = changed(wheel, tmp_path, "appliance/service/systemd.py", "\nNotifier.turn = None\n")
+    broken = changed(wheel, tmp_path, "palpate/service/systemd.py", "\nNotifier.turn = None\n")
     done = site.desktop("install", *at, "--wheel", broken)
     assert done.returncode == 1
     assert "TypeError: 'NoneType' object is not callable" in done.stdout
@@ -296,7 +296,10 @@ def test_a_release_that_fails_its_self_test_is_never_swapped_in(
     """The process that classifies is not touched."""
     before, pid = release(host), host.service["MainPID"]
     broken = changed(
-        wheel, tmp_path, "appliance/inference/classifier.py", "\nraise OSError('not on this box')\n"
+        wheel,
+        tmp_path,
+        "palpate/inference/classifier.py",
+        "\nraise OSError('not on this box')\n",
     )
     done = site.desktop("install", *at, "--wheel", broken)
     assert done.returncode == 1
@@ -319,7 +322,7 @@ def test_an_install_that_is_cut_is_finished_by_the_next(
     """The desktop dies during the copy, or while the box builds: the old release starts, and a
     second command finishes."""
     new, before = (
-        changed(wheel, tmp_path, "appliance/more.py", f"# {said} {after_s}\n"),
+        changed(wheel, tmp_path, "palpate/more.py", f"# {said} {after_s}\n"),
         release(host),
     )
     site.cut("install", *at, "--wheel", new, words=said, after_s=after_s)

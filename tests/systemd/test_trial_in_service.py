@@ -21,9 +21,9 @@ from typing import Any
 
 import pytest
 
-from appliance.bundle import bundle
+from palpate.bundle import bundle
+from palpate_train.export.sign import sign
 from tests.factories.nspawn import CABLED, PALPATE, SITE, STREAMS, Machine, Service
-from train.export.sign import sign
 
 pytestmark = [pytest.mark.slow, pytest.mark.thorough]  # systemd in a container
 
@@ -31,8 +31,8 @@ pytest_plugins = ["tests.factories.systemd_fixtures"]
 
 CURSED = """
 import os, signal, sys, time
-from appliance.__main__ import main
-from appliance.sim import usb
+from palpate.__main__ import main
+from palpate.sim import usb
 class Cursed(usb.RigBackend):
     # a second and a half after it has begun, while the current bundle is that in /run/cursed: do
     # what stands there

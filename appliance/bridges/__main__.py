@@ -1,8 +1,0 @@
-"""`python -m appliance.bridges`: the bridges alone, on a computer without numpy and onnxruntime."""
-
-import sys
-
-from appliance.bridges.command import main
-
-if __name__ == "__main__":
-    sys.exit(main())

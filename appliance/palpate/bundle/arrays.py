@@ -1,0 +1,127 @@
+"""Reads, writes and checks the arrays in the files of a bundle.
+
+Wrong content raises a BundleError. Nothing is unpickled.
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+import zlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.bundle.manifest import MEANS, MOST_BYTES
+from palpate.core.errors import BundleError
+from palpate.core.types import UNREADABLE, SweepFormat
+
+
+def read(data: bytes, file: str, *names: str) -> dict[str, NDArray[Any]]:
+    """The arrays of the .npz `data` by name.
+
+    names: arrays that must be there. Pickled objects are refused. Raises a BundleError that names
+    `file`.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as packed:
+            size = sum(entry.file_size for entry in packed.infolist())
+        if size > MOST_BYTES:
+            raise BundleError(
+                f"{file} unpacks to {size} bytes, {MOST_BYTES} are allowed; export the bundle with "
+                "fewer sweeps"
+            )
+        with np.load(io.BytesIO(data), allow_pickle=False) as z:
+            arrays = dict(z.items())
+        for name, values in arrays.items():
+            if not isinstance(
+                values, np.ndarray
+            ):  # numpy returns a member without an array's header as bytes
+                raise BundleError(
+                    f"{file} cannot be read: {name!r} is not an array; export the bundle again"
+                )
+        return {name: arrays[name] for name in names} | arrays
+    except (*UNREADABLE, OSError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error) as e:
+        raise BundleError(f"{file} cannot be read: {e}; export the bundle again") from e
+
+
+def packed(**arrays: NDArray[Any]) -> bytes:
+    """The bytes of an .npz; equal arrays give equal bytes."""
+    file = io.BytesIO()
+    np.savez_compressed(file, allow_pickle=False, **arrays)
+    return file.getvalue()
+
+
+def changes(samples: NDArray[Any]) -> NDArray[np.uint8]:
+    """The changes from frame to frame of sweeps [G, T, R, C] or [G, T, R, C, A], as bytes [B, G, T,
+    R, C] or [B, G, T, R, C, A] for values of B bytes.
+
+    The values' bits are read as whole numbers. The lowest bytes of all changes come first, then the
+    next bytes. This compresses better than the values themselves and is lossless.
+    """
+    bits = np.ascontiguousarray(samples).view(f"<u{samples.itemsize}")
+    steps = np.diff(bits, axis=1, prepend=np.zeros_like(bits[:, :1]))
+    planes: NDArray[np.uint8] = np.moveaxis(
+        steps.view(np.uint8).reshape(*bits.shape, samples.itemsize), -1, 0
+    )
+    return planes
+
+
+def summed(planes: NDArray[Any], f: SweepFormat, file: str) -> NDArray[Any]:
+    """Sweeps from the bytes of their changes [B, G, T, R, C] or [B, G, T, R, C, A]: the inverse of
+    `changes`. Raises a BundleError that names `file`."""
+    size = f.numpy_type.itemsize
+    if planes.dtype != np.uint8 or planes.shape[:1] + planes.shape[2:] != (
+        size,
+        f.window,
+        *f.shape,
+    ):
+        raise BundleError(
+            f"{file} holds changes {planes.dtype} {planes.shape}, which do not fit the format {f}"
+        )
+    steps = np.ascontiguousarray(np.moveaxis(planes, 0, -1)).view(f"<u{size}")[..., 0]
+    return np.cumsum(steps, axis=1, dtype=steps.dtype).view(f.numpy_type)
+
+
+def check_classes(
+    arrays: Mapping[str, NDArray[Any]], n: int, steps: int, disturbances: int = 0
+) -> None:
+    """Raises BundleError if an array of means.npz does not have the type and shape for `n` labels,
+    `steps` early answers and this number of disturbances, or has a number out of range."""
+    rank = arrays["means"].shape[-1] if arrays["means"].ndim else 0
+    rows = {
+        "means": (n, rank),
+        "bias": (n,),
+        "sweeps": (n,),
+        "spread": (n,),
+        "shapes": (n, 0, 0),
+        "moved_turn": (rank, rank),
+        "moved_means": (n, rank),
+        "moved_shapes": (n, 0, 0),
+        "early_means": (steps, n, rank),
+        "early_shapes": (steps, rank, rank),
+        "changes": (disturbances, int((arrays["sweeps"] == 0).sum()), rank),
+    }
+    halves = dict.fromkeys(("shapes", "moved_shapes", "early_shapes", "changes"), "float16")
+    kinds = {"sweeps": "int64"} | halves
+    for name, wanted in rows.items():
+        unused = not steps if name.startswith("early_") else name == "changes" and not disturbances
+        if name not in arrays or unused:
+            continue
+        values, kind, shape = arrays[name], kinds.get(name, "float32"), arrays[name].shape
+        if name in ("shapes", "moved_shapes") and len(shape) == 3 and shape[1] <= rank:
+            wanted = (n, shape[1], shape[1])
+        if values.dtype != kind or shape != wanted or (not name.endswith("shapes") and 0 in shape):
+            raise BundleError(
+                f"{MEANS} holds {name} {values.dtype} {shape} for {n} labels; {kind} "
+                f"{list(wanted)} is wanted, a row a label"
+            )
+        if not np.isfinite(values).all():
+            raise BundleError(f"{MEANS} holds {name} that are not finite; export the bundle again")
+    if not (arrays["spread"] > 0).all():
+        raise BundleError(
+            f"{MEANS} holds spread {arrays['spread'].tolist()}, which must be above 0; export the "
+            "bundle again"
+        )

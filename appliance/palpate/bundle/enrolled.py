@@ -1,0 +1,214 @@
+"""Applies enrolment.npz, the labels that a box has enrolled into a bundle by itself.
+
+The files of the bundle do not change, and its signature still covers them. For each label
+enrolment.npz holds the mean of its sweeps in the embedding, their number and spread, and a golden
+sweep. Bias, shape and the mean of displaced sweeps are computed from these. So an enrolment can add
+labels and nothing else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.bundle import arrays
+from palpate.bundle.contents import AddedLabels, Bundle, Classes, DisplacedClasses
+from palpate.core.errors import BundleError
+
+ENROLMENT = "enrolment.npz"
+COMMON = ("base", "labels", "means", "sweeps", "spread", "changes")
+"""Arrays in every file; `changes` are the packed golden sweeps (arrays.changes)."""
+ARRAYS, BY_MEANS = (*COMMON, "joint", "least"), (*COMMON, "logits")
+"""Arrays in a file, and in a file of a program that compared all labels by distances. The golden
+logits have another name there. So such a program refuses a file that it would misread."""
+MOST_SWEEPS = 1_000_000
+"""Largest number of sweeps for a label that the file may give."""
+AGAIN = "enrol again (palpate enrol)"
+
+
+def file(added: AddedLabels) -> bytes:
+    """The bytes of enrolment.npz; equal content gives equal bytes."""
+    return arrays.packed(
+        base=np.array(added.base),
+        labels=np.array(added.labels),
+        means=added.means,
+        sweeps=added.sweeps,
+        spread=added.spread,
+        changes=arrays.changes(added.golden),
+        **(
+            {"logits": added.logits}
+            if added.least is None
+            else {"joint": added.logits, "least": np.array(added.least)}
+        ),
+    )
+
+
+def applied(bundle: Bundle, data: bytes, identity: str) -> Bundle:
+    """`bundle` with the labels of `data`, under this id. Raises BundleError if `data` is malformed
+    or is the enrolment of another bundle."""
+    added = _read(bundle, data)
+    for k, label in enumerate(added.labels):
+        bundle = with_label(
+            bundle,
+            label,
+            added.means[k],
+            int(added.sweeps[k]),
+            float(added.spread[k]),
+            added.golden[k],
+        )
+    assert bundle.classes
+    arrays.check_classes(bundle.classes.arrays(), len(bundle.manifest.labels), 0)
+    return replace(
+        deciding(bundle, added.least), golden_logits=added.logits, id=identity, added=added
+    )
+
+
+def deciding(bundle: Bundle, least: float | None) -> Bundle:
+    """`bundle` with this rule for enrolled labels (Known.enrolled). Raises BundleError."""
+    assert bundle.manifest.known
+    known = replace(bundle.manifest.known, enrolled=least)
+    return replace(bundle, manifest=replace(bundle.manifest, known=known))
+
+
+def with_label(
+    bundle: Bundle,
+    label: str,
+    mean: NDArray[np.float32],
+    sweeps: int,
+    spread: float,
+    golden: NDArray[Any],
+) -> Bundle:
+    """`bundle` with one more label, from the mean [r] of its sweeps in the embedding, and one
+    golden sweep [T, R, C] or [T, R, C, A]. The id and the logits of golden sweeps do not change.
+
+    The early heads do not have the label, and the figures of `bundle` no longer hold, so both are
+    removed. Raises BundleError for a label that is taken or cannot be sent.
+    """
+    assert bundle.classes
+    m = bundle.manifest
+    manifest = replace(
+        m,
+        labels=(*m.labels, label),
+        version=f"{m.version}+{label}",
+        early=None,
+        figures={},
+        made=m.made | {"enrolled": bundle.enrolled | {label: sweeps}},
+    )
+    classes = extended(bundle.classes, mean, sweeps, spread)
+    return replace(
+        bundle,
+        manifest=manifest,
+        classes=classes,
+        golden=np.concatenate([bundle.golden, golden[None]]),
+    )
+
+
+def extended(classes: Classes, mean: NDArray[Any], sweeps: int, spread: float) -> Classes:
+    """`classes` with one more label, whose `sweeps` have this mean [r] in the embedding.
+
+    The bias is -|m|^2 / 2 + r / (2 n): on average |m|^2 of a mean of n sweeps exceeds |m|^2 of the
+    true mean by r / n. The shape is the identity, the scatter of all materials together. A
+    displacement is assumed to change the mean by its average change for trained labels.
+    """
+    row, displaced = mean.astype(np.float32).astype(np.float64), classes.displaced
+    if displaced:
+        trained = classes.sweeps == 0
+        change = (displaced.means - classes.means.astype(np.float64) @ displaced.turn)[
+            trained
+        ].mean(axis=0)
+        means = np.vstack([displaced.means, row @ displaced.turn + change]).astype(np.float32)
+        displaced = DisplacedClasses(displaced.turn, means, _one_more(displaced.shapes))
+    with np.errstate(over="ignore"):  # values that are not finite are refused below
+        bias = -(row @ row) / 2 + len(row) / (2 * sweeps)
+        return Classes(
+            np.vstack([classes.means, row]).astype(np.float32),
+            np.append(classes.bias, bias).astype(np.float32),
+            np.append(classes.sweeps, sweeps),
+            np.append(classes.spread, spread).astype(np.float32),
+            _one_more(classes.shapes),
+            displaced,
+            changes=classes.changes,
+        )
+
+
+def _one_more(shapes: NDArray[np.float16]) -> NDArray[np.float16]:
+    """`shapes` [K, b, b] followed by the shape of all materials together: [K + 1, b, b]."""
+    return np.concatenate([shapes, np.eye(shapes.shape[1], dtype=np.float16)[None]])
+
+
+def _read(bundle: Bundle, data: bytes) -> AddedLabels:
+    """The content of `data`, checked against `bundle`. Raises BundleError."""
+    held = arrays.read(data, ENROLMENT, *COMMON)
+    base, labels = held["base"], held["labels"]
+    if (
+        base.dtype.kind != "U"
+        or base.shape != ()
+        or labels.dtype.kind != "U"
+        or labels.ndim != 1
+        or not len(labels)
+    ):
+        raise BundleError(f"{ENROLMENT} names no bundle and its labels; {AGAIN}")
+    if base.item() != bundle.base:
+        raise BundleError(
+            f"{ENROLMENT} belongs to bundle {base.item()[:8]!r}, and the files beside it are those "
+            f"of {bundle.id}; {AGAIN}"
+        )
+    if bundle.classes is None or not bundle.manifest.known:
+        raise BundleError(
+            f"{ENROLMENT} adds labels to bundle {bundle.id}, which has no class means; remove the "
+            "file"
+        )
+    by_means = "logits" in held
+    _check(held, bundle, len(labels), BY_MEANS if by_means else ARRAYS)
+    golden = arrays.summed(held["changes"], bundle.format, ENROLMENT)
+    return AddedLabels(
+        base.item(),
+        tuple(labels.tolist()),
+        held["means"],
+        held["sweeps"],
+        held["spread"],
+        golden,
+        held["logits" if by_means else "joint"],
+        None if by_means else float(held["least"]),
+    )
+
+
+def _check(
+    held: Mapping[str, NDArray[Any]], bundle: Bundle, n: int, names: tuple[str, ...]
+) -> None:
+    """Raises BundleError if one of the arrays `names` is missing, or has a wrong type, shape or
+    range for `n` labels of `bundle`."""
+    assert bundle.classes
+    if missing := [name for name in names if name not in held]:
+        raise BundleError(f"{ENROLMENT} has no {' and no '.join(missing)}; {AGAIN}")
+    f = bundle.format
+    logits = ("float32", (len(bundle.golden) + n, len(bundle.manifest.labels) + n))
+    wanted = {
+        "means": ("float32", (n, bundle.classes.means.shape[1])),
+        "sweeps": ("int64", (n,)),
+        "spread": ("float32", (n,)),
+        "changes": ("uint8", (f.numpy_type.itemsize, n, f.window, *f.shape)),
+        "logits": logits,
+        "joint": logits,
+        "least": ("float64", ()),
+    }
+    for name in names[2:]:
+        values, (kind, shape) = held[name], wanted[name]
+        if values.dtype != kind or values.shape != shape:
+            raise BundleError(
+                f"{ENROLMENT} holds {name} {values.dtype} {list(values.shape)}; {kind} "
+                f"{list(shape)} is wanted: {AGAIN}"
+            )
+        if not np.isfinite(values).all():
+            raise BundleError(f"{ENROLMENT} holds {name} that are not finite; {AGAIN}")
+    if (
+        not ((held["sweeps"] >= 1) & (held["sweeps"] <= MOST_SWEEPS)).all()
+        or not (held["spread"] >= 1).all()
+    ):
+        raise BundleError(
+            f"{ENROLMENT} holds a number of sweeps or a spread below 1, or too many; {AGAIN}"
+        )

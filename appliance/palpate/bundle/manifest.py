@@ -1,0 +1,388 @@
+"""Reads, checks and writes the manifest of a bundle. The dataclasses are its schema."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.core.errors import BundleError, FormatError
+from palpate.core.names import LABEL, MOST_SHOWN, can_be_shown
+from palpate.core.schema import typed
+from palpate.core.types import SweepFormat
+from palpate.signal import features
+from palpate.signal.broken_taxels import Bridging
+from palpate.signal.contact import ContactPositions
+from palpate.signal.disturbances import Disturbances
+from palpate.signal.slide import SpeedRange
+from palpate.signal.vibration import SlideLimits
+from palpate.signal.window_check import WindowLimits
+
+SCHEMA = 4
+"""Schema version that is written. Also read are 1 (without `early`, `known`), 2 (without `runtime`,
+`counter`, `place`) and 3 (without `moved`)."""
+FILE_KEYS = {"displacement": "moved", "contact": "place"}
+"""Fields of Manifest whose keys in manifest.json have other names. Signed bundles have these keys,
+so the file keeps them. Messages use the keys, too."""
+MANIFEST, MODEL, GOLDEN, MEANS = "manifest.json", "model.onnx", "golden.npz", "means.npz"
+INPUTS = ("raw", *features.KINDS)
+UNSURE = 0.5
+"""Least probability for status ok if the bundle does not set it."""
+OPTIONAL = ("farthest_mm", None), ("enrolled", None)
+"""Values of rules that need not be there."""
+MOST_BYTES = 64 << 20
+"""Largest file. The largest of our models, the paper's network in int8, has 16 MB. The memory that
+a model needs is checked by onnx_check."""
+_SHA256 = re.compile(r"[0-9a-f]{64}")
+_VERSION = re.compile(r"[0-9]{1,6}(\.[0-9]{1,6}){2}")
+
+
+@dataclass(frozen=True, slots=True)
+class Thresholds(WindowLimits):
+    """Limits for a window before the network runs, and for the network's answer.
+
+    dead_taxels: largest number that the model tolerates. unsure: least probability for status ok.
+    """
+
+    unsure: float = UNSURE
+
+
+@dataclass(frozen=True, slots=True)
+class Early:
+    """Rule for answers before the sweep has ended. Raises BundleError for a number out of range.
+
+    least: [D], least probability for an answer at each step; above 1 a step never answers. agree:
+    number of steps in a row, including the newest, that must give the same label, and be of a known
+    material. limits: [D], largest squared distance of a known material at each step; () if unknown
+    materials are not detected before the end of a sweep, then `Manifest.json` omits it.
+    """
+
+    least: tuple[float, ...]
+    agree: int
+    limits: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.least or not all(_positive(p) for p in self.least):
+            raise BundleError(
+                f"early.least {list(self.least)} must be numbers above 0, one for each step"
+            )
+        if type(self.agree) is not int or self.agree < 1:
+            raise BundleError(f"early.agree {self.agree!r} must be a whole number from 1 on")
+        if self.limits and not (
+            len(self.limits) == len(self.least) and all(map(_positive, self.limits))
+        ):
+            raise BundleError(
+                f"early.limits {list(self.limits)} must be numbers above 0, one for each step"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """Rule for unknown materials. Raises BundleError for a number out of range.
+
+    limit: largest squared distance from a sweep's embedding to the nearest class mean; beyond it
+    the material is unknown. temperature: divisor of the logits from class means. enrolled: least
+    probability of all enrolled labels together at which a sweep gets one of them; None if all
+    labels are compared by distances alone, as before 0.2, then `Manifest.json` omits it.
+    """
+
+    limit: float
+    temperature: float
+    enrolled: float | None = None
+
+    def __post_init__(self) -> None:
+        _check_positive(self, "known")
+        if self.enrolled is not None and not UNSURE <= self.enrolled < 1:
+            raise BundleError(
+                f"known.enrolled {self.enrolled!r} must be at least {UNSURE} and below 1"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class DisplacementRule:
+    """Rule for sweeps whose contact is displaced from `Manifest.contact`. Raises BundleError for a
+    number out of range.
+
+    limit: as in Known, for the distances of displaced sweeps. temperature: divisor of logits that
+    are calibrated for sweeps without displacement. unsure: least probability for status ok; above 1
+    a single displaced sweep is never ok. farthest_mm: displacement from which on a sweep is not
+    named, because no training copy is displaced as far; None if unknown, then `Manifest.json` omits
+    it.
+    """
+
+    limit: float
+    temperature: float
+    unsure: float
+    farthest_mm: float | None = None
+
+    def __post_init__(self) -> None:
+        _check_positive(self, "moved")
+
+
+def _check_positive(rule: Known | DisplacementRule, where: str) -> None:
+    for name in rule.__slots__:
+        value = getattr(rule, name)
+        if not _positive(value) and (name, value) not in OPTIONAL:
+            raise BundleError(f"{where}.{name} {value!r} must be a number above 0")
+
+
+def _positive(value: object) -> bool:
+    return type(value) in (int, float) and 0 < value <= sys.float_info.max  # type: ignore[operator]
+
+
+@dataclass(frozen=True, slots=True)
+class Manifest:
+    """The manifest of a bundle. Raises BundleError for values out of range.
+
+    input: "raw" or a feature set.
+    files: name -> sha256 and size.
+    figures: results by evaluation protocol.
+    made: commit, seed and machine of the export.
+    early, known: rules for early answers and unknown materials; None if not supported.
+    contact: contact positions in training; None if unknown.
+    displacement: rule for contacts elsewhere; None if not supported.
+    runtime: least version of the program that can run the bundle.
+    counter: increases with each signed bundle, so that an older bundle cannot be installed
+        unnoticed; 0 for a bundle that was never signed.
+    unloaded: raw counts of the skin without contact, the values of a frame in their order; () if
+        unknown, then `json` omits it.
+    speeds: range of the measured speeds in training; None if unknown, then `json` omits it.
+    bridging: broken taxels that the model tolerates; None if that was not measured, then `json`
+        omits it.
+    sliding: what tells a slide from a rest; None if unknown, then `json` omits it.
+    disturbances: allowances for noise, load, speed, lost frames and hum; None if they were not
+        measured, then `json` omits it.
+    displays: names of materials for people, in any language, by label; {} if labels are shown, then
+        `json` omits it.
+    """
+
+    name: str
+    version: str
+    format: SweepFormat
+    input: str
+    labels: tuple[str, ...]
+    thresholds: Thresholds
+    files: dict[str, dict[str, Any]]
+    figures: dict[str, Any] = field(default_factory=dict)
+    made: dict[str, Any] = field(default_factory=dict)
+    early: Early | None = None
+    known: Known | None = None
+    contact: ContactPositions | None = None
+    displacement: DisplacementRule | None = None
+    runtime: str = "0.0.0"
+    counter: int = 0
+    unloaded: tuple[float, ...] = ()
+    speeds: SpeedRange | None = None
+    bridging: Bridging | None = None
+    sliding: SlideLimits | None = None
+    disturbances: Disturbances | None = None
+    displays: dict[str, str] = field(default_factory=dict)
+    schema: int = SCHEMA
+
+    def __post_init__(self) -> None:
+        if type(self.schema) is not int or not 1 <= self.schema <= SCHEMA:
+            raise BundleError(
+                f"manifest schema {self.schema} is unknown; this version reads 1 to {SCHEMA}: "
+                "update one of them"
+            )
+        if self.input not in INPUTS:
+            raise BundleError(
+                f"manifest input {self.input!r} is unknown; use one of {', '.join(INPUTS)}"
+            )
+        _check_age(self)
+        _check_files(self.files)
+        _check_labels(self.labels)
+        _check_displays(self.displays, self.labels)
+        _check_parts(self)
+        if self.unloaded and len(self.unloaded) != self.format.channels:
+            raise BundleError(
+                f"manifest gives {len(self.unloaded)} counts of the unloaded skin, its frames have "
+                f"{self.format.channels}; export the bundle again"
+            )
+        if self.early and self.input != "raw":
+            raise BundleError(
+                f"manifest has `early`, but input {self.input!r} needs the whole window; export it "
+                "without"
+            )
+        if type(self.counter) is not int or not 0 <= self.counter < 1 << 53:
+            raise BundleError(
+                f"manifest counter {self.counter!r} must be a whole number from 0 on; sign the "
+                "bundle again"
+            )
+        version(self.runtime)
+
+    @property
+    def taught(self) -> str:
+        """Who has taught the bundle on a box and when, in words; "" if a desktop has trained it."""
+        about = self.made.get("taught")
+        if not isinstance(about, dict):
+            return ""
+        by, at = (str(about.get(name, "?"))[:40] for name in ("by", "at"))
+        return f"taught here by {by}, {at} UTC by the box's clock"
+
+    def json(self) -> bytes:
+        """The bytes of manifest.json; equal manifests give equal bytes."""
+        values = {FILE_KEYS.get(name, name): value for name, value in asdict(self).items()}
+        values["format"] = self.format.json()
+        for name in ("unloaded", "speeds", "bridging", "sliding", "disturbances", "displays"):
+            if not values[name]:
+                del values[name]
+        added_later = (
+            ("early", "limits"),
+            ("moved", "farthest_mm"),
+            ("known", "enrolled"),
+            ("bridging", "loads"),
+            ("sliding", "pattern"),
+            ("disturbances", "hum"),
+        )
+        for name, added in added_later:
+            if values.get(name) and not values[name][added]:
+                del values[name][added]
+        for allowance in values.get("disturbances", {}).get("allowances", ()):
+            if allowance["tried"] is None:
+                del allowance["tried"]
+        return (json.dumps(values, indent=1, sort_keys=True) + "\n").encode()
+
+    @property
+    def tare(self) -> NDArray[np.float64]:
+        """Raw counts of the unloaded skin in the shape of a frame, the first tare of the box; 0 if
+        unknown."""
+        return np.array(self.unloaded or (0.0,) * self.format.channels).reshape(self.format.shape)
+
+    @classmethod
+    def parse(cls, text: bytes) -> Manifest:
+        """Read a manifest. Raises BundleError if a key is missing or unknown, or a value has the
+        wrong type."""
+        try:
+            made = typed(cls, _by_field(json.loads(text)))
+            made.json()  # raises if it is nested too deeply to be written again after enrolment
+            return made
+        except (ValueError, TypeError, AttributeError, RecursionError, FormatError) as e:
+            raise BundleError(f"manifest cannot be read: {e}; export the bundle again") from e
+
+
+def _by_field(raw: Any) -> Any:
+    """The content of manifest.json under the names of Manifest's fields. Raises TypeError for an
+    unknown key."""
+    if not isinstance(raw, dict):
+        return raw
+    names = {FILE_KEYS.get(f.name, f.name): f.name for f in fields(Manifest)}
+    if unknown := sorted(raw.keys() - names.keys()):
+        raise TypeError(f"{unknown!r} is none of {', '.join(names)}")
+    return {names[key]: value for key, value in raw.items()}
+
+
+def version(text: object) -> tuple[int, ...]:
+    """A version such as 1.2.3 as a tuple of numbers, for comparison. Raises BundleError for other
+    text."""
+    if not isinstance(text, str) or not _VERSION.fullmatch(text):
+        raise BundleError(f"version {text!r} is not of the form 1.2.3; export the bundle again")
+    return tuple(map(int, text.split(".")))
+
+
+def _check_parts(manifest: Manifest) -> None:
+    """Parts that need each other are there together. Raises BundleError."""
+    if (manifest.known is not None) != (MEANS in manifest.files):
+        raise BundleError(
+            f"manifest must have both `known` and {MEANS}, or neither; export the bundle again"
+        )
+    if manifest.early and manifest.early.limits and not manifest.known:
+        raise BundleError("manifest has `early.limits` without `known`; export the bundle again")
+    if manifest.displacement and not (manifest.known and manifest.contact):
+        raise BundleError(
+            "manifest has `moved` without `known` and `place`; export the bundle again"
+        )
+    taxels = manifest.format.rows * manifest.format.cols
+    if manifest.bridging and manifest.bridging.taxels >= taxels:
+        raise BundleError(
+            f"manifest bridges {manifest.bridging.taxels} of {taxels} taxels, which leaves none; "
+            "export the bundle again"
+        )
+    loads = manifest.bridging and manifest.bridging.loads
+    if loads and len(loads.mean) != manifest.format.channels:
+        raise BundleError(
+            f"manifest has {len(loads.mean)} loads in `bridging` for {manifest.format.channels} "
+            "values of a frame; export the bundle again"
+        )
+    if manifest.sliding and len(manifest.sliding.least) > len(manifest.labels):
+        raise BundleError(
+            f"manifest has {len(manifest.sliding.least)} limits in `sliding` for "
+            f"{len(manifest.labels)} labels; export the bundle again"
+        )
+    if manifest.contact and manifest.thresholds.contact is None:
+        raise BundleError(
+            "manifest has `place` without `thresholds.contact`; export the bundle again"
+        )
+
+
+def _check_age(m: Manifest) -> None:
+    """Raises BundleError if a manifest has keys that its schema version does not have."""
+    if m.schema == 1 and (m.early or m.known):
+        raise BundleError(
+            "manifest schema 1 has no `early` and no `known`; export the bundle again"
+        )
+    if m.schema < 3 and (m.contact or m.counter or m.runtime != "0.0.0"):
+        raise BundleError(
+            f"manifest schema {m.schema} has no `place`, `counter`, `runtime`; export the bundle "
+            "again"
+        )
+    if m.schema < 4 and m.displacement:
+        raise BundleError(f"manifest schema {m.schema} has no `moved`; export the bundle again")
+
+
+def _check_files(files: Mapping[str, Mapping[str, Any]]) -> None:
+    """Raises BundleError for an unknown file, or an entry without sha256 and size."""
+    for name, entry in files.items():
+        if name not in (MODEL, GOLDEN, MEANS):
+            raise BundleError(
+                f"manifest names a file {name!r}; a bundle has {MODEL}, {GOLDEN} and {MEANS} alone"
+            )
+        hashed, size = entry.get("sha256"), entry.get("bytes")
+        if (
+            entry.keys() != {"sha256", "bytes"}
+            or not isinstance(hashed, str)
+            or not _SHA256.fullmatch(hashed)
+        ):
+            raise BundleError(
+                f"manifest has {dict(entry)} for {name}; sha256 and bytes are wanted: export the "
+                "bundle again"
+            )
+        if type(size) is not int or not 0 <= size <= MOST_BYTES:
+            raise BundleError(
+                f"manifest gives {name} {size!r} bytes; 0 to {MOST_BYTES} are allowed: export a "
+                "smaller model"
+            )
+
+
+def _check_labels(labels: tuple[str, ...]) -> None:
+    """Raises BundleError for fewer than two labels, equal labels, and labels that cannot be
+    sent."""
+    if len(labels) < 2 or len(set(labels)) < len(labels):
+        raise BundleError(f"manifest labels {list(labels)} must be at least two different names")
+    for label in labels:
+        if not isinstance(label, str) or not LABEL.fullmatch(label):
+            raise BundleError(
+                f"label {label!r} cannot be sent; use 1 to 24 letters, digits, spaces, '.', '_' "
+                "or '-'"
+            )
+
+
+def _check_displays(displays: Mapping[str, str], labels: tuple[str, ...]) -> None:
+    """Raises BundleError for a display name that cannot be shown, or that belongs to no label."""
+    for label, text in displays.items():
+        if label not in labels:
+            raise BundleError(
+                f"manifest has a display name of {label!r}, which is not a label; export the "
+                "bundle again"
+            )
+        if not can_be_shown(text):
+            raise BundleError(
+                f"display name {text!r} of {label!r} cannot be shown; use 1 to {MOST_SHOWN} "
+                "characters that are printed"
+            )

@@ -1,0 +1,111 @@
+"""Steps that several commands share: settings, bundle, signals, a local page."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from palpate.bundle.bundle import Bundle
+from palpate.core import config, fingers, storage
+from palpate.core.clock import SystemClock
+from palpate.core.config import Config
+from palpate.core.errors import BundleDenied, ConfigError
+from palpate.core.interrupts import INTERRUPTED
+from palpate.runtime import assembly
+
+if TYPE_CHECKING:
+    from palpate.web.server import PageServer
+
+Facts = Mapping[str, Callable[[], object]]
+"""Additional facts of status and feed, by name. A text is shown to a person."""
+
+
+def load_settings(args: argparse.Namespace) -> Config:
+    """The settings with the changes that a command's options make. With --finger they are those of
+    one skin; a command that needs one always has this option. Raises ConfigError."""
+    given = {
+        key: value
+        for key, option in (("profile", "skin"), ("port", "skin_port"))
+        if (value := getattr(args, option, None))
+    }
+    sets = [*args.set, *(f"skin.{key}={value}" for key, value in given.items())]
+    every, sweep = getattr(args, "every", None), getattr(args, "sweep", None)
+    mode = getattr(args, "trigger", None)
+    if every is not None or sweep is not None:
+        if mode not in (None, "timed"):
+            raise ConfigError(
+                f"--every and --sweep are for --trigger timed, not for {mode}; leave them out"
+            )
+        mode = "timed"
+    sets += [f"trigger.mode={mode}"] if mode else []
+    settings = config.load(args.board, sets, folder=args.config_dir)
+    times = {name: s for name, s in (("every_s", every), ("sweep_s", sweep)) if s is not None}
+    if times:
+        settings = replace(settings, trigger=replace(settings.trigger, **times))
+    if "finger" not in args:
+        return settings
+    fingers.check_chosen(settings.skins, args.finger)
+    if not args.finger:
+        return settings
+    settings = settings.finger(args.finger)
+    return replace(settings, skin=replace(settings.skin, **given))
+
+
+def status_file(settings: Config) -> Path:
+    """The file with the state of the service. Raises ConfigError if it is turned off."""
+    if not settings.store.status:
+        raise ConfigError(
+            'store.runtime = "" turns the status file off; set it to a folder, and restart the'
+            " service"
+        )
+    return settings.store.status
+
+
+def load_bundle(settings: Config, *, answers: bool = True) -> Bundle:
+    """The bundle of the settings; see assembly.running. Raises BundleDenied without the rights."""
+    try:
+        return assembly.running(settings, answers=answers).bundle
+    except PermissionError as e:
+        raise BundleDenied(
+            f"{e.filename}: this user may not read the deployed bundle; use the service's rights: "
+            "sudo -u palpate palpate ..., with the same command"
+        ) from e
+
+
+def check_output(path: Path) -> None:
+    """Raise ConfigError if a file cannot be written, before the work whose result it gets."""
+    why = storage.refused(path)
+    if why:
+        raise ConfigError(f"{path} cannot be written: {why}; name a file in a folder of yours")
+
+
+class StopFlag:
+    """A function that is true once SIGTERM or SIGINT came. The loop then ends within one turn."""
+
+    def __init__(self) -> None:
+        self._received: list[int] = []
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, lambda n, frame: self._received.append(n))
+
+    def __call__(self) -> bool:
+        return bool(self._received)
+
+    @property
+    def exit_code(self) -> int:
+        """130 after Ctrl-C, otherwise 0: SIGTERM ends a service in order."""
+        return INTERRUPTED if self._received[:1] == [signal.SIGINT] else 0
+
+
+def local_page(name: str, port: int | None, stack: ExitStack) -> list[PageServer]:
+    """The server of a page for browsers on this machine, if there is a port."""
+    if port is None:
+        return []
+    from palpate.web.access import Access
+    from palpate.web.server import PageServer
+
+    return [stack.enter_context(PageServer(name, Access(port), SystemClock().now_ns))]

@@ -1,0 +1,97 @@
+"""The devices of a command, real or simulated.
+
+Simulated devices are chosen by name, and only in this module. Each of their sentences says so.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from itertools import islice
+from typing import TYPE_CHECKING
+
+from palpate.cli.common import load_settings
+from palpate.core import fingers
+from palpate.core.clock import SystemClock
+from palpate.core.config import Config
+from palpate.core.devices import Devices
+from palpate.core.errors import ConfigError
+from palpate.core.types import SweepFormat
+from palpate.io import skins
+from palpate.io.skin_profile import SkinProfile
+
+if TYPE_CHECKING:
+    from palpate.sim.devices import RobotDevices
+
+
+def open_devices(args: argparse.Namespace, format: Callable[[], SweepFormat] | None) -> Devices:
+    """The real devices, or simulated devices with `--sim`. format: gives the format of a simulated
+    skin; None for the format of its script."""
+    if args.sim:
+        return simulated(
+            args.sim, format() if format else None, args, load_settings(args), remember=False
+        )
+    if args.virtual:
+        raise ConfigError("--virtual needs --sim: real devices run in real time")
+    return Devices(SystemClock())
+
+
+def simulated(
+    name: str,
+    format: SweepFormat | None,
+    args: argparse.Namespace,
+    settings: Config,
+    *,
+    remember: bool = True,
+    spread: bool = False,
+    touring: bool = False,
+) -> RobotDevices:
+    """A simulated robot with the skin of the settings: a readout board on USB, or a skin on a
+    terminal. touring: the robot plays the tour of `palpate demo`; on a readout board only."""
+    from palpate.sim import devices, rig, script, tour
+
+    profile = _played(settings)
+    format = skins.hub_format(format, settings.part) if format else None
+    clock = rig.VirtualClock() if args.virtual else SystemClock()
+    follows = settings.trigger.mode == "serial"
+    profile = skins.profile(settings)
+    if profile.codec == "palpate":
+        acts, source, format = script.named(
+            name,
+            format,
+            args.seed,
+            spread=spread,
+            follows=follows,
+            fingers=len(settings.skins) or 1,
+        )
+        acts = islice(tour.tour(format, args.seed) if touring else acts, args.sweeps)
+        of_fingers = dict.fromkeys(settings.skins, format)
+        return devices.build(
+            format, acts, clock, source, remember=remember, follows=follows, fingers=of_fingers
+        )
+    from palpate.sim.skins import devices as terminal
+    from palpate.sim.skins import sweeps
+
+    seen = sweeps.view(settings.skin.profile, profile.format)
+    acts, source, format = script.named(
+        name, format, args.seed, spread=spread, seen=seen, follows=follows
+    )
+    acts = islice(acts, args.sweeps)
+    return terminal.build(
+        settings.skin.profile,
+        profile,
+        format,
+        acts,
+        clock,
+        source,
+        remember=remember,
+        follows=follows,
+    )
+
+
+def _played(settings: Config) -> SkinProfile:
+    """The profile of the simulated skin. Raises ConfigError for a hand that cannot be simulated."""
+    profile = skins.profile(settings)
+    if profile.codec != "palpate" or any(own.part for own in settings.skins.values()):
+        fingers.refuse(settings.skins, "--sim with this skin or with parts of a hub")
+    return profile

@@ -1,0 +1,174 @@
+"""The command `palpate record`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from palpate.cli.common import Facts, StopFlag, load_settings
+from palpate.cli.devices import open_devices
+from palpate.cli.reporting import capture, done, feed, status
+from palpate.core.clock import SystemClock
+from palpate.core.config import Config
+from palpate.core.devices import Devices
+from palpate.core.disk_thread import DiskThread
+from palpate.core.errors import ConfigError, SensorError
+from palpate.core.log import log
+from palpate.core.observer import Observer
+from palpate.core.types import SweepFormat
+from palpate.io import skin_profile, skins
+from palpate.io.robot_link import Command, Port
+from palpate.runtime import assembly
+from palpate.service.systemd import Notifier
+from palpate.sweeps.recording import Labels, RecordingSession
+
+if TYPE_CHECKING:
+    from palpate.web.record import RecordPage
+
+
+def run(args: argparse.Namespace) -> int:
+    """Keep each sweep with its label. No bundle is needed: the skin announces its format."""
+    labels = Labels(args.material, args.position, args.session)
+    settings, stopped = load_settings(args), StopFlag()
+    with ExitStack() as stack:
+        devices, format = open_skin(args, settings)
+        # a person at a terminal reads the log; sentences are for a robot, or for a program that
+        # reads the output
+        sentences = settings.serial.port or not sys.stdout.isatty()
+        port = assembly.port(settings, devices) if sentences else None
+        folder, disk = args.out or settings.kept("sweeps"), DiskThread()
+        recording = RecordingSession(
+            folder,
+            format,
+            labels,
+            devices.clock,
+            _sentences(port),
+            args.target,
+            disk,
+            finger=settings.alone,
+        )
+        stack.callback(recording.close)
+        page = _record_page(
+            args, settings, format, devices, recording, lambda command: box.obey(command)
+        )
+        _announce(format, folder)
+        box = assembly.recorder(
+            settings,
+            format,
+            devices,
+            port,
+            stack,
+            capture=capture(args, settings, format, stack),
+            observers=[disk, *_observers(settings, format, devices.source, recording), *page],
+            commands=recording.commands,
+            ordered=bool(page),
+        )
+        for shown in page:
+            stack.enter_context(shown)
+        box.run(done(args, box, devices, stopped))
+    return stopped.exit_code
+
+
+def open_skin(args: argparse.Namespace, settings: Config) -> tuple[Devices, SweepFormat]:
+    """The devices, and the format of the recorded sweeps. Raises ConfigError if no sweep can be as
+    long as the window."""
+    asked = skins.described(args.format) if args.format else None
+    devices = open_devices(args, (lambda: asked) if asked else None)
+    format = asked or skins.part_of(settings, devices.format) or _announced(settings, devices)
+    if args.window is not None:
+        format = replace(format, window=round(args.window * format.rate_hz))
+    _check_length(format, settings)
+    return devices, format
+
+
+def _announce(format: SweepFormat, folder: Path) -> None:
+    """Log format and folder, and warn if the skin is too slow for textures."""
+    window_s = format.window / format.rate_hz
+    log.info(f"record: {format}, to {folder}; slide for longer than {window_s:.3g} s")
+    if slow := skin_profile.warning(format):
+        log.warning(f"record: {slow}")
+
+
+def _observers(
+    settings: Config, format: SweepFormat, source: str, recording: RecordingSession
+) -> list[Observer]:
+    facts: Facts = {
+        "model": lambda: "none: sweeps are recorded",
+        "recorded": lambda: recording.about()["missing"],
+        "recording": recording.about,
+    }
+    return [
+        Notifier(SystemClock()),
+        recording,
+        *_printer(format, recording),
+        *status(settings, facts),
+        *feed(settings, format, source, {"bundle": "", "labels": []}, facts),
+    ]
+
+
+def _printer(format: SweepFormat, recording: RecordingSession) -> list[Observer]:
+    """The printer of sweeps for a person at a terminal."""
+    if not sys.stdout.isatty():
+        return []
+    from palpate.web.sweep_text import SweepPrinter
+
+    return [SweepPrinter(sys.stdout, format.rate_hz, recording.about)]
+
+
+def _record_page(
+    args: argparse.Namespace,
+    settings: Config,
+    format: SweepFormat,
+    devices: Devices,
+    recording: RecordingSession,
+    obey: Callable[[Command], list[object]],
+) -> list[RecordPage]:
+    """The page of `--web`, which shows the recording and sets its labels."""
+    if args.web is None:
+        return []
+    from palpate.web.access import Access
+    from palpate.web.record import RecordPage
+
+    access = Access.configured(settings.watch, args.web)
+    page = RecordPage(
+        access,
+        format,
+        devices.source,
+        devices.wire(settings).trigger,
+        recording.about,
+        obey,
+        SystemClock(),
+        skins.profile(settings).unit,
+        recording.names.label,
+    )
+    log.info(f"page: {page.server.address}")
+    return [page]
+
+
+def _announced(settings: Config, devices: Devices) -> SweepFormat:
+    """The format that the skin announces. Raises SensorError with advice if it announces none."""
+    try:
+        return skins.part_of(settings, skins.announced(devices.wire(settings), devices))
+    except SensorError as e:
+        raise type(e)(
+            f"{e}; or name its format with --format 4x4:uint8:750; then the command waits for it"
+        ) from e
+
+
+def _check_length(format: SweepFormat, settings: Config) -> None:
+    """Raises ConfigError if no sweep could be as long as the window."""
+    if format.window * format.period_ns > settings.sweep.max_duration_s * 1e9:
+        raise ConfigError(
+            f"a window of {format.window / format.rate_hz:g} s is longer than any sweep may last"
+            f" ({settings.sweep.max_duration_s:g} s); use a shorter --window, or raise"
+            " sweep.max_duration_s"
+        )
+
+
+def _sentences(port: Port | None) -> Callable[[bytes], None]:
+    return port.say if port else lambda line: None

@@ -1,0 +1,109 @@
+"""Parts that `run` and `record` share: status file, feed, capture, and the end of the loop."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+from palpate.bundle.bundle import Bundle
+from palpate.cli.common import Facts
+from palpate.core import fingers
+from palpate.core.clock import SystemClock
+from palpate.core.config import Config
+from palpate.core.devices import Devices
+from palpate.core.errors import ConfigError
+from palpate.core.observer import Observer
+from palpate.core.types import SweepFormat
+from palpate.io import skins
+from palpate.service.status import StatusFile
+from palpate.sweeps.capture import CaptureWriter
+
+if TYPE_CHECKING:
+    from palpate.runtime.loop import Box
+
+
+def capture(
+    args: argparse.Namespace, settings: Config, format: SweepFormat, stack: ExitStack
+) -> CaptureWriter | None:
+    if args.capture:
+        fingers.refuse(settings.skins, "--capture")
+        if settings.part:
+            raise ConfigError(
+                f"--capture keeps the frames of the whole hub, and skins.{settings.alone}.part is "
+                f'"{settings.part}"; leave it out'
+            )
+    capture = CaptureWriter(args.capture, format, skins.profile(settings)) if args.capture else None
+    if capture:
+        stack.callback(capture.close)
+    return capture
+
+
+def done(
+    args: argparse.Namespace, box: Box, devices: Devices, stopped: Callable[[], bool]
+) -> Callable[[], bool]:
+    """True after a signal, after `--sweeps` answers, and at the end of a script."""
+    return lambda: (
+        (args.sweeps is not None and box.answered >= args.sweeps)
+        or stopped()
+        or devices.finished(box.answered)
+    )
+
+
+def status(settings: Config, facts: Facts) -> list[Observer]:
+    """The writer of the status file, if the settings name a file that can be written."""
+    path = settings.store.status
+    if not path or not os.access(path.parent, os.W_OK):
+        return []
+    return [StatusFile(path, SystemClock(), lambda: {name: fact() for name, fact in facts.items()})]
+
+
+def feed(
+    settings: Config,
+    format: SweepFormat,
+    source: str,
+    model: Mapping[str, Any],
+    facts: Facts,
+    bundles: Mapping[str, Bundle] = MappingProxyType({}),
+) -> list[Observer]:
+    """The server of the feed, if the settings name its folder. The default folder exists in a
+    service only. model: facts about the bundle for the first line of the feed. bundles: by
+    finger."""
+    path = settings.store.feed
+    default = settings.sources["store.runtime"] == "code"
+    if not path or (default and not os.access(path.parent, os.W_OK)):
+        return []
+    from palpate.service.feed import FeedServer
+
+    known = {"source": source, "skin": settings.skin.profile, **model}
+    known["unit"] = skins.profile(settings).unit
+    if bundles:
+        known["fingers"] = {finger: _finger(settings, finger, of) for finger, of in bundles.items()}
+    return [
+        FeedServer(
+            path,
+            format,
+            known,
+            SystemClock(),
+            lambda: {name: fact() for name, fact in facts.items()},
+            fingers=[of.format for of in bundles.values()],
+        )
+    ]
+
+
+def _finger(settings: Config, finger: str, bundle: Bundle) -> dict[str, Any]:
+    """The facts about a finger for the first line of the feed."""
+    from palpate.alignment.live import Expected
+
+    own = settings.finger(finger)
+    unit = skins.profile(own).unit
+    return {
+        "skin": own.skin.profile,
+        "unit": unit,
+        "bundle": bundle.id,
+        "format": bundle.format.json(),
+        "alignment": Expected.by(bundle, own.skin.fingertip, unit).json(),
+    }

@@ -1,0 +1,193 @@
+"""The command `palpate run`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from palpate.bundle.bundle import DEFAULT, Bundle
+from palpate.bundle.manifest import Manifest
+from palpate.cli.common import Facts, StopFlag, load_bundle, load_settings
+from palpate.cli.devices import open_devices
+from palpate.cli.reporting import capture, done, feed, status
+from palpate.core import fingers
+from palpate.core.clock import SystemClock
+from palpate.core.config import Config
+from palpate.core.devices import Devices
+from palpate.core.disk_thread import DiskThread
+from palpate.core.errors import ApplianceError
+from palpate.core.log import in_journal, log
+from palpate.core.observer import Observer
+from palpate.io import skins
+from palpate.io.usb_sensor import fits
+from palpate.runtime import assembly
+from palpate.service import ended
+from palpate.service.systemd import Notifier, VerdictLog
+
+if TYPE_CHECKING:
+    from palpate.deployment.shadow import Shadow
+    from palpate.deployment.store import Choice
+
+
+def run(args: argparse.Namespace) -> int:
+    """Classify sweeps until SIGTERM, or with --sim until all sweeps of the script are answered."""
+    settings = load_settings(args)
+    with ended.noted(None if args.sim else settings.store.runtime_folder, SystemClock()):
+        choice = None if settings.classifier.bundle else assembly.store(settings).choose()
+        if choice and choice.folder == DEFAULT and untaught(args, settings, choice.bundle):
+            from palpate.cli import teach_command  # here: a box in service does without it
+
+            return teach_command.until_taught(args, settings)
+        return _classify(args, settings, choice)
+
+
+def _classify(args: argparse.Namespace, settings: Config, choice: Choice | None) -> int:
+    stopped = StopFlag()
+    with ExitStack() as stack:
+        trial = stack.enter_context(choice.trial) if choice and choice.trial else None
+        current = choice.bundle if choice else load_bundle(settings, answers=not args.sim)
+        of_fingers = assembly.of_fingers(settings, current, answers=not args.sim)
+        # labels have the order of the first finger's bundle
+        current = next(iter(of_fingers.values()), current)
+        if unsigned := assembly.UNSIGNED if settings.classifier.allow_unsigned else "":
+            log.warning(f"unsigned {unsigned}")
+        devices = open_devices(args, lambda: current.format)
+        port = assembly.port(settings, devices)
+        disk = DiskThread()
+        if trial:
+            trial.disk = disk
+        # not beside a trial: if the program dies, it must be clear which bundle was the cause
+        shadow = None if trial else _shadow(args, settings, current, devices, disk)
+        facts = {
+            "trial": lambda: trial.text if trial else "",
+            "shadow": lambda: shadow.agreement.text if shadow else "",
+            "disk": lambda: disk.text,
+            "unsigned": lambda: unsigned,
+        }
+        reports = _reports(settings, current, of_fingers, devices.source, facts, stack, disk)
+        observers = disk, Notifier(SystemClock()), trial, shadow, *reports
+        box = assembly.box(
+            settings,
+            current,
+            devices,
+            port,
+            stack,
+            bundles=of_fingers,
+            capture=capture(args, settings, current.format, stack),
+            observers=[o for o in observers if o],
+        )
+        box.run(done(args, box, devices, stopped))
+    return stopped.exit_code
+
+
+def untaught(args: argparse.Namespace, settings: Config, packaged: Bundle) -> bool:
+    """Whether the skin lacks a bundle: none was delivered or taught, and the packaged bundle is for
+    another skin. A skin of PROTOCOL.md announces its format later, so it does not count."""
+    profile = skins.profile(settings)
+    return (
+        not (args.sim or settings.skins)
+        and settings.teach.allow
+        and profile.codec != "palpate"
+        and not fits(profile.format, packaged.format)
+    )
+
+
+def _reports(
+    settings: Config,
+    current: Bundle,
+    bundles: Mapping[str, Bundle],
+    source: str,
+    facts: Facts,
+    stack: ExitStack,
+    disk: DiskThread,
+) -> list[Observer]:
+    """The observers that the settings ask for: log, black box, status file, feed with `facts`.
+    bundles: by finger. source: origin of the frames."""
+    # without a serial port, a terminal shows the sentences
+    shown = in_journal() or bool(settings.serial.port and sys.stderr.isatty())
+    observers: list[Observer] = [VerdictLog()] if shown else []
+    if settings.store.black_box:
+        observers += _black_boxes(settings, current, bundles, stack, disk)
+    m, model = current.manifest, _model(current, bundles)
+    facts = {"model": lambda: model, **facts}
+    from palpate.alignment.live import Expected
+
+    expected = Expected.by(current, settings.skin.fingertip, skins.profile(settings).unit)
+    known = {"bundle": current.id, "labels": m.labels, "alignment": expected.json()}
+    known |= {"displays": m.displays} if m.displays else {}
+    return [
+        *observers,
+        *status(settings, facts),
+        *feed(settings, current.format, source, known, facts, bundles),
+    ]
+
+
+def _model(current: Bundle, bundles: Mapping[str, Bundle]) -> str:
+    """The bundle in words; of fingers with different bundles each, with its name."""
+    if len({of.id for of in bundles.values()}) < 2:
+        return _named(current.manifest)
+    return "; ".join(f"{finger}: {_named(of.manifest)}" for finger, of in bundles.items())
+
+
+def _named(m: Manifest) -> str:
+    return f"{m.name} {m.version}, {len(m.labels)} labels{f', {m.taught}' if m.taught else ''}"
+
+
+def _black_boxes(
+    settings: Config,
+    current: Bundle,
+    bundles: Mapping[str, Bundle],
+    stack: ExitStack,
+    disk: DiskThread,
+) -> list[Observer]:
+    """The black box; of several fingers one for each, in a folder of its name."""
+    from palpate.sweeps.black_box import BlackBox, FingerBox
+
+    folder, most = Path(settings.store.folder) / "black-box", settings.store.black_box
+    boxes: list[BlackBox] = [
+        FingerBox(finger, folder / finger, of.format, most, disk) for finger, of in bundles.items()
+    ] or [BlackBox(folder, current.format, most, disk)]
+    for one in boxes:
+        stack.callback(one.close)
+    return [*boxes]
+
+
+def _shadow(
+    args: argparse.Namespace,
+    settings: Config,
+    current: Bundle,
+    devices: Devices,
+    disk: DiskThread,
+) -> Shadow | None:
+    """The candidate of `--shadow`, which classifies beside the current bundle. None without a
+    candidate, and for a candidate that cannot run."""
+    try:
+        candidate = None
+        if args.shadow is not None:
+            fingers.refuse(settings.skins, "--shadow")
+        if args.shadow:
+            candidate = assembly.named(settings, Path(args.shadow), answers=not args.sim).bundle
+        elif args.shadow is not None:
+            candidate = assembly.store(settings).candidate()
+        if candidate is None:
+            return None
+        from palpate.deployment.shadow import Shadow
+
+        return Shadow(
+            candidate,
+            current,
+            Path(settings.store.folder) / "shadow",
+            devices.clock,
+            lambda bundle: assembly.classifier(settings, bundle, devices.clock),
+            disk,
+        )
+    except (
+        ApplianceError,
+        OSError,
+    ) as e:  # the box serves the robot, the candidate is for a person
+        log.warning(f"no shadow: {e}")
+        return None

@@ -1,0 +1,238 @@
+"""The command `palpate skin`: the skin by itself, without a bundle."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shlex
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, closing
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from palpate.cli.common import StopFlag, load_settings, local_page
+from palpate.cli.devices import open_devices
+from palpate.core import storage
+from palpate.core.clock import SystemClock
+from palpate.core.config import Config
+from palpate.core.errors import ConfigError, SensorMismatch
+from palpate.core.log import log
+from palpate.io import serial_port, skin_profile, skins
+from palpate.io.serial_port import PortInfo
+from palpate.io.skin_profile import DEFAULT, SkinProfile
+
+if TYPE_CHECKING:
+    from palpate.tools.skin_monitor import SkinDisplay
+    from palpate.tools.skin_new import PortSample
+
+CHECK_S = 10.0
+"""Default of `palpate skin check --seconds`."""
+NEW_S = 3.0
+"""Default of `palpate skin new --seconds`, at each speed."""
+
+
+def run_check(args: argparse.Namespace) -> int:
+    """Check each part of PROTOCOL.md; 1 if any fails."""
+    from palpate.tools import skin_check
+
+    devices = open_devices(args, None)
+    settings = devices.wire(load_settings(args))
+    failed, port = 0, settings.skin.link == "serial"
+    seconds = args.seconds or CHECK_S
+    with closing(skins.open_readout(settings, devices)) as link:
+        more = "about half a minute" if port else "some seconds"
+        log.info(
+            f"listening to frames for {seconds:g} s; stopping, requests and overflow take {more}"
+            " more"
+        )
+        for found in skin_check.check(link, devices.clock, seconds, port=port):
+            print(f"{found.verdict:<7}  {found.part:<9} {found.detail}", flush=True)
+            failed += found.verdict == "FAIL"
+    return 1 if failed else 0
+
+
+def run_list(args: argparse.Namespace) -> int:
+    """Print all profiles as a table; 1 if a profile cannot be read."""
+    from palpate.tools import skin_detect
+
+    every = dict(_profiles(load_settings(args)))
+    good = {name: one for name, one in every.items() if not isinstance(one, ConfigError)}
+    print(*skin_detect.table(good), sep="\n")
+    for name, one in every.items():
+        if isinstance(one, ConfigError):
+            print(f"{name}: {one}")
+    return 1 if len(good) < len(every) else 0
+
+
+def run_detect(args: argparse.Namespace) -> int:
+    """Print the connected skins and the profiles that fit; 1 if none fits."""
+    from palpate.tools import skin_detect
+
+    if args.write and not args.skin_port:
+        raise ConfigError("--write sends commands to a port; name the port with --port /dev/...")
+    settings, port = load_settings(args), args.skin_port
+    there = serial_port.ports()
+    if port:
+        there = [one for one in there if one.path == port] or [PortInfo(port)]
+    # a port that is soldered on may lead to the robot, or to nothing: only the named port is opened
+    usb = [one for one in there if one.vendor_id or port]
+    found = 0
+    for line in skin_detect.on_usb(settings.skin):
+        print(line, flush=True)
+        found += 1
+    found += _listen(usb, settings, args.write)
+    if not found and not usb:
+        others = ", ".join(one.path for one in there) or "none"
+        print(f"no skin on USB; plug it in, or name another port with --port (there are: {others})")
+    return 0 if found else 1
+
+
+def _listen(ports: list[PortInfo], settings: Config, write: bool) -> int:
+    """Listen at each port and print the profiles that fit; the number of ports where one fits."""
+    from palpate.io.serial_link import SerialLink
+    from palpate.tools import skin_detect
+
+    clock, fitting = SystemClock(), 0
+    profiles = {name: p for name, p in _profiles(settings) if not isinstance(p, ConfigError)}
+    if ports:
+        names = ", ".join(port.path for port in ports)
+        log.info(f"listening at {names}; some seconds at each")
+    for one in skin_detect.detect(
+        ports,
+        profiles,
+        lambda path, baud: SerialLink(path, baud, clock),
+        clock,
+        write=write,
+        seconds=skin_detect.LISTEN_S,
+    ):
+        print(f"{one.port}: {one.profile or 'no profile fits'}: {one.detail}", flush=True)
+        fitting += bool(one.profile)
+    return fitting
+
+
+def _profiles(settings: Config) -> Iterator[tuple[str, SkinProfile | ConfigError]]:
+    """All profiles by name, or the error of a profile that cannot be read."""
+    folders = skins.folders(settings)
+    for name in sorted({DEFAULT, *skin_profile.names(folders)}):
+        try:
+            yield name, skin_profile.load(name, folders)
+        except ConfigError as e:
+            yield name, e
+
+
+def run_show(args: argparse.Namespace) -> int:
+    """Show the skin live, in the terminal and on a page, until Ctrl-C."""
+    from palpate.tools import skin_show
+    from palpate.tools.skin_screen import SkinScreen
+
+    devices = open_devices(args, None)
+    settings = devices.wire(load_settings(args))
+    format = devices.format or skins.announced(settings, devices)
+    if slow := skin_profile.warning(format):
+        log.warning(f"warning: {slow}")
+    stopped = StopFlag()
+    with ExitStack() as stack:
+        pages = local_page("skin.html", args.web, stack)
+        screen = stack.enter_context(
+            SkinScreen(sys.stdout, devices.clock, *(page.address for page in pages))
+        )
+        sensor = stack.enter_context(closing(skins.sensor(settings, format, devices)))
+        shown_on: list[SkinDisplay] = [screen, *pages]
+        unit = skins.profile(settings).unit
+        name, source = settings.skin.profile, devices.source
+        skin_show.run(sensor, format, name, source, devices.clock, shown_on, stopped, unit)
+    return stopped.exit_code
+
+
+def run_new(args: argparse.Namespace) -> int:
+    """Listen to a port and propose profiles; with a grid, write a profile."""
+    from palpate.io.serial_link import SerialLink
+    from palpate.tools import skin_new
+
+    settings, seconds = load_settings(args), args.seconds or NEW_S
+    path = (args.out or skins.OWN) / f"{_new_name(args, settings)}.toml"
+    if args.grid:
+        _make(path.parent)  # before a user has listened in vain
+    port, clock = args.skin_port, SystemClock()
+    bauds = (args.baud,) if args.baud else skin_new.BAUDS
+    log.info(
+        f"listening at {port}: {seconds:g} s at each speed, until one shows a pattern; touch the"
+        " skin"
+    )
+    heard = skin_new.listen(partial(SerialLink, port, clock=clock), bauds, seconds, clock)
+    for number, proposal in enumerate(heard.proposals[: skin_new.MOST_SHOWN], 1):
+        print(f"{number}: {skin_new.words(proposal)}")
+    if args.grid:
+        _write(path, heard, args)
+    else:
+        print(
+            f"at {heard.baud} baud; give the same command with --grid, and --proposal if the first"
+            " is not right"
+        )
+    return 0
+
+
+def _write(path: Path, heard: PortSample, args: argparse.Namespace) -> None:
+    """Write the profile of the chosen proposal, and print how it is used."""
+    from palpate.tools import skin_new
+
+    chosen, grid = skin_new.choose(heard, args.grid, args.proposal or 0)
+    port = args.skin_port
+    there = next((one for one in serial_port.ports() if one.path == port), PortInfo(port))
+    text = skin_new.profile(chosen, grid, heard.baud, there)
+    frames, garbage = skin_new.decoded(text, heard.reads)
+    if frames < skin_new.FEWEST:
+        raise SensorMismatch(
+            f"the profile reads {frames} frames of what the skin has just sent, so {path} is not "
+            "written; choose another --proposal or --grid, or listen longer with --seconds"
+        )
+    storage.put_all({path: text.encode()}, mode=0o644)
+    use = (
+        f"--skin {shlex.quote(str(path))}"
+        if args.out
+        else f'--skin {path.stem} (skin.profile = "{path.stem}")'
+    )
+    print(f"{path}: decodes {frames} frames, {garbage} bytes are left over; use it with {use}")
+
+
+def _make(folder: Path) -> None:
+    """Make the folder of a profile. Raises ConfigError if it cannot be written."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as e:
+        raise ConfigError(
+            f"{folder} cannot be made: {str(e.strerror).lower()}; name a folder with --out"
+        ) from e
+    if not os.access(folder, os.W_OK):
+        raise ConfigError(
+            f"{folder} may not be written by this user; name another folder with --out"
+        )
+
+
+def _new_name(args: argparse.Namespace, settings: Config) -> str:
+    """The name of the new profile. Raises ConfigError if it cannot be used."""
+    name: str = args.name
+    if not skin_profile.NAME.fullmatch(name):
+        raise ConfigError(
+            f"{name!r} cannot name a profile; use up to 32 small letters, digits and hyphens"
+        )
+    folders = [args.out] if args.out else skins.folders(settings)
+    if name in skin_profile.names(folders) and not args.replace:
+        raise ConfigError(f"there is a profile {name} already; take another name, or --replace")
+    return name
+
+
+RUNS: Mapping[str, Callable[[argparse.Namespace], int]] = {
+    "list": run_list,
+    "detect": run_detect,
+    "check": run_check,
+    "show": run_show,
+    "new": run_new,
+}
+
+
+def run(args: argparse.Namespace) -> int:
+    """`palpate skin ACTION`."""
+    return RUNS[args.action](args)

@@ -1,0 +1,207 @@
+"""Answers and states of the box as objects, read from the fields of RES, FIN, STA and ANS sentences
+(PROTOCOL.md, part 2)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from palpate.core import sentences
+from palpate.core.errors import FormatError
+from palpate.core.status import REASONS, Status
+
+ADVICE = {
+    Status.OK: "use the label",
+    Status.UNSURE: "sweep the same object once more",
+    Status.UNDECIDED: "sort the object out: it has been swept as often as is allowed",
+}
+"""Advice for an answer with a label; for other answers see `status.REASONS`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """The answer to one sweep, with the fields of RES. Probability and margin are 0 to 1.
+
+    time_s: of the box's monotonic clock. lost: number of lost frames in the window. loss_known:
+    whether lost frames can be seen. missed: number of answers before this one that did not arrive,
+    counted by the numbers of the sweeps. measured_mm_s, direction: of the slide as the box measured
+    it, `rows+`, `rows-`, `cols+` or `cols-` for the direction; None and "" if it was not measured.
+    finger: of an answer of one finger, else "". fingers: the answers that a hand's answer was fused
+    from, as far as they arrived; empty of a box with one skin.
+    """
+
+    sweep: int
+    time_s: float
+    status: Status
+    label: str
+    probability: float
+    margin: float
+    fused: int
+    lost: int
+    latency_ms: float
+    bundle: str = ""
+    source: str = ""
+    share: float = 1.0
+    detail: str = ""
+    loss_known: bool = True
+    missed: int = 0
+    measured_mm_s: float | None = None
+    direction: str = ""
+    finger: str = ""
+    fingers: tuple[Answer, ...] = ()
+
+    @classmethod
+    def of(cls, fields: Sequence[str]) -> Answer:
+        """The answer in the fields of a RES sentence. Raises FormatError if they are invalid."""
+        try:
+            (
+                sweep,
+                time_s,
+                status,
+                label,
+                probability,
+                margin,
+                fused,
+                lost,
+                latency,
+                bundle,
+                source,
+                share,
+            ) = fields[:12]
+            return cls(
+                int(sweep),
+                float(time_s),
+                Status(status),
+                label,
+                float(probability),
+                float(margin),
+                int(fused),
+                int(lost),
+                float(latency),
+                bundle,
+                source,
+                float(share),
+                ",".join(fields[12:13]),
+                fields[13:14] != ["1"],
+                measured_mm_s=float(fields[14]) if "".join(fields[14:15]) else None,
+                direction="".join(fields[15:16]),
+            )
+        except ValueError as e:
+            raise FormatError(
+                f"RES,{','.join(fields)}: {e}; is the client older than the box?"
+            ) from e
+
+    @classmethod
+    def of_finger(cls, fields: Sequence[str]) -> Answer:
+        """The answer in the fields of a FIN sentence. Raises FormatError as `of` does."""
+        return replace(cls.of(fields[1:]), finger="".join(fields[:1]))
+
+    @classmethod
+    def read(cls, line: str) -> Answer | None:
+        """The answer in a line; None if it is another sentence or damaged. Raises FormatError as
+        `of` does."""
+        heard = sentences.read(line.encode("ascii", "replace"))
+        return cls.of(heard.fields) if heard.kind == "RES" and heard.summed else None
+
+    @property
+    def known(self) -> bool:
+        """Whether the label can be used."""
+        return self.status is Status.OK
+
+    @property
+    def unsure(self) -> bool:
+        """Whether there is a label, but one more sweep of the same object is needed."""
+        return self.status is Status.UNSURE
+
+    @property
+    def faulty(self) -> bool:
+        """Whether nothing was learned about the object, because of a fault of the sweep, the skin
+        or the wiring."""
+        return not self.status.classified and self.status not in (Status.UNKNOWN, Status.RECORDED)
+
+    @property
+    def early(self) -> bool:
+        """Whether the answer came while the finger was sliding. The finger may stop, and no other
+        answer follows."""
+        return self.share < 1
+
+    @property
+    def what_to_do(self) -> str:
+        """The reason for the status and its remedy, with the box's detail."""
+        text = ADVICE[self.status] if self.status in ADVICE else REASONS[self.status]
+        return f"{text} ({self.detail})" if self.detail else text
+
+
+@dataclass(frozen=True, slots=True)
+class BoxState:
+    """The state of the box, with the fields of STA; it counts since the start of its program.
+
+    degraded: broken taxels that the box bridges, "" for none.
+    """
+
+    time_s: float
+    skin: str
+    sweeping: bool
+    answered: int
+    frames: int
+    lost_frames: int
+    garbage_bytes: int
+    enumerations: int
+    dropped: int
+    bundle: str
+    source: str
+    degraded: str = ""
+
+    @classmethod
+    def of(cls, fields: Sequence[str]) -> BoxState:
+        """The state in the fields of STA or of the answer to STATE. Raises FormatError if they are
+        invalid."""
+        try:
+            time_s, skin, sweeping, *counts = fields[:9]
+            answered, frames, lost, garbage, enumerations, dropped = map(int, counts)
+            bundle, source = fields[9:11]
+            return cls(
+                float(time_s),
+                skin,
+                sweeping == "1",
+                answered,
+                frames,
+                lost,
+                garbage,
+                enumerations,
+                dropped,
+                bundle,
+                source,
+                ",".join(fields[18:19]),
+            )
+        except ValueError as e:
+            raise FormatError(
+                f"STA,{','.join(fields)}: {e}; is the client older than the box?"
+            ) from e
+
+    @property
+    def ready(self) -> bool:
+        """Whether a sweep can begin."""
+        return self.skin == "streaming" and not self.sweeping
+
+
+@dataclass(frozen=True, slots=True)
+class BoxIdentity:
+    """Identity of the box: name, version and id of the bundle, the format of its sweeps, and the
+    readout board."""
+
+    name: str
+    version: str
+    bundle: str
+    format: str
+    skin: str
+
+    @classmethod
+    def of(cls, fields: Sequence[str]) -> BoxIdentity:
+        """The fields of the answer to ID. Raises FormatError if there are too few."""
+        if len(fields) < 5:
+            raise FormatError(
+                f"ID,{','.join(fields)}: {len(fields)} fields instead of 5; is the client older "
+                "than the box?"
+            )
+        return cls(*fields[:5])

@@ -1,0 +1,498 @@
+"""The settings of the box, from TOML files and `--set` options.
+
+Layers, each overriding the layers before it: the defaults below, `skin.toml`, `board-NAME.toml`,
+`/etc/palpate/palpate.toml`, `--set`. The dataclasses are the schema: types and limits of their
+fields are those of the files. Each value has its source.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, is_dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Literal, get_type_hints
+
+from palpate.core import fingers
+from palpate.core.errors import ConfigError
+from palpate.core.schema import (
+    Key,
+    closest,
+    custom,
+    fixed,
+    gpio_line,
+    keys,
+    number,
+    read_table,
+    read_toml,
+    shown,
+)
+
+SITE = Path("/etc/palpate/palpate.toml")
+"""The settings of this robot's installation; the file may be missing."""
+FEED_SCHEMA = 1
+"""Version of the feed's lines (PROTOCOL.md, part 4), for writer and readers."""
+
+
+_USB = re.compile(r"([0-9a-f]{4}):([0-9a-f]{4})(?::(.+))?", re.ASCII | re.IGNORECASE)
+
+
+def _usb(value: Any) -> str | None:
+    """The reader of skin.usb, for `custom`."""
+    known = isinstance(value, str) and value.isprintable() and _USB.fullmatch(value)
+    return value if known else None
+
+
+@dataclass(frozen=True, slots=True)
+class SkinConfig:
+    """The skin and the way to read it.
+
+    profile: name of its profile in skins/NAME.toml. grid: "ROWSxCOLUMNS" if it differs from the
+    profile, else "". rate_hz: frames per second if they differ from the profile, else 0. tare: send
+    the profile's tare command whenever the skin is found; the skin must be unloaded then.
+    fingertip: the side of the grid at the end of the finger, for pictures; "" if unknown. usb: USB
+    ids of the board, and its serial number if several are connected, as in "1209:7ac7:E661";
+    profiles with ids of their own use the serial number alone. link: "vendor" (bulk transfers),
+    "acm" (a serial port over USB, without the kernel's driver), or "serial" (any serial port, with
+    the kernel's driver). port: path of this serial port; "" finds the port by its USB ids.
+    silence_ms: after this time without a frame the skin counts as silent and is started again.
+    """
+
+    profile: str = "palpate"
+    grid: str = ""
+    rate_hz: float = number(0.0, 0.0, 100_000.0)
+    tare: bool = False
+    fingertip: Literal["", "first-row", "last-row", "first-column", "last-column"] = ""
+    usb: str = custom("1209:7ac7", 'USB ids such as "1209:7ac7" or "1209:7ac7:SERIAL"', _usb)
+    link: Literal["vendor", "acm", "serial"] = "vendor"
+    port: str = ""
+    silence_ms: int = number(500, 1, 60_000)
+    baud: int = fixed(0)  # of the serial port; 0: the profile's
+    read_bytes: int = fixed(4096)  # whole USB packets (512): a smaller read can overflow
+    timeout_ms: int = fixed(100)  # a read waits this long, and with it edges and commands
+    retry_ms: int = fixed(250)  # between two searches for a missing skin
+
+    @property
+    def vendor_id(self) -> int:
+        """First half of the USB ids."""
+        return int(self.usb[:4], 16)
+
+    @property
+    def product_id(self) -> int:
+        """Second half of the USB ids."""
+        return int(self.usb[5:9], 16)
+
+    @property
+    def serial(self) -> str:
+        """Serial number of the board, "" for any."""
+        return self.usb[10:]
+
+
+@dataclass(frozen=True, slots=True)
+class FingerConfig(SkinConfig):
+    """The skin of one finger, `[skins.NAME]`. A key that is missing has the value of `[skin]`.
+
+    bundle: path of the finger's own bundle; "" for the bundle of the box. part: the finger's part
+    of the frames of a hub, as in "1/2 rows"; "" for whole frames.
+    """
+
+    bundle: str = ""
+    part: str = custom("", 'a part of a hub such as "1/2 rows" or "2/2 columns"', fingers.part)
+
+
+@dataclass(frozen=True, slots=True)
+class TriggerConfig:
+    """Start and stop of sweeps.
+
+    mode: "two-lines": rising edges of `start` and `stop`. "one-line": `start` rises and falls,
+    `stop` is not used. "serial": commands on the serial line. "key": the space bar. "timed": by the
+    clock, a sweep of 3 s every 5 s (`run` and `record` have options for other times). start, stop:
+    the robot's GPIO lines, by the kernel's names (`gpioinfo` lists them); "" means not wired.
+    new_object: a GPIO line whose rising edge announces another object. active_low: inverts all
+    three lines, and pulls open inputs up instead of down. glitch_us: shorter pulses do not count.
+    """
+
+    mode: Literal["two-lines", "one-line", "serial", "key", "timed"] = "two-lines"
+    start: str = gpio_line()
+    stop: str = gpio_line()
+    new_object: str = gpio_line()
+    active_low: bool = False
+    glitch_us: int = number(500, 1, 1_000_000)
+    storm_edges: int = fixed(2000)  # more edges in one burst come from a broken wire
+    every_s: float = fixed(5.0)  # timed: from one START to the next (--every)
+    sweep_s: float = fixed(3.0)  # timed: from START to STOP (--sweep)
+
+    @property
+    def by_lines(self) -> bool:
+        """Whether GPIO lines start and stop sweeps."""
+        return self.mode in ("two-lines", "one-line")
+
+
+@dataclass(frozen=True, slots=True)
+class OutputConfig:
+    """The box's GPIO lines to the robot; "" means not wired.
+
+    ready, busy, result_valid, fault, decided: PROTOCOL.md, part 3. class_bits: the class code,
+    lowest bit first. settle_us: time from setting these lines to the rise of `result_valid`.
+    """
+
+    ready: str = gpio_line()
+    busy: str = gpio_line()
+    result_valid: str = gpio_line()
+    fault: str = gpio_line()
+    decided: str = gpio_line()
+    class_bits: tuple[str, ...] = field(default=(), metadata={"line": True})
+    settle_us: int = number(200, 1, 1_000_000)
+
+
+@dataclass(frozen=True, slots=True)
+class SweepConfig:
+    """Limits of a sweep.
+
+    max_duration_s: a sweep without a stop edge for this long is answered `long`.
+    """
+
+    max_duration_s: float = number(12.0, 0.1, 3600.0)
+    late_ms: int = fixed(500)  # longest wait for frames after the stop edge
+    lead_ms: int = fixed(500)  # early answers: from the start edge to the window
+    # (with 500 ms the window is the middle of the paper's three seconds)
+
+
+@dataclass(frozen=True, slots=True)
+class SerialConfig:
+    """The serial line to the robot.
+
+    port: a device path, "" for none. baud: bits per second, 8N1.
+    """
+
+    port: str = ""
+    baud: int = number(115200, 1200, 4_000_000)
+    queue: int = fixed(64)  # sentences that wait for a slow reader; then the oldest is dropped
+    state_s: float = fixed(1.0)  # between two STA sentences
+
+
+@dataclass(frozen=True, slots=True)
+class ClassifierConfig:
+    """The classifier.
+
+    bundle: path of a bundle; "" for the bundle that was deployed last, or else the packaged one.
+    allow_unsigned: let an unsigned `bundle` answer a robot. fuse: rule by which the sweeps of one
+    object are fused into one answer; "none" answers each sweep alone. early: answer while the
+    finger still slides, as soon as the bundle's rule allows. min_probability: least probability for
+    status ok; 0 takes the bundle's threshold. max_sweeps: after this many fused sweeps of one
+    object below `min_probability` the answer is `undecided`, and the next sweep begins another
+    object; 0 means no limit. conflict: consequence of a sweep that contradicts the sweeps fused
+    before it: "new" begins another object, "refuse" answers `conflict`, "fuse" fuses all sweeps
+    until NEW OBJECT, also after `max_sweeps`. object_s: longest pause between two sweeps of one
+    object, in seconds; 0 means no limit.
+    """
+
+    bundle: str = ""
+    allow_unsigned: bool = False
+    fuse: Literal["product", "vote", "none"] = "product"
+    early: bool = False
+    min_probability: float = number(0.0, 0.0, 1.0)
+    max_sweeps: int = number(5, 0, 1000)
+    conflict: Literal["new", "refuse", "fuse"] = "new"
+    object_s: float = number(60.0, 0.0, 86_400.0)
+
+
+@dataclass(frozen=True, slots=True)
+class StoreConfig:
+    """The folders of the box.
+
+    folder: bundles, recordings and black box (layout: deployment/store.py). keys: folder of
+    `allowed_signers`, the accepted keys in the format of ssh-keygen, and of `enrolment/`, this
+    box's key for its own labels. runtime: folder of the status file and of the feed's socket
+    (PROTOCOL.md, part 4); "" for neither. black_box: number of latest sweeps to keep, 0 for none.
+    trial_sweeps: a new bundle is committed once it has given a label to this many sweeps, or the
+    skin has streamed for 600 s.
+    """
+
+    folder: str = "/var/lib/palpate"
+    keys: str = "/etc/palpate"
+    runtime: str = "/run/palpate"
+    black_box: int = number(0, 0, 100_000)
+    trial_sweeps: int = number(20, 1, 100_000)
+    trial_s: float = fixed(600.0)  # streaming time after which the trial ends as well
+
+    @property
+    def signers(self) -> Path:
+        """The file of the keys whose bundles are accepted."""
+        return Path(self.keys) / "allowed_signers"
+
+    @property
+    def enrolment_key(self) -> Path:
+        """The folder of this box's key for enrolments."""
+        return Path(self.keys) / "enrolment"
+
+    @property
+    def status(self) -> Path | None:
+        """The file that `palpate status` reads."""
+        return Path(self.runtime) / "status.json" if self.runtime else None
+
+    @property
+    def runtime_folder(self) -> Path | None:
+        """The folder of the status file, None for none."""
+        return Path(self.runtime) if self.runtime else None
+
+    @property
+    def feed(self) -> Path | None:
+        """The socket of the feed."""
+        return Path(self.runtime) / "feed.sock" if self.runtime else None
+
+
+@dataclass(frozen=True, slots=True)
+class WatchConfig:
+    """The page of `palpate watch --web`.
+
+    address: where it listens, then further host names by which browsers may ask for it, separated
+    by spaces. Addresses beyond this machine need token and certificate.
+    """
+
+    address: str = "127.0.0.1"
+    folder: str = fixed("/etc/palpate/watch")  # token, certificate.pem and key.pem
+
+
+@dataclass(frozen=True, slots=True)
+class TeachConfig:
+    """Teaching at the robot (`palpate teach`).
+
+    allow: whether this box may learn materials by itself, and run a bundle that it has taught.
+    serial: whether the robot may teach it,
+    by the commands TEACH, USE and FORGET of the serial line.
+    """
+
+    allow: bool = True
+    serial: bool = False
+    memory_mb: int = fixed(768)  # most private memory of the process that learns
+    limit_s: float = fixed(900.0)  # longest time that it may take
+
+
+@dataclass(frozen=True, slots=True)
+class BridgeConfig:
+    """`palpate bridge` on the box; its options override these values.
+
+    address: where it listens, at the port of its kind. allow_writes: whether peers may start, stop,
+    tare and abort. A bridge has no password.
+    """
+
+    address: str = "127.0.0.1"
+    allow_writes: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """All settings. board: the board file's name, "" for none. folder: where the files are, skins/
+    among them. sources: "section.key" -> "code", the file's name or "--set"; "board" -> "code", the
+    file's name or "--board". skins: of a box with several fingers, by name; else empty. alone:
+    the finger whose settings these are, "" for those of the box. hand: the settings with all
+    fingers then, else None."""
+
+    board: str
+    skin: SkinConfig
+    trigger: TriggerConfig
+    output: OutputConfig
+    sweep: SweepConfig
+    serial: SerialConfig
+    classifier: ClassifierConfig
+    store: StoreConfig
+    watch: WatchConfig
+    teach: TeachConfig
+    bridge: BridgeConfig
+    sources: Mapping[str, str] = field(compare=False)
+    folder: Path = field(default=SITE.parent, compare=False)
+    skins: Mapping[str, FingerConfig] = field(default_factory=dict)
+    alone: str = ""
+    hand: Config | None = field(default=None, compare=False)
+
+    def finger(self, name: str) -> Config:
+        """The settings of a box that has the skin of this finger only."""
+        own = self.skins[name]
+        classifier = replace(self.classifier, bundle=own.bundle or self.classifier.bundle)
+        return replace(self, skin=own, skins={}, classifier=classifier, alone=name, hand=self)
+
+    @property
+    def part(self) -> str:
+        """The part of a hub's frames that these settings are for; "" for whole frames."""
+        return self.skin.part if isinstance(self.skin, FingerConfig) else ""
+
+    @property
+    def bundle_setting(self) -> str:
+        """The setting that names the bundle; "" if the store has it."""
+        if self.hand and self.hand.skins[self.alone].bundle:
+            return f"skins.{self.alone}.bundle"
+        return "classifier.bundle" if self.classifier.bundle else ""
+
+    def kept(self, folder: str) -> Path:
+        """A folder of sweeps in the store; that of one finger alone is below it."""
+        return Path(self.store.folder) / folder / self.alone
+
+
+_SECTIONS: Mapping[str, Any] = MappingProxyType(
+    {n: h for n, h in get_type_hints(Config).items() if is_dataclass(h)}
+)
+_FINGER_KEYS: Mapping[str, Key] = MappingProxyType(keys(FingerConfig))
+_KEYS: Mapping[str, Key] = MappingProxyType(
+    {
+        f"{section}.{last}": key
+        for section, group in _SECTIONS.items()
+        for last, key in keys(group).items()
+    }
+)
+
+
+def load(
+    board: str | None, sets: Sequence[str] = (), *, folder: Path | None = None, site: Path = SITE
+) -> Config:
+    """All layers as one Config.
+
+    board: NAME of a `board-NAME.toml`. None or "" takes `board = "NAME"` in `site`; without it no
+    GPIO line is wired. sets: "section.key=value", the value in TOML or a bare string. folder: where
+    `skin.toml` and the boards' files are; None means `firmware_config/` beside the package, in an
+    installation `/etc/palpate`. site: must exist unless it is SITE. Raises ConfigError with file,
+    key, value and the allowed values.
+    """
+    if folder and not folder.is_dir():
+        raise ConfigError(
+            f"--config-dir {folder}: no such folder; name that of skin.toml and the board files"
+        )
+    folder = folder or _folder()
+    of_site = read_toml(site, needed=site != SITE)
+    in_site = of_site.pop("board", "")
+    board, named_in = (
+        (board, "--board") if board else (in_site, "code" if in_site == "" else str(site))
+    )
+    layers = [(folder / "skin.toml", read_toml(folder / "skin.toml", needed=False))]
+    if board != "":
+        path = _board_file(folder, board, named_in)
+        layers.append((path, read_toml(path)))
+    layers += [(site, of_site), *((Path("--set"), _parse_set(text)) for text in sets)]
+    values = {name: key.default for name, key in _KEYS.items()}
+    sources = {"board": Path(named_in).name} | dict.fromkeys(_KEYS, "code")
+    own: dict[str, dict[str, Any]] = {}  # values of the fingers
+    last = ""  # layer that has named one
+    for where, table in layers:
+        for finger, read in fingers.read(table.pop("skins", {}), str(where), _FINGER_KEYS).items():
+            own.setdefault(finger, {}).update(read)
+            last = str(where)
+            sources |= {f"skins.{finger}.{key}": where.name for key in read}
+            sources.setdefault(f"skins.{finger}.part", "code")  # describe shows each finger
+        for name, value in _checked(table, str(where)):
+            values[name], sources[name] = value, where.name
+    _check_lines(values, sources)
+    groups = {
+        section: group(**{key: values[f"{section}.{key}"] for key in keys(group)})
+        for section, group in _SECTIONS.items()
+    }
+    common = {name: getattr(groups["skin"], name) for name in keys(SkinConfig)}
+    skins = {f: FingerConfig(**it) for f, it in fingers.whole(common, own, last).items()}
+    return Config(
+        board=board, sources=MappingProxyType(sources), folder=folder, skins=skins, **groups
+    )
+
+
+def describe(config: Config) -> str:
+    """One line per value, `section.key = value # source`. The text is TOML that can be loaded as a
+    site file."""
+    values = {"board": json.dumps(config.board)}
+    for name in _KEYS:
+        section, _, last = name.partition(".")
+        value = getattr(getattr(config, section), last)
+        values[name] = json.dumps(value, ensure_ascii=False)
+    for name in [n for n in config.sources if n not in values]:
+        _, finger, last = name.split(".")
+        value = getattr(config.skins[finger], last)
+        values[name] = json.dumps(value, ensure_ascii=False)
+    return "\n".join(
+        f"{f'{name} = {value}':<36}   # {config.sources[name]}" for name, value in values.items()
+    )
+
+
+def boards(folder: Path | None = None) -> dict[str, Path]:
+    """The delivered boards' files by name; folder: as for `load`."""
+    return {
+        path.stem.removeprefix("board-"): path
+        for path in sorted((folder or _folder()).glob("board-*.toml"))
+    }
+
+
+def _folder() -> Path:
+    beside = Path(__file__).resolve().parents[3] / "firmware_config"
+    return beside if beside.is_dir() else SITE.parent
+
+
+def _board_file(folder: Path, board: Any, where: str) -> Path:
+    known = boards(folder)
+    if not (isinstance(board, str) and board in known):
+        there = ", ".join(known) or "none"
+        raise ConfigError(
+            f"{where}: board = {shown(board)} has no board-NAME.toml in {folder}; boards there: "
+            f"{there}"
+        )
+    return known[board]
+
+
+def _parse_set(text: str) -> dict[str, Any]:
+    """`section.key=value` as the table that a file with this line gives."""
+    name, equals, value = text.partition("=")
+    section, dot, key = name.strip().partition(".")
+    if not (equals and dot):
+        raise ConfigError(f"--set {text}: not understood; use --set section.key=value")
+    try:
+        (parsed,) = tomllib.loads(f"value = {value}").values()
+    except (ValueError, RecursionError):
+        parsed = value.strip()
+    if section == "skins":
+        finger, _, key = key.partition(".")
+        return {section: {finger: {key: parsed}}}
+    return {section: {key: parsed}}
+
+
+def _checked(table: Mapping[str, Any], where: str) -> Iterator[tuple[str, Any]]:
+    """Each value of a layer with its full name, as its field's type."""
+    for section, content in table.items():
+        if section not in _SECTIONS:
+            if section == "board":
+                raise ConfigError(
+                    f"{where}: board is chosen in {SITE}, or with --board; move it there"
+                )
+            raise _unknown(section, [*_SECTIONS, "skins", "board"], where)
+        if not isinstance(content, dict):
+            raise ConfigError(
+                f"{where}: {section} = {shown(content)} is not a section; write [{section}], its "
+                "keys below"
+            )
+        named = {f"{section}.{last}": value for last, value in content.items()}
+        yield from read_table(
+            _KEYS,
+            named,
+            unknown=lambda name: _unknown(name, [*_KEYS], where),
+            refused=lambda why: ConfigError(f"{where}: {why}"),
+        ).items()
+
+
+def _unknown(name: str, known: list[str], where: str) -> ConfigError:
+    """The error for an unknown name; a key of that name in another section is suggested before a
+    similar spelling."""
+    last = name.rpartition(".")[2]
+    near = [k for k in _KEYS if k.endswith(f".{last}")] or closest(name, known)
+    hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
+    return ConfigError(f"{where}: {name if name.isprintable() else shown(name)} is unknown; {hint}")
+
+
+def _check_lines(values: Mapping[str, Any], sources: Mapping[str, str]) -> None:
+    """Raise ConfigError if one GPIO line has two meanings."""
+    taken: dict[str, str] = {}
+    for name in (n for n, key in _KEYS.items() if "line" in key.limits):
+        for line in filter(None, [values[name]] if isinstance(values[name], str) else values[name]):
+            if line in taken:
+                first = f"{taken[line]} ({sources[taken[line]]})"
+                raise ConfigError(
+                    f"{sources[name]}: {name} = {line!r} is the GPIO line of {first} already; give "
+                    'each its own line, or ""'
+                )
+            taken[line] = name

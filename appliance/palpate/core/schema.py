@@ -1,0 +1,211 @@
+"""Dataclasses as schemas of files: values from TOML or JSON are checked and converted to the types
+of fields.
+
+A field is the only place for a value's type, default and limits. TOML tables are read with `keys`
+and `read_table`, JSON objects with `typed`. `closest` finds names similar to a misspelt name.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import tomllib
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
+from difflib import get_close_matches
+from pathlib import Path
+from types import UnionType
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+
+from palpate.core.errors import ConfigError, TemporaryError
+from palpate.core.patience import passes
+
+_Number = TypeVar("_Number", int, float)
+_Kind = TypeVar("_Kind")
+
+
+def number(default: _Number, least: _Number, most: _Number) -> _Number:
+    """A number field with its limits."""
+    return field(default=default, metadata={"least": least, "most": most})
+
+
+def fixed(value: _Kind) -> _Kind:
+    """A field that files cannot set: a constant beside the settings it belongs to."""
+    return field(default=value, metadata={"fixed": True})
+
+
+def gpio_line() -> str:
+    """A field that names a GPIO line; "" means not wired."""
+    return field(default="", metadata={"line": True})
+
+
+def custom(default: Any, allowed: str, read: Callable[[Any], Any]) -> Any:
+    """A field with its own reader. allowed: the allowed values, for messages. read: returns the
+    converted value, or None if the value is not allowed. A dict as default is copied for each
+    object."""
+    metadata = {"allowed": allowed, "read": read}
+    if isinstance(default, dict):
+        return field(default_factory=default.copy, metadata=metadata)
+    return field(default=default, metadata=metadata)
+
+
+@dataclass(frozen=True, slots=True)
+class Key:
+    """A field of a dataclass as a key of a TOML table. hint: the field's type. limits: its
+    metadata."""
+
+    hint: Any
+    default: Any
+    limits: Mapping[str, Any]
+
+    def fit(self, value: Any) -> Any:
+        """`value` as the field's type, or None if it is not allowed."""
+        if "read" in self.limits:
+            return self.limits["read"](value)
+        if get_origin(self.hint) is Literal:
+            return value if value in get_args(self.hint) else None
+        if get_origin(self.hint) is tuple:
+            names = isinstance(value, list) and all(_fits(v, str) and v for v in value)
+            return tuple(value) if names else None
+        if self.hint in (str, bool):
+            return value if _fits(value, self.hint) else None
+        known = type(value) in (int, self.hint)
+        within = known and self.limits["least"] <= value <= self.limits["most"]
+        return self.hint(value) if within else None
+
+    @property
+    def allowed(self) -> str:
+        """The values that `fit` accepts, for a person."""
+        if "allowed" in self.limits:
+            return str(self.limits["allowed"])
+        if get_origin(self.hint) is Literal:
+            return "one of " + ", ".join(json.dumps(v) for v in get_args(self.hint))
+        if self.hint not in (int, float):
+            plain = {bool: "true or false", str: "a string in quotes, without control characters"}
+            return plain.get(self.hint, 'names such as ["GPIO16"]')
+        kind = "a whole number" if self.hint is int else "a number"
+        return f"{kind} from {self.limits['least']} to {self.limits['most']}"
+
+
+def keys(kind: Any) -> dict[str, Key]:
+    """The fields of the dataclass `kind` as keys of a TOML table, by name; without fixed ones."""
+    hints = get_type_hints(kind)
+    return {
+        f.name: Key(hints[f.name], f.default, f.metadata)
+        for f in fields(kind)
+        if "fixed" not in f.metadata
+    }
+
+
+def read_table(
+    known: Mapping[str, Key],
+    table: Mapping[str, Any],
+    *,
+    unknown: Callable[[str], Exception],
+    refused: Callable[[str], Exception],
+) -> dict[str, Any]:
+    """The values of a TOML table as their fields' types, by name.
+
+    unknown: makes the error for a name that is not in `known`. refused: makes the error for the
+    text "NAME = VALUE is not allowed; use ...".
+    """
+    values = {}
+    for name, value in table.items():
+        if name not in known:
+            raise unknown(name)
+        values[name] = known[name].fit(value)
+        if values[name] is None:
+            raise refused(f"{name} = {shown(value)} is not allowed; use {known[name].allowed}")
+    return values
+
+
+def read_toml(path: Path, *, needed: bool = True) -> dict[str, Any]:
+    """The table in a TOML file; {} for a missing file that is not needed. Raises ConfigError, or
+    TemporaryError if it may be readable later."""
+    try:
+        return tomllib.loads(path.read_text("utf-8-sig"))
+    except FileNotFoundError as e:
+        if not needed:
+            return {}
+        raise ConfigError(f"{path}: no such file; check the path") from e
+    except OSError as e:
+        raise (TemporaryError if passes(e) else ConfigError)(
+            f"{path}: cannot be read: {str(e.strerror).lower()}; check who may read it"
+        ) from e
+    except (ValueError, RecursionError) as e:  # no TOML or no UTF-8; deeply nested brackets
+        raise ConfigError(
+            f"{path}: not TOML: {str(e).lower()}; write key = value, strings in quotes"
+        ) from e
+
+
+def shown(value: object) -> str:
+    """A value from a file for a message of one line, cut at 80 characters."""
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # an integer of over 4300 digits; deeply nested tables
+        return "(too large to show)"
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def closest(name: str, known: Iterable[str], most: int = 1, cutoff: float = 0.5) -> list[str]:
+    """Up to `most` of the `known` names that a misspelt `name` may stand for, the most similar
+    first; case is ignored.
+
+    cutoff: least similarity, 0 to 1 (difflib's ratio).
+    """
+    by_folded = {k.casefold(): k for k in known}
+    return [by_folded[k] for k in get_close_matches(name.casefold(), by_folded, most, cutoff)]
+
+
+def typed(kind: type[_Kind], table: Any) -> _Kind:
+    """A `kind` (a dataclass) from a JSON object. Lists become tuples and objects dataclasses as its
+    fields require.
+
+    Accepts only values that can be computed with and printed: integers for int, finite numbers,
+    printable strings. Raises TypeError naming the field, and the errors of the dataclass for its
+    values.
+    """
+    hints = get_type_hints(kind)
+    if not isinstance(table, dict) or not table.keys() <= hints.keys():
+        wrong = sorted(table.keys() - hints.keys()) if isinstance(table, dict) else table
+        raise TypeError(f"{wrong!r} is none of {', '.join(hints)}")
+    values = {name: _nested(hints[name], value) for name, value in table.items()}
+    for name, value in values.items():
+        if isinstance(value, str) and not value.isprintable():
+            raise TypeError(f"{kind.__name__}.{name} = {value!r} cannot be shown")
+    # first, because the error of a class about its values is more specific than their types
+    made = kind(**values)
+    for name, value in values.items():
+        if not _fits(value, hints[name]):
+            wanted = getattr(hints[name], "__name__", hints[name])
+            raise TypeError(f"{kind.__name__}.{name} = {value!r} is not of type {wanted}")
+    return made
+
+
+def _nested(hint: Any, value: Any) -> Any:
+    """A JSON value for a field of type `hint`: lists become tuples and objects dataclasses as the
+    type requires."""
+    if get_origin(hint) is tuple and isinstance(value, list):
+        return tuple(_nested(get_args(hint)[0], v) for v in value)
+    if get_origin(hint) is dict and isinstance(value, dict):
+        return {name: _nested(get_args(hint)[1], v) for name, v in value.items()}
+    alternatives = get_args(hint) if get_origin(hint) is UnionType else (hint,)
+    kind: Any = next((k for k in alternatives if is_dataclass(k)), None)
+    if kind is None or value is None or isinstance(value, kind):
+        return value
+    return typed(kind, value)
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Whether `value` from a file is allowed for a field of type `hint`."""
+    if get_origin(hint) is UnionType:
+        return any(_fits(value, part) for part in get_args(hint))
+    if get_origin(hint) is tuple:
+        return type(value) is tuple and all(_fits(v, get_args(hint)[0]) for v in value)
+    if get_origin(hint) is dict:
+        return type(value) is dict and all(_fits(v, get_args(hint)[1]) for v in value.values())
+    if hint in (int, float):  # at most 64 bits, finite
+        return type(value) in (int, hint) and abs(value) <= (
+            sys.float_info.max if type(value) is float else sys.maxsize
+        )
+    return hint is Any or (type(value) is hint and (hint is not str or value.isprintable()))

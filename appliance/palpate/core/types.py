@@ -1,0 +1,428 @@
+"""The types that all packages share: SweepFormat, Frames, Sweep, Verdict, Status; recorded sweeps
+as files.
+
+Times are nanoseconds of the host's `CLOCK_MONOTONIC`.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from enum import StrEnum
+from pathlib import Path
+from tokenize import TokenError
+from types import MappingProxyType
+from typing import Any
+from zlib import crc32
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.core import storage
+from palpate.core.errors import FormatError
+from palpate.core.schema import typed
+from palpate.core.status import Status as Status
+
+DATA_TYPES = ("uint8", "int16", "uint16", "float32")
+"""Data types of a taxel's raw count; the position in this tuple is its code in packets
+(PROTOCOL.md)."""
+LARGEST_READING = 1e12
+"""Largest magnitude of a raw count. Larger ones come from a fault, and their squares overflow."""
+MOST_AXES = 8
+"""Largest number of values of a taxel."""
+
+EPOCH_BITS = 40
+"""An unwrapped sequence number is `(enumeration << EPOCH_BITS) + frame`, so that frames of two
+enumerations of the skin are never adjacent."""
+EPOCHS = 1 << 22
+"""Enumerations are counted modulo this number, so that a frame number always fits int64."""
+SCHEMA = 3
+"""Version of a recorded sweep's sidecar. Versions 1 and 2 are still read: version 1 holds only the
+sweep, and in version 2 the classifier's settings had other names (`runtime.replay`)."""
+UNREADABLE = (ValueError, TypeError, EOFError, SyntaxError, TokenError, MemoryError)
+"""Errors of numpy for a broken .npy, beside OSError; MemoryError if its header gives an impossible
+size."""
+
+
+@dataclass(frozen=True, slots=True)
+class SweepFormat:
+    """Format of a sweep: `rows` x `cols` taxels, `rate_hz` frames per second, `window` frames used,
+    counts of `dtype`.
+
+    axes: values of each taxel; the last is along the skin's normal. The format is part of a bundle:
+    another skin needs another bundle, not other code. Raises FormatError for a value out of range.
+    """
+
+    rows: int
+    cols: int
+    rate_hz: float
+    window: int
+    dtype: str
+    axes: int = 1
+
+    def __post_init__(self) -> None:
+        if self.dtype not in DATA_TYPES:
+            raise FormatError(
+                f"data type {self.dtype!r} is unknown; use one of {', '.join(DATA_TYPES)}"
+            )
+        if not (1 <= self.rows <= 255 and 1 <= self.cols <= 255):
+            raise FormatError(
+                f"a grid of {self.rows} x {self.cols} taxels is out of range; use 1 to 255 each way"
+            )
+        if not 1e-3 <= self.rate_hz <= 1e6:  # a readout board sends thousandths of 1 Hz
+            raise FormatError(f"a rate of {self.rate_hz} Hz is out of range; use 0.001 to 1e6")
+        if self.window < 1:
+            raise FormatError(f"a window of {self.window} frames is empty; use at least 1")
+        if not 1 <= self.axes <= MOST_AXES:
+            raise FormatError(
+                f"{self.axes} axes of each taxel are out of range; use 1 to {MOST_AXES}"
+            )
+
+    @property
+    def numpy_type(self) -> np.dtype[Any]:
+        """numpy type of one raw count, little-endian."""
+        return np.dtype(self.dtype).newbyteorder("<")
+
+    @property
+    def period_ns(self) -> float:
+        """Time between two frames in nanoseconds."""
+        return 1e9 / self.rate_hz
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of one frame's raw counts: [R, C], or [R, C, A] if a taxel has several axes."""
+        return shape(self.rows, self.cols, self.axes)
+
+    @property
+    def channels(self) -> int:
+        """Numbers in one frame: R * C * A."""
+        return self.rows * self.cols * self.axes
+
+    @property
+    def skin(self) -> tuple[tuple[int, ...], str]:
+        """The part that a skin and a bundle must share: shape of a frame, data type."""
+        return self.shape, self.dtype
+
+    def json(self) -> dict[str, Any]:
+        """All fields by name, for JSON. One axis is left out, so that files and ids remain those of
+        earlier versions."""
+        return {name: value for name, value in asdict(self).items() if (name, value) != ("axes", 1)}
+
+    def __str__(self) -> str:
+        return f"{shown(self.shape)} {self.dtype} at {self.rate_hz:g} Hz, window {self.window}"
+
+
+def shape(rows: int, cols: int, axes: int) -> tuple[int, ...]:
+    """Shape of one frame: [R, C], or [R, C, A] if a taxel has several axes."""
+    return (rows, cols) if axes == 1 else (rows, cols, axes)
+
+
+def normal(counts: NDArray[Any], before: int) -> NDArray[Any]:
+    """The axis along the skin's normal, which is the last: [..., R, C] of [..., R, C] or [..., R,
+    C, A].
+
+    before: dimensions before the rows, 0 for one frame, 1 for a window.
+    """
+    return counts[..., -1] if counts.ndim == before + 3 else counts
+
+
+def digitized(x: NDArray[Any], kind: np.dtype[Any]) -> NDArray[Any]:
+    """Counts as the converter gives them: whole numbers within the range of their type. float32
+    stays unchanged."""
+    if kind.kind == "f":
+        return x.astype(kind)
+    limits = np.iinfo(kind)
+    counts: NDArray[Any] = np.clip(np.rint(x), limits.min, limits.max).astype(kind)
+    return counts
+
+
+def shown(shape: Sequence[int]) -> str:
+    """A shape for a person: "3x3", "3x3x3"."""
+    return "x".join(map(str, shape))
+
+
+@dataclass(frozen=True, slots=True)
+class Frames:
+    """n frames: t_ns int64 [n] host monotonic, seq int64 [n] unwrapped numbers, taxels [n, R, C] or
+    [n, R, C, A] raw counts. finger: whose skin sent them, "" in a box with one skin."""
+
+    t_ns: NDArray[np.int64]
+    seq: NDArray[np.int64]
+    taxels: NDArray[Any]
+    finger: str = ""
+
+    def __len__(self) -> int:
+        return len(self.seq)
+
+    @classmethod
+    def empty(cls, format: SweepFormat) -> Frames:
+        """No frames of this format."""
+        none = np.empty(0, np.int64)
+        return cls(none, none, np.empty((0, *format.shape), format.numpy_type))
+
+    @classmethod
+    def joined(cls, runs: Sequence[Frames]) -> Frames:
+        """Several runs of frames of one skin as one."""
+        return cls(
+            np.concatenate([run.t_ns for run in runs]),
+            np.concatenate([run.seq for run in runs]),
+            np.concatenate([run.taxels for run in runs]),
+            runs[0].finger,
+        )
+
+
+def entries(record: Any) -> dict[str, Any]:
+    """The fields of a dataclass with slots, by name, for code that runs with each sweep.
+
+    At each call dataclasses.asdict makes a tuple of a generator. Python keeps up to 2,000 tuples of
+    each length for later use, so memory would grow for hours (docs/faults.md).
+    """
+    return {name: getattr(record, name) for name in record.__slots__}
+
+
+class EdgeKind(StrEnum):
+    """Meaning of an edge. LOST: edges were dropped or came in a storm, so that the robot's signals
+    are unknown."""
+
+    START = "start"
+    STOP = "stop"
+    NEW_OBJECT = "new-object"
+    LOST = "lost"
+
+
+@dataclass(frozen=True, slots=True)
+class Edge:
+    """One debounced edge. t_ns: kernel time stamp, `CLOCK_MONOTONIC`, of the first edge of its
+    burst.
+
+    LOST has the time of the edge at which the loss or the storm was detected. Edges reported before
+    it are certain. No edge follows it until every line has been quiet for `glitch_us`; the levels
+    are then read again, without an edge. speed_mm_s, force_n: of the slide, as sent with
+    the command START; None if not sent, and for each edge of a GPIO line.
+    """
+
+    kind: EdgeKind
+    t_ns: int
+    speed_mm_s: float | None = None
+    force_n: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Sweep:
+    """One sweep as SweepCutter cut it. frames: the middle window if `status` is ok, otherwise
+    empty.
+
+    share: 1 for a finished sweep. For a sweep that is still going on it is the share of a window's
+    frames that has come, counted from half a second after the start edge; `frames` then are these
+    frames. start_ns, stop_ns: trigger edges, host monotonic (equal if one is missing; before the
+    stop edge the last frame). lost: frames of the window that never arrived; if `status` is ok they
+    were interpolated. complete_ns: arrival of the last stop edge or frame that was needed. object:
+    number of NEW OBJECT signals so far; 0 before the first, when sweeps are not fused. material,
+    position, session: labels given while recording, "" for none. speed_mm_s, force_n: as in the
+    start edge. filled: indices of the interpolated frames in `frames`; None if there are none.
+    finger: the finger whose skin sent the frames; None in a box with one skin. fingers: the same
+    sweep as each finger has it; None except in a sweep of several fingers, which has no frames.
+    """
+
+    id: int
+    start_ns: int
+    stop_ns: int
+    status: Status
+    frames: Frames
+    lost: int = 0
+    complete_ns: int = 0
+    object: int = 0
+    material: str = ""
+    position: str = ""
+    session: str = ""
+    share: float = 1.0
+    speed_mm_s: float | None = None
+    force_n: float | None = None
+    filled: tuple[int, ...] | None = None
+    finger: str | None = None
+    fingers: tuple[Sweep, ...] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """The answer to one sweep.
+
+    scores: float64 [K] probabilities of the K labels for this sweep, or for all fused sweeps; empty
+    if nothing was classified. margin: probability of the label minus that of the next label.
+    detail: the subject of the status ("taxel 2.3"). fused: number of sweeps in `scores`. lost: as
+    in Sweep. latency_ns: from `Sweep.complete_ns` to the verdict. bundle: id of the bundle. share:
+    share of the window that was used, less than 1 in an early answer. own: float64 [K]
+    probabilities of this sweep alone, before an enrolled label needs its least probability
+    (EnrolledLabels); empty if it has none. displacement: distance of
+    the contact from its positions in training ("moved 2.1 mm too far towards row 4"); "" if it is
+    in place, or if the bundle does not have the positions. degraded: the broken taxels that were
+    bridged ("silent taxel 2.3"); "" for none. after: number of the last sweep before
+    it that had probabilities, since NEW OBJECT; 0 for none. speed_mm_s, force_n: as in Sweep.
+    measured_mm_s: speed of the slide, measured from the window; None if that was not possible, and
+    in early answers. direction: one of `directions.DIRECTIONS`; None without a measured speed.
+    finger, fingers: as in Sweep; `fingers` are the verdicts that this one was fused from.
+    """
+
+    sweep: int
+    time_ns: int
+    status: Status
+    label: str
+    probability: float
+    margin: float
+    scores: NDArray[np.float64]
+    fused: int
+    lost: int
+    latency_ns: int
+    bundle: str
+    detail: str = ""
+    share: float = 1.0
+    own: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    displacement: str = ""
+    degraded: str = ""
+    after: int = 0
+    speed_mm_s: float | None = None
+    force_n: float | None = None
+    measured_mm_s: float | None = None
+    direction: str | None = None
+    finger: str | None = None
+    fingers: tuple[Verdict, ...] | None = None
+
+    @classmethod
+    def without_label(
+        cls, sweep: Sweep, status: Status, detail: str, now_ns: int, bundle: str
+    ) -> Verdict:
+        """The answer to a sweep that was not classified."""
+        return cls(
+            sweep=sweep.id,
+            time_ns=now_ns,
+            status=status,
+            label="",
+            probability=0.0,
+            margin=0.0,
+            scores=np.empty(0),
+            fused=0,
+            lost=sweep.lost,
+            latency_ns=now_ns - sweep.complete_ns,
+            bundle=bundle,
+            detail=detail,
+            share=sweep.share,
+            speed_mm_s=sweep.speed_mm_s,
+            force_n=sweep.force_n,
+            finger=sweep.finger,
+            fingers=None
+            if sweep.fingers is None
+            else tuple(
+                cls.without_label(of, status, detail, now_ns, bundle) for of in sweep.fingers
+            ),
+        )
+
+    def as_dict(self, *, arrays: bool = True) -> dict[str, Any]:
+        """All fields by name, for JSON, which keeps numbers bit for bit; without fields that are
+        None. arrays: include `scores` and `own`, as lists. fingers: each as an object as well."""
+        # sidecars, the feed and the status file call the displacement `moved`
+        values = {
+            "moved" if name == "displacement" else name: value
+            for name in Verdict.__slots__
+            if (value := getattr(self, name)) is not None
+        }
+        if self.fingers:
+            values["fingers"] = [of.as_dict(arrays=arrays) for of in self.fingers]
+        lists = {
+            name: value.tolist() for name, value in values.items() if isinstance(value, np.ndarray)
+        }
+        return (
+            values | lists
+            if arrays
+            else {name: v for name, v in values.items() if name not in lists}
+        )
+
+
+def _record_dtype(format: SweepFormat) -> np.dtype[Any]:
+    return np.dtype([("t_ns", "<i8"), ("seq", "<i8"), ("taxels", format.numpy_type, format.shape)])
+
+
+def save(
+    path: Path, sweep: Sweep, format: SweepFormat, about: Mapping[str, Any] = MappingProxyType({})
+) -> None:
+    """Write `sweep` as `path` (.npy, one record per frame) with a JSON sidecar beside it,
+    completely or not at all.
+
+    The sidecar gets its name first, so that an .npy always has one. A field that is None is left
+    out, so that a sweep without it has the same bytes as in earlier versions. about: further
+    content of the sidecar, under names that Sweep does not use. Raises OSError if writing fails,
+    and then leaves nothing behind.
+    """
+    table = np.zeros(len(sweep.frames), _record_dtype(format))
+    table["t_ns"], table["seq"], table["taxels"] = (
+        sweep.frames.t_ns,
+        sweep.frames.seq,
+        sweep.frames.taxels,
+    )
+    own = {
+        name: value
+        for name in Sweep.__slots__
+        if name not in ("frames", "fingers") and (value := getattr(sweep, name)) is not None
+    }
+    # np.save writes to a file without Python's I/O, and a full disk then gives no errno
+    packed = io.BytesIO()
+    np.save(packed, table, allow_pickle=False)
+    content = {
+        **about,
+        **own,
+        "format": format.json(),
+        "crc32": crc32(packed.getvalue()),
+        "schema": SCHEMA,
+    }
+    storage.put_all(
+        {path.with_suffix(".json"): json.dumps(content, indent=1).encode(), path: packed.getvalue()}
+    )
+
+
+def sidecar(path: Path) -> dict[str, Any]:
+    """The content of the sidecar of the .npy at `path`. Raises FormatError if it is missing or
+    broken."""
+    try:
+        content = json.loads(path.with_suffix(".json").read_text("utf-8"))
+        if not isinstance(content, dict):
+            raise TypeError(f"{type(content).__name__} instead of an object")
+        return content
+    except (ValueError, OSError, TypeError, RecursionError) as e:
+        raise FormatError(
+            f"{path}: not a recorded sweep ({e}); a recording is an .npy with its .json beside it"
+        ) from e
+
+
+def load(path: Path) -> tuple[Sweep, SweepFormat]:
+    """Read a sweep that `save` wrote. Raises FormatError if a file is missing, broken or of another
+    format."""
+    content = sidecar(path)
+    try:
+        data = path.read_bytes()
+        if content.get("crc32", crc32(data)) != crc32(data):
+            raise FormatError("its bytes are not those that were recorded: the file was altered")
+        table = np.load(io.BytesIO(data), allow_pickle=False)
+        format = typed(SweepFormat, content.pop("format"))
+        schema = content.pop("schema")
+        status = Status(content.pop("status"))
+        if type(schema) is not int or not 1 <= schema <= SCHEMA:
+            raise FormatError(
+                f"schema {schema!r} is unknown to this version, which reads 1 to {SCHEMA}: update "
+                "one of them"
+            )
+        if table.dtype != _record_dtype(format) or table.ndim != 1:
+            raise FormatError(
+                f"records of {table.dtype} do not fit the format {format} of its sidecar"
+            )
+        frames = Frames(table["t_ns"].copy(), table["seq"].copy(), table["taxels"].copy())
+        own = (
+            content
+            if schema == 1
+            else {name: content[name] for name in Sweep.__slots__ if name in content}
+        )
+        return typed(Sweep, own | {"status": status, "frames": frames}), format
+    except (*UNREADABLE, OSError, KeyError, AttributeError, RecursionError, FormatError) as e:
+        raise FormatError(
+            f"{path}: not a recorded sweep ({e}); a recording is an .npy with its .json beside it"
+        ) from e

@@ -1,0 +1,162 @@
+"""The state of the store's bundles, as in bundles.json.
+
+This module only computes; `store` reads and writes the file. Bundles are identified by their names
+(`bundle.name`), the packaged bundle by PACKAGED.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field, fields, replace
+from typing import Any
+
+from palpate.core.errors import BundleError
+from palpate.core.schema import typed
+
+STATE_FILE, OLD_STATE_FILE = "bundles.json", "ledger.json"
+"""The file of a StoreState, and its name in earlier versions."""
+PACKAGED = ""
+"""The bundle that comes with the program. It is never on trial."""
+MOST_STARTS = 3
+"""Largest number of starts without a commit; the next start goes back."""
+MOST_CUTS = 10
+"""Largest number of power-offs during a trial. Without this limit a bundle that switches the
+computer off would stay for ever."""
+MOST_WHY = 300
+"""Largest number of characters kept of the reason why a trial failed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """State of one bundle in the store.
+
+    previous: the bundle to go back to while this bundle is current.
+    counter: of its manifest.
+    starts: number of starts on trial without an orderly end.
+    sweeps, streamed_s: progress of its trial at the last orderly end.
+    why: why its trial failed, "" if it did not.
+    boot: id of the boot of the last counted start, "" if that start is no longer counted.
+    cuts: number of starts that ended by a power cut or a reset of the computer.
+    """
+
+    previous: str = PACKAGED
+    counter: int = 0
+    committed: bool = True
+    starts: int = 0
+    sweeps: int = 0
+    streamed_s: float = 0.0
+    why: str = ""
+    boot: str = ""
+    cuts: int = 0
+
+    def since(self, boot: str) -> Standing:
+        """The state at a start in this boot. If the last counted start was in another boot, the end
+        of that boot ended it, so it counts as a cut and not against the bundle."""
+        if not self.boot or not boot or self.boot == boot:
+            return self
+        return replace(self, starts=self.starts - 1, cuts=self.cuts + 1, boot="")
+
+
+@dataclass(frozen=True, slots=True)
+class StoreState:
+    """State of all bundles in the store.
+
+    counter, highest: the highest counter that was ever committed, and its bundle. candidate: the
+    bundle that classifies beside the current bundle in `palpate run --shadow`, PACKAGED without a
+    candidate.
+    """
+
+    counter: int = 0
+    highest: str = PACKAGED
+    candidate: str = PACKAGED
+    standings: dict[str, Standing] = field(default_factory=dict)
+
+    def of(self, sha: str) -> Standing:
+        """State of a bundle. A bundle without an entry was put there by hand and goes back to the
+        packaged bundle."""
+        return self.standings.get(sha, Standing())
+
+    def changed(self, sha: str, **changes: Any) -> StoreState:
+        """The state with these fields of one bundle changed."""
+        return replace(self, standings=self.standings | {sha: replace(self.of(sha), **changes)})
+
+    def activated(self, sha: str, counter: int, now: str) -> StoreState:
+        """The state that must be written before `sha` replaces the current bundle `now`: `sha` is
+        on trial and goes back to a committed bundle."""
+        back = now if self.of(now).committed else self.of(now).previous
+        fresh = self if sha != self.candidate else replace(self, candidate=PACKAGED)
+        if sha == back:
+            return fresh
+        standings = fresh.standings | {sha: Standing(back, counter, committed=False)}
+        return replace(fresh, standings=standings)
+
+    def committed(self, sha: str) -> StoreState:
+        """The state after `sha` passed its trial: bundles with a lower counter are refused."""
+        made = self.changed(sha, committed=True, starts=0, why="", boot="", cuts=0)
+        counter = self.of(sha).counter
+        return replace(made, counter=counter, highest=sha) if counter >= self.counter else made
+
+    def left(self, sha: str, why: str) -> StoreState:
+        """The state after the trial of `sha` failed for this reason. Its starts are set to the
+        limit, in case the power fails before `current` changes."""
+        text = "".join(c if c.isprintable() else " " for c in why)
+        return self.changed(sha, starts=MOST_STARTS, why=text[:MOST_WHY], boot="")
+
+    def exchanged(self, sha: str) -> StoreState:
+        """The state that must be written before a rollback from `sha`: a second rollback returns
+        to `sha`."""
+        return self.changed(self.of(sha).previous, previous=sha)
+
+    def chain(self, sha: str) -> tuple[str, ...]:
+        """A bundle and the bundle that it goes back to. For a bundle on trial also the next in the
+        chain, which is needed if the trial fails."""
+        back = self.of(sha).previous
+        return (sha, back) if self.of(sha).committed else (sha, back, self.of(back).previous)
+
+    def only(self, *kept: str) -> StoreState:
+        """The state with the entries of these bundles alone."""
+        return replace(
+            self, standings={sha: one for sha, one in self.standings.items() if sha in kept}
+        )
+
+    def admit(self, sha: str, counter: int) -> None:
+        """Raises BundleError if the bundle is older than a bundle that was committed."""
+        if counter <= self.counter and sha != self.highest:
+            raise BundleError(
+                f"bundle has counter {counter}, and {self.counter} was committed here before; sign "
+                "it with a higher counter (palpate-train sign --counter), or use `palpate bundles "
+                "rollback` to go back"
+            )
+
+    def json(self) -> bytes:
+        """The content of bundles.json."""
+        return (json.dumps(asdict(self), indent=1, sort_keys=True) + "\n").encode()
+
+    @classmethod
+    def parse(cls, text: bytes) -> StoreState:
+        """The state in the content of bundles.json. Raises ValueError or TypeError for wrong
+        content.
+
+        Unknown fields are ignored: after a downgrade the program must still read the file of a
+        newer version. The file that this version writes does not have them, and a newer version
+        takes their defaults.
+        """
+        raw = json.loads(text)
+        if isinstance(raw, dict):
+            if "standings" not in raw:
+                raise TypeError("it has no standings")
+            if isinstance(raw["standings"], dict):
+                raw["standings"] = {
+                    sha: _known(Standing, one) for sha, one in raw["standings"].items()
+                }
+        return typed(cls, _known(cls, raw))
+
+
+def _known(kind: type[Standing | StoreState], raw: Any) -> Any:
+    """The JSON object `raw` without the fields that `kind` does not have."""
+    names = {f.name for f in fields(kind)}
+    return (
+        {name: value for name, value in raw.items() if name in names}
+        if isinstance(raw, dict)
+        else raw
+    )

@@ -1,0 +1,164 @@
+"""Observes a bundle on trial and records in the store its progress, the starts that count against
+it, and the commit after enough sweeps and seconds.
+
+`Store.choose` counts a start before the bundle is read. The start is no longer counted while the
+skin is away, after the program has ended in order or because a device is missing, and at the next
+start if the computer was booted in between.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from types import TracebackType
+from typing import TYPE_CHECKING, Protocol
+
+from palpate.core.disk_thread import AtOnce, DiskWork
+from palpate.core.errors import ApplianceError, BundleError
+from palpate.core.log import TroubleLog, log
+from palpate.core.observer import Observer
+from palpate.core.status import Status
+from palpate.deployment.state import STATE_FILE
+
+if TYPE_CHECKING:
+    from palpate.core.config import StoreConfig
+    from palpate.core.health import Health
+    from palpate.core.types import Verdict
+    from palpate.deployment.state import Standing
+
+RETRY_NS = 10_000_000_000
+"""Pause after a failed write."""
+ERRORS = (OSError, ApplianceError)
+"""Errors of a write to the store: of the disk, or because another command holds the lock."""
+
+
+class TrialStore(Protocol):
+    """The part of the store that a trial uses. Both methods raise OSError or ApplianceError if
+    nothing could be written."""
+
+    @property
+    def settings(self) -> StoreConfig:
+        """Settings with the number of sweeps and seconds of a trial."""
+
+    def note(self, sha: str, starts: int, counted: bool, sweeps: int, streamed_s: float) -> None:
+        """Record the progress of the trial of `sha`, and whether this start counts in
+        `starts`."""
+
+    def commit(self, sha: str | None, wait_s: float) -> bool:
+        """End the trial of `sha`. Returns whether it was on trial."""
+
+
+class Trial(Observer):
+    """Observes one bundle's trial; also a context around the run.
+
+    standing: state of the bundle with this start counted. disk: writes the state. Trouble with it
+    raises no error: a failed write is logged once and tried again after RETRY_NS, and classifying
+    goes on.
+    """
+
+    disk: DiskWork = AtOnce()
+
+    def __init__(self, store: TrialStore, sha: str, standing: Standing) -> None:
+        self._store, self._sha = store, sha
+        self._starts, self._counted = standing.starts, True
+        self._sweeps, self._streamed_ns = standing.sweeps, round(standing.streamed_s * 1e9)
+        self._done = False  # the commit has ended the trial
+        self._last_ns: int | None = None  # time of the last turn if it had frames
+        self._next_ns, self._over, self._stale, self._busy = 0, False, False, False
+        self._log = TroubleLog(
+            f"trial of bundle {sha[:8]}: {STATE_FILE} cannot be written", "it is tried again"
+        )
+
+    @property
+    def text(self) -> str:
+        """Progress of the trial, for a person; "" after its end."""
+        if self._over:
+            return ""
+        settings = self._store.settings
+        return (
+            f"on trial: {self._sweeps} of {settings.trial_sweeps} sweeps, "
+            f"{self._streamed_ns / 1e9:.0f} of {settings.trial_s:.0f} s"
+        )
+
+    def answered(self, verdict: Verdict) -> None:
+        """Count a sweep to which the bundle gave a label. A sweep on which it failed begins the
+        trial anew."""
+        self._sweeps += bool(verdict.label)
+        if verdict.status is Status.FAILED:
+            self._sweeps, self._streamed_ns, self._stale = 0, 0, True
+
+    def turn(self, health: Health) -> None:
+        """Add the time in which the skin streamed. Record changes, or commit after enough sweeps
+        and seconds."""
+        if self._over:
+            return
+        if health.streams and self._last_ns is not None:
+            self._streamed_ns += health.time_ns - self._last_ns
+        self._last_ns = health.time_ns if health.streams else None
+        if health.time_ns >= self._next_ns and not self._busy:
+            self._record(health)
+
+    def stopping(self) -> None:
+        """At an orderly end of the program: do not count this start."""
+        self.disk.settle()
+        if not self._over and self._counted:
+            self._log.attempt(self._note(False), ERRORS)
+            self._counted = False
+
+    def __enter__(self) -> Trial:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+    ) -> None:
+        """Count this start against the bundle, unless a signal or an error of hardware or settings
+        ended the program."""
+        if kind is None or not issubclass(kind, Exception) or _is_hardware_or_settings(error):
+            self.stopping()
+
+    def _record(self, health: Health) -> None:
+        """Record or commit if needed. A commit waits until no sweep is open."""
+        settings, counted = self._store.settings, health.streams
+        if self._sweeps >= settings.trial_sweeps or self._streamed_ns >= settings.trial_s * 1e9:
+            if not health.sweeping:
+                self._write(health, self._commit, self._end)
+        elif counted != self._counted or self._stale:
+            self._stale = False
+            self._write(health, self._note(counted), lambda: self._set_counted(counted))
+
+    def _write(self, health: Health, act: Callable[[], object], done: Callable[[], object]) -> None:
+        """Write to the store; `done` follows a success, another attempt a failure."""
+
+        def written(succeeded: bool) -> None:
+            self._busy = False
+            if succeeded:
+                done()
+            else:
+                self._stale, self._next_ns = True, health.time_ns + RETRY_NS
+
+        self._busy = True
+        if not self.disk(lambda: self._log.attempt(act, ERRORS), written):
+            written(False)
+
+    def _note(self, counts: bool) -> Callable[[], object]:
+        """The write of the present progress."""
+        starts, s = self._starts - (not counts), self._streamed_ns / 1e9
+        return partial(self._store.note, self._sha, starts, counts, self._sweeps, s)
+
+    def _set_counted(self, counted: bool) -> None:
+        self._counted = counted
+
+    def _commit(self) -> None:
+        self._done = self._store.commit(self._sha, 0.0)
+
+    def _end(self) -> None:
+        self._over = True
+        if self._done:
+            log.info(f"bundle {self._sha[:8]} has passed its trial and is committed")
+
+
+def _is_hardware_or_settings(error: BaseException | None) -> bool:
+    return isinstance(error, ApplianceError) and not isinstance(error, BundleError)

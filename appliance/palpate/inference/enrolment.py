@@ -1,0 +1,317 @@
+"""Enrolment: the box learns a material from one to ten sweeps, without training.
+
+In the embedding the sweeps of every material have covariance 1 around their mean. A new material
+therefore needs only the mean of its sweeps. The trained model and the files of the bundle do not
+change; the new mean is stored in enrolment.npz (bundle/enrolled.py).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.bundle import bundle, enrolled
+from palpate.bundle.bundle import AddedLabels, Bundle, Classes
+from palpate.core import storage
+from palpate.core.clock import SystemClock
+from palpate.core.errors import ApplianceError, BundleError, FormatError
+from palpate.core.log import log
+from palpate.core.observer import Observer
+from palpate.core.types import Status, Sweep, Verdict
+from palpate.inference.classifier import Classifier, softmax
+from palpate.inference.novelty import ClassDistances
+from palpate.signal.slide_check import SlideCheck
+
+Embedded = NDArray[np.float64]
+LEAST = 0.7
+"""Known.enrolled of an enrolment. Decision 29 compares values and rules."""
+
+
+@dataclass(frozen=True, slots=True)
+class Enrolment:
+    """A bundle with one more label, and its enrolment.npz.
+
+    warnings: for the person who enrols. disagreement: why the sweeps may not be of one material, ""
+    if they agree.
+    """
+
+    bundle: Bundle
+    file: bytes
+    warnings: tuple[str, ...]
+    disagreement: str
+
+
+def admit(old: Bundle, label: str) -> None:
+    """Raises BundleError if `label` cannot be enrolled into `old`."""
+    labels = old.manifest.labels
+    if label in labels:
+        raise BundleError(
+            f"label {label!r} is taken: the bundle has {', '.join(labels)}; choose another name"
+        )
+    if not bundle.LABEL.fullmatch(label):
+        raise BundleError(
+            f"label {label!r} cannot be sent; use 1 to 24 letters, digits, spaces, '.', '_' or '-'"
+        )
+    if old.classes is None:
+        raise BundleError(
+            f"bundle {old.manifest.name} {old.manifest.version} has no embedding and no class "
+            "means, so nothing can be enrolled; pack it again with a method that gives them "
+            "(palpate-train)"
+        )
+
+
+def enrol(old: Bundle, label: str, sweeps: NDArray[Any]) -> Enrolment:
+    """`old` with `label` as its last label, learned from `sweeps`: raw counts [n, T, R, C] or [n,
+    T, R, C, A]. Deterministic.
+
+    The early heads do not have the label, so the new bundle gives no early answers. The figures of
+    `old` no longer hold and are removed. Further problems do not prevent the enrolment; they are
+    listed in the result. Raises BundleError as `admit`, FormatError if `sweeps` do not have the
+    bundle's format, give no embedding, or are not slides.
+    """
+    admit(old, label)
+    m, f = old.manifest, old.format
+    assert old.classes
+    assert m.known
+    if sweeps.shape[1:] != (f.window, *f.shape) or not len(sweeps) or sweeps.dtype != f.numpy_type:
+        raise FormatError(
+            f"sweeps {sweeps.dtype} {sweeps.shape} cannot be enrolled; the bundle wants [n] of {f}"
+        )
+    run = Classifier(old, SystemClock())
+    sweeps = cleaned(run, sweeps)
+    is_no_slide = slide_check(old)
+    for number, sweep in enumerate(sweeps, 1):
+        if why := is_no_slide(sweep):
+            raise FormatError(
+                f"sweep {number} of {len(sweeps)} is not a slide over {label!r}: {why}; take others"
+            )
+    network, z = network_outputs(run, sweeps)
+    if not np.isfinite(z).all():
+        raise FormatError(
+            "the model gives no number for some of the sweeps; look at the skin and take others"
+        )
+    classes = extended(old.classes, z)
+    means = ClassDistances(classes, replace(m.known, enrolled=LEAST), (*m.labels, label))
+    median = _median(softmax(means.joined(network, z)))
+    outputs = network_outputs(run, np.append(old.golden, sweeps[median][None], axis=0))
+    new, file = _added(old, label, classes, sweeps[median], means.joined(*outputs))
+    trained, warnings = ClassDistances(old.classes, m.known, m.labels), []
+    if close := _closeness(trained, label, z):
+        warnings.append(close)
+    if m.early:
+        warnings.append(
+            f"early answers end with this bundle: their heads do not know {label!r}; set "
+            "classifier.early = false"
+        )
+    return Enrolment(new, file, tuple(warnings), _disagreement(trained, label, z))
+
+
+def cleaned(run: Classifier, sweeps: NDArray[Any]) -> NDArray[Any]:
+    """Windows [n, T, R, C] or [n, T, R, C, A] as the network sees them in an answer: broken taxels
+    are bridged, and hum is removed."""
+    bridged = (run.taxels.repaired(sweep, run.tare)[0] for sweep in sweeps)
+    return np.stack([run.without_hum(window)[0] for window in bridged])
+
+
+def network_outputs(run: Classifier, sweeps: NDArray[Any]) -> tuple[Embedded, Embedded]:
+    """The model's own logits [n, K0] and embeddings [n, r] of windows [n, T, R, C] or [n, T, R, C,
+    A]."""
+    logits, z = zip(*map(run.network, sweeps), strict=True)
+    return np.stack(logits).astype(np.float64), np.stack(z).astype(np.float64)
+
+
+def slide_check(old: Bundle) -> SlideCheck:
+    """The check whether a window is a slide, on the skin of a bundle. Patterns are expected where
+    training measured them. They must be higher than for an answer (SlideLimits.pattern), with whose
+    limit mains hum and noise that all taxels share would be learned."""
+    m = old.manifest
+    limits, patterned = m.sliding, m.speeds is not None
+    return SlideCheck(m.format, m.tare, m.thresholds.contact, limits, patterned=patterned)
+
+
+def extended(classes: Classes, z: NDArray[np.float64]) -> Classes:
+    """`classes` with one more label, from the embeddings `z` float64 [n, r] of its sweeps.
+
+    The new mean is the mean of the sweeps. The spread is computed from the sweeps and one assumed
+    sweep at squared distance r, the average for trained labels. It is at least 1, the spread of
+    trained labels, because materials that were not in training scatter more in the embedding. For
+    the other values see `enrolled.extended`.
+    """
+    n, r = z.shape
+    mean = z.mean(axis=0)
+    spread = max(1.0, (r + ((z - mean) ** 2).sum()) / (r * n))
+    return enrolled.extended(classes, mean, n, spread)
+
+
+def _added(
+    old: Bundle, label: str, classes: Classes, golden: NDArray[Any], logits: NDArray[np.float32]
+) -> tuple[Bundle, bytes]:
+    """`old` with the last label of `classes`, and the enrolment.npz that adds all enrolled labels
+    to the signed bundle."""
+    before, mean, sweeps, spread = (
+        old.added,
+        classes.means[-1:],
+        classes.sweeps[-1:],
+        classes.spread[-1:],
+    )
+    added = AddedLabels(old.base, (label,), mean, sweeps, spread, golden[None], logits, LEAST)
+    if before:
+        added = AddedLabels(
+            old.base,
+            (*before.labels, label),
+            np.vstack([before.means, mean]),
+            np.append(before.sweeps, sweeps),
+            np.append(before.spread, spread),
+            np.concatenate([before.golden, golden[None]]),
+            logits,
+            LEAST,
+        )
+    file = enrolled.file(added)
+    new = enrolled.with_label(old, label, mean[0], int(sweeps[0]), float(spread[0]), golden)
+    new = enrolled.deciding(new, LEAST)
+    return replace(new, golden_logits=logits, id=bundle.identity(file), added=added), file
+
+
+def _median(scores: NDArray[np.float64]) -> int:
+    """Index of the sweep to keep as golden, given probabilities `scores` float64 [n, K].
+
+    It has the median probability of the last label among the sweeps that get this label, or among
+    all sweeps if none gets it. As at export, a fault changes the label of such a sweep and a
+    rounding error does not.
+    """
+    correct = np.flatnonzero(scores.argmax(axis=1) == scores.shape[1] - 1)
+    pick = correct if len(correct) else np.arange(len(scores))
+    return int(pick[np.argsort(scores[pick, -1], kind="stable")[len(pick) // 2]])
+
+
+def files(old: Mapping[str, bytes], new: Enrolment, signature: bytes | None) -> dict[str, bytes]:
+    """The files of the enrolled bundle: the unchanged files of the original bundle, the enrolment,
+    and the enrolment's signature if there is one."""
+    kept = {
+        name: data
+        for name, data in old.items()
+        if name not in (bundle.ENROLMENT, bundle.ENROLMENT_SIGNATURE)
+    }
+    return (
+        kept
+        | {bundle.ENROLMENT: new.file}
+        | ({bundle.ENROLMENT_SIGNATURE: signature} if signature else {})
+    )
+
+
+def _disagreement(means: ClassDistances, label: str, z: NDArray[np.float64]) -> str:
+    """Why the sweeps with the embeddings `z` [n, r] may not be of one material, "" where they
+    agree.
+
+    The threshold is the limit beyond which a sweep is of an unknown material. It was tested on sets
+    of five sweeps of simulated materials that were left out of training: of sets of one material
+    one in eleven disagrees, of sets with a sweep of another material four in five.
+    """
+    n, r = z.shape
+    away = ((z - z.mean(axis=0)) ** 2).sum(axis=1)
+    spread = away.sum() / max(1, n - 1)
+    if spread <= means.limit:
+        return ""
+    return (
+        f"the sweeps of {label!r} disagree: they lie {spread:.1f} from their mean (squared; those "
+        f"of a trained material {r}, limit {means.limit:.1f}), number {away.argmax() + 1} most of "
+        "all; take others"
+    )
+
+
+def _closeness(means: ClassDistances, label: str, z: NDArray[np.float64]) -> str:
+    """A warning if the sweeps with the embeddings `z` [n, r] will often get a label of `means`, ""
+    if not."""
+    n, r = z.shape
+    to_old = (
+        means.distances(z.mean(axis=0)) - r / n
+    )  # minus the expected squared error of a mean of n sweeps
+    k = int(to_old.argmin())
+    if to_old[k] >= min(means.limit, means.closest_pair()):
+        return ""
+    return (
+        f"{label!r} lies close to {means.labels[k]!r}: squared distance {max(to_old[k], 0):.1f}, "
+        f"limit {means.limit:.1f}; its sweeps will often be called that"
+    )
+
+
+class SweepCollector(Observer):
+    """Collects `wanted` good sweeps of a running box, and logs each sweep. check: the reason why a
+    window is not a slide, "" if it is one."""
+
+    def __init__(self, wanted: int, check: Callable[[NDArray[Any]], str] = lambda x: "") -> None:
+        self._wanted, self._check = wanted, check
+        self._windows: list[NDArray[Any]] = []
+
+    @property
+    def enough(self) -> bool:
+        return len(self._windows) >= self._wanted
+
+    def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
+        """Collect the sweep's window if the box found no fault in it."""
+        if self.enough:
+            return
+        why = f"{verdict.status} {verdict.detail}".rstrip()
+        if verdict.status.classified or verdict.status in (Status.UNKNOWN, Status.CONFLICT):
+            why = self._check(sweep.frames.taxels)
+        if not why:
+            self._windows.append(sweep.frames.taxels)
+            log.info(f"sweep {sweep.id} taken: {len(self._windows)} of {self._wanted}")
+        else:
+            log.info(f"sweep {sweep.id} not taken: {why}")
+
+    def windows(self) -> NDArray[Any]:
+        """The raw counts [n, T, R, C]. Raises ApplianceError if there are too few."""
+        if not self.enough:
+            raise ApplianceError(
+                f"{len(self._windows)} of {self._wanted} good sweeps had come when it ended; "
+                "nothing was written: enrol again"
+            )
+        return np.stack(self._windows)
+
+
+def check_target(target: Path, swap: bool) -> None:
+    """Raises BundleError if no bundle may be written to `target`. It is also called before the
+    robot sweeps.
+
+    swap: a bundle that exists there may be replaced.
+    """
+    if target.exists() and not swap:
+        raise BundleError(
+            f"{target} is there already; name another folder with --out, or give --replace"
+        )
+    if target.exists() and not (target / bundle.MANIFEST).is_file():
+        raise BundleError(
+            f"{target} is not a bundle and will not be replaced; name another folder with --out"
+        )
+    if not os.access(target.resolve().parent, os.W_OK):
+        raise BundleError(
+            f"{target.resolve().parent} is not a folder that you may write to; name another with "
+            "--out"
+        )
+
+
+def write(files: Mapping[str, bytes], target: Path, swap: bool) -> None:
+    """Write the bundle of `files` to the folder `target`, after its self-test has passed.
+
+    At every moment, and after a power failure, `target` is either the old or the complete new
+    bundle (`storage.folder`). Raises BundleError.
+    """
+    check_target(target, swap)
+    target = target.resolve()
+    try:
+        with storage.folder(target) as new:
+            for name, data in files.items():
+                (new / name).write_bytes(data)
+            Classifier(bundle.load(new), SystemClock()).self_test()
+    except OSError as e:
+        why = e.strerror or e
+        raise BundleError(
+            f"the bundle cannot be written to {target}: {why}; name another folder with --out"
+        ) from e

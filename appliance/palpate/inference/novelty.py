@@ -1,0 +1,215 @@
+"""Distances of a sweep from the known materials, and whether its material is unknown.
+
+The embedding is scaled so that the sweeps of all materials together have covariance 1 around their
+means. A squared distance in it is therefore a squared Mahalanobis distance, and the nearest mean
+gives the label. An enrolled material is one more mean; nothing is trained for it.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.bundle.bundle import Classes, EarlyClasses
+from palpate.bundle.manifest import DisplacementRule, Known
+from palpate.signal.disturbances import Disturbances
+
+Array = NDArray[np.float64]
+UNDISTURBED: Mapping[str, float] = MappingProxyType({})
+KEPT = 16
+"""Number of unknown sweeps that are remembered."""
+ALIKE = 0.5
+"""Largest distance of two sweeps of one unknown material, as a share of the limit of known ones. Of
+pairs of sweeps of one material 13 to 69 % are within it, of two materials at most 2 % (simulated
+skin, four pairs of materials left out). Two cottons of FabricSlide are not told apart."""
+
+
+def shaped_distances(away: NDArray[Any], shapes: NDArray[Any]) -> Array:
+    """Squared distances [..., K] of differences `away` [..., K, r] from the class means.
+
+    In the last b directions each material has its own scatter, so the difference is first
+    multiplied by the material's matrix of `shapes` [K, b, b]. In the other directions all materials
+    have variance 1.
+    """
+    common = away.shape[-1] - shapes.shape[-1]
+    own = np.einsum("...kb,kbc->...kc", away[..., common:], shapes)
+    result: Array = (away[..., :common] ** 2).sum(axis=-1) + (own**2).sum(axis=-1)
+    return result
+
+
+def _of_all(changes: Array, labels: int) -> Array:
+    """Changes [D, labels, r] of the means of trained labels [D, K0, r] and of the enrolled ones
+    after them, which are assumed to change as the trained ones do on average."""
+    mean = changes.mean(axis=1, keepdims=True)
+    return np.concatenate([changes, mean.repeat(labels - changes.shape[1], axis=1)], axis=1)
+
+
+def log_softmax(logits: NDArray[Any]) -> Array:
+    """Logarithms of the probabilities of logits along the last axis, in float64."""
+    z = np.asarray(logits, np.float64)
+    result: Array = z - np.logaddexp.reduce(z, axis=-1, keepdims=True)
+    return result
+
+
+class EarlyDistances:
+    """Finds unknown materials in unfinished sweeps. limits: [D], largest squared distance of a
+    known material at each step."""
+
+    def __init__(self, classes: EarlyClasses, limits: Sequence[float]) -> None:
+        self._means, self._shapes = (
+            part.astype(np.float64) for part in (classes.means, classes.shapes)
+        )
+        self._limits = np.array(limits)
+
+    def known(self, z: NDArray[Any]) -> NDArray[np.bool_]:
+        """Whether the material is known at each of the first d steps, bool [d]. z: embeddings
+        [d, r] after these steps."""
+        known: NDArray[np.bool_] = self.nearest(z) <= self._limits[: len(z)]
+        return known
+
+    def nearest(self, z: NDArray[Any]) -> Array:
+        """Squared distances float64 [d] to the nearest material, see `known`."""
+        d = len(z)
+        away = (z[:, None] - self._means[:d]) @ self._shapes[:d]  # [d, K, r]
+        nearest: Array = (away**2).sum(axis=2).min(axis=1)
+        return nearest
+
+
+class UnknownSweeps:
+    """The latest sweeps of unknown materials, to notice one that comes again."""
+
+    def __init__(self, distances: ClassDistances) -> None:
+        self._distances = distances
+        self._sweeps: deque[tuple[int, NDArray[Any]]] = deque(maxlen=KEPT)
+
+    def put(self, sweep: int, embedding: NDArray[Any]) -> int:
+        """Keep the embedding [r] of the sweep with this number. The number of the sweep before it
+        that is most alike, 0 if none is nearly as alike as two sweeps of one material."""
+        alike = 0
+        if self._sweeps:
+            numbers, others = zip(*self._sweeps, strict=True)
+            apart = self._distances.apart(embedding, np.stack(others))
+            nearest = int(apart.argmin())
+            if apart[nearest] <= ALIKE * self._distances.limit:
+                alike = numbers[nearest]
+        self._sweeps.append((sweep, embedding))
+        return alike
+
+
+class ClassDistances:
+    """Computes distances and logits from a bundle's class means. labels: of the means, [K].
+
+    displacement: rule for sweeps whose contact is displaced. The distances are then computed in
+    `classes.displaced`, where directions that a displacement changes have little weight, and all
+    logits are divided by its temperature. disturbances: the allowances for them.
+    """
+
+    def __init__(
+        self,
+        classes: Classes,
+        known: Known,
+        labels: Sequence[str],
+        displacement: DisplacementRule | None = None,
+        disturbances: Disturbances | None = None,
+    ) -> None:
+        self._disturbances = disturbances or Disturbances()
+        self.labels, self.limit, self._temperature = labels, known.limit, known.temperature
+        self._means, self._turn = classes.means.astype(np.float64), np.eye(classes.means.shape[1])
+        # the rest of the bias, since the squared distance already contains -|m|^2 / 2; logits that
+        # are computed from distances do not suffer from the cancellation of large products
+        self._extra = classes.bias + (self._means**2).sum(axis=1) / 2
+        self._enrolled, self._joint = classes.sweeps > 0, known.enrolled is not None
+        self._softening = displacement.temperature if displacement else 1
+        shapes = classes.shapes
+        if displacement and classes.displaced:
+            self.limit, shapes = displacement.limit, classes.displaced.shapes
+            self._means, self._turn = (
+                classes.displaced.means.astype(np.float64),
+                classes.displaced.turn.astype(np.float64),
+            )
+        self._shapes = shapes.astype(np.float64)
+        n = classes.sweeps
+        # a mean of n sweeps has variance 1 / n in every direction: another sweep has variance 1 + 1
+        # / n around it
+        self._share = np.where(n, n / (n + 1), 1.0) / classes.spread
+        changes = classes.changes.astype(np.float64)
+        self._changes = _of_all(changes, len(n)) @ self._turn if len(changes) else changes
+
+    def _away(self, embedding: NDArray[Any]) -> Array:
+        """Differences [..., K, r] of embeddings [..., r] from the class means."""
+        away: Array = (embedding @ self._turn)[..., None, :] - self._means
+        return away
+
+    def distances(self, embedding: NDArray[Any]) -> Array:
+        """Squared distances float64 [..., K] from embeddings [..., r] to the class means; no unit.
+
+        The scatter is that of all materials together, so the nearest mean is the result of LDA.
+        """
+        result: Array = (self._away(embedding) ** 2).sum(axis=-1)
+        return result
+
+    def logits(self, distances: Array) -> NDArray[np.float32]:
+        """Logits [..., K] from `distances` [..., K], up to a term that is the same for all
+        labels."""
+        result: NDArray[np.float32] = ((self._extra - distances / 2) / self._temperature).astype(
+            np.float32
+        )
+        return result
+
+    def joined(self, network: NDArray[Any], embedding: NDArray[Any]) -> NDArray[np.float32]:
+        """Logits float32 [..., K] of all labels of a bundle.
+
+        network: [..., K0], logits of the K0 trained labels, which come first. embedding: [..., r].
+        Without enrolled labels these are the network's own. With them, the distances give the
+        probability of each enrolled label and that of all trained labels together; the network
+        divides the latter among them. In bundles without `Known.enrolled`, all are from distances.
+        """
+        softened = np.asarray(network / self._softening, np.float32)
+        if not self._enrolled.any():
+            return softened
+        by_means = np.asarray(self.logits(self.distances(embedding)) / self._softening, np.float32)
+        if not self._joint:
+            return by_means
+        n, logs = network.shape[-1], log_softmax(by_means)
+        trained = np.logaddexp.reduce(logs[..., :n], axis=-1, keepdims=True)
+        logits = np.concatenate([trained + log_softmax(softened), logs[..., n:]], axis=-1)
+        return np.asarray(logits, np.float32)
+
+    def novelty(self, embedding: NDArray[Any], disturbed: Mapping[str, float] = UNDISTURBED) -> str:
+        """A message with the distance to the nearest material if it is beyond the limit; "" for a
+        known material.
+
+        embedding: [r]. disturbed: values of the sweep's disturbances by name. Each material has
+        its own scatter. The embedding was optimised for trained labels, so the distance to an
+        enrolled label is multiplied by n / (n + 1) / spread. About the same share of sweeps is
+        then accepted for both.
+        """
+        away, limit = self._away(embedding), self.limit
+        sizes = self._disturbances.sizes(disturbed)
+        if sizes.any():
+            away -= np.tensordot(sizes, self._changes, axes=1)
+            limit *= self._disturbances.growth(sizes)
+        scaled = shaped_distances(away, self._shapes) * self._share
+        k = int(scaled.argmin())
+        if scaled[k] <= limit:
+            return ""
+        return f"squared distance {scaled[k]:.4g} from {self.labels[k]}, limit {limit:.4g}"
+
+    def apart(self, embedding: NDArray[Any], others: NDArray[Any]) -> Array:
+        """Half of the squared distance [n] of an embedding [r] from others [n, r], with the mean
+        scatter of all materials. Two sweeps of one material lie as far apart in this measure as
+        one of them from its mean."""
+        away = ((others - embedding) @ self._turn)[:, None, :]
+        distances: Array = shaped_distances(away, self._shapes).mean(axis=-1) / 2
+        return distances
+
+    def closest_pair(self) -> float:
+        """Squared distance between the two closest class means."""
+        away = self._means[:, None] - self._means
+        between = (away**2).sum(axis=-1)
+        return float(between[~np.eye(len(between), dtype=bool)].min())

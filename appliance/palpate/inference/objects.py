@@ -1,0 +1,207 @@
+"""Fuses the sweeps of one object, and finds where an object ends without NEW OBJECT."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.core.types import Sweep
+
+STRONG = 10.0
+"""Least Bayes factor for another object: strong evidence (Jeffreys 1961, appendix B). Decision 20
+compares it with other rules."""
+LEAST_PROBABILITY = 1e-12
+"""Lower bound of probabilities in a fusion, so that one sweep with a probability of 0 cannot veto
+all others."""
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectRule:
+    """The settings by which an object ends (ClassifierConfig). With the defaults here only NEW
+    OBJECT ends it, as in versions before 0.2."""
+
+    max_sweeps: int = 0
+    conflict: str = "fuse"
+    object_s: float = 0.0
+
+
+def softmax(logits: NDArray[Any]) -> NDArray[np.float64]:
+    """Probabilities of logits along the last axis, in float64 (paper, eq. 10)."""
+    z = np.asarray(logits, np.float64)
+    e = np.exp(z - z.max(axis=-1, keepdims=True))
+    result: NDArray[np.float64] = e / e.sum(axis=-1, keepdims=True)
+    return result
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EnrolledLabels:
+    """The rule that protects trained labels from enrolled ones.
+
+    which: bool [K], the labels that were enrolled. least: as Known.enrolled; 0 for no rule.
+    """
+
+    which: NDArray[np.bool_]
+    least: float = 0.0
+
+    def decided(self, p: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The probabilities `p` [..., K] for an answer. Below the least probability the enrolled
+        labels get 0, and the trained ones are as without them.
+
+        It is applied to the sweeps of an object together: several sweeps that each are not enough
+        may be enough.
+        """
+        if not (self.least and self.which.any()):
+            return p
+        trained = np.where(self.which, 0, p)
+        total = trained.sum(axis=-1, keepdims=True)
+        return np.where(1 - total >= self.least, p, trained / np.maximum(total, 1 - self.least))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evidence:
+    """Sums over the sweeps of one object. Time and memory do not depend on the number of sweeps.
+
+    sweeps: their number. probabilities: float64 [K], fused; a single sweep keeps its own. sums:
+    float64 [K], of log probabilities, or the votes for each label. order: labels in the order of
+    their first vote.
+    """
+
+    sweeps: int
+    probabilities: NDArray[np.float64]
+    sums: NDArray[np.float64]
+    order: tuple[int, ...] = ()
+
+    @classmethod
+    def of(cls, own: NDArray[np.float64], fusion: str, before: Evidence | None = None) -> Evidence:
+        """The evidence `before`, if there is any, and one more sweep with the probabilities `own`
+        float64 [K].
+
+        fusion: "product" (Bayes with independent sweeps; Tulbure and Baeuml 2018), or "vote"
+        (paper, sec. V.D): the most frequent label wins. If two labels are equally frequent, the
+        label that occurred first wins, so with two sweeps the first decides.
+        """
+        sweeps, order = (before.sweeps if before else 0) + 1, before.order if before else ()
+        if fusion == "product":
+            sums = np.log(np.maximum(own, LEAST_PROBABILITY))
+        else:
+            label = int(own.argmax())
+            sums = (np.arange(len(own)) == label).astype(np.float64)
+            order = order if label in order else (*order, label)
+        if not before:
+            return cls(sweeps, own, sums, order)
+        sums = before.sums + sums
+        if fusion == "product":
+            return cls(sweeps, softmax(sums), sums)
+        votes = sums / sweeps
+        # max() keeps the first of equals; argmax must agree
+        votes[max(order, key=lambda k: votes[k])] += 1e-9
+        return cls(sweeps, votes, sums, order)
+
+
+def fuse(scores: Iterable[NDArray[np.float64]], fusion: str) -> NDArray[np.float64]:
+    """Fuse the probabilities float64 [K] of several sweeps of one object, at least one, into one
+    array [K]. fusion: as for `Evidence.of`."""
+    evidence = None
+    for own in scores:
+        evidence = Evidence.of(own, fusion, evidence)
+    assert evidence
+    return evidence.probabilities
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FusedSweeps:
+    """The sweeps of the present object.
+
+    object: its number, as in Sweep; 0 before the first NEW OBJECT. evidence: of the fused sweeps.
+    last, end_ns: number and end of the last sweep that had probabilities, whether it was fused or
+    refused.
+    """
+
+    object: int = 0
+    evidence: Evidence | None = None
+    last: int = 0
+    end_ns: int = 0
+
+    def ended(self, start_ns: int, rule: ObjectRule) -> bool:
+        """Whether a sweep that starts at `start_ns` comes after a pause, or after `max_sweeps`
+        sweeps."""
+        paused = 0 < rule.object_s * 1e9 < start_ns - self.end_ns
+        if rule.conflict == "fuse" or not (rule.max_sweeps and self.evidence):
+            return paused
+        return paused or rule.max_sweeps <= self.evidence.sweeps
+
+
+def contradicts(own: NDArray[np.float64], fused: NDArray[np.float64]) -> bool:
+    """Whether a sweep with the probabilities `own` float64 [K] is of another object than the sweeps
+    whose fused probabilities are `fused` float64 [K].
+
+    Compares two cases: the sweep is of this object, or of an object whose material is drawn anew
+    from K equally frequent ones. The ratio of their likelihoods is K * sum(fused * own). It is near
+    1 if the sweep or the sweeps before it are quite unsure.
+    """
+    return bool(len(own) * (fused @ own) < 1 / STRONG)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ObjectAnswer:
+    """What the sweeps of the present object say together. scores: float64 [K], decided
+    (EnrolledLabels); of a refused sweep its own. fused: number of sweeps in them. after: number of
+    the last sweep before. conflict: a message if the sweep contradicts those before it, else "".
+    final: no further sweep of this object is wanted."""
+
+    scores: NDArray[np.float64]
+    fused: int
+    after: int
+    conflict: str
+    refused: bool
+    final: bool
+
+
+class ObjectSweeps:
+    """Fuses the sweeps of one object after the other. labels: [K], for messages. fusion: "product",
+    "vote" (see `Evidence.of`) or "none"."""
+
+    def __init__(
+        self, labels: Sequence[str], fusion: str, rule: ObjectRule, enrolled: EnrolledLabels
+    ) -> None:
+        self.fusion, self.rule, self.enrolled = fusion, rule, enrolled
+        self.present = FusedSweeps()
+        self._labels = labels
+
+    def put(self, sweep: Sweep, own: NDArray[np.float64]) -> ObjectAnswer:
+        """Fuse one more sweep, with the probabilities `own` float64 [K]."""
+        earlier = self.present
+        if sweep.object == 0 or sweep.object != earlier.object or self.fusion == "none":
+            earlier = FusedSweeps(sweep.object)
+        before = None if earlier.ended(sweep.start_ns, self.rule) else earlier.evidence
+        conflict = self._conflict(own, before)
+        if conflict and self.rule.conflict == "refuse":
+            self.present = replace(earlier, last=sweep.id, end_ns=sweep.stop_ns)
+            return ObjectAnswer(
+                self.enrolled.decided(own), 0, earlier.last, conflict, refused=True, final=False
+            )
+        votes = self.fusion == "vote"  # each sweep votes for the label that it is given
+        kept = Evidence.of(
+            self.enrolled.decided(own) if votes else own, self.fusion, None if conflict else before
+        )
+        self.present = FusedSweeps(sweep.object, kept, sweep.id, sweep.stop_ns)
+        final = 0 < self.rule.max_sweeps <= kept.sweeps
+        scores = kept.probabilities if votes else self.enrolled.decided(kept.probabilities)
+        return ObjectAnswer(scores, kept.sweeps, earlier.last, conflict, refused=False, final=final)
+
+    def _conflict(self, own: NDArray[np.float64], before: Evidence | None) -> str:
+        """A message if `own` [K] contradicts the sweeps `before`, "" if it can be fused with
+        them."""
+        if not before or self.rule.conflict == "fuse":
+            return ""
+        fused = before.probabilities
+        if not contradicts(own, fused):
+            return ""
+        label, before_it = (
+            self._labels[int(self.enrolled.decided(p).argmax())] for p in (own, fused)
+        )
+        return f"another object: {label} after {before_it}"

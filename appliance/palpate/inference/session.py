@@ -1,0 +1,85 @@
+"""Runs onnxruntime as the box does, on a model that onnx_check has accepted.
+
+Errors of onnxruntime become BundleErrors. Only the outputs that are requested are computed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import onnxruntime as ort
+from numpy.typing import NDArray
+from onnxruntime.capi import onnxruntime_pybind11_state
+
+from palpate.bundle.pruning import prune
+from palpate.core.errors import BundleError, ModelError
+from palpate.inference.code_pages import give_back
+
+
+def session(model: bytes) -> ort.InferenceSession:
+    """A session with one thread and without spinning, since the sensor shares its core. It logs
+    errors only and sends no telemetry.
+
+    Raises BundleError if onnxruntime refuses the model.
+    """
+    ort.disable_telemetry_events()
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    options.log_severity_level = 3
+    options.enable_cpu_mem_arena = False
+    try:
+        return ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+    except Exception as e:  # the classes of onnxruntime have no other base in common
+        why = str(e).strip()[:200]
+        if _lacks_memory(e):
+            raise ModelError(f"no memory for the model: {why}; end other programs") from e
+        raise BundleError(f"onnxruntime {ort.__version__} refuses the model: {why}") from e
+
+
+class ModelRunner:
+    """Runs one model, with a session for each group of outputs that are requested together. A
+    session has only the nodes that its outputs need.
+
+    outputs: the first group. Raises BundleError if onnxruntime refuses the model.
+    """
+
+    def __init__(self, model: bytes, *outputs: str) -> None:
+        self._model = model
+        self._sessions: dict[tuple[str, ...], ort.InferenceSession] = {}
+        self._input: str = self.prepare(*outputs).get_inputs()[0].name
+
+    def prepare(self, *outputs: str) -> ort.InferenceSession:
+        """The session for `outputs`: an open session that has them, or a new session. Raises
+        BundleError as the class."""
+        able = (opened for group, opened in self._sessions.items() if set(group) >= set(outputs))
+        opened = next(able, None)
+        if opened is None:
+            opened = session(prune(self._model, set(outputs)))
+            give_back(onnxruntime_pybind11_state.__file__)
+        self._sessions[outputs] = opened
+        return opened
+
+    def __call__(self, outputs: tuple[str, ...], given: NDArray[Any]) -> list[NDArray[Any]]:
+        """The named outputs for one input `given`, without the leading axis of length 1. Raises
+        ModelError as `run`."""
+        opened = self._sessions.get(outputs) or self.prepare(*outputs)
+        return [out[0] for out in run(opened, outputs, {self._input: given[None]})]
+
+
+def run(opened: ort.InferenceSession, outputs: Sequence[str], given: dict[str, Any]) -> list[Any]:
+    """The graph's `outputs` for the input arrays `given` by name. Raises ModelError if they cannot
+    be computed."""
+    try:
+        values: list[Any] = opened.run(outputs, given)
+    except Exception as e:  # as above
+        why = str(e).strip()[:200]
+        raise ModelError(
+            f"onnxruntime {ort.__version__} cannot run the model: {why}; export the bundle again"
+        ) from e
+    return values
+
+
+def _lacks_memory(e: Exception) -> bool:
+    return isinstance(e, MemoryError) or "bad_alloc" in str(e) or "allocate memory" in str(e)

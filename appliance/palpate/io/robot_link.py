@@ -1,0 +1,341 @@
+"""The serial line to the robot controller: sends verdicts and other sentences, and reads commands.
+
+`core.sentences` defines sentences. Nothing here waits for the port: if the peer does not read,
+sentences are dropped and counted, and no frame is lost.
+"""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import select
+import sys
+import termios
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol, TextIO
+
+import serial
+
+from palpate.core import sentences
+from palpate.core.clock import Clock
+from palpate.core.config import SerialConfig
+from palpate.core.sentences import MAX_LINE, TALKER, UNSAFE, sentence
+from palpate.core.types import Verdict
+from palpate.io import serial_port
+
+COMMANDS = (
+    "ID",
+    "STATE",
+    "TEST",
+    "LABEL",
+    "TARE",
+    "NEW",
+    "ABORT",
+    "START",
+    "STOP",
+    "MATERIAL",
+    "POSITION",
+    "SESSION",
+    "NEXT",
+    "DISCARD",
+    "TEACH",
+    "USE",
+    "FORGET",
+)
+TEXT_COMMANDS = ("LABEL", "MATERIAL", "POSITION", "SESSION", "TEACH", "FORGET")
+"""The commands that need a text after a comma. START may have one: speed and force of the slide."""
+OWN = ("RES", "FIN", "STA", "ANS", "REC", "TCH")
+"""Kinds of sentences that the box sends. A line that sends them back, an echo, must not be
+answered: the answer would come back as well, without end."""
+MOST_REFUSED, REFUSAL_NS = 8, 1_000_000_000
+"""After so many bad lines without a command, one in this time is answered. A line that echoes with
+changes would otherwise be answered without end."""
+RETRY_NS = 1_000_000_000
+"""Time between two attempts to open a port that is gone."""
+
+
+class Port(Protocol):
+    """A serial line to the robot controller, for sentences and commands.
+
+    name: of the port, for messages. dropped: number of sentences that were not sent. trouble: the
+    reason why the line does not work, "" if it does.
+    """
+
+    name: str
+    dropped: int
+    trouble: str
+
+    def send(self, verdict: Verdict, *, loss_known: bool = True) -> None:
+        """Send a verdict's sentences without waiting. loss_known: see `result`."""
+        ...
+
+    def say(self, line: bytes) -> None:
+        """Send a sentence without waiting."""
+        ...
+
+    def commands(self) -> list[Command]:
+        """The commands that have come since the last call."""
+        ...
+
+    def close(self) -> None: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """A command of the robot controller: one of COMMANDS, and a text if it has one; or `error`, the
+    reason why it was not understood."""
+
+    name: str
+    text: str = ""
+    error: str = ""
+
+    @property
+    def line(self) -> str:
+        """The command as it stands in a sentence or a capture."""
+        with_text = self.name in TEXT_COMMANDS or (self.name == "START" and self.text)
+        return f"{self.name},{self.text}" if with_text else self.name
+
+
+def results(v: Verdict, source: str, *, loss_known: bool = True) -> list[bytes]:
+    """The sentences of a verdict: FIN for each finger, then RES. Parameters as of `result`."""
+    return [result(of, source, loss_known=loss_known) for of in (*(v.fingers or ()), v)]
+
+
+def result(v: Verdict, source: str, *, loss_known: bool = True) -> bytes:
+    """The RES sentence of a verdict; FIN of a verdict on one finger. source: of the frames (usb,
+    sim, replay). loss_known: whether lost frames of the skin can be seen.
+
+    Optional fields follow the detail: that losses cannot be seen, and the measured slide. The
+    detail is shortened to make room for them. If an empty detail does not suffice, the slide is
+    left out.
+    """
+    kind = "FIN" if v.finger else "RES"
+    fields = (
+        *([v.finger] if v.finger else ()),
+        v.sweep,
+        f"{v.time_ns / 1e9:.3f}",
+        v.status,
+        v.label,
+        f"{v.probability:.3f}",
+        f"{v.margin:.3f}",
+        v.fused,
+        v.lost,
+        f"{v.latency_ns / 1e6:.2f}",
+        v.bundle,
+        source,
+        f"{v.share:.2f}",
+    )
+    unseen: list[object] = [] if loss_known else [1]
+    if v.measured_mm_s is not None:
+        slide = [*(unseen or [""]), f"{v.measured_mm_s:.1f}", v.direction]
+        # a sentence of full length may have been cut
+        if (room := MAX_LINE - len(sentence(kind, *fields, "", *slide))) > 0:
+            return sentence(kind, *fields, v.detail[:room], *slide)
+    if loss_known:
+        return sentence(kind, *fields, v.detail)
+    room = MAX_LINE - len(sentence(kind, *fields, "", 1))
+    return sentence(kind, *fields, v.detail[: max(0, room)], 1)
+
+
+def parse(data: bytes, rest: bytes = b"") -> tuple[list[Command], bytes]:
+    """The commands in `data`, which continues `rest`, and the new unfinished rest (see
+    `sentences.parse`). Sentences of the box itself, from a line that echoes, are left out."""
+    found, rest = sentences.parse(data, rest)
+    return [
+        Command(s.kind, error=s.error) if s.error else command(s.kind, s.text)
+        for s in found
+        if s.kind not in OWN
+    ], rest
+
+
+def command(name: str, text: str | None = None) -> Command:
+    """The command `name` with its text, or a Command with an `error`."""
+    if name == "START":  # its trigger checks the values, and its error quotes the bad one
+        return Command(name, text or "")
+    if name not in COMMANDS or UNSAFE.search(text or ""):
+        return Command(name, error=f"unknown command; known are {' '.join(COMMANDS)}")
+    if (name in TEXT_COMMANDS) != (text is not None):
+        return Command(
+            name, error=f"send it as {TALKER} {name}" + " TEXT" * (name in TEXT_COMMANDS)
+        )
+    return Command(name, text or "")
+
+
+class StdoutPort:
+    """Sentences on standard output, used if no serial port is configured.
+
+    commands: another source of commands, since standard output has none.
+    """
+
+    def __init__(self, source: str, commands: Callable[[], list[Command]] = list) -> None:
+        self.name, self.dropped, self.trouble, self._source, self._commands = (
+            "standard output",
+            0,
+            "",
+            source,
+            commands,
+        )
+        self._gone = False  # the reader of a pipe
+
+    def send(self, verdict: Verdict, *, loss_known: bool = True) -> None:
+        """Print a verdict's sentences."""
+        for line in results(verdict, self._source, loss_known=loss_known):
+            self.say(line)
+
+    def say(self, line: bytes) -> None:
+        """Print a sentence. It is dropped and counted if nobody reads the output, or the disk
+        behind it is full.
+
+        Raises BrokenPipeError once if the reader has gone, as for any program in a pipeline.
+        """
+        if self._gone:
+            self.dropped += 1
+            return
+        try:
+            if not _can_be_written(sys.stdout):
+                raise BlockingIOError(errno.EAGAIN, "nobody reads it")
+            sys.stdout.buffer.write(line)
+            sys.stdout.buffer.flush()
+            self.trouble = ""
+        except BrokenPipeError:
+            self._gone = True
+            raise
+        except (OSError, ValueError, AttributeError) as e:  # closed: no stream, or a closed one
+            self.dropped += 1
+            why = getattr(e, "strerror", None) or "it is closed"
+            self.trouble = f"standard output cannot be written: {why}; sentences are dropped"
+
+    def commands(self) -> list[Command]:
+        return self._commands()
+
+    def close(self) -> None:
+        """Does nothing: standard output stays open."""
+
+
+def _can_be_written(stream: TextIO) -> bool:
+    """Whether a sentence can be written without waiting. A pipe that is ready takes PIPE_BUF bytes,
+    which is more."""
+    try:
+        poll = select.poll()
+        poll.register(stream.fileno(), select.POLLOUT)
+    except io.UnsupportedOperation:  # a stream in memory
+        return True
+    return bool(poll.poll(0))
+
+
+class SerialSink:
+    """Sentences to and commands from a serial port, which may be unplugged and come back.
+
+    opener: opens a `serial.Serial`. dropped: number of sentences that the peer did not read.
+    """
+
+    def __init__(
+        self,
+        config: SerialConfig,
+        clock: Clock,
+        source: str,
+        opener: Callable[..., Any] = serial.Serial,
+    ) -> None:
+        self.name, self.dropped, self.trouble = config.port, 0, ""
+        self._config, self._clock, self._source, self._opener = config, clock, source, opener
+        self._port: Any = None
+        self._retry_ns = clock.now_ns()
+        self._queue: deque[bytes] = deque()
+        self._begun = 0  # sent bytes of the first sentence in the queue
+        self._rest = b""
+        self._refused = 0  # bad lines since the last command
+        self._refusal_ns = clock.now_ns()
+
+    def send(self, verdict: Verdict, *, loss_known: bool = True) -> None:
+        """Queue a verdict's sentences and send as many as the port accepts now."""
+        for line in results(verdict, self._source, loss_known=loss_known):
+            self.say(line)
+
+    def say(self, line: bytes) -> None:
+        """Queue a sentence. If the queue is full, the oldest sentence is dropped and counted,
+        except one that was sent in part."""
+        if len(self._queue) >= self._config.queue:
+            del self._queue[1 if self._begun else 0]
+            self.dropped += 1
+        self._queue.append(line)
+        self._flush()
+
+    def commands(self) -> list[Command]:
+        """Send queued sentences; return the commands that have come since the last call."""
+        self._flush()
+        if not self._port:
+            return []
+        try:
+            data = os.read(self._port.fileno(), 4096)
+        except BlockingIOError:
+            return []
+        except OSError as e:
+            self._lose(e)
+            return []
+        found, self._rest = parse(data, self._rest)
+        return [command for command in found if self._is_answered(command)]
+
+    def close(self) -> None:
+        """Close the port; unsent sentences are lost."""
+        if self._port:
+            port, self._port = self._port, None
+            serial_port.close(port)
+
+    def _is_answered(self, command: Command) -> bool:
+        """Whether a command, or a bad line, gets an answer."""
+        if not command.error:
+            self._refused = 0
+            return True
+        self._refused += 1
+        now_ns = self._clock.now_ns()
+        if self._refused > MOST_REFUSED and now_ns < self._refusal_ns:
+            return False
+        self._refusal_ns = now_ns + REFUSAL_NS
+        return True
+
+    def _flush(self) -> None:
+        if not self._port and not self._open():
+            return
+        while self._queue:
+            try:
+                # not Serial.write: with write_timeout=0 pyserial 3.5 busy-waits while the peer does
+                # not read
+                self._begun += os.write(self._port.fileno(), self._queue[0][self._begun :])
+            except BlockingIOError:
+                return
+            except OSError as e:
+                self._lose(e)
+                return
+            if self._begun == len(self._queue[0]):
+                self._queue.popleft()
+                self._begun = 0
+
+    def _open(self) -> bool:
+        now = self._clock.now_ns()
+        if now < self._retry_ns:
+            return False
+        self._retry_ns = now + RETRY_NS
+        try:
+            port = serial_port.open_alone(self._config.port, self._config.baud, self._opener)
+        except (OSError, ValueError, termios.error) as e:  # SerialException is an OSError
+            held = serial_port.is_held(e)
+            advice = (
+                "end the program that has it (fuser shows it)"
+                if held
+                else "check serial.port and group dialout"
+            )
+            self.trouble = f"serial port {self._config.port} cannot be opened: {e}; {advice}"
+            return False
+        self._port, self.trouble, self._rest = port, "", b""
+        return True
+
+    def _lose(self, e: OSError) -> None:
+        self.trouble = (
+            f"serial port {self._config.port} failed: {e}; it is opened again when it is back"
+        )
+        self.close()
+        self._begun = 0
+        self._retry_ns = self._clock.now_ns() + RETRY_NS

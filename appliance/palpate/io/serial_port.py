@@ -1,0 +1,97 @@
+"""Serial ports, for the line to the robot and for skins: lists them and opens one for this program
+alone."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import os
+import termios
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import serial
+
+from palpate.core.log import printable
+
+PSEUDO_TERMINALS = range(136, 144)
+"""Major device numbers of pseudo-terminals."""
+
+
+@dataclass(frozen=True, slots=True)
+class PortInfo:
+    """A serial port of this machine. vendor_id, product_id: USB ids, 0 if it is not on USB. serial:
+    USB serial number. name: product name of its maker."""
+
+    path: str
+    vendor_id: int = 0
+    product_id: int = 0
+    serial: str = ""
+    name: str = ""
+
+    def __str__(self) -> str:
+        return (
+            f"{self.path} ({self.vendor_id:04x}:{self.product_id:04x} {self.name})"
+            if self.vendor_id
+            else self.path
+        )
+
+
+def ports() -> list[PortInfo]:
+    """The serial ports of this machine, from /sys; none is opened."""
+    from serial.tools.list_ports import comports
+
+    return [
+        PortInfo(
+            p.device,
+            p.vid or 0,
+            p.pid or 0,
+            printable(p.serial_number or ""),
+            printable(p.product or p.description or ""),
+        )
+        for p in sorted(comports(), key=lambda p: str(p.device))
+    ]
+
+
+def open_alone(path: str, baud: int, opener: Callable[..., Any] = serial.Serial) -> Any:
+    """The open port at `path`, non-blocking, with an empty buffer, and closed to other programs.
+    opener: opens a `serial.Serial`.
+
+    Raises OSError, or ValueError for an unsupported baud rate; `is_held` tells whether another
+    program has it.
+    """
+    port = opener(path, baud, timeout=0, write_timeout=0, exclusive=True)
+    try:
+        _keep_others_out(port.fileno())
+    except OSError:
+        port.close()
+        raise
+    return port
+
+
+def close(port: Any) -> None:
+    """Close a port from `open_alone`, also if it is gone."""
+    with contextlib.suppress(OSError):
+        # if another program opened the port earlier, the exclusive mode would remain and lock us
+        # out
+        fcntl.ioctl(port.fileno(), termios.TIOCNXCL)
+    with contextlib.suppress(OSError):
+        port.close()
+
+
+def is_held(e: Exception) -> bool:
+    """Whether a port could not be opened because another program has it."""
+    return getattr(e, "errno", None) in (errno.EBUSY, errno.EAGAIN)
+
+
+def _keep_others_out(port: int) -> None:
+    """Make the kernel refuse any further open of `port`, except by root. Another reader would take
+    bytes away, and a lock only binds programs that check it.
+
+    Pseudo-terminals are left out: if we were killed while the other end is open, it would stay
+    locked, also for us.
+    """
+    if os.major(os.fstat(port).st_rdev) not in PSEUDO_TERMINALS:
+        fcntl.ioctl(port, termios.TIOCEXCL)

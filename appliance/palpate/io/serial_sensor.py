@@ -1,0 +1,145 @@
+"""A skin on a serial port that does not speak PROTOCOL.md: the bytes of the port become Frames as
+the skin's profile describes.
+
+Only the commands of the profile are sent, and nothing else, since the skin may be another device.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Callable, Iterable
+from typing import Protocol
+
+from palpate.core.clock import Clock
+from palpate.core.config import SkinConfig
+from palpate.core.errors import SensorError, SensorMismatch
+from palpate.core.types import SweepFormat, shown
+from palpate.io import packets, serial_port, skin_stream
+from palpate.io.link import SkinLink
+from palpate.io.sensor import TransferObserver
+from palpate.io.serial_link import SerialLink, find
+from palpate.io.serial_port import PortInfo
+from palpate.io.skin_profile import SkinProfile
+from palpate.io.skin_stream import RATE_WANDER
+from palpate.io.usb_sensor import LinkSensor
+
+
+class BytePort(Protocol):
+    """An opened port, as SerialLink is."""
+
+    def write(self, data: bytes) -> None:
+        """Send all of `data`. Raises SensorError."""
+        ...
+
+    def read(self, size: int, timeout_ms: int) -> bytes:
+        """At most `size` bytes; b"" if none came within `timeout_ms`. Raises SensorError."""
+        ...
+
+    def close(self) -> None: ...
+
+
+class ProfileLink:
+    """A port whose skin gets the stop commands of its profile before the port is released."""
+
+    def __init__(self, port: BytePort, stop: Iterable[bytes]) -> None:
+        self._port, self._stop = port, list(stop)
+        self.read = port.read
+
+    def request(self, request: packets.Request, length: int) -> bytes:
+        """Raises SensorMismatch: these skins do not answer requests."""
+        raise SensorMismatch(
+            f"this skin does not speak PROTOCOL.md, so it cannot be asked for {request.name}"
+        )
+
+    def close(self) -> None:
+        """Send the stop commands, unless the skin is gone, and release the port."""
+        with contextlib.suppress(SensorError):
+            for command in self._stop:
+                self._port.write(command)
+        self._port.close()
+
+
+class SerialSensor(LinkSensor):
+    """A skin on a serial port, read as its profile describes.
+
+    open_port: opens a port, given path and baud rate. ports: lists the serial ports of the machine.
+    """
+
+    announced = False
+
+    def __init__(
+        self,
+        config: SkinConfig,
+        profile: SkinProfile,
+        format: SweepFormat,
+        clock: Clock,
+        tap: TransferObserver | None = None,
+        *,
+        open_port: Callable[[str, int], BytePort] | None = None,
+        ports: Callable[[], list[PortInfo]] = serial_port.ports,
+    ) -> None:
+        super().__init__(
+            config,
+            format,
+            clock,
+            lambda counters: skin_stream.stream(profile, format, counters),
+            tap,
+        )
+        self._profile, self._ports = profile, ports
+        self._open_port = open_port or (lambda path, baud: SerialLink(path, baud, clock))
+        self._tared_ns = 0  # until then the skin tares itself, and its frames are not used
+
+    def _proven(self, now_ns: int) -> bool:
+        return now_ns >= self._tared_ns and super()._proven(now_ns)
+
+    def _open(self) -> tuple[SkinLink, packets.Identity]:
+        self._check_format()
+        there = self._ports()
+        path = self._config.port or find(self._profile.ids, self._config.serial, there)
+        node = os.path.realpath(path)  # a path in /dev/serial/by-id is a link
+        info = next((port for port in there if port.path in (path, node)), PortInfo(path))
+        port = self._open_port(path, self._profile.baud)
+        try:
+            for command in self._profile.commands(self._profile.start, self._format.rate_hz):
+                port.write(command)
+            if self._config.tare:
+                for command in self._profile.commands(self._profile.tare, self._format.rate_hz):
+                    port.write(command)
+                self._tared_ns = self._clock.now_ns() + round(self._profile.tare_s * 1e9)
+        except Exception:
+            port.close()
+            raise
+        link = ProfileLink(port, self._profile.commands(self._profile.stop, self._format.rate_hz))
+        return link, packets.Identity(0, (0, 0, 0), self._config.profile, info.serial)
+
+    def _check_format(self) -> None:
+        """Raises SensorMismatch if the skin cannot send the bundle's format."""
+        sent, wanted = self._profile.format, self._format
+        able = (
+            wanted.rate_hz in self._profile.rates_hz
+            or abs(sent.rate_hz / wanted.rate_hz - 1) <= RATE_WANDER
+        )
+        if sent.skin != wanted.skin or not able:
+            rates = " or ".join(f"{rate:g}" for rate in self._profile.rates_hz or (sent.rate_hz,))
+            raise SensorMismatch(
+                f"the profile {self._config.profile} sends {shown(sent.shape)} {sent.dtype} at "
+                f"{rates} Hz, wanted is "
+                f"{wanted}; correct skin.profile, skin.grid or skin.rate_hz, or deploy a "
+                "bundle for this skin"
+            )
+
+    def _no_frame(self, *, bytes_came: bool) -> SensorError:
+        if not bytes_came:
+            return super()._no_frame(bytes_came=False)
+        remedy = (
+            self._stream.misfit
+            or "correct skin.profile, skin.grid or the profile's baud; `palpate skin detect` "
+            "listens for what fits; a board that boots when it is opened needs a longer "
+            "skin.silence_ms"
+        )
+        return SensorMismatch(
+            f"the skin sent bytes for {self._config.silence_ms} ms, "
+            f"but no frame of profile {self._config.profile} "
+            f"({shown(self._profile.format.shape)} {self._profile.number}); {remedy}"
+        )

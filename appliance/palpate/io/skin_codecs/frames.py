@@ -1,0 +1,100 @@
+"""The result of all codecs: raw counts with rows along the direction of sliding, and counts and
+times as far as the skin sends them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.io.skin_profile import SkinProfile
+
+MOST_PACKET = 8192
+"""Longest packet or line, in bytes; after that it counts as garbage."""
+NONE = np.empty(0, np.int64)
+
+
+@dataclass(frozen=True, slots=True)
+class Rest:
+    """The leftover of a codec. synced: it begins with a frame, as the bytes before it have shown.
+    layout: of the last frame, if the codec keeps it."""
+
+    data: bytes = b""
+    synced: bool = False
+    layout: Any = None
+
+
+@dataclass(frozen=True, slots=True)
+class Decoded:
+    """The content of bytes.
+
+    taxels: raw counts [n, R, C] or [n, R, C, A]. ends: int64 [n], bytes up to the end of each
+    frame, counted from the beginning of the leftover. skipped: int64 [n], garbage right before each
+    frame. size: bytes of a frame, 0 if there is none. counts: int64 [n], sequence numbers of 32
+    bits. times_us: int64 [n], device time of 32 bits. Both are empty if the skin sends none.
+    garbage: bytes outside of frames. rest: for the next bytes. wrong: why these frames do not fit
+    the profile, "" if they do. misfit: why bytes are garbage, and the remedy, as far as it shows.
+    foreign: frames of other nodes on the same bus, which are passed over.
+    """
+
+    taxels: NDArray[Any]
+    ends: NDArray[np.int64]
+    skipped: NDArray[np.int64]
+    size: float
+    garbage: int
+    rest: Rest
+    counts: NDArray[np.int64] = field(default_factory=NONE.copy)
+    times_us: NDArray[np.int64] = field(default_factory=NONE.copy)
+    wrong: str = ""
+    misfit: str = ""
+    foreign: int = 0
+
+    def __len__(self) -> int:
+        return len(self.ends)
+
+
+def arranged(profile: SkinProfile, numbers: NDArray[Any]) -> NDArray[Any]:
+    """Numbers in the order of the wire [n, rows * cols * values] -> raw counts [n, R, C] or [n, R,
+    C, A]: the chosen values with the normal axis last, rows along the direction of sliding,
+    little-endian."""
+    grid = numbers.reshape(len(numbers), profile.rows, profile.cols, profile.values)
+    if profile.take != tuple(range(profile.values)):
+        grid = grid[..., list(profile.take)]
+    for turn in profile.orientation:
+        grid = {
+            "transpose": grid.swapaxes(1, 2),
+            "flip-rows": grid[:, ::-1],
+            "flip-columns": grid[:, :, ::-1],
+        }[turn]
+    if len(profile.take) == 1:
+        grid = grid[..., 0]
+    return np.ascontiguousarray(grid, np.dtype(profile.data_type).newbyteorder("<"))
+
+
+def collected(
+    profile: SkinProfile,
+    numbers: list[NDArray[Any]],
+    ends: list[int],
+    skipped: list[int],
+    garbage: int,
+    rest: Rest,
+    size: float,
+    **more: Any,
+) -> Decoded:
+    """Frames that were found one by one. numbers: of each frame, in the order of the wire."""
+    table = (
+        np.stack(numbers)
+        if numbers
+        else np.empty((0, profile.rows * profile.cols * profile.values), profile.data_type)
+    )
+    return Decoded(
+        arranged(profile, table),
+        np.array(ends, np.int64),
+        np.array(skipped, np.int64),
+        size,
+        garbage,
+        rest,
+        **more,
+    )

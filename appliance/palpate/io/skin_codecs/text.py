@@ -1,0 +1,162 @@
+"""Numbers as lines of text: 3D-ViTac, ReSkin, sketches for Arduino, lines of JSON."""
+
+from __future__ import annotations
+
+import re
+from functools import lru_cache, reduce
+from operator import xor
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.io.skin_codecs.frames import MOST_PACKET, Decoded, Rest, collected
+from palpate.io.skin_profile import SkinProfile
+
+SEPARATORS, BRACKETS = b",;\t\r ", b"[](){}"
+"""What may stand between numbers: any separator, and brackets, as lists are printed with them."""
+_BLANKS = bytes.maketrans(SEPARATORS + BRACKETS, b" " * len(SEPARATORS + BRACKETS))
+_BETWEEN = {
+    ".": _BLANKS,
+    # a comma in such a line is a decimal mark
+    ",": bytes.maketrans(
+        SEPARATORS[1:] + BRACKETS + b",", b" " * len(SEPARATORS[1:] + BRACKETS) + b"."
+    ),
+}
+_WHOLE = re.compile(rb"[+-]?[0-9]{1,9}")
+_DECIMAL = re.compile(rb"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?|(?i:nan|null)")
+_STAMP = re.compile(
+    rb"(?:[0-9]{4}-[0-9]{2}-[0-9]{2}[T ])?[0-9]{2}:[0-9]{2}:[0-9]{2}(?:[.,][0-9]+)?Z?"
+)
+"""The time of day, as terminals and loggers put it before a line."""
+_AMONG = re.compile(
+    rb"(?<![\w.])(?:[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?|(?i:nan|null))"
+    rb"(?![0-9.]|[A-Za-z]*[0-9_]|\w*[\"']?\s*[:=])"
+)
+"""A number among other text, perhaps with its unit. Digits in a name, or before a colon or an
+equals sign, label one."""
+_SUM = re.compile(rb"\$([^*]*)\*([0-9A-Fa-f]{2})\s*")
+"""A sentence with the exclusive or of its characters, as in NMEA 0183."""
+
+_DIGITS = re.compile(rb"[0-9]+")
+_MOST_FLOAT = float(np.finfo(np.float32).max)
+_SHOWN = 40
+"""Characters of a line that are shown in a message."""
+
+
+def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
+    """Numbers between separators, brackets, and the text that the profile names. A line is a frame,
+    or a row of a frame that a shorter line ends."""
+    data, mark = rest.data + new, profile.line_end.encode()
+    per_line = profile.cols * profile.values * (profile.rows if profile.lines == "frames" else 1)
+    lines = 1 if profile.lines == "frames" else profile.rows
+    numbers: list[NDArray[Any]] = []
+    ends: list[int] = []
+    skipped: list[int] = []
+    rows: list[NDArray[Any]] = []
+    at = begun = garbage = before = size = 0  # begun: where the lines in `rows` begin
+    broken, misfit = False, ""
+    while (end := data.find(mark, at)) >= 0:
+        line, at = data[at:end], end + 1
+        row, why = _numbers(profile, line, per_line)
+        misfit = why or misfit
+        if row is not None and len(row) == per_line:
+            rows.append(row)
+        closed = profile.lines == "frames" or row is None or len(row) < per_line or closes(line)
+        # a line that begins with other text stands between two frames
+        broken |= len(row) > per_line if row is not None else not _stands_between(line)
+        if not closed:
+            continue
+        if len(rows) == lines and not broken:
+            numbers.append(np.concatenate(rows))
+            ends.append(at)
+            skipped.append(before)
+            size, before = at - begun, 0
+        else:
+            garbage, before = garbage + at - begun, before + at - begun
+        rows, begun, broken = [], at, False
+    if len(data) - begun > MOST_PACKET * lines:
+        garbage, begun = garbage + len(data) - begun, len(data)
+    left = Rest(data[begun:])
+    return collected(profile, numbers, ends, skipped, garbage, left, size, misfit=misfit)
+
+
+def split(line: bytes, decimal: str = ".") -> tuple[list[bytes], str]:
+    """The numbers of a line, and its other characters without separators, brackets and the time of
+    day. The digits of a label count as "#", so that they may change."""
+    words = line.translate(_BETWEEN[decimal]).split()
+    if all(map(_DECIMAL.fullmatch, words)):
+        return words, ""
+    text = _STAMP.sub(b" ", line)
+    if summed := _SUM.fullmatch(text):
+        if reduce(xor, summed[1], 0) != int(summed[2], 16):
+            return [], "another sum"
+        text = b"$" + summed[1]
+    if decimal == ",":
+        text = re.sub(rb"(?<=[0-9]),(?=[0-9])", b".", text)
+    around = _DIGITS.sub(b"#", _AMONG.sub(b" ", text)).translate(_BLANKS)
+    return _AMONG.findall(text), b"".join(around.split()).decode("utf-8", "replace")
+
+
+def closes(line: bytes) -> bool:
+    """Whether a list of lists that began on an earlier line ends with this line, as arrays are
+    printed."""
+    return line.rstrip().endswith(b"]]") and not line.lstrip().startswith(b"[[")
+
+
+def _stands_between(line: bytes) -> bool:
+    """Whether a line that holds no row begins with something else than a number."""
+    return not re.match(rb"[\s\[({]*[-+.]?[0-9]", line)
+
+
+def _numbers(profile: SkinProfile, line: bytes, most: int) -> tuple[NDArray[Any] | None, str]:
+    """The numbers of a line, and what is wrong with it; None if it contains anything else, or a
+    number outside the range of its type. A line with more than `most` is cut after most + 1."""
+    skip = profile.skip_columns
+    words = line.translate(_BETWEEN[profile.decimal]).split()
+    if profile.around or not all(map(_DECIMAL.fullmatch, words)):
+        words, around = split(line, profile.decimal)
+        if around != profile.around:
+            return None, _strange(line, around, profile) if words else ""
+    if skip:
+        if len(words) <= max(skip):
+            words = words[: min(skip)]
+        else:
+            words = [word for i, word in enumerate(words) if i not in _positions(skip)]
+    words = words[: most + 1]
+    if profile.number == "float32":
+        numbers = np.array([float(_NULL.get(word, word)) for word in words])
+        large = np.flatnonzero(np.abs(numbers) > _MOST_FLOAT)
+        if len(large):
+            return None, _unfit(words[large[0]], "float32", "the skin's firmware")
+        return numbers.astype(np.float32), ""
+    limits, wider = np.iinfo(profile.number), 'number = "float32" in its profile'
+    for word in words:
+        if not _WHOLE.fullmatch(word) or not limits.min <= int(word) <= limits.max:
+            return None, _unfit(word, profile.number, wider)
+    return np.array([int(word) for word in words], profile.number), ""
+
+
+_NULL = {b"null": b"nan", b"NULL": b"nan", b"Null": b"nan"}
+
+
+@lru_cache(4)
+def _positions(columns: tuple[int, ...]) -> frozenset[int]:
+    return frozenset(columns)
+
+
+def _unfit(word: bytes, kind: str, remedy: str) -> str:
+    return f"it sends {word[:_SHOWN].decode('ascii', 'replace')}, which {kind} cannot hold; " + (
+        f"set {remedy}" if "=" in remedy else f"check {remedy}"
+    )
+
+
+def _strange(line: bytes, around: str, profile: SkinProfile) -> str:
+    found = line[:_SHOWN].decode("utf-8", "replace").strip()
+    if not found.isprintable() or "\ufffd" in found:
+        return ""  # no text at all: another skin, or another baud
+    wanted = f"{profile.around[:_SHOWN]!r} is expected" if profile.around else "none is expected"
+    return (
+        f"{around[:_SHOWN]!r} stands around its numbers, {wanted}: "
+        f"{found!r}; set around in its profile"
+    )

@@ -1,0 +1,424 @@
+"""Skin profiles: TOML files that describe the bytes of a skin, read into a checked SkinProfile.
+
+The fields of SkinProfile are the schema; firmware_config/skins/matrix.toml explains each for users.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from math import ceil
+from pathlib import Path
+from typing import Any, Literal
+
+from palpate.core.config import SkinConfig
+from palpate.core.errors import ConfigError
+from palpate.core.schema import closest, custom, keys, read_table, read_toml, shown
+from palpate.core.schema import number as limited
+from palpate.core.types import MOST_AXES, SweepFormat
+from palpate.io import checksums, wire_numbers
+
+DEFAULT = "palpate"
+"""The profile of PROTOCOL.md, whose readout board announces grid, type and rate."""
+WINDOW_S = 2.0
+"""Length of a sweep's window if no other is set (paper, sec. II.B)."""
+FEW_FRAMES = 200
+"""A window with fewer frames gets a warning. At 100 Hz, vibrations up to 50 Hz are visible: at
+20 mm/s a texture with ridges 0.4 mm apart, about the finest that feels rough to a hand. Materials
+with finer textures then differ only by stiffness and shape."""
+SLIDE_MM_S = 20
+"""Speed of sliding at which the warning computes the finest texture."""
+MARKS = ("sequence", "time", "checksum")
+"""Abilities that a skin may lack."""
+NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,31}")
+"""Valid names of profiles, and so of their files."""
+_GRID = re.compile(r"([1-9][0-9]{0,2})x([1-9][0-9]{0,2})")
+_USB_ID = re.compile(r"([0-9a-fA-F]{4}):([0-9a-fA-F]{4})")
+_TURNS = ("transpose", "flip-rows", "flip-columns")
+_NEEDED = ("about", "source", "codec")
+
+
+def _hexadecimal(most: int) -> Any:
+    def read(value: Any) -> bytes | None:
+        try:
+            data = bytes.fromhex(value) if isinstance(value, str) else None
+        except ValueError:
+            return None
+        return data if data is not None and len(data) <= most else None
+
+    return custom(b"", f'up to {most} bytes in hexadecimal, such as "aa 55"', read)
+
+
+def _several(allowed: str, fits: Any, default: tuple[Any, ...] = ()) -> Any:
+    def read(value: Any) -> tuple[Any, ...] | None:
+        return tuple(value) if isinstance(value, list) and all(map(fits, value)) else None
+
+    return custom(default, allowed, read)
+
+
+def _is_usb_id(value: Any) -> bool:
+    return isinstance(value, str) and bool(_USB_ID.fullmatch(value))
+
+
+def _is_command(value: Any) -> bool:
+    return (
+        isinstance(value, str)
+        and 0 < len(value) <= 128
+        and (not value.startswith("hex:") or _binary(value))
+    )
+
+
+def _binary(value: str) -> bool:
+    try:
+        return bool(bytes.fromhex(value[4:].replace("{period_ms}", "00")))
+    except ValueError:
+        return False
+
+
+def _is_channel(value: Any) -> bool:
+    return type(value) is int and 0 <= value < 64
+
+
+def _is_column(value: Any) -> bool:
+    return type(value) is int and 0 <= value < 4096
+
+
+def _checksum() -> Any:
+    def read(value: Any) -> str | None:
+        fits = isinstance(value, str) and (not value or checksums.parsed(value))
+        return value if fits else None
+
+    names = ", ".join(checksums.NAMED)
+    return custom("", f'"", {names}, or parameters: "crc8 poly=1d init=ff xorout=00"', read)
+
+
+def _text(most: int) -> Any:
+    def read(value: Any) -> str | None:
+        fits = isinstance(value, str) and len(value) <= most and value.isprintable()
+        return value if fits else None
+
+    return custom("", f"up to {most} printable characters", read)
+
+
+def _is_rate(value: Any) -> bool:
+    return type(value) in (int, float) and 0.1 <= value <= 100_000
+
+
+@dataclass(frozen=True, slots=True)
+class SkinProfile:
+    """The bytes that a skin sends. Raises ConfigError for values that contradict each other.
+
+    about: a line of description. source: where the facts are from. measured: who has compared them
+    with a device, "" for nobody. usb_ids: "vvvv:pppp" of its port. baud: bits per second. start,
+    stop: commands sent after opening and before closing. tare: command that zeroes the unloaded
+    skin, which takes tare_s. codec: how frames are recognized. unit: of its numbers, "" for raw
+    counts.
+
+    "fixed": marker, trailer: bytes before and after a frame. skip_before, skip_after: ignored bytes
+    before and after the numbers. sequence: type of a frame count, sequence_at: its first byte,
+    counted from the end of the marker. checksum: see `checksums.parsed`; it stands behind the
+    bytes of skip_after, checksum_from: the first byte that it covers, counted from the beginning of
+    the marker; it covers all bytes up to itself. byte_order: of a number on the wire;
+    sequence_order, checksum_order: of these, "" for byte_order.
+
+    "text": lines: content of a line. skip_columns: numbers of a line that are ignored, counted from
+    0. around: the characters of a line without its numbers, separators and brackets. decimal: the
+    decimal mark. line_end: the character that ends a line.
+
+    number: type of a number on the wire. values: numbers of one taxel there. take: indices of those
+    that are used, in this order; the last is the axis along the skin's normal. rows, cols: grid on
+    the wire. orientation: turns after which the rows lie along the direction of sliding. rate_hz:
+    frames per second; rates_hz: those that `start` can set with {rate} or {period_ms}.
+    """
+
+    about: str = ""
+    source: str = ""
+    measured: str = ""
+    unit: str = _text(16)
+    codec: Literal["palpate", "fixed", "text", "papillarray", "xela-can", "robotiq-tsf"] = "palpate"
+    usb_ids: tuple[str, ...] = _several('USB ids such as ["1a86:7523"]', _is_usb_id)
+    baud: int = limited(115200, 1200, 4_000_000)
+    start: tuple[str, ...] = _several(
+        'commands such as ["f{rate}\\n"] or ["hex:9a 00"]', _is_command
+    )
+    stop: tuple[str, ...] = _several('commands such as ["stop\\n"] or ["hex:9a 00"]', _is_command)
+    tare: tuple[str, ...] = _several('commands such as ["z\\n"]', _is_command)
+    tare_s: float = limited(0.0, 0.0, 60.0)
+    marker: bytes = _hexadecimal(16)
+    trailer: bytes = _hexadecimal(16)
+    skip_before: int = limited(0, 0, 4096)
+    skip_after: int = limited(0, 0, 4096)
+    sequence: Literal["", "uint8", "uint16", "uint32"] = ""
+    sequence_at: int = limited(0, 0, 1 << 20)
+    sequence_order: Literal["", "little", "big"] = ""
+    checksum: str = _checksum()
+    checksum_from: int = limited(0, 0, 4096)
+    checksum_order: Literal["", "little", "big"] = ""
+    lines: Literal["rows", "frames"] = "rows"
+    skip_columns: tuple[int, ...] = _several("positions of numbers such as [0]", _is_column)
+    around: str = _text(16384)
+    decimal: Literal[".", ","] = "."
+    line_end: Literal["\n", "\r"] = "\n"
+    number: wire_numbers.WireNumber = "uint8"
+    byte_order: Literal["little", "big"] = "little"
+    rows: int = limited(4, 1, 255)
+    cols: int = limited(4, 1, 255)
+    values: int = limited(1, 1, 64)
+    take: tuple[int, ...] = _several(
+        "positions among the values of a taxel such as [1, 2, 3]", _is_channel, (0,)
+    )
+    orientation: tuple[str, ...] = _several(f"some of {', '.join(_TURNS)}", _TURNS.__contains__)
+    rate_hz: float = limited(100.0, 0.1, 100_000.0)
+    rates_hz: tuple[float, ...] = _several("rates such as [100, 250]", _is_rate)
+
+    def __post_init__(self) -> None:
+        if why := _contradiction(self):
+            raise ConfigError(why)
+
+    @property
+    def ids(self) -> list[tuple[int, int]]:
+        """USB ids (vendor, product) of its port."""
+        return [(int(one[:4], 16), int(one[5:], 16)) for one in self.usb_ids]
+
+    @property
+    def lacks(self) -> tuple[str, ...]:
+        """The MARKS that its frames do not have. Without a sequence number, lost frames cannot be
+        seen."""
+        has: tuple[str, ...] = MARKS if self.codec in ("palpate", "papillarray") else ()
+        if self.codec == "fixed":
+            has = ("sequence",) * bool(self.sequence) + ("checksum",) * bool(self.checksum)
+        return tuple(mark for mark in MARKS if mark not in has)
+
+    @property
+    def body(self) -> int:
+        """Bytes of the numbers of a frame on the wire, for "fixed"."""
+        return self.rows * self.cols * self.values * wire_numbers.size(self.number)
+
+    @property
+    def data_type(self) -> str:
+        """The type of its raw counts."""
+        return wire_numbers.data_type(self.number)
+
+    @property
+    def format(self) -> SweepFormat:
+        """The format of its sweeps, with rows along the direction of sliding and a window of
+        WINDOW_S."""
+        rows, cols = (
+            (self.cols, self.rows) if "transpose" in self.orientation else (self.rows, self.cols)
+        )
+        return with_window(rows, cols, self.rate_hz, self.data_type, len(self.take))
+
+    def commands(self, texts: Sequence[str], rate_hz: float) -> list[bytes]:
+        """Commands as bytes. {rate} becomes frames per second in decimal, {period_ms} milliseconds:
+        decimal in a text, one byte in a command that begins with hex:."""
+        period = max(1, min(255, round(1000 / rate_hz)))
+        return [
+            bytes.fromhex(text[4:].replace("{period_ms}", f"{period:02x}"))
+            if text.startswith("hex:")
+            else text.replace("{rate}", f"{rate_hz:g}")
+            .replace("{period_ms}", str(period))
+            .encode("latin-1", "replace")
+            for text in texts
+        ]
+
+    def json(self) -> dict[str, Any]:
+        """All fields by name, for JSON; `from_json` reads them."""
+        return {
+            name: value.hex() if isinstance(value, bytes) else value
+            for name, value in asdict(self).items()
+        }
+
+
+_KEYS = keys(SkinProfile)
+_OF_CODEC = {
+    "fixed": (
+        "marker",
+        "trailer",
+        "skip_before",
+        "skip_after",
+        "sequence",
+        "sequence_at",
+        "sequence_order",
+        "checksum",
+        "checksum_from",
+        "checksum_order",
+    ),
+    "text": ("skip_columns", "around", "decimal", "line_end"),
+}
+"""Keys that belong to one codec."""
+_VALUES = {"papillarray": (6, "float32"), "xela-can": (3, "uint16"), "robotiq-tsf": (1, "uint16")}
+"""Numbers of a taxel and their type, in the codecs that define them."""
+
+
+def _contradiction(p: SkinProfile) -> str:
+    """The contradiction between these values, "" for none."""
+    if p.codec == "fixed" and not (p.marker or p.trailer):
+        return 'codec = "fixed" needs a marker or a trailer; give one, or take "text"'
+    for codec, names in _OF_CODEC.items():
+        if codec != p.codec and (wrong := [n for n in names if getattr(p, n) != _KEYS[n].default]):
+            return (
+                f'{" and ".join(wrong)} belong{"s" * (len(wrong) == 1)} to codec = "{codec}", not '
+                f'to "{p.codec}"; remove {"it" if len(wrong) == 1 else "them"}'
+            )
+    if why := _outside(p):
+        return why
+    if p.codec != "fixed" and p.number in wire_numbers.WIDE:
+        return f'number = "{p.number}" is for codec = "fixed"; write number = "float32"'
+    if (
+        not p.take
+        or len(p.take) > MOST_AXES
+        or len({*p.take}) < len(p.take)
+        or max(p.take) >= p.values
+    ):
+        return (
+            f"take = {list(p.take)} is not 1 to {MOST_AXES} different ones of 0 to {p.values - 1} "
+            "(see values)"
+        )
+    if p.codec in _VALUES and (p.values, p.number) != _VALUES[p.codec]:
+        values, kind = _VALUES[p.codec]
+        return (
+            f'codec = "{p.codec}" sends {values} values of {kind} a taxel; write values = '
+            f'{values}, number = "{kind}"'
+        )
+    if p.codec == "palpate" and (p.usb_ids or p.start or p.stop or p.tare):
+        return (
+            'usb_ids, start, stop and tare are not for codec = "palpate"; skin.link and '
+            "skin.usb say where it is"
+        )
+    if p.codec == "robotiq-tsf" and p.rows * p.cols not in (28, 56):
+        return (
+            f"{p.rows} x {p.cols} taxels are neither one finger (7 x 4) nor two (14 x 4); correct "
+            "rows and cols"
+        )
+    return ""
+
+
+def _outside(p: SkinProfile) -> str:
+    """Why a part of a frame of fixed length lies where it cannot lie, "" if none does."""
+    end = p.skip_before + p.body
+    if p.sequence_at and not p.sequence:
+        return (
+            'sequence_at says where the frame count is; give its type, such as sequence = "uint8"'
+        )
+    if not (p.sequence_at <= p.skip_before or end <= p.sequence_at <= end + p.skip_after):
+        return (
+            f"sequence_at = {p.sequence_at} is among the numbers; use 0 to skip_before "
+            f"({p.skip_before}), or {end} to {end + p.skip_after} behind them"
+        )
+    if p.checksum_from and not p.checksum:
+        return 'checksum_from needs a checksum; give one, such as checksum = "crc8"'
+    if p.checksum_from >= len(p.marker) + end + p.skip_after:
+        return f"checksum_from = {p.checksum_from} is behind the numbers; 0 is the whole frame"
+    return ""
+
+
+PALPATE = SkinProfile()
+"""The profile that is used if no file defines another."""
+
+
+def load(name: str, folders: Sequence[Path]) -> SkinProfile:
+    """The profile NAME.toml in the first folder that has it. DEFAULT needs no file. A name that
+    ends in .toml is a path.
+
+    Raises ConfigError with the file, the key, the value and the allowed values.
+    """
+    there = {name: Path(name)} if name.endswith(".toml") else names(folders)
+    if name == DEFAULT and name not in there:
+        return PALPATE
+    if name not in there:
+        near = closest(name, there)
+        hint = f"did you mean {near[0]}?" if near else f"there are: {', '.join(there) or 'none'}"
+        raise ConfigError(
+            f"skin.profile = {shown(name)} has no profile in {' or '.join(map(str, folders))}; "
+            f"{hint}"
+        )
+    path = there[name]
+    return _made(read_toml(path), str(path))
+
+
+def from_json(table: Any, where: str) -> SkinProfile:
+    """The profile that `json` wrote, checked like a file. where: its place, for messages. Raises
+    ConfigError."""
+    if not isinstance(table, dict):
+        raise ConfigError(
+            f"{where}: {shown(table)} is not a skin profile; take one that was not changed"
+        )
+    return _made(table, where)
+
+
+def _made(table: dict[str, Any], where: str) -> SkinProfile:
+    def unknown(name: str) -> ConfigError:
+        near = closest(name, _KEYS)
+        hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(_KEYS)}"
+        return ConfigError(
+            f"{where}: {name if name.isprintable() else shown(name)} is unknown; {hint}"
+        )
+
+    values = read_table(
+        _KEYS, table, unknown=unknown, refused=lambda why: ConfigError(f"{where}: {why}")
+    )
+    missing = next((name for name in _NEEDED if not values.get(name)), None)
+    if missing:
+        raise ConfigError(f"{where}: {missing} is missing; matrix.toml explains each key")
+    try:
+        return SkinProfile(**values)
+    except ConfigError as e:
+        raise ConfigError(f"{where}: {e}") from e
+
+
+def names(folders: Sequence[Path]) -> dict[str, Path]:
+    """The profiles in these folders, by name; the first folder has priority."""
+    found: dict[str, Path] = {}
+    for folder in folders:
+        for path in sorted(folder.glob("*.toml")):
+            if NAME.fullmatch(path.stem):
+                found.setdefault(path.stem, path)
+    return found
+
+
+def adapted(profile: SkinProfile, config: SkinConfig) -> SkinProfile:
+    """The profile with the changes of skin.grid, skin.rate_hz and baud. Raises
+    ConfigError."""
+    if profile.codec == "palpate" and (config.grid or config.rate_hz):
+        key = "grid" if config.grid else "rate_hz"
+        raise ConfigError(
+            f"sensor.{key} is for skins that do not announce it; this skin speaks "
+            "PROTOCOL.md, so remove it"
+        )
+    grid = _GRID.fullmatch(config.grid)
+    if config.grid and not (grid and max(map(int, grid.groups())) <= 255):
+        raise ConfigError(
+            f"skin.grid = {config.grid!r} is not allowed; use rows x columns, such as 12x32"
+        )
+    changes: dict[str, Any] = {}
+    if grid:
+        changes |= {"rows": int(grid[1]), "cols": int(grid[2])}
+    if config.rate_hz:
+        if profile.rates_hz and config.rate_hz not in profile.rates_hz:
+            allowed = ", ".join(f"{rate:g}" for rate in profile.rates_hz)
+            raise ConfigError(
+                f"skin.rate_hz = {config.rate_hz:g} cannot be set on this skin; use one of "
+                f"{allowed}"
+            )
+        changes["rate_hz"] = config.rate_hz
+    if config.baud:
+        changes["baud"] = config.baud
+    return replace(profile, **changes)
+
+
+def with_window(rows: int, cols: int, rate_hz: float, dtype: str, axes: int) -> SweepFormat:
+    """A format with a window of WINDOW_S. Raises FormatError."""
+    return SweepFormat(rows, cols, rate_hz, max(1, round(WINDOW_S * rate_hz)), dtype, axes)
+
+
+def warning(format: SweepFormat) -> str:
+    """A warning for a skin that is too slow for textures, "" for a faster skin."""
+    if format.window >= FEW_FRAMES:
+        return ""
+    finest = ceil(20 * SLIDE_MM_S / format.rate_hz) / 10
+    return (
+        f"{format.window} frames in a window, at {format.rate_hz:g} Hz: at {SLIDE_MM_S} mm/s "
+        f"textures finer than {finest:g} mm "
+        "cannot be told apart; slide slower, or tell materials apart by stiffness and shape"
+    )

@@ -1,0 +1,160 @@
+"""The skin of a box by its settings: its profile, its sensor, and the format of its sweeps without
+a bundle."""
+
+from __future__ import annotations
+
+import re
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, overload
+
+from palpate.core import fingers
+from palpate.core.config import SITE, Config, SkinConfig
+from palpate.core.devices import Devices
+from palpate.core.errors import ConfigError, FormatError, SensorAbsent, SensorMismatch
+from palpate.core.types import SweepFormat
+from palpate.io import skin_profile
+from palpate.io.link import SkinLink
+from palpate.io.sensor import TransferObserver
+from palpate.io.skin_profile import SkinProfile
+from palpate.io.usb_sensor import LinkSensor, UsbSensor, ask, open_link
+
+if TYPE_CHECKING:
+    from palpate.io.hand_sensor import HandSensor
+
+OWN = SITE.parent / "skins"
+"""Profiles written by the owner of the box. They replace delivered profiles of the same name."""
+_DESCRIPTION = re.compile(r"(\d{1,9})x(\d{1,9})(?:x(\d{1,9}))?:(\w+):(\d{1,9}(?:\.\d+)?)", re.ASCII)
+
+
+def folders(settings: Config) -> list[Path]:
+    """Folders of profiles; the first that has a profile has priority."""
+    return list(dict.fromkeys((OWN, settings.folder / "skins")))
+
+
+def profile(settings: Config) -> SkinProfile:
+    """The profile that the settings name, with their changes. Raises ConfigError."""
+    return skin_profile.adapted(
+        skin_profile.load(settings.skin.profile, folders(settings)), settings.skin
+    )
+
+
+def sensor(
+    settings: Config, format: SweepFormat, devices: Devices, tap: TransferObserver | None = None
+) -> LinkSensor:
+    """The sensor for the whole skin of the settings, which has to send sweeps of `format`. Raises
+    ConfigError."""
+    chosen = profile(settings)
+    if chosen.codec == "palpate":
+        return UsbSensor(_config(settings, chosen), format, devices.clock, devices.backend, tap)
+    # boxes whose skin speaks PROTOCOL.md do without these modules
+    from palpate.io.serial_link import SerialLink
+    from palpate.io.serial_sensor import SerialSensor
+
+    def opened(path: str, baud: int) -> SerialLink:
+        return SerialLink(path, baud, devices.clock, wait=devices.wait)
+
+    return SerialSensor(settings.skin, chosen, format, devices.clock, tap, open_port=opened)
+
+
+def own_sensor(
+    settings: Config, format: SweepFormat, devices: Devices, tap: TransferObserver | None = None
+) -> LinkSensor | HandSensor:
+    """As `sensor`, for the skin of a box with one skin, or for the part of a hub that is the skin
+    of one finger alone. format: of the part."""
+    if not settings.part:
+        return sensor(settings, format, devices, tap)
+    from palpate.io.hand_sensor import HandSensor, HandSkin
+
+    hub = sensor(settings, hub_format(format, settings.part), devices, tap)
+    return HandSensor([HandSkin(hub, ("",), part=settings.part)])
+
+
+def hub_format(format: SweepFormat, part: str) -> SweepFormat:
+    """The format of the frames of a hub, by that of a part; "" for no hub."""
+    _, n, axis = fingers.cut(part) if part else (0, 1, 0)
+    return replace(format, cols=format.cols * n) if axis else replace(format, rows=format.rows * n)
+
+
+@overload
+def part_of(settings: Config, format: SweepFormat) -> SweepFormat: ...
+@overload
+def part_of(settings: Config, format: None) -> None: ...
+def part_of(settings: Config, format: SweepFormat | None) -> SweepFormat | None:
+    """The format of the settings' part of a hub, by that of the hub; `format` itself for whole
+    frames. Raises ConfigError if the hub cannot be cut."""
+    if not (settings.part and format):
+        return format
+    _, n, axis = fingers.cut(settings.part)
+    if format.shape[axis] % n:
+        raise ConfigError(
+            f'skins.{settings.alone}.part = "{settings.part}" does not divide the frames of '
+            f"{format}; use another part, or the hub's own skin.grid"
+        )
+    return (
+        replace(format, cols=format.cols // n) if axis else replace(format, rows=format.rows // n)
+    )
+
+
+def open_readout(settings: Config, devices: Devices) -> SkinLink:
+    """The opened readout board of a skin that speaks PROTOCOL.md. Raises ConfigError for another
+    skin, SensorError if there is none."""
+    chosen = profile(settings)
+    if chosen.codec != "palpate":
+        raise ConfigError(
+            f'skin.profile = "{settings.skin.profile}" sends a protocol of its maker (codec '
+            f'"{chosen.codec}"), not PROTOCOL.md; `palpate check` tests this skin; for a board of'
+            ' PROTOCOL.md use skin.profile = "palpate"'
+        )
+    return open_link(_config(settings, chosen), devices.backend, devices.clock)
+
+
+def announced(settings: Config, devices: Devices, wanted: SweepFormat | None = None) -> SweepFormat:
+    """The format of the skin's sweeps without a bundle: as announced by the readout board or
+    written in the profile, with a window of skin_profile.WINDOW_S. wanted: its rate is used if the
+    skin can be set to it.
+
+    Raises ConfigError, or SensorError if the readout board cannot be asked.
+    """
+    chosen = profile(settings)
+    if chosen.codec != "palpate":
+        settable = wanted and wanted.rate_hz in chosen.rates_hz
+        return (
+            replace(chosen, rate_hz=wanted.rate_hz).format if wanted and settable else chosen.format
+        )
+    try:
+        board = open_readout(settings, devices)
+    except SensorAbsent as e:
+        raise SensorAbsent(
+            f"{e}, or name another skin with --skin; `palpate skin detect` says which"
+        ) from e
+    with closing(board):
+        skin = ask(board)[1]
+    try:
+        return skin_profile.with_window(skin.rows, skin.cols, skin.rate_hz, skin.dtype, skin.axes)
+    except FormatError as e:
+        raise SensorMismatch(
+            f"the skin announces an invalid format: {e}; check its firmware"
+        ) from e
+
+
+def described(text: str) -> SweepFormat:
+    """The format described as ROWSxCOLUMNS[xAXES]:TYPE:RATE, for example "5x3:float32:100". Raises
+    ConfigError."""
+    found = _DESCRIPTION.fullmatch(text.strip())
+    if not found:
+        raise ConfigError(
+            f"--format {text}: not understood; give rows x columns (x axes), data type and frames "
+            "per second, "
+            "for example 5x3:float32:100 or 4x4x3:int16:250"
+        )
+    rows, cols, axes, dtype, rate = found.groups()
+    try:
+        return skin_profile.with_window(int(rows), int(cols), float(rate), dtype, int(axes or 1))
+    except FormatError as e:
+        raise ConfigError(f"--format {text}: {e}") from e
+
+
+def _config(settings: Config, chosen: SkinProfile) -> SkinConfig:
+    return replace(settings.skin, baud=chosen.baud)

@@ -1,0 +1,136 @@
+"""A process of its own that learns beside the loop. It prints a line of JSON for each step.
+
+Nothing here waits: the loop looks for news between two turns.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from contextlib import suppress
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from palpate.core.clock import Clock
+from palpate.core.errors import ConfigError
+
+LEARNS = "palpate_train.teach"
+"""The program that learns. The box itself does not import it, nor what it needs."""
+NEEDED = ("palpate_train", "scipy", "onnx")
+"""Modules of the extra palpate[teach]."""
+NICE = 19
+"""Priority of a process beside the loop: the lowest."""
+ENDED_S = 5.0
+"""Longest wait for a killed process."""
+MOST_LINE = 1 << 20
+"""Most bytes of an unfinished line."""
+
+News = dict[str, Any]
+
+
+def check_installed() -> None:
+    """Raises ConfigError if this box cannot learn."""
+    if missing := [name for name in NEEDED if not find_spec(name)]:
+        raise ConfigError(
+            f"teaching needs {missing[0]}, which is not installed; make install installs it "
+            "unless TEACH=0 was given"
+        )
+
+
+def learning(folder: Path, forgotten: dict[str, int], memory_mb: int, *more: str) -> list[str]:
+    """The command that assesses the sweeps in `folder`, or fits a bundle with the options `more`.
+    forgotten: see TeachingState."""
+    options = ("--forgotten", json.dumps(forgotten), "--memory-mb", str(memory_mb))
+    return [sys.executable, "-P", "-m", LEARNS, str(folder), *options, *more]
+
+
+class TeachingProcess:
+    """A running process. limit_s: it is killed after this time. group: it gets a process group of
+    its own, with which it is killed. Raises ConfigError if it cannot be started."""
+
+    def __init__(
+        self, command: Sequence[str], limit_s: float, clock: Clock, *, group: bool = False
+    ) -> None:
+        self._clock, self._limit_s, self._group = clock, limit_s, group
+        self._end_ns = clock.now_ns() + round(limit_s * 1e9)
+        self._rest, self._told, self.ended = b"", False, False
+        threads = {f"{name}_NUM_THREADS": "1" for name in ("OPENBLAS", "OMP", "MKL")}
+        try:
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                env=os.environ | threads,
+                process_group=0 if group else None,
+            )
+        except OSError as e:
+            raise ConfigError(f"{command[0]} cannot be started: {e.strerror}") from e
+        with suppress(OSError):  # the loop comes first
+            os.setpriority(os.PRIO_PROCESS, self._process.pid, NICE)
+        assert self._process.stdout
+        self._output = self._process.stdout.fileno()
+        os.set_blocking(self._output, False)
+
+    def news(self) -> list[News]:
+        """The lines that have come since the last call. The last of all has the type `assessed`,
+        `taught` or `error`; `ended` is true then."""
+        if self.ended:
+            return []
+        found = self._read()
+        self._told = self._told or any(one["type"] != "step" for one in found)
+        code = self._process.poll()
+        if code is None and self._clock.now_ns() > self._end_ns:
+            self.close()
+            why = f"it was not done within {self._limit_s:g} s; teach fewer sweeps"
+        elif code is None:
+            return found
+        else:
+            found += self._read()
+            self._told = self._told or any(one["type"] != "step" for one in found)
+            why = _why(code)
+            self.close()
+        return found if self._told else [*found, {"type": "error", "text": why}]
+
+    def close(self) -> None:
+        """Kill it, with the processes that it started."""
+        if self.ended:
+            return
+        self.ended = True
+        with suppress(ProcessLookupError):
+            (os.killpg if self._group else os.kill)(self._process.pid, signal.SIGKILL)
+        self._process.wait(ENDED_S)
+        assert self._process.stdout
+        self._process.stdout.close()
+
+    def _read(self) -> list[News]:
+        while len(self._rest) < MOST_LINE:
+            try:
+                data = os.read(self._output, 65536)
+            except BlockingIOError:
+                break
+            if not data:
+                break
+            self._rest += data
+        *lines, self._rest = self._rest.split(b"\n")
+        return [found for line in lines if (found := _parsed(line))]
+
+
+def _parsed(line: bytes) -> News | None:
+    """The object in a line with its type; None for a line of something else, as of a library."""
+    try:
+        found = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    return found if isinstance(found, dict) and isinstance(found.get("type"), str) else None
+
+
+def _why(code: int) -> str:
+    """The reason for an end without a result."""
+    if code == -9:
+        return "the process that learns was killed: there was not enough memory; teach fewer sweeps"
+    return f"the process that learns ended with {code}; the log says why (journalctl -u palpate)"

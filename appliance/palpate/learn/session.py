@@ -1,0 +1,260 @@
+"""A session in which a person or a robot teaches the box: records sweeps, assesses them after each,
+and makes a bundle of them on demand.
+
+The work is done by processes beside the loop (process.py). A failure leaves the sweeps and the
+bundle in service as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from palpate.core.clock import Clock, SystemClock
+from palpate.core.config import TeachConfig
+from palpate.core.errors import ApplianceError, ConfigError
+from palpate.core.health import Health
+from palpate.core.log import log
+from palpate.core.observer import Observer
+from palpate.core.sentences import sentence
+from palpate.core.types import Sweep, Verdict
+from palpate.io.verdict_lines import check_bits
+from palpate.learn.process import News, TeachingProcess, learning
+from palpate.learn.state import TeachingState
+from palpate.sweeps.recording import Labels, RecordingSession
+
+FEWEST = 2
+"""Fewest sweeps of a material that can be assessed, and fewest such materials."""
+PAUSE_NS = 300_000_000
+"""Time without a new sweep before an assessment begins."""
+
+Learn = Callable[[str], list[str]]
+"""The command of a process that does all of `use`, for the person or program that asks; for "" of a
+process that only assesses the sweeps."""
+
+
+def refuse_trained(trained: Iterable[str], labels: Iterable[str]) -> None:
+    """Raises ConfigError for a label that the delivered bundle was trained on: its sweeps teach
+    nothing here."""
+    if known := next((name for name in labels if name in trained), ""):
+        raise ConfigError(
+            f"the bundle in service was trained on {known!r}; record more of it for the desktop "
+            "(palpate record), or take another name"
+        )
+
+
+class TeachingSession(Observer):
+    """Observes a recording and teaches the stored sweeps.
+
+    state: the file of TeachingState. learn: makes the command of USE. say: called with TCH
+    sentences. clock: the real clock, because processes run in real time. codes: number of codes of
+    the class bits, 0 without class bits. base: labels of the delivered bundle into which new
+    materials are taught, () without one. trained: those of them that it was trained on. It must
+    come after `recording` among the observers.
+    """
+
+    def __init__(
+        self,
+        recording: RecordingSession,
+        state: Path,
+        settings: TeachConfig,
+        learn: Learn,
+        say: Callable[[bytes], None],
+        clock: Clock | None = None,
+        codes: int = 0,
+        base: tuple[str, ...] = (),
+        trained: tuple[str, ...] = (),
+    ) -> None:
+        self._recording, self._file, self._settings = recording, state, settings
+        self._codes, self._base, self._trained = codes, base, trained
+        self._fewest = 1 if base else FEWEST
+        self._learn, self._clock, self._say = learn, clock or SystemClock(), say
+        self._state = TeachingState.load(state)
+        self._named: dict[str, None] = {}  # materials without a sweep so far, in order
+        self._process: TeachingProcess | None = None
+        self._using, self._stored = False, 0
+        self._due_ns: int | None = self._clock.now_ns()
+        self._learnt: News | None = None
+        self._step: News | None = None
+        self._trouble = self._too_many()
+        self._refused: set[int] = set()
+        self.by = "the serial line"
+        self.taught: News | None = None
+        self.recording_commands = {**recording.commands, "MATERIAL": self._material}
+        """Those of the recording, which here refuse what TEACH refuses."""
+        self.commands: Mapping[str, Callable[[str], list[object]]] = {
+            "TEACH": self._teach,
+            "USE": self._use,
+            "FORGET": self._forget,
+            "DISCARD": self._discard,
+        }
+
+    def about(self) -> dict[str, Any]:
+        """The session for JSON.
+
+        base: labels of the bundle into which materials are taught; fewest: number of materials
+        that USE needs.
+        materials: each with its number of sweeps, forgotten ones left out. learnt: the last
+        assessment, None without one; assessing: whether the next is being made. using: the step of
+        USE with the share done and the seconds left, None if it does not run. taught: the result of
+        USE. trouble: why the last step failed, "" if it did not.
+        """
+        return {
+            "base": [*self._base],
+            "fewest": self._fewest,
+            "materials": self.materials(),
+            "learnt": self._learnt,
+            "assessing": (bool(self._process) and not self._using) or self._due_ns is not None,
+            "using": (self._step or {"step": "start", "done": 0.0, "left_s": None})
+            if self._using
+            else None,
+            "taught": self.taught,
+            "trouble": self._trouble,
+        }
+
+    def materials(self) -> dict[str, int]:
+        """The number of sweeps of each new material, those without one included."""
+        counts = self._recording.materials(self._state.forgotten)
+        counts = {name: n for name, n in counts.items() if name not in self._trained}
+        return dict.fromkeys(self._named, 0) | counts
+
+    def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
+        """Tell the robot of a sweep that is not taught; the recording tells a person."""
+        if verdict.status.faulty:
+            self._refuse(f"sweep {sweep.id}: {verdict.status} {verdict.detail}".rstrip())
+
+    def _refuse(self, text: str) -> None:
+        self._say(sentence("TCH", "refused", text))
+
+    def admit(self, *labels: str) -> None:
+        """Raises ConfigError for a material that the delivered bundle was trained on, and if the
+        class bits cannot hold these materials beside those of before. A box without class bits
+        admits any number."""
+        refuse_trained(self._trained, labels)
+        if self._codes:
+            wanted = dict.fromkeys((*self._base, *self.materials(), *labels))
+            for name in self._state.forgotten.keys() - self.materials().keys() - {*labels}:
+                if name not in self._trained:
+                    wanted.pop(name, None)
+            check_bits(self._codes, [*wanted])
+
+    def _too_many(self) -> str:
+        """Why the materials of before cannot be sent, "" if they can: one may be forgotten."""
+        try:
+            self.admit()
+        except ConfigError as e:
+            return f"{e}, or forget a material"
+        return ""
+
+    def turn(self, health: Health) -> None:
+        """Take the news of the process, and begin an assessment that is due: a moment after a sweep
+        was stored or discarded."""
+        if self._recording.stored != self._stored:
+            self._stored = self._recording.stored
+            self._due_ns = self._clock.now_ns() + PAUSE_NS
+        if self._process:
+            for one in self._process.news():
+                self._take(one)
+            if self._process.ended:
+                self._process, self._using, self._step = None, False, None
+        elif self._due_ns is not None and self._clock.now_ns() >= self._due_ns:
+            self._due_ns = None
+            if sum(n >= FEWEST for n in self.materials().values()) >= self._fewest:
+                self._assess()
+            else:
+                self._learnt = None
+
+    def close(self) -> None:
+        """End the process. Sweeps stay as they are, and so does the bundle in service."""
+        if self._process:
+            self._process.close()
+
+    def _assess(self) -> None:
+        """Begin an assessment; a failure is shown."""
+        folder, forgotten = self._recording.folder, self._state.forgotten
+        try:
+            own = learning(folder, forgotten, self._settings.memory_mb)
+            self._begin(self._learn("") if self._base else own)
+        except ApplianceError as e:
+            self._take({"type": "error", "text": str(e)})
+
+    def _begin(self, command: list[str], *, using: bool = False) -> None:
+        self._process = TeachingProcess(command, self._settings.limit_s, self._clock, group=True)
+        self._using, self._step = using, None
+
+    def _take(self, news: News) -> None:
+        kind = news["type"]
+        if kind == "step":
+            self._step = news
+            return
+        text = str(news.get("text", ""))
+        self._trouble = text if kind == "error" else ""
+        for one in news.get("no_slides", ()):
+            if one["number"] not in self._refused:
+                self._refused.add(one["number"])
+                self._recording.leave_out(one["number"])
+                log.warning(f"teach: {one['text']}; it is not counted")
+                self._refuse(one["text"])
+        if kind == "assessed":
+            self._learnt = news
+            log.info(f"teach: {text}; next: {news['advice']}")
+        elif kind == "taught":
+            self.taught = news
+            log.info(f"teach: {text}")
+        else:
+            log.warning(f"teach: {text}")
+        self._say(sentence("TCH", kind, text))
+
+    def _teach(self, label: str) -> list[object]:
+        """The next sweeps are of this material; returns it and the number of its sweeps."""
+        label = label.strip()
+        if not label:
+            raise ApplianceError("TEACH needs the name of a material, such as PPLP TEACH cork")
+        Labels(material=label)
+        self.admit(label)
+        self._named.setdefault(label)
+        self._recording.commands["MATERIAL"](label)
+        return [label, self.materials().get(label, 0)]
+
+    def _material(self, label: str) -> list[object]:
+        """As MATERIAL of a recording."""
+        self.admit(*filter(None, [label.strip()]))
+        return self._recording.commands["MATERIAL"](label)
+
+    def _use(self, _: str) -> list[object]:
+        """Begin to teach all sweeps; returns the number of materials and of sweeps."""
+        if self._using:
+            raise ApplianceError("a bundle is being made already; wait for TCH")
+        held = {name: n for name, n in self.materials().items() if n}
+        if len(held) < self._fewest:
+            why = "teach one" if self._base else "a model tells at least two apart: teach another"
+            raise ApplianceError(f"{len(held)} materials have sweeps; {why}")
+        self.admit()
+        if self._process:
+            self._process.close()
+        self._trouble, self.taught = "", None
+        self._begin(self._learn(self.by), using=True)
+        return [len(held), sum(held.values())]
+
+    def _forget(self, label: str) -> list[object]:
+        """Teach the sweeps of a material no longer; returns it and their number. They stay in the
+        folder."""
+        label = label.strip()
+        number = self.materials().get(label)
+        if number is None:
+            raise ApplianceError(f"there is no material {label!r} to forget")
+        if self._using:
+            raise ApplianceError("a bundle is being made; forget it afterwards")
+        try:
+            self._state = self._state.forget(self._file, label, self._recording.last)
+        except OSError as e:
+            raise ApplianceError(f"{label!r} is not forgotten: {e.strerror}; make room") from e
+        self._named.pop(label, None)
+        self._trouble = self._too_many()
+        self._due_ns = self._clock.now_ns()
+        return [label, number]
+
+    def _discard(self, which: str) -> list[object]:
+        """As DISCARD of a recording."""
+        return self._recording.commands["DISCARD"](which)

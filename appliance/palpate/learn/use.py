@@ -1,0 +1,186 @@
+"""From recorded sweeps to a bundle of this box, signed with the box's key and installed on trial.
+
+New materials are taught into a delivered bundle (into.py). Without one, a process of its own fits
+all sweeps.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from palpate.bundle import bundle
+from palpate.core.clock import Clock
+from palpate.core.config import Config
+from palpate.core.errors import ApplianceError, BundleError, ConfigError, FormatError
+from palpate.core.log import log
+from palpate.core.types import SweepFormat, load
+from palpate.deployment.enrolment_key import TAUGHT, EnrolmentKey
+from palpate.deployment.signed import SignedBundle
+from palpate.deployment.store import Store
+from palpate.inference import enrolment
+from palpate.io.usb_sensor import fits
+from palpate.learn import into, state
+from palpate.learn.process import News, TeachingProcess, check_installed, learning
+from palpate.learn.state import TeachingState
+
+POLL_NS = 50_000_000
+"""Time between two looks at the process."""
+
+
+class TeachingFailed(ApplianceError):
+    """No bundle was made; the bundle in service stays."""
+
+
+def check_allowed(settings: Config) -> None:
+    """Raises ConfigError if this box may not or cannot be taught."""
+    if not settings.teach.allow:
+        raise ConfigError(
+            "teach.allow = false forbids teaching on this box; set it to true, or deploy a bundle"
+        )
+    if name := settings.bundle_setting:
+        raise ConfigError(
+            f"{name} names the bundle that runs, so a taught one would not; remove this setting"
+        )
+    check_installed()
+
+
+def use(
+    settings: Config, store: Store, by: str, clock: Clock, tell: Callable[[News], object]
+) -> str:
+    """Teach all recorded sweeps. The bundle runs on trial from the next start on; returns its name
+    in the store.
+
+    The fit has a process of its own; materials for a delivered bundle are learnt here. by: the
+    person or program that asked. tell: gets each news of the process. Raises ConfigError if the box
+    may not be taught or its key does not sign, TeachingFailed without a new bundle, and errors as
+    Store.install.
+    """
+    check_allowed(settings)
+    sweeps, key = settings.kept("sweeps"), EnrolmentKey(settings.store.enrolment_key)
+    if running := base(store, _format(sweeps)):
+        return _into(settings, store, running, key, tell)
+    key.check(TAUGHT)
+    scratch = Path(settings.store.folder) / "teaching"
+    shutil.rmtree(scratch, ignore_errors=True)  # of a process that a power cut ended
+    try:
+        out = scratch / "bundle"
+        day = time.strftime("%Y-%m-%d %H:%M", time.gmtime())
+        options = ("--out", str(out), "--version", version(store), "--by", by, "--at", day)
+        forgotten = TeachingState.load(state.file(settings)).forgotten
+        _wait(
+            learning(sweeps, forgotten, settings.teach.memory_mb, *options),
+            settings.teach.limit_s,
+            clock,
+            tell,
+        )
+        files = bundle.files(out)
+        files[bundle.TAUGHT_SIGNATURE] = key.sign(files[bundle.MANIFEST], TAUGHT)
+        return store.learn(files)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+def base(store: Store, format: SweepFormat | None) -> SignedBundle | None:
+    """The delivered bundle in service, if it is one for a skin of this format (None: any): new
+    materials are taught into it."""
+    try:
+        running = store.running()
+    except (ApplianceError, OSError):  # a damaged bundle is replaced
+        return None
+    suits = format is None or fits(format, running.bundle.format)
+    return running if suits and into.delivered(running) else None
+
+
+def _into(
+    settings: Config,
+    store: Store,
+    running: SignedBundle,
+    key: EnrolmentKey,
+    tell: Callable[[News], object],
+) -> str:
+    """Teach the new materials among the recorded sweeps into a delivered bundle, as `use`."""
+    into.check_settings(settings)
+    key.check()
+    forgotten = TeachingState.load(state.file(settings)).forgotten
+    try:
+        found = into.recorded(running.bundle, settings.kept("sweeps"), forgotten)
+        new = into.taught(running, found.windows, tuple(forgotten))
+        if new.disagreement:
+            raise BundleError(new.disagreement)
+    except (ApplianceError, OSError) as e:
+        raise TeachingFailed(f"{e}; the bundle in service stays") from e
+    for warning in new.warnings:
+        log.warning(f"teach: {warning}")
+    sha = store.learn(enrolment.files(running.files, new, key.sign(new.file)))
+    labels = [*new.bundle.manifest.labels]
+    tell({"type": "taught", "no_slides": found.no_slides, "labels": labels, "figures": {}})
+    return sha
+
+
+def _format(folder: Path) -> SweepFormat | None:
+    """The format of the last sweep in a folder, None without one."""
+    for path in sorted(folder.glob("sweep-*.npy"), reverse=True):
+        try:
+            return load(path)[1]
+        except FormatError:
+            continue  # damaged
+    return None
+
+
+def assessed(settings: Config, store: Store, clock: Clock) -> News:
+    """The assessment of the recorded sweeps, as news of type `assessed`. Raises TeachingFailed if
+    they are too few."""
+    sweeps = settings.kept("sweeps")
+    forgotten = TeachingState.load(state.file(settings)).forgotten
+    if running := base(store, _format(sweeps)):
+        try:
+            return into.assessed(running, into.recorded(running.bundle, sweeps, forgotten))
+        except (ApplianceError, OSError) as e:
+            raise TeachingFailed(f"{e}; the bundle in service stays") from e
+    found: News = {}
+    words = learning(sweeps, forgotten, settings.teach.memory_mb)
+    _wait(words, settings.teach.limit_s, clock, found.update)
+    return found
+
+
+def described(found: News) -> str:
+    """An assessment for a person."""
+    return "\n".join([found["text"], *_suspected(found), f"next: {found['advice']}"])
+
+
+def _suspected(found: News) -> list[str]:
+    return [one["text"] for one in (*found["no_slides"], *found["suspects"])]
+
+
+def version(store: Store) -> str:
+    """The version of the next bundle: one above the taught bundle in service."""
+    try:
+        running = store.running()
+    except ApplianceError:  # a damaged bundle is replaced
+        return "1"
+    held = running.bundle.manifest.version
+    return str(int(held) + 1) if running.taught and held.isdecimal() else "1"
+
+
+def command(options: list[str], by: str = "") -> list[str]:
+    """The command of a process that does all of `use`, or without `by` of `assessed`. options: of
+    the settings."""
+    asked = ["--use", "--by", by] if by else []
+    return [sys.executable, "-P", "-m", "palpate", "teach", *options, *asked, "--json"]
+
+
+def _wait(words: list[str], limit_s: float, clock: Clock, tell: Callable[[News], object]) -> None:
+    process = TeachingProcess(words, limit_s, clock)
+    try:
+        while not process.ended:
+            for one in process.news():
+                if one["type"] == "error":
+                    raise TeachingFailed(f"{one['text']}; the bundle in service stays")
+                tell(one)
+            clock.sleep_until(clock.now_ns() + POLL_NS)
+    finally:
+        process.close()

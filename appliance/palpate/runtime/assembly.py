@@ -1,0 +1,353 @@
+"""Assembles a Box from settings, devices, and a bundle if there is one. The simulator is not
+imported here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+from numpy.typing import NDArray
+
+from palpate.bundle import bundle as bundles
+from palpate.bundle.bundle import Bundle
+from palpate.core.clock import Clock, SystemClock
+from palpate.core.config import Config, TriggerConfig
+from palpate.core.devices import Devices
+from palpate.core.errors import ApplianceError, ConfigError, FormatError
+from palpate.core.log import in_journal, log
+from palpate.core.observer import Observer
+from palpate.core.types import SweepFormat
+from palpate.deployment.signed import SignedBundle
+from palpate.deployment.store import Store
+from palpate.inference.classifier import Classifier
+from palpate.inference.early_exit import EarlyExit
+from palpate.io import skins
+from palpate.io.gpio_lines import Lines
+from palpate.io.lineless_triggers import (
+    AnswerWatch,
+    CommandTrigger,
+    KeyTrigger,
+    StreamWatch,
+    TimedTrigger,
+    standard_input,
+)
+from palpate.io.robot_link import Port, SerialSink, StdoutPort
+from palpate.io.trigger import GpioTrigger, Trigger
+from palpate.io.verdict_lines import LineSink, check_bits
+from palpate.runtime.loop import Answerer, Box, CommandHandler, Panel, Pipeline
+from palpate.sweeps.capture import CaptureWriter
+from palpate.sweeps.sweep_check import SweepCheck
+from palpate.sweeps.sweep_window import SweepCutter
+
+if TYPE_CHECKING:
+    from palpate.runtime.hand import HandParts
+
+UNSIGNED = (
+    "bundles are allowed: classifier.allow_unsigned = true; remove it from the settings once the "
+    "bundle is signed"
+)
+"""Warning text, after the word "unsigned", shown while classifier.allow_unsigned is set."""
+NO_COMMANDS: Mapping[str, CommandHandler] = MappingProxyType({})
+
+
+class NotServing:
+    """The GPIO lines of a box without a bundle: READY stays low, since no sweep gets an answer that
+    a robot could use."""
+
+    def __init__(self, lines: Panel) -> None:
+        self._lines = lines
+
+    def show(self, *, ready: bool, busy: bool, fault: bool, decided: bool = False) -> None:
+        """Drive the lines; `ready` is ignored."""
+        self._lines.show(ready=False, busy=busy, fault=fault, decided=decided)
+
+
+def box(
+    settings: Config,
+    bundle: Bundle,
+    devices: Devices,
+    port: Port | None,
+    stack: ExitStack,
+    *,
+    bundles: Mapping[str, Bundle] = MappingProxyType({}),
+    capture: CaptureWriter | None = None,
+    observers: Iterable[Observer] = (),
+    labels: tuple[str, ...] = (),
+    commands: Mapping[str, CommandHandler] = NO_COMMANDS,
+    ordered: bool = False,
+    announce: Callable[[str], object] = log.info,
+) -> Box:
+    """The box that classifies; `stack` closes it again.
+
+    bundles: by finger (`of_fingers`); empty without fingers. capture: records all inputs. labels:
+    labels that the class bits must hold in addition to the bundle's. commands, ordered, announce:
+    as for `recorder`.
+    """
+    hand = _hand(settings, bundles, devices) if settings.skins else None
+    one = None if hand else classifier(settings, bundle, devices.clock)
+    run = hand.answerer if hand else one
+    assert run
+    run.self_test()
+    return _assembled(
+        devices.wire(settings),
+        run,
+        devices,
+        port,
+        stack,
+        capture,
+        [run, *observers],
+        commands,
+        codes=(*(hand.answerer.labels if hand else bundle.manifest.labels), *labels),
+        early=early_exit(settings, one) if one else None,
+        ordered=ordered,
+        announce=announce,
+        hand=hand,
+    )
+
+
+def _hand(settings: Config, bundles: Mapping[str, Bundle], devices: Devices) -> HandParts:
+    from palpate.runtime import hand  # here: a box with one skin does without it
+
+    return hand.assembled(settings, bundles, devices)
+
+
+def recorder(
+    settings: Config,
+    format: SweepFormat,
+    devices: Devices,
+    port: Port | None,
+    stack: ExitStack,
+    *,
+    capture: CaptureWriter | None = None,
+    observers: Iterable[Observer] = (),
+    commands: Mapping[str, CommandHandler] = NO_COMMANDS,
+    ordered: bool = False,
+    serving: bool = True,
+    slides: Callable[[NDArray[Any]], str] | None = None,
+    announce: Callable[[str], object] = log.info,
+) -> Box:
+    """The box that records sweeps of a format and needs no bundle; the class bits stay 0.
+
+    ordered: commands also come from another source than the port. serving: whether READY may rise.
+    slides: as for SweepCheck.
+    announce: called with the messages of a trigger without lines to a person. Other parameters as
+    for `box`."""
+    check = SweepCheck(format, devices.clock, slides)
+    watching = [check, *observers]
+    return _assembled(
+        devices.wire(settings),
+        check,
+        devices,
+        port,
+        stack,
+        capture,
+        watching,
+        commands,
+        ordered=ordered,
+        serving=serving,
+        announce=announce,
+    )
+
+
+def _assembled(
+    settings: Config,
+    answerer: Answerer,
+    devices: Devices,
+    port: Port | None,
+    stack: ExitStack,
+    capture: CaptureWriter | None,
+    observers: Iterable[Observer],
+    commands: Mapping[str, CommandHandler],
+    *,
+    codes: tuple[str, ...] = (),
+    early: EarlyExit | None = None,
+    ordered: bool = False,
+    serving: bool = True,
+    announce: Callable[[str], object] = log.info,
+    hand: HandParts | None = None,
+) -> Box:
+    """Put the components together. codes: number of labels that the class bits hold. hand: the
+    parts for several fingers."""
+    commands = {**commands, "LABEL": partial(_label, codes)}
+    trigger = _trigger(
+        settings.trigger, answerer.format, devices, port, stack, announce, ordered=ordered
+    )
+    watching = [*observers, *([capture] if capture else []), *_watches(trigger)]
+    if isinstance(trigger, CommandTrigger):
+        commands = {**commands, **trigger.commands}
+    lines = _outputs(settings, devices, stack)
+    sensor = hand.sensor if hand else skins.own_sensor(settings, answerer.format, devices, capture)
+    stack.callback(sensor.close)
+    if port:
+        stack.callback(port.close)
+    if lines and settings.output.class_bits:  # last: it waits for output.settle_us
+        watching.append(LineSink(lines, codes))
+    cutter = hand.cutter if hand else SweepCutter(answerer.format, settings.sweep)
+    return Box(
+        Pipeline(sensor, trigger, cutter, answerer, early),
+        devices.clock,
+        port=port,
+        panel=lines if serving or lines is None else NotServing(lines),
+        observers=watching,
+        commands=commands,
+        source=devices.source,
+        state_s=settings.serial.state_s,
+    )
+
+
+def _watches(trigger: Trigger) -> list[Observer]:
+    """The observers that a trigger without lines needs."""
+    if isinstance(trigger, KeyTrigger):
+        return [AnswerWatch(trigger)]
+    return [StreamWatch(trigger)] if isinstance(trigger, TimedTrigger) else []
+
+
+def _trigger(
+    config: TriggerConfig,
+    format: SweepFormat,
+    devices: Devices,
+    port: Port | None,
+    stack: ExitStack,
+    announce: Callable[[str], object],
+    *,
+    ordered: bool,
+) -> Trigger:
+    """The trigger of the settings. Raises ConfigError if nothing could start and stop sweeps."""
+    if config.mode == "serial":
+        if not ordered and (port is None or isinstance(port, StdoutPort)):
+            raise ConfigError(
+                'trigger.mode = "serial" takes START and STOP from the serial line, but '
+                "serial.port is not set; set it, or use --trigger key, or the page of palpate "
+                "record --web"
+            )
+        return CommandTrigger(devices.clock, devices.commanded)
+    if config.mode == "key":
+        return stack.enter_context(KeyTrigger(standard_input(), devices.clock, announce))
+    if config.mode == "timed":
+        window_s = format.window / format.rate_hz
+        if config.sweep_s < window_s:
+            raise ConfigError(
+                f"a sweep of {config.sweep_s:g} s is shorter than the window of {window_s:g} s; "
+                "use a longer --sweep"
+            )
+        return TimedTrigger(config, devices.clock, announce)
+    missing = next((k for k in ("start", "stop") if not getattr(config, k)), None)
+    if missing == "start" or (missing and config.mode == "two-lines"):
+        raise ConfigError(
+            f"trigger.{missing} has no GPIO line, so no sweep can be cut; choose a board with "
+            "--board, or a trigger without lines: --trigger serial, key or timed"
+        )
+    return stack.enter_context(GpioTrigger(config, gpio(devices)))
+
+
+def _label(labels: tuple[str, ...], code: str) -> list[object]:
+    """The label with this code on the class bits, and the number of labels. Raises FormatError if
+    no label has this code."""
+    if not labels:
+        raise FormatError("sweeps are recorded without a bundle, so there are no labels")
+    if not (code.isdecimal() and 1 <= int(code) <= len(labels)):
+        raise FormatError(f"label {code} is not there; use 1 to {len(labels)}")
+    return [int(code), labels[int(code) - 1], len(labels)]
+
+
+def _outputs(settings: Config, devices: Devices, stack: ExitStack) -> Lines | None:
+    """The GPIO lines to the robot, None if none is wired."""
+    out = settings.output
+    if not any((out.ready, out.busy, out.result_valid, out.fault, out.decided, *out.class_bits)):
+        return None
+    return stack.enter_context(Lines(out, gpio(devices), devices.clock))
+
+
+def gpio(devices: Devices) -> Any:
+    """The module gpiod, or its simulated double; imported only if a GPIO line is wired."""
+    if devices.gpio is not None:
+        return devices.gpio
+    import gpiod
+
+    return gpiod
+
+
+def classifier(settings: Config, bundle: Bundle, clock: Clock) -> Classifier:
+    """The classifier with these settings."""
+    chosen = settings.classifier
+    return Classifier(
+        bundle,
+        clock,
+        chosen.fuse,
+        chosen.min_probability,
+        chosen.max_sweeps,
+        chosen.conflict,
+        chosen.object_s,
+    )
+
+
+def early_exit(settings: Config, run: Classifier) -> EarlyExit | None:
+    """The early exit, None unless the settings ask for it."""
+    return EarlyExit(run) if settings.classifier.early else None
+
+
+def prove(settings: Config, bundle: Bundle) -> None:
+    """Raises BundleError or ConfigError if this machine, with these settings, does not run a bundle
+    correctly."""
+    if settings.skins:
+        from palpate.runtime import hand
+
+        of = of_fingers(settings, bundle, answers=True)
+        hand.classifier(settings, of, SystemClock()).self_test()
+    else:
+        run = classifier(settings, bundle, SystemClock())
+        run.self_test()
+        early_exit(settings, run)
+    if settings.output.class_bits:
+        check_bits(1 << len(settings.output.class_bits), bundle.manifest.labels)
+
+
+def store(settings: Config) -> Store:
+    """The store of bundles that the settings name. Its bundle serves all fingers, so those of one
+    alone do not suffice to prove one."""
+    box = settings.hand or settings
+    return Store(settings.store, lambda bundle: prove(box, bundle), taught=settings.teach.allow)
+
+
+def running(settings: Config, *, answers: bool = True) -> SignedBundle:
+    """The bundle that the settings name, else the deployed bundle, else the packaged bundle.
+
+    answers: whether a robot gets its answers. Then it must be signed, unless
+    classifier.allow_unsigned is set. Raises BundleError or ConfigError.
+    """
+    name = settings.classifier.bundle
+    return named(settings, Path(name), answers=answers) if name else store(settings).running()
+
+
+def named(settings: Config, folder: Path, *, answers: bool) -> SignedBundle:
+    """The bundle in `folder`, from a setting or an option; otherwise as `running`."""
+    if settings.classifier.allow_unsigned or not answers:
+        files = bundles.files(folder)
+        return SignedBundle(bundles.from_files(files, str(folder)), "", files)
+    try:
+        return store(settings).bundles.read(folder)
+    except ApplianceError as e:
+        raise type(e)(
+            f"{e}; a bench may allow unsigned bundles, by classifier.allow_unsigned = true"
+        ) from e
+
+
+def of_fingers(settings: Config, common: Bundle, *, answers: bool) -> dict[str, Bundle]:
+    """The bundle of each finger: its own, or else `common`. answers: as for `running`. Raises
+    BundleError or ConfigError."""
+    return {
+        finger: named(settings, Path(own.bundle), answers=answers).bundle if own.bundle else common
+        for finger, own in settings.skins.items()
+    }
+
+
+def port(settings: Config, devices: Devices) -> Port | None:
+    """The serial line, or standard output if no line is configured. Sentences are not written to
+    the journal, which people read."""
+    if settings.serial.port:
+        return SerialSink(settings.serial, devices.clock, devices.source)
+    return None if in_journal() else StdoutPort(devices.source)

@@ -1,0 +1,497 @@
+"""The loop of the box, in one thread: from frames, edges and commands to verdicts, states and
+answers.
+
+`assembly` chooses the devices. The loop does not depend on whether they are real or simulated.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, Protocol
+
+from numpy.typing import NDArray
+
+from palpate.core.clock import Clock
+from palpate.core.errors import ApplianceError, ModelError
+from palpate.core.health import Health
+from palpate.core.log import TroubleLog, log
+from palpate.core.observer import Observer
+from palpate.core.sentences import sentence
+from palpate.core.types import Edge, Status, Sweep, SweepFormat, Verdict, entries
+from palpate.inference.early_exit import EarlyExit
+from palpate.io.robot_link import Command, Port
+from palpate.io.sensor import Sensor, SensorCounters
+from palpate.io.trigger import Trigger
+from palpate.sweeps.sweep_window import SweepCutter
+
+TARE_S = 0.5
+"""Length of the latest signal that a tare averages."""
+FAILURES, SOUND = 3, 20
+"""The program ends after this many `failed` sweeps, each less than SOUND sweeps after the last. It
+is started again, and the end counts against a bundle on trial."""
+
+CommandHandler = Callable[[str], list[object]]
+"""Carries out a command: its text -> the fields of its answer. An ApplianceError becomes the
+answer."""
+
+
+class Panel(Protocol):
+    """The GPIO lines that show the robot the state of the box."""
+
+    def show(self, *, ready: bool, busy: bool, fault: bool, decided: bool = False) -> None:
+        """Drive READY, BUSY, FAULT and DECIDED."""
+        ...
+
+
+class Answerer(Protocol):
+    """Gives each sweep its verdict: the classifier, or SweepCheck in recordings without a
+    bundle."""
+
+    @property
+    def format(self) -> SweepFormat:
+        """The format of the sweeps."""
+        ...
+
+    @property
+    def model(self) -> str:
+        """The id of the bundle, "" without a bundle."""
+        ...
+
+    @property
+    def degraded(self) -> str:
+        """Taxels that are broken over the stream and bridged, "" for none."""
+        ...
+
+    def __call__(self, sweep: Sweep) -> Verdict:
+        """The verdict on one sweep."""
+        ...
+
+    def about(self) -> dict[str, Any]:
+        """Entries for the sidecar of a recorded sweep, for JSON."""
+        ...
+
+    def describe(self) -> list[object]:
+        """The first fields of the answer to ID: name, version, id, format."""
+        ...
+
+    def test(self) -> str:
+        """Run a self-test; returns its result in words. Raises ApplianceError if it fails."""
+        ...
+
+    def set_tare(self, taxels: NDArray[Any]) -> str:
+        """Take frames [n, R, C] as the unloaded skin; returns a message for a person."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Pipeline:
+    """The stages between a sweep and its verdict. early: answers unfinished sweeps, or None."""
+
+    sensor: Sensor
+    trigger: Trigger
+    cutter: SweepCutter
+    answerer: Answerer
+    early: EarlyExit | None = None
+
+
+class Box:
+    """Turns triggers into verdicts. `step` is one turn of the loop: read, cut, classify, answer,
+    listen.
+
+    port: sends verdicts and state sentences and receives commands, or None. panel: READY, BUSY,
+    FAULT, DECIDED, or None. observers: called in this order, after the port. commands: further
+    commands by name. source: origin of the frames, as in sentences. state_s: time between two state
+    sentences.
+    """
+
+    def __init__(
+        self,
+        pipeline: Pipeline,
+        clock: Clock,
+        *,
+        port: Port | None = None,
+        panel: Panel | None = None,
+        observers: Sequence[Observer] = (),
+        commands: Mapping[str, CommandHandler] = MappingProxyType({}),
+        source: str = "usb",
+        state_s: float = 1.0,
+    ) -> None:
+        self.answered = 0
+        self._unanswered: deque[Sweep] = deque()  # cut, but not sent yet
+        self._asked: deque[Command] = deque()  # commands that were not carried out yet
+        self._edges: list[Edge] = []  # edges that the cutter has not taken yet
+        self._failures, self._sound, self._failure = 0, 0, ""
+        self._sensor, self._trigger, self._cutter = (
+            pipeline.sensor,
+            pipeline.trigger,
+            pipeline.cutter,
+        )
+        self._answerer, self._early = pipeline.answerer, pipeline.early
+        self._clock, self._port, self._panel, self._commands = clock, port, panel, commands
+        self._source, self._state_ns = source, round(state_s * 1e9)
+        # only overridden methods of observers are called, so nothing is computed in vain
+        self._on_frames = [o.frames for o in observers if type(o).frames is not Observer.frames]
+        self._on_edges = [o.edges for o in observers if type(o).edges is not Observer.edges]
+        self._on_command = [o.command for o in observers if type(o).command is not Observer.command]
+        self._on_answered = [
+            o.answered for o in observers if type(o).answered is not Observer.answered
+        ]
+        self._on_sweep = [o.sweep for o in observers if type(o).sweep is not Observer.sweep]
+        self._on_turn = [o.turn for o in observers if type(o).turn is not Observer.turn]
+        self._on_stopping = [
+            o.stopping for o in observers if type(o).stopping is not Observer.stopping
+        ]
+        self._decided = False
+        self._next_state_ns = self._turn_ns = clock.now_ns()
+        self._skin_log = TroubleLog("skin", end="skin: streaming", known=False)
+        self._observer_log = TroubleLog("a part of the program failed", "the answers go on")
+        self._early_log = TroubleLog("early answers failed", "the whole sweeps are answered")
+        self._port_log = TroubleLog(
+            "serial", end=f"serial: {port.name} open" if port else "", known=False
+        )
+
+    @property
+    def counters(self) -> SensorCounters:
+        """Counters of the sensor since the start."""
+        return self._sensor.counters
+
+    @property
+    def format(self) -> SweepFormat:
+        """The format of its sweeps."""
+        return self._answerer.format
+
+    def newest_frame(self) -> NDArray[Any] | None:
+        """The newest frame [R, C] or [R, C, A] of raw counts, None before the first."""
+        frames = self._cutter.latest(1)
+        return None if frames is None else frames[0]
+
+    def run(self, stopped: Callable[[], bool]) -> None:
+        """Take turns until `stopped()`. At the end, also after an exception, answer an open sweep
+        with `aborted`."""
+        try:
+            while not stopped():
+                self.step()
+            self._notify(self._on_stopping)
+        finally:
+            self._end()
+
+    def step(self) -> list[Verdict]:
+        """One turn, which takes at most the sensor's timeout. Returns the verdicts that were sent.
+
+        Raises ModelError after FAILURES sweeps that could not be classified; they are answered.
+        """
+        frames = self._sensor.read()
+        now = self._turn_ns = self._clock.now_ns()
+        self._cutter.put(frames, now)
+        if len(frames):
+            self._notify(self._on_frames, frames)
+        # before the edges of this turn: a capture gives frames and edges in turns of their own
+        verdicts = self._decide(now)
+        self._take_edges(now, ready=self._able)
+        if self._sensor.state != "streaming":
+            self._cutter.interrupt(Status.SENSOR_LOST, now)
+        self._show()
+        verdicts += self._answer(self._cutter.finished(now))
+        self._report(now)
+        if self._on_turn:
+            self._notify(self._on_turn, self.health)
+        if self._failures >= FAILURES:
+            raise ModelError(f"{self._failures} sweeps could not be classified: {self._failure}")
+        return verdicts
+
+    def _take_edges(self, now_ns: int, *, ready: bool) -> None:
+        self._edges += self._trigger.edges(now_ns)
+        # first into the cutter: no edge may be lost between the two, whatever fails
+        self._cutter.trigger(self._edges, ready, now_ns)
+        edges, self._edges = self._edges, []
+        if edges:
+            self._notify(self._on_edges, now_ns, edges)
+
+    def _end(self) -> None:
+        """Answer each sweep that is still open, whatever has failed. A step that fails is tried
+        twice."""
+        now = self._turn_ns
+        for what, act in (
+            ("the last commands", self._obey_asked),
+            ("the last edges", lambda: self._take_edges(self._clock.now_ns(), ready=True)),
+            ("the open sweep", lambda: self._abort_all(now)),
+        ):
+            _succeeds(what, act) or _succeeds(what, act)
+        for _ in range(len(self._unanswered) + 1):
+            _succeeds("the last answers", lambda: self._send_aborted(now))
+
+    def _abort_all(self, now_ns: int) -> None:
+        self._cutter.interrupt(Status.ABORTED, now_ns)
+        self._unanswered.extend(self._cutter.finished(now_ns))
+
+    def _send_aborted(self, now_ns: int) -> None:
+        while self._unanswered:
+            sweep = self._unanswered[0]
+            verdict = self._aborted(sweep, now_ns)
+            self._send(verdict)
+            self._pass_on([sweep], [verdict])
+
+    def _aborted(self, sweep: Sweep, now_ns: int) -> Verdict:
+        """The answer to a sweep that was cut but not classified."""
+        status = Status.ABORTED if sweep.status is Status.OK else sweep.status
+        return Verdict.without_label(sweep, status, "", now_ns, self._answerer.model)
+
+    def _notify(self, calls: Iterable[Callable[..., None]], *event: Any) -> None:
+        """Call the observers. A fault in one must not stop the classifying, so only expected errors
+        of the outputs are raised."""
+        for call in calls:
+            try:
+                call(*event)
+            except ApplianceError:
+                raise
+            except Exception as e:
+                of = getattr(call, "__qualname__", call)
+                self._observer_log.update(f"{of}: {type(e).__name__}: {e}")
+
+    @property
+    def _able(self) -> bool:
+        """True while a sweep could be taken."""
+        return self._sensor.state == "streaming" and not self._trigger.blind
+
+    def _show(self) -> None:
+        sweeping, able = self._cutter.sweeping, self._able
+        self._decided = self._decided and not sweeping
+        if self._panel:
+            self._panel.show(
+                ready=able and not sweeping, busy=sweeping, fault=not able, decided=self._decided
+            )
+
+    def _decide(self, now_ns: int) -> list[Verdict]:
+        """Answer the open sweep early, if the settings allow it and the bundle can."""
+        if not self._early:
+            return []
+        for sweep in self._cutter.so_far(self._early.steps, now_ns):
+            if verdict := self._early_verdict(self._early, sweep):
+                self._cutter.settle()
+                self._unanswered.append(sweep)
+                self._send(verdict)
+                self._decided = True
+                self._show()
+                self._pass_on([sweep], [verdict])
+                return [verdict]
+        return []
+
+    def _early_verdict(self, early: EarlyExit, sweep: Sweep) -> Verdict | None:
+        try:
+            verdict = early(sweep)
+        except Exception as e:  # the classes of onnxruntime have no other base in common
+            self._early_log.update(f"{type(e).__name__}: {e}")
+            return None
+        self._early_log.update("")
+        return verdict
+
+    def _answer(self, sweeps: list[Sweep]) -> list[Verdict]:
+        self._unanswered.extend(sweeps)
+        verdicts = [self._classified(sweep) for sweep in sweeps]
+        for verdict in verdicts:
+            self._send(verdict)
+        self._pass_on(sweeps, verdicts)
+        return verdicts
+
+    def _classified(self, sweep: Sweep) -> Verdict:
+        """The verdict on one sweep; `failed` with the reason if it cannot be computed."""
+        try:
+            verdict = self._answerer(sweep)
+        except Exception as e:  # as in _early_verdict
+            self._failures, self._sound = self._failures + 1, 0
+            self._failure = str(e) or type(e).__name__
+            now_ns, model = self._clock.now_ns(), self._answerer.model
+            return Verdict.without_label(sweep, Status.FAILED, self._failure, now_ns, model)
+        self._sound += sweep.status is Status.OK
+        if self._sound >= SOUND:
+            self._failures = self._sound = 0
+        return verdict
+
+    def _pass_on(self, sweeps: Iterable[Sweep], verdicts: Sequence[Verdict]) -> None:
+        """Give answered sweeps to the observers that keep them. This comes after all answers,
+        because disks are slow."""
+        if not (verdicts and self._on_sweep):
+            return
+        circumstances = self.circumstances()
+        for sweep, verdict in zip(sweeps, verdicts, strict=True):
+            self._notify(self._on_sweep, sweep, verdict, circumstances)
+
+    def _send(self, verdict: Verdict) -> None:
+        if self._port:
+            self._port.send(verdict, loss_known=self._sensor.loss_known)
+        if self._unanswered:
+            self._unanswered.popleft()
+        self.answered += 1
+        self._notify(self._on_answered, verdict)
+
+    def _report(self, now_ns: int) -> None:
+        """Log changes, answer commands, and send the state every `state_s`."""
+        trouble = str(self._sensor.trouble or "")
+        if trouble or self._sensor.state == "streaming":  # not before its first frame
+            self._skin_log.update(trouble)
+        if not self._port:
+            return
+        self._asked.extend(self._port.commands())
+        self._obey_asked()
+        self._port_log.update(self._port.trouble)
+        if now_ns >= self._next_state_ns:
+            self._next_state_ns = now_ns + self._state_ns
+            self._port.say(sentence("STA", *self._state()))
+
+    @property
+    def health(self) -> Health:
+        """The state now."""
+        sensor, counters, edges = self._sensor, self._sensor.counters, self._trigger.edge_counters
+        return Health(
+            time_ns=self._clock.now_ns(),
+            skin=sensor.state,
+            trouble=str(sensor.trouble or ""),
+            streams=sensor.state == "streaming",
+            sweeping=self._cutter.sweeping,
+            answered=self.answered,
+            frames=counters.frames,
+            lost_frames=counters.lost_frames,
+            garbage_bytes=counters.garbage_bytes,
+            enumerations=counters.enumerations,
+            dropped=self._port.dropped if self._port else 0,
+            bundle=self._answerer.model,
+            source=self._source,
+            stale_frames=counters.stale_frames,
+            overflows=counters.overflows,
+            fifo_overflows=counters.fifo_overflows,
+            glitches=edges.glitches,
+            lost_edges=edges.lost_edges,
+            storms=edges.storms,
+            loss_known=sensor.loss_known,
+            ready=self._able and not self._cutter.sweeping,
+            degraded=self._answerer.degraded,
+            foreign_frames=counters.foreign_frames,
+            due_ns=self._trigger.due_ns,
+        )
+
+    def circumstances(self) -> dict[str, Any]:
+        """The present entries for the sidecar of a recorded sweep, for JSON.
+
+        device: the readout board's name, serial number and firmware, None before it was asked.
+        clock: see DeviceClock.quality. trigger: see Trigger.about. loss_known: whether lost frames
+        can be detected.
+        """
+        who = self._sensor.identity
+        return {
+            "device": entries(who) if who else None,
+            "clock": self._sensor.clock,
+            "loss_known": self._sensor.loss_known,
+            "trigger": self._trigger.about,
+            "source": self._source,
+            **self._answerer.about(),
+        }
+
+    def _state(self) -> list[object]:
+        """Fields of the STA sentence (PROTOCOL.md, part 2)."""
+        h = self.health
+        return [
+            f"{h.time_ns / 1e9:.3f}",
+            h.skin,
+            int(h.sweeping),
+            h.answered,
+            h.frames,
+            h.lost_frames,
+            h.garbage_bytes,
+            h.enumerations,
+            h.dropped,
+            h.bundle,
+            h.source,
+            h.stale_frames,
+            h.overflows,
+            h.fifo_overflows,
+            h.glitches,
+            h.lost_edges,
+            h.storms,
+            *_last_fields(h),
+        ]
+
+    def _obey_asked(self) -> None:
+        while self._port and self._asked:
+            self._port.say(self._answer_to(self._asked.popleft()))
+
+    def _answer_to(self, command: Command) -> bytes:
+        """Carry out a command; returns its ANS sentence."""
+        if command.error:
+            return sentence("ANS", command.name, "error", command.error)
+        try:
+            return sentence("ANS", command.name, "ok", *self.obey(command))
+        except Exception as e:  # also one that nobody expected: the robot waits for an answer
+            return sentence("ANS", command.name, "error", str(e) or type(e).__name__)
+
+    def obey(self, command: Command) -> list[object]:
+        """Carry out a command of any origin; returns the fields of its answer.
+
+        To be called between two turns or in an observer's `turn`. Raises ApplianceError with the
+        reason for a refusal.
+        """
+        self._notify(self._on_command, self._turn_ns, command.line)
+        if command.name in self._commands:
+            return self._commands[command.name](command.text)
+        if command.name in ("START", "STOP"):
+            raise ApplianceError("sweeps are triggered otherwise; set trigger.mode to serial")
+        if command.name not in _COMMANDS:
+            raise ApplianceError("nothing is recorded now; use palpate record")
+        return _COMMANDS[command.name](self)
+
+    def _identity(self) -> list[object]:
+        who = self._sensor.identity
+        skin = f"{who.board} {who.serial} {'.'.join(map(str, who.firmware))}" if who else "none"
+        return [*self._answerer.describe(), skin]
+
+    def _self_test(self) -> list[object]:
+        return [self._answerer.test()]
+
+    def _tare(self) -> list[object]:
+        """Take the mean of the latest signal as the unloaded skin."""
+        frames = self._cutter.latest(max(1, round(TARE_S * self.format.rate_hz)))
+        if frames is None or self._cutter.sweeping or self._sensor.state != "streaming":
+            raise ApplianceError(
+                f"tare needs {TARE_S} s of signal without loss and outside a sweep; try again"
+            )
+        return [self._answerer.set_tare(frames)]
+
+    def _new_object(self) -> list[object]:
+        self._cutter.new_object()
+        return []
+
+    def _abort(self) -> list[object]:
+        if not self._cutter.interrupt(Status.ABORTED, self._clock.now_ns()):
+            raise ApplianceError("no sweep is open, so there is nothing to abort")
+        return []
+
+
+def _succeeds(what: str, act: Callable[[], object]) -> bool:
+    """Whether `act` raises no exception. An exception is logged, because the next step must be done
+    as well."""
+    try:
+        act()
+    except Exception as e:
+        log.error(f"{what}: {type(e).__name__}: {e}")
+        return False
+    return True
+
+
+def _last_fields(h: Health) -> list[object]:
+    """The fields of STA that are often missing: whether lost frames cannot be seen, and broken
+    taxels."""
+    if h.degraded:
+        return ["" if h.loss_known else 1, h.degraded]
+    return [] if h.loss_known else [1]
+
+
+_COMMANDS: dict[str, Callable[[Box], list[object]]] = {
+    "ID": Box._identity,
+    "STATE": Box._state,
+    "TEST": Box._self_test,
+    "TARE": Box._tare,
+    "NEW": Box._new_object,
+    "ABORT": Box._abort,
+}

@@ -1,0 +1,305 @@
+"""Classifies recorded data again (captures, kept sweeps, folders of sweeps) and compares the
+verdicts.
+
+A kept sweep is classified under its original conditions: the same rule, tare, time, and previous
+sweeps of its object. So the verdict must equal the verdict in its sidecar, bit for bit.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import astuple, dataclass, replace
+from pathlib import Path
+from typing import Any, get_args, get_type_hints
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.bundle.bundle import Bundle
+from palpate.core.config import ClassifierConfig, Config
+from palpate.core.errors import FormatError
+from palpate.core.schema import typed
+from palpate.core.types import Status, Sweep, SweepFormat, Verdict, load, sidecar
+from palpate.inference.classifier import Classifier
+from palpate.inference.early_exit import EarlyExit
+from palpate.io.robot_link import StdoutPort, result
+from palpate.runtime import assembly
+from palpate.runtime.loop import Box, Pipeline
+from palpate.signal.broken_taxels import BrokenTaxels
+from palpate.sweeps.capture import Playback
+from palpate.sweeps.sweep_window import SweepCutter
+
+SAME, ALONE, DIFFERENT = "the same", "the same by itself", "DIFFERENT"
+"""Outcomes of a comparison. SAME: the verdict is the same, bit for bit. ALONE: the scores of this
+sweep are the same, but earlier sweeps of its object are missing."""
+SILENT, OTHER, BROKEN = "no verdict to compare with", "of another bundle", "not readable"
+OLD_RULE_KEYS = {"how": "fuse", "sure": "min_probability", "most_sweeps": "max_sweeps"}
+"""Keys of the rule in sidecars up to schema 2, with the present keys."""
+CHOICES = {name: get_args(get_type_hints(ClassifierConfig)[name]) for name in ("fuse", "conflict")}
+
+
+class OtherBundle(FormatError):
+    """A kept sweep that another bundle has classified."""
+
+
+def replay(path: Path, settings: Config, bundle: Bundle, out: Callable[[str], object]) -> int:
+    """Replay the file or folder at `path`: write its sentences, and for each kept sweep whether the
+    verdict is the same.
+
+    out: called with each line. Returns 1 if a verdict differs, else 0. Raises FormatError for an
+    unreadable file, another format or another bundle.
+    """
+    if path.is_dir():
+        return _folder(path, SweepReplay(settings, bundle), out)
+    if path.suffix != ".npy":
+        _capture(path, settings, bundle)
+        return 0
+    classify = SweepReplay(settings, bundle)
+    *_, last = [classify(kept) for kept in _with_earlier(path)]
+    return int(_print(path, last, out) == DIFFERENT)
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayRule:
+    """The classifier's settings at the time of the sweep. The fields are the sidecar's keys; older
+    sidecars have only the first three, and only NEW OBJECT ended an object.
+
+    Raises TypeError for an unknown fusion or conflict.
+    """
+
+    fuse: str
+    min_probability: float
+    max_sweeps: int
+    conflict: str = "fuse"
+    object_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, known in CHOICES.items():
+            if (value := getattr(self, name)) not in known:
+                raise TypeError(f"{name} {value!r} is not one of {', '.join(known)}")
+
+    @classmethod
+    def read(cls, about: Mapping[str, Any]) -> ReplayRule | None:
+        """The rule of a sidecar, None if the sidecar has no rule. Raises TypeError or ValueError.
+
+        Sidecars up to schema 2 are read under the names that the settings had then.
+        """
+        rule = about.get("rule")
+        if "rule" not in about:
+            return None
+        if isinstance(rule, dict) and about["schema"] < 3:
+            rule = {OLD_RULE_KEYS.get(name, name): value for name, value in rule.items()}
+        return typed(cls, rule)
+
+
+@dataclass(frozen=True, slots=True)
+class KeptSweep:
+    """A kept sweep with the content of its sidecar; older sidecars have fewer entries.
+
+    object: the folder, run and object number that fused sweeps share. rule: None without an entry.
+    tare: [R, C] or [R, C, A] raw counts, None without an entry. bundle: its id, or "". verdict: as
+    `Verdict.as_dict` returns it, or empty. broken: taxels that were broken over the stream.
+    """
+
+    sweep: Sweep
+    format: SweepFormat
+    object: tuple[Path, int, int]
+    rule: ReplayRule | None
+    tare: NDArray[np.float64] | None
+    bundle: str
+    verdict: dict[str, Any]
+    broken: BrokenTaxels | None = None
+
+    @classmethod
+    def read(cls, path: Path) -> KeptSweep:
+        """The sweep at `path`. Raises FormatError."""
+        sweep, format = load(path)
+        about = sidecar(path)
+        try:
+            tare = (
+                np.broadcast_to(np.asarray(about["tare"], np.float64), format.shape)
+                if "tare" in about
+                else None
+            )
+            rule = ReplayRule.read(about)
+            touched = path.parent, int(about.get("run", 0)), sweep.object
+            verdict = dict(about.get("verdict", {}))
+            if any(type(verdict.get(name, 0)) is not int for name in ("fused", "after", "time_ns")):
+                raise TypeError("the verdict's fused, after and time_ns must be whole numbers")
+            broken = BrokenTaxels.read(about.get("broken"), format)
+            return cls(sweep, format, touched, rule, tare, about.get("bundle", ""), verdict, broken)
+        except (TypeError, ValueError) as e:
+            raise FormatError(
+                f"{path}: its sidecar cannot be used: {e}; use a sweep that was not changed"
+            ) from e
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayResult:
+    """The result for a kept sweep. verdict: None if the replay gives no verdict."""
+
+    verdict: Verdict | None
+    outcome: str
+    detail: str = ""
+
+
+class ReplayClock:
+    """A clock that stands still until it is set, so that a verdict gets its original time."""
+
+    def __init__(self) -> None:
+        self.t_ns = 0
+
+    def now_ns(self) -> int:
+        """The time that was set."""
+        return self.t_ns
+
+    def sleep_until(self, t_ns: int) -> None:
+        """Return at once; a replay does not wait."""
+
+
+class SweepReplay:
+    """Classifies kept sweeps again, in their order, and fuses the sweeps of each object."""
+
+    def __init__(self, settings: Config, bundle: Bundle) -> None:
+        self._settings, self._bundle = settings, bundle
+        self._clock = ReplayClock()
+        self._classifier: Classifier | None = None
+        self._made: object = None  # folder, run and rule of the classifier
+        # (object, number) of the last sweep with probabilities whose earlier sweeps are all there
+        self._last: object = None
+
+    def __call__(self, kept: KeptSweep) -> ReplayResult:
+        """The verdict on `kept`, compared with the verdict in its sidecar. Raises FormatError for a
+        sweep of another bundle or format."""
+        if kept.bundle not in ("", self._bundle.id):
+            raise OtherBundle(
+                f"sweep {kept.sweep.id} was classified by bundle {kept.bundle}, this is "
+                f"{self._bundle.id}; name the sweep's bundle with --set classifier.bundle=DIR"
+            )
+        _check(f"sweep {kept.sweep.id}", kept.format, self._bundle)
+        _check_length(kept.sweep, kept.format)
+        was = kept.verdict
+        fused = was.get("fused", 0)
+        # verdicts without `after` count the sweeps of an object instead
+        number, after = (kept.sweep.id, was["after"]) if "after" in was else (fused, fused - 1)
+        whole = after <= 0 or self._last == (kept.object, after)
+        if (fused or was.get("own")) and (whole or fused == 1):
+            self._last = kept.object, number
+        classifier = self._prepared(kept)
+        if not whole:
+            classifier.forget()
+        sweep = kept.sweep if whole or fused == 1 else replace(kept.sweep, object=0)
+        verdict = classifier(sweep) if sweep.share == 1 else EarlyExit(classifier)(sweep)
+        if not whole:
+            own = verdict.own if verdict else EarlyExit(classifier).scores(sweep)[-1]
+            same = own.tolist() == was.get("own")
+            return ReplayResult(
+                verdict, ALONE if same else DIFFERENT, "earlier sweeps of its object are not there"
+            )
+        if verdict is None:
+            return ReplayResult(
+                verdict, DIFFERENT, "it was answered early, which this bundle does not do"
+            )
+        if not (was and kept.bundle):  # recorded without a bundle
+            return ReplayResult(verdict, SILENT)
+        now = verdict.as_dict()
+        changed = [
+            _change(name, was[name], now.get(name)) for name in was if was[name] != now.get(name)
+        ]
+        return ReplayResult(verdict, DIFFERENT if changed else SAME, ", ".join(changed))
+
+    def _prepared(self, kept: KeptSweep) -> Classifier:
+        """The classifier with the original settings, and the fused sweeps of this replay."""
+        made = kept.object[:2], kept.rule
+        if self._classifier is None or made != self._made:
+            self._made = made
+            if kept.rule:
+                self._classifier = Classifier(self._bundle, self._clock, *astuple(kept.rule))
+            else:
+                self._classifier = assembly.classifier(self._settings, self._bundle, self._clock)
+        self._classifier.tare = self._bundle.manifest.tare if kept.tare is None else kept.tare
+        self._classifier.taxels.broken = kept.broken
+        self._clock.t_ns = kept.verdict.get("time_ns", kept.sweep.complete_ns)
+        return self._classifier
+
+
+def _change(name: str, was: object, now: object) -> str:
+    return f"other {name}" if isinstance(was, list) else f"{name} {was!r} is now {now!r}"
+
+
+def _print(path: Path, found: ReplayResult, out: Callable[[str], object]) -> str:
+    if found.verdict:
+        out(result(found.verdict, "replay").decode("ascii"))
+    out(f"{path.name}: {found.outcome}{found.detail and f' ({found.detail})'}\n")
+    return found.outcome
+
+
+def _folder(folder: Path, classify: SweepReplay, out: Callable[[str], object]) -> int:
+    """Replay all kept sweeps in `folder` and below. A sweep of another bundle is listed, but does
+    not count as a difference."""
+    outcomes: Counter[str] = Counter()
+    paths = sorted(folder.rglob("*.npy"), key=_order)
+    if not paths:
+        raise FormatError(
+            f"{folder}: no kept sweep is there; name a folder of `palpate record` or of the black "
+            "box"
+        )
+    for path in paths:
+        try:
+            found = classify(KeptSweep.read(path))
+        except FormatError as e:  # the others may be readable
+            found = ReplayResult(None, OTHER if isinstance(e, OtherBundle) else BROKEN, str(e))
+        outcomes[_print(path, found, out)] += 1
+    out(f"{len(paths)} sweeps: {', '.join(f'{n} {outcome}' for outcome, n in outcomes.items())}\n")
+    return int(bool(outcomes.keys() & {DIFFERENT, BROKEN}) or outcomes[OTHER] == len(paths))
+
+
+def _order(path: Path) -> tuple[Path, int, str]:
+    return path.parent, len(path.name), path.name
+
+
+def _with_earlier(path: Path) -> list[KeptSweep]:
+    """The earlier sweeps of the object in the same folder, then the sweep at `path`. Raises
+    FormatError."""
+    found = [KeptSweep.read(path)]
+    if found[0].sweep.object:
+        for earlier in sorted(
+            (p for p in path.parent.glob("*.npy") if _order(p) < _order(path)), key=_order
+        )[::-1]:
+            kept = KeptSweep.read(earlier)
+            if kept.object != found[0].object:
+                break
+            found.insert(0, kept)
+    return found
+
+
+def _check(what: str, format: SweepFormat, bundle: Bundle) -> None:
+    if format != bundle.format:
+        raise FormatError(
+            f"{what} is of {format}, the bundle wants {bundle.format}; name its bundle with --set "
+            "classifier.bundle=DIR"
+        )
+
+
+def _check_length(sweep: Sweep, format: SweepFormat) -> None:
+    n = len(sweep.frames)
+    if sweep.status is Status.OK and not (
+        n == format.window if sweep.share == 1 else 0 < n < format.window
+    ):
+        raise FormatError(
+            f"sweep {sweep.id} has {n} frames, share {sweep.share}, of {format}; use a sweep that "
+            "was not changed"
+        )
+
+
+def _capture(path: Path, settings: Config, bundle: Bundle) -> None:
+    """Run the box on a capture, which replaces sensor, trigger, clock and commands."""
+    play = Playback(path)
+    _check(str(path), play.format, bundle)
+    classifier = assembly.classifier(settings, bundle, play)
+    port = StdoutPort("replay", play.commands)
+    cutter = SweepCutter(bundle.format, settings.sweep)
+    pipeline = Pipeline(play, play, cutter, classifier, assembly.early_exit(settings, classifier))
+    box = Box(pipeline, play, port=port, observers=[classifier], source="replay")
+    box.run(lambda: play.finished)

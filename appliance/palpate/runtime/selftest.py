@@ -1,0 +1,310 @@
+"""The self-test of `palpate check`: bundle, golden sweeps, skin, GPIO lines and port, each by
+itself."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+
+from palpate.bundle.bundle import Bundle, Manifest
+from palpate.core.config import Config
+from palpate.core.devices import Devices
+from palpate.core.errors import ApplianceError, PortError, SensorError, SensorMismatch
+from palpate.core.types import SweepFormat, shown
+from palpate.inference.classifier import Classifier
+from palpate.inference.early_exit import EarlyExit
+from palpate.io import skin_profile, skins
+from palpate.io.gpio_lines import Lines
+from palpate.io.robot_link import SerialSink
+from palpate.io.sensor import Sensor
+from palpate.io.trigger import GpioTrigger
+from palpate.io.usb_sensor import fits
+from palpate.runtime.assembly import UNSIGNED, gpio
+from palpate.signal.slide import SlideMeter
+
+UNPROVEN = "broken taxels are refused: export it again to measure how many can be bridged"
+"""Text of a bundle without `bridging`."""
+UNCHECKED = "early answers do not detect unknown materials: export it again"
+"""Text of a bundle with early answers, but without limits for them."""
+UNALLOWED = "noise, hum or another speed look like an unknown material: export it again"
+"""Text of a bundle that detects unknown materials, but has no allowances for disturbances."""
+LISTEN_S, LONGEST_S, LEAST_FRAMES = 1.0, 5.0, 50
+"""Time for which frames of the skin are counted, and for a slow skin the longest time and the
+number of frames that show its rate."""
+BOOT_S = 8.0
+"""Longest wait for the first frame of a skin that was opened; many boards boot then."""
+MOST_READING = 0.5
+"""Share of a core that reading a skin may take. The loop has one core; answers, recordings and
+readers of the feed need the rest."""
+
+
+@dataclass(frozen=True, slots=True)
+class CheckResult:
+    """The result for one component. detail: findings, or the problem and what to do."""
+
+    component: str
+    ok: bool
+    detail: str
+
+
+def check(
+    settings: Config,
+    load: Callable[[], Bundle],
+    devices: Devices,
+    spent_ns: Callable[[], int] = time.thread_time_ns,
+) -> Iterator[CheckResult]:
+    """Check all components in turn, also after a failure; the skin also without a bundle.
+
+    spent_ns: processor time that this thread has taken so far.
+    """
+    loaded: list[Bundle] = []
+    yield from _of_bundle(settings, load, devices, loaded)
+    if loaded:
+        yield CheckResult("speed", True, _speed(loaded[0].manifest))
+    yield _try(
+        "skin", lambda: _skin(settings, loaded[0].format if loaded else None, devices, spent_ns)
+    )
+    yield from _wiring(settings, devices)
+
+
+def check_hand(
+    settings: Config,
+    load: Callable[[str], Bundle],
+    devices: Devices,
+    spent_ns: Callable[[], int] = time.thread_time_ns,
+) -> Iterator[CheckResult]:
+    """As `check`, of a box with several fingers: bundle and skin of each. load: gives the bundle of
+    a finger."""
+    from palpate.runtime import hand
+
+    formats: dict[str, SweepFormat] = {}
+    for finger in settings.skins:
+        loaded: list[Bundle] = []
+        own = settings.finger(finger)
+        for found in _of_bundle(own, partial(load, finger), devices, loaded):
+            yield replace(found, component=f"{finger} {found.component}")
+        if loaded:
+            formats[finger] = loaded[0].format
+
+    def skin(group: tuple[str, ...]) -> str:
+        known = all(finger in formats for finger in group)
+        wanted = hand.whole(settings, group, formats)[0] if known else None
+        there = devices.finger(group[0])
+        return _skin(there.wire(settings.finger(group[0])), wanted, there, spent_ns)
+
+    for group in hand.groups(settings):
+        yield _try(f"{' '.join(group)} skin", partial(skin, group))
+    yield from _wiring(settings, devices)
+
+
+def _of_bundle(
+    settings: Config, load: Callable[[], Bundle], devices: Devices, loaded: list[Bundle]
+) -> Iterator[CheckResult]:
+    """The bundle, which is put into `loaded`, and its golden sweeps."""
+
+    def bundle() -> str:
+        loaded.append(load())
+        m = loaded[0].manifest
+        enrolled = "".join(
+            f", {label} enrolled from {n}" for label, n in loaded[0].enrolled.items()
+        )
+        return (
+            f"{m.name} {m.version}, {loaded[0].id}, {m.format}, {len(m.labels)} labels{enrolled}; "
+            + (f"{m.taught}; " if m.taught else "")
+            + (f"{m.bridging.text} bridged" if m.bridging else UNPROVEN)
+            + (f"; {UNCHECKED}" if m.early and not m.early.limits else "")
+            + (f"; {UNALLOWED}" if m.known and not m.disturbances else "")
+        )
+
+    def golden() -> str:
+        classifier = Classifier(loaded[0], devices.clock)
+        worst = classifier.self_test()
+        if settings.classifier.early:
+            EarlyExit(classifier)
+        return f"{len(loaded[0].golden)} sweeps, largest difference of a probability {worst:.2g}"
+
+    yield _try("bundle", bundle)
+    if settings.classifier.allow_unsigned:
+        yield CheckResult("signatures", True, f"warning: unsigned {UNSIGNED}")
+    if loaded:
+        yield _try("golden sweeps", golden)
+
+
+def _wiring(settings: Config, devices: Devices) -> Iterator[CheckResult]:
+    """Trigger, GPIO lines and serial port."""
+    yield from _triggered(settings, devices)
+    if settings.serial.port:
+        yield _try("serial port", lambda: _port(settings, devices))
+
+
+def _try(component: str, look: Callable[[], str]) -> CheckResult:
+    try:
+        return CheckResult(component, True, look())
+    except ApplianceError as e:
+        return CheckResult(component, False, str(e))
+
+
+def _speed(manifest: Manifest) -> str:
+    """The speeds that can be measured, and those of training."""
+    place, trained = manifest.contact, manifest.speeds
+    meter = SlideMeter(manifest.format, place.pitch_mm if place else None)
+    if meter.why:
+        return f"not measured: {meter.why}"
+    measured = f"measured from {meter.slowest_mm_s:.3g} to {meter.fastest_mm_s:.3g} mm/s"
+    if trained is None:
+        return f"{measured}; the bundle does not state those of training: export it again"
+    return f"{measured}, trained {trained}"
+
+
+def _skin(
+    settings: Config, wanted: SweepFormat | None, devices: Devices, spent_ns: Callable[[], int]
+) -> str:
+    """The skin's name, format and processor time, in words. wanted: format of the bundle.
+
+    Raises SensorError, also if the bundle is for another skin or this board is too slow for it.
+    """
+    format = skins.announced(settings, devices, wanted)
+    sends = _listened(settings, format, devices, spent_ns)
+    if wanted and not fits(format, wanted):
+        raise SensorMismatch(
+            f"{sends}; the bundle wants {wanted}: record sweeps of this skin and train a bundle "
+            "(palpate record needs no bundle), or deploy a bundle for this skin"
+        )
+    slow = skin_profile.warning(format)
+    return f"{sends}; warning: {slow}" if slow else sends
+
+
+def _listened(
+    settings: Config, format: SweepFormat, devices: Devices, spent_ns: Callable[[], int]
+) -> str:
+    """The frames of the skin and the share of a core for reading them, in words. Counting begins
+    with the first frame, since the start takes more processor time."""
+    sensor = skins.sensor(settings, format, devices)
+    clocked = "time" not in skins.profile(settings).lacks
+    try:
+        first_ns = _first_frame(sensor, devices.clock.now_ns)
+        begun_ns, counters, first = spent_ns(), sensor.counters, sensor.counters.frames
+        why, passed_s = _counted(sensor, format, first_ns, devices.clock.now_ns, clocked=clocked)
+        share = (spent_ns() - begun_ns) / max(round(passed_s * 1e9), 1)
+        if sensor.trouble:
+            raise sensor.trouble
+        if why:
+            raise SensorMismatch(why)
+        who = sensor.identity
+        name = f"{who.board} {who.serial}" if who else ""
+        sent = f"{shown(format.shape)} {format.dtype} at {format.rate_hz:g} Hz"
+        lost = (
+            f"{counters.lost_frames} lost"
+            if sensor.loss_known
+            else "whether frames were lost cannot be seen"
+        )
+        sends = (
+            f"{name.strip()}, {sent}, {counters.frames - first} frames in {passed_s:.1f} s, "
+            + f"{lost}, "
+            + (f"{counters.foreign_frames} foreign, " if counters.foreign_frames else "")
+            + f"{100 * share:.1f} % of a core"
+        )
+        if share > MOST_READING:
+            raise SensorError(
+                f"{sends}: {100 * MOST_READING:.0f} % at most leave room for answers, recordings "
+                "and readers; use a faster board, or a skin that sends fewer frames a second"
+            )
+        return sends
+    finally:
+        sensor.close()
+
+
+def _counted(
+    sensor: Sensor, format: SweepFormat, first_ns: int, now_ns: Callable[[], int], *, clocked: bool
+) -> tuple[str, float]:
+    """Read frames for a while: why their rate differs, "" if it does not, and the time in seconds.
+    clocked: the skin has a clock, so that the sensor compares the rate."""
+    counters, first = sensor.counters, sensor.counters.frames
+    seconds = max(LISTEN_S, min(LONGEST_S, LEAST_FRAMES / format.rate_hz))
+    points, why = [(0, first_ns)], ""
+    # a busy machine reads late: a rate that seems wrong is measured for longer
+    while (passed_s := (now_ns() - first_ns) / 1e9) < seconds or (why and passed_s < LONGEST_S):
+        before = counters.frames
+        sensor.read()
+        if counters.frames > before and not clocked:
+            points.append((counters.frames + counters.lost_frames - first, now_ns()))
+        if (now_ns() - first_ns) / 1e9 >= seconds and not clocked:
+            why = _another_rate(points, format.rate_hz)
+    return why, passed_s
+
+
+def _first_frame(sensor: Sensor, now_ns: Callable[[], int]) -> int:
+    """The time of the first frame. Raises SensorError if none comes within LISTEN_S, or within
+    BOOT_S from a skin that was opened: its board may boot first."""
+    begun_ns = now_ns()
+    while not sensor.counters.frames:
+        sensor.read()
+        opened = sensor.counters.enumerations and (
+            sensor.trouble is None or sensor.trouble.state in ("silent", "mismatch")
+        )
+        if now_ns() > begun_ns + (BOOT_S if opened else LISTEN_S) * 1e9:
+            raise sensor.trouble or SensorError(
+                f"the skin sent no frame within {BOOT_S} s; replug it"
+            )
+    return now_ns()
+
+
+def _another_rate(points: list[tuple[int, int]], wanted_hz: float) -> str:
+    """Why a skin without a clock sends at another rate than wanted, "" if it does not. points:
+    frames so far, and the time. One frame more or less does not count."""
+    from palpate.io import skin_stream  # boxes whose skin has a clock do without it
+
+    third = len(points) // 3
+    if third < 2:
+        return ""
+    # a frame may be read late, never early: compare the promptest of the first and the last third
+    late = [t_ns - frames * 1e9 / wanted_hz for frames, t_ns in points]
+    first, last = (
+        min(part, key=late.__getitem__) for part in (range(third), range(2 * third, len(points)))
+    )
+    frames, passed_ns = (points[last][i] - points[first][i] for i in (0, 1))
+    measured_hz = frames * 1e9 / max(passed_ns, 1)
+    wrong = abs(measured_hz / wanted_hz - 1) > skin_stream.RATE_WANDER + 1 / max(frames, 1)
+    return skin_stream.another_rate(measured_hz, wanted_hz) if wrong else ""
+
+
+def _triggered(settings: Config, devices: Devices) -> Iterator[CheckResult]:
+    if settings.trigger.mode == "serial" and not settings.serial.port:
+        hint = "set serial.port, or trigger.mode to two-lines, key or timed"
+        yield CheckResult(
+            "trigger",
+            False,
+            f"serial: START and STOP come over serial.port, which is not set; {hint}",
+        )
+    elif not settings.trigger.by_lines:
+        yield CheckResult("trigger", True, f"{settings.trigger.mode}, no lines")
+    elif settings.trigger.start:
+        yield _try("gpio lines", lambda: _lines(settings, devices))
+    else:
+        hint = "choose a board with --board, or set trigger.mode to serial, key or timed"
+        yield CheckResult("gpio lines", False, f"trigger.start has no GPIO line; {hint}")
+
+
+def _lines(settings: Config, devices: Devices) -> str:
+    module = gpio(devices)
+    with (
+        GpioTrigger(settings.trigger, module),
+        Lines(settings.output, module, devices.clock) as lines,
+    ):
+        codes = lines.capacity
+    inputs = [
+        n for n in (settings.trigger.start, settings.trigger.stop, settings.trigger.new_object) if n
+    ]
+    return f"inputs {' '.join(inputs)}, outputs for {codes} codes"
+
+
+def _port(settings: Config, devices: Devices) -> str:
+    port = SerialSink(settings.serial, devices.clock, devices.source)
+    port.commands()
+    trouble = port.trouble
+    port.close()
+    if trouble:
+        raise PortError(trouble)
+    return f"{settings.serial.port} opened at {settings.serial.baud} baud"

@@ -1,0 +1,218 @@
+"""The connection of one feed reader: its requests and its queue (PROTOCOL.md, part 4).
+
+Nothing here waits for the reader. Lines that it does not take in time are dropped and counted.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+from binascii import b2a_base64
+from collections import deque
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import islice
+from math import isfinite
+from typing import Any
+
+from palpate.core.errors import FormatError
+from palpate.core.types import Sweep
+
+QUEUE_BYTES = 64 * 1024
+"""Most bytes that wait for one reader. A larger line does not count: all readers share one copy."""
+HEARD_BYTES = 64
+"""Bytes of requests that are read at once."""
+MOST_REQUEST = 1024
+"""Longest request, in bytes."""
+MOST_HZ = 20.0
+"""Highest frame rate that a reader may request."""
+_PARTS = 64
+"""Most lines that one system call sends."""
+
+
+@dataclass(frozen=True, slots=True)
+class FeedRequest:
+    """A request of a reader. frames_hz: frames a second, 0 for none. sweeps: whether the reader
+    gets the windows of sweeps. None leaves the earlier request as it is."""
+
+    frames_hz: float | None = None
+    sweeps: bool | None = None
+
+
+def requests(data: bytes, rest: bytes = b"") -> tuple[list[FeedRequest], bytes]:
+    """The requests in `data`, which continues `rest`, and the new unfinished rest.
+
+    Raises FormatError for a line that is not a request or is longer than MOST_REQUEST.
+    """
+    *lines, rest = (rest + data).split(b"\n")
+    for line in (*lines, rest):
+        if len(line) > MOST_REQUEST:
+            raise FormatError(f"a request of over {MOST_REQUEST} bytes; end each with a line feed")
+    return [_request(line) for line in lines], rest
+
+
+def _request(line: bytes) -> FeedRequest:
+    advice = 'send {"frames": HZ} or {"sweeps": true}, as in PROTOCOL.md, part 4'
+    try:
+        asked = json.loads(line)
+    except (ValueError, RecursionError) as e:
+        raise FormatError(f"{_shown(line)} is not json; {advice}") from e
+    if not isinstance(asked, dict) or not asked or not asked.keys() <= {"frames", "sweeps"}:
+        raise FormatError(f"{_shown(line)} is not a request; {advice}")
+    hz, sweeps = asked.get("frames", 0), asked.get("sweeps", False)
+    if type(hz) not in (int, float) or not 0 <= hz <= MOST_HZ:
+        raise FormatError(f"{_shown(line)}: give frames a second as a number from 0 to {MOST_HZ:g}")
+    if type(sweeps) is not bool:
+        raise FormatError(f"{_shown(line)}: give sweeps as true or false")
+    return FeedRequest(
+        float(hz) if "frames" in asked else None, sweeps if "sweeps" in asked else None
+    )
+
+
+def _shown(line: bytes) -> str:
+    """The beginning of a line, in ASCII that is safe on every terminal."""
+    text = ascii(line[:40])[2:-1]
+    return f"{text}..." if len(line) > 40 else text
+
+
+def encode(kind: str, content: Mapping[str, Any]) -> bytes:
+    """One line of the feed. NaN and infinity, which a float skin may send, become null."""
+    values = {"type": kind, **content}
+    try:
+        text = json.dumps(values, allow_nan=False)
+    except ValueError:
+        text = json.dumps(_finite(values), allow_nan=False)
+    return text.encode() + b"\n"
+
+
+def sweep_line(sweep: Sweep) -> bytes:
+    """The line with a sweep's window. It can be large, so its data are copied as rarely as
+    possible."""
+    taxels = sweep.frames.taxels
+    about = {
+        "sweep": sweep.id,
+        "start_ns": sweep.start_ns,
+        "shape": taxels.shape,
+        "dtype": str(taxels.dtype),
+        **({"finger": sweep.finger} if sweep.finger else {}),
+    }
+    data = b2a_base64(
+        taxels.astype(taxels.dtype.newbyteorder("<"), order="C", copy=False).data, newline=False
+    )
+    return b"".join((encode("sweep", about)[:-2], b', "data": "', data, b'"}\n'))
+
+
+def _weight(line: bytes) -> int:
+    """Bytes of a reader's queue that a line takes; 0 for a line that all readers share."""
+    return len(line) if len(line) <= QUEUE_BYTES else 0
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _finite(v) for name, v in value.items()}
+    if isinstance(value, list):
+        return [_finite(v) for v in value]
+    return None if isinstance(value, float) and not isfinite(value) else value
+
+
+class Reader:
+    """One connection with its queue of lines and its requests.
+
+    due: the reader stands in the server's list of readers to write to.
+    """
+
+    def __init__(self, connection: socket.socket) -> None:
+        self.connection = connection
+        self.frames_hz, self.sweeps = 0.0, False
+        self.due = False
+        self._queue: deque[bytes] = deque()
+        self._size = 0  # bytes in the queue
+        self._begun = 0  # bytes of the first line that were sent
+        self._lost = 0  # lines that were dropped
+        self._rest = b""
+
+    @property
+    def waits(self) -> bool:
+        """Whether there is something to send."""
+        return bool(self._queue or self._lost)
+
+    def put(self, line: bytes) -> None:
+        """Queue a line. Where there is no room, the oldest lines are dropped, except one that was
+        sent in part."""
+        self._queue.append(line)
+        self._size += _weight(line)
+        first = 1 if self._begun else 0
+        while self._size > QUEUE_BYTES and len(self._queue) > first:
+            self._size -= _weight(self._queue[first])
+            del self._queue[first]
+            self._lost += 1
+
+    def put_or_miss(self, line: bytes | None) -> None:
+        """Queue a line if there is room, else count it as lost. None: a line that no reader
+        gets."""
+        if line is None or self._size + _weight(line) > QUEUE_BYTES:
+            self._lost += 1
+        else:
+            self.put(line)
+
+    def takes(self, line: bytes) -> bool:
+        """Whether this line is in the queue; part of it may be sent."""
+        return any(one is line for one in self._queue)
+
+    def send(self) -> None:
+        """Send as much as the reader takes now. Between two lines it first gets the number of
+        lines that it has lost.
+
+        Raises OSError if the reader is gone.
+        """
+        lost = 0 if self._begun else self._lost
+        if lost:
+            self._prepend(encode("lost", {"lines": lost}))
+        try:
+            parts = islice(self._queue, 1, _PARTS)
+            sent = self.connection.sendmsg([memoryview(self._queue[0])[self._begun :], *parts])
+        except BlockingIOError:
+            if lost:
+                self._drop_first()
+            return
+        self._lost -= lost
+        self._begun += sent
+        while self._queue and self._begun >= len(self._queue[0]):
+            self._begun -= len(self._queue[0])
+            self._drop_first()
+
+    def receive(self) -> list[FeedRequest]:
+        """The requests that have come since the last call.
+
+        Raises FormatError for a line that is not a request, EOFError or OSError if the reader is
+        gone.
+        """
+        try:
+            data = self.connection.recv(HEARD_BYTES)
+        except BlockingIOError:
+            return []
+        if not data:
+            raise EOFError
+        found, self._rest = requests(data, self._rest)
+        return found
+
+    def close(self, why: str = "") -> None:
+        """Send as much as the reader takes at once, then the reason, and close. The reason is left
+        out if a line was sent in part, since it would stand in the middle of that line."""
+        with suppress(OSError):
+            while self.waits:
+                before = len(self._queue)
+                self.send()
+                if len(self._queue) == before:
+                    break
+            if why and not self.waits:
+                self.connection.send(encode("closed", {"why": why}))
+        self.connection.close()
+
+    def _prepend(self, line: bytes) -> None:
+        self._queue.appendleft(line)
+        self._size += _weight(line)
+
+    def _drop_first(self) -> None:
+        self._size -= _weight(self._queue.popleft())

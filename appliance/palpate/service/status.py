@@ -1,0 +1,249 @@
+"""The content of `palpate status`: writes the state of the box and its last verdicts as a small
+JSON file, and shows this file in words.
+
+The file is in memory (/run). It is written aside and renamed, so that a reader always gets a whole
+file, and never synced.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from palpate import __version__
+from palpate.core import storage
+from palpate.core.clock import Clock
+from palpate.core.errors import ApplianceError, FormatError
+from palpate.core.health import Health
+from palpate.core.log import TroubleLog
+from palpate.core.observer import Observer
+from palpate.core.status import REASONS
+from palpate.core.types import Status, Verdict
+from palpate.service import ended
+
+SCHEMA = 1
+VERDICTS = 20
+"""Number of the latest verdicts in the file."""
+PERIOD_NS = 1_000_000_000
+SOON_NS = 100_000_000
+"""Least time between two writes if there is a new verdict or state of the skin."""
+STALE_NS = 10_000_000_000
+"""A file that has not changed for this long belongs to a program that hangs; it is the unit's
+watchdog time."""
+MOST_BYTES = 1 << 20
+_START = "systemctl start palpate, then see journalctl -u palpate"
+WELL, NOT_RUNNING, SKIN_AWAY = os.EX_OK, 1, os.EX_UNAVAILABLE
+
+
+class Report:
+    """The state of the box as an object for JSON, in the status file and in the feed.
+
+    clock: the real clock of the host, which a reader in another process shares. more: further facts
+    for JSON; `lines` shows each text among them as a line of its own, unless it is empty.
+    """
+
+    def __init__(self, clock: Clock, more: Callable[[], Mapping[str, Any]] = dict) -> None:
+        self._clock, self._more = clock, more
+        self._since_ns = clock.now_ns()
+
+    def __call__(self, health: Health) -> dict[str, Any]:
+        return {
+            **self._more(),
+            **asdict(health),
+            "time_ns": self._clock.now_ns(),
+            "since_ns": self._since_ns,
+            "pid": os.getpid(),
+            "version": __version__,
+        }
+
+
+class StatusFile(Observer):
+    """Writes the state of the box and its latest answers. The file is removed when the program ends
+    in order.
+
+    clock, more: as for Report.
+    """
+
+    def __init__(
+        self, path: Path, clock: Clock, more: Callable[[], Mapping[str, Any]] = dict
+    ) -> None:
+        self._path, self._clock, self._report = path, clock, Report(clock, more)
+        self._next_ns = clock.now_ns()
+        self._verdicts: deque[dict[str, Any]] = deque(maxlen=VERDICTS)
+        self._fresh, self._skin = False, ""
+        self._log = TroubleLog(f"status: {path} cannot be written", "classifying goes on")
+
+    def answered(self, verdict: Verdict) -> None:
+        """Note a verdict; it is written at the end of the turn."""
+        self._verdicts.append(verdict.as_dict(arrays=False))
+        self._fresh = True
+
+    def turn(self, health: Health) -> None:
+        """Write once a second, and soon after a verdict or a new state of the skin."""
+        now_ns = self._clock.now_ns()
+        if health.skin != self._skin:
+            self._skin, self._fresh = health.skin, True
+        if now_ns < self._next_ns - (PERIOD_NS - SOON_NS if self._fresh else 0):
+            return
+        self._next_ns, self._fresh = now_ns + PERIOD_NS, False
+        report = self._report(health) | {"schema": SCHEMA, "verdicts": list(self._verdicts)}
+        # every user of the box may read it; it is in memory (/run), so a card does not wear from a
+        # sync a second
+        self._log.attempt(
+            lambda: storage.put(self._path, json.dumps(report).encode(), durable=False, mode=0o644)
+        )
+
+    def stopping(self) -> None:
+        """Remove the file, which is not true any more."""
+        self._log.attempt(lambda: self._path.unlink(missing_ok=True))
+
+
+def read(path: Path, now_ns: int) -> dict[str, Any]:
+    """The content of the file, with `running`, and `why` if the service does not run. now_ns: of
+    the writer's clock.
+
+    Raises FormatError for a file of another version, ApplianceError if it may not be read.
+    """
+    try:
+        with path.open("rb") as f:
+            report = json.loads(f.read(MOST_BYTES))
+        if not isinstance(report, dict) or report.get("schema") != SCHEMA:
+            raise TypeError(f"not an object of schema {SCHEMA}")
+        pid, age_ns = int(report["pid"]), now_ns - int(report["time_ns"])
+        report["verdicts"] = [v | {"status": Status(v["status"])} for v in report["verdicts"]]
+        Health(**{name: report[name] for name in Health.__slots__})
+    except FileNotFoundError:
+        last = ended.read(path.parent)
+        why = f"the service does not run, or has just started (no {path}); {_START}"
+        return {"running": False, "why": last.text if last else why}
+    except OSError as e:
+        raise ApplianceError(
+            f"{path} cannot be read: {e.strerror}; see store.runtime, or ask as root"
+        ) from e
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as e:
+        raise FormatError(f"{path}: not a status of this version ({e}); restart the service") from e
+    why = ""
+    # a file from before the last boot can be ahead of this boot's clock
+    if not _alive(pid) or age_ns < 0:
+        last = ended.read(path.parent)
+        why = last.text if last else f"process {pid} has ended without closing down; {_START}"
+    elif age_ns > STALE_NS:
+        why = (
+            f"process {pid} has written nothing for {_span(age_ns)}, so it hangs; the service's "
+            "watchdog restarts it"
+        )
+    return report | {"running": not why, "why": why}
+
+
+def _alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except PermissionError:  # another user's process
+        return True
+    except (OSError, OverflowError):
+        return False
+    return pid > 0
+
+
+def exit_code(report: Mapping[str, Any]) -> int:
+    """0 if all is well, 69 if the skin is away, 1 if the service does not run."""
+    if not report["running"]:
+        return NOT_RUNNING
+    return WELL if report["streams"] else SKIN_AWAY
+
+
+def lines(report: Mapping[str, Any], now_ns: int) -> list[str]:
+    """The result of `read` in words: first the state and the remedy, then the last verdicts, the
+    newest first."""
+    if not report["running"]:
+        return [f"not running: {report['why']}"]
+    head = f"process {report['pid']}, palpate {report['version']}, source {report['source']}"
+    rows = [f"running for {_span(now_ns - report['since_ns'])} ({head})"]
+    facts = {
+        "skin": _skin(report),
+        "bundle": report["bundle"] or "none",
+        "sweeps": f"{report['answered']} answered",
+    }
+    if report.get("degraded"):
+        how = "bridged by its neighbours; check the skin"
+        if report["trouble"] and report["streams"]:  # of a hand
+            how = "the other fingers answer; check its cable"
+        facts["degraded"] = f"{report['degraded']}: {how}"
+    if edges := _trigger(report):
+        facts["trigger"] = edges
+    if report["dropped"]:
+        facts["serial"] = (
+            f"{report['dropped']} sentences dropped, since nobody read them; check the robot's end"
+        )
+    shown = {"version", "why", *Health.__slots__}
+    facts |= {
+        name: text
+        for name, text in report.items()
+        if name not in shown and isinstance(text, str) and text
+    }
+    rows += [f"{name:<8} {text}" for name, text in facts.items()]
+    rows += [verdict_line(v, now_ns) for v in reversed(report["verdicts"])]
+    return ["".join(c if c.isprintable() else "?" for c in line) for line in rows]
+
+
+def _skin(report: Mapping[str, Any]) -> str:
+    lost = f"{report['lost_frames']:,} lost"
+    if not report.get("loss_known", True):
+        lost = f"at least {lost}: this skin does not count its frames"
+    counted = f"{report['frames']:,} frames, {lost}"
+    if report["garbage_bytes"]:
+        counted += f", {report['garbage_bytes']:,} bytes in no packet"
+    if report["stale_frames"]:
+        counted += f", {report['stale_frames']:,} repeated or late"
+    if report["overflows"]:
+        counted += f", {report['overflows']:,} transfers too large"
+    if report["fifo_overflows"]:
+        counted += f", {report['fifo_overflows']:,} times the readout board's FIFO was full"
+    if report["foreign_frames"]:
+        counted += f", {report['foreign_frames']:,} frames of other nodes on its bus"
+    if report["enumerations"] > 1:
+        counted += f", plugged in {report['enumerations']} times"
+    return f"{report['skin']}{': ' if report['trouble'] else ''}{report['trouble']} ({counted})"
+
+
+def _trigger(report: Mapping[str, Any]) -> str:
+    """The troubles of the trigger's GPIO lines, "" for none."""
+    counts = {"glitches": "glitches", "lost_edges": "edges lost", "storms": "storms of edges"}
+    found = [f"{report[name]:,} {text}" for name, text in counts.items() if report[name]]
+    return f"{', '.join(found)}; check the GPIO lines of the trigger" if found else ""
+
+
+def verdict_line(v: Mapping[str, Any], now_ns: int) -> str:
+    """One verdict as a row. v: as in the file, with its Status."""
+    what = REASONS.get(v["status"], "")
+    if v["status"].classified:
+        what = f"{v['label']:<24}  {100 * v['probability']:5.1f} %  {v['latency_ns'] / 1e6:6.1f} ms"
+    what = "; ".join(filter(None, (what, v["detail"], fingers(v))))
+    return (
+        f"sweep {v['sweep']:>6}  {_span(now_ns - v['time_ns']):>11} ago  {v['status']:<11}  {what}"
+    )
+
+
+def fingers(v: Mapping[str, Any], names: Mapping[str, str] = MappingProxyType({})) -> str:
+    """The answers of the fingers to a sweep in words, "" for one skin. v: a verdict as in the file
+    or the feed. names: for people, of labels that have one."""
+    return ", ".join(
+        f"{of['finger']} {names.get(of['label'], of['label'])} {100 * of['probability']:.1f} %"
+        if of["label"]
+        else f"{of['finger']} {of['status']}"
+        for of in v.get("fingers", ())
+    )
+
+
+def _span(ns: int) -> str:
+    """A time for a person: its two largest units of days, hours, minutes, seconds."""
+    s = max(0, ns) // 1_000_000_000
+    parts = [(s // 86400, "d"), (s // 3600 % 24, "h"), (s // 60 % 60, "min"), (s % 60, "s")]
+    first = next((i for i, (n, _) in enumerate(parts) if n), len(parts) - 1)
+    return " ".join(f"{n} {unit}" for n, unit in parts[first : first + 2])

@@ -1,0 +1,276 @@
+"""Broken taxels: finds those that are silent or noisy, and bridges them by their neighbours. Pure
+functions of raw counts.
+
+A silent taxel does not change although its neighbours do, or gives no number: it is dead or stuck.
+A noisy taxel is far noisier than its neighbours. All limits were learned from the training sweeps
+of the bundle (train/palpate_train/export/bridging).
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.core.errors import BundleError
+from palpate.core.types import SweepFormat, digitized, normal
+from palpate.signal.load_modes import LoadModes
+from palpate.signal.taxel_statistics import TaxelStatistics
+from palpate.signal.window_check import WindowLimits, enclosed
+
+REACH = 2
+"""A taxel is compared with the taxels up to this many rows and columns away."""
+LIVELY = 0.5
+"""Neighbours with at least this share of the noise of the quietest training sweep show that the
+finger slides."""
+LEAST_FRAMES = 75
+"""Fewer frames do not show whether a taxel is noisy: their noise depends too much on chance."""
+MOST_TAXELS = 1000
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Bridging:
+    """Broken taxels that a model tolerates if they are bridged. Raises BundleError for a value out
+    of range.
+
+    taxels: largest number of broken taxels at any places. row, column: whether all broken taxels
+    may also lie in one row, or in one column. noise: a taxel is noisy from this many times the
+    noise of its neighbours. quietest: noise in counts of the quietest neighbours in training.
+    still: whether sound taxels were constant in training. loads: tell the load of a broken taxel;
+    without them its direct neighbours do.
+    """
+
+    taxels: int
+    row: bool
+    column: bool
+    noise: float
+    quietest: float
+    still: bool
+    loads: LoadModes | None = None
+
+    def __post_init__(self) -> None:
+        if type(self.taxels) is not int or not 0 <= self.taxels <= MOST_TAXELS:
+            raise BundleError(
+                f"bridging.taxels {self.taxels!r} must be a whole number from 0 to {MOST_TAXELS}"
+            )
+        for name in ("noise", "quietest"):
+            value = getattr(self, name)
+            if type(value) not in (int, float) or not 0 < value <= sys.float_info.max:
+                raise BundleError(f"bridging.{name} {value!r} must be a number above 0")
+
+    def allows(self, broken: Mask) -> bool:
+        """Whether the taxels of the mask `broken` [R, C] may be bridged together."""
+        rows, columns = broken.any(axis=1).sum(), broken.any(axis=0).sum()
+        return bool(
+            broken.sum() <= self.taxels
+            or (self.row and rows == 1 < len(broken))
+            or (self.column and columns == 1 < broken.shape[1])
+        )
+
+    @property
+    def text(self) -> str:
+        """The broken taxels that may be bridged, in words."""
+        lines = " or ".join(["one row"] * self.row + ["one column"] * self.column)
+        many = "one broken taxel" if self.taxels == 1 else f"up to {self.taxels} broken taxels"
+        taxels = many if self.taxels else ""
+        return " or ".join(filter(None, (taxels, lines))) or "no broken taxel"
+
+
+@dataclass(frozen=True, slots=True)
+class BrokenTaxels:
+    """The broken taxels of a skin, at least one. silent, noisy: masks [R, C]."""
+
+    silent: Mask
+    noisy: Mask
+
+    @classmethod
+    def of(cls, kinds: Mask) -> BrokenTaxels | None:
+        """From the two masks as one, bool [2, R, C]; None if there is no broken taxel."""
+        return cls(*kinds) if kinds.any() else None
+
+    @classmethod
+    def read(cls, kinds: Any, format: SweepFormat) -> BrokenTaxels | None:
+        """From the lists of a sidecar, [2, R, C]; None if they are None or name no taxel. Raises
+        ValueError for another shape."""
+        if kinds is None:
+            return None
+        masks = np.asarray(kinds, bool)
+        if masks.shape != (2, format.rows, format.cols):
+            raise ValueError(f"broken taxels of shape {masks.shape} do not fit {format}")
+        return cls.of(masks)
+
+    def __or__(self, other: BrokenTaxels) -> BrokenTaxels:
+        return BrokenTaxels(self.silent | other.silent, self.noisy | other.noisy)
+
+    @property
+    def kinds(self) -> Mask:
+        """The two masks as one, bool [2, R, C]."""
+        return np.stack([self.silent, self.noisy])
+
+    @property
+    def mask(self) -> Mask:
+        """All broken taxels, bool [R, C]."""
+        return self.silent | self.noisy
+
+    @property
+    def text(self) -> str:
+        """Kinds and places, for example "silent taxel 2.3 and noisy row 4"."""
+        kinds = {"silent": self.silent, "noisy": self.noisy & ~self.silent}
+        return " and ".join(f"{kind} {places(mask)}" for kind, mask in kinds.items() if mask.any())
+
+
+def places(mask: Mask) -> str:
+    """The taxels of a mask [R, C] by name: "taxel 1.2 2.3", "row 2", "column 3"."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if len(rows) == 1 and 1 < len(columns) == mask.shape[1]:
+        return f"row {rows[0] + 1}"
+    if len(columns) == 1 and 1 < len(rows) == len(mask):
+        return f"column {columns[0] + 1}"
+    return "taxel " + " ".join(f"{r + 1}.{c + 1}" for r, c in np.argwhere(mask))
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """A stretch of the signal, each value of a frame beside the values of its neighbours on the
+    same axis.
+
+    noise, still: of the value, [R * C, A], see TaxelStatistics. around: median noise of the
+    neighbours that are not still, [R * C, A]; infinite if there are none. Of an even number the
+    lower median counts, so that half of the neighbours may be noisy.
+    """
+
+    noise: NDArray[np.float32]
+    still: Mask
+    around: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, measured: TaxelStatistics, grid: tuple[int, ...]) -> Comparison:
+        """Compare the values of `measured`. grid: R, C."""
+        noise = measured.noise().reshape(grid[0] * grid[1], -1)
+        still = measured.still.reshape(noise.shape)
+        numbers, every, middle = _neighbours(*grid)
+        heard = np.empty((len(noise) + 1, noise.shape[1]), np.float32)
+        heard[:-1], heard[-1] = noise, np.inf
+        if still.any():
+            heard[:-1][still] = np.inf
+        around = heard[numbers]  # [R * C, K, A]
+        around.sort(axis=1)
+        if np.isfinite(heard[:-1]).all():
+            return cls(noise, still, around[every, middle])
+        known = np.isfinite(around).sum(axis=1, keepdims=True)
+        middles = np.maximum(known - 1, 0) // 2
+        return cls(noise, still, np.take_along_axis(around, middles, axis=1)[:, 0])
+
+    def lively(self, quietest: float) -> Mask:
+        """Whether the neighbours show that the finger slides, bool [R * C, A]. quietest: see
+        Bridging."""
+        return np.isfinite(self.around) & (self.around >= LIVELY * quietest)
+
+
+def find(
+    measured: TaxelStatistics,
+    compared: Comparison,
+    tare: NDArray[np.float64],
+    limits: WindowLimits,
+    bridging: Bridging,
+) -> BrokenTaxels | None:
+    """The broken taxels of a stretch of the signal; None if there are none.
+
+    compared: the same stretch. tare: raw counts [R, C] or [R, C, A] of the unloaded skin. A taxel
+    is broken if one of its axes is. If sound taxels were constant in training, a constant taxel is
+    silent only if it is loaded, or if its direct neighbours are. A taxel at full scale is
+    saturated, not silent, if a direct neighbour reaches full scale, too.
+    """
+    noisy = compared.noise > bridging.noise * np.maximum(compared.around, bridging.quietest)
+    dark = measured.unreadable
+    if not (noisy.any() or compared.still.any() or dark.any()):
+        return None
+    grid = tare.shape[:2]
+    silent = compared.still & compared.lively(bridging.quietest)
+    if bridging.still:
+        load = measured.mean.reshape(silent.shape)[:, -1:] - normal(tare, 0).reshape(-1, 1)
+        loaded = load >= (-np.inf if limits.contact is None else limits.contact)
+        silent &= loaded | enclosed(loaded.reshape(grid)).reshape(-1, 1)
+    top = (measured.highest >= limits.full_scale).reshape(silent.shape)
+    taxels_at_top: Mask = np.logical_or.reduce(top, axis=1).reshape(grid)
+    silent &= ~(top & _beside(taxels_at_top).reshape(-1, 1))
+    silent |= dark.reshape(silent.shape)
+    noisy &= ~silent & (measured.series.shape[1] >= LEAST_FRAMES)
+    kinds = np.stack([silent, noisy]).any(axis=2)
+    return BrokenTaxels.of(kinds.reshape(2, *grid))
+
+
+@lru_cache(maxsize=4)
+def _neighbours(
+    rows: int, cols: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Numbers of the taxels around each taxel, [R * C, K], and R * C for places beyond the edge;
+    the number of each taxel, and the lower middle of the number of its neighbours, [R * C]."""
+    r, c = np.divmod(np.arange(rows * cols), cols)
+    steps = range(-REACH, REACH + 1)
+    around = [(r + i, c + j) for i in steps for j in steps if i or j]
+    there = np.stack([(i >= 0) & (i < rows) & (j >= 0) & (j < cols) for i, j in around], axis=1)
+    numbers = np.stack([i * cols + j for i, j in around], axis=1)
+    middle = np.maximum(there.sum(axis=1) - 1, 0) // 2
+    return np.where(there, numbers, rows * cols), np.arange(rows * cols), middle
+
+
+def _beside(mask: Mask) -> Mask:
+    """The taxels with a direct neighbour in `mask`, bool [R, C]."""
+    beside = np.zeros_like(mask)
+    beside[1:] |= mask[:-1]
+    beside[:-1] |= mask[1:]
+    beside[:, 1:] |= mask[:, :-1]
+    beside[:, :-1] |= mask[:, 1:]
+    return beside
+
+
+def bridged(
+    taxels: NDArray[Any],
+    broken: Mask,
+    unloaded: NDArray[np.float64],
+    loads: LoadModes | None = None,
+) -> NDArray[Any]:
+    """A copy of raw counts [T, R, C] or [T, R, C, A] with the taxels of the mask `broken` [R, C]
+    replaced: each by what `loads` tell of it, or else by the mean load of its direct neighbours.
+
+    unloaded: [R, C] or [R, C, A] raw counts of the unloaded skin in training, since taxels without
+    load differ. At least one taxel must not be broken.
+    """
+    filled = taxels.copy()
+    flat = filled.reshape(len(taxels), broken.size, -1)  # [T, R * C, A]
+    if loads:
+        values = np.repeat(broken.ravel(), flat.shape[2])
+        frames = flat.reshape(len(taxels), -1)
+        frames[:, values] = digitized(loads.expected(frames, values), taxels.dtype)
+        return filled
+    base = unloaded.reshape(broken.size, -1)
+    targets, sources, weights = _weights(*broken.shape, broken.tobytes())
+    offset = (base[targets] - weights @ base[sources]).astype(np.float32)
+    part = flat[:, sources].astype(np.float32)
+    # [T, A, targets] of [T, sources, A]
+    new = np.tensordot(part, weights.astype(np.float32), axes=(1, 1)).swapaxes(1, 2) + offset
+    flat[:, targets] = digitized(new, taxels.dtype)
+    return filled
+
+
+@lru_cache(maxsize=4)
+def _weights(
+    rows: int, cols: int, mask: bytes
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    """Broken taxels [B], the sound taxels [S] beside them, and weights [B, S] that give each broken
+    taxel the mean of its direct neighbours, which may be broken, too."""
+    broken = np.frombuffer(mask, bool)
+    r, c = np.divmod(np.arange(rows * cols), cols)
+    beside = np.abs(r[:, None] - r) + np.abs(c[:, None] - c) == 1
+    targets = np.flatnonzero(broken)
+    sources = np.flatnonzero(~broken & beside[targets].any(axis=0))
+    between = np.diag(beside[targets].sum(axis=1)) - beside[np.ix_(targets, targets)]
+    weights = np.linalg.solve(between, beside[np.ix_(targets, sources)].astype(np.float64))
+    return targets, sources, weights

@@ -1,0 +1,176 @@
+"""Disturbances of a sweep that the box can measure: noise, load, speed, lost frames and hum.
+
+Each moves the embedding of a known material further than the limit of known materials. Its size is
+known, so the means of the materials move with it and the limit grows with it. A sweep without
+disturbance is judged as before. docs/decisions/0031 has the gain and the cost.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.core.errors import BundleError
+from palpate.core.types import normal
+
+Array = NDArray[Any]
+NAMES = ("noise", "load", "speed", "lost", "hum")
+"""The disturbances. noise, load: see below. speed: natural logarithm of the taxels that the slide
+passes in a second. lost: share of the frames that never arrived. hum: square root of the amplitude
+that was removed, in counts; large hum moves the embedding hardly further than small hum."""
+SAID = {
+    ("noise", 1): "more noise",
+    ("noise", -1): "less noise",
+    ("load", 1): "a higher load",
+    ("load", -1): "a lower load",
+    ("speed", 1): "a faster slide",
+    ("speed", -1): "a slower slide",
+    ("lost", 1): "more lost frames",
+    ("lost", -1): "fewer lost frames",
+    ("hum", 1): "more hum",
+    ("hum", -1): "less hum",
+}
+"""Disturbances in messages, by name and direction."""
+ORDER = 4
+"""Noise is measured in the fourth difference of the counts, in which the vibrations of a slide
+hardly appear: at a tenth of the rate it has a hundredth of the power that noise has."""
+FRAMES = 512
+"""Frames in the middle of the window that show the noise; all of them would take three times as
+long."""
+TINY = 1e-30
+"""Replaces a power or a load of 0."""
+
+
+def noise(taxels: Array) -> float:
+    """Natural logarithm of the noise power of the median taxel, in counts squared. taxels: raw
+    counts [T, R, C] or [T, R, C, A] of a window; only the normal axis is used."""
+    if len(taxels) <= ORDER:
+        return -math.inf
+    first = max(0, (len(taxels) - FRAMES) // 2)
+    some = normal(taxels, 1)[first : first + FRAMES]
+    counts = some.reshape(len(some), -1).astype(np.float32)
+    with np.errstate(all="ignore"):  # float32 counts may be infinite
+        steps = np.diff(counts, ORDER, axis=0)
+        powers = np.sort(np.einsum("tv,tv->v", steps, steps))  # those that are not finite are last
+        middle = (powers[(len(powers) - 1) // 2] + powers[len(powers) // 2]) / 2
+    power = float(middle) / (len(steps) * math.comb(2 * ORDER, ORDER))
+    return math.log(max(power, TINY)) if math.isfinite(power) else math.log(TINY)
+
+
+def load(mean: Array, tare: Array) -> float:
+    """Natural logarithm of the load of all taxels. mean, tare: counts [R, C] or [R, C, A] of the
+    window and of the unloaded skin."""
+    total = float(np.abs(normal(mean, 0) - normal(tare, 0)).sum())
+    return math.log(max(total, TINY)) if math.isfinite(total) else math.nan
+
+
+def speed(taxels_s: float) -> float:
+    """The value of a slide that passes this many taxels in a second; NaN for 0, an unknown
+    speed."""
+    return math.log(taxels_s) if taxels_s else math.nan
+
+
+def hum(counts: float) -> float:
+    """The value of hum of this amplitude."""
+    return math.sqrt(counts)
+
+
+@dataclass(frozen=True, slots=True)
+class Allowance:
+    """The allowance of a bundle for one disturbance.
+
+    of: one of NAMES. start: its value at the edge of training. end: the furthest value that export
+    has proven. slope: growth of the limit of known materials, as a share of it, for a size of 1.
+    tried: the furthest value that export has tried without proof; None without such a value. Raises
+    BundleError for a value out of range.
+    """
+
+    of: str
+    start: float
+    end: float
+    slope: float
+    tried: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.of not in NAMES:
+            raise BundleError(
+                f"disturbances name {self.of!r}, which is none of {', '.join(NAMES)}; update the "
+                "program or export the bundle again"
+            )
+        numbers = self.start, self.end, self.slope
+        finite = all(type(v) in (int, float) and math.isfinite(v) for v in numbers)
+        if not finite or self.start == self.end or self.slope < 0:
+            raise BundleError(
+                f"disturbances have {list(numbers)} for {self.of}; start and end must be different "
+                "finite numbers and the slope at least 0: export the bundle again"
+            )
+        further = self.tried is None or (
+            type(self.tried) in (int, float) and 0 <= self._way * (self.tried - self.end) < math.inf
+        )
+        if not further:
+            raise BundleError(
+                f"disturbances have tried {self.tried!r} for {self.of}, which must be a finite "
+                f"number beyond the end {self.end}: export the bundle again"
+            )
+
+    @property
+    def _way(self) -> int:
+        return 1 if self.end > self.start else -1
+
+    def size(self, value: float) -> float:
+        """How far `value` is beyond the edge of training, at most up to `end`; 0 within it, and for
+        a value that is not known (NaN)."""
+        beyond = self._way * (value - self.start)
+        return min(beyond, abs(self.end - self.start)) if beyond > 0 else 0.0
+
+    def untried(self, value: float) -> str:
+        """A message if `value` is beyond what was tried, else ""."""
+        furthest = self.end if self.tried is None else self.tried
+        if not self._way * (value - furthest) > 0:
+            return ""
+        return f"{SAID[self.of, self._way]} than was tried with this bundle"
+
+
+@dataclass(frozen=True, slots=True)
+class Disturbances:
+    """The allowances of a bundle for disturbances. allowances: [D], in the order of the changes in
+    means.npz. hum: least ratio of hum that is removed (signal.hum); None if none is. Raises
+    BundleError for a number out of range."""
+
+    allowances: tuple[Allowance, ...] = ()
+    hum: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.hum is not None and not (
+            type(self.hum) in (int, float) and 0 < self.hum < math.inf
+        ):
+            raise BundleError(
+                f"disturbances.hum {self.hum!r} must be a finite number above 0; export the "
+                "bundle again"
+            )
+
+    def sizes(self, values: Mapping[str, float]) -> NDArray[np.float64]:
+        """Sizes float64 [D] of the disturbances of a sweep. values: by name; one that is missing
+        is not known."""
+        return np.array([a.size(values.get(a.of, math.nan)) for a in self.allowances])
+
+    def beyond(self, name: str, values: Mapping[str, float]) -> float:
+        """How far the value with this name is above training, 0 within it; see Allowance.size."""
+        above = (a for a in self.allowances if a.of == name and a.end > a.start)
+        return max((a.size(values.get(name, math.nan)) for a in above), default=0.0)
+
+    def untried(self, values: Mapping[str, float]) -> str:
+        """A message with the disturbances of a sweep that are beyond what export has tried, ""
+        without one."""
+        found = [a.untried(values.get(a.of, math.nan)) for a in self.allowances]
+        return ", ".join(filter(None, found))
+
+    def growth(self, sizes: NDArray[np.float64]) -> float:
+        """Factor of the limit of known materials: that of the disturbance that allows most."""
+        slopes = np.array([a.slope for a in self.allowances])
+        return 1 + float((slopes * sizes).max(initial=0.0))

@@ -1,0 +1,281 @@
+"""Speed and direction of a slide, measured from the pattern that passes one taxel after another.
+
+The phase between two taxels at a distance d along the slide is 2 pi f d / v at a frequency f and a
+speed v. Cross-spectra of pairs, divided by the square root of their magnitude, are summed at these
+phases for a grid of speeds, and the highest sum shows the speed (Knapp and Carter 1976, with an
+exponent of 0.5). docs/decisions/0021 has the accuracy. The box calls this once per sweep, `train`
+for the sweeps of a set.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.core.directions import DIRECTIONS
+from palpate.core.errors import BundleError
+from palpate.core.types import SweepFormat, normal
+
+Array = NDArray[Any]
+
+BAND_HZ = 40.0
+"""Highest frequency that is used. Friction vibrations are mostly above it; they have no lag."""
+LEAST_CYCLES = 2
+"""Fewest cycles of a frequency in a window. Slower changes are those of the force."""
+WAVES = 2.0
+"""Waves per taxel pitch of the finest pattern that is used: a taxel blurs finer patterns."""
+SEPARATIONS = 3
+"""Longest distance of a pair, in taxels."""
+BLOCK = 6
+"""Most rows and columns that are used, so that the time has a limit."""
+LONGEST_S = 4.0
+"""Longest part of a window that is used, likewise."""
+LEAST_LAGS = 4
+"""The slowest speed passes this many taxels in a window; with fewer, too little is shared."""
+MOST_LAGS = 100.0
+"""The fastest speed passes this many taxels a second. BAND_HZ then has waves of 2.5 pitches."""
+STEP = 0.04
+"""Natural logarithm of the ratio of two neighbouring speeds of the grid."""
+LEAST_TAXELS = 3
+"""Fewest taxels whose counts change. The signal that all have in common is removed, and of two
+taxels nothing is left that has a direction."""
+CHANCE = 5.0
+"""Height that few windows of noise, of rests and of taxels from different slides exceed
+(docs/decisions/0024)."""
+LEAST_HEIGHT = 7.0
+"""Least height of a peak, in standard deviations of a sum with random phases."""
+RATIO = 1.5
+"""Least ratio of a peak to the next separate peak of its axis, and to the sum without a lag. The
+other axis is left out, because a pattern of straight ridges passes along both."""
+NO_PATTERN = "no pattern passes from taxel to taxel"
+NO_PITCH = "the distance between taxels is unknown; export with --pitch-mm"
+APART = 9
+"""Peaks further apart than this many steps of the grid are separate."""
+MARGIN = 1.2
+"""A speed within this factor of the trained range counts as trained."""
+MOST_MM_S = 1e6
+"""Highest speed that a bundle may state."""
+TINY = 1e-30
+"""Replaces 0 as a divisor."""
+SILENT = 1e-6
+"""A taxel with less than this share of the power of the strongest taxel is silent."""
+
+
+@dataclass(frozen=True, slots=True)
+class Slide:
+    """How the finger slid in a window.
+
+    speed_mm_s: to three digits; None if it could not be measured, with the reason in `why`.
+    direction: of the finger, one of DIRECTIONS; "" without a speed. height: of the highest sum, in
+    standard deviations of a sum with random phases; 0 if nothing was computed. taxels_s: the speed
+    in taxels a second, 0 without one.
+    """
+
+    speed_mm_s: float | None = None
+    direction: str = ""
+    height: float = 0.0
+    why: str = ""
+    taxels_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class SpeedRange:
+    """Range of the measured speeds in training. Raises BundleError for a number out of range."""
+
+    least_mm_s: float
+    most_mm_s: float
+
+    def __post_init__(self) -> None:
+        ends = self.least_mm_s, self.most_mm_s
+        if (
+            not all(type(v) in (int, float) for v in ends)
+            or not 0 < ends[0] <= ends[1] <= MOST_MM_S
+        ):
+            raise BundleError(
+                f"speeds {list(ends)} must be two mm/s above 0, the lower first, up to "
+                f"{MOST_MM_S:g}; export the bundle again"
+            )
+
+    def outside(self, slide: Slide) -> str:
+        """A message with the speed of `slide` if it is outside of the range by more than MARGIN;
+        "" otherwise, and without a speed."""
+        speed = slide.speed_mm_s
+        if speed is None or self.least_mm_s / MARGIN <= speed <= self.most_mm_s * MARGIN:
+            return ""
+        return f"slid at {speed:.0f} mm/s, trained {self}"
+
+    def __str__(self) -> str:
+        return f"{self.least_mm_s:.0f} to {self.most_mm_s:.0f}"
+
+
+class SlideMeter:
+    """Measures windows of one format on a skin with a known pitch. The tables are computed once.
+
+    pitch_mm: distance between neighbouring taxels; None if unknown. why: the reason why no window
+    can be measured, "" if windows can be measured. slowest_mm_s, fastest_mm_s: range of
+    speeds; 0 where `why` is not empty.
+    """
+
+    def __init__(self, format: SweepFormat, pitch_mm: float | None) -> None:
+        self.slowest_mm_s = self.fastest_mm_s = 0.0
+        self._shape = min(format.rows, BLOCK), min(format.cols, BLOCK)
+        seconds = min(format.window / format.rate_hz, LONGEST_S)
+        slowest, fastest = LEAST_LAGS / seconds, min(MOST_LAGS, format.rate_hz)
+        self.why = ""
+        if pitch_mm is None:
+            self.why = NO_PITCH
+        elif format.rows * format.cols < LEAST_TAXELS:
+            self.why = f"fewer than {LEAST_TAXELS} taxels"
+        elif fastest < 2 * slowest:
+            self.why = (
+                f"a window of {seconds:.3g} s at {format.rate_hz:g} Hz is too short, or a frame "
+                "longer than the time from taxel to taxel"
+            )
+        if self.why or pitch_mm is None:
+            return
+        self._pitch_mm = pitch_mm
+        self.slowest_mm_s, self.fastest_mm_s = slowest * pitch_mm, fastest * pitch_mm
+        self._each = max(1, int(format.rate_hz / (4 * BAND_HZ)))
+        self._frames = int(seconds * format.rate_hz) // self._each
+        hz = np.fft.rfftfreq(self._frames, self._each / format.rate_hz)
+        hz = hz[(hz >= LEAST_CYCLES / seconds - 1e-9) & (hz <= BAND_HZ)]
+        self._transform = _transform(hz, self._frames, self._each / format.rate_hz)
+        self._first, self._second, self._of_pair = _pairs(*self._shape)
+        steps = math.floor(math.log(fastest / slowest) / STEP)
+        self._taxels_s = slowest * np.exp(STEP * np.arange(steps + 1))
+        self._tables(hz, seconds)
+
+    def _tables(self, hz: Array, seconds: float) -> None:
+        """Cosine, sine and use of each separation and frequency at each speed of the grid, [V, D *
+        F]."""
+        far = np.arange(1, SEPARATIONS + 1)[:, None]
+        lag_s = far / self._taxels_s[:, None, None]
+        phase = 2 * np.pi * hz * lag_s
+        use = (hz <= WAVES * self._taxels_s[:, None, None]) & (lag_s <= seconds / 2)
+        wide = len(self._taxels_s), -1
+        self._cos, self._sin, self._use = (
+            (table * use).reshape(wide).astype(np.float32)
+            for table in (np.cos(phase), np.sin(phase), np.ones_like(phase))
+        )
+
+    def __call__(self, taxels: Array) -> Slide:
+        """The slide in one window of raw counts [T, R, C] or [T, R, C, A] of the format; only the
+        normal axis is used."""
+        if self.why:
+            return Slide(why=self.why)
+        spectra = self._spectra(normal(taxels, 1)[: self._frames * self._each])
+        if spectra is None:
+            return Slide(why=f"the counts of fewer than {LEAST_TAXELS} taxels change")
+        return self._slide(*self._heights(spectra))
+
+    def _spectra(self, taxels: Array) -> Array | None:
+        """Spectra complex64 [F, M] of the M taxels of the block that moves most, without the part
+        that they have in common; None if too few of them change. Silent and broken taxels are 0,
+        and none is louder than the median."""
+        if taxels[0].size > BLOCK * BLOCK:
+            taxels = _busiest(taxels, self._shape)
+        frames = taxels.reshape(self._frames, self._each, -1)
+        summed = frames[:, 0].astype(np.float32)
+        with np.errstate(over="ignore", invalid="ignore"):
+            for i in range(1, self._each):  # four times as fast as sum(axis=1)
+                summed += frames[:, i]
+            parts = self._transform @ (summed - summed[0])
+            power = (parts * parts).sum(axis=0)
+        broken = ~np.isfinite(power)
+        power[broken] = 0
+        heard = power > SILENT * power.max()
+        loud = np.sort(power[heard])
+        if len(loud) < LEAST_TAXELS:
+            return None
+        parts[:, ~heard] = 0
+        parts /= np.sqrt(np.maximum(power, loud[len(loud) // 2]))
+        common = parts.sum(axis=1)
+        parts -= common[:, None] * (common @ parts / max(float(common @ common), TINY))
+        bins = len(parts) // 2
+        spectra: Array = parts[:bins] + 1j * parts[bins:]
+        return spectra
+
+    def _heights(self, spectra: Array) -> tuple[Array, Array]:
+        """Heights [2, 2, V] of the sums for slides along rows and columns, towards higher and lower
+        numbers, at each speed; and [2] without a lag along rows and columns."""
+        crossed = spectra[:, self._first] * spectra[:, self._second].conj()
+        size = np.abs(crossed)
+        crossed *= 1 / np.sqrt(np.maximum(size, TINY))
+        real, imaginary = (
+            (part @ self._of_pair).T.reshape(2, -1) for part in (crossed.real, crossed.imag)
+        )
+        spread = (size @ self._of_pair).T.reshape(2, -1) / 2
+        straight, across = (self._cos @ real.T).T, (self._sin @ imaginary.T).T
+        deviation = np.sqrt(np.maximum(self._use @ spread.T, TINY)).T[:, None]
+        still = real.sum(axis=1) / np.sqrt(np.maximum(spread.sum(axis=1), TINY))
+        return np.stack([straight - across, straight + across], axis=1) / deviation, still
+
+    def _slide(self, heights: Array, still: Array) -> Slide:
+        """The slide at the highest peak of an axis on which the pattern has a lag, or the reason
+        why it is not one."""
+        tops = heights.max(axis=(1, 2))
+        height = float(tops.max(initial=0, where=tops >= RATIO * still))
+        if height < LEAST_HEIGHT:
+            return Slide(height=height, why=NO_PATTERN)
+        axis, sign, at = (int(i[0]) for i in np.nonzero(heights == height))
+        if at in (0, heights.shape[2] - 1):
+            limit = self.slowest_mm_s if at == 0 else self.fastest_mm_s
+            why = f"{'slower' if at == 0 else 'faster'} than {limit:.3g} mm/s"
+            return Slide(height=height, why=why)
+        others = heights[axis].copy()
+        others[sign, max(0, at - APART) : at + APART + 1] = 0
+        if height < RATIO * others.max():
+            return Slide(height=height, why="the pattern fits several speeds")
+        before, top, after = (float(h) for h in heights[axis, sign, at - 1 : at + 2])
+        bend = before - 2 * top + after
+        shift = (before - after) / (2 * bend) if bend else 0.0  # the vertex of a parabola
+        taxels_s = float(self._taxels_s[at]) * math.exp(STEP * shift)
+        speed = float(f"{taxels_s * self._pitch_mm:.3g}")
+        return Slide(speed, DIRECTIONS[2 * axis + sign], height, taxels_s=taxels_s)
+
+
+def _transform(hz: Array, frames: int, period_s: float) -> Array:
+    """float32 [2 * F, frames]: multiplies a series to give the real and then the imaginary parts
+    of its spectrum at `hz` [F], with a Hann window and without its mean and trend, so that a drift
+    does not hide the pattern."""
+    turns = np.exp(-2j * np.pi * period_s * hz[:, None] * np.arange(frames)) * np.hanning(frames)
+    trend = np.linalg.qr(np.stack([np.ones(frames), np.arange(frames)], axis=1))[0]
+    turns -= turns @ trend @ trend.T
+    transform: Array = np.concatenate([turns.real, turns.imag]).astype(np.float32)
+    return transform
+
+
+def _pairs(rows: int, cols: int) -> tuple[Array, Array, Array]:
+    """Pairs of taxels along rows and columns: the numbers of both taxels, int [P] each, and the
+    axis and separation of each pair as float32 [P, 2 * SEPARATIONS] of 0 and 1."""
+    number = np.arange(rows * cols).reshape(rows, cols)
+    first, second, kinds = [], [], []
+    for kind in range(2 * SEPARATIONS):
+        axis, far = divmod(kind, SEPARATIONS)
+        grid = number if axis == 0 else number.T
+        lower, higher = grid[: -far - 1].ravel(), grid[far + 1 :].ravel()
+        first.append(lower)
+        second.append(higher)
+        kinds += [kind] * len(lower)
+    of_pair = np.zeros((len(kinds), 2 * SEPARATIONS), np.float32)
+    of_pair[np.arange(len(kinds)), kinds] = 1
+    return np.concatenate(first), np.concatenate(second), of_pair
+
+
+def _busiest(taxels: Array, shape: tuple[int, int]) -> Array:
+    """The block of `shape` of frames [T, R, C] whose counts change most, judged by 64 frames. A
+    loud taxel counts like the median of those that change."""
+    some = taxels[:: max(1, len(taxels) // 64)].astype(np.float64)
+    with np.errstate(over="ignore", invalid="ignore"):
+        moving = np.nan_to_num(some.std(axis=0), posinf=0)
+    if moving.any():
+        moving = np.minimum(moving, np.median(moving[moving > 0]))
+    total = np.pad(moving, ((1, 0), (1, 0))).cumsum(axis=0).cumsum(axis=1)
+    rows, cols = shape
+    sums = total[rows:, cols:] - total[:-rows, cols:] - total[rows:, :-cols] + total[:-rows, :-cols]
+    r, c = np.unravel_index(sums.argmax(), sums.shape)
+    return taxels[:, r : r + rows, c : c + cols]

@@ -1,0 +1,110 @@
+"""Whether a window is a slide over something: a material must not be learned from a finger at rest,
+from noise, or from a single taxel.
+
+Unlike the checks of an answer, it does not know the material. Over a slide a pattern passes from
+taxel to taxel, which neither a resting finger nor noise gives. docs/decisions/0027 has the figures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.core.types import SweepFormat, normal
+from palpate.signal.slide import LEAST_HEIGHT, NO_PATTERN, SlideMeter
+from palpate.signal.vibration import PARTS, SlideLimits, vibration
+
+FEW = 4
+"""A skin of at least so many taxels touches a finger with more than one."""
+MANY, CLEAR = 4, 2 * LEAST_HEIGHT
+"""Fewest sweeps by which others are judged, and the least median height of their patterns. The
+median of simulated slides is 20, that of skins whose slides show no pattern 3 to 6."""
+NO_SLIDE = f"no slide: {NO_PATTERN}, as with a resting finger"
+
+
+class SlideCheck:
+    """Checks windows of one format.
+
+    tare: counts [R, C] or [R, C, A] of the unloaded skin. contact: least load of a taxel in counts,
+    None if it is unknown. limits: least vibrations of the known materials, None if they are
+    unknown. patterned: whether slides on this skin show a pattern, as those of training did;
+    SlideMeter measures it.
+    """
+
+    def __init__(
+        self,
+        format: SweepFormat,
+        tare: NDArray[np.float64],
+        contact: float | None = None,
+        limits: SlideLimits | None = None,
+        *,
+        patterned: bool = True,
+    ) -> None:
+        self._tare, self._contact = tare, contact
+        self._least = min(limits.least) if limits and limits.least else None
+        # the height of a pattern does not depend on the pitch
+        self._meter = SlideMeter(format, 1.0 if patterned else None)
+
+    def __call__(self, taxels: NDArray[Any]) -> str:
+        """The reason why a window of raw counts [T, R, C] or [T, R, C, A] is not a slide; "" if it
+        is one, or if that cannot be seen on this skin."""
+        load = np.abs(normal(taxels.mean(axis=0, dtype=np.float64) - self._tare, 0))
+        if self._contact is not None:
+            if load.max() < self._contact:
+                return f"no contact: the strongest taxel has {load.max():.1f} raw counts"
+            if why := only_taxel(load, self._contact):
+                return why
+        if self._least is not None and len(taxels) >= 2 * PARTS:
+            rests = np.flatnonzero(vibration(taxels, self._tare) < self._least) + 1
+            if len(rests):
+                where = " ".join(map(str, rests))
+                return f"the finger rests: hardly any vibration in part {where} of {PARTS}"
+        if self._meter.why:
+            return ""
+        slide = self._meter(taxels)
+        if slide.height < LEAST_HEIGHT:
+            return NO_SLIDE
+        return ""
+
+
+class SlidesAmong:
+    """Checks windows of one format where no bundle knows the skin: a window without a pattern is
+    not a slide if those before it showed one."""
+
+    def __init__(self, format: SweepFormat) -> None:
+        self._meter, self._heights = SlideMeter(format, 1.0), list[float]()
+
+    def __call__(self, taxels: NDArray[Any]) -> str:
+        """As SlideCheck."""
+        if self._meter.why:
+            return ""
+        height = self._meter(taxels).height
+        if _patterned(self._heights) and height < LEAST_HEIGHT:
+            return NO_SLIDE
+        self._heights.append(height)
+        return ""
+
+    def among(self, windows: Iterable[NDArray[Any]]) -> list[str]:
+        """The reason for each of these windows. They are judged by one another."""
+        for taxels in windows:
+            self._heights.append(0.0 if self._meter.why else self._meter(taxels).height)
+        skin = _patterned(self._heights)
+        return [NO_SLIDE if skin and one < LEAST_HEIGHT else "" for one in self._heights]
+
+
+def _patterned(heights: Sequence[float]) -> bool:
+    """Whether slides on a skin show a pattern, by the heights of sweeps that are mostly slides."""
+    return len(heights) >= MANY and float(np.median(heights)) >= CLEAR
+
+
+def only_taxel(load: NDArray[np.float64], contact: float) -> str:
+    """The reason if a single taxel of `load` [R, C] reaches `contact`, on a skin of FEW taxels or
+    more; "" else."""
+    loaded = np.argwhere(load >= contact)
+    if len(loaded) != 1 or load.size < FEW:
+        return ""
+    row, column = loaded[0] + 1
+    return f"only taxel {row}.{column} is loaded"

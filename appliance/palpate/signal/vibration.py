@@ -1,0 +1,78 @@
+"""Whether the finger slides: the vibration of the taxels in tenths of a window, against the load.
+
+A finger that rests on a material gives a load and hardly any vibration. How little a slide vibrates
+depends on the material, so a bundle holds the least vibration of each material in training. The
+measure does not change with the gain of the skin. Pure functions of raw counts.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.core.errors import BundleError
+from palpate.core.types import normal
+
+Array = NDArray[np.float64]
+PARTS = 10
+"""Parts of a window. Early answers are given after whole parts."""
+TINY = 1e-30
+"""Replaces a load or a vibration of 0."""
+
+
+@dataclass(frozen=True, slots=True)
+class SlideLimits:
+    """least: [K], for each trained label the least `vibration` of a part in which the finger
+    slides; empty if that is unknown. pattern: least height of the pattern that passes from taxel to
+    taxel in a slide, as signal.slide measures it; None if slides need not show one. Raises
+    BundleError for a number out of range."""
+
+    least: tuple[float, ...]
+    pattern: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.pattern is not None and not 0 < self.pattern < math.inf:
+            raise BundleError(
+                f"sliding.pattern {self.pattern} must be a finite number above 0; export the "
+                "bundle again"
+            )
+        if not all(type(v) is float and math.isfinite(v) for v in self.least):
+            raise BundleError(
+                f"sliding.least {list(self.least)} must be finite numbers; export the bundle again"
+            )
+
+    def resting(self, vibrations: Array, label: int) -> list[int]:
+        """The parts, counted from 1, that vibrate too little for the label with this number; none
+        for an enrolled label, whose limit is unknown."""
+        if label >= len(self.least):
+            return []
+        found: list[int] = (np.flatnonzero(vibrations < self.least[label]) + 1).tolist()
+        return found
+
+
+def vibration(taxels: NDArray[Any], tare: Array, parts: int = PARTS) -> Array:
+    """Natural logarithm of vibration over load in each part, float64 [parts].
+
+    taxels: raw counts [T, R, C] or [T, R, C, A], at least `parts` frames; only the normal axis
+    counts. tare: counts [R, C] or [R, C, A] of the unloaded skin. The vibration is the root of the
+    mean variance of the taxels within a part, the load their mean count above the tare.
+    """
+    counts = normal(taxels, 1)
+    each = len(counts) // parts
+    # from the first frame on: squares of large counts would round small vibrations away
+    series = counts[: parts * each].reshape(parts, each, -1).astype(np.float32)
+    first = series[0, 0].copy()
+    series -= first
+    with np.errstate(all="ignore"):  # float32 counts may be infinite
+        # products take a third of the time of mean and einsum
+        means = (np.full((1, each), 1 / each, np.float32) @ series)[:, 0]
+        flat = series.reshape(parts, 1, -1)
+        variance = (flat @ flat.swapaxes(1, 2)).ravel() / series[0].size
+        variance -= (means * means).mean(axis=1)
+        load = np.abs((means + first - normal(tare, 0).reshape(-1)).mean(axis=1))
+        result: Array = 0.5 * np.log(np.maximum(variance, TINY)) - np.log(np.maximum(load, TINY))
+    return result.astype(np.float64)

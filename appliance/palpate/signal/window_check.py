@@ -1,0 +1,193 @@
+"""Checks a window without a model: contact, saturation, stuck and dead taxels.
+
+Pure functions. `inspect` uses the limits of a bundle; `inspect_bare` derives limits from the
+unloaded skin.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.core.types import Status, normal
+from palpate.signal.taxel_statistics import TaxelStatistics
+from palpate.signal.unloaded import QUIET, UnloadedSkin
+
+FULL_SCALES = tuple(float(2**bits - 1) for bits in (8, 10, 12, 14, 15, 16, 24))
+"""Highest counts of common converters; a skin does not announce its own."""
+SHARE = 0.1
+"""A loaded taxel has at least this share of the load of the strongest taxel, as in the limits of a
+bundle (train/palpate_train/export/pack)."""
+MANY_FULL = 0.01
+"""With a larger share of the counts at full scale a window is saturated, unless export has proven
+more for the bundle."""
+STAYS = 0.02
+"""Where an amplifier clips, a value that also moves below stays at the highest count for at least
+this share of the frames."""
+
+
+@dataclass(frozen=True, slots=True)
+class WindowLimits:
+    """Limits for a window.
+
+    contact: least mean over time of a loaded taxel, in counts above the tare. With None every taxel
+    counts as loaded, since loads do not differ from the unloaded skin. full_scale: the sensor's
+    highest count. saturated: largest accepted share of full-scale counts. dead_taxels: largest
+    accepted number of dead taxels.
+    """
+
+    contact: float | None
+    full_scale: float
+    saturated: float = MANY_FULL
+    dead_taxels: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """Result of the check of a window: status ok, or another status with the taxels in `detail`.
+
+    degraded: the broken taxels that were bridged, "" for none. mean: counts of the window that was
+    checked, in the shape of a frame, if the check passed. full: share of the counts at full scale,
+    likewise.
+    """
+
+    status: Status
+    detail: str = ""
+    degraded: str = ""
+    mean: NDArray[np.float64] | None = field(default=None, compare=False)
+    full: float = field(default=0.0, compare=False)
+
+
+def _taxels(mask: NDArray[np.bool_]) -> str:
+    """The taxels of a mask [R, C, A], with their axes if not all of several are meant: "taxel 1.2
+    and 2.3 axis 1"."""
+    named = []
+    for r, c in np.argwhere(mask.any(axis=2)):
+        axes = (
+            ""
+            if mask[r, c].all()
+            else " axis " + " ".join(str(a + 1) for a in np.flatnonzero(mask[r, c]))
+        )
+        named.append(f"{r + 1}.{c + 1}{axes}")
+    return "taxel " + (" " if mask.shape[2] == 1 else " and ").join(named)
+
+
+def inspect(
+    taxels: NDArray[Any],
+    tare: NDArray[np.float64],
+    limits: WindowLimits,
+    *,
+    either_way: bool = False,
+    measured: TaxelStatistics | None = None,
+) -> Finding:
+    """Check a window before it is classified. taxels: raw counts [T, R, C] or [T, R, C, A]; tare:
+    counts [R, C] or [R, C, A] of the unloaded skin. measured: statistics of `taxels`, if they are
+    known already.
+
+    A taxel is loaded by its normal axis. A loaded taxel always varies, on each axis, so a constant
+    axis is stuck. A constant unloaded taxel is dead if all its direct neighbours are loaded; at the
+    edge of the contact it may be unloaded. A taxel with a count that is not a number or impossibly
+    large is always dead.
+    Shear has a sign, so shear axes are saturated at both ends. either_way: a load may also lower
+    the counts.
+    """
+    shape = (*tare.shape, 1)[:3]  # [R, C, A]
+    measured = measured or TaxelStatistics.of(taxels)
+    still = measured.still.reshape(shape)
+    load = measured.mean.reshape(shape) - tare.reshape(shape)
+    load = np.abs(load) if either_way else load
+    # possible with float32 counts; the network's output would then be meaningless
+    if (unreadable := measured.unreadable.reshape(shape) | ~np.isfinite(load)).any():
+        return Finding(Status.DEAD_TAXEL, _taxels(unreadable))
+    loaded = load[..., -1:] >= (-np.inf if limits.contact is None else limits.contact)  # [R, C, 1]
+    if not loaded.any():
+        return Finding(Status.NO_CONTACT, f"strongest taxel {load[..., -1].max():.1f} raw counts")
+    full = _at_full_scale(measured, limits.full_scale, shape)
+    stuck = still & loaded & (full < 1)
+    if stuck.any():
+        return Finding(Status.STUCK_TAXEL, _taxels(stuck))
+    share = float(full.mean())
+    if share > limits.saturated:
+        return Finding(Status.SATURATED, _taxels(full > 0))
+    silent = still[..., -1:] & ~loaded
+    if silent.any():
+        dead = silent & enclosed(loaded[..., 0])[..., None]
+        if dead.sum() > limits.dead_taxels:
+            return Finding(Status.DEAD_TAXEL, _taxels(dead & still))
+    return Finding(Status.OK, mean=measured.mean.reshape(tare.shape), full=share)
+
+
+def ceiling(measured: TaxelStatistics, full_scale: float) -> float:
+    """The count at which the amplifier clips in a window.
+
+    It is the highest count of all. A value has to be constant there. Another one has to stay there
+    for STAYS of the frames. Otherwise it is `full_scale`.
+    """
+    highest = float(measured.highest.max())
+    at = measured.highest == highest
+    constant = (at & measured.still).sum()
+    if not (highest < full_scale and constant):
+        return full_scale
+    stays = (measured.series[at & ~measured.still] == highest).mean(axis=1).max(initial=0.0)
+    return highest if constant > 1 or stays >= STAYS else full_scale
+
+
+def _at_full_scale(
+    measured: TaxelStatistics, full_scale: float, shape: tuple[int, ...]
+) -> NDArray[np.float64]:
+    """Share of the frames at full scale, of `shape` [R, C, A]; on shear axes at its negative,
+    too."""
+    full, series = np.zeros(shape), measured.series
+    if measured.highest.max() >= full_scale:  # seldom; counting takes longer than all the rest
+        full = (series >= full_scale).mean(axis=1).reshape(shape)
+    if shape[2] > 1 and measured.lowest.reshape(shape)[..., :-1].min() <= -full_scale:
+        full[..., :-1] += (series <= -full_scale).mean(axis=1).reshape(shape)[..., :-1]
+    return full
+
+
+def enclosed(loaded: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Whether all direct neighbours of a taxel are loaded, bool [R, C]. Places beyond the skin's
+    edge count as loaded."""
+    padded = np.ones((loaded.shape[0] + 2, loaded.shape[1] + 2), bool)
+    padded[1:-1, 1:-1] = loaded
+    enclosed: NDArray[np.bool_] = (
+        padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
+    )
+    return enclosed
+
+
+def inspect_readings(taxels: NDArray[Any]) -> Finding:
+    """Check a window of an unknown skin: a taxel with a count that is not a number or impossibly
+    large is dead."""
+    if taxels.dtype.kind != "f":
+        return Finding(Status.OK)
+    shape = (*taxels.shape[1:], 1)[:3]
+    unreadable = TaxelStatistics.of(taxels).unreadable.reshape(shape)
+    return (
+        Finding(Status.DEAD_TAXEL, _taxels(unreadable)) if unreadable.any() else Finding(Status.OK)
+    )
+
+
+def inspect_bare(taxels: NDArray[Any], unloaded: UnloadedSkin) -> Finding:
+    """As `inspect`, for a skin without a bundle, so that the strength of a contact and the highest
+    count are unknown.
+
+    It refuses only certain cases: `no-contact` if no taxel differs from the unloaded skin, in
+    either direction, and none vibrates; `saturated` if the highest count is one of FULL_SCALES.
+    """
+    if (unreadable := inspect_readings(taxels)).status is not Status.OK:
+        return unreadable
+    load = np.abs(normal(taxels.mean(axis=0, dtype=np.float64) - unloaded.level, 0))
+    strongest = float(load.max(initial=0, where=np.isfinite(load)))
+    if (
+        strongest < unloaded.contact
+        and UnloadedSkin.measured(taxels).contact > QUIET * unloaded.contact
+    ):
+        return Finding(Status.OK)  # the skin slides over something
+    highest = float(taxels.max())
+    full_scale = highest if highest in FULL_SCALES else np.inf
+    limits = WindowLimits(max(unloaded.contact, SHARE * strongest), full_scale)
+    return inspect(taxels, unloaded.level, limits, either_way=True)

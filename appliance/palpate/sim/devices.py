@@ -1,0 +1,152 @@
+"""Simulated devices for the real drivers, built from the acts of the robot: the robot, its GPIO
+lines (a double of gpiod) and the readout board (a pyusb backend)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+
+from palpate.core.clock import Clock
+from palpate.core.config import Config
+from palpate.core.devices import Devices
+from palpate.core.types import SweepFormat
+from palpate.sim import gpio, rig, usb
+
+READY, BUSY, RESULT_VALID, FAULT, DECIDED = "READY", "BUSY", "RESULT-VALID", "FAULT", "DECIDED"
+START, STOP, NEW_OBJECT = "START", "STOP", "NEW-OBJECT"
+BITS = tuple(f"CLASS-{i}" for i in range(8))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RobotDevices(Devices):
+    """Simulated GPIO lines with the robot that acts on them. robot.played: the acts so far, for
+    scoring."""
+
+    gpio: gpio.SimGpio
+    robot: rig.Robot
+
+    def wire(self, settings: Config) -> Config:
+        """The settings with the simulated GPIO lines; a trigger without lines stays."""
+        wires = {"start": START, "stop": STOP, "new_object": NEW_OBJECT}
+        trigger = replace(settings.trigger, **wires, active_low=False)  # type: ignore[arg-type]
+        if trigger.by_lines:
+            trigger = replace(trigger, mode="two-lines")
+        output = replace(
+            settings.output,
+            ready=READY,
+            busy=BUSY,
+            result_valid=RESULT_VALID,
+            fault=FAULT,
+            decided=DECIDED,
+            class_bits=BITS,
+        )
+        return replace(settings, trigger=trigger, output=output)
+
+    def commanded(self, t_ns: int, *, start: bool) -> None:
+        """The robot follows START and STOP."""
+        self.robot.obey(t_ns, start=start)
+
+    def finished(self, answered: int) -> bool:
+        """True when the script has ended and each of its sweeps was answered."""
+        return self.robot.finished and answered >= self.robot.acts
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SimDevices(RobotDevices):
+    """The robot's cell with a readout board on a simulated USB bus. buses: of each finger, by
+    name; empty with one skin."""
+
+    backend: usb.RigBackend
+    buses: Mapping[str, usb.RigBackend] = field(default_factory=dict)
+
+    def finger(self, name: str) -> SimDevices:
+        """The devices with the board of this finger."""
+        return replace(self, backend=self.buses[name])
+
+    def wire(self, settings: Config) -> Config:
+        """The settings with the simulated GPIO lines and skin."""
+        ids = {
+            "usb": f"{usb.VENDOR_ID:04x}:{usb.PRODUCT_ID:04x}",
+            "profile": "palpate",
+            "grid": "",
+        }
+        link = "acm" if self.backend.acm else "vendor"
+        skin_config = replace(settings.skin, **ids, rate_hz=0.0, link=link)  # type: ignore[arg-type]
+        return replace(RobotDevices.wire(self, settings), skin=skin_config)
+
+
+def robot_on_lines(
+    acts: Iterable[rig.Act],
+    clock: Clock,
+    *,
+    stops: bool = True,
+    remember: bool = True,
+    follows: bool = False,
+) -> tuple[rig.Robot, gpio.SimGpio]:
+    """A robot that plays `acts`, and the GPIO lines that it drives. stops, remember, follows: see
+    `build`."""
+    outputs = READY, BUSY, RESULT_VALID, FAULT, DECIDED, *BITS
+    lines = gpio.SimGpio(
+        clock, {"/dev/gpiochip0": [START, STOP, NEW_OBJECT, *outputs]}, remember=remember
+    )
+    robot = rig.Robot(
+        iter(acts),
+        lines,
+        start=START,
+        stop=STOP,
+        new_object=NEW_OBJECT,
+        remember=remember,
+        follows=follows,
+    )
+    if stops:
+        lines.watchers[DECIDED] = robot.react
+    return robot, lines
+
+
+def build(
+    format: SweepFormat,
+    acts: Iterable[rig.Act],
+    clock: Clock,
+    source: str,
+    *,
+    acm: bool = False,
+    stops: bool = True,
+    remember: bool = True,
+    follows: bool = False,
+    fingers: Mapping[str, SweepFormat] = MappingProxyType({}),
+) -> SimDevices:
+    """Devices on which a robot plays `acts`. source: name of the source in sentences. acm: the
+    readout board is a CDC-ACM device. stops: the robot ends its slide after DECIDED. follows: the
+    finger slides from the command START to STOP, instead of in its own time.
+
+    remember: keep all acts and all output levels, to examine them later; without it memory does not
+    grow. fingers: format of each finger's frames, for a robot with several; the acts have frames
+    for each (Act.others).
+    """
+    robot, lines = robot_on_lines(acts, clock, stops=stops, remember=remember, follows=follows)
+    film = rig.Film(robot, *(fingers.values() or [format]))
+    buses = {
+        finger: usb.RigBackend(
+            rig.ReadoutBoard(own, robot, clock, serial=f"SIM000{i + 1}", film=film, finger=i),
+            clock,
+            acm=acm,
+        )
+        for i, (finger, own) in enumerate((fingers or {"": format}).items())
+    }
+    backend = next(iter(buses.values()))
+
+    def cable(out_ns: int, in_ns: int) -> None:
+        backend.at(out_ns, backend.unplug)
+        backend.at(in_ns, backend.plug)
+
+    robot.cable = cable
+    return SimDevices(
+        clock=clock,
+        gpio=lines,
+        backend=backend,
+        source=source,
+        robot=robot,
+        format=format,
+        buses=buses if fingers else {},
+    )

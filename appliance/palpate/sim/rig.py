@@ -1,0 +1,361 @@
+"""The simulated robot and readout board on one timeline, and clocks that can skip time. Acts (the
+frames of a sweep and the positions of its edges) become packets as in PROTOCOL.md and edges, each
+at its time.
+
+`usb` presents the readout board to pyusb, `gpio` the edges to the drivers.
+"""
+
+from __future__ import annotations
+
+import time
+from bisect import bisect_left
+from collections import deque
+from collections.abc import Callable, Iterator, MutableSequence
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.core.clock import Clock
+from palpate.core.types import SweepFormat
+from palpate.io import packets
+
+PULSE_NS = 20_000_000
+"""Length of the robot's pulses."""
+SETTLED = 16
+"""A finger that follows START begins after this part of a slide: until then the skin creeps."""
+WAITING = 2
+"""Frames of a lifted finger that are played at once while it waits for START."""
+REACTION_NS = 20_000_000
+"""Time for which the finger continues to slide after DECIDED has risen."""
+
+
+class VirtualClock:
+    """Time that passes only in `sleep_until`, so that minutes are simulated in a fraction of a
+    second, reproducibly."""
+
+    def __init__(self, start_ns: int = 1_000_000_000) -> None:
+        self._now_ns = start_ns
+
+    def now_ns(self) -> int:
+        """The simulated time in nanoseconds."""
+        return self._now_ns
+
+    def sleep_until(self, t_ns: int) -> None:
+        """Jump to `t_ns`."""
+        self._now_ns = max(self._now_ns, t_ns)
+
+
+class SkippingClock:
+    """Real time without waiting: computing takes real time, sleeping takes none. For measuring the
+    computing time of the box."""
+
+    def __init__(self) -> None:
+        self._skipped_ns = 0
+
+    def now_ns(self) -> int:
+        """Monotonic nanoseconds plus everything that was skipped."""
+        return time.monotonic_ns() + self._skipped_ns
+
+    def sleep_until(self, t_ns: int) -> None:
+        """Skip to `t_ns`."""
+        self._skipped_ns += max(0, t_ns - self.now_ns())
+
+
+@dataclass(frozen=True, slots=True)
+class Act:
+    """One sweep of the robot. frames: raw counts [n, R, C] or [n, R, C, A]. start, stop: frames at
+    which its edges come. label: the material. new_object: NEW OBJECT comes with the first frame.
+    lifted: frames before the finger touches.
+
+    about: what is special about it, for a person. wanted: the right status; "" for `ok`, or
+    `unknown` if the bundle lacks the material. unplugged: frames [from, to) for which the
+    skin is unplugged; None for none. others: as `frames`, for the second finger and further ones.
+    """
+
+    frames: NDArray[Any]
+    start: int
+    stop: int
+    label: str
+    new_object: bool = False
+    about: str = ""
+    wanted: str = ""
+    unplugged: tuple[int, int] | None = None
+    lifted: int = 1
+    others: tuple[NDArray[Any], ...] = ()
+
+    def part(self, of: slice) -> Act:
+        """The same act with a part of its frames, of all fingers."""
+        return replace(self, frames=self.frames[of], others=tuple(x[of] for x in self.others))
+
+
+class EdgeLines(Protocol):
+    """Receives the robot's edges: SimGpio, or a list of a test."""
+
+    def drive(self, name: str, level: bool, t_ns: int) -> None:
+        """Set the input line `name` to `level` at `t_ns`."""
+        ...
+
+    def forget(self, name: str, t_ns: int) -> None:
+        """Cancel the levels scheduled for `name` at `t_ns` and later."""
+        ...
+
+
+class Robot:
+    """The simulated robot: plays a script of acts and drives start, stop and NEW OBJECT at their
+    frames.
+
+    acts: number of acts that it has begun. played: the acts as they were played; without `remember`
+    only the newest. skipped: frame numbers [from, to) that were omitted because it stopped early;
+    the readout board leaves them out. cable: unplugs the skin at one time, plugs it in at another.
+    follows: it waits with a lifted finger for START, then slides until STOP, both by `obey`, and
+    drives no lines.
+    """
+
+    def __init__(
+        self,
+        script: Iterator[Act],
+        lines: EdgeLines,
+        *,
+        start: str,
+        stop: str,
+        new_object: str = "",
+        remember: bool = True,
+        follows: bool = False,
+    ) -> None:
+        self.acts = 0
+        self._follows, self._sliding, self._lifting = follows, False, False
+        self._act: Act | None = None  # the act that waits for START, or slides
+        self.played: MutableSequence[Act] = [] if remember else deque(maxlen=1)
+        self.finished = False
+        self.skipped: tuple[int, int] | None = None
+        self.cable: Callable[[int, int], None] | None = None
+        self._script, self._lines = script, lines
+        self._playing: tuple[Act, int, Callable[[int], int]] | None = None
+        self._start, self._stop, self._new_object = start, stop, new_object
+
+    def next_act(self, first: int, frame_ns: Callable[[int], int]) -> Act | None:
+        """Begin the next act with frame `first`, schedule its edges and return it; None when the
+        script has ended.
+
+        frame_ns: gives the host time at which a frame is taken.
+        """
+        if self._follows:
+            return self._followed(first, frame_ns)
+        act = next(self._script, None)
+        if act is None:
+            self.finished = True
+            return None
+        self.acts += 1
+        self.played.append(act)
+        begin_ns, start_ns, stop_ns = (frame_ns(first + i) for i in (0, act.start, act.stop))
+        if act.new_object and self._new_object:
+            self._pulse(self._new_object, begin_ns, begin_ns + PULSE_NS)
+        if self._stop:
+            self._pulse(self._start, start_ns, start_ns + PULSE_NS)
+            self._pulse(self._stop, stop_ns, stop_ns + PULSE_NS)
+        else:
+            self._pulse(self._start, start_ns, stop_ns)
+        if act.unplugged and self.cable:
+            self.cable(*(frame_ns(first + i) for i in act.unplugged))
+        self._playing = act, first, frame_ns
+        return act
+
+    def react(self, t_ns: int) -> None:
+        """DECIDED has risen at `t_ns`: end the slide REACTION_NS later, unless it ends before."""
+        if not self._playing or self._follows:
+            return
+        act, first, frame_ns = self._playing
+        at = bisect_left(range(act.stop), t_ns + REACTION_NS, key=lambda i: frame_ns(first + i))
+        if at == act.stop:
+            return
+        self._playing = None
+        stop_ns = frame_ns(first + at)
+        self._lines.forget(self._stop or self._start, stop_ns)
+        if self._stop:
+            self._pulse(self._stop, stop_ns, stop_ns + PULSE_NS)
+        else:
+            self._lines.drive(self._start, False, stop_ns)
+        self.skipped = first + at, first + act.stop
+        if self.played:
+            self.played[-1] = replace(
+                act, frames=np.delete(act.frames, slice(at, act.stop), axis=0), stop=at
+            )
+
+    def obey(self, t_ns: int, *, start: bool) -> None:
+        """START or STOP has come as a command at `t_ns`. START makes a finger that waits slide from
+        the next frame on; STOP lifts it."""
+        if start and not self._sliding:
+            self._sliding, self._lifting = True, False
+            self._playing = None
+        elif not start and self._sliding:
+            self._sliding, self._lifting = False, True
+            if self._playing:
+                act, first, frame_ns = self._playing
+                last = len(act.frames)
+                at = bisect_left(range(last), t_ns, key=lambda i: frame_ns(first + i))
+                self.skipped = (first + at, first + last) if at < last else None
+
+    def _followed(self, first: int, frame_ns: Callable[[int], int]) -> Act | None:
+        """The next frames of a finger that follows commands: a few lifted ones, a whole slide, or
+        the end of an act."""
+        if self._act is None:
+            self._act = next(self._script, None)
+            if self._act is None:
+                self.finished = True
+                return None
+        act = self._act
+        if self._sliding:
+            if not self._playing:
+                self.acts += 1
+                self.played.append(act)
+            settled = act.start + (act.stop - act.start) // SETTLED
+            part = act.part(slice(settled, act.stop))  # again, until STOP comes
+            self._playing = part, first, frame_ns
+            return part
+        if self._lifting:
+            self._lifting, self._playing, self._act = False, None, None
+            return act.part(slice(act.stop, None))
+        return act.part(slice(max(1, min(act.lifted, WAITING))))
+
+    def _pulse(self, name: str, up_ns: int, down_ns: int) -> None:
+        self._lines.drive(name, True, up_ns)
+        self._lines.drive(name, False, down_ns)
+
+
+class Film:
+    """The frames of a robot's acts, one after the other, as seen by the skins of the fingers.
+
+    formats: of each finger's frames. Boards of several fingers may be HISTORY frames apart.
+    """
+
+    HISTORY = 1500
+
+    def __init__(self, robot: Robot, *formats: SweepFormat) -> None:
+        self._robot = robot
+        self._history = self.HISTORY if len(formats) > 1 else 0
+        self._frames = [np.zeros((0, *format.shape), format.numpy_type) for format in formats]
+        self._base = 0  # number of the first frame in _frames
+
+    def frames(
+        self, first: int, n: int, frame_ns: Callable[[int], int], finger: int = 0
+    ) -> NDArray[Any]:
+        """Frames `first` to `first + n` of the script [n, *shape], requested in order; after its
+        end all counts are 0.
+
+        frame_ns: gives the host time at which a frame is taken, and so the times of the edges of an
+        act.
+        """
+        if self._robot.skipped:
+            begin, end = (i - self._base for i in self._robot.skipped)
+            self._frames = [np.delete(x, slice(begin, end), axis=0) for x in self._frames]
+            self._robot.skipped = None
+        while first + n > self._base + len(self._frames[0]):
+            act = self._robot.next_act(self._base + len(self._frames[0]), frame_ns)
+            keep = max(0, min(first - self._history - self._base, len(self._frames[0])))
+            more = (act.frames, *act.others) if act else [self._dark(x) for x in self._frames]
+            self._frames = [
+                np.concatenate([x[keep:], new]) for x, new in zip(self._frames, more, strict=True)
+            ]
+            self._base += keep
+        return self._frames[finger][first - self._base :][:n]
+
+    @staticmethod
+    def _dark(like: NDArray[Any]) -> NDArray[Any]:
+        return np.zeros((4096, *like.shape[1:]), like.dtype)
+
+
+class ReadoutBoard:
+    """The simulated readout board (PROTOCOL.md): samples the script at its own rate, has a FIFO,
+    sends packets.
+
+    packet_frames, fifo_frames: frames per packet and in the FIFO. ppm: error of its crystal.
+    latency: draws the time in ns from a packet's last frame to its arrival. first_seq: number of
+    its first frame. film, finger: of a board beside those of other fingers.
+    """
+
+    def __init__(
+        self,
+        format: SweepFormat,
+        robot: Robot,
+        clock: Clock,
+        *,
+        packet_frames: int = 6,
+        fifo_frames: int = 750,
+        ppm: float = 0.0,
+        latency: Callable[[], int] = lambda: 150_000,
+        serial: str = "SIM0001",
+        first_seq: int = 0,
+        film: Film | None = None,
+        finger: int = 0,
+    ) -> None:
+        self.identity = packets.Identity(packets.VERSION, (1, 0, 0), "palpate-sim", serial)
+        self.skin = packets.SkinFormat(
+            format.rows,
+            format.cols,
+            format.dtype,
+            format.rate_hz,
+            fifo_frames,
+            packet_frames,
+            format.axes,
+        )
+        self.present = True
+        self.running = False
+        self._clock, self._latency = clock, latency
+        self._rate = 1 + ppm * 1e-6
+        self._period_ns = format.period_ns / self._rate
+        self._origin_ns = clock.now_ns()
+        self._first_seq = first_seq
+        self._next = 0  # number of the next frame to send
+        # arrival of the packet that begins with this frame, once drawn
+        self._arrival_ns: int | None = None
+        self._film, self._finger = film or Film(robot, format), finger
+
+    def frame_ns(self, i: int) -> int:
+        """Host time at which frame `i` is taken."""
+        return self._origin_ns + round((i + 1) * self._period_ns)
+
+    def request(self, request: int) -> bytes | None:
+        """The reply to a control request; None if it is unknown."""
+        now = int((self._clock.now_ns() - self._origin_ns) / self._period_ns)
+        match request:
+            case packets.Request.IDENTITY:
+                return packets.pack_identity(self.identity)
+            case packets.Request.FORMAT:
+                return packets.pack_format(self.skin)
+            case packets.Request.START:
+                if not self.running:
+                    self.running, self._next, self._arrival_ns = True, now, None
+                return b""
+            case packets.Request.STOP:
+                self.running = False
+                return b""
+        return None
+
+    def due_ns(self) -> int | None:
+        """Time at which the next packet will be on the bus; None while the readout board does not
+        send."""
+        if not self.running:
+            return None
+        if self._arrival_ns is None:
+            self._arrival_ns = (
+                self.frame_ns(self._next + self.skin.packet_frames - 1) + self._latency()
+            )
+        return self._arrival_ns
+
+    def take(self) -> bytes:
+        """The packet that is due. If the FIFO has overflowed, the oldest frames are missing."""
+        n, fifo = self.skin.packet_frames, self.skin.fifo_frames
+        taken = int((self._clock.now_ns() - self._origin_ns) / self._period_ns)
+        late = max(0, taken - fifo - self._next)
+        first = self._next + late
+        self._next, self._arrival_ns = first + n, None
+        device_us = round((self.frame_ns(first) - self._origin_ns) * self._rate / 1000)
+        flags = packets.Flag.OVERFLOW if late else 0
+        return packets.pack(
+            self._first_seq + first,
+            device_us,
+            self._film.frames(first, n, self.frame_ns, self._finger),
+            flags,
+        )

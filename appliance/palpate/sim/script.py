@@ -1,0 +1,282 @@
+"""Scripts for the simulated robot, by the name after `--sim`: sweeps over simulated tubes, a finger
+at rest, or the sweeps of a recorded set, whose windows are exactly the middle of the played sweeps.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from palpate.core.errors import ConfigError, FormatError
+from palpate.core.sweep_set import SweepSet, load_file
+from palpate.core.types import SweepFormat
+from palpate.sim import skin
+from palpate.sim.rig import Act
+
+PLAYED = skin.LEVEL_BLIND
+"""The world that is played. The packaged bundle is fitted to it, and the end of its pad is so near
+that the contact shows a displacement in both directions."""
+SETS = "replay:"
+PAUSE_S = 0.1, 0.14
+"""Time for which the finger is off the tube before and after a sweep. It is drawn for each sweep,
+so that edges come anywhere within packets."""
+PAUSE_FRAMES = 12
+"""Least number of frames without contact, so that a slow skin is seen unloaded, too."""
+SLIDE_S, REST_S = 3.0, 0.1
+"""Duration of the slide (paper, sec. II.B), and of the finger at rest on the tube before and after
+it."""
+FOLLOWED_S = 8.0
+"""Duration of a slide that ends with the command STOP; it is repeated if STOP comes later."""
+LEAD_S = 0.5
+"""Time from an edge to a recorded window, equal to `SweepConfig.lead_ms`; the window's first and
+last frame are repeated for this time."""
+LIFTED_SET_S = 0.4
+"""Time for which the finger is lifted before a sweep of a set. A set does not record the unloaded
+skin, so all counts are 0."""
+RESTS_MM = (4.0, 3.0), (-2.5, 2.0), (1.5, -1.0), (0.0, 0.0)
+"""Positions of the skin while somebody aligns it, each better than the one before: (along the
+finger, across). In mm."""
+RESTS_FOR_S, LIFTED_S = 3.0, 1.0
+"""Time for which the finger then rests on the tube, and for which it is lifted before."""
+MARGIN = 8
+"""Frames before the start edge and after the stop edge."""
+
+_NAME_SKIN = "name another skin with --skin, or use --sim replay:FILE"
+_NAME_BUNDLE = (
+    "name a bundle for this skin with --set classifier.bundle=DIR; palpate record --sim skin "
+    "--skin NAME, palpate-train fit "
+    "and export make one"
+)
+
+
+def named(
+    name: str,
+    format: SweepFormat | None,
+    seed: int,
+    *,
+    spread: bool = False,
+    seen: SeenTubes | None = None,
+    follows: bool = False,
+    fingers: int = 1,
+) -> tuple[Iterator[Act], str, SweepFormat]:
+    """The script with this name after `--sim`, the name of the source in sentences, and the format
+    of its sweeps.
+
+    format: wanted by the bundle, None without a bundle. spread: play the sweeps of a set in a drawn
+    order, the materials in turn. seen: the skin on the finger, None for the simulator's own.
+    follows: slides last FOLLOWED_S, since commands end them. fingers: their number. Raises
+    ConfigError for an unknown name, FormatError if the bundle needs another skin.
+    """
+    kind, _, only = name.partition(":")
+    if name == "rest" or kind == "skin":
+        able: list[tuple[SweepFormat, skin.World, SeenTubes]] = [
+            (world.format, world, skin) for world in (PLAYED, replace(PLAYED, shear=True))
+        ]
+        if seen:
+            able = [(seen.FORMAT, PLAYED, seen)]
+        format = format or able[0][0]
+        fits = [
+            one for one in able if (one[0].skin, one[0].rate_hz) == (format.skin, format.rate_hz)
+        ]
+        if not fits:
+            sent = " or ".join(str(one) for one, _, _ in able)
+            hint = _NAME_BUNDLE if seen else _NAME_SKIN
+            raise FormatError(f"the simulated skin sends {sent}, {format} is wanted; {hint}")
+        _, world, by = fits[0]
+        acts = (
+            rests(seed, world, by)
+            if name == "rest"
+            else tubes(
+                seed,
+                world=world,
+                seen=by,
+                only=only,
+                slide_s=FOLLOWED_S if follows else SLIDE_S,
+                fingers=fingers,
+            )
+        )
+        return _in_hand(acts, fingers), "sim", format
+    if name.startswith(SETS):
+        sweeps = load(Path(name.removeprefix(SETS)), format)
+        acts = play(sweeps, in_turn(sweeps.labels, seed) if spread else range(len(sweeps)))
+        return _in_hand(acts, fingers), "replay", sweeps.format
+    raise ConfigError(
+        f"--sim {name} is unknown; use skin, skin:MATERIAL, rest, or replay:FILE with a sweep set"
+    )
+
+
+def _in_hand(acts: Iterator[Act], fingers: int) -> Iterator[Act]:
+    """Acts with frames for each finger: the same ones where the script has none of its own."""
+    for act in acts:
+        yield replace(act, others=act.others or (act.frames,) * (fingers - 1))
+
+
+class SeenTubes(Protocol):
+    """Tubes as seen by a skin on the finger: the module `skin`, or the view of another skin
+    (`skins.sweeps`)."""
+
+    @property
+    def FORMAT(self) -> SweepFormat:
+        """Format of its sweeps."""
+        ...
+
+    def idle(self, n: int, rng: Generator, world: skin.World) -> NDArray[Any]:
+        """n frames without contact."""
+        ...
+
+    def sweep(
+        self,
+        material: str,
+        placement: skin.Placement,
+        rng: Generator,
+        world: skin.World,
+        *,
+        rest_s: float,
+        slide_s: float,
+        after_s: float,
+    ) -> NDArray[Any]:
+        """A sweep over a tube."""
+        ...
+
+
+def tubes(
+    seed: int,
+    sweeps: int | None = None,
+    places: Sequence[skin.Placement] = (),
+    world: skin.World = PLAYED,
+    seen: SeenTubes = skin,
+    only: str = "",
+    slide_s: float = SLIDE_S,
+    fingers: int = 1,
+) -> Iterator[Act]:
+    """Sweeps over the six tubes in random order; each begins at another spot of its tube.
+
+    sweeps: their number; None for no end. places: positions of the skin, the next for each round of
+    six tubes; by default one position drawn from `seed`. seen: the skin on the finger. only: over
+    this tube alone. fingers: their number. Raises ConfigError for an unknown tube.
+    """
+    materials = (world.tube(only).name,) if only else skin.MATERIALS
+    return _tubes(
+        np.random.default_rng(seed),
+        sweeps,
+        places or skin.placements("T-LAB", seed),
+        world,
+        seen,
+        materials,
+        slide_s,
+        fingers,
+    )
+
+
+def _tubes(
+    rng: Generator,
+    sweeps: int | None,
+    places: Sequence[skin.Placement],
+    world: skin.World,
+    seen: SeenTubes,
+    materials: Sequence[str],
+    slide_s: float,
+    fingers: int,
+) -> Iterator[Act]:
+    rounds = itertools.cycle(places)
+    tubes_left: list[str] = []
+    for _ in itertools.count() if sweeps is None else range(sweeps):
+        if not tubes_left:
+            tubes_left, place = [str(m) for m in rng.permutation(materials)], next(rounds)
+        yield slide(tubes_left.pop(), place, rng, world, seen, slide_s, fingers)
+
+
+def slide(
+    label: str,
+    place: skin.Placement,
+    rng: Generator,
+    world: skin.World,
+    seen: SeenTubes = skin,
+    slide_s: float = SLIDE_S,
+    fingers: int = 1,
+) -> Act:
+    """One sweep over the tube `label`, with the finger lifted before and after it. fingers: each
+    slides over another spot of the tube."""
+    rate = seen.FORMAT.rate_hz
+    off = seen.idle(max(PAUSE_FRAMES, round(rng.uniform(*PAUSE_S) * rate)), rng, world)
+    frames, *others = (
+        np.concatenate([off, on, off])
+        for on in (
+            seen.sweep(label, place, rng, world, rest_s=REST_S, slide_s=slide_s, after_s=REST_S)
+            for _ in range(fingers)
+        )
+    )
+    start = len(off) + round(REST_S * rate)
+    stop = start + round(slide_s * rate)
+    return Act(frames, start, stop, label, lifted=len(off), others=tuple(others))
+
+
+def rests(seed: int, world: skin.World = PLAYED, seen: SeenTubes = skin) -> Iterator[Act]:
+    """A finger that is lifted and put on the wooden tube again, without end. The skin is shifted
+    between the touches."""
+    rng = np.random.default_rng(seed)
+    off = round(LIFTED_S * seen.FORMAT.rate_hz)
+    for dx_mm, dy_mm in itertools.cycle(RESTS_MM):
+        place = skin.Placement(dx_mm, dy_mm, seed=seed)
+        on = seen.sweep("wood", place, rng, world, rest_s=RESTS_FOR_S, slide_s=0, after_s=0)
+        frames = np.concatenate([seen.idle(off, rng, world), on])
+        yield Act(frames, off, len(frames) - 1, "wood", lifted=off)
+
+
+def load(path: Path, format: SweepFormat | None) -> SweepSet:
+    """The set at `path`. Raises FormatError if it is not of `format`."""
+    sweeps = load_file(path, SweepSet)
+    if format not in (None, sweeps.format):
+        raise FormatError(
+            f"{path} holds {sweeps.format}, {format} is wanted; name its bundle with --set "
+            "classifier.bundle=DIR"
+        )
+    return sweeps
+
+
+def in_turn(labels: NDArray[Any], seed: int) -> list[int]:
+    """An order of sweeps in which the materials come in turn, in each round in another order.
+    labels: int [N]."""
+    rng = np.random.default_rng(seed)
+    waiting = {
+        label: rng.permutation(np.flatnonzero(labels == label)).tolist()
+        for label in np.unique(labels).tolist()
+    }
+    order = []
+    while waiting:
+        for label in rng.permutation(list(waiting)).tolist():
+            order.append(waiting[label].pop())
+        waiting = {label: left for label, left in waiting.items() if left}
+    return order
+
+
+def play(sweeps: SweepSet, order: Iterable[int]) -> Iterator[Act]:
+    """The sweeps of a set in this order, with NEW OBJECT where a recording begins."""
+    recording = sweeps.groups.get("recording")
+    before = None
+    lead, lifted = (round(s * sweeps.format.rate_hz) for s in (LEAD_S, LIFTED_SET_S))
+    start = lifted + MARGIN
+    # even, so that a frame lies in the middle
+    stop = start + 2 * lead + sweeps.format.window // 2 * 2
+    for i in order:
+        window, now = sweeps.samples[i], None if recording is None else recording[i]
+        ahead, after = window[:1].repeat(MARGIN + lead, 0), window[-1:].repeat(MARGIN + lead, 0)
+        frames = np.concatenate(
+            [np.zeros((lifted, *window.shape[1:]), window.dtype), ahead, window, after]
+        )
+        yield Act(
+            frames,
+            start,
+            stop,
+            sweeps.materials[sweeps.labels[i]],
+            now is not None and now != before,
+            lifted=lifted,
+        )
+        before = now

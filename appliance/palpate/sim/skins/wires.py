@@ -1,0 +1,381 @@
+"""The bytes that emulated skins send for frames of raw counts, and their answers to commands of the
+box.
+
+Each class is the skin's side of one serial line. Sources are the readers and firmware published by
+makers and users, named at each class. None of the skins was available.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.core.errors import ConfigError
+
+Taxels = NDArray[Any]
+
+
+class Wire(Protocol):
+    """The skin's side of its serial line. period_ns: time between two frames. streaming: whether it
+    sends frames."""
+
+    period_ns: float
+
+    @property
+    def streaming(self) -> bool:
+        """Whether frames are sent; for some skins commands decide."""
+        ...
+
+    def frame(self, taxels: Taxels, t_us: int) -> bytes:
+        """The bytes of one frame [R, C] or [R, C, A]. t_us: the skin's own time."""
+        ...
+
+    def receive(self, data: bytes) -> bytes:
+        """The skin's answer to bytes from the box."""
+        ...
+
+    def skip(self, frames: int) -> None:
+        """This many frames are taken and never sent; a skin that counts frames counts them."""
+        ...
+
+
+class _Uncounted:
+    """A skin whose frames have no number."""
+
+    def skip(self, frames: int) -> None:
+        """Does nothing: the gap is invisible."""
+
+
+class _Deaf(_Uncounted):
+    """A skin that streams from power-on and takes no commands."""
+
+    streaming = True
+
+    def __init__(self, rate_hz: float) -> None:
+        self.period_ns = 1e9 / rate_hz
+
+    def receive(self, data: bytes) -> bytes:
+        """Does nothing: the skin does not listen."""
+        return b""
+
+
+class Marked(_Deaf):
+    """A marker, then all taxels row by row: FlexiTac and most self-made matrices.
+
+    Source: flexitac 0.3.1, firmware/template.ino (AA 55, R x C uint8).
+    """
+
+    def __init__(
+        self, rate_hz: float, marker: bytes = b"\xaa\x55", dtype: str = "u1", trailer: bytes = b""
+    ) -> None:
+        super().__init__(rate_hz)
+        self._marker, self._dtype, self._trailer = marker, dtype, trailer
+
+    def frame(self, taxels: Taxels, t_us: int) -> bytes:
+        """Marker, numbers, trailer."""
+        return self._marker + taxels.astype(self._dtype).tobytes() + self._trailer
+
+
+class Magnetic(_Deaf):
+    """AnySkin: five chips, each its temperature and three axes as float32, then CR LF: 82 bytes.
+
+    Source: anyskin 1.0.0, sensor.py, `burst_mode`.
+    """
+
+    temperature = 25.0
+
+    def frame(self, taxels: Taxels, t_us: int) -> bytes:
+        """(t, x, y, z) of each chip, and the end of line."""
+        return self._with_temperature(taxels).astype("<f4").tobytes() + b"\r\n"
+
+    def _with_temperature(self, taxels: Taxels) -> NDArray[np.float64]:
+        axes = taxels.reshape(-1, 3).astype(np.float64)
+        return np.column_stack([np.full(len(axes), self.temperature), axes])
+
+
+class MagneticText(Magnetic):
+    """ReSkin: the same numbers as a line of decimal text with two digits after the point.
+
+    Source: anyskin 1.0.0, sensor.py, without `burst_mode`; Arduino's Serial.print(float) gives two
+    digits.
+    """
+
+    def frame(self, taxels: Taxels, t_us: int) -> bytes:
+        """One line of text."""
+        return (
+            "\t".join(f"{value:.2f}" for value in self._with_temperature(taxels).ravel()).encode()
+            + b"\r\n"
+        )
+
+
+class Rows(_Deaf):
+    """A line of text for each row, and an empty line after the last: 3D-ViTac, and matrices of
+    sketches for Arduino.
+
+    Source: the firmware notes of 3D-ViTac's 16 x 16 matrix (numbers separated by blanks, 16 rows
+    and a blank line).
+    """
+
+    def __init__(self, rate_hz: float, separator: str = " ") -> None:
+        super().__init__(rate_hz)
+        self._separator = separator
+
+    def frame(self, taxels: Taxels, t_us: int) -> bytes:
+        """R lines of C numbers, and an empty line."""
+        lines = [self._separator.join(map(str, row.tolist())) for row in taxels]
+        return ("\r\n".join(lines) + "\r\n\r\n").encode()
+
+
+class PapillArray:
+    """Contactile's PapillArray controller (PTS 2.0). Frames [3 S, 3, 3]: S sensors of 3 x 3 pillars
+    with Fx, Fy, Fz in N.
+
+    Source: published recordings of a controller's first bytes and readers written by users. Offsets
+    count from the byte that holds their size; the controller pads its table with two zero bytes.
+    """
+
+    START, END = b"\x55\x66\x77\x88", b"\xaa\xbb\xcc\xdd"
+    RATES = (100, 250, 500, 1000)
+    TARE_S = 2.0
+    PILLARS = 9
+
+    def __init__(self, rate_hz: float = 1000, counter: int = 0) -> None:
+        self.period_ns, self.streaming, self.counter = 1e9 / rate_hz, True, counter
+        self._rest = b""
+        self._zero: NDArray[np.float64] | float = 0.0
+        self._unloaded: list[NDArray[np.float64]] = []
+        self._tare_left = 0
+
+    def receive(self, data: bytes) -> bytes:
+        """`f1000\\n` sets the rate, `z\\n` takes the mean of the next two seconds as zero; other
+        lines do nothing."""
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        for line in lines:
+            if line == b"z":
+                self._tare_left, self._unloaded = round(self.TARE_S * 1e9 / self.period_ns), []
+            elif line[:1] == b"f" and line[1:].isdigit() and int(line[1:]) in self.RATES:
+                self.period_ns = 1e9 / int(line[1:])
+        return b""
+
+    def frame(self, taxels: Taxels, t_us: int) -> bytes:
+        """A packet with forces, displacements, sums, and blocks of unknown meaning."""
+        force = taxels.reshape(-1, self.PILLARS, 3).astype(np.float64)
+        if self._tare_left:
+            self._unloaded.append(force)
+            self._tare_left -= 1
+            if not self._tare_left:
+                self._zero = np.mean(self._unloaded, axis=0)
+        force = force - self._zero
+        body = self._blocks(force, t_us)
+        self.counter += 1
+        return self.START + body + struct.pack("<H", sum(body) & 0xFFFF) + self.END
+
+    def skip(self, frames: int) -> None:
+        """The counter of the next packet shows the gap."""
+        self.counter += frames
+
+    def _blocks(self, force: NDArray[np.float64], t_us: int) -> bytes:
+        table, payload = b"", b""
+        kinds = 1, 3, 4, 5, 6, 7
+        first = 1 + 4 * len(kinds) + 2
+        for kind in kinds:
+            at = first + len(payload)
+            table += struct.pack("<HH", kind, at)
+            payload += self._block(kind, force, t_us, at)
+        return b"\x02" + table + b"\0\0" + payload
+
+    def _block(self, kind: int, force: NDArray[np.float64], t_us: int, at: int) -> bytes:
+        """The block of this type that begins at offset `at`."""
+        if kind == 1:
+            return struct.pack("<IQ", self.counter % (1 << 32), t_us)
+        if kind == 7:
+            return b"\0"
+        sums = force.sum(axis=1)
+        if kind in (4, 6):
+            items = [
+                struct.pack("<H6f", 2, *f, *(0.01 * f))
+                if kind == 4
+                else struct.pack("<HB2f", 1, 0, 0.5, 1.0)
+                for f in sums
+            ]
+            return _listed(items, at)
+        inner = [
+            [
+                struct.pack("<H6f", 2, *f, *(0.1 * f))
+                if kind == 3
+                else struct.pack("<Hbf", 1, 0, 0.5)
+                for f in pillars
+            ]
+            for pillars in force
+        ]
+        sizes = [2 + 2 * len(items) + sum(map(len, items)) for items in inner]
+        begins = at + 2 + 2 * len(inner) + np.cumsum([0, *sizes[:-1]])
+        head = struct.pack(f"<H{len(inner)}H", len(inner), *begins)
+        return head + b"".join(
+            _listed(items, int(begin)) for items, begin in zip(inner, begins, strict=True)
+        )
+
+
+def _listed(items: Sequence[bytes], at: int) -> bytes:
+    """Their number, their offsets, and the items, for a list that begins at offset `at`."""
+    begins = at + 2 + 2 * len(items) + np.cumsum([0, *map(len, items[:-1])])
+    return struct.pack(f"<H{len(items)}H", len(items), *begins) + b"".join(items)
+
+
+class Slcan(_Uncounted):
+    """XELA's uSkin on CAN, behind a USB adapter that speaks slcan. Frames [R, C, 3] uint16: X, Y,
+    Z.
+
+    Sources: Lawicel's slcan as github.com/mac-can/SLCAN describes it (commands end with CR, answers
+    are CR or BEL, `z` CR to a transmission); the start command 07 00 to id 0x200 + board, and
+    replies of 0x710 + taxel with big-endian numbers in bytes 1 to 6, from users' readers over
+    socketcan.
+    """
+
+    OK, ERROR = b"\r", b"\a"
+    BUS_SPEED = b"S8"  # 1 Mbit/s, at which the sensors speak
+    FIRST_ID = 0x710
+
+    def __init__(self, rate_hz: float, board: int = 1) -> None:
+        self.period_ns = 1e9 / rate_hz
+        self.invalid: frozenset[int] = frozenset()
+        self._start = b"t%03X20700" % (0x200 + board)
+        self._speed, self._open, self._started = b"", False, False
+        self._rest = b""
+
+    @property
+    def streaming(self) -> bool:
+        """Whether the channel is open at the sensors' speed and the start command was sent."""
+        return self._open and self._started
+
+    def receive(self, data: bytes) -> bytes:
+        """The adapter's answers."""
+        *lines, self._rest = (self._rest + data).split(b"\r")
+        return b"".join(map(self._command, lines))
+
+    def _command(self, line: bytes) -> bytes:
+        match line[:1]:
+            case b"":
+                return self.OK
+            case b"S" if not self._open and line[1:] in (
+                b"0",
+                b"1",
+                b"2",
+                b"3",
+                b"4",
+                b"5",
+                b"6",
+                b"7",
+                b"8",
+            ):
+                self._speed = line
+            case b"O" if line == b"O" and not self._open and self._speed:
+                self._open = True
+            case b"C" if line == b"C" and self._open:
+                # the sensors go on sending, but the closed channel does not pass it on
+                self._open = False
+            case b"V" if line == b"V":
+                return b"V1013\r"
+            case b"t" if self._open and self._speed == self.BUS_SPEED:
+                self._started = self._started or line.upper().replace(b"T", b"t", 1) == self._start
+                return b"z\r"
+            case _:
+                return self.ERROR
+        return self.OK
+
+    def frame(self, taxels: Taxels, t_us: int) -> bytes:
+        """One CAN message for each taxel. invalid: taxels without a value now; their X begins with
+        FA."""
+        words = taxels.reshape(-1, 3).astype(">u2").copy()
+        if self.invalid:
+            words[list(self.invalid), 0] |= 0xFA00
+        messages = (b"\0" + row.tobytes() + b"\0" for row in words)
+        return b"".join(
+            b"t%03X8%b\r" % (self.FIRST_ID + i, m.hex().upper().encode())
+            for i, m in enumerate(messages)
+        )
+
+
+class Robotiq(_Uncounted):
+    """Robotiq's TSF-85 fingertips. Frames [7 F, 4] uint16: F fingers of 7 x 4 taxels.
+
+    Source: Robotiq's reader for Python (tactile_sensors, sensor_quickstart) as packages repeat it:
+    9A, a byte reserved for a checksum, command, length, data; fields begin with type << 4 | finger
+    << 2; numbers are big-endian.
+    """
+
+    READ, AUTOSEND, AUTOSEND_ASYNC, VERSION = 0x61, 0x58, 0x59, 0xE3
+    FIRMWARE = b"2.0.1"
+    STATIC, DYNAMIC, ACCELEROMETER, TIMESTAMP = 0x10, 0x20, 0x30, 0x70
+    UPRIGHT = 0, 0, 16384  # 1 g
+
+    def __init__(self, rate_hz: float) -> None:
+        self.period_ns = 1e9 / rate_hz
+        self.streaming = False
+        self._rest = b""
+        self._last: NDArray[np.int64] | None = None
+
+    def receive(self, data: bytes) -> bytes:
+        """Commands: start sending with a period in ms, 0 to stop; ask for the version."""
+        self._rest += data
+        answer = b""
+        while (at := self._rest.find(b"\x9a")) >= 0 and len(self._rest) >= at + 4 + (
+            self._rest[at + 3 : at + 4] or b"\xff"
+        )[0]:
+            command, length = self._rest[at + 2], self._rest[at + 3]
+            content, self._rest = (
+                self._rest[at + 4 : at + 4 + length],
+                self._rest[at + 4 + length :],
+            )
+            if command in (self.AUTOSEND, self.AUTOSEND_ASYNC) and length == 1:
+                self.streaming = content[0] > 0
+                self.period_ns = content[0] * 1e6 or self.period_ns
+            elif command == self.VERSION:
+                answer += self._packet(self.VERSION, self.FIRMWARE)
+        return answer
+
+    def frame(self, taxels: Taxels, t_us: int) -> bytes:
+        """All fields of all fingers in one packet."""
+        fingers = taxels.reshape(-1, 28).astype(np.int64)
+        change = (
+            np.zeros(len(fingers)) if self._last is None else (fingers - self._last).mean(axis=1)
+        )
+        self._last = fingers
+        data = b""
+        for i, (static, dynamic) in enumerate(zip(fingers, change, strict=True)):
+            finger = i << 2
+            data += bytes([self.STATIC | finger]) + static.astype(">u2").tobytes()
+            data += struct.pack(
+                ">Bh", self.DYNAMIC | finger, int(np.clip(round(dynamic), -32768, 32767))
+            )
+            data += struct.pack(">B3h", self.ACCELEROMETER | finger, *self.UPRIGHT)
+            data += struct.pack(">BQ", self.TIMESTAMP | finger, t_us)
+        return self._packet(self.AUTOSEND, data)
+
+    @staticmethod
+    def _packet(command: int, data: bytes) -> bytes:
+        return bytes([0x9A, 0, command, len(data)]) + data
+
+
+WIRES: Mapping[str, Callable[[float], Wire]] = {
+    "flexitac": Marked,
+    "matrix": Marked,
+    "anyskin": Magnetic,
+    "reskin": MagneticText,
+    "3d-vitac": Rows,
+    "papillarray": PapillArray,
+    "xela-can": Slcan,
+    "robotiq-tsf": Robotiq,
+}
+"""The wire of each skin, by the name of its profile, for a rate in frames per second."""
+
+
+def wire(name: str, rate_hz: float) -> Wire:
+    """The wire of the skin with this name. Raises ConfigError for an unknown skin."""
+    if name not in WIRES:
+        raise ConfigError(f"no emulator of a skin {name!r}; there are {', '.join(WIRES)}")
+    return WIRES[name](rate_hz)

@@ -1,0 +1,96 @@
+"""The black box: files of the last sweeps in service with their verdicts, for `palpate replay`.
+
+Sweeps without a window are not kept. Their sentence has all information, and a robot that continues
+without a skin would push out the sweeps that have a window.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from palpate.core.disk_thread import AtOnce, DiskWork
+from palpate.core.log import TroubleLog
+from palpate.core.observer import Observer
+from palpate.core.types import Sweep, SweepFormat, Verdict
+from palpate.sweeps.recording import FULL, SweepFolder
+
+
+class BlackBox(Observer):
+    """Keeps the last `most` sweeps in `folder`, also over restarts.
+
+    The oldest sweep is removed after the new sweep was written, on a full disk before. disk: does
+    that; a sweep that it refuses is not kept.
+    """
+
+    def __init__(
+        self, folder: Path, format: SweepFormat, most: int, disk: DiskWork | None = None
+    ) -> None:
+        self._path, self._format, self._most = folder, format, most
+        self._disk = disk or AtOnce()
+        self._folder: SweepFolder | None = None
+        self._log = TroubleLog(
+            "black box: no sweep is kept",
+            f"see to {folder}",
+            end="black box: sweeps are kept again",
+        )
+        self._with_folder(
+            lambda folder: None
+        )  # now, at the start, since it waits for the disk several times
+
+    def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
+        """Write the sweep if it has a window, and remove the oldest sweep beyond `most`."""
+        if len(sweep.frames):
+            self._disk(
+                lambda: self._with_folder(
+                    lambda folder: self._put(folder, sweep, verdict, circumstances)
+                )
+            )
+
+    def close(self) -> None:
+        """Finish writing, and release the folder."""
+        self._disk.settle()
+        if self._folder:
+            self._folder.close()
+
+    def _with_folder(self, act: Callable[[SweepFolder], None]) -> None:
+        def attempt() -> None:
+            # a folder that cannot be used at the start may be usable later, and must not stop the
+            # box
+            self._folder = self._folder or SweepFolder(self._path, self._format)
+            act(self._folder)
+
+        self._log.attempt(attempt)
+
+    def _put(
+        self, folder: SweepFolder, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]
+    ) -> None:
+        while True:
+            try:
+                folder.put(sweep, verdict, circumstances)
+                break
+            except OSError as e:
+                if e.errno not in FULL or not folder.numbers:
+                    raise
+            folder.remove(folder.numbers[0])
+        while len(folder.numbers) > self._most:
+            folder.remove(folder.numbers[0])
+
+
+class FingerBox(BlackBox):
+    """The black box of one finger: its part of each sweep, with its own verdict."""
+
+    def __init__(
+        self, finger: str, folder: Path, format: SweepFormat, most: int, disk: DiskWork
+    ) -> None:
+        super().__init__(folder, format, most, disk)
+        self._finger = finger
+
+    def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
+        """Write the finger's sweep if it has a window."""
+        each = zip(sweep.fingers or (), verdict.fingers or (), strict=True)
+        about = {name: value for name, value in circumstances.items() if name != "fingers"}
+        for own, answer in each:
+            if own.finger == self._finger:
+                super().sweep(own, answer, about | circumstances["fingers"][self._finger])

@@ -1,0 +1,423 @@
+"""Records sweeps to files, with labels that a researcher sets by commands while the robot works
+(`palpate record`).
+
+Each sweep becomes sweep-NNNNNN.npy and .json in one folder, and is reported in a REC sentence.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import re
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from palpate.core import storage, wall_clock
+from palpate.core.clock import Clock
+from palpate.core.disk_thread import AtOnce, DiskWork
+from palpate.core.errors import ApplianceError, ConfigError, FormatError, TemporaryError
+from palpate.core.log import TroubleLog, log
+from palpate.core.names import LABEL, TypedNames
+from palpate.core.observer import Observer
+from palpate.core.patience import passes
+from palpate.core.sentences import sentence
+from palpate.core.types import Status, Sweep, SweepFormat, Verdict, entries, save, sidecar
+from palpate.service.systemd import words
+from palpate.sweeps.progress import RecordingProgress
+
+FULL = (errno.ENOSPC, errno.EDQUOT)
+"""Error numbers of a full disk."""
+LEAST_FREE = 64 << 20, 20
+"""Space that is left free for the system: this number of bytes, or on a small disk one part in this
+number. A completely full card can stop more than a recording."""
+TARGET = 10
+"""Default of the wanted number of sweeps of each material at each position."""
+MOST_CHANGES = 1024
+"""Largest number of label changes that are kept until the sweeps before them are answered; far more
+than a person makes."""
+DISCARDED = ".discarded"
+"""Suffix of the file that reserves the number of a discarded sweep. It is the renamed sidecar,
+since a rename needs no space, and is removed once a later number is in use."""
+_KEPT = re.compile(
+    rf"sweep-([0-9]+)(\.npy|\.json|{re.escape(DISCARDED)})({re.escape(storage.PART)})?"
+)
+
+
+class SweepFolder:
+    """A folder of sweeps with their verdicts. Numbers continue after a restart, and no number is
+    used twice.
+
+    Unfinished files of a program that was killed are removed. Only one program at a time can use
+    the folder; its lock ends with the program. numbers: of the sweeps in the folder, in order. run:
+    offset of this run's sweep numbers in the folder; sidecars have it, since each run counts its
+    sweeps and objects from 1. Raises OSError if the folder cannot be made, read or locked.
+    """
+
+    def __init__(self, folder: Path, format: SweepFormat) -> None:
+        self.folder, self._format = folder, format
+        _make(folder)
+        self._lock = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            self._take()
+        except OSError:
+            self.close()
+            raise
+
+    def put(self, sweep: Sweep, verdict: Verdict, about: Mapping[str, Any]) -> int:
+        """Write a sweep with its verdict and `about`, completely or not at all; returns its number.
+        Raises OSError."""
+        number = self.run + sweep.id
+        save(
+            self.path(number),
+            sweep,
+            self._format,
+            {**about, "date": wall_clock.date(), "run": self.run, "verdict": verdict.as_dict()},
+        )
+        self.numbers.append(number)
+        return number
+
+    def remove(self, number: int, *, reserve: bool = False) -> None:
+        """Remove a sweep, its .npy first, so that no .npy is ever without its sidecar. Raises
+        OSError.
+
+        reserve: do not use its number again after a restart, even if it was the highest.
+        """
+        path = self.path(number)
+        path.unlink(missing_ok=True)
+        with suppress(FileNotFoundError):
+            if reserve:
+                path.with_suffix(".json").replace(path.with_suffix(DISCARDED))
+            else:
+                path.with_suffix(".json").unlink()
+        storage.sync(self.folder)
+        self.numbers.remove(number)
+
+    def path(self, number: int) -> Path:
+        """Path of the sweep of this number."""
+        return self.folder / f"sweep-{number:06d}.npy"
+
+    def close(self) -> None:
+        """Release the folder."""
+        os.close(self._lock)
+
+    def _take(self) -> None:
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as e:
+            raise BlockingIOError(
+                e.errno, "another program keeps sweeps there", str(self.folder)
+            ) from e
+        names = [name for path in self.folder.iterdir() if (name := _KEPT.fullmatch(path.name))]
+        # an unfinished sweep was never reported as stored, but its number is not used again
+        self.run = max((int(name[1]) for name in names), default=0)
+        self.numbers = sorted(
+            {int(name[1]) for name in names if name[2] != DISCARDED and not name[3]}
+        )
+        for name in names:
+            if name[3] or (name[2] == DISCARDED and int(name[1]) < self.run):
+                (self.folder / name[0]).unlink()
+
+
+def _make(folder: Path) -> None:
+    """Make the folder and those above it, and sync them to the disk."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for above in (
+        folder.resolve().parents
+    ):  # all folders: a run that was killed may have made folders without syncing them
+        with suppress(PermissionError):  # a folder that we may not open is not ours
+            storage.sync(above)
+
+
+@dataclass(frozen=True, slots=True)
+class Labels:
+    """Material, position on the object, and session; "" if unknown. Raises ConfigError for a text
+    that cannot be sent."""
+
+    material: str = ""
+    position: str = ""
+    session: str = ""
+
+    def __post_init__(self) -> None:
+        for name in self.__slots__:
+            text = getattr(self, name)
+            if text and not LABEL.fullmatch(text):
+                raise ConfigError(
+                    f"{name} {text!r} cannot be used: take 1 to 24 letters, digits, spaces, '.', "
+                    "'_' or '-'"
+                )
+
+
+class RecordingSession(Observer):
+    """Records each sweep that has a window, with the labels that applied at its start edge, and
+    logs the missing sweeps.
+
+    say: called with REC sentences. disk: writes the sweeps; a REC sentence follows once its sweep
+    is on the disk. target: wanted number of sweeps of each material at each position; sweeps of
+    earlier runs in the folder count. names: of materials that were typed, to which those of earlier
+    sweeps are added; sidecars keep them. finger: whose skin is recorded, for the sidecars; "" for
+    the only skin. Raises ConfigError if the folder cannot be used, or has sweeps of another format
+    or of another finger.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        format: SweepFormat,
+        labels: Labels,
+        clock: Clock,
+        say: Callable[[bytes], None],
+        target: int = TARGET,
+        disk: DiskWork | None = None,
+        names: TypedNames | None = None,
+        *,
+        finger: str = "",
+    ) -> None:
+        self.names, self._finger = names or TypedNames(), finger or None
+        self._disk, self._writing = disk or AtOnce(), 0
+        try:
+            self._folder = SweepFolder(folder, format)
+        except OSError as e:
+            raise (TemporaryError if passes(e) else ConfigError)(
+                f"--out {folder}: {e.strerror}; name a folder that can be written"
+            ) from e
+        self._progress = RecordingProgress(target)
+        self._counted: dict[int, Labels] = {}  # of each sweep in the folder that can be trained on
+        self._count_earlier(format)
+        self._clock, self._say = clock, say
+        # (valid from, labels): a command during a sweep does not apply to that sweep
+        self._labels = deque([(0, labels)], MOST_CHANGES)
+        self._answered = False
+        self._stored: list[tuple[int, Labels, Status]] = []
+        self._last: dict[str, Any] | None = None
+        self._log = TroubleLog("record")
+        self.commands: Mapping[str, Callable[[str], list[object]]] = {
+            "MATERIAL": partial(self._change, "material"),
+            "POSITION": partial(self._change, "position"),
+            "SESSION": partial(self._change, "session"),
+            "NEXT": self._next,
+            "DISCARD": self._discard,
+        }
+
+    @property
+    def stored(self) -> int:
+        """Number of stored sweeps of this run."""
+        return len(self._stored)
+
+    @property
+    def folder(self) -> Path:
+        """The folder of the sweeps."""
+        return self._folder.folder
+
+    @property
+    def last(self) -> int:
+        """The highest number of a sweep that is used in the folder."""
+        return max([self._folder.run, *self._folder.numbers])
+
+    def materials(self, forgotten: Mapping[str, int]) -> dict[str, int]:
+        """The number of sweeps in the folder of each material, without those up to the number in
+        `forgotten`."""
+        kept = (
+            labels.material
+            for number, labels in sorted(self._counted.items())
+            if labels.material and number > forgotten.get(labels.material, -1)
+        )
+        return dict(Counter(kept))
+
+    def leave_out(self, number: int) -> None:
+        """Count a stored sweep no longer: it is discarded, or was found not to be a slide."""
+        if labels := self._counted.pop(number, None):
+            self._progress.add(labels.material, labels.position, -1)
+
+    def about(self) -> dict[str, Any]:
+        """The progress of the recording, for JSON.
+
+        It has the present labels, the display names of materials by label, the number of sweeps of
+        this run, the count and the wanted number of each material and position, the missing sweeps
+        in words, the outcome of the last sweep as in REC, and the number of the sweep that DISCARD
+        would remove (None: no sweep).
+        """
+        return {
+            **entries(self._labels[-1][1]),
+            "displays": dict(self.names.displays),
+            "stored": self.stored,
+            "counts": self._progress.counts,
+            "target": self._progress.target,
+            "missing": self._progress.missing(),
+            "last": self._last,
+            "discard": self._stored[-1][0] - self._folder.run if self._stored else None,
+        }
+
+    def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
+        """Write the sweep if it has a window, and report the outcome in a REC sentence."""
+        self._answered = True
+        labels = next(
+            (labels for since_ns, labels in reversed(self._labels) if since_ns <= sweep.start_ns),
+            Labels(),
+        )
+        sweep = replace(
+            sweep,
+            material=labels.material,
+            position=labels.position,
+            session=labels.session,
+            finger=self._finger,
+        )
+        self._writing += 1
+        report = partial(self._report_outcome, sweep, verdict, labels)
+        if not self._disk(partial(self._write, sweep, verdict, circumstances), report):
+            report(("failed", "the disk is too slow"))
+
+    def _report_outcome(
+        self, sweep: Sweep, verdict: Verdict, labels: Labels, written: tuple[str, str] | int
+    ) -> None:
+        """Count, log and send the outcome of a sweep. written: as returned by `_write`."""
+        self._writing -= 1
+        if isinstance(written, int):
+            outcome, detail = "stored", self._count_stored(written, labels, verdict.status)
+        else:
+            outcome, detail = written
+        if len(sweep.frames):
+            trouble = "" if outcome == "stored" else outcome
+            self._log.update(trouble, _report(outcome, sweep.id, detail, self._folder.folder))
+        self._tell(verdict, outcome, labels)
+        self._last = {"sweep": sweep.id, "outcome": outcome, "detail": detail, **entries(labels)}
+        said = outcome, self.stored, labels.material, labels.position, labels.session, detail
+        self._say(sentence("REC", sweep.id, *said))
+
+    def close(self) -> None:
+        """Finish writing, and release the folder. Log the number of stored sweeps if there was a
+        sweep to store."""
+        self._disk.settle()
+        self._folder.close()
+        if not self._answered:
+            return
+        log.info(
+            f"record: sweeps of this run in {self._folder.folder}: {self.stored}; "
+            f"{self._progress.missing()}"
+        )
+
+    def _count_earlier(self, format: SweepFormat) -> None:
+        """Count the sweeps of earlier runs in the folder. Raises ConfigError for a sweep of another
+        format or finger."""
+        for number in self._folder.numbers:
+            path = self._folder.path(number)
+            try:
+                about = sidecar(path)
+                status, labels = Status(about["verdict"]["status"]), _labels(about)
+                stored, finger = about["format"], about.get("finger")
+            except (FormatError, ConfigError, KeyError, TypeError, ValueError):
+                continue  # not a sweep of ours, or damaged: training reports it
+            if stored != format.json():
+                self._folder.close()
+                raise ConfigError(
+                    f"{path} has another format than {format}, and a model is trained on one "
+                    "format; name another folder with --out"
+                )
+            if finger != self._finger:
+                self._folder.close()
+                raise ConfigError(
+                    f"{path} is of {f'the finger {finger}' if finger else 'a box with one skin'}; "
+                    "name another folder with --out"
+                )
+            self._count(number, labels, status)
+            self.names.add(labels.material, about.get("display"))
+
+    def _count(self, number: int, labels: Labels, status: Status) -> None:
+        if not status.faulty:  # a faulty sweep is not used in training
+            self._progress.add(labels.material, labels.position)
+            self._counted[number] = labels
+
+    def _tell(self, verdict: Verdict, outcome: str, labels: Labels) -> None:
+        """Log the outcome of a sweep, for a person beside the robot and a person at a terminal."""
+        if outcome in ("full", "failed"):
+            return  # that was logged when it began
+        if verdict.status.faulty or outcome != "stored":
+            log.warning(words(verdict) + "; it is not counted")
+        else:
+            log.info(f"{words(verdict)}; {self._progress.line(labels.material, labels.position)}")
+
+    def _write(
+        self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]
+    ) -> tuple[str, str] | int:
+        """Write a sweep; its number in the folder, or the outcome ("skipped", "full" or "failed")
+        and details for a person."""
+        if not len(sweep.frames):
+            return "skipped", f"{verdict.status}"
+        try:
+            disk = os.statvfs(self._folder.folder)
+            least = min(LEAST_FREE[0] // disk.f_frsize, disk.f_blocks // LEAST_FREE[1])
+            if disk.f_bavail < least:
+                left, wanted = (n * disk.f_frsize / 1e6 for n in (disk.f_bavail, least))
+                return "full", f"{left:.1f} MB left of {wanted:.1f} for the system"
+            display = self.names.displays.get(sweep.material or "")
+            about = {**circumstances, "display": display} if display else circumstances
+            return self._folder.put(sweep, verdict, about)
+        except OSError as e:
+            return "full" if e.errno in FULL else "failed", str(e.strerror)
+
+    def _count_stored(self, number: int, labels: Labels, status: Status) -> str:
+        """Count a stored sweep; its file's name with remarks, for a person."""
+        self._stored.append((number, labels, status))
+        self._count(number, labels, status)
+        fault = f" {status}" if status.faulty else ""
+        return self._folder.path(number).stem + fault + " no material" * (not labels.material)
+
+    def _change(self, name: str, text: str) -> list[object]:
+        """Set a label for sweeps that start from now on; returns the labels that then apply."""
+        labels = replace(self._labels[-1][1], **{name: text.strip()})
+        self._labels.append((self._clock.now_ns(), labels))
+        return [labels.material, labels.position, labels.session]
+
+    def _next(self, _: str) -> list[object]:
+        position = self._labels[-1][1].position
+        if not position.isdecimal():
+            raise ApplianceError(
+                f"position {position!r} has no next position; begin with PPLP POSITION 1"
+            )
+        return self._change("position", str(int(position) + 1).zfill(len(position)))
+
+    def _discard(self, which: str) -> list[object]:
+        """Remove the last stored sweep of this run; returns its number, the number of sweeps left,
+        and its file name.
+
+        which: the expected number, so that a later sweep is not removed by mistake; "" for any.
+        """
+        if self._writing:
+            raise ApplianceError("a sweep is still being written; wait for its REC sentence")
+        if not self._stored:
+            raise ApplianceError("no sweep of this run is left to discard")
+        number = self._stored[-1][0]
+        if which and which != str(number - self._folder.run):
+            raise ApplianceError(
+                f"the last stored sweep is {number - self._folder.run}, not {which}; "
+                "look at it first"
+            )
+        try:
+            self._folder.remove(number, reserve=True)
+        except OSError as e:
+            raise ApplianceError(
+                f"sweep {number - self._folder.run} cannot be discarded: {e.strerror}"
+            ) from e
+        self._stored.pop()
+        self.leave_out(number)
+        if self._last and self._last["sweep"] == number - self._folder.run:
+            self._last["outcome"] = "discarded"
+        return [number - self._folder.run, self.stored, self._folder.path(number).stem]
+
+
+def _labels(about: Mapping[str, Any]) -> Labels:
+    """The labels in a sidecar. Raises ConfigError or KeyError if it has no valid labels."""
+    return Labels(*(str(about[name]) for name in Labels.__slots__))
+
+
+def _report(outcome: str, sweep: int, detail: str, folder: Path) -> str:
+    """The message in the log for a changed outcome."""
+    if outcome == "stored":
+        return f"record: sweeps are stored again, from sweep {sweep} on"
+    advice = f"make room in {folder}" if outcome == "full" else f"see that {folder} may be written"
+    return f"record: sweep {sweep} is not stored: {detail}; {advice}; the answers go on"

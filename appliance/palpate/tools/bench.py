@@ -1,0 +1,219 @@
+"""`palpate bench`: latency, inference, memory, start and processor share of this machine, with the
+simulated skin.
+
+Each figure is printed in a line, and all of them are returned with plain keys. Memory, start and
+processor share are measured in processes of their own, without parts of the bench.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime as ort
+
+from palpate.bundle.bundle import Bundle
+from palpate.core.clock import Clock, SystemClock
+from palpate.core.errors import BundleError
+from palpate.core.observer import Observer
+from palpate.core.provenance import commit, processor
+from palpate.core.statistics import wilson
+from palpate.core.types import Status, Sweep, SweepFormat, Verdict
+from palpate.inference.classifier import Classifier
+from palpate.inference.session import session
+from palpate.sim import devices, rig, script, skin
+from palpate.tools import bench_process
+from palpate.tools.bench_process import Build, drain
+
+SWEEPS, STARTS, ROUNDS, CALLS = 60, 7, 100, 5
+
+
+def run(
+    bundle: Bundle, build: Build, references: Path, seed: int, report: Callable[[str], None]
+) -> dict[str, Any]:
+    """All figures. report: gets a line for each figure at once. references: folder of the models
+    that are timed beside the bundle; they are made if they are missing. seed: of the simulated
+    sweeps. Raises BundleError if the references cannot be made."""
+    load_before = os.getloadavg()
+    figures: dict[str, Any] = {
+        "commit": commit(),
+        "seed": seed,
+        "machine": _machine(),
+        "bundle": bundle.id,
+    }
+
+    def add(more: dict[str, Any]) -> None:
+        figures.update(more)
+        for key, value in more.items():
+            report(f"{key:<24} {json.dumps(value)}")
+
+    add({k: figures[k] for k in ("commit", "seed", "machine", "bundle")})
+    add(_whole_way(bundle.format, build, seed))
+    add({"inference_ms": _inference(bundle, references, seed)})
+    if "fp32" not in figures["inference_ms"]:
+        report(
+            "fp32 and paper_int8 were not measured: they come with the desktop's tools (make bench)"
+        )
+    for name in bench_process.NAMES:
+        add(_child(name, seed))
+    add(_cold_start())
+    add({"bundle_kb": _size_kb(bundle), "date": time.strftime("%Y-%m-%d", time.gmtime())})
+    add({"load_average": {"before": _rounded(load_before), "after": _rounded(os.getloadavg())}})
+    return figures
+
+
+def _rounded(load: tuple[float, float, float]) -> list[float]:
+    """Mean number of runnable processes in the last 1, 5 and 15 minutes."""
+    return [round(value, 2) for value in load]
+
+
+def _size_kb(bundle: Bundle) -> dict[str, float]:
+    """Size on the disk in 1000 bytes: of the model, and of all files of the bundle."""
+    files = bundle.manifest.files.values()
+    whole = len(bundle.manifest.json()) + sum(entry["bytes"] for entry in files)
+    return {"model": round(len(bundle.model) / 1000, 1), "all": round(whole / 1000, 1)}
+
+
+def _percentiles(values: list[float]) -> dict[str, float]:
+    return {f"p{q}": round(float(np.percentile(values, q)), 4) for q in (50, 99)} | {
+        "n": len(values)
+    }
+
+
+class _Watch(Observer):
+    """Measures the latency of answers. An observer gets a verdict after its sentence was
+    written."""
+
+    def __init__(self, clock: Clock) -> None:
+        self.verdicts: list[Verdict] = []
+        self.answered_ms: list[float] = []
+        self.seen_ms: list[float] = []
+        self._clock = clock
+
+    def answered(self, verdict: Verdict) -> None:
+        in_hand_ns = verdict.time_ns - verdict.latency_ns
+        self.verdicts.append(verdict)
+        self.answered_ms.append((self._clock.now_ns() - in_hand_ns) / 1e6)
+
+    def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
+        self.seen_ms.append((sweep.complete_ns - sweep.stop_ns) / 1e6)
+
+
+def _whole_way(format: SweepFormat, build: Build, seed: int) -> dict[str, Any]:
+    """Latencies of SWEEPS simulated sweeps from USB bytes to sentence, at skin positions outside
+    all training sets.
+
+    Computing takes its real time, waiting is skipped. edge_to_sentence_ms: from stop edge and last
+    frame of the window, both read, to the sentence at the port. edge_seen_ms: from the kernel's
+    time stamp of the stop edge to the same moment (glitch filter, rest of a packet).
+    """
+    clock = rig.SkippingClock()
+    watch = _Watch(clock)
+    simulated = devices.build(
+        format, script.tubes(seed, SWEEPS, skin.placements("T-REAL", seed)), clock, "sim"
+    )
+    with ExitStack() as stack:
+        box, far_end = build(simulated, stack, [watch])
+        while not simulated.finished(box.answered):
+            box.step()
+            drain(far_end)
+        lost = box.counters.lost_frames
+    pairs = zip(watch.verdicts, simulated.robot.played, strict=True)
+    right = sum(v.label == act.label and v.status is Status.OK for v, act in pairs)
+    return {
+        "accuracy": {
+            "right": right,
+            "total": SWEEPS,
+            "interval": [round(v, 4) for v in wilson(right, SWEEPS)],
+        },
+        "frames_lost": lost,
+        "edge_to_sentence_ms": _percentiles(watch.answered_ms),
+        "edge_seen_ms": _percentiles(watch.seen_ms),
+    }
+
+
+def _inference(bundle: Bundle, references: Path, seed: int) -> dict[str, Any]:
+    """Times of the bundle, of the same network in float, and of the paper's network in int8, in
+    turns."""
+    rng = np.random.default_rng(seed)
+    window = rng.integers(0, 256, bundle.golden[0].shape).astype(bundle.format.numpy_type)
+    calls: dict[str, Callable[[], object]] = {}
+    calls["int8"] = partial(Classifier(bundle, SystemClock()).logits, window)
+    _make_references(references)
+    for name in ("fp32", "paper_int8"):
+        path = references / f"{name}.onnx"
+        if path.is_file():
+            calls[name] = partial(session(path.read_bytes()).run, None, {"sweep": window[None]})
+    took_ms: dict[str, list[float]] = {name: [] for name in calls}
+    for _ in range(ROUNDS):
+        for name, call in calls.items():
+            call()  # fills the caches, which the other models have overwritten
+            for _ in range(CALLS):
+                start = time.perf_counter_ns()
+                call()
+                took_ms[name].append((time.perf_counter_ns() - start) / 1e6)
+    return {name: _percentiles(values[len(values) // 10 :]) for name, values in took_ms.items()}
+
+
+def _make_references(folder: Path) -> None:
+    """Let the desktop's tools write the reference models, if they are installed beside this
+    program."""
+    if folder.is_dir() or not Path(sys.executable).with_name("palpate-train").exists():
+        return
+    command = [sys.executable, "-P", "-m", "palpate_studies", "references", "--out", str(folder)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise BundleError(f"palpate_studies references failed: {done.stderr.strip()[-300:]}")
+
+
+def _child(name: str, seed: int) -> dict[str, Any]:
+    """A part of the figures, measured in a new process."""
+    with tempfile.TemporaryDirectory() as folder:
+        acts = Path(folder) / "acts.npz"
+        bench_process.write_acts(acts, script.tubes(seed, 6))
+        words = ["bench", "--part", name, "--acts", str(acts)]
+        command = [sys.executable, "-P", "-m", "palpate", *words]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+    result: dict[str, Any] = json.loads(done.stdout)
+    return result
+
+
+def _cold_start() -> dict[str, Any]:
+    """Seconds from the start of the process to READY with a streaming skin, as the first state
+    sentence reports it."""
+    took = []
+    command = [sys.executable, "-P", "-m", "palpate", "run", "--sim", "skin"]
+    for _ in range(STARTS):
+        start = time.monotonic()
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as box:
+            assert box.stdout
+            while b",streaming," not in box.stdout.readline():
+                pass
+            took.append(time.monotonic() - start)
+            box.terminate()
+    return {
+        "cold_start_s": round(statistics.median(took), 3),
+        "cold_start_worst_s": round(max(took), 3),
+    }
+
+
+def _machine() -> dict[str, Any]:
+    versions = {
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "onnxruntime": ort.__version__,
+    }
+    machine = {"arch": platform.machine(), "cores": os.cpu_count(), "system": platform.system()}
+    return machine | versions | {"processor": processor()}

@@ -1,0 +1,164 @@
+"""Memory and processor share, for the bench, each measured in a process of its own.
+
+This module does not load the simulated skin, which is not part of the box. It must load the
+simulated board, and loads it last, so that its memory can be measured.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack, suppress
+from itertools import cycle
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import gpiod  # noqa: F401 - the box's, which the simulated lines import as well
+import numpy as np
+
+from palpate.core.clock import Clock, SystemClock
+from palpate.core.observer import Observer
+from palpate.core.types import SweepFormat
+from palpate.runtime.loop import Box
+
+if TYPE_CHECKING:
+    from palpate.sim import devices, rig
+
+MEMORY_SWEEPS, STREAM_S = 1000, 15.0
+NAMES = ("memory", "stream", "hand")
+HANDS = (1, 2, 4)
+"""Numbers of skins whose processor time is compared."""
+
+
+class Build(Protocol):
+    """Builds a box on simulated devices, which `stack` closes; returns the box and the robot's end
+    of its serial line."""
+
+    def __call__(
+        self,
+        simulated: devices.SimDevices,
+        stack: ExitStack,
+        /,
+        observers: Iterable[Observer] = (),
+    ) -> tuple[Box, int]:
+        """Build it."""
+        ...
+
+
+def write_acts(path: Path, acts: Iterable[rig.Act]) -> None:
+    """Write acts to a file for `measure`."""
+    frames: dict[str, Any] = {f"{i} {a.start} {a.stop}": a.frames for i, a in enumerate(acts)}
+    np.savez(path, **frames)
+
+
+def measure(name: str, format: SweepFormat, build: Build, path: Path) -> dict[str, Any]:
+    """The part `name` of NAMES, measured in this process, which repeats the acts in `path`."""
+    parts = {"memory": _memory, "stream": _stream, "hand": _hand}
+    return parts[name](format, build, path)
+
+
+def _board(
+    format: SweepFormat, path: Path, clock: Clock | None = None, fingers: Sequence[str] = ()
+) -> devices.SimDevices:
+    """Devices that play the acts in `path`; in virtual time without a clock. fingers: each has a
+    board, which plays the same frames."""
+    from palpate.sim import devices, rig
+
+    with np.load(path, allow_pickle=False) as z:
+        played = ((z[key], *map(int, key.split()[1:])) for key in z)
+        acts = [
+            rig.Act(frames, start, stop, "", others=(frames,) * (len(fingers) - 1))
+            for frames, start, stop in played
+        ]
+    # the simulator's memory of acts is not part of the box
+    return devices.build(
+        format,
+        cycle(acts),
+        clock or rig.VirtualClock(),
+        "sim",
+        remember=False,
+        fingers=dict.fromkeys(fingers, format),
+    )
+
+
+def drain(far_end: int) -> None:
+    """Read and drop the box's output, so that the serial line does not fill up."""
+    with suppress(BlockingIOError):
+        os.read(far_end, 65536)
+
+
+def _memory(format: SweepFormat, build: Build, path: Path) -> dict[str, Any]:
+    """Resident memory (2**20 bytes, as ps and systemd count) after MEMORY_SWEEPS sweeps.
+
+    without_board: minus the memory for loading the simulated board and its acts; the board's memory
+    while it plays is still included. growth_last_900: since a tenth of the sweeps, with the
+    allocator's first growth. growth_next_900: growth over as many further sweeps.
+    """
+    n, rss_mb = MEMORY_SWEEPS, {}
+    board = -_rss_mb()
+    simulated = _board(format, path)
+    board += _rss_mb()
+    with ExitStack() as stack:
+        box, far_end = build(simulated, stack)
+        while box.answered < n * 19 // 10:
+            if box.step() and box.answered in (n // 10, n, n * 19 // 10):
+                rss_mb[box.answered] = _rss_mb()
+            drain(far_end)
+    first, after, later = rss_mb.values()
+    figures = {
+        "after_1000": after,
+        "without_board": after - board,
+        "growth_last_900": after - first,
+        "growth_next_900": later - after,
+    }
+    return {"rss_mb": {name: round(value, 2) for name, value in figures.items()}}
+
+
+def _rss_mb() -> float:
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGESIZE") / 2**20
+
+
+def _stream(format: SweepFormat, build: Build, path: Path) -> dict[str, Any]:
+    """Share of one core while the skin streams in real time, with and without the simulated readout
+    board."""
+    box, whole = _shares(_board(format, path, SystemClock()), build)
+    return {"cpu_share_streaming": box, "cpu_share_with_simulated_board": whole}
+
+
+def _hand(format: SweepFormat, build: Build, path: Path) -> dict[str, Any]:
+    """Share of one core by number of skins, without the simulated readout boards."""
+    shares = {}
+    for n in HANDS:
+        fingers = [f"finger-{i}" for i in range(n)] if n > 1 else []
+        shares[str(n)] = _shares(_board(format, path, SystemClock(), fingers), build)[0]
+    return {"cpu_share_by_skins": shares}
+
+
+def _shares(simulated: devices.SimDevices, build: Build) -> tuple[float, float]:
+    """Share of one core while the skins stream, without and with the simulated readout boards."""
+    board_ns = 0
+
+    def timed(read: Callable[..., int]) -> Callable[..., int]:
+        def timed_read(*args: Any) -> int:
+            nonlocal board_ns
+            start = time.thread_time_ns()
+            try:
+                return read(*args)
+            finally:
+                board_ns += time.thread_time_ns() - start
+
+        return timed_read
+
+    for bus in simulated.buses.values() or [simulated.backend]:
+        bus.bulk_read = timed(bus.bulk_read)  # type: ignore[method-assign]
+    with ExitStack() as stack:
+        box, far_end = build(simulated, stack)
+        box.step()
+        board_ns, wall_ns, cpu_ns = 0, -time.monotonic_ns(), -time.process_time_ns()
+        while time.monotonic_ns() + wall_ns < STREAM_S * 1e9:
+            box.step()
+            drain(far_end)
+        wall_ns, cpu_ns = wall_ns + time.monotonic_ns(), cpu_ns + time.process_time_ns()
+    return round((cpu_ns - board_ns) / wall_ns, 4), round(cpu_ns / wall_ns, 4)

@@ -1,0 +1,285 @@
+"""`palpate skin detect` and `list`: connected skins, and all profiles.
+
+A port is compared by its ids, then by listening. Commands are written only to a port that the user
+has named.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+from palpate.core.clock import Clock
+from palpate.core.config import SkinConfig
+from palpate.core.errors import FormatError, SensorError
+from palpate.core.types import SweepFormat, shown
+from palpate.io import packets, skin_codecs, wire_numbers
+from palpate.io.link import reply_to
+from palpate.io.serial_port import PortInfo
+from palpate.io.serial_sensor import BytePort
+from palpate.io.skin_codecs import Rest
+from palpate.io.skin_profile import DEFAULT, SkinProfile
+
+LISTEN_S = 2.0
+"""Time for each speed of a port: 56 frames of the slowest skin."""
+BOOT_S = 3.0
+"""Additional time for the first byte after a port was opened; many boards boot then."""
+FITS = 0.9
+"""Share of the bytes that must be in frames of a profile."""
+FEWEST = 4
+"""Number of frames that cannot be chance."""
+SAME_RATE = 0.02
+"""Relative difference of rates that needs no setting."""
+OpenPort = Callable[[str, int], BytePort]
+
+
+@dataclass(frozen=True, slots=True)
+class PortFinding:
+    """The skin on a port. profile: its name, "" if no profile fits. detail: the evidence, and the
+    settings or the remedy."""
+
+    port: PortInfo
+    profile: str
+    detail: str
+
+
+@dataclass(frozen=True, slots=True)
+class HeardBytes:
+    """Bytes of a port. reads: (bytes, time of arrival in ns)."""
+
+    reads: list[tuple[bytes, int]]
+
+    @property
+    def data(self) -> bytes:
+        return b"".join(data for data, _ in self.reads)
+
+
+def table(profiles: Mapping[str, SkinProfile]) -> list[str]:
+    """All profiles in lines: name, format, missing features, and what the skin is. A last line
+    names the profiles that nobody has compared with a device."""
+    rows = [("profile", "format", "lacks", "skin")]
+    for name, one in profiles.items():
+        format = "as its board says" if one.codec == DEFAULT else described(one.format)
+        measured = f" (measured: {one.measured})" if one.measured else ""
+        rows.append((name, format, ", ".join(one.lacks) or "nothing", one.about + measured))
+    wide = [max(len(row[i]) for row in rows) for i in range(3)]
+    lines = [
+        "  ".join(f"{cell:<{n}}" for cell, n in zip(row[:3], wide, strict=True)) + f"  {row[3]}"
+        for row in rows
+    ]
+    if not any(one.measured for one in profiles.values()):
+        return [*lines, "none was measured on a device"]
+    never = [name for name, one in profiles.items() if not one.measured]
+    return [*lines, f"not measured on a device: {', '.join(never)}"] if never else lines
+
+
+def described(format: SweepFormat) -> str:
+    """Shape, type and rate for a person."""
+    return f"{shown(format.shape)} {format.dtype} at {format.rate_hz:g} Hz"
+
+
+def detect(
+    ports: Iterable[PortInfo],
+    profiles: Mapping[str, SkinProfile],
+    open_port: OpenPort,
+    clock: Clock,
+    *,
+    write: bool = False,
+    seconds: float = LISTEN_S,
+) -> Iterator[PortFinding]:
+    """The skins on the ports. profiles: with the changes of the settings. write: also ask, and send
+    start commands."""
+    for port in ports:
+        try:
+            yield from _on_port(port, profiles, open_port, clock, write, seconds)
+        except SensorError as e:
+            yield PortFinding(port, "", str(e))
+
+
+def _another_grid(port: PortInfo, name: str, taxels: int) -> str:
+    return (
+        f"the marks of {name}, but {taxels} taxels a frame; set skin.grid to their rows x columns,"
+        f' skin.profile = "{name}", skin.port = "{port.path}"; if it is another skin, describe it'
+        " with `palpate skin new`"
+    )
+
+
+def _on_port(
+    port: PortInfo,
+    profiles: Mapping[str, SkinProfile],
+    open_port: OpenPort,
+    clock: Clock,
+    write: bool,
+    seconds: float,
+) -> Iterator[PortFinding]:
+    by_ids = [name for name, p in profiles.items() if (port.vendor_id, port.product_id) in p.ids]
+    known = f"ids as {', '.join(by_ids)}; " if by_ids else ""
+    others = {name: p for name, p in profiles.items() if p.codec != DEFAULT}
+    heard: dict[int, HeardBytes] = {}
+    # profiles with the port's ids first; each speed once, for all profiles that use it
+    for baud in dict.fromkeys(
+        others[name].baud for name in sorted(others, key=lambda n: n not in by_ids)
+    ):
+        these = {name: p for name, p in others.items() if p.baud == baud}
+        for starter in [None, *(n for n in these if write and these[n].start)]:
+            heard[baud] = listen(
+                port.path, baud, these[starter] if starter else None, open_port, clock, seconds
+            )
+            fitting = [n for n in these if fits(these[n], heard[baud])]
+            if fitting:
+                yield PortFinding(
+                    port, fitting[0], known + _settings(port, fitting, these, heard[baud])
+                )
+                return
+    for name, p in others.items():
+        if taxels := other_grid(p, heard[p.baud]):
+            yield PortFinding(port, name, known + _another_grid(port, name, taxels))
+            return
+    if write and (who := _asked(port.path, open_port, clock)):
+        yield PortFinding(
+            port, DEFAULT, f'{known}{who}; set skin.link = "serial", skin.port = "{port.path}"'
+        )
+        return
+    yield PortFinding(
+        port, "", known + _nothing(max(len(one.data) for one in heard.values()), others, write)
+    )
+
+
+def listen(
+    path: str,
+    baud: int,
+    starter: SkinProfile | None,
+    open_port: OpenPort,
+    clock: Clock,
+    seconds: float,
+) -> HeardBytes:
+    """The bytes of a port at this speed. starter: the profile whose start and stop commands are
+    written. Raises SensorError."""
+    port = open_port(path, baud)
+    reads: list[tuple[bytes, int]] = []
+    try:
+        for command in starter.commands(starter.start, starter.rate_hz) if starter else ():
+            port.write(command)
+        reads = collect(port, clock, seconds)
+    finally:
+        with contextlib.suppress(SensorError):
+            for command in starter.commands(starter.stop, starter.rate_hz) if starter else ():
+                port.write(command)
+        port.close()
+    return HeardBytes(reads)
+
+
+def collect(
+    port: BytePort, clock: Clock, seconds: float, boot_s: float = 0.0
+) -> list[tuple[bytes, int]]:
+    """The reads of an open port within `seconds` of its first byte, with their times. boot_s: time
+    beyond `seconds` in which the first byte may come. Raises SensorError."""
+    reads: list[tuple[bytes, int]] = []
+    until_ns = clock.now_ns() + round((seconds + boot_s) * 1e9)
+    while (left_ns := until_ns - clock.now_ns()) > 0:
+        if data := port.read(1 << 16, max(1, left_ns // 1_000_000)):
+            if not reads:
+                until_ns = clock.now_ns() + round(seconds * 1e9)
+            reads.append((data, clock.now_ns()))
+    return reads
+
+
+def fits(profile: SkinProfile, heard: HeardBytes) -> bool:
+    """Whether frames of a profile explain nearly all bytes."""
+    found = skin_codecs.codec(profile)(Rest(), heard.data)
+    # opening the port cut the first frame, closing it cut the last frame
+    most = len(heard.data) - len(found.rest.data) - found.size
+    return len(found) >= FEWEST and len(found) * found.size >= FITS * most
+
+
+def measured_hz(profile: SkinProfile, heard: HeardBytes) -> float:
+    """Frames per second, by the arrivals of the first and the last frame; 0 for fewer than two
+    frames."""
+    codec, rest, seen = skin_codecs.codec(profile), Rest(), []
+    for data, t_ns in heard.reads:
+        found = codec(rest, data)
+        rest = found.rest
+        if len(found):
+            seen.append((len(found), t_ns))
+    if len(seen) < 2:
+        return 0.0
+    return sum(n for n, _ in seen[1:]) * 1e9 / (seen[-1][1] - seen[0][1])
+
+
+def _settings(
+    port: PortInfo, fitting: list[str], profiles: Mapping[str, SkinProfile], heard: HeardBytes
+) -> str:
+    """The measurements, and the settings."""
+    profile = profiles[fitting[0]]
+    hz = measured_hz(profile, heard)
+    sets = [f'skin.profile = "{fitting[0]}"', f'skin.port = "{port.path}"']
+    if hz and not profile.rates_hz and abs(hz / profile.rate_hz - 1) > SAME_RATE:
+        sets.append(f"skin.rate_hz = {hz:.1f}")
+    more = f" (and as {', '.join(fitting[1:])})" if len(fitting) > 1 else ""
+    format = replace(profile.format, rate_hz=round(hz, 1)) if hz else profile.format
+    return f"sends {described(format)}{more}; set {', '.join(sets)}"
+
+
+def _asked(path: str, open_port: OpenPort, clock: Clock) -> str:
+    """The answer of a board of PROTOCOL.md, "" if there is none."""
+    port = open_port(path, SkinProfile().baud)
+    try:
+        port.write(bytes([packets.Request.IDENTITY]))
+        who = packets.unpack_identity(reply_to(packets.Request.IDENTITY, port.read, clock))
+        return f"board {who.board} {who.serial} speaks PROTOCOL.md, version {who.protocol}"
+    except (SensorError, FormatError):
+        return ""
+    finally:
+        port.close()
+
+
+def _nothing(heard: int, profiles: Mapping[str, SkinProfile], write: bool) -> str:
+    """The reason why no profile fits, and the remedy."""
+    if heard:
+        return (
+            f"sends {heard} bytes, but no frames of a profile; try skin.grid, or describe it with"
+            " `palpate skin new`"
+        )
+    if write:
+        return "sends nothing and answers nothing"
+    asking = ", ".join(name for name, p in profiles.items() if p.start)
+    return (
+        f"sends nothing unasked; {asking} and boards of PROTOCOL.md may have to be asked: add"
+        " --write --port with its path"
+    )
+
+
+def other_grid(profile: SkinProfile, heard: HeardBytes) -> int:
+    """Taxels of a frame, by the distance between the marks of a profile; 0 if it is not
+    constant."""
+    mark, data = profile.trailer + profile.marker, heard.data
+    places = [at for at in range(len(data)) if mark and data.startswith(mark, at)]
+    steps = Counter(later - at for at, later in pairwise(places))
+    if not steps:
+        return 0
+    step, times = steps.most_common(1)[0]
+    each = wire_numbers.size(profile.number) * profile.values
+    whole = (
+        times >= FEWEST
+        and times * step >= FITS * (len(data) - 2 * step)
+        and (step - len(mark)) % each == 0
+    )
+    return (step - len(mark)) // each if whole else 0
+
+
+def on_usb(config: SkinConfig) -> list[str]:
+    """A line for each board of PROTOCOL.md on USB with the configured ids. The boards are not
+    opened."""
+    import usb.core
+
+    try:
+        found = list(usb.core.find(True, idVendor=config.vendor_id, idProduct=config.product_id))
+    except usb.core.NoBackendError:
+        return []
+    ids = f"{config.vendor_id:04x}:{config.product_id:04x}"
+    return [
+        f"USB {d.bus}-{d.address} ({ids}): {DEFAULT}: its ids are those of skin.usb" for d in found
+    ]

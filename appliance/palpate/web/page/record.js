@@ -1,0 +1,236 @@
+/* The page of a recording: what is there and what is missing, the last sweep, the skin; and the labels, which are set here. */
+
+import {listen} from "/events.js";
+import {ago, byId, call, enable, frame, listenToPedal, made, mark, order, put} from "/parts.js";
+import {signal, spectrogram} from "/plots.js";
+import {SkinPicture} from "/skin.js";
+
+const FIELDS = ["material", "position", "session"], SKIN = new SkinPicture(document.querySelector(".skin"));
+let key, recording, last, view; // events of these names, as appliance/palpate/web/record.py sends them
+let picture = null, drawn = {}, table = "", reached = null, answers = true, wallMs = 0, ordering = false, dirty = true;
+
+function begin() {
+  key = "";
+  recording = last = view = null;
+}
+begin();
+
+/* A material by the name that people read. */
+function shown(material) { return recording?.displays?.[material] ?? material; }
+
+function named(material, position) { return material ? shown(material) + (position && ` at ${position}`) : "no material"; }
+
+function live() { return reached === true && recording !== null; }
+
+/* Why what is shown is not of this moment; "" where it is. */
+function trouble() {
+  if (reached === null) return "";
+  const heard = recording ? `; last heard of it ${ago(Date.now() - wallMs - recording.time_ns / 1e6)} ago` : "";
+  if (!reached) return `${answers ? "palpate record answers, but has no news" : "no connection to palpate record"}${heard}; trying again`;
+  if (recording && recording.skin !== "streaming") return `no skin: ${recording.skin}${recording.trouble && `; ${recording.trouble}`}`;
+  return "";
+}
+
+function drawHeader() {
+  const why = trouble();
+  document.body.classList.toggle("stale", Boolean(why));
+  const state = !reached ? "no connection" : !recording ? "waiting" : recording.skin !== "streaming" ? `skin ${recording.skin}`
+    : recording.sweeping ? "sweeping" : recording.ready ? "ready" : "not ready";
+  frame({state, fine: live() && recording.skin === "streaming", source: recording?.source, why});
+  byId("format").hidden = !recording;
+  if (recording) put("format", recording.format);
+}
+
+function drawLabels() {
+  for (const id of ["set", "next"]) enable(byId(id), live());
+  if (!recording) return;
+  put("now", named(recording.material, recording.position));
+  for (const name of FIELDS) { // what a person has typed and not set yet stays
+    const value = name === "material" ? shown(recording[name]) : recording[name];
+    if (byId(name).value === (drawn[name] ?? "")) byId(name).value = value;
+    drawn[name] = value;
+  }
+  put("trigger", recording.trigger);
+  byId("sweeps").hidden = !recording.commands.includes("START");
+  enable(byId("start"), live() && recording.ready);
+  enable(byId("stop"), live() && recording.sweeping);
+}
+
+function drawCall() {
+  const [words, seconds] = live() ? call(recording, (Date.now() - wallMs) * 1e6) : ["", ""];
+  put("call", words);
+  put("countdown", seconds);
+}
+
+function sorted(values) { return [...new Set(values)].sort((a, b) => a.localeCompare(b, "en", {numeric: true})); }
+
+function drawCounts() {
+  if (!recording) return;
+  const {counts, material, position, target} = recording, held = new Map(counts.map(([m, p, n]) => [JSON.stringify([m, p]), n]));
+  const materials = sorted([...counts.map((one) => one[0]), ...(material ? [material] : [])]);
+  const positions = sorted([...counts.map((one) => one[1]), ...(material ? [position] : [])]);
+  const content = JSON.stringify([materials, positions, recording.displays]), box = byId("counts");
+  if (content !== table) {
+    table = content;
+    const head = made("tr"), body = materials.map((name) => {
+      const row = made("tr");
+      made("th", "", shown(name), row).scope = "row";
+      for (const at of positions) Object.assign(made("button", "", "", made("td", "", undefined, row)).dataset, {material: name, position: at});
+      return row;
+    });
+    made("td", "", undefined, head);
+    for (const at of positions) made("th", "", at || "no position", head).scope = "col";
+    box.querySelector("thead").replaceChildren(...(materials.length ? [head] : []));
+    box.querySelector("tbody").replaceChildren(...body);
+    for (const [id, names] of [["materials", materials.map(shown)], ["positions", positions]]) {
+      byId(id).replaceChildren(...names.filter(Boolean).map((value) => Object.assign(made("option"), {value})));
+    }
+  }
+  for (const field of box.querySelectorAll("button")) {
+    const {material: m, position: p} = field.dataset, n = held.get(JSON.stringify([m, p])) ?? 0, text = `${n} of ${target}`;
+    if (field.textContent !== text) field.textContent = text;
+    field.type = "button";
+    field.className = n >= target ? "done" : "";
+    field.setAttribute("aria-label", `${named(m, p)}: ${text}`);
+    field.setAttribute("aria-pressed", m === material && p === position);
+    enable(field, live());
+  }
+  put("missing", recording.missing);
+}
+
+function outcome(sweep) {
+  const became = recording?.last;
+  if (became?.sweep !== sweep.sweep) return "";
+  const of = named(became.material, became.position);
+  return {stored: `${of}, stored as ${became.detail.split(" ")[0]}`, skipped: "not stored, since it has no window", discarded: `${of}, discarded`,
+    }[became.outcome] ?? `not stored: ${became.detail}`;
+}
+
+function drawSweep() {
+  const which = recording?.discard ?? null;
+  enable(byId("discard"), live() && which !== null);
+  put("discard", which === null ? "Discard" : `Discard sweep ${which}`);
+  byId("status").hidden = !last;
+  if (!last) {
+    for (const draw of [signal, spectrogram]) draw(byId(draw.name), null, "no sweep yet");
+    return;
+  }
+  mark(byId("status"), last.status);
+  put("sweep-title", `Sweep ${last.sweep}, ${ago(Date.now() - wallMs - last.time_ns / 1e6)} ago`);
+  put("outcome", outcome(last));
+  const wrong = last.status === "recorded" ? "" : `${last.reason}; it is not counted`;
+  const lost = last.lost ? `${last.lost} lost frames filled in` : "";
+  put("check", [wrong, last.detail, lost].filter(Boolean).join("; ") || "checked: contact, saturation, stuck and dead taxels; nothing is wrong");
+  const drawing = picture?.sweep === last.sweep ? picture : null;
+  const why = !last.signal ? "it has no window" : drawing?.asked ? "asking palpate record" : "its signal is not kept";
+  const drawn = drawing?.taxels ? drawing : null;
+  signal(byId("signal"), drawn, why, recording?.unit || undefined);
+  spectrogram(byId("spectrogram"), drawn, why);
+  if (last.signal && !drawing && reached) fetchPicture(last.sweep);
+}
+
+async function fetchPicture(sweep) {
+  picture = {sweep, asked: true};
+  let got = {sweep};
+  try {
+    const answer = await fetch(`/sweep/${sweep}`, {cache: "no-store"});
+    if (answer.ok) got = await answer.json();
+  } catch { /* said where the signal would be; asked again when the connection is back */ }
+  if (last?.sweep === sweep) picture = got;
+  dirty = true;
+}
+
+function drawSkin() {
+  if (!view) return;
+  SKIN.show(view);
+  document.body.dataset.state = view.state;
+  put("contact", view.state === "wait" ? `${view.message}: ${view.hint}` : `${view.load_unit || "raw counts"} above the lowest seen`);
+}
+
+function draw() {
+  dirty = false;
+  drawHeader();
+  drawLabels();
+  drawCounts();
+  drawSweep();
+}
+
+/* Sends orders one after another, until one is refused: [command, text, what is said, its field]. */
+async function send(orders) {
+  if (ordering) return;
+  ordering = dirty = true;
+  for (const name of FIELDS) byId(name).removeAttribute("aria-invalid");
+  let said = "";
+  for (const [command, text, done, field] of orders) {
+    const why = await order("palpate record", key, command, text);
+    said = why || done;
+    byId("said").className = why ? "wrong" : "";
+    if (why && field) byId(field).setAttribute("aria-invalid", "true");
+    if (why) break;
+    if (field) drawn[field] = byId(field).value = text.trim();
+  }
+  put("said", said);
+  ordering = false;
+  dirty = true;
+}
+
+function setLabels() {
+  const changed = FIELDS.filter((name) => byId(name).value !== drawn[name]);
+  send(changed.map((name) => [name.toUpperCase(), byId(name).value, `${changed.join(", ")} set`, name]));
+}
+
+const PRESSED = {
+  set: setLabels,
+  next: () => send([["NEXT", "", "next position"]]),
+  start: () => send([["START", "", "started"]]),
+  stop: () => send([["STOP", "", "stopped"]]),
+  discard: () => send([["DISCARD", `${recording.discard}`, `sweep ${recording.discard} discarded`]]),
+};
+
+byId("record").addEventListener("click", (event) => {
+  const button = event.target.closest("button");
+  if (!button || button.getAttribute("aria-disabled") === "true") return;
+  if (event.detail) button.blur(); // not after a key: so that the pedal starts a sweep
+  const {material, position} = button.dataset;
+  if (!material) return PRESSED[button.id]();
+  send([["MATERIAL", material, "", "material"], ["POSITION", position, `now ${named(material, position)}`, "position"]]);
+});
+byId("fields").addEventListener("keydown", (event) => { if (event.key === "Enter" && live()) setLabels(); });
+
+listenToPedal(() => {
+  const button = byId(recording?.sweeping ? "stop" : "start");
+  if (recording?.commands.includes("START") && button.getAttribute("aria-disabled") === "false") PRESSED[button.id]();
+});
+
+listen({
+  now(ns) { wallMs = Date.now() - ns / 1e6; },
+  begin,
+  key(one) { key = one; },
+  recording(one) {
+    recording = one;
+    dirty = true;
+  },
+  sweep(one) {
+    last = one;
+    dirty = true;
+  },
+  view(one) {
+    view = one;
+    drawSkin();
+  },
+}, (there, program) => {
+  [reached, answers] = [there, program];
+  if (there && !picture?.taxels) picture = null;
+  dirty = true;
+});
+
+function tick() {
+  if (dirty) draw();
+  drawCall();
+  requestAnimationFrame(tick);
+}
+for (const [what, name] of [[window, "resize"], [matchMedia("(prefers-color-scheme: dark)"), "change"]]) {
+  what.addEventListener(name, () => { dirty = true; });
+}
+setInterval(() => { dirty = true; }, 1000);
+tick();

@@ -1,0 +1,499 @@
+"""Serves a page and its events to browsers, with tornado, and takes orders of the page.
+
+The server runs in a thread of its own, so that no browser keeps the program waiting. It answers GET
+of the paths it was given, and reads only the head of a request. A new browser gets the kept events,
+then the new events (server-sent events); a browser that comes back gets the events it has missed.
+The program alone decides about orders: a page without orders is read-only
+(docs/decisions/0016-labels-from-the-page.md).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hmac
+import json
+import logging
+import secrets
+import threading
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from heapq import merge
+from pathlib import Path
+from typing import Any, Protocol, Self
+from weakref import WeakSet
+
+from palpate.core.errors import AddressError, ApplianceError, ConfigError, FormatError, NoAnswer
+from palpate.core.log import TroubleLog
+from palpate.web import local_users
+from palpate.web.access import Access
+
+try:
+    from tornado.httpserver import HTTPServer
+    from tornado.ioloop import PeriodicCallback
+    from tornado.iostream import StreamClosedError
+    from tornado.netutil import bind_sockets
+    from tornado.template import Loader
+    from tornado.web import Application, HTTPError, RequestHandler
+except ImportError as e:
+    raise ConfigError(
+        "--web needs tornado, which is not installed; pip install 'palpate[page]'"
+    ) from e
+
+FOLDER = Path(__file__).with_name("page")
+KINDS = {
+    ".html": "text/html; charset=utf-8",
+    ".css": "text/css; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+}
+HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
+    "connect-src 'self'; img-src data:; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'",
+    "Cache-Control": "no-store",
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Server": "palpate",
+}
+"""Permissions of the page in a browser, in every answer, errors included."""
+HEAD_S = 5.0
+"""Time limit for a request's head, including the handshake of TLS, and for a connection without a
+request."""
+TAKEN_S = 30
+"""Time after which a browser that reads nothing is disconnected."""
+MOST_HEAD = 8192
+"""Most bytes of a request."""
+MOST_OPEN, MOST_OF_ONE = 64, 24
+"""Most connections at a time, and most of an address; further connections are closed at once. A
+browser opens up to six."""
+MOST_WAITING = 100
+"""Most events that wait for a browser. A browser that is further behind is disconnected, and gets
+the kept events when it comes back."""
+MOST_ORDER = 1024
+"""Most bytes of an order."""
+DONE_S = 3.0
+"""Longest wait for the answer to an order."""
+WRONG_S = 1.0
+"""Delay of the answer to a wrong token."""
+COOKIE = "__Host-palpate"
+KEY = "X-Palpate-Key"
+"""Header with the key of an order. The page gets the key with its events; another site cannot read
+it."""
+DAY = 86_400
+
+Answer = Callable[[str], object | None]
+"""The content for JSON by the last part of a path; None for an unknown path."""
+Orders = Callable[[bytes], Future[Any]]
+"""Takes an order without waiting. Its future gives the answer for JSON, or an ApplianceError if the
+order is refused."""
+
+
+class State(Protocol):
+    """The content of a page with a single view."""
+
+    def json(self) -> dict[str, Any]:
+        """The content as JSON."""
+        ...
+
+
+class EventLog:
+    """The events of a program, with numbers.
+
+    Of each name the newest `kept[name]` events are kept, or the newest event if `kept` lacks the
+    name. run: distinguishes this server from the next, which counts anew.
+    """
+
+    def __init__(self, kept: Mapping[str, int]) -> None:
+        self.run = secrets.token_hex(4)
+        self._kept = kept
+        self._number = 0
+        self._events: dict[str, deque[tuple[int, bytes]]] = {}
+
+    def add(self, name: str, content: object) -> bytes:
+        """Add an event and return its text for browsers."""
+        self._number += 1
+        data = json.dumps(content, allow_nan=False, separators=(",", ":"))
+        event = f"id: {self.run}-{self._number}\nevent: {name}\ndata: {data}\n\n".encode()
+        self._events.setdefault(name, deque(maxlen=self._kept.get(name, 1))).append(
+            (self._number, event)
+        )
+        return event
+
+    def since(self, last: str) -> list[bytes]:
+        """The events after the event `last` ("": all), in order."""
+        run, _, number = last.partition("-")
+        after = int(number) if run == self.run and number.isdecimal() and len(number) < 20 else 0
+        first = [] if after else [f"event: begin\ndata: {json.dumps(self.run)}\n\n".encode()]
+        return first + [event for number, event in merge(*self._events.values()) if number > after]
+
+
+class PageServer:
+    """Serves the page `name` of FOLDER and the other files there, at `access`.
+
+    kept: as for EventLog. now_ns: the clock of the events' time stamps. answers: functions for
+    content on request, by the first part of its path. orders: takes the page's POSTs to /order;
+    None for a page that is read-only. Raises AddressError if the address is in use or not there
+    yet, ConfigError if it cannot be used at all.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        access: Access,
+        now_ns: Callable[[], int],
+        kept: Mapping[str, int] | None = None,
+        answers: Mapping[str, Answer] | None = None,
+        orders: Orders | None = None,
+    ) -> None:
+        self.access, self.now_ns, self.answers, self.orders = access, now_ns, answers or {}, orders
+        self.events, self.key = EventLog(kept or {}), secrets.token_urlsafe()
+        if orders:
+            self.events.add("key", self.key)
+        self.queues: set[asyncio.Queue[bytes]] = set()
+        self.answering: set[asyncio.Task[Any]] = set()
+        self.wrong = TroubleLog("page")
+        self.files = page_files()
+        self.files["/"] = self.files[f"/{name}"]
+        self._stop = asyncio.Event()
+        self.server: LimitedServer | None = None
+        try:
+            self._tls = access.tls()
+            self._sockets = bind_sockets(
+                _checked(access.port), access.address, backlog=2 * MOST_OPEN
+            )
+        except (OSError, ValueError) as e:
+            where = f"port {access.port} of {access.address}"
+            passing = isinstance(e, OSError) and not isinstance(e, PermissionError)
+            raise (AddressError if passing else ConfigError)(
+                f"{where} cannot be used: {e}; name another with --web PORT"
+            ) from e
+        self.address = access.url(self._sockets[0].getsockname()[1])
+
+    def __enter__(self) -> Self:
+        # tornado logs each malformed request, and the terminal may show a skin
+        logging.getLogger("tornado").addHandler(logging.NullHandler())
+        logging.getLogger("tornado").propagate = False
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(
+            target=self._loop.run_until_complete, args=(self._serve(),), daemon=True
+        )
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._loop.call_soon_threadsafe(self._stop.set)
+        self._thread.join()
+        self._loop.close()
+
+    @property
+    def watched(self) -> bool:
+        """Whether a browser is connected."""
+        return bool(self.queues)
+
+    def publish(self, name: str, content: object) -> None:
+        """Send an event to all browsers, and keep it. It never waits. Raises ValueError for a
+        number that JSON lacks."""
+        json.dumps(
+            content, allow_nan=False
+        )  # an error belongs to the caller, not into the server's thread
+        self._loop.call_soon_threadsafe(self._spread, name, content)
+
+    def show(self, view: State) -> None:
+        """Make `view` the newest event of this name."""
+        self.publish("view", view.json())
+
+    def _spread(self, name: str, content: object) -> None:
+        event = self.events.add(name, content)
+        for queue in [*self.queues]:
+            if queue.full():
+                self.queues.remove(queue)  # its handler ends at its next event
+            else:
+                queue.put_nowait(event)
+
+    async def _serve(self) -> None:
+        routes = [(r"/events", EventsHandler), (r"/(\w+)/(\d{1,9})", AnswerHandler)]
+        routes += [(r"/order", OrderHandler)] if self.orders else []
+        application = Application(
+            [(path, handler, {"page": self}) for path, handler in routes],
+            default_handler_class=FileHandler,
+            default_handler_args={"page": self},
+            log_function=lambda handler: None,
+        )
+        server = self.server = LimitedServer(
+            application,
+            ssl_options=self._tls,
+            max_header_size=MOST_HEAD,
+            max_body_size=MOST_ORDER if self.orders else 0,
+            max_buffer_size=1 << 16,
+            idle_connection_timeout=HEAD_S,
+            body_timeout=HEAD_S,
+            chunk_size=MOST_HEAD,
+        )
+        server.add_sockets(self._sockets)
+        tick = PeriodicCallback(server.drop_those_who_take_nothing, 1000)
+        tick.start()
+        await self._stop.wait()
+        if self.answering:
+            await asyncio.wait(self.answering, timeout=DONE_S)
+        tick.stop()
+        server.stop()
+        await server.close_all_connections()
+        await asyncio.sleep(0)  # cancelled handlers end
+
+
+def page_files() -> dict[str, tuple[str, bytes]]:
+    """Type and content of each file of FOLDER, by its path. Pages are in the frame that all of them
+    share, frame.html."""
+    frames = Loader(str(FOLDER), autoescape=None, whitespace="all")
+    return {
+        f"/{f.name}": (
+            KINDS[f.suffix],
+            frames.load(f.name).generate() if f.suffix == ".html" else f.read_bytes(),
+        )
+        for f in FOLDER.iterdir()
+        if f.suffix in KINDS and f.name != "frame.html"
+    }
+
+
+def _checked(port: int) -> int:
+    """The port. Raises ValueError for other numbers, which the resolver would take modulo 65536."""
+    if not 0 <= port <= 65535:
+        raise ValueError("ports are numbers from 0 to 65535")
+    return port
+
+
+class LimitedServer(HTTPServer):
+    """tornado's server with limits for connections and for the time without reading. admitted:
+    connections that have sent an allowed request; they are not closed for others."""
+
+    def initialize(self, *args: Any, **options: Any) -> None:
+        """As HTTPServer.initialize."""
+        super().initialize(*args, **options)
+        self._open: dict[Any, str] = {}  # stream -> address, the oldest first
+        self.admitted: WeakSet[Any] = WeakSet()
+        self._since: Counter[Any] = Counter()  # stream -> seconds without reading
+
+    def handle_stream(self, stream: Any, address: Any) -> None:
+        """Accept a connection if there is room, or if another can be closed for it."""
+        self._open = {one: ip for one, ip in self._open.items() if not one.closed()}
+        own = sum(ip == address[0] for ip in self._open.values())
+        if own >= MOST_OF_ONE and not self._close_one(address[0]):
+            stream.close()
+            return
+        if len(self._open) >= MOST_OPEN and not self._close_one(self._busiest(own)):
+            stream.close()
+            return
+        self._open[stream] = address[0]
+        super().handle_stream(stream, address)
+
+    def _busiest(self, own: int) -> str:
+        """The address with the most connections, "" if none has more than `own`."""
+        address, most = Counter(self._open.values()).most_common(1)[0]
+        return address if most > own else ""
+
+    def _close_one(self, address: str) -> bool:
+        """Close the oldest connection of an address that has sent no allowed request so far.
+        Returns whether there was one."""
+        for stream, ip in self._open.items():
+            if ip == address and stream not in self.admitted:
+                stream.close()
+                del self._open[stream]
+                return True
+        return False
+
+    def drop_those_who_take_nothing(self) -> None:
+        """Close connections whose other side has read nothing for TAKEN_S. It is called once a
+        second."""
+        self._since = Counter({one: self._since[one] + 1 for one in self._open if one.writing()})
+        for stream, seconds in self._since.items():
+            if seconds >= TAKEN_S:
+                stream.close()
+
+
+class _Handler(RequestHandler):
+    """Common part of all requests: permissions and headers."""
+
+    SUPPORTED_METHODS = ("GET",)
+
+    def initialize(self, page: PageServer) -> None:
+        """page: the page that gets the request."""
+        self.page = page
+
+    def set_default_headers(self) -> None:
+        """Set the headers of all answers."""
+        for name, value in HEADERS.items():
+            self.set_header(name, value)
+
+    async def prepare(self) -> None:
+        """Refuse a request for another site, and a request without the token."""
+        access, request = self.page.access, self.request
+        stream = request.connection.stream if request.connection else None  # type: ignore[attr-defined]
+        own = stream.socket.getsockname()[0] if stream and stream.socket else ""
+        if not access.is_host(request.headers.get("Host", ""), own):
+            raise HTTPError(421)
+        scheme, _, given = request.headers.get("Authorization", "").partition(" ")
+        given = given if scheme == "Bearer" else self.get_cookie(COOKIE, "") or ""
+        if access.admits(given):
+            self._admit(stream)
+            return
+        if given:
+            self.page.wrong.update(
+                "a wrong token",
+                f"page: wrong token from {request.remote_ip}; further wrong tokens are not logged",
+            )
+            await asyncio.sleep(WRONG_S)
+            self.clear_cookie(COOKIE, path="/", secure=True)
+        raise HTTPError(401)
+
+    def _admit(self, stream: Any) -> None:
+        """Note the connection of an allowed request. Without a token it must be of a user who may
+        read the feed, too."""
+        server = self.page.server
+        if not (stream and stream.socket and server) or stream in server.admitted:
+            return
+        if not self.page.access.token:
+            peer, own = stream.socket.getpeername()[:2], stream.socket.getsockname()[:2]
+            if not local_users.may_see(local_users.owner(peer, own)):
+                raise HTTPError(403, reason=f"only for root and group {local_users.GROUP}")
+        server.admitted.add(stream)
+
+    def write_error(self, status_code: int, **_: Any) -> None:
+        """Answer with a line of text."""
+        self.set_header("Content-Type", "text/plain; charset=utf-8")
+        self.finish(f"{status_code} {self._reason}\n")
+
+
+class FileHandler(_Handler):
+    """The page and its files. A browser without the token gets a page that asks for it."""
+
+    def get(self) -> None:
+        """Answer with a file, or with 404."""
+        if self.request.path == "/enter" and self.page.access.token:  # the token was right
+            self.set_cookie(
+                COOKIE,
+                self.page.access.token,
+                path="/",
+                secure=True,
+                httponly=True,
+                samesite="Strict",
+                max_age=365 * DAY,
+            )
+            self.set_status(204)
+            return
+        if self.request.path not in self.page.files or self.request.query:
+            raise HTTPError(404)
+        self._send(self.request.path)
+
+    def write_error(self, status_code: int, **kwargs: Any) -> None:
+        """Let a browser without a token enter it. Style and script of this page are not secret."""
+        path = "/enter.html" if self.request.path == "/" else self.request.path
+        if status_code == 401 and path in ("/enter.html", "/enter.js", "/page.css"):
+            self.set_status(401 if path == "/enter.html" else 200)
+            self._send(path)
+            self.finish()
+        else:
+            super().write_error(status_code, **kwargs)
+
+    def _send(self, path: str) -> None:
+        kind, body = self.page.files[path]
+        self.set_header("Content-Type", kind)
+        self.write(body)
+
+
+class AnswerHandler(_Handler):
+    """Content that is computed on request."""
+
+    def get(self, name: str, which: str) -> None:
+        """Answer with JSON, or with 404."""
+        answer = self.page.answers.get(name)
+        content = answer(which) if answer else None
+        if content is None:
+            raise HTTPError(404)
+        self.set_header("Content-Type", "application/json")
+        self.finish(json.dumps(content, allow_nan=False, separators=(",", ":")))
+
+
+class OrderHandler(_Handler):
+    """Orders of the page."""
+
+    SUPPORTED_METHODS = ("POST",)
+
+    async def prepare(self) -> None:
+        """Refuse orders of other sites: they have another origin, and cannot read the key."""
+        await super().prepare()
+        headers, own = (
+            self.request.headers,
+            f"{self.request.protocol}://{self.request.headers['Host']}",
+        )
+        if headers.get("Origin") != own or not hmac.compare_digest(
+            headers.get(KEY, "").encode(), self.page.key.encode()
+        ):
+            raise HTTPError(403)
+        if headers.get("Content-Type") != "application/json":
+            raise HTTPError(415)
+
+    async def post(self) -> None:
+        """Answer with the result of the order as JSON, or with the reason for a refusal as a
+        line."""
+        task = asyncio.current_task()
+        assert task
+        self.page.answering.add(task)
+        task.add_done_callback(self.page.answering.discard)
+        try:
+            content = json.dumps(await self._done())
+            self.set_header("Content-Type", "application/json")
+            self.finish(content)
+        except ApplianceError as e:
+            self.set_status(
+                400 if isinstance(e, FormatError) else 503 if isinstance(e, NoAnswer) else 409
+            )
+            self.set_header("Content-Type", "text/plain; charset=utf-8")
+            self.finish(str(e))
+
+    async def _done(self) -> Any:
+        """The result of an order. Raises ApplianceError if it is refused; NoAnswer if it is not
+        carried out in time."""
+        assert self.page.orders
+        order = self.page.orders(self.request.body)
+        try:
+            async with asyncio.timeout(DONE_S):
+                return await asyncio.shield(asyncio.wrap_future(order))
+        except TimeoutError as e:
+            known = (
+                "it was not carried out; try again"
+                if order.cancel()
+                else "it may still be carried out; wait for it"
+            )
+            raise NoAnswer(f"no answer within {DONE_S:g} s; {known}") from e
+
+
+class EventsHandler(_Handler):
+    """The stream of events to a browser."""
+
+    async def get(self) -> None:
+        """Send the missed events, then each new event, until browser or page ends."""
+        page, queue = self.page, asyncio.Queue[bytes](MOST_WAITING)
+        self.set_header("Content-Type", "text/event-stream")
+        now = f"event: now\ndata: {page.now_ns()}\n\n".encode()
+        missed = page.events.since(self.get_query_argument("last", ""))
+        page.queues.add(queue)
+        self._queue = queue
+        try:
+            self.write(b"".join([now, *missed]))
+            await self.flush()
+            while queue in page.queues:
+                self.write(await queue.get())
+                await self.flush()
+        except StreamClosedError:
+            pass
+        finally:
+            page.queues.discard(queue)
+
+    def on_connection_close(self) -> None:
+        """Wake the handler up, so that it ends."""
+        if (queue := getattr(self, "_queue", None)) in self.page.queues:
+            self.page.queues.discard(queue)
+            if queue.empty():
+                queue.put_nowait(b"")

@@ -1,3 +1,0 @@
-"""Emulated skins that exist: the bytes that each sends over its serial line (`wires`), and a
-terminal on which it is plugged in (`player`). They were written from published layouts, not from
-the decoders of `appliance.io`, which read them."""

@@ -1,0 +1,428 @@
+"""The View of the contact on the skin, and its picture in a terminal."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import io
+import math
+import os
+import re
+import signal
+import struct
+import subprocess
+import sys
+import termios
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from palpate.alignment import live
+from palpate.alignment.live import Alignment, Expected
+from palpate.alignment.terminal import ASCII, BLOCKS, ENTER, LEAVE, Canvas, Screen, line
+from palpate.alignment.view import View
+from palpate.bundle import bundle
+from palpate.bundle.bundle import Bundle, Manifest
+from palpate.cli.common import StopFlag
+from palpate.cli.main import main
+from palpate.core import config
+from palpate.signal.contact import ContactPositions
+from palpate.sim import devices, rig, script, skin
+from tests.factories import terminals
+from tests.factories.paths import NO_SITE
+from tests.factories.simulated_box import SECOND, idle_devices
+
+MIDDLE = ContactPositions(4.0, (6.0, 6.4), (6.0, 5.8), 0.6)
+
+
+@pytest.fixture
+def model(default_bundle: Bundle) -> Bundle:
+    """The default bundle, with trained positions."""
+    return replace(default_bundle, manifest=replace(default_bundle.manifest, contact=MIDDLE))
+
+
+def views_of(
+    simulated: devices.SimDevices, model: Bundle | Expected
+) -> Callable[[float], list[View]]:
+    """A function that reads the skin of `simulated` for some seconds and returns the Views."""
+    settings = simulated.wire(config.load(None, [], site=NO_SITE))
+    alignment = Alignment(
+        settings, model if isinstance(model, Expected) else Expected.by(model), simulated
+    )
+
+    def views(seconds: float) -> list[View]:
+        seen, end_ns, next_ns = (
+            [],
+            simulated.clock.now_ns() + round(seconds * SECOND),
+            simulated.clock.now_ns(),
+        )
+        while simulated.clock.now_ns() < end_ns:
+            alignment.read()
+            if simulated.clock.now_ns() >= next_ns:
+                next_ns = simulated.clock.now_ns() + live.VIEW_NS
+                seen.append(alignment.view())
+        return seen
+
+    return views
+
+
+def resting(seed: int = 1) -> devices.SimDevices:
+    """The simulated finger that rests on the tube while a person aligns the skin."""
+    return devices.build(
+        skin.FORMAT, script.named("rest", skin.FORMAT, seed)[0], rig.VirtualClock(), "sim"
+    )
+
+
+def states(views: list[View]) -> list[str]:
+    """The states in order, without repetitions."""
+    return [v.state for i, v in enumerate(views) if i == 0 or v.state != views[i - 1].state]
+
+
+def test_views_follow_the_touches(model: Bundle):
+    """Finger off, then four touches, each nearer than the last: the message follows, and the last
+    touch is in place."""
+    views = views_of(resting(), model)
+    seen = views(17)
+    assert states(seen)[:4] == ["wait", "no-contact", "off", "no-contact"]
+    assert states(seen)[-3:] == ["no-contact", "in-place", "no-contact"]
+    off = [v for v in seen if v.state == "off"]
+    assert off[3].message.startswith("2.5 mm too far towards column 1 and ")
+    assert off[3].message.endswith("towards row 1")
+    last = [v for v in seen if v.state == "in-place"][-4]
+    assert last.message == "in place"
+    assert last.centre == pytest.approx((6, 6), abs=0.6)
+    assert math.dist(last.centre, last.nearest) < MIDDLE.limit_mm
+    assert last.full == pytest.approx(max(max(row) for v in seen for row in v.load), abs=0.1)
+    assert [v.number for v in seen] == list(range(1, len(seen) + 1))
+
+
+def pressed(*loads: float) -> devices.SimDevices:
+    """A skin with these loads on all taxels except the last, for a second each."""
+    on = np.concatenate([np.full((750, 4, 4), load, np.uint8) for load in loads])
+    on[:, 3, 3] = 3
+    return devices.build(skin.FORMAT, [rig.Act(on, 0, len(on) - 1, "")], rig.VirtualClock(), "sim")
+
+
+def test_a_finger_that_lay_on_the_skin_at_the_start_is_noticed(model: Bundle):
+    """No advice until each taxel was unloaded once; then the load is right."""
+    views = views_of(pressed(80, 95, 2, 80), model)
+    seen = views(4)
+    assert states(seen) == ["wait", "lift", "no-contact", "in-place"]
+    assert "80 raw counts" in next(v for v in seen if v.state == "lift").hint
+    assert seen[-1].load[0][0] == pytest.approx(78)
+    assert seen[-1].load[3][3] == 0
+
+
+def test_a_skin_that_is_never_near_zero(model: Bundle):
+    """The bundle's counts of the unloaded skin are subtracted: the finger is detected, and the hint
+    counts above them."""
+    rest = replace(model, manifest=replace(model.manifest, unloaded=(50.0,) * 16))
+    seen = views_of(pressed(130, 145, 52, 130), rest)(4)
+    assert states(seen) == ["wait", "lift", "no-contact", "in-place"]
+    assert (
+        "80 raw counts above the unloaded skin" in next(v for v in seen if v.state == "lift").hint
+    )
+    assert states(views_of(pressed(130, 145, 52, 130), model)(4)) == ["wait", "lift"]
+
+
+def test_a_bundle_without_a_threshold_shows_the_centre(model: Bundle):
+    """The threshold comes from the present unloaded skin, as without a bundle. No position is
+    compared."""
+    m = model.manifest
+    limits = replace(m.thresholds, contact=None)
+    without = replace(
+        model, manifest=replace(m, contact=None, displacement=None, thresholds=limits)
+    )
+    last = [v for v in views_of(resting(), without)(14.5) if v.centre][-1]
+    assert last.centre == pytest.approx((1.5, 1.5), abs=0.15)
+    assert last.hint == (
+        "this bundle cannot detect contact, so it has no trained position; "
+        "train a bundle on sweeps of palpate record"
+    )
+
+
+def test_an_unplugged_skin_is_shown_and_waited_for(model: Bundle):
+    """While the skin is unplugged, the View has its state and advice, and no old picture. After it
+    is plugged in, the unloaded skin is measured anew."""
+    simulated = resting()
+    views = views_of(simulated, model)
+    views(2)
+    simulated.backend.unplug()
+    gone = views(0.6)[-1]
+    assert gone.state == "no-skin"
+    assert gone.message in ("no skin: absent", "no skin: lost")
+    assert gone.hint
+    assert gone.load == ()
+    simulated.backend.plug()
+    assert states(views(4)) == ["no-skin", "wait", "lift", "no-contact", "off"]
+
+
+def test_a_bundle_without_positions_shows_the_centre(default_bundle: Bundle):
+    """The View says that the bundle has no positions, and what to do. The centre is in taxels."""
+    without = replace(
+        default_bundle, manifest=replace(default_bundle.manifest, contact=None, displacement=None)
+    )
+    views = views_of(resting(), without)
+    last = [v for v in views(14.5) if v.centre][-1]
+    assert last.state == "no-positions"
+    assert "export it again" in last.hint
+    assert last.centre == pytest.approx((1.5, 1.5), abs=0.15)
+    assert last.nearest is None
+
+
+def test_without_a_bundle_the_contact_alone_is_shown(model: Bundle):
+    """For a skin without a bundle the View has load and centre, in taxels. The threshold comes from
+    the unloaded skin."""
+    seen = views_of(resting(), Expected(model.format))(14.5)
+    assert [state for state in states(seen) if state != "wait"][:2] == [
+        "no-contact",
+        "no-positions",
+    ]
+    last = [v for v in seen if v.centre][-1]
+    assert last.centre == pytest.approx((1.5, 1.5), abs=0.15)
+    assert (last.bundle, last.contact, last.unit) == ("none for this skin", None, "taxels")
+    assert "no bundle fits this skin" in last.hint
+
+
+@pytest.mark.parametrize(
+    ("source", "word"), [("usb", ""), ("sim", "SIMULATED"), ("replay", "REPLAYED")]
+)
+def test_a_view_says_what_it_is_of(source: str, word: str):
+    """A replayed set is not called simulated. A real skin has no note."""
+    shown = Canvas(replace(VIEW, source=source), ASCII, 80, 24, "").lines(False)[0]
+    assert shown.endswith(word or VIEW.bundle)
+    assert line(replace(VIEW, source=source)).startswith(f"{word}  " * bool(word) + VIEW.message)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("which", "want"), [("skin", "SIMULATED"), ("replay", "REPLAYED")])
+def test_align_with_what_is_simulated(
+    which: str,
+    want: str,
+    tmp_path: Path,
+    default_bundle: Bundle,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+):
+    """`align --sim skin` and `--sim replay:SET` find a contact, and say that they are simulated or
+    replayed."""
+    np.savez(
+        tmp_path / "s.npz",
+        samples=default_bundle.golden,
+        labels=[0, 1],
+        materials=["a", "b"],
+        rate_hz=750.0,
+    )
+    turns = iter(range(1200))
+    monkeypatch.setattr(StopFlag, "__call__", lambda flag: next(turns, None) is None)
+    name = which if which == "skin" else f"replay:{tmp_path / 's.npz'}"
+    assert main(["align", "--sim", name, "--virtual"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert all(text.startswith(want) for text in lines)
+    assert any("centre row" in text for text in lines)
+
+
+def test_another_skin_shape(model: Bundle):
+    """A skin of 2 x 3 taxels with floating-point counts, some of them NaN."""
+    format = replace(model.format, rows=2, cols=3, dtype="float32")
+    other = replace(
+        model,
+        manifest=replace(
+            model.manifest,
+            format=format,
+            contact=replace(MIDDLE, rows_mm=(2.0, 2.0), cols_mm=(4.0, 4.0)),
+        ),
+    )
+    load = np.zeros((3000, 2, 3), np.float32)
+    load[1000:, :, 1:] = 60.0
+    load[:, 0, 0] = np.nan
+    simulated = devices.build(format, [rig.Act(load, 0, 2999, "")], rig.VirtualClock(), "sim")
+    seen = views_of(simulated, other)(3)
+    assert seen[-1].message == "2.0 mm too far towards column 3"
+    assert seen[-1].load[0][0] == 0
+    screen = Canvas(seen[-1], ASCII, 80, 24, "").lines(False)
+    assert any("row 2" in line and "60" in line for line in screen)
+
+
+def test_only_the_normal_axis_is_looked_at(model: Bundle):
+    """A finger on the simulated skin with shear is found at its position. Shear, which may be
+    negative, is not shown."""
+    world = skin.World(shear=True)
+    other = replace(model, manifest=replace(model.manifest, format=world.format))
+    script_of = script.named("rest", world.format, 1)[0]
+    seen = views_of(devices.build(world.format, script_of, rig.VirtualClock(), "sim"), other)(17)
+    assert states(seen)[-2:] == ["in-place", "no-contact"]
+    last = [v for v in seen if v.state == "in-place"][-4]
+    assert (last.shape, len(last.load), len(last.load[0])) == ((4, 4), 4, 4)
+    assert last.centre == pytest.approx((6, 6), abs=0.6)
+
+
+VIEW = View(
+    7,
+    "sim",
+    "default 3, 9f3c2a1b",
+    "streaming",
+    "off",
+    "2.2 mm too far towards row 1",
+    "move it",
+    (4, 4),
+    tuple(tuple(float(20 * r + c) for c in range(4)) for r in range(4)),
+    80.0,
+    (3.8, 6.0),
+    (6.0, 6.0),
+    MIDDLE,
+)
+
+
+def test_a_pipe_gets_one_plain_line_a_second():
+    """The line has message, centre and the note that the skin is simulated, and no control
+    characters."""
+    out, clock = io.StringIO(), rig.VirtualClock()
+    begin_ns = clock.now_ns()
+    with Screen(out, clock, "http://127.0.0.1:8137") as screen:
+        for tenth in range(25):
+            clock.sleep_until(begin_ns + tenth * SECOND // 10)
+            screen.show(VIEW)
+    first, *lines = out.getvalue().splitlines()
+    assert first == "page: http://127.0.0.1:8137"
+    assert (
+        lines
+        == ["SIMULATED  2.2 mm too far towards row 1  centre row 3.8 column 6.0 mm  (move it)"] * 3
+    )
+
+
+@pytest.mark.parametrize(("width", "height"), [(80, 24), (132, 50), (40, 16), (20, 5), (1, 1)])
+@pytest.mark.parametrize("signs", [BLOCKS, ASCII])
+def test_the_picture_fits_the_terminal(width: int, height: int, signs: str):
+    """The number and length of the lines fit the terminal. At 80 x 24 all numbers, both points, the
+    texts and the key are shown."""
+    lines = Canvas(VIEW, signs, width, height, "http://127.0.0.1:8137").lines(False)
+    plain = [re.sub(r"\033\[[0-9;]*m", "", line) for line in lines]
+    assert len(lines) == height
+    assert all(len(line) <= width for line in plain)
+    if width < 80:
+        return
+    text = "\n".join(plain)
+    wanted = [
+        "SIMULATED",
+        "2.2 mm too far towards row 1",
+        "move it",
+        "row 4",
+        "col 4",
+        "Ctrl-C ends",
+        "http://127.0.0.1:8137",
+    ]
+    assert all(
+        word in text for word in wanted + [f"{20 * r + c} " for r in range(4) for c in range(4)]
+    )
+    row_1, row_4 = (
+        next(line for line in plain if f"row {n}" in line and "│" in line.replace("|", "│"))
+        for n in (1, 4)
+    )
+    assert signs[0] * 4 in row_1.replace(" ", signs[0])
+    assert signs[3] in row_4
+    assert f"({signs[5]})" in text
+    assert signs[6] in "\n".join(plain[9:14])
+    assert all(ord(sign) < 128 for sign in text) == (signs is ASCII)
+
+
+def test_a_place_beside_the_skin_is_shown_at_its_edge():
+    """At any distance, since a bundle may have any number."""
+    far = replace(VIEW, contact=replace(MIDDLE, rows_mm=(-50.0, 1e6), cols_mm=(6.0, -1e6)))
+    lines = Canvas(far, ASCII, 80, 24, "").lines(False)
+    assert [
+        line.index("+")
+        for plain in lines
+        if "+" in (line := re.sub(r"\033\[[0-9;]*m", "", plain)) and "|" in line
+    ] == [24, 8]
+
+
+def test_only_a_terminal_that_knows_colours_gets_them():
+    """38;5 for terminals with 256 colours; bold and inverse for all."""
+    assert any("38;5" in line for line in Canvas(VIEW, BLOCKS, 80, 24, "").lines(True))
+    plain = Canvas(VIEW, BLOCKS, 80, 24, "").lines(False)
+    assert not any("38;5" in line for line in plain)
+    assert any("\033[1;7m" in line for line in plain)
+
+
+def test_a_slow_terminal_ends_nothing(model: Bundle, monkeypatch: pytest.MonkeyPatch):
+    """There is a View every VIEW_NS, not a View for each frame. `stopped` ends the command, and the
+    skin is released."""
+    simulated, out = resting(), io.StringIO()
+    end_ns = simulated.clock.now_ns() + 5 * SECOND
+    monkeypatch.setattr("palpate.alignment.terminal.LINE_NS", 0)
+    settings = simulated.wire(config.load(None, [], site=NO_SITE))
+    live.run(
+        settings,
+        Expected.by(model),
+        simulated,
+        [Screen(out, simulated.clock)],
+        lambda: simulated.clock.now_ns() >= end_ns,
+    )
+    assert 24 <= len(out.getvalue().splitlines()) <= 26
+    assert not simulated.backend.board.running
+
+
+def test_a_denied_skin_is_named(model: Bundle):
+    """The View says why the skin cannot be read and what to do. The command goes on."""
+    simulated = idle_devices()
+    simulated.backend.errors["open"] = errno.EACCES
+    alignment = Alignment(config.load(None, [], site=NO_SITE), Expected.by(model), simulated)
+    alignment.read()
+    view = alignment.view()
+    assert (view.state, view.skin, view.message) == ("no-skin", "denied", "no skin: denied")
+    assert "udev" in view.hint
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bundle with trained positions, on disk."""
+    target = tmp_path_factory.mktemp("bundle")
+    for name in bundle.load(bundle.DEFAULT).manifest.files:
+        (target / name).write_bytes((bundle.DEFAULT / name).read_bytes())
+    manifest = Manifest.parse((bundle.DEFAULT / bundle.MANIFEST).read_bytes())
+    (target / bundle.MANIFEST).write_bytes(replace(manifest, contact=MIDDLE).json())
+    return target
+
+
+@pytest.fixture
+def terminal() -> Iterator[tuple[int, int]]:
+    """A terminal of 80 x 24: the far end, and the end for programs."""
+    far, near = os.openpty()
+    fcntl.ioctl(near, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
+    yield far, near
+    os.close(far)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["xterm-256color", "dumb"])
+def test_ctrl_c_ends_it_and_leaves_the_terminal_as_it_was(
+    folder: Path, terminal: tuple[int, int], kind: str
+):
+    """In a terminal the command ends with exit code 0 and leaves the alternate screen. A dumb
+    terminal gets no alternate screen."""
+    far, near = terminal
+    command = [
+        sys.executable,
+        "-m",
+        "palpate",
+        "align",
+        "--sim",
+        "rest",
+        "--set",
+        f"classifier.bundle={folder}",
+    ]
+    with subprocess.Popen(command, stdout=near, env=os.environ | {"TERM": kind}) as run:
+        os.close(near)
+        shown = terminals.read(far, run, lambda shown: b"SIMULATED" in shown)
+        run.send_signal(signal.SIGINT)
+        shown += terminals.read(far, run)
+        assert terminals.ended(run, shown) == 130
+    text = shown.decode()
+    live = kind != "dumb"
+    assert (text.startswith(ENTER), text.endswith(LEAVE)) == (live, live)
+    assert ("\033" in text) == live
+    assert text.count("reading the unloaded skin") >= 1

@@ -1,0 +1,151 @@
+"""Values that a bridge takes from the settings of the box where no option sets them."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import select
+import signal
+import socket
+import subprocess
+import sys
+import tty
+from pathlib import Path
+
+import pytest
+
+from palpate.bridges import command
+from palpate.bridges.options import LINKS, add_arguments, parse
+from palpate.core import config
+from palpate.core.errors import ConfigError
+from palpate.core.menu import CommandParser
+from tests.factories.paths import NO_SITE, ROOT
+
+
+def settled(kind: str, *options: str, sets: tuple[str, ...] = ()) -> argparse.Namespace:
+    """The options of a bridge, once the settings have filled them in."""
+    parser = CommandParser("bridge")
+    add_arguments(parser)
+    args = parse(parser, [kind, *options])
+    command.settle(kind, args, config.load(None, sets, site=NO_SITE))
+    return args
+
+
+@pytest.mark.slow
+@pytest.mark.thorough  # starts processes and waits for them
+@pytest.mark.parametrize("kind", ["tcp", "modbus"])
+def test_ctrl_c_while_the_box_owes_an_answer(kind: str):
+    """A command is pending: the bridge ends at once with exit code 130 and without a traceback."""
+    far, near = os.openpty()
+    tty.setraw(near)
+    words = [sys.executable, "-m", "palpate", "bridge", kind, "--port", os.ttyname(near)]
+    with subprocess.Popen(
+        [*words, "--listen", "127.0.0.1:0", "--allow-writes"],
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+    ) as bridge:
+        assert bridge.stderr
+        told = bridge.stderr.readline()
+        port = int(re.search(r"listening on 127.0.0.1:(\d+)", told)[1])
+        with socket.create_connection(("127.0.0.1", port)) as client:
+            start = {"tcp": b"PPLP START\r\n", "modbus": bytes.fromhex("0001000000060105 0000ff00")}
+            client.sendall(start[kind])
+            assert select.select([far], [], [], 30)[0]
+            bridge.send_signal(signal.SIGINT)
+            rest = bridge.communicate(timeout=60)[1]
+    os.close(far)
+    os.close(near)
+    assert (bridge.returncode, "Traceback" in rest) == (130, False), rest
+
+
+def test_a_serial_line_that_is_not_there_gets_a_warning(caplog: pytest.LogCaptureFixture):
+    """A port that does not exist is named; sockets and existing ports are not."""
+    command._warn(settled("modbus", "--port", "/dev/nonexist"))
+    assert "--port /dev/nonexist does not exist; trying again" in caplog.text
+    caplog.clear()
+    command._warn(settled("modbus", "--port", "/dev/null"))
+    command._warn(settled("tcp", "--port", "socket://127.0.0.1:9"))
+    assert not caplog.text
+
+
+def test_the_settings_of_a_new_box():
+    """Modbus reads the feed, on this machine alone, and refuses commands; TCP lacks a serial line,
+    and the error names the setting."""
+    args = settled("modbus")
+    assert (args.feed, args.link, args.listen, args.allow_writes) == (
+        "/run/palpate/feed.sock",
+        None,
+        "127.0.0.1:1502",
+        False,
+    )
+    with pytest.raises(
+        ConfigError,
+        match=r'serial\.port = "" is not a serial line .* set serial\.port = '
+        r'"/run/palpate-tcp/line"',
+    ):
+        settled("tcp")
+
+
+@pytest.mark.parametrize("kind", LINKS)
+def test_the_line_of_the_bridge(kind: str):
+    """serial.port names its link: the bridge makes it, listens at the address of the settings, and
+    passes commands on if that is allowed."""
+    sets = (f"serial.port={LINKS[kind]}", "bridge.address=192.168.0.10", "bridge.allow_writes=true")
+    args = settled(kind, sets=sets)
+    assert (args.link, args.allow_writes) == (Path(LINKS[kind]), True)
+    assert args.listen == {"tcp": "192.168.0.10:1503", "modbus": "192.168.0.10:1502"}[kind]
+
+
+def test_options_hold():
+    """A line, an address, or a feed by option: the settings do not change them."""
+    sets = (f"serial.port={LINKS['tcp']}", "bridge.address=192.168.0.10")
+    args = settled(
+        "tcp", "--port", "/dev/ttyUSB0", "--listen", "[::1]:7", "--allow-writes", sets=sets
+    )
+    assert (args.port, args.link, args.listen, args.allow_writes) == (
+        "/dev/ttyUSB0",
+        None,
+        "[::1]:7",
+        True,
+    )
+    assert settled("modbus", "--feed", "/tmp/x", sets=sets).feed == "/tmp/x"
+
+
+@pytest.mark.parametrize(
+    "sets",
+    [
+        ("bridge.allow_writes=true",),
+        ("store.runtime=",),
+        ("serial.port=/dev/ttyAMA0", "store.runtime="),
+    ],
+)
+def test_no_way_to_the_box(sets: tuple[str, ...]):
+    """Commands without a line, or neither line nor feed: refused, with what to set."""
+    with pytest.raises(
+        ConfigError,
+        match=r'feed is read-only; set serial\.port = "/run/palpate-modbus/line"',
+    ):
+        settled("modbus", sets=sets)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("tcp", "--feed", "x"), "--feed is for modbus, not for tcp"),
+        (("ros", "--port", "x"), "--port is for tcp and modbus, not for ros"),
+        (("modbus", "--feed", "x", "--port", "y"), "--port and --feed both name a way to the box"),
+        (("modbuss",), "there is no kind 'modbuss'; did you mean 'modbus'?"),
+    ],
+)
+def test_options_that_do_not_fit(
+    options: tuple[str, ...], words: str, capsys: pytest.CaptureFixture[str]
+):
+    """An option of another kind, or two ways to the box: one line, exit code 2."""
+    with pytest.raises(SystemExit) as ended:
+        settled(*options)
+    assert ended.value.code == 2
+    err = capsys.readouterr().err
+    assert words in err
+    assert err.count("\n") == 1

@@ -1,0 +1,581 @@
+"""The Modbus bridge as a process, seen by pymodbus's client and by bytes put together by hand; and
+its map alone."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import random
+import re
+import socket
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pymodbus.client import ModbusTcpClient
+
+from palpate.bridges import modbus, modbus_pdu
+from palpate.bridges.modbus import (
+    ADDRESSES,
+    COILS,
+    INPUTS,
+    STALE,
+    STATUS_CODES,
+    inputs,
+    registers,
+)
+from palpate.bridges.options import MOST
+from palpate.bridges.source import BoxView, noted
+from palpate.cli.main import main
+from palpate.client.answers import Answer, BoxState
+from palpate.core.errors import FormatError
+from palpate.core.sentences import Sentence, read, sentence
+from palpate.core.status import Status
+from tests.factories import speaking_box
+from tests.factories.bridges import LONG_S, RawModbus, bridge, eventually, page_blocks
+from tests.factories.paths import ROOT
+from tests.factories.speaking_box import LABELS, SpeakingBox, finger, obeying, result, state
+
+Address = tuple[str, int]
+START, STOP, NEW = (COILS.index(name) for name in ("START", "STOP", "NEW"))
+
+
+@pytest.fixture
+def address(box: SpeakingBox) -> Iterator[Address]:
+    """A bridge to it that may write."""
+    with bridge("modbus", "--port", box.path, "--allow-writes") as there:
+        yield there
+
+
+@pytest.fixture
+def raw(box: SpeakingBox, address: Address) -> Iterator[RawModbus]:
+    """A hand-made client; the box has been heard, and its labels are known."""
+    box.say(state())
+    with RawModbus(address) as client:
+        eventually(lambda: client.registers(ADDRESSES["labels"], 1) == [len(LABELS)])
+        yield client
+
+
+def word(client: RawModbus, name: str) -> int:
+    """One register by its name."""
+    return client.registers(ADDRESSES[name], 1)[0]
+
+
+def test_another_client_reads_the_map(box: SpeakingBox, raw: RawModbus, address: Address):
+    """pymodbus, an independent client, finds the answer in input and in holding registers, and the
+    inputs."""
+    box.say(result(70_000, label="paper"), state(answered=7))
+    eventually(
+        lambda: word(raw, "answered") == 0 and raw.registers(ADDRESSES["answered"], 2) == [0, 7]
+    )
+    with ModbusTcpClient(address[0], port=address[1], timeout=LONG_S) as client:
+        for read_words in (client.read_input_registers, client.read_holding_registers):
+            found = read_words(0, count=ADDRESSES["label"] + modbus.LABEL_WORDS)
+            assert not found.isError()
+            words = found.registers
+            got = {name: words[at] for name, at in ADDRESSES.items()}
+            assert got["map version"] == 1
+            assert (got["state of the skin"], got["answers"], got["status"]) == (
+                1,
+                1,
+                STATUS_CODES[Status.OK],
+            )
+            assert (got["label code"], got["probability"], got["margin"], got["latency"]) == (
+                2,
+                900,
+                800,
+                125,
+            )
+            assert words[ADDRESSES["sweep"] :][:2] == [1, 70_000 - 65_536]
+            text = client.convert_from_registers(
+                words[ADDRESSES["label"] :], client.DATATYPE.STRING
+            )
+            assert text.rstrip("\0") == "paper"
+        bits = client.read_discrete_inputs(0, count=len(INPUTS)).bits
+        assert dict(zip(INPUTS, bits, strict=False)) == {
+            "alive": True,
+            "ready": True,
+            "sweeping": False,
+            "fault": False,
+            "known": True,
+            "early": False,
+        }
+
+
+MEASURED_AT = 42
+
+
+@pytest.mark.parametrize(
+    ("optional", "words"),
+    [
+        ((), [0, 0]),
+        ((1,), [0, 0]),
+        (("", "30.5", "rows+"), [305, 1]),
+        ((1, "8.0", "rows-"), [80, 2]),
+        (("", "400.0", "cols+"), [4000, 3]),
+        (("", "9999.9", "cols-"), [65535, 4]),
+        (("", "30.5", "sideways"), [305, 0]),
+    ],
+)
+def test_the_measured_slide_is_read(
+    box: SpeakingBox, raw: RawModbus, optional: tuple[object, ...], words: list[int]
+):
+    """Two registers: tenths of mm/s, and a code for each direction; 0 where RES has no
+    speed, or a direction of a later version. They are refused to writers."""
+    box.say(result(1, optional=optional))
+    eventually(lambda: word(raw, "answers") == 1)
+    assert raw.registers(MEASURED_AT, 2) == words
+    assert modbus.SLIDE_AT + len(modbus.SLIDE) == MEASURED_AT
+
+
+FINGERS_AT = 44
+
+
+def test_the_fingers_are_read(box: SpeakingBox, raw: RawModbus):
+    """Their number, then name, status, label code and probability of each; 0 where there is none,
+    and after the next answer of a box with one skin."""
+    box.say(finger("left", 1, "ok", "paper"))
+    box.say(finger("right", 1, "no-contact", "", "0.000"))
+    box.say(result(1, label="paper"))
+    eventually(lambda: word(raw, "answers") == 1)
+    eventually(lambda: word(raw, "label code") == 2)
+    found = raw.registers(FINGERS_AT, 1 + 4 * 7)
+    assert found[0] == 2
+    assert b"".join(w.to_bytes(2, "big") for w in found[1:5]) == b"left\0\0\0\0"
+    assert found[5:8] == [STATUS_CODES[Status.OK], 2, 900]
+    assert b"".join(w.to_bytes(2, "big") for w in found[8:12]) == b"right\0\0\0"
+    assert found[12:15] == [STATUS_CODES[Status.NO_CONTACT], 0, 0]
+    assert found[15:] == [0] * 14
+    box.say(result(2))
+    eventually(lambda: word(raw, "answers") == 2)
+    assert raw.registers(FINGERS_AT, 1 + 4 * 7) == [0] * 29
+
+
+def test_another_client_sweeps(box: SpeakingBox, raw: RawModbus, address: Address):
+    """pymodbus pulses NEW, START and STOP: the box hears them once each, in order, and the answer's
+    number rises."""
+    with ModbusTcpClient(address[0], port=address[1], timeout=LONG_S) as client:
+        for coil in (NEW, START, STOP):
+            assert not client.write_coil(coil, True).isError()
+            assert not client.write_coil(coil, True).isError()  # still on: no second command
+            assert client.read_coils(0, count=len(COILS)).bits[coil]
+            assert not client.write_coils(coil, [False]).isError()
+        eventually(lambda: word(raw, "answers") == 1)
+    assert [s.kind for s in box.heard if s.kind in COILS] == ["NEW", "START", "STOP"]
+
+
+def test_another_client_writes_speed_and_force(box: SpeakingBox, address: Address):
+    """pymodbus writes both registers, and START reaches the box with them."""
+    with ModbusTcpClient(address[0], port=address[1], timeout=LONG_S) as client:
+        assert not client.write_registers(modbus.SLIDE_AT, [305, 150]).isError()
+        assert client.read_holding_registers(modbus.SLIDE_AT, count=2).registers == [305, 150]
+        assert not client.write_coil(START, True).isError()
+    assert [s.fields for s in box.heard if s.kind == "START"] == [["30.5", "1.5"]]
+
+
+def test_bytes_by_hand(raw: RawModbus):
+    """Requests and replies as the specification prints them: transaction, unit, lengths, exception
+    codes."""
+    raw.send(bytes.fromhex("0400000001"), transaction=0x1234, unit=7)
+    assert raw.receive().hex() == "123400000005" + "07" + "0402" + "0001"
+    for pdu, code in (
+        ("0400270064", 2),  # beyond the map
+        ("04ffff0001", 2),
+        ("0400000000", 3),  # no register
+        ("040000007e", 3),  # 126 of them
+        ("0100000000", 3),
+        ("01000007d1", 3),
+        ("04000000", 3),  # a byte short
+        ("0400000001ff", 3),
+        ("0500000001", 3),  # neither on nor off
+        ("0f0000000301", 3),  # without its coils
+        ("0f00000003020700", 3),
+        ("050005ff00", 2),  # a coil that is not there
+        ("0f0003000301ff", 2),
+        ("0600000001", 2),  # a register that is not written
+        ("1000000001020001", 2),
+        ("10002800010100", 3),  # half a register
+        ("2b0e0100", 1),
+        ("00", 1),
+        ("ff", 1),
+    ):
+        reply = raw.ask(bytes.fromhex(pdu))
+        assert reply == bytes([int(pdu[:2], 16) | 0x80, code]), pdu
+
+
+def test_a_request_in_pieces_and_several_in_one(raw: RawModbus):
+    """TCP keeps no boundaries: byte by byte, and three at once."""
+    one = struct.pack(">HHHB", 9, 0, 6, 1) + bytes.fromhex("0400000001")
+    for byte in one:
+        raw.socket.sendall(bytes([byte]))
+    assert raw.receive()[:2] == b"\0\x09"
+    raw.socket.sendall(one * 3)
+    assert [raw.receive() for _ in range(3)] == [
+        one[:4] + b"\0\x05\x01" + bytes.fromhex("04020001")
+    ] * 3
+
+
+def test_nothing_is_written_without_leave(box: SpeakingBox):
+    """Without --allow-writes each write is an illegal function, and the box hears nothing; reading
+    works."""
+    with bridge("modbus", "--port", box.path) as address, RawModbus(address) as client:
+        for pdu in ("050000ff00", "0f0000000501ff", "060028000a", "1000280001020001"):
+            assert client.ask(bytes.fromhex(pdu)) == bytes([int(pdu[:2], 16) | 0x80, 1])
+        assert client.registers(0, 1) == [1]
+    assert {s.kind for s in box.heard} <= {"LABEL"}
+
+
+def test_a_command_that_the_box_refuses(box: SpeakingBox, raw: RawModbus):
+    """A device failure; the same command, sent again, reaches the box."""
+    box.script = lambda s: [sentence("ANS", s.kind, "error", "set trigger.mode to serial")]
+    assert raw.ask(bytes.fromhex("050000ff00")) == b"\x85\x04"
+    box.script = obeying
+    assert raw.ask(bytes.fromhex("050000ff00")) == bytes.fromhex("050000ff00")
+    assert [s.kind for s in box.heard if s.kind in COILS] == ["START", "START"]
+
+
+def test_one_command_at_a_time(box: SpeakingBox, raw: RawModbus, address: Address):
+    """While the box carries out a command, another peer gets the exception BUSY, and reading goes
+    on."""
+    box.script = lambda s: [] if s.kind == "TARE" else obeying(s)
+    raw.send(bytes.fromhex("050003ff00"))
+    box.wait_for("TARE")
+    with RawModbus(address) as other:
+        assert other.ask(bytes.fromhex("050000ff00")) == b"\x85\x06"
+        assert other.registers(0, 1) == [1]
+    assert raw.receive()[7:] == b"\x85\x04"  # no answer came in time
+
+
+def test_a_silent_box_is_stale_and_comes_back(box: SpeakingBox, raw: RawModbus):
+    """Unplugged: status 99, state 0, FAULT, and the heartbeat stands still; plugged in again it
+    goes on."""
+    box.say(result(1))
+    eventually(lambda: word(raw, "status") == 1)
+    box.unplug()
+    eventually(lambda: word(raw, "status") == STALE)
+    before = word(raw, "heartbeat")
+    assert (word(raw, "state of the skin"), word(raw, "label code"), word(raw, "answers")) == (
+        0,
+        0,
+        1,
+    )
+    assert raw.ask(bytes.fromhex("0200000006")) == bytes.fromhex("020108")
+    assert raw.ask(bytes.fromhex("050000ff00")) == b"\x85\x04"
+    box.plug_in()
+
+    def back() -> bool:
+        box.say(state(answered=1))
+        return word(raw, "heartbeat") > before
+
+    eventually(back)
+    assert (word(raw, "status"), word(raw, "state of the skin")) == (1, 1)
+
+
+def test_another_bundle_brings_its_labels(box: SpeakingBox, raw: RawModbus):
+    """The box restarts with another bundle: its labels are asked for, codes follow them."""
+
+    def other(heard: Sentence) -> list[bytes]:
+        return (
+            [sentence("ANS", "LABEL", "ok", 1, "cork", 1)]
+            if heard.kind == "LABEL"
+            else obeying(heard)
+        )
+
+    box.script = other
+    box.say(state(bundle="00000001"), result(1, label="cork"))
+    eventually(lambda: word(raw, "labels") == 1)
+    assert word(raw, "label code") == 1
+
+
+def flood(peer: socket.socket) -> None:
+    """Send requests without end, and read no reply."""
+    while True:
+        peer.sendall((struct.pack(">HHHB", 9, 0, 6, 1) + bytes.fromhex("0400000020")) * 1000)
+
+
+def test_hostile_bytes_reach_nobody_else(raw: RawModbus, address: Address):
+    """Noise, wrong headers, an endless stream without sense, a peer that stops in the middle and
+    one that never reads: each loses its own connection at most."""
+    generator = random.Random(1)
+    for data in [
+        *(generator.randbytes(generator.randrange(1, 400)) for _ in range(100)),
+        b"\0\1\0\1\0\6\1\4\0\0\0\1",
+        b"\0\1\0\0\0\0\1",
+        b"\0\1\0\0\xff\xff\1",
+        b"GET / HTTP/1.1\r\nHost: box\r\n\r\n",
+        b"\xff" * 100_000,
+    ]:
+        with socket.create_connection(address, timeout=LONG_S) as peer:
+            try:
+                peer.sendall(data)
+            except ConnectionError:
+                continue  # closed on its way
+    half = [socket.create_connection(address, timeout=LONG_S) for _ in range(4)]
+    for peer in half:
+        peer.sendall(b"\0\1\0\0\0\6\1\4")
+    deaf = socket.create_connection(address, timeout=0.2)
+    deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
+    with pytest.raises((TimeoutError, ConnectionError)):
+        flood(deaf)
+    assert raw.registers(0, 1) == [1]
+    for peer in (*half, deaf):
+        peer.close()
+    assert raw.registers(0, 1) == [1]
+
+
+def is_closed(peer: socket.socket) -> bool:
+    """Whether the bridge has ended this connection."""
+    peer.settimeout(0)
+    try:
+        return peer.recv(1) == b""
+    except BlockingIOError:
+        return False
+    except ConnectionError:
+        return True
+
+
+def test_a_thousand_connections(raw: RawModbus, address: Address):
+    """No more connections than the limit are kept, the others are closed at once, and the first is
+    still served."""
+    peers = []
+    for _ in range(1000):
+        peers.append(socket.create_connection(address, timeout=LONG_S))
+        if len(peers) % 10 == 0:
+            assert raw.registers(0, 1) == [1]
+    eventually(lambda: sum(map(is_closed, peers)) >= 1000 - MOST)
+    for peer in peers:
+        peer.close()
+    assert raw.registers(0, 1) == [1]
+
+
+HEALTH = {
+    "type": "health",
+    "time_ns": 9_000_000_000,
+    "skin": "streaming",
+    "trouble": "",
+    "streams": True,
+    "ready": True,
+    "sweeping": False,
+    "answered": 5,
+    "frames": 70_000,
+    "lost_frames": 2,
+    "garbage_bytes": 0,
+    "enumerations": 1,
+    "dropped": 0,
+    "bundle": "b1",
+    "source": "usb",
+}
+VERDICT = {
+    "type": "verdict",
+    "sweep": 6,
+    "time_ns": 9_500_000_000,
+    "status": "unsure",
+    "label": "paper",
+    "probability": 0.6,
+    "margin": 0.3,
+    "fused": 2,
+    "lost": 1,
+    "latency_ns": 1_250_000,
+    "bundle": "b1",
+    "share": 0.5,
+    "detail": "",
+    "measured_mm_s": 61.2,
+    "direction": "cols-",
+}
+HELLO = {"type": "hello", "schema": 1, "labels": ["wood", "paper"], "bundle": "b1", "format": {}}
+
+
+def test_the_feed_in_place_of_the_line(tmp_path: Path):
+    """On the box, beside a robot that has the serial line: the same map. Commands are refused;
+    lines of a later version are counted and do no harm."""
+    strange = {"type": "verdict", "status": "sideways"}
+    lines = [HELLO, HEALTH, strange, VERDICT, {"type": "later"}, {"type": "lost", "lines": 4}]
+    path = tmp_path / "feed.sock"
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(path))
+        listener.listen()
+        with (
+            bridge("modbus", "--feed", path, "--allow-writes") as address,
+            RawModbus(address) as client,
+        ):
+            connection, _ = listener.accept()
+            connection.sendall(b"".join(json.dumps(line).encode() + b"\n" for line in lines))
+            eventually(lambda: word(client, "missed answers") == 4)
+            assert (word(client, "status"), word(client, "damaged sentences")) == (
+                STATUS_CODES[Status.UNSURE],
+                1,
+            )
+            assert (
+                word(client, "label code"),
+                word(client, "likeliest label code"),
+                word(client, "early"),
+            ) == (
+                0,
+                2,
+                1,
+            )
+            assert client.registers(ADDRESSES["frames"], 2) == [1, 70_000 - 65_536]
+            assert client.registers(MEASURED_AT, 2) == [612, 4]
+            assert client.ask(bytes.fromhex("050000ff00")) == b"\x85\x04"
+            connection.close()
+
+
+@given(st.binary(max_size=300), st.lists(st.integers(0, 300), max_size=5))
+def test_requests_split_anywhere(data: bytes, cuts: list[int]):
+    """Any bytes, split anywhere: the same requests, or the same refusal."""
+    data = b"\0\1\0\0\0\6\1\4\0\0\0\1" + data
+    edges = sorted({0, len(data), *(c % (len(data) + 1) for c in cuts)})
+
+    def whole() -> list[modbus_pdu.ModbusRequest] | None:
+        try:
+            return modbus_pdu.requests(data)[0]
+        except FormatError:
+            return None
+
+    found: list[modbus_pdu.ModbusRequest] | None = []
+    rest = b""
+    try:
+        for a, b in itertools.pairwise(edges):
+            more, rest = modbus_pdu.requests(data[a:b], rest)
+            found += more
+    except FormatError:
+        found = None
+    assert found == whole()
+
+
+@given(st.binary(min_size=1, max_size=253))
+def test_every_pdu_is_parsed_or_refused(pdu: bytes):
+    """No other error is raised; parsed requests stay within the limits of the specification."""
+    try:
+        wanted = modbus_pdu.parse(pdu)
+    except modbus_pdu.RequestRefused:
+        return
+    count = wanted.count if isinstance(wanted, modbus_pdu.Reading) else len(wanted.values)
+    assert 1 <= count <= modbus_pdu.MOST_BITS
+
+
+def viewed(answer: Answer | None = None, **counts: int) -> BoxView:
+    """A view of a box that streams."""
+    said = BoxState.of(read(speaking_box.state()).fields)
+    view = noted(BoxView(labels=LABELS), said, 1)
+    return noted(view, answer, 1) if answer else view
+
+
+@pytest.mark.parametrize("status", list(Status))
+def test_each_status_has_its_code(status: Status):
+    """In the order of PROTOCOL.md, from 1; the label's code stands with `ok` alone, the likeliest
+    with any label."""
+    label = "paper" if status.classified else ""
+    words = registers(viewed(Answer(1, 1.0, status, label, 0.9, 0.8, 1, 0, 1e9)), alive=True)
+    assert words[ADDRESSES["status"]] == [*Status].index(status) + 1
+    assert words[ADDRESSES["label code"]] == (2 if status is Status.OK else 0)
+    assert words[ADDRESSES["likeliest label code"]] == (2 if status.classified else 0)
+    assert words[ADDRESSES["latency"]] == 65535  # more than fits
+
+
+def test_before_anything_was_heard():
+    """All zero except the version and the entries for a box that is not heard."""
+    words = registers(BoxView(), alive=False)
+    assert {i: w for i, w in enumerate(words) if w} == {0: 1, ADDRESSES["status"]: STALE}
+    assert inputs(BoxView(), alive=False) == [False, False, False, True, False, False]
+
+
+def test_the_python_of_the_page_runs(box: SpeakingBox, raw: RawModbus, address: Address):
+    """docs/robots/modbus.md: `unsure` is swept again, `ok` gives its code, other statuses their
+    errors."""
+    names: dict[str, Any] = {}
+    exec(page_blocks("modbus.md", "python")[0], names)
+    numbers = itertools.count(1)
+    statuses = iter(["unsure", "ok", "unknown", "stuck-taxel"])
+
+    def script(heard: Sentence) -> list[bytes]:
+        answer = [result(next(numbers), next(statuses), "paper")] if heard.kind == "STOP" else []
+        return [*obeying(heard)[:1], *answer]
+
+    box.script = script
+    with ModbusTcpClient(address[0], port=address[1], timeout=LONG_S) as plc:
+        assert names["classify"](plc, lambda: None, timeout_s=LONG_S) == 2
+        assert [s.kind for s in box.heard if s.kind in COILS] == [
+            "NEW",
+            "START",
+            "STOP",
+            "START",
+            "STOP",
+        ]
+        assert names["classify"](plc, lambda: None, timeout_s=LONG_S) == 0
+        with pytest.raises(RuntimeError, match="status 10: the sweep or the skin was at fault"):
+            names["classify"](plc, lambda: None, timeout_s=LONG_S)
+        box.unplug()
+        with pytest.raises(RuntimeError, match=r"the box refuses coil 2|the box is not heard"):
+            names["classify"](plc, lambda: None, timeout_s=LONG_S)
+
+
+def test_the_document_has_the_map():
+    """docs/robots/modbus.md lists each register, input, coil and code as the code has them."""
+    text = (ROOT / "docs" / "robots" / "modbus.md").read_text()
+    rows = re.findall(
+        r"^\| (\d+)(?:, \d+| to \d+)? \| `([a-z0-9 ]+)` \|",
+        text.partition("## Discrete inputs")[0],
+        re.M,
+    )
+    assert [(int(at), name) for at, name in rows if name in ADDRESSES] == [
+        (at, name) for name, at in ADDRESSES.items()
+    ]
+    last = [name.partition("_")[0] for name in modbus.SLIDE]
+    last += [register.name for register in modbus.MEASURED]
+    more = [(modbus.SLIDE_AT + i, name) for i, name in enumerate(last)]
+    at = modbus.SLIDE_AT + len(last)
+    for register in modbus.FINGERS[:5]:  # of the first finger; the text has the rule for the others
+        more.append((at, register.name))
+        at += register.words
+    assert [(int(at), name) for at, name in rows if name not in ADDRESSES] == more
+    assert modbus.FINGERS[5].name == "finger 2"
+    assert f"from {at} on" in text
+    assert re.findall(
+        r"^\| \d+ \| `([a-z]+)` \|",
+        text.partition("Discrete inputs")[2].partition("Coils")[0],
+        re.M,
+    ) == [*INPUTS]
+    assert tuple(re.findall(r"^\| \d+ \| ([A-Z]+) \|", text.partition("Coils")[2], re.M)) == COILS
+    codes = dict(
+        re.findall(r"(\d+)\s`([a-z-]+)`", text.partition("Status codes")[2].partition("\n\n")[0])
+    )
+    assert codes == {str(code): str(status) for status, code in STATUS_CODES.items()}
+
+
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [
+        (["--port", "x", "--listen", "1502"], "not an address; use HOST:PORT"),
+        (["--port", "x", "--listen", "127.0.0.1:99999"], "not an address"),
+        (
+            ["--link", "/nowhere/line"],
+            "--link /nowhere/line: no such file or directory; name a path that is free",
+        ),
+        (["--link", "/proc/version"], "--link /proc/version: file exists"),
+    ],
+)
+def test_settings_that_cannot_be(options: list[str], why: str, capsys: pytest.CaptureFixture[str]):
+    """One line that names the value, and the exit code of settings."""
+    assert main(["bridge", "modbus", *options]) == 78
+    assert why in capsys.readouterr().err
+
+
+def test_an_address_that_may_still_come_is_waited_for(capsys: pytest.CaptureFixture[str]):
+    """After a power cut the network may be late: the exit code is one that systemd starts again."""
+    assert main(["bridge", "modbus", "--port", "x", "--listen", "203.0.113.1:1502"]) == 69
+    assert "name an address of this machine" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "options", [["--port", "x", "--most", "0"], ["--port", "x", "--link", "y"]]
+)
+def test_wrong_arguments(options: list[str]):
+    """No connections, two boxes: usage errors."""
+    with pytest.raises(SystemExit) as e:
+        main(["bridge", "modbus", *options])
+    assert e.value.code == 2

@@ -1,0 +1,346 @@
+"""The programs of docs/robots, run straight out of the pages: Python, and URScript read as Python.
+Modbus: test_modbus."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import re
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from palpate.client.box import Palpate
+from palpate.core.errors import NoAnswer
+from palpate.core.sentences import Sentence
+from palpate.core.status import Status
+from tests.factories import ros
+from tests.factories.bridges import LONG_S, bridge, eventually, page_blocks
+from tests.factories.paths import ROOT
+from tests.factories.speaking_box import SpeakingBox, obeying, result, state
+
+FAULTS = [s for s in Status if not s.classified and s not in (Status.UNKNOWN, Status.RECORDED)]
+
+
+def answering(*statuses: str) -> Callable[[Sentence], list[bytes]]:
+    """A script: each STOP is answered with the next status."""
+    numbers, left = itertools.count(1), iter(statuses)
+
+    def script(heard: Sentence) -> list[bytes]:
+        answer = [result(next(numbers), next(left))] if heard.kind == "STOP" else []
+        return [*obeying(heard)[:1], *answer]
+
+    return script
+
+
+def sweeps(box: SpeakingBox) -> list[str]:
+    """The commands of sweeps that the box has heard."""
+    return [s.kind for s in box.heard if s.kind in ("NEW", "START", "STOP")]
+
+
+def test_python(box: SpeakingBox):
+    """python.md: `unsure` is swept again without NEW, `undecided` and `unknown` are sorted out,
+    each fault is an error."""
+    names: dict[str, Any] = {}
+    exec(page_blocks("python.md", "python")[0], names)
+    with Palpate(str(box.path), timeout_s=LONG_S) as client:
+        box.script = answering(
+            "unsure", "ok", "undecided", "unknown", "unsure", "unsure", "unsure", *FAULTS
+        )
+        assert names["classify"](client, lambda: None) == "wood"
+        assert sweeps(box) == ["NEW", "START", "STOP", "START", "STOP"]
+        assert [names["classify"](client, lambda: None) for _ in range(3)] == [None] * 3
+        for status in FAULTS:
+            with pytest.raises(RuntimeError, match=f"{status}: "):
+                names["classify"](client, lambda: None)
+
+
+def test_python_prints_what_to_do(box: SpeakingBox, capsys: pytest.CaptureFixture[str]):
+    """`main` of python.md: a label, something to sort out, a box that is gone."""
+    names: dict[str, Any] = {}
+    exec(page_blocks("python.md", "python")[0], names)
+    box.script = answering("ok", "unknown")
+    for _ in range(2):
+        names["main"](str(box.path), lambda: None)
+    box.unplug()
+    names["main"](str(box.path), lambda: None)
+    out = capsys.readouterr().out.splitlines()
+    assert out[:2] == ["wood", "sort it out"]
+    assert out[2].startswith("no answer: ")
+
+
+class SocketOfUr:
+    """`socket_*` of URScript, as the Script Directory describes them."""
+
+    def __init__(self, address: tuple[str, int]) -> None:
+        self._address, self._rest = address, ""
+        self._socket: socket.socket | None = None
+
+    def open(self, host: str, port: int, name: str) -> bool:
+        """The page's address stands for that of the test's bridge."""
+        assert (host, port, name) == ("192.168.0.10", 1503, "palpate")
+        try:
+            self._socket = socket.create_connection(self._address, timeout=LONG_S)
+        except OSError:
+            return False
+        self._rest = ""
+        return True
+
+    def read(self, name: str, prefix: str = "", suffix: str = "", timeout: float = 2) -> str:
+        """The text between prefix and suffix, without them; "" at the time-out."""
+        deadline = threading.Event()
+        timer = threading.Timer(timeout, deadline.set)
+        timer.start()
+        try:
+            while not deadline.is_set():
+                _, found, after = self._rest.partition(prefix)
+                text, ended, rest = after.partition(suffix)
+                if found and ended:
+                    self._rest = rest
+                    return text
+                self._socket.settimeout(timeout)
+                self._rest += self._socket.recv(4096).decode("ascii")
+        except TimeoutError:
+            return ""
+        finally:
+            timer.cancel()
+        return ""
+
+    def send_line(self, text: str, name: str) -> bool:
+        """Send a line."""
+        self._socket.sendall(text.encode() + b"\n")
+        return True
+
+    def close(self, name: str) -> None:
+        """Close."""
+        self._socket.close()
+
+
+def urscript(block: str, **functions: Any) -> dict[str, Any]:
+    """A block of URScript as Python: `end` and `local` left out. functions: those of the
+    controller."""
+    text = re.sub(r"(?m)^ *end\n", "", block).replace("local ", "")
+    names: dict[str, Any] = {
+        "str_find": lambda text, what, start=0: text.find(what, start),
+        "str_len": len,
+        "str_sub": lambda text, at, n: text[at : at + n],
+        "str_cat": lambda a, b: a + b,
+        "textmsg": lambda *texts: None,
+        "movel": lambda pose, a, v: None,
+        **functions,
+    }
+    exec(text, names)
+    return names
+
+
+def by_socket(address: tuple[str, int]) -> dict[str, Any]:
+    """The program with a socket."""
+    ur = SocketOfUr(address)
+    return urscript(
+        page_blocks("urscript.md", "urscript")[1],
+        socket_open=ur.open,
+        socket_read_string=ur.read,
+        socket_send_line=ur.send_line,
+        socket_close=ur.close,
+    )
+
+
+def test_urscript_by_socket(box: SpeakingBox):
+    """urscript.md against a real bridge: a retry without NEW, objects that are sorted out, each
+    fault by its name."""
+    with bridge("tcp", "--port", box.path, "--allow-writes") as address:
+        classify = by_socket(address)["palpate_classify"]
+        box.script = answering("unsure", "ok", "undecided", "unknown", "unsure", "unsure", *FAULTS)
+        assert classify("from", "to", 3) == "wood"
+        assert sweeps(box) == ["NEW", "START", "STOP", "START", "STOP"]
+        assert [classify("from", "to", 2) for _ in range(3)] == [""] * 3
+        assert [classify("from", "to", 2) for _ in FAULTS] == [
+            f"fault: {status}" for status in FAULTS
+        ]
+
+
+def test_urscript_by_socket_at_faults(box: SpeakingBox):
+    """A bridge that refuses commands, a box that does not answer, no bridge: one line for a person,
+    and no hanging."""
+    with bridge("tcp", "--port", box.path) as address:
+        assert by_socket(address)["palpate_classify"]("from", "to", 2).startswith(
+            "fault: the box does not answer, or refuses"
+        )
+    with bridge("tcp", "--port", box.path, "--allow-writes") as address:
+        classify = by_socket(address)["palpate_classify"]
+        box.script = lambda heard: obeying(heard)[:1]
+        assert classify("from", "to", 2) == "fault: no answer in time"
+    assert classify("from", "to", 2) == "fault: no connection to the box"
+
+
+@pytest.mark.parametrize(
+    ("ready", "answers", "want"),
+    [
+        (True, [3], 3),
+        (True, [0, 5], 5),
+        (True, [0, 0, 0], 0),
+        (False, [], -1),
+        (True, [None], -2),
+        (True, ["fault"], -3),
+    ],
+)
+def test_urscript_by_lines(ready: bool, answers: list[Any], want: int):
+    """urscript.md with digital lines: READY is waited for, code 0 is swept again, FAULT and silence
+    end it."""
+    inputs = {0: ready} | dict.fromkeys(range(1, 7), False)
+    pulsed: list[int] = []
+    left = iter(answers)
+
+    def set_output(output: int, level: bool) -> None:
+        if level:
+            pulsed.append(output)
+        if level and output == 0:
+            inputs[1] = False
+        if level and output == 1:
+            answer = next(left)
+            inputs[1], inputs[2] = answer is not None, answer == "fault"
+            code = answer if isinstance(answer, int) else 0
+            inputs.update({3 + bit: bool(code >> bit & 1) for bit in range(4)})
+
+    program = urscript(
+        page_blocks("urscript.md", "urscript")[0],
+        get_standard_digital_in=lambda n: inputs[n],
+        set_standard_digital_out=set_output,
+        sleep=lambda seconds: None,
+    )
+    assert program["palpate_classify"]("from", "to", 3) == want
+    assert pulsed == [2, *[0, 1] * len(answers)]
+
+
+@pytest.mark.parametrize(
+    ("block", "program", "settings"),
+    [(0, "Toucher", {"timeout_s": 20.0}), (1, "Sweeper", {"timeout_s": 20.0, "slide_s": 0.1})],
+    ids=["services", "action"],
+)
+def test_ros(box: SpeakingBox, block: int, program: str, settings: dict[str, float]):
+    """ros2.md: a node of a cell, in a process of its own, through the bridge, by services and by
+    the action."""
+    ros.required()
+    ros.messages_required()
+    box.script = answering("unsure", "ok", "unknown", "stuck-taxel", "unsure", "unsure", "unsure")
+    command = [
+        str(ros.PYTHON),
+        str(ROOT / "tests" / "factories" / "ros_page.py"),
+        program,
+        json.dumps(settings),
+    ]
+    pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with (
+        ros.bridge("-p", f"port:={box.path}", "-p", "allow_writes:=true"),
+        ros.peer() as peer,
+    ):
+        eventually(lambda: bool(box.say(state()) or peer.on("state")))
+        with subprocess.Popen(command, env=ros.environment(), **pipes) as cell:
+            cell.stdin.write(page_blocks("ros2.md", "python")[block])
+            cell.stdin.close()
+            told = [json.loads(cell.stdout.readline()) for _ in range(4)]
+            cell.kill()
+    assert told[:2] == ["wood", None]
+    assert told[2].startswith("RuntimeError: ")
+    assert "a loaded taxel shows a constant count; check the skin" in told[2]
+    assert told[3] is None
+    assert sweeps(box)[:5] == ["NEW", "START", "STOP", "START", "STOP"]
+
+
+def test_every_page_is_linked_and_every_link_leads_somewhere():
+    """README names each page; no link is dead."""
+    folder = ROOT / "docs" / "robots"
+    readme = (folder / "README.md").read_text()
+    for page in folder.glob("*.md"):
+        for target in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
+            assert (folder / target).is_file(), f"{page.name}: {target}"
+        assert page.name == "README.md" or f"({page.name})" in readme
+
+
+@pytest.mark.slow
+@pytest.mark.thorough  # starts processes and waits for them
+def test_the_manuals_client_without_hardware(tmp_path: Path):
+    """Its three commands, with another path and a free port: the program names the bundle and
+    prints three answers, all `ok`, since the simulated finger follows START and STOP."""
+    text = (ROOT / "docs" / "how-to" / "write-a-client.md").read_text()
+    blocks = [
+        re.sub(r"(?m)^    ", "", block)
+        for block in re.findall(r"(?:^    .*\n|^\n)+", text, re.M)
+        if block.strip()
+    ]
+    commands, program = blocks[0].strip().splitlines(), blocks[1]
+    line = str(tmp_path / "line")
+    assert commands[2] == "python3 client.py"
+    words = [command.replace("/tmp/palpate-line", line).split()[1:] for command in commands[:2]]
+    assert [given[0] for given in words] == ["bridge", "run"]
+    quiet = ["--set", "store.runtime="]
+    command = [sys.executable, "-m", "palpate", *words[1], *quiet]
+    with bridge(words[0][1], *words[0][2:]) as address, subprocess.Popen(command, cwd=ROOT) as run:
+        try:
+            client = program.replace("127.0.0.1:1503", f"{address[0]}:{address[1]}")
+            assert client != program
+            # the box needs a moment to start, as with a person in three terminals
+            (tmp_path / "client.py").write_text(
+                client.replace("as box:\n", "as box:\n    box.wait_ready(timeout_s=60)\n", 1)
+            )
+            done = subprocess.run(
+                [sys.executable, tmp_path / "client.py"],
+                env={**os.environ, "PYTHONPATH": str(ROOT)},
+                capture_output=True,
+                text=True,
+                timeout=120,
+                check=False,
+            )
+        finally:
+            run.terminate()
+    told = done.stdout.splitlines()
+    assert done.returncode == 0, done.stderr
+    assert told[0].startswith("BoxIdentity(name='default'")
+    assert len(told) == 4
+    assert [line.split()[0] for line in told[1:]] == ["ok"] * 3, told
+
+
+@pytest.mark.slow
+@pytest.mark.thorough  # starts processes and waits for them
+def test_a_box_that_is_killed_and_started_again(tmp_path: Path):
+    """The real program behind a bridge is killed in the middle of a sweep: the client's wait ends,
+    the restart is counted, and the same client sweeps on."""
+    command = [
+        sys.executable,
+        "-m",
+        "palpate",
+        "run",
+        "--sim",
+        "skin",
+        "--trigger",
+        "serial",
+        "--set",
+        f"serial.port={tmp_path / 'line'}",
+        "--set",
+        "store.runtime=",
+    ]
+    with (
+        bridge("tcp", "--link", tmp_path / "line", "--allow-writes") as address,
+        Palpate(f"socket://{address[0]}:{address[1]}", timeout_s=LONG_S) as client,
+    ):
+        for life in range(2):
+            with subprocess.Popen(command, cwd=ROOT) as run:
+                client.wait_ready(2 * LONG_S)
+                for _ in range(2):
+                    client.start()
+                    client.abort()
+                    assert client.result(LONG_S).status is Status.ABORTED
+                    client.stop()
+                assert (client.restarts, client.missed) == (life, 0)
+                client.wait_ready(LONG_S)
+                client.start()
+                run.kill()
+            with pytest.raises(NoAnswer):
+                client.result(0.5)

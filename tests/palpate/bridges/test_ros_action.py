@@ -1,0 +1,340 @@
+"""The action ~/sweep: the bridge as a process, another node as a second one, over loopback."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from palpate.core.sentences import Sentence
+from palpate.core.status import Status
+from tests.factories import ros
+from tests.factories.bridges import LONG_S, bridge, eventually
+from tests.factories.ros import RosPeer
+from tests.factories.speaking_box import SpeakingBox, obeying, result, state
+
+WRITES = ("-p", "allow_writes:=true")
+LONG = {"slide_s": LONG_S, "timeout_s": 2 * LONG_S}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _installed() -> None:
+    """These tests need ROS 2 and the action's messages."""
+    ros.required()
+    ros.messages_required()
+
+
+@pytest.fixture
+def node(box: SpeakingBox) -> Iterator[RosPeer]:
+    """A node that hears the box through a bridge with permission to command it, and knows its
+    labels."""
+    with ros.peer() as peer, ros.bridge("-p", f"port:={box.path}", *WRITES):
+        ready(box, peer)
+        yield peer
+
+
+def ready(box: SpeakingBox, peer: RosPeer) -> None:
+    """Wait until the bridge is there."""
+    eventually(lambda: bool(box.say(state())) or peer.on("state") != [])
+    eventually(lambda: [s.kind for s in box.heard].count("LABEL") >= 3)
+
+
+def commands(box: SpeakingBox) -> list[str]:
+    """The commands that the box has heard, without questions."""
+    return [s.kind for s in box.heard if s.kind not in ("STATE", "LABEL")]
+
+
+def swept(node: RosPeer, **terms: float | bool) -> Mapping[str, Any]:
+    """Send a goal; its result."""
+    before = len(node.on("result"))
+    node.sweep(**terms)
+    return later(node, before)
+
+
+def later(node: RosPeer, before: int) -> Mapping[str, Any]:
+    """The result after so many."""
+    eventually(lambda: len(node.on("result")) > before)
+    return node.on("result")[before]
+
+
+def phases(node: RosPeer) -> list[str]:
+    """The feedback of the goals."""
+    return [feedback["phase"] for feedback in node.on("feedback")]
+
+
+def begun(node: RosPeer, **terms: float) -> None:
+    """Send a goal, and wait until the finger slides."""
+    before = phases(node).count("sliding")
+    node.sweep(**LONG | terms)
+    eventually(lambda: phases(node).count("sliding") > before)
+
+
+def silent(heard: Sentence) -> list[bytes]:
+    """A box that obeys and answers no sweep."""
+    return obeying(heard)[:1]
+
+
+def test_a_sweep(box: SpeakingBox, node: RosPeer):
+    """START, the slide, STOP, the answer with all fields of RES; feedback announces the slide; NEW
+    if it is requested."""
+    found = swept(node, slide_s=0.1, timeout_s=LONG_S, new_object=True, speed_mm_s=30.1)
+    assert (found["state"], found["status"], found["label"]) == ("succeeded", "ok", "wood")
+    assert (found["sweep"], found["code"], found["fused"], found["lost"], found["share"]) == (
+        1,
+        1,
+        1,
+        0,
+        1,
+    )
+    assert [round(found[name], 3) for name in ("probability", "margin", "latency_ms")] == [
+        0.9,
+        0.8,
+        1.25,
+    ]
+    assert (found["bundle"], found["message"]) == ("9f3c2a1b", "use the label")
+    assert commands(box) == ["NEW", "START", "STOP"]
+    assert [s.fields for s in box.heard if s.kind == "START"] == [["30.1"]]
+    eventually(lambda: phases(node) == ["sliding", "judging"])
+    eventually(lambda: node.on("verdict") != [])
+
+
+def test_an_early_answer(box: SpeakingBox, node: RosPeer):
+    """Feedback has it while the finger slides; the result follows at once."""
+    box.script = lambda s: [
+        *silent(s),
+        *([result(1, label="paper", share="0.40")] if s.kind == "START" else []),
+    ]
+    found = swept(node, **LONG)
+    eventually(lambda: phases(node) == ["sliding", "early"])
+    early = node.on("feedback")[-1]
+    assert (early["status"], early["label"], round(early["probability"], 3)) == ("ok", "paper", 0.9)
+    assert (found["state"], found["label"], round(found["share"], 3)) == ("succeeded", "paper", 0.4)
+
+
+def test_what_was_not_ok(box: SpeakingBox, node: RosPeer):
+    """`unsure` is an answer; a fault is none, and its status and remedy are there."""
+    lines = iter((result(1, "unsure"), result(2, "stuck-taxel", "", detail="taxel 2.3")))
+    box.script = lambda s: [*silent(s), *([next(lines)] if s.kind == "STOP" else [])]
+    unsure = swept(node, slide_s=0.1)
+    assert (unsure["state"], unsure["status"], unsure["label"]) == ("succeeded", "unsure", "wood")
+    stuck = swept(node, slide_s=0.1)
+    assert (stuck["state"], stuck["status"], stuck["label"], stuck["code"]) == (
+        "aborted",
+        "stuck-taxel",
+        "",
+        0,
+    )
+    assert stuck["message"] == "a loaded taxel shows a constant count; check the skin (taxel 2.3)"
+
+
+def test_one_at_a_time_and_canceled(box: SpeakingBox, node: RosPeer):
+    """A second goal is rejected and disturbs nothing; canceled, the box aborts its sweep; the next
+    goal works."""
+    box.script = lambda s: [*obeying(s), *([result(1, "aborted", "")] if s.kind == "ABORT" else [])]
+    begun(node)
+    assert swept(node)["state"] == "rejected"
+    assert commands(box) == ["START"]
+    node.cancel()
+    found = later(node, 1)
+    assert (found["state"], found["status"]) == ("canceled", "aborted")
+    assert commands(box) == ["START", "ABORT"]
+    box.script = lambda s: [*silent(s), *([result(2)] if s.kind == "STOP" else [])]
+    assert swept(node, slide_s=0.1)["state"] == "succeeded"
+
+
+def test_unplugged_meanwhile(box: SpeakingBox, node: RosPeer):
+    """Aborted with the reason, at once; a goal without a line, too; plugged in again, the next
+    works."""
+    begun(node)
+    box.unplug()
+    lost = later(node, 0)
+    assert (lost["state"], lost["status"], lost["sweep"]) == ("aborted", "", 0)
+    assert lost["message"].startswith("the box was lost during the sweep: ")
+    absent = swept(node)
+    assert absent["state"] == "aborted"
+    assert absent["message"].startswith("not ready within 3 s: ")
+    box.plug_in()
+    eventually(lambda: box.say(state()) or node.last("diagnostics")["level"] == 0)
+    assert swept(node, slide_s=0.1)["state"] == "succeeded"
+
+
+def test_a_dead_box(box: SpeakingBox, node: RosPeer):
+    """A box that has fallen silent: the goal ends long before the time limit."""
+    box.script = silent
+    begun(node)
+    assert (
+        later(node, 0)["message"]
+        == "the box has said nothing for 3.5 s during the sweep; is it on?"
+    )
+    assert node.on("result")[0]["state"] == "aborted"
+
+
+def test_no_answer_in_time(box: SpeakingBox, node: RosPeer):
+    """Aborted, and the box's sweep with it."""
+    box.script = silent
+    found = swept(node, slide_s=0.1, timeout_s=0.5)
+    assert found["state"] == "aborted"
+    assert found["message"] == "no answer within timeout_s = 0.5 of START; the sweep was aborted"
+    eventually(lambda: commands(box) == ["START", "STOP", "ABORT"])
+
+
+def test_a_goal_that_cannot_be(box: SpeakingBox, node: RosPeer):
+    """Aborted with the value and what to use; nothing reaches the box."""
+    found = swept(node, slide_s=3.0, timeout_s=2.0)
+    assert found["state"] == "aborted"
+    assert found["message"].startswith(
+        "timeout_s = 2 is not a valid limit from START to the answer; use more than slide_s = 3"
+    )
+    assert commands(box) == []
+
+
+def test_cleaned_up_meanwhile(box: SpeakingBox, node: RosPeer):
+    """The box's sweep is aborted before its line is closed, and the goal has its result; without a
+    line, goals are aborted; configured again, they work."""
+    box.script = lambda s: [*silent(s), *([result(1, "aborted", "")] if s.kind == "ABORT" else [])]
+    begun(node)
+    assert node.call("deactivate")["success"]
+    assert node.call("cleanup")["success"]
+    ended = later(node, 0)
+    assert (ended["state"], ended["status"]) == ("aborted", "aborted")
+    assert commands(box) == ["START", "ABORT"]
+    assert swept(node)["message"] == "the node is not configured"
+    assert node.call("configure")["success"]
+    box.script = lambda s: [*silent(s), *([result(2)] if s.kind == "STOP" else [])]
+    assert swept(node, slide_s=0.1)["state"] == "succeeded"
+
+
+def test_the_bridge_ends_meanwhile(box: SpeakingBox):
+    """By SIGTERM: the box's sweep is aborted."""
+    with ros.peer() as peer:
+        with ros.bridge("-p", f"port:={box.path}", *WRITES) as process:
+            ready(box, peer)
+            begun(peer)
+            process.terminate()
+            assert process.wait(LONG_S) == 0
+        assert commands(box) == ["START", "ABORT"]
+
+
+def test_commands_need_allow_writes(box: SpeakingBox):
+    """Without it neither action nor services reach the box, and no other node can set it; verdicts
+    come."""
+    with ros.peer() as peer, ros.bridge("-p", f"port:={box.path}"):
+        ready(box, peer)
+        want = "commands are refused; start the bridge with -p allow_writes:=true"
+        found = swept(peer)
+        assert (found["state"], found["message"]) == ("aborted", want)
+        assert peer.call("tare") == {"service": "tare", "success": False, "message": want}
+        refused = peer.call("allow_writes")
+        assert not refused["success"]
+        assert "read-only" in refused["message"]
+        assert peer.call("tare")["message"] == want
+        assert commands(box) == []
+        eventually(lambda: bool(box.say(result(1))) or peer.on("verdict") != [])
+
+
+def test_without_the_messages(box: SpeakingBox, tmp_path: Path):
+    """palpate_msgs cannot be imported: one log line about it, and everything else works."""
+    broken = tmp_path / "path" / "palpate_msgs"
+    broken.mkdir(parents=True)
+    (broken / "__init__.py").write_text("raise ImportError('no palpate_msgs here')\n")
+    path = f"{broken.parent}:{ros.environment()['PYTHONPATH']}"
+    with (
+        (tmp_path / "log").open("wb") as log,
+        ros.peer() as peer,
+        ros.bridge("-p", f"port:={box.path}", *WRITES, log=log.fileno(), PYTHONPATH=path),
+    ):
+        ready(box, peer)
+        assert peer.call("tare")["success"]
+    lines = [line for line in (tmp_path / "log").read_text().splitlines() if "~/sweep" in line]
+    assert len(lines) == 1
+    assert (
+        "~/sweep is not offered (no palpate_msgs here); build palpate_msgs, see docs/robots/ros2.md"
+        in lines[0]
+    )
+
+
+def test_with_the_messages_nothing_is_said_of_them(box: SpeakingBox, tmp_path: Path):
+    """The line is there only where the action is not."""
+    with (
+        (tmp_path / "log").open("wb") as log,
+        ros.peer() as peer,
+        ros.bridge("-p", f"port:={box.path}", log=log.fileno()),
+    ):
+        ready(box, peer)
+    assert b"~/sweep is not offered" not in (tmp_path / "log").read_bytes()
+
+
+@pytest.mark.slow
+def test_with_the_box_itself(tmp_path: Path):
+    """The box's program on a simulated skin, a bridge on its serial line, another node: the box
+    numbers, times and answers sweeps, whatever the simulated finger did; it decides about a second
+    START."""
+    quiet = [
+        "--set",
+        "store.runtime=",
+        "--set",
+        "store.folder=/nonexistent",
+    ]
+    line = tmp_path / "line"
+    command = [
+        sys.executable,
+        "-m",
+        "palpate",
+        "run",
+        "--sim",
+        "skin",
+        "--trigger",
+        "serial",
+        "--set",
+        f"serial.port={line}",
+    ]
+    with (
+        bridge("tcp", "--link", line, "--allow-writes") as address,
+        subprocess.Popen(
+            [*command, *quiet], cwd=ros.ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        ) as run,
+        ros.peer() as peer,
+        ros.bridge("-p", f"port:=socket://{address[0]}:{address[1]}", *WRITES),
+    ):
+        try:
+            eventually(lambda: peer.on("state") != [])
+            for number in (1, 2):
+                found = swept(peer, slide_s=2.5, timeout_s=LONG_S)
+                assert (found["sweep"], found["share"]) == (number, 1)
+                status = Status(found["status"])
+                answered = status.classified or status is Status.UNKNOWN
+                assert found["state"] == ("succeeded" if answered else "aborted")
+            begun(peer)
+            assert peer.call("start")["success"]
+            ended = later(peer, 2)
+            assert (ended["state"], ended["status"]) == ("aborted", "no-stop")
+        finally:
+            run.terminate()
+
+
+def test_the_definition_is_what_was_built():
+    """The installed package has the action of the sources, so the tests are of it."""
+    prefix = ros.PYTHON.parent.parent
+    built = (prefix / "share" / "palpate_msgs" / "action" / "Sweep.action").read_text()
+    assert (
+        built
+        == (
+            ros.ROOT / "appliance" / "plugins" / "palpate_msgs" / "action" / "Sweep.action"
+        ).read_text()
+    )
+    told = subprocess.run(
+        [ros.PYTHON, "-c", "from palpate_msgs.action import Sweep; print(Sweep.Goal())"],
+        env=ros.environment(),
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout
+    assert (
+        told.strip()
+        == "palpate_msgs.action.Sweep_Goal(new_object=False, slide_s=3.0, timeout_s=10.0, "
+        "speed_mm_s=0.0, force_n=0.0)"
+    )

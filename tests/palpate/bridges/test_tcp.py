@@ -1,0 +1,338 @@
+"""The serial line over TCP as a process: the sentences and commands of peers; the pseudo-terminal
+that a box opens; limits."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+import serial
+
+from palpate.bridges import tcp
+from palpate.bridges.server import QUIET_S, TcpServer
+from palpate.bridges.source import LinkPort
+from palpate.client.box import Palpate
+from palpate.core.errors import CommandRefused, ConfigError
+from palpate.core.sentences import Sentence, sentence
+from tests.factories.bridges import LONG_S, bridge, eventually
+from tests.factories.paths import ROOT
+from tests.factories.speaking_box import LABELS, SpeakingBox, finger, result, state
+
+Address = tuple[str, int]
+
+
+def url(address: Address) -> str:
+    """The URL for the client."""
+    return f"socket://{address[0]}:{address[1]}"
+
+
+def test_the_client_works_through_it(box: SpeakingBox):
+    """The client of the serial line, on the other side of a network: a sweep from end to end."""
+    with (
+        bridge("tcp", "--port", box.path, "--allow-writes") as address,
+        Palpate(url(address), timeout_s=LONG_S) as client,
+    ):
+        client.wait_ready(LONG_S)
+        client.start(speed_mm_s=30.5, force_n=1.5)
+        client.stop()
+        assert client.result(LONG_S).label == "wood"
+        assert client.labels() == LABELS
+    assert [s.fields for s in box.heard if s.kind == "START"] == [["30.5", "1.5"]]
+
+
+def test_the_fingers_of_a_hand_come_through_it(box: SpeakingBox):
+    """FIN is passed on like RES, and the client beyond has the fingers of the answer."""
+    with (
+        bridge("tcp", "--port", box.path) as address,
+        Palpate(url(address), timeout_s=LONG_S) as client,
+    ):
+        client.state()
+        box.say(finger("left", 7), finger("right", 7, "no-contact", "", "0.000"), result(7))
+        answer = client.result(LONG_S)
+        assert [(of.finger, of.label) for of in answer.fingers] == [("left", "wood"), ("right", "")]
+
+
+def test_without_leave_questions_alone_are_passed_on(box: SpeakingBox):
+    """STATE, ID and LABEL are answered; what would change something is refused here, and the box
+    never hears it."""
+    with (
+        bridge("tcp", "--port", box.path) as address,
+        Palpate(url(address), timeout_s=LONG_S) as client,
+    ):
+        assert client.state().skin == "streaming"
+        assert client.identify().name == "mine"
+        for ask in (client.start, client.stop, client.tare, client.new_object, client.abort):
+            with pytest.raises(CommandRefused, match="read-only; start it with --allow-writes"):
+                ask()
+    assert {s.kind for s in box.heard} == {"STATE", "ID"}
+
+
+def test_every_peer_hears_everything_and_noise_stays_out(box: SpeakingBox):
+    """Two peers get the same sentences, and each the answers only to its own commands; damaged
+    sentences are not passed on."""
+    with bridge("tcp", "--port", box.path) as address:
+        peers = [socket.create_connection(address, timeout=LONG_S) for _ in range(2)]
+        for peer, command in zip(peers, (b"ID", b"STATE"), strict=True):
+            peer.sendall(b"$PPLP," + command + b"\r\n")
+            # so it is served by now
+            assert peer.recv(4096).startswith(b"$PPLP,ANS," + command + b",ok,")
+        box.say(result(1).replace(b"wood", b"wo0d"), b"\xff\xfe\r\n", state(), result(2))
+        for peer in peers:
+            heard = b""
+            while not heard.endswith(result(2)):
+                heard += peer.recv(4096)
+            assert heard == state() + result(2)
+            peer.close()
+
+
+def test_what_a_peer_says_wrong_is_answered_to_it_alone(box: SpeakingBox):
+    """Noise, an endless line and a wrong checksum: an error each; the box hears none of it."""
+    with bridge("tcp", "--port", box.path, "--allow-writes") as address:
+        with socket.create_connection(address, timeout=LONG_S) as peer:
+            peer.sendall(b"hello\r\n" + b"x" * 100_000 + b"\r\n$PPLP,START*00\r\n$PPLP,ID\r\n")
+            heard = b""
+            while b"ANS,ID" not in heard:
+                heard += peer.recv(4096)
+        assert heard.count(b",error,") == 3
+        assert b"without an end" in heard
+    assert [s.kind for s in box.heard] == ["ID"]
+
+
+def ask_often(client: Palpate) -> None:
+    """Ask until the bridge has noticed that the line is gone."""
+    for _ in range(1000):
+        client.ask("ID", timeout_s=LONG_S)
+
+
+def test_a_line_that_is_gone(box: SpeakingBox):
+    """A command is answered with the reason; when the line is back the same connection works."""
+    with (
+        bridge("tcp", "--port", box.path, "--allow-writes") as address,
+        Palpate(url(address), timeout_s=LONG_S) as client,
+    ):
+        client.wait_ready(LONG_S)
+        box.unplug()
+        with pytest.raises(CommandRefused, match=r"was lost|cannot be opened|does not take"):
+            ask_often(client)
+        box.plug_in()
+        assert client.wait_ready(LONG_S).ready
+
+
+def all_of(peer: socket.socket) -> bytes:
+    """All bytes until the connection ends."""
+    got = b""
+    with peer, suppress(ConnectionError):  # reset: what waited is gone
+        while more := peer.recv(1 << 16):
+            got += more
+    return got
+
+
+def test_a_peer_that_never_reads_is_given_up(box: SpeakingBox):
+    """It fills its buffer and is dropped; the other peer gets every sentence."""
+    with bridge("tcp", "--port", box.path) as address:
+        deaf = socket.socket()
+        deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
+        deaf.connect(address)
+        with socket.create_connection(address, timeout=LONG_S) as peer:
+            peer.sendall(b"$PPLP,ID\r\n")
+            heard = peer.recv(4096)
+            for number in range(1, 5_001):
+                box.say(result(number))
+                if number % 20 == 0:  # the pseudo-terminal holds 4 kB
+                    while not heard.endswith(result(number)):
+                        heard += peer.recv(1 << 16)
+            assert heard.count(b"$PPLP,RES,") == 5_000
+        deaf.settimeout(LONG_S)
+        assert all_of(deaf).count(b"$PPLP,RES,") < 5_000
+
+
+class DeafPort:
+    """A port that accepts all bytes."""
+
+    def __init__(self) -> None:
+        self.written: list[bytes] = []
+        self.in_waiting = 0
+
+    def read(self, size: int) -> bytes:
+        """Nothing comes."""
+        threading.Event().wait(0.01)
+        return b""
+
+    def write(self, data: bytes) -> None:
+        """Keep it."""
+        self.written.append(data)
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+
+def test_a_flood_of_commands_does_not_reach_the_box(monkeypatch: pytest.MonkeyPatch):
+    """Of many commands at once one is sent, and the next after its pause, whichever peer sent
+    it."""
+    monkeypatch.setattr(tcp, "PACE_S", 3600.0)
+    monkeypatch.setattr(tcp, "ANSWER_S", 0.01)
+    port = DeafPort()
+
+    async def run() -> None:
+        bridge = tcp.TcpBridge(
+            "x", lambda: port, writes=True, most=9, loop=asyncio.get_running_loop()
+        )
+        flood = [asyncio.create_task(bridge._ask(Sentence("STATE"))) for _ in range(200)]
+        while not port.written:
+            await asyncio.sleep(0.01)
+        await asyncio.sleep(0.1)
+        for task in flood:
+            task.cancel()
+        bridge.close()
+
+    asyncio.run(run())
+    assert port.written == [sentence("STATE")]
+
+
+def test_a_box_that_does_not_answer(monkeypatch: pytest.MonkeyPatch):
+    """The peer gets an error; an answer that comes too late, or to another command, is dropped."""
+    monkeypatch.setattr(tcp, "ANSWER_S", 0.1)
+    monkeypatch.setattr(tcp, "PACE_S", 0.0)
+
+    async def run() -> list[bytes]:
+        bridge = tcp.TcpBridge("x", DeafPort, writes=True, most=9, loop=asyncio.get_running_loop())
+        said = [await bridge._ask(Sentence("START"))]
+        bridge._heard(Sentence("ANS", "START,ok", summed=True))
+        asking = asyncio.create_task(bridge._ask(Sentence("STOP")))
+        while bridge._asked != "STOP":
+            await asyncio.sleep(0)
+        bridge._heard(Sentence("ANS", "START,ok", summed=True))
+        bridge._heard(Sentence("ANS", "STOP,ok", summed=True))
+        said.append(await asking)
+        bridge.close()
+        return said
+
+    late, right = asyncio.run(run())
+    assert late.startswith(b"$PPLP,ANS,START,error,the box has not answered within 0.1 s")
+    assert right == sentence("ANS", "STOP", "ok")
+
+
+def test_a_question_that_is_cancelled_as_its_answer_arrives_ends():
+    """The task does not go on, as it did with asyncio.wait_for of Python 3.11: then the bridge
+    never ended after SIGTERM."""
+
+    async def run() -> bool:
+        bridge = tcp.TcpBridge("x", DeafPort, writes=True, most=9, loop=asyncio.get_running_loop())
+        asking = asyncio.create_task(bridge._ask(Sentence("STOP")))
+        while bridge._asked != "STOP":
+            await asyncio.sleep(0)
+        await asyncio.sleep(0.05)
+        bridge._pass_on(Sentence("ANS", "STOP,ok", summed=True))
+        asking.cancel()
+        await asyncio.wait([asking])
+        bridge.close()
+        return asking.cancelled()
+
+    assert asyncio.run(run())
+
+
+def test_a_silent_peer_makes_room():
+    """A full server drops the peer that has been silent longest, but none that has sent something
+    lately."""
+
+    async def run() -> None:
+        server = TcpServer(lambda peer: asyncio.sleep(LONG_S), most=2)
+        await server.open("127.0.0.1", 0)
+        for _ in range(2):
+            await asyncio.open_connection(*server.address)
+        while len(server.peers) < 2:
+            await asyncio.sleep(0)
+        first, second = server.peers
+        first.heard_s, second.heard_s = 100.0, 101.0
+        assert not server._make_room(100.0 + QUIET_S - 0.1)
+        assert server._make_room(100.0 + QUIET_S)
+        assert server.peers == {second}
+
+    asyncio.run(run())
+
+
+def test_a_box_opens_what_the_bridge_makes(tmp_path: Path):
+    """--link: one name, for serial.port of a box on this machine. Bytes written before the bridge
+    came are not read later, and the name goes with the bridge."""
+    path = tmp_path / "line"
+    with bridge("tcp", "--link", path, "--allow-writes") as address:
+        with (
+            socket.create_connection(address, timeout=LONG_S) as peer,
+            serial.Serial(str(path)) as near,
+        ):
+            peer.sendall(b"hello\r\n")
+            assert b"not a command" in peer.recv(4096)  # so it is served by now
+            near.write(state())  # stands for the box
+            assert peer.recv(4096) == state()
+        assert path.is_symlink()
+    eventually(lambda: not path.is_symlink())
+
+
+def test_a_link_that_was_left_behind(tmp_path: Path):
+    """The link of a killed bridge is replaced; another program's file is not."""
+    path = tmp_path / "line"
+    path.symlink_to("/dev/pts/999999")
+    port = LinkPort(path)
+    assert os.readlink(path) != "/dev/pts/999999"
+    assert port.read(port.in_waiting or 1) == b""
+    port.close()
+    path.write_text("mine")
+    with pytest.raises(ConfigError, match="name a path that is free"):
+        LinkPort(path)
+    assert path.read_text() == "mine"
+
+
+def test_a_link_that_nobody_reads(tmp_path: Path):
+    """Writing does not hang: if the buffer is full it raises."""
+    port = LinkPort(tmp_path / "line")
+    with pytest.raises(BlockingIOError):
+        port.write(sentence("ID") * 10_000)
+    port.close()
+
+
+def test_it_ends_with_the_service_manager(box: SpeakingBox):
+    """SIGTERM: exit code 0 within the time of one command, with a peer connected."""
+    command = [
+        sys.executable,
+        "-m",
+        "palpate",
+        "bridge",
+        "tcp",
+        "--port",
+        str(box.path),
+        "--listen",
+        "127.0.0.1:0",
+    ]
+    with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) as process:
+        line = process.stderr.readline()
+        assert "commands are refused (--allow-writes)" in line
+        port = int(line.partition("127.0.0.1:")[2].partition(",")[0])
+        with socket.create_connection(("127.0.0.1", port), timeout=LONG_S):
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(LONG_S) == 0
+
+
+def test_bridges_need_neither_numpy_nor_onnxruntime():
+    """A fresh process with all of a bridge loaded; the options alone load nothing of one."""
+    code = (
+        "import sys; import palpate.bridges.command, palpate.bridges.modbus, "
+        "palpate.bridges.tcp;"
+        "print({m.split('.')[0] for m in sys.modules} & {'numpy', 'onnxruntime', 'usb', 'gpiod'})"
+    )
+    options = (
+        "import sys; import palpate.cli.parser; print({'asyncio', "
+        "'palpate.bridges.server'} & {*sys.modules})"
+    )
+    for text in (code, options):
+        done = subprocess.run(
+            [sys.executable, "-c", text], cwd=ROOT, capture_output=True, text=True, check=True
+        )
+        assert done.stdout.strip() == "set()"

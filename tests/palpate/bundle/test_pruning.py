@@ -1,0 +1,100 @@
+"""Pruning: the remaining outputs keep their bits, and nodes for other outputs are removed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from palpate.bundle.bundle import Bundle
+from palpate.bundle.onnx_check import check, reader
+from palpate.bundle.pruning import prune
+from palpate.core.errors import BundleError
+from palpate.inference.session import run, session
+from tests.factories import toy_bundle
+
+ALL = ("logits", "early", "embedding")
+
+
+def names(model: bytes, field: str) -> list[str]:
+    """Names of the graph's fields of one kind."""
+    return [one.name for one in getattr(reader.read(model).graph, field)]
+
+
+@pytest.mark.parametrize(
+    "outputs", [("logits",), ("logits", "embedding"), ("early",), ("embedding",)]
+)
+def test_outputs_keep_their_bits(default_bundle: Bundle, outputs: tuple[str, ...]):
+    """For golden sweeps and noise, each output of the pruned model equals that of the whole model
+    bit for bit."""
+    whole, pruned = (
+        session(default_bundle.model),
+        session(prune(default_bundle.model, set(outputs))),
+    )
+    assert [o.name for o in pruned.get_outputs()] == [name for name in ALL if name in outputs]
+    noise = np.random.default_rng(0).integers(
+        0, 256, (5, *default_bundle.golden.shape[1:]), np.uint8
+    )
+    for window in (*default_bundle.golden, *noise):
+        want, have = (run(of, outputs, {"sweep": window[None]}) for of in (whole, pruned))
+        assert [a.tobytes() for a in have] == [a.tobytes() for a in want]
+
+
+def test_what_only_early_heads_need_is_gone(default_bundle: Bundle):
+    """All nodes and constants of the heads are removed, and exactly those that the outputs need are
+    left."""
+    pruned = prune(default_bundle.model, {"logits", "embedding"})
+    graph = reader.read(pruned).graph
+    needed = {name for node in graph.node for name in node.input} | set(names(pruned, "output"))
+    assert all(needed.intersection(node.output) for node in graph.node)
+    assert {tensor.name for tensor in graph.initializer} <= needed
+    given, kept = (
+        {name for node in reader.read(of).graph.node for name in node.output}
+        for of in (default_bundle.model, pruned)
+    )
+    assert {"early", "head.steps"} <= given - kept
+    assert len(names(pruned, "initializer")) < len(names(default_bundle.model, "initializer"))
+    assert {"logits", "embedding"} <= kept
+    assert len(pruned) < 0.95 * len(default_bundle.model)
+
+
+def test_what_is_left_passes_the_check(default_bundle: Bundle):
+    """The check accepts a pruned model as the model of a bundle without early heads."""
+    pruned = prune(default_bundle.model, {"logits", "embedding"})
+    manifest = default_bundle.manifest
+    check.check(pruned, replace(manifest, early=None))
+    with pytest.raises(BundleError, match="the manifest needs early"):
+        check.check(pruned, manifest)
+
+
+def test_a_model_without_other_outputs_stays_as_it_is():
+    """The bytes are the same, even if the result of a node is not used."""
+    model = toy_bundle.model(("logits", "embedding"))
+    assert "early" in [name for node in reader.read(model).graph.node for name in node.output]
+    assert prune(model, {"embedding", "logits"}) is model
+
+
+def test_declarations_of_what_is_gone_are_gone():
+    """Only the values of remaining nodes stay declared."""
+    onnx = pytest.importorskip("onnx", reason="onnx comes with the desktop's tools (make test)")
+    inferred = onnx.shape_inference.infer_shapes(
+        onnx.load_from_string(toy_bundle.model(ALL))
+    ).SerializeToString()
+    assert {"row", "mean"} <= set(names(inferred, "value_info"))
+    pruned = prune(inferred, {"embedding"})
+    assert set(names(pruned, "value_info")) == {"float", "mean", "taxels"}
+    onnx.checker.check_model(onnx.load_from_string(pruned), full_check=True)
+
+
+def test_an_output_that_is_not_there_is_refused():
+    """The message names the missing output and the outputs of the model. Bytes that are not a model
+    are refused, too."""
+    with pytest.raises(
+        BundleError, match=r"gives \['embedding', 'logits'\], not \['early'\]; export"
+    ):
+        prune(toy_bundle.model(), {"logits", "early"})
+    with pytest.raises(BundleError, match=r"gives \[\], not \['logits'\]"):
+        prune(b"", {"logits"})
+    with pytest.raises(BundleError, match="which no model of a bundle may have"):
+        prune(b"nonsense", {"logits"})

@@ -1,0 +1,145 @@
+"""`palpate bundles install` refuses a bundle for another skin than the skin that streams."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from palpate.bundle import bundle
+from palpate.bundle.manifest import SCHEMA, Manifest
+from palpate.cli import bundle_commands
+from palpate.cli.main import main
+from palpate.core import config
+from palpate.core.clock import SystemClock
+from palpate.core.config import Config
+from palpate.core.errors import BundleError
+from palpate.core.health import Health
+from palpate.deployment.store import Store
+from palpate.service.status import StatusFile
+from tests.factories import deliveries, hands, toy_bundle
+from tests.factories.deliveries import Delivery
+
+RUNNING = bundle.load(bundle.DEFAULT)
+HEALTH = Health(
+    time_ns=0,
+    skin="streaming",
+    trouble="",
+    streams=True,
+    sweeping=False,
+    answered=7,
+    frames=5_000,
+    lost_frames=0,
+    garbage_bytes=0,
+    enumerations=1,
+    dropped=0,
+    bundle=RUNNING.id,
+    source="usb",
+    stale_frames=0,
+    overflows=0,
+    fifo_overflows=0,
+    glitches=0,
+    lost_edges=0,
+    storms=0,
+)
+
+
+@pytest.fixture
+def settings(tmp_path: Path) -> Config:
+    """Settings of a box without deliveries, which runs the packaged bundle."""
+    store = (f"store.folder={tmp_path}", f"store.runtime={tmp_path}")
+    return config.load(None, store, site=Path("/dev/null"))
+
+
+def streaming(settings: Config, health: Health | None) -> object:
+    """The format that an install learns from a service in this state; None without a service."""
+    if health:
+        StatusFile(settings.store.status, SystemClock()).turn(health)
+    return bundle_commands.streaming(settings, Store(settings.store, lambda bundle: None))
+
+
+def test_the_skin_that_streams_is_known_by_the_bundle_that_runs(settings: Config):
+    """Without a service, without a skin, or with a bundle from elsewhere, the format is unknown."""
+    assert streaming(settings, None) is None
+    assert streaming(settings, HEALTH) == RUNNING.format
+    assert streaming(settings, replace(HEALTH, skin="mismatch", streams=False)) is None
+    assert streaming(settings, replace(HEALTH, bundle="9f3c2a1b")) is None
+
+
+def test_a_bundle_for_another_skin_is_refused_with_both_formats():
+    """A bundle for the same skin with another window is accepted, and any bundle if the skin is
+    unknown."""
+    format = RUNNING.format
+    other = replace(
+        RUNNING,
+        manifest=replace(RUNNING.manifest, format=replace(format, rows=5, cols=3, rate_hz=100.0)),
+    )
+    with pytest.raises(
+        BundleError,
+        match=r"is for a skin of 5x3 uint8 at 100 Hz.*the skin that streams has 4x4 uint8",
+    ):
+        bundle_commands.suits(other, format)
+    bundle_commands.suits(other, None)
+    shorter = replace(
+        RUNNING, manifest=replace(RUNNING.manifest, format=replace(format, window=750))
+    )
+    bundle_commands.suits(shorter, format)
+
+
+@deliveries.NEEDED
+def test_the_command_refuses_it_unless_it_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """`palpate bundles install` beside a service whose skin streams changes nothing; with
+    `--other-skin` the bundle is on trial."""
+    box = Delivery(tmp_path)
+    held = toy_bundle.files()
+    held[bundle.MANIFEST] = replace(
+        Manifest.parse(held[bundle.MANIFEST]), counter=1, schema=SCHEMA
+    ).json()
+    folder = box.copied(deliveries.signed(held, box.key))
+    how = {"folder": box.how.folder, "keys": box.how.keys, "runtime": tmp_path}
+    StatusFile(tmp_path / "status.json", SystemClock()).turn(HEALTH)
+    command = [
+        "bundles",
+        "install",
+        str(folder),
+        *(word for name in how for word in ("--set", f"store.{name}={how[name]}")),
+    ]
+    before = sorted(Path(box.how.folder).rglob("*"))
+    assert main(command) == 78
+    said = capsys.readouterr()
+    assert (
+        "it would answer no sweep; if another skin comes with it, use --other-skin (make deploy"
+        " OTHER_SKIN=1)" in said.err
+    )
+    assert sorted(Path(box.how.folder).rglob("*")) == before
+    assert main([*command, "--other-skin"]) == 0
+    assert "is installed; it runs on trial" in capsys.readouterr().out
+
+
+@deliveries.NEEDED
+@pytest.mark.parametrize(
+    ("sets", "named"),
+    [
+        ([], ""),
+        (["classifier.bundle=/own"], "classifier.bundle"),
+        (hands.of(*hands.TWO), ""),
+        ([*hands.of(*hands.TWO), "skins.right.bundle={own}"], "skins.right.bundle"),
+    ],
+    ids=["store", "box", "hand", "finger"],
+)
+def test_a_bundle_that_the_settings_name_stays(
+    sets: list[str], named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """The message names the setting because of which the new bundle does not run there."""
+    box = Delivery(tmp_path)
+    own, new = box.made(1), box.made(2)
+    sets = [f"store.folder={box.how.folder}", f"store.keys={box.how.keys}", *sets]
+    words = [word for one in sets for word in ("--set", one.format(own=own))]
+    assert main(["bundles", "install", str(new), "--other-skin", *words]) == 0
+    said = capsys.readouterr().out
+    assert "is installed; it runs on trial" in said
+    end = f"; it does not run where the settings name another bundle: {named}\n"
+    assert said.endswith(end) if named else "does not run where" not in said

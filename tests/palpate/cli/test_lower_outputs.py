@@ -1,0 +1,88 @@
+"""After the end of a program, the command of systemd sets its lines low."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+
+import pytest
+
+from palpate.cli import lower_outputs
+from palpate.core import config
+from palpate.sim import gpio, rig
+from tests.factories.paths import ROOT
+
+
+@pytest.fixture
+def chip() -> gpio.SimGpio:
+    """The header of the board files, as its kernel names the lines."""
+    return gpio.SimGpio(rig.VirtualClock(), {"/dev/gpiochip0": [f"GPIO{i}" for i in range(28)]})
+
+
+def test_all_outputs_are_requested_low_and_given_back(
+    chip: gpio.SimGpio, monkeypatch: pytest.MonkeyPatch
+):
+    """Each output of the board is requested once, as an output at its low level, and released;
+    inputs are not touched."""
+    asked = []
+    request = chip.request_lines
+    monkeypatch.setattr(
+        chip, "request_lines", lambda *a, **k: asked.append(a[1]) or request(*a, **k)
+    )
+    assert lower_outputs.main(["--board", "rpi5"], chip) == 0
+    ((lines, settings),) = [item for one in asked for item in one.items()]
+    output = config.load("rpi5").output
+    names = [
+        output.ready,
+        output.busy,
+        output.fault,
+        output.decided,
+        output.result_valid,
+        *output.class_bits,
+    ]
+    assert sorted(f"GPIO{offset}" for offset in lines) == sorted(names)
+    assert settings.direction is chip.line.Direction.OUTPUT
+    assert settings.output_value is chip.line.Value.INACTIVE
+    assert chip.requests == []
+
+
+def test_a_box_without_lines_has_nothing_to_lower(
+    chip: gpio.SimGpio, capsys: pytest.CaptureFixture[str]
+):
+    """Without a board the command touches no line and prints nothing."""
+    assert lower_outputs.main(["--set", "output.ready="], chip) == 0
+    assert capsys.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("args", "code", "message"),
+    [
+        (["--board", "rpi5"], 69, "cannot request gpio lines .*errno 16.*another program"),
+        (["--board", "rpi9"], 78, "board = 'rpi9' has no board-NAME.toml"),
+    ],
+)
+def test_what_cannot_be_lowered_is_said(
+    chip: gpio.SimGpio, args: list[str], code: int, message: str, capsys: pytest.CaptureFixture[str]
+):
+    """Lines of another program, or settings that cannot be read, cause one line and the exit code
+    of their kind."""
+    request = chip.request_lines("/dev/gpiochip0", {(23,): chip.LineSettings()})
+    assert lower_outputs.main(args, chip) == code
+    error = capsys.readouterr().err
+    assert error.startswith("palpate: outputs may not be low: ")
+    assert error.count("\n") == 1
+    assert re.search(message, error)
+    assert chip.requests == [request]
+
+
+def test_it_is_quick_as_it_loads_little():
+    """A process of its own imports neither numpy nor onnxruntime."""
+    code = (
+        "import sys; from palpate.cli import lower_outputs; lower_outputs.main([]);"
+        "print({'numpy', 'onnxruntime', 'usb', 'serial'} & set(sys.modules))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "set()\n"

@@ -1,0 +1,408 @@
+"""Settings: layers and their sources, all faults of a file, and the board files as wiring plans."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import os
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from palpate.core import config, schema
+from palpate.core.errors import ConfigError
+from tests.factories.paths import ROOT
+
+FIRMWARE = ROOT / "firmware_config"
+BOARDS = sorted(path.stem.removeprefix("board-") for path in FIRMWARE.glob("board-*.toml"))
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder with `skin.toml`, two boards and an empty `palpate.toml`."""
+    (tmp_path / "skin.toml").write_text(
+        "[skin]\nsilence_ms = 50\nrate_hz = 300\n[trigger]\nglitch_us = 100\n"
+    )
+    (tmp_path / "board-a.toml").write_text(
+        '[trigger]\nstart = "L1"\nstop = "L2"\nglitch_us = 200\n'
+    )
+    (tmp_path / "board-b.toml").write_text('[output]\nready = "L9"\n')
+    (tmp_path / "palpate.toml").write_text("")
+    return tmp_path
+
+
+def _load(folder: Path, board: str | None = None, *sets: str) -> config.Config:
+    return config.load(board, sets, folder=folder, site=folder / "palpate.toml")
+
+
+def _shipped(board: str | None = None, *sets: str) -> config.Config:
+    """The files of this repository, without those of this machine in /etc."""
+    return config.load(board, sets, folder=FIRMWARE, site=Path(os.devnull))
+
+
+def test_later_layers_win_and_each_value_knows_its_source(folder: Path) -> None:
+    """Defaults, skin.toml, board, site and --set each decide one value; of two --set the last
+    wins."""
+    (folder / "palpate.toml").write_text("[trigger]\nglitch_us = 300\nactive_low = true\n")
+    c = _load(
+        folder, "a", "trigger.glitch_us=9", "trigger.glitch_us=400", "serial.port=/dev/ttyUSB0"
+    )
+    assert (c.board, c.sources["board"]) == ("a", "--board")
+    got = {
+        "output.settle_us": (c.output.settle_us, 200, "code"),
+        "skin.silence_ms": (c.skin.silence_ms, 50, "skin.toml"),
+        "trigger.start": (c.trigger.start, "L1", "board-a.toml"),
+        "trigger.active_low": (c.trigger.active_low, True, "palpate.toml"),
+        "trigger.glitch_us": (c.trigger.glitch_us, 400, "--set"),
+        "serial.port": (c.serial.port, "/dev/ttyUSB0", "--set"),
+    }
+    for name, (value, want, source) in got.items():
+        assert (value, c.sources[name]) == (want, source), name
+    assert len(c.sources) == 1 + sum(
+        len(schema.keys(type(getattr(c, s)))) for s in config.Config.__slots__[1:-5]
+    )
+
+
+def test_the_site_file_can_name_the_board_and_the_command_line_wins(folder: Path) -> None:
+    """`board = "a"` in palpate.toml, then --board b over it."""
+    (folder / "palpate.toml").write_text('board = "a"\n')
+    assert (_load(folder).trigger.start, _load(folder).sources["board"]) == ("L1", "palpate.toml")
+    assert (_load(folder, "b").trigger.start, _load(folder, "b").output.ready) == ("", "L9")
+
+
+def test_without_a_board_and_files_no_line_is_wired(tmp_path: Path) -> None:
+    """Without skin.toml the defaults apply, and no line is wired."""
+    (tmp_path / "palpate.toml").write_text("")
+    c = _load(tmp_path)
+    assert set(c.sources.values()) == {"code"}
+    assert c.trigger == config.TriggerConfig()
+    assert (c.output.ready, c.output.class_bits, c.trigger.start, c.serial.port) == ("", (), "", "")
+
+
+def test_a_config_cannot_be_changed(folder: Path) -> None:
+    """Sections are frozen and the sources are read-only."""
+    c = _load(folder)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        c.skin.silence_ms = 1  # type: ignore[misc]
+    with pytest.raises(TypeError):
+        c.sources["skin.silence_ms"] = "me"  # type: ignore[index]
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "hint"),
+    [
+        ("[trigger]\nglich_us = 3", "trigger.glich_us", "did you mean trigger.glitch_us?"),
+        ("[skin]\nsettle_us = 9", "skin.settle_us", "did you mean output.settle_us?"),
+        ("[triger]\nmode = 'one-line'", "triger", "did you mean trigger?"),
+        ("[gpio]\nx = 1", "gpio", "known are skin, trigger, output, sweep, serial, classifier"),
+        ("settle_us = 9", "settle_us", "did you mean output.settle_us?"),
+        ("skin = 5", "skin = 5", "write [skin], its keys below"),
+        ("[trigger]\nglitch_us = 0", "trigger.glitch_us = 0", "a whole number from 1 to 1000000"),
+        ("[trigger]\nglitch_us = true", "trigger.glitch_us = True", "a whole number from 1"),
+        ("[trigger]\nactive_low = 1", "trigger.active_low = 1", "true or false"),
+        ("[trigger]\nmode = 'both'", "trigger.mode = 'both'", 'one of "two-lines", "one-line"'),
+        (
+            "[classifier]\nfuse = ['vote']",
+            "classifier.fuse = ['vote']",
+            'one of "product", "vote"',
+        ),
+        ("[trigger]\nstart = 17", "trigger.start = 17", "a string in quotes"),
+        ('[trigger]\nstart = "a\\u0000"', "trigger.start = 'a\\x00'", "without control characters"),
+        (
+            "[output]\nclass_bits = 'GPIO16'",
+            "output.class_bits = 'GPIO16'",
+            'names such as ["GPIO16"]',
+        ),
+        (
+            "[output]\nclass_bits = ['A', '']",
+            "output.class_bits = ['A', '']",
+            'names such as ["GPIO16"]',
+        ),
+        (
+            "[sweep]\nmax_duration_s = nan",
+            "sweep.max_duration_s = nan",
+            "a number from 0.1 to 3600.0",
+        ),
+        ("[skin]\nusb = '1209'", "skin.usb = '1209'", 'USB ids such as "1209:7ac7"'),
+        ("[skin]\nusb = 0x1209", "skin.usb = 4617", 'USB ids such as "1209:7ac7"'),
+        ("[skin]\ntimeout_ms = 9", "skin.timeout_ms is unknown", "did you mean skin."),
+        ("[skin\nport = 1", "not TOML", "line 1"),
+        ("[skin]\n\nlink = vendor", "not TOML", "line 3"),
+    ],
+)
+@pytest.mark.parametrize("file", ["skin.toml", "board-a.toml", "palpate.toml"])
+def test_a_wrong_file_names_itself_the_key_and_what_is_allowed(
+    folder: Path, file: str, text: str, name: str, hint: str
+) -> None:
+    """The same mistakes in each layer's file: the message has path, key with value, and advice."""
+    (folder / file).write_text(text)
+    with pytest.raises(ConfigError) as e:
+        _load(folder, "a")
+    assert str(folder / file) in str(e.value)
+    assert name in str(e.value)
+    assert hint in str(e.value)
+
+
+@pytest.mark.parametrize(
+    ("option", "name", "hint"),
+    [
+        ("trigger.glich_us=3", "--set: trigger.glich_us", "did you mean trigger.glitch_us?"),
+        ("serial.baud=fast", "--set: serial.baud = 'fast'", "a whole number from 1200 to 4000000"),
+        ("skin.grid=1234", "--set: skin.grid = 1234", "a string in quotes"),
+        ("glitch_us=3", "--set glitch_us=3", "use --set section.key=value"),
+    ],
+)
+def test_a_wrong_set_option_is_named(folder: Path, option: str, name: str, hint: str) -> None:
+    """--set goes through the same checks as a file."""
+    with pytest.raises(ConfigError, match=f"^{re.escape(name)}.*{re.escape(hint)}"):
+        _load(folder, None, option)
+
+
+@pytest.mark.parametrize(
+    ("option", "section", "key", "value"),
+    [
+        ("trigger.start=GPIO5", "trigger", "start", "GPIO5"),
+        ("trigger.start=", "trigger", "start", ""),
+        ('skin.grid="1234"', "skin", "grid", "1234"),
+        ("sweep.max_duration_s=3", "sweep", "max_duration_s", 3.0),
+        ('output.class_bits=["A", "B"]', "output", "class_bits", ("A", "B")),
+        ("serial.port=/dev/ttyS0 # not a comment", "serial", "port", "/dev/ttyS0 # not a comment"),
+        ('serial.port="a" x=1', "serial", "port", '"a" x=1'),
+    ],
+)
+def test_set_takes_toml_or_a_bare_string(
+    folder: Path, option: str, section: str, key: str, value: object
+) -> None:
+    """A text that is not one TOML value is used as a string."""
+    got = getattr(getattr(_load(folder, None, option), section), key)
+    assert (got, type(got)) == (value, type(value))
+
+
+@pytest.mark.parametrize("board", ["c", "../a", "a.toml", 0, [], ["a"], True])
+def test_a_missing_board_lists_those_there_are(folder: Path, board: object) -> None:
+    """By option and by site file; no name leads out of the folder, and an invalid name is an
+    error."""
+    (folder / "palpate.toml").write_text(f"board = {json.dumps(board)}\n")
+    with pytest.raises(ConfigError, match=r"palpate\.toml: board = .*boards there: a, b$"):
+        _load(folder)
+    if isinstance(board, str):
+        with pytest.raises(ConfigError, match=r"--board: board = .*boards there: a, b$"):
+            _load(folder, board)
+
+
+def test_only_the_site_file_may_choose_the_board(folder: Path) -> None:
+    """`board` in skin.toml would be read too late."""
+    (folder / "skin.toml").write_text('board = "a"\n')
+    with pytest.raises(
+        ConfigError, match=r"skin\.toml: board is chosen in .*palpate\.toml, or with --board"
+    ):
+        _load(folder)
+
+
+def test_a_line_with_two_meanings_is_refused(folder: Path) -> None:
+    """Across layers and inside class_bits; both roles and both sources are named."""
+    with pytest.raises(ConfigError) as e:
+        _load(folder, "a", "output.busy=L1")
+    assert (
+        "--set: output.busy = 'L1' is the GPIO line of trigger.start (board-a.toml) already"
+        in str(e.value)
+    )
+    with pytest.raises(
+        ConfigError, match=r"output\.class_bits = 'X' is the GPIO line of output\.class_bits"
+    ):
+        _load(folder, None, "output.class_bits=['X', 'X']")
+
+
+def test_files_that_cannot_be_read_are_named(folder: Path) -> None:
+    """A named site file that is missing, a folder at its path, and bytes that are not UTF-8."""
+    with pytest.raises(ConfigError, match=r"other\.toml: no such file"):
+        config.load(None, folder=folder, site=folder / "other.toml")
+    with pytest.raises(ConfigError, match="cannot be read: is a directory"):
+        config.load(None, folder=folder, site=folder)
+    (folder / "skin.toml").write_bytes(b'[skin]\ngrid = "\xff"\n')
+    with pytest.raises(ConfigError, match=r"skin\.toml: not TOML: .*utf-8"):
+        _load(folder)
+
+
+_NAMES = ["skin.grid", "skin.usb", "serial.baud", "output.class_bits", "trigger.mode", "x.y"]
+
+
+@pytest.mark.slow
+@settings(deadline=None)
+@given(st.text(max_size=30), st.sampled_from(_NAMES))
+def test_any_set_text_is_a_value_or_a_config_error(text: str, name: str) -> None:
+    """No text raises another exception."""
+    with contextlib.suppress(ConfigError):
+        assert _shipped(None, f"{name}={text}").sources[name] == "--set"
+
+
+def test_describe_gives_each_value_with_its_source_and_loads_again(folder: Path) -> None:
+    """The printed text is a palpate.toml with the same settings."""
+    sets = [
+        "output.class_bits=['A', 'B']",
+        "skin.grid=Ü𝄞 \\",
+        "sweep.max_duration_s=3",
+        "trigger.active_low=true",
+    ]
+    c = _load(folder, "a", *sets)
+    lines = config.describe(c).splitlines()
+    assert len(lines) == len(c.sources)
+    shown = {" ".join(line.split()) for line in lines}
+    assert shown > {
+        'board = "a" # --board',
+        'skin.usb = "1209:7ac7" # code',
+        'trigger.start = "L1" # board-a.toml',
+    }
+    (folder / "palpate.toml").write_text("\n".join(lines))
+    assert _load(folder) == c
+
+
+@pytest.mark.parametrize(
+    ("usb", "ids"),
+    [
+        ("1209:7ac7", (0x1209, 0x7AC7, "")),
+        ("2E8A:0005:E661:4", (0x2E8A, 5, "E661:4")),
+    ],
+)
+def test_usb_ids_and_serial_number(folder: Path, usb: str, ids: tuple[int, int, str]) -> None:
+    """One setting holds both."""
+    skin = _load(folder, None, f"skin.usb={usb}").skin
+    assert (skin.vendor_id, skin.product_id, skin.serial) == ids
+
+
+@pytest.mark.parametrize(
+    "section",
+    [
+        n
+        for n in config.Config.__slots__
+        if n not in ("board", "sources", "folder", "skins", "alone", "hand")
+    ],
+)
+def test_each_field_is_explained(section: str) -> None:
+    """The name of each setting stands in the docstring of its group."""
+    group = type(getattr(_shipped(), section))
+    assert [
+        name for name in schema.keys(group) if not re.search(rf"\b{name}\b", group.__doc__)
+    ] == []
+
+
+def test_skin_toml_shows_every_skin_setting_as_the_code_has_it() -> None:
+    """The shipped skin.toml is complete and changes nothing."""
+    table = tomllib.loads((FIRMWARE / "skin.toml").read_text())
+    known = schema.keys(config.SkinConfig)
+    assert table == {"skin": {name: key.default for name, key in known.items()}}
+
+
+HEADER = {
+    3: "GPIO2",
+    5: "GPIO3",
+    7: "GPIO4",
+    8: "GPIO14",
+    10: "GPIO15",
+    11: "GPIO17",
+    12: "GPIO18",
+    13: "GPIO27",
+    15: "GPIO22",
+    16: "GPIO23",
+    18: "GPIO24",
+    19: "GPIO10",
+    21: "GPIO9",
+    22: "GPIO25",
+    23: "GPIO11",
+    24: "GPIO8",
+    26: "GPIO7",
+    27: "ID_SD",
+    28: "ID_SC",
+    29: "GPIO5",
+    31: "GPIO6",
+    32: "GPIO12",
+    33: "GPIO13",
+    35: "GPIO19",
+    36: "GPIO16",
+    37: "GPIO26",
+    38: "GPIO20",
+    40: "GPIO21",
+    **dict.fromkeys((1, 17), "3V3"),
+    **dict.fromkeys((2, 4), "5V"),
+    **dict.fromkeys((6, 9, 14, 20, 25, 30, 34, 39), "GND"),
+}
+
+
+def _page(board: str) -> str:
+    return (FIRMWARE / f"board-{board}.toml").read_text()
+
+
+def _drawing(board: str) -> tuple[dict[int, str], dict[str, str]]:
+    """The drawing in the comment of a board file: {pin: name}, {role: name}, a role with its arrow
+    as seen from the box."""
+    rows = re.findall(
+        r"^#\s+(?:(\w+(?: \d)?) ([<>])\s+)?(\w+)\s+\((\d+)\) \((\d+)\)\s+(\w+)(?: ([<>]) ([\w "
+        r"]+))?$",
+        _page(board),
+        re.MULTILINE,
+    )
+    pins, roles = {}, {}
+    for left_role, left_way, left, odd, even, right, right_way, right_role in rows:
+        pins |= {int(odd): left, int(even): right}
+        for role, way, inward, line in (
+            (left_role, left_way, ">", left),
+            (right_role, right_way, "<", right),
+        ):
+            if role:
+                roles[f"{'in' if way == inward else 'out'} {role}"] = line
+    return pins, roles
+
+
+@pytest.mark.parametrize("board", BOARDS)
+def test_the_drawing_of_a_board_shows_the_lines_that_its_values_name(board: str) -> None:
+    """Each pin is where the 40-pin header has it, in the drawing and beside the values; each role
+    is at its line."""
+    c = _shipped(board)
+    pins, roles = _drawing(board)
+    assert pins == HEADER
+    wired = {f"in {name}": getattr(c.trigger, name) for name in ("start", "stop", "new_object")}
+    wired |= {
+        f"out {name}": getattr(c.output, name)
+        for name in ("ready", "busy", "result_valid", "fault", "decided")
+    }
+    wired |= {f"out class_bits {i}": name for i, name in enumerate(c.output.class_bits)}
+    assert roles == wired | {"out serial TXD": "GPIO14", "in serial RXD": "GPIO15"}
+    beside = re.findall(r"^\w+ = (.*GPIO.*)# pins? ([\d, ]+)", _page(board), re.MULTILINE)
+    names, numbers = (re.findall(r"\w+", " ".join(column)) for column in zip(*beside, strict=True))
+    assert names == [HEADER[int(pin)] for pin in numbers] == list(wired.values())
+
+
+@pytest.mark.parametrize("board", BOARDS)
+def test_a_dead_program_is_not_ready(board: str) -> None:
+    """READY is on a line that is low from power-on, and the page asks for strict_gpiod and the
+    pull-down."""
+    assert int(_shipped(board).output.ready.removeprefix("GPIO")) >= 9
+    for words in ("\n#     dtparam=strict_gpiod\n", "10 kohm pull-down on READY", "6117", "6150"):
+        assert words in _page(board)
+
+
+def test_one_cable_fits_both_boards() -> None:
+    """The Raspberry Pi 4 and 5 files agree on every value."""
+    four, five = map(_shipped, ("rpi4", "rpi5"))
+    assert dataclasses.replace(four, board="rpi5") == five
+
+
+def test_rules_and_unit_agree_with_the_settings() -> None:
+    """The udev rules have the skin's ids, and the unit's groups are those that sysusers makes and
+    the rules use."""
+    skin = config.SkinConfig()
+    rules = (FIRMWARE / "70-palpate.rules").read_text()
+    assert (
+        rules.count(f'=="{skin.vendor_id:04x}"') == rules.count(f'=="{skin.product_id:04x}"') == 2
+    )
+    unit, users = (
+        (ROOT / "systemd" / f"palpate.{kind}").read_text() for kind in ("service", "sysusers")
+    )
+    groups = set(re.findall(r"^SupplementaryGroups=(.*)$", unit, re.MULTILINE)[0].split())
+    assert groups == set(re.findall(r"^g (\w+)", users, re.MULTILINE))
+    assert set(re.findall(r'GROUP="(\w+)"', rules)) <= groups

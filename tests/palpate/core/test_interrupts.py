@@ -1,0 +1,86 @@
+"""Ctrl-C during the imports of both programs: real processes, and a library that waits to be
+interrupted while it loads."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.factories.paths import ROOT
+
+LOADING = """
+import os, time
+os.write(1, b"loading")
+try:
+    time.sleep(600)
+except BaseException as e:  # as extension modules do
+    raise ImportError("initialization failed") from e
+"""
+
+
+def _loading(
+    module: str, argv: list[str], library: str, folder: Path, ignored: bool = False
+) -> subprocess.Popen[str]:
+    """A process of `python -m module` that has begun to import `library`. ignored: it was started
+    with SIGINT ignored."""
+    (folder / f"{library}.py").write_text(LOADING)
+    env = os.environ | {"PYTHONPATH": os.pathsep.join([str(folder), str(ROOT)])}
+    process = subprocess.Popen(
+        [sys.executable, "-m", module, *argv],
+        env=env,
+        cwd=folder,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=(lambda: signal.signal(signal.SIGINT, signal.SIG_IGN)) if ignored else None,
+    )
+    assert process.stdout
+    assert process.stdout.read(len("loading")) == "loading"
+    return process
+
+
+@pytest.mark.parametrize(
+    ("program", "module", "argv", "library"),
+    [
+        ("palpate", "palpate", ["skin", "list"], "onnxruntime"),
+        (
+            "palpate-train",
+            "palpate_train",
+            ["evaluate", "--list"],
+            "numpy",
+        ),  # while the program is imported
+        ("palpate-train", "palpate_train", ["evaluate", "--list"], "scipy"),  # while the command is
+    ],
+)
+def test_ctrl_c_during_the_imports_is_one_line(
+    program: str, module: str, argv: list[str], library: str, tmp_path: Path
+):
+    """Exit code 130, although the library makes another error of an exception."""
+    process = _loading(module, argv, library, tmp_path)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (130, f"{program}: interrupted before anything was done\n")
+
+
+def test_ctrl_c_during_a_late_import_is_one_line(tmp_path: Path):
+    """A library that a command imports during its work: exit code 130 without a traceback, although
+    the command takes the library's error for a missing library."""
+    process = _loading("palpate_train", ["sets", "describe", "aeon:GunPoint"], "aeon", tmp_path)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    line = "palpate-train: interrupted; the same command begins anew\n"
+    assert (process.returncode, err) == (130, line)
+
+
+def test_ctrl_c_that_is_ignored_stays_ignored(tmp_path: Path):
+    """A program in the background of a script goes on importing; SIGTERM ends it."""
+    process = _loading("palpate", ["skin", "list"], "onnxruntime", tmp_path, ignored=True)
+    process.send_signal(signal.SIGINT)
+    process.send_signal(signal.SIGTERM)
+    _, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (-signal.SIGTERM, "")

@@ -1,0 +1,130 @@
+"""The log: lines for a terminal and for the journal, levels, a full disk, and trouble that is
+logged once."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from palpate.core.errors import ApplianceError
+from palpate.core.log import LineHandler, SparseLog, TroubleLog, in_journal, log, to_stderr
+
+
+def line(text: str, level: int = logging.INFO, *, journal: bool) -> str:
+    """A record as it is printed."""
+    return LineHandler(journal=journal).format(
+        logging.LogRecord("palpate", level, "", 0, text, None, None)
+    )
+
+
+def test_priorities_are_for_the_journal_alone():
+    """A terminal shows the program's name and no priority; the journal knows the name and needs the
+    priority."""
+    assert line("skin: gone", logging.WARNING, journal=True) == "<4>skin: gone"
+    assert line("skin: gone", logging.WARNING, journal=False) == "palpate: skin: gone"
+    assert line("skin: streaming", journal=True) == "<6>skin: streaming"
+    assert line("lost", logging.ERROR, journal=True) == "<3>lost"
+    assert line("detail", logging.DEBUG, journal=True) == "<7>detail"
+    assert line("skin: <4>", journal=False) == "palpate: skin: <4>"
+    assert line("skin: X\r\n<0>board", journal=True) == "<6>skin: X <0>board"
+    assert line("100 % of %s", journal=False) == "palpate: 100 % of %s"
+
+
+def test_the_journal_is_known_by_its_stream(tmp_path: Path):
+    """JOURNAL_STREAM must name this very stream: a child with its output elsewhere is not in the
+    journal."""
+    with (tmp_path / "out").open("w") as f:
+        status = os.fstat(f.fileno())
+        environ = {"JOURNAL_STREAM": f"{status.st_dev}:{status.st_ino}"}
+        assert in_journal(environ, f.fileno())
+        assert not in_journal({}, f.fileno())
+        assert not in_journal(environ, 0)
+    assert not in_journal(environ, 1_000_000)
+
+
+def test_one_line_on_standard_error_however_often_it_is_set_up(capsys: pytest.CaptureFixture[str]):
+    """Two commands in one process print each line once."""
+    to_stderr()
+    to_stderr()
+    log.info("ready")
+    assert capsys.readouterr().err == "palpate: ready\n"
+
+
+def test_a_full_disk_costs_the_line_alone(monkeypatch: pytest.MonkeyPatch):
+    """Standard error that cannot be written: nothing is raised, nothing else is printed."""
+    to_stderr()
+    full = open("/dev/full", "w")  # noqa: SIM115 (its close fails, too)
+    monkeypatch.setattr(sys, "stderr", full)
+    log.warning("lost")
+    monkeypatch.undo()
+    with pytest.raises(OSError, match="No space left"):
+        full.close()
+
+
+def test_trouble_is_logged_when_it_begins_changes_and_ends(logged: list[str]):
+    """Each once, as a warning except the end; without a text for the end it has no line."""
+    trouble = TroubleLog("skin", "look at the cable", end="skin: streaming")
+    for now in ("", "", "gone", "gone", "busy", "", "", "gone"):
+        trouble.update(now)
+    quiet = TroubleLog("disk")
+    for now in ("full", "", "full"):
+        quiet.update(now)
+    assert logged == [
+        "<4>skin: gone; look at the cable",
+        "<4>skin: busy; look at the cable",
+        "skin: streaming",
+        "<4>skin: gone; look at the cable",
+        "<4>disk: full",
+        "<4>disk: full",
+    ]
+
+
+def test_the_first_state_is_logged_where_it_is_not_known(logged: list[str]):
+    """A first state is news, also if it is not a trouble."""
+    trouble = TroubleLog("serial", end="serial: open", known=False)
+    trouble.update("")
+    trouble.update("")
+    assert logged == ["serial: open"]
+
+
+def test_an_attempt_is_repeated_in_silence(logged: list[str]):
+    """The same error is one line until it went well; another kind of error is the caller's."""
+    trouble = TroubleLog("status: cannot be written", "classifying goes on")
+
+    def fail(error: Exception) -> None:
+        raise error
+
+    full = OSError(28, "No space left on device")
+    assert [trouble.attempt(lambda: fail(full)) for _ in range(3)] == [False] * 3
+    assert trouble.attempt(lambda: None)
+    assert not trouble.attempt(lambda: fail(full))
+    assert not trouble.attempt(lambda: fail(ApplianceError("in use")), (OSError, ApplianceError))
+    with pytest.raises(ApplianceError):
+        trouble.attempt(lambda: fail(ApplianceError("in use")))
+    begin = "<4>status: cannot be written: "
+    end = "; classifying goes on"
+    assert logged == [f"{begin}{why}{end}" for why in ["No space left on device"] * 2 + ["in use"]]
+
+
+def test_what_a_device_sends_cannot_control_a_terminal():
+    """Escape characters of a text of a device are replaced, in both forms of a line."""
+    record = logging.LogRecord("palpate", logging.INFO, "", 0, "a\x1b[31mred\x07\x9b2J", None, None)
+    for journal in (True, False):
+        line = LineHandler(journal=journal).format(record)
+        assert line.isprintable()
+        assert "a?[31mred??2J" in line
+
+
+def test_what_others_cause_is_logged_sparsely(logged: list[str]):
+    """Refusals as fast as a peer can ask: one line in ten seconds, with the number left out."""
+    now = [0]
+    sparse = SparseLog(lambda: now[0])
+    for _ in range(749):
+        sparse.warning("modbus: START: refused")
+        now[0] += 40_000_000_000 // 749
+    assert len(logged) <= 5
+    assert "more since the last line" in logged[1]

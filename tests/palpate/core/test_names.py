@@ -1,0 +1,62 @@
+"""Labels and display names of materials."""
+
+from __future__ import annotations
+
+import pytest
+
+from palpate.core import names
+from palpate.core.names import TypedNames
+
+
+@pytest.mark.parametrize(
+    ("name", "label"),
+    [
+        ("wood", "wood"),
+        ("Spülmaschinentuch", "Spuelmaschinentuch"),
+        ("mi-bois, été", "mi-bois ete"),
+        ("ミラー 2", "2"),
+        ("木", "material"),
+        ("$PPLP,RES", "PPLP RES"),
+        ("x" * 30, "x" * 24),
+    ],
+)
+def test_each_name_has_a_label_that_can_be_sent(name: str, label: str):
+    """It is like the name, and another where that is taken."""
+    assert names.sendable(name) == label
+    assert names.LABEL.fullmatch(names.sendable(name, {label})) or name == label
+    if name != label:
+        assert names.sendable(name, {label}) not in (label, name)
+
+
+@pytest.mark.parametrize(
+    ("text", "can"),
+    [
+        ("Holz, geölt", True),
+        ("木", True),
+        ("x" * 60, True),
+        ("x" * 61, False),
+        ("", False),
+        (" ", False),
+        ("a\nb", False),
+        ("a\u202eb", False),
+        (7, False),
+    ],
+)
+def test_only_short_printed_texts_are_shown(text: object, can: bool):
+    """No line breaks, nothing that turns the direction of a text; what is not so is made so."""
+    assert names.can_be_shown(text) is can
+    if isinstance(text, str) and text.strip():
+        assert names.can_be_shown(names.shown(text))
+
+
+def test_a_typed_name_keeps_its_label():
+    """Typed again it has the same; another name and a material without display name keep theirs."""
+    known = TypedNames()
+    known.add("Filz weiss", None)
+    known.add("Holz", "Holz, geölt")
+    assert known.label(" Holz, geölt ") == "Holz"
+    assert known.label("Filz weiß") == known.label("Filz weiß") == "Filz weiss 2"
+    assert known.label("Filz weiss") == "Filz weiss"
+    for bad in ("a\nb", "ä\nb", "-wood", "<b>", ""):
+        assert known.label(bad) == bad
+    assert known.displays == {"Holz": "Holz, geölt", "Filz weiss 2": "Filz weiß"}

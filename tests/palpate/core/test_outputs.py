@@ -1,0 +1,76 @@
+"""The name of a new file says what it is: other names are refused before any work."""
+
+from __future__ import annotations
+
+import re
+from argparse import ArgumentTypeError
+from pathlib import Path
+
+import pytest
+
+from palpate.cli import main as box
+from palpate.core import outputs
+from palpate_studies import __main__ as studies
+from palpate_train.cli import main as desktop
+
+DESKTOP = (
+    ("import", "none", "--pattern", "{material}.csv", "--rate", "1"),
+    ("fit", "--set", "none", "--seed", "1"),
+    ("report", "none", "--set", "none"),
+    ("export", "none", "--name", "a", "--version", "1"),
+    ("pack", "--set", "none", "--method", "H-svm", "--seed", "1", "--name", "a", "--version", "1"),
+    ("sets", "view", "none"),
+    ("pull", "none"),
+)
+BOX = (
+    ("record", "--format", "4x4:uint8:750"),
+    ("enrol", "felt"),
+    ("skin", "new", "mine"),
+)
+STUDIES = (("fabrics", "--method", "H-svm"), ("matrix", "none"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["i.csv", "r.pdf"])
+@pytest.mark.parametrize(
+    ("run", "words"),
+    [
+        *((desktop.main, words) for words in DESKTOP),
+        *((box.main, words) for words in BOX),
+        *((studies.main, words) for words in STUDIES),
+    ],
+    ids=lambda x: x[0] if isinstance(x, tuple) else "",
+)
+def test_no_command_writes_another_kind_of_file(
+    run, words: tuple[str, ...], name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """Its name is in the message, nothing is read or written, and the exit code is that of bad
+    options or data."""
+    out = tmp_path / name
+    try:
+        code = run([*words, "--out", str(out)])
+    except SystemExit as e:
+        code = e.code
+    assert code in (2, 65)
+    said = " ".join(capsys.readouterr().err.split())
+    assert "--out" in said
+    assert name in said
+    assert re.search("an? .* file|a folder|ends so", said), said
+    assert not [*tmp_path.iterdir()]
+
+
+def test_a_folder_may_have_a_point_in_its_name(tmp_path: Path):
+    """As in the version of a bundle; and a folder that is there keeps the name that it has."""
+    assert outputs.folder("bundle-1.2") == Path("bundle-1.2")
+    (tmp_path / "old.csv").mkdir()
+    assert outputs.folder(str(tmp_path / "old.csv")) == tmp_path / "old.csv"
+    with pytest.raises(ArgumentTypeError, match=r"i\.csv would be a folder, not a \.csv file"):
+        outputs.folder("i.csv")
+
+
+def test_a_file_has_its_ending_or_none():
+    """All that are allowed are named."""
+    read = outputs.file(".svg", ".html")
+    assert (read("a.SVG"), read("a")) == (Path("a.SVG"), Path("a"))
+    with pytest.raises(ArgumentTypeError, match=r"name one that ends in \.svg or \.html"):
+        read("a.pdf")

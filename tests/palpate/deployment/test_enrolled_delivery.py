@@ -1,0 +1,194 @@
+"""A bundle with an enrolled label in the store: trial, rollback, age, and each reason for a
+refusal."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from palpate.bundle import bundle
+from palpate.core.errors import BundleError, ConfigError
+from palpate.deployment.enrolment_key import KEY, SIGNER
+from palpate.deployment.state import PACKAGED
+from tests.factories import deliveries, install_scripts
+from tests.factories.deliveries import SIGNER as ANNA
+from tests.factories.deliveries import Delivery
+
+pytestmark = [deliveries.NEEDED, pytest.mark.slow]
+
+
+@pytest.fixture
+def box(tmp_path: Path) -> Delivery:
+    """A box without a delivered bundle."""
+    return Delivery(tmp_path)
+
+
+def grown(box: Delivery, label: str = "cork") -> dict[str, bytes]:
+    """The files of the running bundle after the enrolment of a label."""
+    return deliveries.enrolled(dict(box.store.running().files), box.enrolment_key, label)
+
+
+def test_a_label_is_on_trial_and_gone_back_from(box: Delivery):
+    """A label is enrolled into a delivered bundle. The new bundle runs on trial and is committed;
+    `rollback` leads to the bundle without the label."""
+    one = box.committed(1)
+    with_cork = box.store.learn(grown(box))
+    chosen = box.store.choose()
+    assert chosen.trial
+    assert chosen.bundle.enrolled == {"cork": 1}
+    assert (chosen.bundle.manifest.counter, chosen.folder.name) == (1, with_cork)
+    assert box.store.running().signer == f"{ANNA}, enrolled here"
+    assert box.store.commit()
+    assert box.store.rollback() == one
+    assert box.store.rollback() == with_cork
+
+
+def test_a_second_label_and_the_packaged_bundle(box: Delivery):
+    """The packaged bundle is trusted like the program. A second label is enrolled into the same
+    bundle."""
+    first = box.store.learn(grown(box))
+    second = box.store.learn(grown(box, "felt"))
+    running = box.store.running()
+    assert running.bundle.enrolled == {"cork": 1, "felt": 1}
+    assert running.signer == "palpate, enrolled here"
+    assert running.base == bundle.digest((bundle.DEFAULT / bundle.MANIFEST).read_bytes())
+    assert len({first, second, running.base}) == 3
+    assert box.store.rollback() == PACKAGED
+
+
+def test_three_bad_starts_lead_back_to_the_bundle_without_the_label(box: Delivery):
+    """As with every bundle on trial."""
+    one, with_cork = box.committed(1), box.store.learn(grown(box))
+    assert [box.start() for _ in range(4)] == [with_cork] * 3 + [one]
+
+
+def test_the_next_delivery_counts_from_the_bundle_that_was_signed(box: Delivery):
+    """After a newer bundle was committed, labels that were enrolled into the older bundle are
+    refused. Delivering the running bundle again may remove its label."""
+    box.committed(1)
+    old = grown(box)
+    with_cork = box.store.learn(old)
+    assert box.store.commit()
+    assert box.store.install(box.made(1)) != with_cork
+    assert box.store.learn(old) == with_cork
+    box.committed(2)
+    with pytest.raises(BundleError, match="counter 1, and 2 was committed"):
+        box.store.learn(old)
+    box.store.rollback()
+    assert box.store.learn(grown(box, "felt"))
+
+
+def check_refused(
+    box: Delivery, files: dict[str, bytes], why: str, kind: type[Exception] = BundleError
+) -> None:
+    """The box refuses these files, from a folder and from its own enrolment, and continues with the
+    same bundle."""
+    before = box.store.current
+    for deliver in (lambda: box.store.install(box.copied(files)), lambda: box.store.learn(files)):
+        with pytest.raises(kind, match=why):
+            deliver()
+    assert box.store.current == before
+
+
+def test_no_part_can_be_exchanged(box: Delivery, tmp_path: Path):
+    """Refused: an enrolment without a signature, signed by another box, or by a signer of bundles;
+    labels of another bundle, other labels of this bundle; a base that is unsigned, altered, or by
+    an unknown signer."""
+    box.committed(1)
+    good, unsigned = grown(box), deliveries.enrolled(dict(box.store.running().files), None)
+    other_box = install_scripts.enrolment_key(tmp_path / "other")
+    check_refused(box, unsigned, "enrolment.npz is not signed; enrol again on this box")
+    for signed in (
+        other_box.sign(good[bundle.ENROLMENT]),
+        deliveries.signature.sign(good[bundle.ENROLMENT], box.key),
+    ):
+        check_refused(box, good | {bundle.ENROLMENT_SIGNATURE: signed}, "not enrolled on this box")
+    labels = (bundle.ENROLMENT, bundle.ENROLMENT_SIGNATURE)
+    other = deliveries.files(1, box.key, version="other")
+    check_refused(
+        box, other | {name: good[name] for name in labels}, "enrolment.npz belongs to bundle"
+    )
+    felt = grown(box, "felt")
+    check_refused(
+        box,
+        good | {bundle.ENROLMENT: felt[bundle.ENROLMENT]},
+        "not enrolled on this box, or altered",
+    )
+    nobody = deliveries.files(9, None)
+    by_nobody = deliveries.enrolled(nobody, box.enrolment_key)
+    check_refused(
+        box,
+        by_nobody,
+        "is not signed, and is not the packaged bundle of this version; enrol again",
+    )
+    unknown = deliveries.files(9, deliveries.key(tmp_path, "unknown"))
+    check_refused(
+        box, deliveries.enrolled(unknown, box.enrolment_key), "signed by none of the signers"
+    )
+    check_refused(box, good | {bundle.MEANS: good[bundle.MEANS] + b"\0"}, "means.npz was altered")
+    assert box.store.learn(good)
+
+
+def test_the_key_can_add_labels_and_nothing_else(box: Delivery):
+    """A person with the box's private key cannot change the model, a threshold or a class mean by
+    an enrolment."""
+    box.committed(1)
+    good = grown(box)
+    evil = deliveries.signed(deliveries.files(1, None, name="evil"), box.enrolment_key.folder / KEY)
+    check_refused(
+        box, deliveries.enrolled(evil, box.enrolment_key), "signed by none of the signers"
+    )
+    model = bytearray(good[bundle.MODEL])
+    model[len(model) // 2] ^= 1
+    check_refused(box, good | {bundle.MODEL: bytes(model)}, "model.onnx was altered")
+
+
+def test_a_lost_key_or_signer_does_not_end_what_runs_unless_it_must(box: Delivery):
+    """Without the private key the box continues. Without the signer the error says what to do, and
+    the box continues after the signer was made again."""
+    box.committed(1)
+    box.store.learn(grown(box))
+    assert box.store.commit()
+    (box.enrolment_key.folder / KEY).rename(box.folder / "kept")
+    assert box.store.running().bundle.enrolled
+    (box.enrolment_key.folder / SIGNER).unlink()
+    with pytest.raises(
+        ConfigError, match=r"cannot be checked.*make install, which makes signer again"
+    ):
+        box.store.choose()
+    (box.folder / "kept").rename(box.enrolment_key.folder / KEY)
+    install_scripts.enrolment_key(box.enrolment_key.folder)
+    assert box.start() == box.store.current
+
+
+def test_a_program_with_another_packaged_bundle_does_not_take_the_label(
+    box: Delivery, monkeypatch: pytest.MonkeyPatch
+):
+    """An upgrade replaced the base: the error says what to do, and `rollback` leads to the new
+    packaged bundle."""
+    box.store.learn(grown(box))
+    assert box.store.commit()
+    newer = deliveries.put(box.folder / "newer", deliveries.files(0, None, version="99"))
+    monkeypatch.setattr(bundle, "DEFAULT", newer)
+    with pytest.raises(
+        BundleError,
+        match=r"not the packaged bundle of this version; enrol again.*rollback",
+    ):
+        box.store.choose()
+    assert box.store.rollback() == PACKAGED
+    assert box.store.running().bundle.manifest.version == "99"
+
+
+def test_a_damaged_enrolment_is_told_and_gone_back_from(box: Delivery):
+    """One byte of the enrolment has changed on the card."""
+    one, sha = box.committed(1), box.store.learn(grown(box))
+    assert box.store.commit()
+    path = box.store.bundles.at(sha) / bundle.ENROLMENT
+    data = bytearray(path.read_bytes())
+    data[100] ^= 1
+    path.write_bytes(bytes(data))
+    with pytest.raises(BundleError, match=r"not enrolled on this box, or altered since.*rollback"):
+        box.store.choose()
+    assert box.store.rollback() == one
+    assert box.start() == one

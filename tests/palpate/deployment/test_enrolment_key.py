@@ -1,0 +1,193 @@
+"""The box's key for enrolments: made at the install, private, for nothing else; and the errors if
+the key is missing or damaged."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from palpate.core.errors import BundleError, ConfigError, TemporaryError
+from palpate.deployment import enrolment_key, signature
+from palpate.deployment.enrolment_key import KEY, NAMESPACE, SIGNER, TAUGHT, EnrolmentKey
+from tests.factories import deliveries, install_scripts
+
+pytestmark = deliveries.NEEDED
+DATA = b"any enrolment"
+
+
+@pytest.fixture
+def key(tmp_path: Path) -> EnrolmentKey:
+    """A key as an install makes it."""
+    return install_scripts.enrolment_key(tmp_path / "enrolment")
+
+
+def test_an_install_makes_a_private_key_once(key: EnrolmentKey):
+    """Nobody else may read the key, it signs, and its signatures are valid. Another install changes
+    nothing."""
+    assert (key.folder / KEY).stat().st_mode & 0o777 == 0o400
+    assert (key.folder / SIGNER).stat().st_mode & 0o777 == 0o644
+    assert key.folder.stat().st_mode & 0o777 == 0o750
+    assert sorted(os.listdir(key.folder)) == [KEY, SIGNER]
+    before = {name: (key.folder / name).read_bytes() for name in (KEY, SIGNER)}
+    key.check()
+    install_scripts.enrolment_key(key.folder)
+    assert {name: (key.folder / name).read_bytes() for name in (KEY, SIGNER)} == before
+    key.verify(DATA, key.sign(DATA))
+
+
+def test_two_boxes_do_not_believe_each_other(key: EnrolmentKey, tmp_path: Path):
+    """A signature of another box, of other data, or for another use, and a cut signature are
+    refused."""
+    other = install_scripts.enrolment_key(tmp_path / "other")
+    assert (other.folder / KEY).read_bytes() != (key.folder / KEY).read_bytes()
+    good = key.sign(DATA)
+    bundles = signature.sign(DATA, key.folder / KEY)
+    for data, signed in (
+        (DATA, other.sign(DATA)),
+        (DATA + b"!", good),
+        (DATA, bundles),
+        (DATA, good[:80]),
+        (DATA, b""),
+    ):
+        with pytest.raises(
+            BundleError, match=r"not enrolled on this box, or altered since .*palpate enrol"
+        ):
+            key.verify(data, signed)
+    key.verify(DATA, good)
+
+
+def test_the_key_signs_no_bundle(key: EnrolmentKey, tmp_path: Path):
+    """Its signatures are not valid for bundles, even if an administrator adds its line to the
+    signers of bundles."""
+    signers = tmp_path / "allowed_signers"
+    signers.write_text((key.folder / SIGNER).read_text())
+    for signed in (key.sign(DATA), signature.sign(DATA, key.folder / KEY)):
+        with pytest.raises(BundleError, match="namespace"):
+            signature.verify(DATA, signed, signers)
+
+
+def lost(key: EnrolmentKey) -> None:
+    """Remove the private key."""
+    (key.folder / KEY).unlink()
+
+
+def open_to_all(key: EnrolmentKey) -> None:
+    """Let others read the private key."""
+    (key.folder / KEY).chmod(0o444)
+
+
+def cut(key: EnrolmentKey) -> None:
+    """Cut the private key to half its length."""
+    path = key.folder / KEY
+    half = path.read_bytes()[: path.stat().st_size // 2]
+    path.chmod(0o600)
+    path.write_bytes(half)
+    path.chmod(0o400)
+
+
+def empty(key: EnrolmentKey) -> None:
+    """Make the private key an empty file."""
+    (key.folder / KEY).chmod(0o600)
+    (key.folder / KEY).write_bytes(b"")
+    (key.folder / KEY).chmod(0o400)
+
+
+def of_another(key: EnrolmentKey) -> None:
+    """Replace the private key by the key of another box."""
+    other = install_scripts.enrolment_key(key.folder.parent / "another")
+    shutil.copy2(other.folder / KEY, key.folder / "new")
+    (key.folder / "new").replace(key.folder / KEY)
+
+
+def unsigned(key: EnrolmentKey) -> None:
+    """Remove the signer."""
+    (key.folder / SIGNER).unlink()
+
+
+@pytest.mark.parametrize(
+    ("spoil", "why"),
+    [
+        (lost, "key: No such file or directory, so nothing can be enrolled"),
+        (open_to_all, r"may be read by others \(mode 444\)"),
+        (cut, "key is damaged; remove it and signer, run make install again"),
+        (empty, "key is damaged"),
+        (of_another, "is not the key of .*enrol all labels again"),
+        (
+            unsigned,
+            "cannot be checked: .*signer cannot be read.*make install, which makes signer again "
+            "from key",
+        ),
+    ],
+)
+def test_a_key_that_cannot_be_used_is_told_with_what_to_do(
+    key: EnrolmentKey, spoil: Callable[[EnrolmentKey], None], why: str
+):
+    """A key that is missing, readable by others, damaged, or of another box, or has no signer, is
+    reported in one line before the robot sweeps."""
+    spoil(key)
+    with pytest.raises(ConfigError, match=why) as e:
+        key.check()
+    assert "\n" not in str(e.value)
+
+
+def test_what_was_enrolled_is_believed_without_the_private_key(key: EnrolmentKey):
+    """After the loss of the private key the enrolled labels stay valid. The next install does not
+    make another key, which would make them invalid."""
+    signed = key.sign(DATA)
+    lost(key)
+    install_scripts.enrolment_key(key.folder)
+    assert os.listdir(key.folder) == [SIGNER]
+    key.verify(DATA, signed)
+
+
+def test_a_lost_signer_is_made_again_from_the_key(key: EnrolmentKey):
+    """`make install` makes the signer again, and earlier signatures are valid again."""
+    signed, before = key.sign(DATA), (key.folder / SIGNER).read_bytes()
+    unsigned(key)
+    install_scripts.enrolment_key(key.folder)
+    assert (key.folder / SIGNER).read_bytes() == before
+    key.verify(DATA, signed)
+    unsigned(key)
+    cut(key)
+    with pytest.raises(subprocess.CalledProcessError) as e:
+        install_scripts.enrolment_key(key.folder)
+    assert b"key is damaged; remove it" in e.value.stderr
+
+
+def test_a_box_without_ssh_keygen_says_so(key: EnrolmentKey, monkeypatch: pytest.MonkeyPatch):
+    """The error mentions neither a damaged key nor a wrong signature."""
+    monkeypatch.setenv("PATH", "/nowhere")
+    with pytest.raises(ConfigError, match="ssh-keygen is missing"):
+        key.sign(DATA)
+    with pytest.raises(ConfigError, match="ssh-keygen is missing"):
+        key.verify(DATA, b"")
+    assert NAMESPACE == enrolment_key.NAMESPACE != signature.NAMESPACE
+
+
+@pytest.mark.parametrize("namespace", [NAMESPACE, TAUGHT])
+def test_an_ssh_keygen_that_dies_once_is_tried_again(
+    key: EnrolmentKey, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, namespace: str
+):
+    """At the start of a box with enrolled labels or a taught bundle, and before a lesson: the error
+    passes, so the service is restarted, not ended for good (exit code 78)."""
+    signed = key.sign(DATA, namespace)
+    (tmp_path / "bin").mkdir()
+    dying = tmp_path / "bin" / "ssh-keygen"
+    dying.write_text("#!/bin/sh\nkill -9 $$\n")
+    dying.chmod(0o755)
+    with monkeypatch.context() as patched:
+        patched.setenv("PATH", f"{dying.parent}:{os.environ['PATH']}")
+        for act in (
+            lambda: key.verify(DATA, signed, namespace),
+            lambda: key.sign(DATA, namespace),
+            lambda: key.check(namespace),
+        ):
+            with pytest.raises(TemporaryError) as e:
+                act()
+            assert e.value.exit_code != ConfigError.exit_code
+    key.verify(DATA, signed, namespace)

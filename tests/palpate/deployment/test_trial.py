@@ -1,0 +1,371 @@
+"""A bundle on trial: which starts count, how the trial ends, and that classifying goes on during
+trouble with the disk."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from palpate.bundle import bundle
+from palpate.core.errors import ApplianceError, BundleError, LineError, ModelError
+from palpate.core.health import Health
+from palpate.core.types import Status, Verdict
+from palpate.deployment.state import MOST_STARTS, Standing
+from palpate.deployment.store import Store
+from palpate.deployment.trial import Trial
+from palpate.sim import devices, rig, script, skin
+from tests.factories import deliveries
+from tests.factories.deliveries import Delivery
+from tests.factories.simulated_box import Rigged, idle_devices
+
+pytestmark = deliveries.NEEDED
+SECOND = 1_000_000_000
+
+
+def health(time_s: float, streams: bool = True, sweeping: bool = False) -> Health:
+    """Health of the box at this time."""
+    return Health(
+        time_ns=round(time_s * SECOND),
+        skin="streaming" if streams else "absent",
+        trouble="",
+        streams=streams,
+        sweeping=sweeping,
+        answered=0,
+        frames=0,
+        lost_frames=0,
+        garbage_bytes=0,
+        enumerations=1,
+        dropped=0,
+        bundle="",
+        source="sim",
+        stale_frames=0,
+        overflows=0,
+        fifo_overflows=0,
+        glitches=0,
+        lost_edges=0,
+        storms=0,
+    )
+
+
+def verdict(label: str = "Canvas") -> Verdict:
+    """An answer, by default with a label."""
+    status = Status.OK if label else Status.NO_CONTACT
+    return Verdict(1, 0, status, label, 1.0, 1.0, np.empty(0), 1, 0, 0, "", "")
+
+
+class Trying(Delivery):
+    """A box with bundle 1 committed and bundle 2 on trial. Its trial ends after 5 sweeps or 600
+    s."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self.one, self.two = self.committed(1), self.installed(2)
+
+    def tried(self) -> Trial:
+        """The trial of one more start."""
+        trial = self.store.choose().trial
+        assert trial
+        return trial
+
+    @property
+    def standing(self) -> Standing:
+        """The recorded state of the bundle on trial."""
+        return self.store.state.of(self.two)
+
+
+@pytest.fixture
+def box(tmp_path: Path) -> Trying:
+    """A box with a bundle on trial."""
+    return Trying(tmp_path)
+
+
+def booted(box: Trying, name: str) -> None:
+    """Change the id of the boot, as after a power cut."""
+    file = box.folder / "boot_id"
+    file.write_text(f"{name}\n")
+    box.store = Store(box.how, lambda bundle: None, boot=file)
+
+
+def test_power_cuts_do_not_count_against_the_bundle(box: Trying):
+    """After nine power cuts in its trial the bundle still runs. A crash within one boot counts,
+    also after power cuts."""
+    for cut in range(9):
+        booted(box, f"boot {cut}")
+        assert box.start() == box.two
+        assert (box.standing.starts, box.standing.cuts) == (1, cut)
+    assert [box.start(), box.start()] == [box.two] * 2
+    assert box.start() == box.one
+    booted(box, "the next")
+    assert box.start() == box.one
+
+
+def test_an_orderly_end_before_the_power_goes_is_not_taken_back_twice(box: Trying):
+    """A crash stays counted after orderly shutdowns, whose starts are not counted."""
+    booted(box, "first")
+    box.tried()
+    for boot in ("second", "third"):
+        box.tried().stopping()
+        booted(box, boot)
+    assert (box.standing.starts, box.standing.cuts) == (1, 0)
+
+
+def test_a_bundle_under_which_the_computer_is_reset_again_and_again_gives_way(
+    box: Trying, logged: list[str]
+):
+    """The bundle is replaced after ten power cuts. Else a bundle that resets the computer would
+    stay for ever."""
+    for cut in range(10):
+        booted(box, f"boot {cut}")
+        assert box.start() == box.two
+    booted(box, "the last")
+    assert box.start() == box.one
+    assert "switched off 10 times while it was on trial" in logged[-1]
+
+
+def test_without_the_id_of_the_boot_each_start_counts(box: Trying):
+    """If the id of the boot cannot be read, each start counts as if the program had crashed."""
+    box.store = Store(box.how, lambda bundle: None, boot=box.folder / "none")
+    assert [box.start() for _ in range(MOST_STARTS + 1)] == [box.two] * MOST_STARTS + [box.one]
+
+
+def test_a_start_counts_until_the_program_ends_in_order(box: Trying):
+    """A start that crashes stays counted. After an orderly end the start is no longer counted."""
+    trial = box.tried()
+    assert box.standing.starts == 1
+    trial.stopping()
+    trial.stopping()
+    assert box.standing.starts == 0
+    for n in range(MOST_STARTS):
+        box.tried()
+        assert box.standing.starts == n + 1
+    assert box.start() == box.one
+
+
+@pytest.mark.slow
+def test_a_skin_that_is_unplugged_never_counts(box: Trying):
+    """Starts without a skin do not count. Once the skin streams, the start counts."""
+    for _ in range(3 * MOST_STARTS):
+        trial = box.tried()
+        assert box.standing.starts == 1
+        for t in range(5):
+            trial.turn(health(t, streams=False))
+        assert box.standing.starts == 0
+    trial.turn(health(5))
+    assert box.standing.starts == 1
+    trial.turn(health(6, streams=False))
+    assert box.standing.starts == 0
+
+
+def test_nothing_is_written_while_nothing_is_new(box: Trying):
+    """There is a turn about every millisecond; a file is written only when a fact has changed."""
+    trial = box.tried()
+    trial.turn(health(0))
+    book = Path(box.how.folder, "bundles.json")
+    before = book.stat().st_mtime_ns, book.stat().st_ino
+    for t in range(100):
+        trial.turn(health(t))
+    assert before == (book.stat().st_mtime_ns, book.stat().st_ino)
+
+
+def test_enough_sweeps_commit(box: Trying, logged: list[str]):
+    """Sweeps with a label count, and the commit waits until no sweep is open. Afterwards older
+    bundles are refused."""
+    trial = box.tried()
+    for _ in range(box.how.trial_sweeps - 1):
+        trial.answered(verdict())
+    for _ in range(10):
+        trial.answered(verdict(label=""))
+    trial.turn(health(1))
+    assert trial.text == "on trial: 4 of 5 sweeps, 0 of 600 s"
+    trial.answered(verdict())
+    trial.turn(health(2, sweeping=True))
+    assert not box.standing.committed
+    trial.turn(health(3))
+    assert box.standing.committed
+    assert logged[-1] == f"bundle {box.two[:8]} has passed its trial and is committed"
+    assert (box.store.state.counter, box.store.state.highest, trial.text) == (2, box.two, "")
+    trial.stopping()
+    trial.turn(health(4, streams=False))
+    assert box.store.state.of(box.two) == Standing(box.one, 2)
+    assert box.start() == box.two
+
+
+def test_enough_time_commits(box: Trying):
+    """Only time with a streaming skin counts."""
+    trial = box.tried()
+    for t in range(0, 400):
+        trial.turn(health(t))
+    for t in range(400, 2000):
+        trial.turn(health(t, streams=False))
+    assert not box.standing.committed
+    for t in range(2000, 2201):
+        trial.turn(health(t))
+    assert not box.standing.committed
+    trial.turn(health(2202))
+    assert box.standing.committed
+
+
+def test_what_an_orderly_run_has_shown_counts_in_the_next(box: Trying):
+    """A robot that is switched off each evening also commits its bundle. The progress of a crashed
+    start is lost."""
+    for n in range(2):
+        trial = box.tried()
+        trial.turn(health(0))
+        trial.turn(health(100))
+        trial.answered(verdict())
+        trial.answered(verdict())
+        trial.stopping()
+        assert (box.standing.sweeps, box.standing.streamed_s) == (2 * (n + 1), 100 * (n + 1))
+    dies = box.tried()
+    dies.answered(verdict())
+    trial = box.tried()
+    assert trial.text == "on trial: 4 of 5 sweeps, 200 of 600 s"
+
+
+@pytest.mark.parametrize(
+    ("error", "counts"),
+    [
+        (None, 0),
+        (LineError("no chip"), 0),
+        (KeyboardInterrupt(), 0),
+        (BundleError("bad"), 1),
+        (IndexError("bug"), 1),
+    ],
+    ids=repr,
+)
+def test_what_ends_the_program_decides_whether_the_start_counts(
+    box: Trying, error: BaseException | None, counts: int
+):
+    """Missing hardware and a person who stops the program do not count; an error that the bundle
+    may have caused does."""
+    with suppress(type(error)), box.tried():
+        if error:
+            raise error
+    assert box.standing.starts == counts
+
+
+def test_a_full_disk_is_told_once_and_tried_again(
+    box: Trying, monkeypatch: pytest.MonkeyPatch, logged: list[str]
+):
+    """Nothing is raised; the commit comes when the disk can be written again."""
+    trial = box.tried()
+    calls: list[float] = []
+
+    def full(path: Path, data: bytes) -> None:
+        calls.append(1)
+        raise OSError(28, "No space left on device", str(path))
+
+    with monkeypatch.context() as patch:
+        patch.setattr("palpate.core.storage.put", full)
+        for t in range(100):
+            trial.turn(health(t / 10, streams=False))
+        assert len(calls) == 1
+        for _ in range(5):
+            trial.answered(verdict())
+        for t in range(100, 200):
+            trial.turn(health(t / 10))
+        trial.stopping()
+    assert len(calls) == 3
+    assert logged[1:] == [
+        f"<4>trial of bundle {box.two[:8]}: bundles.json cannot be written: No space left on "
+        "device; it is tried again"
+    ]
+    trial.turn(health(30))
+    assert box.standing.committed
+
+
+def test_another_command_is_not_waited_for(box: Trying, logged: list[str]):
+    """The loop goes on, and the write is tried again later."""
+    trial = box.tried()
+    with box.store._locked():
+        trial.turn(health(0, streams=False))
+    assert box.standing.starts == 1
+    assert "in use by another command" in logged[-1]
+    trial.turn(health(11, streams=False))
+    assert box.standing.starts == 0
+
+
+@pytest.mark.slow
+def test_a_bundle_that_is_no_longer_current_is_not_committed(box: Trying):
+    """Another bundle was deployed, or a person rolled back, while the old bundle still runs."""
+    for way in (lambda: box.installed(3), box.store.rollback):
+        trial = box.tried()
+        way()
+        for _ in range(5):
+            trial.answered(verdict())
+        trial.turn(health(1))
+        assert trial.text == ""
+        assert not box.standing.committed
+        assert box.store.state.counter == 1
+        box.store.install(box.made(2))
+
+
+def test_a_person_may_commit_while_it_runs(box: Trying):
+    """The program notices the commit and logs nothing. Its end changes nothing."""
+    trial = box.tried()
+    assert box.store.commit()
+    trial.turn(health(0, streams=False))
+    trial.stopping()
+    assert box.standing.committed
+    with pytest.raises(ApplianceError, match="counter 1"):
+        box.store.install(box.made(1, version="x"))
+
+
+def test_a_box_at_work_commits(box: Trying, rigged: Callable[..., Rigged]):
+    """On the simulated box: five sweeps of the simulated robot, each with its answer."""
+    trial = box.tried()
+    simulated = devices.build(skin.FORMAT, script.tubes(1), rig.VirtualClock(), "sim")
+    running = rigged(simulated, model=bundle.load(box.store.bundles.at(box.two)), observers=[trial])
+    running.until(lambda: running.box.answered >= 5 and not trial.text)
+    assert box.standing.committed
+
+
+def test_a_box_without_a_skin_takes_its_start_back(box: Trying, rigged: Callable[..., Rigged]):
+    """On the simulated box, with nothing on the bus."""
+    trial = box.tried()
+    simulated = idle_devices()
+    simulated.backend.unplug()
+    running = rigged(simulated, model=bundle.load(box.store.bundles.at(box.two)), observers=[trial])
+    running.seconds(1)
+    assert box.standing.starts == 0
+
+
+def failed() -> Verdict:
+    """The answer to a sweep on which the bundle failed."""
+    return replace(verdict(""), status=Status.FAILED)
+
+
+def test_a_bundle_that_fails_on_sweeps_gives_way(box: Trying):
+    """The program ends after some failed sweeps; three such starts end the trial."""
+    for _ in range(MOST_STARTS):
+        trial = box.tried()
+        trial.turn(health(1))
+        trial.answered(failed())
+        trial.__exit__(ModelError, ModelError("3 sweeps could not be classified"), None)
+    assert box.start() == box.one
+
+
+def test_a_failed_sweep_begins_the_trial_anew(box: Trying):
+    """Sweeps and time before it do not count, also not those that were recorded already."""
+    trial = box.tried()
+    for _ in range(4):
+        trial.answered(verdict())
+    trial.turn(health(1))
+    trial.turn(health(500))
+    trial.turn(health(501, streams=False))
+    assert (box.standing.sweeps, box.standing.streamed_s > 400) == (4, True)
+    trial.answered(failed())
+    trial.turn(health(502, streams=False))
+    assert (box.standing.sweeps, box.standing.streamed_s) == (0, 0)
+    for _ in range(4):
+        trial.answered(verdict())
+    trial.turn(health(503))
+    assert not box.standing.committed
+    trial.answered(verdict())
+    trial.turn(health(504))
+    assert box.standing.committed

@@ -1,0 +1,79 @@
+"""Code that only the start needed is released, and needed pages are read again."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from onnxruntime.capi import onnxruntime_pybind11_state
+
+from palpate.bundle.bundle import Bundle
+from palpate.inference.classifier import Classifier
+from palpate.inference.code_pages import give_back
+from palpate.inference.session import session
+from palpate.sim.rig import VirtualClock
+
+LIBRARY = os.path.realpath(onnxruntime_pybind11_state.__file__)
+
+
+def resident_code() -> int:
+    """KiB of onnxruntime's code in memory."""
+    found = re.findall(
+        rf"^\S+ r-xp .*{re.escape(LIBRARY)}\n(?:\S+:.*\n)*?Rss: *(\d+)",
+        Path("/proc/self/smaps").read_text(),
+        re.M,
+    )
+    return sum(map(int, found))
+
+
+@pytest.fixture
+def it(default_bundle: Bundle) -> Classifier:
+    """A classifier that has run."""
+    it = Classifier(default_bundle, VirtualClock())
+    it.self_test()
+    return it
+
+
+def test_what_is_given_back_is_read_again(it: Classifier):
+    """None of the code stays in memory. The next answer is the same, bit for bit, and reads a part
+    of it again."""
+    golden = it.bundle.golden[0]
+    want, before = it.logits(golden), resident_code()
+    assert give_back(LIBRARY) > 1024 * before > 0
+    assert resident_code() == 0
+    np.testing.assert_array_equal(it.logits(golden), want)
+    assert 0 < resident_code() < before + 1
+
+
+def test_opening_a_model_gives_its_code_back(default_bundle: Bundle):
+    """Before its first answer a classifier has less than half of the resident code of a bare
+    session."""
+    session(default_bundle.model)
+    opened = resident_code()
+    Classifier(default_bundle, VirtualClock())
+    assert resident_code() < opened / 2
+
+
+def test_nothing_else_is_touched(tmp_path: Path):
+    """Without a file of this name, or a list of mappings, nothing is released. Data and writable
+    code stay."""
+    assert give_back("/no/such/library.so") == 0
+    assert give_back(LIBRARY, tmp_path / "maps") == 0
+    lines = [
+        line for line in Path("/proc/self/maps").read_text().splitlines() if line.endswith(LIBRARY)
+    ]
+    other = [line for line in lines if " r-xp " not in line]
+    (tmp_path / "maps").write_text(
+        "\n".join([*other, *(line.replace(" r-xp ", " rwxp ") for line in lines)])
+    )
+    assert len(other) > 1
+    assert give_back(LIBRARY, tmp_path / "maps") == 0
+
+
+def test_what_linux_refuses_counts_nothing(tmp_path: Path):
+    """Linux refuses a range that is not mapped."""
+    (tmp_path / "maps").write_text("1000-2000 r-xp 00000000 00:00 1 /lib.so\n")
+    assert give_back("/lib.so", tmp_path / "maps") == 0

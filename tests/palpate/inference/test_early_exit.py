@@ -1,0 +1,707 @@
+"""Early exit on simulated devices, with a toy graph whose heads can be computed by hand; and each
+failure."""
+
+from __future__ import annotations
+
+import io
+import itertools
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from palpate.bundle import bundle
+from palpate.bundle.bundle import Bundle, Early, Manifest, Thresholds
+from palpate.cli.main import main
+from palpate.client.answers import Answer
+from palpate.core.config import SweepConfig
+from palpate.core.errors import BundleError
+from palpate.core.types import Frames, Status, Sweep, SweepFormat, Verdict, load, save
+from palpate.inference.classifier import Classifier
+from palpate.inference.early_exit import EarlyExit, decides
+from palpate.io.robot_link import StdoutPort
+from palpate.runtime import assembly
+from palpate.runtime.loop import Box, Pipeline
+from palpate.sim import devices, gpio, rig, script
+from palpate.sweeps.capture import CaptureWriter, Playback
+from palpate.sweeps.frame_ring import FrameRing
+from palpate.sweeps.sweep_window import SweepCutter
+from palpate.tools import demo
+from tests.factories.settings import load as load_settings
+from tests.factories.simulated_box import SECOND, SETTLE_S, OnSweep, Rigged
+
+onnx = pytest.importorskip("onnx", reason="onnx comes with the desktop's tools (make test)")
+helper, numpy_helper = onnx.helper, onnx.numpy_helper
+
+FMT = SweepFormat(2, 2, 100.0, 100, "uint8")
+STEPS = 4
+NEEDS = (20, 40, 60, 80)
+LEAD = 10
+SLIDE = 120
+SETS = ("classifier.early=true", "sweep.lead_ms=100")
+WEIGHTS = (
+    np.array([[1, 0], [-1, 0], [1, 0], [-1, 0]], np.float32) / 20
+)  # "left": a tenth of left minus right, in counts
+
+
+def toy(least: tuple[float, ...] = (0.9,) * STEPS, agree: int = 1, early: bool = True) -> Bundle:
+    """A bundle whose logit of "left" is a tenth of the left minus the right taxels' mean. The logit
+    of "right" is 0.
+
+    Head d gets the mean of exactly the frames of its step.
+    """
+    share = np.zeros((STEPS, FMT.window), np.float32)
+    for row, n in zip(share, NEEDS, strict=True):
+        row[:n] = 1 / n
+    nodes = [
+        helper.make_node("Cast", ["sweep"], ["float"], to=onnx.TensorProto.FLOAT),
+        helper.make_node("Reshape", ["float", "series"], ["x"]),
+    ]
+    for name, row in (("early", "share"), ("logits", "all")):
+        nodes += [
+            helper.make_node("MatMul", [row, "x"], [f"{name}_mean"]),
+            helper.make_node("MatMul", [f"{name}_mean", "weights"], [f"{name}_flat"]),
+            helper.make_node("Reshape", [f"{name}_flat", f"{name}_shape"], [name]),
+        ]
+    constants = {
+        "series": np.array([FMT.window, 4]),
+        "share": share,
+        "all": np.full((1, FMT.window), 0.01, np.float32),
+        "weights": WEIGHTS,
+        "early_shape": np.array([1, STEPS, 2]),
+        "logits_shape": np.array([1, 2]),
+    }
+    outputs = [helper.make_tensor_value_info("logits", onnx.TensorProto.FLOAT, [1, 2])]
+    if early:
+        outputs.append(
+            helper.make_tensor_value_info("early", onnx.TensorProto.FLOAT, [1, STEPS, 2])
+        )
+    graph = helper.make_graph(
+        nodes,
+        "toy",
+        [helper.make_tensor_value_info("sweep", onnx.TensorProto.UINT8, [1, FMT.window, 2, 2])],
+        outputs,
+        [numpy_helper.from_array(value, name) for name, value in constants.items()],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
+    golden = slid(20)[None, LEAD : LEAD + FMT.window]
+    manifest = Manifest(
+        "toy",
+        "1",
+        FMT,
+        "raw",
+        ("left", "right"),
+        Thresholds(5.0, 255.0),
+        {},
+        early=Early(least, agree) if early else None,
+    )
+    return Bundle(
+        manifest, "0" * 8, model.SerializeToString(), golden, np.array([[2, 0]], np.float32)
+    )
+
+
+def slid(*differences: int) -> np.ndarray:
+    """A slide [SLIDE, 2, 2] with the given left minus right in each fifth of the window; the last
+    value holds to the end."""
+    diff = np.repeat(differences, FMT.window // 5)[: FMT.window]
+    diff = np.concatenate([diff[:1].repeat(LEAD), diff, diff[-1:].repeat(SLIDE)])[:SLIDE]
+    frames = np.empty((SLIDE, 2, 2))
+    frames[:, :, 0], frames[:, :, 1] = 100 + diff[:, None], 100
+    return (frames + np.arange(SLIDE)[:, None, None] % 2).astype(
+        np.uint8
+    )  # all taxels move, by the same
+
+
+def acts(
+    *slides: np.ndarray, label: str = "left", new_object: tuple[int, ...] = ()
+) -> list[rig.Act]:
+    """The finger off, a slide from edge to edge, off again; NEW OBJECT before the acts with these
+    numbers."""
+    off = np.zeros((40, 2, 2), np.uint8)
+    return [
+        rig.Act(np.concatenate([off, s, off]), 40, 40 + SLIDE, label, i in new_object)
+        for i, s in enumerate(slides)
+    ]
+
+
+def simulated_slides(
+    *slides: np.ndarray, stops: bool = True, packet_frames: int = 3, clock=None, **more
+) -> devices.SimDevices:
+    """Simulated devices on which the finger slides like this."""
+    simulated = devices.build(
+        FMT, acts(*slides, **more), clock or rig.VirtualClock(), "sim", stops=stops
+    )
+    simulated.backend.board = rig.ReadoutBoard(
+        FMT, simulated.robot, simulated.clock, packet_frames=packet_frames
+    )
+    return simulated
+
+
+def all_of(box: Rigged) -> list[Verdict]:
+    """The verdicts until the robot has finished, and of two more seconds."""
+    verdicts = box.until(lambda: box.simulated.finished(box.box.answered))
+    return verdicts + box.seconds(2)
+
+
+def summary(verdicts: list[Verdict]) -> list[tuple[str, str, float]]:
+    """Status, label and share of each."""
+    return [(str(v.status), v.label, v.share) for v in verdicts]
+
+
+def levels(simulated: devices.SimDevices, *names: str) -> list[tuple[str, bool]]:
+    """The levels that were written to these lines, in order."""
+    return [(name, level) for _, name, level in simulated.gpio.written if name in names]
+
+
+@pytest.mark.parametrize(
+    ("scores", "agree", "want"),
+    [
+        ([0.95], 1, True),
+        ([0.89], 1, False),
+        ([0.95, 0.85], 1, True),
+        ([0.95, 0.79], 1, False),
+        ([0.95], 2, False),
+        ([0.6, 0.85], 2, True),
+        ([0.4, 0.85], 2, False),
+        ([0.4, 0.6, 0.99], 2, False),
+        ([0.4, 0.6, 0.99, 1.0], 3, True),
+        ([0.02], 1, True),
+        ([np.nan], 1, False),
+    ],
+)
+def test_the_rule(scores: list[float], agree: int, want: bool):
+    """An answer needs the step's least probability and the same label in the last `agree` steps. A
+    least probability above 1 is never reached."""
+    rule = Early((0.9, 0.8, 1.1, 0.5), agree)
+    assert decides(np.array([[p, 1 - p] for p in scores]), rule) is want
+
+
+def test_an_early_answer(rigged: Callable[..., Rigged]):
+    """Left less right: -10, then 60. After 0.4 of the window the mean is 25, so sigmoid(2.5): more
+    than 0.9."""
+    simulated = simulated_slides(slid(-10, 60))
+    box = rigged(simulated, SETS, toy())
+    (verdict,) = all_of(box)
+    assert summary([verdict]) == [("ok", "left", 0.4)]
+    assert verdict.probability == pytest.approx(1 / (1 + np.exp(-2.5)), abs=1e-6)
+    assert verdict.fused == 1
+    assert 0 <= verdict.latency_ns < 1_000_000
+    (answer,) = [a for a in map(Answer.read, box.heard) if a]
+    assert (answer.status, answer.label, answer.share) == ("ok", "left", 0.4)
+
+
+def test_steps_must_agree(rigged: Callable[..., Rigged]):
+    """The same slide where two steps must agree: the first named "right", so the third step
+    answers."""
+    assert summary(all_of(rigged(simulated_slides(slid(-10, 60)), SETS, toy(agree=2)))) == [
+        ("ok", "left", 0.6)
+    ]
+
+
+@pytest.mark.parametrize(("sets", "least"), [((), 0.9), (SETS, 1.1)])
+def test_otherwise_the_answer_is_the_usual_one(
+    rigged: Callable[..., Rigged], sets: tuple[str, ...], least: float
+):
+    """With early exit off, or if no step is sufficient, the middle window is answered once, bit for
+    bit the same."""
+    (want,) = all_of(rigged(simulated_slides(slid(20, 20)), (), toy(early=False)))
+    simulated = simulated_slides(slid(20, 20))
+    (verdict,) = all_of(rigged(simulated, sets, toy((least,) * STEPS)))
+    assert summary([verdict]) == [("ok", "left", 1.0)]
+    assert verdict.scores.tobytes() == want.scores.tobytes()
+    assert (devices.DECIDED, True) not in levels(simulated, devices.DECIDED)
+
+
+def test_the_robot_stops_and_is_faster(rigged: Callable[..., Rigged]):
+    """DECIDED ends the slide: three sweeps, three answers, each touch as short as its share and the
+    robot's reaction."""
+    simulated = simulated_slides(slid(60), slid(-10, 60), slid(10))
+    box = rigged(simulated, SETS, toy())
+    verdicts = box.until(lambda: box.box.answered == 1)
+    assert box.box.newest_frame().any()
+    box.seconds(0.1)
+    assert not box.box.newest_frame().any()
+    assert summary(verdicts + all_of(box)) == [
+        ("ok", "left", 0.2),
+        ("ok", "left", 0.4),
+        ("ok", "left", 1.0),
+    ]
+    touched = [a.stop - a.start for a in simulated.robot.played]
+    for frames, n in zip(touched, (20, 40), strict=False):
+        assert (
+            LEAD + n < frames <= LEAD + n + 3 + 3
+        )  # the rest of a packet, 20 ms to react, and up to the next frame
+    assert touched[2] == SLIDE
+    assert box.box.counters.lost_frames == 0
+
+
+def test_lines_change_in_order(rigged: Callable[..., Rigged]):
+    """Sentence, class bits, RESULT VALID, then DECIDED with READY and BUSY; DECIDED falls when the
+    next sweep starts."""
+    simulated = simulated_slides(slid(60), slid(10))
+    heard_before: list[bool] = []
+    kept_after: list[bool] = []
+    keep = OnSweep(
+        lambda sweep, verdict: kept_after.append(bool(heard_before))
+    )  # a disk may be slow
+    box = rigged(simulated, SETS, toy(), observers=[keep])
+    stop = simulated.gpio.watchers[devices.DECIDED]
+
+    def watch(t_ns: int) -> None:
+        box.listen(SETTLE_S)
+        heard_before.append(any(",RES,1," in line for line in box.heard))
+        stop(t_ns)
+
+    simulated.gpio.watchers[devices.DECIDED] = watch
+    all_of(box)
+    names = devices.READY, devices.BUSY, devices.DECIDED, devices.RESULT_VALID, devices.BITS[0]
+    start, free = (
+        [(devices.READY, False), (devices.BUSY, True)],
+        [(devices.READY, True), (devices.BUSY, False)],
+    )
+    first = [
+        *start,
+        (devices.BITS[0], True),
+        (devices.RESULT_VALID, True),
+        *free,
+        (devices.DECIDED, True),
+    ]
+    second = [
+        (devices.RESULT_VALID, False),
+        *start,
+        (devices.DECIDED, False),
+        (devices.RESULT_VALID, True),
+        *free,
+    ]
+    assert levels(simulated, *names) == [(devices.READY, True), *first, *second]
+    assert heard_before == [True]
+    assert kept_after == [True, True]
+
+
+def test_a_start_edge_beside_the_answer(rigged: Callable[..., Rigged]):
+    """In the turn of an early answer the next sweep starts: RESULT VALID and DECIDED were high, and
+    fall."""
+    simulated = simulated_slides(slid(60), stops=False, packet_frames=30)
+    box = rigged(simulated, SETS, toy())
+    simulated.gpio.drive(
+        devices.START, True, simulated.backend.board.frame_ns(85)
+    )  # frame 69 comes with frame 89
+    box.until(lambda: box.box.answered == 1)
+    assert levels(simulated, devices.DECIDED, devices.RESULT_VALID) == [
+        (name, level) for level in (True, False) for name in (devices.RESULT_VALID, devices.DECIDED)
+    ]
+    assert summary(box.seconds(1)) == [("ok", "left", 0.2)]  # the finger still slides
+
+
+def test_a_robot_that_slides_on_gets_no_second_answer(rigged: Callable[..., Rigged]):
+    """The stop edge at the slide's usual end gives no answer, and the next sweep is treated as
+    usual."""
+    simulated = simulated_slides(slid(60), slid(60), stops=False)
+    assert summary(all_of(rigged(simulated, SETS, toy()))) == [("ok", "left", 0.2)] * 2
+    assert [a.stop - a.start for a in simulated.robot.played] == [SLIDE] * 2
+
+
+@pytest.mark.parametrize("packet_frames", [1, 7, 30])
+def test_how_frames_come_changes_nothing(rigged: Callable[..., Rigged], packet_frames: int):
+    """Single frames, or packets that hold a step and a half: the same steps, the same scores bit
+    for bit."""
+    slides = slid(-10, 20, 60), slid(-10, -10, 60), slid(60)
+    want = all_of(rigged(simulated_slides(*slides), SETS, toy()))
+    have = all_of(rigged(simulated_slides(*slides, packet_frames=packet_frames), SETS, toy()))
+    assert summary(have) == summary(want) == [("ok", "left", s) for s in (0.6, 0.8, 0.2)]
+    assert [v.scores.tobytes() for v in have] == [v.scores.tobytes() for v in want]
+
+
+def test_one_run_of_the_graph_at_each_step(
+    rigged: Callable[..., Rigged], monkeypatch: pytest.MonkeyPatch
+):
+    """The heads run four times for a sweep without early answer, twice for one answered at step
+    two, never when idle.
+
+    The begin of the window is searched once for the steps, and once for the middle.
+    """
+    asked: list[int] = []
+    looked: list[int] = []
+    heads, look = Classifier.unfinished, FrameRing.seq_at
+    monkeypatch.setattr(
+        FrameRing,
+        "seq_at",
+        lambda self, t_ns: looked.append(box.box.answered) or look(self, t_ns),
+    )
+    monkeypatch.setattr(
+        Classifier,
+        "unfinished",
+        lambda self, *given: asked.append(box.box.answered) or heads(self, *given),
+    )
+    box = rigged(simulated_slides(slid(10), slid(-10, 60)), SETS, toy())
+    all_of(box)
+    assert [asked.count(k) for k in (0, 1, 2)] == [4, 2, 0]
+    assert looked == [0, 0, 1]
+
+
+def test_the_rest_of_the_window_repeats_the_newest_frame(monkeypatch: pytest.MonkeyPatch):
+    """The graph gets the frames so far, and the last of them repeated to the end of the window."""
+    given: list[np.ndarray] = []
+    classifier = Classifier(toy(), rig.VirtualClock())
+    heads = classifier.unfinished
+    monkeypatch.setattr(
+        classifier, "unfinished", lambda x, *outputs: given.append(x) or heads(x, *outputs)
+    )
+    verdict = EarlyExit(classifier)(so_far(slid(60)[:40], 0.4))
+    assert verdict is not None
+    assert verdict.share == 0.4
+    assert (given[0][:40] == slid(60)[:40]).all()
+    assert (given[0][40:] == slid(60)[39]).all()
+    assert (given[0].shape, given[0].dtype) == ((100, 2, 2), np.uint8)
+
+
+def so_far(taxels: np.ndarray, share: float) -> Sweep:
+    """A sweep that is still going on."""
+    n = np.arange(len(taxels))
+    return Sweep(1, 0, 0, Status.OK, Frames(n, n, taxels), share=share)
+
+
+def spoiled(fault: str) -> np.ndarray:
+    """A slide that is clear to the toy, on a faulty skin."""
+    frames = slid(60)
+    if fault == "saturated":
+        frames[:, :, 0] = 255 - (np.arange(SLIDE) % 4 == 0)[:, None]
+    elif fault == "stuck-taxel":
+        frames[:, 1, 0] = 200
+    elif fault == "dead-taxel":
+        frames[:, 1, 1] = 0
+    elif fault == "no-contact":
+        frames = frames // 50
+    return frames
+
+
+@pytest.mark.parametrize("fault", ["saturated", "stuck-taxel", "dead-taxel", "no-contact"])
+def test_a_spoiled_skin_is_not_decided_early(rigged: Callable[..., Rigged], fault: str):
+    """For any output of the heads the whole sweep reports the fault. Without the fault the answer
+    is early."""
+    assert summary(all_of(rigged(simulated_slides(spoiled(fault)), SETS, toy((0.5,) * STEPS)))) == [
+        (fault, "", 1.0)
+    ]
+    assert summary(all_of(rigged(simulated_slides(spoiled("")), SETS, toy((0.5,) * STEPS)))) == [
+        ("ok", "left", 0.2)
+    ]
+
+
+def test_a_taxel_that_moves_late_is_no_fault(rigged: Callable[..., Rigged]):
+    """Constant in the first step, varying in the second: no answer there, an answer here."""
+    frames = slid(60)
+    frames[: LEAD + NEEDS[0], 0, 0] = 160
+    assert summary(all_of(rigged(simulated_slides(frames), SETS, toy()))) == [("ok", "left", 0.4)]
+
+
+def test_a_tare_counts(rigged: Callable[..., Rigged]):
+    """With a tare as high as the load neither the early nor the whole sweep has contact."""
+    classifier = Classifier(toy(), rig.VirtualClock())
+    decider, sweep = EarlyExit(classifier), so_far(slid(60)[:20], 0.2)
+    assert decider(sweep) is not None
+    classifier.tare = np.full((2, 2), 200.0)
+    assert decider(sweep) is None
+
+
+@pytest.mark.parametrize(
+    ("at", "lost", "counted", "want"),
+    [
+        (30, 2, 2, ("ok", "left", 0.4)),
+        (NEEDS[1] - 1, 2, 1, ("ok", "left", 0.4)),  # the other one is the next step's
+        (30, 3, 3, ("gap", "", 1.0)),
+        (NEEDS[1] - 1, 3, 3, ("gap", "", 1.0)),
+        (NEEDS[1], 3, 0, ("ok", "left", 0.4)),
+    ],
+)
+def test_missing_frames(
+    rigged: Callable[..., Rigged], at: int, lost: int, counted: int, want: tuple[str, str, float]
+):
+    """Two lost frames, also at the end of a step, are interpolated and counted. A wider gap
+    prevents an early answer."""
+    simulated = simulated_slides(slid(-10, 60), packet_frames=1)
+    count = itertools.count()
+    simulated.backend.mangle = lambda data: (
+        b"" if 0 <= next(count) - 40 - LEAD - at < lost else data
+    )
+    box = rigged(simulated, SETS, toy())
+    assert summary(all_of(box)) == [want]
+    assert [s.lost for s in box.kept] == [counted]
+
+
+@pytest.mark.parametrize(
+    ("what", "want"),
+    [
+        ("unplug", []),
+        ("start", ["ok"]),
+        ("abort", []),
+        ("lost", ["edges-lost"]),
+        ("stop", ["no-start"]),
+    ],
+)
+def test_what_goes_wrong_after_the_answer(
+    rigged: Callable[..., Rigged], what: str, want: list[str]
+):
+    """After unplugging, another start, an abort or lost edges, the early answer stays the only
+    answer to its trigger."""
+    simulated = simulated_slides(slid(60), stops=False)
+    box = rigged(simulated, SETS, toy())
+    verdicts = box.until(lambda: box.box.answered == 1)
+    if what == "unplug":
+        simulated.backend.unplug()
+    elif what == "abort":
+        assert "no sweep is open" in box.ask("$PPLP,ABORT")
+    elif what == "start":
+        box.pulse(
+            devices.START, 0.1
+        )  # while the finger still slides: a sweep with an early answer of its own
+    elif what == "lost":
+        for i in range(3000):
+            box.edge(devices.START, 0.1 + i * 1e-4, i % 2 == 0)
+    elif what == "stop":
+        box.pulse(devices.STOP, 0.1)  # one too many: that of the slide's end has no start any more
+    assert summary(verdicts) == [("ok", "left", 0.2)]
+    assert [str(v.status) for v in box.seconds(3)] == want
+
+
+def test_what_goes_wrong_before_the_answer(rigged: Callable[..., Rigged]):
+    """Unplugged before an early answer: `sensor-lost` at once, and no early answer after it is
+    plugged in again."""
+    simulated = simulated_slides(slid(-10, 60), stops=False)
+    box = rigged(simulated, SETS, toy())
+    box.until(lambda: box.box.format == FMT and ("BUSY", True) in levels(simulated, "BUSY"))
+    now = simulated.clock.now_ns()
+    simulated.backend.at(now + SECOND // 4, simulated.backend.unplug)
+    simulated.backend.at(now + SECOND // 2, simulated.backend.plug)
+    assert [str(v.status) for v in all_of(box)] == ["sensor-lost"]
+
+
+def test_a_trigger_while_not_ready_is_not_decided(rigged: Callable[..., Rigged]):
+    """The start edge comes while the skin is away: `not-ready`, though the slide that follows is
+    clear."""
+    simulated = simulated_slides(slid(60), stops=False)
+    box = rigged(simulated, SETS, toy())
+    start = simulated.backend.board.frame_ns(40)
+    simulated.backend.at(start - SECOND // 10, simulated.backend.unplug)
+    simulated.backend.at(start + SECOND // 20, simulated.backend.plug)
+    assert [str(v.status) for v in all_of(box)] == ["not-ready"]
+
+
+def test_an_early_answer_counts_as_one_sweep_of_its_object(rigged: Callable[..., Rigged]):
+    """Three sweeps of an object, the second whole: fused 1, 2, 3, with the product of their
+    probabilities."""
+    simulated = simulated_slides(slid(60), slid(20), slid(30), new_object=(0,))
+    verdicts = all_of(rigged(simulated, SETS, toy()))
+    assert [(v.fused, v.share) for v in verdicts] == [(1, 0.2), (2, 1.0), (3, 0.2)]
+    logits = np.cumsum(
+        [6.0, 2.0, 3.0]
+    )  # sigmoid(2) is below 0.9: the rule is about the sweep itself
+    assert [v.probability for v in verdicts] == pytest.approx(1 / (1 + np.exp(-logits)), abs=1e-6)
+
+
+def test_without_ok_the_sweep_goes_on(rigged: Callable[..., Rigged]):
+    """One sweep does not reach `min_probability`, so its answer is not early and requests another
+    sweep. Fused with that, the answer is early."""
+    simulated = simulated_slides(slid(30), slid(30), new_object=(0,))
+    verdicts = all_of(rigged(simulated, (*SETS, "classifier.min_probability=0.99"), toy()))
+    assert [(str(v.status), v.fused, v.share) for v in verdicts] == [
+        ("unsure", 1, 1.0),
+        ("ok", 2, 0.2),
+    ]
+
+
+def test_a_bundle_without_heads_says_so(rigged: Callable[..., Rigged]):
+    """At start, naming the bundle, the setting and what to do."""
+    with pytest.raises(BundleError, match=r"toy 1 has no early heads.*classifier\.early = false"):
+        rigged(simulated_slides(slid(60)), SETS, toy(early=False))
+
+
+class Ticking(rig.VirtualClock):
+    """Each call takes a microsecond, so that the events of one turn have different times, as on a
+    real machine."""
+
+    def now_ns(self) -> int:
+        """A little later than before."""
+        self.sleep_until(super().now_ns() + 1000)
+        return super().now_ns()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("packet_frames", [1, 30])
+def test_a_capture_gives_the_same_answers(
+    rigged: Callable[..., Rigged], tmp_path: Path, packet_frames: int
+):
+    """With lost packets, early, whole and fused answers, and a stop edge beside a step, the replay
+    is the same."""
+    rng = np.random.default_rng(7)
+    slides = [slid(*rng.integers(-30, 50, 5)) for _ in range(20)]
+    simulated = simulated_slides(
+        *slides, stops=False, packet_frames=packet_frames, clock=Ticking(), new_object=(5, 9)
+    )
+    played = acts(*slides, new_object=(5, 9))
+    for i in range(10, 20):  # stopped too early on purpose, anywhere near the last step
+        played[i] = replace(played[i], stop=played[i].start + LEAD + NEEDS[-1] + i - 12)
+    simulated.robot._script = iter(played)
+    simulated.backend.mangle = lambda data: b"" if rng.random() < 0.03 / packet_frames else data
+    capture = CaptureWriter(tmp_path / "capture", FMT)
+    box = rigged(simulated, SETS, toy((0.97, 0.95, 0.93, 0.7)), capture=capture)
+    first = all_of(box)
+    capture.close()
+    play = Playback(tmp_path / "capture")
+    classifier = assembly.classifier(load_settings(SETS), toy((0.97, 0.95, 0.93, 0.7)), play)
+    again, kept = [], []
+    replayed = Box(
+        Pipeline(
+            play,
+            play,
+            SweepCutter(FMT, SweepConfig(lead_ms=100)),
+            classifier,
+            EarlyExit(classifier),
+        ),
+        play,
+        port=StdoutPort("replay", play.commands),
+        observers=[OnSweep(lambda sweep, verdict: kept.append(sweep))],
+    )
+    while not play.finished:
+        again += replayed.step()
+    assert {v.share for v in first} >= {0.4, 0.6, 1.0}
+    assert len(first) == 20
+    assert [(v.sweep, v.fused, v.lost, *summary([v])) for v in again] == [
+        (v.sweep, v.fused, v.lost, *summary([v])) for v in first
+    ]
+    assert [v.scores.tobytes() for v in again] == [v.scores.tobytes() for v in first]
+    assert [s.frames.taxels.tobytes() for s in kept] == [
+        s.frames.taxels.tobytes() for s in box.kept
+    ]
+
+
+def test_a_kept_sweep_gives_the_same_answer(rigged: Callable[..., Rigged], tmp_path: Path):
+    """The frames of an early answer are kept; replayed they give the same answer with the same
+    scores."""
+    box = rigged(simulated_slides(slid(-10, 60)), SETS, toy())
+    (verdict,) = all_of(box)
+    save(tmp_path / "sweep-000001.npy", box.kept[0], FMT)
+    sweep, format = load(tmp_path / "sweep-000001.npy")
+    assert (format, len(sweep.frames), sweep.share) == (FMT, 40, 0.4)
+    assert round((sweep.stop_ns - sweep.start_ns) / FMT.period_ns) == LEAD + 39
+    again = EarlyExit(Classifier(toy(), rig.VirtualClock()))(sweep)
+    assert again is not None
+    assert summary([again]) == summary([verdict])
+    assert again.scores.tobytes() == verdict.scores.tobytes()
+    assert EarlyExit(Classifier(toy((0.99,) * STEPS), rig.VirtualClock()))(sweep) is None
+
+
+def test_the_command_replays_what_it_decided(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """`palpate run` on a set with a capture and kept sweeps, then `palpate replay` of each: the
+    same answers."""
+    model = toy()
+    (tmp_path / "toy").mkdir()
+    np.savez(tmp_path / "toy" / bundle.GOLDEN, samples=model.golden, logits=model.golden_logits)
+    (tmp_path / "toy" / bundle.MODEL).write_bytes(model.model)
+    files = {
+        n: bundle.file_entry((tmp_path / "toy" / n).read_bytes())
+        for n in (bundle.MODEL, bundle.GOLDEN)
+    }
+    (tmp_path / "toy" / bundle.MANIFEST).write_bytes(replace(model.manifest, files=files).json())
+    windows = np.stack([slid(*d)[LEAD : LEAD + FMT.window] for d in ((60,), (10,), (-10, 60))])
+    np.savez(
+        tmp_path / "s.npz",
+        samples=windows,
+        labels=[0, 0, 0],
+        materials=["left", "right"],
+        rate_hz=100.0,
+    )
+    sets = ["--set", f"classifier.bundle={tmp_path / 'toy'}", "--set", "classifier.early=true"]
+
+    def printed(*args: str) -> list[list[str]]:
+        assert main([*args, *sets]) == 0
+        answers = [
+            line.split(",") for line in capsys.readouterr().out.splitlines() if ",RES," in line
+        ]
+        return [[a[2], *a[4:10], a[13]] for a in answers]
+
+    kept, capture = tmp_path / "black-box", tmp_path / "capture"
+    sets += ["--set", f"store.folder={tmp_path}", "--set", "store.black_box=9"]
+    first = printed(
+        "run", "--sim", f"replay:{tmp_path / 's.npz'}", "--virtual", "--capture", str(capture)
+    )
+    assert [(a[1], a[-1]) for a in first] == [("ok", "0.20"), ("ok", "1.00"), ("ok", "0.40")]
+    assert printed("replay", str(capture)) == first
+    assert [printed("replay", str(path))[0] for path in sorted(kept.glob("*.npy"))] == first
+
+
+def test_the_demo_shows_what_it_saves(rigged: Callable[..., Rigged]):
+    """The share beside an early answer, and the mean touch time below; neither without early
+    answers."""
+    for slides, early in (((slid(60), slid(10)), 1), ((slid(10), slid(10)), 0)):
+        simulated = simulated_slides(*slides)
+        box, out = rigged(simulated, SETS, toy()), io.StringIO()
+        show = demo.Demo(
+            simulated.robot.played,
+            box.far_end,
+            simulated.clock,
+            out,
+            toy().manifest.labels,
+            raw=False,
+        )
+        show.run(box.box, 2, lambda: False)
+        assert out.getvalue().count("after 20% of the window") == early
+        want = [(a.stop - a.start) / 100 for a in simulated.robot.played]
+        line = f"touch time      {np.mean(want):.2f} s mean, {early} of 2 answered early"
+        assert (line in out.getvalue()) == bool(early)
+        assert ("touch time" in out.getvalue()) == bool(early)
+
+
+def test_a_set_is_played_so_that_early_answers_see_it(tmp_path: Path):
+    """The recorded window begins `sweep.lead_ms` (as delivered) after the start edge and lies in
+    the middle."""
+    windows = np.random.default_rng(0).integers(0, 256, (2, 100, 2, 2)).astype(np.uint8)
+    np.savez(
+        tmp_path / "s.npz",
+        samples=windows,
+        labels=[0, 1],
+        materials=["left", "right"],
+        rate_hz=100.0,
+    )
+    for act, window in zip(
+        script.play(script.load(tmp_path / "s.npz", FMT), range(2)), windows, strict=True
+    ):
+        first = act.start + round(SweepConfig().lead_ms / 1000 * FMT.rate_hz)
+        assert (act.frames[first:][:100] == window).all()
+        assert (act.start + act.stop) // 2 - 50 == first
+
+
+@pytest.mark.parametrize("stop", ["STOP", ""])
+def test_the_simulated_robot_stops_once(stop: str):
+    """Two lines or one: scheduled edges are cancelled, the stop edge comes after the reaction,
+    frames are omitted."""
+    clock = rig.VirtualClock(0)
+    lines = gpio.SimGpio(clock, {"/dev/gpiochip0": ["START", "STOP"]})
+    robot = rig.Robot(iter(acts(slid(60))), lines, start="START", stop=stop)
+    robot.react(0)
+    assert robot.skipped is None
+    robot.next_act(100, lambda i: i * 10_000_000)
+    start_ns = 140 * 10_000_000
+    robot.react(start_ns + 300_000_000)
+    robot.react(start_ns + 400_000_000)
+    assert robot.skipped == (100 + 40 + 32, 100 + 40 + SLIDE)
+    planned = sorted((t_ns - start_ns, name, level) for t_ns, _, name, level in lines._plan)
+    stopped = (
+        [(320_000_000, "STOP", True), (340_000_000, "STOP", False)]
+        if stop
+        else [(320_000_000, "START", False)]
+    )
+    assert planned[-len(stopped) :] == stopped
+    assert len(planned) == (4 if stop else 2)
+    assert (robot.played[0].stop, len(robot.played[0].frames)) == (72, 40 + 32 + 40)
+
+
+def test_the_simulated_robot_does_not_stop_later_than_planned():
+    """DECIDED just before the end of a slide changes nothing."""
+    lines = gpio.SimGpio(rig.VirtualClock(0), {"/dev/gpiochip0": ["START", "STOP"]})
+    robot = rig.Robot(iter(acts(slid(60))), lines, start="START", stop="STOP")
+    robot.next_act(0, lambda i: i * 10_000_000)
+    robot.react(159 * 10_000_000)
+    assert robot.skipped is None
+    assert robot.played[0].stop == 40 + SLIDE

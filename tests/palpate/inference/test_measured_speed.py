@@ -1,0 +1,132 @@
+"""The measured speed in verdicts, and the range of trained speeds in manifests."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from palpate.bundle.bundle import Bundle, Manifest
+from palpate.core.errors import BundleError
+from palpate.core.types import Frames, Status, Sweep
+from palpate.inference.classifier import Classifier
+from palpate.signal.slide import SpeedRange
+from palpate.sim import skin
+from palpate.sim.rig import VirtualClock
+
+FAST = "slid at 60 mm/s, trained 28 to 33"
+NOTHING = np.full(6, np.nan)
+"""Probabilities of a model that gives no number: the sweep is unknown."""
+
+
+def slid(speed: float = 2.0, material: str = "plastic rough", **more: Any) -> Sweep:
+    """A sweep at a multiple of 30 mm/s, towards row 4."""
+    world = replace(skin.LEVEL_BLIND, speed=speed)
+    window = skin.window(material, skin.Placement(), np.random.default_rng(5), world)
+    n = np.arange(len(window))
+    return Sweep(1, 0, 0, Status.OK, Frames(n, n, window), **more)
+
+
+def trained(of: Bundle, **changes: Any) -> Bundle:
+    """A bundle that was trained at 28 to 33 mm/s."""
+    return replace(of, manifest=replace(of.manifest, speeds=SpeedRange(28.0, 33.0), **changes))
+
+
+def untrained(of: Bundle) -> Bundle:
+    """A bundle that does not state its speeds, as those of earlier versions."""
+    return replace(of, manifest=replace(of.manifest, speeds=None))
+
+
+def box(of: Bundle, **more: Any) -> Classifier:
+    return Classifier(of, VirtualClock(), **more)
+
+
+def test_a_verdict_has_the_measured_slide(default_bundle: Bundle):
+    """Speed and direction of the finger; the speed of START stands beside it unchanged."""
+    for speed in (1.0, 2.0):
+        v = box(default_bundle)(slid(speed, speed_mm_s=99.0))
+        assert v.measured_mm_s == pytest.approx(30 * speed, rel=0.03)
+        assert (v.direction, v.speed_mm_s) == ("rows+", 99.0)
+        assert v.as_dict()["measured_mm_s"] == v.measured_mm_s
+
+
+def test_a_verdict_without_a_measured_slide_has_no_such_fields(default_bundle: Bundle):
+    """A bundle without a pitch, a finger that rests, an early answer, a refused sweep."""
+    bare = replace(default_bundle.manifest, contact=None, displacement=None)
+    resting = skin.sweep("wood", skin.Placement(), np.random.default_rng(1), rest_s=2, slide_s=0.1)
+    n, half = np.arange(1500), slid(share=0.5)
+    cut = Frames(*(getattr(half.frames, name)[:750] for name in ("t_ns", "seq", "taxels")))
+    found = [
+        box(replace(default_bundle, manifest=bare))(slid()),
+        box(default_bundle)(Sweep(1, 0, 0, Status.OK, Frames(n, n, resting[:1500]))),
+        box(default_bundle).conclude(replace(half, frames=cut), np.eye(6)[0]),
+        box(default_bundle)(replace(slid(), status=Status.GAP)),
+    ]
+    assert [v.as_dict().keys() & {"measured_mm_s", "direction"} for v in found] == [set()] * 4
+
+
+def test_a_uncertain_answer_reports_a_speed_outside_of_training(default_bundle: Bundle):
+    """Unsure, undecided and unknown; before the other findings, after a displacement."""
+    probable = np.array([0.9, 0.1, 0, 0, 0, 0])
+    unsure = box(trained(default_bundle), min_probability=0.95)
+    undecided = box(trained(default_bundle), min_probability=0.95, max_sweeps=1)
+    found = [
+        unsure.conclude(slid(), probable),
+        undecided.conclude(slid(), probable),
+        unsure.conclude(slid(), NOTHING),
+    ]
+    assert [(v.status, v.detail) for v in found] == [
+        (Status.UNSURE, FAST),
+        (Status.UNDECIDED, FAST),
+        (Status.UNKNOWN, f"{FAST}; the model gives no number"),
+    ]
+    place = default_bundle.manifest.contact
+    assert place
+    far = replace(place, rows_mm=(0.0,), cols_mm=(0.0,))
+    v = box(trained(default_bundle, contact=far)).conclude(slid(), NOTHING)
+    assert v.detail == f"{v.displacement}; {FAST}; the model gives no number"
+    assert v.displacement.startswith("moved")
+
+
+def test_other_answers_do_not_report_it(default_bundle: Bundle):
+    """An answer that is ok, a speed of training, a bundle without the range: as in earlier
+    versions."""
+    sure, probable = np.eye(6)[0], np.array([0.9, 0.1, 0, 0, 0, 0])
+    found = [
+        box(trained(default_bundle)).conclude(slid(), sure),
+        box(trained(default_bundle), min_probability=0.95).conclude(slid(1.0), probable),
+        box(untrained(default_bundle), min_probability=0.95).conclude(slid(), probable),
+    ]
+    assert [v.detail for v in found] == [""] * 3
+    assert [v.status for v in found] == [Status.OK, Status.UNSURE, Status.UNSURE]
+    assert all(v.measured_mm_s for v in found)
+
+
+def test_a_manifest_may_state_the_speeds(default_bundle: Bundle):
+    """It is read as it was written. Without them the manifest has no such key, so that files and
+    ids remain those of earlier versions."""
+    manifest = trained(default_bundle).manifest
+    assert json.loads(manifest.json())["speeds"] == {"least_mm_s": 28.0, "most_mm_s": 33.0}
+    assert Manifest.parse(manifest.json()) == manifest
+    assert b"speeds" not in untrained(default_bundle).manifest.json()
+
+
+@pytest.mark.parametrize(
+    ("speeds", "hint"),
+    [
+        ({"least_mm_s": 0, "most_mm_s": 33}, r"speeds \[0, 33\] must be two mm/s above 0"),
+        ({"least_mm_s": 34, "most_mm_s": 33}, "the lower first"),
+        ({"least_mm_s": 28, "most_mm_s": 2e6}, "up to 1e\\+06; export the bundle again"),
+        ({"least_mm_s": True, "most_mm_s": 33}, r"speeds \[True, 33\] must be two mm/s"),
+        ({"least_mm_s": 28}, "manifest cannot be read"),
+        ([28, 33], "manifest cannot be read"),
+    ],
+)
+def test_wrong_speeds_are_named(default_bundle: Bundle, speeds: object, hint: str):
+    """Numbers out of range and other types are refused with the value."""
+    content = json.loads(default_bundle.manifest.json()) | {"speeds": speeds}
+    with pytest.raises(BundleError, match=hint):
+        Manifest.parse(json.dumps(content).encode())

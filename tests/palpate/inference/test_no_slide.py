@@ -1,0 +1,167 @@
+"""A finger that rests in a part of the window gets the status `no-slide`."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from palpate.bundle import bundle
+from palpate.bundle.bundle import Bundle, Early
+from palpate.core.errors import BundleError
+from palpate.core.types import Frames, Status, Sweep
+from palpate.inference.classifier import Classifier
+from palpate.inference.early_exit import EarlyExit
+from palpate.signal.disturbances import Allowance, Disturbances
+from palpate.signal.vibration import SlideLimits
+from palpate.sim import skin
+from palpate.sim.rig import VirtualClock
+from tests.factories import toy_bundle
+
+LEAST = math.log(1 / 200)
+"""Half of the vibration of "a", whose counts swing by 1 around 100."""
+
+
+@pytest.fixture
+def toy(tmp_path: Path) -> Bundle:
+    """The toy with limits for two of its three labels, and early answers."""
+    outputs = ("logits", "embedding", "early")
+    made = toy_bundle.load(tmp_path / "toy", outputs=outputs, early=Early((0.6,) * 3, 1))
+    limits = SlideLimits((LEAST, LEAST))
+    return replace(made, manifest=replace(made.manifest, sliding=limits))
+
+
+def resting(z1: float, z2: float, begin: int, end: int) -> Sweep:
+    """A sweep whose counts do not change between two frames, of 20."""
+    sweep = toy_bundle.sweep(z1, z2)
+    taxels = sweep.frames.taxels
+    taxels[begin:end] = taxels[begin]
+    return sweep
+
+
+def test_a_rest_is_answered_no_slide(toy: Bundle):
+    """The detail names the tenths. The sweep is not fused, and the next one is answered."""
+    box = Classifier(toy, VirtualClock(), max_sweeps=3)
+    verdict = box(replace(resting(0, 0, 10, 14), object=1))
+    assert (verdict.status, verdict.label) == (Status.NO_SLIDE, "")
+    assert verdict.detail == "hardly any vibration in part 6 7 of 10, less than a gives"
+    after = box(replace(toy_bundle.sweep(0, 0), object=1))
+    assert (after.status, after.fused) == (Status.OK, 1)
+
+
+def test_a_load_beyond_training_counts_as_that_of_training(toy: Bundle):
+    """Counts around 100 that swing by 1 vibrate too little, but not for a load of 75."""
+    total = math.log(100 * toy.format.rows * toy.format.cols)
+    load = Allowance("load", total - 0.3, total + 0.5, 1.0)
+    assert toy.classes
+    changes = np.zeros((1, *toy.classes.means.shape), np.float16)
+    limits = SlideLimits((math.log(1 / 80),) * 2)
+    strict = replace(toy, manifest=replace(toy.manifest, sliding=limits))
+    assert Classifier(strict, VirtualClock())(toy_bundle.sweep(0, 0)).status is Status.NO_SLIDE
+    for start, status in ((total - 0.3, Status.OK), (total - 0.1, Status.NO_SLIDE)):
+        allowed = Disturbances((replace(load, start=start),))
+        manifest = replace(strict.manifest, disturbances=allowed)
+        pressed = replace(strict, manifest=manifest, classes=replace(toy.classes, changes=changes))
+        assert Classifier(pressed, VirtualClock())(toy_bundle.sweep(0, 0)).status is status
+
+
+def test_without_a_limit_nothing_is_checked(toy: Bundle):
+    """For a label without one, and for an older bundle."""
+    assert Classifier(toy, VirtualClock())(resting(0, 6, 10, 14)).label == "c"
+    older = replace(toy, manifest=replace(toy.manifest, sliding=None))
+    assert Classifier(older, VirtualClock())(resting(0, 0, 10, 14)).label == "a"
+
+
+def test_no_early_answer_to_a_finger_that_rests(toy: Bundle):
+    """It rests in the second tenth of the window; half of the window has come."""
+    early = EarlyExit(Classifier(toy, VirtualClock()))
+
+    def half(sweep: Sweep) -> Sweep:
+        frames = replace(sweep.frames, taxels=sweep.frames.taxels[:10])
+        return replace(sweep, frames=frames, share=0.5)
+
+    assert early(half(toy_bundle.sweep(0, 0)))
+    assert early(half(resting(0, 0, 2, 4))) is None
+
+
+def test_more_limits_than_labels_are_refused(toy: Bundle):
+    """Four limits for three labels."""
+    with pytest.raises(BundleError, match="4 limits in `sliding` for 3 labels"):
+        replace(toy.manifest, sliding=SlideLimits((LEAST,) * 4))
+
+
+def test_the_manifest_keeps_the_limits(toy: Bundle):
+    """And leaves them out where there are none, so that older bundles keep their bytes."""
+    manifest = toy.manifest
+    assert bundle.Manifest.parse(manifest.json()) == manifest
+    assert b"sliding" not in replace(manifest, sliding=None).json()
+
+
+@pytest.fixture(scope="module")
+def packaged() -> Bundle:
+    """The packaged bundle, whose training sweeps all show a pattern that passes."""
+    made = bundle.load(bundle.DEFAULT)
+    assert made.manifest.sliding
+    assert made.manifest.sliding.pattern
+    return made
+
+
+def swept(taxels: np.ndarray) -> Sweep:
+    """A valid sweep with this window."""
+    n = np.arange(len(taxels))
+    return Sweep(1, 0, 0, Status.OK, Frames(n, n, taxels))
+
+
+def mixed(number: int) -> tuple[Sweep, Sweep]:
+    """A slide over foam, and a window whose taxels come from slides of their own: the spectra and
+    loads of foam without a pattern that passes."""
+    rng = np.random.default_rng(number)
+    places = skin.placements("T-REAL", number)
+    slides = [skin.window("foam", places[0], rng, skin.LEVEL_BLIND) for _ in range(16)]
+    own = np.stack([slides[i].reshape(-1, 16)[:, i] for i in range(16)], axis=1)
+    return swept(slides[0]), swept(own.reshape(slides[0].shape))
+
+
+def any_material(made: Bundle, pattern: float | None) -> Classifier:
+    """A classifier to which no material is unknown, with this limit of patterns."""
+    m = made.manifest
+    assert m.known
+    assert m.sliding
+    known, sliding = replace(m.known, limit=1e9), replace(m.sliding, pattern=pattern)
+    manifest = replace(m, known=known, sliding=sliding)
+    return Classifier(replace(made, manifest=manifest), VirtualClock(), slides=False)
+
+
+def test_a_whole_window_without_a_pattern_is_no_slide(packaged: Bundle):
+    """The slide is named. Without the limit the mixed window has a label as well. An answer without
+    speeds (`slides`) is checked, too."""
+    assert packaged.manifest.sliding
+    box = any_material(packaged, packaged.manifest.sliding.pattern)
+    unlimited = any_material(packaged, None)
+    for number in range(5):
+        slide, own = mixed(number)
+        assert (box(slide).label, box(slide).measured_mm_s) == ("foam", None)
+        assert unlimited(own).label
+        verdict = box(own)
+        assert (verdict.status, verdict.label) == (Status.NO_SLIDE, "")
+        assert verdict.detail.startswith("no pattern passes from taxel to taxel")
+
+
+@pytest.mark.parametrize("pattern", [0.0, -1.0, math.inf, math.nan])
+def test_a_limit_of_patterns_out_of_range_is_refused(pattern: float):
+    """It is a number above 0."""
+    with pytest.raises(BundleError, match=r"sliding.pattern .* finite number above 0"):
+        SlideLimits((), pattern)
+
+
+def test_the_manifest_keeps_the_limit_of_patterns(packaged: Bundle):
+    """And leaves it out where there is none."""
+    manifest = packaged.manifest
+    assert manifest.sliding
+    assert bundle.Manifest.parse(manifest.json()) == manifest
+    without = replace(manifest, sliding=replace(manifest.sliding, pattern=None))
+    assert b"pattern" not in without.json()
+    assert bundle.Manifest.parse(without.json()) == without

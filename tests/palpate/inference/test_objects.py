@@ -1,0 +1,312 @@
+"""Objects end without NEW OBJECT: by a sweep that contradicts them, by a pause, and after
+max_sweeps."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Iterable
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from palpate.bundle.bundle import Bundle
+from palpate.core.config import ClassifierConfig
+from palpate.core.types import Frames, Status, Sweep, Verdict
+from palpate.inference.classifier import LEAST_PROBABILITY, Classifier, Touched, softmax
+from palpate.inference.objects import FusedSweeps, ObjectRule, contradicts
+from palpate.runtime import assembly
+from palpate.sim import skin
+from palpate.sim.rig import VirtualClock
+from tests.factories import toy_bundle
+from tests.factories.settings import load
+
+A, B, NEAR_A = (0.0, 0.0), (6.0, 0.0), (2.8, -1.0)
+"""Embeddings of a sure "a", a sure "b", and an "a" with a probability of .65."""
+S = 1_000_000_000
+PERIOD_S, SLIDE_S = 10, 3
+UNTIL_NEW_OBJECT = ClassifierConfig(max_sweeps=0, conflict="fuse", object_s=0)
+"""The settings with which only NEW OBJECT ends an object."""
+
+
+def classifier(bundle: Bundle, settings: ClassifierConfig, **changes: float) -> Classifier:
+    """A classifier with these settings."""
+    chosen = replace(settings, **changes)
+    return Classifier(
+        bundle,
+        VirtualClock(),
+        chosen.fuse,
+        chosen.min_probability,
+        chosen.max_sweeps,
+        chosen.conflict,
+        chosen.object_s,
+    )
+
+
+def timed(sweeps: Iterable[Sweep], pause_s: float = PERIOD_S - SLIDE_S) -> list[Sweep]:
+    """The sweeps with numbers and times, of an object that was signalled before the first."""
+    period = round((pause_s + SLIDE_S) * S)
+    return [
+        replace(
+            sweep,
+            id=n,
+            start_ns=n * period,
+            stop_ns=n * period + SLIDE_S * S,
+            object=sweep.object or 1,
+        )
+        for n, sweep in enumerate(sweeps, 1)
+    ]
+
+
+def felt(*embeddings: tuple[float, float], pause_s: float = PERIOD_S - SLIDE_S) -> list[Sweep]:
+    """Sweeps of one object with these embeddings."""
+    return timed((toy_bundle.sweep(*z) for z in embeddings), pause_s)
+
+
+def short(verdict: Verdict) -> tuple[str, str, int, str]:
+    """The part of a verdict that these tests compare."""
+    return str(verdict.status), verdict.label, verdict.fused, verdict.detail
+
+
+@pytest.fixture
+def toy(tmp_path: Path) -> Bundle:
+    """The toy bundle."""
+    return toy_bundle.load(tmp_path / "toy")
+
+
+@pytest.mark.parametrize("labels", [2, 6, 50])
+def test_a_bayes_factor_of_ten_contradicts(labels: int):
+    """The likelihood ratio K * sum(fused * own) is compared with 1 / 10, however many labels there
+    are. Unsure sweeps contradict nothing."""
+
+    def ratio_of(r: float) -> tuple[np.ndarray, np.ndarray]:
+        fused, own = np.zeros(labels), np.zeros(labels)
+        fused[0], own[:2] = 1, (r / labels, 1 - r / labels)
+        return own, fused
+
+    assert contradicts(*ratio_of(0.09))
+    assert not contradicts(*ratio_of(0.11))
+    assert not contradicts(np.full(labels, 1 / labels), ratio_of(0)[1])
+    assert not contradicts(ratio_of(0)[0], np.full(labels, 1 / labels))
+
+
+def test_a_pause_is_from_the_end_to_the_start():
+    """More than object_s ends an object; 0 never does. A sweep before the end is not a pause."""
+    before = FusedSweeps(1, (np.ones(2) / 2,), 1, 100 * S)
+    assert not before.ended(160 * S, ObjectRule(object_s=60))
+    assert before.ended(160 * S + 1, ObjectRule(object_s=60))
+    assert not before.ended(10**6 * S, ObjectRule(object_s=0))
+    assert not before.ended(0, ObjectRule(object_s=60))
+
+
+def test_a_contradiction_begins_another_object(toy: Bundle):
+    """Its evidence is that sweep alone, the detail names both labels, and later sweeps are fused
+    with it."""
+    it = classifier(toy, ClassifierConfig())
+    given = [short(it(sweep)) for sweep in felt(A, A, B, B, A)]
+    assert given == [
+        ("ok", "a", 1, ""),
+        ("ok", "a", 2, ""),
+        ("ok", "b", 1, "another object: b after a"),
+        ("ok", "b", 2, ""),
+        ("ok", "a", 1, "another object: a after b"),
+    ]
+
+
+def test_an_unsure_sweep_is_fused(toy: Bundle):
+    """A sweep that is not sure of another label does not end the object, and neither does a sure
+    sweep after unsure ones."""
+    it = classifier(toy, ClassifierConfig(), min_probability=0.9)
+    towards_b = (3.2, -1.0)
+    assert [short(it(sweep))[1:3] for sweep in felt(A, towards_b)] == [("a", 1), ("a", 2)]
+    it.forget()
+    assert [short(it(sweep))[1:3] for sweep in felt(NEAR_A, B)] == [("a", 1), ("b", 2)]
+
+
+def test_a_contradiction_can_be_refused(toy: Bundle):
+    """The answer is `conflict` without a label, and the evidence stays as it was, until NEW
+    OBJECT."""
+    it = classifier(toy, ClassifierConfig(), conflict="refuse")
+    sweeps = felt(A, B, A, B)
+    given = [it(sweep) for sweep in sweeps]
+    assert [short(v) for v in given] == [
+        ("ok", "a", 1, ""),
+        ("conflict", "", 0, "another object: b after a"),
+        ("ok", "a", 2, ""),
+        ("conflict", "", 0, "another object: b after a"),
+    ]
+    assert [len(v.scores) for v in given] == [3, 0, 3, 0]
+    assert [len(v.own) for v in given] == [3] * 4
+    assert [v.after for v in given] == [0, 1, 2, 3]
+    assert short(it(replace(sweeps[3], object=2))) == ("ok", "b", 1, "")
+
+
+def test_a_refused_sweep_is_not_a_pause(toy: Bundle):
+    """The object goes on while sweeps of it are refused; it ends after a pause without sweeps."""
+    it = classifier(toy, ClassifierConfig(), conflict="refuse", object_s=10)
+    sweeps = felt(A, B, B, B)
+    assert [short(it(sweep))[0] for sweep in sweeps] == ["ok"] + ["conflict"] * 3
+    later = sweeps[-1].stop_ns + 10 * S + 1
+    assert short(it(replace(sweeps[-1], id=5, start_ns=later)))[:3] == ("ok", "b", 1)
+
+
+@pytest.mark.parametrize(("pause_s", "fused"), [(60.0, [1, 2, 3]), (60.5, [1, 1, 1])])
+def test_a_pause_ends_an_object(toy: Bundle, pause_s: float, fused: list[int]):
+    """By the times of the sweeps; the default is 60 s."""
+    it = classifier(toy, ClassifierConfig())
+    assert [it(sweep).fused for sweep in felt(A, A, A, pause_s=pause_s)] == fused
+
+
+def test_after_max_sweeps_another_object_begins(toy: Bundle):
+    """Whether the last answer was `ok` or `undecided`, and without the evidence of the object."""
+    it = classifier(toy, ClassifierConfig())
+    assert [it(sweep).fused for sweep in felt(*[A] * 12)] == [1, 2, 3, 4, 5, 1, 2, 3, 4, 5, 1, 2]
+    it = classifier(toy, ClassifierConfig(), min_probability=0.999, max_sweeps=2)
+    given = [short(it(sweep)) for sweep in felt(*[NEAR_A] * 3)]
+    assert [g[::2] for g in given] == [("unsure", 1), ("undecided", 2), ("unsure", 1)]
+
+
+def test_a_vote_ends_by_the_votes(toy: Bundle):
+    """With `vote` the sweep is compared with the share of the votes."""
+    it = classifier(toy, replace(ClassifierConfig(), fuse="vote"))
+    assert [short(it(sweep))[1:3] for sweep in felt(A, A, B)] == [("a", 1), ("a", 2), ("b", 1)]
+
+
+@pytest.mark.parametrize("more", [{"object": 0}, {"object": 1, "fuse": "none"}])
+def test_sweeps_by_themselves_end_no_object(toy: Bundle, more: dict):
+    """Before NEW OBJECT and with `none` nothing is compared."""
+    settings = replace(ClassifierConfig(), fuse=more.get("fuse", "product"), conflict="refuse")
+    it = classifier(toy, settings)
+    sweeps = [replace(sweep, object=more["object"]) for sweep in felt(A, B)]
+    assert [short(it(sweep)) for sweep in sweeps] == [("ok", "a", 1, ""), ("ok", "b", 1, "")]
+
+
+@pytest.mark.parametrize(
+    ("conflict", "label", "fused"), [("new", "b", 1), ("refuse", None, 3), ("fuse", "a", 4)]
+)
+def test_early_answers_end_objects_too(toy: Bundle, conflict: str, label: str | None, fused: int):
+    """A sure early answer of another label begins an object. If it is refused, or not ok, the sweep
+    goes on and does not count."""
+    it = classifier(toy, ClassifierConfig(), conflict=conflict)
+    first, second, third, fourth = felt(A, A, B, A)
+    assert [it(sweep).fused for sweep in (first, second)] == [1, 2]
+    early = it.conclude_if_ok(replace(third, share=0.5), np.array([0.001, 0.999, 0.0]))
+    assert (early and early.label) == label
+    assert it(fourth).fused == fused
+
+
+def test_enrolled_labels_contradict(tmp_path: Path):
+    """A label that was enrolled counts as any other."""
+    arrays = toy_bundle.means(sweeps=np.array([0, 0, 5]))
+    it = classifier(
+        toy_bundle.load(tmp_path / "enrolled", arrays=arrays, labels=2), ClassifierConfig()
+    )
+    given = [short(it(sweep)) for sweep in felt(A, (0.0, 6.0))]
+    assert given[1] == ("ok", "c", 1, "another object: c after a")
+
+
+def drawn(materials: Iterable[int], seed: int) -> list[tuple[str, Sweep]]:
+    """A sweep of each material (an index into MATERIALS) with its name. The skin is attached anew
+    after every 30."""
+    rng = np.random.default_rng(seed)
+    places, n = skin.placements("T-REAL", seed), np.arange(skin.FORMAT.window)
+    found = []
+    for i, k in enumerate(materials):
+        name, place = skin.MATERIALS[k], places[i // 30 % len(places)]
+        window = skin.window(name, place, rng, skin.LEVEL_BLIND)
+        found.append((name, Sweep(1, 0, 0, Status.OK, Frames(n, n, window))))
+    return found
+
+
+def in_runs(seed: int) -> Iterable[int]:
+    """Materials in random order, 2 to 4 sweeps of each."""
+    rng = np.random.default_rng(seed)
+    while True:
+        yield from [int(rng.integers(6))] * int(rng.integers(2, 5))
+
+
+def named(it: Classifier, sweeps: Iterable[Sweep]) -> list[str]:
+    """The label of each answer, "" unless its status is ok."""
+    return [v.label if v.status is Status.OK else "" for v in map(it, sweeps)]
+
+
+ORDERS = {
+    "in turn": lambda: (i % 6 for i in range(240)),
+    "in random order": lambda: np.random.default_rng(8).integers(0, 6, 240).tolist(),
+    "in runs": lambda: islice(in_runs(9), 240),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("order", ORDERS)
+def test_new_object_forgotten(default_bundle: Bundle, order: str):
+    """NEW OBJECT once, then 240 sweeps of six materials: at most 1 % of the answers are wrong
+    though the sweep alone is right. If all are fused, over half are."""
+    truth, sweeps = zip(*drawn(ORDERS[order](), 41), strict=True)
+    alone = named(classifier(default_bundle, ClassifierConfig()), sweeps)
+
+    def harmed(settings: ClassifierConfig) -> int:
+        given = named(classifier(default_bundle, settings), timed(sweeps))
+        triples = zip(truth, alone, given, strict=True)
+        return sum(own == name and answer not in ("", name) for name, own, answer in triples)
+
+    assert harmed(ClassifierConfig()) <= 2
+    assert harmed(UNTIL_NEW_OBJECT) > 120
+
+
+@pytest.mark.slow
+def test_new_object_before_each(default_bundle: Bundle):
+    """NEW OBJECT before each third sweep: no answer gets worse than if only NEW OBJECT ended an
+    object, except to the few sweeps that are wrong by themselves."""
+    truth, sweeps = zip(*drawn([i // 3 % 6 for i in range(180)], 43), strict=True)
+    signalled = timed(replace(sweep, object=1 + i // 3) for i, sweep in enumerate(sweeps))
+    alone = named(classifier(default_bundle, ClassifierConfig()), sweeps)
+    ended, fused = (
+        named(classifier(default_bundle, settings), signalled)
+        for settings in (ClassifierConfig(), UNTIL_NEW_OBJECT)
+    )
+    stray = [i for i, name in enumerate(truth) if alone[i] not in ("", name)]
+    worse = [i for i, name in enumerate(truth) if fused[i] == name != ended[i]]
+    assert len(stray) < 5
+    assert set(worse) <= set(stray)
+
+
+def test_the_settings_reach_the_classifier(toy: Bundle):
+    """By `assembly.classifier`, which the box, its shadow and replays of captures use; the rule is
+    kept with each sweep."""
+    sets = ("conflict=refuse", "object_s=7.5", "max_sweeps=3", "fuse=vote", "min_probability=0.6")
+    for given in ((), sets):
+        settings = load([f"classifier.{text}" for text in given])
+        rule = assembly.classifier(settings, toy, VirtualClock()).rule
+        chosen = settings.classifier
+        assert rule == {
+            "fuse": chosen.fuse,
+            "min_probability": chosen.min_probability or toy_bundle.LIMITS.unsure,
+            "max_sweeps": chosen.max_sweeps,
+            "conflict": chosen.conflict,
+            "object_s": chosen.object_s,
+        }
+    assert (rule["conflict"], rule["object_s"], rule["max_sweeps"]) == ("refuse", 7.5, 3)
+
+
+@pytest.mark.parametrize("fusion", ["product", "vote"])
+def test_an_object_without_end_takes_no_more_memory_or_time(toy: Bundle, fusion: str):
+    """After 20,000 sweeps of one object the fused sweeps are as small as after two, and the fused
+    probabilities are those of all sweeps."""
+    it = classifier(toy, UNTIL_NEW_OBJECT, fuse=fusion)
+    rng, given = np.random.default_rng(1), []
+    sizes = []
+    for n, own in enumerate(rng.dirichlet((2, 1, 1), 20_000), 1):
+        last = it.conclude(replace(toy_bundle.sweep(0, 0), id=n, object=1), own, Touched())
+        given.append(own)
+        if n in (2, 20_000):
+            sizes.append(len(pickle.dumps(it._objects.present.evidence)))
+    assert sizes[1] <= sizes[0] + 32
+    assert last.fused == 20_000
+    if fusion == "product":
+        together = softmax(np.log(np.maximum(given, LEAST_PROBABILITY)).sum(axis=0))
+    else:
+        together = np.bincount([int(p.argmax()) for p in given], minlength=3) / 20_000
+    assert last.scores == pytest.approx(together, abs=1e-8)

@@ -1,0 +1,108 @@
+"""The model runner: one session for outputs that are requested together, and no second session for
+the same outputs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from palpate.bundle.bundle import Bundle, Early
+from palpate.bundle.onnx_check import reader
+from palpate.core.errors import BundleError
+from palpate.inference import session
+from palpate.inference.classifier import Classifier
+from palpate.inference.early_exit import EarlyExit
+from palpate.inference.enrolment import enrol
+from palpate.inference.session import ModelRunner
+from palpate.sim.rig import VirtualClock
+from tests.factories import toy_bundle
+
+EARLY = Early((0.9,) * 3, 1)
+OUTPUTS = ("logits", "early", "embedding")
+
+
+@pytest.fixture
+def opened(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+    """The outputs of each model that onnxruntime opens."""
+    seen: list[list[str]] = []
+    real = session.session
+
+    def watched(model: bytes) -> object:
+        seen.append([output.name for output in reader.read(model).graph.output])
+        return real(model)
+
+    monkeypatch.setattr(session, "session", watched)
+    return seen
+
+
+@pytest.mark.parametrize(
+    ("more", "wanted"),
+    [
+        ({"early": EARLY, "outputs": OUTPUTS}, ["logits", "embedding"]),
+        ({"known": None, "outputs": OUTPUTS}, ["logits"]),
+        ({}, ["logits", "embedding"]),
+        (
+            {"arrays": toy_bundle.means(sweeps=np.array([0, 0, 5])), "labels": 2},
+            ["logits", "embedding"],
+        ),
+    ],
+)
+def test_a_classifier_opens_what_its_answers_need(
+    tmp_path, opened: list[list[str]], more: dict, wanted: list[str]
+):
+    """Self-test and sweep run on one session, whatever else the model gives."""
+    it = Classifier(toy_bundle.load(tmp_path / "toy", **more), VirtualClock())
+    it.self_test()
+    assert it(toy_bundle.sweep(1, 0)).label == "a"
+    assert opened == [wanted]
+
+
+def test_early_heads_have_their_own_session(tmp_path, opened: list[list[str]]):
+    """It is opened with the EarlyExit, before the first sweep, and once."""
+    it = Classifier(toy_bundle.load(tmp_path / "toy", early=EARLY, outputs=OUTPUTS), VirtualClock())
+    EarlyExit(it)
+    assert opened == [["logits", "embedding"], ["early"]]
+    it.early(toy_bundle.window(1, 0))
+    EarlyExit(it)
+    assert len(opened) == 2
+
+
+def test_answers_are_the_same_with_early_heads_and_without(default_bundle: Bundle):
+    """The logits of golden sweeps and noise are the same, bit for bit, from classifiers with and
+    without early answers, and from all outputs of the delivered model at once."""
+    plain, early = (
+        Classifier(default_bundle, VirtualClock()),
+        Classifier(default_bundle, VirtualClock()),
+    )
+    EarlyExit(early)
+    whole = session.session(default_bundle.model)
+    noise = np.random.default_rng(1).integers(
+        0, 256, (3, *default_bundle.golden.shape[1:]), np.uint8
+    )
+    for window in (*default_bundle.golden, *noise):
+        want = dict(zip(OUTPUTS, session.run(whole, OUTPUTS, {"sweep": window[None]}), strict=True))
+        assert early.early(window).tobytes() == want["early"].tobytes()
+        for it in (plain, early):
+            assert it.logits(window).tobytes() == want["logits"].tobytes()
+            assert it.embedding(window).tobytes() == want["embedding"].tobytes()
+
+
+def test_an_enrolled_bundle_runs_without_the_early_heads(
+    default_bundle: Bundle, opened: list[list[str]]
+):
+    """The bundle keeps the delivered model. Its heads, which do not have the label, are not
+    computed."""
+    new = enrol(default_bundle, "cork", default_bundle.golden[:1]).bundle
+    assert new.model == default_bundle.model
+    del opened[:]
+    Classifier(new, VirtualClock()).self_test()
+    assert opened == [["logits", "embedding"]]
+
+
+def test_an_output_that_the_model_does_not_give(tmp_path):
+    """The output is refused when it is requested. The other outputs can still be requested."""
+    it = ModelRunner(toy_bundle.model(), "logits")
+    with pytest.raises(BundleError, match=r"not \['early'\]"):
+        it(("early",), toy_bundle.window(0, 0))
+    (logits,) = it(("logits",), toy_bundle.window(0, 0))
+    assert logits.shape == (3,)

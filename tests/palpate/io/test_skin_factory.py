@@ -1,0 +1,124 @@
+"""The factory: the sensor for each profile, the format of its sweeps, and a real terminal with an
+emulated skin."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import replace
+
+import pytest
+
+from palpate.core import config
+from palpate.core.clock import SystemClock
+from palpate.core.config import Config
+from palpate.core.devices import Devices
+from palpate.core.errors import ConfigError
+from palpate.core.types import SweepFormat
+from palpate.io import skins
+from palpate.io.serial_sensor import SerialSensor
+from palpate.io.usb_sensor import UsbSensor
+from palpate.sim import skin
+from palpate.tools import pseudo_terminal
+from tests.factories.paths import NO_SITE
+from tests.factories.simulated_box import idle_devices
+from tests.factories.skin_wires import NAMES, profile, taxels, wire
+
+
+def settings(*sets: str) -> Config:
+    """The delivered settings with these changes."""
+    return config.load(None, sets, site=NO_SITE)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_profile_has_its_sensor_and_form(name: str):
+    """Skins of other protocols are read from a serial port; the format is the profile's, without
+    asking the skin."""
+    simulated = idle_devices()
+    chosen = settings(f"skin.profile={name}")
+    assert skins.announced(chosen, simulated) == profile(name).format
+    assert isinstance(skins.sensor(chosen, profile(name).format, simulated), SerialSensor)
+
+
+def test_the_protocol_has_the_old_sensor():
+    """The profile `palpate` is read as before, and its readout board is asked for the format."""
+    simulated = idle_devices()
+    chosen = simulated.wire(settings("skin.profile=flexitac", "skin.grid=3x3"))
+    assert isinstance(skins.sensor(chosen, skin.FORMAT, simulated), UsbSensor)
+    assert skins.announced(chosen, simulated) == skin.FORMAT
+
+
+def test_a_rate_that_can_be_set_is_that_of_the_bundle():
+    """A bundle for 250 Hz sets a skin that has this rate; other rates are refused."""
+    simulated, chosen = idle_devices(), settings("skin.profile=papillarray")
+    wanted = SweepFormat(3, 3, 250, 500, "float32", 3)
+    assert skins.announced(chosen, simulated, wanted) == wanted
+    assert skins.announced(chosen, simulated, replace(wanted, rate_hz=300)).rate_hz == 1000
+
+
+def test_a_form_that_a_person_describes():
+    """The examples of the error are understood, with a window of two seconds; a wrong description
+    is refused with them."""
+    assert skins.described("5x3:float32:100") == SweepFormat(5, 3, 100.0, 200, "float32")
+    assert skins.described(" 4x4x3:int16:250 ") == SweepFormat(4, 4, 250.0, 500, "int16", 3)
+    with pytest.raises(
+        ConfigError, match=r"--format 5x3: not understood.* 5x3:float32:100 or 4x4x3:int16:250"
+    ):
+        skins.described("5x3")
+    with pytest.raises(ConfigError, match=r"--format 0x3:int16:9: a grid of 0 x 3"):
+        skins.described("0x3:int16:9")
+
+
+def test_a_wrong_profile_is_named():
+    """The profile is not guessed."""
+    with pytest.raises(ConfigError, match="did you mean flexitac"):
+        skins.sensor(settings("skin.profile=flexitak"), skin.FORMAT, idle_devices())
+
+
+@pytest.fixture
+def playing() -> Iterator[str]:
+    """Path of a terminal on which a FlexiTac sends 100 frames a second."""
+    with pseudo_terminal.pair() as (far, path):
+        ended = threading.Event()
+
+        def play() -> None:
+            rest, i, begin = b"", 0, time.monotonic()
+            while not ended.is_set():
+                if not rest:
+                    # 100 Hz on average, however busy the machine
+                    ended.wait(max(0, begin + i / 100 - time.monotonic()))
+                    rest, i = wire("flexitac", i), i + 1
+                try:
+                    rest = rest[os.write(far, rest) :]
+                except BlockingIOError:
+                    ended.wait(0.001)
+
+        thread = threading.Thread(target=play)
+        thread.start()
+        yield path
+        ended.set()
+        thread.join()
+
+
+def test_on_a_real_terminal(playing: str):
+    """The real pyserial on a real terminal: frames as they were sent; the port is free again after
+    that."""
+    clock = SystemClock()
+    chosen = settings("skin.profile=flexitac", f"skin.port={playing}")
+    known = {taxels(profile("flexitac"), i).tobytes() for i in range(199)}
+    for _ in range(2):
+        with closing(
+            skins.sensor(chosen, profile("flexitac").format, Devices(clock, None))
+        ) as sensor:
+            end_ns, n = clock.now_ns() + 20_000_000_000, 0
+            while n < 50:
+                assert clock.now_ns() < end_ns, f"{sensor.state}: {sensor.trouble}"
+                frames = sensor.read()
+                assert all(one.tobytes() in known for one in frames.taxels)
+                n += len(frames)
+            assert sensor.identity
+            assert sensor.identity.board == "flexitac"
+            assert not sensor.loss_known

@@ -1,0 +1,189 @@
+"""`palpate teach` as a command: what it refuses, and a whole session in simulation."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from palpate.bundle import bundle
+from palpate.cli import run_command, teach_command
+from palpate.cli.common import load_settings
+from palpate.cli.main import main
+from palpate.cli.parser import arguments
+from palpate.core import config
+from palpate.core.types import sidecar
+from palpate.io.robot_link import command
+from palpate.learn import state, use
+from palpate.runtime import assembly
+from tests.factories import deliveries, hands, install_scripts, lessons
+from tests.factories.paths import ROOT
+from tests.factories.sweep_sets import easy
+
+
+@pytest.fixture
+def options(tmp_path: Path) -> list[str]:
+    """The settings of a box whose folders are below a temporary one."""
+    (tmp_path / "store").mkdir()
+    return ["--set", f"store.folder={tmp_path / 'store'}", "--set", f"store.keys={tmp_path}"]
+
+
+def said(words: list[str], capsys: pytest.CaptureFixture[str]) -> tuple[int, str]:
+    """Exit code and output of `palpate teach`."""
+    code = main(["teach", *words])
+    return code, "".join(capsys.readouterr())
+
+
+def test_a_setting_forbids_it(options: list[str], capsys: pytest.CaptureFixture[str]):
+    """With teach.allow = false nothing of it works; the message names the setting."""
+    for more in (["--use"], ["--label", "cork", "--sim", "skin"], ["--forget", "cork"]):
+        code, text = said([*options, "--set", "teach.allow=false", *more], capsys)
+        assert code == 78
+        assert "teach.allow = false forbids teaching on this box" in text
+
+
+def test_simulated_sweeps_stay_out_of_a_box(capsys: pytest.CaptureFixture[str]):
+    """--sim needs a folder of its own."""
+    code, text = said(["--label", "cork", "--sim", "skin"], capsys)
+    assert code == 78
+    assert "--sim must not teach a box: name a folder" in text
+
+
+def test_a_box_without_a_key_says_so_before_sweeps(
+    options: list[str], capsys: pytest.CaptureFixture[str]
+):
+    """No sweep is made in vain."""
+    code, text = said([*options, "--label", "cork", "--sim", "skin", "--virtual"], capsys)
+    assert code == 78
+    assert "make install" in text
+
+
+def test_materials_beyond_the_class_bits_are_refused_before_a_sweep(
+    options: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """Of two materials the single bit can show one; no sweep is recorded, of the first neither."""
+    install_scripts.enrolment_key(tmp_path / "enrolment")
+    bits = ["--set", 'output.class_bits=["GPIO5"]']
+    words = ["--label", "cork", "--label", "pine", "--sim", "skin", "--virtual", *bits]
+    code, text = said([*options, *words], capsys)
+    assert code == 78
+    assert "2 labels and the code 0 do not fit output.class_bits, which have 2 codes" in text
+    assert not list((tmp_path / "store" / "sweeps").glob("*.npy"))
+
+
+def test_nothing_recorded_yet(options: list[str], capsys: pytest.CaptureFixture[str]):
+    """The reason, and no bundle."""
+    code, text = said(options, capsys)
+    assert code == 1
+    assert "cannot be read" in text
+    assert "the bundle in service stays" in text
+
+
+@pytest.mark.parametrize(
+    ("words", "untaught"),
+    [
+        (["--skin", "flexitac"], True),
+        (["--skin", "palpate"], False),
+        (["--skin", "flexitac", "--set", "teach.allow=false"], False),
+        (["--skin", "flexitac", "--sim", "skin"], False),
+    ],
+)
+def test_a_box_without_a_bundle_for_its_skin_is_taught_first(words: list[str], untaught: bool):
+    """Only where the profile says that the packaged bundle is for another skin."""
+    args = arguments("run", words)
+    packaged = bundle.load(bundle.DEFAULT)
+    assert run_command.untaught(args, load_settings(args), packaged) is untaught
+
+
+@pytest.mark.parametrize(
+    ("words", "mode"),
+    [
+        (["--web"], "serial"),
+        ([], "two-lines"),
+        (["--web", "--board", "rpi5"], "two-lines"),
+        (["--web", "--trigger", "timed"], "timed"),
+    ],
+)
+def test_the_page_triggers_where_no_line_is_wired(words: list[str], mode: str):
+    """With lines, or another trigger by choice, the page waits for it."""
+    args = arguments("teach", words)
+    assert teach_command.by_page(args, load_settings(args)).trigger.mode == mode
+
+
+@pytest.mark.parametrize(("board", "mode"), [([], "serial"), (["--board", "rpi5"], "two-lines")])
+def test_a_box_without_lines_waits_to_be_taught(
+    board: list[str], mode: str, monkeypatch: pytest.MonkeyPatch
+):
+    """It does not end because no line can start a sweep: the page or a command does later."""
+    modes = []
+    monkeypatch.setattr(
+        teach_command.Session, "run", lambda self: modes.append(self._settings.trigger.mode)
+    )
+    args = arguments("run", ["--skin", "flexitac", *board])
+    assert teach_command.until_taught(args, load_settings(args)) == 0
+    assert modes == [mode]
+
+
+def test_the_process_learns_from_the_same_finger(tmp_path: Path):
+    """The command of USE has the finger of the session, and finds its sweeps and its state."""
+    sets = [word for one in hands.of(*hands.TWO) for word in ("--set", one)]
+    words = [*sets, "--set", f"store.folder={tmp_path}", "--finger", "right", "--web"]
+    args = arguments("teach", words)
+    settings = load_settings(args)
+    made = teach_command.Session(args, settings)._command("anna")
+    again = load_settings(arguments("teach", made[made.index("teach") + 1 :]))
+    assert again == settings
+    assert again.kept("sweeps") == tmp_path / "sweeps" / "right"
+    assert state.file(again) == tmp_path / "teaching-right.json"
+    assert state.file(load_settings(arguments("teach", words[4:-3]))).name == "teaching.json"
+
+
+@deliveries.NEEDED
+def test_sweeps_of_a_session_are_of_its_finger(
+    options: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """Recorded into the folder of the finger, with its name in the sidecars; a single material
+    cannot be judged yet."""
+    install_scripts.enrolment_key(tmp_path / "enrolment")
+    sets = [word for one in hands.of(*hands.TWO) for word in ("--set", one)]
+    words = ["--label", "cork", "--sweeps", "2", "--finger", "right", "--sim", "skin:wood"]
+    code, text = said([*options, *sets, *words, "--virtual"], capsys)
+    assert code == 0, text
+    assert "record two of another material" in text
+    kept = sorted((tmp_path / "store" / "sweeps").rglob("*.npy"))
+    assert [path.parent.name for path in kept] == ["right"] * 2
+    assert {sidecar(path)["finger"] for path in kept} == {"right"}
+
+
+def test_its_commands_are_commands_of_the_line():
+    """TEACH and FORGET need a name, USE none."""
+    assert command("TEACH", "cork").line == "TEACH,cork"
+    assert command("USE").line == "USE"
+    assert command("FORGET").error == "send it as PPLP FORGET TEXT"
+
+
+@deliveries.NEEDED
+@pytest.mark.slow
+@pytest.mark.thorough  # a fit with all checks of an export
+@pytest.mark.parametrize("finger", ["", "left"])
+def test_recorded_sweeps_become_the_bundle_of_the_box(
+    finger: str, options: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """Signed by the box, on trial, with who has taught it; taught again, the version counts up.
+    Scratch files are gone, the sweeps are not. The sweeps of one finger alone make a bundle of all
+    fingers."""
+    install_scripts.enrolment_key(tmp_path / "enrolment")
+    lessons.write(tmp_path / "store" / "sweeps" / finger, easy(8))
+    if finger:
+        options += [word for one in hands.of(*hands.TWO) for word in ("--set", one)]
+    chosen = ["--finger", finger] if finger else []
+    code, text = said([*options, *chosen, "--use", "--by", "anna"], capsys)
+    assert code == 0, text
+    assert "with high, low, middle is installed, on trial" in text
+    settings = config.load(None, [*options[1::2]], site=ROOT / "tests/factories/no-site.toml")
+    running = assembly.store(settings).running()
+    assert running.signer == "taught here"
+    assert running.bundle.manifest.taught.startswith("taught here by anna, 20")
+    assert use.version(assembly.store(settings)) == "2"
+    left = {path.name for path in (tmp_path / "store").iterdir()}
+    assert left == {"sweeps", "bundles", "bundles.json", "current"}

@@ -1,0 +1,352 @@
+"""New materials taught into a delivered bundle: from recorded sweeps to the bundle on trial."""
+
+from __future__ import annotations
+
+import errno
+import json
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from palpate.bundle import bundle
+from palpate.cli import teach_command
+from palpate.cli.main import main
+from palpate.cli.parser import arguments
+from palpate.core.clock import SystemClock
+from palpate.core.config import load
+from palpate.core.errors import BundleError, ConfigError, ModelError
+from palpate.deployment.enrolment_key import EnrolmentKey
+from palpate.deployment.signed import SignedBundle
+from palpate.inference import enrolment
+from palpate.inference.classifier import Classifier
+from palpate.learn import into, use
+from palpate.learn.session import TeachingSession
+from palpate.learn.state import TeachingState
+from palpate.runtime import assembly
+from palpate.runtime.hand import classifier
+from palpate.sim import skin
+from palpate_train.data.sets import Dataset
+from tests.campaigns import junk
+from tests.factories import deliveries, hands, lessons
+from tests.factories.paths import ROOT
+
+pytestmark = [deliveries.NEEDED, pytest.mark.slow]
+WORLD = skin.WORLDS[""]
+CORK, FELT = 6, 4
+"""Numbers of two new materials."""
+
+
+def slides(material: int, count: int, first: int = 0) -> list[np.ndarray]:
+    """Sweeps of a material that nobody trained, drawn by this number, at different places."""
+    tube = junk.random_material(junk.SweepDraw(WORLD, np.random.default_rng(material)))
+    world, made = replace(WORLD, tubes=(tube,)), []
+    for n in range(first, first + count):
+        rng = np.random.default_rng([material, n])
+        made.append(skin.window(tube.name, skin.placements("T-REAL", n + 1)[0], rng, world))
+    return made
+
+
+def rests(count: int) -> list[np.ndarray]:
+    """Sweeps of a finger that rests."""
+    return [junk.window("finger rests", WORLD, n)[0] for n in range(count)]
+
+
+def record(store: Path, material: str, of: list[np.ndarray], first: int, finger: str = "") -> None:
+    """Write recorded sweeps of a material, numbered from `first`."""
+    labels = np.zeros(len(of), int)
+    sweeps = Dataset(np.stack(of), labels, (material,), skin.FORMAT.rate_hz, {}, material)
+    lessons.write(store / "sweeps" / finger, sweeps, first=first)
+
+
+class TaughtDelivery:
+    """A box in service with a delivered bundle. words: its settings."""
+
+    def __init__(self, folder: Path) -> None:
+        delivery = deliveries.Delivery(folder)
+        delivery.committed(1)
+        self.store = Path(delivery.how.folder)
+        sets = [f"store.folder={self.store}", f"store.keys={folder}"]
+        self.words = [word for one in sets for word in ("--set", one)]
+        self.settings = load(None, sets, site=ROOT / "tests/factories/no-site.toml")
+
+    @property
+    def running(self) -> SignedBundle:
+        return assembly.store(self.settings).running()
+
+    def teach(self, capsys: Any, *more: str) -> tuple[int, dict[str, Any]]:
+        """`palpate teach --json`: its exit code, and its last line."""
+        capsys.readouterr()
+        code = main(["teach", *self.words, "--json", *more])
+        return code, json.loads(capsys.readouterr().out.splitlines()[-1])
+
+
+@pytest.fixture
+def box(tmp_path: Path) -> TaughtDelivery:
+    """A box with five sweeps of cork beside one of a finger at rest."""
+    one = TaughtDelivery(tmp_path)
+    record(one.store, "cork", [*rests(1), *slides(CORK, 5)], 1)
+    return one
+
+
+def test_a_new_material_joins_the_delivered_ones(box: TaughtDelivery, capsys: Any):
+    """It is signed by this box and on trial, without a fit; model and trained labels stay byte for
+    byte; the sweep that was not a slide is named and not learnt from."""
+    before = box.running
+    code, learnt = box.teach(capsys)
+    assert code == 0
+    assert learnt["sweeps"] == 5
+    assert "sweeps of new materials are named rightly among 7" in learnt["text"]
+    code, news = box.teach(capsys, "--use")
+    assert code == 0, news
+    assert [one["number"] for one in news["no_slides"]] == [1]
+    assert news["no_slides"][0]["text"].startswith("sweep 1 of cork is not learnt from: ")
+    after = box.running
+    assert after.signer == f"{deliveries.SIGNER}, enrolled here"
+    assert after.bundle.manifest.labels == (*before.bundle.manifest.labels, "cork")
+    assert after.bundle.enrolled == {"cork": 5}
+    assert {name: after.files[name] for name in before.files} == dict(before.files)
+    assert not (box.store / "teaching").exists()
+
+
+def test_more_sweeps_another_material_and_a_forgotten_one(box: TaughtDelivery, capsys: Any):
+    """Each USE learns all that is recorded anew; a material that `enrol` has added stays; one that
+    is forgotten leaves."""
+    box.teach(capsys, "--use")
+    first = box.running.bundle
+    record(box.store, "cork", slides(CORK, 2, first=10), 10)
+    assert box.teach(capsys, "--use")[0] == 0
+    assert box.running.bundle.enrolled == {"cork": 7}
+    record(box.store, "felt", slides(FELT, 1), 20)
+    assert box.teach(capsys, "--use")[0] == 0
+    assert box.running.bundle.enrolled == {"cork": 7, "felt": 1}
+    TeachingState().forget(box.store / "teaching.json", "cork", 19)
+    assert box.teach(capsys, "--use")[0] == 0
+    assert box.running.bundle.enrolled == {"felt": 1}
+    assert first.enrolled == {"cork": 5}
+
+
+def test_a_label_without_recorded_sweeps_stays(box: TaughtDelivery, capsys: Any):
+    """One that `enrol` has added, whose sweeps are not kept, has the same mean after each USE."""
+    store, key = assembly.store(box.settings), EnrolmentKey(box.settings.store.enrolment_key)
+    running = box.running
+    new = into.taught(running, {"wool": np.stack(slides(FELT, 2))})
+    store.learn(enrolment.files(running.files, new, key.sign(new.file)))
+    for _ in range(2):
+        assert box.teach(capsys, "--use")[0] == 0
+        assert box.running.bundle.enrolled == {"wool": 2, "cork": 5}
+        assert box.running.bundle.classes
+        assert np.array_equal(box.running.bundle.classes.means[-2], new.bundle.classes.means[-1])
+
+
+def test_nothing_new_leaves_the_bundle_in_service(box: TaughtDelivery, capsys: Any):
+    """Sweeps of trained materials, of rests alone, or of another format teach nothing."""
+    TeachingState().forget(box.store / "teaching.json", "cork", 19)
+    record(box.store, "foam", slides(CORK, 3), 20)
+    record(box.store, "oak", rests(3), 30)
+    before = box.running.sha
+    code, news = box.teach(capsys, "--use")
+    assert code == 1
+    assert "gets no new material; record one that it does not have yet" in news["text"]
+    assert news["text"].endswith("the bundle in service stays")
+    code, news = box.teach(capsys)
+    assert code == 1
+    assert "no new material has two sweeps" in news["text"]
+    assert box.running.sha == before
+
+
+def test_sweeps_that_disagree_are_refused(box: TaughtDelivery, capsys: Any):
+    """As by `enrol`: the sweep that is most of all another material is named."""
+    record(box.store, "oak", [*slides(CORK, 4), *slides(FELT, 1)], 20)
+    code, news = box.teach(capsys, "--use")
+    assert code == 1
+    assert "the sweeps of 'oak' disagree" in news["text"]
+    assert "number 5 most of all" in news["text"]
+
+
+@pytest.mark.parametrize(
+    "error", [ModelError("std::bad_alloc"), OSError(errno.ENOSPC, "No space left on device")]
+)
+@pytest.mark.parametrize("more", [(), ("--use",)], ids=["assess", "use"])
+def test_a_model_or_disk_that_fails_leaves_the_bundle_in_service(
+    box: TaughtDelivery,
+    capsys: Any,
+    monkeypatch: pytest.MonkeyPatch,
+    error: Exception,
+    more: tuple[str, ...],
+):
+    """The reason is a line for the page; the next attempt succeeds."""
+    before = box.running.sha
+
+    def fail(*given: object) -> None:
+        raise error
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Classifier, "network", fail)
+        code, news = box.teach(capsys, *more)
+    assert code
+    assert news["type"] == "error"
+    assert news["text"].endswith("the bundle in service stays")
+    assert box.running.sha == before
+    assert box.teach(capsys, *more)[0] == 0
+
+
+def test_a_reader_that_is_gone_gets_an_exit_code(box: TaughtDelivery):
+    """Standard output is full: the result could not be told, and nothing hangs or is half done."""
+    words = [sys.executable, "-P", "-m", "palpate", "teach", *box.words, "--json", "--use"]
+    with open("/dev/full", "wb") as full:
+        done = subprocess.run(words, cwd=ROOT, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert done.returncode
+    assert "Traceback" not in done.stderr
+    assert box.running.bundle.enrolled in ({}, {"cork": 5})
+
+
+FINGERS = [word for text in hands.of(*hands.TWO) for word in ("--set", text)]
+
+
+@pytest.fixture
+def hand(tmp_path: Path) -> TaughtDelivery:
+    """A box with two fingers, the left one with sweeps of cork and felt, the right one of oak."""
+    box = TaughtDelivery(tmp_path)
+    for finger, material, of in (
+        ("left", "cork", slides(CORK, 5)),
+        ("left", "felt", slides(FELT, 2)),
+        ("right", "oak", slides(CORK, 5)),
+    ):
+        record(box.store, material, of, 1 if material != "felt" else 10, finger)
+    box.words += FINGERS
+    return box
+
+
+def test_a_hand_is_taught_with_one_finger(hand: TaughtDelivery, capsys: Any):
+    """By its sweeps alone; what it has forgotten the other has not. The bundle names the material
+    for all fingers without a bundle of their own."""
+    assert main(["teach", *hand.words, "--finger", "left", "--forget", "felt"]) == 0
+    assert (hand.store / "teaching-left.json").exists()
+    code, learnt = hand.teach(capsys, "--finger", "left")
+    assert code == 0
+    assert learnt["materials"] == {"cork": 5}
+    code, news = hand.teach(capsys, "--finger", "left", "--use")
+    assert code == 0, news
+    assert hand.running.bundle.enrolled == {"cork": 5}
+    settings = load(None, hand.words[1::2], site=ROOT / "tests/factories/no-site.toml")
+    both = assembly.of_fingers(settings, hand.running.bundle, answers=True)
+    run = classifier(settings, both, SystemClock())
+    assert {*run.labels} == {*skin.MATERIALS, "cork"}
+    code, news = hand.teach(capsys, "--finger", "right", "--use")
+    assert code == 0, news
+    assert hand.running.bundle.enrolled == {"cork": 5, "oak": 5}
+
+
+def test_a_bundle_that_does_not_suit_the_other_finger_is_not_used(
+    hand: TaughtDelivery, tmp_path: Path, capsys: Any
+):
+    """The right finger has a bundle of its own, which lacks the new label: the service would not
+    start with both."""
+    own = tmp_path / "own"
+    shutil.copytree(hand.store / (hand.store / "current").readlink(), own)
+    hand.words += ["--set", f"skins.right.bundle={own}"]
+    before = hand.running.sha
+    code, news = hand.teach(capsys, "--finger", "left", "--use")
+    assert code == 78, news
+    assert "the bundle of skins.right has other labels than that of the first" in news["text"]
+    assert hand.running.sha == before
+
+
+def test_a_taught_bundle_and_another_skin_are_fitted_anew(box: TaughtDelivery):
+    """Only a delivered bundle for this skin is taught into; the packaged one is not."""
+    store = assembly.store(box.settings)
+    assert use.base(store, skin.FORMAT)
+    assert use.base(store, None)
+    assert use.base(store, replace(skin.FORMAT, rows=8)) is None
+    assert use.base(store, replace(skin.FORMAT, window=900))
+    files = {**box.running.files}
+    del files[bundle.SIGNATURE]
+    assert not into.delivered(SignedBundle(box.running.bundle, "", files))
+    (box.store / "current").unlink()
+    assert use.base(store, skin.FORMAT) is None
+
+
+def test_early_answers_are_refused_before_a_sweep(box: TaughtDelivery):
+    """They cannot name a label without heads."""
+    classifier = replace(box.settings.classifier, early=True)
+    with pytest.raises(ConfigError, match=r"set classifier.early = false"):
+        into.check_settings(replace(box.settings, classifier=classifier))
+
+
+def test_a_sweep_of_another_new_material_is_suspected(box: TaughtDelivery):
+    """Left out, it is named as what it is."""
+    found = into.recorded(box.running.bundle, box.store / "sweeps", {})
+    other = slides(FELT, 4)
+    mixed = {"cork": np.stack([*found.windows["cork"], other[0]]), "felt": np.stack(other[1:])}
+    sweeps = into.NewSweeps(mixed, {"cork": [*range(2, 8)], "felt": [20, 21, 22]}, [])
+    learnt = into.assessed(box.running, sweeps)
+    assert [one["text"] for one in learnt["suspects"]] == ["sweep 6 of cork looks like felt"]
+    assert learnt["suspects"][0]["sweep"] == "sweep-000007"
+    assert learnt["advice"].startswith("look at it first: sweep 6 of cork looks like felt")
+    with pytest.raises(BundleError, match="no new material has two sweeps"):
+        into.assessed(box.running, into.NewSweeps({}, {}, []))
+
+
+def test_the_session_needs_one_material_and_refuses_trained_ones(tmp_path: Path):
+    """Beside the delivered labels one material is enough; class bits count all."""
+    session: TeachingSession = sessions(tmp_path, codes=8)
+    with pytest.raises(ConfigError, match="was trained on 'oak'; record more of it for"):
+        session.commands["TEACH"]("oak")
+    for again in ("oak", " oak"):
+        with pytest.raises(
+            ConfigError, match="was trained on 'oak'; record more of it for the desk"
+        ):
+            session.recording_commands["MATERIAL"](again)
+    assert session.materials() == {}
+    with pytest.raises(Exception, match="0 materials have sweeps; teach one"):
+        session.commands["USE"]("")
+    assert session.about()["fewest"] == 1
+    assert session.about()["base"] == ["oak", "pine", "cork"]
+    narrow = sessions(tmp_path / "narrow", codes=4)
+    with pytest.raises(ConfigError, match="4 labels and the code 0 do not fit"):
+        narrow.commands["TEACH"]("felt")
+    assert narrow.commands["TEACH"]("cork") == ["cork", 0]
+
+
+def test_a_trained_material_is_refused_before_a_sweep(box: TaughtDelivery, capsys: Any):
+    """In the terminal, and on the page or the serial line after a trial: more sweeps of it would
+    teach nothing here."""
+    words = [*box.words, "--label", "foam", "--sim", "skin", "--virtual"]
+    recorded = sorted((box.store / "sweeps").iterdir())
+    assert main(["teach", *words]) == ConfigError.exit_code
+    assert "was trained on 'foam'; record more of it for the desktop" in capsys.readouterr().err
+    assert sorted((box.store / "sweeps").iterdir()) == recorded
+    session = teach_command.Session(arguments("teach", box.words), box.settings)
+    session._base = box.running
+    with pytest.raises(ConfigError, match="was trained on 'foam'"):
+        session._teach_again("foam")
+    assert session._teach_again("cork") == ["cork"]
+
+
+def sessions(folder: Path, codes: int) -> TeachingSession:
+    """A session with a bundle of oak and pine, into which cork was taught."""
+    from palpate.core.config import TeachConfig
+    from palpate.sweeps.recording import Labels, RecordingSession
+
+    def say(line: bytes) -> None:
+        pass
+
+    sweeps = folder / "sweeps"
+    recording = RecordingSession(sweeps, skin.FORMAT, Labels(), SystemClock(), say, 3)
+    base = ("oak", "pine", "cork")
+    return TeachingSession(
+        recording,
+        folder / "teaching.json",
+        TeachConfig(),
+        lambda by: [],
+        say,
+        codes=codes,
+        base=base,
+        trained=base[:2],
+    )

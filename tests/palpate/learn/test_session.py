@@ -1,0 +1,313 @@
+"""A session of teaching: its commands, the processes beside the loop, and each failure of these."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from palpate.core.clock import SystemClock
+from palpate.core.config import TeachConfig
+from palpate.core.errors import ApplianceError, ConfigError, FormatError
+from palpate.core.types import Status
+from palpate.learn import process, session
+from palpate.learn.process import TeachingProcess
+from palpate.learn.session import TeachingSession
+from palpate.learn.state import TeachingState
+from palpate.learn.teacher import Teacher
+from palpate.sim import skin
+from palpate.sweeps.recording import Labels, RecordingSession
+from tests.factories.feeds import HEALTH, OK, cut
+
+WAIT_S = 20
+
+
+def program(code: str) -> list[str]:
+    """The command of a process that runs this code."""
+    return [sys.executable, "-c", code]
+
+
+def printed(*lines: dict[str, Any], then: str = "") -> list[str]:
+    """The command of a process that prints these lines."""
+    text = "".join(json.dumps(line) + "\n" for line in lines)
+    return program(f"print({text!r}, end='', flush=True)\n{then}")
+
+
+FILE = "teaching.json"
+ASSESSED = {"type": "assessed", "text": "80 % right", "advice": "3 more of cork"}
+TAUGHT = {"type": "taught", "text": "bundle 1234 is installed", "labels": ["cork", "pine"]}
+
+
+class Taught:
+    """A recording with its session; `learn` and `assess` are the commands of its processes."""
+
+    def __init__(self, folder: Path, codes: int = 0) -> None:
+        self.folder, self.said, self.number = folder, [], 0
+        self.learn, self.assess = printed(TAUGHT), printed(ASSESSED)
+        self.recording = RecordingSession(
+            folder / "sweeps", skin.FORMAT, Labels(), SystemClock(), self.said.append, 3
+        )
+        self.session = TeachingSession(
+            self.recording,
+            folder / FILE,
+            TeachConfig(),
+            lambda by: self.learn,
+            lambda line: self.said.append(line.decode()),
+            codes=codes,
+        )
+
+    def order(self, name: str, text: str = "") -> list[object]:
+        """Carry out a command."""
+        return self.session.commands[name](text)
+
+    def sweeps(self, material: str, count: int, status: Status = Status.RECORDED) -> None:
+        """Record sweeps of a material."""
+        self.order("TEACH", material)
+        for _ in range(count):
+            self.number += 1
+            sweep = replace(cut(), id=self.number, start_ns=SystemClock().now_ns())
+            verdict = replace(OK, sweep=self.number, status=status, label="", scores=np.empty(0))
+            for observer in (self.recording, self.session):
+                observer.sweep(sweep, verdict, {})
+
+    def until(self, done: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
+        """Take turns until the session is in this state."""
+        end = time.monotonic() + WAIT_S
+        while not done(about := self.session.about()):
+            assert time.monotonic() < end, about
+            self.session.turn(HEALTH)
+            time.sleep(0.01)
+        return about
+
+
+@pytest.fixture
+def taught(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Taught]:
+    """A session whose processes are the commands above."""
+    monkeypatch.setattr(session, "PAUSE_NS", 0)
+    one = Taught(tmp_path)
+    monkeypatch.setattr(session, "learning", lambda *_: one.assess)
+    yield one
+    one.session.close()
+    one.recording.close()
+
+
+def test_it_assesses_from_the_second_sweep_of_two_materials_on(taught: Taught):
+    """Before, there is nothing to say."""
+    taught.sweeps("cork", 3)
+    taught.sweeps("pine", 1)
+    about = taught.until(lambda about: not about["assessing"])
+    assert about["learnt"] is None
+    assert about["materials"] == {"cork": 3, "pine": 1}
+    taught.sweeps("pine", 1)
+    about = taught.until(lambda about: about["learnt"])
+    assert about["learnt"]["advice"] == "3 more of cork"
+    assert not about["trouble"]
+
+
+def test_faulty_sweeps_do_not_count(taught: Taught):
+    """They are stored, and neither counted nor taught."""
+    taught.sweeps("cork", 2)
+    taught.sweeps("cork", 2, Status.NO_CONTACT)
+    assert taught.session.materials() == {"cork": 2}
+
+
+def test_sweeps_that_were_no_slides_are_said_and_not_counted(taught: Taught):
+    """At once if the check finds it; later if the process does, by comparing all sweeps. Each is
+    said once; files stay."""
+    taught.assess = printed(
+        ASSESSED
+        | {"no_slides": [{"number": 2, "text": "sweep 2 of cork is not learnt from: rest"}]}
+    )
+    taught.sweeps("cork", 3)
+    taught.sweeps("cork", 1, Status.NO_SLIDE)
+    taught.sweeps("pine", 2)
+    assert taught.session.materials() == {"cork": 3, "pine": 2}
+    taught.until(lambda about: about["learnt"])
+    assert taught.session.materials() == {"cork": 2, "pine": 2}
+    taught.sweeps("pine", 1)
+    taught.until(lambda about: not about["assessing"])
+    said = [line for line in map(str, taught.said) if "TCH,refused" in line]
+    assert len(said) == 2
+    assert "$PPLP,TCH,refused,sweep 4: no-slide*" in said[0]
+    assert "$PPLP,TCH,refused,sweep 2 of cork is not learnt from: rest*" in said[1]
+    assert taught.recording.about()["counts"] == [("cork", "", 2), ("pine", "", 3)]
+    assert len(list((taught.folder / "sweeps").glob("*.npy"))) == 7
+
+
+def test_use_makes_a_bundle_and_says_so(taught: Taught):
+    """Steps are shown with the time left; the end is a sentence for a robot."""
+    step = {"type": "step", "step": "heads", "done": 0.2, "left_s": 4.0}
+    go = taught.folder / "go"
+    wait = f"import os, time\nwhile not os.path.exists({str(go)!r}): time.sleep(.01)"
+    taught.learn = printed(step, then=f"{wait}\nprint({json.dumps(TAUGHT)!r})")
+    taught.sweeps("cork", 2)
+    taught.sweeps("pine", 2)
+    assert taught.order("USE") == [2, 4]
+    about = taught.until(lambda about: (about["using"] or {}).get("step") == "heads")
+    assert about["using"]["left_s"] == 4.0
+    with pytest.raises(ApplianceError, match="a bundle is being made already; wait for TCH"):
+        taught.order("USE")
+    with pytest.raises(ApplianceError, match="a bundle is being made; forget it afterwards"):
+        taught.order("FORGET", "cork")
+    go.touch()
+    about = taught.until(lambda about: about["taught"] and not about["using"])
+    assert about["taught"]["labels"] == ["cork", "pine"]
+    assert any(str(line).startswith("$PPLP,TCH,taught,bundle 1234") for line in taught.said)
+
+
+@pytest.mark.parametrize(
+    ("learn", "why"),
+    [
+        (printed({"type": "error", "text": "the pair is too alike"}), "the pair is too alike"),
+        (program("import sys; sys.exit(3)"), "the process that learns ended with 3"),
+        (program("import os; os.kill(os.getpid(), 9)"), "there was not enough memory"),
+        (program("print('{half a line')"), "the process that learns ended with 0"),
+        (program("print('not json')\nprint('{\"type\": 3')"), "ended with 0"),
+        (["/nowhere/python"], "cannot be started"),
+    ],
+)
+def test_a_failed_process_is_said_and_changes_nothing(taught: Taught, learn: list[str], why: str):
+    """Whatever becomes of the process: the reason is shown, all sweeps stay, and the next attempt
+    is possible."""
+    taught.sweeps("cork", 2)
+    taught.sweeps("pine", 2)
+    taught.learn = learn
+    if "nowhere" in learn[0]:
+        with pytest.raises(ConfigError, match=why):
+            taught.order("USE")
+    else:
+        taught.order("USE")
+        assert why in taught.until(lambda about: about["trouble"])["trouble"]
+    assert taught.session.materials() == {"cork": 2, "pine": 2}
+    assert len(list((taught.folder / "sweeps").glob("*.npy"))) == 4
+    taught.learn = printed(TAUGHT)
+    taught.until(lambda about: not about["using"])
+    taught.order("USE")
+    taught.until(lambda about: about["taught"])
+
+
+def test_an_assessment_that_cannot_start_is_said(taught: Taught):
+    """The turn of the loop raises nothing."""
+    taught.assess = ["/nowhere/python"]
+    taught.sweeps("cork", 2)
+    taught.sweeps("pine", 2)
+    assert "cannot be started" in taught.until(lambda about: about["trouble"])["trouble"]
+
+
+def test_a_process_that_hangs_is_killed():
+    """After its limit it ends with a reason, together with the processes that it started."""
+    code = (
+        "import subprocess, sys, time\n"
+        "child = subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(60)'])\n"
+        'print(\'{"type": "step", "child": %d}\' % child.pid, flush=True)\n'
+        "time.sleep(60)"
+    )
+    one = TeachingProcess(program(code), 3.0, SystemClock(), group=True)
+    news: list[dict[str, Any]] = []
+    while not one.ended:
+        news += one.news()
+        time.sleep(0.02)
+    assert news[-1]["text"] == "it was not done within 3 s; teach fewer sweeps"
+    status = Path(f"/proc/{news[0]['child']}/stat")
+    end = time.monotonic() + WAIT_S
+    while status.exists() and status.read_text().rpartition(")")[2].split()[0] != "Z":
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def test_use_needs_two_materials(taught: Taught):
+    """A single material has nothing to be confused with; the message names the remedy."""
+    taught.sweeps("cork", 5)
+    with pytest.raises(ApplianceError, match=r"1 materials have sweeps; .*: teach another"):
+        taught.order("USE")
+
+
+@pytest.mark.parametrize("label", ["", " ", "käse", "a,b", "x" * 25])
+def test_a_label_that_cannot_be_sent_is_refused(taught: Taught, label: str):
+    """Before any sweep of it is recorded."""
+    with pytest.raises(ApplianceError, match=r"needs the name of a material|cannot be used"):
+        taught.order("TEACH", label)
+    assert taught.session.materials() == {}
+
+
+def test_class_bits_that_are_too_few_are_said_before_recording(tmp_path: Path):
+    """Two bits name three materials: the fourth is refused by TEACH, before a sweep of it is made.
+    Recorded by a box with more bits, it is said at the next start, until one is forgotten."""
+    narrow = Taught(tmp_path, codes=4)
+    for material in ("cork", "pine", "felt"):
+        narrow.sweeps(material, 1)
+    assert narrow.session.about()["trouble"] == ""
+    with pytest.raises(ConfigError, match=r"4 labels and the code 0 do not fit output.class_bits"):
+        narrow.order("TEACH", "oak")
+    assert narrow.order("TEACH", "felt") == ["felt", 1]
+    assert narrow.session.materials() == {"cork": 1, "pine": 1, "felt": 1}
+    narrow.recording.close()
+    narrower = Taught(tmp_path, codes=2)
+    assert narrower.session.about()["trouble"].endswith("or none, or forget a material")
+    with pytest.raises(ConfigError, match="3 labels and the code 0 do not fit"):
+        narrower.order("USE")
+    narrower.order("FORGET", "cork")
+    narrower.order("FORGET", "pine")
+    assert narrower.session.about()["trouble"] == ""
+    narrower.recording.close()
+
+
+def test_a_forgotten_material_is_gone_and_its_sweeps_stay(taught: Taught):
+    """Also after a restart; recorded again, it counts from 1."""
+    taught.sweeps("cork", 2)
+    taught.sweeps("pine", 2)
+    assert taught.order("FORGET", "cork") == ["cork", 2]
+    assert taught.session.materials() == {"pine": 2}
+    assert len(list((taught.folder / "sweeps").glob("*.npy"))) == 4
+    assert TeachingState.load(taught.folder / FILE).forgotten == {"cork": 4}
+    taught.sweeps("cork", 1)
+    assert taught.session.materials() == {"pine": 2, "cork": 1}
+    with pytest.raises(ApplianceError, match="there is no material 'felt' to forget"):
+        taught.order("FORGET", "felt")
+
+
+def test_a_damaged_state_is_named(tmp_path: Path):
+    """The message says what removing the file means."""
+    (tmp_path / FILE).write_text('{"forgotten": [1]}')
+    with pytest.raises(FormatError, match=r"teaching.json cannot be read: .*; remove it"):
+        TeachingState.load(tmp_path / FILE)
+
+
+def test_a_discarded_sweep_is_not_taught(taught: Taught):
+    """It is removed and the rest is assessed again."""
+    taught.sweeps("cork", 3)
+    taught.order("DISCARD", "3")
+    assert taught.session.materials() == {"cork": 2}
+    with pytest.raises(ApplianceError, match="the last stored sweep is 2, not 3"):
+        taught.order("DISCARD", "3")
+
+
+def test_the_teacher_leads_from_material_to_material(taught: Taught):
+    """Each label until its sweeps are there, those of earlier sessions not counted."""
+    taught.sweeps("pine", 1)
+    teacher = Teacher(taught.session, ["cork", "pine"], 2)
+    teacher.turn(HEALTH)
+    assert taught.recording.about()["material"] == "cork"
+    taught.sweeps("cork", 2)
+    teacher.turn(HEALTH)
+    assert taught.recording.about()["material"] == "pine"
+    taught.sweeps("pine", 1)
+    teacher.turn(HEALTH)
+    assert not teacher.done
+    taught.sweeps("pine", 1)
+    teacher.turn(HEALTH)
+    assert teacher.done
+
+
+def test_a_box_without_the_extra_says_what_to_install(monkeypatch: pytest.MonkeyPatch):
+    """Before a person records anything."""
+    monkeypatch.setattr(process, "find_spec", lambda name: None if name == "scipy" else name)
+    with pytest.raises(ConfigError, match=r"teaching needs scipy, .*; make install installs it"):
+        process.check_installed()

@@ -1,0 +1,222 @@
+"""A model, an observer or a command that fails: each sweep is answered, and the program ends only
+where a new start may help."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+
+import numpy as np
+import pytest
+
+from palpate.bundle import bundle
+from palpate.client.answers import Answer
+from palpate.core import config
+from palpate.core.errors import LineError, ModelError
+from palpate.core.health import Health
+from palpate.core.observer import Observer
+from palpate.core.types import Status, Sweep, Verdict
+from palpate.inference import session
+from palpate.runtime import assembly
+from palpate.runtime.loop import FAILURES, SOUND
+from palpate.sim import devices, rig, script, skin
+from tests.factories.paths import NO_SITE
+from tests.factories.simulated_box import SECOND, SETTLE_S, Rigged
+
+BAD_ALLOC = RuntimeError("std::bad_alloc")
+
+
+def sweeping(n: int) -> devices.SimDevices:
+    """Simulated devices whose robot sweeps `n` times."""
+    return devices.build(skin.FORMAT, script.tubes(1, n), rig.VirtualClock(), "sim")
+
+
+def heard(box: Rigged) -> list[tuple[int, str]]:
+    """Number and status of each answer that the robot has read."""
+    box.listen(SETTLE_S)
+    return [(a.sweep, a.status) for a in map(Answer.read, box.heard) if a]
+
+
+class FailingModel:
+    """Stands before an answerer; fails on the sweeps with these numbers."""
+
+    def __init__(self, answerer: object, on: Callable[[int], bool], error: Exception) -> None:
+        self._answerer, self._on, self._error = answerer, on, error
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._answerer, name)
+
+    def __call__(self, sweep: Sweep) -> Verdict:
+        if sweep.status is Status.OK and self._on(sweep.id):
+            raise self._error
+        return self._answerer(sweep)
+
+
+def fail(box: Rigged, on: Callable[[int], bool], error: Exception = BAD_ALLOC) -> None:
+    """Make the model of a box fail on these sweeps."""
+    box.box._answerer = FailingModel(box.box._answerer, on, error)
+
+
+@pytest.mark.parametrize("error", [BAD_ALLOC, MemoryError(), ModelError("Gather: index 7")])
+def test_a_sweep_on_which_the_model_fails_is_answered(
+    rigged: Callable[..., Rigged], error: Exception
+):
+    """Its status is `failed`, its detail the reason, and the sweeps after it are answered."""
+    simulated = sweeping(3)
+    box = rigged(simulated)
+    fail(box, {2}.__contains__, error)
+    verdicts = box.until(lambda: simulated.finished(box.box.answered))
+    assert [v.status for v in verdicts].count(Status.FAILED) == 1
+    assert heard(box)[1] == (2, "failed")
+    assert verdicts[1].detail == (str(error) or "MemoryError")
+    assert verdicts[1].label == ""
+
+
+def test_repeated_failures_end_the_program_once_all_are_answered(rigged: Callable[..., Rigged]):
+    """After the third failed sweep the program ends with exit code 70, which the unit restarts."""
+    simulated = sweeping(5)
+    box = rigged(simulated)
+    fail(box, lambda number: True)
+    with pytest.raises(ModelError, match=r"3 sweeps could not be classified: std::bad_alloc") as e:
+        box.box.run(lambda: simulated.finished(box.box.answered))
+    assert e.value.exit_code == 70
+    assert heard(box) == [(1, "failed"), (2, "failed"), (3, "failed")]
+
+
+def test_failures_far_apart_do_not_end_it():
+    """A failure counts until SOUND sweeps were classified after it."""
+    failures = np.arange(1, 100) % (SOUND + 1) == 0
+    ended = run_of(failures)
+    assert ended is None
+    assert run_of(np.arange(1, 100) % SOUND == 0) == SOUND * FAILURES
+
+
+def run_of(failures: np.ndarray) -> int | None:
+    """The number of the sweep that ends a box whose model fails on these, None if none does."""
+    box = assembly.box(
+        config.load(None, site=NO_SITE), bundle.load(bundle.DEFAULT), sweeping(1), None, ExitStack()
+    )
+    verdict = Verdict(1, 0, Status.OK, "wood", 1, 1, np.ones(1), 1, 0, 0, "")
+
+    def answer(sweep: Sweep) -> Verdict:
+        if failures[sweep.id - 1]:
+            raise RuntimeError("no")
+        return verdict
+
+    answer.model = ""
+    box._answerer = answer
+    empty = np.empty(0)
+    for number in range(1, len(failures) + 1):
+        box._classified(Sweep(number, 0, 0, Status.OK, empty))
+        if box._failures >= FAILURES:
+            return number
+    return None
+
+
+def test_early_heads_that_fail_leave_the_whole_sweep(
+    rigged: Callable[..., Rigged], logged: list[str]
+):
+    """An error of the early heads is logged once, and the whole window is answered."""
+    simulated = sweeping(2)
+    box = rigged(simulated, sets=("classifier.early=true",))
+
+    class Failing:
+        steps = box.box._early.steps
+
+        def __call__(self, sweep: Sweep) -> Verdict:
+            raise BAD_ALLOC
+
+    box.box._early = Failing()
+    verdicts = box.until(lambda: simulated.finished(box.box.answered))
+    assert all(v.status is not Status.FAILED and v.share == 1 for v in verdicts)
+    assert sum("early answers failed" in line for line in logged) == 1
+
+
+class Breaking(Observer):
+    """An observer that raises in each of its methods."""
+
+    def __init__(self, error: Exception) -> None:
+        self._error = error
+
+    def turn(self, health: Health) -> None:
+        raise self._error
+
+    def answered(self, verdict: Verdict) -> None:
+        raise self._error
+
+    def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: object) -> None:
+        raise self._error
+
+
+def test_a_fault_in_an_observer_costs_nothing_else(
+    rigged: Callable[..., Rigged], logged: list[str]
+):
+    """It is logged, the sweeps are answered, and the other observers are called."""
+    simulated = sweeping(3)
+    box = rigged(simulated, observers=[Breaking(KeyError("none of these"))])
+    box.until(lambda: simulated.finished(box.box.answered))
+    assert [number for number, _ in heard(box)] == [1, 2, 3]
+    assert len(box.kept) == 3
+    assert any("KeyError: 'none of these'; the answers go on" in line for line in logged)
+
+
+def test_a_failed_output_ends_the_program_and_the_open_sweep_is_answered(
+    rigged: Callable[..., Rigged],
+):
+    """An error of the GPIO lines is a fault that the robot must see: the program ends with 69."""
+    simulated = sweeping(3)
+    box = rigged(simulated)
+    box.until(lambda: box.box.health.sweeping)
+
+    def show(**levels: bool) -> None:
+        raise LineError("chip is gone")
+
+    box.box._panel.show = show
+    with pytest.raises(LineError):
+        box.box.run(lambda: False)
+    assert heard(box) == [(1, "aborted")]
+
+
+@pytest.mark.parametrize("error", [RuntimeError("no"), SystemExit(3), KeyboardInterrupt()])
+def test_any_end_answers_the_open_sweep(rigged: Callable[..., Rigged], error: BaseException):
+    """Whatever ends the loop, the open sweep is answered `aborted`."""
+    simulated = sweeping(1)
+    box = rigged(simulated)
+    end_ns = simulated.clock.now_ns() + 2 * SECOND
+
+    def stopped() -> bool:
+        if simulated.clock.now_ns() > end_ns:
+            raise error
+        return False
+
+    with pytest.raises(type(error)):
+        box.box.run(stopped)
+    assert heard(box) == [(1, "aborted")]
+
+
+def test_a_command_that_fails_is_answered(
+    rigged: Callable[..., Rigged], monkeypatch: pytest.MonkeyPatch
+):
+    """An unexpected error of a command becomes its answer."""
+    box = rigged()
+    box.seconds(1)
+    monkeypatch.setattr(session, "run", lambda *given: (_ for _ in ()).throw(BAD_ALLOC))
+    assert ",TEST,error,std::bad_alloc" in box.ask("$PPLP,TEST")
+    assert ",ID,ok," in box.ask("$PPLP,ID")
+
+
+def test_memory_that_is_short_is_no_fault_of_the_bundle(monkeypatch: pytest.MonkeyPatch):
+    """std::bad_alloc while a model is opened or run has an exit code that is restarted; a model
+    that onnxruntime refuses has not."""
+
+    def refuse(why: str) -> Callable[..., None]:
+        def opened(*given: object, **more: object) -> None:
+            raise RuntimeError(why)
+
+        return opened
+
+    for why, code in (("std::bad_alloc", 70), ("Failed to allocate memory", 70), ("no op X", 78)):
+        monkeypatch.setattr(session.ort, "InferenceSession", refuse(why))
+        with pytest.raises(Exception, match=why) as e:
+            session.session(b"")
+        assert e.value.exit_code == code

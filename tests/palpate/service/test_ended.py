@@ -1,0 +1,107 @@
+"""The reason of a failed end: noted for `palpate status`, counted for the pause, removed after an
+end in order."""
+
+from __future__ import annotations
+
+import json
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from palpate.cli import lower_outputs
+from palpate.core.errors import AddressError, ApplianceError, BundleError, LineError
+from palpate.service import ended, status
+from palpate.service.ended import PAUSES_S, Ended
+from palpate.sim import gpio
+from palpate.sim.rig import VirtualClock
+
+SECOND = 1_000_000_000
+
+
+def failed(folder: Path, clock: VirtualClock, error: Exception) -> Ended:
+    """The note of one more end by this error."""
+    with suppress(type(error)), ended.noted(folder, clock):
+        raise error
+    found = ended.read(folder)
+    assert found
+    return found
+
+
+def test_status_says_which_end_a_person_must_mend(tmp_path: Path):
+    """Exit code 78 stays stopped until somebody acts; everything else is started again."""
+    clock = VirtualClock()
+    failed(tmp_path, clock, BundleError("golden sweeps differ"))
+    (line,) = status.lines(status.read(tmp_path / "status.json", 0), 0)
+    assert "exit code 78 and stays stopped: golden sweeps differ; correct that" in line
+    failed(tmp_path, clock, LineError("no chip"))
+    (line,) = status.lines(status.read(tmp_path / "status.json", 0), 0)
+    assert "exit code 69" in line
+    assert "started again by itself: no chip" in line
+    failed(tmp_path, clock, KeyError("a fault of the program"))
+    assert "KeyError" in status.read(tmp_path / "status.json", 0)["why"]
+
+
+def test_the_pause_grows_and_begins_anew(tmp_path: Path):
+    """Failures in a row lengthen it up to a limit; a run of a minute makes it short again."""
+    clock = VirtualClock()
+    pauses = []
+    for _ in range(len(PAUSES_S) + 2):
+        pauses.append(failed(tmp_path, clock, LineError("no chip")).pause_s)
+        clock.sleep_until(clock.now_ns() + 5 * SECOND)
+    assert pauses == [*PAUSES_S, PAUSES_S[-1], PAUSES_S[-1]]
+    clock.sleep_until(clock.now_ns() + 100 * SECOND)
+    assert failed(tmp_path, clock, LineError("no chip")).failures == 1
+
+
+def test_an_end_in_order_leaves_nothing(tmp_path: Path):
+    """The next start is not delayed, and status says nothing of an older end."""
+    failed(tmp_path, VirtualClock(), LineError("no chip"))
+    with ended.noted(tmp_path, VirtualClock()):
+        pass
+    assert ended.read(tmp_path) is None
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"[]", b'{"why": 3}', b"\xff" * 99])
+def test_a_damaged_note_is_none(tmp_path: Path, content: bytes):
+    """Whatever is in the file, it is ignored and written anew."""
+    (tmp_path / ended.FILE).write_bytes(content)
+    assert ended.read(tmp_path) is None
+    assert failed(tmp_path, VirtualClock(), LineError("no chip")).failures == 1
+
+
+def test_a_note_that_cannot_be_written_changes_nothing(tmp_path: Path):
+    """The error itself is raised, without the folder as well."""
+    for folder in (None, tmp_path / "not there"):
+        with pytest.raises(LineError, match="no chip"), ended.noted(folder, VirtualClock()):
+            raise LineError("no chip")
+
+
+@pytest.mark.parametrize(
+    ("error", "exit_status", "waits"),
+    [
+        (LineError("no chip"), "69", True),
+        (BundleError("damaged"), "78", False),
+        (LineError("no chip"), "KILL", False),
+        (AddressError("in use"), "69", True),
+    ],
+)
+def test_the_start_after_a_failure_waits(
+    tmp_path: Path, error: ApplianceError, exit_status: str, waits: bool
+):
+    """ExecStopPost waits after failures that are started again, and not after others."""
+    clock = VirtualClock()
+    for _ in range(3):
+        failed(tmp_path, clock, error)
+    begun = clock.now_ns()
+    lines = gpio.SimGpio(clock, {"/dev/gpiochip0": ["A"]})
+    words = ["--set", f"store.runtime={tmp_path}"]
+    assert lower_outputs.main(words, lines, clock, {"EXIT_STATUS": exit_status}) == 0
+    assert (clock.now_ns() > begun) == waits
+
+
+def test_the_note_is_readable_json(tmp_path: Path):
+    """Long reasons are cut, so that the file stays small."""
+    failed(tmp_path, VirtualClock(), LineError("x" * 100_000))
+    assert len(json.loads((tmp_path / ended.FILE).read_text())["why"]) == 1000

@@ -1,0 +1,452 @@
+"""The service as a person sees it: the status file and its reader, and the log lines of
+verdicts."""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from palpate.core.errors import ApplianceError, FormatError
+from palpate.core.health import Health
+from palpate.core.sentences import MAX_LINE, sentence
+from palpate.core.status import REASONS
+from palpate.core.types import Status, Verdict
+from palpate.service import status
+from palpate.service.status import StatusFile
+from palpate.service.systemd import VerdictLog
+from palpate.sim import devices, rig
+from tests.factories.simulated_box import SECOND, Rigged, idle_devices
+
+HEALTH = Health(
+    time_ns=0,
+    skin="streaming",
+    trouble="",
+    streams=True,
+    sweeping=False,
+    answered=7,
+    frames=5_000_000,
+    lost_frames=3,
+    garbage_bytes=0,
+    enumerations=1,
+    dropped=0,
+    bundle="9f3c2a1b",
+    source="usb",
+    stale_frames=0,
+    overflows=0,
+    fifo_overflows=0,
+    glitches=0,
+    lost_edges=0,
+    storms=0,
+)
+AWAY = replace(HEALTH, skin="absent", trouble="no skin on USB; check cable", streams=False)
+OK = Verdict(
+    sweep=7,
+    time_ns=0,
+    status=Status.OK,
+    label="plastic rough",
+    probability=0.987,
+    margin=0.9,
+    scores=np.ones(2) / 2,
+    fused=1,
+    lost=0,
+    latency_ns=1_200_000,
+    bundle="9f3c2a1b",
+)
+SHORT = replace(
+    OK, sweep=8, status=Status.SHORT, label="", probability=0.0, fused=0, scores=np.empty(0)
+)
+
+
+class ClockedStatus:
+    """A status file on a virtual clock."""
+
+    def __init__(self, folder: Path, **more: object) -> None:
+        self.clock, self.path = rig.VirtualClock(), folder / "status.json"
+        self.file = StatusFile(self.path, self.clock, **more)
+
+    def turns(self, seconds: float, health: Health = HEALTH, step_s: float = 0.01) -> int:
+        """Take turns; how often the file was written anew."""
+        inodes, end_ns = [], self.clock.now_ns() + round(seconds * SECOND)
+        while self.clock.now_ns() < end_ns:
+            self.file.turn(health)
+            inodes.append(self.path.stat().st_mtime_ns if self.path.exists() else 0)
+            self.clock.sleep_until(self.clock.now_ns() + round(step_s * SECOND))
+        return len(set(inodes))
+
+    def read(self) -> dict:
+        """The result for a reader now."""
+        return status.read(self.path, self.clock.now_ns())
+
+    def text(self) -> str:
+        """The same in words."""
+        return "\n".join(status.lines(self.read(), self.clock.now_ns()))
+
+
+@pytest.fixture
+def status_file(tmp_path: Path) -> ClockedStatus:
+    """A status file that was not written yet."""
+    return ClockedStatus(tmp_path)
+
+
+def test_it_is_written_once_a_second_and_soon_after_news(status_file: ClockedStatus):
+    """Four times in four seconds of turns; a verdict, and a lost skin, are there a tenth of a
+    second later."""
+    assert status_file.turns(4) in (4, 5)
+    status_file.file.turn(HEALTH)
+    status_file.file.answered(OK)
+    status_file.turns(0.12)
+    assert [v["sweep"] for v in status_file.read()["verdicts"]] == [7]
+    status_file.turns(0.12, AWAY)
+    assert status_file.read()["skin"] == "absent"
+
+
+def test_a_bridged_taxel_has_a_line(status_file: ClockedStatus):
+    """With its remedy; a sound skin has none."""
+    status_file.turns(2)
+    assert "degraded" not in status_file.text()
+    status_file.turns(2, replace(HEALTH, degraded="silent taxel 2.3"))
+    assert "degraded silent taxel 2.3: bridged by its neighbours; check the skin" in (
+        status_file.text()
+    )
+
+
+def test_the_answers_of_fingers_stand_in_the_line_of_their_sweep(status_file: ClockedStatus):
+    """Label and probability of each, or its status; and a finger that is away, with the remedy,
+    while the box is in service."""
+    left, right = replace(OK, finger="left"), replace(SHORT, finger="right", status="sensor-lost")
+    hand = replace(OK, detail="right sensor-lost", fingers=(left, right))
+    status_file.file.answered(hand)
+    away = replace(HEALTH, degraded="right absent", trouble="right: no skin on USB")
+    status_file.turns(2, away)
+    text = status_file.text()
+    assert "right sensor-lost; left plastic rough 98.7 %, right sensor-lost" in text
+    assert "degraded right absent: the other fingers answer; check its cable" in text
+    assert "streaming: right: no skin on USB" in text
+    assert status.exit_code(status_file.read()) == 0
+
+
+def test_a_storm_of_verdicts_writes_ten_times_a_second_at_most(status_file: ClockedStatus):
+    """Verdicts with every turn: one write in a tenth of a second, and the last twenty are kept."""
+    written = 0
+    for i in range(100):
+        status_file.file.answered(replace(SHORT, sweep=i))
+        before = status_file.path.stat().st_ino if status_file.path.exists() else None
+        status_file.file.turn(HEALTH)
+        written += status_file.path.stat().st_ino != before
+        status_file.clock.sleep_until(status_file.clock.now_ns() + SECOND // 100)
+    assert 9 <= written <= 11
+    assert len(status_file.read()["verdicts"]) == 20
+
+
+def test_writing_it_interns_no_string(status_file: ClockedStatus, monkeypatch: pytest.MonkeyPatch):
+    """pathlib interns the parts of a path: one a second would fill Python's table of interned
+    strings (docs/faults.md)."""
+    status_file.turns(2)
+    interned = []
+    monkeypatch.setattr(sys, "intern", lambda text: interned.append(text) or text)
+    if not Path("a").name or not interned:
+        pytest.skip("pathlib of this Python interns nothing")
+    interned.clear()
+    assert status_file.turns(3) >= 3
+    assert not interned
+
+
+def test_every_user_may_read_it_whole(status_file: ClockedStatus):
+    """Mode 644 under the service's umask; the file is replaced, so a reader that had it open still
+    has it whole."""
+    before = os.umask(0o027)
+    try:
+        status_file.turns(0.01)
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE(status_file.path.stat().st_mode) == 0o644
+    with status_file.path.open() as f:
+        status_file.turns(2)
+        assert json.load(f)["answered"] == 7
+    assert [p.name for p in status_file.path.parent.iterdir()] == ["status.json"]
+
+
+def test_in_words_it_says_how_it_is_and_what_to_do(tmp_path: Path):
+    """Since when, skin, bundle, further facts, the last verdicts newest first; advice where
+    something is wrong."""
+    status_file = ClockedStatus(
+        tmp_path, more=lambda: {"trial": "start 1 of 3, 7 of 20 sweeps", "shadow": "", "steps": [1]}
+    )
+    status_file.file.answered(replace(OK, sweep=6, detail="moved 2.1 mm too far towards row 4"))
+    status_file.file.answered(OK)
+    status_file.file.answered(SHORT)
+    status_file.turns(135)
+    text = status_file.text().splitlines()
+    assert (
+        text[0]
+        == f"running for 2 min 15 s (process {os.getpid()}, palpate {status.__version__}, source "
+        "usb)"
+    )
+    assert text[1:5] == [
+        "skin     streaming (5,000,000 frames, 3 lost)",
+        "bundle   9f3c2a1b",
+        "sweeps   7 answered",
+        "trial    start 1 of 3, 7 of 20 sweeps",
+    ]
+    assert [line.split()[1] for line in text[5:]] == ["8", "7", "6"]
+    assert "short        the stop edge came before a window" in text[5]
+    assert text[6].split()[-6:] == ["plastic", "rough", "98.7", "%", "1.2", "ms"]
+    assert text[7].endswith("1.2 ms; moved 2.1 mm too far towards row 4")
+    assert status.exit_code(status_file.read()) == 0
+    status_file.turns(1.5, replace(AWAY, garbage_bytes=9, enumerations=2, dropped=4, bundle=""))
+    text = status_file.text()
+    assert "bundle   none" in text  # while sweeps are recorded
+    assert (
+        "absent: no skin on USB; check cable (5,000,000 frames, 3 lost, 9 bytes in no packet, "
+        "plugged in 2 t" in text
+    )
+    assert "serial   4 sentences dropped, since nobody read them" in text
+    assert status.exit_code(status_file.read()) == 69
+
+
+def test_text_of_a_device_does_not_steer_a_terminal(status_file: ClockedStatus):
+    """Escape characters from outside are shown as question marks."""
+    status_file.turns(0.01, replace(AWAY, trouble="\x1b[2Jgone\n"))
+    assert "?[2Jgone?" in status_file.text()
+
+
+def test_a_program_that_has_ended_is_not_running(status_file: ClockedStatus):
+    """Stopped in order: the file is gone. Killed, hung, or from before the last boot: `why` has the
+    reason. All exit with 1."""
+    assert status.exit_code(status_file.read()) == 1
+    assert "does not run" in status_file.text()
+    status_file.turns(0.01)
+    assert status_file.read()["running"]
+    written = json.loads(status_file.path.read_text())
+    status_file.clock.sleep_until(status_file.clock.now_ns() + 11 * SECOND)
+    assert "has written nothing for 11 s, so it hangs" in status_file.text()
+    gone = subprocess.run(
+        [sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True
+    )
+    for wrong in ({"pid": int(gone.stdout)}, {"time_ns": 10**18}):
+        status_file.path.write_text(
+            json.dumps(written | {"time_ns": status_file.clock.now_ns()} | wrong)
+        )
+        assert "has ended without closing down" in status_file.text()
+        assert status.exit_code(status_file.read()) == 1
+    status_file.file.stopping()
+    assert not status_file.path.exists()
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", "{}", '{"schema": 2}', "[" * 100_000, '{"schema": 1, "pid": "x"}']
+)
+def test_a_file_of_another_form_is_named(status_file: ClockedStatus, text: str):
+    """A status of another version is an error, not a guess."""
+    status_file.path.write_text(text)
+    with pytest.raises(FormatError, match="not a status of this version"):
+        status_file.read()
+
+
+def test_a_file_that_may_not_be_read_is_named(status_file: ClockedStatus):
+    """A folder at its path: the error names the path and the remedy."""
+    status_file.path.mkdir()
+    with pytest.raises(ApplianceError, match="cannot be read"):
+        status_file.read()
+
+
+def test_trouble_with_the_file_is_logged_once(tmp_path: Path, logged: list[str]):
+    """Without its folder the box goes on; one line, and another only after it had worked in
+    between."""
+    status_file = ClockedStatus(tmp_path / "run")
+    status_file.turns(5)
+    assert len(logged) == 1
+    assert "classifying goes on" in logged[0]
+    status_file.path.parent.mkdir()
+    status_file.turns(2)
+    assert status_file.read()["running"]
+    status_file.path.unlink()
+    status_file.path.parent.rmdir()
+    status_file.turns(2)
+    status_file.file.stopping()
+    assert len(logged) == 2
+
+
+def test_a_running_box_reports_its_verdicts(rigged, tmp_path: Path, logged: list[str]):
+    """On simulated devices: skin, bundle and verdicts of the box, and the same verdicts in the
+    log."""
+    clock = rig.VirtualClock()
+    file = StatusFile(tmp_path / "status.json", clock)
+    box: Rigged = rigged(observers=[file, VerdictLog()])
+    verdicts = box.until(lambda: box.box.answered >= 2)
+    clock.sleep_until(SECOND * 60)
+    box.seconds(0.2)
+    read = status.read(tmp_path / "status.json", clock.now_ns())
+    assert (read["skin"], read["answered"], read["bundle"]) == ("streaming", 2, verdicts[0].bundle)
+    assert [(v["sweep"], v["label"]) for v in read["verdicts"]] == [
+        (v.sweep, v.label) for v in verdicts
+    ]
+    lines = [line.removeprefix("<4>") for line in logged if line.startswith(("sweep", "<4>sweep"))]
+    assert [line.split(",")[0] for line in lines] == [
+        f"sweep {v.sweep}: {v.label}" for v in verdicts
+    ]
+
+
+@pytest.mark.parametrize(
+    ("verdict", "line"),
+    [
+        (OK, "sweep 7: plastic rough, 98.7 % (1.2 ms)"),
+        (replace(OK, fused=3), "sweep 7: plastic rough, 98.7 % after 3 sweeps (1.2 ms)"),
+        (
+            replace(OK, share=0.4),
+            "sweep 7: plastic rough, 98.7 %, early at 40 % of the window (1.2 ms)",
+        ),
+        (
+            replace(OK, status=Status.UNSURE),
+            "sweep 7: unsure, perhaps plastic rough, 98.7 % (1.2 ms)",
+        ),
+        (
+            replace(OK, displacement="moved 2 mm", detail="moved 2 mm"),
+            "<4>sweep 7: plastic rough, 98.7 % (1.2 ms); moved 2 mm",
+        ),
+        (
+            SHORT,
+            "<4>sweep 8: no answer, short: the stop edge came before a window's length had passed",
+        ),
+        (
+            replace(SHORT, status=Status.STUCK_TAXEL, detail="taxel 2.3"),
+            "<4>sweep 8: no answer, stuck-taxel: a loaded taxel shows a constant count; check the "
+            "skin; "
+            "taxel 2.3",
+        ),
+        (
+            replace(SHORT, status=Status.ABORTED),
+            "sweep 8: no answer, aborted: by command, or because the box was stopping",
+        ),
+    ],
+)
+def test_the_log_has_one_line_a_verdict(verdict: Verdict, line: str, logged: list[str]):
+    """In words; a verdict that needs attention is a warning."""
+    VerdictLog().answered(verdict)
+    assert logged == [line]
+
+
+def test_every_status_without_a_label_has_its_reason():
+    """One list: a new status needs its advice."""
+    assert set(REASONS) == {s for s in Status if not s.classified}
+
+
+def once(change: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
+    """A fault of the bus that changes one transfer."""
+    left = [change]
+    return lambda data: left.pop()(data) if left else data
+
+
+def burst(line: str, edges: int, apart_s: float) -> Callable[[Rigged], None]:
+    """A fault of a trigger line: so many edges, the last one down."""
+
+    def drive(box: Rigged) -> None:
+        for i in range(edges):
+            box.edge(line, 0.1 + i * apart_s, i % 2 == 0)
+
+    return drive
+
+
+@pytest.mark.parametrize(
+    ("name", "field", "fault", "text"),
+    [
+        (
+            "stale_frames",
+            12,
+            lambda box: setattr(box.simulated.backend, "mangle", once(lambda data: data * 2)),
+            "4 repeated or late",
+        ),
+        (
+            "overflows",
+            13,
+            lambda box: setattr(
+                box.simulated.backend, "mangle", once(lambda data: data + bytes(5000))
+            ),
+            "1 transfers too large",
+        ),
+        (
+            "fifo_overflows",
+            14,
+            lambda box: box.simulated.clock.sleep_until(box.simulated.clock.now_ns() + 2 * SECOND),
+            "1 times the readout board's FIFO was full",
+        ),
+        (
+            "glitches",
+            15,
+            burst(devices.START, 2, 1e-4),
+            "1 glitches; check the GPIO lines of the trigger",
+        ),
+        (
+            "lost_edges",
+            16,
+            burst(devices.STOP, 3000, 1e-6),
+            "edges lost; check the GPIO lines of the trigger",
+        ),
+        (
+            "storms",
+            17,
+            burst(devices.STOP, 60, 1e-4),
+            "1 storms of edges; check the GPIO lines of the trigger",
+        ),
+    ],
+)
+def test_what_is_counted_is_shown(
+    rigged: Callable[..., Rigged],
+    tmp_path: Path,
+    name: str,
+    field: int,
+    fault: Callable[[Rigged], None],
+    text: str,
+):
+    """Each fault is in the STA sentence, in its answer to STATE, in the file and in words, and was
+    not before it."""
+    simulated = idle_devices(60)
+    file = StatusFile(tmp_path / "status.json", simulated.clock)
+    box = rigged(
+        simulated, ("trigger.storm_edges=50",) if name == "storms" else (), observers=[file]
+    )
+    box.seconds(1.5)
+
+    def shown() -> tuple[int, int, int, bool]:
+        report = status.read(tmp_path / "status.json", simulated.clock.now_ns())
+        answer = box.ask("$PPLP,STATE").split("*")[0].split(",")[4:]
+        sentence = next(h for h in reversed(box.heard) if ",STA," in h).split("*")[0].split(",")[2:]
+        in_words = text in "\n".join(status.lines(report, simulated.clock.now_ns()))
+        return int(sentence[field - 1]), int(answer[field - 1]), report[name], in_words
+
+    assert shown() == (0, 0, 0, False)
+    fault(box)
+    box.seconds(2.5)
+    sent, answered, written, in_words = shown()
+    assert sent == answered == written == getattr(box.box.health, name) > 0
+    assert in_words
+
+
+def test_numbers_of_a_state_are_left_out_rather_than_cut():
+    """After years of faults the line is full: the counts in it are whole, and it is not longer than
+    the limit."""
+    states = [
+        "31536000.125",
+        "streaming",
+        1,
+        10_000_000,
+        23_652_000_000,
+        99_999_999,
+        99_999_999,
+        99_999,
+        9_999_999,
+    ]
+    for kind in (("STA",), ("ANS", "STATE", "ok")):
+        line = sentence(*kind, *states, "9f3c2a1b", "usb", *[987_654_321] * 6).decode()
+        assert len(line) <= MAX_LINE
+        assert set(line.split("*")[0].split(",")[len(kind) + 12 :]) <= {"987654321"}
+        assert ",9f3c2a1b,usb" in line

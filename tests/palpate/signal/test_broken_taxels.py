@@ -1,0 +1,278 @@
+"""Broken taxels are found by what their neighbours do, named, and bridged."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from palpate.core.errors import BundleError
+from palpate.core.types import SweepFormat
+from palpate.signal.broken_taxels import (
+    LEAST_FRAMES,
+    Bridging,
+    BrokenTaxels,
+    Comparison,
+    bridged,
+    find,
+    places,
+)
+from palpate.signal.taxel_statistics import TRIPLES, TaxelStatistics
+from palpate.signal.window_check import WindowLimits
+
+ROWS, COLS, FRAMES = 6, 5, 600
+LIMITS = WindowLimits(contact=10, full_scale=255)
+RULE = Bridging(taxels=3, row=True, column=True, noise=4.0, quietest=1.0, still=False)
+
+
+def slide(axes: int = 1, seed: int = 0) -> np.ndarray:
+    """Raw counts uint8 [T, 6, 5] or [T, 6, 5, A]: a contact whose load and noise fall off by half
+    from its middle to its edge."""
+    rng = np.random.default_rng(seed)
+    r, c = np.indices((ROWS, COLS))
+    load = 1 - 0.5 * np.hypot(r - 2.5, c - 2) / 4
+    noise = rng.standard_normal((FRAMES, ROWS, COLS, axes)) * 3
+    counts = load[..., None] * (100 + noise)
+    return np.rint(counts).astype(np.uint8).reshape(FRAMES, *(ROWS, COLS, axes)[: 2 + (axes > 1)])
+
+
+def found(taxels: np.ndarray, rule: Bridging = RULE, limits: WindowLimits = LIMITS) -> str:
+    """The broken taxels of a window in words; "" for none."""
+    measured = TaxelStatistics.of(taxels)
+    compared = Comparison.of(measured, (ROWS, COLS))
+    broken = find(measured, compared, np.zeros(taxels.shape[1:]), limits, rule)
+    return broken.text if broken else ""
+
+
+def test_a_sound_skin_has_no_broken_taxel():
+    """Of one axis and of three."""
+    assert found(slide()) == ""
+    assert found(slide(axes=3)) == ""
+
+
+@pytest.mark.parametrize("count", [0, 90, 255])
+def test_a_constant_taxel_is_silent(count: int):
+    """Dead, stuck within the range, or at full scale while its neighbours are below."""
+    taxels = slide()
+    taxels[:, 2, 3] = count
+    assert found(taxels) == "silent taxel 3.4"
+
+
+@pytest.mark.parametrize(
+    ("place", "named"),
+    [
+        (np.s_[:, 2], "silent row 3"),
+        (np.s_[:, 0], "silent row 1"),
+        (np.s_[:, :, 4], "silent column 5"),
+        (np.s_[:, 2:4, 1:3], "silent taxel 3.2 3.3 4.2 4.3"),
+        (np.s_[:, 0, 0], "silent taxel 1.1"),
+    ],
+)
+def test_broken_taxels_side_by_side(place: Any, named: str):
+    """A broken wire of a matrix silences a row or a column, also at the edge."""
+    taxels = slide()
+    taxels[place] = 0
+    assert found(taxels) == named
+
+
+def test_a_noisy_taxel_is_one_that_is_noisier_than_its_neighbours():
+    """Three of them, two side by side; and a skin that is noisy all over has none."""
+    rng = np.random.default_rng(1)
+    taxels, more = slide(), np.zeros((FRAMES, ROWS, COLS))
+    more[:, [1, 1, 4], [1, 2, 4]] = 30 * rng.standard_normal((FRAMES, 3))
+    assert found(np.clip(taxels + more, 0, 255).astype(np.uint8)) == "noisy taxel 2.2 2.3 5.5"
+    everywhere = 20 * rng.standard_normal(taxels.shape)
+    assert found(np.clip(taxels + everywhere, 0, 255).astype(np.uint8)) == ""
+
+
+def test_noise_at_rest_is_compared_with_the_quietest_training_sweep():
+    """Beside neighbours that are nearly silent, little noise does not make a taxel noisy."""
+    rng = np.random.default_rng(1)
+    taxels = 100 + 0.01 * rng.standard_normal((FRAMES, ROWS, COLS)).astype(np.float32)
+    taxels[:, 1, 1] += rng.standard_normal(FRAMES).astype(np.float32)
+    assert found(taxels) == ""
+    taxels[:, 1, 1] *= 10
+    assert found(taxels) == "noisy taxel 2.2"
+
+
+def test_few_frames_do_not_show_noise():
+    """The same taxel is noisy in one frame more."""
+    taxels = slide()
+    taxels[::2, 1, 1] = 200
+    assert found(taxels[:LEAST_FRAMES]) == "noisy taxel 2.2"
+    assert found(taxels[: LEAST_FRAMES - 1]) == ""
+
+
+def test_a_still_skin_has_no_silent_taxel():
+    """At rest and under a finger that does not slide, every taxel may be constant."""
+    assert found(np.full((FRAMES, ROWS, COLS), 90, np.uint8)) == ""
+    nearly = np.full((FRAMES, ROWS, COLS), 90, np.uint8)
+    nearly[::300, 0, 0] += 1  # one that changes now and then shows no slide
+    assert found(nearly) == ""
+
+
+def test_saturated_taxels_beside_each_other_are_not_silent():
+    """Both are at full scale, so the load is too high."""
+    taxels = slide()
+    taxels[:, 2, 2:4] = 255
+    assert found(taxels) == ""
+
+
+def test_a_skin_whose_sound_taxels_may_be_constant():
+    """Then a constant taxel is silent if it is loaded, or if all direct neighbours are; one at the
+    edge of the contact may be sound."""
+    rule, taxels = replace(RULE, still=True), slide()
+    taxels[:, 0] = 0  # beside the contact
+    assert found(taxels, rule) == ""
+    taxels[:, 3, 2] = 0
+    taxels[:, 4, 4] = 60
+    assert found(taxels, rule) == "silent taxel 4.3 5.5"
+    unlimited = replace(LIMITS, contact=None)  # every taxel counts as loaded
+    assert (
+        found(taxels, rule, unlimited)
+        == found(taxels)
+        == ("silent taxel 1.1 1.2 1.3 1.4 1.5 4.3 5.5")
+    )
+
+
+def test_one_axis_makes_the_taxel_broken():
+    """A constant shear axis is enough."""
+    taxels = slide(axes=3)
+    taxels[:, 1, 1, 0] = 7
+    assert found(taxels) == "silent taxel 2.2"
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_taxel_that_gives_no_number_is_silent(value: float):
+    """One frame is enough, and its neighbours are judged without it."""
+    taxels = slide().astype(np.float32)
+    taxels[17, 1, 1] = value
+    assert found(taxels) == "silent taxel 2.2"
+
+
+def test_noise_is_measured_at_triples_of_frames():
+    """White noise of deviation 1 has a mean second difference of sqrt(6 * 2 / pi); a ramp has
+    none; two frames show none."""
+    rng = np.random.default_rng(0)
+    white = rng.standard_normal((30 * TRIPLES, 1, 1)).astype(np.float32)
+    assert TaxelStatistics.of(white).noise()[0] == pytest.approx(np.sqrt(12 / np.pi), rel=0.2)
+    ramp = np.arange(300, dtype=np.int16).reshape(-1, 1, 1)
+    assert TaxelStatistics.of(ramp).noise().tolist() == [0]
+    assert TaxelStatistics.of(ramp[:2]).noise().tolist() == [0]
+
+
+def test_a_broken_taxel_gets_the_mean_of_its_direct_neighbours():
+    """In the middle of four, and in a corner of two; the given counts stay."""
+    taxels = np.arange(9, dtype=np.uint8).reshape(1, 3, 3).repeat(4, axis=0)
+    middle = np.zeros((3, 3), bool)
+    middle[1, 1] = True
+    broken = taxels.copy()
+    broken[:, 1, 1] = 200
+    assert (bridged(broken, middle, np.zeros((3, 3))) == taxels).all()
+    assert (broken[:, 1, 1] == 200).all()
+    corner = np.zeros((3, 3), bool)
+    corner[0, 0] = True
+    assert (bridged(taxels, corner, np.zeros((3, 3)))[:, 0, 0] == 2).all()
+
+
+def test_broken_taxels_beside_each_other_are_interpolated():
+    """A broken row lies evenly between the rows beside it; two rows at a third and two thirds."""
+    level = np.array([10, 20, 30, 40], float)[:, None] * np.ones((4, 3))
+    taxels = np.tile(level, (2, 1, 1)).astype(np.int16)
+    mask = np.zeros((4, 3), bool)
+    mask[1:3] = True
+    broken = taxels.copy()
+    broken[:, 1:3] = -5
+    assert (bridged(broken, mask, np.zeros((4, 3))) == taxels).all()
+
+
+def test_the_level_of_an_unloaded_taxel_is_kept():
+    """The load is bridged, on each axis; the unloaded levels of the taxels differ."""
+    unloaded = np.arange(4 * 3 * 2, dtype=float).reshape(4, 3, 2) * 10
+    taxels = (unloaded + 7 + np.arange(5).reshape(5, 1, 1, 1)).astype(np.float32)
+    mask = np.zeros((4, 3), bool)
+    mask[[0, 2], [1, 2]] = True
+    broken = taxels.copy()
+    broken[:, mask] = np.nan
+    assert bridged(broken, mask, unloaded) == pytest.approx(taxels, rel=1e-6)
+
+
+def test_bridged_counts_stay_in_the_range_of_their_type():
+    """A sum above 255 becomes 255."""
+    taxels = np.full((3, 1, 3), 250, np.uint8)
+    mask, unloaded = np.array([[True, False, False]]), np.array([[40.0, 0, 0]])
+    assert (bridged(taxels, mask, unloaded)[:, 0, 0] == 255).all()
+
+
+@pytest.mark.parametrize(
+    ("place", "allowed"),
+    [
+        (np.s_[0, :3], True),
+        (np.s_[2], True),
+        (np.s_[:, 4], True),
+        (np.s_[2:4], False),
+        (np.s_[:2, :2], False),
+    ],
+)
+def test_the_number_that_may_be_bridged(place: Any, allowed: bool):
+    """Up to three anywhere, or any number in one row or one column."""
+    mask = np.zeros((ROWS, COLS), bool)
+    mask[place] = True
+    assert RULE.allows(mask) == allowed
+    few = replace(RULE, taxels=2, row=False, column=False)
+    assert not few.allows(mask)
+
+
+def test_the_only_row_of_a_skin_is_not_a_row_that_may_be_bridged():
+    """Nothing would be left to bridge it with."""
+    assert not RULE.allows(np.ones((1, COLS), bool))
+    assert not RULE.allows(np.ones((ROWS, 1), bool))
+
+
+@pytest.mark.parametrize(
+    ("rule", "text"),
+    [
+        (RULE, "up to 3 broken taxels or one row or one column"),
+        (replace(RULE, column=False), "up to 3 broken taxels or one row"),
+        (replace(RULE, taxels=0, row=False, column=False), "no broken taxel"),
+    ],
+)
+def test_the_rule_in_words(rule: Bridging, text: str):
+    """As `check` and `export` print it."""
+    assert rule.text == text
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"taxels": -1}, "taxels -1"),
+        ({"taxels": True}, "taxels True"),
+        ({"noise": 0.0}, "noise 0.0"),
+        ({"quietest": float("inf")}, "quietest inf"),
+    ],
+)
+def test_a_rule_out_of_range_is_refused(change: dict[str, Any], why: str):
+    """The message names the field and its value."""
+    with pytest.raises(BundleError, match=f"bridging.{why} must be"):
+        replace(RULE, **change)
+
+
+def test_broken_taxels_in_words_and_in_a_file():
+    """Both kinds; a taxel that is silent is not called noisy, too. Lists of another shape are
+    refused."""
+    kinds = np.zeros((2, ROWS, COLS), bool)
+    kinds[0, 1, 2] = kinds[1, 3] = True
+    broken = BrokenTaxels.of(kinds)
+    assert broken
+    assert broken.text == "silent taxel 2.3 and noisy row 4"
+    format = SweepFormat(ROWS, COLS, 100.0, 20, "uint8")
+    again = BrokenTaxels.read(kinds.tolist(), format)
+    assert again
+    assert (again.kinds == kinds).all()
+    assert BrokenTaxels.read(None, format) is None
+    assert BrokenTaxels.of(kinds & False) is None
+    with pytest.raises(ValueError, match=r"\(2, 6, 5\) do not fit 4x5"):
+        BrokenTaxels.read(kinds.tolist(), replace(format, rows=4))
+    assert places(np.ones((1, 1), bool)) == "taxel 1.1"

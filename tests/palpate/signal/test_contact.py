@@ -1,0 +1,188 @@
+"""The centre of a contact, the advice that follows from it, and the positions in a bundle."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from palpate.bundle.bundle import Bundle, Manifest
+from palpate.core.errors import BundleError
+from palpate.core.sentences import MAX_LINE
+from palpate.core.types import Status, Verdict
+from palpate.io.robot_link import result
+from palpate.signal.contact import (
+    ContactPositions,
+    advice,
+    centre,
+    displacement,
+    fill_dead_taxels,
+)
+from palpate.sim import skin
+from tests.factories.contacts import MIDDLE, TARE, counts, patch
+
+NAN, INF = float("nan"), float("inf")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"pitch_mm": 0.0}, "pitch_mm"),
+        ({"pitch_mm": NAN}, "pitch_mm"),
+        ({"pitch_mm": "4"}, "pitch_mm"),
+        ({"limit_mm": -1.0}, "limit_mm"),
+        ({"limit_mm": INF}, "limit_mm"),
+        ({"pitch_mm": 1e7}, "pitch_mm"),
+        ({"rows_mm": (6.0, -1e7)}, "rows_mm"),
+        ({"limit_mm": True}, "limit_mm"),
+        ({"rows_mm": ()}, "rows_mm"),
+        ({"rows_mm": (6.0, NAN)}, "rows_mm"),
+        ({"rows_mm": [6.0, 6.4]}, "rows_mm"),
+        ({"cols_mm": (6.0, None)}, "cols_mm"),
+        ({"cols_mm": (6.0,)}, "1 cols_mm"),
+        ({"rows_mm": (6.0,) * 1001, "cols_mm": (6.0,) * 1001}, "1000"),
+    ],
+)
+def test_a_place_that_makes_no_sense_is_refused(wrong: dict[str, Any], message: str):
+    """Values that are not numbers, not finite, too many or not in pairs: a BundleError that names
+    them."""
+    with pytest.raises(BundleError, match=re.escape(message)):
+        replace(MIDDLE, **wrong)
+
+
+def test_a_place_goes_through_the_manifest(default_bundle: Bundle):
+    """Written as JSON and read again it is the same."""
+    manifest = replace(default_bundle.manifest, contact=MIDDLE)
+    assert Manifest.parse(manifest.json()).contact == MIDDLE
+
+
+@pytest.mark.parametrize("at", [(1.5, 1.5), (1.0, 2.0), (1.8, 1.4), (2.0, 1.0)])
+def test_the_centre_of_a_contact_that_lies_on_the_skin(at: tuple[float, float]):
+    """It is found to 0.15 of a taxel, with any tare and any load below the contact threshold."""
+    load = patch(*at)
+    for tare in (TARE, np.arange(16.0).reshape(4, 4)):
+        noisy = load + tare + 4 * (np.indices((4, 4)).sum(0) == 6)
+        assert centre(counts(noisy), tare, 5.0) == pytest.approx(at, abs=0.15)
+
+
+def test_only_the_normal_axis_of_several_counts():
+    """Shear, however large, does not move the centre; only the normal axis counts, tare
+    included."""
+    load, tare = patch(2.5, 1.5), np.full((4, 4), 3.0)
+    flat = counts(load + tare)
+    shear = np.stack([500 * np.indices((4, 4))[0], -counts(load)[0]], axis=-1)
+    three = np.concatenate([np.broadcast_to(shear, (*flat.shape, 2)), flat[..., None]], axis=-1)
+    tares = np.stack([np.full((4, 4), 77.0), np.zeros((4, 4)), tare], axis=-1)
+    assert centre(three, tares, 5.0) == centre(flat, tare, 5.0)
+    means = three.mean(axis=0), flat.mean(axis=0)
+    moved = [
+        displacement(m, t, 5.0, MIDDLE).text for m, t in zip(means, (tares, tare), strict=True)
+    ]
+    assert moved[0] == moved[1] != ""
+
+
+def test_without_contact_there_is_no_centre():
+    """Below the threshold, or if a floating-point skin gives no number: None, and no
+    displacement."""
+    for load in (np.full((4, 4), 4.9), np.full((4, 4), NAN), np.full((4, 4), -80.0)):
+        assert centre(counts(load), TARE, 5.0) is None
+        assert displacement(counts(load).mean(axis=0), TARE, 5.0, MIDDLE).text == ""
+    one = np.where(np.indices((4, 4)).sum(0) == 6, INF, patch(1.5, 1.5))
+    assert centre(counts(one), TARE, 5.0) == pytest.approx((1.5, 1.5))
+
+
+def test_a_threshold_below_zero_takes_no_pulled_taxel_along():
+    """A tared skin's threshold may be negative; a taxel with negative load has no weight."""
+    load = np.array([[-3.0, 0, 0, 0], [0, 50, 50, 0], [0, 50, 50, 0], [0, 0, 0, -3]])
+    assert centre(counts(load), TARE, -10.0) == (1.5, 1.5)
+
+
+@pytest.mark.parametrize("dead", [(1, 1), (2, 2), (1, 0), (0, 2)])
+def test_a_dead_taxel_does_not_push_the_centre_away(dead: tuple[int, int]):
+    """Silent between two loaded ones it is filled in: the centre stays within 0.15 taxels; without
+    that it would not."""
+    load = patch(1.5, 1.5) + 30
+    whole = np.array(centre(counts(load), TARE, 5.0))
+    load[dead] = 0
+    there = np.array(centre(counts(load), TARE, 5.0))
+    assert np.hypot(*(there - whole)) < 0.15
+    silent = np.array([(load.sum(a) @ np.arange(4)) / load.sum() for a in (1, 0)])
+    assert np.hypot(*(silent - whole)) > 2 * np.hypot(*(there - whole))
+
+
+def test_the_rim_of_a_contact_is_not_filled_in():
+    """A silent taxel beside the contact, or at its corner, stays silent."""
+    load = np.zeros((4, 4))
+    load[1:3, 0:3] = 50
+    load[1, 2] = 0
+    assert (fill_dead_taxels(load) == load).all()
+
+
+@pytest.mark.parametrize(
+    ("along", "axis", "towards"),
+    [("dx_mm", 0, ("row 4", "row 1")), ("dy_mm", 1, ("column 4", "column 1"))],
+)
+def test_the_advice_follows_the_simulated_skin(along: str, axis: int, towards: tuple[str, str]):
+    """The further forward the skin is, the further back is the centre, if the end of the pad is
+    near; the advice names the right end."""
+    found = []
+    for mm in (-4.0, -3.0, 0.0, 3.0, 4.0):
+        window = skin.window(
+            "wood",
+            skin.Placement(**{along: mm}, seed=3),
+            np.random.default_rng(0),
+            skin.LEVEL_BLIND,
+        )[:200]
+        found.append(centre(window, TARE, 5.4)[axis])
+        text = displacement(window.mean(axis=0), TARE, 5.4, MIDDLE).text
+        assert text == "" if mm == 0 else text.endswith(f"mm too far towards {towards[mm > 0]}")
+    assert (np.diff(found) < 0).all()
+
+
+@pytest.mark.parametrize(
+    ("offset", "text"),
+    [
+        ((2.1, 0.0), "2.1 mm too far towards row 4"),
+        ((-2.1, 0.5), "2.1 mm too far towards row 1"),
+        ((0.2, -1.26), "1.3 mm too far towards column 1"),
+        ((1.0, 3.0), "3.0 mm too far towards column 5 and 1.0 mm towards row 4"),
+        ((-3.0, -1.0), "3.0 mm too far towards row 1 and 1.0 mm towards column 1"),
+    ],
+)
+def test_the_advice_names_direction_and_distance(offset: tuple[float, float], text: str):
+    """The larger direction first; an insignificant one is left out."""
+    assert advice(offset, (4, 5)) == text
+
+
+def test_the_nearest_position_counts():
+    """Distance is to the nearest position, not to their middle; the limit itself is within."""
+    two = ContactPositions(2.0, (0.0, 6.0), (0.0, 0.0), 0.5)
+    assert two.offset((3.1, 0.0)) == pytest.approx((0.2, 0.0))
+    assert two.within((0.3, -0.4))
+    assert not two.within((0.3, -0.41))
+
+
+def test_a_sentence_keeps_what_matters_most_of_the_advice():
+    """If a RES sentence is cut at 128 characters, the larger direction is still in it."""
+    detail = f"moved {advice((-12.5, 11.5), (4, 4))}"
+    scores = np.array([0.98, 0.02])
+    v = Verdict(
+        12345,
+        10**14,
+        Status.OK,
+        "plastic rough",
+        0.98,
+        0.96,
+        scores,
+        1,
+        0,
+        400_000,
+        "9f3c2a1b",
+        detail,
+    )
+    line = result(v, "usb")
+    assert len(line) <= MAX_LINE
+    assert b"moved 12.5 mm too far towards row 1" in line

@@ -1,0 +1,109 @@
+"""The hum of the mains is found and removed, and nothing else is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from palpate.core.types import SweepFormat
+from palpate.signal.hum import HumFilter
+
+FORMAT = SweepFormat(4, 4, 750.0, 1500, "uint8")
+LIMIT = 4.0
+
+
+def sweep(format: SweepFormat = FORMAT, seed: int = 0) -> NDArray[np.float64]:
+    """Vibrations around a load, not yet rounded; taxels of different strength."""
+    rng = np.random.default_rng(seed)
+    strength = rng.uniform(0.5, 8, format.shape)
+    return 100 + strength * rng.standard_normal((format.window, *format.shape))
+
+
+def hum(format: SweepFormat = FORMAT, hz: float = 50.0, counts: float = 3.0) -> NDArray[np.float64]:
+    """A sine, the same on all taxels, [T, 1, ...]."""
+    times = np.arange(format.window) / format.rate_hz
+    sine = counts * np.sin(2 * np.pi * hz * times + 1)
+    return sine.reshape(-1, *(1,) * len(format.shape))
+
+
+def counts(x: NDArray[np.float64], format: SweepFormat = FORMAT) -> NDArray[np.uint8]:
+    return np.rint(x).clip(0, 255).astype(format.numpy_type)
+
+
+@pytest.mark.parametrize("hz", [50.0, 60.0, 49.85, 60.2])
+def test_hum_is_removed(hz: float):
+    """At the frequencies of mains and somewhat beside them. The sweep remains, but for
+    rounding."""
+    filter, clean = HumFilter(FORMAT), sweep()
+    found, amplitude = filter(counts(clean + hum(hz=hz)), LIMIT)
+    assert amplitude == pytest.approx(3, rel=0.05)
+    assert found.dtype == np.uint8
+    assert np.sqrt(((found - clean) ** 2).mean()) < 0.6
+    assert filter.ratio(found) < LIMIT
+
+
+@pytest.mark.parametrize("hz", [45.0, 100.0])
+def test_other_frequencies_stay(hz: float):
+    """A sine that is not of the mains is part of the material."""
+    given = counts(sweep() + hum(hz=hz))
+    found, amplitude = HumFilter(FORMAT)(given, LIMIT)
+    assert amplitude == 0
+    assert found is given
+
+
+def test_a_ridge_that_passes_one_taxel_after_the_other_stays():
+    """It has 50 Hz on every taxel, and another phase on each row."""
+    rows = np.exp(1j * np.arange(4))[:, None]
+    times = np.arange(FORMAT.window)[:, None, None] / FORMAT.rate_hz
+    ridge = 5 * (np.exp(2j * np.pi * 50 * times) * rows).real
+    assert HumFilter(FORMAT)(counts(sweep() + ridge), LIMIT)[1] == 0
+
+
+def test_hum_stands_out_of_the_quiet_taxels():
+    """Twelve of sixteen taxels are far louder than the hum."""
+    given = sweep()
+    given[:, 1:] = 100 + 8 * (given[:, 1:] - 100)
+    assert HumFilter(FORMAT).ratio(counts(given + hum(counts=2))) > LIMIT
+
+
+def test_each_axis_is_cleaned():
+    """Shear axes have the hum as well; the normal axis says how much it is."""
+    format = replace(FORMAT, axes=3)
+    clean = np.stack([sweep(seed=axis) for axis in range(3)], axis=-1)
+    found, amplitude = HumFilter(format)(counts(clean + hum(format), format), LIMIT)
+    assert amplitude == pytest.approx(3, rel=0.05)
+    assert np.sqrt(((found - clean) ** 2).mean()) < 0.6
+
+
+@pytest.mark.parametrize(
+    "format",
+    [replace(FORMAT, window=90), replace(FORMAT, rate_hz=100.0, window=200)],
+    ids=["short", "slow"],
+)
+def test_a_window_that_cannot_show_it_stays(format: SweepFormat):
+    """Too short for 60 Hz beside others, or with a rate that 50 Hz folds into."""
+    filter = HumFilter(format)
+    assert filter.hz == ()
+    given = counts(sweep(format), format)
+    assert filter(given, LIMIT) == (given, 0.0)
+    assert filter.ratio(given) == 0
+
+
+@pytest.mark.filterwarnings("error")
+def test_counts_that_are_not_finite_are_left_alone():
+    """float32 counts can be infinite or not a number; constant ones have no hum."""
+    format = SweepFormat(4, 4, 750.0, 1500, "float32")
+    given = sweep().astype(np.float32)
+    given[3, 0, 0], given[5, 1, 1] = np.inf, np.nan
+    found, amplitude = HumFilter(format)(given, LIMIT)
+    assert np.array_equal(found, given, equal_nan=True)
+    assert amplitude == 0
+    assert HumFilter(format).ratio(np.ones_like(given)) == 0
+
+
+def test_a_part_of_a_window_stays():
+    """An unfinished sweep is shorter than the format's window."""
+    assert HumFilter(FORMAT).ratio(counts(sweep() + hum())[:900]) == 0

@@ -1,0 +1,93 @@
+"""What the loads of sound taxels tell of a broken one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from palpate.bundle import bundle
+from palpate.bundle.manifest import Manifest
+from palpate.core.errors import BundleError
+from palpate.signal.broken_taxels import Bridging, bridged
+from palpate.signal.load_modes import LoadModes
+from tests.factories import toy_bundle
+
+SPREAD = np.array([4.0, 8.0, 2.0, 6.0, 1.0, 5.0])
+TILT = np.array([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0])
+LOADS = LoadModes(tuple(20 * SPREAD), (tuple(5 * SPREAD), tuple(4 * TILT)), 1e-3)
+"""Six values that are pressed differently: a common force, and a tilt."""
+
+
+def frames(n: int = 30) -> np.ndarray:
+    """float32 [n, 6] of random forces and tilts."""
+    rng = np.random.default_rng(0)
+    force, tilt = rng.uniform(10, 30, n), rng.uniform(-10, 10, n)
+    return (force[:, None] * SPREAD + tilt[:, None] * TILT).astype(np.float32)
+
+
+@pytest.mark.parametrize("places", [[0], [5], [1, 2], [0, 2, 4], [0, 1, 2, 3]])
+def test_sound_values_tell_the_broken_ones(places: list[int]):
+    """Exactly, where the modes are all there is; whatever the broken ones read."""
+    broken = np.isin(np.arange(6), places)
+    read = np.where(broken, np.nan, frames())
+    assert LOADS.expected(read, broken) == pytest.approx(frames()[:, broken], rel=0.01, abs=0.5)
+
+
+@pytest.mark.parametrize(("shape", "mask"), [((3, 2), (1, 0)), ((3, 1, 2), (0, 0))])
+def test_a_broken_taxel_is_filled_on_all_axes(shape: tuple[int, ...], mask: tuple[int, int]):
+    """Neighbours, which are pressed harder or less, would be far off. Counts stay whole, the given
+    ones as they were."""
+    taxels = np.rint(frames()).astype(np.int16).reshape(-1, *shape)
+    broken = np.zeros(shape[:2], bool)
+    broken[mask] = True
+    given = taxels.copy()
+    given[:, broken] = -7
+    filled = bridged(given, broken, np.zeros(shape), LOADS)
+    assert (given[:, broken] == -7).all()
+    assert np.abs(filled.astype(int) - taxels).max() <= 1
+    assert filled.dtype == np.int16
+    beside = bridged(given, broken, np.zeros(shape))
+    assert np.abs(beside.astype(int) - taxels).max() > 20
+
+
+def test_filled_counts_stay_in_the_range_of_their_type():
+    """A load above 255 becomes 255."""
+    taxels = np.full((3, 3, 2), 250, np.uint8)
+    assert bridged(taxels, np.eye(3, 2, dtype=bool), np.zeros((3, 2)), LOADS).max() == 255
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"modes": ()}, "has 0 modes"),
+        ({"modes": LOADS.modes * 5}, "has 10 modes"),
+        ({"modes": ((1.0, 2.0),)}, "as many values as the mean"),
+        ({"rest": 0.0}, "`rest` above 0"),
+        ({"rest": float("nan")}, "`rest` above 0"),
+        ({"mean": (float("inf"),) * 6}, "finite"),
+        ({"modes": ((1e300,) * 6,)}, "finite"),
+    ],
+)
+def test_values_that_cannot_be_computed_with_are_refused(change: dict[str, Any], why: str):
+    """With the name of what is wrong."""
+    with pytest.raises(BundleError, match=why):
+        replace(LOADS, **change)
+
+
+def test_a_manifest_holds_them_and_one_without_stays_as_it_was(tmp_path: Path):
+    """Older bundles have none; loads of another skin are refused."""
+    rule = Bridging(1, False, False, 4.0, 2.0, False)
+    toy = bundle.load(toy_bundle.put(tmp_path / "toy", toy_bundle.files())).manifest
+    manifest = replace(toy, bridging=rule)
+    assert b"loads" not in manifest.json()
+    assert Manifest.parse(manifest.json()) == manifest
+    n = manifest.format.channels
+    loads = LoadModes((1.0,) * n, ((2.0,) * n,), 0.5)
+    told = replace(manifest, bridging=replace(rule, loads=loads))
+    assert Manifest.parse(told.json()) == told
+    with pytest.raises(BundleError, match=f"6 loads in `bridging` for {n} values"):
+        Manifest.parse(replace(manifest, bridging=replace(rule, loads=LOADS)).json())

@@ -1,0 +1,111 @@
+"""A window that is not a slide is refused with its reason; slides are accepted."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from palpate.bundle import bundle
+from palpate.bundle.bundle import Bundle
+from palpate.core.errors import FormatError
+from palpate.core.types import Status, SweepFormat, Verdict
+from palpate.inference import enrolment
+from palpate.inference.enrolment import SweepCollector
+from palpate.signal.slide_check import MANY, SlideCheck, SlidesAmong
+from palpate.sim import skin
+from tests.campaigns.junk import KINDS, window
+from tests.factories import toy_bundle
+
+JUNK = [
+    *("finger rests", "rests, noise", "rests, common noise", "rests, 50 Hz hum", "rests, clicks"),
+    *("load and white noise", "load and common noise", "load and pink noise", "random bytes"),
+    *("load and brown noise", "load and a 50 Hz sine", "load and a chirp", "random walk"),
+    *("rests and taps", "rests and rocks", "one taxel loaded", "sixteen slides, a taxel of each"),
+    *("frames shuffled", "load and clicks"),
+]
+
+
+@pytest.fixture(scope="module")
+def model() -> Bundle:
+    """The packaged bundle."""
+    return bundle.load(bundle.DEFAULT)
+
+
+@pytest.mark.parametrize("world", skin.WORLDS)
+def test_slides_over_every_material_are_accepted(model: Bundle, world: str):
+    """In both worlds, also over a material that the bundle does not know."""
+    check = enrolment.slide_check(model)
+    rng = np.random.default_rng(5)
+    for place in skin.placements("T-REAL", 1005)[:4]:
+        for material in skin.MATERIALS:
+            assert check(skin.window(material, place, rng, skin.WORLDS[world])) == ""
+
+
+@pytest.mark.parametrize("kind", JUNK)
+def test_what_is_no_slide_is_refused_with_its_reason(model: Bundle, kind: str):
+    """A finger at rest, noise, hum, one taxel, in any disguise."""
+    assert kind in KINDS
+    check = enrolment.slide_check(model)
+    for number in range(4):
+        assert check(window(kind, skin.WORLDS["level-blind"], number)[0])
+
+
+@pytest.mark.parametrize("kind", ["finger rests", "load and white noise", "one taxel loaded"])
+def test_enrolment_names_the_sweep_that_was_none(model: Bundle, kind: str):
+    """The second of three sweeps is not a slide: nothing is learned, and it is named."""
+    rng, place = np.random.default_rng(6), skin.placements("T-REAL", 1005)[0]
+    sweeps = [skin.window("wood", place, rng, skin.WORLDS["level-blind"]) for _ in range(3)]
+    sweeps[1] = window(kind, skin.WORLDS["level-blind"], 1)[0]
+    with pytest.raises(FormatError, match=r"sweep 2 of 3 is not a slide over 'cork': "):
+        enrolment.enrol(model, "cork", np.stack(sweeps))
+
+
+def test_the_collector_does_not_take_it(logged: list[str]):
+    """It says why, and waits for another sweep."""
+    taken = SweepCollector(1, lambda taxels: "no slide: it rests")
+    sweep = toy_bundle.sweep(1, 0)
+    unknown = Verdict.without_label(sweep, Status.UNKNOWN, "", 0, "")
+    taken.sweep(sweep, unknown, {})
+    assert not taken.enough
+    assert logged == [f"sweep {sweep.id} not taken: no slide: it rests"]
+
+
+def test_only_one_loaded_taxel_is_named():
+    """With a known contact threshold the taxel is named; a skin of two taxels is not judged."""
+    format = SweepFormat(4, 4, 100, 200, "uint8")
+    counts = np.zeros((200, 4, 4), np.uint8)
+    counts[:, 1, 2] = 50 + np.arange(200) % 7
+    assert SlideCheck(format, np.zeros((4, 4)), 5.0)(counts) == "only taxel 2.3 is loaded"
+    assert "no contact" in SlideCheck(format, np.zeros((4, 4)), 90.0)(counts)
+    small = SweepFormat(1, 2, 100, 200, "uint8")
+    assert SlideCheck(small, np.zeros((1, 2)), 5.0)(counts[:, 1:2, 2:4]) == ""
+
+
+def slides(count: int) -> list[np.ndarray]:
+    """Windows of slides over wood."""
+    rng, place = np.random.default_rng(6), skin.placements("T-REAL", 1005)[0]
+    return [skin.window("wood", place, rng, skin.WORLDS["level-blind"]) for _ in range(count)]
+
+
+@pytest.mark.parametrize("kind", ["finger rests", "rests, noise", "load and chirp", "random bytes"])
+def test_where_slides_show_a_pattern_others_are_refused_without_a_bundle(kind: str):
+    """After MANY slides; also if the rest came first, once all are judged by one another."""
+    kind = kind.replace("chirp", "a chirp")
+    rest = window(kind, skin.WORLDS["level-blind"], 1)[0]
+    check = SlidesAmong(skin.FORMAT)
+    assert check(rest) == ""  # so far nothing shows what a slide looks like
+    assert [check(one) for one in slides(MANY)] == [""] * MANY
+    assert check(rest).startswith("no slide")
+    assert check(slides(1)[0]) == ""
+    first = SlidesAmong(skin.FORMAT).among([rest, *slides(MANY)])
+    assert first[0].startswith("no slide")
+    assert first[1:] == [""] * MANY
+
+
+def test_a_skin_without_patterns_is_not_judged_by_them():
+    """Its slides look like rests, so all are accepted; nor is a skin of two taxels judged."""
+    rests = [window("finger rests", skin.WORLDS["level-blind"], n)[0] for n in range(6)]
+    assert SlidesAmong(skin.FORMAT).among(rests) == [""] * 6
+    tiny = SlidesAmong(SweepFormat(1, 2, 100, 200, "uint8"))
+    assert tiny.among([np.zeros((200, 1, 2), np.uint8)] * MANY) == [""] * MANY
+    assert tiny(np.zeros((200, 1, 2), np.uint8)) == ""

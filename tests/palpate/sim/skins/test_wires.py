@@ -1,0 +1,186 @@
+"""The bytes of the emulated skins, compared with bytes put together by hand from the published
+layouts. None of the skins was available."""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+import pytest
+
+from palpate.core.errors import ConfigError
+from palpate.io import skin_profile
+from palpate.io.skin_codecs import Rest, codec
+from palpate.sim.skins import wires
+from tests.factories.paths import ROOT
+
+PREVIEW = bytes.fromhex(
+    "556677880201001b0003002700040029020500630206000f0307002b0300004efa320031aa768f0000000002002d002b01"
+    "090041005b0075008f00a900c300dd"
+)
+"""The first bytes that a real PapillArray controller (v2.0, two sensors) sent to a user, published
+in the tests of the project langxin11/parallel_gripper_tactile."""
+
+
+def test_marked() -> None:
+    """FlexiTac: AA 55, then the rows."""
+    assert wires.wire("flexitac", 100).frame(
+        np.array([[1, 2], [3, 255]], np.uint8), 0
+    ) == bytes.fromhex("aa55010203ff")
+    big = wires.Marked(100, b"\x55\xaa\x01", ">u2", b"\r\n")
+    assert big.frame(np.array([[1, 0x1234]], np.uint16), 0) == bytes.fromhex("55aa01000112340d0a")
+
+
+def test_magnetic() -> None:
+    """AnySkin: t, x, y, z of each chip, CR LF, 82 bytes in all; ReSkin the same as text."""
+    taxels = np.arange(15, dtype=np.float32).reshape(1, 5, 3) - 7
+    sent = wires.wire("anyskin", 28).frame(taxels, 0)
+    assert len(sent) == 82
+    assert struct.unpack("<20f2s", sent) == (
+        25,
+        -7,
+        -6,
+        -5,
+        25,
+        -4,
+        -3,
+        -2,
+        25,
+        -1,
+        0,
+        1,
+        25,
+        2,
+        3,
+        4,
+        25,
+        5,
+        6,
+        7,
+        b"\r\n",
+    )
+    text = wires.wire("reskin", 28).frame(np.array([[[1.25, -2, 300.126]]], np.float32), 0)
+    assert text == b"25.00\t1.25\t-2.00\t300.13\r\n"
+
+
+def test_rows() -> None:
+    """3D-ViTac: a line for each row, and an empty line."""
+    sent = wires.wire("3d-vitac", 32).frame(np.arange(256, dtype=np.uint8).reshape(16, 16), 0)
+    lines = sent.split(b"\r\n")
+    assert lines[0] == b"0 1 2 3 4 5 6 7 8 9 10 11 12 13 14 15"
+    assert len(lines) == 18
+    assert lines[16:] == [b"", b""]
+    assert wires.Rows(10, ",").frame(np.array([[7]], np.uint8), 0) == b"7\r\n\r\n"
+
+
+def test_papillarray_as_a_controller_sends_it() -> None:
+    """The layout of two sensors is that of a real controller to the byte; sum and end marker follow
+    from the layout."""
+    sent = wires.PapillArray(counter=0x32FA4E).frame(np.zeros((6, 3, 3), np.float32), 0x8F76AA31)
+    assert sent.startswith(PREVIEW)
+    body = sent[4:-6]
+    assert sent[-6:] == (sum(body) % 65536).to_bytes(2, "little") + bytes.fromhex("aabbccdd")
+
+
+def test_papillarray_numbers() -> None:
+    """One sensor, by hand: block 3 lies where the table says, and pillar 9's force is the last but
+    its displacement."""
+    skin = wires.PapillArray(500, counter=7)
+    force = np.arange(27, dtype=np.float32).reshape(3, 3, 3)
+    sent = skin.frame(force, 123_456_789_012)
+    body = sent[4:-6]
+    table = dict(struct.unpack_from("<HH", body, 1 + 4 * i) for i in range(6))
+    assert struct.unpack_from("<IQ", body, table[1]) == (7, 123_456_789_012)
+    ((sensor,),) = [struct.unpack_from("<xxH", body, table[3])]
+    count, *pillars = struct.unpack_from("<10H", body, sensor)
+    assert count == 9
+    read = [struct.unpack_from("<H6f", body, at) for at in pillars]
+    assert {item[0] for item in read} == {2}
+    assert [item[1:4] for item in read] == [tuple(f) for f in force.reshape(9, 3).tolist()]
+    assert table[4] == pillars[-1] + 26
+    (whole,) = struct.unpack_from("<xxH", body, table[4])
+    assert struct.unpack_from("<H3f", body, whole) == (2, 9 * 12, 9 * 13, 9 * 14)
+    assert skin.frame(force, 0)[4 + table[1] :][:4] == b"\x08\0\0\0"
+
+
+def test_papillarray_commands() -> None:
+    """f sets one of four rates, in parts, too; z makes the mean of two seconds the zero; nothing
+    answers."""
+    skin = wires.PapillArray(1000)
+    assert skin.receive(b"f2") == b""
+    assert skin.period_ns == 1e6
+    assert skin.receive(b"50\nf300\nf\nfast\n") == b""
+    assert skin.period_ns == 4e6
+    skin.receive(b"f100\nz\n")
+    forces = []
+    for i in range(202):
+        sent = skin.frame(np.full((3, 3, 3), 1.0 + i % 2), 0)
+        table = dict(struct.unpack_from("<HH", sent[4:], 1 + 4 * i) for i in range(6))
+        (total,) = struct.unpack_from("<xxxxH", sent[4:], table[4] - 2)
+        forces.append(struct.unpack_from("<f", sent[4:], total + 2)[0] / 9)
+    assert forces[:199] == [1.0 + i % 2 for i in range(199)]
+    assert forces[-2:] == [-0.5, 0.5]
+
+
+def test_slcan() -> None:
+    """The adapter answers as Lawicel's; the sensor is quiet until the channel is open at 1 Mbit/s
+    and it was started."""
+    skin = wires.Slcan(100)
+    taxels = np.arange(48).reshape(4, 4, 3).astype(np.uint16) + 0x1234
+    assert skin.receive(b"t20120700\rO\rS9\r") == b"\a\a\a"
+    assert skin.receive(b"S6\rO\rt20120700\rC\r") == b"\r\r\a\r"
+    assert skin.receive(b"S8\rO\rO\rS8\r") == b"\r\r\a\a"
+    assert not skin.streaming
+    assert skin.receive(b"t20220700\rt20110") == b"z\r"  # another CAN board
+    assert not skin.streaming
+    assert skin.receive(b"7\rt20120700\r\rV\rX\r") == b"z\rz\r\rV1013\r\a"
+    assert skin.streaming
+    first, *_, last, empty = skin.frame(taxels, 0).split(b"\r")
+    assert first == b"t71080012341235123600"
+    assert last == b"t71F80012611262126300"
+    assert empty == b""
+    skin.invalid = frozenset({0})
+    assert skin.frame(taxels, 0).startswith(b"t710800FA34")
+    assert skin.receive(b"C\r") == b"\r"
+    assert not skin.streaming
+
+
+def test_robotiq() -> None:
+    """It sends after autosend with a period, stops at 0, and tells its version; fields in the
+    published order."""
+    skin = wires.Robotiq(60)
+    assert not skin.streaming
+    assert skin.receive(bytes.fromhex("009a00e300 9a0058")) == bytes.fromhex("9a00e305") + b"2.0.1"
+    skin.receive(bytes.fromhex("0110"))
+    assert (skin.streaming, skin.period_ns) == (True, 16e6)
+    taxels = np.arange(56).reshape(14, 4) + 0x2700
+    sent = skin.frame(taxels.astype(np.uint16), 5)
+    assert sent[:4] == bytes.fromhex("9a005898")
+    assert sent[4:9] == bytes.fromhex("1027002701")
+    assert sent[61:64] == bytes.fromhex("200000")
+    assert sent[64:71] == bytes.fromhex("30000000004000")
+    assert sent[71:80] == bytes.fromhex("700000000000000005")
+    assert sent[80:85] == bytes.fromhex("14271c271d")
+    assert skin.frame((taxels + 3).astype(np.uint16), 6)[61:64] == bytes.fromhex("200003")
+    skin.receive(bytes.fromhex("9a00580100"))
+    assert not skin.streaming
+
+
+def test_unknown_name() -> None:
+    """The error names what there is."""
+    with pytest.raises(ConfigError, match=r"'biotac'; there are flexitac, .*robotiq-tsf"):
+        wires.wire("biotac", 100)
+
+
+def test_a_zero_that_is_missing_makes_no_frame() -> None:
+    """The controller's sum does not detect a missing zero byte. Wherever it is missing, the box
+    reads the frame as it was sent, or no frame."""
+    profile = skin_profile.load("papillarray", [ROOT / "firmware_config" / "skins"])
+    force = np.arange(27, dtype=np.float32).reshape(3, 3, 3)
+    sent = wires.PapillArray().frame(force, 1000)
+    taken = 0
+    for at in (i for i, byte in enumerate(sent) if not byte):
+        for taxels in codec(profile)(Rest(), sent[:at] + sent[at + 1 :]).taxels:
+            assert (taxels == force).all()
+            taken += 1
+    assert taken > 0  # the bytes after the forces do not matter

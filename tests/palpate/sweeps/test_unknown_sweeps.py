@@ -1,0 +1,157 @@
+"""Kept sweeps of unknown materials: how they are grouped, and enrolled without a new sweep."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from palpate.bundle import bundle
+from palpate.cli.main import main
+from palpate.core.errors import ApplianceError
+from palpate.inference.classifier import Classifier
+from palpate.sim.rig import VirtualClock
+from palpate.sweeps import unknown_sweeps
+from palpate.sweeps.black_box import BlackBox
+from tests.factories import toy_bundle
+
+FELT = [(20, 20), (20.4, 19.7), (19.8, 20.5), (20.2, 20.1), (19.9, 19.6), (20.1, 20.4)]
+CORK = [(-4, 30), (-4.3, 30.2)]
+
+
+@pytest.fixture
+def box(tmp_path: Path) -> Classifier:
+    """A box with the toy bundle, from disk."""
+    return Classifier(toy_bundle.load(tmp_path / "old"), VirtualClock())
+
+
+def kept(folder: Path, box: Classifier, *places: tuple[float, float]) -> list[str]:
+    """Answer sweeps at these places of the embedding in one run, and keep them as the box does; the
+    details of the answers."""
+    black_box, said = BlackBox(folder, box.bundle.format, 500), []
+    for i, place in enumerate(places, 1):
+        sweep = toy_bundle.sweep(*place, number=i, object=i)
+        verdict = box(sweep)
+        black_box.sweep(sweep, verdict, {"bundle": box.bundle.id})
+        said.append(verdict.detail)
+    black_box.close()
+    return said
+
+
+def numbers(folder: Path, box: Classifier) -> list[list[int]]:
+    """The numbers of each group."""
+    return [[*one.paths] for one in unknown_sweeps.groups(folder, box.bundle.id)]
+
+
+def test_sweeps_of_a_material_that_comes_again_are_a_group(tmp_path: Path, box: Classifier):
+    """Each run counts from 1; a material that was seen once is none, nor is a known one, nor an
+    answer of another bundle."""
+    folder = tmp_path / "black-box"
+    said = kept(folder, box, FELT[0], CORK[0], (0, 0), FELT[1], (60, -60), CORK[1], FELT[2])
+    assert [one.rpartition("; ")[2] for one in said if "; as" in one] == [
+        "as sweep 1",
+        "as sweep 2",
+        "as sweep 1",
+    ]
+    assert numbers(folder, box) == [[1, 4, 7], [2, 6]]
+    again = Classifier(box.bundle, VirtualClock())
+    kept(folder, again, *FELT)
+    assert numbers(folder, box) == [[8, 9, 10, 11, 12, 13], [1, 4, 7], [2, 6]]
+    assert unknown_sweeps.groups(folder, "another") == []
+    assert unknown_sweeps.groups(tmp_path / "nowhere", box.bundle.id) == []
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        b"{",
+        b"[]",
+        b'{"verdict": 3}',
+        b'{"verdict": {"status": "unknown", "bundle": "ID"}}',
+        b'{"verdict": {"status": "unknown", "bundle": "ID", "detail": 3}, "id": 3}',
+        b'{"verdict": {"status": "unknown", "bundle": "ID", "detail": ""}, "id": "x"}',
+    ],
+)
+def test_a_damaged_sidecar_is_named_and_left_out(
+    tmp_path: Path, box: Classifier, logged: list[str], damage: bytes
+):
+    """The others are still offered."""
+    kept(tmp_path, box, *FELT)
+    path = tmp_path / "sweep-000003.json"
+    path.write_bytes(damage.replace(b"ID", box.bundle.id.encode()))
+    assert numbers(tmp_path, box)[0][:2] == [1, 2]
+    assert len([line for line in logged if f"{path} is left out" in line]) == 1
+
+
+def test_which_group_is_never_guessed(tmp_path: Path, box: Classifier):
+    """Without a number there has to be one only; the message lists what there is."""
+    with pytest.raises(ApplianceError, match=r"store\.black_box = 500 keeps the last 500 sweeps"):
+        unknown_sweeps.chosen([], 0, tmp_path)
+    kept(tmp_path, box, *FELT[:2])
+    found = unknown_sweeps.groups(tmp_path, box.bundle.id)
+    assert unknown_sweeps.chosen(found, 0, tmp_path) is found[0]
+    with pytest.raises(ApplianceError, match=r"--unknown NUMBER: 2 sweeps: 1, 2; the last 20"):
+        unknown_sweeps.chosen(found, 3, tmp_path)
+    kept(tmp_path, Classifier(box.bundle, VirtualClock()), *CORK)
+    found = unknown_sweeps.groups(tmp_path, box.bundle.id)
+    with pytest.raises(ApplianceError, match="name one of these by a sweep of it"):
+        unknown_sweeps.chosen(found, 0, tmp_path)
+    assert [*unknown_sweeps.chosen(found, 4, tmp_path).paths] == [3, 4]
+
+
+@pytest.fixture
+def enrol(tmp_path: Path, box: Classifier, capsys: pytest.CaptureFixture[str]) -> Any:
+    """`palpate enrol` with kept sweeps; exit code and output."""
+    kept(tmp_path / "black-box", box, *FELT, *CORK)
+    sets = {"store.folder": tmp_path, "classifier.bundle": tmp_path / "old"}
+    sets |= {"classifier.allow_unsigned": "true"}
+    options = [word for k, v in sets.items() for word in ("--set", f"{k}={v}")]
+
+    def run(*words: str) -> tuple[int, str]:
+        code = main(["enrol", *words, *options, "--out", str(tmp_path / "new")])
+        return code, "".join(capsys.readouterr())
+
+    return run
+
+
+def test_kept_sweeps_become_a_label(tmp_path: Path, box: Classifier, enrol: Any):
+    """Listed, chosen by one of them, and enrolled without the skin; then the box knows the
+    material."""
+    code, text = enrol("--unknown")
+    assert code == 0
+    assert [line.partition(";")[0] for line in text.splitlines()] == [
+        "6 sweeps: 1, 2, 3, 4, 5, 6",
+        "2 sweeps: 7, 8",
+    ]
+    code, text = enrol("felt", "--unknown", "3")
+    assert code == 0, text
+    assert "taken: 6 sweeps: 1, 2, 3, 4, 5, 6" in text
+    new = bundle.load(tmp_path / "new")
+    assert new.enrolled == {"felt": 6}
+    assert Classifier(new, VirtualClock())(toy_bundle.sweep(*FELT[0])).label == "felt"
+
+
+def test_sweeps_that_cannot_be_used_are_named(tmp_path: Path, enrol: Any):
+    """One is left out; with fewer than two nothing is written."""
+    (tmp_path / "black-box/sweep-000007.npy").write_bytes(b"")
+    code, text = enrol("cork", "--unknown", "8")
+    assert code == 1
+    assert "sweep 7 not taken" in text
+    assert "1 of these sweeps can be used, and 2 are needed; make others" in text
+    assert not (tmp_path / "new").exists()
+    about = tmp_path / "black-box/sweep-000002.json"
+    held = json.loads(about.read_text())
+    about.write_text(json.dumps(held | {"format": held["format"] | {"rate_hz": 50.0}}))
+    code, text = enrol("felt", "--unknown", "1")
+    assert code == 0, text
+    assert "sweep 2 not taken: of another format" in text
+    assert bundle.load(tmp_path / "new").enrolled == {"felt": 5}
+
+
+def test_a_label_is_needed_without_kept_sweeps(capsys: pytest.CaptureFixture[str]):
+    """`palpate enrol` alone says so."""
+    with pytest.raises(SystemExit, match="2"):
+        main(["enrol"])
+    assert "enrol needs LABEL, the name of the new material" in capsys.readouterr().err

@@ -1,0 +1,67 @@
+"""`palpate bench`: the keys of its JSON, and the parts that are measured in processes of their
+own."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from palpate.bundle import bundle
+from palpate.cli.main import main
+from palpate.sim import script
+from palpate.tools import bench, bench_process
+
+
+@pytest.mark.slow
+def test_bench_writes_its_figures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """A small bench: every key that scripts rely on, in JSON, with commit, seed and machine."""
+    for name, value in {"SWEEPS": 6, "STARTS": 1, "ROUNDS": 5}.items():
+        monkeypatch.setattr(bench, name, value)
+    monkeypatch.setattr(bench, "_child", lambda name, seed: {name: {"seed": seed}})
+    monkeypatch.setattr(bench, "_make_references", lambda folder: None)
+    assert main(["bench", "--json", str(tmp_path / "b.json"), "--references", str(tmp_path)]) == 0
+    figures = json.loads((tmp_path / "b.json").read_text())
+    assert figures["accuracy"]["total"] == 6
+    assert figures["frames_lost"] == 0
+    assert figures["edge_to_sentence_ms"].keys() >= {"p50", "p99"}
+    assert figures["inference_ms"]["int8"]["p50"] > 0
+    assert figures["cold_start_s"] > 0
+    assert figures["memory"] == {"seed": 2000}
+    assert {"commit", "seed", "machine"} <= figures.keys()
+    on_disk = sum(file.stat().st_size for file in bundle.DEFAULT.iterdir())
+    model = (bundle.DEFAULT / bundle.MODEL).stat().st_size
+    assert figures["bundle_kb"] == {
+        "model": pytest.approx(model / 1000, abs=0.05),
+        "all": pytest.approx(on_disk / 1000, abs=0.05),
+    }
+    assert re.fullmatch(r"20\d\d-\d\d-\d\d", figures["date"])
+    assert [len(figures["load_average"][when]) for when in ("before", "after")] == [3, 3]
+    assert list(figures)[-3:] == ["bundle_kb", "date", "load_average"]
+    out = capsys.readouterr().out
+    assert "edge_to_sentence_ms" in out
+    assert "fp32 and paper_int8 were not measured" in out
+
+
+@pytest.mark.slow
+def test_bench_parts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """Short measurements of memory and processor share."""
+    monkeypatch.setattr(bench_process, "MEMORY_SWEEPS", 20)
+    monkeypatch.setattr(bench_process, "STREAM_S", 0.5)
+    bench_process.write_acts(tmp_path / "acts.npz", script.tubes(1, 2))
+    assert main(["bench", "--part", "memory", "--acts", str(tmp_path / "acts.npz")]) == 0
+    memory = json.loads(capsys.readouterr().out)["rss_mb"]
+    assert 10 < memory["without_board"] <= memory["after_1000"]
+    assert main(["bench", "--part", "stream", "--acts", str(tmp_path / "acts.npz")]) == 0
+    shares = json.loads(capsys.readouterr().out)
+    assert 0 < shares["cpu_share_streaming"] < shares["cpu_share_with_simulated_board"]
+    assert main(["bench", "--part", "hand", "--acts", str(tmp_path / "acts.npz")]) == 0
+    shares = json.loads(capsys.readouterr().out)["cpu_share_by_skins"]
+    assert [*shares] == ["1", "2", "4"]
+    assert 0 < shares["1"] < shares["4"]

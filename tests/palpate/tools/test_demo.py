@@ -1,0 +1,222 @@
+"""`palpate demo` with and without a terminal."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from palpate.bundle import bundle
+from palpate.bundle.bundle import Bundle
+from palpate.cli.main import main
+from palpate.sim import script
+from palpate.tools import demo
+from tests.factories import deliveries, terminals
+from tests.factories.simulated_box import numbered
+
+VIRTUAL = ["--virtual", "--sweeps", "3", "--seed", "7"]
+
+
+def test_demo_prints_plain_lines_without_a_terminal(capsys: pytest.CaptureFixture[str]):
+    """Heads, each sweep with truth and answer, without a sentence; then the sum, and what to do
+    next."""
+    assert main(["demo", *VIRTUAL]) == 0
+    out = capsys.readouterr().out
+    assert "$PPLP" not in out
+    assert out.count("-> ") == 3
+    assert out.splitlines()[1].split() == ["felt", "answer", "sure"]
+    assert "next: palpate demo --raw" in out
+    assert "frames lost     0 of" in out
+    assert "latency         not measured: --virtual lets no time pass" in out
+    assert "\033" not in out
+
+
+@pytest.mark.slow
+def test_the_tour_has_each_special_sweep_with_its_right_answer(capsys: pytest.CaptureFixture[str]):
+    """A stuck taxel is bridged; an untaught material is unknown; a sweep over two materials is
+    unsure; a pulled cable is sensor-lost, and the next sweep is named again. If a new default
+    bundle is sure about two materials, tour.SEED has to be drawn again."""
+    assert main(["demo", "--virtual"]) == 0
+    out = capsys.readouterr().out
+    rows = [line for line in out.splitlines() if "-> " in line]
+    shown = [(row[5:21].strip(), row[25:41].strip(), "✓" in row) for row in rows]
+    assert shown == [
+        ("wood", "wood", True),
+        ("plastic rough", "plastic rough", True),
+        ("foam", "foam", True),
+        ("cork", "unknown", True),
+        ("metal", "metal", True),
+        ("metal, then wood", "unsure", True),
+        ("paper", "sensor-lost", True),
+        ("paper", "paper", True),
+    ]
+    for about in ("a taxel is stuck", "nobody taught it", "somebody pulled the cable"):
+        assert out.count(about) == 1
+    assert "8 of 8 answers are right" in out
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 0)])
+def test_ctrl_c_ends_with_its_exit_code(number: int, code: int):
+    """As the table of exit codes says; SIGTERM is an orderly end."""
+    with subprocess.Popen(
+        [sys.executable, "-m", "palpate", "demo", "--raw"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+    ) as run:
+        assert run.stdout
+        run.stdout.readline()
+        run.send_signal(number)
+        run.stdout.read()
+        assert run.wait(timeout=30) == code
+
+
+def test_demo_raw_prints_sentences_alone(capsys: pytest.CaptureFixture[str]):
+    """The output is sentences alone, and the same in every run with the same seed."""
+    assert main(["demo", "--raw", *VIRTUAL]) == 0
+    first = capsys.readouterr().out
+    assert all(line.startswith("$PPLP,") for line in first.splitlines())
+    assert first.count(",RES,") == 3
+    main(["demo", "--raw", *VIRTUAL])
+    assert capsys.readouterr().out == first
+
+
+def played_set(folder: Path, bundle: Bundle, each: int = 4) -> str:
+    """A set of three materials in the order of a file: all of the first, then all of the next. The
+    name of its script."""
+    samples = np.repeat(bundle.golden[:1], 3 * each, axis=0)
+    np.savez(
+        folder / "s.npz",
+        samples=samples,
+        labels=np.repeat(np.arange(3), each),
+        materials=["a", "b", "c"],
+        rate_hz=bundle.format.rate_hz,
+        group_recording=np.repeat(np.arange(3), each),
+    )
+    return f"replay:{folder / 's.npz'}"
+
+
+def test_demo_of_a_set_shows_its_materials_in_turn(
+    tmp_path: Path, default_bundle: Bundle, capsys: pytest.CaptureFixture[str]
+):
+    """Three sweeps of a set of three materials show each once, also where the file has them one
+    after another."""
+    assert main(["demo", *VIRTUAL, "--sim", played_set(tmp_path, default_bundle)]) == 0
+    named = [line.split()[1] for line in capsys.readouterr().out.splitlines() if "-> " in line]
+    assert sorted(named) == ["a", "b", "c"]
+
+
+def test_demo_of_a_set_ends_with_the_set(
+    tmp_path: Path, default_bundle: Bundle, capsys: pytest.CaptureFixture[str]
+):
+    """More sweeps are asked for than there are: all are shown, then the table, and the exit code is
+    0."""
+    which = ["--sim", played_set(tmp_path, default_bundle, 1), "--sweeps", "50"]
+    assert main(["demo", "--virtual", *which]) == 0
+    out = capsys.readouterr().out
+    assert out.count("-> ") == 3
+    assert "not in the bundle: " in out
+
+
+def test_materials_that_the_bundle_never_learnt_are_counted_apart(
+    tmp_path: Path, default_bundle: Bundle, capsys: pytest.CaptureFixture[str]
+):
+    """A bundle has two of the simulated materials: other materials do not count as wrong, and
+    `unknown` is their right answer."""
+    files = bundle.files(bundle.DEFAULT)
+    names = [f"x{i}" for i in range(len(default_bundle.manifest.labels))]
+    names[:2] = default_bundle.manifest.labels[:2]
+    text = replace(default_bundle.manifest, labels=tuple(names)).json()
+    folder = deliveries.put(tmp_path / "few", files | {bundle.MANIFEST: text})
+    assert (
+        main(
+            [
+                *("demo", "--virtual", "--sim", "skin", "--sweeps", "12"),
+                *("--set", f"classifier.bundle={folder}"),
+            ]
+        )
+        == 0
+    )
+    out = capsys.readouterr().out
+    table = out[out.index("right / all") :].splitlines()
+    assert sorted(line.split()[0] for line in table[1:3]) == sorted(
+        name.split()[0] for name in names[:2]
+    )
+    assert table[3].split()[:5] == ["all", "sweeps", "4", "/", "4"]
+    others = ", ".join(sorted(set(default_bundle.manifest.labels[2:])))
+    assert f"not in the bundle: 0 of 8 sweeps called unknown ({others})" in out
+    assert out.count("  not in the bundle\n") + out.count("  not in the bundle; ") == 8
+
+
+def test_a_user_who_may_not_read_the_store_sees_the_packaged_bundle(
+    tmp_path: Path,
+    default_bundle: Bundle,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    """On an installed box only the user palpate may read deployed bundles: a message says so with
+    the remedy, and the demo plays."""
+
+    def refused(path: object) -> str:
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+
+    monkeypatch.setattr(os, "readlink", refused)
+    assert main(["demo", *VIRTUAL, "--set", f"store.folder={tmp_path}"]) == 0
+    output = capsys.readouterr()
+    assert f"{tmp_path}/current: this user may not read" in output.err
+    assert "sudo -u palpate" in output.err
+    assert output.out.count("-> ") == 3
+
+
+@pytest.mark.parametrize("text", ["0", "-3", "many", "1.5"])
+def test_a_number_of_sweeps_is_a_number(text: str, capsys: pytest.CaptureFixture[str]):
+    """Other values are usage errors that name the value."""
+    with pytest.raises(SystemExit) as e:
+        main(["demo", "--sweeps", text])
+    assert e.value.code == 2
+    assert f"{text} is not a number of sweeps" in capsys.readouterr().err
+
+
+def test_the_order_of_a_set_depends_on_the_seed_alone():
+    """Each sweep once; in each round each material that has one left."""
+    labels = np.array([0, 0, 0, 0, 1, 1, 2])
+    order = script.in_turn(labels, 1)
+    assert sorted(order) == list(range(7))
+    assert [sorted(labels[order[:3]]), sorted(labels[order[3:5]]), labels[order[5:]].tolist()] == [
+        [0, 1, 2],
+        [0, 1],
+        [0, 0],
+    ]
+    assert order == script.in_turn(labels, 1)
+    assert order != script.in_turn(labels, 2)
+
+
+@pytest.mark.slow
+def test_demo_paints_on_a_terminal():
+    """On a terminal the skin is drawn in 16 shaded cells and painted over."""
+    far, near = os.openpty()
+    with subprocess.Popen(
+        [sys.executable, "-m", "palpate", "demo", "--virtual", "--sweeps", "1"],
+        stdout=near,
+        stderr=subprocess.DEVNULL,
+    ) as run:
+        os.close(near)
+        shown = terminals.read(far, run)
+        assert terminals.ended(run, shown) == 0
+    os.close(far)
+    first = shown.split(b"\033[12A")[0]
+    assert first.count(b"\033[48;5;") == 32
+    assert b"\033[32mwood" in shown  # the answer in the colour of its status
+
+
+def test_picture_shows_each_digit():
+    """The picture's numbers are the newest frame's digits."""
+    frame = numbered(1)
+    text = "\n".join(demo.picture(frame[0]))
+    assert all(f"{d:^6}" in text for d in frame.ravel())

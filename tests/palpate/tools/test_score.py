@@ -1,0 +1,95 @@
+"""Answers are counted against the true materials."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from palpate.client.answers import Answer
+from palpate.core.types import Status, Verdict
+from palpate.io.robot_link import result
+from palpate.sim.rig import Act
+from palpate.tools.score import AnswerScore
+
+
+def answer(number: int, label: str, status: Status = Status.OK, share: float = 1.0) -> Answer:
+    """One that went through its sentence."""
+    v = Verdict(
+        number,
+        10**9,
+        status,
+        label,
+        0.9,
+        0.8,
+        np.array([0.9, 0.1]),
+        1,
+        0,
+        1_500_000,
+        "9f3c2a1b",
+        share=share,
+    )
+    read = Answer.read(result(v, "sim").decode().strip())
+    assert read
+    return read
+
+
+def act(label: str, *, new_object: bool = False) -> Act:
+    """A slide of 1500 frames over a tube of this material."""
+    return Act(np.zeros((1, 4, 4), np.uint8), 0, 1500, label, new_object)
+
+
+def test_only_ok_with_the_right_label_counts():
+    """Another label, and the right one that is unsure, are wrong; percentages have their
+    intervals."""
+    score = AnswerScore(frozenset({"wood", "paper"}))
+    answers = [
+        answer(1, "wood"),
+        answer(2, "wood"),
+        answer(3, "wood", Status.UNSURE),
+        answer(4, "wood", share=0.5),
+    ]
+    right = [
+        score.add(act(name), one)
+        for name, one in zip(("wood", "paper", "wood", "wood"), answers, strict=True)
+    ]
+    assert right == [True, False, False, True]
+    assert score.table()[1:] == [
+        "  paper               0 / 1",
+        "  wood                2 / 3",
+        "  all sweeps          2 / 4     50.0 % [15.0, 85.0]",
+    ]
+    assert score.touch(750.0) == "2.00 s mean, 1 of 4 answered early"
+    assert score.latency() == "1.50 ms median, 1.50 ms worst"
+
+
+def test_an_object_counts_by_its_last_answer():
+    """Two sweeps of the first object, one of the second."""
+    score = AnswerScore(frozenset({"wood", "paper"}))
+    for new, label in ((True, "paper"), (False, "wood"), (True, "paper")):
+        score.add(act("wood", new_object=new), answer(1, label))
+    assert score.objects == [True, False]
+    assert score.table()[-1].startswith("  all objects         1 / 2     50.0 % [")
+
+
+def test_a_material_that_the_bundle_does_not_know_is_unknown_at_best():
+    """Sweeps of such a material are counted apart; its objects do not count as wrong."""
+    score = AnswerScore(frozenset({"wood"}))
+    right = [
+        score.add(act("cork", new_object=True), answer(1, "wood")),
+        score.add(act("cork"), answer(2, "", Status.UNKNOWN)),
+        score.add(act("felt"), answer(3, "", Status.UNSURE)),
+        score.add(act("wood"), answer(4, "wood")),
+    ]
+    assert right == [False, True, False, True]
+    assert score.answers == 4
+    assert score.objects == []
+    assert score.table()[1:] == [
+        "  wood                1 / 1",
+        "  all sweeps          1 / 1     100.0 % [20.7, 100.0]",
+        "  not in the bundle: 1 of 3 sweeps called unknown (cork, felt)",
+    ]
+
+
+def test_another_sentence_is_no_answer():
+    """A state sentence and half a line do not count as answers."""
+    assert Answer.read("$PPLP,STA,1,streaming*00") is None
+    assert Answer.read("$PP") is None

@@ -1,0 +1,418 @@
+"""Conformance of readout boards: a sound board passes over each link, and each fault is found and
+named."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+
+from palpate.cli.main import main
+from palpate.core.config import SkinConfig
+from palpate.core.errors import SensorLost, SensorMismatch
+from palpate.io import packets
+from palpate.io.usb_sensor import open_link
+from palpate.sim import rig, skin
+from palpate.sim.devices import SimDevices
+from palpate.tools import skin_check
+from palpate.tools.skin_check import PartResult
+from tests.factories import pico
+from tests.factories.simulated_box import idle_devices
+
+PARTS = (
+    "identity",
+    "format",
+    "start",
+    "crc",
+    "packets",
+    "sequence",
+    "loss",
+    "rate",
+    "clock",
+    "requests",
+    "overflow",
+    "stop",
+)
+Fault = Callable[[SimDevices], object]
+
+
+def findings(simulated: SimDevices, seconds: float = 5) -> dict[str, PartResult]:
+    """The findings of a board on the simulated bus, in their order."""
+    config = SkinConfig(link="acm" if simulated.backend.acm else "vendor")
+    link = open_link(config, simulated.backend, simulated.clock)
+    found = list(skin_check.check(link, simulated.clock, seconds, port=False))
+    link.close()
+    assert len({f.part for f in found}) == len(found)
+    return {f.part: f for f in found}
+
+
+def of_packets(change: Callable[[packets.Packet], packets.Packet]) -> Fault:
+    """Each packet changed, with a right CRC."""
+
+    def mangled(data: bytes) -> bytes:
+        (p,) = packets.unpack(data).packets
+        p = change(p)
+        return packets.pack(p.seq, p.t_us, p.taxels, p.flags)
+
+    return lambda simulated: setattr(simulated.backend, "mangle", mangled)
+
+
+def of_crc(crc: Callable[[bytes], bytes]) -> Fault:
+    """Each packet with another CRC."""
+    return lambda simulated: setattr(
+        simulated.backend, "mangle", lambda data: data[:-4] + crc(data[:-4])
+    )
+
+
+def of_bytes(change: Callable[[bytes], bytes]) -> Fault:
+    """Each transfer changed."""
+    return lambda simulated: setattr(simulated.backend, "mangle", change)
+
+
+def of_replies(number: int, change: Callable[[bytes], bytes]) -> Fault:
+    """One reply changed."""
+
+    def faulty(simulated: SimDevices) -> None:
+        board = simulated.backend.board
+        right = board.request
+        board.request = lambda n: change(right(n)) if n == number else right(n)  # type: ignore[method-assign]
+
+    return faulty
+
+
+def of_requests(change: Callable[[rig.ReadoutBoard, int], bool]) -> Fault:
+    """Requests that `change` deals with itself are not seen by the board."""
+
+    def faulty(simulated: SimDevices) -> None:
+        board = simulated.backend.board
+        right = board.request
+        board.request = lambda n: b"" if change(board, n) else right(n)  # type: ignore[method-assign]
+
+    return faulty
+
+
+def of_format(**changes: object) -> Fault:
+    """FORMAT disagrees with the packets."""
+    return lambda simulated: of_replies(
+        packets.Request.FORMAT,
+        lambda _: packets.pack_format(replace(simulated.backend.board.skin, **changes)),
+    )(simulated)
+
+
+def every(n: int, change: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
+    """Only each nth transfer changed."""
+    count = iter(range(10**9))
+    return lambda data: change(data) if next(count) % n == n - 1 else data
+
+
+def restarting(simulated: SimDevices) -> None:
+    """The count begins again every 200 packets."""
+    of_packets(lambda p: replace(p, seq=p.seq % 1200 + (1 << 20) * (p.seq // 1200 % 2)))(simulated)
+
+
+class NewestDropped(rig.ReadoutBoard):
+    """A board whose full FIFO keeps the oldest frames; it says that it has overflowed."""
+
+    cut = resume = -1
+
+    def take(self) -> bytes:
+        """The packet that is due."""
+        fifo, self.skin = self.skin.fifo_frames, replace(self.skin, fifo_frames=10**9)
+        taken = int((self._clock.now_ns() - self._origin_ns) / self._period_ns)
+        if taken - self._next > fifo:
+            self.cut, self.resume = self._next + fifo, taken
+        jumped = 0 <= self.cut <= self._next
+        if jumped:
+            self._next, self.cut = self.resume - self.skin.packet_frames, -1
+        data = super().take()
+        self.skin = replace(self.skin, fifo_frames=fifo)
+        (p,) = packets.unpack(data).packets
+        return packets.pack(p.seq, p.t_us, p.taxels, packets.Flag.OVERFLOW if jumped else 0)
+
+
+def newest_dropped(simulated: SimDevices) -> None:
+    """Another board on the bus."""
+    simulated.backend.board = NewestDropped(skin.FORMAT, simulated.robot, simulated.clock)
+
+
+def inverse(data: bytes) -> bytes:
+    """CRC without its last step."""
+    return struct.pack("<I", zlib.crc32(data) ^ 0xFFFFFFFF)
+
+
+FAULTS: dict[str, tuple[Fault, str, str]] = {
+    "short identity": (of_replies(1, lambda r: r[:20]), "identity", "identity of 20 bytes"),
+    "other version": (
+        of_replies(1, lambda r: b"\2" + r[1:]),
+        "identity",
+        "protocol version 2; byte 0 must be 1",
+    ),
+    "no name": (
+        of_replies(1, lambda r: r[:4] + bytes(16) + r[20:]),
+        "identity",
+        "the board's name is empty",
+    ),
+    "short format": (of_replies(2, lambda r: r[:8]), "format", "format of 8 bytes"),
+    "unknown type": (of_replies(2, lambda r: r[:2] + b"\7" + r[3:]), "format", "data type 7"),
+    "rate 0": (of_format(rate_hz=0), "format", "a rate of 0.0 Hz"),
+    "small FIFO": (of_format(fifo_frames=100), "format", "the FIFO must hold 0.25 s"),
+    "no frames in a packet": (
+        of_format(packet_frames=0),
+        "format",
+        "0 bytes a packet; use 1 to 4096",
+    ),
+    "large packets": (of_format(packet_frames=300), "format", "4800 bytes a packet; use 1 to 4096"),
+    "sends unasked": (
+        of_requests(lambda b, n: n == 4 and setattr(b, "running", True) is None),
+        "start",
+        "sends before START",
+    ),
+    "never starts": (of_requests(lambda b, n: n == 3), "start", "no byte within 1 s of START"),
+    "big-endian CRC": (
+        of_crc(lambda d: struct.pack(">I", zlib.crc32(d))),
+        "crc",
+        "big-endian; send its lowest byte",
+    ),
+    "CRC not inverted": (of_crc(inverse), "crc", "lacks the inversion"),
+    "CRC of the payload": (
+        of_crc(lambda d: struct.pack("<I", zlib.crc32(d[20:]))),
+        "crc",
+        "that of the payload",
+    ),
+    "no CRC": (of_crc(lambda d: bytes(4)), "crc", "the CRC is 0"),
+    "other CRC": (of_crc(lambda d: b"\1\2\3\4"), "crc", "each packet begins with 50 C1 01 00"),
+    "text between packets": (
+        of_bytes(every(50, lambda d: b"debug: 17\n" + d)),
+        "crc",
+        "nothing else prints to this port",
+    ),
+    "bytes lost": (
+        of_bytes(every(50, lambda d: d[:30] + d[31:])),
+        "crc",
+        "bytes were lost or added",
+    ),
+    "other grid": (
+        of_packets(lambda p: replace(p, taxels=p.taxels.reshape(-1, 2, 8))),
+        "packets",
+        "it sends 2x8 uint8",
+    ),
+    "more frames": (of_format(packet_frames=2), "packets", "4 frames in a packet, FORMAT says 2"),
+    "counts packets": (
+        of_packets(lambda p: replace(p, seq=p.seq // 4)),
+        "sequence",
+        "it counts packets",
+    ),
+    "number stands": (
+        of_packets(lambda p: replace(p, seq=7)),
+        "sequence",
+        "the number never changes",
+    ),
+    "number restarts": (restarting, "sequence", "restarts of the count"),
+    "packets lost": (of_bytes(every(10, lambda d: b"")), "loss", "no packet reports an overflow"),
+    "rate too high": (of_format(rate_hz=800.0), "rate", "FORMAT says 800 Hz: -6.25 %"),
+    "rate too low": (of_format(rate_hz=700.0), "rate", "FORMAT says 700 Hz: +7.1"),
+    "clock of milliseconds": (
+        of_packets(lambda p: replace(p, t_us=p.t_us // 1000)),
+        "clock",
+        "count microseconds",
+    ),
+    "clock runs fast": (
+        of_packets(lambda p: replace(p, t_us=round(p.t_us * 1.001))),
+        "clock",
+        "+1000 ppm",
+    ),
+    "clock jumps": (
+        of_packets(lambda p: replace(p, t_us=p.t_us + 30_000 * (p.seq // 100 % 7 == 3))),
+        "clock",
+        "the skin's clock went on",
+    ),
+    "unknown request stops it": (
+        of_requests(lambda b, n: n == 0x51 and b.request(4) is None),
+        "requests",
+        "leave unknown requests alone",
+    ),
+    "flag always": (
+        of_packets(lambda p: replace(p, flags=2)),
+        "overflow",
+        "while no frame is missing",
+    ),
+    "flag never": (
+        of_packets(lambda p: replace(p, flags=0)),
+        "overflow",
+        "set bit 1 of byte 6 in the next packet",
+    ),
+    "newest dropped": (newest_dropped, "overflow", "drop the oldest frames, not the newest"),
+    "FIFO smaller than it says": (
+        of_format(fifo_frames=1500),
+        "overflow",
+        "s were kept, FORMAT says 2.00 s",
+    ),
+    "goes on after STOP": (
+        of_requests(lambda b, n: n == 4 and b.due_ns() is not None),
+        "stop",
+        "frames come after STOP",
+    ),
+}
+"""What is wrong, the part that must fail, and words of its line."""
+
+
+@pytest.mark.parametrize("acm", [False, True])
+def test_a_sound_board_passes(acm: bool):
+    """Every part, over bulk transfers and over a serial port of USB."""
+    found = findings(idle_devices(acm=acm))
+    assert tuple(found) == PARTS
+    assert {f.verdict for f in found.values()} == {"ok"}, found
+
+
+def test_a_board_that_was_left_sending_passes():
+    """A board that still sends for a killed program passes."""
+    simulated = idle_devices(acm=True)
+    simulated.backend.board.request(packets.Request.START)
+    simulated.clock.sleep_until(simulated.clock.now_ns() + 20_000_000_000)
+    found = findings(simulated)
+    assert {f.verdict for f in found.values()} == {"ok"}, found
+
+
+@pytest.mark.parametrize(("fault", "part", "words"), FAULTS.values(), ids=list(FAULTS))
+def test_each_fault_is_found(fault: Fault, part: str, words: str):
+    """The part fails with a remedy, and independent parts are ok."""
+    simulated = idle_devices(acm=True)
+    fault(simulated)
+    found = findings(simulated)
+    assert found[part].verdict == "FAIL", found
+    assert words in found[part].detail
+    depends = {
+        "format": PARTS,
+        "crc": PARTS,
+        "packets": ("rate", "clock"),
+        "sequence": ("start", *PARTS[4:]),
+        "loss": ("overflow",),
+        "rate": ("clock", "overflow"),
+        "clock": ("overflow",),
+        "start": PARTS,
+        "identity": (),
+        "requests": PARTS[10:],
+    }.get(part, ())
+    others = {name: f for name, f in found.items() if name != part and name not in depends}
+    assert not {name: f for name, f in others.items() if f.verdict == "FAIL"}
+
+
+def test_a_board_that_stops_for_good_is_found():
+    """A board must send again after STOP and START."""
+    simulated = idle_devices(acm=True)
+    stops: list[int] = []
+    of_requests(lambda b, n: stops.append(n) or (stops.count(4) > 1 and n == 3))(simulated)
+    assert "no frames after STOP and another START" in findings(simulated)["stop"].detail
+
+
+def test_no_reply_while_frames_are_sent_is_found():
+    """Over a serial port, where replies come between packets."""
+    simulated = idle_devices(acm=True)
+    of_requests(lambda b, n: b.running and n in (1, 2))(simulated)
+    assert "does not answer request IDENTITY" in findings(simulated)["requests"].detail
+
+
+def test_what_cannot_be_decided_is_unknown():
+    """Too short a time for the clock; packets that arrive with much jitter; a FIFO that does not
+    run over."""
+    found = findings(idle_devices(), seconds=0.02)
+    assert (found["rate"].verdict, found["clock"].verdict) == ("unknown", "unknown")
+    assert "listen longer with --seconds" in found["clock"].detail
+    delays = iter(range(10**9))
+    found = findings(idle_devices(latency=lambda: 150_000 + next(delays) * 7919 % 4000_000))
+    assert found["rate"].verdict == "ok"
+    assert found["clock"].verdict == "unknown"
+    simulated = idle_devices()
+    simulated.backend.board.skin = replace(simulated.backend.board.skin, fifo_frames=10**6)
+    of_format(fifo_frames=750)(simulated)
+    assert findings(simulated)["overflow"].verdict == "unknown"
+
+
+def test_a_cable_that_is_pulled_ends_the_check():
+    """With the link's error, not with a verdict on the board."""
+    simulated = idle_devices()
+    simulated.backend.at(simulated.clock.now_ns() + 3_000_000_000, simulated.backend.unplug)
+    with pytest.raises(SensorLost, match="was unplugged"):
+        findings(simulated)
+
+
+class EchoLink:
+    """A device that sends each byte back, as a terminal does; it never answers."""
+
+    def __init__(self) -> None:
+        self.clock, self.sent = rig.VirtualClock(), b""
+
+    def request(self, request: packets.Request, length: int) -> bytes:
+        """No reply."""
+        self.sent += bytes([request])
+        if length:
+            raise SensorMismatch(
+                f"the skin sends 1 other bytes but does not answer request {request.name}"
+            )
+        return b""
+
+    def read(self, size: int, timeout_ms: int) -> bytes:
+        """The echo."""
+        self.clock.sleep_until(self.clock.now_ns() + timeout_ms * 1_000_000)
+        data, self.sent = self.sent, b""
+        return data
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+def test_another_device_at_the_port_is_told_apart():
+    """Another device answers nothing and sends no packets: no part is ok, and the check ends."""
+    link = EchoLink()
+    found = {f.part: f for f in skin_check.check(link, link.clock, 5, port=True)}
+    assert [found[part].verdict for part in ("identity", "format", "start")] == [
+        "FAIL",
+        "FAIL",
+        "unknown",
+    ]
+    assert "does not answer request FORMAT" in found["format"].detail
+    assert found["start"].detail.startswith("1 bytes came after it, and no whole packet")
+    assert not [f for f in found.values() if f.verdict == "ok"]
+
+
+def of_a_port(
+    capsys: pytest.CaptureFixture[str], port: str, *options: str
+) -> dict[str, tuple[str, str]]:
+    """(verdict, detail) by part, as `palpate skin check` prints them for a board at a serial
+    port."""
+    sets = ("--set", "skin.link=serial", "--set", f"skin.port={port}")
+    ended = main(["skin", "check", *sets, *options])
+    lines = [line.split(maxsplit=2) for line in capsys.readouterr().out.splitlines()]
+    assert ended == any(line[0] == "FAIL" for line in lines)
+    return {part: (verdict, detail) for verdict, part, detail in lines}
+
+
+@pytest.mark.slow
+def test_the_pico_passes(capsys: pytest.CaptureFixture[str]):
+    """The reference firmware under MicroPython, at a serial port: nothing that a busy machine has
+    no part in fails."""
+    with pico.plugged_in(ROWS=16, COLS=16, RATE_HZ=200, DTYPE="uint16", FIFO_S=0.5) as port:
+        found = of_a_port(capsys, port, "--seconds", "2")
+    assert tuple(found) == PARTS
+    timed = {"rate", "clock", "loss", "start"}
+    assert {verdict for name, (verdict, _) in found.items() if name not in timed} == {"ok"}, found
+
+
+@pytest.mark.slow
+def test_a_pico_that_is_too_slow_is_found(capsys: pytest.CaptureFixture[str]):
+    """Every tenth interrupt comes 20 ms late: frames are missing though all was read, and count and
+    clock still agree."""
+    with pico.plugged_in(RATE_HZ=200, late_ms=20, late_every=10) as port:
+        found = of_a_port(capsys, port, "--seconds", "3")
+    verdict, detail = found["loss"]
+    assert verdict == "FAIL"
+    assert detail.endswith(
+        "no packet reports an overflow: the frames were never taken; lower the rate"
+    )
+    assert found["sequence"][0] == "ok"
+    # at 3.2 kB/s the kernel's buffer for a port lasts longer than the longest pause
+    assert found["overflow"][0] == "unknown"
+    assert "not waited for" in found["overflow"][1]

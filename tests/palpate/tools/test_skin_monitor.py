@@ -1,0 +1,102 @@
+"""Rate, noise, load and faults of a skin are those that were put into its frames."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from palpate.core.types import Frames, SweepFormat
+from palpate.tools.skin_monitor import STUCK_S, SkinMonitor
+
+RATE = 100
+
+
+def frames(taxels: np.ndarray, first: int = 0) -> Frames:
+    """Frames with these taxels, 10 ms apart."""
+    seq = first + np.arange(len(taxels), dtype=np.int64)
+    return Frames(seq * 10_000_000, seq, taxels)
+
+
+def signal(
+    seconds: float, shape: tuple[int, ...] = (3, 4), noise: float = 2.0, seed: int = 1
+) -> np.ndarray:
+    """Noise around 50 raw counts, [n, *shape]."""
+    return np.random.default_rng(seed).normal(50, noise, (round(seconds * RATE), *shape))
+
+
+def monitor(taxels: np.ndarray, dtype: str = "float32", piece: int = 7) -> dict[str, object]:
+    """The measurements of a monitor that gets these taxels piece by piece."""
+    rows, cols, *axes = taxels.shape[1:]
+    watched = SkinMonitor(SweepFormat(rows, cols, RATE, 2 * RATE, dtype, *axes))
+    for at in range(0, len(taxels), piece):
+        watched.put(frames(taxels[at : at + piece].astype(dtype), at))
+    return watched.measured()
+
+
+def test_rate_and_noise_are_measured() -> None:
+    """Rate and noise are measured."""
+    found = monitor(signal(4))
+    assert found["rate_hz"] == pytest.approx(RATE, rel=1e-6)
+    assert np.array(found["noise"]) == pytest.approx(np.full((1, 3, 4), 2.0), rel=0.25)
+
+
+def test_a_slow_touch_is_load_and_no_noise() -> None:
+    """A slow touch is load and no noise."""
+    taxels = signal(4)
+    taxels[200:, 1, 2] += np.linspace(0, 400, 200)
+    found = monitor(taxels)
+    load = np.array(found["load"])[0]
+    assert load.argmax() == 1 * 4 + 2
+    assert load[1, 2] > 380
+    assert found["full"] == pytest.approx(load.max(), rel=0.01)
+    assert np.array(found["noise"]).max() < 4
+
+
+def test_a_taxel_that_has_one_value_is_stuck_and_no_other_is() -> None:
+    """A taxel that has one value is stuck and no other is."""
+    taxels = signal(STUCK_S + 1)
+    taxels[:, 0, 3] = 255
+    assert monitor(taxels)["stuck"] == ("1.4",)
+    assert monitor(taxels[: 100 * 4])["stuck"] == ()
+
+
+def test_where_all_stand_still_nothing_says_which_is_stuck() -> None:
+    """Where all stand still nothing says which is stuck."""
+    assert monitor(np.full((1000, 3, 4), 7.0))["stuck"] == ()
+
+
+def test_a_taxel_that_does_not_move_when_the_others_are_touched_is_dead() -> None:
+    """A taxel that does not move when the others are touched is dead."""
+    taxels = signal(6, noise=0.5)
+    taxels[300:] += 100
+    taxels[300:, 2, 1] -= 100
+    assert monitor(taxels)["dead"] == ("3.2",)
+    assert monitor(signal(6))["dead"] == ()
+
+
+def test_a_count_at_the_end_of_its_type_is_saturated() -> None:
+    """A count at the end of its type is saturated."""
+    taxels = signal(1)
+    taxels[:, 1, 1] = 255
+    taxels[:, 0, 0] = 0
+    assert monitor(taxels, "uint8")["saturated"] == ("2.2",)
+    assert monitor(taxels * 1e6)["saturated"] == ()
+
+
+def test_axes_have_their_own_maps_and_names() -> None:
+    """Axes have their own maps and names."""
+    taxels = signal(STUCK_S + 1, (2, 2, 3))
+    taxels[:, 1, 0, 2] = 0
+    found = monitor(taxels)
+    assert found["stuck"] == ("2.1 axis 3",)
+    assert np.array(found["load"]).shape == (3, 2, 2)
+
+
+def test_before_the_second_frame_nothing_is_measured_and_a_new_skin_starts_anew() -> None:
+    """Before the second frame nothing is measured and a new skin starts anew."""
+    watched = SkinMonitor(SweepFormat(3, 4, RATE, 200, "float32"))
+    assert watched.measured() == {}
+    watched.put(frames(signal(1)))
+    assert watched.measured()["rate_hz"]
+    watched.reset()
+    assert watched.measured() == {}

@@ -1,0 +1,396 @@
+"""The page of `palpate align` in a headless browser: alone, and as the command serves it."""
+
+from __future__ import annotations
+
+import re
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import pairwise
+from math import dist, hypot
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from palpate.alignment.view import View
+from palpate.bundle import bundle
+from palpate.bundle.bundle import Manifest
+from palpate.core.clock import SystemClock
+from palpate.signal.contact import ContactPositions
+from palpate.web.access import Access
+from palpate.web.server import PageServer
+from tests.factories.browser import WAIT_S, BrowsedPage, contrast, luminance, until
+
+PLACE = ContactPositions(4.0, (6.0, 6.4), (6.0, 5.8), 0.6)
+LOADS = tuple(tuple(float(20 * r + c) for c in range(4)) for r in range(4))
+VIEW = View(
+    7,
+    "usb",
+    "tubes 3, 9f3c2a1b",
+    "streaming",
+    "off",
+    "2.2 mm too far towards row 1",
+    "move the skin",
+    (4, 4),
+    LOADS,
+    80.0,
+    (3.8, 6.0),
+    (6.0, 6.0),
+    PLACE,
+)
+
+
+@pytest.fixture
+def page() -> Iterator[PageServer]:
+    """A page that shows VIEW, at any free port."""
+    with PageServer("watch.html", Access(0), SystemClock().now_ns) as one:
+        one.show(VIEW)
+        yield one
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bundle with trained positions, on disk."""
+    target = tmp_path_factory.mktemp("bundle")
+    manifest = Manifest.parse((bundle.DEFAULT / bundle.MANIFEST).read_bytes())
+    for name in manifest.files:
+        (target / name).write_bytes((bundle.DEFAULT / name).read_bytes())
+    (target / bundle.MANIFEST).write_bytes(replace(manifest, contact=PLACE).json())
+    return target
+
+
+@pytest.fixture
+def box(folder: Path) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
+    """The running command with the simulated skin, and the address of its page."""
+    command = [sys.executable, "-m", "palpate", "align", "--sim", "rest", "--web", "0"]
+    with subprocess.Popen(
+        [*command, "--set", f"classifier.bundle={folder}"], stdout=subprocess.PIPE
+    ) as run:
+        address = run.stdout.readline().decode().removeprefix("page: ").strip()
+        yield run, address
+        run.stdout.close()
+        run.kill()
+
+
+TURN_S = 40
+"""Longest wait for one of the four touches, which are repeated every 16 s."""
+SHOWN = """() => {
+  const text = (id) => document.getElementById(id).innerText.replaceAll("\u00a0", " ");
+  const sight = (id) => document.getElementById(id)?.style.visibility;
+  return {
+    state: document.body.dataset.state, message: text("message"), hint: text("hint"),
+    skin: text("state"), simulated: document.getElementById("simulated").checkVisibility(),
+    trained: document.querySelectorAll("#align .trained").length, way: sight("way"),
+    centre: sight("centre"),
+    counts: [...document.querySelectorAll("#align .count")].map((e) => e.textContent),
+  };
+}"""
+"""The page at one moment: a finger comes and goes, so two looks may be of two states."""
+
+
+def reached(seen: BrowsedPage, wanted: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+    """The first moment of the page that is as wanted."""
+    shown: dict[str, Any] = {}
+
+    def look() -> bool:
+        shown.update(seen.page.evaluate(SHOWN))
+        return wanted(shown)
+
+    until(look, TURN_S)
+    return shown
+
+
+@pytest.mark.slow
+def test_the_whole_way(browser: Any, box: tuple[subprocess.Popen[bytes], str]):
+    """The real command: the page waits for contact, advises, follows the next touch; when it ends,
+    "no connection"."""
+    run, address = box
+    context = browser.new_context(viewport={"width": 820, "height": 1180})
+    seen = BrowsedPage(context, address)
+    advice = re.compile(r"2\.\d mm too far towards row 1 and 2\.\d mm towards column 1")
+    off = reached(
+        seen, lambda shown: shown["state"] == "off" and bool(advice.fullmatch(shown["message"]))
+    )
+    assert "move the skin" in off["hint"]
+    assert (off["simulated"], off["skin"]) == (True, "skin streaming")
+    assert (off["trained"], off["way"]) == (2, "visible")
+    reached(
+        seen,
+        lambda shown: (
+            shown["state"] == "no-contact"
+            and shown["centre"] == "hidden"
+            and {*shown["counts"]} <= {"0", "1"}
+        ),
+    )
+    seen.state("off")
+    assert seen.errors == []
+    run.send_signal(signal.SIGINT)
+    assert run.wait(timeout=WAIT_S) in (0, 130)
+    seen.state("no-connection")
+    assert seen.text("#message") == "no connection"
+    assert {url.removeprefix(address).split("?")[0] for url in seen.requests} <= FILES
+    context.close()
+
+
+@pytest.mark.slow
+def test_the_page_draws_what_the_box_says(browser: Any, page: PageServer):
+    """Loads as shades and numbers, points at their coordinates, the message in large letters and
+    for screen readers."""
+    context = browser.new_context(viewport={"width": 1180, "height": 820})
+    seen = BrowsedPage(context, page.address)
+    seen.state("off")
+    assert seen.text("#message") == VIEW.message
+    assert seen.page.text_content("#spoken").startswith(VIEW.message)
+    assert seen.page.get_attribute("#spoken", "aria-live") == "polite"
+    assert not seen.page.is_visible("#simulated")
+    fills = seen.page.eval_on_selector_all(".tile", FILLS)
+    assert all(
+        light[2] - light[0] <= dark[2] - dark[0] for light, dark in pairwise(fills[:4])
+    )  # bluer with the load
+    assert fills[0] == [0xE9, 0xED, 0xF2]
+    assert seen.page.locator(".count").all_text_contents() == [
+        f"{load:.0f}" for row in LOADS for load in row
+    ]
+    centre = seen.page.evaluate("new DOMMatrix(document.getElementById('centre').style.transform)")
+    assert (centre["e"], centre["f"]) == pytest.approx((6.0 / 4 * 100 + 50, 3.8 / 4 * 100 + 50))
+    assert [e["r"] for e in circles(seen, ".halo")] == pytest.approx([15, 15])
+    assert circles(seen, ".trained")[1] == pytest.approx({"cx": 195, "cy": 210, "r": 3.5})
+    page.show(replace(VIEW, number=8, state="in-place", message="in place"))
+    seen.state("in-place")
+    assert seen.text("#message") == "✓ in place"
+    assert not seen.page.is_visible("#way")
+    assert not seen.page.is_visible("#push")
+    page.show(
+        replace(
+            VIEW,
+            number=9,
+            state="no-skin",
+            skin="absent",
+            message="no skin: absent",
+            load=(),
+            centre=None,
+        )
+    )
+    seen.state("no-skin")
+    assert seen.text("#state") == "skin absent"
+    assert set(seen.page.locator(".count").all_text_contents()) == {""}
+    page.show(
+        replace(
+            VIEW,
+            number=10,
+            shape=(2, 3),
+            load=((1.0, 2, 3),) * 2,
+            contact=None,
+            state="no-positions",
+            nearest=None,
+            centre=(0.5, 1.0),
+        )
+    )
+    seen.state("no-positions")
+    assert seen.page.locator(".tile").count() == 6
+    assert "0.5, column 1.0 taxels" in seen.text("#figures")
+    assert seen.errors == []
+    context.close()
+
+
+def circles(seen: BrowsedPage, which: str) -> list[dict[str, float]]:
+    """Centre and radius of each."""
+    return seen.page.eval_on_selector_all(
+        which,
+        "all => all.map(e => ({cx: e.cx.baseVal.value, cy: e.cy.baseVal.value, r:"
+        " e.r.baseVal.value}))",
+    )
+
+
+FILES = {
+    "/",
+    "/tablet.js",
+    "/verdict.js",
+    "/shift.js",
+    "/page.css",
+    "/watch.js",
+    "/events.js",
+    "/parts.js",
+    "/skin.js",
+    "/plots.js",
+    "/events",
+    "data:,",
+}
+FILLS = "all => all.map(e => getComputedStyle(e).fill.match(/\\d+/g).map(Number))"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("centre", "message", "way"),
+    [
+        ((2.0, 6.0), "4.0 mm too far towards row 1", (0, -1)),
+        ((10.0, 6.0), "3.6 mm too far towards row 4", (0, 1)),
+        ((6.4, 1.8), "4.0 mm too far towards column 1", (-1, 0)),
+        ((6.0, 11.0), "5.0 mm too far towards column 4", (1, 0)),
+    ],
+)
+def test_the_arrow_points_where_the_skin_has_to_go(
+    browser: Any, page: PageServer, centre: tuple[float, float], message: str, way: tuple[int, int]
+):
+    """Towards the row or column that the message names, in the picture and beside the words: a skin
+    on which the contact lies too far towards row 1 is moved towards row 1."""
+    nearest = min(
+        zip(PLACE.rows_mm, PLACE.cols_mm, strict=True), key=lambda spot: dist(spot, centre)
+    )
+    page.show(replace(VIEW, message=message, centre=centre, nearest=nearest))
+    seen = BrowsedPage(browser.new_context(), page.address)
+    seen.state("off")
+    path = [
+        float(n)
+        for n in re.findall(r"-?[\d.]+", str(seen.page.locator("#way .line").get_attribute("d")))
+    ]
+    drawn = path[2] - path[0], path[3] - path[1]
+    turned = seen.page.evaluate(
+        "new DOMMatrix(getComputedStyle(document.querySelector('#push path')).transform)"
+    )
+    pushed = turned["c"] * -1, turned["d"] * -1  # where the arrow's head, at (0, -1), has got to
+    for arrow in (drawn, pushed):
+        assert (arrow[0] * way[0] + arrow[1] * way[1]) / hypot(*arrow) > 0.9
+    seen.page.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_every_count_can_be_read_on_its_taxel(browser: Any, page: PageServer, scheme: str):
+    """A contrast of 4.5 between the number and its taxel, from no load to the full one (WCAG 2.1,
+    1.4.3)."""
+    page.show(
+        replace(
+            VIEW, load=tuple(tuple(float(4 * r + c) for c in range(4)) for r in range(4)), full=15.0
+        )
+    )
+    context = browser.new_context(color_scheme=scheme)
+    seen = BrowsedPage(context, page.address)
+    seen.state("off")
+    tiles, counts = (seen.page.eval_on_selector_all(which, FILLS) for which in (".tile", ".count"))
+    assert len(tiles) == 16
+    assert len({tuple(one) for one in counts}) == 2  # black on light ones, white on dark ones
+    assert min(contrast(*pair) for pair in zip(tiles, counts, strict=True)) >= 4.5
+    context.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("side", "at"),
+    [
+        ("first-row", "top"),
+        ("last-row", "bottom"),
+        ("first-column", "left"),
+        ("last-column", "right"),
+    ],
+)
+def test_the_picture_shows_which_end_is_the_fingertip(
+    browser: Any, page: PageServer, side: str, at: str
+):
+    """A cap at the side that `skin.fingertip` names; where it is not set, the page says how to
+    find it out."""
+    seen = BrowsedPage(browser.new_context(viewport={"width": 1024, "height": 768}), page.address)
+    seen.state("off")
+    assert seen.page.locator(".finger").count() == 0
+    assert "press one end of the skin" in seen.text("#where")
+    page.show(replace(VIEW, number=8, fingertip=side))
+    until(lambda: seen.page.locator(".finger").count() == 1)
+    board, cap = (seen.page.locator(which).bounding_box() for which in (".board", ".finger"))
+    assert beyond(board, cap) == at
+    name = seen.page.locator("text=fingertip").last.bounding_box()
+    assert beyond(board, name) == at
+    assert min(name["x"], name["y"]) >= 0
+    assert not seen.page.is_visible("#where")
+    seen.page.close()
+
+
+def beyond(board: dict[str, float], box: dict[str, float]) -> str:
+    """The side of the skin beyond which the middle of a box lies."""
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    out = {"left": board["x"] - x, "right": x - board["x"] - board["width"], "top": board["y"] - y}
+    out["bottom"] = y - board["y"] - board["height"]
+    return max(out, key=lambda side: out[side])
+
+
+@pytest.mark.slow
+def test_a_box_that_says_nothing_new_is_no_news(browser: Any, page: PageServer):
+    """The server still answers, but its loop hangs: after a while the page says so instead of
+    showing an old picture."""
+    context = browser.new_context()
+    seen = BrowsedPage(context, page.address)
+    seen.state("off")
+    seen.state("no-connection")
+    assert "The box does not answer" in seen.text("#hint")
+    page.show(replace(VIEW, number=8))
+    seen.state("off")
+    context.close()
+
+
+@pytest.mark.slow
+def test_a_server_that_is_gone_is_no_connection(browser: Any):
+    """The page says at once that there is no connection, and the age of its picture. It shows a new
+    server at the same port by itself."""
+    access = Access(0)
+    with PageServer("watch.html", access, SystemClock().now_ns) as page:
+        page.show(VIEW)
+        seen = BrowsedPage(browser.new_context(), page.address)
+        seen.state("off")
+        access = Access(int(page.address.rsplit(":", 1)[1]))
+    seen.state("no-connection")
+    assert "tunnel" in seen.text("#hint")
+    with PageServer("watch.html", access, SystemClock().now_ns) as page:
+        page.show(replace(VIEW, state="in-place", message="in place"))
+        seen.state("in-place")
+        seen.page.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("width", "height"), [(360, 640), (844, 390), (820, 1180), (1440, 900)])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_it_fits_phone_tablet_and_desktop(
+    browser: Any, page: PageServer, width: int, height: int, scheme: str
+):
+    """Everything on one screen without scrolling, in the light and the dark scheme; the text has
+    enough contrast."""
+    page.show(
+        replace(
+            VIEW, message="12.5 mm too far towards column 4 and 10.5 mm towards row 4", source="sim"
+        )
+    )
+    context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme)
+    seen = BrowsedPage(context, page.address)
+    seen.state("off")
+    assert seen.page.evaluate("document.documentElement.scrollWidth") <= width
+    assert seen.page.evaluate("document.documentElement.scrollHeight") <= height
+    board = seen.page.locator(".board").bounding_box()
+    assert board["x"] >= 0
+    assert board["y"] + board["height"] <= height
+    assert min(board["width"], board["height"]) > 0.3 * min(width, height)
+    for what in ("#message", "#hint", "#figures"):
+        box = seen.page.locator(what).bounding_box()
+        assert box["x"] + box["width"] <= width
+        assert contrast(style(seen, what, "color"), style(seen, "body", "backgroundColor")) >= 4.5
+    assert (luminance(style(seen, "body", "backgroundColor")) > 0.5) == (scheme == "light")
+    context.close()
+
+
+def style(seen: BrowsedPage, what: str, name: str) -> list[float]:
+    """A colour of an element, as red, green and blue."""
+    text = seen.page.locator(what).evaluate(f"e => getComputedStyle(e).{name}")
+    return [float(part) for part in re.findall(r"\d+", text)[:3]]
+
+
+@pytest.mark.slow
+def test_without_a_browser_the_command_ends_at_sigterm(box: tuple[subprocess.Popen[bytes], str]):
+    """SIGTERM ends the command with 0 while connections are open, and the port is free."""
+    run, address = box
+    where = int(address.rsplit(":", 1)[1])
+    with socket.create_connection(("127.0.0.1", where), timeout=WAIT_S):
+        run.send_signal(signal.SIGTERM)
+        assert run.wait(timeout=WAIT_S) in (0, 130)
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(("127.0.0.1", where), timeout=WAIT_S)

@@ -1,0 +1,282 @@
+"""The content of the page from lines of the feed: published events, kept events, refused lines."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+
+from palpate.core.errors import FormatError
+from palpate.core.status import REASONS
+from palpate.web.board import SWEEPS, PageBoard
+from tests.factories import feed_lines
+
+
+class Events:
+    """The published events of a board."""
+
+    def __init__(self) -> None:
+        self.all: list[tuple[str, Any]] = []
+
+    def __call__(self, name: str, content: object) -> None:
+        """Take an event, which must be JSON."""
+        self.all.append((name, json.loads(json.dumps(content, allow_nan=False))))
+
+    def of(self, name: str) -> list[Any]:
+        """The contents of the events of a name."""
+        return [content for one, content in self.all if one == name]
+
+
+@pytest.fixture
+def events() -> Events:
+    """The events of the board."""
+    return Events()
+
+
+@pytest.fixture
+def board(events: Events) -> PageBoard:
+    """A board that has a connection."""
+    one = PageBoard(events)
+    one.take(feed_lines.hello())
+    one.take(feed_lines.health(1.0))
+    return one
+
+
+def frames(board: PageBoard, at_s: float, row: float, col: float, strength: float = 120.0) -> None:
+    """Half a second of frames, 20 a second."""
+    for i in range(10):
+        board.take(feed_lines.frame(at_s + i / 20, feed_lines.load(row, col, strength)))
+
+
+def test_the_first_lines_say_what_box_it_is(board: PageBoard, events: Events):
+    """The page gets the box's presence, its labels, and its state with the content of the status
+    file."""
+    assert events.of("box") == [{"there": True, "why": ""}]
+    assert events.of("hello")[0]["labels"] == list(feed_lines.LABELS)
+    health = events.of("health")[0]
+    assert (health["trial"], health["ready"], health["lost_frames"]) == (
+        "on trial: 12 of 20 sweeps",
+        True,
+        0,
+    )
+
+
+def test_people_read_display_names(events: Events):
+    """The labels stay; names beside them are those of the bundle, and labels where it has none."""
+    board = PageBoard(events)
+    board.take(feed_lines.hello(displays={"wood": "Holz, geölt", "gone": "weg"}))
+    for number, label in enumerate(("wood", "metal"), 1):
+        board.take(feed_lines.verdict(number, float(number), label))
+    board.take(feed_lines.verdict(3, 3.0, status="gap"))
+    (hello,) = events.of("hello")
+    assert hello["labels"] == list(feed_lines.LABELS)
+    assert hello["names"] == ["metal", "Holz, geölt", *feed_lines.LABELS[2:]]
+    shown = [(one["label"], one["name"]) for one in events.of("verdict")]
+    assert shown == [("wood", "Holz, geölt"), ("metal", "metal"), ("", "")]
+
+
+@pytest.mark.parametrize("status", ["ok", "unsure", "unknown", "gap", "sensor-lost"])
+def test_a_verdict_comes_with_its_probabilities_or_its_reason(
+    board: PageBoard, events: Events, status: str
+):
+    """A verdict has rounded probabilities of all labels; without them it has the reason and the
+    remedy in words."""
+    board.take(feed_lines.verdict(7, 2.0, "wood", status))
+    (shown,) = events.of("verdict")
+    assert shown["pid"] == 71
+    assert shown["reason"] == REASONS.get(status, "")
+    assert bool(shown["reason"]) != bool(shown["label"])
+    if shown["label"]:
+        assert shown["scores"][feed_lines.LABELS.index("wood")] == pytest.approx(
+            shown["probability"], abs=1e-4
+        )
+    assert "own" not in shown
+
+
+def test_frames_become_the_view_of_palpate_align(board: PageBoard, events: Events):
+    """Load above the lowest, the contact's centre, the way back; five times a second, however many
+    frames come."""
+    frames(board, 2.0, 0.7, 1.5, 0)
+    assert events.of("view")[-1]["state"] == "no-contact"
+    frames(board, 3.0, 0.7, 1.5)
+    view = events.of("view")[-1]
+    assert view["state"] == "off"
+    assert view["message"].endswith("towards row 1")
+    assert view["fingertip"] == "first-row"
+    assert np.shape(view["load"]) == (4, 4)
+    assert view["centre"][0] == pytest.approx(4 * 0.7, abs=0.6)
+    numbers = [one["number"] for one in events.of("view")]
+    assert numbers == sorted(set(numbers))
+    assert len(numbers) <= 6
+
+
+def test_without_a_bundle_the_picture_has_no_positions(events: Events):
+    """Without a bundle, as in `palpate record`, the picture has the load and the centre alone."""
+    board = PageBoard(events)
+    board.take(
+        {name: value for name, value in feed_lines.hello(bundle="").items() if name != "alignment"}
+    )
+    board.take(feed_lines.state())
+    rng = np.random.default_rng(1)
+    for i in range(40):
+        board.take(
+            feed_lines.frame(
+                i / 20, np.round(feed_lines.load(0, 0, 0) + rng.integers(0, 2, (4, 4)))
+            )
+        )
+    frames(board, 3.0, 1.5, 1.5)
+    assert events.of("view")[-1]["state"] == "no-positions"
+
+
+def test_a_skin_that_goes_is_shown_at_once(board: PageBoard, events: Events):
+    """State and view change with the next line; the counts of another skin get their own lowest
+    value."""
+    frames(board, 2.0, 1.5, 1.5)
+    board.take(feed_lines.state("absent", "check the cable"))
+    assert events.of("state")[-1] == {
+        "skin": "absent",
+        "trouble": "check the cable",
+        "sweeping": False,
+        "ready": False,
+    }
+    assert (events.of("view")[-1]["state"], events.of("view")[-1]["hint"]) == (
+        "no-skin",
+        "check the cable",
+    )
+    board.take(feed_lines.state())
+    board.take(feed_lines.frame(9.0, feed_lines.load(1.5, 1.5)))
+    assert events.of("view")[-1]["state"] == "wait"
+
+
+def test_loss_is_counted_by_the_minute(board: PageBoard, events: Events):
+    """Frames and lost frames of each minute, not over a restart, after which the box counts from
+    0."""
+    for at_s in range(2, 125):
+        board.take(feed_lines.health(float(at_s), lost_frames=3 if at_s > 70 else 0))
+    assert [(one["frames"], one["lost"]) for one in events.of("minute")] == [
+        (45_000, 0),
+        (45_000, 3),
+    ]
+    board.away("the box has ended")
+    board.take(feed_lines.hello(pid=72))
+    for at_s in range(200, 262):
+        board.take(feed_lines.health(float(at_s), frames=750 * (at_s - 200), lost_frames=1, pid=72))
+    assert (events.of("minute")[-1]["frames"], events.of("minute")[-1]["lost"]) == (45_000, 0)
+
+
+def test_a_restart_is_noted_with_what_has_changed(board: PageBoard, events: Events):
+    """A restarted process causes a note in the history, with the new bundle; a cut connection does
+    not."""
+    board.away("the connection was cut")
+    assert events.of("box")[-1] == {"there": False, "why": "the connection was cut"}
+    board.take(feed_lines.hello())
+    board.take(feed_lines.health(5.0))
+    assert events.of("note") == []
+    board.take(feed_lines.hello(pid=72, bundle="aaaa0001"))
+    board.take(feed_lines.health(9.0, pid=72))
+    board.take(feed_lines.health(10.0, pid=72))
+    (note,) = events.of("note")
+    assert note["time_ns"] == 9 * feed_lines.SECOND
+    assert note["text"] == "the box was restarted, with bundle aaaa0001 in place of 9f3c2a1b"
+
+
+def test_the_latest_sweeps_are_kept(board: PageBoard, events: Events):
+    """The latest SWEEPS sweeps are kept by a number of their own, because the box counts anew after
+    a restart."""
+    for number in range(SWEEPS + 3):
+        board.take(feed_lines.sweep(number))
+    numbers = [one["number"] for one in events.of("signal")]
+    assert numbers == list(range(1, SWEEPS + 4))
+    assert board.sweep("3") is None
+    assert board.sweep("4")["sweep"] == 3
+    assert board.sweep(str(SWEEPS + 4)) is None
+
+
+def test_lines_of_a_later_version_are_passed_over(board: PageBoard, events: Events):
+    """Lines of an unknown type and unknown fields change nothing."""
+    before = len(events.all)
+    board.take({"type": "weather", "sun": True})
+    board.take({"type": "lost", "lines": 7})
+    board.take({})
+    assert len(events.all) == before
+    board.take(feed_lines.health(2.0, later=1))
+    assert events.of("health")[-1]["later"] == 1
+
+
+HELLO, SWEEP = feed_lines.hello(), feed_lines.sweep(1)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        {"type": "hello"},
+        HELLO | {"format": {"rows": 0}},
+        HELLO | {"format": "4x4"},
+        HELLO | {"frames_hz": "many"},
+        HELLO | {"alignment": {"contact": 5.0}},
+        HELLO | {"alignment": HELLO["alignment"] | {"unloaded": [[0.0]]}},
+        HELLO | {"alignment": HELLO["alignment"] | {"place": {"pitch_mm": -4.0}}},
+        {"type": "health", "skin": "streaming"},
+        feed_lines.health(1.0) | {"frames": "many"},
+        {"type": "state"},
+        {"type": "verdict", "sweep": 1},
+        feed_lines.verdict(1, 1.0) | {"scores": ["high"]},
+        {"type": "frame", "time_ns": 1, "taxels": [[1, 2], [3]]},
+        {"type": "frame", "time_ns": 1, "taxels": [[1, 2], [3, 4]]},
+        {"type": "frame", "time_ns": None, "taxels": [[0] * 4] * 4},
+        SWEEP | {"data": "###"},
+        SWEEP | {"data": SWEEP["data"][:-8]},
+        SWEEP | {"dtype": "object"},
+        SWEEP | {"shape": [1500, 4]},
+        SWEEP | {"shape": [-1, 4, 4]},
+        SWEEP | {"shape": [0, 4, 4], "data": ""},
+    ],
+)
+def test_a_line_that_is_not_as_it_must_be_is_refused(board: PageBoard, line: dict[str, Any]):
+    """The error names the type and the remedy; the board continues with the next line."""
+    with pytest.raises(FormatError, match=f"{line['type']}.*update"):
+        board.take(line)
+    board.take(HELLO)
+    board.take(feed_lines.health(3.0))
+    frames(board, 4.0, 1.5, 1.5)
+
+
+HANDS = {"left": {}, "right": {}}
+"""Of the first line of a box with two fingers; the page needs the names alone."""
+
+
+def test_a_hand_has_the_answers_of_its_fingers_and_the_skin_of_the_first(events: Events):
+    """The words for each finger stand in the verdict. Frames and windows of the second finger are
+    not drawn."""
+    board = PageBoard(events)
+    board.take(feed_lines.hello(fingers=HANDS))
+    board.take(feed_lines.health(1.0))
+    fingers = [
+        {"finger": "left", "label": "wood", "probability": 0.912, "status": "ok"},
+        {"finger": "right", "label": "", "probability": 0.0, "status": "no-contact"},
+    ]
+    board.take(feed_lines.verdict(1, 2.0, fingers=fingers))
+    assert events.of("verdict")[0]["fingers"] == "left wood 91.2 %, right no-contact"
+    at_first = feed_lines.frame(3.0, feed_lines.load(1, 1))
+    board.take(at_first | {"finger": "right", "taxels": [[1, 2]]})
+    board.take(feed_lines.sweep(1) | {"finger": "right"})
+    assert not events.of("view")
+    assert not events.of("signal")
+    board.take(at_first | {"finger": "left"})
+    board.take(feed_lines.sweep(1) | {"finger": "left"})
+    assert len(events.of("view")) == len(events.of("signal")) == 1
+
+
+def test_a_box_with_one_skin_has_no_fingers(board: PageBoard, events: Events):
+    """Neither in a verdict nor in a frame."""
+    board.take(feed_lines.verdict(1, 2.0))
+    assert "fingers" not in events.of("verdict")[0]
+
+
+@pytest.mark.parametrize("fingers", [3, [3], [{"finger": "left"}], [{"label": 3}]])
+def test_fingers_that_are_none_are_refused(board: PageBoard, fingers: object):
+    """With the type of the line."""
+    with pytest.raises(FormatError, match="'verdict' does not fit"):
+        board.take(feed_lines.verdict(1, 2.0, fingers=fingers))

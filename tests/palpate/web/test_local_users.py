@@ -1,0 +1,104 @@
+"""The page on loopback is for the users who may read the feed; slow connections lock nobody out."""
+
+from __future__ import annotations
+
+import os
+import socket
+import time
+from collections.abc import Iterator
+from http.client import HTTPConnection
+
+import pytest
+
+from palpate.core.clock import SystemClock
+from palpate.web import local_users, server
+from palpate.web.access import Access
+from palpate.web.server import MOST_OF_ONE, MOST_OPEN, PageServer
+
+
+@pytest.fixture
+def page() -> Iterator[PageServer]:
+    """A page on loopback, at a free port."""
+    with PageServer("watch.html", Access(0), SystemClock().now_ns) as made:
+        yield made
+
+
+def port(page: PageServer) -> int:
+    """The port of a page."""
+    return int(page.address.rpartition(":")[2])
+
+
+def status(page: PageServer, host: str = "127.0.0.1") -> tuple[int, str]:
+    """The answer to a request for the page. host: address of the client."""
+    asked = HTTPConnection("127.0.0.1", port(page), timeout=5, source_address=(host, 0))
+    try:
+        asked.request("GET", "/")
+        answer = asked.getresponse()
+        return answer.status, answer.reason
+    finally:
+        asked.close()
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
+def test_the_owner_of_a_connection(host: str):
+    """The kernel names this user for both families, and nobody for a connection that is not
+    there."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with (
+        socket.create_server((host, 0), family=family) as listener,
+        socket.create_connection(listener.getsockname()[:2]) as client,
+    ):
+        places = client.getsockname()[:2], client.getpeername()[:2]
+        assert local_users.owner(*places) == os.geteuid()
+        assert local_users.owner(places[0], (host, 1)) is None
+
+
+def test_who_may_see_the_box():
+    """Root and this user; nobody unknown."""
+    assert local_users.may_see(0)
+    assert local_users.may_see(os.geteuid())
+    assert not local_users.may_see(None)
+    assert not local_users.may_see(987_654)
+
+
+def test_another_user_gets_nothing(page: PageServer, monkeypatch: pytest.MonkeyPatch):
+    """Neither the page nor its events; the answer names the group."""
+    assert status(page)[0] == 200
+    monkeypatch.setattr(local_users, "owner", lambda peer, own: 987_654)
+    assert status(page) == (403, "only for root and group palpate")
+
+
+def test_slow_connections_lock_nobody_out(page: PageServer):
+    """Three addresses hold all places with connections that say nothing: another address, and one
+    of the three, are served at once."""
+    slow = []
+    try:
+        for number in range(MOST_OPEN + 8):
+            host = f"127.0.0.{2 + number % 3}"
+            slow.append(
+                socket.create_connection(("127.0.0.1", port(page)), source_address=(host, 0))
+            )
+        time.sleep(0.3)
+        assert [status(page)[0], status(page, "127.0.0.2")[0]] == [200, 200]
+    finally:
+        for one in slow:
+            one.close()
+
+
+def test_connections_that_were_served_stay(page: PageServer):
+    """A browser that reads events is not closed for connections that say nothing."""
+    events = socket.create_connection(("127.0.0.1", port(page)))
+    events.sendall(f"GET /events HTTP/1.1\r\nHost: 127.0.0.1:{port(page)}\r\n\r\n".encode())
+    assert events.recv(4096).startswith(b"HTTP/1.1 200")
+    slow = [socket.create_connection(("127.0.0.1", port(page))) for _ in range(2 * MOST_OF_ONE)]
+    time.sleep(0.3)
+    events.setblocking(False)
+    try:
+        while data := events.recv(4096):
+            assert data
+    except BlockingIOError:
+        data = b"open"
+    assert data == b"open"
+    assert server.MOST_OF_ONE < MOST_OPEN
+    for one in [events, *slow]:
+        one.close()

@@ -1,0 +1,527 @@
+"""The page of a recording, without a browser: the loop carries out its orders, refuses others, and
+never waits."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import ssl
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from palpate.core.config import TriggerConfig, WatchConfig
+from palpate.core.errors import ApplianceError, ConfigError, FormatError, NoAnswer
+from palpate.core.types import Status, sidecar
+from palpate.io.robot_link import Command
+from palpate.sim import skin
+from palpate.sweeps.recording import Labels, RecordingSession
+from palpate.web import record, server
+from palpate.web.access import Access
+from palpate.web.record import MOST_WAITING, CommandQueue, RecordPage, order, trigger_words
+from tests.factories.browser import WAIT_S, until
+from tests.factories.install_scripts import page_secrets
+from tests.factories.page_client import (
+    EventReader,
+    PageAddress,
+    ask,
+    connected,
+    port,
+    received_by,
+    status,
+)
+from tests.factories.recorded_page import KIND, RecordedPage, key_of, ordered
+from tests.factories.simulated_box import Rigged, idle_devices
+
+ALLOWED = ("MATERIAL", "POSITION", "SESSION", "NEXT", "DISCARD")
+WOOD = {"command": "MATERIAL", "text": "wood"}
+
+
+@pytest.fixture
+def recorded(tmp_path: Path) -> Iterator[RecordedPage]:
+    """A recording with a page, whose turns the test takes."""
+    one = RecordedPage(tmp_path, Labels("metal", "1"))
+    with one.page:
+        yield one
+    one.recording.close()
+
+
+class Asking:
+    """Orders on their way, each in a thread of its own."""
+
+    def __init__(self, recorded: RecordedPage, *bodies: dict[str, str]) -> None:
+        key, self.answers = key_of(recorded.page.server), []
+        self.threads = [
+            threading.Thread(
+                target=lambda b=body: self.answers.append(ordered(recorded.page.server, key, b))
+            )
+            for body in bodies
+        ]
+        for thread in self.threads:
+            thread.start()
+
+    def finished(self) -> list[int]:
+        """The status of each answer, when all are there."""
+        for thread in self.threads:
+            thread.join(WAIT_S)
+        return [status(answer) for answer in self.answers]
+
+
+def waiting(recorded: RecordedPage) -> int:
+    """How many commands wait for the loop."""
+    return recorded.page._queue._waiting.qsize()
+
+
+@pytest.mark.parametrize(
+    ("body", "command"),
+    [
+        (
+            b'{"command": "MATERIAL", "text": " plastic rough "}',
+            Command("MATERIAL", "plastic rough"),
+        ),
+        (b'{"command": "POSITION", "text": "\\n7\\t"}', Command("POSITION", "7")),
+        (b'{"command": "SESSION", "text": ""}', Command("SESSION")),
+        (b'{"command": "NEXT"}', Command("NEXT")),
+        (b'{"command": "DISCARD", "text": "7"}', Command("DISCARD", "7")),
+    ],
+)
+def test_an_order_is_a_command_of_the_serial_line(body: bytes, command: Command):
+    """With its text, or without one."""
+    assert order(body, ALLOWED) == command
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        b"",
+        b"wood",
+        b"[]",
+        b"7",
+        b"null",
+        b"\xff\xfe",
+        b"[" * 1000,
+        b'{"command": 7}',
+        b'{"text": "wood"}',
+        b'{"command": ["NEXT"]}',
+        b'{"command": "START"}',
+        b'{"command": "next"}',
+        b'{"command": "MATERIAL", "text": 7}',
+        b'{"command": "MATERIAL", "text": null}',
+        b'{"command": "NEXT", "more": 1}',
+        b'{"command": "NEXT", "text": "7"}',
+        b'{"command": "DISCARD", "text": "-1"}',
+        '{"command": "DISCARD", "text": "²"}'.encode(),
+        b'{"command": "TEST"}',
+        b'{"command": "MATERIAL\\n"}',
+    ],
+)
+def test_what_is_no_order(body: bytes):
+    """Each is refused with one line that describes an order."""
+    with pytest.raises(FormatError, match=r"^[^\n]+$"):
+        order(body, ALLOWED)
+
+
+@pytest.mark.parametrize("text", ["-1", "a,b", "blé", "x" * 25, "a\nb", "$"])
+@pytest.mark.parametrize("name", record.LABELS)
+def test_a_bad_label_is_refused_as_the_command_refuses_it(tmp_path: Path, name: str, text: str):
+    """The refusal has the command's words, and comes before the loop or a capture gets the
+    order."""
+    recording = RecordingSession(
+        tmp_path, skin.FORMAT, Labels(), idle_devices().clock, lambda line: None
+    )
+    with pytest.raises(ApplianceError) as by_command:
+        recording.commands[name](text)
+    with pytest.raises(ConfigError) as by_page:
+        order(json.dumps({"command": name, "text": text}).encode(), ALLOWED)
+    assert str(by_page.value) == str(by_command.value)
+    assert "1 to 24 letters" in str(by_page.value)
+
+
+def test_labels_from_the_page_are_those_of_the_stored_sweep(
+    rigged: Callable[..., Rigged], tmp_path: Path
+):
+    """On a whole box: set, started and stopped by the page alone, with labels that the robot had
+    set otherwise."""
+    simulated, box = idle_devices(), None
+    recording = RecordingSession(
+        tmp_path, skin.FORMAT, Labels(), simulated.clock, lambda line: None
+    )
+    page = RecordPage(
+        Access(0),
+        skin.FORMAT,
+        "sim",
+        TriggerConfig(mode="serial"),
+        recording.about,
+        lambda command: box.box.obey(command),
+        simulated.clock,
+    )
+    box = rigged(
+        simulated,
+        ("trigger.mode=serial",),
+        observers=[recording, page],
+        commands=recording.commands,
+    )
+
+    def by_page(name: str, text: str = "") -> object:
+        answers: list[bytes] = []
+        body = {"command": name, "text": text}
+        thread = threading.Thread(
+            target=lambda: answers.append(ordered(page.server, page.server.key, body))
+        )
+        thread.start()
+        until(lambda: page._queue._waiting.qsize() == 1)
+        box.box.step()
+        thread.join(WAIT_S)
+        assert status(answers[0]) == 200
+        return json.loads(answers[0].partition(b"\r\n\r\n")[2])
+
+    with page:
+        box.seconds(1)
+        assert ",MATERIAL,ok,paper,,*" in box.ask("$PPLP,MATERIAL,paper")
+        assert by_page("MATERIAL", "plastic rough") == ["plastic rough", "", ""]
+        assert by_page("POSITION", "09") == ["plastic rough", "09", ""]
+        assert by_page("NEXT") == ["plastic rough", "10", ""]
+        assert by_page("SESSION", "monday") == ["plastic rough", "10", "monday"]
+        assert by_page("START") == []
+        box.seconds(3)
+        assert by_page("STOP") == []
+        box.until(lambda: box.box.answered == 1)
+        about = sidecar(tmp_path / "sweep-000001.npy")
+        assert (about["material"], about["position"], about["session"]) == (
+            "plastic rough",
+            "10",
+            "monday",
+        )
+        assert by_page("DISCARD", "1") == [1, 0, "sweep-000001"]
+        assert not (tmp_path / "sweep-000001.npy").exists()
+    assert not any(",ANS,START" in line or ",ANS,NEXT" in line for line in box.heard)
+
+
+def test_the_page_hears_what_there_is(recorded: RecordedPage):
+    """The page gets labels, counts, missing sweeps, and the result and checks of the last sweep;
+    the skin only while a browser is connected."""
+    reader = EventReader(recorded.page.server)
+    assert reader.until("key") == recorded.page.server.key
+    until(lambda: recorded.page.server.watched)
+    recorded.turn()
+    said = reader.until("recording")
+    assert (said["material"], said["position"], said["counts"], said["last"]) == (
+        "metal",
+        "1",
+        [],
+        None,
+    )
+    assert said["trigger"] == "START and STOP, here or on the serial line"
+    assert recorded.sweep(detail="contact not checked") == 1
+    assert reader.until("sweep")["detail"] == "contact not checked"
+    recorded.turn()
+    said = reader.until("recording")
+    assert (said["counts"], said["missing"], said["discard"]) == (
+        [["metal", "1", 1]],
+        "missing: metal at 1: 2",
+        1,
+    )
+    assert (said["last"]["outcome"], said["last"]["detail"]) == ("stored", "sweep-000001")
+    before = recorded.page._view_ns
+    until(lambda: (recorded.turn(), recorded.page._view_ns != before)[1])
+    assert reader.until("view")["shape"] == [4, 4]
+    reader.socket.close()
+
+
+def test_nothing_is_computed_for_nobody(recorded: RecordedPage, monkeypatch: pytest.MonkeyPatch):
+    """Without a browser no picture of the skin is made."""
+    recorded.turn()
+    monkeypatch.setattr(recorded.page, "_tracker", None)
+    recorded.turn()
+    assert not recorded.page.server.watched
+
+
+REFUSED = [
+    (403, {"X_Palpate_Key": None}),
+    (403, {"X_Palpate_Key": "wrong"}),
+    (403, {"X_Palpate_Key": "ö"}),
+    (403, {"Origin": None}),
+    (403, {"Origin": "null"}),
+    (403, {"Origin": "http://evil.example"}),
+    (403, {"Origin": "http://localhost"}),
+    (403, {"Origin": "http://localhost:1"}),
+    (415, {"Content_Type": None}),
+    (415, {"Content_Type": "text/plain"}),
+    (415, {"Content_Type": "application/x-www-form-urlencoded"}),
+]
+
+
+@pytest.mark.parametrize(("answer", "changed"), REFUSED)
+def test_an_order_of_another_site_is_refused(
+    recorded: RecordedPage, answer: int, changed: dict[str, str | None]
+):
+    """Requests that a page of another site can send are refused: wrong or missing key, another
+    origin, a content type without preflight."""
+    server_of, key = recorded.page.server, key_of(recorded.page.server)
+    assert status(ordered(server_of, key, WOOD, **changed)) == answer
+    assert waiting(recorded) == 0
+    assert recorded.recording.about()["material"] == "metal"
+
+
+def test_a_key_of_another_run_is_refused(recorded: RecordedPage, tmp_path: Path):
+    """The key of another start of the program is refused."""
+    other = RecordedPage(tmp_path / "other", Labels())
+    with other.page:
+        assert status(ordered(recorded.page.server, other.page.server.key, WOOD)) == 403
+    other.recording.close()
+    assert waiting(recorded) == 0
+
+
+@pytest.mark.parametrize(
+    ("method", "host", "answer"),
+    [
+        ("GET", None, 405),
+        ("PUT", None, 405),
+        ("OPTIONS", None, 405),
+        ("POST", "evil.example", 421),
+        ("POST", "", 421),
+    ],
+)
+def test_other_ways_to_order_are_refused(
+    recorded: RecordedPage, method: str, host: str | None, answer: int
+):
+    """Other methods, a preflight of another site among them, and a name that is not this
+    machine's."""
+    page = recorded.page.server
+    host = f"localhost:{port(page)}" if host is None else host
+    more = (
+        f"Origin: http://{host}\r\nX-Palpate-Key: {page.key}\r\nContent-Type:"
+        f" {KIND}\r\nContent-Length: 2\r\n"
+    )
+    assert status(ask(page, "/order", method, host, more, body=b"{}")) == answer
+    assert waiting(recorded) == 0
+
+
+@pytest.mark.parametrize("chunked", [False, True])
+def test_too_large_a_body_is_refused(recorded: RecordedPage, chunked: bool):
+    """A body that is too large, announced or in chunks, is not read to its end; the next request is
+    answered."""
+    page, body = (
+        recorded.page.server,
+        json.dumps({"command": "MATERIAL", "text": "x" * 2000}).encode(),
+    )
+    if chunked:
+        body = b"%x\r\n%s\r\n0\r\n\r\n" % (len(body), body)
+        answer = ordered(page, page.key, body, Content_Length=None, Transfer_Encoding="chunked")
+    else:
+        answer = ordered(page, page.key, body)
+    assert status(answer) in (0, 400)
+    assert waiting(recorded) == 0
+    assert status(ask(page)) == 200
+
+
+def test_half_a_body_ends_at_the_deadline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The connection is closed, and no order comes from it."""
+    monkeypatch.setattr(server, "HEAD_S", 0.3)
+    one = RecordedPage(tmp_path, Labels())
+    with one.page, connected(one.page.server) as slow:
+        slow.sendall(b"POST /order HTTP/1.1\r\nHost: localhost\r\nContent-Length: 40\r\n\r\n{")
+        assert status(received_by(slow)) in (0, 400)
+        assert waiting(one) == 0
+    one.recording.close()
+
+
+def test_refusals_say_why(recorded: RecordedPage):
+    """In the words of the command, as a line of text; the labels stay."""
+    page = recorded.page.server
+    answer = ordered(page, page.key, {"command": "MATERIAL", "text": "-1"})
+    assert (status(answer), b"text/plain" in answer) == (409, True)
+    assert answer.endswith(
+        b"material '-1' cannot be used: take 1 to 24 letters, digits, spaces, '.', '_' or '-'"
+    )
+    assert status(ordered(page, page.key, b"{}")) == 400
+    asking = Asking(recorded, {"command": "DISCARD"})
+    until(lambda: waiting(recorded) == 1)
+    recorded.turn()
+    assert asking.finished() == [409]
+    assert asking.answers[0].endswith(b"no sweep of this run is left to discard")
+
+
+def test_many_requests_wait_in_bounds_and_the_loop_takes_one_a_turn(recorded: RecordedPage):
+    """While the loop stands still, orders beyond MOST_WAITING are refused at once. Then each turn
+    carries out exactly one."""
+    asking = Asking(recorded, *[WOOD] * (MOST_WAITING + 6))
+    until(lambda: len(asking.answers) == 6)
+    assert waiting(recorded) == MOST_WAITING
+    assert {status(answer) for answer in asking.answers} == {503}
+    assert b"16 commands wait already" in asking.answers[0]
+    for done in range(1, MOST_WAITING + 1):
+        recorded.turn()
+        assert len(recorded.done) == done
+    assert sorted(asking.finished()) == [200] * MOST_WAITING + [503] * 6
+
+
+def test_a_loop_that_takes_nothing_up(recorded: RecordedPage, monkeypatch: pytest.MonkeyPatch):
+    """After DONE_S the page gets an error, and the order is not carried out later."""
+    monkeypatch.setattr(server, "DONE_S", 0.05)
+    asking = Asking(recorded, WOOD)
+    assert asking.finished() == [503]
+    assert b"it was not carried out" in asking.answers[0]
+    recorded.turn()
+    assert recorded.done == []
+
+
+def test_a_command_that_takes_long_is_not_called_undone(
+    recorded: RecordedPage, monkeypatch: pytest.MonkeyPatch
+):
+    """If an order is under way after DONE_S, as on a slow disk, the page does not get an error."""
+    monkeypatch.setattr(server, "DONE_S", 0.05)
+    answered = threading.Event()
+    monkeypatch.setattr(recorded.page, "_obey", lambda command: [answered.wait(WAIT_S)])
+    asking = Asking(recorded, WOOD)
+    until(lambda: waiting(recorded) == 1)
+    turn = threading.Thread(target=recorded.turn)
+    turn.start()
+    assert asking.finished() == [503]
+    answered.set()
+    turn.join()
+    assert b"it may still be carried out" in asking.answers[0]
+
+
+def test_the_end_of_the_recording_answers_who_waits(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+):
+    """Waiting orders are refused with the reason, and none is carried out."""
+    one = RecordedPage(tmp_path, Labels())
+    with one.page:
+        asking = Asking(one, WOOD, WOOD)
+        until(lambda: waiting(one) == 2)
+    assert asking.finished() == [503, 503]
+    assert all(b"the recording has ended" in answer for answer in asking.answers)
+    assert one.done == []
+    one.recording.close()
+    assert capfd.readouterr().err == ""
+
+
+def test_commands_that_nobody_wants_any_more_take_no_turn():
+    """An abandoned order is skipped; the next order is carried out in the same turn."""
+    queue, done = CommandQueue(), []
+    first, second = queue.put(Command("NEXT")), queue.put(Command("DISCARD"))
+    assert first.cancel()
+    assert queue.carry_out(lambda command: [done.append(command.name)])
+    assert (done, second.result(0)) == (["DISCARD"], [None])
+    assert not queue.carry_out(lambda command: [])
+    for _ in range(MOST_WAITING):
+        queue.put(Command("NEXT"))
+    with pytest.raises(NoAnswer, match="try again"):
+        queue.put(Command("NEXT"))
+
+
+def test_a_sweep_is_drawn_once(recorded: RecordedPage, monkeypatch: pytest.MonkeyPatch):
+    """The picture is computed once. Only the last sweep has a picture, and a sweep without a window
+    has none."""
+    drawn: list[int] = []
+    draw = record.picture
+    monkeypatch.setattr(
+        record, "picture", lambda window: (drawn.append(window.sweep), draw(window))[1]
+    )
+    page = recorded.page.server
+    recorded.sweep()
+    recorded.sweep()
+    answers = [ask(page, f"/sweep/{n}") for n in (2, 2, 2, 1, 3)]
+    assert [status(answer) for answer in answers] == [200, 200, 200, 404, 404]
+    assert json.loads(answers[0].partition(b"\r\n\r\n")[2])["seconds"] == 2.0
+    assert drawn == [2]
+    recorded.sweep(Status.SHORT)
+    assert status(ask(page, "/sweep/3")) == 404
+
+
+@pytest.mark.parametrize(
+    ("mode", "words"),
+    [
+        ("two-lines", "lines START and STOP"),
+        ("one-line", "line START"),
+        ("serial", "here or on the serial line"),
+        ("key", "space bar in the terminal"),
+        ("timed", "the clock: 3 s in every 5 s"),
+    ],
+)
+def test_the_trigger_is_named(mode: str, words: str):
+    """Each mode in words."""
+    assert words in trigger_words(TriggerConfig(mode=mode))
+
+
+def test_on_the_network_it_takes_token_and_key(tmp_path: Path):
+    """As on the watch page, an order without the token is refused, and plain HTTP is not
+    answered."""
+    page_secrets(tmp_path / "secrets")
+    settings = WatchConfig(address="0.0.0.0 localhost", folder=str(tmp_path / "secrets"))
+    token = (tmp_path / "secrets" / "token").read_text().strip()
+    one = RecordedPage(tmp_path / "sweeps", Labels(), access=Access.configured(settings, 0))
+    trusts = ssl.create_default_context(cafile=tmp_path / "secrets" / "certificate.pem")
+    with one:
+        page, body = one.page.server, json.dumps(WOOD).encode()
+        head = (
+            f"Origin: https://localhost:{port(page)}\r\nX-Palpate-Key: {page.key}\r\nContent-Type:"
+            f" {KIND}\r\n"
+            f"Content-Length: {len(body)}\r\n"
+        )
+        host = f"localhost:{port(page)}"
+        assert status(ask(page, "/order", "POST", host, head, trusts, body)) == 401
+        assert status(ask(page, "/order", "POST", host, head, None, body)) == 0
+        assert one.done == []
+        known = f"{head}Authorization: Bearer {token}\r\n"
+        assert status(ask(page, "/order", "POST", host, known, trusts, body)) == 200
+        assert one.done == ["MATERIAL,wood"]
+
+
+@pytest.mark.slow
+def test_the_command_records_what_its_page_orders(tmp_path: Path):
+    """The real command without a serial line: its page sets the label, starts and stops; it ends
+    with the page open."""
+    command = [
+        sys.executable,
+        "-m",
+        "palpate",
+        "record",
+        "--sim",
+        "skin",
+        "--trigger",
+        "serial",
+        "--web",
+        "0",
+    ]
+    options = ["--out", str(tmp_path), "--set", "store.runtime="]
+    with subprocess.Popen(
+        [*command, *options], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
+    ) as run:
+        there = PageAddress(re.search(r"page: (http://127\.0\.0\.1:\d+)", run.stderr.readline())[1])
+        draining = threading.Thread(target=run.stderr.read, daemon=True)
+        draining.start()
+        reader, key = EventReader(there), key_of(there)
+        until(lambda: reader.until("recording")["skin"] == "streaming")
+        assert status(ordered(there, key, WOOD)) == 200
+        assert status(ordered(there, key, {"command": "START"})) == 200
+        until(lambda: reader.until("recording")["sweeping"])
+        assert status(ordered(there, key, {"command": "STOP"})) == 200
+        until(lambda: reader.until("recording")["last"] is not None)
+        run.send_signal(signal.SIGTERM)
+        assert run.wait(timeout=WAIT_S) == 0
+        with suppress(OSError), pytest.raises(EOFError):
+            reader.until("nothing")
+        draining.join(WAIT_S)
+
+
+def test_a_serial_trigger_needs_a_line_or_a_page(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+):
+    """Without either, the error names both ways."""
+    from palpate.__main__ import main
+
+    assert (
+        main(["record", "--sim", "skin", "--trigger", "serial", "--out", os.fspath(tmp_path)])
+        == ConfigError.exit_code
+    )
+    assert "or the page of palpate record --web" in capsys.readouterr().err

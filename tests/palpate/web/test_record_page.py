@@ -1,0 +1,487 @@
+"""The page of `palpate record --web` in a headless browser: content, labels, and layout at three
+sizes."""
+
+from __future__ import annotations
+
+import functools
+import http.server
+import json
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from palpate.core.clock import SystemClock
+from palpate.core.types import Status, sidecar
+from palpate.sweeps.recording import Labels
+from palpate.web.access import Access
+from palpate.web.server import OrderHandler
+from tests.factories.browser import BrowsedPage, until
+from tests.factories.page_client import port
+from tests.factories.recorded_page import RecordedPage
+
+pytestmark = pytest.mark.slow
+
+SECOND = 1_000_000_000
+SIZES = [(390, 844), (1024, 768), (1920, 1080)]
+
+
+def begun(folder: Path, access: Access | None = None) -> RecordedPage:
+    """A recording of two materials at two positions, with a sweep too many and some too few."""
+    one = RecordedPage(folder, Labels("metal", "1", "monday"), target=3, access=access)
+    for material, position, sweeps in (("metal", "1", 4), ("metal", "2", 3), ("wood", "1", 1)):
+        for name, text in (("MATERIAL", material), ("POSITION", position)):
+            one.recording.commands[name](text)
+        for _ in range(sweeps):
+            one.recording.sweep(*one.answered(Status.RECORDED), {})
+    return one
+
+
+@pytest.fixture
+def recorded(tmp_path: Path) -> Iterator[RecordedPage]:
+    """The recording, with a page that is served."""
+    one = begun(tmp_path)
+    with one:
+        yield one
+
+
+def opened(
+    browser: Any, recorded: RecordedPage, width: int = 1024, height: int = 768, **more: Any
+) -> BrowsedPage:
+    """The page in a browser, with its content."""
+    context = browser.new_context(viewport={"width": width, "height": height}, **more)
+    seen = BrowsedPage(context, recorded.page.server.address)
+    until(lambda: seen.page.locator("#counts button").count() == 4)
+    until(lambda: seen.page.locator(".skin .tile").count() == 16)
+    return seen
+
+
+def labels(recorded: RecordedPage) -> tuple[str, str, str]:
+    """The current labels."""
+    about = recorded.recording.about()
+    return about["material"], about["position"], about["session"]
+
+
+def test_what_is_there_and_what_is_missing(browser: Any, recorded: RecordedPage):
+    """A row for each material, a column for each position, with recorded and missing sweeps; the
+    trigger in words."""
+    seen = opened(browser, recorded)
+    assert seen.page.locator("#counts th").all_inner_texts() == ["1", "2", "metal", "wood"]
+    fields = seen.page.locator("#counts button")
+    assert fields.all_inner_texts() == ["4 of 3", "3 of 3", "1 of 3", "0 of 3"]
+    assert [one.get_attribute("class") for one in fields.all()] == ["done", "done", "", ""]
+    assert [one.get_attribute("aria-pressed") for one in fields.all()] == [
+        "false",
+        "false",
+        "true",
+        "false",
+    ]
+    assert seen.text("#missing") == "missing: wood at 1: 2, wood at 2: 3"
+    assert seen.text("#now") == "wood at 1"
+    assert seen.text("#trigger") == "START and STOP, here or on the serial line"
+    assert seen.page.is_visible("#simulated")
+    recorded.sweep()
+    until(lambda: fields.nth(2).inner_text() == "2 of 3")
+    assert not seen.errors
+
+
+def test_the_last_sweep_with_its_checks(browser: Any, recorded: RecordedPage):
+    """The last sweep has status, checks, path and signal; also a faulty sweep, and a sweep without
+    a window."""
+    seen = opened(browser, recorded)
+    number = recorded.sweep()
+    until(lambda: seen.text("#outcome") == f"wood at 1, stored as sweep-{number:06d}")
+    assert (
+        seen.text("#check")
+        == "checked: contact, saturation, stuck and dead taxels; nothing is wrong"
+    )
+    until(lambda: "16 taxels over 2.0 s" in str(seen.page.get_attribute("#signal", "aria-label")))
+    assert "spectrogram up to" in seen.page.get_attribute("#spectrogram", "aria-label")
+    recorded.sweep(Status.NO_CONTACT, "taxel 2.2 is loaded most, with 1 count")
+    until(lambda: seen.text("#status") == "no-contact")
+    said = (
+        "no taxel is loaded; check that the finger touches the object; it is not counted; taxel"
+        " 2.2 is loaded most, with 1 count"
+    )
+    assert seen.text("#check") == said
+    recorded.sweep(Status.SHORT)
+    until(lambda: seen.text("#status") == "short")
+    until(lambda: seen.text("#outcome") == "not stored, since it has no window")
+    assert seen.page.get_attribute("#signal", "aria-label") == "it has no window"
+    assert not seen.errors
+
+
+def test_labels_are_set_with_the_keyboard(browser: Any, recorded: RecordedPage, tmp_path: Path):
+    """Tab reaches every control with a visible focus. Enter in a field sets the changed labels, and
+    the stored sweep has them."""
+    seen, stops = opened(browser, recorded), []
+    for _ in range(11):
+        seen.page.keyboard.press("Tab")
+        stops.append(
+            seen.page.evaluate("document.activeElement.id || document.activeElement.textContent")
+        )
+        outline = seen.page.evaluate("getComputedStyle(document.activeElement).outlineWidth")
+        assert float(outline.removesuffix("px")) >= 2
+    assert stops == [
+        "start",
+        "stop",
+        "material",
+        "position",
+        "session",
+        "set",
+        "next",
+        "4 of 3",
+        "3 of 3",
+        "1 of 3",
+        "0 of 3",
+    ]
+    seen.page.focus("#material")
+    seen.page.keyboard.press("Control+A")
+    seen.page.keyboard.type("plastic rough")
+    seen.page.keyboard.press("Tab")
+    seen.page.keyboard.type("07")
+    seen.page.keyboard.press("Enter")
+    until(lambda: seen.text("#now") == "plastic rough at 07")
+    assert seen.text("#said") == "material, position set"
+    seen.page.focus("#next")
+    seen.page.keyboard.press("Space")
+    until(lambda: seen.text("#now") == "plastic rough at 08")
+    assert seen.page.input_value("#position") == "08"
+    number = recorded.sweep()
+    about = sidecar(tmp_path / f"sweep-{number:06d}.npy")
+    assert (about["material"], about["position"], about["session"]) == (
+        "plastic rough",
+        "08",
+        "monday",
+    )
+    assert not seen.errors
+
+
+def test_a_bad_label_is_refused_with_its_reason(browser: Any, recorded: RecordedPage):
+    """The refusal has the command's words and stands beside the field, which keeps the text; a good
+    label removes it."""
+    seen = opened(browser, recorded)
+    for wrong in ("-wood", "<b>wood</b>", "a,b"):
+        seen.page.fill("#material", wrong)
+        seen.page.click("#set")
+        until(
+            lambda wrong=wrong: (
+                f"material '{wrong}' cannot be used: take 1 to 24 letters" in seen.text("#said")
+            )
+        )
+        assert seen.page.get_attribute("#material", "aria-invalid") == "true"
+        assert seen.page.input_value("#material") == wrong
+        assert labels(recorded) == ("wood", "1", "monday")
+    assert seen.page.locator("#said b").count() == 0
+    seen.page.fill("#material", "paper")
+    seen.page.click("#set")
+    until(lambda: seen.text("#said") == "material set")
+    assert seen.page.get_attribute("#material", "aria-invalid") is None
+    assert labels(recorded) == ("paper", "1", "monday")
+    assert [one for one in seen.errors if "409" not in one] == []
+
+
+def test_what_is_being_typed_is_not_overwritten(browser: Any, recorded: RecordedPage):
+    """The robot sets a label meanwhile: the page shows it, and the field keeps the person's
+    text."""
+    seen = opened(browser, recorded)
+    seen.page.fill("#material", "pap")
+    recorded.recording.commands["MATERIAL"]("cork")
+    recorded.recording.commands["POSITION"]("9")
+    until(lambda: seen.text("#now") == "cork at 9")
+    assert seen.page.input_value("#material") == "pap"
+    until(lambda: seen.page.input_value("#position") == "9")
+
+
+def test_a_field_of_the_table_sets_both_labels(browser: Any, recorded: RecordedPage):
+    """Pressing a cell of the table sets both labels. The cell keeps the focus, so that the next
+    cell can be reached."""
+    seen = opened(browser, recorded)
+    seen.page.focus("#counts button[aria-label='wood at 2: 0 of 3']")
+    seen.page.keyboard.press("Enter")
+    until(lambda: seen.text("#said") == "now wood at 2")
+    assert labels(recorded) == ("wood", "2", "monday")
+    until(
+        lambda: seen.page.locator("#counts button").nth(3).get_attribute("aria-pressed") == "true"
+    )
+    until(lambda: not seen.page.is_disabled("#set"))
+    assert seen.page.evaluate("document.activeElement.textContent") == "0 of 3"
+
+
+def test_start_and_stop(browser: Any, recorded: RecordedPage):
+    """Each button can be pressed while it has an effect, and the state says so."""
+    seen = opened(browser, recorded)
+    until(lambda: not seen.page.is_disabled("#start"))
+    assert seen.page.is_disabled("#stop")
+    seen.page.click("#start")
+    until(lambda: seen.text("#state") == "sweeping")
+    until(lambda: not seen.page.is_disabled("#stop"))
+    assert seen.page.is_disabled("#start")
+    seen.page.click("#stop")
+    until(lambda: seen.text("#state") == "ready")
+    assert recorded.done == ["START", "STOP"]
+
+
+def test_space_starts_and_stops(browser: Any, recorded: RecordedPage):
+    """Also after a button was pressed with the mouse; in a field it is a space."""
+    seen = opened(browser, recorded)
+    until(lambda: seen.text("#call") == "Press Start, Space or the pedal")
+    seen.page.click("#counts button[aria-label='metal at 2: 3 of 3']")
+    until(lambda: seen.text("#said") == "now metal at 2")
+    for state, words in (
+        ("sweeping", "Slide now"),
+        ("ready", "Press Start, Space or the pedal"),
+    ):
+        seen.page.keyboard.press("Space")
+        until(lambda state=state: seen.text("#state") == state)
+        assert seen.text("#call") == words
+    seen.page.focus("#material")
+    seen.page.keyboard.type("a b")
+    assert "a b" in seen.page.input_value("#material")
+    assert recorded.done[-2:] == ["START", "STOP"]
+    assert not seen.errors
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize(("width", "height"), [(390, 844), (1024, 768), (1400, 900)])
+@pytest.mark.parametrize("teaching", [False, True], ids=["record", "teach"])
+def test_timed_sweeps_are_counted_down(
+    browser: Any, tmp_path: Path, width: int, height: int, scheme: str, teaching: bool
+):
+    """In sight, in letters of 96 px or more, for recording and teaching; a skin that is away has no
+    countdown."""
+    with RecordedPage(tmp_path, Labels("metal", "1"), teaching=teaching) as one:
+        context = browser.new_context(
+            viewport={"width": width, "height": height}, color_scheme=scheme
+        )
+        seen = BrowsedPage(context, one.page.server.address)
+        for sweeping, words in ((False, "Next sweep in"), (True, "Slide now")):
+            due_ns = SystemClock().now_ns() + 60 * SECOND
+            one.health = replace(one.health, due_ns=due_ns, sweeping=sweeping, ready=not sweeping)
+            until(lambda words=words: seen.text("#call") == words and seen.text("#countdown"))
+            before = float(seen.text("#countdown"))
+            assert 5 < before < 70  # the page learns the clock late by the delay of an event
+            until(lambda before=before: float(seen.text("#countdown")) < before)
+            box = seen.page.locator("#countdown").bounding_box()
+            assert box["height"] >= 96
+            assert box["y"] + box["height"] <= height
+            assert seen.legibility()[1] == []
+        one.health = replace(one.health, skin="lost", trouble="unplugged", due_ns=0)
+        until(lambda: seen.text("#call") == seen.text("#countdown") == "")
+        assert not seen.errors
+        context.close()
+
+
+def test_only_the_sweep_that_was_seen_is_discarded(
+    browser: Any, recorded: RecordedPage, tmp_path: Path
+):
+    """The button names the sweep; a sweep that has come since then is not removed in its place."""
+    seen = opened(browser, recorded)
+    number = recorded.sweep()
+    until(lambda: seen.text("#discard") == f"Discard sweep {number}")
+    seen.page.click("#discard")
+    until(lambda: seen.text("#outcome") == "wood at 1, discarded")
+    assert not (tmp_path / f"sweep-{number:06d}.npy").exists()
+    assert seen.text("#said") == f"sweep {number} discarded"
+    until(lambda: seen.text("#discard") == f"Discard sweep {number - 1}")
+    late = seen.page.evaluate(
+        """async () => {
+          const events = new EventSource("/events");
+          const key = await new Promise((got) =>
+            events.addEventListener("key", (e) => got(JSON.parse(e.data))));
+          const answer = await fetch("/order", {
+            method: "POST", body: '{"command": "DISCARD", "text": "1"}',
+            headers: {"Content-Type": "application/json", "X-Palpate-Key": key}});
+          return [answer.status, await answer.text()];
+        }"""
+    )
+    assert late == [409, f"the last stored sweep is {number - 1}, not 1; look at it first"]
+
+
+def test_a_recorder_that_ends_and_comes_back_while_the_page_is_open(browser: Any, tmp_path: Path):
+    """The page says that the recorder has ended, and its controls are off. It shows the next run by
+    itself, and orders have the new key."""
+    first = begun(tmp_path / "a")
+    with first:
+        seen = opened(browser, first)
+        address = Access(port(first.page.server))
+    until(lambda: "no connection to palpate record; last heard of it" in seen.text("#banner"))
+    assert seen.text("#state") == "no connection"
+    for one in seen.page.locator("button").all():
+        assert one.is_disabled()
+    seen.page.fill("#material", "paper")
+    seen.page.keyboard.press("Enter")
+    assert first.done == []
+    with begun(tmp_path / "b", address) as second:
+        until(lambda: not seen.page.is_visible("#banner"))
+        until(lambda: not seen.page.is_disabled("#set"))
+        assert seen.page.input_value("#material") == "paper"
+        seen.page.click("#set")
+        until(lambda: labels(second) == ("paper", "1", "monday"))
+        seen.page.context.close()
+
+
+def test_a_skin_that_is_away(browser: Any, recorded: RecordedPage):
+    """The banner says why."""
+    seen = opened(browser, recorded)
+    recorded.health = replace(
+        recorded.health, skin="lost", trouble="the skin was unplugged", ready=False
+    )
+    until(lambda: seen.page.is_visible("#banner"))
+    assert seen.text("#banner") == "no skin: lost; the skin was unplugged"
+    assert seen.text("#state") == "skin lost"
+    assert seen.page.is_disabled("#start")
+
+
+@contextmanager
+def other_site(folder: Path) -> Iterator[str]:
+    """A site of another origin on this machine."""
+    (folder / "index.html").write_text("<!DOCTYPE html><title>other</title>")
+
+    class QuietHandler(http.server.SimpleHTTPRequestHandler):
+        """Writes nothing on the terminal."""
+
+        def log_message(self, *args: object) -> None:
+            """Nothing."""
+
+    with http.server.ThreadingHTTPServer(
+        ("127.0.0.1", 0), functools.partial(QuietHandler, directory=str(folder))
+    ) as site:
+        thread = threading.Thread(target=site.serve_forever)
+        thread.start()
+        try:
+            yield f"http://127.0.0.1:{site.server_address[1]}/"
+        finally:
+            site.shutdown()
+            thread.join()
+
+
+ATTACKS = """async (page) => {
+  const body = '{"command": "MATERIAL", "text": "evil"}';
+  const json = {"Content-Type": "application/json"};
+  const tries = [
+    ["cors", {method: "POST", body, headers: json}],
+    ["cors", {method: "POST", body, headers: {...json, "X-Palpate-Key": "x"}}],
+    ["no-cors", {method: "POST", body}],
+    ["no-cors", {method: "POST", body, headers: {"Content-Type": "text/plain"}}],
+  ];
+  const said = [];
+  for (const [mode, what] of tries) {
+    const answer = fetch(`${page}/order`, {...what, mode, credentials: "include"});
+    said.push(await answer.then((a) => a.status, () => "blocked"));
+  }
+  said.push(navigator.sendBeacon(`${page}/order`, body));
+  said.push(await new Promise((got) => {
+    const source = new EventSource(`${page}/events`);
+    source.addEventListener("key", (event) => got(event.data));
+    source.onerror = () => { source.close(); got("no key"); };
+  }));
+  const made = (tag, fields) => Object.assign(document.createElement(tag), fields);
+  const sent = {method: "POST", action: `${page}/order`, enctype: "text/plain", target: "frame"};
+  const form = made("form", sent);
+  form.append(made("input", {name: body.slice(0, -1), value: "}"}));
+  document.body.append(made("iframe", {name: "frame"}), form);
+  form.submit();
+  return said;
+}"""
+
+
+def test_no_other_site_sets_a_label(
+    browser: Any, recorded: RecordedPage, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """A page of another origin in the same browser: with and without headers, as a beacon, as a
+    form; and it gets no key."""
+    refused: list[tuple[str, int]] = []
+    monkeypatch.setattr(
+        OrderHandler,
+        "on_finish",
+        lambda self: refused.append((self.request.method, self.get_status())),
+    )
+    with other_site(tmp_path) as address:
+        seen = BrowsedPage(browser.new_context(), address)
+        said = seen.page.evaluate(ATTACKS, recorded.page.server.address)
+        assert said == ["blocked", "blocked", "blocked", "blocked", True, "no key"]
+        until(
+            lambda: refused.count(("POST", 403)) == 4
+        )  # a browser sends these without asking first
+        assert set(refused) == {("POST", 403), ("OPTIONS", 405)}
+        assert (recorded.done, labels(recorded)) == ([], ("wood", "1", "monday"))
+        seen.page.context.close()
+
+
+CUT = """() => [...document.querySelectorAll("main :not(svg *, #counts)")]
+  .filter((e) => getComputedStyle(e).display !== "inline")
+  .filter((e) => e.scrollWidth > e.clientWidth + 1)
+  .map((e) => e.outerHTML.slice(0, 60))"""
+"""Elements whose content is cut; the table may scroll within itself."""
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_every_text_of_it_can_be_read(
+    browser: Any, recorded: RecordedPage, width: int, height: int, scheme: str
+):
+    """Text, an error and a banner have a contrast of 4.5 with their background (WCAG 2.1, 1.4.3).
+    The longest names and more positions than fit stay within the page."""
+    recorded.recording.commands["MATERIAL"]("corrugated cardboard 2mm")
+    for position in range(3, 15):
+        recorded.recording.commands["POSITION"](f"{position}")
+        recorded.sweep()
+    recorded.sweep(Status.STUCK_TAXEL, "taxel 1.4")
+    seen = BrowsedPage(
+        browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme),
+        recorded.page.server.address,
+    )
+    until(lambda: seen.page.locator("#counts button").count() == 3 * 14)
+    seen.page.fill("#session", "-")
+    seen.page.click("#set")
+    until(lambda: "cannot be used" in seen.text("#said"))
+    away = replace(recorded.health, skin="lost", trouble="the skin was unplugged", ready=False)
+    for act in (lambda: None, lambda: setattr(recorded, "health", away)):
+        act()
+        until(lambda act=act: seen.page.is_visible("#banner") == (recorded.health is away))
+        texts, faint = seen.legibility()
+        assert texts > 60
+        assert faint == []
+        assert seen.page.evaluate("document.documentElement.scrollWidth") <= width
+        assert seen.page.evaluate(CUT) == []
+    assert [one for one in seen.errors if "409" not in one] == []
+    seen.page.context.close()
+
+
+def test_everything_on_it_has_a_role_and_a_name(browser: Any, recorded: RecordedPage):
+    """Sections, fields, pictures and buttons have names for screen readers, which speak changes."""
+    seen = opened(browser, recorded)
+    unnamed = seen.page.evaluate(
+        """() => [...document.querySelectorAll("section, canvas, button, input, table, [role]")]
+        .filter((e) => !(e.textContent.trim() || e.labels?.length
+          || e.getAttribute("aria-label") || e.getAttribute("aria-labelledby")))
+        .map((e) => e.id)"""
+    )
+    assert set(unnamed) <= {"banner", "said"}
+    assert seen.page.get_attribute("#said", "role") == "status"
+    assert seen.page.get_attribute("#now", "aria-live") == "polite"
+    assert json.dumps(seen.requests).count(".js") == 5
+
+
+def test_a_material_has_a_name_in_any_language(
+    browser: Any, recorded: RecordedPage, tmp_path: Path
+):
+    """It is typed and shown as it is written; the command and the sweep have a label in ASCII, and
+    the sidecar has both."""
+    seen = opened(browser, recorded)
+    seen.page.fill("#material", "Holz, geölt")
+    seen.page.press("#material", "Enter")
+    until(lambda: seen.text("#now") == "Holz, geölt at 1")
+    assert recorded.done == ["MATERIAL,Holz geoelt"]
+    assert seen.page.input_value("#material") == "Holz, geölt"
+    number = recorded.sweep()
+    until(lambda: seen.text("#outcome").startswith("Holz, geölt at 1, stored"))
+    assert "Holz, geölt" in seen.page.locator("#counts th").all_inner_texts()
+    about = sidecar(tmp_path / f"sweep-{number:06d}.npy")
+    assert (about["material"], about["display"]) == ("Holz geoelt", "Holz, geölt")
+    assert not seen.errors

@@ -1,0 +1,488 @@
+"""The server of the pages: answers, refusals, faults."""
+
+from __future__ import annotations
+
+import json
+import re
+import socket
+import ssl
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+
+import pytest
+
+from palpate.core.config import WatchConfig
+from palpate.core.errors import ConfigError
+from palpate.web import server
+from palpate.web.access import Access
+from palpate.web.server import (
+    FOLDER,
+    MOST_HEAD,
+    MOST_OF_ONE,
+    MOST_WAITING,
+    EventLog,
+    PageServer,
+)
+from tests.factories.browser import WAIT_S, until
+from tests.factories.install_scripts import page_secrets
+from tests.factories.page_client import EventReader, ask, connected, port, received_by, status
+
+
+def now_ns() -> int:
+    """The clock of the tests' pages."""
+    return 5_000_000_000
+
+
+@pytest.fixture
+def page() -> Iterator[PageServer]:
+    """A page at any free port, with an event."""
+    with PageServer(
+        "watch.html", Access(0), now_ns, {"row": 3}, {"sweep": {"7": {"seconds": 2.0}}.get}
+    ) as one:
+        one.publish("view", {"number": 1})
+        yield one
+
+
+@contextmanager
+def guarded(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[tuple[PageServer, str, ssl.SSLContext]]:
+    """A page on the network as `make install` sets it up: the page, its token, and the context of a
+    browser that trusts it."""
+    page_secrets(folder)
+    settings = WatchConfig(address="0.0.0.0 localhost", folder=str(folder))
+    token = (folder / "token").read_text().strip()
+    with PageServer("watch.html", Access.configured(settings, 0), now_ns) as one:
+        one.publish("view", {"number": 1})
+        trusts = ssl.create_default_context(cafile=folder / "certificate.pem")
+        yield one, token, trusts
+
+
+def test_events_are_numbered_and_the_newest_are_kept():
+    """The requested number of events of each name is kept, else the newest; in order. A browser
+    gets later events, a browser of another server all events."""
+    log = EventLog({"row": 2})
+    for i in range(4):
+        log.add("row", i)
+        log.add("view", 10 * i)
+    sent = b"".join(log.since("")).decode()
+    assert re.findall(r"event: (\w+)\ndata: (.*)\n", sent) == [
+        ("begin", f'"{log.run}"'),
+        ("row", "2"),
+        ("row", "3"),
+        ("view", "30"),
+    ]
+    assert [event.split(b"data: ")[1] for event in log.since(f"{log.run}-7")] == [b"30\n\n"]
+    assert log.since(f"{log.run}-8") == []
+    for other in ("0000-7", f"{log.run}-", f"{log.run}-x", "-7", f"{log.run}-{10**30}"):
+        assert b"begin" in log.since(other)[0], other
+
+
+def test_a_browser_gets_what_is_kept_and_then_what_comes(page: PageServer):
+    """The clock is the first event. A browser that comes back gets only the events it has
+    missed."""
+    reader = EventReader(page)
+    assert [reader.next() for _ in range(3)] == [
+        ("now", now_ns()),
+        ("begin", page.events.run),
+        ("view", {"number": 1}),
+    ]
+    page.publish("row", "first")
+    assert reader.next() == ("row", "first")
+    reader.socket.close()
+    page.publish("row", "second")
+    page.publish("view", {"number": 2})
+    again = EventReader(page, reader.last)
+    assert [again.next() for _ in range(3)] == [
+        ("now", now_ns()),
+        ("row", "second"),
+        ("view", {"number": 2}),
+    ]
+    again.socket.close()
+
+
+def test_a_number_that_json_lacks_is_an_error_of_who_publishes(page: PageServer):
+    """ValueError there; the server goes on."""
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        page.publish("view", float("nan"))
+    reader = EventReader(page)
+    assert reader.until("view") == {"number": 1}
+
+
+@pytest.mark.parametrize(
+    "path", ["/", "/page.css", "/watch.js", "/events", "/sweep/7", "/sweep/8", "/nothing"]
+)
+def test_every_answer_says_what_a_browser_may_do(page: PageServer, path: str):
+    """No caching, no frames, nothing loaded from elsewhere, and no version of the server; in
+    errors, too."""
+    with connected(page) as one:
+        one.sendall(f"GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
+        head = b""
+        while b"\r\n\r\n" not in head:
+            head += one.recv(65536)
+    lines = head.partition(b"\r\n\r\n")[0].decode()
+    for line in (
+        "Cache-Control: no-store",
+        "X-Frame-Options: DENY",
+        "X-Content-Type-Options: nosniff",
+        "Content-Security-Policy: default-src 'none'; script-src 'self'; style-src 'self';"
+        " connect-src 'self'",
+        "frame-ancestors 'none'",
+        "Server: palpate",
+    ):
+        assert line in lines
+    assert "unsafe" not in lines
+    assert "ornado" not in lines
+
+
+@pytest.mark.parametrize(
+    ("path", "method", "host", "answer"),
+    [
+        ("/", "GET", "127.0.0.1:9000", 200),
+        ("/watch.html", "GET", "localhost", 200),
+        ("/sweep/7", "GET", "localhost", 200),
+        ("/sweep/8", "GET", "localhost", 404),
+        ("/sweep/-7", "GET", "localhost", 404),
+        ("/sweep/7777777777", "GET", "localhost", 404),
+        ("/other/7", "GET", "localhost", 404),
+        ("/index.html", "GET", "localhost", 404),
+        ("/enter", "GET", "localhost", 404),
+        ("/?x", "GET", "localhost", 404),
+        ("/../etc/passwd", "GET", "localhost", 404),
+        ("/..%2f..%2fetc/passwd", "GET", "localhost", 404),
+        ("/page.css/../../server.py", "GET", "localhost", 404),
+        ("/server.py", "GET", "localhost", 404),
+        ("//evil.example/", "GET", "localhost", 404),
+        ("/", "HEAD", "localhost", 405),
+        ("/", "POST", "localhost", 405),
+        ("/order", "POST", "localhost", 405),
+        ("/order", "GET", "localhost", 404),
+        ("/events", "PUT", "localhost", 405),
+        ("/sweep/7", "DELETE", "localhost", 405),
+        ("/", "OPTIONS", "localhost", 405),
+        ("/", "GET", "evil.example", 421),
+        ("/events", "GET", "evil.example:80", 421),
+        ("/sweep/7", "GET", "localhost.evil.example:80", 421),
+        ("/", "GET", "[::2]", 421),
+        ("/", "GET", "", 421),
+    ],
+)
+def test_the_page_for_this_machine_and_no_more(
+    page: PageServer, path: str, method: str, host: str, answer: int
+):
+    """GET of the page, its files and its data is answered under this machine's names; other
+    requests get their HTTP status."""
+    assert status(ask(page, path, method, host)) == answer
+    assert status(ask(page)) == 200
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [
+        b"\x00\x01\x02\r\n\r\n",
+        b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03"
+        + bytes(64)
+        + b"\r\n\r\n",  # TLS spoken to plain HTTP
+        b"GET / HTTP/9.9\r\nHost: localhost\r\n\r\n",
+        b"GET /\r\n\r\n",
+        b"GET / HTTP/1.1\r\n\r\n",
+        b"GET / HTTP/1.1\r\nHost: a\r\nHost: b\r\n\r\n",
+        b"GET / HTTP/1.1\r\nHost: localhost\r\nno colon\r\n\r\n",
+        b"GET / HTTP/1.1\r\nHost: localhost\r\nContent-Length: -1\r\n\r\n",
+        b"GET / HTTP/1.1\r\nHost: localhost\r\nContent-Length: 999999999999\r\n\r\n",
+        b"GET / HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\nffffffff\r\n",
+        b"GET /events?last=%ff%fe HTTP/1.1\r\nHost: localhost\r\n\r\n",
+        b"GET /%00%ff HTTP/1.1\r\nHost: localhost\r\n\r\n",
+        b"POST / HTTP/1.1\r\nHost: localhost\r\nContent-Length: 5\r\n\r\nhello",
+        "GET /ö HTTP/1.1\r\nHost: localhost\r\n\r\n".encode(),
+    ],
+)
+def test_malformed_requests_are_refused(
+    page: PageServer, sent: bytes, capfd: pytest.CaptureFixture[str]
+):
+    """Each request ends with an error or a closed connection and prints nothing; the next request
+    is served."""
+    with connected(page) as one:
+        with suppress(OSError):
+            one.sendall(sent)
+            one.shutdown(socket.SHUT_WR)
+        assert 400 <= status(received_by(one) or b"x 499") < 500
+    assert status(ask(page)) == 200
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    "sent", [b"", b"GET / HTTP/1.1\r\nHost: localhost\r\n", b"x" * (MOST_HEAD - 1)]
+)
+def test_half_a_request_ends_at_the_deadline(monkeypatch: pytest.MonkeyPatch, sent: bytes):
+    """Half a request gets no answer and a closed connection, even if its other side continues to
+    send; others are served."""
+    monkeypatch.setattr(server, "HEAD_S", 0.3)
+    with (
+        PageServer("watch.html", Access(0), now_ns) as page,
+        connected(page) as slow,
+        connected(page) as dripping,
+    ):
+        slow.sendall(sent)
+        dripping.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n")
+        assert status(ask(page)) == 200
+        dripping.settimeout(0.02)
+        ended = False
+        while not ended:
+            try:
+                dripping.sendall(b"X: y\r\n")
+                ended = not dripping.recv(100)
+            except TimeoutError:
+                pass
+            except OSError:
+                ended = True
+        assert received_by(slow) == b""
+
+
+def test_an_endless_head_is_not_read_on(page: PageServer):
+    """After MOST_HEAD bytes without an empty line the connection is closed at once, long before the
+    deadline."""
+    with connected(page) as one:
+        with suppress(OSError):
+            one.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\nX: " + b"y" * 10 * MOST_HEAD)
+        assert status(received_by(one)) in (0, 400)
+
+
+def test_a_thousand_silent_connections_make_room(page: PageServer):
+    """Beyond MOST_OF_ONE the oldest connection that has sent nothing is closed, so that somebody
+    who asks is served."""
+    with ExitStack() as stack:
+        silent = [stack.enter_context(connected(page)) for _ in range(1000)]
+        assert status(ask(page)) == 200
+        for one in silent[: 1000 - MOST_OF_ONE]:
+            assert received_by(one) == b""
+    until(lambda: status(ask(page)) == 200)
+
+
+def test_one_who_reads_nothing_holds_nobody_up(page: PageServer, monkeypatch: pytest.MonkeyPatch):
+    """A browser that never reads is disconnected when too many events wait for it; other browsers
+    get all events."""
+    lazy = EventReader(page)
+    busy = EventReader(page)
+    until(lambda: len(page.queues) == 2)
+    for i in range(40 * MOST_WAITING):
+        page.publish("row", [i, "x" * 20_000])
+        while (got := busy.until("row"))[0] != i:
+            pass
+    assert got[0] == 40 * MOST_WAITING - 1
+    assert len(page.queues) == 1
+    lazy.socket.close()
+
+
+def test_one_who_takes_nothing_is_closed(page: PageServer, monkeypatch: pytest.MonkeyPatch):
+    """A connection with an answer half sent is closed after TAKEN_S, and its place is free
+    again."""
+    monkeypatch.setattr(server, "TAKEN_S", 1)
+    monkeypatch.setattr(server, "MOST_OF_ONE", 1)
+    page.files["/big"] = "text/plain", b"x" * 50_000_000
+    with connected(page) as one:
+        one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        one.sendall(b"GET /big HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        assert status(one.recv(15)) == 200
+        assert ask(page) == b""
+        until(lambda: status(ask(page)) == 200)
+
+
+@pytest.mark.parametrize("rudely", [False, True])
+def test_a_browser_that_goes_is_forgotten(page: PageServer, rudely: bool):
+    """In the middle of the events, with or without a word: nothing waits for it any longer."""
+    reader = EventReader(page)
+    assert reader.until("view") == {"number": 1}
+    assert page.watched
+    if rudely:
+        reader.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")
+    reader.socket.close()
+    until(lambda: not page.watched)
+
+
+def test_another_server_at_the_port_begins_anew(page: PageServer):
+    """The event numbers of a previous server are not valid: the browser gets `begin` and all
+    events."""
+    reader = EventReader(page)
+    reader.until("view")
+    with PageServer("watch.html", Access(0), now_ns) as other:
+        other.publish("view", {"number": 9})
+        again = EventReader(other, reader.last)
+        assert [again.next()[0] for _ in range(3)] == ["now", "begin", "view"]
+
+
+def test_it_listens_on_this_machine_alone(page: PageServer):
+    """The socket is bound to 127.0.0.1; another address of this machine is refused."""
+    assert page.address.startswith("http://127.0.0.1:")
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(("127.0.0.2", port(page)), timeout=WAIT_S)
+
+
+def test_a_port_that_is_taken_is_named(page: PageServer):
+    """A ConfigError names the port and the remedy, also for an invalid port number."""
+    for taken in (port(page), 70_000):
+        with pytest.raises(ConfigError, match=f"port {taken} .*--web PORT"):
+            PageServer("watch.html", Access(taken), now_ns)
+
+
+def test_the_pages_hold_everything_they_show():
+    """No address but the namespace of SVG, no sources elsewhere, and nothing that could send or
+    keep data."""
+    names = {f.name for f in FOLDER.iterdir()}
+    for file in FOLDER.iterdir():
+        text = file.read_text(encoding="utf-8")
+        assert set(re.findall(r"https?://[^\"' ]+", text)) <= {"http://www.w3.org/2000/svg"}, file
+        assert not re.search(
+            r"@import|url\(|<form|innerHTML|eval\(|localStorage|document\.cookie|style=\"", text
+        ), file
+        assert {
+            path for path in re.findall(r'(?:src|href|from) ?=? ?"/([\w.]+)"', text)
+        } <= names, file
+
+
+@pytest.mark.parametrize(
+    "command", [["align", "--sim", "rest"], ["record", "--sim", "skin", "--virtual"]]
+)
+def test_without_tornado_it_says_what_to_install(tmp_path: Path, command: list[str]):
+    """One line that names the extra; nothing else of the box needs it."""
+    command += ["--out", str(tmp_path)] if "record" in command else []
+    code = (
+        "import sys; sys.modules['tornado'] = None; from palpate.__main__ import main;"
+        f"sys.exit(main({[*command, '--web', '0']}))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.returncode == ConfigError.exit_code
+    assert done.stderr.splitlines()[-1].endswith(
+        "--web needs tornado, which is not installed; pip install 'palpate[page]'"
+    )
+
+
+def test_on_the_network_it_takes_a_token(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Without the token the server answers with the page that asks for it. With the token, in a
+    header or in the server's cookie, everything is served. A browser that trusts the certificate
+    accepts it."""
+    with guarded(tmp_path, monkeypatch) as (page, token, trusts):
+        answer = ask(page, tls=trusts)
+        assert status(answer) == 401
+        assert b"/enter.js" in answer
+        assert [status(ask(page, path, tls=trusts)) for path in ("/enter.js", "/page.css")] == [
+            200,
+            200,
+        ]
+        for path in ("/events", "/watch.js", "/watch.html", "/sweep/1", "/enter", "/nothing"):
+            assert status(ask(page, path, tls=trusts)) == 401
+        answer = ask(page, "/enter", more=f"Authorization: Bearer {token}\r\n", tls=trusts)
+        assert status(answer) == 204
+        cookie = re.search(r"Set-Cookie: (.*)\r\n", answer.decode())[1]
+        assert {"HttpOnly", "Secure", "SameSite=Strict", "Path=/"} <= set(cookie.split("; "))
+        assert cookie.startswith("__Host-")
+        answer = ask(page, more=f"Cookie: {cookie.split(';')[0]}\r\n", tls=trusts)
+        assert status(answer) == 200
+        assert b"/watch.js" in answer
+        assert (
+            status(
+                ask(
+                    page, host="evil.example", more=f"Authorization: Bearer {token}\r\n", tls=trusts
+                )
+            )
+            == 421
+        )
+        assert (
+            status(
+                ask(
+                    page,
+                    host=f"{socket.gethostname()}:1",
+                    more=f"Authorization: Bearer {token}\r\n",
+                    tls=trusts,
+                )
+            )
+            == 200
+        )
+
+
+def test_plain_http_is_not_answered_on_the_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Plain HTTP, which would reveal the token, gets no answer; a handshake that never ends is cut
+    off."""
+    monkeypatch.setattr(server, "HEAD_S", 0.3)
+    with guarded(tmp_path, monkeypatch) as (page, token, trusts):
+        assert status(ask(page, more=f"Authorization: Bearer {token}\r\n")) == 0
+        with connected(page) as silent:
+            assert received_by(silent) == b""
+        assert status(ask(page, tls=trusts)) == 401
+
+
+def test_wrong_tokens_are_slowed_and_logged_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, logged: list[str]
+):
+    """Each wrong token waits for WRONG_S. The first is logged with the address, further wrong
+    tokens are not."""
+    waited = []
+
+    async def sleep(seconds: float) -> None:
+        if seconds == server.WRONG_S:
+            waited.append(seconds)
+
+    monkeypatch.setattr(server.asyncio, "sleep", sleep)
+    with guarded(tmp_path, monkeypatch) as (page, token, trusts):
+        for wrong in ("x", token[:-1], token + "0", "ö", "x" * 4000):
+            answer = ask(page, "/enter", more=f"Authorization: Bearer {wrong}\r\n", tls=trusts)
+            assert status(answer) == 401
+            assert (
+                status(ask(page, "/events", more=f"Cookie: __Host-palpate={wrong}\r\n", tls=trusts))
+                == 401
+            )
+        assert (
+            status(ask(page, "/enter", more=f"Authorization: Bearer {token}\r\n", tls=trusts))
+            == 204
+        )
+    assert len(waited) == 10
+    assert [line for line in logged if "token" in line] == [
+        "<4>page: wrong token from 127.0.0.1; further wrong tokens are not logged"
+    ]
+
+
+def test_beyond_this_machine_token_and_certificate_must_be_there(tmp_path: Path):
+    """Errors for missing or broken files name the file and `make install`; an invalid address is
+    refused."""
+    network = WatchConfig(address="0.0.0.0", folder=str(tmp_path))
+    with pytest.raises(ConfigError, match=r"token cannot be read: No such file.*make install"):
+        Access.configured(network, 0)
+    for text in ("short", "x" * 300, "with spaces in the middle", "ö" * 20):
+        (tmp_path / "token").write_text(text)
+        with pytest.raises(ConfigError, match="make install makes one"):
+            Access.configured(network, 0)
+    (tmp_path / "token").write_text("0123456789abcdef0123456789abcdef\n")
+    with pytest.raises(ConfigError, match=r"certificate.pem and key.pem cannot be used"):
+        PageServer("watch.html", Access.configured(network, 0), now_ns)
+    with pytest.raises(ConfigError, match=r"watch.address: 'tablet' is not an IP address"):
+        Access.configured(WatchConfig(address="tablet"), 0)
+    assert Access.configured(WatchConfig(), 0) == Access(0)
+
+
+def test_a_token_of_another_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """If this user may not read the token, the error names the group."""
+
+    def denied(path: Path, *args: object) -> str:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "read_text", denied)
+    with pytest.raises(
+        ConfigError, match=r"token may not be read by this user; .*usermod -aG GROUP USER"
+    ):
+        Access.configured(WatchConfig(address="0.0.0.0", folder=str(tmp_path)), 0)
+
+
+def test_what_install_makes_is_for_the_unit_alone(tmp_path: Path):
+    """Token, key and certificate stay as they are on another install; nobody but root and the group
+    reads them."""
+    page_secrets(tmp_path)
+    first = {f.name: f.read_bytes() for f in tmp_path.iterdir()}
+    assert sorted(first) == ["certificate.pem", "key.pem", "token"]
+    assert {f.stat().st_mode & 0o777 for f in tmp_path.iterdir()} == {0o640}
+    page_secrets(tmp_path)
+    assert {f.name: f.read_bytes() for f in tmp_path.iterdir()} == first
+    shown = json.dumps(ssl._ssl._test_decode_cert(str(tmp_path / "certificate.pem")))  # type: ignore[attr-defined]
+    assert f"{socket.gethostname()}.local" in shown

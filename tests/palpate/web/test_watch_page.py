@@ -1,0 +1,453 @@
+"""The page of `palpate watch --web` in a headless browser: content, use, and layout at three
+sizes."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from palpate.core.config import WatchConfig
+from palpate.web.access import Access
+from tests.factories import feed_lines
+from tests.factories.browser import BrowsedPage, until
+from tests.factories.install_scripts import page_secrets
+from tests.factories.shown_page import NOW_S, Shown, opened
+
+pytestmark = pytest.mark.slow
+
+SIZES = [(390, 844), (1024, 768), (1400, 900)]
+
+
+@pytest.fixture
+def shown() -> Iterator[Shown]:
+    """A page that shows a shift."""
+    one = Shown(Access(0))
+    with one:
+        one.shift()
+        yield one
+
+
+def test_the_verdict_comes_first_and_large(browser: Any, shown: Shown):
+    """Letters that are read from two metres: 20' of arc are 12 mm there, 57 px of a tablet's 0.2
+    mm; less at no size."""
+    for width, height in SIZES:
+        seen = opened(browser, shown, width, height)
+        assert seen.text("#label") == feed_lines.LABELS[40 % 6]
+        assert seen.text("#sure") == "96.2 %"
+        assert seen.text("#which").startswith("sweep 40, ")
+        label = seen.page.locator("#label")
+        assert float(label.evaluate("e => parseFloat(getComputedStyle(e).fontSize)")) >= (
+            57 if width > 400 else 40
+        )
+        box = label.bounding_box()
+        assert box["y"] + box["height"] <= height  # without scrolling
+        assert not seen.errors
+        seen.page.context.close()
+
+
+@pytest.mark.parametrize(
+    "label",
+    [
+        "x",
+        "a material whose name is as long as it may be",
+        "Donaudampfschifffahrtsgesellschaft",
+        "<img src=x onerror=alert(1)>",
+    ],
+)
+def test_a_name_of_any_length_fits(browser: Any, shown: Shown, label: str):
+    """Nothing is cut off at any size, and markup in a name is shown as text."""
+    shown.board.take(feed_lines.verdict(41, 390.0, "wood") | {"label": label})
+    for width, height in SIZES:
+        seen = opened(browser, shown, width, height, rows=41)
+        until(lambda: seen.text("#label") == label)  # noqa: B023
+        inside = seen.page.locator("#label").evaluate(
+            "e => [e.scrollWidth - e.clientWidth, e.scrollHeight - e.clientHeight]"
+        )
+        assert max(inside) <= 1
+        seen.page.context.close()
+
+
+def test_people_read_display_names_and_programs_labels(browser: Any, shown: Shown, tmp_path: Path):
+    """Card, list, counts and probabilities have the name in any language; the CSV has the label."""
+    shown.board.take(feed_lines.hello(displays={"wood": "Holz, <b>geölt</b>"}))
+    shown.board.take(feed_lines.verdict(41, 390.0, "wood"))
+    seen = opened(browser, shown, rows=41)
+    until(lambda: seen.text("#label") == "Holz, <b>geölt</b>")
+    assert "Holz, <b>geölt</b>" in seen.page.locator(".row").first.inner_text()
+    assert "Holz, <b>geölt</b>" in seen.page.locator("#tally th").all_text_contents()
+    assert seen.page.locator("#scores span").first.inner_text() == "Holz, <b>geölt</b>"
+    with seen.page.expect_download() as begun:
+        seen.page.locator("#save").click()
+    begun.value.save_as(tmp_path / "shift.csv")
+    text = (tmp_path / "shift.csv").read_text("utf-8")
+    assert ",wood," in text
+    assert "Holz" not in text
+    assert not seen.errors
+
+
+def test_the_answers_of_the_fingers_stand_below_that_of_the_hand(browser: Any, shown: Shown):
+    """In the card, and in the row of the sweep, with the names of materials for people."""
+    shown.board.take(feed_lines.hello(displays={"wood": "Holz, geölt"}))
+    seen = opened(browser, shown)
+    fingers = [
+        {"finger": "left", "label": "wood", "probability": 0.912, "status": "ok"},
+        {"finger": "right", "label": "", "probability": 0.0, "status": "no-contact"},
+    ]
+    shown.board.take(feed_lines.verdict(41, 390.0, "wood", fingers=fingers))
+    until(lambda: seen.text("#label") == "Holz, geölt")
+    said = "left Holz, geölt 91.2 %, right no-contact"
+    assert seen.text("#sure").endswith(f", {said}")
+    assert seen.page.locator(".row").first.locator(".more").inner_text() == said
+    assert not seen.errors
+
+
+def test_a_sweep_without_a_label_says_why(browser: Any, shown: Shown):
+    """The card has words for an operator, the fold the reason; the probabilities are gone."""
+    seen = opened(browser, shown)
+    shown.board.take(feed_lines.verdict(41, 390.0, status="sensor-lost"))
+    until(lambda: seen.text("#status") == "sensor-lost")
+    assert (seen.text("#label"), seen.text("#advice")) == ("Skin lost", "Check the skin's cable.")
+    assert seen.text("#sure") == ""
+    assert not seen.page.is_visible("#detail")
+    seen.page.click("#why summary")
+    assert "the skin was lost during the sweep" in seen.text("#detail")
+    assert seen.page.locator("#scores li").count() == 0
+
+
+def test_probabilities_signal_and_spectrogram_of_a_chosen_sweep(browser: Any, shown: Shown):
+    """The last sweep is shown by itself, and another sweep after a click, until the latest is asked
+    for. An old sweep no longer has a signal."""
+    seen = opened(browser, shown)
+    scores = seen.page.locator("#scores li").all_inner_texts()
+    assert len(scores) == 6
+    assert scores[0].split("\n") == [feed_lines.LABELS[40 % 6], "96.2\xa0%"]
+    until(lambda: "16 taxels over 2.0 s" in str(seen.page.get_attribute("#signal", "aria-label")))
+    assert re.search(
+        r"strongest at about [57]0 Hz", seen.page.get_attribute("#spectrogram", "aria-label")
+    )
+    seen.page.click(".row:nth-child(3)")
+    until(lambda: seen.text("#sweep-title").startswith("Sweep 38"))
+    shown.board.take(feed_lines.verdict(41, 390.0, "wood"))
+    until(lambda: seen.text("#label") == "wood")
+    assert seen.text("#sweep-title").startswith("Sweep 38")
+    seen.page.click("#follow")
+    until(lambda: seen.text("#sweep-title").startswith("Sweep 41"))
+    assert not seen.page.is_visible("#follow")
+    until(
+        lambda: "not kept" in str(seen.page.get_attribute("#signal", "aria-label"))
+    )  # no `sweep` line came with it
+    assert not seen.errors
+
+
+def test_the_shift_is_filtered_by_status(browser: Any, shown: Shown):
+    """A button for each status with its count; several at a time; `all` again."""
+    seen = opened(browser, shown)
+    buttons = seen.page.locator("#filter button")
+    assert buttons.all_inner_texts() == ["all 40", "ok 36", "unsure 2", "gap 1", "no-contact 1"]
+    buttons.nth(2).click()
+    until(lambda: seen.page.locator(".row").count() == 2)
+    assert buttons.nth(2).get_attribute("aria-pressed") == "true"
+    buttons.nth(3).click()
+    until(lambda: seen.page.locator(".row").count() == 3)
+    shown.board.take(feed_lines.verdict(41, 390.0, "wood", "unsure"))
+    until(lambda: seen.page.locator(".row").count() == 4)
+    assert buttons.nth(2).inner_text() == "unsure 3"
+    buttons.nth(0).click()
+    until(lambda: seen.page.locator(".row").count() == 41)
+
+
+def test_a_moved_skin_and_the_way_back(browser: Any, shown: Shown):
+    """The verdict leads to the view that shows the direction in which to move the skin, while the
+    service runs."""
+    seen = opened(browser, shown)
+    shown.board.take(
+        feed_lines.verdict(41, 390.0, "wood", moved="moved 2.2 mm too far towards row 1")
+    )
+    until(lambda: seen.text("#moved") == "moved 2.2 mm too far towards row 1: align the skin")
+    seen.page.click("#moved a")
+    seen.state("off")
+    until(lambda: seen.page.is_visible("#message"))
+    assert seen.text("#message").endswith("towards row 1")
+    assert seen.page.is_visible("#push")
+    assert seen.page.locator("#way").evaluate("e => e.style.visibility") == "visible"
+    assert not seen.page.is_visible("#watch")
+    seen.page.click("text=Watch")
+    until(lambda: seen.page.is_visible("#label"))
+    assert seen.page.locator("#watch .skin svg").count() == 1
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_a_large_skin_is_drawn_without_numbers(browser: Any, shown: Shown, width: int, height: int):
+    """12 x 32 taxels: some rows and columns have numbers that do not overlap; the contact's ring is
+    large enough."""
+    shape = {"rows": 12, "cols": 32, "rate_hz": 100.0, "window": 200, "dtype": "uint16"}
+    known = {"contact": 5.0, "place": None, "unloaded": 0.0, "fingertip": "first-column"}
+    shown.board.take(feed_lines.hello(format=shape, alignment=known))
+    for i in range(20):
+        taxels = np.zeros((12, 32))
+        taxels[4:6, 10:14] = 200 * (i > 9)
+        shown.board.take(feed_lines.frame(380 + i / 20, taxels))
+    seen = opened(browser, shown, width, height)
+    until(lambda: seen.page.locator(".tile").count() == 12 * 32)
+    assert seen.page.locator(".count").count() == 0
+    boxes = [one.bounding_box() for one in seen.page.locator("svg .name").all()]
+    assert len(boxes) == 4 + 9 + 1
+    for i, one in enumerate(boxes):
+        for other in boxes[:i]:
+            apart = max(
+                one["x"] - other["x"] - other["width"],
+                other["x"] - one["x"] - one["width"],
+                one["y"] - other["y"] - other["height"],
+                other["y"] - one["y"] - one["height"],
+            )
+            assert apart >= -1
+    assert seen.page.locator("#centre").bounding_box()["width"] > 12
+    seen.page.context.close()
+
+
+def test_loss_latency_and_the_box(browser: Any, shown: Shown):
+    """In words beside their pictures; bundle and trial by name."""
+    seen = opened(browser, shown)
+    assert re.fullmatch(r"median 1\.\d ms, longest 1\.\d ms", seen.text("#latency-said"))
+    assert seen.text("#loss-said") == "3 of 270,003 since the start"
+    assert "in 5 minutes" in seen.page.get_attribute("#loss", "aria-label")
+    facts = seen.text("#facts dl")
+    for text in (
+        "tubes 3, 6 labels (9f3c2a1b)",
+        "on trial: 12 of 20 sweeps",
+        "4x4 uint8 at 750 Hz",
+        "process 71",
+    ):
+        assert text in facts
+    shown.board.take(feed_lines.health(380.0, loss_known=False, lost_frames=2))
+    until(lambda: "at least 2" in seen.text("#loss-said"))
+
+
+def test_unsigned_bundles_are_told_at_the_top(browser: Any, shown: Shown):
+    """While a setting allows unsigned bundles, the top of the page says so at every size, without
+    scrolling; otherwise it does not."""
+    for text in ("", "bundles are allowed: classifier.allow_unsigned = true"):
+        shown.board.take(feed_lines.health(380.0, unsigned=text))
+        for width, height in SIZES:
+            seen = opened(browser, shown, width, height)
+            until(lambda: seen.page.locator("#unsigned").is_visible() == bool(text))  # noqa: B023
+            if text:
+                box = seen.page.locator("#unsigned").bounding_box()
+                assert 0 <= box["x"] < box["x"] + box["width"] <= width
+                assert box["y"] < height / 2
+                assert "allow_unsigned" in seen.text("#facts")
+            seen.page.context.close()
+
+
+def test_a_box_that_dies_and_comes_back_while_the_page_is_open(browser: Any, shown: Shown):
+    """The page says at once that the box is off, and since when; the reason is behind a fold. It
+    shows the new box and bundle by itself, and its card waits for a sweep of the new box."""
+    seen = opened(browser, shown)
+    assert not seen.page.is_visible("#banner")
+    shown.board.take({"type": "closed", "why": "the box is stopping"})
+    until(lambda: seen.page.is_visible("#banner"))
+    said = re.compile(r"The box is off or restarting, last heard (?:(\d+) min )?(\d+) s ago")
+
+    def age_s() -> int:
+        minutes, seconds = said.fullmatch(seen.text("#banner")).groups("0")
+        return 60 * int(minutes) + int(seconds)
+
+    before = age_s()
+    assert seen.text("#state") == "box off"
+    assert seen.text("#label") == "The box is off or restarting"
+    assert re.match(r"Last heard at \d\d:\d\d:\d\d, .* ago\.", seen.text("#advice"))
+    assert seen.text("#sure").startswith(f"Before that: {feed_lines.LABELS[40 % 6]}, sweep 40, ")
+    seen.page.click("#why summary")
+    assert seen.text("#detail") == "the box is stopping"
+    until(lambda: age_s() > before)
+    shown.board.take(feed_lines.hello(pid=72, bundle="aaaa0001"))
+    shown.board.take(feed_lines.health(NOW_S, pid=72, bundle="aaaa0001", model="tubes 4, 6 labels"))
+    until(lambda: not seen.page.is_visible("#banner"))
+    assert seen.text("#state") == "ready"
+    assert seen.text("#label") == "Ready"
+    assert seen.text("#advice") == "No sweep yet since the box was started."
+    assert seen.text("#bundle") == "tubes 4, 6 labels"
+    assert "aaaa0001 in place of 9f3c2a1b" in seen.text(".note")
+    assert seen.page.locator(".row").count() == 40
+    assert not seen.errors
+
+
+def test_a_page_program_that_dies_and_comes_back(browser: Any):
+    """The page says at once that the connection is gone, and tries again. The content of the new
+    program replaces the old content."""
+    first = Shown(Access(0))
+    with first:
+        first.shift()
+        seen = opened(browser, first)
+        access = Access(int(first.server.address.rsplit(":", 1)[1]))
+    until(lambda: "No connection to the box" in seen.text("#banner"))
+    seen.page.click("#why summary")
+    assert seen.text("#detail") == "The page tries again by itself."
+    second = Shown(access)
+    with second:
+        second.board.take(feed_lines.hello())
+        second.board.take(feed_lines.health(NOW_S))
+        until(lambda: not seen.page.is_visible("#banner"))
+        until(lambda: seen.page.locator(".row").count() == 0)
+        assert seen.text("#state") == "ready"
+        seen.page.context.close()
+
+
+def test_a_skin_that_is_away_is_not_a_box_that_is_away(browser: Any, shown: Shown):
+    """The banner names the skin and what to do."""
+    seen = opened(browser, shown)
+    shown.board.take(
+        feed_lines.health(
+            NOW_S, skin="absent", trouble="no skin on USB; check the cable", ready=False
+        )
+    )
+    until(lambda: seen.page.is_visible("#banner"))
+    assert seen.text("#banner") == "No skin: check its cable"
+    assert (seen.text("#label"), seen.text("#advice")) == ("No skin", "Check its cable.")
+    seen.page.click("#why summary")
+    assert seen.text("#detail") == "no skin on USB; check the cable"
+    assert seen.text("#state") == "skin absent"
+
+
+def test_it_is_used_with_the_keyboard(browser: Any, shown: Shown):
+    """Tab goes from the views over the filter to the sweeps with a visible focus; arrows choose a
+    sweep, space a status."""
+    seen = opened(browser, shown)
+    stops = []
+    for _ in range(11):
+        seen.page.keyboard.press("Tab")
+        stops.append(
+            seen.page.evaluate("document.activeElement.id || document.activeElement.textContent")
+        )
+        outline = seen.page.evaluate("getComputedStyle(document.activeElement).outlineWidth")
+        assert float(outline.removesuffix("px")) >= 2
+    assert stops == [
+        "Watch",
+        "Align",
+        "full",
+        "tone",
+        "save",
+        "all 40",
+        "ok 36",
+        "unsure 2",
+        "gap 1",
+        "no-contact 1",
+        "rows",
+    ]
+    seen.page.keyboard.press("ArrowDown")
+    until(lambda: seen.text("#sweep-title").startswith("Sweep 39"))
+    seen.page.keyboard.press("End")
+    until(lambda: seen.text("#sweep-title").startswith("Sweep 1,"))
+    active = seen.page.get_attribute("#rows", "aria-activedescendant")
+    assert seen.page.locator(f"#{active}").get_attribute("aria-selected") == "true"
+    for _ in range(4):
+        seen.page.keyboard.press("Shift+Tab")
+    seen.page.keyboard.press("Space")
+    until(lambda: seen.page.locator(".row").count() == 36)
+
+
+def test_everything_has_a_role_and_a_name(browser: Any, shown: Shown):
+    """Sections, pictures, lists and buttons have names for screen readers, which speak urgent
+    changes."""
+    seen = opened(browser, shown)
+    unnamed = seen.page.evaluate(
+        """() => [...document.querySelectorAll("section, canvas, meter, button, a, [role]")]
+        .filter((e) => !(e.textContent.trim()
+          || e.getAttribute("aria-label") || e.getAttribute("aria-labelledby")))
+        .map((e) => e.outerHTML.slice(0, 80))"""
+    )
+    assert [one for one in unnamed if 'id="banner"' not in one] == []
+    assert seen.page.get_attribute("#banner", "role") == "status"
+    assert seen.page.get_attribute("#label", "aria-live") == "polite"
+    assert seen.page.locator("[role=listbox] [role=option]").count() == 40
+    assert seen.page.locator("nav a[aria-current=page]").inner_text() == "Watch"
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize(("width", "height"), SIZES)
+@pytest.mark.parametrize("at", ["/", "/#align"])
+def test_every_text_can_be_read(
+    browser: Any, shown: Shown, width: int, height: int, scheme: str, at: str
+):
+    """All text has a contrast of 4.5 with its background (WCAG 2.1, 1.4.3), also with a banner and
+    each tone; nothing is too wide."""
+    for number, status in enumerate(("unsure", "unknown", "gap", "aborted"), 41):
+        shown.board.take(
+            feed_lines.verdict(
+                number, 390.0, "wood", status, moved="moved 2 mm too far towards row 1"
+            )
+        )
+    context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme)
+    seen = BrowsedPage(context, shown.server.address + at)
+    until(lambda: seen.page.locator(".row").count() == 44 or bool(at[1:]))
+    seen.state("off")
+    for act in (lambda: None, lambda: shown.board.away("it was stopped")):
+        act()
+        until(lambda: seen.page.is_visible("#message" if at[1:] else "#label"))
+        texts, faint = seen.legibility()
+        assert texts > (10 if at[1:] else 100)
+        assert faint == []
+        assert seen.page.evaluate("document.documentElement.scrollWidth") <= width
+    assert not seen.errors
+    context.close()
+
+
+def test_nothing_moves_when_something_new_comes(browser: Any, shown: Shown):
+    """Each section stays where it is over verdicts of all kinds, views and a box that goes away."""
+    seen = opened(browser, shown)
+    boxes = (
+        "() => [...document.querySelectorAll('#watch > section')].map((e) => [e.offsetLeft,"
+        " e.offsetTop, e.offsetWidth, e.offsetHeight])"
+    )
+    before = seen.page.evaluate(boxes)
+    for number, (label, status) in enumerate(
+        [("foam", "ok"), ("", "no-start"), ("plastic smooth", "unsure")], 41
+    ):
+        moved = "moved 2.2 mm too far towards row 1 and 1.1 mm towards column 4" * (
+            status == "unsure"
+        )
+        shown.board.take(feed_lines.verdict(number, 390.0, label, status, moved=moved))
+        until(lambda number=number: seen.text("#which").startswith(f"sweep {number}"))
+        shown.board.take(feed_lines.frame(380.0 + number, feed_lines.load(2.0, 2.0)))
+        assert seen.page.evaluate(boxes)[:2] == before[:2]
+    shown.board.away("it was stopped")
+    until(lambda: seen.page.is_visible("#banner"))
+    assert seen.page.evaluate(boxes)[:2] == before[:2]
+
+
+def test_on_a_tablet_in_the_network(browser: Any, tmp_path: Path):
+    """Over TLS the page asks for the token, and refuses a wrong token. The right token, or a link
+    with it, opens the page; a reload needs no token. The address does not show it."""
+    page_secrets(tmp_path)
+    token = (tmp_path / "token").read_text().strip()
+    shown = Shown(Access.configured(WatchConfig(address="0.0.0.0", folder=str(tmp_path)), 0))
+    with shown:
+        shown.shift()
+        address = f"https://localhost:{shown.server.address.rsplit(':', 1)[1]}"
+        context = browser.new_context(ignore_https_errors=True)
+        seen = BrowsedPage(context, address)
+        assert seen.page.evaluate("document.activeElement.id") == "token"
+        for wrong, said in (
+            ("nonsense", "this is not the token"),
+            ("schlüssel €", "letters and digits"),
+        ):
+            seen.page.fill("#token", wrong)
+            seen.page.keyboard.press("Enter")
+            until(lambda said=said: said in seen.text("#said"))
+        seen.page.fill("#token", token)
+        seen.page.click("#go")
+        until(lambda: seen.page.locator(".row").count() == 40)
+        seen.page.reload()
+        until(lambda: seen.page.locator(".row").count() == 40)
+        assert token not in seen.page.url
+        assert token not in "".join(seen.requests)
+        other = BrowsedPage(browser.new_context(ignore_https_errors=True), f"{address}/#{token}")
+        until(lambda: other.page.locator(".row").count() == 40)
+        assert token not in other.page.url
+        other.page.context.close()
+        context.close()

@@ -1,0 +1,360 @@
+"""The states of `palpate watch --web` as an operator sees them from two metres, and the use of the
+page on a tablet, in a headless browser."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from palpate.core.status import Status
+from palpate.web.access import Access
+from tests.factories import feed_lines
+from tests.factories.browser import BrowsedPage, until
+from tests.factories.feed_lines import verdict
+from tests.factories.shown_page import NOW_S, Shown, opened
+
+pytestmark = pytest.mark.slow
+
+SIZES = [(390, 844), (1024, 768), (1400, 900)]
+MOVED = "moved 2.2 mm too far towards row 1"
+OFF = "no palpate offers its feed there: the box is off or restarting; start it"
+
+
+@pytest.fixture
+def shown() -> Iterator[Shown]:
+    """A page that shows a shift."""
+    one = Shown(Access(0))
+    with one:
+        one.shift()
+        yield one
+
+
+def sweep(label: str = "wood", status: str = "ok", **more: Any) -> Callable[[Shown], None]:
+    """Sweep 41 with this answer, of a box that runs."""
+
+    def act(shown: Shown) -> None:
+        shown.board.take(feed_lines.hello())
+        shown.board.take(feed_lines.health(NOW_S))
+        shown.board.take(verdict(41, 395.0, label, status, **more))
+
+    return act
+
+
+def off(shown: Shown) -> None:
+    shown.board.take({"type": "closed", "why": OFF})
+
+
+def restarted(shown: Shown) -> None:
+    off(shown)
+    shown.board.take(feed_lines.hello(pid=72))
+    shown.board.take(feed_lines.health(NOW_S, pid=72))
+
+
+def no_skin(shown: Shown) -> None:
+    shown.board.take(feed_lines.health(NOW_S, skin="absent", trouble="none on USB", ready=False))
+
+
+STATES: list[tuple[Callable[[Shown], None], str, str, str, str]] = [
+    (sweep(), "good", "ok", "wood", ""),
+    (sweep(status="unsure"), "warn", "unsure", "Unsure", "Sweep again."),
+    (sweep(status="unknown"), "warn", "unknown", "Unknown", "Not like any taught material."),
+    (sweep(moved=MOVED), "warn", "displaced", "wood", "The skin has moved: align it."),
+    (
+        sweep(status="unknown", moved=MOVED),
+        "warn",
+        "displaced",
+        "Displaced",
+        "The skin has moved: align it.",
+    ),
+    (sweep(status="short"), "bad", "short", "Too short", "Slide for longer than 2 s."),
+    (sweep(status="sensor-lost"), "bad", "sensor-lost", "Skin lost", "Check the skin's cable."),
+    (no_skin, "bad", "no skin", "No skin", "Check its cable."),
+    (off, "away", "off", "The box is off or restarting", "Last heard at "),
+    (restarted, "plain", "", "Ready", "No sweep yet since the box was started."),
+]
+"""What happens; tone and status of the card; its words and its advice, or how that begins."""
+
+
+BACK = "getComputedStyle(document.querySelector('#verdict')).backgroundColor"
+
+
+def shows(seen: BrowsedPage, tone: str, status: str, words: str, advice: str) -> None:
+    """The card comes to show this."""
+    until(lambda: seen.text("#label") == words and seen.text("#status") == status)
+    assert seen.page.get_attribute("#verdict", "data-tone") == tone
+    assert (seen.text("#advice") if advice else "").startswith(advice)
+
+
+OVERLAPS = """() => {
+  const parts = [...document.querySelectorAll("#verdict > *")].filter((e) => e.checkVisibility());
+  const inner = (e) => [e, ...e.querySelectorAll("svg, span")].map((one) => one.getBoundingClientRect());
+  const ends = parts.map((e) => Math.max(...inner(e).map((box) => box.bottom)));
+  const below = parts.filter((e, i) => i && e.getBoundingClientRect().top < ends[i - 1] - 1);
+  const end = document.querySelector("#verdict").getBoundingClientRect().bottom;
+  return [...below, ...parts.filter((e, i) => ends[i] > end)].map((e) => e.id);
+}"""  # noqa: E501
+"""Parts of the card that lie on the part above, or beyond the card's end."""
+
+
+def fits(seen: BrowsedPage, width: int, height: int) -> None:
+    """The card is in sight without scrolling, its words are large enough and whole."""
+    assert seen.page.evaluate("document.documentElement.scrollWidth") <= width
+    size = "e => parseFloat(getComputedStyle(e).fontSize)"
+    label, advice = seen.page.locator("#label"), seen.page.locator("#advice")
+    assert label.evaluate(size) >= (48 if width > 400 else 36)
+    if advice.is_visible():
+        assert advice.evaluate(size) >= 22
+        assert advice.bounding_box()["y"] + advice.bounding_box()["height"] <= height
+    assert seen.page.evaluate(OVERLAPS) == []
+    cut = "e => Math.max(e.scrollWidth - e.clientWidth, e.scrollHeight - e.clientHeight)"
+    assert label.evaluate(cut) <= 12  # the descent of letters with a line height of 1
+    assert label.evaluate("e => e.scrollWidth - e.clientWidth") <= 1
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_each_state_is_told_from_two_metres(
+    browser: Any, shown: Shown, width: int, height: int, scheme: str
+):
+    """Colour, shape and word differ between an answer, a refusal, a fault and a box that is off;
+    what to do stands beside it. All text can be read (WCAG 2.1, 1.4.3), on the whole screen too."""
+    size = {"width": width, "height": height}
+    context = browser.new_context(viewport=size, color_scheme=scheme)
+    seen = BrowsedPage(context, shown.server.address)
+    until(lambda: seen.page.locator(".row").count() == 40)
+    looks = {tone: set() for tone in ("good", "warn", "bad", "away", "plain")}
+    for act, *told in STATES:
+        act(shown)
+        shows(seen, *told)
+        looks[told[0]].add((seen.page.evaluate(BACK), seen.page.get_attribute("#sign path", "d")))
+        for _ in ("on", "off"):
+            assert seen.legibility()[1] == []
+            fits(seen, width, height)
+            seen.page.keyboard.press("f")
+    assert [len(one) for one in looks.values()] == [1] * 5
+    colours, signs = zip(*(one.pop() for one in looks.values()), strict=True)
+    assert len({*colours}) == len({*signs}) == 5
+    assert not seen.errors
+    context.close()
+
+
+def test_each_status_has_words_for_an_operator(browser: Any, shown: Shown):
+    """The statuses of the program are those of the page, and `displaced`; no word is missing."""
+    seen = opened(browser, shown)
+    words = seen.page.evaluate("import('/verdict.js').then((module) => module.WORDS)")
+    assert words.keys() == {*map(str, Status), "displaced"}
+    assert {name for name, texts in words.items() if not all(texts)} == {"ok"}
+
+
+def test_an_unsure_answer_shows_its_candidate_small(browser: Any, shown: Shown):
+    """The name of a material that the box does not answer for is never the large word."""
+    seen = opened(browser, shown)
+    for status in ("unsure", "undecided"):
+        shown.board.take(verdict(41, 395.0, "wood", status))
+        until(lambda: seen.text("#status") == status)  # noqa: B023
+        assert "wood" not in seen.text("#label")
+        assert seen.text("#sure") == "Perhaps wood, 48.1 %"
+
+
+def test_distances_are_behind_a_fold(browser: Any, shown: Shown):
+    """The detail of an unknown sweep is for the person who opens it."""
+    seen = opened(browser, shown)
+    detail = "squared distance 97.65 from metal, limit 68.84"
+    shown.board.take(verdict(41, 395.0, status="unknown", detail=detail))
+    until(lambda: seen.text("#label") == "Unknown")
+    assert detail not in seen.text("#verdict")
+    seen.page.focus("#why summary")
+    seen.page.keyboard.press("Enter")
+    until(lambda: detail in seen.text("#detail"))
+
+
+def test_the_whole_screen_has_the_verdict_alone(browser: Any, shown: Shown):
+    """With a key or the button; the way back is the same key, or Escape."""
+    seen = opened(browser, shown)
+    seen.page.keyboard.press("f")
+    until(lambda: not seen.page.is_visible("#history"))
+    box = seen.page.locator("#verdict").bounding_box()
+    assert box["width"] * box["height"] > 0.8 * 1024 * 768
+    assert seen.page.is_visible("#state")
+    assert seen.page.get_attribute("#full", "aria-pressed") == "true"
+    seen.page.keyboard.press("Escape")
+    until(lambda: seen.page.is_visible("#history"))
+    seen.page.click("#full")
+    until(lambda: not seen.page.is_visible("#history"))
+    seen.page.click("#full")
+    until(lambda: seen.page.is_visible("#history"))
+
+
+DEVICE = """() => {
+  window.locks = 0; window.tones = [];
+  const lock = () => Object.assign(new EventTarget(), {released: false});
+  Object.defineProperty(navigator, "wakeLock", {value: {request: async () => { window.locks += 1; return window.lock = lock(); }}});
+  window.AudioContext = class {
+    currentTime = 0;
+    createOscillator() {
+      const frequency = {};
+      return {frequency, connect() {}, start() { window.tones.push(frequency.value); }, stop() {}};
+    }
+    resume() {}
+  };
+}"""  # noqa: E501
+"""A tablet that notes how often its screen is kept on, and its tones in Hz."""
+
+
+def test_a_tablet_stays_awake_and_sounds_on_a_refusal(browser: Any, shown: Shown):
+    """The screen is kept on, again after the page was hidden. If it is wanted, a refusal sounds
+    once, and an answer does not."""
+    context = browser.new_context()
+    context.add_init_script(f"({DEVICE})()")
+    seen = BrowsedPage(context, shown.server.address)
+    until(lambda: seen.page.locator(".row").count() == 40)
+    until(lambda: seen.page.evaluate("window.locks") == 1)
+    assert "the screen stays on" in seen.text("#awake")
+    seen.page.evaluate(
+        "window.lock.released = true; document.dispatchEvent(new Event('visibilitychange'))"
+    )
+    until(lambda: seen.page.evaluate("window.locks") == 2)
+    for number, pressed, tones in ((41, False, 0), (42, True, 2), (43, False, 4)):
+        if pressed:
+            seen.page.keyboard.press("t")
+        shown.board.take(verdict(number, 395.0, status="unknown"))
+        until(lambda: seen.text("#which").startswith(f"sweep {number},"))  # noqa: B023
+        assert len(seen.page.evaluate("window.tones")) == tones
+    shown.board.take(verdict(44, 395.0, "wood"))
+    until(lambda: seen.text("#label") == "wood")
+    assert len(seen.page.evaluate("window.tones")) == 4
+    assert not seen.errors
+    context.close()
+
+
+def test_keys_lead_to_views_and_history(browser: Any, shown: Shown):
+    """A letter each, listed on the page; with Ctrl a letter belongs to the browser."""
+    seen = opened(browser, shown)
+    seen.page.keyboard.press("a")
+    until(lambda: seen.page.is_visible("#align"))
+    seen.page.keyboard.press("w")
+    until(lambda: seen.page.is_visible("#watch"))
+    seen.page.keyboard.press("h")
+    seen.page.keyboard.press("ArrowDown")
+    until(lambda: seen.text("#sweep-title").startswith("Sweep 39"))
+    seen.page.keyboard.press("l")
+    until(lambda: seen.text("#sweep-title").startswith("Sweep 40"))
+    seen.page.keyboard.press("Control+a")
+    assert seen.page.is_visible("#watch")
+    seen.page.click("summary:text('keys')")
+    assert seen.page.locator("#keys dt").all_text_contents() == list("ftwalhs")
+
+
+def test_the_shift_is_counted_and_saved(browser: Any, shown: Shown):
+    """A sentence, and a table by material and status; the CSV file holds each sweep with its time
+    by the clock on the wall."""
+    shown.board.take(verdict(41, 395.0, "=1+1", detail='a "word", and more'))
+    seen = opened(browser, shown, rows=41)
+    assert re.match(
+        r"41 sweeps since \d\d:\d\d:\d\d: 37 named \(90.2 %\), 2 not sure, 2 without a material",
+        seen.text("#counted"),
+    )
+    lines = [one.split("\t") for one in seen.text("#tally table").splitlines()]
+    assert lines[0] == ["material", "ok", "unsure", "all"]
+    assert ["foam", "2", "2", "4"] in lines
+    assert [line[0] for line in lines[-2:]] == ["gap", "no-contact"]
+    assert sum(int(line[-1]) for line in lines[1:]) == 41
+    with seen.page.expect_download() as download:
+        seen.page.keyboard.press("s")
+    assert re.fullmatch(r"palpate-\d{4}-\d\d-\d\d-\d{4}\.csv", download.value.suggested_filename)
+    text = Path(download.value.path()).read_bytes().decode()
+    rows = list(csv.DictReader(io.StringIO(text, newline="")))
+    assert len(rows) == 41
+    assert [rows[0][name] for name in ("sweep", "status", "material")] == ["1", "ok", "wood"]
+    assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}[+-]\d\d:\d\d", rows[0]["time"])
+    assert rows[10]["status"] == "gap"
+    assert rows[10]["material"] == rows[10]["probability"] == ""
+    assert rows[40]["material"] == "'=1+1"
+    assert rows[40]["detail"] == 'a "word", and more'
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_long_names_and_many_materials_are_not_cut(
+    browser: Any, shown: Shown, width: int, height: int
+):
+    """Names of 24 characters, 26 materials: nothing is cut in the list, the probabilities, the
+    counts and the card."""
+    names = [f"Schaumstoff-beschichtet{chr(65 + i)}" for i in range(26)]
+    shown.board.take(feed_lines.hello(labels=names))
+    for i, name in enumerate(names):
+        scores = [0.9 if j == i else 0.004 for j in range(26)]
+        shown.board.take(verdict(41 + i, 395.0, name) | {"label": name, "scores": scores})
+    seen = opened(browser, shown, width, height, rows=66)
+    assert seen.page.locator("#scores li").count() == 6
+    seen.page.click("#more")
+    until(lambda: seen.page.locator("#scores li").count() == 26)
+    assert seen.page.locator("#tally tbody tr").count() == 26 + 6 + 2
+    wide = seen.page.evaluate(
+        "() => [...document.querySelectorAll('.row, .row *, #scores *, #tally *, #label')]"
+        ".filter((e) => getComputedStyle(e).display !== 'inline')"
+        ".filter((e) => e.scrollWidth > e.clientWidth + 1)"
+        ".map((e) => e.outerHTML.slice(0, 60))"
+    )
+    assert wide == []
+    assert seen.page.evaluate("document.documentElement.scrollWidth") <= width
+    seen.page.context.close()
+
+
+def test_a_taxel_of_a_large_skin_tells_its_value(browser: Any, shown: Shown):
+    """Of 16 x 32 taxels the one that is pointed at: row, column and value, in newtons with two
+    digits where the profile says newtons."""
+    shape = {"rows": 16, "cols": 32, "rate_hz": 100.0, "window": 200, "dtype": "float32"}
+    known = {"contact": 0.05, "place": None, "unloaded": 0.0, "fingertip": ""}
+    for unit, said in (("N", "row 3, column 7: 1.25 N"), ("", "row 3, column 7: 1 raw counts")):
+        shown.board.take(feed_lines.hello(format=shape, alignment=known, unit=unit))
+        for i in range(20):
+            taxels = np.zeros((16, 32))
+            taxels[2, 6] = 1.25 * (i > 9)
+            line = feed_lines.frame(380 + i / 20, taxels) | {"taxels": taxels.tolist()}
+            shown.board.take(line)
+        seen = opened(browser, shown)
+        until(lambda: seen.page.locator(".tile").count() == 16 * 32)  # noqa: B023
+        seen.page.locator("[data-row='2'][data-col='6']").first.hover()
+        shown.board.take(line | {"time_ns": round(390 * feed_lines.SECOND)})
+        until(lambda: seen.text("#taxel") == said)  # noqa: B023
+        assert not seen.errors
+        seen.page.context.close()
+
+
+def test_the_signs_on_the_skin_have_a_legend(browser: Any, shown: Shown):
+    """Ring, dots and cloud are named below the skin, without a trained position the ring alone."""
+    seen = opened(browser, shown)
+    key = seen.page.locator("#watch .key span")
+    until(lambda: key.all_inner_texts() == ["contact", "in training", "near enough"])
+    shown.board.take(feed_lines.hello(alignment={}))
+    shown.board.take(feed_lines.frame(391.0, feed_lines.load(1.0, 1.0)))
+    until(lambda: [one.is_visible() for one in key.all()] == [True, False, False])
+    assert not seen.errors
+
+
+QUESTIONS = {
+    "what did it say?": ("#label", "wood"),
+    "may I trust it?": ("#status", "ok"),
+    "what do I do now?": ("#next", "Ready for the next sweep"),
+    "since when is it off?": ("#advice", r"Last heard at \d\d:\d\d:\d\d, \d+ s ago\."),
+    "how was the shift?": ("#counted", r"41 sweeps since .*: 37 named \(90\.2 %\), .*"),
+}
+
+
+def test_five_questions_are_answered_by_the_page(browser: Any, shown: Shown):
+    """Each by one element, in words."""
+    sweep()(shown)
+    seen = opened(browser, shown, rows=41)
+    until(lambda: seen.text("#label") == "wood")
+    for question, (where, answer) in QUESTIONS.items():
+        if "off" in question:
+            off(shown)
+            until(lambda: seen.page.get_attribute("#verdict", "data-tone") == "away")
+        assert re.fullmatch(answer, seen.text(where)), question

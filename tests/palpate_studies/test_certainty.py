@@ -1,0 +1,371 @@
+"""The study `certainty`: figures on Gaussians with known true values, and the command from set to
+page.
+"""
+
+import json
+import re
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from palpate.core.errors import FormatError
+from palpate_studies import certainty, uncertainty_report
+from palpate_train.data.sets import Dataset
+from palpate_train.evaluate import uncertainty, uncertainty_cases
+from palpate_train.evaluate.evaluate import Where
+from palpate_train.evaluate.uncertainty_cases import NONE_LEFT_OUT, Case
+from palpate_train.models.methods import Effort
+from palpate_train.models.recipe.calibrate import fit_calibration
+from palpate_train.reports.plot_style import SCHEMES
+from tests.factories.calibration_inputs import plain_inputs
+
+pytestmark = pytest.mark.slow
+
+NAMES = ("a", "b", "c", "d")
+
+
+def world(places: int, n: int, seed: int, apart: float = 6.0, first: int = 0):
+    """Features [N, 10, 4] of n sweeps of four materials at each position.
+
+    The materials differ from the middle of the sweep on.
+    """
+    rng = np.random.default_rng(seed)
+    labels = np.tile(np.repeat(np.arange(4), n), places)
+    at = np.repeat(np.arange(places), 4 * n) + first
+    grown = np.minimum(np.arange(1, 11) / 5, 1)
+    means = apart / np.sqrt(2) * np.eye(4)  # any two are `apart`
+    x = (
+        means[labels][:, None] * grown[:, None]
+        + rng.standard_normal((len(labels), 1, 4))
+        + 0 * grown[:, None]
+    )
+    return x, labels, at
+
+
+def case(left_out: int = NONE_LEFT_OUT, apart: float = 6.0, fold: int = 0, places: int = 3) -> Case:
+    """A training on eight positions and a test on others."""
+    x, y, at = world(8, 20, 1, apart)
+    keep = y != left_out
+    y = y - (y > left_out) * (left_out != NONE_LEFT_OUT)
+    new, labels, there = world(places, 24, 2 + fold, apart, first=100 + 10 * fold)
+    x, y, at = x[keep], y[keep], at[keep]
+    seen = at % 2 == 1
+    copied = x[:, -1] + np.random.default_rng(9).normal(0, 0.1, (len(x), 4))
+    return Case(
+        left_out,
+        fold,
+        2,
+        x,
+        y,
+        at[None],
+        ~seen,
+        True,
+        copied,
+        y,
+        np.arange(len(y)),
+        ~seen,
+        new,
+        labels,
+        there,
+        np.zeros(len(y), bool),
+    )
+
+
+@pytest.fixture(scope="module")
+def figures():
+    """All figures of one fold, with each material left out once."""
+    held = [case(k) for k in (NONE_LEFT_OUT, 0, 1, 2, 3)]
+    return json.loads(json.dumps(certainty.figures(held, NAMES, 1)))
+
+
+def test_error_is_the_gap_between_probability_and_accuracy():
+    """A probability of 0.9 with an accuracy of 0.7 is an error of 0.2; a calibrated probability has
+    0.
+
+    Bins are weighted by their number of sweeps.
+    """
+    right = np.arange(100) < 70
+    assert uncertainty.error(np.full(100, 0.9), right) == pytest.approx(0.2)
+    assert uncertainty.error(np.full(100, 0.7), right) == pytest.approx(0)
+    confidence = np.concatenate([np.full(50, 0.95), np.full(50, 0.55)])
+    assert uncertainty.error(
+        confidence, np.concatenate([np.ones(50, bool), np.arange(50) < 5])
+    ) == pytest.approx(0.25)
+    assert uncertainty.reliability(np.array([1.0, 0.0]), np.array([True, False]))[-1] == {
+        "said": 1.0,
+        "right": 1.0,
+        "n": 1,
+    }
+
+
+def test_temperature_scaling_corrects_an_overconfident_head():
+    """If positions shift the materials, LDA is overconfident.
+
+    The temperature fitted across positions corrects that.
+    """
+    one = case(apart=2.5, places=12)
+    # sweeps of one position close together: their scatter says little of other positions
+    shift = 1.5 * np.random.default_rng(3).standard_normal((200, 1, 4))
+    one = replace(one, seen=one.seen + shift[one.seen_groups[0]], new=one.new + shift[one.places])
+    done = fit_calibration(plain_inputs(one.seen, one.seen_labels, one.seen_groups[0], one.held))
+    figures = certainty.calibration([(one, done)])
+    right = figures["accuracy"]["accuracy"]
+    mean = {
+        when: np.average(
+            [b["said"] for b in figures[when]["bins"]],
+            weights=[b["n"] for b in figures[when]["bins"]],
+        )
+        for when in ("before", "after")
+    }
+    assert figures["n"] == sum(b["n"] for b in figures["after"]["bins"]) == 12 * 4 * 24
+    assert done.temperature > 1.3
+    assert mean["before"] > right + 0.1
+    assert right < mean["after"] < mean["before"] - 0.1
+    assert figures["after"]["error"] < 0.5 * figures["before"]["error"]
+    assert figures["accuracy"]["low"] < right < figures["accuracy"]["high"]
+
+
+def test_more_sweeps_for_more_certainty(figures):
+    """The mean number of sweeps and the accuracy rise with the requested probability. Without a
+    requested probability an object takes one sweep.
+    """
+    for held in figures["sequence"].values():
+        sweeps = [p["sweeps"] for p in held["points"]]
+        assert sweeps[0] == 1
+        assert sweeps == sorted(sweeps)
+        assert sweeps[-1] > 1
+        assert held["points"][-1]["accuracy"] >= held["points"][0]["accuracy"]
+        assert held["points"][-1]["right_of_decided"] > 0.995
+
+
+def test_the_sequential_test_stops_at_the_wanted_probability():
+    """By hand: of two objects one is decided at the second sweep, the other is ended by the
+    limit.
+    """
+    fused = np.array(
+        [[[0.6, 0.4], [0.9, 0.1], [0.99, 0.01]], [[0.5, 0.5], [0.4, 0.6], [0.45, 0.55]]]
+    )
+    point = certainty._stopped(fused, np.array([0, 0]), np.array([0, 1]), 0.9)
+    assert (point["sweeps"], point["decided"], point["accuracy"], point["right_of_decided"]) == (
+        2.5,
+        0.5,
+        0.5,
+        1.0,
+    )
+    assert (
+        certainty._stopped(fused, np.array([0, 0]), np.array([0, 1]), 0.999)["right_of_decided"]
+        is None
+    )
+
+
+def test_unknown_materials_six_deviations_away_are_detected(figures):
+    """A left-out material is six deviations away, known materials are chi-squared: AUROC above
+    0.95.
+    """
+    for row in figures["unknown"]["materials"].values():
+        assert row["low"] <= row["auroc"] <= row["high"]
+        assert (row["known"], row["unknown"]) == (216, 72)
+    assert 0.99 < figures["unknown"]["mean"]["auroc"] <= 1
+    assert (
+        figures["unknown"]["scores"]["distance, where trained materials differ"] < 0.95
+    )  # among them
+    assert figures["unknown"]["mean"]["kept"] > 0.95
+    limits = figures["unknown"]["limits"]
+    for name in ("kept", "false_known", "kept_twice", "false_known_twice"):
+        assert [point[name] for point in limits] == sorted(point[name] for point in limits)
+    (here,) = (point for point in limits if point["factor"] == 1)
+    assert (here["kept"], here["false_known"]) == pytest.approx(
+        (figures["unknown"]["mean"]["kept"], figures["unknown"]["mean"]["false_known"]), abs=1e-3
+    )
+
+
+def test_two_sweeps_at_a_place_must_both_pass():
+    """By hand: three known sweeps at one position, the middle one over the limit, and two unknown
+    sweeps within it.
+    """
+    scores, known = np.array([0.5, 0.9, 2.0, 0.5, 0.8]), np.array([True, False, True, True, False])
+    places, labels = np.zeros(5, int), np.array([0, 1, 0, 0, 1])
+    assert uncertainty._passed(scores, known, places, labels, 1.0, 1) == (pytest.approx(2 / 3), 1.0)
+    assert uncertainty._passed(scores, known, places, labels, 1.0, 2) == (0.0, 1.0)
+    assert uncertainty._passed(scores, known, places, labels, 0.85, 2) == (0.0, 0.0)
+    assert uncertainty._passed(scores, known, places, labels, 2.0, 2) == (1.0, 1.0)
+
+
+def test_an_unknown_material_that_does_not_differ_is_not_seen():
+    """Equal materials have an AUROC of 0.5."""
+    held = [case(k, apart=0.0) for k in (0, 1)]
+    done = [
+        (c, fit_calibration(plain_inputs(c.seen, c.seen_labels, c.seen_groups[0], c.held)))
+        for c in held
+    ]
+    assert abs(uncertainty.unknown(done, NAMES)["mean"]["auroc"] - 0.5) < 0.06
+
+
+def test_enrolment_from_more_sweeps_comes_nearer(figures):
+    """More sweeps bring the accuracy nearer to that of a full training. Old classes lose little.
+
+    Both positions are reported.
+    """
+    points = {(p["where"], p["sweeps"]): p for p in figures["enrolment"]["points"]}
+    assert {w for w, _ in points} == {"same place", "other places"}
+    for where in ("same place", "other places"):
+        assert points[where, 1]["share"] < points[where, 10]["share"]
+        assert 0.9 < points[where, 5]["share"] <= 1.02
+        assert points[where, 5]["old_lost"] < 0.06
+        assert set(points[where, 5]["by_material"]) == set(NAMES)
+
+
+def test_early_needs_half_the_sweep_where_that_suffices(figures):
+    """All is known at the fifth tenth. The share is below 0.6, the accuracy that of the whole
+    sweep.
+    """
+    early = figures["early"]
+    assert early["share"] < 0.6
+    assert abs(early["lost"]) <= 0.02
+    assert len(early["always"]) == 10
+    assert early["always"][0]["accuracy"] < early["always"][5]["accuracy"]
+
+
+def test_of_two_materials_none_is_left_out():
+    """The page has calibration, sweeps and early answers, and nothing of left-out materials."""
+    one = case()
+    two, test = one.seen_labels < 2, one.labels < 2
+    also = one.copied_labels < 2
+    one = Case(
+        NONE_LEFT_OUT,
+        0,
+        2,
+        one.seen[two],
+        one.seen_labels[two],
+        one.seen_groups[:, two],
+        one.held[two],
+        one.staged,
+        one.copied[also],
+        one.copied_labels[also],
+        np.cumsum(two)[one.copied_source[also]] - 1,
+        one.copied_held[also],
+        one.new[test],
+        one.labels[test],
+        one.places[test],
+        one.faulty[two],
+    )
+    figures = certainty.figures([one], NAMES[:2], 1)
+    assert set(figures) == {"calibration", "sequence", "early"}
+    html, pictures = uncertainty_report.render(figures | dict.fromkeys(ABOUT, "x"))
+    assert set(pictures) == {"reliability", "sweeps", "touch"}
+    assert "never trained<" not in html
+
+
+ABOUT = (
+    "set",
+    "test",
+    "protocol",
+    "method",
+    "seed",
+    "effort",
+    "folds",
+    "trainings",
+    "sweeps",
+    "tested",
+    "format",
+    "digest",
+    "commit",
+    "machine",
+    "took_s",
+)
+
+
+def test_the_page_stands_alone(figures):
+    """The page is one file without script or address. Its pictures are valid XML, and each target
+    has its verdict.
+    """
+    html, pictures = uncertainty_report.render(figures | dict.fromkeys(ABOUT, "x"))
+    assert not re.search(r"<script(?! type=\"application/json\")|src=|href=\"http", html)
+    assert len(pictures) == 5
+    for svg in pictures.values():
+        assert ET.fromstring(svg).tag.endswith("svg")
+        assert svg.replace(SCHEMES, "") in html
+    assert html.count("reached") >= 8
+    assert not re.search(r"\bnan\b", html, re.IGNORECASE)
+
+
+def sweeps(materials: int = 3) -> Dataset:
+    """Hums of different pitch at four positions, [128, 16, 1] float32 at 36 Hz."""
+    rng = np.random.default_rng(0)
+    labels = np.tile(np.repeat(np.arange(materials), 6), 4)
+    t = np.arange(128)[:, None] / 36
+    hum = np.stack(
+        [
+            np.sin(2 * np.pi * (3 + 3 * k) * t + rng.uniform(0, 6)) * rng.uniform(0.8, 1.2)
+            for k in labels
+        ]
+    )
+    x = (hum[:, :, None] + rng.normal(0, 0.5, (len(labels), 128, 16, 1))).astype(np.float32)
+    position = np.repeat(np.arange(4), 6 * materials)
+    return Dataset(x, labels, tuple("abcd"[:materials]), 36.0, {"position": position}, "hums")
+
+
+@pytest.mark.thorough  # a whole study
+def test_from_set_to_page_and_again_from_the_cache(tmp_path):
+    """A study with a few iterations writes results, pictures and a page. A second run trains
+    nothing.
+    """
+    hums, lines = sweeps(), []
+    where = Where(jobs=1, cache=tmp_path / "cache")
+    first = certainty.run(
+        hums, None, "split:position=0,1,2->3", "palpate-pairs", where, lines.append, Effort(0.02)
+    )
+    assert first["trainings"] == 4
+    assert "4/4 done" in lines[-2]
+    _, pictures = uncertainty_report.render(first)
+    assert sorted(pictures) == ["enrolment", "reliability", "sweeps", "touch", "unknown"]
+    again = certainty.run(
+        hums,
+        None,
+        "split:position=0,1,2->3",
+        "palpate-pairs",
+        replace(where, kept=True),
+        lines.append,
+        Effort(0.02),
+    )
+    assert {k: v for k, v in again.items() if k != "took_s"} == {
+        k: v for k, v in first.items() if k != "took_s"
+    }
+    with pytest.raises(FormatError, match="4 of 4 trainings are not kept"):
+        certainty.run(
+            hums,
+            None,
+            "split:position=0,1->2",
+            "palpate-pairs",
+            replace(where, kept=True),
+            lines.append,
+            Effort(0.02),
+        )
+
+
+def test_methods_without_tenths_are_refused(tmp_path):
+    """L-gauss has no trunk. The error names it."""
+    with pytest.raises(FormatError, match="L-gauss"):
+        certainty.run(
+            sweeps(),
+            None,
+            "split:position=0,1,2->3",
+            "L-gauss",
+            Where(jobs=1, cache=None),
+            print,
+            Effort(0.02),
+        )
+
+
+def test_a_case_lost_on_the_way_is_trained_again(tmp_path):
+    """A broken cache file is not taken for a Case."""
+    path = tmp_path / "x.case.npz"
+    uncertainty_cases._save(case(2), path)
+    kept = uncertainty_cases._load(path)
+    assert kept
+    assert kept.left_out == 2
+    assert np.array_equal(kept.seen, case(2).seen)
+    path.write_bytes(path.read_bytes()[:100])
+    assert uncertainty_cases._load(path) is None

@@ -1,0 +1,90 @@
+"""The costs that are counted in a graph: weights and multiply-accumulates."""
+
+from __future__ import annotations
+
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper
+
+from palpate.core.errors import FormatError
+from palpate.sim import skin
+from palpate_studies import cost
+from palpate_train.onnx_tools.quantize import quantize
+from tests.factories.loud_model import loudness, sweeps
+
+
+def test_weights_and_multiply_accumulates_are_counted():
+    """A graph with sums by hand. int8 counts the same; scales and zero points are not weights."""
+    plain, whole = loudness(), quantize(loudness(), sweeps().samples)
+    assert cost.precision(plain) == "float"
+    assert cost.precision(whole) == "int8"
+    assert cost.macs(plain) == cost.macs(whole) == 39 * 3 * 4 * 2 + 3 * 2
+    assert cost.weights(plain) == cost.weights(whole) == 3 * 4 * 2 + 3 + 3 * 2 + 2
+
+
+def test_a_gru_a_kernel_and_neighbours_are_counted():
+    """One node each, with costs computed by hand."""
+    nodes = {
+        "GRU": (
+            [7, 1, 5],
+            helper.make_node("GRU", ["x", "w", "r"], ["y"], hidden_size=4),
+            7 * 3 * 4 * (5 + 4),
+        ),
+        "CDist": (
+            [1, 5],
+            helper.make_node("CDist", ["x", "w"], ["y"], domain="com.microsoft"),
+            1 * 12 * 5,
+        ),
+        "SVM": (
+            [1, 5],
+            helper.make_node(
+                "SVMClassifier",
+                ["x"],
+                ["y"],
+                domain="ai.onnx.ml",
+                support_vectors=[0.0] * 15,
+                coefficients=[0.0] * 3,
+            ),
+            18,
+        ),
+    }
+    for shape, node, expected in nodes.values():
+        weights = [
+            onnx.numpy_helper.from_array(np.zeros(of, np.float32), name)
+            for name, of in (
+                ("w", [1, 12, 5] if node.op_type == "GRU" else [12, 5]),
+                ("r", [1, 12, 4]),
+            )
+        ]
+        x = helper.make_tensor_value_info("x", TensorProto.FLOAT, shape)
+        y = helper.make_tensor_value_info("y", TensorProto.FLOAT, None)
+        graph = helper.make_graph([node], "one", [x], [y], weights)
+        domains = [
+            helper.make_opsetid(name, v)
+            for name, v in (("", 17), ("ai.onnx.ml", 3), ("com.microsoft", 1))
+        ]
+        assert cost.macs(helper.make_model(graph, opset_imports=domains)) == expected
+
+
+def test_a_graph_of_unknown_shapes_is_refused():
+    """A product with an unknown shape is reported by name instead of counted as nothing."""
+    x = helper.make_tensor_value_info("x", TensorProto.FLOAT, ["n", 3])
+    w = onnx.numpy_helper.from_array(np.zeros((3, 2), np.float32), "w")
+    y = helper.make_tensor_value_info("y", TensorProto.FLOAT, None)
+    model = helper.make_model(
+        helper.make_graph(
+            [helper.make_node("MatMul", ["x", "w"], ["y"], "product")], "g", [x], [y], [w]
+        )
+    )
+    with pytest.raises(FormatError, match=r"'product'.*'x' is not known"):
+        cost.macs(model)
+
+
+def test_the_transforms_of_features_are_counted():
+    """L has one transform of 1500 frames for each of 16 taxels, H 40 of 75 frames; raw counts have
+    none.
+    """
+    assert cost.feature_macs("L", skin.FORMAT) == pytest.approx(16 * 1500 * np.log2(1500), abs=1)
+    assert cost.feature_macs("H", skin.FORMAT) == pytest.approx(16 * 40 * 75 * np.log2(75), abs=1)
+    assert cost.feature_macs("raw", skin.FORMAT) == 0

@@ -1,0 +1,116 @@
+"""`python -m palpate_studies fabrics`: its tests, the results that it keeps, and its errors."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from palpate.core.errors import FormatError
+from palpate_studies import fabrics_experiment, matrix_table
+from palpate_studies.command import main
+from palpate_studies.development_experiment import FOUR
+from palpate_train.data.sets import Dataset
+
+MATERIALS = ("BeigeCotton", "BrownCotton", "Canvas", "Denim", "DenimFlex", "Linen", "WovenFabric")
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    """A folder with a set of FabricSlide's names.
+
+    Each material is louder noise than the previous one; each condition has two values.
+    """
+    labels, force, speed, rep, direction = (
+        x.ravel() for x in np.meshgrid(range(len(MATERIALS)), (100, 180), (1, 2), (1, 2), (0, 1))
+    )
+    noise = np.random.default_rng(1).normal(size=(len(labels), 40, 2, 1))
+    samples = (noise * (labels + 1.0)[:, None, None, None]).astype(np.float32)
+    groups = {
+        "force": force,
+        "speed": speed,
+        "rep": rep,
+        "direction": direction,
+        "recording": np.arange(len(labels)),
+    }
+    (tmp_path / "fabricslide").mkdir()
+    Dataset(samples, labels, MATERIALS, 1000.0, groups, "made").save(
+        tmp_path / "fabricslide" / "fabricslide.npz"
+    )
+    return tmp_path
+
+
+def run(data: Path, *more: str, method: str = "static-svm") -> int:
+    """Run the command on this set, with the folds cached beside it."""
+    out, cache = data / "fabrics.json", data / "cache"
+    return main(
+        [
+            "fabrics",
+            "--data",
+            str(data),
+            "--method",
+            method,
+            "--out",
+            str(out),
+            "--jobs",
+            "1",
+            "--cache",
+            str(cache),
+            *more,
+        ]
+    )
+
+
+def results(data: Path) -> list[dict[str, Any]]:
+    """The written results."""
+    found: list[dict[str, Any]] = json.loads((data / "fabrics.json").read_bytes())
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.thorough  # fits 24 models
+def test_one_method_is_run_and_all_others_stay(data: Path, capsys: pytest.CaptureFixture[str]):
+    """Twelve tests run, those without means first. A second method is added, and the first is
+    unchanged.
+    """
+    assert run(data) == 0
+    first = results(data)
+    assert [(r["means_removed"], r["protocol"]) for r in first] == [
+        (removed, protocol)
+        for removed in (True, False)
+        for _, protocols in fabrics_experiment.PROTOCOLS
+        for protocol in protocols
+    ]
+    assert Counter(len(r["materials"]) for r in first) == {7: 6, 4: 6}
+    assert all(r["only"] == list(FOUR) for r in first if r["protocol"] == "leave:direction")
+    assert run(data, method="palpate") == 0
+    both = results(data)
+    assert [r for r in both if r["method"] == "static-svm"] == first
+    assert len(both) == 24
+    assert "| 7 classes: a force it never felt | removed |" in matrix_table.headline(both)
+
+
+def test_what_is_missing_is_named(
+    data: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """The errors name missing sweeps, unreadable results, and a method that cannot use these
+    sweeps.
+    """
+    monkeypatch.delenv("PALPATE_DATA", raising=False)
+    assert (
+        main(["fabrics", "--method", "static-svm", "--out", str(data / "fabrics.json")])
+        == FormatError.exit_code
+    )
+    assert "name their folder with --data or PALPATE_DATA" in capsys.readouterr().err
+    (data / "fabrics.json").write_text("{")
+    assert run(data) == FormatError.exit_code
+    assert "fabrics.json: not JSON" in capsys.readouterr().err
+    assert not (data / "cache").exists()
+    (data / "fabrics.json").unlink()
+    assert run(data, method="H-svm,static-svm") == 0
+    assert "left out: H-svm: 40 frames" in capsys.readouterr().out
+    assert {r["method"] for r in results(data)} == {"static-svm"}

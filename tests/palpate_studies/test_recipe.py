@@ -1,0 +1,161 @@
+"""The study `recipe`: the cost of views, the views of sets, and their table and picture."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from palpate_studies import loads_table, recipe_page, recipe_views
+from palpate_studies.study import StudyCase, StudyRun
+from palpate_train.data import sets
+from palpate_train.data.sets import Dataset
+from palpate_train.evaluate.evaluate import Where
+from palpate_train.export import measure
+from palpate_train.models.recipe import recipe
+from palpate_train.models.recipe.architectures import Architecture
+from palpate_train.models.recipe.recipe import Settings
+from palpate_train.models.recipe.sizes import UNLIMITED
+
+RESULTS: dict[str, Any] = {
+    "views": [
+        {"view": name, "features": 10 + i, "us": 20.5 + i, "bytes": 3000 + i}
+        for i, name in enumerate((*recipe_page.VIEWS, "few relations"))
+    ],
+    "sets": [
+        {"set": "7 fabrics", "views": ["spectrum", "stages"], "chosen": "…"},
+        {"set": "tubes", "views": ["spectrum"], "chosen": "…"},
+    ],
+}
+
+
+@pytest.mark.slow
+def test_each_view_has_a_cost_of_its_own(monkeypatch: pytest.MonkeyPatch):
+    """All views are timed in turns in graphs with the features of one view; more lags of relations
+    are more features."""
+    turns = []
+    timed = measure.timed
+
+    def once(calls: Any, sweeps: np.ndarray) -> dict[str, np.ndarray]:
+        turns.append(list(calls))
+        return timed(calls, sweeps, 1, 1)
+
+    monkeypatch.setattr(measure, "timed", once)
+    sweeps = sets.load("sim:T-REAL/level-blind:1001:1")
+    short = replace(sweeps, samples=sweeps.samples[:12, :400], labels=sweeps.labels[:12], groups={})
+    found = {view["view"]: view for view in recipe_views.costs(short)}
+    assert turns == [list(found)]
+    assert set(recipe_page.VIEWS) | {"few relations"} == set(found)
+    assert all(view["us"] > 0 for view in found.values())
+    assert found["loads"]["features"] >= 16
+    assert found["filters"]["features"] * 2 == found["shares"]["features"]
+    assert found["few relations"]["features"] < found["relations"]["features"]
+    assert found["loads"]["bytes"] < found["stages"]["bytes"]
+
+
+@pytest.mark.slow
+def test_each_set_is_fitted_once(monkeypatch: pytest.MonkeyPatch):
+    """Cases of the same sweeps are one set; a set that is not there is left out with the reason."""
+    tubes = StudyCase(("sim:T-REAL/level-blind:1001:2",), only=("position<=2",))
+    cases = {"tubes, a": tubes, "tubes, b": tubes, "fabrics, a": StudyCase(("x",), real=True)}
+    monkeypatch.setattr(recipe_views, "CASES", cases)
+    run = StudyRun(Where(), lambda line: None)
+    (one,) = recipe_views.choices(run)
+    assert (one["set"], one["real"], one["sweeps"]) == ("tubes", False, 36)
+    assert one["views"]
+    assert list(run.left_out) == ["fabrics"]
+
+
+def test_views_are_read_from_the_trunk():
+    """Each part of an architecture is a view; a trunk of the spectrum has one."""
+    assert recipe_views.views_of(Architecture((), spectrum=True)) == ["spectrum"]
+    every = Architecture((4,), 8, 2, 0, True, 2, True, True, 3)
+    assert recipe_views.views_of(every) == list(recipe_page.VIEWS)
+
+
+def test_the_table_has_a_row_for_each_view_with_its_sets():
+    """Cost, condition and sets of each view; a view that no set has says so."""
+    head, line, *rows = recipe_page.table(RESULTS).split("\n")
+    assert head.count("|") == line.count("|") == rows[0].count("|") == 7
+    assert [row.split("|")[1].strip() for row in rows] == list(recipe_page.VIEWS)
+    assert "| 13, 23.5 µs, 3 KB |" in rows[3]
+    assert rows[3].endswith("| 2 of 2: 7 fabrics, tubes |")
+    assert rows[-1].endswith("| 1 of 2: 7 fabrics |")
+    assert rows[0].endswith("| no set |")
+
+
+def test_the_picture_has_every_view_with_its_time():
+    """From raw counts to the sum of logits."""
+    svg = recipe_page.draw(RESULTS)
+    for text in (*recipe_page.VIEWS, "23.5 µs", "raw counts", "sum of logits,"):
+        assert f">{text}</text>" in svg, text
+
+
+def test_results_without_a_view_are_refused():
+    """The table needs the cost of each view."""
+    with pytest.raises(KeyError, match="stages"):
+        recipe_page.table(
+            {"views": [v for v in RESULTS["views"] if v["view"] != "stages"], "sets": []}
+        )
+
+
+class LoadsFits:
+    """Stands for fits of one position each: a fit may have chosen loads, and its answers say so."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, chosen: bool) -> None:
+        self.made: list[tuple[int, bool]] = []
+        self._chosen = chosen
+        monkeypatch.setattr(loads_table.recipe, "fit", self.fit)
+        monkeypatch.setattr(loads_table, "answers", self.answers)
+
+    def fit(self, sweeps: Dataset, seed: int, settings: Settings) -> Any:
+        self.made.append((len(sweeps), settings.size.loads))
+        loads = settings.size.loads and self._chosen
+        return SimpleNamespace(architecture=replace(Architecture(()), loads=loads))
+
+    def answers(self, made: Any, test: Dataset) -> dict[str, np.ndarray]:
+        right = np.full(len(test), made.architecture.loads)
+        return {"label": np.ones(len(test), bool), "right": right, "wrong": ~right}
+
+
+def test_loads_are_compared_in_both_worlds(monkeypatch: pytest.MonkeyPatch):
+    """Each world has a skin that was put back and positions left out; a fit without loads stands
+    beside each fit that chose them, and the answers of all positions are counted together."""
+    fits = LoadsFits(monkeypatch, chosen=True)
+    monkeypatch.setattr(loads_table, "ATTACHMENTS", "1-2")
+    found = list(loads_table.rows(lambda line: None))
+    assert [(row["world"], row["condition"], row["sweeps"]) for row in found] == [
+        (world, condition, sweeps)
+        for world in ("laboratory", "level-blind")
+        for condition, sweeps in (("skin put back", 12), ("new position", 180))
+    ]
+    assert fits.made == 2 * ([(540, True), (540, False)] + 3 * [(480, True), (480, False)])
+    for row in found:
+        assert row["with"] == {"label": 100, "right": 100, "wrong": 0}
+        assert row["without"] == {"label": 100, "right": 0, "wrong": 100}
+
+
+def test_loads_that_no_fit_chose_have_no_figures(monkeypatch: pytest.MonkeyPatch):
+    """Each fit is made once then, and the table says "not chosen"."""
+    fits = LoadsFits(monkeypatch, chosen=False)
+    monkeypatch.setattr(loads_table, "ATTACHMENTS", "1-2")
+    found = list(loads_table.rows(lambda line: None))
+    assert len(fits.made) == 8
+    assert all(row["with"] is None and row["without"]["wrong"] == 100 for row in found)
+    *_, last = recipe_page.loads({"loads": found}).split("\n")
+    assert last == "| level-blind | new position | 180 | not chosen | 100.0 %, 0.0 %, 100.0 % |"
+
+
+@pytest.mark.thorough  # exports a bundle; the other tests have the rows
+def test_answers_are_those_of_the_box(monkeypatch: pytest.MonkeyPatch):
+    """A fit without loads, and the box's answers to its own sweeps: most are right."""
+    tubes = sets.load("sim:T-REAL:1").select(["position<=2"])
+    made = recipe.fit(tubes, 1, Settings(steps=0, size=replace(UNLIMITED, loads=False)))
+    assert not made.architecture.loads
+    found = loads_table.answers(made, tubes)
+    assert found["label"].mean() > 0.95
+    assert found["right"].mean() > 0.9
+    assert not (found["right"] & found["wrong"]).any()

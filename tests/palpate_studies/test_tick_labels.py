@@ -1,0 +1,188 @@
+"""Every tick label of every picture shows the value at the position of its tick."""
+
+from __future__ import annotations
+
+import ast
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.axis import Axis
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedFormatter
+
+from palpate.core.types import SweepFormat
+from palpate_studies import (
+    contact_plot,
+    development_report,
+    overview_plot,
+    paper_report,
+    plots,
+    recipe_page,
+    stress_report,
+    uncertainty_report,
+)
+from palpate_train.reports import bundle_report, plot_style, selection_plots, sweep_plot
+from tests.factories import choice_data, development_data, stress_data
+from tests.factories.paths import ROOT
+from tests.factories.study_pages import committed
+from tests.rig import soak_page
+
+DRAWN_HERE = [
+    *sorted((ROOT / "train" / "palpate_train" / "reports").glob("*.py")),
+    *sorted((ROOT / "train" / "studies" / "palpate_studies").glob("*.py")),
+    ROOT / "tests" / "rig" / "soak_page.py",
+]
+
+
+def image() -> str:
+    """A sweep of a skin with too many taxels for a plot of each."""
+    form = SweepFormat(12, 12, 50.0, 40, "float32")
+    counts = np.random.default_rng(0).random((40, 12, 12), np.float32)
+    return sweep_plot.draw(
+        sweep_plot.ShownSweep(
+            counts, np.arange(40) / 50, form, "", (), "seconds", None, np.empty(0, int)
+        )
+    )
+
+
+PICTURES: dict[str, Callable[[], Any]] = {
+    "paper": lambda: paper_report.render(committed("paper")),
+    "long training": lambda: plots.curve(
+        [np.array([[1, 1.8], [4000, 1e-4]])], [(2500, 0.002)], "cost"
+    ),
+    "certainty": lambda: uncertainty_report.render(committed("certainty")),
+    "stress": lambda: stress_report.render(stress_data.figures()),
+    "matrix": lambda: plots.matrix(committed("fabrics")),
+    "alignment": lambda: contact_plot.draw(committed("alignment")),
+    "choice": lambda: selection_plots.sizes(choice_data.choice()["rungs"], "pairs", 0.9, "sizes"),
+    "less": lambda: selection_plots.reductions(choice_data.choice()["less"], "less"),
+    "soak": lambda: soak_page.charts(committed("soak")),
+    "sweep": lambda: sweep_plot.draw(sweep_plot.load("sim:T-REAL:1001:1", 3)),
+    "image": image,
+    "development": lambda: development_report.render(development_data.figures()),
+    "bundle": lambda: bundle_report.calibration(
+        {"n": 9, "bins": [{"said": 0.6, "right": 0.5, "n": 4}, {"said": 0.9, "right": 1.0, "n": 5}]}
+    ),
+    "curve of a bundle": lambda: bundle_report.curve(
+        [{"each": n, "share": 0.5, "low": 0.4, "high": 0.6} for n in (5, 10, 37.5)]
+    ),
+    "confusion of a bundle": lambda: bundle_report.confusion(
+        {"labels": ["a", "b"], "answers": {"a": {"a": 3, "b": 1}}}
+    ),
+    "overview": lambda: overview_plot.draw("paper"),
+    "recipe": lambda: recipe_page.draw(committed("recipe")),
+}
+
+
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Figure, tuple[str, str]]]:
+    """Collects each figure that becomes an SVG, with the file and the function that drew it."""
+    found: list[tuple[Figure, tuple[str, str]]] = []
+    save = Figure.savefig
+
+    def saved(figure: Figure, *args: Any, **options: Any) -> None:
+        save(figure, *args, **options)
+        code = sys._getframe(2).f_code  # the caller of plot_style.to_svg
+        found.append((figure, (Path(code.co_filename).name, code.co_name)))
+
+    monkeypatch.setattr(Figure, "savefig", saved)
+    return found
+
+
+def axes_of(figure: Figure) -> Iterator[Axis]:
+    """All axes that show ticks."""
+    for axes in figure.axes:
+        if axes.axison:
+            yield from (axes.xaxis, axes.yaxis)
+
+
+def wrong_labels(axis: Axis) -> list[tuple[float, str]]:
+    """Ticks (position, label) whose label is another number than their position.
+
+    The last label has a unit. A label is correct to five significant digits, which is far less than
+    half of its last place.
+    """
+    ticks = [(tick.get_loc(), tick.label1.get_text()) for tick in axis.get_major_ticks()]
+    shown = [(at, label) for at, label in ticks if label]
+    unit = shown[-1][1].partition(" ")[2] if shown else ""
+    factor = 100 if unit.startswith("%") else 1e-3 if unit == "k" else 1
+    return [
+        (at, label)
+        for at, label in shown
+        if float(label.partition(" ")[0].replace("−", "-"))
+        != pytest.approx(factor * at, rel=1e-5, abs=1e-12)
+    ]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PICTURES)
+def test_labels_are_where_they_say(name: str, drawn: list[tuple[Figure, tuple[str, str]]]):
+    """The labels of an axis with values are those of its ticks. Only names may be another text."""
+    PICTURES[name]()
+    assert drawn
+    named = 0
+    for figure, _ in drawn:
+        for axis in axes_of(figure):
+            if isinstance(axis.get_major_formatter(), FixedFormatter):
+                named += 1
+            else:
+                assert wrong_labels(axis) == []
+    assert (named > 0) == (name in ("less", "image", "development")), (
+        "only kept parts, taxels and cases have names instead of values"
+    )
+
+
+@pytest.mark.slow
+def test_no_picture_is_left_out(drawn: list[tuple[Figure, tuple[str, str]]]):
+    """Every function that ends in `to_svg` draws one of the pictures above."""
+    calls = {
+        (path.name, function.name)
+        for path in DRAWN_HERE
+        for function in ast.walk(ast.parse(path.read_text()))
+        if isinstance(function, ast.FunctionDef)
+        for call in ast.walk(function)
+        if isinstance(call, ast.Call)
+        and isinstance(call.func, ast.Name)
+        and call.func.id == "to_svg"
+    }
+    for draw in PICTURES.values():
+        draw()
+    assert len(calls) > 10
+    assert {function for _, function in drawn} == calls
+
+
+@pytest.mark.parametrize(
+    ("ticks", "labels"),
+    [
+        ((0.9, 0.925, 0.95, 0.975, 1.0), ["90", "92.5", "95", "97.5", "100 %"]),
+        ((0.0, 1 / 3, 0.7000000001), ["0", "33.3333", "70 %"]),
+        ((-0.5, 0.987), ["−50", "98.7 %"]),
+    ],
+)
+def test_ticks_have_as_many_decimals_as_they_need(ticks: tuple[float, ...], labels: list[str]):
+    """No label is rounded to the places of another."""
+    figure, axes = plot_style.single_axes(2, 0.1, 0.9, 0.1, 0.1)
+    axes.set_xlim(-1, 1)
+    plot_style.set_ticks(axes.xaxis, ticks, percent=True)
+    plot_style.set_ticks(axes.yaxis, [1e-5, 12_500], "ms")
+    plot_style.to_svg(figure, "ticks")
+    assert [label.get_text() for label in axes.get_xticklabels()] == labels
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["0.00001", "12500 ms"]
+    assert wrong_labels(axes.xaxis) == []
+
+
+def test_a_rounded_label_is_found():
+    """The check itself: .975 as 98 or 97 is wrong, and so is .987 as 98."""
+    figure, axes = plot_style.single_axes(2, 0.1, 0.9, 0.1, 0.1)
+    axes.set_xlim(0, 1)
+    for text in ("97 %", "98 %"):
+        axes.set_xticks([0.975], [text])
+        figure.canvas.draw()
+        assert wrong_labels(axes.xaxis) == [(0.975, text)]
+    axes.set_xticks([0.987], ["98 %"])
+    figure.canvas.draw()
+    assert wrong_labels(axes.xaxis) == [(0.987, "98 %")]

@@ -1,0 +1,425 @@
+"""The command palpate-train: options, messages and exit codes."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from palpate.bundle import bundle
+from palpate.bundle.bundle import Bundle
+from palpate.core.errors import FormatError
+from palpate_train.cli import bundles
+from palpate_train.cli.main import PROGRAM, main
+from palpate_train.data import pull, sets
+from palpate_train.models.recipe.stages import Fit
+from tests.factories.sweep_sets import easy
+
+
+@pytest.mark.slow
+def test_the_command_splits_and_keeps_the_rest(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """fit writes the sweeps that it did not train on as a set. Recordings stay whole, and training,
+    held-out and written sweeps together are the whole set."""
+    easy(20, pieces=2).save(tmp_path / "easy.npz")
+    args = [
+        "fit",
+        "--set",
+        str(tmp_path / "easy.npz"),
+        "--seed",
+        "1",
+        "--steps",
+        "4",
+        "--only",
+        "speed<=2",
+    ]
+    args += [
+        "--split",
+        "recording:0.7",
+        "--rest",
+        str(tmp_path / "rest.npz"),
+        "--out",
+        str(tmp_path / "new" / "fit.npz"),
+    ]
+    assert main(args) == 0
+    made, rest = Fit.load(tmp_path / "new" / "fit.npz"), sets.load(str(tmp_path / "rest.npz"))
+    parts = [set(s.groups["recording"]) for s in (made.train, made.held, rest)]
+    whole = easy(20, pieces=2).select(["speed<=2"])
+    assert (
+        sum(map(len, parts)) == len(set.union(*parts)) == len(np.unique(whole.groups["recording"]))
+    )
+    assert len(made.train) + len(made.held) + len(rest) == len(whole)
+    out = capsys.readouterr().out
+    figure = r"\d+\.\d % \[\d+\.\d, \d+\.\d\] of \d+"
+    assert re.search(f"held-out speed, as the box answers: {figure}; ", out)
+    assert re.search(f"held-out speed, network alone: {figure}\n", out)
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (["--set", "none.npz"], "none.npz: not a sweep set"),
+        (["--set", "sim:T-LAB:1:1", "--only", "force=1"], "no group 'force'"),
+        (["--set", "sim:T-LAB:1:1", "--split", "recording"], "split 'recording' cannot be read"),
+        (["--set", "sim:T-LAB:1:1", "--rest", "rest.npz"], "--rest needs --split"),
+        (
+            ["--set", "sim:T-LAB:1:1", "--seed", "-1"],
+            "--seed -1 is out of range; use a whole number from 0 on",
+        ),
+        (["--set", "sim:T-LAB:1:1", "--steps", "-1"], "--steps -1 is out of range"),
+        (["--set", "sim:T-LAB:1:1", "--steps", "x"], "--steps x is out of range"),
+        (
+            ["--set", "sim:T-LAB:1:1", "--row-shift", "3"],
+            "--row-shift 3 is out of range; use a number from 0 to 1",
+        ),
+        (["--set", "sim:T-LAB:1:1", "--stretch", "-1"], "--stretch -1 is out of range"),
+        (
+            ["--set", "sim:T-LAB:1:1", "--out", "/proc/none/fit.npz"],
+            "--out /proc/none/fit.npz: cannot be written there",
+        ),
+        (["--set", "sim:T-LAB:1:1", "--out", "/"], "--out / is a folder; name a file"),
+        (
+            ["--set", "sim:T-LAB:1:1", "--out", "f.csv"],
+            "--out f.csv would not be a .csv file; name one that ends in .npz",
+        ),
+        (
+            ["--set", "x.npz", "--split", "recording:0.5", "--rest", "r.pdf"],
+            "--rest r.pdf would not be a .pdf file; name one that ends in .npz or .h5 or .hdf5",
+        ),
+        (
+            ["--set", "sim:T-LAB:1:1", "--rename", "wood"],
+            "--rename 'wood' cannot be read; write OLD=NEW",
+        ),
+        (
+            ["--set", "sim:T-LAB:1:1", "--rename", "wod=oak"],
+            "there is no material 'wod'; did you mean 'wood'?",
+        ),
+        (
+            ["--set", "sim:T-LAB:1:1", "--rename", "wood=a", "--rename", "wood=b"],
+            "'wood' two names, 'a' and 'b'",
+        ),
+        (
+            ["--set", "sim:T-LAB:1:1", "--rename", "wood=a,b", "--rename", "foam=" + "f" * 33],
+            "cannot send 'a,b' (3 charac",
+        ),
+        (
+            ["--set", "sim:T-LAB:1:1", "--rename", "wood=a,b", "--rename", "foam=" + "f" * 33],
+            "f' (33 characters); a label",
+        ),
+    ],
+)
+def test_an_error_of_the_project_is_one_line(
+    args: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """A FormatError gives its exit code, and its message on the error stream."""
+    assert (
+        main(["fit", "--seed", "1", "--out", str(tmp_path / "fit.npz"), *args])
+        == FormatError.exit_code
+    )
+    err = capsys.readouterr().err
+    assert err.startswith("palpate-train: ")
+    assert message in err
+    assert err.count("\n") == 1
+
+
+@pytest.mark.slow
+@pytest.mark.thorough  # starts a process for each command
+def test_a_reader_that_closes_the_pipe_ends_the_command_quietly():
+    """`palpate-train evaluate --list | head -1` gives exit code 1 and nothing on the error
+    stream."""
+    command = [sys.executable, "-m", "palpate_train", "evaluate", "--list"]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout
+        assert process.stderr
+        process.stdout.close()
+        error = process.stderr.read()
+    assert (process.returncode, error) == (1, "")
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (
+            ["fit", "--set", "none", "--seed", "1", "--out", "/proc/none/b.npz"],
+            "--out /proc/none/b.npz: cannot be written",
+        ),
+        (
+            ["export", "none.npz", "--out", "/proc/none/b", "--name", "b", "--version", "1"],
+            "written to /proc/none/b",
+        ),
+        (
+            [
+                "pack",
+                "--set",
+                "none",
+                "--method",
+                "H-svm",
+                "--seed",
+                "1",
+                "--out",
+                "/proc/none/b",
+                "--name",
+                "b",
+                "--version",
+                "1",
+            ],
+            "written to /proc/none/b",
+        ),
+        (
+            ["score", "none", "--set", "none.npz", "--json", "/proc/none/x.json"],
+            "--json /proc/none/x.json: cannot be",
+        ),
+        (
+            [
+                "evaluate",
+                "--set",
+                "none",
+                "--protocol",
+                "random:2",
+                "--method",
+                "H-svm",
+                "--jobs",
+                "0",
+            ],
+            "--jobs 0 is out of range",
+        ),
+        (
+            [
+                "evaluate",
+                "--set",
+                "none",
+                "--protocol",
+                "random:2",
+                "--method",
+                "H-svm",
+                "--effort",
+                "0",
+            ],
+            "--effort 0 is out of",
+        ),
+    ],
+)
+def test_what_cannot_be_written_or_computed_is_refused_first(
+    args: list[str], message: str, capsys: pytest.CaptureFixture[str]
+):
+    """Wrong options are refused before a set is read: the sets named here do not exist."""
+    assert main(args) != 0
+    err = capsys.readouterr().err
+    assert message in err
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (
+            ["fit", "--set", "x", "--seed", "1", "--out", "fit.npz"],
+            "the same command goes on where it was",
+        ),
+        (["score", str(bundle.DEFAULT), "--set", "x"], "the same command begins anew"),
+        (
+            ["evaluate", "--set", "x", "--protocol", "random:2", "--method", "H-svm"],
+            "the same command goes on where it was",
+        ),
+        (["pull", "user@box", "--out", "here"], "the same command goes on where it was"),
+    ],
+)
+def test_an_interrupted_command_says_what_becomes_of_it(
+    args: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    """Ctrl-C gives exit code 130 and one line, which says whether the next call begins anew."""
+
+    def interrupt(*args: object, **more: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sets, "load", interrupt)
+    monkeypatch.setattr(pull, "pull", interrupt)
+    assert main(args) == 130
+    assert capsys.readouterr().err == f"palpate-train: interrupted; {message}\n"
+
+
+@pytest.mark.parametrize(("labels", "told"), [(15, False), (16, True)])
+def test_more_labels_than_the_boards_wire_are_told_with_the_bundle(
+    default_bundle: Bundle, capsys: pytest.CaptureFixture[str], labels: int, told: bool
+):
+    """Four GPIO lines have fifteen codes beside 0. With one more label, the figures state the
+    number of lines that are needed."""
+    manifest = replace(default_bundle.manifest, labels=tuple(f"m{i}" for i in range(labels)))
+    bundles._print(manifest, bundle.DEFAULT)
+    line = (
+        "answers on GPIO lines: 16 labels need 5 of output.class_bits; rpi4 wires 4, rpi5 wires 4"
+    )
+    assert (line in capsys.readouterr().out) == told
+
+
+def test_each_command_is_found_in_the_module_that_registers_it():
+    """One command needs the imports of one module; `palpate-train --help` shows all commands."""
+    for group, names in PROGRAM.modules.items():
+        assert registered_by(group) == sorted(names)
+
+
+def registered_by(group: str) -> list[str]:
+    """The commands that a module of palpate_train.cli registers."""
+    commands = argparse.ArgumentParser().add_subparsers()
+    import_module(f"palpate_train.cli.{group}").register(
+        lambda name, run: commands.add_parser(name)
+    )
+    return sorted(commands.choices)
+
+
+def test_signing_does_without_the_imports_of_training():
+    """`sign` imports no training library: they take seconds, and the signing machine may lack
+    them."""
+    code = "import sys; from palpate_train.cli.main import main; main(['sign', '--help'])"
+    code = f"import sys\ntry:\n    {code}\nexcept SystemExit:\n    print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "usage: palpate-train sign" in done.stdout
+    assert not {"sklearn", "scipy", "torch", "onnx", "pandas", "matplotlib"} & {
+        *done.stdout.split()
+    }
+
+
+def few(tmp_path: Path) -> Path:
+    """A set with a material of one recording, a material without any, and a constant taxel."""
+    whole = easy(6)
+    held = whole.take((whole.labels < 2) | (np.arange(len(whole)) == 12))
+    held.samples[:, :, 0, 1] = 7
+    replace(held, materials=(*held.materials, "ghost")).save(file := tmp_path / "few.npz")
+    return file
+
+
+@pytest.mark.parametrize("only", [[], ["--only", "material=low,middle"]])
+def test_what_a_set_lacks_is_told_by_each_command_that_reads_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], only: list[str]
+):
+    """Materials without sweeps, which are left out, and constant taxels cause a warning. Materials
+    that --only leaves out do not."""
+    args = [
+        "evaluate",
+        "--set",
+        str(few(tmp_path)),
+        "--method",
+        "L-svm",
+        "--protocol",
+        "leave:speed",
+        "--jobs",
+        "1",
+    ]
+    assert main([*args, "--cache", str(tmp_path), *only]) == 0
+    err = capsys.readouterr().err
+    assert "warning: taxels that never change in any sweep: 1.2;" in err
+    assert ("warning: materials without a sweep: ghost;" in err) == (not only)
+
+
+def test_a_material_of_one_recording_is_told_by_its_name(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """Too few sweeps are named by fit, which has none to judge with; by export, which refuses such
+    a fit; and by evaluate."""
+    args = ["--set", str(few(tmp_path)), "--only", "material=low,high"]
+    why = "split by 'recording' leaves one sweep of 'high'; record more of it"
+    fit = str(tmp_path / "fit.npz")
+    assert main(["fit", *args, "--seed", "1", "--steps", "0", "--out", fit]) == 0
+    assert (
+        f"nothing was held out that could judge the model, so export will refuse it: few.npz: {why}"
+        in capsys.readouterr().out
+    )
+    assert (
+        main(["export", fit, "--out", str(tmp_path / "b"), "--name", "b", "--version", "1"]) == 65
+    )
+    assert why in capsys.readouterr().err
+    assert main(["evaluate", *args, "--method", "L-svm", "--protocol", "random:2"]) == 65
+    assert "material 'high' has one recording" in capsys.readouterr().err
+    assert (
+        main(
+            [
+                "evaluate",
+                "--set",
+                str(tmp_path / "few.npz"),
+                "--only",
+                "material=low,middle",
+                "--method",
+                "L-svm",
+                "--protocol",
+                "random:9",
+            ]
+        )
+        == 65
+    )
+    assert "'low' has 6: use random:6 or less" in capsys.readouterr().err
+
+
+def test_an_error_of_a_library_without_a_file_is_told_in_its_words(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """The message has a cause instead of "None: None"."""
+
+    def fails(*args: object) -> None:
+        raise OSError("the disk is on fire")
+
+    monkeypatch.setattr(sets, "load", fails)
+    assert main(["evaluate", "--set", "x", "--protocol", "random:2", "--method", "H-svm"]) == 1
+    assert capsys.readouterr().err == "palpate-train: the disk is on fire\n"
+
+
+def test_too_little_memory_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """A message with cause and remedy, and no traceback."""
+
+    def load(*_: object) -> None:
+        raise MemoryError("Unable to allocate 9.00 TiB")
+
+    monkeypatch.setattr("palpate_train.data.sets.load", load)
+    assert main(["sets", "describe", "sim:T-LAB:1:1"]) == 1
+    said = capsys.readouterr().err
+    assert said.startswith(
+        "palpate-train: not enough memory: Unable to allocate 9.00 TiB; use fewer"
+    )
+    assert said.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("evaluate", "--protocol", "random:2"),
+        ("pack", "--seed", "1", "--name", "a", "--version", "1", "--out", "b"),
+    ],
+)
+def test_an_unknown_method_is_refused_before_sets_are_read(
+    words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+):
+    """Its name and the known ones are in the message; the set, which is not there, is not."""
+    assert main([*words, "--set", "nowhere.npz", "--method", "magic"]) != 0
+    said = capsys.readouterr().err
+    assert "method 'magic' is unknown; use some of " in said
+    assert "nowhere" not in said
+
+
+@pytest.mark.slow
+def test_a_fit_names_groups_of_one_value(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """No figure can show another direction then; a group of several values and one that says where
+    sweeps come from are not named."""
+    tubes = sets.load("sim:T-REAL/level-blind:1:2").select(["position<=2"])
+    tubes = replace(tubes, groups=tubes.groups | {"direction": np.zeros(len(tubes), int)})
+    source = tmp_path / "set.npz"
+    tubes.save(source)
+    words = "--seed 1 --steps 0 --size bands --out"
+    assert main(["fit", "--set", str(source), *words.split(), str(tmp_path / "fit.npz")]) == 0
+    told = [line for line in capsys.readouterr().out.splitlines() if "expect less" in line]
+    assert told == [
+        "every sweep has the same direction: expect less at another, no figure shows it"
+    ]

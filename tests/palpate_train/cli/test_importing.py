@@ -1,0 +1,364 @@
+"""palpate-train import as users call it: the commands of its page, its report, its exit codes."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from palpate.sim import skin
+from palpate_train.cli.main import main
+from palpate_train.data import sets
+from tests.factories.lab_files import csv_folder, write
+from tests.factories.paths import ROOT
+
+PAGE = (ROOT / "docs" / "how-to" / "import.md").read_text()
+
+
+def five() -> list[list[str]]:
+    """The commands of the page, split as a shell splits them."""
+    (block,) = re.findall(r"<!-- five -->\n(.*?)<!-- /five -->", PAGE, re.S)
+    return [shlex.split(line) for line in block.splitlines()]
+
+
+@pytest.mark.slow
+@pytest.mark.thorough  # a whole way to a bundle
+def test_the_five_commands_of_the_page_make_a_bundle(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
+):
+    """The commands of the page on simulated sweeps written as CSV: the sweeps come back, most of
+    the rest get the right label, and no library prints anything."""
+    monkeypatch.chdir(tmp_path)
+    folder = csv_folder(tmp_path / "recordings", each=3, positions=6)
+    assert (folder / "wood_p0_1.csv").read_text().splitlines()[0] in PAGE
+    commands = five()
+    assert len(commands) == 5
+    for program, *args in commands:
+        assert program == "palpate-train"
+        assert main(args) == 0, capsys.readouterr()
+    made = sets.load("build/mine.npz")
+    samples, labels, position = skin.sweep_set("T-REAL", 5, 3)
+    expected = samples[(labels < 3) & (position < 6)]
+    assert len(made) == len(expected) == 54
+    assert {s.tobytes() for s in made.samples} == {s.tobytes() for s in expected}
+    out, err = capsys.readouterr()
+    warned = [line for line in re.findall(".*[Ww]arning.*|.*Gemm.*", err) if "the mean" not in line]
+    assert [*caplog.messages, *warned] == []
+    assert "they also helped to choose the model" in out
+    assert "in build/rest.npz, which no part of the fit has seen\n" in out
+    next_commands = out.partition("next:\n")[2].splitlines()[:3]
+    assert [line.split()[:2] for line in next_commands] == [
+        ["palpate-train", name] for name in ("export", "score", "report")
+    ]
+    assert all("--set build/rest.npz" in line for line in next_commands[1:])
+    assert (
+        f"to score it on the sweeps that fit --split left out: {shlex.join(commands[-1])}\n" in out
+    )
+    assert "left out: README.md: its name does not match the pattern" in out
+    found = re.search(r"named rightly: (\d+) of 18: ", out)
+    assert found
+    assert int(found[1]) >= 12
+
+
+def test_a_broken_file_is_told_and_the_others_are_imported(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """A broken file gets a line; the other files make a set; the report has a line for each file;
+    the exit code is 65."""
+    folder = csv_folder(tmp_path / "r", each=1, positions=1)
+    (folder / "foam_p0_1.csv").write_text("time,s0\n0,1\n0,x\n")
+    args = [
+        "import",
+        str(folder),
+        "--pattern",
+        "{material}_p{position:d}_{trial:d}.csv",
+        "--time",
+        "time:ms",
+        "--grid",
+        "4x4",
+    ]
+    args += ["--out", str(tmp_path / "s.h5"), "--report", str(tmp_path / "report.txt")]
+    assert main(args) == 65
+    told = capsys.readouterr()
+    assert "left out: foam_p0_1.csv: line 3, column 2 is 'x', which is not a number" in told.out
+    assert told.err.splitlines()[-1].startswith(
+        "palpate-train: 1 of 4 files could not be used, as said above"
+    )
+    assert len(sets.load(str(tmp_path / "s.h5"))) == 3
+    report = dict(line.split("\t") for line in (tmp_path / "report.txt").read_text().splitlines())
+    assert report["metal_p0_1.csv"] == "taken: 1 windows of 2100 frames"
+    assert report["foam_p0_1.csv"].startswith("left out: line 3, column 2")
+    assert report.keys() == {path.name for path in folder.iterdir()}
+
+
+def test_what_fails_the_same_way_is_told_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Five lines for twelve files, and one line for the others; only the report is written."""
+    for k in range(12):
+        write(tmp_path / "r" / f"wood_{k:02}.csv", np.zeros((9, 4)), 100.0)
+    args = [
+        "import",
+        str(tmp_path / "r"),
+        "--pattern",
+        "{material}_{trial}.csv",
+        "--rate",
+        "100",
+        "--grid",
+        "4x4",
+    ]
+    args += ["--out", str(tmp_path / "s.npz"), "--report", str(tmp_path / "report.txt")]
+    assert main(args) == 65
+    told = capsys.readouterr()
+    assert told.out.count("left out: ") == 6
+    assert (
+        "left out: 7 more for the same reason: it has 5 columns, but a grid of 4x4 needs 16"
+        in told.out
+    )
+    assert "none of 12 files could be imported" in told.err
+    assert not (tmp_path / "s.npz").exists()
+    assert len((tmp_path / "report.txt").read_text().splitlines()) == 12
+
+
+@pytest.mark.skipif(
+    "PALPATE_DATA" not in os.environ, reason="PALPATE_DATA names no folder of real sweeps"
+)
+@pytest.mark.slow
+def test_real_sweeps_come_back_from_csv(tmp_path: Path):
+    """FabricSlide with each window as a CSV file, with force and speed in its name: the same counts
+    and groups come back."""
+    real = sets.load(str(Path(os.environ["PALPATE_DATA"]) / "fabricslide" / "fabricslide.npz"))
+    real = real.take(np.arange(len(real)) % 20 == 0)
+    for i, counts in enumerate(real.samples):
+        force, speed = real.groups["force"][i], real.groups["speed"][i]
+        name = f"{real.materials[real.labels[i]]}/{force}_{speed}_{i}.csv"
+        write(tmp_path / "r" / name, counts.reshape(len(counts), -1), real.rate_hz)
+    args = [
+        "import",
+        str(tmp_path / "r"),
+        "--pattern",
+        "{material}/{force:d}_{speed:d}_{number:d}.csv",
+        "--time",
+        "time:ms",
+    ]
+    args += [
+        "--grid",
+        "16x1",
+        "--window",
+        "128",
+        "--dtype",
+        real.samples.dtype.name,
+        "--out",
+        str(tmp_path / "s.npz"),
+    ]
+    assert main(args) == 0
+    made = sets.load(str(tmp_path / "s.npz"))
+    order = np.argsort(made.groups["number"])
+    assert made.rate_hz == pytest.approx(real.rate_hz, rel=0.005)
+    np.testing.assert_array_equal(made.samples[order], real.samples)
+    for group in ("force", "speed"):
+        np.testing.assert_array_equal(made.groups[group][order], real.groups[group])
+    assert [made.materials[k] for k in made.labels[order]] == [
+        real.materials[k] for k in real.labels
+    ]
+
+
+def test_a_folder_that_may_not_be_read_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """The message names the cause instead of an empty result."""
+
+    def denied(self: Path) -> None:
+        raise PermissionError(13, "Permission denied", str(self))
+
+    monkeypatch.setattr(Path, "iterdir", denied)
+    out = str(tmp_path / "x.npz")
+    assert (
+        main(
+            ["import", str(tmp_path), "--pattern", "{material}.csv", "--rate", "100", "--out", out]
+        )
+        == 65
+    )
+    assert "the folder cannot be read: Permission denied" in capsys.readouterr().err
+
+
+def imported(folder: Path, *more: str) -> int:
+    """palpate-train import of four taxels at 100 Hz with windows of ten frames."""
+    return main(
+        [
+            "import",
+            str(folder),
+            "--rate",
+            "100",
+            "--grid",
+            "2x2",
+            "--window",
+            "10",
+            "--out",
+            str(folder.parent / "s.npz"),
+            *more,
+        ]
+    )
+
+
+def nine(folder: Path, suffix: str = "csv") -> Path:
+    """Eight files whose counts all differ; the ninth is missing."""
+    folder.mkdir()
+    for k in range(8):
+        counts = 7 * np.arange(160).reshape(40, 4) % 150 + k
+        np.savetxt(folder / f"{'wood' if k % 2 else 'felt'}_{k}.{suffix}", counts, "%d", ",")
+    return folder
+
+
+BAD_NINTH = {
+    "NULs": b"1,2,3,4\n" * 9 + bytes(4096) + b"\n" + b"1,2,3,4\n" * 9,
+    "NULs alone": bytes(65536),
+    "a cell of 256 kB": b"1,2,3,4\n" * 9 + b"1," + b"x" * 262144 + b",3,4\n" + b"1,2,3,4\n" * 9,
+    "a quote that is not closed": b'1,2,3,4\n"1,2,3,4\n' + b"1,2,3,4\n" * 20,
+    "an error of a spreadsheet": b"1,2,3,4\n" * 9 + b"#N/A,2,3,4\n" + b"1,2,3,4\n" * 9,
+    "a commented frame": b"1,2,3,4\n" * 9 + b"#1,2,3,4\n" + b"1,2,3,4\n" * 9,
+    "thousands": b"1,012;987;3;4\n" * 20,
+    "binary": bytes(range(256)) * 40,
+}
+
+
+@pytest.mark.parametrize("name", BAD_NINTH)
+def test_one_bad_file_of_nine_is_left_out_and_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+):
+    """The set is of the other eight; exit code 65."""
+    folder = nine(tmp_path / "r")
+    (folder / "wood_9.csv").write_bytes(BAD_NINTH[name])
+    assert imported(folder, "--pattern", "{material}_{trial}.csv") == 65
+    told = capsys.readouterr()
+    (line,) = [line for line in told.out.splitlines() if line.startswith("left out")]
+    assert line.startswith("left out: wood_9.csv: ")
+    assert len(line) < 200
+    assert "Traceback" not in told.err
+    assert len(sets.load(str(tmp_path / "s.npz"))) == 8
+
+
+def test_files_of_the_system_are_passed_over(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """macOS, Windows and Office leave files that match the pattern; not a word is said."""
+    folder = nine(tmp_path / "r")
+    for name in (
+        "._wood_1.csv",
+        "__MACOSX/._wood_1.csv",
+        "__MACOSX/wood_1.csv",
+        "~$wood_2.csv",
+        ".DS_Store",
+        "sub/.DS_Store",
+        "sub/._felt_3.csv",
+        ".ipynb_checkpoints/wood_3.csv",
+        "Thumbs.db",
+        "desktop.ini",
+    ):
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_bytes(b"\0\5\26\7")
+    assert imported(folder, "--pattern", "{material}_{trial}.csv") == 0
+    assert "left out: 0" in capsys.readouterr().out
+
+
+def test_names_are_equal_in_every_normal_form(tmp_path: Path):
+    """A decomposed ö in a file's name, in --rename and in --pattern is the composed one."""
+    folder = tmp_path / "r"
+    folder.mkdir()
+    for k, name in enumerate(("ko\u0308per", "k\u00f6per", "felt")):
+        np.savetxt(folder / f"{name}_{k}.csv", np.arange(160).reshape(40, 4) + k, "%d", ",")
+    for old in ("k\u00f6per", "ko\u0308per"):
+        given = ("--pattern", "{material}_{trial}.csv", "--rename", f"{old}=twill")
+        assert imported(folder, *given) == 0
+        made = sets.load(str(tmp_path / "s.npz"))
+        assert made.materials == ("felt", "twill")
+        assert len(made) == 3
+
+
+def test_the_same_content_counts_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """A copy under another name, or in another format, is left out and said; under another material
+    it is warned of."""
+    folder = nine(tmp_path / "r")
+    content = (folder / "wood_1.csv").read_bytes()
+    (folder / "wood_1copy.csv").write_bytes(content)
+    (folder / "wood_1b.csv").write_bytes(content.replace(b",", b";"))
+    (folder / "felt_1c.csv").write_bytes(content)
+    assert imported(folder, "--pattern", "{material}_{trial}.csv") == 0
+    told = capsys.readouterr().out
+    assert "warning: wood_1.csv holds the same frames as felt_1c.csv, of felt: one of" in told
+    made = sets.load(str(tmp_path / "s.npz"))
+    assert len(made) == 9
+    (folder / "felt_1c.csv").unlink()
+    assert imported(folder, "--pattern", "{material}_{trial}.csv") == 0
+    told = capsys.readouterr().out
+    assert "left out: wood_1b.csv: holds the same frames as wood_1.csv, which counts once" in told
+    assert "left out: wood_1copy.csv: holds the same frames as wood_1.csv" in told
+    assert len(sets.load(str(tmp_path / "s.npz"))) == 8
+
+
+def test_columns_give_material_and_session(tmp_path: Path):
+    """One file with a label and a date beside the counts, without a pattern: each run of a label is
+    a recording."""
+    folder = tmp_path / "r"
+    folder.mkdir()
+    rows = ["when,what,a,b,c,d"]
+    for k in range(120):
+        label = ("wood", "felt", "wood")[k // 40]
+        rows.append(f"2026-01-{10 + k // 80} 10:00:{k / 100:05.2f},{label},{k},{k + 1},{k},0")
+    (folder / "all.csv").write_text("\n".join(rows))
+    given = ("--field", "material=what", "--field", "session=when", "--time", "when:date")
+    assert imported(folder, *given) == 0
+    made = sets.load(str(tmp_path / "s.npz"))
+    assert [made.materials[k] for k in made.labels] == ["wood", "felt", "wood"]
+    assert made.groups["session"].tolist() == ["2026-01-10", "2026-01-10", "2026-01-11"]
+    assert made.groups["recording"].tolist() == [0, 1, 2]
+    np.testing.assert_array_equal(made.samples[0, :, 0, 0], np.arange(15, 25))
+
+
+def test_what_was_passed_over_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """A footer: the file, the line and its text, on the screen and in the report."""
+    folder = nine(tmp_path / "r")
+    with (folder / "wood_1.csv").open("a") as file:
+        file.write("@@\n")
+    given = ("--pattern", "{material}_{trial}.csv", "--report", str(tmp_path / "report.txt"))
+    assert imported(folder, *given) == 0
+    assert "  wood_1.csv: read up to line 41, which is '@@'\n" in capsys.readouterr().out
+    assert "windows of 40 frames; read up to line 41" in (tmp_path / "report.txt").read_text()
+
+
+@pytest.mark.parametrize("name", ["a,b,b,c", "a,b,b,b"])
+def test_a_name_that_occurs_twice_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+):
+    """With the numbers of the columns."""
+    folder = tmp_path / "r"
+    folder.mkdir()
+    np.savetxt(
+        folder / "wood_1.csv", np.arange(160).reshape(40, 4), "%d", ",", header=name, comments=""
+    )
+    assert imported(folder, "--pattern", "{material}_{}.csv", "--columns", "a,b,c,d") == 65
+    assert "are all called 'b'; use their numbers, such as 2" in capsys.readouterr().out
+
+
+def test_a_terminal_without_unicode_shows_replaced_characters(tmp_path: Path):
+    """A file whose name is not even UTF-8, on a terminal that knows only ASCII: no traceback."""
+    folder = nine(tmp_path / "r")
+    (folder / "k\u00f6per_\u2713.txt").write_text("nothing")
+    os.close(os.open(os.fsencode(folder) + b"/k\xf6per.txt", os.O_CREAT))
+    words = ["import", str(folder), "--pattern", "{material}_{trial}.csv", "--rate", "100"]
+    words += ["--grid", "2x2", "--window", "10", "--out", str(tmp_path / "s.npz")]
+    words += ["--report", str(tmp_path / "report.txt")]
+    done = subprocess.run(
+        [sys.executable, "-m", "palpate_train", *words],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONIOENCODING": "ascii", "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert b"left out: k?per_?.txt: its name does not match the pattern" in done.stdout

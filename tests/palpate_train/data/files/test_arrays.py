@@ -1,0 +1,235 @@
+"""HDF5 and NumPy: only the wanted array is read, whatever stands beside it; named fields are
+columns."""
+
+from __future__ import annotations
+
+import json
+import tracemalloc
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from palpate.core.errors import FormatError
+from palpate_train.data import raw_files
+from palpate_train.data.files.table import ReadPlan
+
+SKIN = np.arange(40 * 4, dtype=np.uint16).reshape(40, 4)
+FIELDS = np.zeros(40, [("t", "f8"), ("who", "S5"), ("taxels", "u2", (4,)), ("note", "U3")])
+FIELDS["t"], FIELDS["taxels"], FIELDS["who"] = np.arange(40) / 10, SKIN, b"wood"
+
+
+def test_an_npz_with_objects_is_read_beside_them(tmp_path: Path):
+    """Dictionaries and None are passed over, without being unpickled."""
+    np.savez(
+        tmp_path / "a.npz", skin=SKIN, info={"who": "Ada"}, none=None, name="wood", t=SKIN[:, 0]
+    )
+    found = raw_files.read(tmp_path / "a.npz", ReadPlan(time="t"))
+    np.testing.assert_array_equal(found.values, SKIN)
+    np.testing.assert_array_equal(found.vectors["t"], SKIN[:, 0])
+    np.savez(tmp_path / "b.npz", info={"skin": SKIN})
+    with pytest.raises(FormatError, match=r"holds 0 arrays of frames; .* it holds nothing"):
+        raw_files.read(tmp_path / "b.npz")
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".npz", ".h5"])
+def test_named_fields_are_columns(tmp_path: Path, suffix: str):
+    """A field of several numbers is several columns; a field of text is a text column."""
+    path = tmp_path / f"a{suffix}"
+    if suffix == ".npy":
+        np.save(path, FIELDS)
+    elif suffix == ".npz":
+        np.savez(path, run=FIELDS)
+    else:
+        with h5py.File(path, "w") as file:
+            file["run/data"] = FIELDS.astype(
+                [("t", "f8"), ("who", "S5"), ("taxels", "u2", (4,)), ("note", "S3")]
+            )
+    found = raw_files.read(path)
+    assert found.columns == ("t", "who", *(f"taxels.{k}" for k in range(4)), "note")
+    assert found.texts[1][3] == "wood"
+    np.testing.assert_array_equal(found.values[:, 2:6], SKIN)
+    np.testing.assert_allclose(found.values[:, 0], FIELDS["t"])
+
+
+def test_a_camera_beside_the_skin_is_not_read(tmp_path: Path):
+    """A camera that is unfinished, virtual or larger than the memory does not matter if the skin is
+    named."""
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["skin"] = SKIN
+        file.create_dataset("camera", (4000, 480, 640), "u1", chunks=(1, 480, 640))
+        file["link"] = h5py.ExternalLink("other.h5", "/camera")
+    tracemalloc.start()
+    found = raw_files.read(tmp_path / "a.h5", ReadPlan("skin"))
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    np.testing.assert_array_equal(found.values, SKIN)
+    assert peak < 2e6
+    with pytest.raises(FormatError, match=r"holds 2 arrays of frames; .*camera \[4000, 480, 640\]"):
+        raw_files.read(tmp_path / "a.h5")
+    with pytest.raises(FormatError, match=r"camera .* was not written to its end"):
+        raw_files.read(tmp_path / "a.h5", ReadPlan("camera"))
+
+
+def test_an_array_is_found_by_the_end_of_its_path(tmp_path: Path):
+    """`skin` names run/skin if no other array is called so."""
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["run/skin"], file["run/camera"] = SKIN, np.zeros((3, 3))
+    np.testing.assert_array_equal(raw_files.read(tmp_path / "a.h5", ReadPlan("skin")).values, SKIN)
+
+
+def test_vectors_are_columns(tmp_path: Path):
+    """Of one length, in one group; the times are not among them, and others are left out."""
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for k in range(4):
+            file[f"taxels/s{k}"] = SKIN[:, k]
+        file["rate"], file["t"], file["events"] = 100.0, np.arange(40) / 10, np.arange(7)
+    found = raw_files.read(tmp_path / "a.h5", ReadPlan(time="t"))
+    np.testing.assert_array_equal(found.values, SKIN)
+    assert found.columns == tuple(f"taxels/s{k}" for k in range(4))
+    assert found.vectors["t"][3] == 0.3
+    assert found.notes == ("its 4 arrays of 40 numbers are its columns",)
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        file["camera"] = np.zeros((5, 6, 6))
+    found = raw_files.read(tmp_path / "a.h5", ReadPlan("taxels", time="t"))
+    np.testing.assert_array_equal(found.values, SKIN)
+    assert found.vectors["t"][3] == 0.3
+
+
+def test_numbered_arrays_are_frames(tmp_path: Path):
+    """In the order of their numbers, not of their names; without one of them they are refused."""
+    frames = {f"frame {k}": row.reshape(2, 2) for k, row in enumerate(SKIN)}
+    np.savez(tmp_path / "a.npz", **frames)
+    found = raw_files.read(tmp_path / "a.npz")
+    np.testing.assert_array_equal(found.values.reshape(40, 4), SKIN)
+    assert found.notes == ("its 40 arrays frame 0 to frame 39 are its frames",)
+    for change in ({"frame 12": np.zeros((3, 3))}, {"frame 77": SKIN[:2, :2]}, {"x": SKIN}):
+        np.savez(tmp_path / "a.npz", **frames | change)
+        with pytest.raises(FormatError, match=r"holds 4\d arrays of frames; name one"):
+            raw_files.read(tmp_path / "a.npz")
+    np.savez(tmp_path / "a.npz", **{k: v for k, v in frames.items() if k != "frame 12"})
+    with pytest.raises(FormatError, match="holds 39 arrays of frames; name one"):
+        raw_files.read(tmp_path / "a.npz")
+
+
+def lines(*rows: object) -> bytes:
+    return "".join(json.dumps(row) + "\n" for row in rows).encode()
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        lines(*({"t": k / 10, "skin": r} for k, r in enumerate(SKIN.tolist()))),
+        lines(
+            *(
+                {"t": k / 10, "skin": {"a": r[:2], "b": [r[2:]]}}
+                for k, r in enumerate(SKIN.tolist())
+            )
+        ),
+        json.dumps([{"t": k / 10, "skin": r} for k, r in enumerate(SKIN.tolist())]).encode(),
+        json.dumps({"t": [k / 10 for k in range(40)], "skin": SKIN.tolist()}).encode(),
+        lines(*([k / 10, *r] for k, r in enumerate(SKIN.tolist()))),
+        lines(*({"t": k / 10, "skin": r} for k, r in enumerate(SKIN.tolist()))) + b'{"t": 4.0, "sk',
+    ],
+)
+def test_json_is_read(tmp_path: Path, content: bytes):
+    """Objects or lists on lines, a list of objects, lists by name; a cut last line is dropped."""
+    (tmp_path / "a.jsonl").write_bytes(content)
+    found = raw_files.read(tmp_path / "a.jsonl")
+    np.testing.assert_array_equal(found.values[:, 1:], SKIN)
+    np.testing.assert_allclose(found.values[:, 0], np.arange(40) / 10)
+    cut = content.endswith(b"sk")
+    assert found.notes == ("read up to line 41, which is cut off",) * cut
+
+
+FRAMES = [{"t": k / 10, "skin": r} for k, r in enumerate(SKIN.tolist())]
+
+
+@pytest.mark.parametrize(
+    ("content", "note"),
+    [
+        (json.dumps({"who": "Ada", "frames": FRAMES}).encode(), "its list 'frames' holds the fra"),
+        (lines({"type": "head", "rate": 10}, *FRAMES), "line 1 is passed over: it has other keys"),
+        (b",\n".join(json.dumps(x).encode() for x in FRAMES), ""),
+        (b"[\n" + b",\n".join(json.dumps(x).encode() for x in FRAMES) + b",\n]", ""),
+        (
+            json.dumps(
+                {"columns": ["t", *"abcd"], "data": [[x["t"], *x["skin"]] for x in FRAMES]}
+            ).encode(),
+            "",
+        ),
+        (
+            json.dumps(
+                {k: {str(i): x[k] for i, x in enumerate(FRAMES)} for k in ("t", "skin")}
+            ).encode(),
+            "",
+        ),
+    ],
+)
+def test_frames_inside_of_json_are_read(tmp_path: Path, content: bytes, note: str):
+    """In a list beside facts, behind a first line of facts, with commas between lines, and in the
+    forms of pandas."""
+    (tmp_path / "a.json").write_bytes(content)
+    found = raw_files.read(tmp_path / "a.json")
+    np.testing.assert_array_equal(found.values[:, 1:], SKIN)
+    np.testing.assert_allclose(found.values[:, 0], np.arange(40) / 10)
+    assert [said[: len(note)] for said in found.notes] == [note] * bool(note)
+
+
+def test_one_of_several_lists_is_named(tmp_path: Path):
+    """Without --variable they have to be the columns of one table."""
+    both = {"left": SKIN.tolist(), "right": SKIN[:9].tolist()}
+    (tmp_path / "a.json").write_text(json.dumps(both))
+    found = raw_files.read(tmp_path / "a.json", ReadPlan("left"))
+    np.testing.assert_array_equal(found.values, SKIN)
+    with pytest.raises(
+        FormatError, match=r"its columns differ in length: .'left': 40, 'right': 9."
+    ):
+        raw_files.read(tmp_path / "a.json")
+
+
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [
+        (lines({"a": 1, "b": 2}, {"a": 1}), "line 2 lacks 'b', unlike line 1"),
+        (b'{"a": 1, "a": 2}\n', "the key 'a' occurs twice in one object"),
+        (b'{"a": 1}\n{"a": \n{"a": 2}\n', "line 2 is '{\"a\":', which is not JSON"),
+        (lines({"a": 1, "b": [1, 2]}, {"a": 1, "b": [1]}), "line 2 lacks 'b.1', unlike line 1"),
+    ],
+)
+def test_bad_json_is_named(tmp_path: Path, content: bytes, why: str):
+    """The line and the key."""
+    (tmp_path / "a.jsonl").write_bytes(content)
+    with pytest.raises(FormatError) as e:
+        raw_files.read(tmp_path / "a.jsonl")
+    assert str(e.value).startswith(why)
+
+
+def test_null_in_json_is_a_fault(tmp_path: Path):
+    """It counts only if the column is a taxel."""
+    rows = [{"a": 1, "b": 2}, {"a": None, "b": 3}, {"a": 1, "b": 3}]
+    (tmp_path / "a.jsonl").write_bytes(lines(*rows))
+    found = raw_files.read(tmp_path / "a.jsonl")
+    assert found.faults == {0: "line 2, a is None, which is not a number"}
+    assert found.values[:, 1].tolist() == [2, 3, 3]
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "why"),
+    [
+        ("a.pkl", b"", "is a pickle, which can run any program; save arrays with numpy.savez"),
+        ("a.rds", b"", "is a file of R; save the table with write.csv"),
+        ("a.csv", b"PK\3\4...", "is a zip archive; give it the suffix of its format"),
+        ("a.csv", b"\x1f\x8b...", "is packed with gzip; unpack it"),
+        ("a.fsx", b"", "is Tekscan's own format; export it as ASCII (.asf)"),
+        ("a.txt", b"PAR1", "is a Parquet file; give it the suffix .parquet"),
+        ("a.mp4", b"", "is a picture or a video; export the counts as CSV or .npy"),
+    ],
+)
+def test_a_format_that_is_not_read_is_named(tmp_path: Path, name: str, content: bytes, why: str):
+    """With what to do."""
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(FormatError) as e:
+        raw_files.read(tmp_path / name)
+    assert str(e.value).startswith(why)

@@ -1,0 +1,231 @@
+"""Formats that a library reads: spreadsheets, Parquet, TDMS, recordings of ROS."""
+
+from __future__ import annotations
+
+import sys
+from decimal import Decimal
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from palpate.core.errors import FormatError
+from palpate_train.data import raw_files
+from palpate_train.data.files.table import ReadPlan
+
+SKIN = np.arange(40 * 4, dtype=np.uint16).reshape(40, 4)
+TIMES = np.arange(40) / 10
+
+
+@pytest.mark.parametrize(
+    ("name", "module"),
+    [
+        ("a.xlsx", "python_calamine"),
+        ("a.parquet", "pyarrow"),
+        ("a.tdms", "nptdms"),
+        ("a.mcap", "rosbags.highlevel"),
+    ],
+)
+def test_a_missing_library_is_named_with_its_extra(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, module: str
+):
+    """The message says which format it is and what to install."""
+    monkeypatch.setitem(sys.modules, module, None)
+    (tmp_path / name).write_bytes(b"")
+    with pytest.raises(FormatError, match=r"is a.*; to read it: pip install .*train\[files\]"):
+        raw_files.read(tmp_path / name)
+
+
+def book(path: Path, sheets: dict[str, list[list[object]]]) -> Path:
+    openpyxl = pytest.importorskip("openpyxl")
+    made = openpyxl.Workbook()
+    made.remove(made.active)
+    for name, rows in sheets.items():
+        sheet = made.create_sheet(name)
+        for row in rows:
+            sheet.append(row)
+    made.save(path)
+    return path
+
+
+ROWS = [
+    ["t", "label", *"abcd"],
+    *([t, "wood", *r] for t, r in zip(TIMES, SKIN.tolist(), strict=True)),
+]
+
+
+def test_a_spreadsheet_is_read_as_a_text(tmp_path: Path):
+    """Names, text columns and numbers; the sheet of remarks is passed over."""
+    path = book(tmp_path / "a.xlsx", {"remarks": [["Recorded by Ada"]], "run": ROWS})
+    found = raw_files.read(path)
+    assert found.columns == ("t", "label", *"abcd")
+    np.testing.assert_array_equal(found.values[:, 2:], SKIN)
+    np.testing.assert_allclose(found.values[:, 0], TIMES)
+    assert found.texts[1][0] == "wood"
+    path = book(tmp_path / "b.xlsx", {"one": ROWS, "two": ROWS})
+    with pytest.raises(FormatError, match="holds 2 sheets of frames, one, two; name one with"):
+        raw_files.read(path)
+    np.testing.assert_array_equal(raw_files.read(path, ReadPlan("two")).values[:, 2:], SKIN)
+
+
+def test_a_table_may_stand_anywhere_on_a_sheet(tmp_path: Path):
+    """Two columns and three rows further, with a remark beside two of its rows."""
+    rows = [[], [], ["", "", "Recorded by Ada"], *[["", "", *row] for row in ROWS]]
+    rows[7].append("touched")
+    rows[9].append("let go")
+    found = raw_files.read(book(tmp_path / "a.xlsx", {"run": rows}))
+    assert found.columns == ("t", "label", *"abcd")
+    np.testing.assert_array_equal(found.values[:, 2:], SKIN)
+    assert found.notes == (
+        "its first 2 columns are empty and do not count",
+        "columns of remarks are left out: 9",
+    )
+
+
+def test_a_hole_in_a_spreadsheet_is_a_fault(tmp_path: Path):
+    """An empty cell and an error of a formula; rows above the table count."""
+    rows = [["Recorded by Ada"], [], *[list(row) for row in ROWS]]
+    rows[9][3] = None
+    rows[12][4] = "#DIV/0!"
+    found = raw_files.read(book(tmp_path / "a.xlsx", {"run": rows}))
+    assert found.faults == {
+        3: "line 10, column 4 is '', which is not a number",
+        4: "line 13, column 5 is '', which is not a number",
+    }
+
+
+def test_parquet_is_read(tmp_path: Path):
+    """Lists of equal length become columns; empty cells are faults; texts stay; other types are
+    passed over."""
+    pa = pytest.importorskip("pyarrow")
+    parquet = pytest.importorskip("pyarrow.parquet")
+    columns: dict[str, Any] = {
+        "t": TIMES,
+        "skin": SKIN.tolist(),
+        "grid": pa.array(SKIN.reshape(40, 2, 2).tolist()),
+        "fixed": pa.FixedSizeListArray.from_arrays(pa.array(SKIN.ravel()), 4),
+        "who": ["Ada"] * 40,
+        "hole": [None, *range(39)],
+        "image": [b"x"] * 40,
+        "both": [{"left": k, "right": {"deep": -k}} for k in range(40)],
+        "exact": [Decimal(k) / 4 for k in range(40)],
+    }
+    parquet.write_table(pa.table(columns), tmp_path / "a.parquet")
+    found = raw_files.read(tmp_path / "a.parquet")
+    assert found.columns[:5] == ("t", "skin.0", "skin.1", "skin.2", "skin.3")
+    for start in (1, 5, 9):
+        np.testing.assert_array_equal(found.values[:, start : start + 4], SKIN)
+    assert found.texts[13][0] == "Ada"
+    assert found.faults == {14: "row 1 of hole is empty"}
+    assert found.columns[15:] == ("both.left", "both.right.deep", "exact")
+    assert found.values[8, 15:].tolist() == [8, -8, 2]
+    assert found.notes == ("column image is passed over",)
+
+
+def test_a_list_column_that_changes_its_length_is_a_fault(tmp_path: Path):
+    """Only if it is used; and an empty row has no numbers."""
+    pa = pytest.importorskip("pyarrow")
+    parquet = pytest.importorskip("pyarrow.parquet")
+    columns = {
+        "skin": [None if k == 5 else row for k, row in enumerate(SKIN.tolist())],
+        "odd": [[1] * (1 + k % 2) for k in range(40)],
+    }
+    parquet.write_table(pa.table(columns), tmp_path / "a.parquet")
+    found = raw_files.read(tmp_path / "a.parquet")
+    assert found.faults[4] == "column odd holds lists of different lengths"
+    assert found.faults[0] == "row 6 of skin is empty"
+    assert np.isnan(found.values[5, 0])
+    assert found.values[6, :4].tolist() == SKIN[6].tolist()
+
+
+def test_tdms_is_read(tmp_path: Path):
+    """Channels of a group are columns; their interval gives the times; groups are named."""
+    nptdms = pytest.importorskip("nptdms")
+    with nptdms.TdmsWriter(tmp_path / "a.tdms") as writer:
+        writer.write_segment(
+            [
+                nptdms.ChannelObject("skin", name, SKIN[:, k], {"wf_increment": 0.1})
+                for k, name in enumerate("abcd")
+            ]
+        )
+    found = raw_files.read(tmp_path / "a.tdms")
+    assert found.columns == tuple("abcd")
+    np.testing.assert_array_equal(found.values, SKIN)
+    np.testing.assert_allclose(found.vectors["time"], TIMES)
+    with nptdms.TdmsWriter(tmp_path / "b.tdms") as writer:
+        for group in ("one", "two"):
+            writer.write_segment([nptdms.ChannelObject(group, "a", SKIN[:, 0])])
+    with pytest.raises(FormatError, match="holds 2 groups with numbers, one, two; name one"):
+        raw_files.read(tmp_path / "b.tdms")
+
+
+def bag(path: Path, kind: str, messages: str = "sensor_msgs/msg/Image") -> Path:
+    """A recording of ROS with a topic of the skin, a topic of texts and one of large images."""
+    rosbags = pytest.importorskip("rosbags.rosbag2")
+    rosbag1 = pytest.importorskip("rosbags.rosbag1")
+    from rosbags.typesys import Stores, get_typestore
+
+    ros1 = kind == "bag"
+    store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_JAZZY)
+    types = store.types
+    time, header = types["builtin_interfaces/msg/Time"], types["std_msgs/msg/Header"]
+    if ros1:
+        writer = rosbag1.Writer(path)
+    else:
+        plugin = rosbags.StoragePlugin.MCAP if kind == "mcap" else rosbags.StoragePlugin.SQLITE3
+        writer = rosbags.Writer(path, version=9, storage_plugin=plugin)
+    write = store.serialize_ros1 if ros1 else store.serialize_cdr
+    with writer:
+        topics = {
+            "/skin": messages,
+            "/note": "std_msgs/msg/String",
+            "/camera": "sensor_msgs/msg/Image",
+        }
+        made = {t: writer.add_connection(t, m, typestore=store) for t, m in topics.items()}
+        for k, row in enumerate(SKIN):
+            stamp = time(sec=5 + k // 10, nanosec=k % 10 * 10**8)
+            extra = {"seq": k} if ros1 else {}
+            head = header(stamp=stamp, frame_id="skin", **extra)
+            image = types["sensor_msgs/msg/Image"]
+            if messages.endswith("Image"):
+                padded = np.concatenate(
+                    [row.reshape(2, 2).view(np.uint8), np.full((2, 4), 77, np.uint8)], axis=1
+                )
+                one = image(head, 2, 2, "mono16", 0, 8, padded.ravel())
+            else:
+                layout = types["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
+                one = types[messages](layout=layout, data=row.astype(np.float32))
+            writer.write(made["/skin"], k * 10**8 + 10**9, write(one, messages))
+            text = types["std_msgs/msg/String"]("here")
+            writer.write(made["/note"], k * 10**8 + 10**9, write(text, "std_msgs/msg/String"))
+            picture = image(head, 400, 640, "rgb8", 0, 1920, np.zeros(768000, np.uint8))
+            if k < 2:
+                writer.write(
+                    made["/camera"], k * 10**8 + 10**9, write(picture, "sensor_msgs/msg/Image")
+                )
+    return path
+
+
+@pytest.mark.parametrize("messages", ["sensor_msgs/msg/Image", "std_msgs/msg/Float32MultiArray"])
+@pytest.mark.parametrize("kind", ["bag", "mcap", "db3"])
+def test_recordings_of_ros_are_read(tmp_path: Path, kind: str, messages: str):
+    """The topic of the skin, with the times of the headers or of the recording; images of one
+    channel are arrays of their encoding, without the padding of their lines."""
+    path = bag(tmp_path / ("a.bag" if kind == "bag" else "a"), kind, messages)
+    if kind != "bag":
+        (path,) = path.glob(f"*.{kind}")
+    found = raw_files.read(path)
+    np.testing.assert_array_equal(found.values, SKIN)
+    assert found.columns == tuple(f"data.{k}" for k in range(4))
+    np.testing.assert_allclose(found.vectors["received"], TIMES)
+    if messages.endswith("Image"):
+        np.testing.assert_allclose(found.vectors["time"], TIMES, atol=1e-6)
+    with pytest.raises(FormatError, match=r"has no topic 'skin'; it holds /skin \(.*/note"):
+        raw_files.read(path, ReadPlan("skin"))
+    moved = path.rename(tmp_path / f"moved{path.suffix}")
+    if kind == "db3":
+        with pytest.raises(FormatError, match=r"lacks metadata.yaml"):
+            raw_files.read(moved)
+    else:
+        np.testing.assert_array_equal(raw_files.read(moved).values, SKIN)

@@ -1,0 +1,147 @@
+"""What people and programs write around numbers is left out of lines that all have it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from palpate.core.errors import FormatError
+from palpate_train.data import raw_files
+from palpate_train.data.files.table import Table
+
+SKIN = np.random.default_rng(3).integers(1000, 9000, (40, 4))
+NAMES = ("s0", "s1", "s2", "s3")
+
+
+def read(folder: Path, line: Callable[[list[int]], str], head: str = "") -> Table:
+    """The table of a file with these lines."""
+    text = head + "\n" * bool(head) + "\n".join(map(line, SKIN.tolist()))
+    (folder / "a.csv").write_text(text)
+    return raw_files.read(folder / "a.csv")
+
+
+def joined(sign: str, form: str) -> Callable[[list[int]], str]:
+    return lambda row: sign.join(form.format(value) for value in row)
+
+
+def labelled(sign: str, mark: str) -> Callable[[list[int]], str]:
+    return lambda row: sign.join(f"s{i}{mark}{value}" for i, value in enumerate(row))
+
+
+@pytest.mark.parametrize(
+    ("line", "what"),
+    [
+        (lambda row: str(row), "brackets are left out"),
+        (lambda row: f"tensor([{' '.join(map(str, row))}]),", "brackets are left out"),
+        (lambda row: f"[[{row[0]}, {row[1]}], [{row[2]}, {row[3]}]]", "brackets are left out"),
+        (joined(",", "'{}'"), "single quotes are left out"),
+        (joined(",", "{} mV"), "units of the cells are left out"),
+        (joined(";", "{}N"), "units of the cells are left out"),
+        (joined(",", "{:x}".replace("{", "0x{")), "marks of hexadecimal numbers are left out"),
+        (joined(",", "{}.0D+00"), "D in exponents are left out"),
+        (labelled(",", ":"), ""),
+        (labelled(" ", "="), ""),
+        (labelled(", ", " = "), ""),
+        (joined("|", " {} "), ""),
+    ],
+)
+def test_decorations_are_left_out(tmp_path: Path, line: Callable[[list[int]], str], what: str):
+    """The numbers are read, and a remark names the decoration."""
+    found = read(tmp_path, line)
+    np.testing.assert_array_equal(found.values, SKIN)
+    assert found.notes == ((what,) if what else ())
+    if "s1" in line(SKIN[0].tolist()):
+        assert found.columns == NAMES
+
+
+@pytest.mark.parametrize("sign", ["'", "’", "\u00a0", "\u202f", "\u2009"])
+def test_separators_that_are_no_decimal_sign(tmp_path: Path, sign: str):
+    """Switzerland's apostrophe and the blanks of ISO 31, in columns that a semicolon separates."""
+    found = read(tmp_path, lambda row: ";".join(f"{v:,}".replace(",", sign) for v in row))
+    np.testing.assert_array_equal(found.values, SKIN)
+    assert found.notes == ("separators of thousands are left out",)
+
+
+def test_blanks_of_other_widths_separate_columns(tmp_path: Path):
+    """Without another sign they are not separators of thousands."""
+    found = read(tmp_path, joined("\u00a0", "{}"))
+    np.testing.assert_array_equal(found.values, SKIN)
+
+
+def test_the_serial_monitors_clock_is_a_column(tmp_path: Path):
+    """With labels, too; its times can be used."""
+    text = "\n".join(
+        f"12:00:0{i // 10}.{i % 10}00 -> " + ",".join(map(str, row))
+        for i, row in enumerate(SKIN.tolist())
+    )
+    (tmp_path / "a.txt").write_text(text)
+    found = raw_files.read(tmp_path / "a.txt")
+    np.testing.assert_array_equal(found.values[:, 1:], SKIN)
+    assert found.texts[0][11] == "12:00:01.100"
+    (tmp_path / "a.txt").write_text(text.replace("-> ", "-> force:").replace(",", ",b:"))
+    found = raw_files.read(tmp_path / "a.txt")
+    np.testing.assert_array_equal(found.values[:, 1:], SKIN)
+    assert found.columns == ("clock", "force", "b", "b", "b")
+
+
+def test_minus_signs_of_typographers(tmp_path: Path):
+    """U+2212 is a minus."""
+    found = read(tmp_path, joined(";", "\u2212{}"))
+    np.testing.assert_array_equal(found.values, -SKIN)
+
+
+def test_comments_behind_numbers_and_with_slashes(tmp_path: Path):
+    """On lines of their own, and behind the numbers of a few lines."""
+    lines = [",".join(map(str, row)) for row in SKIN.tolist()]
+    lines[7] += " # touched"
+    lines[9] += "\t// let go"
+    text = "\n".join(["// my log", *lines[:20], "// paused", *lines[20:]])
+    (tmp_path / "a.csv").write_text(text)
+    found = raw_files.read(tmp_path / "a.csv")
+    np.testing.assert_array_equal(found.values, SKIN)
+    assert found.notes == (
+        "comments behind numbers are left out",
+        "1 comments between its frames are passed over",
+    )
+
+
+def spoilt(folder: Path, row: str) -> Path:
+    """Bracketed lines; the eighth is `row`."""
+    lines = [*map(str, SKIN.tolist())]
+    lines[7] = row
+    (folder / "a.txt").write_text("\n".join(lines))
+    return folder / "a.txt"
+
+
+@pytest.mark.parametrize("cell", ["x", ""])
+def test_a_bad_cell_is_still_named_by_its_line(tmp_path: Path, cell: str):
+    """Nothing is spliced over it, and lines keep their numbers."""
+    found = raw_files.read(spoilt(tmp_path, f"[1, {cell}, 3, 4]"))
+    assert found.faults == {1: f"line 8, column 2 is {cell!r}, which is not a number"}
+
+
+def test_a_short_line_is_still_refused(tmp_path: Path):
+    """Its brackets do not hide that a number is missing."""
+    with pytest.raises(FormatError, match="line 8 has 3 columns, line 1 has 4"):
+        raw_files.read(spoilt(tmp_path, "[1, 2, 3]"))
+
+
+def test_a_label_that_changes_is_a_fault(tmp_path: Path):
+    """Another label is another number."""
+    lines = [labelled(",", ":")(row) for row in SKIN.tolist()]
+    lines[7] = lines[7].replace("s1", "s9")
+    (tmp_path / "a.txt").write_text("\n".join(lines))
+    assert "line 8, column 1 is 's0:" in raw_files.read(tmp_path / "a.txt").faults[0]
+
+
+@pytest.mark.parametrize("encoding", ["utf-16-le", "utf-16-be", "utf-32", "utf-16"])
+def test_wide_texts_are_read(tmp_path: Path, encoding: str):
+    """With a mark at the beginning or without."""
+    text = "t,s1\n" + "\n".join(f"{a},{b}" for a, b in SKIN[:, :2].tolist())
+    (tmp_path / "a.csv").write_bytes(text.encode(encoding))
+    found = raw_files.read(tmp_path / "a.csv")
+    assert found.columns == ("t", "s1")
+    np.testing.assert_array_equal(found.values, SKIN[:, :2])

@@ -1,0 +1,101 @@
+"""Tekscan's exports: movies as blocks of lines, with or without places that have no sensel."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from palpate.core.errors import FormatError
+from palpate_train.data.files import tekscan
+from palpate_train.data.files.table import ReadPlan, Table
+from palpate_train.data.files.text import lines_of
+
+FRAMES = np.arange(12 * 3 * 4).reshape(12, 3, 4)
+HEAD = """DATA_TYPE MOVIE
+VERSION I-Scan 7.60
+SENSOR_TYPE 5051
+ROWS 3
+COLS 4
+ROW_SPACING 1.27 mm
+SECONDS_PER_FRAME 0.01
+START_FRAME 1
+END_FRAME 12
+UNITS Raw
+ASCII_DATA @@
+
+"""
+
+
+def movie(frames: np.ndarray = FRAMES, head: str = HEAD, tail: str = "") -> str:
+    """A movie as I-Scan exports it."""
+    blocks = [
+        f"Frame {k}\n" + "".join(",".join(map(str, row)) + tail + "\n" for row in frame.tolist())
+        for k, frame in enumerate(frames, 1)
+    ]
+    return head + "\n".join(blocks) + "\n@@\n"
+
+
+def read(text: str) -> Table:
+    lines = lines_of(text)
+    assert tekscan.is_movie(lines)
+    return tekscan.read(lines, ReadPlan(), ())
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        movie(),
+        movie().replace("\n", "\r\n"),
+        movie(tail=","),
+        movie(head=HEAD.replace("\n", ",,,\n")),
+        "".join(
+            f'"{line}"\n' if line[:1].isupper() else f"{line}\n" for line in movie().split("\n")
+        ),
+    ],
+)
+def test_each_block_is_a_frame(text: str):
+    """Rows and columns as stored, times from the interval in the header."""
+    found = read(text)
+    np.testing.assert_array_equal(found.values, FRAMES)
+    np.testing.assert_allclose(found.vectors["time"], np.arange(12) / 100)
+    assert found.notes == ()
+
+
+def test_places_without_a_sensel_are_left_out_or_read_zero():
+    """A row and a column of B vanish; a B at another place reads 0, and both are said."""
+    text = movie().replace("\n0,1,2,3\n", "\nB,1,2,B\n")
+    cells = FRAMES.astype(object)
+    cells[:, 0, :] = "B"
+    cells[:, :, 3] = "B"
+    cells[:, 1, 0] = "B"
+    found = read(movie(cells))
+    expected = FRAMES[:, 1:, :3].copy()
+    expected[:, 0, 0] = 0
+    np.testing.assert_array_equal(found.values, expected)
+    assert found.notes == ("has sensels in 2 rows and 3 columns; 1 places without one read 0",)
+    with pytest.raises(FormatError, match="row 1, column 1 is B in some of the frames only"):
+        read(text)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "why"),
+    [
+        ("\n40,41,42,43\n", "\n40,41,42\n", "line 30 has 3 columns, and COLS says 4"),
+        ("\n40,41,42,43\n", "\n40,x,42,43\n", "line 30, column 2 is 'x', which is not a number"),
+        ("\n40,41,42,43\n", "\n", "frame 4 has 2 lines, and ROWS says 3"),
+        ("Frame 4\n", "Frame 5\n", "frame 5 follows frame 3; export all frames"),
+    ],
+)
+def test_damage_is_named(old: str, new: str, why: str):
+    """The line and the cell, or the frame."""
+    with pytest.raises(FormatError) as e:
+        read(movie().replace(old, new))
+    assert str(e.value) == why
+
+
+def test_a_cut_movie_is_read_up_to_its_last_whole_frame():
+    """The end mark is missing, and so is a part of the last frame: both are said."""
+    text = movie()[: -len("140,141,142,143\n@@\n")]
+    found = read(text)
+    np.testing.assert_array_equal(found.values, FRAMES[:11])
+    assert found.notes == ("has no @@ at its end", "read up to frame 12, which is cut off")

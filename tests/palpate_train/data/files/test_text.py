@@ -1,0 +1,239 @@
+"""Text: each kind of table that programs write gives its numbers, or an error that names line,
+cell and remedy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from palpate.core.errors import FormatError
+from palpate_train.data.files.table import ReadPlan, Table
+from palpate_train.data.files.text import decoded, lines_of, table
+
+ROWS = [[10 * r + c for c in range(4)] for r in range(1, 31)]
+BODY = "".join(",".join(map(str, row)) + "\n" for row in ROWS)
+HEAD = "a,b,c,d\n"
+
+
+def read(text: str | bytes, decimal: str = "") -> Table:
+    """The table in a text."""
+    content, notes = decoded(text if isinstance(text, bytes) else text.encode())
+    return table(lines_of(content), ReadPlan(decimal=decimal), notes)
+
+
+def check_whole(text: str | bytes, names: tuple[str, ...] = ("a", "b", "c", "d")) -> Table:
+    """The table in a text that holds all of ROWS; no cell is bad."""
+    found = read(text)
+    numbers = [i for i in range(found.values.shape[1]) if i not in found.texts]
+    np.testing.assert_array_equal(found.values[:, numbers], ROWS)
+    assert found.faults == {}
+    assert tuple(found.columns[i] for i in numbers if found.columns) == names
+    return found
+
+
+@pytest.mark.parametrize(
+    "cell", ["#N/A", "#DIV/0!", "#REF!", "#VALUE!", "#NUM!", "#NAME?", "#NULL!", "#NV", "#WERT!"]
+)
+@pytest.mark.parametrize("column", [0, 1, 3])
+@pytest.mark.parametrize("row", [0, 12, 29])
+def test_a_spreadsheet_error_is_never_a_comment(cell: str, column: int, row: int):
+    """In whatever row and column it stands, the row stays and the cell is a fault."""
+    rows = [list(map(str, r)) for r in ROWS]
+    rows[row][column] = cell
+    found = read(HEAD + "".join(",".join(r) + "\n" for r in rows))
+    assert len(found.values) == len(ROWS)
+    assert found.faults == {
+        column: f"line {row + 2}, column {column + 1} is {cell!r}, which is not a number"
+    }
+
+
+def test_a_row_behind_a_comment_sign_does_not_vanish():
+    """A commented frame leaves a hole, so it is a fault; a remark between frames is passed over."""
+    lines = BODY.splitlines()
+    lines[5] = "#" + lines[5]
+    assert read("\n".join(lines)).faults[0] == "line 6, column 1 is '#60', which is not a number"
+    lines = BODY.splitlines()
+    lines.insert(5, "# paused")
+    assert check_whole("\n".join(lines), ()).notes == (
+        "1 comments between its frames are passed over",
+    )
+
+
+@pytest.mark.parametrize("delimiter", ["\t", ";", " "])
+@pytest.mark.parametrize("sign", [",", "."])
+def test_a_separator_of_thousands_is_not_a_decimal_sign(delimiter: str, sign: str):
+    """1,012 beside 987 is refused with both meanings; --decimal decides."""
+    text = "\n".join(delimiter.join([f"1{sign}012", "987", "5"]) for _ in range(9))
+    text = text.replace(f"1{sign}012", "998", 1) if sign == "." else text
+    with pytest.raises(FormatError) as e:
+        read(text)
+    assert "column 1 is '1" in str(e.value)
+    assert "--decimal . that this is" in str(e.value)
+    assert "--decimal , that it is" in str(e.value)
+    other = "." if sign == "," else ","
+    assert read(text, other).values[-1, 0] == 1012
+    assert read(text, sign).values[-1, 0] == 1.012
+
+
+@pytest.mark.parametrize(
+    ("cells", "expected"),
+    [
+        (["0,5", "1,012"], [0.5, 1.012]),
+        (["1,5", "1,012"], [1.5, 1.012]),
+        (["1234,567", "1,012"], [1234.567, 1.012]),
+        (["1,012,345", "1,012"], [1012345, 1012]),
+        (["1,012.5", "1,012"], [1012.5, 1012]),
+        (["1.012,5", "1.012"], [1012.5, 1012]),
+        (["1.012.345", "2.012"], [1012345, 2012]),
+        (["0.5", "1.012"], [0.5, 1.012]),
+        (["1.012e0", "3"], [1.012, 3]),
+    ],
+)
+def test_other_numbers_show_the_decimal_sign(cells: list[str], expected: list[float]):
+    """One number that can only be read in one way decides for the text."""
+    for delimiter in ("\t", ";", "  "):
+        found = read("\n".join([delimiter.join(cells)] * 5))
+        np.testing.assert_allclose(found.values[0], expected)
+
+
+def test_two_decimal_signs_in_one_text_are_refused():
+    """0,5 beside 0.5: the cell is named."""
+    with pytest.raises(FormatError, match=r"line 1, column 1 is '0,5', and another cell has a dot"):
+        read("0,5\t0.25\n" * 4)
+
+
+def test_quoted_thousands_between_commas_are_refused():
+    """Spreadsheets quote 1,012 in a CSV."""
+    with pytest.raises(FormatError, match="column 2 is '1,012'; say with --decimal"):
+        read('987,"1,012",5\n' * 4)
+    assert read('987,"1,012",5\n' * 4, ".").values[0].tolist() == [987, 1012, 5]
+
+
+@pytest.mark.parametrize(
+    ("end", "note"),
+    [
+        ("@@\n", "read up to line 32, which is '@@'"),
+        ('"@@"\n', "read up to line 32, which is '\"@@\"'"),
+        ("End of recording\n", "read up to line 32, which is 'End of recording'"),
+        (
+            "\nMean of column a: 12.5\nby hand\n",
+            "read up to line 33, which is 'Mean of column a: 12.5'",
+        ),
+        ("310,31", "read up to line 32, which is cut off: 2 of 4 columns"),
+        ("310,311,", "read up to line 32, which is cut off: 2 of 4 columns"),
+        ("3", "read up to line 32, which is cut off: 1 of 4 columns"),
+        ("\0\0\0\0", "read up to 4 bytes NUL at its end"),
+        ("\x1a", "read up to 1 bytes NUL at its end"),
+    ],
+)
+def test_what_follows_the_frames_is_said(end: str, note: str):
+    """A footer, a cut line, bytes without content: the frames before it are read."""
+    assert note in check_whole(HEAD + BODY + end).notes
+
+
+def test_text_between_frames_is_refused():
+    """A second head or a second table is not a footer."""
+    with pytest.raises(FormatError, match="line 32 has 1 columns, line 2 has 4"):
+        read(HEAD + BODY + "again\n" + BODY)
+    assert read(HEAD + BODY + HEAD + BODY).faults[0].startswith("line 32, column 1 is 'a'")
+
+
+def test_bytes_in_the_middle_are_a_fault():
+    """A block of NULs, as a full disk leaves it; a cell of 256 kB."""
+    assert (
+        read(HEAD + BODY + "1,\0\0\0\0,3,4\n" + BODY)
+        .faults[1]
+        .startswith("line 32, column 2 is '\\x00\\x00")
+    )
+    with pytest.raises(FormatError, match=r"line 32: the line .* cannot be divided into cells"):
+        read(HEAD + BODY + f"1,{'x' * 262144},3,4\n" + BODY)
+
+
+@pytest.mark.parametrize("at", [0, 2, 4])
+@pytest.mark.parametrize("text", ["wood", "2026-01-01 12:00:00.{:03}", "skin_frame", '"a, b"'])
+def test_a_text_column_stands_beside_numbers(at: int, text: str):
+    """Labels, dates, names of frames: the column keeps its text, the others their numbers."""
+    head, rows = HEAD.strip().split(","), [list(map(str, row)) for row in ROWS]
+    head.insert(at, "what")
+    for k, row in enumerate(rows):
+        row.insert(at, text.format(k))
+    found = check_whole("\n".join(",".join(row) for row in [head, *rows]))
+    assert found.texts[at][7] == text.format(7).strip('"')
+    assert found.columns[at] == "what"
+
+
+def test_rs_tables_are_read():
+    """write.table quotes names and rows and leaves the head one name short; write.csv leaves it
+    empty; quote=FALSE leaves numbers."""
+    rows = [f'"{k}" {" ".join(map(str, row))}' for k, row in enumerate(ROWS, 1)]
+    check_whole("\n".join(['"a" "b" "c" "d"', *rows]))
+    check_whole("\n".join(["a b c d", *(row.replace('"', "") for row in rows)]))
+    check_whole("\n".join(['"","a","b","c","d"', *(row.replace(" ", ",") for row in rows)]))
+    check_whole("\n".join(["a\tb\tc\td", *(row.replace(" ", "\t") for row in rows)]))
+    names = [f'"w {k}" {" ".join(map(str, row))}' for k, row in enumerate(ROWS, 1)]
+    assert check_whole("\n".join(['"a" "b" "c" "d"', *names])).texts[0][0] == "w 1"
+
+
+def test_pandas_numbers_its_rows_and_columns():
+    """A nameless frame: a head ,0,1,2,3 and a first column that counts."""
+    rows = [f"{k},{','.join(map(str, row))}" for k, row in enumerate(ROWS)]
+    check_whole("\n".join([",0,1,2,3", *rows]), ("0", "1", "2", "3"))
+
+
+def test_names_stand_on_the_last_line_before_the_numbers():
+    """A remark with as many cells above it, and units below it, are not the names."""
+    check_whole("Recorded,by,hand,today\n" + HEAD + BODY)
+    check_whole(HEAD + "(N),(N),(N),(V)\n" + BODY)
+    check_whole(HEAD + "N,N,N,V\n" + BODY)
+    check_whole("# " + HEAD + BODY)
+
+
+LVM = """LabVIEW Measurement\t
+Writer_Version\t2
+Reader_Version\t2
+Separator\tTab
+Decimal_Separator\t{0}
+Multi_Headings\tNo
+X_Columns\tOne
+Time_Pref\tAbsolute
+Date\t2026/01/31
+***End_of_Header***\t\t\t\t\t
+Channels\t4\t\t\t\t
+Samples\t30\t30\t30\t30\t
+Date\t2026/01/31\t2026/01/31\t2026/01/31\t2026/01/31\t
+X_Dimension\tTime\tTime\tTime\tTime\t
+X0\t0{0}0\t0{0}0\t0{0}0\t0{0}0\t
+Delta_X\t0{0}01\t0{0}01\t0{0}01\t0{0}01\t
+***End_of_Header***\t\t\t\t\t
+X_Value\ta\tb\tc\td\tComment
+"""
+
+
+@pytest.mark.parametrize("sign", [".", ","])
+@pytest.mark.parametrize("tail", ["", "\t"])
+def test_labviews_measurements_are_read(sign: str, tail: str):
+    """Names from the line after the last header; the header states the decimal sign."""
+    rows = "".join(
+        f"{k / 100:.6f}".replace(".", sign) + "\t" + "\t".join(map(str, row)) + f"{tail}\n"
+        for k, row in enumerate(ROWS)
+    )
+    found = read(LVM.format(sign) + rows)
+    assert found.columns == ("X_Value", "a", "b", "c", "d")
+    np.testing.assert_array_equal(found.values[:, 1:], ROWS)
+    np.testing.assert_allclose(found.values[:, 0], np.arange(30) / 100)
+
+
+def test_a_mark_shows_utf_16():
+    """With the mark it is read; names in Latin-1 are kept."""
+    check_whole((HEAD + BODY).encode("utf-16"))
+    assert read(("Größe,b,c,d\n" + BODY).encode("latin-1")).columns[0] == "Größe"
+    assert read("Gro\u0308ße,b,c,d\n" + BODY).columns[0] == "Größe"
+
+
+def test_blanks_and_decimal_commas_go_together():
+    """1,5 2,5: blanks separate, not the comma."""
+    assert read("1,5 2,5 3,25\n" * 5).values[0].tolist() == [1.5, 2.5, 3.25]
+    assert (
+        read("1_000,2\n1,2\n1,2\n").faults[0]
+        == "line 1, column 1 is '1_000', which is not a number"
+    )

@@ -1,0 +1,286 @@
+"""Frames of taxels: the axis of time, columns by name, fields in columns, readings that cannot
+be."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import scipy.io
+
+from palpate.core.errors import FormatError
+from palpate_train.data import frames, raw_files
+from palpate_train.data.file_names import NamePattern
+from palpate_train.data.files.table import Table
+from palpate_train.data.import_plan import ImportPlan, Length
+
+NAMES = NamePattern("{material}.{}")
+
+
+def plan(**changes: object) -> ImportPlan:
+    given = {"pattern": NAMES, "rate_hz": 100.0, "window": Length("20", "--window")} | changes
+    return ImportPlan(**given)
+
+
+def cube(rows: int, columns: int, count: int, axes: int = 0) -> np.ndarray:
+    """Frames [n, R, C] or [n, R, C, A] whose counts all differ."""
+    shape = (count, rows, columns, axes) if axes else (count, rows, columns)
+    return np.arange(np.prod(shape), dtype=np.int32).reshape(shape)
+
+
+def stored(path: Path, values: np.ndarray, how: str) -> Table:
+    """A table read from a file of `values`, as each program stores them."""
+    if how == "npy":
+        np.save(path.with_suffix(".npy"), values)
+        return raw_files.read(path.with_suffix(".npy"))
+    if how == "mat":
+        scipy.io.savemat(path.with_suffix(".mat"), {"skin": values})
+        return raw_files.read(path.with_suffix(".mat"))
+    suffix = ".mat" if how == "v7.3" else ".h5"
+    with h5py.File(path.with_suffix(suffix), "w") as file:
+        if how == "h5":
+            file["skin"] = values
+        else:
+            file["skin"] = values.T
+            file["skin"].attrs["MATLAB_class"] = np.bytes_("int32")
+    return raw_files.read(path.with_suffix(suffix))
+
+
+@pytest.mark.parametrize("how", ["npy", "mat", "v7.3", "h5", "h5 of MATLAB"])
+@pytest.mark.parametrize(
+    ("rows", "columns", "axes"), [(4, 4, 0), (2, 5, 0), (4, 4, 3), (16, 16, 0)]
+)
+@pytest.mark.parametrize("grid", [True, False])
+def test_the_last_axis_is_the_time_if_only_it_fits(
+    tmp_path: Path, how: str, rows: int, columns: int, axes: int, grid: bool
+):
+    """(row, column, frame) and (frame, row, column) give the same frames; the first is said."""
+    x = cube(rows, columns, 60, axes)
+    last = np.moveaxis(x, 0, -1)
+    name = f"{rows}x{columns}x{axes}" if axes else f"{rows}x{columns}"
+    asked = plan(grid=name if grid else "")
+    for values, notes in (
+        (x, []),
+        (last, [f"its last axis is the time: frames of {[*x.shape[1:]]}"]),
+    ):
+        found, time_s, said = frames.frames(stored(tmp_path / "a", values, how), asked)
+        np.testing.assert_array_equal(found, x)
+        square = how == "h5" and values is x and rows == columns and not axes
+        assert (time_s, said) == (None, [frames.SQUARE] if square else notes)
+
+
+@pytest.mark.parametrize(
+    ("shape", "grid", "answer"),
+    [
+        ((30, 30, 30), "", "first"),
+        ((30, 30, 30), "30x30", "first"),
+        ((40, 32, 64), "", "first"),
+        ((16, 16, 16), "", "neither"),
+    ],
+)
+def test_what_both_axes_could_be_is_asked_for(shape: tuple[int, ...], grid: str, answer: str):
+    """The message shows the shape and both answers, and each of them works."""
+    x = np.arange(np.prod(shape)).reshape(shape)
+    what = (
+        "the first and the last axis could both be" if answer == "first" else "neither end can be"
+    )
+    with pytest.raises(FormatError) as e:
+        frames.frames(Table(x), plan(grid=grid))
+    assert str(e.value) == (
+        f"holds {list(shape)}: {what} the time; say with --axes frame,row,column or "
+        "--axes row,column,frame, or give --grid"
+    )
+    np.testing.assert_array_equal(frames.frames(Table(x), plan(axes="frame,row,column"))[0], x)
+    last, _, _ = frames.frames(Table(x), plan(axes="row,column,frame"))
+    np.testing.assert_array_equal(last, np.moveaxis(x, -1, 0))
+    swapped, _, _ = frames.frames(Table(x), plan(axes="column,row,frame"))
+    np.testing.assert_array_equal(swapped, x.T)
+
+
+def test_square_arrays_of_taxels_and_frames_are_asked_for():
+    """16 frames of 16 taxels: no axis shows its kind."""
+    x = np.arange(256).reshape(16, 16)
+    with pytest.raises(
+        FormatError, match="both axes could be the 16 taxels; say which with --axes"
+    ):
+        frames.frames(Table(x), plan(grid="4x4"))
+    asked = plan(grid="4x4", axes="taxel,frame")
+    np.testing.assert_array_equal(frames.frames(Table(x), asked)[0], x.T.reshape(16, 4, 4))
+    with pytest.raises(FormatError, match=r"holds \[2, 3, 4\], but --transpose names 2 axes"):
+        frames.frames(Table(np.zeros((2, 3, 4))), plan(transpose=True))
+
+
+def test_times_show_the_axis_of_time():
+    """A vector of times has as many values as there are frames."""
+    x = cube(30, 30, 40)
+    beside = {"t": np.arange(40) / 100}
+    asked = plan(rate_hz=None, time="t:s")
+    for values in (x, np.moveaxis(x, 0, -1)):
+        found, time_s, _ = frames.frames(Table(values, vectors=beside, beside=("t",)), asked)
+        np.testing.assert_array_equal(found, x)
+        np.testing.assert_array_equal(time_s, beside["t"])
+
+
+def text(names: tuple[str, ...], **more: object) -> Table:
+    return Table(np.arange(40.0 * len(names)).reshape(40, -1), names, **more)
+
+
+@pytest.mark.parametrize("option", ["columns", "time", "pattern", "field"])
+def test_a_name_that_occurs_twice_needs_numbers(option: str):
+    """Columns 2 and 4 are called s: neither is taken, whichever option names them."""
+    table = text(("t", "s", "a", "s", "b"))
+    asked = {
+        "columns": {"columns": "s,a"},
+        "pattern": {"columns": "*"},
+        "time": {"time": "s:ms"},
+        "field": {"fields": {"session": "s"}},
+    }[option]
+    with pytest.raises(FormatError, match="columns 2 and 4 are all called 's'; use their numbers"):
+        frames.frames(table, plan(grid="2x2", **asked))
+    with pytest.raises(FormatError, match="columns 2 and 4 are all called 's'; use their numbers"):
+        frames.fields(table, {"session": "s"}, 40)
+    found, _, _ = frames.frames(table, plan(grid="2x2", columns="2-5"))
+    np.testing.assert_array_equal(found.reshape(40, 4), table.values[:, 1:])
+
+
+def test_a_name_that_is_the_number_of_another_column_is_refused():
+    """pandas calls the columns 0, 1, 2, 3: is 2 a name or a number?"""
+    with pytest.raises(FormatError, match="'2' is the name of column 3 and the number of another"):
+        frames.frames(text(("0", "1", "2", "3")), plan(grid="2x1", columns="2,3"))
+
+
+def test_only_the_columns_that_are_used_must_be_numbers():
+    """A fault in another column does not matter; in a taxel or in the time it is named."""
+    table = text(("t", "a", "b"), faults={2: "line 3, column 3 is '', which is not a number"})
+    assert frames.frames(table, plan(grid="1x1", columns="a"))[0].shape == (40, 1, 1)
+    for asked in ({"columns": "b"}, {"columns": "a", "time": "b:s"}, {"time": "t:s"}):
+        grid = "1x2" if asked == {"time": "t:s"} else "1x1"
+        with pytest.raises(FormatError, match="line 3, column 3 is ''"):
+            frames.frames(table, plan(grid=grid, **asked))
+
+
+@pytest.mark.parametrize("shape", [(1, 40, 2, 3), (40, 1, 2, 3), (40, 2, 3, 1), (1, 2, 3, 40)])
+def test_axes_of_length_one_are_left_out(shape: tuple[int, ...]):
+    """A batch, a channel, an axis: the grid does not have them. A grid with them keeps them."""
+    values = cube(2, 3, 40)
+    moved = np.moveaxis(values, 0, -1) if shape[-1] == 40 else values
+    found, _, _ = frames.frames(Table(moved.reshape(shape)), plan(grid="2x3"))
+    np.testing.assert_array_equal(found, values)
+    found, _, _ = frames.frames(Table(values.reshape(40, 6, 1)), plan(grid="6x1"))
+    np.testing.assert_array_equal(found, values.reshape(40, 6, 1))
+
+
+def test_text_columns_are_no_taxels():
+    """They are passed over without --columns, and refused if --columns names them."""
+    table = text(("label", "a", "b"), texts={0: ["wood"] * 40})
+    found, _, _ = frames.frames(table, plan(grid="1x2"))
+    np.testing.assert_array_equal(found[:, 0], table.values[:, 1:])
+    with pytest.raises(FormatError, match="column 1 'label' holds text, such as 'wood'"):
+        frames.frames(table, plan(grid="1x1", columns="label"))
+    with pytest.raises(FormatError, match=r"holds text, such as 'wood'; for dates .* label:date"):
+        frames.frames(table, plan(grid="1x2", time="label:s"))
+
+
+def test_a_column_of_dates_gives_the_times():
+    """Dates with a clock time, as loggers write them."""
+    dates = [f"2026-01-31 12:00:{k / 10:06.3f}" for k in range(40)]
+    table = text(("when", "a"), texts={0: dates})
+    _, time_s, _ = frames.frames(table, plan(grid="1x1", time="when:date", rate_hz=None))
+    np.testing.assert_allclose(time_s, np.arange(40) / 10)
+    dates[3] = "noon"
+    with pytest.raises(FormatError, match="frame 4: 'noon' in column when is not a date"):
+        frames.frames(table, plan(grid="1x1", time="when:date", rate_hz=None))
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        "2026-01-31T12:59:{0:06.3f}+01:00",
+        "2026-01-31 12:59:{0:06.3f}Z",
+        "31.01.2026 12:59:{0:06.3f}",
+        "1/31/2026 12:59:{0:06.3f} PM",
+        "12:59:{0:06.3f}",
+        "12:59:{1:02d},{2:03d}",
+    ],
+)
+def test_dates_of_other_forms_give_the_times(form: str):
+    """With a zone, of other countries, of a clock alone, with a decimal comma."""
+    at = 40 + np.arange(40) / 4
+    dates = [form.format(s, int(s), round(s % 1 * 1000)) for s in at.tolist()]
+    table = text(("when", "a"), texts={0: dates})
+    _, time_s, _ = frames.frames(table, plan(grid="1x1", time="when:date", rate_hz=None))
+    np.testing.assert_allclose(time_s, np.arange(40) / 4)
+
+
+@pytest.mark.parametrize(
+    "form",
+    ["2026-01-{0} {1}", "{0}.1.2026 {1}", "2026/1/{0} {1}", "{1}"],
+)
+def test_dates_go_on_at_midnight(form: str):
+    """Days that change, and a clock that begins again."""
+    clock = [(23, 59, 59), (0, 0, 0), (0, 0, 1)]
+    texts = [
+        form.format(30 + (not hour), f"{hour:02}:{minute:02}:{second:02}")
+        for hour, minute, second in clock
+    ]
+    table = text(("when", "a"), texts={0: texts})
+    table = replace(table, values=table.values[:3])
+    _, time_s, _ = frames.frames(table, plan(grid="1x1", time="when:date", rate_hz=None))
+    assert time_s is not None
+    assert time_s.tolist() == [0, 1, 2]
+
+
+def test_days_that_could_be_months_are_refused():
+    """Only where they change, since the time between frames then depends on it."""
+    texts = ["01/02/2026 12:00:00"] * 39 + ["02/02/2026 12:00:00"]
+    table = text(("when", "a"), texts={0: texts})
+    with pytest.raises(FormatError, match="the day changes from '01/02/2026' to '02/02/2026'"):
+        frames.frames(table, plan(grid="1x1", time="when:date", rate_hz=None))
+
+
+def test_fields_cut_a_table_where_they_change():
+    """A label gives the material, a date the session; numbers are written as they are."""
+    labels = ["wood"] * 10 + ["felt"] * 20 + ["wood"] * 10
+    days = [f"2026-01-3{k // 35} 12:00" for k in range(40)]
+    table = text(("l", "d", "n", "a"), texts={0: labels, 1: days})
+    table.values[:, 2] = 7
+    found = frames.fields(table, {"material": "l", "session": "d", "trial": "n"}, 40)
+    assert [(part.start, part.stop) for part, _ in found] == [(0, 10), (10, 30), (30, 35), (35, 40)]
+    assert found[1][1] == {"material": "felt", "session": "2026-01-30", "trial": "7"}
+    labels[4] = ""
+    with pytest.raises(FormatError, match="frame 5 has no material in column l"):
+        frames.fields(table, {"material": "l"}, 40)
+
+
+@pytest.mark.parametrize(("value", "shown"), [(1e20, "1e+20"), (-3e15, "-3e+15"), (np.inf, "inf")])
+def test_a_reading_that_cannot_be_is_named(value: float, shown: str):
+    """Frame and taxel of the first; a skin of 32-bit integers is not concerned."""
+    table = text(("a", "b", "c", "d"))
+    table.values[12, 2] = value
+    with pytest.raises(FormatError, match=f"frame 13, taxel 2, 1 is {shown}".replace("+", r"\+")):
+        frames.frames(table, plan(grid="2x2"))
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"axes": "row,column"}, "--axes row,column cannot be read; name each axis"),
+        ({"axes": "frame,frame"}, "--axes frame,frame cannot be read"),
+        ({"axes": "frame,time"}, "--axes frame,time cannot be read"),
+        ({"axes": "taxel,frame", "transpose": True}, "--axes already says"),
+        ({"decimal": "'"}, "--decimal ' is unknown; use . or ,"),
+        ({"pattern": None}, "where the material stands is not known; give --pattern"),
+        (
+            {"fields": {"material": "l"}},
+            "material stands in --pattern or --variable and in --field",
+        ),
+    ],
+)
+def test_an_option_that_cannot_be_read_is_named(changes: dict, why: str):
+    """Before any file is read."""
+    with pytest.raises(FormatError) as e:
+        plan(**changes)
+    assert str(e.value).startswith(why)

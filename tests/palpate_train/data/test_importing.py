@@ -1,0 +1,570 @@
+"""Import: folders of CSV, text, MAT, HDF5 and .npy become sets; each file that cannot be used gets
+one exact line."""
+
+from __future__ import annotations
+
+import re
+import zipfile
+from contextlib import suppress
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import scipy.io
+
+from palpate.core.errors import FormatError
+from palpate_train.data import sets
+from palpate_train.data.file_names import NamePattern
+from palpate_train.data.import_plan import ImportPlan, Length
+from palpate_train.data.importing import Imported, LeftOut, import_folder
+from tests.factories.lab_files import write
+
+NAMES = NamePattern("{material}_{trial:d}.{}")
+COUNTS = np.arange(40 * 4).reshape(40, 4) % 150
+
+
+def plan(**changes: object) -> ImportPlan:
+    """Four taxels at 100 Hz, windows of ten frames."""
+    given = {"grid": "2x2", "rate_hz": 100.0, "window": Length("10", "--window")} | changes
+    return ImportPlan(**{"pattern": NAMES} | given)
+
+
+def taken(folder: Path, **changes: object) -> Imported:
+    """The imported sweeps; every file fits and is used."""
+    left_out: list[LeftOut] = []
+    made = import_folder(folder, plan(**changes), lambda line: None, left_out)
+    assert left_out == []
+    return made
+
+
+def reasons(folder: Path, **changes: object) -> dict[str, str]:
+    """Why files were left out, by name."""
+    left_out: list[LeftOut] = []
+    with suppress(FormatError):  # if no file could be imported
+        import_folder(folder, plan(**changes), lambda line: None, left_out)
+    return {one.name: one.why for one in left_out}
+
+
+def text(path: Path, counts: np.ndarray = COUNTS, delimiter: str = ",", head: str = "") -> Path:
+    """Counts as text, without times."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(
+        head + "".join(delimiter.join(f"{c:g}" for c in row) + "\n" for row in counts.tolist())
+    )
+    return path
+
+
+def zipped(path: Path, name: str, data: bytes) -> None:
+    """An archive with one member."""
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr(name, data)
+
+
+FORMS = {
+    "csv": lambda path: text(path),
+    "txt": lambda path: text(path, delimiter=" ", head="# a b c d\n\n"),
+    "tsv": lambda path: text(path, delimiter="\t", head="Recorded by hand\na\tb\tc\td\n"),
+    "dat": lambda path: path.write_text(text(path, delimiter=";").read_text().replace("\n", ";\n")),
+    "npy": lambda path: np.save(path, COUNTS.astype(np.uint8)),
+    "npz": lambda path: np.savez(path, frames=COUNTS.astype(np.uint8), t=np.arange(40.0)),
+    "mat": lambda path: scipy.io.savemat(path, {"frames": COUNTS, "rate": 100.0}),
+    "h5": lambda path: h5py.File(path, "w").create_dataset("run/frames", data=COUNTS).file.close(),
+}
+
+
+@pytest.mark.parametrize("suffix", FORMS)
+def test_every_format_gives_the_same_sweeps(tmp_path: Path, suffix: str):
+    """The middle ten frames of each file as a sweep [10, 2, 2] of the smallest type, with its
+    groups."""
+    for name in ("cork_1", "felt_1", "wool_2"):
+        FORMS[suffix](tmp_path / f"{name}.{suffix}")
+    s = taken(tmp_path).sweeps
+    assert str(s.format) == "2x2 uint8 at 100 Hz, window 10"
+    np.testing.assert_array_equal(s.samples, np.tile(COUNTS[15:25].reshape(10, 2, 2), (3, 1, 1, 1)))
+    assert (s.materials, s.labels.tolist()) == (("cork", "felt", "wool"), [0, 1, 2])
+    assert s.groups["trial"].tolist() == [1, 1, 2]
+    assert s.groups["recording"].tolist() == [0, 1, 2]
+    s.save(tmp_path / "set.npz")
+    assert sets.digest(sets.load(str(tmp_path / "set.npz"))) == sets.digest(s)
+
+
+def test_a_mat_file_of_version_7_3_has_its_axes_back(tmp_path: Path):
+    """MATLAB stores columns first; HDF5 shows the arrays as [taxels, frames]."""
+    for name in ("cork_1", "felt_1"):
+        with h5py.File(tmp_path / f"{name}.mat", "w") as file:
+            file["frames"] = COUNTS.T
+    np.testing.assert_array_equal(
+        taken(tmp_path).sweeps.samples[0], COUNTS[15:25].reshape(10, 2, 2)
+    )
+
+
+def test_columns_are_named_numbered_or_all_but_the_time(tmp_path: Path):
+    """By name, by number from 1 on, by range, by a pattern; in the given order."""
+    for name in ("cork_1", "felt_1"):
+        write(tmp_path / f"{name}.csv", COUNTS, 100.0)
+    whole = COUNTS[15:25].reshape(10, 2, 2)
+    for given in (
+        {"time": "time:ms", "rate_hz": None},
+        {"columns": "2-5"},
+        {"columns": "s*"},
+        {"columns": "s0,3,s2-,5"},
+    ):
+        if "s2-" in str(given):
+            assert "there is no column 's2-'" in reasons(tmp_path, **given)["cork_1.csv"]
+        else:
+            np.testing.assert_array_equal(taken(tmp_path, **given).sweeps.samples[0], whole)
+    turned = taken(tmp_path, columns="s3,4,3,s0").sweeps.samples[0]
+    np.testing.assert_array_equal(turned, whole.reshape(10, 4)[:, ::-1].reshape(10, 2, 2))
+
+
+def test_windows_are_cut_as_asked(tmp_path: Path):
+    """The middle window, or a window at regular intervals from the start on; all belong to one
+    recording."""
+    for name in ("cork_1", "felt_1"):
+        text(tmp_path / f"{name}.csv")
+    s = taken(tmp_path, every=Length("150ms", "--every")).sweeps
+    assert s.groups["recording"].tolist() == [0, 0, 0, 1, 1, 1]
+    np.testing.assert_array_equal(s.samples[1].reshape(10, 4), COUNTS[15:25])
+    assert taken(tmp_path, window=Length("0.25s", "--window")).sweeps.format.window == 25
+
+
+def test_times_give_the_rate_and_even_frames_are_kept(tmp_path: Path):
+    """Times rounded to milliseconds at 300 Hz: the counts stay as recorded, and the set has the
+    right rate."""
+    for name in ("cork_1", "felt_1"):
+        write(tmp_path / f"{name}.csv", COUNTS, 300.0, np.round(1000 * np.arange(40) / 300))
+    made = taken(tmp_path, time="time:ms", rate_hz=None)
+    assert made.sweeps.rate_hz == pytest.approx(300, rel=0.005)
+    np.testing.assert_array_equal(made.sweeps.samples[0].reshape(10, 4), COUNTS[15:25])
+    assert [cut.notes for cut in made.taken] == ["", ""]
+
+
+def test_times_that_wander_are_interpolated(tmp_path: Path):
+    """A ramp sampled at irregular times becomes a ramp again, in whole counts, and the report says
+    so."""
+    late = 25 * np.sin(np.arange(400) / 20)  # ms, for periods of 10 ms
+    times = 10 * np.arange(400) + late
+    ramp = np.repeat(np.rint(times)[:, None] + 100, 4, axis=1)
+    for name in ("cork_1", "felt_1"):
+        write(tmp_path / f"{name}.csv", ramp, 100.0, times)
+    made = taken(tmp_path, time="time:ms", rate_hz=100.0)
+    steps = np.diff(made.sweeps.samples[0, :, 0, 0].astype(float))
+    assert np.abs(steps - 10).max() <= 1
+    assert made.sweeps.samples.dtype == np.int16
+    assert made.taken[0].notes == "interpolated onto even times"
+
+
+def test_no_window_goes_over_a_gap(tmp_path: Path):
+    """Half a second without frames: windows lie before and after the gap, none across it."""
+    times = 10.0 * np.arange(40)
+    times[25:] += 500
+    for name in ("cork_1", "felt_1"):
+        write(tmp_path / f"{name}.csv", COUNTS, 100.0, times)
+    made = taken(tmp_path, time="time:ms", rate_hz=100.0, every=Length("5", "--every"))
+    starts = [
+        int(np.flatnonzero((w.reshape(10, 4)[0] == COUNTS).all(1))[0])
+        for w in made.sweeps.samples[:6]
+    ]
+    assert starts == [0, 5, 10, 15, 25, 30]
+    assert made.taken[0].notes == "1 gaps"
+    why = reasons(tmp_path, time="time:ms", rate_hz=100.0, window=Length("26", "--window"))[
+        "cork_1.csv"
+    ]
+    assert why == "has 25 frames in a row (1 gaps), but a window needs 26; see --window"
+
+
+@pytest.mark.parametrize(
+    ("dtype", "recorded", "expected"),
+    [
+        ("", np.int16, "int16"),
+        ("", np.float64, "uint8"),
+        ("", np.int64, "uint8"),
+        ("float32", np.int16, "float32"),
+    ],
+)
+def test_types_stay_as_recorded_or_are_the_first_that_holds_all(
+    tmp_path: Path, dtype: str, recorded: type, expected: str
+):
+    """Types that the box knows stay; others become the first type that holds every count; --dtype
+    overrides."""
+    for name in ("cork_1", "felt_1"):
+        np.save(tmp_path / f"{name}.npy", COUNTS.astype(recorded))
+    assert taken(tmp_path, dtype=dtype).sweeps.samples.dtype == expected
+
+
+@pytest.mark.parametrize(
+    ("dtype", "value", "why"),
+    [
+        ("uint8", 300, "a count is 300, and uint8 holds 0 to 255"),
+        ("int16", 40000, "a count is 40000, and int16 holds -32768 to 32767"),
+        ("uint16", -1, "a count is -1, and uint16 holds 0 to 65535"),
+        ("int16", 0.5, "a count is 0.5, and int16 holds whole numbers"),
+        ("", 16777217, "a count is 16777217, and float32 would round it; subtract an offset"),
+        (
+            "",
+            1e300,
+            "frame 21, taxel 2, 1 is 1e+300; no skin reads more than 1e+12: "
+            "fill it in or cut it away",
+        ),
+    ],
+)
+def test_a_count_that_does_not_fit_leaves_its_file_out(
+    tmp_path: Path, dtype: str, value: float, why: str
+):
+    """The message gives the file, the count and the range of the type; other files are imported."""
+    for name in ("cork_1", "felt_1", "felt_2"):
+        np.save(tmp_path / f"{name}.npy", COUNTS.astype(np.float64))
+    bad = COUNTS.astype(np.float64)
+    bad[20, 2] = value
+    np.save(tmp_path / "felt_2.npy", bad)
+    assert reasons(tmp_path, dtype=dtype) == {"felt_2.npy": why}
+
+
+GOOD = "1,2,3,4\n" * 20
+BAD = {
+    "empty": (b"", "holds no line of numbers"),
+    "words": (b"time,a,b\nnone,of,these\n", "holds no line of numbers"),
+    "short line": (b"1,2,3,4\n1,2,3\n" + GOOD.encode(), "line 2 has 3 columns, line 1 has 4"),
+    "word": (
+        b"a,b,c,d\n" + GOOD.encode() + b"1,2,x,4\n",
+        "line 22, column 3 is 'x', which is not a number",
+    ),
+    "hole": (GOOD.encode() + b"1,,3,4\n", "line 21, column 2 is '', which is not a number"),
+    "nan": (
+        GOOD.encode() + b"1,nan,3,4\n",
+        "frame 21, taxel 1, 2 is nan; fill it in or cut it away",
+    ),
+    "numbers": (bytes([1, 0, 0, 0] * 99), "is not a text; save it as UTF-8"),
+    "wide": (
+        b"1,2,3,4,5\n" * 20,
+        "it has 5 columns, but a grid of 2x2 needs 4; see --columns and --grid",
+    ),
+    "taxels x frames": (
+        b"1,2,3,4,5\n" * 4,
+        "it has 5 columns, but a grid of 2x2 needs 4; it has 4 rows, so add --transpose",
+    ),
+    "few": (b"1,2,3,4\n" * 9, "has 9 frames, but a window needs 10; see --window"),
+    "noise": (bytes(range(256)) * 9, "holds no line of numbers"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_each_bad_text_gets_one_exact_line(tmp_path: Path, name: str):
+    """The line gives the place and the bad text; other files are imported."""
+    content, why = BAD[name]
+    for good in ("cork_1", "felt_1"):
+        (tmp_path / f"{good}.csv").write_text(GOOD)
+    (tmp_path / "felt_2.csv").write_bytes(content)
+    assert reasons(tmp_path) == {"felt_2.csv": why}
+
+
+@pytest.mark.parametrize(
+    ("suffix", "save", "why"),
+    [
+        (
+            "npy",
+            lambda p: np.save(p, np.zeros(9)),
+            "holds float64 [9]; give an array of frames x taxels",
+        ),
+        (
+            "npy",
+            lambda p: np.save(p, np.array(["a"])),
+            "holds <U1 [1]; give an array of frames x taxels",
+        ),
+        (
+            "npy",
+            lambda p: np.save(p, np.array([{}]), allow_pickle=True),
+            "holds objects of Python, which are not read; save numbers",
+        ),
+        ("npy", lambda p: p.write_bytes(b"\x93NUMPY"), "cannot be read: "),
+        (
+            "npy",
+            lambda p: np.save(p, np.zeros((20, 3, 3))),
+            "holds frames of shape [3, 3]; leave --columns out",
+        ),
+        ("npz", lambda p: p.write_bytes(b"PK\3\4"), "cannot be read: "),
+        ("npz", lambda p: zipped(p, "a.npy", b"nothing"), "holds 0 arrays of frames; name one"),
+        (
+            "npz",
+            lambda p: np.savez(p, a=COUNTS, b=COUNTS),
+            "holds 2 arrays of frames; name one with --variable",
+        ),
+        (
+            "mat",
+            lambda p: p.write_bytes(b"MATLAB 5.0" + bytes(200)),
+            "is not a MAT file of version 4 to 7.3; save it with -v7",
+        ),
+        ("h5", lambda p: p.write_bytes(b"nothing"), "cannot be read: "),
+        (
+            "h5",
+            lambda p: h5py.File(p, "w").close(),
+            "holds 0 arrays of frames; name one with --variable: it holds nothing",
+        ),
+    ],
+)
+def test_each_bad_binary_gets_one_exact_line(tmp_path: Path, suffix: str, save, why: str):
+    """Damaged files, objects, other shapes; nothing is unpickled."""
+    for good in ("cork_1", "felt_1"):
+        text(tmp_path / f"{good}.csv")
+    save(tmp_path / f"felt_2.{suffix}")
+    (found,) = reasons(tmp_path).values()
+    assert found.startswith(why)
+    assert "\n" not in found
+
+
+def test_an_array_is_chosen_and_turned(tmp_path: Path):
+    """--variable chooses between two arrays; --transpose reads taxels x frames; times stand beside
+    the array."""
+    for name in ("cork_1", "felt_1"):
+        np.savez(
+            tmp_path / f"{name}.npz", other=np.zeros((3, 3)), frames=COUNTS.T, t=np.arange(40) / 50
+        )
+    made = taken(tmp_path, variable="frames", transpose=True, time="t:s", rate_hz=None)
+    assert made.sweeps.rate_hz == 50
+    np.testing.assert_array_equal(made.sweeps.samples[0].reshape(10, 4), COUNTS[15:25])
+    assert (
+        "has no array 'x'; it holds other [3, 3]" in reasons(tmp_path, variable="x")["cork_1.npz"]
+    )
+
+
+@pytest.mark.parametrize(
+    ("times", "why"),
+    [
+        (
+            np.r_[np.arange(30), 5, np.arange(31, 40)] * 10.0,
+            "the time of frame 31 is before that of frame 30",
+        ),
+        (np.zeros(40), "all its times are the same; give --rate instead of --time"),
+        (np.arange(40) // 8 * 80.0, "its frames come in bursts"),
+        (np.arange(40) // 4 * 40.0 + np.arange(40) % 4 * 0.1, "its frames come in bursts"),
+        (np.arange(40) * 20.0, "is sampled at 50 Hz, the set at 100 Hz; import it by itself"),
+        (
+            np.r_[0:10, 12:30, 29, 30:41] * 10.0,
+            "frames 28 and 29 of a run have the same time; if only the times are uneven",
+        ),
+        (np.r_[np.nan, 1:40] * 10.0, "the time of frame 1 is not a number"),
+    ],
+)
+def test_times_that_cannot_be_are_named(tmp_path: Path, times: np.ndarray, why: str):
+    """Times that go back, stand still, come in bursts or at another rate: the file is left out, the
+    others are imported."""
+    for good in ("cork_1", "felt_1"):
+        write(tmp_path / f"{good}.csv", COUNTS, 100.0)
+    write(tmp_path / "felt_2.csv", COUNTS, 100.0, times)
+    (found,) = reasons(tmp_path, time="time:ms", rate_hz=None).items()
+    assert found[0] == "felt_2.csv"
+    assert found[1].startswith(why)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"rate_hz": None},
+            "the frame rate is not known; give --rate HZ, or --time COLUMN:UNIT",
+        ),
+        ({"time": "t"}, "--time t names no unit; write t:s, :ms, :us or :ns"),
+        ({"grid": "4"}, "--grid 4 cannot be read; write ROWSxCOLUMNS"),
+        ({"dtype": "int8"}, "--dtype int8 is unknown; use one of uint8"),
+    ],
+)
+def test_an_option_that_cannot_be_read_is_named(changes: dict, message: str):
+    """Before any file is read."""
+    with pytest.raises(FormatError) as e:
+        plan(**changes)
+    assert str(e.value).startswith(message)
+
+
+@pytest.mark.parametrize("length", ["", "2", "0s", "-1s", "2 s", "0", "x"])
+def test_a_length_is_seconds_or_frames(length: str):
+    """2 alone is two frames; nothing and nonsense are refused."""
+    if length == "2":
+        assert Length(length, "--window").frames(100) == 2
+        return
+    with pytest.raises(FormatError, match=r"--window .*cannot be read; write 2s"):
+        Length(length, "--window")
+
+
+def test_names_of_materials_are_checked_before_anything_is_read(tmp_path: Path):
+    """All bad new names at once; --rename changes names and joins materials; renaming an unknown
+    material is refused."""
+    for name in ("a,b", "x" * 30, "felt"):
+        (tmp_path / f"{name}_1.csv").write_text("nothing to read")
+    bad = {"a,b": "c,d", "felt": "y" * 30}
+    with pytest.raises(
+        FormatError, match=r"cannot send 'c,d' \(3 characters\), 'y+' \(30 characters\)"
+    ):
+        taken(tmp_path, renames=bad)
+    for k, name in enumerate(("a,b", "x" * 30, "felt")):
+        text(tmp_path / f"{name}_1.csv", COUNTS + k)
+    s = taken(tmp_path, renames={"a,b": "ab", "x" * 30: "ab"}).sweeps
+    assert (s.materials, s.labels.tolist()) == (("ab", "felt"), [0, 1, 0])
+    with pytest.raises(FormatError, match="there is no material 'felz'; did you mean 'felt'"):
+        taken(tmp_path, renames={"felz": "wool"})
+
+
+def test_shapes_that_differ_are_refused(tmp_path: Path):
+    """Arrays of two grids are not a set; nor is a path that is not a folder, or a folder in which
+    no file matches."""
+    np.save(tmp_path / "cork_1.npy", np.zeros((20, 2, 2)))
+    np.save(tmp_path / "felt_1.npy", np.zeros((20, 2, 3)))
+    with pytest.raises(FormatError, match=r"frames differ in shape: \[\[2, 2\], \[2, 3\]\]"):
+        taken(tmp_path, grid="")
+    with pytest.raises(FormatError, match="is not a folder"):
+        taken(tmp_path / "cork_1.npy")
+    with pytest.raises(
+        FormatError, match=r"no file matches --pattern .*; the first file is 'cork_1.npy'"
+    ):
+        taken(tmp_path, pattern=NamePattern("{material}.csv"))
+
+
+def test_axes_are_the_last_of_a_frame(tmp_path: Path):
+    """Columns x, y, z of each taxel become frames [R, C, A]."""
+    counts = np.arange(20 * 12).reshape(20, 12) % 250
+    for name in ("cork_1", "felt_1"):
+        text(tmp_path / f"{name}.csv", counts)
+    s = taken(tmp_path, grid="2x2x3").sweeps
+    np.testing.assert_array_equal(s.samples[0], counts[5:15].reshape(10, 2, 2, 3))
+    assert taken(tmp_path, grid="3x4x1").sweeps.samples.shape == (2, 10, 3, 4)
+
+
+def test_a_name_that_cannot_be_sent_becomes_a_display_name(tmp_path: Path):
+    """The import goes on and proposes an ASCII name that no other material has. The set keeps the
+    name of the file, in .npz and HDF5; two that become one material have no display name."""
+    names = ("felt", "Filz, weiß", "Filz weiss", "木", "x" * 30, "a,b")
+    for k, name in enumerate(names):
+        text(tmp_path / "in" / f"{name}_1.csv", COUNTS + k)
+    made = taken(tmp_path / "in", renames={"a,b": "felt"})
+    displays = {
+        "Filz weiss 2": "Filz, weiß",
+        "material 5": "木",
+        "x" * 24: "x" * 30,
+        "felt": "a,b",
+    }
+    assert made.sweeps.displays == displays
+    assert set(made.sweeps.materials) == {"Filz weiss", *displays}
+    assert "'木' is sent as 'material 5'; --rename changes that" in made.notes
+    for name in ("set.npz", "set.h5"):
+        made.sweeps.save(tmp_path / name)
+        assert sets.load(str(tmp_path / name)).displays == displays
+
+
+def test_a_missing_grid_ends_the_import_at_the_first_file(tmp_path: Path):
+    """The other files are not read: they would need it, too."""
+    text(tmp_path / "a_1.csv")
+    (tmp_path / "b_2.csv").write_text("not read")
+    left_out: list[LeftOut] = []
+    with pytest.raises(FormatError, match=r"a_1.csv has 4 columns; give their layout with --grid"):
+        import_folder(tmp_path, plan(grid=""), lambda line: None, left_out)
+    assert left_out == []
+
+
+def test_columns_in_another_order_are_refused_unless_they_are_named(tmp_path: Path):
+    """Taxels would change places, silently. The place of the times does not matter."""
+    timed = np.column_stack([np.arange(40) / 100, COUNTS])
+    text(tmp_path / "felt_1.csv", np.roll(timed, -1, axis=1) + 1, head="a,b,c,d,t\n")
+    text(tmp_path / "felt_2.csv", timed[:, ::-1], head="d,c,b,a,t\n")
+    text(tmp_path / "wood_1.csv", timed, head="t,a,b,c,d\n")
+    assert reasons(tmp_path, time="t:s", rate_hz=None) == {
+        "felt_2.csv": "has the column 'd' where another file has 'a'; "
+        "give the order of the taxels with --columns and their names"
+    }
+    made = taken(tmp_path, time="t:s", rate_hz=None, columns="a,b,c,d")
+    np.testing.assert_array_equal(made.sweeps.samples[1], made.sweeps.samples[2])
+
+
+ARRAYS = {
+    "npz": lambda path, arrays: np.savez(path, **arrays),
+    "mat": lambda path, arrays: scipy.io.savemat(path, arrays),
+    "h5": lambda path, arrays: [
+        h5py.File(path, "a").create_dataset(f"day/{name}", data=x).file.close()
+        for name, x in arrays.items()
+    ],
+}
+
+
+@pytest.mark.parametrize("suffix", ARRAYS)
+def test_each_array_whose_name_matches_is_a_recording(tmp_path: Path, suffix: str):
+    """The name of the array has the material and the trial, that of the file the session; times and
+    other arrays are passed over."""
+    for session, first in (("mo", 1), ("tu", 3)):
+        arrays = {f"{m}_{k}": COUNTS + k for k in (first, first + 1) for m in ("felt", "wool")}
+        ARRAYS[suffix](
+            tmp_path / f"{session}.{suffix}", arrays | {"t": np.arange(40.0), "x": COUNTS}
+        )
+    made = taken(
+        tmp_path,
+        pattern=NamePattern("{session}.{}", ("material", "trial")),
+        variable="{material}_{trial:d}",
+    ).sweeps
+    assert made.materials == ("felt", "wool")
+    held = zip(
+        made.labels,
+        made.group("session"),
+        made.group("trial"),
+        made.samples[:, 0, 0, 0],
+        strict=True,
+    )
+    first = int(COUNTS[15, 0])
+    wanted = [(m, "mo" if k < 3 else "tu", k, first + k) for m in (0, 1) for k in (1, 2, 3, 4)]
+    assert sorted((int(a), str(b), int(c), int(d)) for a, b, c, d in held) == wanted
+    assert len(np.unique(made.group("recording"))) == 8
+
+
+def test_arrays_without_a_pattern_of_files(tmp_path: Path):
+    """The arrays alone say all; a label that cannot be sent gets another."""
+    np.savez(tmp_path / "all.npz", **{"Filz weiß 1": COUNTS, "wool 2": COUNTS + 1})
+    made = taken(tmp_path, pattern=None, variable="{material} {trial:d}").sweeps
+    assert made.materials == ("Filz weiss", "wool")
+    assert made.displays == {"Filz weiss": "Filz weiß"}
+
+
+def test_arrays_that_cannot_be_recordings_are_named(tmp_path: Path):
+    """A file without arrays, one without a match, and a name that fits in several ways."""
+    text(tmp_path / "a.csv")
+    np.savez(tmp_path / "b.npz", felt=COUNTS, t=np.arange(40.0))
+    np.savez(tmp_path / "c.npz", felt_a_b=COUNTS, felt_c=COUNTS, **{"wool_1": COUNTS[:3]})
+    why = reasons(tmp_path, pattern=None, variable="{material}_{trial}")
+    assert why["a.csv"].startswith("holds no named arrays; --variable takes a name there")
+    assert why["b.npz"] == (
+        "has no array of frames that matches --variable '{material}_{trial}'; it holds felt"
+    )
+    assert why["c.npz felt_a_b"].startswith("its name fits the pattern in several ways")
+    assert why["c.npz wool_1"] == "has 3 frames, but a window needs 10; see --window"
+    assert len(why) == 4
+
+
+@pytest.mark.parametrize(
+    ("variable", "pattern", "message"),
+    [
+        ("{material", "{material}.csv", "--variable '{material' has an unmatched brace"),
+        ("{trial}", None, "--variable '{trial}' does not say where the material stands"),
+        ("{material}", "{material}.csv", "material stands in --pattern and in --variable"),
+        ("{material}{recording}", None, "--variable: each file or array is a recording"),
+    ],
+)
+def test_patterns_of_arrays_that_cannot_be(variable: str, pattern: str | None, message: str):
+    """Each is refused by the name of its option."""
+    named = NamePattern(pattern) if pattern else None
+    with pytest.raises(FormatError, match=re.escape(message)):
+        plan(pattern=named, variable=variable)
+
+
+def test_a_square_grid_of_hdf5_may_have_its_axes_reversed(tmp_path: Path):
+    """MATLAB's h5write leaves no sign of itself, so the import says how to turn the frames. With
+    --axes, and for an array that MATLAB itself saved, nothing is open."""
+    frames = np.arange(640, dtype=np.int16).reshape(40, 4, 4)
+    for name, kind in (("felt_1", None), ("wool_1", b"int16")):
+        with h5py.File(tmp_path / f"{name}.h5", "w") as file:
+            made = file.create_dataset("skin", data=frames if kind is None else frames.T)
+            if kind:
+                made.attrs["MATLAB_class"] = np.bytes_(kind)
+    plain = taken(tmp_path, grid="4x4")
+    notes = {one.name: one.notes for one in plain.taken}
+    assert "--axes frame,column,row" in notes["felt_1.h5"]
+    assert "h5write" not in notes["wool_1.h5"]
+    (tmp_path / "wool_1.h5").unlink()
+    turned = taken(tmp_path, grid="4x4", axes="frame,column,row")
+    assert "h5write" not in turned.taken[0].notes
+    np.testing.assert_array_equal(turned.sweeps.samples[0], plain.sweeps.samples[0].swapaxes(1, 2))

@@ -1,0 +1,231 @@
+"""LeRobot data sets: episodes become recordings, tasks become materials; versions 2.1 and 3.0.
+Sets are written as version 3.0, and LeRobot reads them where it is installed."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from palpate.core.errors import FormatError
+from palpate_train.cli.main import main
+from palpate_train.data import lerobot_writer, sets
+from tests.factories import lerobot as environment
+
+COUNTS = np.arange(4 * 60 * 6, dtype=np.float32).reshape(4, 60, 2, 3) % 997
+TASKS = ("slide over wood", "slide over felt")
+
+
+def data_set(folder: Path, version: str, **features: Any) -> Path:
+    """Four episodes of 60 frames at 30 Hz of a 2x3 skin; the task of an episode alternates."""
+    pa = pytest.importorskip("pyarrow")
+    parquet = pytest.importorskip("pyarrow.parquet")
+    skin = {"observation.tactile": {"dtype": "float32", "shape": [2, 3], "names": None}}
+    arm = {"observation.state": {"dtype": "float32", "shape": [6], "names": None}}
+    camera = {"observation.images.touch": {"dtype": "video", "shape": [480, 640, 3]}}
+    info = {"codebase_version": version, "fps": 30, "features": skin | arm | camera | features}
+    (folder / "meta").mkdir(parents=True)
+    (folder / "meta" / "info.json").write_text(json.dumps(info))
+    tables = [
+        pa.table(
+            {
+                "observation.state": np.zeros((60, 6)).tolist(),
+                "observation.tactile": frames.tolist(),
+                "timestamp": np.arange(60, dtype=np.float32) / 30,
+                "frame_index": np.arange(60),
+                "episode_index": np.full(60, k),
+                "task_index": np.full(60, k % 2),
+                "operator": ["Ada" if k < 2 else "Bob"] * 60,
+            }
+        )
+        for k, frames in enumerate(COUNTS)
+    ]
+    chunk = folder / "data" / "chunk-000"
+    chunk.mkdir(parents=True)
+    if version == "v3.0":
+        parquet.write_table(pa.concat_tables(tables), chunk / "file-000.parquet")
+        tasks = pa.table({"task_index": [0, 1], "__index_level_0__": list(TASKS)})
+        parquet.write_table(tasks, folder / "meta" / "tasks.parquet")
+        return folder
+    for k, table in enumerate(tables):
+        parquet.write_table(table, chunk / f"episode_{k:06}.parquet")
+    lines = [json.dumps({"task_index": k, "task": text}) + "\n" for k, text in enumerate(TASKS)]
+    (folder / "meta" / "tasks.jsonl").write_text("".join(lines))
+    return folder
+
+
+def imported(folder: Path, *more: str) -> int:
+    return main(
+        ["import", str(folder), "--out", str(folder.parent / "s.npz"), "--window", "20", *more]
+    )
+
+
+MATERIAL = (
+    "--field",
+    "material=task",
+    "--rename",
+    f"{TASKS[0]}=wood",
+    "--rename",
+    f"{TASKS[1]}=felt",
+)
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_tactile_columns_become_sweeps(tmp_path: Path, version: str):
+    """Rate, grid and materials come from the set; other columns can be groups."""
+    folder = data_set(tmp_path / "set", version)
+    more = ("--field", "session=operator", "--field", "trial=episode_index")
+    assert imported(folder, *MATERIAL, *more) == 0
+    made = sets.load(str(tmp_path / "s.npz"))
+    assert str(made.format) == "2x3 int16 at 30 Hz, window 20"
+    assert [made.materials[k] for k in made.labels] == ["wood", "felt", "wood", "felt"]
+    assert made.groups["session"].tolist() == ["Ada", "Ada", "Bob", "Bob"]
+    assert made.groups["trial"].tolist() == [0, 1, 2, 3]
+    np.testing.assert_array_equal(made.samples, COUNTS[:, 20:40])
+
+
+def test_the_times_of_the_set_can_be_used(tmp_path: Path):
+    """--time timestamp:s, with the float32 times that LeRobot writes."""
+    folder = data_set(tmp_path / "set", "v3.0")
+    assert imported(folder, *MATERIAL, "--time", "timestamp:s") == 0
+    np.testing.assert_array_equal(sets.load(str(tmp_path / "s.npz")).samples, COUNTS[:, 20:40])
+
+
+def test_a_feature_is_named_where_several_are_tactile(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """The features of numbers are listed with their shapes."""
+    more = {"observation.touch_left": {"dtype": "float32", "shape": [4]}}
+    folder = data_set(tmp_path / "set", "v3.0", **more)
+    assert imported(folder, *MATERIAL) == 65
+    told = capsys.readouterr().err
+    assert "holds 2 tactile features; name one with --variable: its features of numbers are" in told
+    assert "observation.tactile [2, 3], observation.state [6]" in told
+    assert imported(folder, *MATERIAL, "--variable", "observation.tactile") == 0
+
+
+def test_an_episode_that_lacks_a_frame_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """A row that was filtered out would be spliced over."""
+    folder = data_set(tmp_path / "set", "v3.0")
+    parquet = pytest.importorskip("pyarrow.parquet")
+    path = folder / "data" / "chunk-000" / "file-000.parquet"
+    whole = parquet.read_table(path)
+    pa = pytest.importorskip("pyarrow")
+    parquet.write_table(pa.concat_tables([whole.slice(0, 70), whole.slice(71)]), path)
+    assert imported(folder, *MATERIAL) == 65
+    assert "episode 1 lacks a frame; fetch the whole set" in capsys.readouterr().err
+
+
+BY_LEROBOT = """
+import json, sys
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+first, second = 0, 1 / 750
+whole = LeRobotDataset("own/set", root=sys.argv[1])
+part = LeRobotDataset("own/set", root=sys.argv[1], episodes=[5],
+                      delta_timestamps={"observation.tactile": [first, second]})
+print(json.dumps({
+    "size": [whole.num_episodes, len(whole), whole.fps],
+    "tasks": [part[0]["task"], whole[0]["task"]],
+    "two frames": part[0]["observation.tactile"].tolist(),
+    "position": int(part[0]["position"]),
+    "mean": whole.meta.stats["observation.tactile"]["mean"].tolist(),
+    "normal": whole.meta.stats["observation.tactile"]["std"].shape,
+}))
+"""
+
+
+def written(folder: Path) -> sets.Dataset:
+    """A simulated set of three materials that is written as the data set `folder`."""
+    whole = sets.load("sim:T-REAL:1:1").select(["material=foam,metal,wood", "position<=1"])
+    whole.save(folder.with_suffix(".npz"))
+    assert main(["sets", "lerobot", str(folder.with_suffix(".npz")), str(folder)]) == 0
+    return whole
+
+
+def test_a_set_is_written_and_read_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Sweeps, type, rate, materials and groups stay; also with several files."""
+    pytest.importorskip("pyarrow")
+    monkeypatch.setattr(lerobot_writer, "FILE_BYTES", 4 * 24000)
+    whole = written(tmp_path / "set")
+    assert len(list((tmp_path / "set" / "data").rglob("*.parquet"))) == 2
+    out = tmp_path / "back.npz"
+    more = ("--field", "material=task", "--field", "position=position")
+    assert main(["import", str(tmp_path / "set"), *more, "--out", str(out)]) == 0
+    back = sets.load(str(out))
+    np.testing.assert_array_equal(back.samples, whole.samples)
+    assert back.format == whole.format
+    names, same = ([s.materials[k] for k in s.labels] for s in (back, whole))
+    assert names == same
+    assert back.groups["position"].tolist() == whole.groups["position"].tolist()
+
+
+@pytest.mark.slow
+def test_lerobot_itself_reads_a_written_set(tmp_path: Path):
+    """Frames at neighbouring times, tasks, groups and statistics."""
+    environment.required()
+    pytest.importorskip("pyarrow")
+    whole = written(tmp_path / "set")
+    found = environment.run(BY_LEROBOT, tmp_path / "set")
+    assert found["size"] == [6, 9000, 750]
+    assert found["tasks"] == [whole.materials[whole.labels[k]] for k in (5, 0)]
+    assert found["two frames"] == whole.samples[5, :2].tolist()
+    assert found["position"] == whole.groups["position"][5]
+    np.testing.assert_allclose(found["mean"], whole.samples.mean(axis=(0, 1)))
+    assert found["normal"] == [4, 4]
+
+
+@pytest.mark.parametrize(
+    ("group", "folder", "why"),
+    [
+        ("timestamp", "new", "its group 'timestamp' has the name of a column of LeRobot"),
+        ("person", "s.npz", "is there already; name a new folder"),
+        ("person", "no/new", "there is no folder"),
+    ],
+)
+def test_a_set_that_cannot_be_written_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], group: str, folder: str, why: str
+):
+    """Nothing is written."""
+    samples = np.arange(2 * 9 * 4, dtype=np.uint8).reshape(2, 9, 2, 2)
+    people = {group: np.array(["Ada", "Bob"])}
+    made = sets.Dataset(samples, np.array([0, 1]), ("felt", "wood"), 12.5, people)
+    made.save(tmp_path / "s.npz")
+    out = tmp_path / folder
+    assert main(["sets", "lerobot", str(tmp_path / "s.npz"), str(out)]) == 65
+    assert why in capsys.readouterr().err
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["s.npz"]
+
+
+def test_names_and_a_broken_rate_are_written(tmp_path: Path):
+    """Groups of names are texts, which have no statistics."""
+    pytest.importorskip("pyarrow")
+    samples = np.arange(2 * 9 * 4, dtype=np.float32).reshape(2, 9, 2, 2)
+    people = {"person": np.array(["Ada", "Bob"]), "force": np.array([0.5, 1.5])}
+    made = sets.Dataset(samples, np.array([0, 1]), ("felt", "wood"), 12.5, people)
+    lerobot_writer.write(made, tmp_path / "set")
+    info = json.loads((tmp_path / "set" / "meta" / "info.json").read_text())
+    assert info["fps"] == 12.5
+    assert info["features"]["person"] == {"dtype": "string", "shape": [1], "names": None}
+    stats = json.loads((tmp_path / "set" / "meta" / "stats.json").read_text())
+    assert "person" not in stats
+    assert (stats["force"]["min"], stats["force"]["q50"], stats["force"]["count"]) == (
+        [0.5],
+        [1.0],
+        [18],
+    )
+
+
+def test_pyarrow_is_named_where_it_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """What to install, before anything is written."""
+    monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
+    samples = np.zeros((2, 9, 2, 2), np.uint8)
+    made = sets.Dataset(samples, np.array([0, 1]), ("felt", "wood"), 10.0)
+    with pytest.raises(FormatError, match=r"set is a set of Parquet files; to write it: pip"):
+        lerobot_writer.write(made, tmp_path / "set")
+    assert list(tmp_path.iterdir()) == []

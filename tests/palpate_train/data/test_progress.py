@@ -1,0 +1,61 @@
+"""Progress of long work: the share that is done and the time that is left, as a line and as
+numbers."""
+
+from __future__ import annotations
+
+import pytest
+
+from palpate_train.data.progress import Progress, ProgressLine, spoken
+
+
+class SteppedClock:
+    """A clock that the test sets, in seconds."""
+
+    now = 0.0
+
+    def __call__(self) -> float:
+        """Now."""
+        return self.now
+
+
+def test_progress_shows_how_much_is_left():
+    """Tasks done, tasks in all, the time left estimated from finished tasks, and the task; the line
+    carries the same numbers."""
+    lines: list[str] = []
+    clock = SteppedClock()
+    progress = Progress(4, lines.append, clock)
+    for what in ("a", "b"):
+        clock.now += 30
+        progress(what)
+    assert lines == ["1/4 done, 90 s left (a)", "2/4 done, 60 s left (b)"]
+    assert progress.done == 2
+    assert isinstance(lines[1], ProgressLine)
+    assert (lines[1].done, lines[1].total) == (2, 4)
+
+
+def test_a_task_that_begins_is_not_done():
+    """It counts as done when the next task begins; an estimate needs a finished
+    task."""
+    lines: list[str] = []
+    clock = SteppedClock()
+    progress = Progress(3, lines.append, clock)
+    progress.begin("a")
+    clock.now += 120
+    progress.begin("b")
+    assert lines == ["0/3 done (a)", "1/3 done, 4 min left (b)"]
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [
+        (0, "0 s"),
+        (99, "99 s"),
+        (100, "2 min"),
+        (5999, "100 min"),
+        (6000, "1.7 h"),
+        (36000, "10.0 h"),
+    ],
+)
+def test_a_duration_is_said_in_the_unit_that_suits_it(seconds: float, text: str):
+    """Seconds, minutes, hours."""
+    assert spoken(seconds) == text

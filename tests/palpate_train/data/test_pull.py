@@ -1,0 +1,490 @@
+"""Fetching recordings: only new ones, whole pairs whenever a connection breaks, nothing
+overwritten, and nothing else accepted.
+
+The box is this machine: an `ssh` that hands its command to sh, with the real find, sha256sum and
+tar. One test uses a real sshd if openssh-server is installed.
+"""
+
+from __future__ import annotations
+
+import getpass
+import io
+import json
+import os
+import shutil
+import subprocess
+import tarfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from palpate.core.errors import ApplianceError, FormatError
+from palpate.core.types import Status, load
+from palpate_train.cli.main import parser
+from palpate_train.data import pull
+from palpate_train.data.pull import PullReport, RecordingHost
+from tests.factories.recordings import record
+
+SSH = """#!/bin/sh
+for command; do :; done
+case "$command" in *{when}*) {what} ;; esac
+exec sh -c "$command"
+"""
+SSHD = Path("/usr/sbin/sshd")
+
+
+class Ground:
+    """A box with the folder `box`, and the local folder `here`; `ssh` can be replaced."""
+
+    def __init__(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.box, self.here, self.bin = path / "box", path / "here", path / "bin"
+        self.bin.mkdir()
+        self.ssh()
+        monkeypatch.setenv("PATH", str(self.bin), prepend=os.pathsep)
+        for i in range(4):
+            record(self.box / f"run {i // 2}" / f"sweep-{i:06d}.npy", "ab"[i % 2], id=i)
+
+    def ssh(self, when: str = "nothing", what: str = "") -> None:
+        """From now on `ssh` does `what` if its command holds `when`."""
+        self.program("ssh", SSH.format(when=when, what=what))
+
+    def program(self, name: str, text: str) -> None:
+        """Put a command before the system's."""
+        (self.bin / name).write_text(text)
+        (self.bin / name).chmod(0o755)
+
+    def pull(self, *more: str) -> None:
+        """Run the command."""
+        args = parser("pull").parse_args(
+            ["pull", "user@box", "--from", str(self.box), "--out", str(self.here), *more]
+        )
+        args.run(args)
+
+    def fetch(self) -> PullReport:
+        """Call the function behind the command."""
+        tally = PullReport()
+        pull.pull(RecordingHost("user@box", str(self.box)), self.here, tally, lambda line: None)
+        return tally
+
+    def same(self) -> bool:
+        """Whether `here` holds exactly the files of the box."""
+        return files(self.here) == files(self.box)
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    """All files in a folder and below."""
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
+
+
+@pytest.fixture
+def ground(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Ground:
+    """A box with four recordings of two runs."""
+    return Ground(tmp_path, monkeypatch)
+
+
+def test_what_is_new_is_fetched(ground: Ground, capsys: pytest.CaptureFixture[str]):
+    """All recordings at first, then none, then the new recording; folders are the box's."""
+    ground.pull()
+    assert capsys.readouterr().out == "fetched 4, there already 0, refused 0\n"
+    assert ground.same()
+    ground.ssh("tar", "exit 1")  # no recording that is present is fetched
+    ground.pull()
+    assert capsys.readouterr().out == "fetched 0, there already 4, refused 0\n"
+    ground.ssh()
+    record(ground.box / "run 1" / "sweep-000004.npy", "a", id=4)
+    ground.pull()
+    assert capsys.readouterr().out == "fetched 1, there already 4, refused 0\n"
+    assert ground.same()
+
+
+def test_a_box_without_recordings_has_none(ground: Ground, capsys: pytest.CaptureFixture[str]):
+    """An empty folder is not an error, and no local folder is made."""
+    shutil.rmtree(ground.box)
+    ground.box.mkdir()
+    ground.pull()
+    assert capsys.readouterr().out.startswith("fetched 0, ")
+    assert not ground.here.exists()
+
+
+def test_names_that_a_shell_would_read_otherwise_are_kept(ground: Ground):
+    """Spaces, quotes, dollars, a leading dash, several dots, letters of other languages, and long
+    names."""
+    for name in (
+        "a b",
+        "it's $HOME",
+        "-rf",
+        "--checkpoint",
+        "v1.2",
+        "Häkelgarn",
+        "x" * 150,
+        "*",
+        "\\n",
+    ):
+        record(ground.box / name / f"{name}.npy", id=1)
+    assert len(ground.fetch().fetched) == 13
+    assert ground.same()
+
+
+@pytest.mark.slow
+def test_a_connection_that_breaks_off_leaves_whole_pairs(ground: Ground):
+    """Wherever the stream ends: local files equal the box's, byte for byte and in pairs, and the
+    next call fetches the rest."""
+    whole = sum(len(data) for data in files(ground.box).values()) + 8 * 512
+    for cut in [*range(0, whole, 700), whole]:
+        ground.ssh("tar", f'sh -c "$command" | head -c {cut}; exit 255')
+        with pytest.raises(
+            ApplianceError, match="user@box: no connection; see that `ssh user@box true` works"
+        ):
+            ground.fetch()
+        held = files(ground.here) if ground.here.exists() else {}
+        assert held.items() <= files(ground.box).items()
+        assert {name[:-4] for name in held if name.endswith(".npy")} == {
+            name[:-5] for name in held if name.endswith(".json")
+        }
+        ground.ssh()
+        assert len(ground.fetch().fetched) == 4 - len(held) // 2
+        assert ground.same()
+        shutil.rmtree(ground.here)
+
+
+def test_an_interrupted_call_goes_on(ground: Ground):
+    """Ctrl-C after two recordings: these stay, and the next call fetches the other two."""
+    tally = PullReport()
+
+    def stop(line: str) -> None:
+        if line.startswith("2/4 done"):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        pull.pull(RecordingHost("user@box", str(ground.box)), ground.here, tally, stop)
+    assert len(tally.fetched) == 2
+    assert len(files(ground.here)) == 4
+    again = ground.fetch()
+    assert (len(again.present), len(again.fetched)) == (2, 2)
+    assert ground.same()
+
+
+def test_what_is_left_of_a_kill_is_made_whole(ground: Ground):
+    """A lone sidecar, as after a kill between the two files, or a temporary file: the pair is
+    fetched again."""
+    ground.fetch()
+    (ground.here / "run 0" / "sweep-000000.npy").unlink()
+    (ground.here / "run 0" / "sweep-000001.npy").unlink()
+    (ground.here / "run 0" / "sweep-000001.json").unlink()
+    (ground.here / "run 0" / "sweep-000001.json.part").write_text("{")
+    assert sorted(ground.fetch().fetched) == ["run 0/sweep-000000", "run 0/sweep-000001"]
+    assert ground.same()
+
+
+def test_half_a_recording_is_left_there(ground: Ground, capsys: pytest.CaptureFixture[str]):
+    """A missing sidecar, or the sidecar of a sweep in progress: reported and not fetched; the
+    others are fetched."""
+    (ground.box / "run 0" / "sweep-000000.json").unlink()
+    (ground.box / "run 1" / "sweep-000003.npy").unlink()
+    (ground.box / "run 1" / "sweep-000004.npy.part").write_bytes(b"half")
+    ground.pull()
+    out = capsys.readouterr().out
+    assert out.startswith("fetched 2, there already 0, refused 0\n")
+    assert (
+        "run 0/sweep-000000, run 1/sweep-000003: without its .json or .npy on the box; left there\n"
+        in out
+    )
+    assert sorted(files(ground.here)) == [
+        f"run {i // 2}/sweep-00000{i}.{end}" for i in (1, 2) for end in ("json", "npy")
+    ]
+
+
+def test_another_sweep_of_the_same_name_is_never_written_over(
+    ground: Ground, capsys: pytest.CaptureFixture[str]
+):
+    """A box that counts from 1 again: both sweeps stay where they are, and the call fails."""
+    ground.fetch()
+    before = files(ground.here)
+    record(ground.box / "run 0" / "sweep-000000.npy", "b", id=77)
+    with pytest.raises(FormatError, match="1 recordings of user@box were not taken"):
+        ground.pull()
+    assert (
+        "run 0/sweep-000000: the box has another sweep of the same name; the sweep in"
+        in capsys.readouterr().out
+    )
+    assert files(ground.here) == before
+
+
+def test_a_label_that_was_set_right_here_stays(ground: Ground, capsys: pytest.CaptureFixture[str]):
+    """The user may edit a sidecar: it is reported, but is not a failure. The same if it was edited
+    on the box."""
+    ground.fetch()
+    mine = ground.here / "run 0" / "sweep-000000.json"
+    mine.write_text(json.dumps(json.loads(mine.read_text()) | {"material": "cork"}))
+    theirs = ground.box / "run 0" / "sweep-000001.json"
+    theirs.write_text(json.dumps(json.loads(theirs.read_text()) | {"material": "felt"}))
+    before = files(ground.here)
+    ground.pull()
+    out = capsys.readouterr().out
+    assert out.startswith(
+        "fetched 0, there already 2, refused 0\n"
+        "run 0/sweep-000000, run 0/sweep-000001: the box has another description"
+    )
+    assert files(ground.here) == before
+
+
+def test_what_is_no_recording_is_refused(ground: Ground, capsys: pytest.CaptureFixture[str]):
+    """A recording that is broken on the box is not stored; the others are. A recording without
+    frames is valid."""
+    (ground.box / "run 0" / "sweep-000000.npy").write_bytes(b"\x93NUMPY")
+    (ground.box / "run 0" / "sweep-000001.json").write_text("{}")
+    np.save(ground.box / "run 1" / "sweep-000002.npy", np.array([{}], object), allow_pickle=True)
+    record(ground.box / "sweep-000009.npy", status=Status.GAP, frames=0)
+    with pytest.raises(FormatError, match="3 recordings of user@box were not taken"):
+        ground.pull()
+    out = capsys.readouterr().out
+    assert out.startswith("fetched 2, there already 0, refused 3\n")
+    assert "run 0/sweep-000000 (" in out
+    assert sorted(files(ground.here)) == [
+        *(f"run 1/sweep-000003.{end}" for end in ("json", "npy")),
+        "sweep-000009.json",
+        "sweep-000009.npy",
+    ]
+
+
+def test_what_changes_while_it_is_fetched_is_refused(ground: Ground):
+    """The bytes differ from the hash in the list."""
+    ground.ssh("tar", f"echo >> '{ground.box}/run 0/sweep-000000.json'")
+    tally = ground.fetch()
+    assert tally.refused == [
+        "run 0/sweep-000000 (run 0/sweep-000000.json changed while it was fetched; "
+        "run the same command again)"
+    ]
+    assert len(tally.fetched) == 3
+
+
+def test_what_goes_away_meanwhile_is_told(ground: Ground, capsys: pytest.CaptureFixture[str]):
+    """Removed between list and stream: the others are kept, and the box's message is passed on."""
+    ground.ssh("tar", f"rm '{ground.box}/run 0/sweep-000000.npy'")
+    with pytest.raises(ApplianceError, match="run the same command again"):
+        ground.fetch()
+    assert "sweep-000000.npy" in capsys.readouterr().err
+    assert len(files(ground.here)) == 6
+
+
+def member(name: str, kind: bytes = tarfile.REGTYPE, data: bytes = b"x", link: str = "") -> bytes:
+    """An archive with one member of any kind."""
+    held = io.BytesIO()
+    with tarfile.open(fileobj=held, mode="w") as archive:
+        info = tarfile.TarInfo(name)
+        info.type, info.size, info.linkname = kind, len(data), link
+        archive.addfile(info, io.BytesIO(data))
+    return held.getvalue()
+
+
+@pytest.mark.parametrize(
+    "archive",
+    [
+        member("../evil.npy"),
+        member("run 0/../../evil.npy"),
+        member("/tmp/evil.npy"),
+        member("run 0/sweep-000007.npy"),
+        member("run 0/sweep-000000.npy", tarfile.SYMTYPE, b"", "/etc/passwd"),
+        member("run 0/sweep-000000.npy", tarfile.LNKTYPE, b"", "../../../etc/passwd"),
+        member("run 0", tarfile.SYMTYPE, b"", "/tmp"),
+        member("run 0/sweep-000000.npy", tarfile.CHRTYPE, b""),
+        member("run 0/sweep-000000.npy", tarfile.FIFOTYPE, b""),
+        member("run 0/sweep-000000.npy", tarfile.DIRTYPE, b""),
+    ],
+)
+def test_a_hostile_archive_is_refused(ground: Ground, archive: bytes):
+    """Paths outside the folder, absolute paths, links, devices, files that were not requested: none
+    is written."""
+    (ground.bin / "archive").write_bytes(archive)
+    ground.ssh("tar", f"exec cat '{ground.bin}/archive'")
+    with pytest.raises(
+        FormatError, match=r"the box sends '.*', which was not requested; check that box"
+    ):
+        ground.fetch()
+    assert not ground.here.exists()
+
+
+def test_a_member_beyond_all_size_is_refused(ground: Ground):
+    """Refused before its bytes are read: the archive holds only its header."""
+    info = tarfile.TarInfo("run 0/sweep-000000.json")
+    info.size = 1 << 40
+    (ground.bin / "archive").write_bytes(info.tobuf())
+    ground.ssh("tar", f"exec cat '{ground.bin}/archive'")
+    with pytest.raises(FormatError, match="which was not requested"):
+        ground.fetch()
+
+
+def test_a_name_that_leads_elsewhere_is_refused(ground: Ground):
+    """A path in the list that leads elsewhere: it is not requested, and the others are fetched."""
+    record(ground.box.parent / "evil.npy")
+    sha256 = "f" * 64
+    (ground.box / "run 0" / "line\nbreak.npy").write_bytes(b"")
+    ground.program(
+        "find",
+        f"""#!/bin/sh
+        printf '{sha256}  ./../evil.npy\\0{sha256}  ./../evil.json\\0{sha256}  .//etc/evil.npy\\0'
+        exec {shutil.which("find")} "$@"
+    """,
+    )
+    tally = ground.fetch()
+    assert [refused.partition(" (")[0] for refused in tally.refused] == [
+        "'../evil'",
+        "'/etc/evil'",
+        "'run 0/line\\nbreak'",
+    ]
+    assert ground.fetch().present == tally.fetched
+    assert len(files(ground.here)) == 8
+
+
+def test_a_shell_that_talks_is_named(ground: Ground):
+    """A greeting before the list is not a file."""
+    ground.ssh("find", "echo Welcome")
+    with pytest.raises(
+        FormatError, match=r"user@box sends b'Welcome.*; see that its shell prints nothing at login"
+    ):
+        ground.fetch()
+
+
+def test_a_folder_of_others_is_read_with_sudo(ground: Ground):
+    """Only if it cannot be read without sudo; sudo runs the same script."""
+    ground.program("sudo", f'#!/bin/sh\ntouch "{ground.bin}/asked"\nshift\nexec "$@"\n')
+    ground.fetch()
+    assert not (ground.bin / "asked").exists()
+    shutil.rmtree(ground.here)
+    ground.program("test", "#!/bin/sh\nexit 1\n")
+    ground.ssh(
+        "sh", f'command=$(echo "$command" | sed "s:test -r:{ground.bin}/test -r:")'
+    )  # root may read anything
+    assert len(ground.fetch().fetched) == 4
+    assert (ground.bin / "asked").exists()
+
+
+def test_a_folder_that_cannot_be_read_is_named(ground: Ground, capsys: pytest.CaptureFixture[str]):
+    """It does not exist for this user, and sudo asks for a password: one message, after the box's
+    messages."""
+    ground.program("sudo", "#!/bin/sh\necho 'sudo: a password is required' >&2\nexit 1\n")
+    with pytest.raises(
+        ApplianceError,
+        match=r"^user@box: /nowhere cannot be read; name another folder with --from, .*",
+    ):
+        pull.pull(
+            RecordingHost("user@box", "/nowhere"), ground.here, PullReport(), lambda line: None
+        )
+    assert capsys.readouterr().err == "user@box: sudo: a password is required\n"
+
+
+def test_a_box_that_has_recorded_nothing_says_so(ground: Ground):
+    """The folder does not exist, as sudo confirms."""
+    ground.program("sudo", '#!/bin/sh\nshift\nexec "$@"\n')
+    with pytest.raises(
+        ApplianceError, match=r"^user@box: there is no /nowhere; record something first"
+    ):
+        pull.pull(
+            RecordingHost("user@box", "/nowhere"), ground.here, PullReport(), lambda line: None
+        )
+
+
+def test_a_list_or_stream_that_is_cut_short_is_told(ground: Ground):
+    """Failing or missing tools never look like a box without recordings, however the connection
+    ends."""
+    ground.ssh("tar", "exit 0")
+    with pytest.raises(
+        ApplianceError, match="only 0 of 4 recordings came; run the same command again"
+    ):
+        ground.fetch()
+    ground.program("find", "#!/bin/sh\nexit 127\n")
+    with pytest.raises(ApplianceError, match="cannot be read"):
+        ground.fetch()
+
+
+def test_an_npy_takes_its_name_last(ground: Ground, monkeypatch: pytest.MonkeyPatch):
+    """As on a recording box: no .npy is ever without its sidecar, whenever the power fails."""
+    taken = []
+    monkeypatch.setattr(
+        pull.storage, "put_all", lambda held: taken.extend(path.suffix for path in held)
+    )
+    ground.fetch()
+    assert taken == [".json", ".npy"] * 4
+
+
+def test_ssh_is_asked_without_questions(ground: Ground):
+    """The user's options come first, so they take effect; no password is asked for; a host is never
+    read as an option."""
+    ground.program("ssh", f'#!/bin/sh\nprintf "%s\\n" "$@" > "{ground.bin}/asked"\nexit 255\n')
+    with pytest.raises(ApplianceError, match="no connection"):
+        ground.pull("--port", "2222", "--ssh-option", "BatchMode=no")
+    asked = (ground.bin / "asked").read_text().splitlines()
+    assert asked[:6] == ["-o", "BatchMode=no", "-p", "2222", "-o", "BatchMode=yes"]
+    assert asked[asked.index("--") + 1] == "user@box"
+    assert "ConnectTimeout=10" in asked
+
+
+def test_no_ssh_here_is_told(ground: Ground, monkeypatch: pytest.MonkeyPatch):
+    """The message says what to install."""
+    monkeypatch.setenv("PATH", "/nowhere")
+    with pytest.raises(ApplianceError, match="ssh is not installed; apt install openssh-client"):
+        ground.fetch()
+
+
+@pytest.fixture
+def sshd(tmp_path: Path) -> list[str]:
+    """A real sshd on loopback with its own key; the options that reach it."""
+    if not SSHD.exists():
+        pytest.skip("no sshd: apt-get install openssh-server")
+    if os.getuid() == 0:
+        Path("/run/sshd").mkdir(exist_ok=True)  # normally made by its service
+    for name in ("host", "mine"):
+        subprocess.run(
+            ["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", tmp_path / name], check=True
+        )
+    settings = {
+        "HostKey": tmp_path / "host",
+        "AuthorizedKeysFile": tmp_path / "mine.pub",
+        "PidFile": "none",
+        "StrictModes": "no",
+        "UsePAM": "no",
+        "PasswordAuthentication": "no",
+        "KbdInteractiveAuthentication": "no",
+    }
+    (tmp_path / "config").write_text(
+        "".join(f"{name} {value}\n" for name, value in settings.items())
+    )
+    # sshd takes one connection from a socket that ssh itself holds: no port is needed
+    proxy = f"ProxyCommand={SSHD} -i -f {tmp_path}/config"
+    return [
+        "-F",
+        "none",
+        "-o",
+        proxy,
+        "-o",
+        f"IdentityFile={tmp_path}/mine",
+        "-o",
+        f"UserKnownHostsFile={tmp_path}/known",
+        "-o",
+        "StrictHostKeyChecking=accept-new",
+        "-o",
+        "IdentityAgent=none",
+    ]
+
+
+@pytest.mark.slow
+def test_through_a_real_sshd(tmp_path: Path, sshd: list[str]):
+    """Keys, a login shell, the real tools: everything is fetched, twice; a wrong key gives no
+    connection."""
+    for i in range(3):
+        record(tmp_path / "box" / "a session" / f"sweep-{i:06d}.npy", "ab"[i % 2], id=i)
+    box = RecordingHost(f"{getpass.getuser()}@palpate", str(tmp_path / "box"), sshd)
+    tally = PullReport()
+    pull.pull(box, tmp_path / "here", tally, lambda line: None)
+    pull.pull(box, tmp_path / "here", tally, lambda line: None)
+    assert (len(tally.fetched), len(tally.present)) == (3, 3)
+    assert files(tmp_path / "here") == files(tmp_path / "box")
+    assert load(tmp_path / "here" / "a session" / "sweep-000002.npy")[0].material == "a"
+    (tmp_path / "mine.pub").write_text("")
+    with pytest.raises(ApplianceError, match="no connection"):
+        pull.listing(box)

@@ -1,0 +1,495 @@
+"""Sweep sets: refused sets and their messages, and groups that stay together."""
+
+from __future__ import annotations
+
+import pickle
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from palpate.core.errors import FormatError
+from palpate.sim import skin
+from palpate_train.data import sets
+from tests.factories.sweep_sets import easy, held, write
+
+
+def test_a_file_is_read_as_it_is_described(tmp_path: Path):
+    """Format, materials, groups and raw counts are read as they were written; save writes the same
+    arrays."""
+    s = sets.load(write(tmp_path / "good.npz"))
+    assert str(s.format) == "2x3 int16 at 50 Hz, window 8"
+    assert s.materials == ("a", "b", "c")
+    s.save(tmp_path / "again.npz")
+    again = sets.load(str(tmp_path / "again.npz"))
+    np.testing.assert_array_equal(again.samples, held()["samples"])
+    np.testing.assert_array_equal(again.groups["speed"], held()["group_speed"])
+    assert (again.materials, again.rate_hz) == (s.materials, s.rate_hz)
+
+
+@pytest.mark.parametrize("name", ["s.npz", "s.h5"])
+def test_a_set_with_axes_is_read_as_it_was_written(tmp_path: Path, name: str):
+    """Counts and format, from both file formats; parts of the set keep the axes."""
+    samples = np.arange(6 * 8 * 2 * 3 * 3, dtype=np.int16).reshape(6, 8, 2, 3, 3)
+    s = sets.load(write(tmp_path / "good.npz", samples=samples))
+    assert str(s.format) == "2x3x3 int16 at 50 Hz, window 8"
+    s.save(tmp_path / name)
+    again = sets.load(str(tmp_path / name))
+    np.testing.assert_array_equal(again.samples, samples)
+    assert again.select(["material=a,b"]).format == s.format
+    assert again.without_means().samples.shape == samples.shape
+
+
+NAN = np.zeros((6, 8, 2, 3), np.float32)
+NAN[4, 7, 1, 2] = np.nan
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"samples": None}, "lacks samples"),
+        ({"materials": None, "rate_hz": None}, "lacks materials, rate_hz"),
+        ({"samples": np.zeros((6, 8, 6), np.uint8)}, "shape \\[6, 8, 6\\]"),
+        ({"samples": np.zeros((6, 0, 2, 3), np.uint8)}, "none empty"),
+        (
+            {"samples": np.zeros((6, 8, 2, 3, 1), np.uint8)},
+            "shape \\[6, 8, 2, 3, 1\\]; .* axes after them only where",
+        ),
+        ({"samples": np.zeros((6, 8, 2, 3, 9), np.uint8)}, "9 axes of each taxel are out of range"),
+        (
+            {"samples": np.zeros((6, 8, 2, 3))},
+            "samples are float64; use one of uint8.*samples.astype\\('float32'\\)",
+        ),
+        (
+            {"samples": np.full((6, 8, 2, 3), -1)},
+            "samples are int64; .*samples.astype\\('int16'\\)",
+        ),
+        (
+            {"samples": np.ones((6, 8, 2, 3), bool)},
+            "samples are bool; .*samples.astype\\('uint8'\\)",
+        ),
+        (
+            {"samples": np.full((6, 8, 2, 3), 1 << 40)},
+            "samples are int64; .*samples.astype\\('float32'\\)",
+        ),
+        (
+            {"samples": np.full((6, 8, 2, 3), 1j)},
+            "samples are complex128; use one of uint8, int16, uint16, float32$",
+        ),
+        (
+            {"samples": np.zeros((6, 8, 256, 1), np.uint8)},
+            "a grid of 256 x 1 taxels is out of range",
+        ),
+        ({"rate_hz": np.array(np.nan)}, "rate_hz is nan"),
+        ({"rate_hz": np.array(2e6)}, "a rate of 2000000.0 Hz is out of range"),
+        ({"group_speed": np.ones(6, bool)}, "group_speed holds bool .*one number or name for each"),
+        ({"group_speed": np.array([1, 2, np.nan, 1, 2, 3])}, "group_speed of sweep 2 is nan; give"),
+        ({"group_speed": np.array([*"abcd", "", "e"])}, "group_speed of sweep 4 is ''; give a"),
+        ({"group_recording": np.full(6, 1j)}, "group_recording holds complex128 .*whole number"),
+        ({"samples": NAN}, "samples\\[4, 7, 1, 2\\] is nan; drop sweep 4"),
+        (
+            {"samples": np.nan_to_num(NAN, nan=1e20)},
+            "sweep 4, frame 7, taxel 1, 2 reads 1e\\+20 .counted from 0., and no skin reads more",
+        ),
+        (
+            {"labels": np.arange(5)},
+            "labels holds int64 \\[5\\]; give one whole number for each of 6",
+        ),
+        ({"labels": np.zeros(6)}, "labels holds float64"),
+        (
+            {"labels": np.array([0, 1, 2, 0, 3, 1])},
+            "label 3 of sweep 4 is out of range; there are 3",
+        ),
+        ({"labels": np.array([0, 1, -1, 0, 2, 1])}, "label -1 of sweep 2 is out of range"),
+        ({"labels": np.full(6, 2)}, "only one class, 'c'"),
+        ({"materials": np.array(["a", "b", "a"])}, "name one twice"),
+        ({"materials": np.arange(3)}, "materials hold int64"),
+        ({"rate_hz": np.array([50.0, 60.0])}, "give one number"),
+        ({"rate_hz": np.array(-1.0)}, "rate_hz is -1.0"),
+        ({"group_speed": np.ones(7, int)}, "group_speed holds int64 \\[7\\]"),
+        ({"materials": np.array(["a", {}, "c"], object)}, "not a sweep set"),
+        (
+            {"unloaded": np.zeros((6, 2, 3))},
+            "unloaded holds float64 \\[6, 2, 3\\]; give floats \\[6, 2, 2, 3\\]",
+        ),
+        ({"unloaded": np.zeros((6, 2, 2, 3), int)}, "unloaded holds int64"),
+    ],
+)
+def test_a_broken_file_is_refused_by_name(tmp_path: Path, changes: dict, message: str):
+    """Each fault has its message, which begins with the file."""
+    with pytest.raises(FormatError, match=f"^broken.npz: .*{message}"):
+        sets.load(write(tmp_path / "broken.npz", **changes))
+
+
+def test_what_is_no_set_at_all_is_refused(tmp_path: Path):
+    """Text, a single array, a truncated archive, an empty file."""
+    (tmp_path / "text.npz").write_text("samples")
+    (tmp_path / "empty.npz").write_bytes(b"")
+    np.save(tmp_path / "array.npy", np.zeros(3))
+    whole = Path(write(tmp_path / "whole.npz")).read_bytes()
+    (tmp_path / "cut.npz").write_bytes(whole[: len(whole) // 2])
+    for name in ("text.npz", "empty.npz", "array.npy", "cut.npz", "missing.npz"):
+        with pytest.raises(FormatError, match=f"^{name}: not a sweep set"):
+            sets.load(str(tmp_path / name))
+
+
+@pytest.mark.slow
+def test_simulated_sets_have_their_worlds():
+    """Sizes of the paper's sets, the position of the seed in the name, and separate positions of
+    joined scenes."""
+    real = sets.load("sim:T-REAL:5-6:1")
+    assert (len(real), real.format, real.materials) == (2 * 9 * 6, skin.FORMAT, skin.MATERIALS)
+    assert len(np.unique(real.groups["position"])) == 18
+    hard = sets.load("sim:T-HARD", seed=6)
+    assert len(hard) == 60
+    np.testing.assert_array_equal(hard.samples, sets.load("sim:T-HARD:6").samples)
+    np.testing.assert_array_equal(real.samples[:54], skin.sweep_set("T-REAL", 5, 1)[0])
+    shear = sets.load("sim:T-HARDx3:6:1")
+    assert (len(shear), str(shear.format)) == (6, "4x4x3 int16 at 750 Hz, window 1500")
+    np.testing.assert_array_equal(
+        shear.samples, skin.sweep_set("T-HARD", 6, 1, skin.World(shear=True))[0]
+    )
+
+
+def test_a_named_world_is_drawn_in_its_physics() -> None:
+    """Equal seeds have equal positions in all worlds. An unknown world is refused with those that
+    exist."""
+    blind, usual = sets.load("sim:T-HARD/level-blind:6:1"), sets.load("sim:T-HARD:6:1")
+    drawn = skin.sweep_set("T-HARD", 6, 1, skin.LEVEL_BLIND)[0]
+    np.testing.assert_array_equal(blind.samples, drawn)
+    assert not np.array_equal(blind.samples, usual.samples)
+    np.testing.assert_array_equal(blind.labels, usual.labels)
+    assert blind.source == "sim:T-HARD/level-blind:6:1"
+    shear = sets.load("sim:T-LABx3/level-blind:6-7:1")
+    assert shear.format == skin.SHEAR_FORMAT
+    with pytest.raises(FormatError, match="unknown world, 'flat'; use level-blind or none"):
+        sets.load("sim:T-REAL/flat:1")
+
+
+@pytest.mark.parametrize(
+    "spec", ["sim:T-SOFT", "sim:T-REAL:x", "sim:T-REAL:1:0", "sim:", "sim:T-REAL:2-1"]
+)
+def test_an_unknown_simulated_set_is_refused(spec: str):
+    """The message repeats the name."""
+    with pytest.raises(FormatError, match=f"^set '{spec}' is "):
+        sets.load(spec)
+
+
+def test_select_keeps_what_fulfils_every_condition():
+    """All of = <= >=; materials that no longer occur are removed, and labels are renumbered."""
+    s = easy(8)
+    part = s.select(["speed>=1", "speed<=2"])
+    assert set(part.groups["speed"]) == {1, 2}
+    assert len(part) == len(s) // 2
+    assert len(s.select([])) == len(s)
+    upper = s.select(["recording>=8"])
+    assert upper.materials == ("middle", "high")
+    np.testing.assert_array_equal(np.bincount(upper.labels), [8, 8])
+    np.testing.assert_array_equal(upper.samples, s.samples[8:])
+
+
+def test_select_takes_any_of_several_values():
+    """Values of a group, and materials by name, spaces around either."""
+    s = easy(8)
+    assert set(s.select(["speed=0, 3"]).groups["speed"]) == {0, 3}
+    part = s.select(["material=high, low"])
+    assert part.materials == ("low", "high")
+    np.testing.assert_array_equal(part.samples, s.samples[np.r_[:8, 16:24]])
+    assert s.select(["material=high,low", "speed=1"]).format == s.format
+
+
+@pytest.mark.parametrize(
+    ("condition", "message"),
+    [
+        ("speed<2", "cannot be read"),
+        ("speed", "cannot be read"),
+        ("force=1", "no group 'force'; it has recording, speed"),
+        ("speed=", "'' is not a number"),
+        ("speed=1,fast", "'fast' is not a number"),
+        ("speed<=1,2", "<= takes a group of numbers and one number"),
+        ("material>=low", ">= takes a group of numbers and one number; material"),
+        ("speed=9", "no sweep fulfils speed=9; it has 0, 1, 2, 3$"),
+        ("speed=1,9", "no sweep fulfils speed=9; it has 0"),
+        ("material=low,hihg", "no sweep fulfils material=hihg; it has high, low, middle"),
+        ("recording>=99999999999999999999", "no sweep fulfils recording>=9+;"),
+        ("recording<=7", "only one class, 'low'"),
+    ],
+)
+def test_select_names_what_is_wrong(condition: str, message: str):
+    """A typing error is never treated as an empty filter."""
+    with pytest.raises(FormatError, match=message):
+        easy(8).select([condition])
+
+
+@pytest.mark.slow
+@settings(max_examples=60, deadline=None)
+@given(st.integers(1, 7), st.floats(0.05, 0.95), st.integers(0, 2**32 - 1))
+def test_split_never_separates_a_recording(pieces: int, share: float, seed: int):
+    """No recording is on both sides, no sweep is lost or doubled, and both sides have each material
+    close to the share."""
+    s = easy(21, pieces=pieces) if 21 % pieces == 0 else easy(6 * pieces, pieces=pieces)
+    first, second = s.split("recording", share, seed)
+    assert not set(first.groups["recording"]) & set(second.groups["recording"])
+    assert len(first) + len(second) == len(s)
+    for part, ideal in ((first, share), (second, 1 - share)):
+        per_material = np.bincount(part.labels, minlength=3) / (len(s) / 3)
+        recordings = len(np.unique(s.groups["recording"])) / 3
+        assert np.all(np.abs(per_material - ideal) <= 1 / recordings + 1e-9)
+
+
+def test_split_is_the_seed_s_alone():
+    """The same seed gives the same parts, another seed gives others."""
+    s = easy(20)
+    parts = [s.split("recording", 0.5, seed)[0].groups["recording"] for seed in (1, 1, 2)]
+    np.testing.assert_array_equal(parts[0], parts[1])
+    assert set(parts[0]) != set(parts[2])
+
+
+def test_split_refuses_what_would_flatter():
+    """Groups that cut recordings, a part without a material, an invalid share."""
+    s = easy(8, pieces=2)
+    s.groups["half"] = np.arange(len(s)) % 2
+    with pytest.raises(FormatError, match="'half' cut recordings in two"):
+        s.split("half", 0.5, 0)
+    s.groups["material"] = s.labels
+    del s.groups["recording"]
+    s.groups["one"] = np.zeros(len(s), int)
+    with pytest.raises(FormatError, match="the first part is everything; it has 1 groups"):
+        s.split("one", 0.5, 0)
+    for share in (0.0, 1.0, 1.5):
+        with pytest.raises(FormatError, match="splits nothing"):
+            s.split("material", share, 0)
+
+
+def test_split_never_trains_without_a_material():
+    """If only one group has a material, it is in the first part, or the split is refused."""
+    s = easy(8).take(np.arange(19))  # 8 low, 8 middle, 3 high
+    s.groups["box"] = np.array([0] * 8 + [1] * 4 + [2] * 7)
+    outcomes = set()
+    for seed in range(20):
+        try:
+            outcomes.add(s.split("box", 0.5, seed)[0].labels.max())
+        except FormatError as e:
+            outcomes.add(str(e))
+    assert outcomes == {
+        2,
+        "easy: split by 'box': the first part lacks 'high'; it has 3 groups, use a finer one",
+    }
+
+
+def test_join_keeps_recordings_apart_and_forces_together():
+    """Number 0 of two sets becomes two recordings, also if one set has no numbers; a speed of 2
+    stays 2."""
+    a, b = easy(4, pieces=2), easy(4, seed=1)
+    both = sets.join([a, b])
+    assert not set(both.groups["recording"][:12]) & set(both.groups["recording"][12:])
+    np.testing.assert_array_equal(
+        both.groups["speed"], np.append(a.groups["speed"], b.groups["speed"])
+    )
+    del b.groups["recording"]
+    assert len(np.unique(sets.join([a, b]).groups["recording"])) == 6 + 12
+    with pytest.raises(FormatError, match="differ; join sets of one kind"):
+        sets.join([a, easy(4, dtype="int16")])
+
+
+def grouped(**groups: object) -> sets.Dataset:
+    """A set of twelve sweeps with these groups, and their units after a colon in the names."""
+    named = {name.partition("__")[0]: np.array(v) for name, v in groups.items()}
+    units = {k.partition("__")[0]: k.partition("__")[2] for k in groups if "__" in k}
+    return replace(easy(4), groups=named, units=units, source="grouped")
+
+
+@pytest.mark.parametrize("file", ["s.npz", "s.h5"])
+def test_values_of_groups_are_kept(tmp_path: Path, file: str):
+    """Numbers with fractions, names and units are in both files, in parts, and count for the
+    digest; recordings may be named in a file."""
+    s = grouped(force__N=[0.0, 0.5, 1.0, 1.5] * 3, speed=["slow", "fast", "käse"] * 4)
+    s.save(tmp_path / file)
+    again = sets.load(str(tmp_path / file))
+    assert again.groups["force"].tolist() == [0.0, 0.5, 1.0, 1.5] * 3
+    assert again.groups["speed"].tolist() == ["slow", "fast", "käse"] * 4
+    assert again.units == {"force": "N"}
+    assert sets.digest(again) == sets.digest(s)
+    others = [grouped(force=[0.0, 0.5, 1.0, v] * 3, speed=["slow"] * 12) for v in (1.5, 1.25)]
+    assert len({sets.digest(x) for x in (s, *others)}) == 3
+    held_names = np.array(["p1", "p1", "p2", "p0", "p0", "p2"])
+    named = sets.load(write(tmp_path / "n.npz", group_recording=held_names))
+    assert named.groups["recording"].tolist() == [1, 1, 2, 0, 0, 2]
+    short = np.array([0.1, 0.2, 0.3] * 2, np.float32)
+    assert sets.load(write(tmp_path / "f.npz", group_force=short)).groups["force"][1] == 0.2
+
+
+@pytest.mark.parametrize(
+    ("condition", "kept"),
+    [
+        ("force<=1", 9),
+        ("force>=0.5", 9),
+        ("force=0.5,1.5", 6),
+        ("force=0.5N", 3),
+        ("force<=1 N", 9),
+        ("speed=slow", 4),
+        ("speed=slow, fast", 8),
+        ("speed=a, b", 4),
+        ("trial=01", 6),
+    ],
+)
+def test_conditions_speak_of_values(condition: str, kept: int):
+    """Numbers with fractions and their unit, names, a name with a comma, and a name that looks like
+    a number."""
+    speed, trial = ["slow", "fast", "a, b"] * 4, ["01", "1"] * 6
+    s = grouped(force__N=[0.0, 0.5, 1.0, 1.5] * 3, speed=speed, trial=trial)
+    assert len(s.select([condition])) == kept
+
+
+@pytest.mark.parametrize(
+    ("condition", "message"),
+    [
+        ("force<=slow", "'slow' is not a number in N"),
+        ("force<=5mN", "'5mN' is not a number in N"),
+        ("force=0.7", "no sweep fulfils force=0.7; it has 0, 0.5, 1, 1.5$"),
+        ("speed<=1", "<= takes a group of numbers and one number; speed holds names"),
+        ("speed=1", "no sweep fulfils speed=1; it has fast, slow$"),
+    ],
+)
+def test_values_that_do_not_occur_are_named(condition: str, message: str):
+    """Another unit, a limit of names, values that the group does not have."""
+    s = grouped(force__N=[0.0, 0.5, 1.0, 1.5] * 3, speed=["slow", "fast"] * 6)
+    with pytest.raises(FormatError, match=message):
+        s.select([condition])
+
+
+def test_sets_are_joined_by_values():
+    """Names stay together over sets, and so do positions that have names; units are converted; if
+    one set has names, all become names. Units of different kinds are refused."""
+    one = grouped(speed=["fast", "slow"] * 6, force__mN=[300, 1500] * 6, position=["tip"] * 12)
+    two = grouped(speed=["medium", "slow"] * 6, force__N=[0.3, 2.0] * 6, position=["tip"] * 12)
+    both = sets.join([one, two])
+    assert both.groups["speed"].tolist() == ["fast", "slow"] * 6 + ["medium", "slow"] * 6
+    assert both.groups["force"].tolist() == [300, 1500] * 6 + [300, 2000] * 6
+    assert (both.units, sets.join([two, one]).units) == ({"force": "mN"}, {"force": "N"})
+    assert sets.join([two, one]).groups["force"][12:].tolist() == [0.3, 1.5] * 6
+    assert set(both.groups["position"]) == {"tip"}
+    old = grouped(speed=[0, 1] * 6, force=[300, 1500] * 6, position=[0, 1] * 6)
+    mixed = sets.join([old, old, one])
+    assert sorted(set(mixed.groups["speed"])) == ["0", "1", "fast", "slow"]
+    assert sorted(set(mixed.groups["position"])) == ["0", "1", "2", "3", "tip"]
+    assert (mixed.groups["force"][0], mixed.units) == (300, {})
+    with pytest.raises(FormatError, match="'force' is in mN in one set and in mm in another; give"):
+        sets.join([one, grouped(force__mm=[1] * 12)])
+
+
+def test_joined_sets_are_told_apart():
+    """`set` counts in the given order, so that a protocol can train on one set and test on the
+    other; a single set has no such group."""
+    real, hard = sets.load("sim:T-REAL:1001:1"), sets.load("sim:T-HARD:1001-1002:2")
+    both = sets.join([real, hard])
+    np.testing.assert_array_equal(both.groups["set"], [0] * 54 + [1] * 24)
+    np.testing.assert_array_equal(both.groups["world"], [1001] * 66 + [1002] * 12)
+    assert not set(both.groups["position"][:54]) & set(both.groups["position"][54:])
+    assert sets.join([hard]) is hard
+    assert "set" not in hard.groups
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "int16", "float32"])
+def test_without_means_leaves_the_texture(dtype: str):
+    """Float32, mean zero, a constant taxel exactly zero; differences in time, labels and groups are
+    unchanged."""
+    s = easy(4, dtype=dtype)
+    s.samples[2, :, 1, 0] = 3.3 if dtype == "float32" else 3
+    s = replace(s, samples=s.samples[:, :49])  # in float32 the mean of this many 3.3 is not 3.3
+    bare = s.without_means()
+    assert bare.samples.dtype == np.float32
+    assert np.abs(bare.samples.mean(axis=1, dtype=np.float64)).max() < 1e-6
+    assert not bare.samples[2, :, 1, 0].any()
+    np.testing.assert_allclose(
+        np.diff(bare.samples, axis=1), np.diff(s.samples.astype(float), axis=1), atol=1e-4
+    )
+    assert (bare.labels is s.labels, bare.groups, bare.materials) == (True, s.groups, s.materials)
+
+
+@pytest.mark.parametrize("name", ["s.npz", "s.h5"])
+def test_the_unloaded_skin_goes_with_its_sweeps(tmp_path: Path, name: str):
+    """It is in files of both formats, in parts and in joined sets, where it is unknown for the
+    sweeps of a set without it; it changes the digest. A set without means has none."""
+    known = 0.1 * np.random.default_rng(1).random((12, 2, 2, 2))  # differences smaller than a load
+    s = replace(easy(4), unloaded=known)
+    s.save(tmp_path / name)
+    again = sets.load(str(tmp_path / name))
+    np.testing.assert_array_equal(again.unloaded, known)
+    assert sets.digest(again) == sets.digest(s) != sets.digest(easy(4))
+    np.testing.assert_array_equal(
+        s.select(["material=low,high"]).unloaded, np.delete(known, np.s_[4:8], 0)
+    )
+    both = sets.join([easy(4, seed=1), s])
+    assert np.isnan(both.unloaded[:12]).all()
+    np.testing.assert_array_equal(both.unloaded[12:], known)
+    assert sets.join([easy(4), easy(4)]).unloaded is None
+    assert s.without_means().unloaded is None
+
+
+def test_digest_names_the_data_and_nothing_else(tmp_path: Path):
+    """Equal for a set that was read back from any file; different after each change that could
+    alter a result."""
+    s = easy(4)
+    for name in ("a.npz", "b.h5"):
+        s.save(tmp_path / name)
+        assert sets.digest(sets.load(str(tmp_path / name))) == sets.digest(s)
+    assert re.fullmatch("[0-9a-f]{16}", sets.digest(s))
+    other = s.samples.copy()
+    other[-1, -1, -1, -1] ^= 1
+    changed = [
+        replace(s, samples=other),
+        replace(s, samples=s.samples.astype(np.int16)),
+        replace(s, samples=s.samples.astype(np.uint16)),
+        replace(s, samples=s.samples.reshape(12, 64, 4, 1)),
+        replace(s, labels=s.labels[::-1]),
+        replace(s, materials=("low", "middle", "top")),
+        replace(s, rate_hz=101.0),
+        replace(s, groups={"recording": s.groups["recording"]}),
+        replace(s, groups=s.groups | {"speed": s.groups["recording"]}),
+    ]
+    assert len({sets.digest(x) for x in (s, *changed)}) == 10
+    assert sets.digest(
+        replace(s, source="elsewhere", labels=s.labels.astype(np.uint8))
+    ) == sets.digest(s)
+
+
+def test_a_set_goes_to_another_process():
+    """Pickled and back, as on a cluster; files are never loaded like this."""
+    s = easy(4)
+    again = pickle.loads(pickle.dumps(s))
+    assert sets.digest(again) == sets.digest(s)
+    assert again.source == s.source
+
+
+def test_labels_may_be_names(tmp_path: Path):
+    """With or without materials; a name that is not among them is refused."""
+    texts = np.array(["b", "a", "b", "a", "c", "c"])
+    bare = sets.load(write(tmp_path / "bare.npz", labels=texts, materials=None))
+    assert (bare.materials, bare.labels.tolist()) == (("a", "b", "c"), [1, 0, 1, 0, 2, 2])
+    given = sets.load(
+        write(tmp_path / "given.npz", labels=texts, materials=np.array(["c", "b", "a"]))
+    )
+    assert (given.materials, given.labels.tolist()) == (("c", "b", "a"), [1, 2, 1, 2, 0, 0])
+    with pytest.raises(
+        FormatError, match=r"label 'c' is not among the materials \['a', 'b'\]; add it there"
+    ):
+        sets.load(write(tmp_path / "less.npz", labels=texts, materials=np.array(["a", "b"])))
+
+
+@pytest.mark.parametrize("name", ["labels", "materials", "group_speed"])
+def test_objects_are_refused_with_the_remedy(tmp_path: Path, name: str):
+    """Object arrays, which numpy makes of pandas data and lists of names; nothing is unpickled."""
+    arrays = held()
+    np.savez(tmp_path / "o.npz", **arrays | {name: arrays[name].astype(object)})
+    with pytest.raises(
+        FormatError,
+        match=rf"{name} holds objects, which are not read; save np.array\({name}, dtype=str\)",
+    ):
+        sets.load(str(tmp_path / "o.npz"))
+    with pytest.raises(FormatError, match=r"materials hold .S1; give a list of names, dtype=str"):
+        sets.load(write(tmp_path / "s.npz", materials=np.array([b"a", b"b", b"c"])))

@@ -1,0 +1,209 @@
+"""Protocols: which sweeps train and which test, and never a recording on both sides."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sklearn.model_selection import LeaveOneGroupOut as Theirs
+from sklearn.model_selection import StratifiedGroupKFold, cross_val_score
+from sklearn.naive_bayes import GaussianNB
+
+from palpate.core.errors import FormatError
+from palpate_train.data.sets import Dataset
+from palpate_train.data.splitters import Protocol, draw, inner_parts
+
+
+def a_set(labels: list[int], **groups: list[int]) -> Dataset:
+    """Sweeps of one frame whose count is their number."""
+    n = len(labels)
+    samples = np.arange(n, dtype=np.int16).reshape(n, 1, 1, 1)
+    names = tuple("abcdef"[: max(labels) + 1])
+    return Dataset(
+        samples,
+        np.array(labels),
+        names,
+        100.0,
+        {k: np.array(v) for k, v in groups.items()},
+        "made up",
+    )
+
+
+GRID = a_set(
+    [k for _ in range(3) for k in (0, 0, 1, 1)],
+    position=[p for p in range(3) for _ in range(4)],
+    recording=[r for r in range(6) for _ in range(2)],
+)
+
+
+@pytest.mark.parametrize("text", ["leave:position", "random:3", "split:position=0,1->2"])
+def test_a_protocol_tests_what_it_did_not_train_on(text: str):
+    """No sweep and no recording on both sides; every fold has both."""
+    for train, test in Protocol(text).folds(GRID, 1):
+        assert len(train)
+        assert len(test)
+        assert not set(GRID.groups["recording"][train]) & set(GRID.groups["recording"][test])
+
+
+def test_leave_is_scikit_learns_leave_one_group_out():
+    """The same folds in the same order."""
+    theirs = Theirs().split(GRID.samples, GRID.labels, GRID.groups["position"])
+    for (train, test), (their_train, their_test) in zip(
+        Protocol("leave:position").folds(GRID, 1), theirs, strict=True
+    ):
+        assert train.tolist() == their_train.tolist()
+        assert test.tolist() == their_test.tolist()
+
+
+def test_split_trains_on_a_and_tests_on_b():
+    """Values before the arrow on one side, after it on the other; the rest on neither."""
+    ((train, test),) = Protocol("split:position=2->0").folds(GRID, 1)
+    assert set(GRID.groups["position"][train]) == {2}
+    assert set(GRID.groups["position"][test]) == {0}
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(2, 4), st.integers(0, 99), st.integers(1, 4))
+def test_random_folds_are_whole_recordings_and_everything_once(folds: int, seed: int, pieces: int):
+    """Each sweep is tested once; no recording is cut; every fold holds every material."""
+    recording = np.repeat(np.arange(12), pieces)
+    sweeps = a_set((recording % 3).tolist(), recording=recording.tolist())
+    tested = []
+    for train, test in Protocol(f"random:{folds}").folds(sweeps, seed):
+        assert not set(recording[train]) & set(recording[test])
+        assert set(sweeps.labels[test]) == {0, 1, 2}
+        tested += test.tolist()
+    assert sorted(tested) == list(range(len(sweeps)))
+
+
+def test_random_folds_follow_their_seed():
+    """The same seed gives the same folds, another seed gives others."""
+    sweeps = a_set([0, 1] * 20)
+    one, same, other = (
+        [t.tolist() for _, t in Protocol("random:4").folds(sweeps, s)] for s in (1, 1, 2)
+    )
+    assert one == same
+    assert one != other
+
+
+@pytest.mark.parametrize("text", ["leave:position", "random:3", "split:position=0,1->2"])
+def test_scikit_learn_takes_them_as_splitters(text: str):
+    """cross_val_score runs on each."""
+    splitter = Protocol(text).splitter(GRID, 1)
+    x = GRID.samples.reshape(len(GRID), -1)
+    scores = cross_val_score(
+        GaussianNB(), x, GRID.labels, groups=GRID.groups["recording"], cv=splitter
+    )
+    assert len(scores) == splitter.get_n_splits(x, GRID.labels, GRID.groups["recording"])
+
+
+def test_a_material_of_one_recording_needs_more():
+    """No number of folds would help, so the message does not suggest a number."""
+    with pytest.raises(
+        FormatError, match=r"^material 'b' has one recording; record two of each or more"
+    ):
+        Protocol("random:2").folds(a_set([0, 0, 1]), 1)
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("loo", "cannot be read; use random:FOLDS"),
+        ("random:1", "too few folds"),
+        ("random:4", "needs 4 recordings of each material; 'a' has 3: use random:3 or less"),
+        ("leave:speed", "no group 'speed'; it has one, position, recording"),
+        ("leave:one", "all sweeps have 7"),
+        ("split:position=0->9", "has no 9; it has 0, 1, 2"),
+        ("split:position=0,1->1,2", "position=1 is on both sides"),
+        ("split:position=0", "cannot be read"),
+    ],
+)
+def test_what_cannot_be_split_is_named(text: str, why: str):
+    """Unknown protocols, groups and values, and folds that cannot be filled."""
+    sweeps = a_set(GRID.labels.tolist(), **GRID.groups, one=[7] * 12)
+    with pytest.raises(FormatError, match=why):
+        Protocol(text).folds(sweeps, 1)
+
+
+@pytest.mark.parametrize("text", ["leave:half", "split:half=0->1"])
+def test_a_group_that_cuts_recordings_is_refused(text: str):
+    """Pieces of one recording are never on both sides."""
+    sweeps = a_set([0, 0, 1, 1], recording=[0, 0, 1, 1], half=[0, 1, 0, 1])
+    with pytest.raises(
+        FormatError, match="2 recordings, 0 among them, would be trained on and tested on"
+    ):
+        Protocol(text).folds(sweeps, 1)
+
+
+def test_a_recording_of_several_materials_is_refused():
+    """If numbers start anew for each material, sweeps of different materials would be fused."""
+    sweeps = a_set([0, 0, 1, 1], recording=[5, 6, 5, 6], day=[0, 1, 0, 1])
+    with pytest.raises(FormatError, match="recording 5 holds sweeps of several materials, as 2 do"):
+        Protocol("leave:day").folds(sweeps, 1)
+
+
+def test_nothing_left_to_train_on_is_refused():
+    """If a group is the material, leaving out one of two leaves only one."""
+    sweeps = a_set([0, 0, 1, 1], session=[0, 0, 1, 1])
+    with pytest.raises(FormatError, match="2 sweeps of fewer than two materials are left"):
+        Protocol("leave:session").folds(sweeps, 1)
+
+
+def test_protocols_speak_of_values():
+    """Numbers with fractions and names; a value that the group does not have, or that is not a
+    number, is named."""
+    force, speed = [0.0, 0.5, 1.5] * 4, ["slow", "medium", "fast"] * 4
+    sweeps = a_set([0, 0, 0, 1, 1, 1] * 2, force=force, speed=speed)
+    for text, left in (("force=0,0.5->1.5", 2), ("speed=slow,medium->fast", 2)):
+        ((train, test),) = Protocol(f"split:{text}").folds(sweeps, 1)
+        assert set(test % 3) == {left}
+        assert len(train) == 8
+    assert len(Protocol("leave:speed").folds(sweeps, 1)) == 3
+    assert Protocol("leave:speed").clusters(sweeps).tolist() == speed
+    with pytest.raises(FormatError, match="'speed' has no quick; it has fast, medium, slow"):
+        Protocol("split:speed=slow->quick").folds(sweeps, 1)
+    with pytest.raises(FormatError, match="cannot be read; 'slow' is not a number"):
+        Protocol("split:force=0->slow").folds(sweeps, 1)
+    parts = inner_parts(sweeps)
+    assert {part.group for part in parts} == {"force", "speed"}
+    assert all(part.out.sum() == 4 for part in parts)
+
+
+def test_clusters_are_what_was_left_out_or_recordings():
+    """The left-out groups for leave, else recordings of several windows; None if each sweep is
+    independent."""
+    assert Protocol("leave:position").clusters(GRID).tolist() == GRID.groups["position"].tolist()
+    assert Protocol("random:3").clusters(GRID).tolist() == GRID.groups["recording"].tolist()
+    assert Protocol("random:3").clusters(a_set([0, 1])) is None
+
+
+def test_a_learning_curve_adds_to_what_was_there():
+    """At most this many sweeps of each material, from the training side only, equal for equal
+    seeds; all sweeps if there are fewer."""
+    labels = np.repeat([0, 1, 2], [20, 8, 3])
+    train = np.flatnonzero(np.arange(31) % 5)
+    few, more = (draw(train, labels, each, 1) for each in (2, 6))
+    assert np.bincount(labels[few]).tolist() == [2, 2, 2]
+    assert np.bincount(labels[more]).tolist() == [6, 6, 2]
+    assert set(few) <= set(more) <= set(train)
+    assert more.tolist() == sorted(more)
+    assert draw(train, labels, 6, 1).tolist() == more.tolist() != draw(train, labels, 6, 2).tolist()
+    assert draw(train, labels, 99, 1).tolist() == train.tolist()
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(2, 5), st.integers(0, 99), st.integers(1, 4), st.booleans())
+def test_random_folds_are_scikit_learns(folds: int, seed: int, pieces: int, mixed: bool):
+    """The folds of StratifiedGroupKFold, although scikit-learn is not imported: results of earlier
+    versions stay comparable."""
+    recording = np.repeat(np.arange(20), pieces)
+    label = np.random.default_rng(seed).permutation(20)[recording] % 3 if mixed else recording % 3
+    sweeps = a_set(label.tolist(), recording=recording.tolist())
+    theirs = StratifiedGroupKFold(folds, shuffle=True, random_state=seed).split(
+        label, label, recording
+    )
+    for (_, test), (_, wanted) in zip(
+        Protocol(f"random:{folds}").folds(sweeps, seed), theirs, strict=True
+    ):
+        assert test.tolist() == wanted.tolist()

@@ -1,0 +1,64 @@
+"""Fewer sweeps of a large set: of each material and recording alike."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from palpate_train.data.sets import Dataset
+from palpate_train.data.thinning import thinned
+from tests.factories.sweep_sets import easy
+
+
+def uneven() -> Dataset:
+    """Sweeps of three materials: 3, 40 and 200, in recordings of 1, 10 and 100 to 4; each sweep has
+    its number as its first count."""
+    labels = np.repeat([0, 1, 2], [3, 40, 200])
+    recording = np.concatenate(
+        [
+            np.arange(3),
+            3 + np.repeat(np.arange(4), 10),
+            7 + np.repeat(np.arange(5), [100, 50, 30, 16, 4]),
+        ]
+    )
+    base = easy(1)
+    samples = np.zeros((len(labels), *base.samples.shape[1:]), np.int16)
+    samples[:, 0, 0, 0] = np.arange(len(labels))
+    return replace(base, samples=samples, labels=labels, groups={"recording": recording})
+
+
+def test_a_set_that_is_small_enough_is_itself():
+    """No copy, so its results have the same bits."""
+    s = uneven()
+    assert thinned(s, len(s)) is s
+
+
+def test_materials_and_recordings_share_alike():
+    """A material with few sweeps keeps all; a long recording loses first; no recording is lost."""
+    s = uneven()
+    part = thinned(s, 63)
+    assert len(part) == 63
+    assert np.bincount(part.labels).tolist() == [3, 30, 30]
+    counts = np.unique(part.group("recording"), return_counts=True)[1].tolist()
+    assert sorted(counts[:3]) == [1, 1, 1]
+    assert sorted(counts[3:7]) == [7, 7, 8, 8]
+    assert sorted(counts[7:]) == [4, 6, 6, 7, 7]
+
+
+def test_the_windows_of_a_recording_are_evenly_spaced_and_in_order():
+    """Neighbours overlap, so they are worth less than others."""
+    part = thinned(uneven(), 63)
+    numbers = part.samples[:, 0, 0, 0]
+    assert (np.diff(numbers) > 0).all()
+    longest = numbers[part.group("recording") == 7]
+    assert set(np.diff(longest)) <= {14, 15, 16, 17}
+
+
+@pytest.mark.parametrize("most", [1, 2, 3, 17, 100, 242])
+def test_any_number_is_met(most: int):
+    """Never more than asked for, but one of each material; never the same sweep twice."""
+    part = thinned(uneven(), most)
+    assert len(part) == max(most, 3)
+    assert len(set(part.samples[:, 0, 0, 0].tolist())) == len(part)

@@ -1,0 +1,570 @@
+"""The grid of methods, protocols, folds and seeds: its counts, its cache, and its results for
+scripts."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+
+from palpate.core.errors import FormatError
+from palpate.inference.classifier import softmax
+from palpate_train.cli.main import main
+from palpate_train.data.sets import Dataset
+from palpate_train.evaluate import evaluate, fold
+from palpate_train.evaluate.evaluate import Plan, Where
+from palpate_train.export import pack
+from palpate_train.models import methods
+from tests.factories.sweep_sets import tones
+
+KEYS = {
+    "method",
+    "protocol",
+    "means_removed",
+    "seed",
+    "window",
+    "recording",
+    "interval",
+    "fit_s",
+    "ms_p50",
+}
+
+
+def every(sweeps: Dataset, where: Where, *names: str, **plan) -> list[evaluate.Result]:
+    given = {"protocols": ("leave:session",), **plan}
+    return list(evaluate.evaluate(sweeps, Plan(names, **given), where))
+
+
+HERE = Where(jobs=1, cache=None)
+
+
+@pytest.mark.slow
+def test_it_finds_what_distinguishes_materials():
+    """Hums of three pitches are distinguished under every protocol, by window and by recording."""
+    for result in every(
+        tones(),
+        HERE,
+        "L-gauss",
+        "H-svm",
+        protocols=("leave:session", "random:3", "split:session=0,1->2"),
+    ):
+        figures = result.json()
+        assert figures["window"]["right"] >= 0.9 * figures["window"]["total"], figures
+        assert figures["recording"]["right"] == figures["recording"]["total"]
+        assert figures["agreement"] == 1
+
+
+def test_it_finds_nothing_where_there_is_nothing():
+    """Labels drawn at random are guessed at about one in three, so nothing leaks from the test
+    sweeps."""
+    sweeps = tones(recordings=20, windows=1)
+    labels = np.random.default_rng(2).permutation(sweeps.labels)
+    shuffled = Dataset(sweeps.samples, labels, sweeps.materials, 100.0, sweeps.groups, "shuffled")
+    (result,) = every(shuffled, HERE, "L-svm")
+    assert 8 <= result.json()["window"]["right"] <= 32
+
+
+@pytest.mark.slow
+def test_removed_means_are_gone():
+    """A material that differs only by its offset cannot be recognized without means."""
+    hidden = tones(offset=40.0, noise=60.0)
+    hidden = Dataset(
+        (hidden.samples - hidden.samples % 40).astype(np.int16),
+        hidden.labels,
+        hidden.materials,
+        100.0,
+        hidden.groups,
+        "offsets",
+    )
+    (with_means,), (without,) = (
+        every(hidden, HERE, "static-svm", means_removed=gone) for gone in (False, True)
+    )
+    assert with_means.json()["window"]["right"] > without.json()["window"]["right"] + 5
+    assert without.json()["means_removed"] is True
+    assert np.abs(without.sweeps.samples.mean(axis=1)).max() < 1e-3
+
+
+@pytest.mark.slow
+def test_the_counts_are_those_of_the_logits():
+    """Windows count by the largest logit, recordings by the product of their probabilities; the
+    confusion matrices agree with the counts."""
+    sweeps = tones(noise=150.0)
+    (result,) = every(sweeps, HERE, "L-knn")
+    figures, labels = result.json(), sweeps.labels[result.test]
+    assert sorted(result.test) == list(range(len(sweeps)))
+    assert figures["window"] == {
+        "right": int((result.logits.argmax(1) == labels).sum()),
+        "total": 36,
+    }
+    right = 0
+    for number in range(18):
+        mine = sweeps.groups["recording"][result.test] == number
+        right += np.log(softmax(result.logits[mine])).sum(0).argmax() == labels[mine][0]
+    assert figures["recording"] == {"right": right, "total": 18}
+    confusion = np.array(figures["confusion"])
+    assert confusion.sum(1).tolist() == [12, 12, 12]
+    assert np.trace(confusion) == figures["window"]["right"]
+    low, high = figures["interval"]
+    assert low <= figures["window"]["right"] / 36 <= high
+
+
+@pytest.mark.slow
+@pytest.mark.thorough  # starts processes for each run
+def test_the_same_seed_gives_the_same_bits_in_one_process_or_two():
+    """The number of processes does not change the result."""
+    one, two = (
+        every(tones(), Where(jobs, cache=None), "L-svm", protocols=("random:3",)) for jobs in (1, 2)
+    )
+    assert np.array_equal(one[0].logits, two[0].logits)
+
+
+def test_an_interrupted_evaluation_continues_where_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Finished folds are not trained again, and the result is the same."""
+    where = Where(jobs=1, cache=tmp_path)
+    calls: list[int] = []
+    train = fold.run
+
+    def counted(*args):
+        calls.append(1)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return train(*args)
+
+    monkeypatch.setattr(evaluate, "run", counted)
+    with pytest.raises(KeyboardInterrupt):
+        every(tones(), where, "L-gauss")
+    assert len(list(tmp_path.glob("*.npz"))) == 2
+    assert not every(
+        tones(), replace(where, kept=True), "L-gauss"
+    )  # and nothing is trained, no incomplete result reported
+    (result,) = every(tones(), where, "L-gauss")
+    assert len(calls) == 4
+    (again,) = every(tones(), where, "L-gauss")
+    assert len(calls) == 4
+    assert np.array_equal(result.logits, again.logits)
+    assert np.array_equal(
+        result.logits, every(tones(), replace(where, kept=True), "L-gauss")[0].logits
+    )
+    assert again.json()["window"] == every(tones(), HERE, "L-gauss")[0].json()["window"]
+
+
+def test_a_broken_cache_file_is_done_again(tmp_path: Path):
+    """A file that is cut in half is ignored."""
+    where = Where(jobs=1, cache=tmp_path)
+    (first,) = every(tones(), where, "L-gauss")
+    path = min(tmp_path.glob("*.npz"))
+    path.write_bytes(path.read_bytes()[:100])
+    (again,) = every(tones(), where, "L-gauss")
+    assert np.array_equal(first.logits, again.logits)
+
+
+def test_a_fold_is_kept_under_all_that_it_depends_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Data, method, effort, seed, split and code each give the fold another name."""
+    task = fold.FoldTask("L-svm", methods.FULL_EFFORT, 1, np.arange(5), np.arange(5, 9))
+    others = [
+        fold.FoldTask("L-knn", methods.FULL_EFFORT, 1, task.train, task.test),
+        fold.FoldTask("recurrent", methods.FULL_EFFORT, 1, task.train, task.test),
+        fold.FoldTask("recurrent", methods.Effort(0.5), 1, task.train, task.test),
+        fold.FoldTask("L-svm", methods.FULL_EFFORT, 2, task.train, task.test),
+        fold.FoldTask("L-svm", methods.FULL_EFFORT, 1, task.train[:4], task.test),
+        fold.FoldTask("L-svm", methods.FULL_EFFORT, 1, task.train, task.test[:3]),
+    ]
+    names = {fold.key(t, "data") for t in [task, *others]} | {fold.key(task, "other data")}
+    assert len(names) == 8
+    assert (
+        fold.key(fold.FoldTask("L-svm", methods.Effort(0.5), 1, task.train, task.test), "data")
+        in names
+    )  # nothing to it
+    monkeypatch.setattr(fold, "version", lambda name: "0")
+    assert fold.key(task, "data") not in names
+
+
+def test_a_fold_depends_on_the_code_that_its_method_runs():
+    """The code that a method imports counts, directly or indirectly; code around it and the
+    networks of other methods do not."""
+
+    def reached(method: str) -> set[str]:
+        """Names of modules without the packages."""
+        return {
+            name.split(".")[-1]
+            for name in fold.reached((methods.module_of(method), "palpate_train.evaluate.fold"))
+        }
+
+    assert {"paper_cnn", "networks", "training", "graph_builder", "linear_head", "fold"} <= reached(
+        "paper-cnn"
+    )
+    classical = reached("L-svm")
+    assert {
+        "baselines",
+        "temperature",
+        "graph_builder",
+        "features",
+        "time_series",
+        "prior_work",
+    } <= classical
+    assert (
+        not {"paper_cnn", "recurrent", "networks", "network", "evaluate", "score", "main"}
+        & classical
+    )
+    assert all(methods.module_of(name) in methods.MODULES for name in methods.every())
+
+
+@pytest.mark.parametrize(
+    ("method", "used", "unused"),
+    [
+        ("L-svm", {"numpy", "scikit-learn", "scipy", "onnx", "skl2onnx", "onnxruntime"}, {"aeon"}),
+        ("minirocket", {"aeon", "numba", "scikit-learn", "onnxruntime"}, set()),
+        ("paper-cnn", {"torch", "onnx", "onnxruntime", "numpy"}, {"aeon", "skl2onnx"}),
+        ("palpate", {"torch", "onnx", "onnxruntime", "numpy"}, {"aeon"}),
+    ],
+)
+def test_a_fold_depends_on_the_versions_of_all_libraries_that_its_method_uses(
+    method: str, used: set[str], unused: set[str], monkeypatch: pytest.MonkeyPatch
+):
+    """An upgrade of each library that the method uses gives the fold another name; other libraries
+    may change."""
+    task = fold.FoldTask(method, methods.FULL_EFFORT, 1, np.arange(5), np.arange(5, 9))
+    plain, real = fold.key(task, "data"), fold.version
+    modules = (methods.module_of(method), "palpate_train.evaluate.fold")
+    assert used <= set(fold.libraries(modules))
+    assert not unused & set(fold.libraries(modules))
+    for name in used:
+        monkeypatch.setattr(fold, "version", lambda of, name=name: "0" if of == name else real(of))
+        assert fold.key(task, "data") != plain, name
+    for name in unused:
+        monkeypatch.setattr(fold, "version", lambda of, name=name: "0" if of == name else real(of))
+        assert fold.key(task, "data") == plain, name
+
+
+@pytest.mark.parametrize(
+    ("names", "protocol", "why"),
+    [
+        (["L-gaus"], "leave:session", "method 'L-gaus' is unknown; use some of L-gauss, L-knn"),
+        (["L-gauss"], "leave:speed", "no group 'speed'"),
+        (["L-gauss"], "random:7", "needs 7 recordings of each material; 'a' has 6"),
+    ],
+)
+def test_what_cannot_be_evaluated_is_named(names: list[str], protocol: str, why: str):
+    """An unknown method or protocol is refused before any training."""
+    with pytest.raises(FormatError, match=why):
+        every(tones(), HERE, *names, protocols=(protocol,))
+
+
+def command(*args: str, cache: Path) -> int:
+    """palpate-train evaluate in this process."""
+    return main(["evaluate", *args, "--jobs", "1", "--cache", str(cache)])
+
+
+@pytest.mark.slow
+def test_the_command_writes_what_scripts_rely_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """A list of results with the documented keys, one for each method and seed, in the requested
+    order."""
+    tones(offset=9.0).save(tmp_path / "tones.npz")
+    out = tmp_path / "deep" / "results.json"
+    args = (
+        "--set",
+        str(tmp_path / "tones.npz"),
+        "--protocol",
+        "leave:session",
+        "--method",
+        "H-knn,L-gauss",
+        "--seeds",
+        "2",
+        "--only",
+        "material=a,c",
+        "session<=2",
+        "--remove-means",
+        "--json",
+        str(out),
+    )
+    assert command(*args, cache=tmp_path / "cache") == 0
+    results = json.loads(out.read_text())
+    assert [(r["method"], r["seed"]) for r in results] == [
+        ("H-knn", 1),
+        ("H-knn", 2),
+        ("L-gauss", 1),
+        ("L-gauss", 2),
+    ]
+    for result in results:
+        assert set(result) >= KEYS
+        assert result["protocol"] == "leave:session"
+        assert result["means_removed"] is True
+        assert result["materials"] == ["a", "c"]
+        assert result["window"]["total"] == 24
+        assert result["recording"]["total"] == 12
+        assert 0 <= result["interval"][0] <= result["interval"][1] <= 1
+        assert result["fit_s"] > 0
+        assert result["ms_p50"] > 0
+    printed = capsys.readouterr().out.splitlines()
+    assert len(printed) == 7  # the header, two baselines, four results
+    assert "leave:session" in printed[1]
+    assert " out " in printed[1]
+
+
+def test_a_set_without_recordings_has_no_count_of_them(tmp_path: Path):
+    """Every sweep counts alone."""
+    whole = tones(windows=1)
+    Dataset(
+        whole.samples, whole.labels, whole.materials, 100.0, {"day": whole.groups["session"]}
+    ).save(tmp_path / "a.npz")
+    out = tmp_path / "r.json"
+    assert (
+        command(
+            "--set",
+            str(tmp_path / "a.npz"),
+            "--protocol",
+            "leave:day",
+            "--method",
+            "L-svm",
+            "--json",
+            str(out),
+            cache=tmp_path,
+        )
+        == 0
+    )
+    (result,) = json.loads(out.read_text())
+    assert "recording" not in result
+
+
+def test_a_method_that_cannot_work_does_not_stop_the_others(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """Windows too short for a spectrum over time: reported with the reason and an exit code, after
+    all other results."""
+    whole, out = tones(), tmp_path / "r.json"
+    short = Dataset(
+        whole.samples[:, :7], whole.labels, whole.materials, 100.0, whole.groups, "short"
+    )
+    short.save(tmp_path / "short.npz")
+    assert (
+        command(
+            "--set",
+            str(tmp_path / "short.npz"),
+            "--protocol",
+            "leave:session",
+            "--method",
+            "minirocket,L-gauss",
+            "--json",
+            str(out),
+            cache=tmp_path,
+        )
+        == FormatError.exit_code
+    )
+    assert [r["method"] for r in json.loads(out.read_text())] == ["L-gauss"]
+    assert (
+        "minirocket cannot be used here: a window of 7 frames is too short"
+        in capsys.readouterr().err
+    )
+
+
+def test_a_method_whose_features_cannot_be_computed_does_not_stop_the_others(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """Too few frames for H at this rate: named once, above the final line, and kept, so that --kept
+    names it too."""
+    whole, out = tones(), tmp_path / "r.json"
+    fast = Dataset(
+        whole.samples[:, :80], whole.labels, whole.materials, 1000.0, whole.groups, "fast"
+    )
+    fast.save(tmp_path / "fast.npz")
+    args = (
+        "--set",
+        str(tmp_path / "fast.npz"),
+        "--protocol",
+        "leave:session",
+        "--method",
+        "H-svm,L-gauss,H-knn",
+        "--seeds",
+        "2",
+        "--json",
+        str(out),
+    )
+    assert command(*args, cache=tmp_path / "cache") == FormatError.exit_code
+    assert [(r["method"], r["seed"]) for r in json.loads(out.read_text())] == [
+        ("L-gauss", 1),
+        ("L-gauss", 2),
+    ]
+    *above, last = capsys.readouterr().err.splitlines()
+    assert [line.split(": ")[0] for line in above] == [
+        "H-svm cannot be used here",
+        "H-knn cannot be used here",
+    ]
+    assert all("80 frames are too few" in line for line in above)
+    assert "H-svm, H-knn left out of H-svm, L-gauss, H-knn" in last
+    kept = every(fast, Where(jobs=1, cache=tmp_path / "cache", kept=True), "H-svm")
+    assert "80 frames are too few" in kept[0].refused
+
+
+@pytest.mark.parametrize("broken", ["train", "logits", "not finite"])
+def test_a_method_refused_in_one_fold_loses_no_other_result(
+    broken: str, monkeypatch: pytest.MonkeyPatch
+):
+    """A refusal is named once for a protocol and seed, at once; the other protocols and methods are
+    complete."""
+    calls: list[int] = []
+    (sound,) = methods.find(["L-gauss"])
+
+    def second_fold_fails(sweeps: Dataset, inputs: np.ndarray, seed: int) -> methods.Model:
+        calls.append(1)
+        if broken == "train" and len(calls) == 2:
+            raise FormatError("too few of something")
+        model = sound.train(sweeps, inputs, seed)
+        return Spoilt(model, broken) if len(calls) == 2 else model
+
+    fragile = replace(sound, name="fragile", train=second_fold_fails)
+    monkeypatch.setattr(
+        methods, "every", lambda effort=methods.FULL_EFFORT: {"fragile": fragile, "L-gauss": sound}
+    )
+    results = every(
+        tones(), HERE, "fragile", "L-gauss", protocols=("leave:session", "split:session=0,1->2")
+    )
+    found = [(r.method, r.protocol, bool(r.refused)) for r in results]
+    assert found == [
+        ("fragile", "leave:session", True),
+        ("fragile", "split:session=0,1->2", False),
+        ("L-gauss", "leave:session", False),
+        ("L-gauss", "split:session=0,1->2", False),
+    ]
+    why = "gave a logit that is not finite" if broken == "not finite" else "too few of something"
+    assert why in results[0].refused
+    assert results[2].json()["window"]["total"] == 36
+
+
+@dataclass(frozen=True)
+class Spoilt:
+    """A model that fails after training, or gives logits that are not numbers."""
+
+    model: methods.Model
+    how: str
+
+    def logits(self, inputs: np.ndarray) -> np.ndarray:
+        """Fail, or give logits that cannot be used."""
+        if self.how == "logits":
+            raise FormatError("too few of something")
+        return self.model.logits(inputs) * np.nan
+
+    def graph(self) -> onnx.ModelProto:
+        """The graph of the sound model."""
+        return self.model.graph()
+
+
+def test_a_model_without_a_graph_is_timed_in_its_library(monkeypatch: pytest.MonkeyPatch):
+    """One sweep is classified at a time, and its label is compared with the labels of all sweeps at
+    once; pack names the library."""
+    (sound,) = methods.find(["L-gauss"])
+    asked: list[int] = []
+
+    class Alone:
+        """A model without a graph."""
+
+        def __init__(self, model: methods.Model) -> None:
+            self.model = model
+
+        def logits(self, inputs: np.ndarray) -> np.ndarray:
+            """The logits of the sound model."""
+            asked.append(len(inputs))
+            return self.model.logits(inputs)
+
+    alone = replace(
+        sound, name="alone", library="its library", train=lambda *args: Alone(sound.train(*args))
+    )
+    monkeypatch.setattr(methods, "every", lambda effort=methods.FULL_EFFORT: {"alone": alone})
+    monkeypatch.setattr(fold, "TIMED_SWEEPS", 5)
+    (result,) = every(tones(), HERE, "alone", protocols=("split:session=0,1->2",))
+    figures = result.json()
+    assert asked == [12, 1, 1, 1, 1, 1]
+    assert figures["agreement"] == 1
+    assert figures["ms_p50"] > 0
+    assert not alone.runs_on_the_box
+    with pytest.raises(
+        FormatError, match="method 'alone' runs in its library alone and has no graph"
+    ):
+        pack.trained(alone, tones(), 1)
+
+
+def test_a_point_of_a_learning_curve_is_trained_on_so_many(monkeypatch: pytest.MonkeyPatch):
+    """Each fold trains on the given number of sweeps of each material; its test sweeps stay."""
+    seen: list[np.ndarray] = []
+    (sound,) = methods.find(["L-gauss"])
+
+    def watched(sweeps: Dataset, inputs: np.ndarray, seed: int) -> methods.Model:
+        seen.append(np.bincount(sweeps.labels))
+        return sound.train(sweeps, inputs, seed)
+
+    monkeypatch.setattr(
+        methods,
+        "every",
+        lambda effort=methods.FULL_EFFORT: {"L-gauss": replace(sound, train=watched)},
+    )
+    (result,) = every(tones(), HERE, "L-gauss", each=5)
+    assert np.array(seen).tolist() == [[5, 5, 5]] * 3
+    assert result.json()["window"]["total"] == 36
+
+
+def test_trained_on_one_set_and_tested_on_another(tmp_path: Path):
+    """Two sets make one with a group `set`: T-REAL for training, T-HARD for the test."""
+    out = tmp_path / "r.json"
+    assert (
+        command(
+            "--set",
+            "sim:T-REAL:1001:1",
+            "--set",
+            "sim:T-HARD:1002:1",
+            "--protocol",
+            "split:set=0->1",
+            "--method",
+            "L-gauss",
+            "--json",
+            str(out),
+            cache=tmp_path,
+        )
+        == 0
+    )
+    assert json.loads(out.read_text())[0]["window"]["total"] == 6
+
+
+@pytest.mark.parametrize(
+    "args",
+    [
+        ("--seeds", "0"),
+        ("--each", "-2"),
+        ("--method", "nobody"),
+        ("--protocol", "loo"),
+        ("--only", "x=1"),
+    ],
+)
+def test_bad_arguments_are_one_line(
+    args: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """The message has the value and a remedy."""
+    tones().save(tmp_path / "t.npz")
+    good = {"--set": str(tmp_path / "t.npz"), "--protocol": "leave:session", "--method": "L-svm"}
+    assert command(*sum((good | dict([args])).items(), ()), cache=tmp_path) == FormatError.exit_code
+    error = capsys.readouterr().err.splitlines()
+    assert len(error) == 1
+    assert args[1].split("=")[0] in error[0]
+
+
+def test_the_methods_are_listed_with_a_line_each(capsys: pytest.CaptureFixture[str]):
+    """The documented methods are listed, and a method that needs an extra states it."""
+    with pytest.raises(SystemExit, match="0"):
+        main(["evaluate", "--list"])
+    lines = capsys.readouterr().out.splitlines()
+    promised = (
+        "L-gauss L-knn L-svm H-knn H-svm fishel-bayes static-svm spectrogram-svm correlation-svm "
+        "st-hmp paper-cnn "
+        "tactnet2 recurrent minirocket palpate"
+    )
+    assert {line.split()[0] for line in lines} >= set(promised.split())
+    assert all(len(line.split()) > 4 for line in lines)
+    assert any("palpate-train[peers]" in line for line in lines)

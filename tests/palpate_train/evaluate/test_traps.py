@@ -1,0 +1,97 @@
+"""Warnings before an evaluation, and trivial baselines beside it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from palpate_train.cli.main import main
+from palpate_train.data.sets import Dataset
+from palpate_train.data.splitters import Protocol
+from palpate_train.evaluate import traps, trivial
+from tests.factories.sweep_sets import easy, tones
+
+
+def of_protocol(sweeps: Dataset, text: str) -> list[str]:
+    """The warnings about a protocol."""
+    return list(traps.of_protocol(sweeps, text, Protocol(text).folds(sweeps, 1)))
+
+
+def test_materials_that_cannot_be_named_are_counted():
+    """Sessions of one material each: every tested sweep, with a protocol that leaves sessions out;
+    no line with another protocol."""
+    sweeps = easy(8)
+    sweeps.groups["session"] = sweeps.labels * 2 + np.arange(24) % 2
+    half = replace(sweeps, groups=sweeps.groups | {"session": sweeps.labels})
+    assert of_protocol(sweeps, "leave:session") == []
+    (line,) = of_protocol(half, "leave:session")
+    assert "leave:session: 24 of 24 tested sweeps are of a material that their fold is not" in line
+    assert of_protocol(half, "random:4") == []
+    (line,) = [line for line in traps.of_set(half) if "session" in line]
+    assert "24 of 24 sweeps are of materials with one session only (low, middle, high)" in line
+    assert not any("session only" in line for line in traps.of_set(sweeps))
+
+
+def test_shared_frames_are_counted_for_the_folds():
+    """Windows of pure noise that overlap, without recordings, in random folds; not if recordings
+    are stated."""
+    rng = np.random.default_rng(1)
+    long = rng.normal(0, 20, (8, 640, 2, 2)).astype(np.int16)
+    samples = np.concatenate([[one[s : s + 64] for s in range(0, 577, 16)] for one in long])
+    labels, recording = np.repeat(np.arange(8) % 2, 37), np.repeat(np.arange(8), 37)
+    sweeps = Dataset(samples, labels, ("a", "b"), 100.0, {}, "noise")
+    (line,) = of_protocol(sweeps, "random:5")
+    assert "294 of 296 tested sweeps are identical to a training sweep or share frames" in line
+    assert any("296 of 296 sweeps share frames" in line for line in traps.of_set(sweeps))
+    stated = replace(sweeps, groups={"recording": recording})
+    assert of_protocol(stated, "random:4") == []
+
+
+def test_baselines_find_what_they_look_at():
+    """Means distinguish offsets, bands distinguish pitches, and neither does the other's work."""
+    folds = Protocol("leave:session").folds(tones(), 1)
+    found = trivial.figures(tones(), folds)
+    assert found[trivial.BANDS]["right"] == 36
+    assert found[trivial.MEANS]["accuracy"] < 0.7
+    assert trivial.figures(tones(offset=200.0), folds)[trivial.MEANS]["right"] == 36
+    assert trivial.beside_a_fit(tones())[trivial.BANDS]["accuracy"] == 1
+    constant = replace(tones(), samples=np.ones_like(tones().samples))
+    assert trivial.figures(constant, folds)[trivial.MEANS]["n"] == 36
+    assert trivial.beside_a_fit(tones(recordings=1)) == {}
+
+
+@pytest.mark.slow
+@pytest.mark.thorough  # fits and packs three models
+def test_evaluate_shows_the_answers_of_the_box(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Beside the label alone, counted, and for each sweep of each fold with the left-out value; a
+    method that export does not pack has none."""
+    file, out = tmp_path / "s.npz", tmp_path / "r.json"
+    sweeps = easy(24)
+    sweeps.groups["speed"] = np.array(["slow", "fast", "0.5"])[np.arange(72) % 3]
+    sweeps.save(file)
+    words = ["evaluate", "--set", str(file), "--protocol", "leave:speed", "--jobs", "1"]
+    words += ["--method", "palpate-bands,L-gauss", "--cache", str(tmp_path), "--json", str(out)]
+    assert main(words) == 0
+    printed = capsys.readouterr().out
+    assert "as the box answers" in printed.splitlines()[0]
+    assert "(means alone)" in printed
+    ours, theirs = json.loads(out.read_text())
+    assert theirs["box"] is None
+    counts = [ours["box"][k] for k in ("right", "wrong", "unsure", "unknown", "refused")]
+    assert sum(counts) == ours["box"]["total"] == 72
+    assert counts[0] >= 60
+    assert [fold["left_out"]["speed"] for fold in ours["each_fold"]] == [
+        ["0.5"],
+        ["fast"],
+        ["slow"],
+    ]
+    answers = [answer for fold in ours["each_fold"] for answer in fold["answers"]]
+    assert sorted(answer["sweep"] for answer in answers) == list(range(72))
+    right = sum(a["box"] == "ok" and a["box_label"] == a["material"] for a in answers)
+    assert right == counts[0]
+    assert main([*words, "--label-alone"]) == 0
+    assert json.loads(out.read_text())[0]["box"] is None

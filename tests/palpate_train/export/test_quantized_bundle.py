@@ -1,0 +1,705 @@
+"""Export: the graphs, the checks that a bundle must pass, and its refusals with their reasons."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from onnx import numpy_helper
+
+from palpate.bundle import bundle
+from palpate.cli.main import main as palpate
+from palpate.core.clock import SystemClock
+from palpate.core.errors import BundleError, FormatError
+from palpate.core.types import SweepFormat
+from palpate.inference.classifier import Classifier, softmax
+from palpate.inference.session import session
+from palpate.sim import skin
+from palpate_studies import cost
+from palpate_studies.command import main as study
+from palpate_train.calibration.heads import HeadData
+from palpate_train.cli.main import main
+from palpate_train.data import sets
+from palpate_train.export import bundle_score, pack, quantized_bundle
+from palpate_train.export.bundle_graph import turn_of
+from palpate_train.export.pack import ExportRefused
+from palpate_train.metrics.answers import REFUSED
+from palpate_train.metrics.temperature import platt_temperature
+from palpate_train.models import methods
+from palpate_train.models.linear_head import hold_out
+from palpate_train.models.peers import paper_cnn
+from palpate_train.models.recipe import loads, recipe, stages
+from palpate_train.models.recipe.fitted import Fit, finished
+from palpate_train.models.recipe.sizes import SIZES
+from palpate_train.models.recipe.stages import StagesNetwork
+from palpate_train.onnx_tools import graph_builder, parity
+from palpate_train.onnx_tools.parity import Layer
+from palpate_train.onnx_tools.quantize import quantize
+from tests.factories.parity import close
+from tests.factories.sweep_sets import easy
+from tests.factories.trained_stages import with_stages
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def fitted() -> Fit:
+    """A fit on the easy set, two sweeps to a recording, of a skin that reads 0 without contact."""
+    sweeps = easy(pieces=2)
+    rest = np.zeros((len(sweeps), 2, *sweeps.format.shape))
+    return with_stages(replace(sweeps, unloaded=rest))
+
+
+@pytest.fixture(scope="module")
+def tight() -> Fit:
+    """A fit on a set that needs the whole resolution of int8."""
+    return with_stages(close(), steps=60)
+
+
+@pytest.fixture(scope="module")
+def packed(fitted: Fit, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The bundle of `fitted`."""
+    target = tmp_path_factory.mktemp("export") / "bundle"
+    quantized_bundle.export(fitted, target, "easy", "1", "0123abcd")
+    return target
+
+
+def box(folder: Path) -> Classifier:
+    """The classifier of the box for a bundle."""
+    return Classifier(bundle.load(folder), SystemClock())
+
+
+def shapes(model: onnx.ModelProto) -> list[list[int]]:
+    """Every inferred shape of the graph."""
+    graph = onnx.shape_inference.infer_shapes(model, strict_mode=True).graph
+    return [
+        [d.dim_value for d in v.type.tensor_type.shape.dim]
+        for v in (*graph.input, *graph.value_info, *graph.output)
+    ]
+
+
+def negated(fitted: Fit) -> Fit:
+    """A fit whose float head gives the opposite logits."""
+    return replace(fitted, weights=fitted.weights | {"head.weight": -fitted.weights["head.weight"]})
+
+
+@pytest.mark.parametrize("dtype", graph_builder.TENSOR)
+def test_the_float_graph_is_the_network(dtype: str):
+    """For each type of raw counts it has PyTorch's logits, fixed shapes, and the sensor's own
+    counts as input."""
+    form = SweepFormat(3, 2, 100.0, 128, dtype)
+    torch.manual_seed(0)
+    model = StagesNetwork(form, 3, 0.1, norm=False).eval()
+    graph = model.graph()
+    counts = np.random.default_rng(0).integers(0, 200, (5, 128, 3, 2)).astype(dtype)
+    with torch.no_grad():
+        want = model(torch.from_numpy(counts.astype(np.float32))).numpy()
+    np.testing.assert_allclose(parity.logits(graph, counts), want, atol=1e-3)
+    assert all(size > 0 for shape in shapes(graph) for size in shape)
+    (given,) = graph.graph.input
+    assert (given.name, given.type.tensor_type.elem_type) == ("sweep", graph_builder.TENSOR[dtype])
+    assert [d.dim_value for d in given.type.tensor_type.shape.dim] == [1, 128, 3, 2]
+
+
+def test_the_int8_graph_computes_its_convolutions_in_int8(fitted: Fit, packed: Path):
+    """Weights have seven bits and one scale for each channel; every convolution is between
+    quantizers; the output is 1 x K."""
+    model = onnx.load(packed / bundle.MODEL)
+    maker = {name: n for n in model.graph.node for name in n.output}
+    values = {c.name: numpy_helper.to_array(c) for c in model.graph.initializer}
+    convs = [n for n in model.graph.node if n.op_type == "Conv"]
+    assert len(convs) == len(fitted.architecture.channels)
+    for conv in convs:
+        assert [maker[name].op_type for name in conv.input] == ["DequantizeLinear"] * 3
+        weight, scale = (values[name] for name in maker[conv.input[1]].input[:2])
+        assert weight.dtype == np.int8
+        assert 60 <= np.abs(weight.astype(int)).max() <= 64
+        assert scale.shape == (len(weight),)
+        assert [n.op_type for n in model.graph.node if conv.output[0] in n.input] == [
+            "QuantizeLinear"
+        ]
+    run = session(model.SerializeToString())
+    assert [(i.name, i.shape, i.type) for i in run.get_inputs()] == [
+        ("sweep", [1, 64, 2, 2], "tensor(uint8)")
+    ]
+    assert [(o.name, o.shape, o.type) for o in run.get_outputs()] == [
+        (name, [1, size], "tensor(float)")
+        for name, size in (("logits", 3), ("embedding", 2 + fitted.bands))
+    ]
+
+
+def test_a_model_holds_the_matrix_of_its_embedding(fitted: Fit, packed: Path):
+    """`palpate-train widen` reads from it which directions were not trained. A model that selects
+    no features has none."""
+    assert fitted.calibration
+    embedding = fitted.calibration.embedding
+    model = onnx.load_from_string(bundle.load(packed).model)
+    assert embedding.selected == fitted.bands
+    np.testing.assert_array_equal(turn_of(model), embedding.turn.astype(np.float32))
+    assert turn_of(fitted.trunk()) is None
+
+
+def test_quantizing_leaves_its_model_alone(fitted: Fit):
+    """onnxruntime empties the model that it gets; ours still runs."""
+    trunk = fitted.trunk(int8=False)
+    before = trunk.SerializeToString()
+    quantize(trunk, fitted.train.samples[:4])
+    assert trunk.SerializeToString() == before
+
+
+def test_a_bundle_passes_its_own_tests(fitted: Fit, packed: Path):
+    """It has golden sweeps of two materials, figures of held-out sweeps, thresholds from training,
+    and small files."""
+    it = box(packed)
+    assert it.self_test() < 1e-6
+    manifest = it.bundle.manifest
+    assert it.bundle.golden_logits.argmax(1).tolist() == [0, 2]
+    held = manifest.figures["held-out speed"]
+    assert held["n"] == len(fitted.held)
+    assert held["accuracy"] + (held["wrong"] + held["unsure"] + held["unknown"]) / held[
+        "n"
+    ] == pytest.approx(1, abs=1e-4)
+    assert held["refused"] == 0
+    assert manifest.figures["held-out speed, network alone"]["accuracy"] >= held["accuracy"]
+    assert manifest.figures["held-out speed, by recording"]["n"] == len(fitted.held) / 2
+    result = manifest.figures["parity"]
+    assert result["agreement"] >= quantized_bundle.LEAST_AGREEMENT
+    assert result["lost"] <= quantized_bundle.MOST_LOST
+    assert result["total"] == len(fitted.held)
+    weakest = fitted.train.samples.mean(axis=1).max(axis=(1, 2)).min()
+    assert manifest.thresholds.contact == pytest.approx(0.1 * weakest)
+    assert manifest.thresholds.full_scale == 255
+    assert (manifest.labels, manifest.made["commit"], manifest.made["seed"]) == (
+        ("low", "middle", "high"),
+        "0123abcd",
+        1,
+    )
+    assert np.mean(bundle_score.labels_of(it, easy(seed=5))[0] == easy(seed=5).labels) > 0.9
+
+
+def test_a_rule_for_moved_sweeps_needs_places(fitted: Fit, packed: Path, tmp_path: Path):
+    """With the distance of the taxels the bundle has contact positions and a rule for displaced
+    sweeps; without it the box could not recognise these, and the file has no arrays for them."""
+    quantized_bundle.export(fitted, tmp_path / "placed", "easy", "1", "0123abcd", pitch_mm=4.0)
+    placed, plain = bundle.load(tmp_path / "placed"), bundle.load(packed)
+    assert placed.manifest.contact
+    assert placed.manifest.displacement
+    assert placed.classes
+    assert placed.classes.displaced
+    assert plain.manifest.displacement is None
+    with np.load(packed / bundle.MEANS) as arrays:
+        assert not [name for name in arrays if name.startswith("moved")]
+
+
+def test_figures_of_held_out_sweeps_are_not_of_heads_that_saw_them(fitted: Fit):
+    """Held-out sweeps get wrong labels: heads fitted to them would give these labels, heads of the
+    others do not."""
+    wrong = replace(fitted.held, labels=(fitted.held.labels + 1) % 3)
+    spoilt = replace(fitted, held=wrong)
+    honest, misled = (
+        finished(one).held_out_figures()["held-out speed, network alone"]["accuracy"]
+        for one in (fitted, spoilt)
+    )
+    assert honest > 0.9
+    assert misled < 0.1
+
+
+def test_the_same_fit_gives_the_same_bytes(
+    fitted: Fit, packed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Every file is the same, the zip of golden sweeps included; also from the file of the fit,
+    which keeps calibration and contacts, so that export finds neither again."""
+    fitted.save(tmp_path / "fit.npz")
+    monkeypatch.setattr(quantized_bundle, "finished", None)
+    for made in (fitted, Fit.load(tmp_path / "fit.npz")):
+        assert made.calibration
+        assert made.contacts
+        quantized_bundle.export(made, tmp_path / "again", "easy", "1", "0123abcd")
+        for file in (bundle.MANIFEST, bundle.MODEL, bundle.GOLDEN, bundle.MEANS):
+            assert (tmp_path / "again" / file).read_bytes() == (packed / file).read_bytes(), file
+    assert sorted(f.name for f in tmp_path.iterdir()) == ["again", "fit.npz"]
+
+
+def test_scores_are_fused_by_recording(packed: Path):
+    """Each window gets the label of its recording's product, even if its own label differs; refused
+    windows get -1."""
+    it, s = box(packed), easy(10, pieces=5, seed=7)
+    s.samples[3] = 0
+    s.samples[9] = s.samples[29]
+    alone, fused = bundle_score.labels_of(it, s)[0], bundle_score.labels_of(it, s, fused=True)[0]
+    assert np.flatnonzero(alone == REFUSED).tolist() == [3]
+    assert alone[9] != fused[9]
+    p = softmax(np.stack([it.logits(x) for x in s.samples]))
+    for recording in np.unique(s.groups["recording"]):
+        member = s.groups["recording"] == recording
+        assert set(fused[member]) == {np.log(p[member & (alone != REFUSED)]).sum(0).argmax()}
+
+
+def test_a_head_that_says_otherwise_stays_in_float(fitted: Fit, tmp_path: Path):
+    """int8 with its refitted head disagrees with a spoilt float head: the bundle holds the float
+    model, with the reason."""
+    made = quantized_bundle.export(negated(fitted), tmp_path / "bundle", "easy", "1", "")
+    why = made.made["float_because"]
+    assert re.match(
+        r"int8 loses \d+\.\d\d points on held-out sweeps, by float's own .*limit 0\.5", why
+    )
+    assert "QuantizeLinear" not in {
+        n.op_type for n in onnx.load(tmp_path / "bundle" / bundle.MODEL).graph.node
+    }
+    assert (
+        "float_because"
+        not in quantized_bundle.export(fitted, tmp_path / "bundle", "easy", "1", "").made
+    )
+
+
+def test_weights_that_are_no_numbers_are_refused(fitted: Fit, tmp_path: Path):
+    """A difference of nan is beyond every limit."""
+    with pytest.raises(ExportRefused, match="differs from pytorch by nan in a logit"):
+        quantized_bundle.export(
+            replace(fitted, weights=without_numbers(fitted)), tmp_path / "bundle", "easy", "1", ""
+        )
+
+
+def test_stages_are_compared_with_pytorch_beside_any_feature(fitted: Fit):
+    """Loads, which PyTorch does not compute, are no obstacle; the head here ignores them."""
+    size, at = loads.count(fitted.train.format), sum(fitted.architecture.channels)
+    weight = np.insert(fitted.weights["head.weight"], [at] * size, 0, axis=1)
+    more = replace(
+        fitted,
+        architecture=replace(fitted.architecture, loads=True),
+        weights=fitted.weights | {"head.weight": weight, "int8.weight": weight},
+    )
+    differences = [
+        quantized_bundle._torch_difference(fit, quantized_bundle.graphs(fit)[0])
+        for fit in (fitted, more)
+    ]
+    assert differences[0] == pytest.approx(differences[1], abs=1e-4)
+    assert 0 < differences[0] < quantized_bundle.MOST_TORCH_DIFFERENCE
+
+
+def without_numbers(fitted: Fit) -> dict[str, np.ndarray]:
+    """Weights whose float head gives nan."""
+    return fitted.weights | {"head.bias": fitted.weights["head.bias"] * np.nan}
+
+
+def judged(fitted: Fit) -> None:
+    """Compare both precisions as export does."""
+    reference, int8 = quantized_bundle.graphs(fitted)
+    quantized_bundle.check(parity.measure(int8, fitted.held.samples, fitted.held.labels, reference))
+
+
+def ranged(fitted: Fit, responses: Sequence[float]) -> Fit:
+    """A fit with these ranges of its stages in int8, its head refitted."""
+    other = replace(fitted, ranges=replace(fitted.ranges, responses=tuple(responses)))
+    seen, unseen = (
+        graph_builder.run(other.trunk(), s.samples) for s in (fitted.train, fitted.held)
+    )
+    labels = fitted.train.labels
+    weight, bias = fitted.plan.fit(
+        HeadData(seen, labels, seen[:0], labels[:0], np.empty((len(labels), 0))), 3
+    )
+    temperature = platt_temperature(unseen @ weight.T + bias, fitted.held.labels)
+    weight, bias = weight / temperature, bias / temperature
+    return replace(other, weights=fitted.weights | {"int8.weight": weight, "int8.bias": bias})
+
+
+@pytest.mark.thorough  # a fit of its own
+def test_a_range_for_one_outlier_is_refused(tight: Fit):
+    """Ranges reach from the smallest to the largest value, and one sweep is a thousandfold: too
+    little is left for all others."""
+    wild = tight.train.samples[:1].astype(np.float32)
+    wild = wild.mean(axis=1, keepdims=True) + 1000 * (wild - wild.mean(axis=1, keepdims=True))
+    network = stages.network_of(tight)
+    with torch.no_grad():
+        responses = network.responses(network.prepare(torch.from_numpy(wild)))
+    with pytest.raises(
+        ExportRefused, match=r"int8 .*\(limit .*suffers most \(-?\d+ dB, 0\.0% beyond.*record more"
+    ):
+        judged(ranged(tight, [float(x.max()) for x in responses]))
+    judged(ranged(tight, tight.ranges.responses))
+
+
+def test_a_layer_that_saturates_is_refused(tight: Fit):
+    """The first stage reaches 0.3 % of its range: no head can compensate, not even with the
+    spectrum, and the clipped share is reported."""
+    first, *others = tight.ranges.responses
+    with pytest.raises(
+        ExportRefused, match=r"\(limit .*suffers most \(\d+ dB, [3-6]\d\.\d% beyond"
+    ):
+        judged(ranged(tight, (0.003 * first, *others)))
+
+
+def test_a_head_that_was_not_refitted_is_refused(tight: Fit):
+    """With an int8 trunk that saturates, the float head fails; only a head of its own copes with
+    the features."""
+    *before, last = tight.ranges.responses
+    refitted = ranged(tight, (*before, 0.1 * last))
+    judged(refitted)
+    stale = {f"int8.{name}": refitted.weights[f"head.{name}"] for name in ("weight", "bias")}
+    with pytest.raises(ExportRefused, match=r"int8 (loses|moves|is right)"):
+        judged(replace(refitted, weights=refitted.weights | stale))
+
+
+def found(n: int = 100, lost: int = 0, won: int = 0, **apart: float) -> parity.Parity:
+    """A Parity of `n` sweeps, of which int8 loses and wins some; all else is perfect unless it is
+    named."""
+    right = np.arange(n) >= won, np.arange(n) < n - lost
+    usual = {"agreement": 1, "expected_loss": 0, "probability_difference": 0, "probability_mean": 0}
+    difference = parity.AnswerDifference(**(usual | apart), logit_difference=0, logit_mean=0)
+    layer = Layer("conv1", "activations", "float", (0,) * 4, 0, 1, 1 / 255, 0.001, 35)
+    return parity.Parity(n, int(right[1].sum()), difference, parity.loss(*right), 0, (layer,))
+
+
+@pytest.mark.parametrize(
+    ("good", "bad", "message"),
+    [
+        (
+            {"n": 1200, "lost": 6},
+            {"n": 1200, "lost": 7},
+            r"int8 is right on 1193 of 1200 .* 0\.58 points lost \(limit 0\.5\)",
+        ),
+        ({"n": 60, "lost": 4}, {"n": 60, "lost": 5}, r"55 of 60 .*, float on 60"),
+        ({"n": 300, "lost": 12, "won": 6}, {"n": 300, "lost": 13, "won": 4}, "3.00 points lost"),
+        (
+            {"expected_loss": 0.0049},
+            {"expected_loss": 0.0051},
+            r"loses 0\.51 points .* by float's own probabilities",
+        ),
+        (
+            {"probability_difference": 0.29},
+            {"probability_difference": 0.31},
+            r"by up to 0\.310 \(limit 0\.3\)",
+        ),
+        (
+            {"probability_mean": 0.024},
+            {"probability_mean": 0.026},
+            r"by 0\.026 on average \(limit 0\.025\)",
+        ),
+        (
+            {"agreement": 0.96},
+            {"agreement": 0.95},
+            r"agrees with float on 0\.950 of 100 .*\(limit 0\.96\)",
+        ),
+        ({"n": 10, "agreement": 0.9}, {"n": 10, "agreement": 0.8}, r"0\.800 of 10"),
+        ({}, {"expected_loss": np.nan}, "loses nan points"),
+        ({}, {"probability_mean": np.nan}, "by nan on average"),
+    ],
+)
+def test_each_limit_is_where_it_stands(good: dict, bad: dict, message: str):
+    """Within a limit the comparison passes; beyond it the message names number, limit and
+    remedy."""
+    quantized_bundle.check(found(**good))
+    with pytest.raises(ExportRefused, match=message) as refused:
+        quantized_bundle.check(found(**bad))
+    assert str(refused.value).endswith(
+        "drop training sweeps that are unlike all others, or record more"
+    )
+
+
+def test_a_bundle_whose_sweeps_the_box_refuses_is_refused(fitted: Fit, tmp_path: Path):
+    """Sweeps beyond the full scale count as saturated, which export reports before a robot meets
+    it."""
+    refused = (
+        r"the box would refuse \d+ of \d+ held-out sweeps \(limit 5%\), by status: "
+        r"\d+ saturated\. .* --full-scale$"
+    )
+    with pytest.raises(ExportRefused, match=refused):
+        quantized_bundle.export(fitted, tmp_path / "bundle", "easy", "1", "", full_scale=60)
+
+
+def test_a_bundle_that_calls_too_many_sweeps_unknown_is_refused(
+    fitted: Fit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """The message has their number, the limit, and the distance beyond which a sweep is unknown."""
+    monkeypatch.setattr(pack, "MOST_UNKNOWN", -0.5)
+    told = (
+        r"would call \d+ of \d+ held-out sweeps unknown \(limit -50%, squared distance "
+        r"\d[\d.]*\); record more positions"
+    )
+    with pytest.raises(ExportRefused, match=told):
+        quantized_bundle.export(fitted, tmp_path / "bundle", "easy", "1", "")
+
+
+def test_the_box_must_answer_as_export_did(fitted: Fit, packed: Path):
+    """If the labels of the box and of the int8 model differ, the message has the number of such
+    sweeps."""
+    logits = np.stack([box(packed).logits(x) for x in fitted.held.samples])
+    assert "held-out" in pack.judge(packed, fitted.held, logits, "held-out")
+    logits[:2] = -logits[:2]
+    with pytest.raises(ExportRefused, match="labels 2 of 30 held-out sweeps otherwise"):
+        pack.judge(packed, fitted.held, logits, "held-out")
+
+
+def test_a_material_never_recognised_is_refused(fitted: Fit):
+    """It has no golden sweep."""
+    logits = np.tile(np.float32([1, 0, 0]), (len(fitted.train), 1))
+    with pytest.raises(ExportRefused, match="no training sweep of 'high' is recognised"):
+        pack.golden_sweeps(fitted.train, logits, logits)
+
+
+def test_a_bundle_is_replaced_whole_or_not_at_all(fitted: Fit, packed: Path, tmp_path: Path):
+    """A refused export leaves the old bundle; a good one replaces it, stray files included; other
+    folders are safe."""
+    target = tmp_path / "bundle"
+    quantized_bundle.export(fitted, target, "old", "1", "")
+    (target / "stray").write_text("left over")
+    before = (target / bundle.MANIFEST).read_bytes()
+    with pytest.raises(ExportRefused):
+        quantized_bundle.export(
+            replace(fitted, weights=without_numbers(fitted)), target, "new", "2", ""
+        )
+    assert (target / bundle.MANIFEST).read_bytes() == before
+    quantized_bundle.export(fitted, target, "new", "2", "")
+    assert bundle.load(target).manifest.name == "new"
+    assert sorted(f.name for f in target.iterdir()) == sorted(
+        [bundle.MANIFEST, bundle.MODEL, bundle.GOLDEN, bundle.MEANS, "card.md"]
+    )
+    (tmp_path / "letters").mkdir()
+    with pytest.raises(ExportRefused, match="is not a bundle and will not be replaced"):
+        quantized_bundle.export(fitted, tmp_path / "letters", "new", "2", "")
+    assert sorted(f.name for f in tmp_path.iterdir()) == ["bundle", "letters"]
+
+
+def test_a_target_that_cannot_be_written_is_named(fitted: Fit, tmp_path: Path):
+    """The target is in a file instead of a folder."""
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ExportRefused, match="the bundle cannot be written to"):
+        quantized_bundle.export(fitted, tmp_path / "file" / "bundle", "easy", "1", "")
+
+
+def test_a_label_that_cannot_be_sent_is_refused(fitted: Fit, tmp_path: Path):
+    """The check of the manifest fails before anything is written."""
+    named = replace(
+        fitted,
+        **{k: replace(getattr(fitted, k), materials=("a,b", "c", "d")) for k in ("train", "held")},
+    )
+    with pytest.raises(BundleError, match="label 'a,b' cannot be sent"):
+        quantized_bundle.export(named, tmp_path / "bundle", "easy", "1", "")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_default_bundle_is_what_the_box_needs():
+    """It has the skin's format and tubes, at most 128 KB, golden sweeps as exported, and names
+    unseen placements."""
+    it = box(bundle.DEFAULT)
+    assert it.self_test() <= bundle.GOLDEN_TOLERANCE
+    assert (it.bundle.format, it.bundle.manifest.labels) == (skin.FORMAT, skin.MATERIALS)
+    assert sum(f.stat().st_size for f in bundle.DEFAULT.iterdir()) <= 128_000
+    unseen = sets.load("sim:T-REAL:1900:3")
+    assert np.mean(bundle_score.labels_of(it, unseen)[0] == unseen.labels) > 0.9
+    assert json.loads(it.bundle.manifest.json())["figures"]["held-out position"]["low"] > 0.9
+
+
+@pytest.mark.thorough  # exports every reference
+@pytest.mark.filterwarnings("error")
+def test_references_are_what_they_are_called(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    """The paper's CNN has the paper's number of parameters; both take the skin's sweeps and give
+    six logits. No library logs anything while they are made, about a bias that stays in float, for
+    instance."""
+    whole = paper_cnn.random_paper_cnn(skin.FORMAT, 6, np.random.default_rng(0))
+    assert cost.weights(whole) == 15_891_910
+    assert study(["references", "--out", str(tmp_path / "new")]) == 0
+    assert not caplog.records
+    sizes = {}
+    for path in (tmp_path / "new").iterdir():
+        run = session(path.read_bytes())
+        assert [(i.name, i.shape, i.type) for i in run.get_inputs()] == [
+            ("sweep", [1, 1500, 4, 4], "tensor(uint8)")
+        ]
+        assert np.isfinite(
+            run.run(["logits"], {"sweep": np.full((1, 1500, 4, 4), 7, np.uint8)})[0]
+        ).all()
+        sizes[path.name] = path.stat().st_size
+    kinds = {
+        path.name: {n.op_type for n in onnx.load(path).graph.node}
+        for path in (tmp_path / "new").iterdir()
+    }
+    assert ["QuantizeLinear" in kinds[name] for name in ("fp32.onnx", "paper_int8.onnx")] == [
+        False,
+        True,
+    ]
+    assert cost.macs(onnx.load(tmp_path / "new" / "fp32.onnx")) > 4e6
+    assert 15_891_910 < sizes["paper_int8.onnx"] < 1.01 * 15_891_910
+
+
+def test_the_command_exports_what_fit_wrote(
+    fitted: Fit, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """It prints one line for each figure, then the size, at last the command to score it; another
+    file has the exit code of FormatError."""
+    fitted.save(tmp_path / "fit.npz")
+    args = ["--out", str(tmp_path / "bundle"), "--name", "easy", "--version", "3"]
+    assert main(["export", str(tmp_path / "fit.npz"), *args]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    lines = [line for line in lines if not line.startswith("  ")]  # each fault, each alteration
+    assert [line.split(":")[0] for line in lines] == [
+        "held-out speed, as the box answers",
+        "held-out speed, network alone",
+        "held-out speed, by recording",
+        "broken taxels",
+        "clipped counts",
+        "altered sweeps",
+        "a finger that rests",
+        "bundle",
+        "to score it on sweeps that the fit has not seen",
+        "for a page about it and its limits",
+    ]
+    assert lines[-2].endswith(f": palpate-train score {tmp_path / 'bundle'} --set SET")
+    assert lines[-1].endswith(
+        f": palpate-train report {tmp_path / 'bundle'} --set SET --out report.html"
+    )
+    assert bundle.load(tmp_path / "bundle").manifest.version == "3"
+    assert main(["export", str(tmp_path / "bundle" / "golden.npz"), *args]) == FormatError.exit_code
+    assert "golden.npz: not a fit" in capsys.readouterr().err
+
+
+def test_a_fit_without_a_convolution_is_exported(tmp_path: Path):
+    """Nothing in it is int8: both precisions are equal, the labels of box and fit agree, and no
+    tensor is reported. A spoilt head is reported here as well."""
+    made = recipe.fit(easy(), 1, recipe.Settings(steps=0, size=SIZES["bands"]))
+    quantized_bundle.export(made, tmp_path / "b", "easy", "1", "0123abcd")
+    it = box(tmp_path / "b")
+    assert it.self_test() < 1e-6
+    assert "QuantizeLinear" not in {
+        n.op_type for n in onnx.load(tmp_path / "b" / bundle.MODEL).graph.node
+    }
+    logits = parity.logits(quantized_bundle.graphs(made)[0], made.held.samples)
+    assert [it.logits(x).argmax() for x in made.held.samples] == logits.argmax(1).tolist()
+    result = it.bundle.manifest.figures["parity"]
+    assert (result["agreement"], result["lost"]) == (1, 0)
+    assert result["probability_difference"] < 1e-3
+    (method,) = methods.find(["palpate-bands"])
+    content = pack.trained(method, easy(), 1)
+    assert quantized_bundle.checked(content, content.reference).figures["parity"]["agreement"] == 1
+    other = quantized_bundle.export(negated(made), tmp_path / "other", "easy", "1", "")
+    assert re.match(r"int8 loses \d+\.\d\d points .*record more", other.made["float_because"])
+
+
+def test_any_method_is_judged_by_the_same_limits(monkeypatch: pytest.MonkeyPatch):
+    """The figures of an int8 method are in its content; beyond a limit it is refused; without a
+    float model nothing is compared."""
+    (method,) = methods.find(["palpate-64"])
+    train, held, by = hold_out(close(), 1)
+    model = method.train(train, train.samples, 1)
+    content, reference = (
+        pack.Content(model.graph(), "raw", train, held, by, {}),
+        model.precisions["float"].graph(),
+    )
+    assert quantized_bundle.checked(content, reference).figures["parity"]["total"] == len(
+        content.held_out
+    )
+    assert quantized_bundle.checked(content, None) is content
+    monkeypatch.setattr(quantized_bundle, "MOST_MEAN_DIFFERENCE", 0.0)
+    with pytest.raises(ExportRefused, match=r"on average \(limit 0.0\)"):
+        quantized_bundle.checked(content, reference)
+
+
+@pytest.mark.skipif(
+    "PALPATE_DATA" not in os.environ, reason="PALPATE_DATA does not name the folder of real sweeps"
+)
+def test_fabrics_go_the_whole_way(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Another skin (int16, 16 x 1, 35.6 Hz, 128 frames) with the same commands. Unseen sweeps go
+    over the USB wire into sentences, with materials in turn, so that nearly each is another object;
+    as many are right as by the classifier itself."""
+    path = Path(os.environ["PALPATE_DATA"]) / "fabricslide" / "fabricslide.npz"
+    args = [
+        "--set",
+        str(path),
+        "--only",
+        "direction=0",
+        "--only",
+        "force<=180",
+        "--seed",
+        "1",
+        "--steps",
+        "300",
+    ]
+    args += [
+        "--split",
+        "recording:0.7",
+        "--rest",
+        str(tmp_path / "rest.npz"),
+        "--out",
+        str(tmp_path / "fit.npz"),
+    ]
+    assert main(["fit", *args]) == 0
+    assert (
+        main(
+            [
+                "export",
+                str(tmp_path / "fit.npz"),
+                "--out",
+                str(tmp_path / "b"),
+                "--name",
+                "f",
+                "--version",
+                "1",
+            ]
+        )
+        == 0
+    )
+    it, rest = box(tmp_path / "b"), sets.load(str(tmp_path / "rest.npz"))
+    assert (it.bundle.format.dtype, it.bundle.format.rows, it.bundle.format.window) == (
+        "int16",
+        16,
+        128,
+    )
+    logits = np.stack([it.logits(counts) for counts in rest.samples])
+    result = bundle_score.answers_to(it, rest, logits).figures(
+        rest.labels, rest.group("recording"), "unseen"
+    )
+    assert result["unseen"]["accuracy"] > 0.9
+    assert result["unseen, by recording"]["accuracy"] > 0.9
+    sentences = [
+        "demo",
+        "--sim",
+        f"replay:{tmp_path / 'rest.npz'}",
+        "--virtual",
+        "--sweeps",
+        str(len(rest)),
+    ]
+    assert palpate([*sentences, "--set", f"classifier.bundle={tmp_path / 'b'}"]) == 0
+    out = capsys.readouterr().out
+    right, total = (int(n) for n in re.search(r"all sweeps +(\d+) / (\d+)", out).groups())
+    assert total == result["unseen"]["n"] == len(rest)
+    assert right / total == pytest.approx(result["unseen"]["accuracy"], abs=0.01)
+    assert "frames lost     0 of" in out
+
+
+def test_a_fit_does_not_see_offsets(tmp_path: Path):
+    """It cannot distinguish materials that differ only in their offset, without groups that show
+    what loads are good for."""
+    whole = easy(seed=3)
+    del whole.groups["speed"]
+    rng = np.random.default_rng(4)
+    labels = rng.permutation(whole.labels)
+    level = (
+        whole.samples.mean(axis=1, keepdims=True)
+        - np.array([60, 100, 140])[labels][:, None, None, None]
+    )
+    offset = replace(whole, samples=(whole.samples - level).round().astype(np.uint8), labels=labels)
+    try:
+        made = with_stages(offset, steps=20)
+        manifest = quantized_bundle.export(made, tmp_path / "b", "offset", "1", "0123abcd")
+    except ExportRefused:  # what was never learnt may not survive int8 either
+        return
+    assert manifest.figures["held-out recording"]["accuracy"] < 0.6
+
+
+def test_display_names_are_in_manifest_and_card(fitted: Fit, tmp_path: Path):
+    """Only those of the set's materials; the labels stay."""
+    shown = {"low": "tief, 低い", "gone": "weg"}
+    named = replace(fitted, train=replace(fitted.train, displays=shown))
+    quantized_bundle.export(named, tmp_path / "b", "easy", "1", "", proven=False)
+    manifest = bundle.load(tmp_path / "b").manifest
+    assert manifest.labels == fitted.train.materials
+    assert manifest.displays == {"low": "tief, 低い"}
+    assert 'display_names: {"low": "tief, 低い"}' in (tmp_path / "b" / "card.md").read_text("utf-8")

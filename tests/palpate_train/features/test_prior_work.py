@@ -1,0 +1,230 @@
+"""The features of prior work against scipy and against formulas written out, and exploration until
+the posterior is certain."""
+
+from __future__ import annotations
+
+import math
+from itertools import combinations
+
+import numpy as np
+import pytest
+import scipy.stats
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from palpate.core.errors import FormatError
+from palpate.signal import features, time_series
+from palpate_train.features import kinds
+from palpate_train.features.prior_work import correlation, spectrogram, static
+from palpate_train.models.peers.prior_work import explore
+
+KINDS = ("static", "spectrogram", "correlation")
+RATE = 750.0
+
+
+def noise(frames: int = 300, rows: int = 2, cols: int = 3) -> np.ndarray:
+    """Taxels that share a part of their noise, float32, each with another mean."""
+    rng = np.random.default_rng(4)
+    x = (
+        rng.normal(0, 5, (frames, rows, cols))
+        + rng.normal(0, 4, (frames, 1, 1))
+        + rng.uniform(20, 90, (rows, cols))
+    )
+    return x.astype(np.float32)
+
+
+def test_static_features_are_what_they_say():
+    """Two frames of 1x2 taxels by hand: means, deviations, the pressure's four numbers, centre and
+    contact area."""
+    x = np.array([[[10, 0]], [[30, 2]]], np.uint8)
+    centre = (-0.5 * 20 + 0.5 * 1) / 21
+    want = [20, 1, 10, 1, 10.5, 5.5, 5, 16, 0, centre, 0.5]
+    np.testing.assert_allclose(static(x, RATE), want)
+
+
+def test_static_features_do_not_know_time():
+    """Frames in another order give the same numbers, at any rate."""
+    x = noise()
+    other = x[np.random.default_rng(0).permutation(len(x))]
+    np.testing.assert_allclose(static(other, 20.0), static(x, RATE), rtol=1e-9)
+
+
+def test_a_spectrogram_is_its_formula():
+    """One part by formula: Hann window, Fourier sum without DC, mean over a band's six bins, taxels
+    by eq. 4, logarithm."""
+    x = noise(1500)
+    part = x.reshape(1500, -1).T.astype(float)[:, 300:600]
+    n = np.arange(300)
+    shaped = (part - part.mean(1, keepdims=True)) * np.sin(np.pi * (n + 0.5) / 300) ** 2
+    bins = np.array(
+        [np.abs(shaped @ np.exp(-2j * np.pi * q * n / 300)) ** 2 / 300 for q in range(1, 151)]
+    )
+    want = np.log(bins.reshape(25, 6, 6).mean(axis=1) @ features.taxel_weights(x))
+    np.testing.assert_allclose(spectrogram(x, RATE).reshape(5, 25)[1], want)
+
+
+def test_load_and_place_are_those_of_the_normal_axis():
+    """Shear of any size only adds its own means and deviations, and power weighted by its taxel's
+    load."""
+    x = noise()
+    shear = np.random.default_rng(8).normal(-300, 9, (*x.shape, 2)).astype(np.float32)
+    three = np.concatenate([shear, x[..., None]], axis=-1)
+    np.testing.assert_allclose(static(three, RATE)[-7:], static(x, RATE)[-7:])
+    np.testing.assert_allclose(
+        static(three, RATE)[:36].reshape(2, 6, 3)[..., 2], static(x, RATE)[:12].reshape(2, 6)
+    )
+    same = np.stack([x, x, x], axis=-1)
+    np.testing.assert_allclose(spectrogram(same, RATE), spectrogram(x, RATE))
+    np.testing.assert_allclose(correlation(same, RATE)[:3], correlation(x, RATE)[:3])
+
+
+@pytest.mark.parametrize(("frames", "band"), [(1500, 7), (128, 3), (100, 20)])
+def test_a_tone_lands_in_its_part_and_band(frames: int, band: int):
+    """A burst in the fourth fifth of the sweep is the maximum there, also where zeros must be
+    appended."""
+    t = np.arange(frames)
+    at = t * 5 // frames == 3
+    tone = 100 + 50 * at * np.sin(2 * np.pi * (band + 0.5) / 50 * t)
+    power = spectrogram(tone.reshape(-1, 1, 1).astype(np.float32), RATE).reshape(5, 25)
+    part, strongest = np.unravel_index(power.argmax(), power.shape)
+    assert part == 3
+    assert abs(int(strongest) - band) <= 1
+
+
+def test_hjorth_parameters_of_a_sine():
+    """Activity log(A^2 / 2), mobility 2 pi f, complexity 1."""
+    t = np.arange(1500) / RATE
+    x = (100 + 20 * np.sin(2 * np.pi * 12 * t)).reshape(-1, 1, 1).astype(np.float32)
+    np.testing.assert_allclose(
+        correlation(x, RATE)[:3], [math.log(200), 2 * math.pi * 12, 1], rtol=2e-3
+    )
+
+
+@pytest.mark.parametrize("frames", [300, 4])
+def test_correlations_are_those_of_scipy(frames: int):
+    """Mean and spread of Pearson's and Spearman's r over all pairs, with ties, for more frames than
+    taxels and fewer."""
+    x = np.round(noise(frames)).astype(np.uint8)
+    flat = x.reshape(frames, -1).T.astype(float)
+    want = []
+    for r in (scipy.stats.pearsonr, scipy.stats.spearmanr):
+        each = [r(a, b).statistic for a, b in combinations(flat, 2)]
+        want += [np.mean(each), np.std(each)]
+    got = correlation(x, RATE)
+    np.testing.assert_allclose(got[3:7], want, atol=1e-9)
+    np.testing.assert_allclose(
+        got[7:], [math.log(np.linalg.norm(np.cov(flat, ddof=0))), flat.mean()]
+    )
+
+
+def test_a_still_taxel_takes_no_part_in_correlations():
+    """A dead taxel leaves the four numbers unchanged, however large its count; a single varying
+    taxel has no correlation."""
+    x = noise()
+    for level in (0, 3.3e30):
+        dead = np.concatenate([x, np.full((len(x), 2, 1), level, np.float32)], axis=2)
+        np.testing.assert_allclose(
+            correlation(dead, RATE)[3:7], correlation(x, RATE)[3:7], atol=1e-12
+        )
+    assert correlation(x[:, :1, :1], RATE)[3:7].tolist() == [0, 0, 0, 0]
+
+
+@pytest.mark.parametrize("level", [0, 255])
+def test_a_silent_or_saturated_skin_has_plain_answers(level: int):
+    """Constant counts: floors, rates and levels, nothing else."""
+    x = np.full((100, 2, 2), level, np.uint8)
+    low = math.log(time_series.FLOOR)
+    np.testing.assert_allclose(spectrogram(x, RATE), np.full(125, low))
+    np.testing.assert_allclose(correlation(x, RATE), [low, RATE, 1, 0, 0, 0, 0, low, level])
+    whole = [level, 0, level, level, 0, 0, float(level > 0)]
+    np.testing.assert_allclose(static(x, RATE), [level] * 4 + [0] * 4 + whole)
+
+
+def test_a_mean_that_rounding_left_is_none():
+    """Float32 counts without their means: the weights are equal, and no feature shows the rounding
+    error."""
+    x = noise()
+    centred = (x - x.mean(axis=0, dtype=np.float64)).astype(np.float32)
+    assert centred.mean(axis=0, dtype=np.float64).any()
+    np.testing.assert_array_equal(features.taxel_weights(centred), np.full(6, 1 / 6))
+    assert not static(centred, RATE)[:6].any()
+    assert correlation(centred, RATE)[8] == 0
+
+
+@pytest.mark.parametrize(("rows", "cols"), [(1, 1), (3, 3), (16, 1), (20, 30)])
+def test_the_number_of_features_hangs_on_the_grid_alone(rows: int, cols: int):
+    """2 M + 7, 125 and 9, whatever the length of the sweep."""
+    for frames in (20, 61):
+        x = np.random.default_rng(0).integers(0, 99, (frames, rows, cols)).astype(np.int16)
+        assert [len(kinds.compute(k, x, 50.0)) for k in KINDS] == [2 * rows * cols + 7, 125, 9]
+
+
+_DIGITS = st.sampled_from(["uint8", "int16", "uint16", "float32"]).flatmap(
+    lambda dtype: hnp.arrays(
+        dtype,
+        st.tuples(st.integers(20, 60), st.integers(1, 3), st.integers(1, 3)),
+        elements={"allow_nan": False, "allow_infinity": False} if dtype == "float32" else None,
+    )
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(_DIGITS, st.floats(1, 5000), st.sampled_from(KINDS))
+def test_results_are_finite_for_any_digits(taxels: np.ndarray, rate_hz: float, kind: str):
+    """Finite float32 numbers for any counts."""
+    assert np.isfinite(kinds.compute(kind, taxels, rate_hz)).all()
+
+
+@pytest.mark.parametrize(
+    ("kind", "shape", "rate_hz", "message"),
+    [
+        ("static", (0, 2, 2), RATE, r"shape \(0, 2, 2\) is not a sweep"),
+        (
+            "spectrogram",
+            (19, 2, 2),
+            RATE,
+            "19 frames are too few for a spectrogram; use at least 20",
+        ),
+        ("correlation", (2, 2, 2), RATE, "2 frames are too few .* use at least 3"),
+        ("correlation", (20, 2, 2), 0.0, "rate of 0.0 Hz"),
+    ],
+)
+def test_what_cannot_be_computed_is_named(
+    kind: str, shape: tuple[int, ...], rate_hz: float, message: str
+):
+    """Each refusal is a FormatError with the wrong value."""
+    with pytest.raises(FormatError, match=message):
+        kinds.compute(kind, np.ones(shape, np.uint8), rate_hz)
+
+
+def test_exploring_stops_when_the_posterior_is_sure():
+    """.6, then .6 * .6 over the sum (.69), then .77: two sweeps for .65, three for .7, all of them
+    for .99."""
+    log_p = np.log(np.array([[0.6, 0.4]] * 3))
+    assert [explore(log_p, sure) for sure in (0.55, 0.65, 0.7, 0.99)] == [
+        (0, 1),
+        (0, 2),
+        (0, 3),
+        (0, 3),
+    ]
+
+
+def test_later_sweeps_correct_the_first():
+    """Later sweeps outweigh a wrong first sweep, even if it is certain beyond float64."""
+    log_p = np.log(np.array([[0.6, 0.4], [0.1, 0.9], [0.1, 0.9]]))
+    assert explore(log_p, 0.95) == (1, 3)
+    assert explore(np.array([[0.0, -1e9]] + [[-12.0, 0.0]] * 4), 1)[0] == 1
+
+
+@pytest.mark.parametrize(
+    ("log_p", "sure", "hint"),
+    [
+        (np.zeros((0, 3)), 0.9, "at least one of each"),
+        (np.zeros((2, 3)), 1.5, "1.5 cannot be reached"),
+    ],
+)
+def test_what_cannot_be_explored_is_named(log_p: np.ndarray, sure: float, hint: str):
+    """No sweep, and a certainty that is not a probability."""
+    with pytest.raises(FormatError, match=hint):
+        explore(log_p, sure)

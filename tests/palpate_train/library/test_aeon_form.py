@@ -1,0 +1,44 @@
+"""The recipe with aeon's base class: aeon's own checks, and the answers of the other classifier."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+
+from palpate_train import PalpateClassifier
+
+pytest.importorskip("aeon")
+from aeon.classification.compose import ClassifierPipeline
+from aeon.testing.estimator_checking import check_estimator
+from aeon.transformations.collection import Normalizer
+
+from palpate_train.library.aeon_form import AeonPalpateClassifier
+
+RNG = np.random.default_rng(5)
+LABELS = np.array(["felt", "wood"])[np.arange(32) % 2]
+SWEEPS = RNG.normal(0, 8, (32, 4, 100)) + 100
+SWEEPS[LABELS == "wood"] += 20 * np.sin(np.arange(100) * 0.9)
+small = partial(dict, steps=0, size="bands", grid=(2, 2))
+
+
+def test_it_answers_as_the_classifier_does():
+    """Fit, labels and probabilities; it can stand at the end of a pipeline of aeon."""
+    made = AeonPalpateClassifier(**small()).fit(SWEEPS[:24], LABELS[:24])
+    same = PalpateClassifier(**small()).fit(SWEEPS[:24], LABELS[:24])
+    np.testing.assert_array_equal(made.predict_proba(SWEEPS[24:]), same.predict_proba(SWEEPS[24:]))
+    assert made.score(SWEEPS[24:], LABELS[24:]) == 1
+    assert made.palpate_.sweeps.format.rows == 2
+    pipeline = ClassifierPipeline(Normalizer(), AeonPalpateClassifier(**small()))
+    pipeline.fit(SWEEPS[:24], LABELS[:24])
+    assert set(pipeline.predict(SWEEPS[24:])) <= {"felt", "wood"}
+
+
+@pytest.mark.slow
+@pytest.mark.thorough  # aeon's checks fit a dozen times
+def test_aeons_own_checks_pass():
+    """All of them, with its sweeps of 20 frames, which need a size with filters."""
+    found = check_estimator(AeonPalpateClassifier, raise_exceptions=False, verbose=False)
+    assert len(found) > 20
+    assert {name: said for name, said in found.items() if said != "PASSED"} == {}

@@ -1,0 +1,117 @@
+"""The library: the recipe as a classifier of scikit-learn, and bundles with the box's answers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from sklearn.base import clone
+from sklearn.exceptions import NotFittedError
+from sklearn.model_selection import LeaveOneGroupOut, cross_val_score
+from sklearn.utils import estimator_checks
+
+from palpate.core.errors import FormatError
+from palpate_train import PalpateClassifier, load_bundle
+from palpate_train.library.sweeps import raw_counts
+
+RNG = np.random.default_rng(0)
+LABELS = np.array(["felt", "wood"])[np.arange(48) % 2]
+GROUPS = np.arange(48) // 12
+SWEEPS = RNG.normal(0, 8, (48, 4, 100)) + 100
+SWEEPS[LABELS == "wood"] += 20 * np.sin(np.arange(100) * 0.9)
+SWEEPS = np.rint(SWEEPS).astype(np.uint8)
+
+
+def small(**changes: object) -> PalpateClassifier:
+    """A classifier that fits in seconds."""
+    return PalpateClassifier(**{"grid": (2, 2), "steps": 0, "size": "bands"} | changes)
+
+
+@pytest.fixture(scope="module")
+def fitted() -> PalpateClassifier:
+    return small().fit(SWEEPS[:36], LABELS[:36], groups=GROUPS[:36])
+
+
+def test_scikit_learn_accepts_it(fitted: PalpateClassifier):
+    """Its checks without data of two axes; parameters, clones, an unfitted classifier."""
+    for check in (
+        estimator_checks.check_no_attributes_set_in_init,
+        estimator_checks.check_get_params_invariance,
+        estimator_checks.check_set_params,
+        estimator_checks.check_parameters_default_constructible,
+        estimator_checks.check_estimator_repr,
+    ):
+        check("PalpateClassifier", PalpateClassifier())
+    with pytest.warns(UserWarning, match="Can't test estimator PalpateClassifier"):
+        estimator_checks.check_estimator(PalpateClassifier())
+    copy = clone(fitted)
+    assert copy.get_params() == fitted.get_params()
+    with pytest.raises(NotFittedError):
+        copy.predict(SWEEPS)
+
+
+def test_labels_and_probabilities(fitted: PalpateClassifier):
+    """New sweeps get the right label; probabilities are in the order of classes_; [n, time, rows,
+    columns] gives the same answers as [n, channels, time]."""
+    assert fitted.classes_.tolist() == ["felt", "wood"]
+    assert fitted.score(SWEEPS[36:], LABELS[36:]) == 1
+    found = fitted.predict_proba(SWEEPS[36:])
+    np.testing.assert_allclose(found.sum(axis=1), 1)
+    frames = SWEEPS.transpose(0, 2, 1).reshape(48, 100, 2, 2)
+    np.testing.assert_array_equal(fitted.predict_proba(frames[36:]), found)
+    np.testing.assert_array_equal(raw_counts(frames), raw_counts(SWEEPS, (2, 2)))
+    assert fitted.sweeps.groups["position"].tolist() == GROUPS[:36].tolist()
+
+
+@pytest.mark.slow
+@pytest.mark.thorough  # four fits
+def test_groups_are_left_out():
+    """cross_val_score over whole groups."""
+    found = cross_val_score(small(), SWEEPS, LABELS, groups=GROUPS, cv=LeaveOneGroupOut())
+    assert found.tolist() == [1, 1, 1, 1]
+
+
+def test_a_bundle_answers_with_the_boxs_code(fitted: PalpateClassifier, tmp_path: Path):
+    """save_bundle, load_bundle, predict; the card names the origin of the bundle."""
+    manifest = fitted.save_bundle(tmp_path / "b", licence="CC-BY-4.0", proven=False)
+    assert manifest.labels == ("felt", "wood")
+    head = yaml.safe_load((tmp_path / "b" / "card.md").read_text().split("---")[1])
+    assert head["license"] == "CC-BY-4.0"
+    assert head["sensor"] == "2x2 uint8 at 100 Hz, window 100"
+    assert head["materials"].keys() == {"felt", "wood"}
+    assert head["groups"] == {"position": 2}
+    assert head["protocol"] == "held-out position"
+    assert 0 <= head["interval_95"][0] <= head["accuracy"] <= head["interval_95"][1] <= 1
+    assert len(head["training_digest"]) == 16
+    box = load_bundle(tmp_path / "b")
+    assert box.score(SWEEPS[36:], LABELS[36:]) >= 0.8
+    known = set(box.predict(SWEEPS[36:])) - {"unknown"}
+    assert known == {"felt", "wood"}
+    assert box.predict_proba(SWEEPS[36:]).shape == (12, 2)
+    for found, verdict in zip(
+        box.predict_proba(SWEEPS[36:]), box.verdicts(SWEEPS[36:]), strict=True
+    ):
+        if verdict.label:
+            assert found.max() == pytest.approx(verdict.probability)
+    with pytest.raises(FormatError, match="the bundle takes 2x2 uint8 at 100 Hz, window 100"):
+        box.predict(SWEEPS[36:, :, :50])
+    with pytest.raises(FormatError, match="X holds float32, and the bundle takes uint8"):
+        box.predict(SWEEPS[36:] + 0.5)
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "why"),
+    [
+        (np.zeros((4, 4)), LABELS[:4], r"X holds float64 \[4, 4\]; give numbers"),
+        (np.zeros((4, 3, 9)), LABELS[:4], "X has 3 channels, but the grid 2x2 has 4 places"),
+        (np.zeros((4, 4, 9)), LABELS[:3], r"y holds \[3\] values for 4 sweeps"),
+        (np.zeros((4, 4, 9)), None, "y is missing"),
+        ([[[1, 2], [3]]], ["a"], "objects; give one array|inhomogeneous"),
+    ],
+)
+def test_what_cannot_be_fitted_is_named(x: object, y: object, why: str):
+    """Before any training."""
+    with pytest.raises((FormatError, ValueError), match=why):
+        small().fit(x, y)

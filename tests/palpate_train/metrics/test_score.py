@@ -1,0 +1,65 @@
+"""Counting: intervals and fused windows."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from palpate.inference.classifier import softmax
+from palpate_train.metrics.score import Score, accuracy_figure, fuse, interval
+
+
+def test_a_score_counts():
+    """The number of right answers and the total, as plain numbers."""
+    assert Score.of(np.array([True, False, True])).json() == {"right": 2, "total": 3}
+
+
+def test_one_pool_has_the_papers_wilson_interval():
+    """55 of 60 is [.819, .964], the paper's T-HARD."""
+    assert interval(np.arange(60) < 55) == pytest.approx((0.819, 0.964), abs=5e-4)
+
+
+def test_sweeps_that_fail_together_widen_the_interval():
+    """Two of ten positions all wrong: a much wider interval than of a pool with as many wrong;
+    never narrower than Wilson's."""
+    position = np.repeat(np.arange(10), 50)
+    right = position >= 2
+    low, high = interval(right, position)
+    pool_low, pool_high = interval(right)
+    assert low < pool_low - 0.1
+    assert high > pool_high + 0.05
+    assert interval(np.ones(90, bool), np.repeat(np.arange(9), 10)) == interval(np.ones(90, bool))
+
+
+def test_the_bootstrap_covers_the_truth():
+    """Of 200 experiments with 12 groups whose accuracies differ, about 19 in 20 intervals hold the
+    true mean."""
+    rng, held = np.random.default_rng(1), 0
+    for _ in range(200):
+        p = rng.beta(8, 2, 12)
+        right = rng.random((12, 30)) < p[:, None]
+        low, high = interval(right.ravel(), np.repeat(np.arange(12), 30))
+        held += low <= 0.8 <= high
+    assert 176 <= held <= 200
+
+
+def test_windows_of_a_recording_are_fused_as_a_product():
+    """The sum of log probabilities, recordings in the order of their numbers, with the first sweep
+    of each."""
+    logits = np.array([[1.0, 0.0], [0.0, 3.0], [2.0, 0.0]], np.float32)
+    scores, first = fuse(logits, np.array([7, 3, 7]))
+    assert first.tolist() == [1, 0]
+    assert scores[1] == pytest.approx(np.log(softmax(logits[0])) + np.log(softmax(logits[2])))
+    assert scores.argmax(1).tolist() == [1, 0]
+
+
+def test_no_window_can_veto_all_others():
+    """A probability of 0 in float does not outweigh the others with log 0."""
+    scores, _ = fuse(np.array([[1e4, 0.0]] + [[0.0, 9.0]] * 5, np.float32), np.zeros(6, int))
+    assert np.isfinite(scores).all()
+    assert scores.argmax() == 1
+
+
+def test_a_figure_has_wilsons_interval():
+    """55 of 60, the paper's T-HARD: .917 in [.819, .964]."""
+    assert accuracy_figure(55, 60) == {"accuracy": 0.9167, "n": 60, "low": 0.8193, "high": 0.9639}

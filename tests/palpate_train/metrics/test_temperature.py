@@ -1,0 +1,65 @@
+"""Temperature scaling on logits whose true temperature is known."""
+
+import numpy as np
+import pytest
+
+from palpate.inference.classifier import softmax
+from palpate_train.metrics.temperature import platt_temperature, sufficient_temperature
+
+
+def drawn(n: int, groups: int, seed: int = 0, scale: float = 2.0):
+    """Calibrated logits [n, 3], labels drawn from their softmax, groups."""
+    rng = np.random.default_rng(seed)
+    logits = scale * rng.standard_normal((n, 3))
+    labels = (softmax(logits).cumsum(axis=1) < rng.random((n, 1))).sum(axis=1)
+    return logits, labels, np.arange(n) % groups
+
+
+@pytest.mark.parametrize("times", [3.0, 6.0])
+def test_a_head_that_is_too_sure_is_cooled(times: float):
+    """For calibrated logits times `times`, the result is that factor, or within an error below it,
+    and never above."""
+    logits, labels, groups = drawn(3000, 30)
+    found = sufficient_temperature(times * logits, labels, groups)
+    assert 0.8 * times < found < 1.05 * times
+
+
+def test_a_calibrated_head_stays_as_it_is():
+    """Without evidence of overconfidence the temperature is 1, also if all sweeps are right by a
+    large margin."""
+    temperatures = [sufficient_temperature(*drawn(300, 10, seed)) for seed in range(20)]
+    assert np.mean(np.array(temperatures) == 1) > 0.8
+    assert max(temperatures) < 1.3
+    labels = np.arange(60) % 3
+    assert sufficient_temperature(100 * np.eye(3)[labels], labels, np.arange(60) % 6) == 1
+
+
+def test_sweeps_that_are_right_by_far_do_not_ask_for_a_temperature():
+    """Of 300 sweeps with a margin of 30, one is wrong by a margin of 1: the temperature is a little
+    over half of that with Platt's correction."""
+    labels = np.arange(300) % 3
+    logits = 30 * np.eye(3)[labels]
+    logits[0] = [0, 1, 0]
+    assert sufficient_temperature(logits, labels, np.arange(300) % 10) < 0.6 * platt_temperature(
+        logits, labels
+    )
+
+
+def test_sweeps_that_fail_together_count_as_one():
+    """If all evidence comes from one group of thirty, it does not count. The same evidence from
+    every group does."""
+    labels = np.zeros(300, int)
+    logits = np.tile([6.0, 0.0], (300, 1))
+    logits[:10] = [0.0, 6.0]
+    together, apart = np.repeat(np.arange(30), 10), np.arange(300) % 30
+    apart_temperature = sufficient_temperature(logits, labels, apart)
+    assert sufficient_temperature(logits, labels, together) < apart_temperature
+    assert apart_temperature > 1.2
+
+
+def test_with_one_group_each_sweep_is_its_own():
+    """A single group has no spread between groups, so the spread of its sweeps is used."""
+    logits, labels, groups = drawn(1000, 1)
+    assert sufficient_temperature(4 * logits, labels, groups) == sufficient_temperature(
+        4 * logits, labels, np.arange(1000)
+    )

@@ -1,0 +1,73 @@
+"""MiniRocket with augmented copies: the copies, and that none of them is a copy of a held-out
+sweep."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from palpate.core.errors import FormatError
+from palpate_train.data.sets import Dataset
+from palpate_train.models.peers import minirocket, minirocket_augmented
+from palpate_train.models.recipe.architectures import STAGES
+from palpate_train.models.recipe.augment import COPIES, SLOW, copies, default_augmentation
+from tests.factories.sweep_sets import easy
+
+
+def test_copies_are_augmented_as_in_our_own_training():
+    """They are as many, and augmented as for the format. A window that our networks cannot take
+    counts as that of a slow sensor."""
+    assert minirocket_augmented.COPIES == COPIES
+    for window in (64, 1500):
+        assert minirocket_augmented.augmentation(window) == default_augmentation(
+            STAGES.zero_sum(window)
+        )
+    assert minirocket_augmented.augmentation(12) == SLOW
+
+
+@pytest.mark.parametrize("dtype", ["int16", "float32"])
+def test_copies_keep_label_and_recording_of_their_sweep(
+    dtype: str, monkeypatch: pytest.MonkeyPatch
+):
+    """There are two copies of each sweep, after the sweeps themselves; no two copies are equal."""
+    seen: list[tuple[Dataset, np.ndarray]] = []
+    monkeypatch.setattr(
+        minirocket, "train", lambda sweeps, inputs, seed: seen.append((sweeps, inputs))
+    )
+    sweeps = easy(6, pieces=2, dtype=dtype)
+    minirocket_augmented.train(sweeps, sweeps.samples, 1)
+    minirocket_augmented.train(replace(sweeps, groups={}), sweeps.samples, 1)
+    changed = copies(sweeps, minirocket_augmented.augmentation(64), 1, 2)
+    for copy, start in zip(changed, (18, 36), strict=True):
+        np.testing.assert_array_equal(seen[0][1][start : start + 18], copy.samples)
+    for several, inputs in seen:
+        np.testing.assert_array_equal(several.labels, np.tile(sweeps.labels, 3))
+        np.testing.assert_array_equal(inputs[:18], sweeps.samples)
+        assert inputs.dtype == dtype
+        assert not np.array_equal(inputs[18:36], inputs[36:])
+    np.testing.assert_array_equal(
+        seen[0][0].group("recording"), np.tile(sweeps.group("recording"), 3)
+    )
+    np.testing.assert_array_equal(seen[1][0].group("recording"), np.tile(np.arange(18), 3))
+
+
+@pytest.mark.slow
+def test_what_is_easy_is_learnt_and_a_seed_gives_one_model(monkeypatch: pytest.MonkeyPatch):
+    """Sweeps of another seed are named rightly; the same seed gives the same bytes, another seed
+    others; errors are those of minirocket."""
+    pytest.importorskip("aeon")
+    monkeypatch.setattr(minirocket, "FEATURES", 500)
+    sweeps, other = easy(12), easy(12, seed=1)
+    models = [minirocket_augmented.train(sweeps, sweeps.samples, seed) for seed in (1, 1, 2)]
+    assert np.mean(models[0].logits(other.samples).argmax(1) == other.labels) > 0.95
+    graphs = [model.graph().SerializeToString() for model in models]
+    assert graphs[0] == graphs[1] != graphs[2]
+    twelve = replace(sweeps, samples=sweeps.samples[:, :12])
+    assert np.isfinite(
+        minirocket_augmented.train(twelve, twelve.samples, 0).logits(twelve.samples)
+    ).all()
+    short = replace(sweeps, samples=sweeps.samples[:, :8])
+    with pytest.raises(FormatError, match="a window of 8 frames is too short for minirocket"):
+        minirocket_augmented.train(short, short.samples, 0)

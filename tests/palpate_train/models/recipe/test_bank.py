@@ -1,0 +1,179 @@
+"""The filter bank: its graph against the definition, float against int8, offsets, and windows that
+are too short."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import onnx
+import pytest
+
+from palpate.core.errors import FormatError
+from palpate.core.types import SweepFormat
+from palpate_train.models.recipe import bank, graph
+from palpate_train.models.recipe.architectures import FLOOR, Architecture
+from palpate_train.models.recipe.augment import texture_scale
+from palpate_train.models.recipe.bank import DILATIONS, TAPS, Bank
+from palpate_train.models.recipe.recipe import FIXED
+from palpate_train.onnx_tools.graph_builder import run
+
+FORMATS = [
+    SweepFormat(2, 2, 100.0, 64, "uint8"),
+    SweepFormat(3, 3, 50.0, 40, "int16"),
+    SweepFormat(1, 1, 10.0, 16, "uint16"),
+    SweepFormat(4, 4, 750.0, 600, "uint8"),
+    SweepFormat(4, 2, 750.0, 600, "float32"),
+    SweepFormat(2, 2, 750.0, 600, "int16", 3),
+]
+forms = pytest.mark.parametrize("format", FORMATS, ids=str)
+BANK = replace(FIXED, pools=2)
+
+
+def counts(format: SweepFormat, n: int = 3) -> np.ndarray:
+    """Random walks [n, T, R, C] of raw counts."""
+    walk = (
+        np.random.default_rng(7).integers(-3, 4, (n, format.window, *format.shape)).cumsum(axis=1)
+    )
+    return (
+        1000 * (format.dtype != "uint8")
+        + np.clip(100 + walk - walk.mean(axis=1, keepdims=True).astype(int), 0, 255)
+    ).astype(format.dtype)
+
+
+def small(format: SweepFormat, architecture: Architecture = BANK) -> Bank:
+    """Twenty filters of the kinds for `format`, fitted to the random walks."""
+    rng, kinds = (
+        np.random.default_rng(3),
+        (False,) if architecture.zero_sum(format.window) else (False, True),
+    )
+    every = bank.draw(format, rng, kinds)
+    some = every.take(np.concatenate([np.flatnonzero(every.free == free)[:20] for free in kinds]))
+    given, seen = counts(format, 12), [np.empty(0)] * len(some)
+    for numbers, model in graph.bank_responses(format, texture_scale(given), architecture, some):
+        for number, values in zip(numbers, run(model, given).swapaxes(0, 2), strict=True):
+            seen[number] = values.ravel()
+    return bank.fitted(some, seen, rng)
+
+
+def trunk(
+    format: SweepFormat, filters: Bank, int8: bool, prefixes: bool = False
+) -> onnx.ModelProto:
+    """The trunk of these filters alone."""
+    given = counts(format, 12)
+    ranges = graph.Ranges(graph.count_range(given, BANK), ()) if int8 else None
+    return graph.trunk_graph(
+        format, texture_scale(given), filters.weights(), BANK, ranges, prefixes
+    )
+
+
+@forms
+def test_the_graph_is_the_definition(format: SweepFormat):
+    """Each response is computed tap by tap; features are the log of its mean magnitude in
+    deviations and the share above its threshold."""
+    filters, given = small(format), counts(format)
+    scaled = (given - given.mean(axis=1, keepdims=True)) * texture_scale(counts(format, 12))
+    for sweep, row in zip(
+        scaled.reshape(len(given), format.window, -1),
+        run(trunk(format, filters, False), given),
+        strict=True,
+    ):
+        sizes, shares = [], []
+        for weights, dilation, reach, limit in zip(
+            filters.taps(), filters.dilations, filters.reach, filters.limits, strict=True
+        ):
+            stride = bank.stage(format, dilation).stride
+            starts = range(0, format.window - (TAPS - 1) * dilation, stride)
+            y = np.array(
+                [
+                    sum(weights[:, tap] @ sweep[at + tap * dilation] for tap in range(TAPS))
+                    for at in starts
+                ]
+            )
+            sizes.append(np.log(np.abs(y).mean() * reach + FLOOR))
+            shares.append(np.mean(y > limit))
+        np.testing.assert_allclose(row[: len(filters)], sizes, atol=2e-3)
+        np.testing.assert_allclose(row[len(filters) :], shares, atol=3.5 / len(starts))
+
+
+@forms
+def test_int8_is_close_and_the_last_tenth_is_the_whole_window(format: SweepFormat):
+    """In both precisions, magnitudes agree within a few hundredths of a logarithm, shares within a
+    few responses."""
+    filters, given = small(format), counts(format)
+    precise, rounded = (run(trunk(format, filters, int8), given) for int8 in (False, True))
+    assert np.abs(precise - rounded).mean() < 0.03
+    for int8, whole in ((False, precise), (True, rounded)):
+        prefixes = run(trunk(format, filters, int8, prefixes=True), given)
+        assert prefixes.shape == (len(given), 10, whole.shape[1])
+        np.testing.assert_allclose(prefixes[:, -1], whole, atol=1e-5)
+
+
+def test_wide_counts_keep_what_a_byte_would_round_away():
+    """One sweep of eight is ten thousand times as large as the others, which are then below a step
+    of 8 bits: int8 still gives the features of float."""
+    format = FORMATS[4]
+    given = counts(format, 8)
+    given[0] = (given[0] - 1000) * 1e4
+    assert graph.count_range(given, BANK) / 127 > given[1:].max() - given[1:].min()
+    ranges, filters = graph.Ranges(graph.count_range(given, BANK), ()), small(format)
+    rounded, precise = (
+        run(
+            graph.trunk_graph(
+                format, texture_scale(counts(format, 12)), filters.weights(), BANK, some
+            ),
+            given,
+        )
+        for some in (ranges, None)
+    )
+    np.testing.assert_array_equal(rounded, precise)
+    assert len(np.unique(rounded[1:, len(filters) :])) > 20
+
+
+@forms
+def test_an_offset_changes_nothing(format: SweepFormat):
+    """An offset of all taxels changes no bit in int8 if counts are whole."""
+    filters, given = small(format), counts(format)
+    higher = (given.clip(0, 250) + 5 if format.dtype == "uint8" else given + 1000).astype(
+        format.dtype
+    )
+    given = given.clip(0, 250).astype(format.dtype) if format.dtype == "uint8" else given
+    model = trunk(format, filters, True)
+    np.testing.assert_allclose(
+        run(model, higher),
+        run(model, given),
+        atol=0 if format.dtype == "uint8" and format.window == 600 else 0.05,
+    )
+
+
+@forms
+def test_filters_fit_the_window(format: SweepFormat):
+    """Filters have unit norm and sum to zero unless they are free; all dilations fit; some see one
+    taxel and some see all."""
+    for free in (False, True):
+        drawn = bank.draw(format, np.random.default_rng(0), (free,))
+        assert (drawn.along.sum(axis=1) == 0).all() is np.bool_(not free)
+        assert 0 < max(np.abs(drawn.across).max(), np.abs(drawn.along).max()) <= bank.LARGEST
+        np.testing.assert_allclose(np.linalg.norm(drawn.taps(), axis=(1, 2)), 1, atol=1e-5)
+        assert set(drawn.dilations) == {d for d in DILATIONS if 8 * d < format.window}
+        seen = (drawn.across != 0).sum(axis=1)
+        assert (seen.min(), seen.max()) == (1, format.channels)
+        assert len(drawn) * format.channels * TAPS <= bank.MOST_TAPS
+        last = bank.stage(format, int(drawn.dilations.max()))
+        assert (last.steps - 1) * last.hop + last.reach <= format.window
+
+
+def test_thresholds_leave_the_shares_that_were_drawn():
+    """The shares are those of the responses from which the thresholds were taken."""
+    format = FORMATS[0]
+    shares = run(trunk(format, small(format), False), counts(format, 12))[:, 40:].mean(axis=0)
+    assert 0.05 < shares.min() < 0.25
+    assert 0.75 < shares.max() < 0.95
+
+
+def test_a_window_shorter_than_a_filter():
+    """The message names the required length."""
+    with pytest.raises(
+        FormatError, match="a window of 8 frames is too short for a filter; record at least 9"
+    ):
+        bank.draw(SweepFormat(1, 1, 10.0, 8, "uint8"), np.random.default_rng(0), (False,))

@@ -1,0 +1,487 @@
+"""Heads that add discriminants, and the choice among candidates by held-out parts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from palpate.inference.classifier import softmax
+from palpate_train.calibration.heads import HeadData, HeadPart, HeadPlan, fit_discriminant
+from palpate_train.data.splitters import InnerPart
+from palpate_train.models.recipe import choice
+from palpate_train.models.recipe.choice import Candidates, FeatureColumns, HeldOutScores
+
+GOOD, NOISE, TRAP = (0, 1), (2, 3), (4,)
+"""Features that name the material everywhere; features without information; a feature that names it
+in one group and misleads in the others."""
+
+
+def known(n: int = 240, seed: int = 0) -> tuple[HeadData, list[InnerPart]]:
+    """Sweeps of three materials in three groups of equal size, with one copy of each, and a part
+    for each group."""
+    rng = np.random.default_rng(seed)
+    labels, group = np.arange(n) % 3, np.arange(n) // (n // 3)
+    angle = 2 * np.pi * labels / 3
+    x = rng.standard_normal((n, 5))
+    x[:, GOOD] += 2.5 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    x[:, TRAP] = ((labels + group) % 3)[:, None] + 0.01 * x[:, TRAP]
+    copied = x + 0.1 * rng.standard_normal(x.shape)
+    given = HeadData(
+        x.astype(np.float32), labels, copied.astype(np.float32), np.arange(n), group[:, None]
+    )
+    return given, [InnerPart("place", group == value) for value in range(3)]
+
+
+def candidates(
+    kinds: Sequence[Sequence[int]],
+    magnitudes: Sequence[int],
+    shares: Sequence[int],
+    levels: Sequence[int] = (),
+    bands: Sequence[int] = (),
+    copies: bool = False,
+    loads: Sequence[int] = (),
+    grouped: bool = True,
+    relations: Sequence[Sequence[int]] = ((),),
+) -> Candidates:
+    """The candidates of a trunk with these features."""
+    parts = [np.array(part, int) for part in (magnitudes, shares, levels, loads, relations, bands)]
+    columns = FeatureColumns(*parts[:2], tuple(map(np.array, kinds)), *parts[2:])
+    return Candidates(columns, copies, grouped)
+
+
+def scores() -> HeldOutScores:
+    """The scores of `known`."""
+    given, parts = known()
+    return HeldOutScores([given] * 3, parts, 3)
+
+
+def test_a_plan_is_the_sum_of_its_discriminants():
+    """As one matrix over all features it equals the sum of its discriminants times their factors; a
+    discriminant sees copies only on request."""
+    given, _ = known()
+    plan = HeadPlan((HeadPart(GOOD, False, factor=2.0), HeadPart((1, 2), True, factor=0.5)))
+    weight, bias = plan.fit(given, 3)
+    x, y, under = given.features, given.labels, given.conditions
+    apart = fit_discriminant(x[:, GOOD], y, 3, under)
+    both = np.concatenate([x, given.copied])[:, 1:3]
+    with_copies = fit_discriminant(both, np.tile(y, 2), 3, np.tile(under, (2, 1)))
+    want = 2 * (given.features[:, GOOD] @ apart[0].T + apart[1])
+    want += 0.5 * (given.features[:, 1:3] @ with_copies[0].T + with_copies[1])
+    np.testing.assert_allclose(given.features @ weight.T + bias, want, rtol=1e-4, atol=1e-3)
+    assert plan.columns().tolist() == [0, 1, 2]
+    kept = np.array([0, 1, 2, 4])
+    less = replace(given, features=given.features[:, kept], copied=given.copied[:, kept])
+    np.testing.assert_array_equal(plan.renumbered(kept).fit(less, 3)[0][:, :3], weight[:, :3])
+    cooler = plan.cooled(4.0).fit(given, 3)
+    np.testing.assert_allclose(cooler[0] * 4, weight, rtol=1e-5)
+    assert HeadPlan.read(plan.json()) == plan
+
+
+def test_a_part_takes_the_copies_of_its_sweeps_alone():
+    """Each copy stays with its sweep."""
+    given, _ = known()
+    kept = np.arange(240) % 2 == 0
+    less = given.take(kept)
+    assert len(less.labels) == len(less.copied) == 120
+    np.testing.assert_array_equal(less.features[less.source], given.features[kept])
+    np.testing.assert_array_equal(less.copied, given.copied[kept])
+    np.testing.assert_array_equal(less.conditions, given.conditions[kept])
+
+
+def test_what_lies_in_another_group_is_not_chosen():
+    """The feature that names every material within a group is the worst of all for an unseen
+    group."""
+    at = scores()
+    losses = [at.loss(at.score([HeadPart(columns, False)])) for columns in (GOOD, NOISE, TRAP)]
+    assert losses[0] < 0.2 < losses[1]
+    assert losses[0] < losses[2]
+    chosen = choice.choose(at, candidates([[0, 1]], GOOD, NOISE, bands=TRAP), print)
+    assert (
+        sum(TRAP[0] in part.columns for part in chosen.plan.parts) <= 1
+    )  # where the usual one sees the spectrum
+    assert at.accuracy(chosen) > 0.9
+
+
+def test_what_is_clearly_better_is_chosen():
+    """Bands name most of the materials, and filters name others in each group: all chosen
+    discriminants see the bands."""
+    given, parts = known(600)
+    x = given.features.copy()
+    x[:, GOOD] += np.random.default_rng(1).standard_normal((600, 2))
+    x[:, NOISE] += 3 * ((given.labels + np.arange(600) // 200) % 3)[:, None]
+    at = HeldOutScores([replace(given, features=x, copied=x)] * 3, parts, 3)
+    chosen = choice.choose(at, candidates([[0, 1]], NOISE, NOISE, bands=GOOD), print)
+    assert all(set(GOOD) <= set(part.columns) for part in chosen.plan.parts)
+    assert at.better(chosen, at.score([HeadPart(NOISE, False)]))
+
+
+def test_the_usual_one_stays_where_nothing_is_clearly_better():
+    """It is a discriminant of all magnitudes and one of all features, without copies."""
+    at = scores()
+    chosen = choice.choose(at, candidates([[0, 1]], GOOD, NOISE), print)
+    assert chosen.plan == at.score([HeadPart(GOOD, False), HeadPart((*GOOD, *NOISE), False)]).plan
+
+
+def test_a_factor_from_before_does_not_count():
+    """A part gets the same score again, alone and beside others, whatever its old factor."""
+    given, parts = known()
+    for factor in (1.0, 1e-3):
+        at = HeldOutScores([given] * 3, parts, 3)
+        both = at.score([HeadPart(GOOD, False, factor), HeadPart(NOISE, False, 7 * factor)])
+        fresh = HeldOutScores([given] * 3, parts, 3).score(
+            [HeadPart(GOOD, False), HeadPart(NOISE, False)]
+        )
+        assert both.plan == fresh.plan
+
+
+def test_loss_alone_is_no_reason():
+    """If two candidates name the same sweeps rightly, neither is better, however certain one is of
+    its wrong answers."""
+    at = scores()
+    one = at.score([HeadPart(GOOD, False)])
+    wrong = one.logits.argmax(axis=1) != at.labels
+    surer = replace(one, losses=one.losses + 5.0 * wrong)
+    assert at.loss(surer) > at.loss(one)
+    assert not at.better(one, surer)
+
+
+def test_fewer_filters_where_held_out_parts_show_no_loss():
+    """Of filters that all give the same response, a half, a quarter and so on are kept, but at
+    least `least`; other features stay."""
+    given, parts = known(600)
+    rng = np.random.default_rng(2)
+    same = given.features[:, :1] @ np.ones((1, 16)) + given.features[:, 1:2] @ np.tile(
+        [[1.0, -1.0]], 8
+    )
+    x = np.hstack([same + 1e-3 * rng.standard_normal(same.shape), given.features[:, [2]]]).astype(
+        np.float32
+    )
+    none = np.empty((0, 17), np.float32), np.empty(0, int)
+    own = HeadData(x, given.labels, *none, np.empty((600, 0), int))
+    at, number = HeldOutScores([own] * 3, parts, 3), np.append(np.arange(16), -1)
+    full = at.score([HeadPart(tuple(range(17)), False)])
+    tried: list[str] = []
+    # every other of these has the same sign: a half is not enough to name the materials
+    assert choice.with_fewer_filters(at, full, number, tried.append, 4) == full
+    assert tried == ["choosing: 8 filters"]
+    pairs = np.append(np.arange(16) // 2, -1)
+    less = choice.with_fewer_filters(at, full, pairs, print, 2)
+    assert less.plan.parts[0].columns == (0, 1, 8, 9, 16)
+    assert at.accuracy(less) > at.accuracy(full) - 0.01
+
+
+def test_too_few_sweeps_show_nothing():
+    """A hundred sweeps, all named rightly by fewer filters, may be luck, so all filters stay."""
+    given, parts = known(99)
+    at = HeldOutScores([given] * 3, parts, 3)
+    sure = at.score([HeadPart(GOOD, False)])
+    assert not at.holds(sure, sure)
+    many, parts = known(600)
+    at = HeldOutScores([many] * 3, parts, 3)
+    sure = at.score([HeadPart(GOOD, False)])
+    assert at.holds(sure, sure)
+    assert not at.holds(at.score([HeadPart(NOISE, False)]), sure)
+
+
+def test_no_group_loses_for_the_gain_of_another():
+    """Wrong answers under a new force are not made up by right ones at a new place."""
+    given, parts = known(600)
+    forces = [InnerPart("force", part.out) for part in parts]
+    at = HeldOutScores([given] * 6, [*parts, *forces], 3)
+    full = at.score([HeadPart(GOOD, False)])
+    force, right = at.groups == "force", at.right(full)
+    better = np.where(force[:, None], full.logits, np.eye(3)[at.labels])
+    less = replace(full, logits=better)
+    assert at.holds(less, full)
+    lost = np.flatnonzero(force & right)[:6]  # a hundredth of the group
+    better[lost] = -np.eye(3)[at.labels[lost]]
+    assert at.accuracy(less) > at.accuracy(full)
+    assert not at.holds(less, full)
+
+
+def test_no_sweep_is_judged_by_a_head_that_saw_its_part():
+    """A head that overfits scores far from perfect on held-out sweeps."""
+    given, parts = known()
+    rng = np.random.default_rng(1)
+    own = HeadData(
+        rng.standard_normal((240, 400)).astype(np.float32),
+        given.labels,
+        np.empty((0, 400)),
+        np.empty(0, int),
+        np.empty((240, 0), int),
+    )
+    at = HeldOutScores([own] * 3, parts, 3)
+    assert at.accuracy(at.score([HeadPart(tuple(range(400)), False)])) < 0.5
+    assert at.labels.tolist() == given.labels.tolist()
+
+
+def test_copies_of_held_out_sweeps_count_as_much_as_these():
+    """If copies are scored, a head that fails on copies loses to one that does not."""
+    given, parts = known()
+    copied = given.copied.copy()
+    copied[:, GOOD[0]] = 0
+    blind = (
+        np.hstack([given.features, given.features[:, GOOD]]),
+        np.hstack([copied, given.copied[:, GOOD]]),
+    )
+    both = replace(given, features=blind[0], copied=blind[1])
+    fails, stands = [HeadPart(GOOD, False)], [HeadPart((5, 6), False)]
+    in_place, moved = (
+        HeldOutScores([both] * 3, parts, 3),
+        HeldOutScores([both] * 3, parts, 3, copied=True),
+    )
+    assert in_place.own.all()
+    assert in_place.accuracy(in_place.score(fails)) == in_place.accuracy(in_place.score(stands))
+    assert moved.own.sum() == len(given.labels) == (~moved.own).sum()
+    assert moved.weights[moved.own].sum() == pytest.approx(0.5)
+    assert moved.better(moved.score(stands), moved.score(fails))
+    assert not moved.holds(moved.score(fails), moved.score(stands))
+    own = moved.score(fails).logits[moved.own].argmax(axis=1) == moved.labels[moved.own]
+    assert own.mean() == pytest.approx(in_place.accuracy(in_place.score(fails)))
+
+
+def test_the_temperature_is_the_best_for_held_out_sweeps():
+    """No other divisor of the logits has a lower loss; every group counts the same."""
+    at = scores()
+    judged = at.score([HeadPart(GOOD, False), HeadPart(NOISE, True)])
+
+    def loss(temperature: float) -> float:
+        p = np.log(softmax(judged.logits / temperature))
+        right, any_ = p[np.arange(240), at.labels], p.mean(axis=1)
+        return float(-((1 - 1 / 242) * right + any_ / 242) @ at.weights)  # Platt's correction
+
+    plain = -np.log(softmax(judged.logits)[np.arange(240), at.labels]) @ at.weights
+    assert plain == pytest.approx(at.loss(judged))
+    assert loss(1) <= min(loss(0.97), loss(1.03))
+    assert at.weights.sum() == pytest.approx(1)
+
+
+def test_candidates_are_what_the_features_allow():
+    """They are the usual one and magnitudes alone; the usual one without the spectrum; then the
+    best with copies, with the spectrum, and the spectrum alone."""
+    tried: list[str] = []
+    choice.choose(scores(), candidates([[0], [1]], [0, 1], [2, 3], bands=[4]), tried.append)
+    assert len(tried) == len(set(tried)) == 2 + 1 + 5
+    assert tried[:3] == [
+        "choosing: magnitudes, shares, distribution",
+        "choosing: magnitudes",
+        "choosing: without spectrum",
+    ]
+    assert tried[-1] == "choosing: the spectrum alone, with copies"
+    tried.clear()
+    chosen = choice.choose(scores(), candidates([[0]], [0, 1], [2, 3]), tried.append)
+    assert len(tried) == 2 + 1
+    assert {part.columns for part in chosen.plan.parts} == {(0,), (0, 2)}
+
+
+def test_every_discriminant_sees_copies_where_these_are_wanted():
+    """There are fewer candidates, because all of them see copies. One without copies shows that
+    they do no harm."""
+    tried: list[str] = []
+    heads = candidates([[0], [1]], [0, 1], [2, 3], bands=[4], copies=True)
+    chosen = choice.choose(scores(), heads, tried.append)
+    assert all(part.copies for part in chosen.plan.parts)
+    assert "choosing: without copies" in tried
+    assert len(tried) == len(set(tried)) == 2 + 2 + 2
+
+
+def test_the_usual_one_sees_each_kind_three_times():
+    """Magnitudes; with shares and the spectrum; with the distribution and the spectrum. No
+    discriminant has a feature twice."""
+    given, parts = known()
+    x = np.hstack([given.features[:, [0]]] * 6 + [given.features[:, [1]]] * 6)
+    rng = np.random.default_rng(0)
+    own = replace(
+        given,
+        features=(x + 0.1 * rng.standard_normal(x.shape)).astype(np.float32),
+        copied=np.zeros((240, 12)),
+    )
+    at = HeldOutScores([own] * 3, parts, 3)
+    heads = candidates([[0], [1]], [0, 1], [2, 3], levels=range(4, 8), bands=range(8, 12))
+    chosen = choice.choose(at, heads, print)
+    wanted = [(0,), (1,)]
+    wanted += [(kind, kind + 2, 8, 9, 10, 11) for kind in (0, 1)] + [
+        (kind, *range(4, 12)) for kind in (0, 1)
+    ]
+    assert [part.columns for part in chosen.plan.parts] == wanted
+
+
+def spoiled(*noise: int) -> HeldOutScores:
+    """The scores of sweeps whose features `noise` name the material in two groups, and another one
+    in the first."""
+    given, parts = known()
+    rng = np.random.default_rng(1)
+    x = given.features.copy()
+    group = np.arange(len(x)) // (len(x) // 3)
+    for column in noise:
+        x[:, column] = (given.labels + (group == 0)) % 3 + 0.01 * rng.standard_normal(len(x))
+    copied = x + 0.1 * rng.standard_normal(x.shape).astype(np.float32)
+    return HeldOutScores([replace(given, features=x, copied=copied)] * 3, parts, 3)
+
+
+def test_a_view_stays_away_where_it_harms():
+    """A distribution that names materials within a group alone makes the usual candidate worse on
+    the other groups, so no discriminant sees it; a harmless one stays."""
+    heads = candidates([[0, 1]], [0, 1], [0, 1], levels=[2, 3])
+    harmed = choice.choose(spoiled(2, 3), heads, print)
+    assert not {2, 3} & set(harmed.plan.columns().tolist())
+    kept = choice.choose(scores(), candidates([[0]], [0], [0], levels=[1]), print)
+    assert 1 in kept.plan.columns()
+
+
+def test_copies_stay_away_where_they_harm():
+    """Copies that are named by another feature than the sweeps spoil the heads that see them."""
+    given, parts = known()
+    rng = np.random.default_rng(2)
+    mixed = given.features[rng.permutation(len(given.features))] * 3
+    at = HeldOutScores([replace(given, copied=mixed)] * 3, parts, 3)
+    heads = candidates([[0, 1]], [0, 1], [0, 1], copies=True)
+    assert not any(part.copies for part in choice.choose(at, heads, print).plan.parts)
+
+
+def with_loads(seed: int = 3) -> tuple[HeldOutScores, FeatureColumns]:
+    """Scores of sweeps with one weak filter (0) and loads (1, 2) that name the material in all
+    groups."""
+    given, parts = known(seed=seed)
+    x = given.features[:, [3, 0, 1]].copy()
+    x[:, 0] += 0.4 * given.features[:, 0]
+    own = replace(given, features=x, copied=x)
+    columns = candidates([[0]], [0], [0], loads=[1, 2]).columns
+    return HeldOutScores([own] * 3, parts, 3), columns
+
+
+def test_loads_join_where_held_out_groups_show_it():
+    """Loads that name the material in all groups join; in one session they may not."""
+    at, columns = with_loads()
+    joined = choice.choose(at, Candidates(columns, False, True), print)
+    assert {1, 2} <= set(joined.plan.columns().tolist())
+    alone = choice.choose(at, Candidates(columns, False, False), print)
+    assert not {1, 2} & set(alone.plan.columns().tolist())
+
+
+def test_a_weight_is_the_size_of_logits_beside_others():
+    """Half the weight of a discriminant halves its logits in the sum, before the temperature."""
+    at = scores()
+    one, other = HeadPart(GOOD, False), HeadPart(NOISE, False)
+    even, less = (at.score([one, replace(other, weight=weight)]).plan for weight in (1.0, 0.5))
+    ratio = [plan.parts[1].factor / plan.parts[0].factor for plan in (even, less)]
+    assert ratio[1] == pytest.approx(ratio[0] / 2)
+
+
+def test_a_discriminant_that_is_mostly_wrong_does_not_outvote_others():
+    """One that names all held-out sweeps and one that names chance: scaled to the same size they
+    name a tenth less than the good one alone, here hardly less."""
+    at = scores()
+    good, noise = HeadPart(GOOD, False), HeadPart(NOISE, False)
+    alone, both = at.accuracy(at.score([good])), at.score([good, noise])
+    assert at.accuracy(both) > alone - 0.02
+    sizes = [np.abs(at.score([part]).logits).mean() for part in (good, noise)]
+    assert sizes[0] > 10 * sizes[1]  # at its best temperature chance is never sure
+    ratio = both.plan.parts[0].factor / both.plan.parts[1].factor
+    given, _ = known()
+    weights = [part.fit(given, 3)[0] for part in (good, noise)]
+    assert ratio * np.abs(weights[0]).max() > np.abs(weights[1]).max()
+
+
+def test_a_material_that_a_part_lacks_does_not_set_the_scale():
+    """Its logit of -10,000 is far below all others, and says nothing of their size."""
+    given, parts = known()
+    lacking = replace(given, labels=np.where(given.labels == 2, 0, given.labels))
+    one, other = HeadPart(GOOD, False), HeadPart(NOISE, False)
+    factors = [
+        [
+            part.factor
+            for part in HeldOutScores([lacking] * 3, parts, k).score([one, other]).plan.parts
+        ]
+        for k in (2, 3)
+    ]
+    np.testing.assert_allclose(factors[0], factors[1], rtol=0.05)
+
+
+def test_a_size_without_filters_has_relations_and_spectrum_in_one_discriminant():
+    """A weak spectrum beside them would only add its errors."""
+    given, parts = known(seed=3)
+    at = HeldOutScores([given] * 3, parts, 3)
+    heads = candidates([], [], [], bands=[2], relations=[[0], [1]])
+    assert [part.columns for part in choice.choose(at, heads, print).plan.parts] == [(0, 1, 2)]
+
+
+def test_relations_join_where_held_out_groups_show_it():
+    """Relations that name the material in all groups join, with a discriminant of few scales and
+    one of all; those that mislead in another group stay away."""
+    given, parts = known(seed=3)
+    x = given.features[:, [3, 0, 1, 2, 4]].copy()
+    x[:, 0] += 0.4 * given.features[:, 0]
+    at = HeldOutScores([replace(given, features=x, copied=x)] * 3, parts, 3)
+    heads = candidates([[0]], [0], [0], relations=[[1], [2], [3], [3]])
+    joined = choice.choose(at, heads, print).plan.parts
+    assert [part.columns for part in joined[-2:]] == [(1, 2, 3), (1, 2, 3, 3)]
+    assert not {4} & set(
+        choice.choose(at, candidates([[0]], [0], [0], relations=[[4]]), print)
+        .plan.columns()
+        .tolist()
+    )
+
+
+def test_relations_join_where_they_name_more_although_one_group_is_less_sure(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    """The loss of a group depends on the size of logits as well; clearly more right answers count.
+    Loads stay away: their group may be the session whose level they know."""
+    given, parts = known(600)
+    halves = [InnerPart("speed", np.arange(600) % 2 == half) for half in (0, 1)]
+    at = HeldOutScores([given] * 5, [*parts, *halves], 3)
+    usual = at.score([HeadPart(NOISE, False)])
+    right = np.eye(3)[at.labels] * 4
+    losses = usual.losses - np.where(at.groups == "speed", -0.05, 0.8)
+    named = replace(usual, logits=right, losses=losses)
+    assert at.better(named, usual)
+    assert not at.helps(named, usual)
+    score, heads = at.score, candidates([[0]], NOISE, NOISE, loads=[4])
+    monkeypatch.setattr(
+        at, "score", lambda heads: named if isinstance(heads, str) else score(heads)
+    )
+    for view, joins in (("related", True), ("loaded", False)):
+        with monkeypatch.context() as patched:
+            patched.setattr(Candidates, view, lambda self, best: {"more": "more"})
+            if view == "related":
+                patched.setattr(Candidates, "loaded", lambda self, best: {})
+            assert (choice.choose(at, heads, print) is named) == joins
+
+
+def test_loads_that_mislead_in_another_group_stay_away():
+    """The level of a session names its materials and misleads in the next."""
+    heads = candidates([[0, 1]], [0, 1], [0, 1], loads=[2, 4])
+    chosen = choice.choose(spoiled(2), heads, print)
+    assert not {2, 4} & set(chosen.plan.columns().tolist())
+
+
+def test_one_group_that_shows_the_opposite_suffices_against_loads():
+    """Loads that help by force and harm by speed stay away, even if the sum is a gain."""
+    given, parts = known()
+    halves = [InnerPart("speed", np.arange(240) % 2 == half) for half in (0, 1)]
+    at = HeldOutScores([given] * 5, [*parts, *halves], 3)
+    one = at.score([HeadPart(GOOD, False)])
+    better = replace(one, losses=one.losses - np.where(at.groups == "speed", -0.05, 0.4))
+    assert not at.helps(better, one)
+    assert at.helps(replace(one, losses=one.losses - np.where(at.groups == "speed", 0, 0.4)), one)
+
+
+def test_worse_is_more_than_chance():
+    """A few wrong answers more are chance; many are not; none is not."""
+    at = scores()
+    one = at.score([HeadPart(GOOD, False)])
+    wrong = np.roll(one.logits, 1, axis=1)
+
+    def spoiled_by(n: int) -> choice.ScoredPlan:
+        logits = one.logits.copy()
+        right = np.flatnonzero(one.logits.argmax(axis=1) == at.labels)
+        logits[right[:: len(right) // n][:n]] = wrong[right[:: len(right) // n][:n]]
+        return replace(one, logits=logits)
+
+    assert at.worse(spoiled_by(40), one)
+    assert not at.worse(one, one)
+    assert not at.worse(one, spoiled_by(40))

@@ -1,0 +1,97 @@
+"""The memory of a fit: it does not grow with the set. A fit that needs too much is refused
+first."""
+
+from __future__ import annotations
+
+import tracemalloc
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from palpate.core.errors import FormatError
+from palpate_train.data.sets import Dataset
+from palpate_train.models.recipe import memory, recipe
+from palpate_train.models.recipe.recipe import Settings
+from tests.factories.sweep_sets import easy
+
+USED = 120
+
+
+def repeated(times: int) -> Dataset:
+    """The easy set several times, each time with other recordings and other noise."""
+    s, rng = easy(20), np.random.default_rng(0)
+    samples = np.concatenate([s.samples] * times)
+    noisy = samples + rng.integers(-2, 3, samples.shape)
+    limits = np.iinfo(samples.dtype)
+    groups = {"recording": np.arange(len(samples)) // 2}
+    return replace(
+        s,
+        samples=noisy.clip(limits.min, limits.max).astype(samples.dtype),
+        labels=np.tile(s.labels, times),
+        groups=groups,
+    )
+
+
+def peak(sweeps: Dataset) -> int:
+    """The largest number of bytes that a fit to USED of these sweeps allocates beside them."""
+    tracemalloc.start()
+    try:
+        recipe.fit(sweeps, 1, Settings(steps=0, most=USED))
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.slow
+@pytest.mark.thorough  # fits twice
+def test_memory_does_not_grow_with_the_set():
+    """A set of thirty times as many sweeps takes as much beside itself, and no more than the
+    estimate says."""
+    small, large = repeated(3), repeated(90)
+    least, most = peak(small), peak(large)
+    assert most < 1.1 * least + 64 * len(large), (least, most)  # 64: groups and labels
+    assert most < memory.needed(large, USED), (most, memory.needed(large, USED))
+
+
+def test_a_set_under_the_cap_is_used_whole():
+    """Its results do not change with the cap."""
+    s = easy(4)
+    assert len(recipe.Setup.of(s, 1, Settings(steps=0), print).sweeps) == len(s)
+    assert len(recipe.Setup.of(s, 1, Settings(steps=0, most=6), print).sweeps) == 6
+
+
+@pytest.mark.parametrize(
+    ("kilobytes", "limit", "advice"),
+    [
+        (1_000_000, "max", "1.0 GB are free; use --most-sweeps"),
+        (9_000_000, "500000000", "0.4 GB are free; use --most-sweeps"),
+        (100_000, "max", "0.1 GB are free; close other programs"),
+    ],
+)
+def test_what_cannot_be_held_is_told_before(
+    kilobytes: int, limit: str, advice: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """The message has the needed and the free memory, and a number that fits; the limit of a
+    container counts."""
+    (tmp_path / "meminfo").write_text(f"MemTotal: 1 kB\nMemAvailable: {kilobytes} kB\n")
+    (tmp_path / "memory.max").write_text(limit + "\n")
+    (tmp_path / "memory.current").write_text("100000000\n")
+    monkeypatch.setattr(memory, "MEMINFO", tmp_path / "meminfo")
+    monkeypatch.setattr(memory, "CGROUP", tmp_path)
+    s = easy(4)
+    with pytest.raises(FormatError, match=r"a fit to 100000 sweeps of .* needs about") as e:
+        memory.check(s, 100_000)
+    assert advice in str(e.value)
+    if kilobytes > 300_000:
+        memory.check(s, int(str(e.value).split("--most-sweeps ")[1].split(",")[0]))
+
+
+def test_a_system_that_does_not_say_refuses_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Then no estimate is compared."""
+    monkeypatch.setattr(memory, "MEMINFO", tmp_path / "none")
+    monkeypatch.setattr(memory, "CGROUP", tmp_path / "none")
+    memory.check(easy(4), 10**9)

@@ -1,0 +1,364 @@
+"""Neural methods: the paper's CNN as printed, graphs against PyTorch, small trainings with
+calibrated results."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from palpate.core.errors import FormatError
+from palpate.core.types import SweepFormat
+from palpate.inference.classifier import softmax
+from palpate.sim import skin
+from palpate_train.data.sets import Dataset
+from palpate_train.evaluate import evaluate, fold
+from palpate_train.models import methods, training
+from palpate_train.models.methods import Effort, Method
+from palpate_train.models.peers import ds_cnn, edge_spectral, lite, paper_cnn, recurrent
+from palpate_train.models.recipe.stages import StagesNetwork
+from palpate_train.models.training import TrainingRecipe
+from palpate_train.onnx_tools import graph_builder
+from tests.factories.costly import quick_first
+from tests.factories.sweep_sets import easy
+
+NETS = (
+    "paper-cnn",
+    "paper-cnn-centred",
+    "tactnet2",
+    "recurrent",
+    "ds-cnn",
+    "lite",
+    "edge-spectral",
+)
+BRIEF = Effort(share=0.01, paper_steps=2)
+"""Two to eight iterations, for tests that are not about accuracy."""
+
+
+def method(name: str, effort: Effort = BRIEF) -> Method:
+    """The method of this name."""
+    return methods.find([name], effort)[0]
+
+
+def made(
+    shape: tuple[int, ...], dtype: str, classes: int = 3, seed: int = 0, rate_hz: float = 100.0
+) -> Dataset:
+    """Sweeps [N, T, R, C] of noise, whose strength depends on the class; two sweeps to a
+    recording."""
+    rng, labels = np.random.default_rng(seed), np.arange(shape[0]) // 2 % classes
+    samples = 60 + (1 + 6 * labels)[:, None, None, None] * rng.standard_normal(shape)
+    names = tuple(f"material {k}" for k in range(classes))
+    return Dataset(
+        samples.astype(dtype),
+        labels,
+        names,
+        rate_hz,
+        {"recording": np.arange(shape[0]) // 2},
+        "made",
+    )
+
+
+def train(name: str, s: Dataset, effort: Effort = BRIEF, seed: int = 1) -> training.NetworkModel:
+    """Train the method on all sweeps."""
+    return method(name, effort).train(s, s.samples, seed)
+
+
+def check_agrees(model: training.NetworkModel, samples: np.ndarray) -> None:
+    """The graph in the box's session gives the logits of the model, which are finite."""
+    want = model.logits(samples)
+    assert want.dtype == np.float32
+    assert np.isfinite(want).all()
+    have = graph_builder.run(model.graph(), samples)
+    np.testing.assert_allclose(have, want, atol=1e-3, rtol=1e-4)
+
+
+def test_the_paper_s_cnn_is_the_paper_s():
+    """15,891,910 parameters; 1500 x 16 -> 150 -> 15; the recipe as printed, and in PyTorch's terms.
+    TactNet-II has about its published 1.84 M."""
+    net = paper_cnn.build_paper_cnn(skin.FORMAT, 6, np.zeros((1, 1, 1, 1)))
+    assert sum(p.numel() for p in net.parameters()) == 15_891_910
+    assert [tuple(c.weight.shape) for c in net.convs] == [(32, 1, 15, 5), (64, 32, 15, 5)]
+    assert net.dense.in_features == 15 * 16 * 64
+    r = paper_cnn.PAPER_RECIPE
+    assert (r.batch, r.peak_rate, r.dropout, paper_cnn.PAPER_STEPS) == (50, 1e-4, 0.25, 4000)
+    assert (r.weight_decay, r.smoothing, r.ema, r.noise, r.gain, r.adversarial) == (0,) * 6
+    assert not r.cycle
+    other = paper_cnn.build_tactnet2(skin.FORMAT, 6, np.zeros((1, 1, 1, 1)))
+    assert sum(p.numel() for p in other.parameters()) == pytest.approx(1.84e6, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("window", "steps"), [(1500, (150, 15)), (128, (13, 2)), (101, (11, 2)), (5, (1, 1))]
+)
+def test_pooling_runs_over_the_end(window: int, steps: tuple[int, int]):
+    """With zero padding the rest at the end makes one more step, and changes the output."""
+    net = paper_cnn.ImageNetwork(
+        SweepFormat(1, 1, 100.0, window, "float32"), 2, 1.0, 0.0, paper_cnn.PAPER
+    )
+    assert net.dense.in_features == 64 * steps[1]
+    counts = torch.rand(1, window, 1, 1)
+    with torch.no_grad():
+        before = net(counts)
+        counts[0, -1] += 100
+        assert not torch.equal(net(counts), before)
+
+
+@pytest.mark.slow
+def test_the_loop_is_adam_as_the_paper_prints_it():
+    """Step by step it equals PyTorch's Adam: batches in sequence from a shuffled set, shuffled
+    again after each round."""
+    s, r = (
+        made((6, 12, 2, 1), "float32", 2),
+        replace(paper_cnn.PAPER_RECIPE, steps=5, batch=4, dropout=0.0),
+    )
+    with torch.random.fork_rng():
+        torch.manual_seed(3)
+        mine = paper_cnn.ImageNetwork(s.format, 2, 0.1, 60.0, replace(paper_cnn.PAPER, dense=8))
+        plain = pickle.loads(pickle.dumps(mine))
+    trained, cost = training.learn(mine, s, r, 7)
+    rng = torch.Generator().manual_seed(7)
+    order = torch.cat([torch.randperm(6, generator=rng) for _ in range(4)])
+    adam = torch.optim.Adam(plain.parameters(), 1e-4, betas=(0.9, 0.999), eps=1e-8)
+    for step in range(5):
+        pick = order[4 * step : 4 * step + 4]
+        logits = plain(torch.from_numpy(s.samples[pick.numpy()]))
+        loss = nn.functional.cross_entropy(logits, torch.from_numpy(s.labels)[pick])
+        adam.zero_grad()
+        loss.backward()
+        adam.step()
+        assert cost[step] == (step + 1, pytest.approx(loss.item(), rel=1e-5))
+    for have, want in zip(trained.parameters(), plain.parameters(), strict=True):
+        torch.testing.assert_close(have, want, rtol=1e-5, atol=1e-7)
+
+
+def test_adversarial_training_sees_the_worse_sweep():
+    """The gradient is the sum of that of the sweep and that of the sweep moved by the fast gradient
+    sign."""
+    s = made((6, 20, 2, 2), "float32", 2)
+    net = paper_cnn.ImageNetwork(
+        s.format, 2, 0.1, 60.0, paper_cnn.ImageLayers((4, 4), ((2, 1), (2, 1)), 2, False, 8)
+    )
+    x, labels = net.prepare(torch.from_numpy(s.samples)), torch.from_numpy(s.labels)
+    still = x.clone().requires_grad_()
+    cost = nn.functional.cross_entropy(net.training_logits(still), labels)
+    cost.backward()
+    worse = nn.functional.cross_entropy(net.training_logits(x + 0.1 * still.grad.sign()), labels)
+    assert worse > cost
+    worse.backward()
+    want = [p.grad.clone() for p in net.parameters()]
+    net.zero_grad()
+    loss = training.backward(net, x, labels, TrainingRecipe(adversarial=0.1, smoothing=0.0))
+    assert loss == pytest.approx(cost.item())
+    for p, gradient in zip(net.parameters(), want, strict=True):
+        torch.testing.assert_close(p.grad, gradient)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", quick_first(NETS))
+@pytest.mark.parametrize(
+    ("shape", "dtype", "classes"),
+    [((12, 64, 3, 3), "int16", 2), ((12, 21, 1, 1), "uint16", 3), ((12, 128, 16, 1), "float32", 3)],
+)
+def test_any_form_goes_all_the_way(name: str, shape: tuple[int, ...], dtype: str, classes: int):
+    """Odd grids, windows and data types are trained, give finite logits, and the box's session
+    gives the same."""
+    s = made(shape, dtype, classes)
+    model = train(name, s)
+    assert model.logits(s.samples[:5]).shape == (5, classes)
+    check_agrees(model, s.samples[:3])
+    check_agrees(model, np.zeros_like(s.samples[:1]))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", quick_first((*NETS, "stages")))
+def test_the_skin_s_own_sweeps_agree_with_the_graph(name: str):
+    """Real sizes, 1500 x 4 x 4 of uint8, with random weights or the smallest training."""
+    build = {
+        "paper-cnn": paper_cnn.build_paper_cnn,
+        "paper-cnn-centred": paper_cnn.build_centred,
+        "tactnet2": paper_cnn.build_tactnet2,
+        "recurrent": recurrent.build_recurrent,
+        "ds-cnn": ds_cnn.build,
+        "lite": lite.build,
+        "edge-spectral": edge_spectral.build,
+        "stages": lambda format, classes, _: StagesNetwork(format, classes, 0.1, norm=False),
+    }[name]
+    counts = np.random.default_rng(0).integers(40, 80, (2, 1500, 4, 4)).astype(np.uint8)
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        net = build(skin.FORMAT, 6, counts)
+    check_agrees(training.NetworkModel(net.eval(), ""), counts)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", quick_first(NETS))
+def test_what_is_easy_is_learnt(name: str):
+    """Three tones are named on sweeps of another seed; the cost falls; the run is reported."""
+    model = train(name, easy(), Effort(share=0.25, paper_steps=40))
+    other = easy(seed=9)
+    p = softmax(model.logits(other.samples))
+    right = p.argmax(1) == other.labels
+    assert right.mean() > 0.8
+    assert p.max(1).mean() == pytest.approx(right.mean(), abs=0.2)
+    steps, cost = np.array(model.cost).T
+    assert steps.tolist() == list(range(1, len(steps) + 1))
+    assert cost[-10:].mean() < 0.7 * cost[:3].mean()
+    assert model.ran.startswith(f"{len(steps)} iterations of ")
+    assert "float32 on c" in model.ran
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", quick_first(NETS))
+def test_the_same_again_for_the_same_seed(name: str):
+    """It has the same bits for any random state outside, which does not change; another seed gives
+    another network."""
+    s = easy(8)
+    first = train(name, s).logits(s.samples)
+    torch.manual_seed(99)
+    before, threads = torch.get_rng_state(), torch.get_num_threads()
+    np.testing.assert_array_equal(train(name, s).logits(s.samples), first)
+    assert torch.equal(torch.get_rng_state(), before)
+    assert torch.get_num_threads() == threads
+    assert not np.array_equal(train(name, s, seed=2).logits(s.samples), first)
+
+
+@pytest.mark.parametrize("name", quick_first(NETS))
+def test_a_material_that_never_came_is_never_given(name: str):
+    """Its logit is finite and far below, in the graph too; the others keep their places."""
+    s = easy(12)
+    part = s.take(s.labels != 1)
+    model = train(name, part)
+    z = model.logits(s.samples)
+    assert z.shape == (len(s), 3)
+    assert softmax(z)[:, 1].max() < 1e-12
+    np.testing.assert_allclose(z[:, [0, 2]].sum(1), 0, atol=1e-4)
+    check_agrees(model, s.samples[:2])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", quick_first(NETS))
+def test_small_sets_are_trained_whole(name: str):
+    """Two recordings of one sweep each cannot be split; one position alone does not prevent a split
+    by recording."""
+    tiny = easy(2)
+    check_agrees(train(name, tiny), tiny.samples)
+    one = easy(6)
+    one.groups["position"] = np.zeros(len(one), int)
+    check_agrees(train(name, one), one.samples[:2])
+    with pytest.raises(FormatError, match="only one class, 'low'"):
+        train(name, easy(4).take(np.arange(4)))
+
+
+@pytest.mark.slow
+def test_one_sweep_of_each_is_enough_for_gradient_descent():
+    """A linear discriminant would refuse it."""
+    check_agrees(train("recurrent", easy(1)), easy(1).samples)
+
+
+@pytest.mark.parametrize("name", quick_first(NETS))
+def test_silence_is_no_trouble(name: str):
+    """After training without any signal, logits of constant sweeps are finite and equal for all."""
+    s = easy(6)
+    dumb = replace(s, samples=np.full_like(s.samples, 7))
+    model = train(name, dumb)
+    z = model.logits(dumb.samples)
+    assert np.isfinite(z).all()
+    assert np.ptp(z, axis=0).max() == 0
+    check_agrees(model, s.samples[:2])
+
+
+@pytest.mark.slow
+def test_probabilities_come_from_what_was_held_out():
+    """With random labels a network overfits, and held-out sweeps lower its probabilities."""
+    s = easy(40)
+    lot = replace(s, labels=np.random.default_rng(1).permutation(s.labels))
+    model = train("tactnet2", lot, Effort(share=0.5))
+    other = easy(seed=9)
+    assert softmax(model.logits(other.samples)).max(1).mean() < 0.6
+
+
+@pytest.mark.slow
+def test_networks_take_any_window():
+    """Seven frames are enough."""
+    s = made((12, 7, 2, 2), "int16")
+    for name in NETS:
+        check_agrees(train(name, s), s.samples[:1])
+
+
+@pytest.mark.slow
+def test_bfloat16_is_used_where_it_is_asked_for_and_there():
+    """It is reported, its answers stay float32 and close; a processor without it is reported
+    too."""
+    s = easy(8)
+    exact = train("paper-cnn", s, Effort(paper_steps=4))
+    rough = train("paper-cnn", s, Effort(paper_steps=4, bfloat16=True))
+    there = torch.cuda.is_available() or torch.cpu.get_capabilities().get("avx512_bf16", False)
+    assert ("in bfloat16" in rough.ran) == there
+    assert ("no bfloat16 here" in rough.ran) != there
+    np.testing.assert_allclose(rough.logits(s.samples), exact.logits(s.samples), atol=0.1)
+    assert np.array_equal(rough.logits(s.samples), exact.logits(s.samples)) != there
+    assert "float32 on" in train("recurrent", s, Effort(share=0.01, bfloat16=True)).ran
+
+
+def test_effort_is_kept():
+    """Names, iterations and logs follow the effort; methods can be sent to another process."""
+    networks = (
+        *paper_cnn.METHODS,
+        *recurrent.METHODS,
+        *ds_cnn.METHODS,
+        *lite.METHODS,
+        *edge_spectral.METHODS,
+    )
+    assert tuple(m.name for m in networks) == NETS
+    assert all(m.input == "raw" and "\n" not in m.about for m in networks)
+    if not torch.cuda.is_available():
+        assert f"{paper_cnn.PROCESSOR_STEPS} iterations" in paper_cnn.METHODS[0].about
+    assert "17 iterations" in method("paper-cnn", Effort(paper_steps=17)).about
+    lines: list[str] = []
+    s = easy(4)
+    recurrent.methods(BRIEF, lines.append)[0].train(s, s.samples, 1)
+    assert lines[-1].startswith("step 4/4 loss")
+    again = pickle.loads(pickle.dumps(method("recurrent")))
+    np.testing.assert_array_equal(
+        again.train(s, s.samples, 1).logits(s.samples), train("recurrent", s).logits(s.samples)
+    )
+
+
+@pytest.mark.parametrize("name", ["paper-cnn", "paper-cnn-centred"])
+def test_the_paper_s_cnn_has_an_int8_form(name: str):
+    """It has a quarter of the size and the same labels up to quantization; centred, an offset
+    changes nothing."""
+    s = easy(8)
+    model = train(name, s)
+    int8 = model.precisions["int8"]
+    assert len(int8.graph().SerializeToString()) < 0.3 * len(model.graph().SerializeToString())
+    sure, rough = softmax(model.logits(s.samples)), softmax(int8.logits(s.samples))
+    np.testing.assert_allclose(rough, sure, atol=0.1)
+    assert not np.array_equal(rough, sure)
+    moved = softmax(model.logits(s.samples + np.float32(5)))
+    assert np.allclose(moved, sure, atol=1e-4) == (name == "paper-cnn-centred")
+
+
+def test_forms_are_kept_and_counted(tmp_path: Path):
+    """Logits of the other precision are read from the file unchanged, and evaluate reports them
+    beside the others."""
+    s = easy(12)
+    order = np.arange(len(s))
+    made_ = fold.run(fold.FoldTask("paper-cnn", BRIEF, 1, order[::2], order[1::2]), s, s.samples)
+    made_.save(tmp_path / "fold.npz")
+    again = fold.Fold.load(tmp_path / "fold.npz")
+    assert set(again.forms) == {"int8"}
+    np.testing.assert_array_equal(again.forms["int8"], made_.forms["int8"])
+    figures = evaluate.Result("paper-cnn", "random:2", False, 1, s, [again]).json()["forms"]["int8"]
+    assert figures["window"]["right"] == int(
+        (made_.forms["int8"].argmax(1) == s.labels[made_.test]).sum()
+    )
+    assert figures["agreement"] == np.mean(
+        made_.forms["int8"].argmax(1) == made_.logits.argmax(1)
+    ).round(4)
+    assert 0 < figures["probability_difference"] < 0.2

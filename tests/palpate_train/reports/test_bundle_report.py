@@ -1,0 +1,238 @@
+"""The report on a bundle: its figures are the box's answers, and the page holds all of them."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from palpate.bundle import bundle
+from palpate.bundle.bundle import Bundle
+from palpate.core.clock import SystemClock
+from palpate.inference.classifier import Classifier
+from palpate_train.cli.main import main
+from palpate_train.data import sets
+from palpate_train.data.sets import Dataset
+from palpate_train.evaluate.evaluation_sweeps import EvaluationSweeps
+from palpate_train.export import bundle_score
+from palpate_train.reports import bundle_experiment, bundle_report
+from tests.factories.page_reader import PageReader
+
+NOTHING = lambda line: None  # noqa: E731
+
+
+@pytest.fixture(scope="module")
+def sweeps() -> Dataset:
+    """A few sweeps of each material that the packaged bundle was not trained on."""
+    return sets.load("sim:T-REAL:1021:1", 1).select(["position<=3"])
+
+
+@pytest.fixture(scope="module")
+def figures(sweeps: Dataset) -> dict:
+    """The figures of the packaged bundle."""
+    return bundle_experiment.run(bundle.DEFAULT, sweeps, NOTHING) | {
+        "command": "palpate-train report"
+    }
+
+
+def test_the_figures_are_those_of_score(figures: dict, sweeps: Dataset, default_bundle: Bundle):
+    """The counts by material add up to the answers of the box's classifier, and precision includes
+    the sweeps of other materials."""
+    found = bundle_score.score(Classifier(default_bundle, SystemClock()), sweeps)
+    assert figures["named_rightly"]["right"] == found.right.sum()
+    assert sum(row["sweeps"] for row in figures["materials"]) == len(sweeps)
+    assert (
+        round(sum(row["recall"][0] * row["sweeps"] for row in figures["materials"]))
+        == found.right.sum()
+    )
+    assert figures["calibration"]["n"] == found.statuses["ok"] + found.statuses["unsure"]
+
+
+def test_a_material_that_others_are_taken_for_loses_precision(
+    figures: dict, sweeps: Dataset, default_bundle: Bundle
+):
+    """Three sweeps of wood as metal and one refused: each is counted in the right place."""
+    found = bundle_score.score(Classifier(default_bundle, SystemClock()), sweeps)
+    answered = {
+        "wood": Counter({"wood": 5, "metal": 3, "(unsure)": 1, "(unknown)": 1, "(dead-taxel)": 2}),
+        "metal": Counter({"metal": 9}),
+    }
+    mixed = replace(found, answered=answered, foreign={"felt": Counter({"metal": 6})})
+    wood, metal = (bundle_experiment.material(name, mixed) for name in ("wood", "metal"))
+    assert [wood[k] for k in ("sweeps", "unsure", "unknown", "refused", "taken_for")] == [
+        12,
+        1,
+        1,
+        2,
+        ["metal", 3],
+    ]
+    assert wood["recall"][0] == 5 / 12
+    assert wood["precision"][0] == 1
+    assert metal["precision"][0] == 9 / 18
+    assert (
+        bundle_experiment.material(
+            "metal", replace(mixed, answered={"metal": Counter({"(gap)": 2})}, foreign={})
+        )["precision"]
+        == []
+    )
+
+
+def test_what_breaks_it_first_stands_on_top(figures: dict):
+    """The corruptions are ordered by the share of the range at which five points are lost; each
+    begins with clean sweeps."""
+    rows = figures["corruptions"]
+    reach = [
+        np.inf if row["falls"] is None else row["falls"] / row["severities"][-1] for row in rows
+    ]
+    assert reach == sorted(reach)
+    assert len({row["right"][0] for row in rows}) == 1
+    assert all(
+        r + w <= row["total"]
+        for row in rows
+        for r, w in zip(row["right"], row["wrong"], strict=True)
+    )
+    assert {"noise", "dead", "lost", "hum"} <= {row["name"] for row in rows}
+
+
+def test_the_page_holds_the_figures(figures: dict, sweeps: Dataset):
+    """The page has a headline and a row for each material and corruption; tags are closed, no
+    template syntax is left, and nothing is loaded from elsewhere."""
+    reader = PageReader(bundle_report.page(figures, sweeps))
+    assert (reader.open, reader.wrong) == ([], [])
+    assert all(link.startswith(("#", "data:")) for link in reader.links)
+    assert f"Of {figures['named_rightly']['total']} sweeps of 6 materials" in reader.text
+    assert "All sweeps are simulated" in reader.text
+    assert not re.search(r"\{\{|\}\}|\{%", reader.text)
+    for row in figures["materials"]:
+        assert row["name"] in reader.text
+    for row in figures["corruptions"]:
+        assert f"{row['title']}: {row['about']}" in reader.text
+
+
+def test_a_set_with_a_foreign_material_and_many_labels(figures: dict, sweeps: Dataset):
+    """A material that the bundle lacks has its own table; with more than twelve labels there is no
+    matrix."""
+    many = figures | {
+        "labels": [f"m{i}" for i in range(13)],
+        "not_in_the_bundle": {"felt": {"(unknown)": 7, "wood": 1}},
+        "set": "mine.npz",
+        "recordings": {"right": 3, "total": 4},
+    }
+    plain = PageReader(bundle_report.page(many, sweeps)).text
+    assert "felt 8 7 1" in plain
+    assert "materials by the labels that they get" not in plain
+    assert "Sweeps of one recording fused: 3 of 4 right" in plain
+    assert "simulated" not in plain.split("How it was made")[0]
+
+
+def test_windows_too_short_for_a_spectrogram_say_so(figures: dict, sweeps: Dataset):
+    """A skin of 28 Hz has 56 frames; its signals are still shown."""
+    short = replace(sweeps, samples=sweeps.samples[:, :40])
+    text = bundle_report.page(figures, short)
+    assert text.count("no spectrogram: less than 64 frames") == len(np.unique(sweeps.labels))
+    assert text.count("raw counts over") == len(np.unique(sweeps.labels))
+
+
+def test_the_headline_says_what_was_missed(figures: dict, sweeps: Dataset):
+    """Right, wrong and unnamed sweeps add up to all sweeps. The headline has the worst material,
+    the first corruption to break the bundle, errors and cost."""
+    named = figures["named"]
+    assert named["right"] + named["wrong"] + named["not_named"] == named["n"] == len(sweeps)
+    missed = figures | {
+        "named": {"n": 20, "right": 15, "wrong": 3, "not_named": 2, "unknown": [0.1, 0.0, 0.3]},
+        "materials": [
+            row | {"recall": [0.25, 0.1, 0.5] if row["name"] == "wood" else [1.0, 0.9, 1.0]}
+            for row in figures["materials"]
+        ],
+        "foreign_named": [0.75, 0.5, 0.9],
+    }
+    text = PageReader(bundle_report.page(missed, sweeps)).text
+    for line in (
+        "named rightly 75.0 %, 15 of 20",
+        "named wrongly 15.0 %, 3 of 20",
+        "refused) 10.0 %, 2 of 20",
+        "least often: wood 25.0 % [10.0, 50.0]",
+        "yet it names them 75.0 % [50.0, 90.0]",
+        "10.0 % [0.0, 30.0] of the sweeps of its own materials are called unknown",
+    ):
+        assert line in text, line
+
+
+def test_what_the_bundle_calls_a_foreign_material_is_counted(
+    sweeps: Dataset, default_bundle: Bundle
+):
+    """Six sweeps of felt, of which four get a label: two thirds. Wrong answers and missing answers
+    to the bundle's own materials are counted apart."""
+    found = bundle_score.score(Classifier(default_bundle, SystemClock()), sweeps)
+    answered = {"wood": Counter({"wood": 5, "metal": 3, "(unsure)": 1, "(unknown)": 2})}
+    mixed = replace(
+        found,
+        answered=answered,
+        right=np.arange(11) < 5,
+        foreign={"felt": Counter({"metal": 3, "wood": 1, "(unknown)": 2})},
+    )
+    assert bundle_experiment.foreign_named(mixed)[0] == pytest.approx(4 / 6)
+    assert bundle_experiment.foreign_named(found) == []
+    named = bundle_experiment.named(sweeps.take(np.arange(11)), mixed)
+    assert [named[k] for k in ("n", "right", "wrong", "not_named")] == [11, 5, 3, 3]
+    assert named["unknown"][0] == pytest.approx(2 / 11)
+
+
+def test_a_bundle_without_novelty_says_so(figures: dict, sweeps: Dataset):
+    """Such a bundle never answers `unknown`, and the page states no figure for it."""
+    text = PageReader(bundle_report.page(figures | {"tells_unknown": False}, sweeps)).text
+    assert "This bundle holds no measure of novelty: it never answers unknown" in text
+    assert "Of the sweeps of its own materials" not in text
+
+
+@pytest.mark.slow
+@pytest.mark.thorough  # a command that trains and draws
+def test_the_command_writes_page_and_figures(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    """Both files are written; the target is checked before any measurement."""
+    monkeypatch.setattr(EvaluationSweeps.of.__func__, "__defaults__", (12, 0))
+    named = ["report", str(bundle.DEFAULT), "--set", "sim:T-REAL:1021:1", "--only", "position<=2"]
+    assert main([*named, "--out", "/proc/none/report.html"]) != 0
+    assert "cannot be written" in capsys.readouterr().err
+    assert (
+        main([*named, "--out", str(tmp_path / "report.html"), "--json", str(tmp_path / "f.json")])
+        == 0
+    )
+    text = (tmp_path / "report.html").read_text()
+    assert "<h2>What it will be bad at</h2>" in text
+    assert "name the sweeps that it was fitted to with <code>--train</code>" in text
+    assert json.loads((tmp_path / "f.json").read_text())["bundle"]["name"] == "default"
+
+
+def test_people_read_display_names(figures: dict, sweeps: Dataset):
+    """In tables and pictures; figures for programs keep the labels."""
+    shown = figures | {"displays": {"wood": "Holz, geölt"}}
+    page = bundle_report.page(shown, replace(sweeps, displays=shown["displays"]))
+    text = PageReader(page).text
+    assert "Holz, geölt" in text
+    assert not re.search(r"\bwood\b", text.partition("How it was made")[0])
+    assert shown["labels"] == figures["labels"]
+
+
+def test_a_row_of_few_sweeps_says_how_many(figures: dict):
+    """The share is that of all sweeps, those without a label too: one of thirty is 3 %."""
+    answers = {
+        "wood": {"wood": 1, "(unknown)": 29},
+        "metal": {"metal": 2, "paper": 1},
+        "x" * 40: {"x" * 40: 1},
+    }
+    some = figures | {"labels": [*answers, "paper"], "answers": answers}
+    drawn = PageReader(bundle_report.confusion(some)).text
+    assert "wood · " not in drawn
+    assert re.search(r"\b3\b", drawn)
+    assert "n = 3" in drawn
+    assert "n = 30" not in drawn
+    assert "n = 0" in drawn
+    assert "n = 1" in drawn
+    assert f"{'x' * 23}…" in drawn

@@ -1,0 +1,238 @@
+"""Trainings for a report: points of the learning curve, materials left out, and sets that are
+joined."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from palpate.core.errors import FormatError
+from palpate_train.cli.main import main
+from palpate_train.data.sets import Dataset
+from palpate_train.evaluate.evaluate import Where
+from palpate_train.models.recipe import recipe
+from palpate_train.models.recipe.fitted import Fit
+from palpate_train.reports import bundle_report, bundle_trainings
+from tests.factories import rendered
+from tests.factories.page_reader import PageReader
+from tests.factories.sweep_sets import easy, tones
+
+NOTHING = lambda line: None  # noqa: E731
+
+
+def where(folder: Path) -> Where:
+    """One process, with its results below `folder`."""
+    return Where(jobs=1, cache=folder)
+
+
+@pytest.mark.slow
+def test_the_curve_rises_with_sweeps_to_all_of_them(tmp_path: Path):
+    """Points at 5 and 10 sweeps of each material, the last at all 16. Each tests all sweeps, and
+    more training is at least as good here."""
+    made = {"method": "static-svm"}
+    test = easy(30, seed=5)
+    found = bundle_trainings.run(made, easy(16), test, where(tmp_path), NOTHING)
+    assert [p["each"] for p in found["curve"]] == [5, 10, 16]
+    assert {p["n"] for p in found["curve"]} == {len(test)}
+    assert all(p["low"] <= p["share"] <= p["high"] for p in found["curve"])
+    assert found["trained"]["method"] == "static-svm"
+    assert "left_out" not in found  # an SVM knows no novelty
+    assert found["why_not"]
+
+
+@pytest.mark.slow
+@pytest.mark.thorough  # fits again for each material
+def test_each_material_is_left_out_where_the_method_knows_novelty(tmp_path: Path):
+    """The default recipe gives, for each material, a share that gets a known label and a share of
+    known sweeps that are kept."""
+    train, test = tones(10), tones(4, noise=1.5)
+    found = bundle_trainings.run({"chosen": "filters"}, train, test, where(tmp_path), NOTHING)
+    assert set(found["left_out"]["materials"]) == {"a", "b", "c"}
+    for m in found["left_out"]["materials"].values():
+        assert (m["known"], m["unknown"]) == (16, 8)
+        assert 0 <= m["false_known"] <= 1
+    assert found["trained"]["method"] == "palpate"
+
+
+def test_a_bundle_of_no_method_has_no_curve(tmp_path: Path):
+    """A fit with its own size gives the reason instead of figures."""
+    found = bundle_trainings.run({}, easy(4), easy(4), where(tmp_path), NOTHING)
+    assert found == {
+        "why_not": "the bundle was fitted with settings of its own, which no method has"
+    }
+
+
+def test_materials_are_matched_by_name():
+    """With another order, one more and one less material, labels keep their meaning, and materials
+    without a match are left out. Formats must agree."""
+    train, other = easy(4), easy(6)
+    mixed = replace(other, materials=("high", "felt", "low"))
+    found = bundle_trainings.aligned(mixed, train)
+    assert found.materials == train.materials
+    assert len(found) == 12
+    assert [train.materials[k] for k in found.labels] == [
+        mixed.materials[k] for k in mixed.labels if k != 1
+    ]
+    with pytest.raises(FormatError, match="name sets of one form"):
+        bundle_trainings.aligned(tones(), train)
+
+
+def test_a_fit_gives_back_all_its_sweeps():
+    """The training sweeps come first, then the held-out ones, with their groups."""
+    whole = easy(20)
+    made = recipe.fit(whole, 1, recipe.Settings(0), NOTHING)
+    again = bundle_trainings.whole(made)
+    assert len(again) == len(whole)
+    np.testing.assert_array_equal(
+        np.sort(again.group("recording")), np.sort(whole.group("recording"))
+    )
+    assert again.materials == whole.materials
+
+
+def figures(curve: list[dict]) -> dict:
+    """Figures for a page without any sweep, with this curve."""
+    return {
+        "bundle": {"name": "b", "version": "1", "id": "0"},
+        "set": "s.npz",
+        "digest": "d",
+        "sweeps": 6,
+        "labels": ["low", "middle"],
+        "named_rightly": {"right": 5, "total": 6, "interval": [0.4, 1.0]},
+        "interval_by": "",
+        "statuses": {"ok": 6},
+        "unsure_right": 0,
+        "answers": {},
+        "not_in_the_bundle": {},
+        "format": "f",
+        "made": {"set": "t.npz", "seed": 1, "commit": "c"},
+        "figures": {},
+        "fitted_to_this": False,
+        "tells_unknown": True,
+        "groups": {"position": 2},
+        "foreign_named": [],
+        "named": {"n": 6, "right": 5, "wrong": 1, "not_named": 0, "unknown": [0.0, 0.0, 0.4]},
+        "materials": [
+            {
+                "name": "low",
+                "sweeps": 6,
+                "recall": [5 / 6, 0.4, 1.0],
+                "precision": [],
+                "unsure": 0,
+                "unknown": 0,
+                "refused": 0,
+                "taken_for": [],
+            }
+        ],
+        "calibration": {"n": 6, "error": 0.1, "bins": [{"said": 0.9, "right": 0.8, "n": 6}]},
+        "corruptions": [],
+        "cost": {"ms": 1.0, "ms_p99": 2.0, "kb": 3.0, "mib": 4.0},
+        "commit": "c",
+        "machine": "m",
+        "command": "palpate-train report",
+        "curve": curve,
+        "trained": {"method": "palpate", "set": "t.npz", "sweeps": 60, "effort": 1.0},
+        "left_out": {
+            "materials": {
+                "low": {
+                    "auroc": 0.9,
+                    "low": 0.8,
+                    "high": 1.0,
+                    "kept": 0.95,
+                    "false_known": 0.25,
+                    "known": 9,
+                    "unknown": 4,
+                }
+            },
+            "mean": {"auroc": 0.9, "kept": 0.95, "false_known": 0.25},
+        },
+    }
+
+
+def test_the_page_shows_the_curve_and_materials_left_out():
+    """The page has each point in words, the picture with titles of its axes, and the material in
+    its table and in the headline."""
+    points = [
+        {"each": 5, "share": 0.5, "low": 0.4, "high": 0.6, "n": 90},
+        {"each": 16.0, "share": 0.75, "low": 0.7, "high": 0.8, "n": 90},
+    ]
+    page = bundle_report.page(figures(points), easy(2))
+    text = PageReader(page).text
+    assert "5: 50.0 % [40.0, 60.0]; 16: 75.0 % [70.0, 80.0]" in text
+    assert "training sweeps of each material" in page
+    assert "low 25.0 % 95.0 % 90.0 % [80.0, 100.0] 9 / 4" in text
+    assert "yet named (mean) 25.0 %" in text
+    assert "Not measured" not in text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", rendered.SCHEMES)
+@pytest.mark.parametrize("width", rendered.WIDTHS)
+def test_the_page_can_be_read_everywhere(browser: Any, tmp_path: Path, width: int, scheme: str):
+    """The page with a curve, materials left out, a matrix and sweeps can be read at three widths,
+    by day and by night."""
+    points = [
+        {"each": 5, "share": 0.5, "low": 0.4, "high": 0.6, "n": 90},
+        {"each": 16.0, "share": 0.75, "low": 0.7, "high": 0.8, "n": 90},
+    ]
+    (tmp_path / "r.html").write_text(bundle_report.page(figures(points), easy(2)))
+    assert rendered.faults(browser, rendered.address(tmp_path / "r.html"), width, scheme) == {}
+
+
+@pytest.mark.slow
+@pytest.mark.thorough  # fits again for each part of the report
+def test_the_report_of_a_fit_is_that_of_its_bundle(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """Two commands lead from a fit to its page, and the first names the second; there is a curve,
+    since a fit holds its sweeps."""
+    tones(12).save(tmp_path / "t.npz")
+    fit, page = tmp_path / "mine.npz", tmp_path / "r.html"
+    assert (
+        main(
+            [
+                "fit",
+                "--set",
+                str(tmp_path / "t.npz"),
+                "--seed",
+                "1",
+                "--steps",
+                "0",
+                "--out",
+                str(fit),
+            ]
+        )
+        == 0
+    )
+    assert f"palpate-train report {fit} --set " in capsys.readouterr().out.splitlines()[-1]
+    tones(4, noise=1.5).save(tmp_path / "test.npz")
+    named = [
+        "report",
+        str(fit),
+        "--set",
+        str(tmp_path / "test.npz"),
+        "--out",
+        str(page),
+        "--jobs",
+        "1",
+    ]
+    assert main([*named, "--cache", str(tmp_path / "cache")]) == 0
+    text = PageReader(page.read_text()).text
+    assert "mine 1: what it answers" in text
+    assert "Accuracy on this page's sweeps after training on 5, 10, 20" in text
+    assert "left out of training gets a known name" in text
+    assert isinstance(Fit.load(fit), Fit)
+    assert main(["report", str(tmp_path / "t.npz"), *named[2:]]) == FormatError.exit_code
+    assert "t.npz: not a fit" in capsys.readouterr().err
+
+
+def test_sets_for_training_must_have_the_form_of_the_bundle():
+    """A set of another skin is refused before any training."""
+    other: Dataset = tones()
+    with pytest.raises(FormatError, match=r"easy is of .*, tones of .*; name sets of one form"):
+        bundle_trainings.run(
+            {"method": "static-svm"}, easy(4), other, Where(jobs=1, cache=None), NOTHING
+        )

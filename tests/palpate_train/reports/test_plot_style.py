@@ -1,0 +1,100 @@
+"""The style of all pictures: light and dark without a page, and titles of axes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from xml.etree import ElementTree
+
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from palpate_train.reports import html, plot_style
+from tests.factories.browser import contrast
+
+Draw = Callable[[Figure, Axes], None]
+
+
+def drawn(draw: Draw, plain: bool = False) -> str:
+    """A picture with one plot with numbers on both axes, to which `draw` is applied."""
+    figure, axes = plot_style.single_axes(2.0, 0.1, 0.9, 0.3, 0.4)
+    axes.set(xlim=(0, 1), ylim=(0, 1))
+    for axis in (axes.xaxis, axes.yaxis):
+        plot_style.set_ticks(axis, (0, 0.5, 1), "s")
+    draw(figure, axes)
+    return plot_style.to_svg(figure, "about", plain)
+
+
+def titles(svg: str) -> list[str | None]:
+    """The titles of the axes with numbers."""
+    return [
+        found
+        for node in ElementTree.fromstring(svg).iter()
+        if (found := node.get("data-axis")) is not None
+    ]
+
+
+@pytest.mark.parametrize(
+    ("draw", "there"),
+    [
+        (lambda figure, axes: None, ["", ""]),
+        (lambda figure, axes: plot_style.set_titles(axes, x="time, s"), ["time, s", ""]),
+        (
+            lambda figure, axes: plot_style.set_titles(axes, "time, s", "named rightly, %"),
+            ["time, s", "named rightly, %"],
+        ),
+        (
+            lambda figure, axes: (figure.supxlabel("time, s"), figure.supylabel("share")),
+            ["time, s", "share"],
+        ),
+        (lambda figure, axes: plot_style.set_ticks(axes.xaxis, (0, 1), bare=True), [""]),
+        (
+            lambda figure, axes: plot_style.set_categories(axes.yaxis, (0, 1), ("wood", "foam")),
+            [""],
+        ),
+        (
+            lambda figure, axes: (
+                plot_style.set_ticks(axes.xaxis, ()),
+                plot_style.set_ticks(axes.yaxis, ()),
+            ),
+            [],
+        ),
+    ],
+    ids=["none", "one", "both", "shared", "no numbers", "names", "no ticks"],
+)
+def test_an_axis_with_numbers_says_what_it_shows_or_that_it_does_not(draw: Draw, there: list[str]):
+    """The title of an axis is an attribute, empty if it is missing; axes without numbers need
+    none."""
+    assert titles(drawn(draw)) == there
+
+
+def test_titles_stand_by_their_axes():
+    """Both titles are written, the vertical one horizontally."""
+    svg = drawn(lambda figure, axes: plot_style.set_titles(axes, "time, s", "share named"))
+    texts = {
+        node.text: node
+        for node in ElementTree.fromstring(svg).iter("{http://www.w3.org/2000/svg}text")
+    }
+    assert {"time, s", "share named"} <= texts.keys()
+    assert "rotate" not in texts["share named"].get("transform", "")
+
+
+def test_a_picture_by_itself_is_light_or_dark():
+    """The roles have values for light and dark; within a page they are the page's; programs without
+    style sheets get colours."""
+    svg = drawn(lambda figure, axes: None)
+    assert svg.count(plot_style.SCHEMES) == 1
+    for roles in (plot_style.ROLES, plot_style.DARK_ROLES):
+        assert all(f"--{role}: {colour};" in plot_style.SCHEMES for role, colour in roles.items())
+    assert "<style" not in html.picture(svg)
+    plain = drawn(lambda figure, axes: None, plain=True)
+    assert "<style" not in plain
+    assert "var(" not in plain
+
+
+@pytest.mark.parametrize("roles", [plot_style.ROLES, plot_style.DARK_ROLES], ids=["light", "dark"])
+def test_texts_of_every_role_can_be_read(roles: dict[str, str]):
+    """All text has a contrast of at least 4.5 to the background (WCAG 2.1, 1.4.3)."""
+    rgb = {role: [int(colour[i : i + 2], 16) for i in (1, 3, 5)] for role, colour in roles.items()}
+    for role in ("text", "grey", "accent"):
+        assert contrast(rgb[role], rgb["background"]) >= 4.5, role

@@ -1,0 +1,178 @@
+"""The header of pages, pictures and results: made once, found in each kind of file, with a warning
+for older figures."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from palpate.core.errors import FormatError
+from palpate_train.metrics import score
+from palpate_train.reports import html, provenance
+from palpate_train.reports.provenance import Provenance
+from tests.factories.page_reader import PageReader
+
+ABOUT = Provenance(
+    ("abc", "def+"), ("12345678",), ("sim:T-REAL:1", "a & b <c>--d.npz"), (1, 2), "2026-11-22"
+)
+SVG = '<svg xmlns="http://www.w3.org/2000/svg"><title>a</title></svg>'
+
+
+def as_html(about: Provenance, home: str = html.HOME) -> str:
+    """A page with a title and one line."""
+    folder = html.TEMPLATES
+    return html.render("base.html.j2", folder, header=about, home=home)
+
+
+def written(folder: Path, about: Provenance) -> list[Path]:
+    """One file of each kind with this header."""
+    texts = {
+        "a.html": as_html(about),
+        "a.svg": provenance.in_svg(SVG, about),
+        "a.md": provenance.in_markdown("# Title\n\nText.\n", about),
+    }
+    for name, text in texts.items():
+        (folder / name).write_text(text)
+    return [folder / name for name in texts]
+
+
+def test_each_kind_of_file_gives_its_header_back(tmp_path: Path):
+    """Names may contain tags, ends of comments and quotes."""
+    for path in written(tmp_path, ABOUT):
+        assert provenance.read(path) == ABOUT, path.name
+    (tmp_path / "a.json").write_text(json.dumps({"commit": "abc", "bundle": "12345678", "seed": 3}))
+    assert provenance.read(tmp_path / "a.json") == Provenance(("abc",), ("12345678",), (), (3,))
+
+
+def test_a_second_header_takes_the_place_of_the_first():
+    """The text beside the header stays."""
+    other = replace(ABOUT, commit=("fff",), bundle=(score.shipped(),))
+    assert provenance.in_svg(provenance.in_svg(SVG, ABOUT), other) == provenance.in_svg(SVG, other)
+    page = "# Title\n\nText -- and <!-- a --> more.\n\n- line\n"
+    again = provenance.in_markdown(provenance.in_markdown(page, ABOUT), other)
+    assert again == provenance.in_markdown(page, other)
+    assert again.endswith("<!-- /provenance -->\n\nText -- and <!-- a --> more.\n\n- line\n")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "no header",
+        '<script type="application/json" id="provenance">{"commit": }</script>',
+        '<script type="application/json" id="provenance">{"comit": []}</script>',
+    ],
+)
+def test_a_file_without_header_is_named(tmp_path: Path, text: str):
+    """A FormatError has the file's name and a remedy, also if the file is missing."""
+    path = tmp_path / "index.html"
+    if text:
+        path.write_text(text)
+    with pytest.raises(
+        FormatError, match=r"index\.html: .*; make it again: python -m palpate_studies reports"
+    ):
+        provenance.read(path)
+
+
+def test_the_header_is_collected_wherever_figures_say_it():
+    """The origin is collected from joined runs, results in lists and sets of parts; names that
+    stand for several sets are left to their results."""
+    figures = {
+        "runs": [
+            {
+                "methods": ["palpate"],
+                "seeds": [1, 2],
+                "commit": "a",
+                "shipped": "11111111",
+                "date": "2026-01-02",
+            },
+            {
+                "methods": ["minirocket"],
+                "seeds": [3],
+                "commit": "b",
+                "shipped": "22222222",
+                "date": "2026-01-03",
+            },
+        ],
+        "parts": {"hard": {"sets": ["sim:T-REAL:{w}"]}},
+        "results": [{"method": "H-svm", "set": "sim:T-REAL:1", "seed": 4, "right": True}],
+        "made": {"commit": "of the bundle", "set": "of the bundle", "seed": 9},
+    }
+    about = provenance.of(figures)
+    assert about == Provenance(
+        ("a", "b"), ("11111111",), ("sim:T-REAL:1",), (1, 2, 3, 4), "2026-01-03"
+    )
+    assert (
+        provenance.of([{"commit": "a"}, {"commit": "a", "started": "2026-05-06T07:08"}]).date
+        == "2026-05-06"
+    )
+    assert provenance.of(
+        {"bundle": {"id": "33333333", "name": "mine"}, "shipped": "11111111"}
+    ).bundle == ("33333333",)
+
+
+def test_a_run_records_its_origin():
+    """A run records the packaged bundle, the day and the commit; figures of today are not older."""
+    known = score.provenance()
+    assert known["shipped"] == score.shipped()
+    assert re.fullmatch(r"[0-9a-f]{8}", known["shipped"])
+    assert re.fullmatch(r"20\d\d-\d\d-\d\d", known["date"])
+    assert provenance.of({"method": "palpate"} | known).older == ""
+    assert "without the default" in provenance.of({"method": "minirocket"} | known).older
+
+
+def test_a_page_of_an_older_default_says_so_in_its_first_line():
+    """The warning stands below the title, in HTML and in Markdown. A page of today's default, and a
+    page for others, has none."""
+    now, text = (
+        score.shipped(),
+        f"Made with an older default, bundle 12345678; the box ships bundle {score.shipped()} now.",
+    )
+    assert ABOUT.older == text
+    assert re.search(rf"</h1>\s*<p class=\"stop older\">{text}</p>", as_html(ABOUT))
+    assert f"-->\n> **{text}**\n" in provenance.in_markdown("# Title\n\nText.\n", ABOUT)
+    for about, home in ((replace(ABOUT, bundle=(now,)), html.HOME), (ABOUT, "")):
+        assert "stop older" not in as_html(about, home)
+    assert "older" not in provenance.in_markdown("# Title\n", replace(ABOUT, bundle=(now,)))
+    both = replace(ABOUT, bundle=("87654321", now))
+    assert both.older.startswith("Made in part with an older default, bundle 87654321;")
+
+
+def test_a_page_leads_back_to_the_readme_and_says_where_it_is_from():
+    """A link with text stands before the title, and the origin at the end; a page for others has no
+    such link."""
+    page = as_html(ABOUT)
+    assert '<nav><a href="../../README.md">← Palpate</a></nav>\n<h1>' in page
+    assert "2026-11-22, commit abc, def+, bundle 12345678, seeds 1, 2." in PageReader(page).text
+    assert "README" not in as_html(ABOUT, home="")
+
+
+def test_every_table_has_a_frame(tmp_path: Path):
+    """Headings of all tables have a scope, and wide tables take the focus; attributes set by a
+    template stay."""
+    (tmp_path / "a.html.j2").write_text(
+        '<div class="wide"><table><thead><tr><th class="text">a</th></tr></thead>'
+        '<tr><th scope="row">b</th></tr></table></div>'
+    )
+    page = html.render("a.html.j2", tmp_path)
+    assert '<th scope="col" class="text">a</th>' in page
+    assert '<th scope="row">b</th>' in page
+    assert "<thead>" in page
+    assert page.startswith(
+        '<div class="wide" tabindex="0" role="region" aria-label="table, scrolls sideways">'
+    )
+
+
+def test_a_page_is_published_with_its_pictures(tmp_path: Path):
+    """All files have the header."""
+    assert (
+        html.publish(tmp_path, {"index": as_html(ABOUT)}, {"one": SVG, "two": SVG}, ABOUT)
+        == tmp_path / "index.html"
+    )
+    names = ("index.html", "one.svg", "two.svg")
+    assert [provenance.read(tmp_path / name) for name in names] == [ABOUT] * 3
+    assert {path.name for path in tmp_path.iterdir()} == set(names)

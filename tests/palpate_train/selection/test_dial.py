@@ -1,0 +1,443 @@
+"""The choice of the smallest size within the budget, the accuracy to expect, and its page."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from palpate.core.errors import FormatError
+from palpate_train.cli.main import main
+from palpate_train.data import sets
+from palpate_train.data.sets import Dataset
+from palpate_train.data.transforms import WHOLE, Change
+from palpate_train.export import measure
+from palpate_train.export.measure import Measurement
+from palpate_train.models.recipe import choice as head_choice
+from palpate_train.models.recipe import recipe
+from palpate_train.models.recipe.fitted import Fit
+from palpate_train.models.recipe.recipe import Settings
+from palpate_train.selection import dial, reduction_curves
+from palpate_train.selection.dial import (
+    Budget,
+    BundleCost,
+    JudgedSize,
+    Judgement,
+    NothingFits,
+    SizeWish,
+)
+from palpate_train.selection.reduction_curves import ReducedFits
+
+CLOSED = Settings(steps=0)
+CLUSTERS = np.repeat(np.arange(8), 12)
+"""Eight places of twelve sweeps."""
+
+
+def nothing(line: str) -> None:
+    """A log that drops every line."""
+
+
+def skin(places: int = 8, each: int = 3, taxels: tuple[int, ...] = (0, 1)) -> Dataset:
+    """Four materials at several places. Each of the named taxels has half of the information, in
+    the strength of its signal."""
+    labels = np.tile(np.arange(4), places * each)
+    rng = np.random.default_rng(3)
+    bits = np.stack([labels % 2, labels // 2], axis=1)
+    strength = 3 * np.exp(0.15 * rng.standard_normal((len(labels), 6)))
+    for taxel, bit in zip(taxels, bits.T, strict=True):
+        strength[:, taxel] *= 1 + 2 * bit
+    x = 100 + strength[:, None] * rng.standard_normal((len(labels), 120, 6))
+    groups = {"place": np.repeat(np.arange(places), 4 * each)}
+    return Dataset(
+        np.rint(x).astype(np.int16)[..., None], labels, ("a", "b", "c", "d"), 100.0, groups, "skin"
+    )
+
+
+def judgement(**rights: np.ndarray) -> Judgement:
+    """Sizes with these right answers, bool [96], of two labels at eight places."""
+    labels = np.arange(96) % 2
+    sizes = {
+        name: JudgedSize(None, cast(Any, None), np.where(right, labels, 1 - labels))
+        for name, right in rights.items()
+    }
+    return Judgement(cast(Any, None), sizes, {}, labels, CLUSTERS, ("place",))
+
+
+EVERYTHING = np.ones(96, bool)
+
+
+def missing(numbers: slice) -> np.ndarray:
+    """All sweeps named rightly but these."""
+    right = EVERYTHING.copy()
+    right[numbers] = False
+    return right
+
+
+def test_a_gain_within_the_error_is_no_reason():
+    """A gain at one place does not justify a larger size; the same gain at all places does."""
+    for small, chosen in ((missing(slice(12)), "bands"), (missing(slice(0, None, 8)), "all")):
+        judged = judgement(bands=small, all=EVERYTHING)
+        assert judged.choose(["bands", "all"], 0.0, EVERYTHING) == chosen
+
+
+def test_the_first_in_order_is_taken_where_all_suffice():
+    """The order is that of cost, whatever the names."""
+    judged = judgement(bands=EVERYTHING, all=EVERYTHING)
+    assert judged.choose(["all", "bands"], 0.0, EVERYTHING) == "all"
+
+
+def test_the_smallest_that_reaches_what_is_wanted_is_taken():
+    """87.5 % is enough where .85 is wanted; where nothing reaches it, the rule of one standard
+    error remains."""
+    judged = judgement(bands=missing(slice(0, None, 8)), all=missing(slice(1)))
+    assert judged.choose(["bands", "all"], 0.85, EVERYTHING) == "bands"
+    assert judged.choose(["bands", "all"], 0.9, EVERYTHING) == "all"
+    assert judged.choose(["bands", "all"], 1.0, EVERYTHING) == "all"
+
+
+def test_the_accuracy_to_expect_is_that_of_choices_that_did_not_see_the_part():
+    """The best of sixteen guessing sizes looks good; choices tested on parts that they did not use
+    are guesses, on average over thirty draws. A single part gives no such figure."""
+    best, expected = [], []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        guesses = {name: rng.random(96) < 0.5 for name in map(str, range(16))}
+        judged = judgement(**guesses)
+        best.append(max(right.mean() for right in guesses.values()))
+        found = judged.expected(list(guesses), 0.0)
+        assert found
+        assert sum(found["chose"].values()) == 8
+        expected.append(found["mean"])
+    assert np.mean(best) > 0.57
+    assert np.mean(expected) == pytest.approx(0.5, abs=0.03)
+    assert replace(judged, clusters=np.zeros(96, int)).expected(list(guesses), 0.0) is None
+
+
+def test_the_error_is_that_of_what_fails_together():
+    """The same loss at one place has a larger error than at all places; no loss has no error."""
+    here, everywhere = missing(slice(12)), missing(slice(0, None, 8))
+    one, all_ = (dial.difference(EVERYTHING, x, CLUSTERS) for x in (here, everywhere))
+    assert one.mean == all_.mean == 0.125
+    assert one.se == pytest.approx(0.125)  # one of eight places failed
+    assert all_.se == pytest.approx(np.std(everywhere, ddof=1) / np.sqrt(96))
+    same = dial.difference(EVERYTHING, EVERYTHING, CLUSTERS)
+    assert same.json() == {"mean": 0, "se": 0, "low": 0, "high": 0}
+
+
+def test_cheap_is_what_takes_little_of_the_scarcer():
+    """Cost is the larger of the shares of time and bytes; without a budget the bytes, then the
+    time."""
+    small, fast = BundleCost(0.4, 20, 60), BundleCost(0.1, 40, 50)
+    for budget, dearer, cheaper in (
+        (Budget(ms=1, kb=1000, slower=2), small, fast),
+        (Budget(ms=100, kb=50), fast, small),
+        (Budget(), fast, small),
+    ):
+        assert cheaper.order(budget) < dearer.order(budget)
+    assert BundleCost(0.1, 20, 50).order(Budget()) < small.order(Budget())
+    assert Budget(ms=1, kb=1000, slower=2).used(small) == {"ms": 0.8, "kb": 0.02}
+    assert Budget(ms=0.5, slower=2).over(small) == "over the budget: 0.8 ms of 0.5"
+    assert not Budget(kb=20).over(small)
+
+
+@cache
+def judged_skin() -> Judgement:
+    """Three sizes in closed form, judged on the skin."""
+    return dial.judge(skin(), 1, CLOSED, ["bands", "pairs", "all"], nothing)
+
+
+def test_all_sizes_are_judged_on_the_same_sweeps():
+    """Every held-out sweep once; the spectrum that all taxels share does not see which taxel is
+    strong, relations of taxels do."""
+    judged = judged_skin()
+    assert judged.by == ("place",)
+    assert len(judged.labels) == len(judged.clusters) == 96
+    rights = {name: judged.right(name).mean() for name in judged.sizes}
+    assert rights["bands"] < 0.8 < rights["pairs"]
+    assert judged.choose(["bands", "pairs", "all"], 0.0, EVERYTHING) != "bands"
+    assert not judged.staged
+    made = judged.fit("pairs")
+    assert (made.architecture.pools, made.architecture.relations > 0) == (0, True)
+
+
+def test_equal_models_are_fitted_once():
+    """A single taxel has no relations: `pairs` chooses what `bands` chose, `all` more."""
+    sweeps = skin()
+    one = replace(sweeps, samples=sweeps.samples[:, :, :1])
+    judged = dial.judge(one, 1, CLOSED, ["bands", "pairs", "all"], nothing)
+    assert judged.first_equals() == {"bands": "bands", "pairs": "bands", "all": "all"}
+
+
+def test_a_size_alone_is_the_same_model():
+    """The fit of a judged size has the weights of `recipe.fit` with that size."""
+    alone = recipe.fit(skin(), 1, replace(CLOSED, size=dial.FAMILY["pairs"]))
+    made = judged_skin().fit("pairs")
+    assert alone.weights.keys() == made.weights.keys()
+    for name, value in alone.weights.items():
+        np.testing.assert_array_equal(value, made.weights[name])
+
+
+@pytest.mark.slow
+def test_sizes_with_stages_are_judged_where_stages_were_not_trained(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    """All sizes then have the same held-out sweeps, those of some places, and stages were trained
+    once."""
+    trained = []
+    train = recipe._trained
+    monkeypatch.setattr(recipe, "ENOUGH", 1.1)
+    monkeypatch.setattr(head_choice.HeldOutScores, "worse", lambda *pair: False)
+    monkeypatch.setattr(recipe, "_trained", lambda setup: trained.append(1) or train(setup))
+    sweeps = skin(each=8)
+    sweeps = replace(sweeps, groups={"position": sweeps.group("place")})
+    judged = dial.judge(sweeps, 1, Settings(steps=2), ["bands", "stages", "all"], nothing)
+    assert (judged.staged, len(trained)) == (True, 1)
+    assert judged.sizes["bands"].trunk is None
+    assert judged.sizes["stages"].trunk is not None
+    held = sweeps.take(judged.setup.judging.out)
+    np.testing.assert_array_equal(judged.labels, held.labels)
+    np.testing.assert_array_equal(judged.clusters, held.group("position"))
+    assert judged.by == ("position",)
+    assert judged.reduced("bands").steps == 0
+    assert judged.reduced("stages").steps == 2
+
+
+def test_a_size_that_the_windows_do_not_allow_is_named():
+    """Thirty frames have no spectrum; sizes with filters remain. If none remains, each reason is
+    named."""
+    short = skin()
+    short = replace(short, samples=short.samples[:, :30])
+    judged = dial.judge(short, 1, CLOSED, ["bands", "64"], nothing)
+    assert list(judged.sizes) == ["64"]
+    assert "too short for a spectrum" in judged.refused["bands"]
+    with pytest.raises(FormatError, match=r"^bands: windows of 30 frames are too short"):
+        dial.judge(short, 1, CLOSED, ["bands"], nothing)
+
+
+@pytest.fixture
+def costs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fixed costs in the order of the sizes, without a bundle."""
+
+    def fixed(
+        fits: dict[str, Fit], sweeps: Dataset, log: object
+    ) -> tuple[dict[str, BundleCost], dict[str, str]]:
+        return {n: BundleCost(0.1 * i, 10.0 * i, 50.0) for i, n in enumerate(fits, 1)}, {}
+
+    monkeypatch.setattr(dial, "bundle_costs", fixed)
+    judged = judged_skin()
+    monkeypatch.setattr(dial, "judge", lambda *args: judged)
+
+
+def chosen(**budget: float) -> dial.Selection:
+    """The choice on the skin within these limits."""
+    wanted = SizeWish(Budget(**budget), sizes=tuple(judged_skin().sizes))
+    return dial.choose(skin(), 1, CLOSED, wanted, nothing)
+
+
+@pytest.mark.usefixtures("costs")
+def test_what_is_over_the_budget_is_not_chosen():
+    """The best of the others is chosen, and each limit is named. Without limits the smallest that
+    suffices is."""
+    assert chosen().chosen == "pairs"
+    for budget in ({"ms": 0.15}, {"kb": 15}, {"ms": 0.3, "slower": 2.0}):
+        found = chosen(**budget)
+        assert (found.chosen, found.order) == ("bands", ["bands"])
+        assert found.why_not["pairs"].startswith("over the budget: ")
+    assert chosen(kb=15).why_not["pairs"] == "over the budget: 20 kb of 15"
+
+
+@pytest.mark.usefixtures("costs")
+def test_nothing_fits(monkeypatch: pytest.MonkeyPatch):
+    """The nearest size is named with the exceeded limit; a size that cannot be packed with the
+    reason."""
+    nearest = r"nearest is bands, over the budget: 10 kb of 5: raise the budget"
+    with pytest.raises(NothingFits, match=nearest):
+        chosen(kb=5)
+    refused = dict.fromkeys(judged_skin().sizes, "too few recordings")
+    monkeypatch.setattr(dial, "bundle_costs", lambda *args: ({}, refused))
+    with pytest.raises(NothingFits, match="all cannot be used here: too few recordings"):
+        chosen()
+
+
+@pytest.mark.usefixtures("costs")
+def test_the_result_has_every_size_with_its_reason():
+    """The chosen size between its neighbours, in the order of cost."""
+    result = chosen(kb=25).json()
+    assert [line["method"] for line in result["rungs"]] == ["bands", "pairs", "all"]
+    assert (result["chosen"], result["smaller"]["method"]) == ("pairs", "bands")
+    assert result["smaller"]["low"] > 0
+    assert result["larger"] is None
+    assert result["rungs"][2]["why_not"] == "over the budget: 30 kb of 25"
+    assert result["honest"]["mean"] == pytest.approx(result["accuracy"]["mean"], abs=0.05)
+    assert result["confused"] == sorted(result["confused"], key=lambda pair: -pair["share"])
+    json.dumps(result, allow_nan=False)
+
+
+def reduced(sweeps: Dataset, kind: str, wanted: float = 0.0) -> tuple[dict[str, Any], Change]:
+    """The curve of one kind for the size "pairs", and the change of the fit."""
+    judged = dial.judge(sweeps, 1, CLOSED, ["pairs"], nothing)
+    some = SizeWish(accuracy=wanted, sizes=("pairs",))
+    cost = {"pairs": BundleCost(0.1, 10, 50)}
+    choice = dial.Selection(judged, some, ["pairs"], cost, {}, "pairs", cast(Any, None))
+    (curve,), change = reduction_curves.curves(choice, [kind], nothing)
+    return curve, change
+
+
+def test_two_taxels_are_all_that_is_needed():
+    """Of six taxels the third and the fifth have all the information: one alone is not enough.
+    Nothing is applied, because the sensor would have to be set."""
+    curve, change = reduced(skin(taxels=(2, 4)), "taxels")
+    assert curve["kept"] == "2 taxels"
+    assert curve["taxels"] == [[2, 0], [4, 0]]
+    assert [point["fine"] for point in curve["points"]] == [True, True, True, False]
+    assert (curve["applied"], change) == (False, WHOLE)
+    assert curve["set"].startswith("connect only these taxels")
+
+
+@pytest.mark.slow
+def test_a_shorter_window_is_applied_and_what_cannot_be_is_reported():
+    """Half of the frames are enough; a window that is too short ends the curve with the reason."""
+    curve, change = reduced(skin(), "window")
+    assert curve["applied"]
+    assert change.window < 1
+    short = skin()
+    curve, _ = reduced(replace(short, samples=short.samples[:, :48]), "window")
+    assert "too short" in curve["points"][-1]["refused"]
+
+
+@pytest.mark.slow
+def test_rate_and_bits_are_reported():
+    """White noise needs neither all frames nor all bits; how to set the sensor is said."""
+    curve, change = reduced(skin(), "rate")
+    assert curve["kept"] == "all" or curve["set"].startswith("set the readout board to average")
+    curve, change = reduced(skin(), "bits")
+    assert curve["kept"] == "all" or curve["set"].startswith("a converter of this many bits")
+    assert change == WHOLE
+
+
+def test_less_does_not_fall_below_what_is_wanted():
+    """A loss within the error is refused if the whole sweeps reach the wanted accuracy and the
+    reduced ones do not."""
+    less = missing(slice(1))
+
+    def fits(wanted: float) -> ReducedFits:
+        return ReducedFits(judgement(all=EVERYTHING), "all", wanted, nothing)
+
+    assert fits(0.9).fine(EVERYTHING, less)
+    assert not fits(0.995).fine(EVERYTHING, less)
+    assert fits(1.0).fine(less, less)
+
+
+def test_materials_that_look_alike_are_proposed_as_one():
+    """Only the first taxel has information, so that a and c, b and d are alike. The pairs are
+    proposed and not applied."""
+    sweeps = skin(taxels=(0, 5))
+    blind = sweeps.samples.copy()
+    blind[:, :, 5] = blind[:, :, 4]
+    curve, change = reduced(replace(sweeps, samples=blind), "classes", 0.9)
+    assert sorted(map(sorted, curve["proposed"])) == [["a", "c"], ["b", "d"]]
+    assert [point["name"] for point in curve["points"]] == ["4", "3", "2"]
+    assert curve["points"][-1]["accuracy"]["mean"] > 0.9
+    assert (curve["applied"], change) == (False, WHOLE)
+    assert not reduced(skin(), "classes", 0.9)[0]["proposed"]
+
+
+def command(folder: Path, *more: str) -> list[str]:
+    """`fit` with a scene beside the set."""
+    skin().save(folder / "skin.npz")
+    (folder / "scene.toml").write_text('set = ["skin.npz"]\nbudget-ms = 1000\nslower = 3\n')
+    scene, out = folder / "scene.toml", folder / "mine.npz"
+    return ["fit", "--scene", str(scene), "--seed", "1", "--steps", "0", "--out", str(out), *more]
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bundles are packed and not timed."""
+    one = Measurement(0.5, 0.6, 9_000, 12_000, 50.0)
+    monkeypatch.setattr(measure, "measure_all", lambda folders, sweeps: [one] * len(folders))
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("quick")
+def test_the_command_fits_what_it_chose_and_says_why(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """A scene and options of the command line together; the fit has the shorter window, and so has
+    the set of --rest. The page loads nothing from elsewhere."""
+    rest = tmp_path / "rest.npz"
+    more = ["--size", "pairs", "--reduce", "window", "classes", "--accuracy", "0.8"]
+    more += ["--split", "place:0.75", "--rest", str(rest)]
+    assert main(command(tmp_path, *more)) == 0
+    result = json.loads((tmp_path / "mine-why" / "choice.json").read_text())
+    made = Fit.load(tmp_path / "mine.npz")
+    assert result["chosen"] == made.about["size"] == "pairs"
+    frames = round(120 * result["applied"]["window"])
+    assert made.train.format.window == result["bundle"]["format"]["window"] == frames < 120
+    assert sets.load(str(rest)).format == made.train.format
+    assert result["bundle"]["used"] == {"ms": 0.002}
+    assert result["command"].startswith("palpate-train fit --scene ")
+    assert {"commit", "machine", "digest", "seeds"} <= result.keys()
+    page = (tmp_path / "mine-why" / "index.html").read_text()
+    assert "http" not in page.replace("http://www.w3.org", "")
+    output = capsys.readouterr().out
+    assert "pairs with" in output
+    assert "Reached: 80 % is wanted" in output
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("quick")
+def test_a_reduction_that_cannot_be_packed_is_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """The fit is that of whole sweeps, and the page says why."""
+
+    def never(*args: object) -> None:
+        raise FormatError("too few frames")
+
+    monkeypatch.setattr(dial, "reduced", never)
+    assert main(command(tmp_path, "--size", "pairs", "--reduce", "window")) == 0
+    assert Fit.load(tmp_path / "mine.npz").train.format.window == 120
+    assert "not shortened: too few frames" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("quick")
+def test_what_is_wanted_and_not_reached_is_said_first(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """The best is reported and fitted although it misses the wanted accuracy."""
+    assert main(command(tmp_path, "--size", "bands", "--accuracy", "0.99")) == 0
+    printed = capsys.readouterr().out
+    assert "Not reached: 99 % is wanted" in printed
+    assert 'class="stop">Not reached' in (tmp_path / "mine-why" / "index.html").read_text()
+    assert Fit.load(tmp_path / "mine.npz").about["size"] == "bands"
+
+
+@pytest.mark.parametrize(
+    ("more", "why"),
+    [
+        (["--slower", "3"], "--slower needs --budget-ms"),
+        (["--budget-ms", "0"], "--budget-ms 0 is out of range"),
+        (["--accuracy", "90"], "--accuracy 90 is out of range; use a number above 0, to 1"),
+        ([], "no sweeps; name a set with --set, or with set in the file of --scene"),
+    ],
+)
+def test_wishes_that_make_no_sense_are_refused_first(
+    more: list[str], why: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """Before any set is read."""
+    named = ["--set", "none.npz"] if more else []
+    assert main(["fit", *named, "--seed", "1", "--out", str(tmp_path / "x.npz"), *more]) != 0
+    assert why in capsys.readouterr().err
+
+
+def test_every_size_has_a_name():
+    """The family ends with everything, and limits are infinite by default."""
+    assert list(dial.FAMILY)[-1] == dial.ALL
+    assert Budget() == Budget(math.inf, math.inf, 1.0)

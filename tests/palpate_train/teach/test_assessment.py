@@ -1,0 +1,115 @@
+"""The assessment of a box: accuracy, confusion, wrong labels, and what to record next."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from palpate_train.data.sets import Dataset
+from palpate_train.data.splitters import InnerPart
+from palpate_train.teach.assessment import Assessment, assess, judged
+from palpate_train.teach.lesson import Lesson
+from tests.factories.sweep_sets import easy
+
+
+def lesson(sweeps: Dataset) -> Lesson:
+    """The lesson of a set."""
+    names = tuple(f"sweep-{i:06d}" for i in range(1, len(sweeps) + 1))
+    plain = replace(sweeps, groups={"recording": np.arange(len(sweeps))})
+    return Lesson(plain, names, {})
+
+
+def answers(p: np.ndarray, labels: list[int]) -> Assessment:
+    """The assessment of sweeps with these probabilities."""
+    made = easy(1)
+    sweeps = made.take(np.zeros(len(labels), int))
+    sweeps = replace(sweeps, labels=np.array(labels), materials=("cork", "felt", "pine"))
+    return judged(lesson(sweeps), [InnerPart("recording", np.ones(len(labels), bool))], p)
+
+
+def sure(*named: int) -> np.ndarray:
+    """Probabilities that name these materials."""
+    return np.where(np.eye(3)[list(named)] > 0, 0.98, 0.01)
+
+
+def test_easy_materials_are_enough():
+    """All sweeps are right, and the sentence agrees with the interval."""
+    found = assess(lesson(easy(14)))
+    assert found.json()["accuracy"] == 1
+    assert found.low > 0.9
+    assert found.advice().startswith("enough: at least 9")
+    assert found.confused() is None
+    assert "42 sweeps are named rightly if their sweeps are left out [9" in found.text()
+
+
+def test_few_sweeps_are_not_enough_however_right_they_are():
+    """Nine right answers show little; the material with the fewest sweeps comes first."""
+    found = answers(sure(0, 0, 0, 0, 1, 1, 1, 2, 2), [0, 0, 0, 0, 1, 1, 1, 2, 2])
+    assert found.advice() == (
+        "nothing was confused, but 9 sweeps are few: 3 more of each, of pine first"
+    )
+
+
+def test_a_mislabelled_sweep_is_pointed_out():
+    """Sweep 4 of cork is surely pine, while all others are named rightly."""
+    labels = [0] * 6 + [1] * 6 + [2] * 6
+    named = list(labels)
+    named[3] = 2
+    found = answers(sure(*named), labels)
+    (suspect,) = found.suspects
+    assert suspect.text == "sweep 4 of cork looks like pine"
+    assert suspect.sweep == "sweep-000004"
+    assert found.advice().startswith("look at it first: sweep 4 of cork looks like pine")
+
+
+def test_a_mislabelled_sweep_is_found_in_signals():
+    """The same from raw counts: one label of easy materials is exchanged."""
+    sweeps = easy(8)
+    labels = sweeps.labels.copy()
+    labels[2] = 1
+    found = assess(lesson(replace(sweeps, labels=labels)))
+    assert [one.sweep for one in found.suspects] == ["sweep-000003"]
+    assert found.suspects[0].looks_like == "low"
+
+
+def test_materials_that_cannot_be_told_apart_are_named():
+    """Half of two materials is taken for the other: no label is suspected, and no number of
+    further sweeps is promised to help."""
+    labels = [0] * 8 + [1] * 8 + [2] * 8
+    named = [0, 1] * 4 + [1, 0] * 4 + [2] * 8
+    found = answers(sure(*named), labels)
+    assert not found.suspects
+    assert found.inseparable() == (0, 1)
+    assert found.advice().startswith("cork and felt cannot be told apart so far")
+    assert found.json()["confused"] == ["cork", "felt", 8.0]
+
+
+def test_the_material_with_most_errors_comes_next():
+    """Errors of a material and answers that name it wrongly both count."""
+    labels = [0] * 10 + [1] * 10 + [2] * 10
+    named = list(labels)
+    named[0], named[1] = 1, 1
+    p = sure(*named)
+    p[:2] = [0.3, 0.6, 0.1]
+    assert answers(p, labels).advice() == "3 more of cork, from another place"
+
+
+@pytest.mark.slow
+def test_materials_of_one_place_are_judged_by_sweeps():
+    """Where places cannot be left out for all materials, sweeps are: none stays unjudged."""
+    sweeps = easy(6)
+    position = np.where((sweeps.labels == 0) & (np.arange(18) % 2 == 0), 2, 1)
+    one = lesson(sweeps)
+    found = assess(
+        replace(one, sweeps=replace(one.sweeps, groups=one.sweeps.groups | {"position": position}))
+    )
+    assert found.left_out == ("recording",)
+    assert (found.named.sum(axis=1) > 0.99).all()
+
+
+def test_an_exchange_of_all_labels_is_no_suspect():
+    """Two materials in equal shares that both look like the other say nothing about one sweep."""
+    found = answers(sure(1, 1, 0, 0, 2, 2), [0, 0, 1, 1, 2, 2])
+    assert not found.suspects

@@ -1,0 +1,102 @@
+"""The sweeps that a box is taught from: omissions and completions."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from palpate.core.errors import FormatError
+from palpate.core.types import Status, SweepFormat
+from palpate.sim import skin
+from palpate_train.data.sets import Dataset
+from palpate_train.teach.lesson import Lesson
+from tests.factories import lessons
+from tests.factories.recordings import FORMAT, record
+
+
+def sweeps(folder: Path, *materials: str, first: int = 1, **more: object) -> None:
+    """A recording of each material, numbered from `first`."""
+    for number, material in enumerate(materials, first):
+        record(folder / f"sweep-{number:06d}.npy", material, id=number, **more)
+
+
+def test_sweeps_that_cannot_be_taught_are_left_out_and_counted(tmp_path: Path):
+    """Damaged files, sweeps without a material, faulty ones and those of another format do not
+    prevent a lesson."""
+    sweeps(tmp_path, "a", "b")
+    sweeps(tmp_path, "", first=3)
+    sweeps(tmp_path, "a", first=4, status=Status.GAP)
+    (tmp_path / "sweep-000005.npy").write_bytes(b"half a file")
+    record(tmp_path / "sweep-000006.npy", "a", format=SweepFormat(2, 3, 50.0, 9, "int16"), frames=9)
+    sweeps(tmp_path, "b", first=7)
+    lesson = Lesson.read(tmp_path)
+    assert lesson.names == ("sweep-000001", "sweep-000002", "sweep-000007")
+    assert dict(lesson.left_out) == {
+        "no material": 1,
+        "gap": 1,
+        "damaged": 1,
+        "another format": 1,
+    }
+    assert lesson.number(2) == 2
+
+
+def test_forgotten_materials_stay_away_until_they_are_recorded_again(tmp_path: Path):
+    """Sweeps up to the number are left out; later ones of the same name are taught."""
+    sweeps(tmp_path, "a", "b", "a", "a")
+    lesson = Lesson.read(tmp_path, {"a": 3})
+    assert lesson.names == ("sweep-000002", "sweep-000004")
+    assert lesson.left_out["forgotten"] == 2
+
+
+def test_a_missing_position_is_a_place_of_its_own(tmp_path: Path):
+    """Sweeps with and without a position can be taught together."""
+    sweeps(tmp_path, "a", "b", position="1")
+    sweeps(tmp_path, "a", "b", first=3)
+    lesson = Lesson.read(tmp_path)
+    assert len(set(lesson.sweeps.groups["position"].tolist())) == 2
+
+
+def test_nothing_to_teach_is_an_error_with_the_reasons(tmp_path: Path):
+    """The message counts the omitted sweeps."""
+    sweeps(tmp_path, "", "")
+    with pytest.raises(FormatError, match=r"no sweep can be taught \(2 no material\); record some"):
+        Lesson.read(tmp_path)
+    with pytest.raises(FormatError, match="cannot be read"):
+        Lesson.read(tmp_path / "nowhere")
+
+
+def test_a_single_sweep_is_not_judged_yet(tmp_path: Path):
+    """Materials with one sweep are left out of an assessment; one material alone is an error."""
+    sweeps(tmp_path, "a", "a", "b", "b", "c")
+    lesson = Lesson.read(tmp_path).repeated()
+    assert lesson.sweeps.materials == ("a", "b")
+    assert lesson.sweeps.format == FORMAT
+    sweeps(tmp_path / "one", "a", "a", "b")
+    with pytest.raises(FormatError, match="1 of the materials have two sweeps or more"):
+        Lesson.read(tmp_path / "one").repeated()
+
+
+def test_sweeps_without_a_slide_are_not_learnt_from_and_named(tmp_path: Path):
+    """A finger at rest taught as foam, among slides: named by its number, whatever its place. A
+    material that has no slide left is said with the reason."""
+    rng, place = np.random.default_rng(2), skin.placements("T-REAL", 1005)[0]
+    windows = [skin.window(name, place, rng) for name in ("wood",) * 3 + ("foam",) * 3]
+    rest = np.broadcast_to(windows[3].mean(axis=0).round(), windows[3].shape)
+    windows[3] = (rest + rng.integers(0, 2, rest.shape)).astype(np.uint8)
+    labels = np.repeat([0, 1], 3)
+    format = skin.FORMAT
+    sweeps = Dataset(np.stack(windows), labels, ("wood", "foam"), format.rate_hz, {}, "slides")
+    lessons.write(tmp_path, sweeps)
+    lesson = Lesson.read(tmp_path)
+    assert np.bincount(lesson.sweeps.labels).tolist() == [2, 3]
+    assert dict(lesson.left_out) == {"no slide": 1}
+    (one,) = lesson.no_slides
+    assert one.number == 4
+    assert one.text.startswith("sweep 1 of foam is not learnt from: no slide: no pattern passes")
+    only = tmp_path / "only"
+    lessons.write(only, replace(sweeps.take(np.arange(4)), materials=("wood", "foam")))
+    with pytest.raises(FormatError, match=r"record two of another material \(sweep 1 of foam is"):
+        Lesson.read(only).repeated()

@@ -1,0 +1,177 @@
+"""`python -m palpate_train.teach` as a process: its imports, output, files and failures."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from palpate.bundle import bundle
+from palpate.core.clock import SystemClock
+from palpate.inference.classifier import Classifier
+from palpate_train.data.sets import Dataset
+from palpate_train.models.recipe import recipe
+from palpate_train.teach.lesson import Lesson
+from tests.factories import lessons
+from tests.factories.paths import ROOT
+from tests.factories.sweep_sets import easy
+
+pytestmark = pytest.mark.slow
+
+WATCHED = """
+import sys
+from palpate_train.teach.__main__ import main
+code = main(sys.argv[1:])
+loaded = sorted({name.partition(".")[0] for name in sys.modules})
+print(" ".join(loaded), file=sys.stderr)
+sys.exit(code)
+"""
+FORBIDDEN = {"torch", "sklearn", "pandas", "h5py", "joblib", "matplotlib", "skl2onnx", "aeon"}
+
+
+def ran(*words: str | Path) -> tuple[int, list[dict[str, Any]], set[str]]:
+    """Exit code, printed objects, and the imported packages."""
+    done = subprocess.run(
+        [sys.executable, "-c", WATCHED, *map(str, words)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    lines = [json.loads(line) for line in done.stdout.splitlines()]
+    return done.returncode, lines, set(done.stderr.split("\n")[-2].split())
+
+
+def test_a_bundle_is_made_without_a_desktops_libraries(tmp_path: Path):
+    """Assessment and fit import neither torch nor scikit-learn nor pandas. The bundle is that of
+    the recipe without stages, names its sweeps, and says who has taught it."""
+    sweeps = easy(12)
+    plain = replace(sweeps, groups={"recording": np.arange(len(sweeps))})
+    lessons.write(tmp_path / "sweeps", plain)
+    code, (assessed,), loaded = ran(tmp_path / "sweeps")
+    assert code == 0
+    assert assessed["type"] == "assessed"
+    assert not loaded & FORBIDDEN
+    out = tmp_path / "bundle"
+    code, lines, loaded = ran(
+        tmp_path / "sweeps", "--out", out, "--by", "anna", "--at", "today", "--memory-mb", "700"
+    )
+    assert code == 0, lines
+    assert not loaded & FORBIDDEN
+    assert [one.get("step") for one in lines[:-1]] == ["features", "heads", "bundle"]
+    made = bundle.load(out)
+    held = {"high": 12, "low": 12, "middle": 12}
+    assert made.manifest.made["taught"] == {"by": "anna", "at": "today", "sweeps": held}
+    box = Classifier(made, SystemClock())
+    box.self_test()
+    lesson = Lesson.read(tmp_path / "sweeps")
+    fit = recipe.fit(lesson.sweeps, 0, recipe.Settings(steps=0))
+    assert made.manifest.made["chosen"] == fit.about["chosen"]
+    assert made.manifest.known
+    assert lines[-1]["peak_mb"] < 700
+
+
+@pytest.mark.parametrize(
+    ("materials", "each", "why"),
+    [
+        (1, 6, "only one class, 'high'; a classifier needs two"),
+        (3, 2, "'high' has 2 sweeps; record 3 or more of each material, or forget it"),
+    ],
+)
+def test_too_little_is_refused_with_the_remedy(tmp_path: Path, materials: int, each: int, why: str):
+    """One material, or too few sweeps of one: no bundle, and the reason on a line."""
+    sweeps = easy(each)
+    lessons.write(tmp_path / "sweeps", sweeps.take(sweeps.labels >= 3 - materials))
+    code, lines, _ = ran(tmp_path / "sweeps", "--out", tmp_path / "bundle")
+    assert code
+    assert why in lines[-1]["text"]
+    assert not (tmp_path / "bundle").exists()
+
+
+def materials(kinds: int, each: int, spread: float) -> Dataset:
+    """Sweeps of materials whose pitches lie apart by `spread` periods per frame."""
+    rng = np.random.default_rng(0)
+    labels = np.repeat(np.arange(kinds), each)
+    pitch = 0.15 + spread * labels * rng.uniform(0.98, 1.02, kinds * each)
+    phase = 2 * np.pi * (pitch[:, None] * np.arange(64) + rng.random((kinds * each, 1)))
+    level = rng.uniform(80, 120, (kinds * each, 1, 2, 2))
+    samples = level + 12 * np.sin(phase)[:, :, None, None]
+    samples = samples + 2 * rng.standard_normal((*samples.shape[:2], 2, 2))
+    names = tuple(f"material {k}" for k in range(kinds))
+    groups = {"recording": np.arange(kinds * each)}
+    return Dataset(samples.astype(np.uint8), labels, names, 100.0, groups, "materials")
+
+
+def test_materials_that_chance_would_name_as_well_are_refused(tmp_path: Path):
+    """One material under two names: no bundle is made, and the reason says what to do."""
+    lessons.write(tmp_path / "sweeps", materials(2, 8, 0.0))
+    code, lines, _ = ran(tmp_path / "sweeps", "--out", tmp_path / "bundle")
+    assert code
+    assert "material 0, material 1 cannot be told apart: " in lines[-1]["text"]
+    assert "or teach them as one material" in lines[-1]["text"]
+    assert not (tmp_path / "bundle").exists()
+
+
+@pytest.mark.thorough  # a fit of minutes
+def test_forty_materials_are_a_bundle(tmp_path: Path):
+    """With three sweeps of each: all of them are its labels, and it says how often it is right."""
+    lessons.write(tmp_path / "sweeps", materials(40, 3, 0.008))
+    code, lines, _ = ran(tmp_path / "sweeps", "--out", tmp_path / "bundle")
+    assert code == 0, lines
+    assert len(lines[-1]["labels"]) == 40
+    assert lines[-1]["figures"]["held-out recording"]["n"] == 120
+    assert len(bundle.load(tmp_path / "bundle").manifest.labels) == 40
+
+
+@pytest.mark.thorough  # a fit with all checks of an export
+def test_a_full_disk_leaves_no_bundle(tmp_path: Path):
+    """The model does not fit: the reason is on a line, and nothing is left."""
+    lessons.write(tmp_path / "sweeps", easy(8))
+    limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (9000, 9000))\n"
+    done = subprocess.run(
+        [sys.executable, "-c", limit + WATCHED, tmp_path / "sweeps", "--out", tmp_path / "bundle"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode
+    assert "cannot be written to" in json.loads(done.stdout.splitlines()[-1])["text"]
+    assert [path.name for path in tmp_path.iterdir()] == ["sweeps"]
+
+
+def test_too_little_memory_is_said(tmp_path: Path):
+    """The limit holds: the process ends with a reason and leaves nothing."""
+    lessons.write(tmp_path / "sweeps", easy(12))
+    words = [tmp_path / "sweeps", "--out", tmp_path / "bundle", "--memory-mb", "100"]
+    done = subprocess.run(
+        [sys.executable, "-m", "palpate_train.teach", *map(str, words)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode
+    assert "100 MB are too few for these sweeps; use a desktop" in done.stdout
+    assert not (tmp_path / "bundle").exists()
+
+
+def test_up_to_twenty_sweeps_the_desktop_makes_the_same_model():
+    """`palpate-train fit` at its default trains stages from 25 sweeps of each material on. Below,
+    its model is the taught one, bit for bit."""
+    sweeps = easy(20)
+    plain = replace(sweeps, groups={"recording": np.arange(len(sweeps))})
+    assert recipe.Settings().steps > 0
+    default, taught = (
+        recipe.fit(plain, 0, settings) for settings in (recipe.Settings(), recipe.Settings(steps=0))
+    )
+    assert default.weights.keys() == taught.weights.keys()
+    for name, values in taught.weights.items():
+        np.testing.assert_array_equal(default.weights[name], values, err_msg=name)
+    assert default.plan == taught.plan

@@ -1,0 +1,343 @@
+"""The command `fit`: sweep sets to a fit, of the smallest size that suffices if there is a wish."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import shlex
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from palpate.core.errors import FormatError
+from palpate.core.storage import put
+from palpate_train.arguments import numbers, options, scene_file
+from palpate_train.arguments.types import Add
+from palpate_train.data import labels
+from palpate_train.data.sets import Dataset, digest
+from palpate_train.data.splitters import OF_THE_SET
+from palpate_train.data.transforms import WHOLE, Change
+from palpate_train.evaluate import trivial
+from palpate_train.evaluate.evaluate import CACHE
+from palpate_train.evaluate.fold import fingerprint
+from palpate_train.metrics import score
+from palpate_train.models.methods import SkinUse
+from palpate_train.models.recipe import memory, recipe
+from palpate_train.models.recipe.fitted import Fit
+from palpate_train.models.recipe.sizes import SIZES, UNLIMITED
+from palpate_train.reports import formatting, selection_report
+from palpate_train.selection import dial, reduction_curves
+from palpate_train.selection.dial import Budget, SizeWish
+
+Json = dict[str, Any]
+MAINS = (50, 60)
+"""Frequencies of the mains in Hz: public grids have no others."""
+STEPS, MOST = recipe.Settings().steps, memory.MOST_SWEEPS
+
+
+def register(add: Add) -> None:
+    """fit."""
+    command = add("fit", run)
+    command.set_defaults(resumes=True, parser=command)
+    options.add_set(command, required=False)
+    command.add_argument(
+        "--scene", type=Path, metavar="FILE", help="options in a file, as docs/choose/tubes.toml"
+    )
+    options.add_seed(command)
+    command.add_argument(
+        "--out", type=Path, required=True, metavar="FIT", help="where the fit goes (.npz)"
+    )
+    command.add_argument(
+        "--split", metavar="GROUP:SHARE", help="train on this share of a group, e.g. recording:0.7"
+    )
+    command.add_argument(
+        "--rest", type=Path, metavar="FILE", help="write what --split left out as a sweep set"
+    )
+    command.add_argument(
+        "--varies",
+        type=lambda text: tuple(text.split(",")),
+        default=(),
+        metavar="GROUP,...",
+        help="groups that will have other values in service, e.g. force,speed; each is held out "
+        "for the limits and for the printed accuracy (default: all that can be)",
+    )
+    command.add_argument(
+        "--most-sweeps",
+        type=numbers.whole("--most-sweeps", 1),
+        default=MOST,
+        metavar="N",
+        help="largest number of sweeps that the model is fitted to; of more, some of each "
+        f"recording are drawn (default {MOST}); memory and time grow with it",
+    )
+    _add_use(command)
+    _add_dial(command)
+
+
+def _add_use(command: argparse.ArgumentParser) -> None:
+    """Options for the use of the skin."""
+    command.add_argument(
+        "--reattached",
+        action="store_true",
+        help=(
+            "the skin will be taken off and put back after the recordings: train all heads on "
+            "augmented copies of that, too"
+        ),
+    )
+    command.add_argument(
+        "--mains",
+        type=int,
+        choices=MAINS,
+        default=int(SkinUse().mains_hz),
+        metavar="HZ",
+        help=(
+            f"frequency of the mains where the skin is used, {MAINS[0]} or {MAINS[1]}; the "
+            f"features ignore its hum (default {SkinUse().mains_hz:g})"
+        ),
+    )
+    command.add_argument(
+        "--row-shift",
+        type=numbers.number("--row-shift", lambda x: 0 <= x <= 1, "from 0 to 1"),
+        metavar="SHARE",
+        dest="displaced",
+        help="share of training sweeps with a displacement of up to a row (default 0.5)",
+    )
+    command.add_argument(
+        "--stretch",
+        type=numbers.number("--stretch", lambda x: 0 <= x < 1, "from 0 to less than 1"),
+        metavar="SHARE",
+        help="change the speed of training sweeps by up to this share (default 0)",
+    )
+
+
+def _add_dial(command: argparse.ArgumentParser) -> None:
+    """Options for the size of the model."""
+    command.add_argument(
+        "--steps",
+        type=numbers.whole("--steps", 0),
+        default=STEPS,
+        help=f"training steps of the stages (default {STEPS}; 0 for none)",
+    )
+    command.add_argument(
+        "--size",
+        choices=SIZES,
+        help="; ".join(f"{name}: at most {size.about}" for name, size in SIZES.items())
+        + " (default: no limit)",
+    )
+    _add_wish(command)
+
+
+def _add_wish(command: argparse.ArgumentParser) -> None:
+    """Options for the smallest size that suffices."""
+    for option, unit, what in (
+        ("--budget-ms", "MS", "processor time of a sweep on the board"),
+        ("--budget-kb", "KB", "size of the bundle in 1000 bytes"),
+    ):
+        command.add_argument(
+            option,
+            type=numbers.above_zero(option),
+            metavar=unit,
+            help=f"{what}: choose the smallest size that suffices within this",
+        )
+    command.add_argument(
+        "--slower",
+        type=numbers.above_zero("--slower"),
+        metavar="TIMES",
+        help="assumed time on the board as a multiple of the time here (1)",
+    )
+    command.add_argument(
+        "--accuracy",
+        type=numbers.number("--accuracy", lambda x: 0 < x <= 1, "above 0, to 1"),
+        metavar="SHARE",
+        help="choose the smallest size that reaches this on held-out sweeps",
+    )
+    command.add_argument(
+        "--reduce",
+        nargs="+",
+        choices=reduction_curves.REDUCTIONS,
+        metavar="WHAT",
+        help=(
+            f"show how much less suffices, of {', '.join(reduction_curves.REDUCTIONS)}; the fit "
+            "has the shorter window, the others need another sensor"
+        ),
+    )
+
+
+def run(args: argparse.Namespace) -> None:
+    """Train, save the fit and print its accuracy on the held-out sweeps."""
+    if args.scene:
+        words = [*scene_file.words(args.scene, args.parser), *args.words[1:]]
+        args = argparse.Namespace(**vars(args.parser.parse_args(words)) | {"words": args.words})
+    _check(args)
+    sweeps, rest = labels.check(options.load(args, args.seed)), None
+    if args.split:
+        sweeps, rest = sweeps.split(*options.group_share(args.split), args.seed)
+    memory.check(sweeps, min(len(sweeps), args.most_sweeps))
+    made, change, unfinished = _fitted(args, sweeps)
+    if args.rest and rest:
+        change.of(rest).save(args.rest)
+        made = replace(made, about=made.about | {"rest": str(args.rest)})
+    made.save(args.out)
+    unfinished.unlink(missing_ok=True)
+    print(f"fit: {len(made.train)} sweeps, {made.train.format}; {args.out}")
+    if len(sweeps) > args.most_sweeps:
+        print(
+            f"used: {args.most_sweeps} of {len(sweeps)} sweeps, some of each recording; "
+            "--most-sweeps N uses more, with more memory and time"
+        )
+    _print_held_out(made)
+    if beside := trivial.beside_a_fit(sweeps, args.varies):
+        told = "; ".join(f"{name} {formatting.counted(figure)}" for name, figure in beside.items())
+        print(f"trivial baselines on held-out parts: {told}")
+    if args.rest and rest:
+        print(f"rest: {len(rest)} sweeps in {args.rest}, which no part of the fit has seen")
+    print(_next_commands(args.out, [str(args.rest)] if args.rest and rest else args.sets))
+
+
+def _next_commands(out: Path, judges: Sequence[str]) -> str:
+    """The commands after a fit, as they can be pasted. judges: the sets to judge the bundle on."""
+    folder = out.with_suffix("") if out.suffix else out.with_name(f"{out.name}-bundle")
+    sets = [word for one in judges for word in ("--set", one)]
+    version = ["--name", folder.name, "--version", "1"]
+    commands = (
+        ["export", str(out), "--out", str(folder), *version],
+        ["score", str(folder), *sets],
+        ["report", str(out), *sets, "--out", str(out.with_suffix(".html"))],
+    )
+    return "\n".join(["next:", *(f"  palpate-train {shlex.join(words)}" for words in commands)])
+
+
+def _check(args: argparse.Namespace) -> None:
+    """Refuse options that do not go together, before hours of work. Raises FormatError."""
+    if not args.sets:
+        raise FormatError("no sweeps; name a set with --set, or with set in the file of --scene")
+    if args.rest and not args.split:
+        raise FormatError("--rest needs --split; without it nothing is left over")
+    if args.slower and not args.budget_ms:
+        raise FormatError("--slower needs --budget-ms; without a limit of time it changes nothing")
+    for option, endings in (("out", (".npz",)), ("rest", options.SET_FILES)):
+        if path := getattr(args, option):
+            options.writable_file(path, f"--{option}", *endings)
+
+
+def _fitted(args: argparse.Namespace, sweeps: Dataset) -> tuple[Fit, Change, Path]:
+    """The fit for these options, the reduction of its sweeps, and the file that keeps its training
+    until the fit is written."""
+    use = SkinUse(args.reattached, float(args.mains), args.displaced, args.stretch)
+    unfinished = _unfinished(args, sweeps, use)
+    settings = recipe.Settings(
+        args.steps,
+        unfinished=unfinished,
+        size=SIZES.get(args.size, UNLIMITED),
+        use=use,
+        varies=args.varies,
+        most=args.most_sweeps,
+    )
+    wish = (args.budget_ms, args.budget_kb, args.accuracy, args.reduce)
+    if any(wish):
+        return *_chosen(args, sweeps, settings), unfinished
+    log = options.Log()
+    made = recipe.fit(sweeps, args.seed, settings, log)
+    log.end()
+    held_out = formatting.counted(made.about["validation"])
+    print(f"chosen: {made.about['chosen']}; {held_out} of held-out parts")
+    return made, WHOLE, unfinished
+
+
+def _chosen(
+    args: argparse.Namespace, sweeps: Dataset, settings: recipe.Settings
+) -> tuple[Fit, Change]:
+    """The fit of the smallest size that suffices, on reduced sweeps if they suffice; writes the
+    page with the reasons."""
+    log = options.Log()
+    budget = Budget(args.budget_ms or math.inf, args.budget_kb or math.inf, args.slower or 1.0)
+    sizes = (args.size,) if args.size else tuple(dial.FAMILY)
+    choice = dial.choose(
+        sweeps, args.seed, settings, SizeWish(budget, args.accuracy or 0.0, sizes), log
+    )
+    less, change = reduction_curves.curves(choice, args.reduce or (), log)
+    made, cost, refused = choice.fit, choice.costs[choice.chosen], ""
+    if change != WHOLE:
+        try:
+            made, cost = dial.reduced(choice, change, log)
+        except FormatError as e:
+            refused, change = str(e), WHOLE
+    log.end()
+    result = choice.json() | {"less": less, "applied": asdict(change)}
+    result |= {"bundle": _described(made, cost, budget, refused)} | _origin(args, sweeps, budget)
+    page = args.out.with_name(f"{args.out.stem}-why") / "index.html"
+    put(page.with_name("choice.json"), (json.dumps(result, indent=1) + "\n").encode(), parents=True)
+    put(page, selection_report.page(result).encode(), parents=True)
+    print(selection_report.text(result))
+    print(f"why: {page}")
+    return replace(made, about=made.about | {"size": choice.chosen}), change
+
+
+def _described(made: Fit, cost: dial.BundleCost, budget: Budget, refused: str) -> Json:
+    used = {k: round(v, 3) for k, v in budget.used(cost).items()}
+    about = {"content": made.about["chosen"], "format": made.train.format.json(), "used": used}
+    return about | asdict(cost) | {"refused_with_less": refused}
+
+
+def _origin(args: argparse.Namespace, sweeps: Dataset, budget: Budget) -> Json:
+    """The origin of the result: command, set, commit."""
+    return {
+        "command": shlex.join(["palpate-train", *args.words]),
+        "set": sweeps.source,
+        "digest": digest(sweeps),
+        "sweeps": len(sweeps),
+        "format": sweeps.format.json(),
+        "materials": list(sweeps.materials),
+        "reattached": args.reattached,
+        "steps": args.steps,
+        "budget": {k: v for k, v in asdict(budget).items() if v != math.inf},
+        "seeds": [args.seed],
+    } | score.provenance()
+
+
+def _unfinished(args: argparse.Namespace, sweeps: Dataset, use: SkinUse) -> Path:
+    """The file that keeps a training until the fit is written. Its name is a fingerprint of all
+    that the training depends on."""
+    about = [digest(sweeps), args.seed, args.size, args.steps, args.varies, asdict(use)]
+    about += [args.most_sweeps] * (len(sweeps) > args.most_sweeps)
+    modules = (f"palpate_train.models.recipe.{name}" for name in ("recipe", "stages"))
+    return CACHE / f"{fingerprint(about, *modules)}.pt"
+
+
+def _print_held_out(made: Fit) -> None:
+    """Print the accuracy on the sweeps that judged the fit, and how they differ from those of
+    --rest."""
+    if made.about["held_out_by"] == "nothing":
+        print(
+            "nothing was held out that could judge the model, so export will refuse it: "
+            f"{made.uncalibrated}"
+        )
+        return
+    conditions = made.about["conditions"]
+    if conditions == ["recording"]:
+        print(
+            "recorded under one condition: expect less under another; these figures are optimistic"
+        )
+    print(
+        f"held-out {', '.join(conditions)}: sweeps of this set, by heads that did not see their "
+        f"{' or '.join(conditions)}; slightly too high, since they also helped to choose the model"
+    )
+    for name in conditions:
+        if name != "recording" and len(made.values(name)) == 2:
+            print(
+                f"there are two values of {name}: its figures are of heads that know only one, "
+                "so expect more"
+            )
+    for name in sorted(set(made.train.groups) - {*OF_THE_SET, *conditions}):
+        if len(made.values(name)) == 1:
+            print(f"every sweep has the same {name}: expect less at another, no figure shows it")
+    if made.calibration:
+        print(*formatting.figure_lines(figures := made.held_out_figures()), sep="\n")
+        if len(conditions) > 1:
+            mean = sum(figures[f"held-out {name}"]["accuracy"] for name in conditions)
+            share = formatting.percent(mean / len(conditions))
+            print(f"to expect where one of these is new, as the box answers: {share} (their mean)")
+    else:  # too few sweeps to judge by
+        alone = formatting.counted(made.about["validation"])
+        print(f"network alone: {alone}; nothing judges the box's answers: {made.uncalibrated}")

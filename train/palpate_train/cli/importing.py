@@ -1,0 +1,212 @@
+"""The command import: makes a sweep set of a folder of recordings, and reports on each file."""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+from palpate.core.errors import FormatError
+from palpate.core.storage import put
+from palpate.core.types import DATA_TYPES
+from palpate_train.arguments import numbers, options
+from palpate_train.arguments.types import Add
+from palpate_train.data import labels, lerobot, summary
+from palpate_train.data.file_names import EXAMPLE, FIELD, GROUP, NamePattern
+from palpate_train.data.import_plan import ImportPlan, Length
+from palpate_train.data.importing import Imported, LeftOut, Taken, import_folder
+
+SHOWN = 5
+"""Largest number of files with a line each that were left out for the same reason."""
+
+
+def register(add: Add) -> None:
+    """Add the command import."""
+    command = add("import", run)
+    command.add_argument(
+        "folder", type=Path, metavar="FOLDER", help="the recordings, in all folders below it"
+    )
+    command.add_argument(
+        "--pattern",
+        metavar="PATTERN",
+        help=f"meaning of the names below FOLDER: {EXAMPLE}, '{{material}}/{{speed}}/{{}}.csv'",
+    )
+    command.add_argument(
+        "--field",
+        action="append",
+        default=[],
+        metavar="NAME=COLUMN",
+        help="a column that holds a field of each frame: material=label, session=date",
+    )
+    command.add_argument(
+        "--out", type=Path, required=True, metavar="SET", help="the sweep set (.npz, .h5)"
+    )
+    command.add_argument(
+        "--report", type=Path, metavar="FILE", help="a line for each file, imported or not"
+    )
+    _add_layout(command)
+    _add_windows(command)
+    options.add_rename(command)
+
+
+def _add_layout(command: argparse.ArgumentParser) -> None:
+    """Options that say where the counts stand in a file."""
+    command.add_argument(
+        "--grid", default="", metavar="ROWSxCOLUMNS[xAXES]", help="how the columns lie: 4x4, 5x3x3"
+    )
+    command.add_argument(
+        "--columns",
+        default="",
+        metavar="COLUMNS",
+        help="columns of the taxels, in the grid's order: 2-17, s0,s1, s* (all but the time)",
+    )
+    command.add_argument(
+        "--variable",
+        default="",
+        metavar="NAME",
+        help="the array to read if a file holds several; with a pattern, each that matches is a "
+        "recording: '{material}_{trial:d}'",
+    )
+    command.add_argument(
+        "--axes",
+        default="",
+        metavar="AXES",
+        help="the axes of an array in their order: row,column,frame",
+    )
+    command.add_argument(
+        "--decimal", default="", metavar="SIGN", help="the decimal sign of texts, . or ,"
+    )
+    command.add_argument("--transpose", action="store_true", help="arrays are taxels x frames")
+    command.add_argument(
+        "--dtype",
+        default="",
+        metavar="TYPE",
+        help=f"type of the counts: {', '.join(DATA_TYPES)} "
+        "(as recorded, else the first that holds all)",
+    )
+
+
+def _add_windows(command: argparse.ArgumentParser) -> None:
+    """Options that say when frames were recorded and which become sweeps."""
+    command.add_argument(
+        "--time",
+        default="",
+        metavar="COLUMN:UNIT",
+        help="column of the sampling times, in s, ms, us or ns: t:ms, 1:s",
+    )
+    command.add_argument(
+        "--rate", type=numbers.above_zero("--rate"), metavar="HZ", help="frames per second"
+    )
+    command.add_argument(
+        "--window",
+        default="2s",
+        metavar="LENGTH",
+        help="length of a sweep: 2s, 500ms or 1500 frames (2s)",
+    )
+    command.add_argument(
+        "--every",
+        metavar="LENGTH",
+        help="cut windows from the start on, one each LENGTH (the middle window alone)",
+    )
+
+
+def run(args: argparse.Namespace) -> None:
+    """Import a folder, and print the files that were left out and the contents of the set.
+
+    Raises FormatError at the end if a file was broken.
+    """
+    plan = _plan(args)
+    for option, endings in (("out", options.SET_FILES), ("report", ())):
+        if path := getattr(args, option):
+            options.writable_file(path, f"--{option}", *endings)
+    left_out: list[LeftOut] = []
+    taken: Sequence[Taken] = ()
+    try:
+        made = import_folder(args.folder, plan, options.Log(), left_out)
+        taken = made.taken
+        made.sweeps.save(args.out)
+    finally:
+        print(*_left_out(left_out), sep="\n", end="\n" * bool(left_out))
+        if args.report:
+            put(args.report, _report(taken, left_out).encode(errors="replace"))
+    print("\n".join([*_taken(made), *summary.description(made.sweeps), f"set: {args.out}"]))
+    if broken := sum(one.broken for one in left_out):
+        raise FormatError(
+            f"{broken} of {broken + len(taken)} files could not be used, as said above; "
+            f"{args.out} is of the others"
+        )
+
+
+def _plan(args: argparse.Namespace) -> ImportPlan:
+    """The options as a plan. A LeRobot data set states its frame rate."""
+    fields = dict(_field(text) for text in args.field)
+    in_variable = [name for name, _ in FIELD.findall(args.variable)]
+    rate = args.rate
+    if not (args.pattern or args.time or rate) and lerobot.is_data_set(args.folder):
+        rate = lerobot.rate_hz(args.folder)
+    return ImportPlan(
+        NamePattern(args.pattern, (*fields, *in_variable)) if args.pattern else None,
+        args.grid,
+        args.columns,
+        args.time,
+        rate,
+        Length(args.window, "--window"),
+        Length(args.every, "--every") if args.every else None,
+        args.dtype,
+        args.variable,
+        args.transpose,
+        labels.parse_renames(args.rename),
+        args.axes,
+        args.decimal,
+        fields,
+    )
+
+
+def _field(text: str) -> tuple[str, str]:
+    """Name and column of a text NAME=COLUMN."""
+    name, separator, column = text.partition("=")
+    if not (separator and column and GROUP.fullmatch(name)) or name == "recording":
+        raise FormatError(f"--field {text!r} cannot be read; write NAME=COLUMN: material=label")
+    return name, column
+
+
+def _left_out(left_out: Sequence[LeftOut]) -> list[str]:
+    """A line for each file; with the same reason, only for the first SHOWN files."""
+    lines, reasons = [], Counter(one.why for one in left_out)
+    seen: Counter[str] = Counter()
+    for one in sorted(left_out, key=lambda one: one.name):
+        seen[one.why] += 1
+        if seen[one.why] <= SHOWN:
+            lines.append(f"left out: {one.name}: {one.why}")
+        elif seen[one.why] == reasons[one.why]:
+            lines.append(
+                f"left out: {seen[one.why] - SHOWN} more for the same reason: {one.why}; "
+                "--report FILE lists all"
+            )
+    return lines
+
+
+def _taken(made: Imported) -> list[str]:
+    """How the taken files became sweeps, in lines."""
+    lines = [f"taken: {len(made.taken)} files; left out: {len(made.left_out)}"]
+    for what in ("interpolated onto even times", "gaps"):
+        if n := sum(what in one.notes for one in made.taken):
+            lines.append(f"  {n} of them: {what}")
+    said = [(one.name, note) for one in made.taken for note in one.said]
+    notes = Counter(note for _, note in said)
+    for note, n in list(notes.items())[:SHOWN]:
+        name = next(name for name, other in said if other == note)
+        lines.append(f"  {name}: {note}" + f" ({n} files)" * (n > 1))
+    if len(notes) > SHOWN:
+        lines.append(f"  {len(notes) - SHOWN} more remarks; --report FILE lists all")
+    return [*lines, *(f"  {note}" for note in made.notes)]
+
+
+def _report(taken: Sequence[Taken], left_out: Sequence[LeftOut]) -> str:
+    """A line for each file, in the order of their names."""
+    lines = {one.name: f"left out: {one.why}" for one in left_out}
+    for one in taken:
+        notes = f"; {one.notes}" if one.notes else ""
+        lines[one.name] = f"taken: {one.windows} windows of {one.frames} frames{notes}"
+    return "".join(f"{name}\t{line}\n" for name, line in sorted(lines.items()))

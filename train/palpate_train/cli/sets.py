@@ -1,0 +1,177 @@
+"""The commands `sets`, `sets describe`, `sets view`, `sets lerobot` and `pull`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from palpate.core import outputs
+from palpate.core.errors import FormatError
+from palpate.core.storage import put
+from palpate_train.arguments import numbers, options
+from palpate_train.arguments.types import Add
+from palpate_train.data import lerobot_writer, pull, sets, summary
+from palpate_train.evaluate import traps
+from palpate_train.reports import sweep_pages, sweep_plot
+
+
+def register(add: Add) -> None:
+    """sets and pull."""
+    _add_sets(add)
+    _add_pull(add)
+
+
+def _add_sets(add: Add) -> None:
+    known = add("sets", run_known)
+    commands = known.add_subparsers(metavar="COMMAND")
+    describe = commands.add_parser(
+        "describe", help="count what is in sets: materials by position and session, frames lost"
+    )
+    describe.add_argument("sets", nargs="+", metavar="SET", help=options.SET)
+    describe.set_defaults(run=run_describe)
+    view = commands.add_parser("view", help="draw sweeps: taxels over time, spectrum, spectrogram")
+    view.add_argument(
+        "sweep", metavar="SWEEP", help=f"an .npy that the box recorded, or a SET: {options.SET}"
+    )
+    view.add_argument(
+        "--number",
+        type=numbers.span("--number", "0-49"),
+        metavar="N[-LAST]",
+        help="which sweep of the set, from 0 on; of a page the first and the last",
+    )
+    view.add_argument(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="FILE",
+        help="FILE.svg: the picture of one sweep; FILE.html: a page to leaf through the set",
+    )
+    view.set_defaults(run=run_view)
+    robot = commands.add_parser("lerobot", help="write a set as a LeRobot data set, version 3.0")
+    robot.add_argument("set", metavar="SET", help=options.SET)
+    robot.add_argument("out", type=Path, metavar="OUT", help="its folder, which is made")
+    robot.set_defaults(run=run_lerobot)
+
+
+def _add_pull(add: Add) -> None:
+    command = add("pull", run_pull)
+    command.set_defaults(resumes=True)
+    command.add_argument("host", metavar="HOST", help="as for ssh: user@box")
+    command.add_argument(
+        "--from",
+        default=pull.FOLDER,
+        metavar="DIR",
+        dest="folder",
+        help=f"on the box ({pull.FOLDER})",
+    )
+    command.add_argument(
+        "--out",
+        type=outputs.folder,
+        required=True,
+        metavar="DIR",
+        help="here; its folders are those of the box",
+    )
+    command.add_argument("--port", type=int, metavar="N", help="of the box's sshd")
+    command.add_argument(
+        "--ssh-option",
+        action="append",
+        default=[],
+        metavar="OPTION",
+        help="as for ssh -o, e.g. User=pi",
+    )
+
+
+def run_known(args: argparse.Namespace) -> None:
+    """Print the sets that can be named."""
+    print(summary.known())
+
+
+def run_describe(args: argparse.Namespace) -> None:
+    """Print the content of the named sets."""
+    print("\n\n".join(summary.describe(spec, traps.of_set) for spec in args.sets))
+
+
+def run_view(args: argparse.Namespace) -> None:
+    """Write the picture or the page and print its path."""
+    kind, span = args.out.suffix.lower(), args.number
+    if kind not in (".svg", ".html"):
+        raise FormatError(
+            f"--out {args.out}: one sweep is an .svg, a page of many an .html; name a file "
+            "that ends so"
+        )
+    options.writable_file(args.out)
+    if kind == ".svg":
+        if span is not None and len(span) != 1:
+            raise FormatError(
+                f"--number {span.start}-{span.stop - 1}: an .svg shows one sweep; name an "
+                ".html for more"
+            )
+        made = sweep_plot.draw(sweep_plot.load(args.sweep, None if span is None else span.start))
+    else:
+        found = sweep_plot.source(args.sweep)
+        shown = sweep_pages.chosen(found, span)
+        made = sweep_pages.page(found, shown, options.Log())
+        if span is None and len(shown) < found.count:
+            print(
+                f"{len(shown)} of {found.count} sweeps, from all over the set; --number "
+                "FIRST-LAST shows others"
+            )
+    put(args.out, made.encode(), parents=True)
+    print(args.out)
+
+
+def run_lerobot(args: argparse.Namespace) -> None:
+    """Write the set and print its size."""
+    sweeps = sets.load(args.set)
+    lerobot_writer.write(sweeps, args.out)
+    frames = len(sweeps) * sweeps.format.window
+    print(f"{args.out}: {len(sweeps)} episodes of {len(sweeps.materials)} tasks, {frames} frames")
+
+
+def run_pull(args: argparse.Namespace) -> None:
+    """Fetch recordings; print which were fetched and which were not."""
+    ssh_options = [part for option in args.ssh_option for part in ("-o", option)]
+    box = pull.RecordingHost(
+        args.host, args.folder, [*ssh_options, *(["-p", str(args.port)] if args.port else [])]
+    )
+    report = pull.PullReport()
+    try:
+        pull.pull(box, args.out, report, options.Log())
+    finally:
+        print(
+            (
+                f"fetched {len(report.fetched)}, there already {len(report.present)}, refused "
+                f"{len(report.refused)}"
+            ),
+            flush=True,
+        )
+        _print(report, args.out)
+    if bad := len(report.refused) + len(report.different):
+        raise FormatError(
+            f"{bad} recordings of {args.host} were not taken; the lines above say why"
+        )
+
+
+def _print(report: pull.PullReport, out: Path) -> None:
+    """Print a line for each kind of recording that needs attention."""
+    for names, what in (
+        (report.incomplete, "without its .json or .npy on the box; left there"),
+        (
+            report.relabelled,
+            (
+                f"the box has another description; the files in {out} stay: "
+                "remove .npy and .json there to fetch the box's"
+            ),
+        ),
+        (
+            report.different,
+            (
+                f"the box has another sweep of the same name; the sweep in {out} stays: "
+                "remove it, or pull into another folder"
+            ),
+        ),
+        (report.refused, "refused"),
+    ):
+        if names:
+            more = f" and {len(names) - pull.SHOWN} more" if len(names) > pull.SHOWN else ""
+            print(f"{', '.join(sorted(names)[: pull.SHOWN])}{more}: {what}")

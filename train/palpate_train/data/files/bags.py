@@ -1,0 +1,135 @@
+"""Reads recordings of ROS: ROS 1 .bag, ROS 2 .mcap and .db3, with rosbags and without ROS."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from palpate.core.errors import FormatError
+from palpate_train.data.files.optional import library
+from palpate_train.data.files.table import Array, ReadPlan, Table, from_columns, normal, printable
+
+SUFFIXES = (".bag", ".mcap", ".db3")
+WHAT = "a recording of ROS"
+STAMP = "header.stamp"
+TIME, RECEIVED = "time", "received"
+"""Vectors of the times in the messages' headers, and of the times of their recording, in s."""
+MOST = 100_000
+"""Largest number of values of one message; camera images are larger."""
+PIXELS = {
+    "mono8": "u1", "8UC1": "u1", "8SC1": "i1", "mono16": "u2", "16UC1": "u2", "16SC1": "i2",
+    "32SC1": "i4", "32FC1": "f4", "64FC1": "f8",
+}  # fmt: skip
+"""NumPy types of the pixels of an image with one channel, by the name of its encoding."""
+IMAGE = "Image"
+
+
+def read(path: Path, wanted: ReadPlan) -> Table:
+    """The messages of the only topic with numbers, or of the topic `wanted.variable`, one frame
+    each. Raises FormatError that lists the topics."""
+    highlevel = library("rosbags.highlevel", WHAT)
+    stores = library("rosbags.typesys", WHAT)
+    source = path
+    if path.suffix.lower() == ".db3":
+        source = path.parent
+        if not (source / "metadata.yaml").exists():
+            raise FormatError("lacks metadata.yaml beside it; run `ros2 bag reindex` on its folder")
+    store = stores.get_typestore(stores.Stores.ROS2_JAZZY)
+    with highlevel.AnyReader([source], default_typestore=store) as bag:
+        topics: dict[str, list[Any]] = {}
+        for connection in bag.connections:
+            topics.setdefault(normal(connection.topic), []).append(connection)
+        listed = ", ".join(f"{printable(t)} ({c[0].msgtype})" for t, c in topics.items())
+        name = normal(wanted.variable)
+        if name and name not in topics:
+            raise FormatError(f"has no topic {name!r}; it holds {listed or 'nothing'}")
+        fitting = [name] if name else _fitting(bag, topics)
+        if len(fitting) != 1:
+            raise FormatError(
+                f"holds {len(fitting)} topics of frames; name one with --variable: "
+                f"it holds {listed or 'nothing'}"
+            )
+        return _table(bag, topics[fitting[0]])
+
+
+def _fitting(bag: Any, topics: dict[str, list[Any]]) -> list[str]:
+    """The topics whose first message holds several numbers beside its header."""
+    found = []
+    for topic, connections in topics.items():
+        for connection, _, raw in bag.messages(connections=connections):
+            try:
+                message = bag.deserialize(raw, connection.msgtype)
+            except Exception:  # a type whose definition the file lacks is not a topic of frames
+                break
+            sizes = [np.size(v) for k, v in _numbers("", message) if STAMP not in k]
+            if 1 < sum(sizes) <= MOST:
+                found.append(topic)
+            break
+    return found
+
+
+def _table(bag: Any, connections: list[Any]) -> Table:
+    """The messages of one topic as frames."""
+    rows: list[Array] = []
+    received: list[int] = []
+    stamps: list[float] = []
+    names: list[str] = []
+    for connection, at, raw in bag.messages(connections=connections):
+        found = dict(_numbers("", bag.deserialize(raw, connection.msgtype)))
+        stamp = [found.pop(f"{STAMP}.{part}", None) for part in ("sec", "nanosec")]
+        if None not in stamp:
+            stamps.append(float(np.asarray(stamp[0]) + 1e-9 * np.asarray(stamp[1])))
+        found = {k: v for k, v in found.items() if not k.startswith(("header.", "layout."))}
+        row = np.concatenate([np.ravel(v) for v in found.values()]) if found else np.empty(0)
+        if rows and len(row) != len(rows[0]):
+            raise FormatError(
+                f"message {len(rows) + 1} holds {len(row)} numbers, message 1 holds {len(rows[0])}"
+            )
+        names = names or [
+            k if np.ndim(v) == 0 else f"{k}.{i}"
+            for k, v in found.items()
+            for i in range(np.size(v))
+        ]
+        rows.append(row)
+        received.append(at)
+    if not rows or not names:
+        raise FormatError(f"topic {connections[0].topic} holds no numbers")
+    values = np.stack(rows)
+    table = from_columns(names, list(values.T), {})
+    times = {RECEIVED: 1e-9 * (np.array(received) - received[0])}
+    if len(stamps) == len(rows) and any(stamps):
+        times[TIME] = np.array(stamps) - stamps[0]
+    return Table(table.values, table.columns, times, tuple(times))
+
+
+def _numbers(name: str, value: Any) -> Iterator[tuple[str, Any]]:
+    """The numbers in a message, with the paths of their fields."""
+    fields = getattr(value, "__dataclass_fields__", None)
+    if type(value).__name__.endswith(IMAGE) and fields and "encoding" in fields:
+        yield from _numbers("header", value.header)
+        if value.encoding in PIXELS:
+            yield "data", _pixels(value)
+    elif fields is not None:
+        for field in fields:
+            if not field.startswith("__"):
+                yield from _numbers(f"{name}.{field}" if name else field, getattr(value, field))
+    elif isinstance(value, list):
+        for k, inner in enumerate(value):
+            yield from _numbers(f"{name}.{k}", inner)
+    elif isinstance(value, np.ndarray):
+        if value.dtype.kind in "biuf":
+            yield name, value
+    elif isinstance(value, int | float) and not isinstance(value, bool):
+        yield name, value
+
+
+def _pixels(image: Any) -> Array:
+    """The pixels [rows, columns] of an image with one channel. Lines may be padded."""
+    kind = np.dtype((">" if image.is_bigendian else "<") + PIXELS[image.encoding])
+    lines = np.asarray(image.data, np.uint8).reshape(image.height, image.step)
+    width = image.width * kind.itemsize
+    values: Array = np.ascontiguousarray(lines[:, :width]).view(kind)
+    return values.astype(kind.newbyteorder("="))

@@ -1,0 +1,229 @@
+"""One recording as a table, and the choice of an array from a file that holds several."""
+
+from __future__ import annotations
+
+import math
+import re
+import unicodedata
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.core.errors import FormatError
+
+Array = NDArray[Any]
+MOST_LISTED = 12
+"""Largest number of arrays that an error message lists."""
+LEAST_SERIES = 20
+"""Smallest number of arrays that are the frames of one recording."""
+RUNNING = re.compile(r"(.*?)(\d+)(\D*)")
+"""A name with a running number."""
+LONGEST = 40
+"""Longest excerpt of a cell in an error message."""
+
+
+@dataclass(frozen=True)
+class ReadPlan:
+    """What to read from a file. variable: the array, sheet, group or topic. time: the name of the
+    times. decimal: the decimal sign of text, "" if the text must show it. names_only: read no
+    array, only the names of those that hold frames."""
+
+    variable: str = ""
+    time: str = ""
+    decimal: str = ""
+    names_only: bool = False
+
+
+@dataclass(frozen=True)
+class Table:
+    """One recording.
+
+    values: [n, ...] numbers in the file's data type, float64 from text; NaN where a cell is not a
+    number. columns: names of the columns, () if unnamed. vectors: one-dimensional arrays beside
+    the values, such as times, by name. beside: names of vectors, or with names_only of
+    arrays of frames, that were not read. texts: text
+    columns, one text for each frame, by column number from 0. faults: for each other column with a
+    cell that is not a number, a message about the first. notes: remarks.
+    reversible: whether a program may have reversed the axes, and the file does not show it.
+    """
+
+    values: Array
+    columns: tuple[str, ...] = ()
+    vectors: Mapping[str, Array] = field(default_factory=dict)
+    beside: tuple[str, ...] = ()
+    texts: Mapping[int, Sequence[str]] = field(default_factory=dict)
+    faults: Mapping[int, str] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    reversible: bool = False
+
+
+@dataclass(frozen=True)
+class Entry:
+    """An array of a file, before it is read. fields: names of the fields of a record array. kind:
+    NumPy's letter for the kind of type."""
+
+    shape: tuple[int, ...]
+    kind: str
+    read: Callable[[], Array]
+    fields: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, shape: tuple[int, ...], dtype: np.dtype[Any], read: Callable[[], Array]) -> Entry:
+        return cls(shape, dtype.kind, read, dtype.names or ())
+
+    @property
+    def holds_frames(self) -> bool:
+        """Whether the array can be frames: records, or numbers of at least two axes."""
+        if self.fields:
+            return len(self.shape) == 1 and self.shape[0] > 1
+        return self.kind in "biuf" and sum(n > 1 for n in self.shape) > 1
+
+    @property
+    def size(self) -> int:
+        """The number of elements."""
+        return math.prod(self.shape)
+
+    @property
+    def is_vector(self) -> bool:
+        return self.kind in "biuf" and sum(n > 1 for n in self.shape) < 2 and 0 not in self.shape
+
+
+def normal(name: str) -> str:
+    """A name in Unicode's composed form (NFC), so that equal names have equal characters."""
+    return unicodedata.normalize("NFC", name)
+
+
+def printable(name: str) -> str:
+    """A name from a file, safe for a terminal: names in a damaged file may hold any bytes."""
+    return name if name.isprintable() else repr(name)
+
+
+def excerpt(text: str) -> str:
+    """A cell as it is shown in an error message."""
+    return repr(text if len(text) <= LONGEST else f"{text[: LONGEST - 1]}…")
+
+
+def chosen(entries: Mapping[str, Entry], wanted: ReadPlan) -> Table:
+    """The only array of frames, or the array `wanted.variable`, with the times beside it.
+
+    No other array is read. Raises FormatError that lists the arrays if none or several fit.
+    """
+    entries = {normal(name): entry for name, entry in entries.items()}
+    numbers = {name: e for name, e in entries.items() if e.kind in "biuf" or e.fields}
+    if wanted.names_only:
+        return Table(
+            np.empty((0, 0)), beside=tuple(n for n, e in numbers.items() if e.holds_frames)
+        )
+    listed = _listed(numbers)
+    name, time = normal(wanted.variable), normal(wanted.time)
+    if name and name not in numbers:
+        found = [known for known in numbers if known.rpartition("/")[2] == name]
+        inside = {n: e for n, e in numbers.items() if re.match(rf"{re.escape(name)}[/.({{]", n)}
+        if len(found) != 1 and inside:
+            beside = {time: numbers[time]} if time in numbers else {}
+            return chosen(inside | beside, replace(wanted, variable=""))
+        if len(found) != 1:
+            raise FormatError(f"has no array {name!r}; it holds {listed}")
+        (name,) = found
+    tables = {name: numbers[name]} if name else {n: e for n, e in numbers.items() if e.holds_frames}
+    table = _only(tables) or _series(tables) or (None if tables else _columns(numbers, time))
+    if table is None:
+        raise FormatError(
+            f"holds {len(tables)} arrays of frames; name one with --variable: it holds {listed}"
+        )
+    vectors = {n: e for n, e in numbers.items() if e.is_vector and n != name}
+    asked = {time: vectors[time].read().ravel()} if time in vectors else {}
+    return replace(table, vectors=asked, beside=tuple(vectors))
+
+
+def _only(tables: Mapping[str, Entry]) -> Table | None:
+    """The table of the only array."""
+    if len(tables) != 1:
+        return None
+    (entry,) = tables.values()
+    return records(entry.read()) if entry.fields else Table(entry.read())
+
+
+def _series(tables: Mapping[str, Entry]) -> Table | None:
+    """Arrays of one shape whose names differ in a running number, as the frames of a table."""
+    found = [RUNNING.fullmatch(name) for name in tables]
+    if len(tables) < LEAST_SERIES or None in found or any(e.fields for e in tables.values()):
+        return None
+    numbered = {int(one[2]): name for one, name in zip(found, tables, strict=True) if one}
+    stems = {one.group(1, 3) for one in found if one}
+    shapes = {entry.shape for entry in tables.values()}
+    order = sorted(numbered)
+    if len(stems) > 1 or len(shapes) > 1 or order[-1] - order[0] != len(tables) - 1:
+        return None
+    first, last = numbered[order[0]], numbered[order[-1]]
+    frames = np.stack([np.squeeze(tables[numbered[k]].read()) for k in order])
+    return Table(frames, notes=(f"its {len(order)} arrays {first} to {last} are its frames",))
+
+
+def _columns(numbers: Mapping[str, Entry], time: str) -> Table | None:
+    """Vectors of one length as the columns of a table, without the times."""
+    vectors = {n: e for n, e in numbers.items() if e.is_vector and e.size > 1 and n != time}
+    if len(vectors) < 2:
+        return None
+    usual = Counter(entry.size for entry in vectors.values()).most_common(1)[0][0]
+    kept = {n: e.read().ravel() for n, e in vectors.items() if e.size == usual}
+    note = f"its {len(kept)} arrays of {usual} numbers are its columns"
+    return from_columns(list(kept), list(kept.values()), {}, [note])
+
+
+def _listed(numbers: Mapping[str, Entry]) -> str:
+    """The arrays of a file with their shapes, the first MOST_LISTED of them."""
+    texts = [
+        f"{printable(name)} {list(entry.shape)}"
+        + (f" of {', '.join(map(printable, entry.fields))}" if entry.fields else "")
+        for name, entry in numbers.items()
+    ]
+    more = [f"and {len(texts) - MOST_LISTED} more"] if len(texts) > MOST_LISTED else []
+    return ", ".join([*texts[:MOST_LISTED], *more]) or "nothing"
+
+
+def records(values: Array) -> Table:
+    """A table of a record array [n]: one column for each number of a field, one text column for
+    each field of text. Fields of other kinds are passed over."""
+    names: list[str] = []
+    columns: list[Array] = []
+    texts: dict[int, list[str]] = {}
+    left: list[str] = []
+    for name in values.dtype.names or ():
+        part = values[name]
+        if part.dtype.kind in "biuf":
+            flat = part.reshape(len(part), -1)
+            columns += list(flat.T)
+            names += [name] if part.ndim == 1 else [f"{name}.{i}" for i in range(flat.shape[1])]
+        elif part.dtype.kind in "SUO" and part.ndim == 1:
+            texts[len(names)] = [
+                t.decode("utf-8", "replace") if isinstance(t, bytes) else str(t) for t in part
+            ]
+            columns.append(np.full(len(part), np.nan, np.float32))
+            names.append(name)
+        else:
+            left.append(name)
+    return from_columns(names, columns, texts, [f"field {n} is passed over" for n in left])
+
+
+def from_columns(
+    names: Sequence[str],
+    columns: Sequence[Array],
+    texts: Mapping[int, Sequence[str]],
+    notes: Sequence[str] = (),
+) -> Table:
+    """A table of columns [n] of equal length, in the smallest type that holds all numbers."""
+    if len(texts) == len(columns):
+        raise FormatError(f"holds no numbers; its columns are {', '.join(names) or 'none'}")
+    kinds = [c.dtype for i, c in enumerate(columns) if i not in texts]
+    common = np.result_type(*kinds)
+    if common.kind == "b":
+        common = np.dtype(np.uint8)
+    values = np.empty((len(columns[0]), len(columns)), common)
+    for i, column in enumerate(columns):
+        values[:, i] = 0 if i in texts else column
+    return Table(values, tuple(map(normal, names)), texts=dict(texts), notes=tuple(notes))

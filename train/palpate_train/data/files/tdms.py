@@ -1,0 +1,61 @@
+"""Reads LabVIEW's TDMS with npTDMS."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from palpate.core.errors import FormatError
+from palpate_train.data.files.optional import library
+from palpate_train.data.files.table import Array, ReadPlan, Table, from_columns, normal
+
+STEP = "wf_increment"
+
+
+def read(path: Path, wanted: ReadPlan) -> Table:
+    """The channels of the only group with numbers, or of the group `wanted.variable`.
+
+    The vector `time`, in seconds, exists if the channels state their interval. Raises FormatError.
+    """
+    nptdms = library("nptdms", "a TDMS file")
+    with nptdms.TdmsFile.open(path) as file:
+        groups = {normal(group.name): group for group in file.groups()}
+        groups = {n: g for n, g in groups.items() if any(_is_numeric(c) for c in g.channels())}
+        name = normal(wanted.variable)
+        if name and name not in groups:
+            raise FormatError(f"has no group {name!r}; it holds {', '.join(groups) or 'nothing'}")
+        if not name and len(groups) != 1:
+            raise FormatError(
+                f"holds {len(groups)} groups with numbers, {', '.join(groups) or 'none'}; "
+                "name one with --variable"
+            )
+        return _table(groups[name or next(iter(groups))])
+
+
+def _is_numeric(channel: Any) -> bool:
+    return len(channel) > 0 and channel.dtype.kind in "biuf"
+
+
+def _table(group: Any) -> Table:
+    kept = [c for c in group.channels() if _is_numeric(c) or (len(c) and c.dtype.kind in "OSUM")]
+    lengths = {c.name: len(c) for c in kept}
+    if len(set(lengths.values())) > 1:
+        raise FormatError(
+            f"its channels differ in length: {', '.join(f'{k} {n}' for k, n in lengths.items())}"
+        )
+    columns: list[Array] = []
+    texts: dict[int, list[str]] = {}
+    for k, channel in enumerate(kept):
+        values = channel[:]
+        if not _is_numeric(channel):
+            texts[k] = list(map(str, values))
+            values = np.zeros(len(values), np.uint8)
+        columns.append(values)
+    made = from_columns([c.name for c in kept], columns, texts)
+    steps = {float(c.properties[STEP]) for c in kept if c.properties.get(STEP)}
+    if len(steps) != 1:
+        return made
+    time = steps.pop() * np.arange(len(made.values))
+    return Table(made.values, made.columns, {"time": time}, ("time",), made.texts)

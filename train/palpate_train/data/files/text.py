@@ -1,0 +1,382 @@
+"""Reads text with one frame on each line: CSV and its kin, R's tables, LabVIEW's .lvm.
+
+NumPy and the csv module parse lines and cells. This module decides which lines are frames and which
+column is text. A cell that is not a number is never skipped: it is kept as a fault of its column.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
+
+import numpy as np
+
+from palpate.core.errors import FormatError
+from palpate_train.data.files import plain_lines
+from palpate_train.data.files.decimals import decimal_sign, plain
+from palpate_train.data.files.plain_lines import PlainText
+from palpate_train.data.files.table import Array, ReadPlan, Table, excerpt, normal
+
+COMMENTS = ("#", "%", "//")
+DELIMITERS = ("\t", ";", "|", ",", None)
+"""What can separate columns. Without any of the signs, blanks do."""
+SHEET_ERROR = re.compile(r"[\"']?#(N/A|N/V|NV|[A-ZÄÖÜ0-9/]+[!?])")
+"""How spreadsheets write a cell without a value. It is not a comment."""
+NUMBER = re.compile(
+    r"[+-]?(\d+([.]\d*|,\d+)?|\.\d+|\d{1,3}(,\d{3})+(\.\d+)?|\d{1,3}(\.\d{3})+(,\d+)?)([eE][+-]?\d+)?"
+    r"|[+-]?(nan|inf|infinity)",
+    re.IGNORECASE,
+)
+MISSING = {"", "na", "n/a", "null", "none", "-", "--", "?", "nil", "err", "error", "overflow"}
+UNIT = re.compile(
+    r"[\[(].*[\])]|[kmuµn]?(s|sec|V|N|A|Pa|g|m|T)|%|°C|bar|psi|counts?|raw|lsb|digits?|a\.?u\.?|-?",
+    re.IGNORECASE,
+)
+SAMPLED = 200
+"""Number of lines at the start and at the end that show the layout of a text."""
+CLEAR = 0.9
+"""A sign separates the columns if the share of numbers between it is this part of the largest."""
+LVM = "LabVIEW Measurement"
+LVM_END = "***End_of_Header***"
+Row = tuple[int, str]
+
+
+def decoded(data: bytes) -> tuple[str, list[str]]:
+    """The text, and remarks on what was dropped at its end."""
+    notes: list[str] = []
+    if wide := _wide(data):
+        return data.decode(wide, "replace").lstrip("\ufeff"), notes
+    if data[:400].count(0) > len(data[:400]) // 3:
+        raise FormatError("is not a text; save it as UTF-8")
+    whole = data.rstrip(b"\0\x1a")
+    if lost := len(data) - len(whole):
+        notes.append(f"read up to {lost} bytes NUL at its end")
+    try:
+        return whole.decode("utf-8-sig"), notes
+    except UnicodeDecodeError:
+        return whole.decode("cp1252", "replace"), notes
+
+
+def _wide(data: bytes) -> str:
+    """The encoding of a text of two or four bytes a character, "" for another: a mark at its
+    beginning shows it, or the zeros between its characters."""
+    if data.startswith((b"\xff\xfe\0\0", b"\0\0\xfe\xff")):
+        return "utf-32"
+    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return "utf-16"
+    head = data[:400]
+    for encoding, zeros, others in (
+        ("utf-16-le", head[1::2], head[::2]),
+        ("utf-16-be", head[::2], head[1::2]),
+    ):
+        if len(zeros) > 8 and not any(zeros) and all(others):
+            return encoding
+    return ""
+
+
+def lines_of(text: str) -> list[str]:
+    """The lines of a text, in the order of their numbers."""
+    return re.split(r"\r\n|\n|\r", text.replace("\r\r\n", "\n"))
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How the lines of a text divide into cells. text_columns: those that hold words in most
+    lines."""
+
+    delimiter: str | None
+    wide: int
+    text_columns: frozenset[int]
+
+    def cells(self, line: str) -> list[str]:
+        found = cells(line, self.delimiter)
+        return found[:-1] if len(found) == self.wide + 1 and not found[-1].strip() else found
+
+    def is_frame(self, line: str) -> bool:
+        """Whether at least half of the columns of numbers hold one."""
+        found = self.cells(line)
+        given = [is_number(found[i]) for i in self.numbers] if len(found) == self.wide else []
+        return sum(given) * 2 >= len(given) > 0
+
+    @property
+    def numbers(self) -> list[int]:
+        return [i for i in range(self.wide) if i not in self.text_columns]
+
+
+def table(
+    lines: Sequence[str],
+    wanted: ReadPlan,
+    notes: Sequence[str] = (),
+    delimiter: str = "",
+    decimal: str = "",
+) -> Table:
+    """The table in the lines of a text. delimiter, decimal: "" if the text must show them."""
+    decimal = wanted.decimal or decimal
+    bare = PlainText(lines) if lines and lines[0].startswith(LVM) else plain_lines.plain(lines)
+    lines = bare.lines
+    numbered, names, decimal = _labview(lines, decimal)
+    kept = [(i, line) for i, line in numbered if line.strip()]
+    layout = _layout(kept, delimiter)
+    start, end = _body(kept, layout)
+    said = [*notes, *bare.notes, *_remarks(kept, start, end, layout)]
+    rows = [(i, line) for i, line in kept[start:end] if not _is_comment(line, layout)]
+    if between := end - start - len(rows):
+        said.append(f"{between} comments between its frames are passed over")
+    decimal = decimal or decimal_sign(rows, layout.delimiter, layout.cells)
+    named = len(bare.names) == layout.wide
+    names = names or (bare.names if named else _heads(lines, kept[:start], layout))
+    names, label = _row_names(names, rows, layout)
+    layout = Layout(layout.delimiter, layout.wide, layout.text_columns | label)
+    whole = _plain_numbers(rows, layout, decimal)
+    if whole is not None:
+        return Table(whole, names, notes=tuple(said))
+    values, texts, faults = _columns(rows, layout, decimal)
+    return Table(values, names, texts=texts, faults=faults, notes=tuple(said))
+
+
+def cells(line: str, delimiter: str | None) -> list[str]:
+    """The cells of a line. delimiter: None separates at blanks. Raises FormatError for a cell that
+    is too long."""
+    if delimiter is None and '"' not in line:
+        return line.split()
+    blanks = delimiter is None
+    try:
+        return next(
+            csv.reader(
+                [line.replace("\t", " ").strip() if blanks else line],
+                delimiter=delimiter or " ",
+                skipinitialspace=blanks,
+            ),
+            [],
+        )
+    except csv.Error as e:
+        raise FormatError(f"the line {excerpt(line)} cannot be divided into cells: {e}") from e
+
+
+def is_number(text: str) -> bool:
+    return NUMBER.fullmatch(text.strip()) is not None
+
+
+def _labview(lines: Sequence[str], decimal: str) -> tuple[list[Row], tuple[str, ...], str]:
+    """The numbered lines after the headers of an .lvm file, the names of its columns and its
+    decimal sign; all lines of another text."""
+    rows = list(enumerate(lines, 1))
+    if not lines or not lines[0].startswith(LVM):
+        return rows, (), decimal
+    ends = [i for i, line in rows if line.startswith(LVM_END)]
+    head = dict(cells(line, "\t")[:2] for line in lines[: ends[0] if ends else 0] if "\t" in line)
+    delimiter = "," if head.get("Separator") == "Comma" else "\t"
+    segments = [i for i in ends if any(x.strip() for x in lines[i : i + 1])]
+    if len(ends) > 2 and len(segments) > 1:
+        raise FormatError(
+            f"holds {len(segments)} segments, the second after line {segments[1]}; "
+            "save each as a file"
+        )
+    if not ends:
+        raise FormatError(f"has no line {LVM_END}; export it again")
+    names = [name.strip() for name in cells(lines[ends[-1]], delimiter)]
+    names = names[:-1] if names[-1] in ("Comment", "") else names
+    return rows[ends[-1] + 1 :], tuple(names), decimal or head.get("Decimal_Separator", "")
+
+
+def _layout(kept: Sequence[Row], delimiter: str) -> Layout:
+    """The layout that most lines at the start and the end share."""
+    sample = [line for _, line in (*kept[:SAMPLED], *kept[max(SAMPLED, len(kept) - SAMPLED) :])]
+    sample = [line for line in sample if not line.lstrip().startswith(COMMENTS)]
+    ways = (delimiter,) if delimiter else DELIMITERS
+    shares = {way: sum(_share(line, way) for line in sample) for way in ways}
+    best = next(way for way, share in shares.items() if share >= CLEAR * max(shares.values()))
+    found = [_trimmed(cells(line, best)) for line in sample if _share(line, best)]
+    if not found:
+        raise FormatError("holds no line of numbers")
+    counts = Counter(map(len, found))
+    wide = max(counts, key=lambda n: (counts[n], n))
+    lines = [row for row in found if len(row) == wide][-SAMPLED:]
+    words = frozenset(
+        i
+        for i in range(wide)
+        if 2 * sum(not is_number(r[i]) and r[i].strip().lower() not in MISSING for r in lines)
+        > len(lines)
+    )
+    return Layout(best, wide, words)
+
+
+def _share(line: str, delimiter: str | None) -> float:
+    """The share of a line's cells that are numbers, 0 if it lacks the delimiter."""
+    if delimiter and delimiter not in line:
+        return 0.0
+    try:
+        found = _trimmed(cells(line, delimiter))
+    except FormatError:
+        return 0.0
+    return sum(map(is_number, found)) / max(len(found), 1)
+
+
+def _trimmed(found: list[str]) -> list[str]:
+    return found[:-1] if len(found) > 1 and not found[-1].strip() else found
+
+
+def _is_comment(line: str, layout: Layout) -> bool:
+    """Whether a line among frames is a comment; a frame that begins with # is not."""
+    return line.lstrip().startswith(COMMENTS) and not (
+        SHEET_ERROR.match(line.lstrip()) or len(layout.cells(line)) == layout.wide
+    )
+
+
+def _body(kept: Sequence[Row], layout: Layout) -> tuple[int, int]:
+    """The first frame and the end of the frames among the lines that are not blank."""
+    start = next(
+        (
+            k
+            for k, (_, line) in enumerate(kept)
+            if (SHEET_ERROR.match(line.lstrip()) or not line.lstrip().startswith(COMMENTS))
+            and layout.is_frame(line)
+            and not _counts_columns(layout.cells(line))
+        ),
+        len(kept),
+    )
+    if start == len(kept):
+        raise FormatError("holds no line of numbers")
+    end = len(kept)
+    while end > start + 1 and _is_footer(kept[end - 1][1], layout, end == len(kept)):
+        end -= 1
+    return start, end
+
+
+def _counts_columns(found: Sequence[str]) -> bool:
+    """Whether a line is the head that pandas writes for nameless columns: ,0,1,2,3."""
+    return not found[0].strip() and [c.strip() for c in found[1:]] == [
+        str(i) for i in range(len(found) - 1)
+    ]
+
+
+def _is_footer(line: str, layout: Layout, last: bool) -> bool:
+    """Whether a line after the frames is text, a comment or, as the last one, cut off."""
+    if line.lstrip().startswith(COMMENTS) and not SHEET_ERROR.match(line.lstrip()):
+        return len(layout.cells(line)) != layout.wide or not layout.is_frame(line)
+    found = _trimmed(layout.cells(line))
+    given = [is_number(cell) for cell in found]
+    if len(found) < layout.wide and (last or not all(given)):
+        return True
+    return len(found) != layout.wide and not any(given)
+
+
+def _remarks(kept: Sequence[Row], start: int, end: int, layout: Layout) -> list[str]:
+    """Remarks on the lines after the frames."""
+    rest = [(i, line) for i, line in kept[end:] if not line.lstrip().startswith(COMMENTS)]
+    if not rest:
+        return []
+    i, line = rest[0]
+    found = _trimmed(layout.cells(line))
+    if len(rest) == 1 and found and is_number(found[0]):
+        return [f"read up to line {i}, which is cut off: {len(found)} of {layout.wide} columns"]
+    return [f"read up to line {i}, which is {excerpt(line.strip())}"]
+
+
+def _heads(lines: Sequence[str], before: Sequence[Row], layout: Layout) -> tuple[str, ...]:
+    """The names of the columns: the cells of the last line before the frames that has as many, or
+    one fewer as in R. A line of units is passed over."""
+    comments = [line.lstrip("#% ") for _, line in before if line.lstrip().startswith(COMMENTS)]
+    plain_lines = [line for _, line in before if not line.lstrip().startswith(COMMENTS)]
+    for wide in (layout.wide, layout.wide - 1):
+        for group in (plain_lines, comments):
+            heads = [
+                [c.strip().strip("\"'") for c in cells(line, layout.delimiter)] for line in group
+            ]
+            heads = [h[:-1] if len(h) == wide + 1 and not h[-1] else h for h in heads]
+            heads = [h for h in heads if len(h) == wide and not all(map(is_number, h))]
+            if named := [h for h in heads if not all(map(UNIT.fullmatch, h))] or heads:
+                return tuple(map(normal, named[-1]))
+    return ()
+
+
+def _row_names(
+    names: tuple[str, ...], rows: Sequence[Row], layout: Layout
+) -> tuple[tuple[str, ...], frozenset[int]]:
+    """The names of all columns, and column 0 if it names or counts the rows: R and pandas write
+    such a column, without a name."""
+    if len(names) == layout.wide - 1:
+        names = ("", *names)
+    elif not names or names[0] not in ("", "Unnamed: 0"):
+        return names, frozenset()
+    first = [layout.cells(line)[0].strip() for _, line in rows]
+    quoted = all(line.lstrip().startswith('"') for _, line in rows)
+    running = all(cell.isdecimal() for cell in first) and all(
+        int(b) - int(a) == 1 for a, b in pairwise(first)
+    )
+    if quoted or running or 0 in layout.text_columns:
+        return names, frozenset({0})
+    return (names if names[0] else ()) if len(names) != layout.wide else names, frozenset()
+
+
+def _plain_numbers(rows: Sequence[Row], layout: Layout, decimal: str) -> Array | None:
+    """float64 [rows, columns] if every cell is a number, else None."""
+    if layout.text_columns:
+        return None
+    lines = [line for _, line in rows]
+    if layout.delimiter != ",":
+        lines = [plain(line, ",") if decimal == "," else line.replace(",", "") for line in lines]
+    if layout.delimiter and all(line.rstrip(" ").endswith(layout.delimiter) for line in lines):
+        lines = [line.rstrip(" ")[:-1] for line in lines]
+    try:
+        values = np.loadtxt(
+            lines, np.float64, comments=None, delimiter=layout.delimiter, ndmin=2, quotechar='"'
+        )
+    except ValueError:
+        return None
+    return values if values.shape == (len(rows), layout.wide) else None
+
+
+def _columns(
+    rows: Sequence[Row], layout: Layout, decimal: str
+) -> tuple[Array, dict[int, list[str]], dict[int, str]]:
+    """The numbers, the text columns and the faults of the other columns. Raises FormatError if a
+    line has another number of columns."""
+    found = []
+    for i, line in rows:
+        try:
+            found.append(layout.cells(line))
+        except FormatError as e:
+            raise FormatError(f"line {i}: {e}") from e
+        if len(found[-1]) != layout.wide:
+            raise FormatError(
+                f"line {i} has {len(found[-1])} columns, line {rows[0][0]} has {layout.wide}"
+            )
+    values = np.full((len(rows), layout.wide), math.nan)
+    texts: dict[int, list[str]] = {}
+    faults: dict[int, str] = {}
+    convert = partial(_number, decimal=decimal)
+    for c in range(layout.wide):
+        column = [row[c].strip() for row in found]
+        if c in layout.text_columns:
+            texts[c] = [normal(cell) for cell in column]
+            continue
+        bad = _into(values[:, c], column, convert)
+        if bad is not None:
+            faults[c] = (
+                f"line {rows[bad][0]}, column {c + 1} is {excerpt(column[bad])}, "
+                "which is not a number"
+            )
+    return values, texts, faults
+
+
+def _into(into: Array, column: Sequence[str], convert: Callable[[str], float]) -> int | None:
+    """Write the numbers of a column; the index of the first cell that is not one."""
+    for k, cell in enumerate(column):
+        if not is_number(cell):
+            return k
+        try:
+            into[k] = convert(cell)
+        except ValueError:
+            return k
+    return None
+
+
+def _number(cell: str, decimal: str) -> float:
+    return float(plain(cell, decimal))

@@ -1,0 +1,371 @@
+"""Frames of taxels from the table of a file: which axis is time, which column is a taxel, and which
+columns hold times or fields. Nothing is guessed: an ambiguous table raises an error."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from fnmatch import fnmatchcase
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.core.errors import FormatError
+from palpate.core.types import LARGEST_READING
+from palpate_train.data import sampling
+from palpate_train.data.files.table import Table, normal
+from palpate_train.data.import_plan import DATE, ImportPlan
+
+Array = NDArray[Any]
+RANGE = re.compile(r"([1-9]\d*)(?:-([1-9]\d*))?")
+DAY = re.compile(r"(\d{4}-\d\d-\d\d|\d{1,2}[./]\d{1,2}[./]\d{2,4})[T ].*")
+"""A date with a clock time; the first group is the day."""
+DAY_S = 86_400
+MOMENT = re.compile(
+    r"(?:(?P<day>\d{1,4}[-./]\d{1,2}[-./]\d{1,4})[T ]+)?(?P<hour>\d{1,2}):(?P<minute>\d\d)"
+    r"(?::(?P<second>\d\d(?:[.,]\d+)?))?\s?(?P<noon>[aApP][mM])?(?P<zone>Z|[+-]\d\d:?\d\d)?"
+)
+"""A time of the day, perhaps with its date and zone."""
+
+SQUARE = (
+    "if MATLAB's h5write wrote it, rows and columns have changed places: give --axes "
+    "frame,column,row"
+)
+
+
+class GridMissing(FormatError):
+    """Columns of taxels without --grid, which says how they lie."""
+
+
+def frames(table: Table, plan: ImportPlan) -> tuple[Array, Array | None, list[str]]:
+    """The frames [n, R, C] or [n, R, C, A] of a table, as recorded; their times [n] in seconds, or
+    None without --time; and remarks.
+
+    Raises FormatError that names the option which decides, or the first reading that is not a
+    number.
+    """
+    values = table.values.astype(np.uint8) if table.values.dtype.kind == "b" else table.values
+    if values.dtype.kind not in "iuf" or values.ndim < 2 or not values.size:
+        raise FormatError(
+            f"holds {values.dtype} {list(values.shape)}; give an array of frames x taxels"
+        )
+    values = _without_single_axes(values, plan)
+    values, notes = _time_first(values, table, plan)
+    at, time_s = _times(values, table, plan)
+    chosen = _taxels(values, table, plan, at)
+    bad = ~np.isfinite(chosen) if chosen.dtype.kind == "f" else np.zeros(0, bool)
+    what = "fill it in or cut it away"
+    if chosen.dtype.kind == "f" and not bad.any():
+        bad, what = (
+            np.abs(chosen) > LARGEST_READING,
+            (f"no skin reads more than {LARGEST_READING:g}: fill it in or cut it away"),
+        )
+    if bad.any():
+        index = np.argwhere(bad)[0]
+        taxel = ", ".join(map(str, index[1:] + 1))
+        raise FormatError(
+            f"frame {index[0] + 1}, taxel {taxel} is {chosen[tuple(index)]:g}; {what}"
+        )
+    return chosen, time_s, notes
+
+
+def _without_single_axes(values: Array, plan: ImportPlan) -> Array:
+    """The array without axes of length 1 that --grid does not have, such as the channel of
+    PyTorch."""
+    others = tuple(n for n in values.shape if n > 1)
+    if plan.order or not plan.shape or 1 in plan.shape or len(others) != len(plan.shape) + 1:
+        return values
+    return values.reshape(others)
+
+
+def _time_first(values: Array, table: Table, plan: ImportPlan) -> tuple[Array, list[str]]:
+    """The array with its frames along the first axis.
+
+    Time is the first or the last axis if only that fits --grid, the times or the window.
+    """
+    if plan.order:
+        return _ordered(values, plan), []
+    if values.ndim == 2:
+        wide, want = values.shape[1], int(np.prod(plan.shape))
+        if plan.shape and len(values) == wide == want and not table.columns:
+            raise FormatError(
+                f"holds {list(values.shape)}: both axes could be the {want} taxels; "
+                "say which with --axes frame,taxel or --axes taxel,frame"
+            )
+        return values, []
+    first, last = _fits(values, 0, table, plan), _fits(values, values.ndim - 1, table, plan)
+    if plan.shape and not (first or last):
+        return values, []  # its frames differ from the grid, as _taxels says
+    if first == last:
+        names = ",".join(("row", "column", "axis")[: values.ndim - 1])
+        what = "the first and the last axis could both be" if first else "neither end can be"
+        raise FormatError(
+            f"holds {list(values.shape)}: {what} the time; "
+            f"say with --axes frame,{names} or --axes {names},frame, or give --grid"
+        )
+    if first:
+        square = values.ndim == 3 and values.shape[1] == values.shape[2]
+        return values, [SQUARE] if square and table.reversible else []
+    moved = np.moveaxis(values, -1, 0)
+    return moved, [f"its last axis is the time: frames of {list(moved.shape[1:])}"]
+
+
+def _fits(values: Array, axis: int, table: Table, plan: ImportPlan) -> bool:
+    """Whether the first or last axis can be the time."""
+    others = values.shape[1:] if axis == 0 else values.shape[:-1]
+    if plan.shape and others != plan.shape:
+        return False
+    name, _, _ = plan.time.rpartition(":")
+    if name in table.vectors and len(table.vectors[name]) != values.shape[axis]:
+        return False
+    if plan.shape:
+        return True
+    if values.ndim == 4 and others[-1] > 8:
+        return False
+    if plan.rate_hz is None:
+        return bool(name) or values.shape[axis] == max(values.shape)
+    return bool(values.shape[axis] >= plan.window.frames(plan.rate_hz))
+
+
+def _ordered(values: Array, plan: ImportPlan) -> Array:
+    """The array with the axes that --axes names, as [frame, row, column(, axis)] or
+    [frame, taxel]."""
+    order = plan.order
+    if len(order) != values.ndim:
+        given = "--transpose" if plan.transpose else f"--axes {plan.axes}"
+        raise FormatError(
+            f"holds {list(values.shape)}, but {given} names {len(order)} axes; "
+            "name each axis with --axes"
+        )
+    wanted = [name for name in ("frame", "row", "column", "taxel", "axis") if name in order]
+    turned = np.transpose(values, [order.index(name) for name in wanted])
+    if "taxel" in order and "axis" in order:
+        return turned.reshape(len(turned), -1)
+    return turned
+
+
+def _times(values: Array, table: Table, plan: ImportPlan) -> tuple[int | None, Array | None]:
+    """The number of the time column, None if `values` has no such column, and the times [n] in
+    seconds."""
+    if not plan.time:
+        return None, None
+    name, _, unit = plan.time.rpartition(":")
+    name = normal(name)
+    if name in table.vectors and unit != DATE:
+        time_s = table.vectors[name] * sampling.UNITS_S[unit]
+        if len(time_s) != len(values):
+            raise FormatError(f"{name} holds {len(time_s)} times, there are {len(values)} frames")
+        return None, time_s
+    if values.ndim != 2 or (not table.columns and table.beside and not RANGE.fullmatch(name)):
+        raise FormatError(
+            f"has no times {name!r}; beside the frames it has "
+            f"{', '.join(table.beside) or 'nothing'}"
+        )
+    (at,) = column_numbers(name, table.columns, values.shape[1], "--time", 1)
+    if unit == DATE:
+        return at, _dates(name, table, at)
+    if at in table.texts:
+        raise FormatError(
+            f"column {name} holds text, such as {table.texts[at][0]!r}; "
+            f"for dates with a clock time write --time {name}:{DATE}"
+        )
+    _check_numbers(table, [at])
+    return at, values[:, at] * sampling.UNITS_S[unit]
+
+
+def _dates(name: str, table: Table, at: int) -> Array:
+    """The times [n] in seconds of a column of dates or of times of the day, from its first on.
+    Raises FormatError."""
+    if at not in table.texts:
+        raise FormatError(f"column {name} holds numbers, not dates; name their unit")
+    found = [MOMENT.fullmatch(text.strip()) for text in table.texts[at]]
+    if None in found:
+        k = found.index(None)
+        raise FormatError(
+            f"frame {k + 1}: {table.texts[at][k]!r} in column {name} is not a date such as "
+            "2026-01-31 12:00:00.5"
+        )
+    parts = [one.groupdict("") for one in found if one]
+    days = _days(name, [one["day"] for one in parts])
+    clock = np.array([_clock_s(one) for one in parts])
+    if not any(one["day"] for one in parts):  # times of the day begin again at midnight
+        days = np.cumsum(np.diff(clock, prepend=clock[0]) < -DAY_S / 2)
+    times: Array = (days - days[0]) * DAY_S + clock - clock[0]
+    return times
+
+
+def _days(name: str, texts: Sequence[str]) -> Array:
+    """The days [n] as numbers. Any form will do if the day does not change. Raises FormatError."""
+    if len(set(texts)) == 1:
+        return np.zeros(len(texts))
+    iso = [re.sub(r"^(\d{1,2})\.(\d{1,2})\.(\d{4})$", r"\3-\2-\1", text) for text in texts]
+    iso = [re.sub(r"-(\d)(?!\d)", r"-0\1", text.replace("/", "-")) for text in iso]
+    try:
+        return np.array(iso, "datetime64[D]").astype(np.int64)
+    except ValueError as e:
+        day = next(text for text in texts if text != texts[0])
+        raise FormatError(
+            f"the day changes from {texts[0]!r} to {day!r} in column {name}; "
+            "write days as 2026-01-31"
+        ) from e
+
+
+def _clock_s(parts: Mapping[str, str]) -> float:
+    """The time of the day in seconds, in the zone of its date."""
+    hours, noon = int(parts["hour"]), parts["noon"].lower()
+    hours = hours % 12 + 12 * (noon == "pm") if noon else hours
+    zone = re.fullmatch(r"([+-])(\d\d):?(\d\d)", parts["zone"])
+    offset = 60 * (60 * int(zone[2]) + int(zone[3])) * (1 if zone[1] == "+" else -1) if zone else 0
+    seconds = float(parts["second"].replace(",", ".") or 0)
+    return 3600 * hours + 60 * int(parts["minute"]) + seconds - offset
+
+
+def _taxels(values: Array, table: Table, plan: ImportPlan, time_column: int | None) -> Array:
+    """The counts of the taxels, [n, R, C] or [n, R, C, A]."""
+    shape = plan.shape
+    if values.ndim > 2:
+        if plan.columns or (shape and values.shape[1:] != shape):
+            raise FormatError(
+                f"holds frames of shape {list(values.shape[1:])}; "
+                "leave --columns out, and leave --grid out or give that shape, "
+                "or name the axes with --axes"
+            )
+        return values
+    others = [
+        column_numbers(column, table.columns, values.shape[1], "--field", 1)[0]
+        for column in plan.fields.values()
+        if table.columns
+    ]
+    if not shape:
+        count = values.shape[1] - len(table.texts)
+        raise GridMissing(
+            f"has {count} columns; give their layout with --grid, e.g. 4x4 for 16 taxels"
+        )
+    wide, want = values.shape[1], int(np.prod(shape))
+    if plan.columns:
+        numbers = column_numbers(plan.columns, table.columns, wide, "--columns")
+    else:
+        numbers = [
+            i for i in range(wide) if i not in (time_column, *others) and i not in table.texts
+        ]
+    _check_numbers(table, numbers)
+    if len(numbers) != want:
+        raise FormatError(_mismatch(len(numbers), len(values), plan, time_column))
+    return values[:, numbers].reshape(len(values), *shape)
+
+
+def _mismatch(count: int, rows: int, plan: ImportPlan, time_column: int | None) -> str:
+    """The message about a number of columns that does not fill the grid."""
+    which = (
+        "--columns names"
+        if plan.columns
+        else "it has"
+        if time_column is None
+        else "beside the time it has"
+    )
+    want = int(np.prod(plan.shape))
+    advice = (
+        f"it has {want} rows, so add --transpose" if rows == want else "see --columns and --grid"
+    )
+    return f"{which} {count} columns, but a grid of {plan.grid} needs {want}; {advice}"
+
+
+def _check_numbers(table: Table, numbers: Sequence[int]) -> None:
+    """Raise FormatError if one of the columns has a cell that is not a number."""
+    for i in numbers:
+        if i in table.texts:
+            name = f" {table.columns[i]!r}" if table.columns else ""
+            raise FormatError(
+                f"column {i + 1}{name} holds text, such as {table.texts[i][0]!r}; "
+                "name the columns of the taxels with --columns"
+            )
+    if found := [table.faults[i] for i in sorted(table.faults) if i in numbers]:
+        raise FormatError(found[0])
+
+
+def column_numbers(
+    text: str, names: Sequence[str], wide: int, option: str, most: int = 1 << 20
+) -> list[int]:
+    """Column numbers, from 0, for a comma-separated list `text`.
+
+    Each entry is a name, a name with *, a number from 1, or a range such as 2-17.
+    """
+    text = normal(text)
+    found: list[int] = []
+    for part in (text,) if text in names else text.split(","):
+        if part in names:
+            found.append(_named(part, names, option))
+        elif number := RANGE.fullmatch(part):
+            first, last = int(number[1]), int(number[2] or number[1])
+            if not first <= last <= wide:
+                raise FormatError(f"{option} {part}: it has {wide} columns")
+            found += range(first - 1, last)
+        elif matching := [
+            i for i, name in enumerate(names) if "*" in part and fnmatchcase(name, part)
+        ]:
+            for i in matching:
+                _named(names[i], names, option)
+            found += matching
+        else:
+            known = (
+                f"its columns are {', '.join(names)}"
+                if names
+                else f"its {wide} columns have no names: use numbers"
+            )
+            raise FormatError(f"{option}: there is no column {part!r}; {known}")
+    if len(set(found)) < len(found) or len(found) > most:
+        raise FormatError(
+            f"{option} {text} names {'a column twice' if len(found) <= most else 'several columns'}"
+        )
+    return found
+
+
+def _named(name: str, names: Sequence[str], option: str) -> int:
+    """The number of the column `name`, from 0. Raises FormatError if several have the name, or if
+    the name is the number of another column."""
+    where = [i for i, other in enumerate(names) if other == name]
+    if len(where) > 1:
+        listed = " and ".join(str(i + 1) for i in where)
+        raise FormatError(
+            f"{option}: columns {listed} are all called {name!r}; use their numbers, "
+            f"such as {where[0] + 1}"
+        )
+    if (
+        RANGE.fullmatch(name)
+        and name != str(where[0] + 1)
+        and int(name.split("-")[0]) <= len(names)
+    ):
+        raise FormatError(
+            f"{option}: {name!r} is the name of column {where[0] + 1} and the number of another; "
+            f"give the range {where[0] + 1}-{where[0] + 1}, or rename the columns"
+        )
+    return where[0]
+
+
+def fields(
+    table: Table, given: Mapping[str, str], count: int
+) -> list[tuple[slice, dict[str, str]]]:
+    """The parts of a table within which the columns `given` by field do not change, and the fields
+    of each part. Of a date with a clock time, the day counts. Raises FormatError for an empty
+    cell."""
+    if not given:
+        return [(slice(0, count), {})]
+    columns: dict[str, list[str]] = {}
+    for name, column in given.items():
+        (at,) = column_numbers(column, table.columns, len(table.columns), "--field", 1)
+        _check_numbers(table, [] if at in table.texts else [at])
+        texts = (
+            [DAY.sub(r"\1", text.strip()) for text in table.texts[at]]
+            if at in table.texts
+            else [f"{value:g}" for value in table.values[:, at]]
+        )
+        if "" in texts:
+            raise FormatError(f"frame {texts.index('') + 1} has no {name} in column {column}")
+        columns[name] = texts
+    rows = list(zip(*columns.values(), strict=True))
+    starts = [0, *(k for k in range(1, len(rows)) if rows[k] != rows[k - 1])]
+    return [
+        (slice(a, b), dict(zip(columns, rows[a], strict=True)))
+        for a, b in zip(starts, [*starts[1:], len(rows)], strict=True)
+    ]

@@ -1,0 +1,303 @@
+"""Evaluation protocols: a text such as "leave:position" says which sweeps train and which test.
+
+Each protocol is a splitter over the numbers of the sweeps that scikit-learn can use:
+split(X, y, groups) yields pairs (training, test); `groups` are the recordings. A splitter never
+puts parts of one recording on both sides. Nothing here imports scikit-learn, because a box that is
+taught does not have it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import zip_longest
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.core.errors import FormatError
+from palpate_train.data.group_values import text_of
+from palpate_train.data.sets import Dataset
+
+Array = NDArray[Any]
+Fold = tuple[Array, Array]
+FORMS = "random:FOLDS, leave:GROUP or split:GROUP=a,b->c"
+RANDOM = re.compile(r"random:(\d+)")
+LEAVE = re.compile(r"leave:(\w+)")
+SPLIT = re.compile(r"split:(\w+)=(.+?)->(.+)")
+
+
+class RandomFolds:
+    """Whole recordings divided into `folds` parts at random, materials in equal shares. The paper's
+    protocol, which overestimates accuracy."""
+
+    def __init__(self, folds: int, seed: int, materials: Sequence[str]) -> None:
+        self.folds, self.seed, self.materials = folds, seed, materials
+
+    def get_n_splits(self, X: Any = None, y: Any = None, groups: Any = None) -> int:
+        """The number of folds."""
+        return self.folds
+
+    def split(self, X: Any, y: Array, groups: Array) -> Iterator[Fold]:
+        """Pairs (training, test) of sweep numbers. y: labels [N]; groups: recordings [N].
+
+        Raises FormatError if a material has fewer recordings than there are folds.
+        """
+        for label in np.unique(y):
+            if (n := len(np.unique(groups[y == label]))) < 2:
+                raise FormatError(
+                    f"material {self.materials[label]!r} has one recording; "
+                    "record two of each or more, to test on one"
+                )
+            if n < self.folds:
+                raise FormatError(
+                    f"random:{self.folds} needs {self.folds} recordings of each material; "
+                    f"{self.materials[label]!r} has {n}: "
+                    f"use random:{n} or less"
+                )
+        fold = _spread_evenly(y, groups, self.folds, self.seed)
+        for k in range(self.folds):
+            yield np.flatnonzero(fold != k), np.flatnonzero(fold == k)
+
+
+def _spread_evenly(labels: Array, groups: Array, folds: int, seed: int) -> Array:
+    """The fold [N] of each sweep: whole groups, with the materials in equal shares.
+
+    Groups are dealt out in random order, those of the most unequal materials first. Each goes where
+    the shares of the materials then differ least between folds, and of equal folds to the smallest.
+    The folds are those of scikit-learn's StratifiedGroupKFold with shuffling.
+    """
+    kinds, label = np.unique(labels, return_inverse=True)
+    values, member = np.unique(groups, return_inverse=True)
+    counts = np.zeros((len(values), len(kinds)))
+    np.add.at(counts, (member, label), 1)
+    order = np.arange(len(values))
+    np.random.RandomState(seed).shuffle(order)
+    order = order[np.argsort(-counts[order].std(axis=1), kind="stable")]
+    totals, held, fold = (
+        counts.sum(axis=0),
+        np.zeros((folds, len(kinds))),
+        np.empty(len(values), int),
+    )
+    for group in order:
+        best, least, size = 0, np.inf, np.inf
+        for k in range(folds):
+            tried = held.copy()
+            tried[k] += counts[group]
+            unequal = float((tried / totals).std(axis=0).mean())
+            smaller = np.isclose(unequal, least) and held[k].sum() < size
+            if unequal < least or smaller:
+                best, least, size = k, unequal, held[k].sum()
+        held[best] += counts[group]
+        fold[group] = best
+    dealt: Array = fold[member]
+    return dealt
+
+
+class LeaveOneGroupOut:
+    """Test on one value of the group `name` at a time and train on all others, as in
+    leave-one-position-out."""
+
+    def __init__(self, name: str, group: Array) -> None:
+        self.name, self.group = name, group
+
+    def get_n_splits(self, X: Any = None, y: Any = None, groups: Any = None) -> int:
+        """The number of values of the group."""
+        return len(np.unique(self.group))
+
+    def split(self, X: Any, y: Array, groups: Array) -> Iterator[Fold]:
+        """Pairs (training, test) of sweep numbers. Raises FormatError if the group has only one
+        value or cuts a recording in two."""
+        if (n := self.get_n_splits()) < 2:
+            raise FormatError(
+                f"leave:{self.name} needs two values of the group {self.name!r}; "
+                f"all sweeps have {text_of(self.group[0])} "
+                f"({n} value): choose another group"
+            )
+        for value in np.unique(self.group):
+            out = self.group == value
+            yield _checked(f"leave:{self.name}, {text_of(value)} left out", ~out, out, y, groups)
+
+
+class TrainTest:
+    """Train on some values of the group `name` and test on others, such as T-REAL and T-HARD, or
+    the first and the last block."""
+
+    def __init__(self, name: str, group: Array, train: Sequence[Any], test: Sequence[Any]) -> None:
+        self.name, self.group, self.train, self.test = name, group, tuple(train), tuple(test)
+
+    def get_n_splits(self, X: Any = None, y: Any = None, groups: Any = None) -> int:
+        """There is one fold."""
+        return 1
+
+    def split(self, X: Any, y: Array, groups: Array) -> Iterator[Fold]:
+        """The pair (training, test) of sweep numbers. Raises FormatError if a value is unknown or
+        on both sides."""
+        present = np.unique(self.group)
+        for value in (*self.train, *self.test):
+            if value not in present:
+                raise FormatError(
+                    f"group {self.name!r} has no {text_of(value)}; "
+                    f"it has {', '.join(map(text_of, present[:20]))}"
+                )
+        if both := set(self.train) & set(self.test):
+            raise FormatError(
+                f"{self.name}={text_of(min(both))} is on both sides of the split; name it once"
+            )
+        yield _checked(
+            f"split:{self.name}",
+            np.isin(self.group, self.train),
+            np.isin(self.group, self.test),
+            y,
+            groups,
+        )
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """A protocol by its text. Raises FormatError if the text matches none of FORMS."""
+
+    text: str
+
+    def __post_init__(self) -> None:
+        if not any(form.fullmatch(self.text) for form in (RANDOM, LEAVE, SPLIT)):
+            raise FormatError(f"protocol {self.text!r} cannot be read; use {FORMS}")
+        if (found := RANDOM.fullmatch(self.text)) and int(found[1]) < 2:
+            raise FormatError(f"protocol {self.text!r} has too few folds; use random:2 or more")
+
+    def splitter(self, sweeps: Dataset, seed: int) -> RandomFolds | LeaveOneGroupOut | TrainTest:
+        """The splitter for `sweeps`. seed: for random folds. Raises FormatError for an
+        unknown group."""
+        if found := RANDOM.fullmatch(self.text):
+            return RandomFolds(int(found[1]), seed, sweeps.materials)
+        if found := LEAVE.fullmatch(self.text):
+            return LeaveOneGroupOut(found[1], sweeps.group(found[1]))
+        found = SPLIT.fullmatch(self.text)
+        assert found
+        name, *sides = found.groups()
+        try:
+            train, test = (sweeps.listed(name, side) for side in sides)
+        except FormatError as e:
+            raise FormatError(f"protocol {self.text!r} cannot be read; {e}") from None
+        return TrainTest(name, sweeps.group(name), train, test)
+
+    def folds(self, sweeps: Dataset, seed: int) -> list[Fold]:
+        """All pairs (training, test) of sweep numbers. Raises FormatError if the protocol cannot
+        split `sweeps`."""
+        sweeps.require_materials().require_pure_recordings()
+        return list(
+            self.splitter(sweeps, seed).split(
+                sweeps.samples, sweeps.labels, sweeps.group("recording")
+            )
+        )
+
+    def left_out(self, sweeps: Dataset, test: Array) -> dict[str, list[Any]]:
+        """The values that the tested sweeps have of the group that the protocol leaves out; {} for
+        random folds. test: numbers of sweeps."""
+        found = LEAVE.fullmatch(self.text) or SPLIT.fullmatch(self.text)
+        return {found[1]: np.unique(sweeps.group(found[1])[test]).tolist()} if found else {}
+
+    def clusters(self, sweeps: Dataset) -> Array | None:
+        """A cluster number for each sweep [N], for intervals: sweeps of a cluster succeed or fail
+        together. Clusters are the left-out groups, or else recordings of several windows. None if
+        sweeps are independent."""
+        if found := LEAVE.fullmatch(self.text):
+            return sweeps.group(found[1])
+        recording = sweeps.group("recording")
+        return recording if len(np.unique(recording)) < len(sweeps) else None
+
+
+def draw(train: Array, labels: Array, each: int, seed: int) -> Array:
+    """At most `each` sweeps of every material, from the sweep numbers `train`; sorted. labels: int
+    [N], of all sweeps.
+
+    With the same seed, a larger `each` adds to the sweeps of a smaller value, so a learning curve
+    only grows.
+    """
+    rng = np.random.default_rng(seed)
+    mine = labels[train]
+    return np.sort(
+        np.concatenate([rng.permutation(train[mine == label])[:each] for label in np.unique(mine)])
+    )
+
+
+def _checked(what: str, train: Array, test: Array, labels: Array, recordings: Array) -> Fold:
+    """The masks as numbers. Raises FormatError if both sides share a recording or there is too
+    little to train on."""
+    if shared := set(recordings[train].tolist()) & set(recordings[test].tolist()):
+        raise FormatError(
+            f"{what}: {len(shared)} recordings, {min(shared)} among them, "
+            "would be trained on and tested on; "
+            "choose a group that does not cut recordings"
+        )
+    if len(np.unique(labels[train])) < 2:
+        raise FormatError(
+            f"{what}: {train.sum()} sweeps of fewer than two materials are left to train on"
+        )
+    return np.flatnonzero(train), np.flatnonzero(test)
+
+
+OF_THE_SET = ("recording", "set", "split", "trial", "world")
+"""Groups that say where a sweep comes from. They are not conditions that a user would vary."""
+RANDOM_PARTS = 5
+
+
+@dataclass(frozen=True)
+class InnerPart:
+    """Sweeps of a training set that are held out to judge a model fitted to the other sweeps.
+    group: the name of the group that is left out. out: bool [N]."""
+
+    group: str
+    out: Array
+
+
+def inner_parts(sweeps: Dataset, most: int = 3, varies: Sequence[str] = ()) -> list[InnerPart]:
+    """The parts of each group that can be left out, at most `most` for a group. If no group can,
+    the parts are recordings, with materials spread evenly. varies: only these groups.
+
+    The first part of every group comes first, then the second parts, and so on. A group can be left
+    out if it does not cut recordings in two, and if the other sweeps hold every material that is
+    tested. Raises FormatError if nothing can be left out, or a group of `varies` cannot.
+    """
+    names = varies or sorted(set(sweeps.groups) - set(OF_THE_SET))
+    of_all = [_parts_of(sweeps, name, most) for name in names]
+    for name, parts in zip(varies, of_all, strict=False):
+        if not parts:
+            raise FormatError(
+                f"{sweeps.source}: no value of {name!r} can be left out; it needs two values, "
+                "materials under several of them, and no recording under two"
+            )
+    if any(of_all):
+        return [part for turn in zip_longest(*of_all) for part in turn if part]
+    return recording_parts(sweeps)
+
+
+def recording_parts(sweeps: Dataset) -> list[InnerPart]:
+    """Parts of recordings, with materials spread evenly; each sweep is in one of them. Raises
+    FormatError if a material has one recording."""
+    fewest = min(
+        len(np.unique(sweeps.group("recording")[sweeps.labels == k]))
+        for k in np.unique(sweeps.labels)
+    )
+    if fewest < 2:
+        raise FormatError(
+            f"{sweeps.source}: a material has one recording; "
+            "choosing a model needs two of each, so record more"
+        )
+    drawn = Protocol(f"random:{min(RANDOM_PARTS, fewest)}").folds(sweeps, 1)
+    return [InnerPart("recording", np.isin(np.arange(len(sweeps)), test)) for _, test in drawn]
+
+
+def _parts_of(sweeps: Dataset, name: str, most: int) -> list[InnerPart]:
+    values, member = np.unique(sweeps.group(name), return_inverse=True)
+    recording = sweeps.group("recording")
+    shuffled = np.random.default_rng(0).permutation(len(values))
+    if len(shuffled) < 2 or len(np.unique(np.stack([recording, member]), axis=1).T) > len(
+        np.unique(recording)
+    ):
+        return []
+    parts = [np.isin(member, some) for some in np.array_split(shuffled, min(most, len(shuffled)))]
+    labels = sweeps.labels
+    return [InnerPart(name, out) for out in parts if set(labels[out]) <= set(labels[~out])]

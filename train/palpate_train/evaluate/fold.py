@@ -1,0 +1,336 @@
+"""One fold: a method is trained on some sweeps and tested on others.
+
+A fold is kept under a fingerprint of all that its result depends on, including the code and the
+versions of libraries.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import io
+import json
+import re
+import sys
+import time
+import zipfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache
+from importlib.metadata import PackageNotFoundError, packages_distributions, requires, version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.core.errors import BundleError, FormatError
+from palpate.core.storage import put
+from palpate.inference.session import session
+from palpate_train.data.sets import Dataset
+from palpate_train.features import kinds
+from palpate_train.models import methods
+
+Array = NDArray[Any]
+Answer = Callable[[Array], Array]
+"""Raw counts [T, R, C] -> logits [K]."""
+BOX = ("palpate.inference.classifier", "palpate.inference.novelty")
+"""Modules of the box that its answers depend on, beside the code of COUNTED."""
+TIMED_SWEEPS = 24
+"""Number of test sweeps that are classified one by one, to measure their time and to compare their
+labels. They run in an inference session of the box, or in the method's library if the method has no
+graph."""
+NOT_COUNTED = (
+    "palpate_train.data.readers",
+    "palpate_train.data.sets",
+    "palpate_train.evaluate.evaluate",
+    "palpate_train.evaluate.parallel",
+    "palpate_train.metrics.score",
+    "palpate_train.models.methods",
+)
+"""Modules that methods use and that do not change the result of a fold: it stays valid when their
+code changes. Sets are fingerprinted by their data."""
+OWN = ("palpate_train", "palpate_studies", "palpate")
+COUNTED = ("palpate_train", "palpate_studies", "palpate.signal")
+"""Packages whose code may change the result of a fold. `agreement` compares the box's other code
+with the desktop's."""
+
+
+@dataclass(frozen=True)
+class BoxAnswers:
+    """The answers of the box to n sweeps. labels: int [n], or REFUSED or UNKNOWN of
+    palpate_train.metrics.answers. sure: bool [n], whether it is certain of the label."""
+
+    labels: Array
+    sure: Array
+
+    @classmethod
+    def of(cls, labels: Sequence[int], sure: Array) -> BoxAnswers:
+        """The answers with these labels."""
+        return cls(np.array(labels, int), np.asarray(sure, bool))
+
+
+AsTheBox = Callable[[methods.Model, Dataset], BoxAnswers | None]
+"""The box's answers to sweeps by a trained model; None if it is of a method that export does not
+pack."""
+
+
+@dataclass(frozen=True)
+class FoldTask:
+    """One fold. train, test: numbers of sweeps. as_the_box: a function of a module, or None to
+    leave the box's answers out."""
+
+    method: str
+    effort: methods.Effort
+    seed: int
+    train: Array
+    test: Array
+    as_the_box: AsTheBox | None = None
+
+    def kept_in(self, path: Path) -> FoldTask:
+        """The same fold with `path` as the file that keeps its unfinished training."""
+        return replace(self, effort=replace(self.effort, unfinished=path))
+
+
+@dataclass(frozen=True)
+class Fold:
+    """The result of one fold.
+
+    logits: float32 [n, K] of its test sweeps. ms: median time of one sweep, for features and graph.
+    agreement: share of the timed sweeps that get the same label one by one from the exported graph,
+    or from the library if the method has no graph. ran: name of the trained model, if the method's
+    name does not state it. cost: the training's cross entropy [iterations, 2], if it has one.
+    forms: logits float32 [n, K] of the same sweeps by the same model in other precisions. box,
+    sure: the box's answers as in BoxAnswers, empty if there are none; not_packed: why export
+    refuses the model. refused: why the method cannot work with this set; all else is empty then.
+    """
+
+    test: Array
+    logits: Array
+    fit_s: float
+    ms: float
+    agreement: float
+    ran: str = ""
+    cost: Array = field(default_factory=lambda: np.empty((0, 2)))
+    refused: str = ""
+    forms: dict[str, Array] = field(default_factory=dict)
+    box: Array = field(default_factory=lambda: np.empty(0, int))
+    sure: Array = field(default_factory=lambda: np.empty(0, bool))
+    not_packed: str = ""
+
+    @classmethod
+    def refusal(cls, task: FoldTask, why: str) -> Fold:
+        """The fold of a method that cannot work with this set."""
+        return cls(task.test, np.empty((0, 0), np.float32), 0.0, 0.0, 0.0, refused=why)
+
+    def save(self, path: Path) -> None:
+        """Write the fold, whole or not at all."""
+        packed = io.BytesIO()
+        arrays: dict[str, Any] = {k: np.asarray(getattr(self, k)) for k in PLAIN}
+        arrays |= {FORM + name: logits for name, logits in self.forms.items()}
+        np.savez(packed, **arrays)
+        put(path, packed.getvalue(), parents=True)
+
+    @classmethod
+    def load(cls, path: Path) -> Fold | None:
+        """Read a fold that `save` wrote; None if the file is missing or cannot be read."""
+        try:
+            with np.load(path, allow_pickle=False) as z:
+                arrays = {k: z[k] for k in PLAIN}
+                forms = {k.removeprefix(FORM): z[k] for k in z.files if k.startswith(FORM)}
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+            return None
+        plain = {k: v.item() if v.ndim == 0 else v for k, v in arrays.items()}
+        return cls(**plain, forms=forms)
+
+
+FORM = "form "
+PLAIN = tuple(name for name in Fold.__dataclass_fields__ if name != "forms")
+
+
+def run(task: FoldTask, sweeps: Dataset, inputs: Array) -> Fold:
+    """Train on one side and classify the other; a refusal if the method raises FormatError.
+
+    inputs: the method's input of all `sweeps`.
+    """
+    (method,) = methods.find([task.method], task.effort)
+    try:
+        return _completed(task, method, sweeps, inputs)
+    except FormatError as e:
+        return Fold.refusal(task, str(e))
+
+
+def _completed(task: FoldTask, method: methods.Method, sweeps: Dataset, inputs: Array) -> Fold:
+    start = time.perf_counter()
+    model = method.train(sweeps.take(task.train), inputs[task.train], task.seed)
+    fit_s = time.perf_counter() - start
+    models = {"": model} | dict(getattr(model, "precisions", {}))
+    answers = {
+        name: np.asarray(one.logits(inputs[task.test]), np.float32) for name, one in models.items()
+    }
+    if not all(np.isfinite(logits).all() for logits in answers.values()):
+        raise FormatError(
+            f"{task.method} gave a logit that is not finite; please report it with the set"
+        )
+    logits = answers.pop("")
+    some = task.test[
+        np.linspace(0, len(task.test) - 1, min(TIMED_SWEEPS, len(task.test))).astype(int)
+    ]
+    ms, labels = _timed_labels(_alone(method, model, sweeps.rate_hz), sweeps.samples[some])
+    agreement = float(np.mean(labels == logits[np.searchsorted(task.test, some)].argmax(1)))
+    cost = np.asarray(getattr(model, "cost", []), float).reshape(-1, 2)
+    fold = Fold(
+        task.test, logits, fit_s, ms, agreement, getattr(model, "ran", ""), cost, forms=answers
+    )
+    if not task.as_the_box:
+        return fold
+    try:
+        box = task.as_the_box(model, sweeps.take(task.test))
+    except (FormatError, BundleError) as e:
+        return replace(fold, not_packed=str(e))
+    return replace(fold, box=box.labels, sure=box.sure) if box else fold
+
+
+def _timed_labels(answer: Answer, samples: Array) -> tuple[float, Array]:
+    """Median time in ms of one sweep of `samples`, raw counts [n, T, R, C], and the labels [n]."""
+    times, labels = [], []
+    for counts in samples:
+        start = time.perf_counter()
+        labels.append(int(answer(counts).argmax()))
+        times.append(time.perf_counter() - start)
+    return 1e3 * float(np.median(times)), np.array(labels)
+
+
+def _alone(method: methods.Method, model: methods.Model, rate_hz: float) -> Answer:
+    """The function that classifies one sweep: features and the graph in a session like the box's,
+    or the library of a method without a graph."""
+    if method.library:
+        return lambda counts: model.logits(kinds.graph_input(method.input, counts, rate_hz)[None])[
+            0
+        ]
+    graph = session(model.graph().SerializeToString())
+    name = graph.get_inputs()[0].name
+    return lambda counts: graph.run(
+        None, {name: kinds.graph_input(method.input, counts, rate_hz)[None]}
+    )[0][0]
+
+
+def key(task: FoldTask, data: str) -> str:
+    """The fingerprint of all that the fold depends on. data: the set's digest."""
+    (method,) = methods.find([task.method], task.effort)
+    about = [data, method.name, method.effort, task.seed, task.train.tolist(), task.test.tolist()]
+    box = (task.as_the_box.__module__, *BOX) if task.as_the_box else ()
+    return fingerprint(about, methods.module_of(method.name), "palpate_train.evaluate.fold", *box)
+
+
+def fingerprint(about: Any, *modules: str) -> str:
+    """32 hex digits of a hash over `about` (for JSON), the code of `modules`, the code that they
+    import from this project, and the versions of the libraries that this code uses."""
+    versions = {name: version(name) for name in libraries(modules)}
+    return hashlib.sha256(json.dumps([about, versions]).encode() + _code(modules)).hexdigest()[:32]
+
+
+@cache
+def libraries(modules: tuple[str, ...]) -> tuple[str, ...]:
+    """The installed distributions that can change a result of `modules`.
+
+    These are the distributions that `modules` import, directly or through other code of this
+    project, and numerical distributions beneath them, such as SciPy beneath scikit-learn. Imports
+    of the box's code count as well: `agreement` guards its code, but the libraries that it calls
+    can change a result. A requirement is numerical if it requires numpy itself. All others, such as
+    Jinja beneath PyTorch, do not change a fold.
+    """
+    closure = _closure(modules, OWN, NOT_COUNTED)
+    roots = {name.partition(".")[0] for module in closure for name in _import_names(module)}
+    known = packages_distributions()
+    named = [name for root in roots - sys.stdlib_module_names for name in known.get(root, ())]
+    left = [name for name in map(_normal, named) if not name.startswith("palpate")]
+    found: set[str] = set()
+    while left:
+        if (name := left.pop()) not in found and _installed(name):
+            found.add(name)
+            left += [one for one in _required(name) if "numpy" in (one, *_required(one))]
+    return tuple(sorted(found))
+
+
+def _normal(name: str) -> str:
+    """The name of a distribution in the normal form of PEP 503."""
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def _installed(name: str) -> bool:
+    try:
+        version(name)
+    except PackageNotFoundError:
+        return False
+    return True
+
+
+def _required(name: str) -> list[str]:
+    """The distributions that `name` requires without its extras; none if it is not installed."""
+    lines = (requires(name) or ()) if _installed(name) else ()
+    own = [line for line in lines if not re.search(r";.*\bextra\b", line)]
+    return [_normal(re.split(r"[^A-Za-z0-9._-]", line, maxsplit=1)[0]) for line in own]
+
+
+@cache
+def _code(modules: tuple[str, ...]) -> bytes:
+    """SHA-256 of the code. It is read once, since a process continues with the code that it
+    loaded."""
+    code = hashlib.sha256()
+    for module in sorted(reached(modules)):
+        code.update(_file(module).read_bytes())
+    return code.digest()
+
+
+def reached(modules: Sequence[str]) -> set[str]:
+    """`modules` and all modules of the packages COUNTED that they import, directly or indirectly,
+    without NOT_COUNTED."""
+    return _closure(modules, COUNTED, NOT_COUNTED)
+
+
+def _closure(modules: Sequence[str], packages: Sequence[str], without: Sequence[str]) -> set[str]:
+    """`modules` and all modules of `packages` that they import, directly or indirectly, except
+    `without`."""
+    found, left = set(without), list(modules)
+    while left:
+        if (module := left.pop()) not in found:
+            found.add(module)
+            left += _imported(module, packages)
+    return found - set(without)
+
+
+def _file(module: str) -> Path:
+    spec = find_spec(module)
+    if spec is None or spec.origin is None:
+        raise ModuleNotFoundError(f"{module} has no file")
+    return Path(spec.origin)
+
+
+def _imported(module: str, packages: Sequence[str]) -> list[str]:
+    """The modules of `packages` that `module` imports."""
+    ours = tuple(f"{package}." for package in packages)
+    return [name for name in _import_names(module) if name.startswith(ours) and _is_module(name)]
+
+
+@cache
+def _import_names(module: str) -> tuple[str, ...]:
+    """All names in the import statements of a module and of its functions: `a.b` and `a.b.c` for
+    `from a.b import c`."""
+    names: list[str] = []
+    for node in ast.walk(ast.parse(_file(module).read_bytes())):
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            names += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+    return tuple(names)
+
+
+def _is_module(name: str) -> bool:
+    """Whether `name` is a module, not a package or an object in a module."""
+    try:
+        spec = find_spec(name)
+    except ModuleNotFoundError:  # its parent is a module, not a package
+        return False
+    return spec is not None and spec.submodule_search_locations is None

@@ -1,0 +1,63 @@
+"""Warnings about what a sweep set or a protocol makes look better or worse than it is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate_train.calibration import level_check
+from palpate_train.data import repeats
+from palpate_train.data.sets import Dataset, shortened
+from palpate_train.data.splitters import OF_THE_SET
+
+Array = NDArray[Any]
+
+
+def of_set(sweeps: Dataset) -> list[str]:
+    """The warnings about a set that can be trained on: sweeps that it holds twice, materials that
+    were recorded under one condition only, and the mean level."""
+    return [
+        *repeats.warnings_of(sweeps, repeats.pairs(sweeps)),
+        *_coinciding(sweeps),
+        *level_check.warnings_of(sweeps),
+    ]
+
+
+def _coinciding(sweeps: Dataset) -> Iterator[str]:
+    """A warning for each group whose values cannot be left out without a material."""
+    for name in sorted(set(sweeps.groups) - {*OF_THE_SET, "object"}):
+        values, _, counts = sweeps.counts_by(name)
+        once = (counts > 0).sum(axis=0) == 1
+        if len(values) < 2 or not once.any():
+            continue
+        n = int(counts[:, once].sum())
+        materials = [sweeps.materials[k] for k in np.flatnonzero(once)]
+        yield (
+            f"warning: {n} of {len(sweeps)} sweeps are of materials with one {name} only "
+            f"({shortened(materials)}): a protocol that leaves it out cannot name them, and others "
+            f"may name the {name} in place of the material; record them under another one, too"
+        )
+
+
+def of_protocol(sweeps: Dataset, text: str, folds: Sequence[tuple[Array, Array]]) -> Iterator[str]:
+    """The warnings about the folds of a protocol, pairs (training, test) of sweep numbers."""
+    tested = sum(len(test) for _, test in folds)
+    unnamed = sum(
+        int((~np.isin(sweeps.labels[test], sweeps.labels[train])).sum()) for train, test in folds
+    )
+    if unnamed:
+        yield (
+            f"warning: {text}: {unnamed} of {tested} tested sweeps are of a material that their "
+            "fold is not trained on, so no method can name them; leave out another group"
+        )
+    found = repeats.pairs(sweeps)
+    shared = sum(len(found.across(*fold)) for fold in folds)
+    if shared:
+        yield (
+            f"warning: {text}: {shared} of {tested} tested sweeps are identical to a training "
+            "sweep or share frames with one, so even noise would be named rightly; give windows of "
+            "one recording the same number in the group recording"
+        )

@@ -1,0 +1,208 @@
+"""Uncertainty of answers: calibration error, and detection of materials that were not trained.
+
+All figures are of test sweeps that nothing was fitted to. Intervals are 95 %, from a bootstrap over
+the placements of the skin, since the errors of sweeps at one placement are correlated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.core.errors import FormatError
+from palpate.inference.classifier import softmax
+from palpate_train.calibration.novelty import auroc, embed
+from palpate_train.data.sets import Dataset
+from palpate_train.evaluate.evaluate import Where
+from palpate_train.evaluate.uncertainty_cases import NONE_LEFT_OUT, Case, Log, Trainings, cases
+from palpate_train.models import methods
+from palpate_train.models.methods import Effort
+from palpate_train.models.recipe.calibrate import Calibration
+
+Array = NDArray[Any]
+Json = dict[str, Any]
+BINS = 10
+"""Bins of the reliability diagram and of the calibration error."""
+LIMITS = (0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0)
+"""Multiples of the novelty limit at which the shares of kept and of passed sweeps are reported."""
+DRAWS = 500
+"""Draws of the bootstrap."""
+Trained = tuple[Case, Calibration]
+"""One training and its calibration."""
+
+
+def left_out(
+    train: Dataset,
+    test: Dataset,
+    method: str,
+    where: Where,
+    log: Log,
+    effort: Effort = methods.FULL_EFFORT,
+    seed: int = 1,
+) -> Json:
+    """Train without each material in turn; `unknown` of the sweeps of `test`.
+
+    Raises FormatError if the sets do not fit together, or if the method has no features to judge
+    novelty by.
+    """
+    plan = Trainings.of(train, test, "", seed)
+    wanted = [t for t in plan.tasks(method, effort, seed) if t.left_out != NONE_LEFT_OUT]
+    done = cases(wanted, plan.sweeps, where, log)
+    return unknown([(case, case.calibration()) for case in done], plan.sweeps.materials)
+
+
+def error(confidence: Array, right: Array) -> float:
+    """Expected calibration error (Naeini et al. 2015): mean over sweeps of |accuracy - probability|
+    of their bin."""
+    bins = reliability(confidence, right)
+    return float(
+        sum(b["n"] * abs(b["right"] - b["said"]) for b in bins) / max(sum(b["n"] for b in bins), 1)
+    )
+
+
+def reliability(confidence: Array, right: Array) -> list[Json]:
+    """For each non-empty bin of the highest probability [n]: its mean (`said`), the share of right
+    answers, and their number."""
+    which = np.minimum((confidence * BINS).astype(int), BINS - 1)
+    some = [(which == b) for b in range(BINS) if (which == b).any()]
+    return [
+        {
+            "said": round(float(confidence[i].mean()), 4),
+            "right": round(float(right[i].mean()), 4),
+            "n": int(i.sum()),
+        }
+        for i in some
+    ]
+
+
+def unknown(without: Sequence[Trained], materials: Sequence[str]) -> Json:
+    """Detection of a material that was left out of training.
+
+    Gives the AUROC of known test sweeps against those of the material, for several scores; the
+    share of known sweeps below the limit found in training, and of unknown sweeps that pass as
+    known; the same at multiples of the limit, and if a second sweep at the same placement must pass
+    as well.
+    """
+    materials_of: dict[str, Json] = {}
+    every: dict[str, list[float]] = {}
+    passed: list[Array] = []
+    for k in sorted({case.left_out for case, _ in without}):
+        held = [one for one in without if one[0].left_out == k]
+        known, places = np.concatenate([case.known() for case, _ in held]), placements(held)
+        scores = {
+            name: np.concatenate([score(case, done) for case, done in held])
+            for name, score in SCORES.items()
+        }
+        ours, labels = scores["distance"], joined(held, "labels")
+        materials_of[materials[k]] = _detection(ours, known, places)
+        twice = [
+            [_passed(ours, known, places, labels, factor, n) for n in (1, 2)] for factor in LIMITS
+        ]
+        passed.append(np.array(twice))
+        for name, row in scores.items():
+            every.setdefault(name, []).append(auroc(row[known], row[~known]))
+    mean = {
+        name: round(float(np.mean([row[name] for row in materials_of.values()])), 4)
+        for name in ("auroc", "kept", "false_known", "false_known_at_95")
+    }
+    means = {name: round(float(np.mean(values)), 4) for name, values in every.items()}
+    limits = [
+        {
+            "factor": factor,
+            "kept": one[0],
+            "false_known": one[1],
+            "kept_twice": two[0],
+            "false_known_twice": two[1],
+        }
+        for factor, (one, two) in zip(
+            LIMITS, np.mean(passed, axis=0).round(4).tolist(), strict=True
+        )
+    ]
+    return {"materials": materials_of, "mean": mean, "scores": means, "limits": limits}
+
+
+def _detection(scores: Array, known: Array, places: Array) -> Json:
+    """Figures of one material by its `scores` in units of the limit [n]. known: bool [n]."""
+    low, high = bootstrap(partial(_auroc_of, scores, known), places)
+    at = np.quantile(scores[known], 0.95)
+    return {
+        "auroc": round(auroc(scores[known], scores[~known]), 4),
+        "low": low,
+        "high": high,
+        "kept": round(float(np.mean(scores[known] <= 1)), 4),
+        "false_known": round(float(np.mean(scores[~known] <= 1)), 4),
+        "false_known_at_95": round(float(np.mean(scores[~known] <= at)), 4),
+        "known": int(known.sum()),
+        "unknown": int((~known).sum()),
+    }
+
+
+def _passed(
+    scores: Array, known: Array, places: Array, labels: Array, factor: float, n: int
+) -> tuple[float, float]:
+    """Shares of known and of unknown sweeps that pass `factor` times the limit together with the
+    next n - 1 sweeps of their material at their placement. The last sweeps of a placement have too
+    few successors and are left out."""
+    order = np.lexsort((labels, places))
+    here, fits = np.stack([places, labels])[:, order], (scores <= factor)[order]
+    size = len(order) - n + 1
+    whole = (here[:, :size] == here[:, n - 1 :]).all(axis=0)
+    all_fit = np.logical_and.reduce([fits[i : i + size] for i in range(n)])[whole]
+    is_known = known[order][:size][whole]
+    return float(all_fit[is_known].mean()), float(all_fit[~is_known].mean())
+
+
+def _auroc_of(scores: Array, known: Array, some: Array) -> float:
+    return auroc(scores[some][known[some]], scores[some][~known[some]])
+
+
+def _of_trunk(case: Case, done: Calibration) -> Array:
+    """Squared distance in the trained features alone; 0 for all sweeps if there are none."""
+    if not (size := case.seen.shape[2] - case.fixed):
+        return np.zeros(len(case.new))
+    return embed(case.seen[:, -1, :size], case.seen_labels, size).novelty(case.new[:, -1, :size])
+
+
+SCORES: dict[str, Callable[[Case, Calibration], Array]] = {
+    "distance": lambda case, done: done.embedding.novelty(case.new[:, -1]) / done.limit,
+    "distance, trained features only": _of_trunk,
+    "distance, where trained materials differ": lambda case, done: embed(
+        case.seen[:, -1], case.seen_labels
+    ).novelty(case.new[:, -1]),
+    "highest probability": lambda case, done: -softmax(done.logits(case.new[:, -1])).max(1),
+}
+"""Each score is larger for a sweep that is less like the training sweeps. The limits of folds
+differ, so the first score is in units of the limit."""
+
+
+def joined(held: Sequence[Trained], name: str) -> Array:
+    return np.concatenate([getattr(case, name) for case, _ in held])
+
+
+def placements(held: Sequence[Trained]) -> Array:
+    """The placement of the skin in each test sweep, numbered from 0."""
+    places: Array = np.unique(joined(held, "places"), return_inverse=True)[1]
+    return places
+
+
+def bootstrap(figure: Callable[[Array], float], clusters: Array) -> tuple[float, float]:
+    """The 95 % interval of `figure`, a function of sweep numbers, from a bootstrap of clusters
+    [n]."""
+    members = [np.flatnonzero(clusters == c) for c in np.unique(clusters)]
+    rng, drawn = np.random.default_rng(0), []
+    for _ in range(DRAWS):
+        with suppress(FormatError):  # a draw that lacks a kind of sweep has no figure
+            drawn.append(
+                figure(
+                    np.concatenate(
+                        [members[c] for c in rng.integers(len(members), size=len(members))]
+                    )
+                )
+            )
+    low, high = np.quantile(drawn, (0.025, 0.975)) if drawn else (0.0, 1.0)
+    return round(float(low), 4), round(float(high), 4)

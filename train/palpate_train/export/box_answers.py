@@ -1,0 +1,36 @@
+"""The answers of the box to sweeps, by the bundle that export makes of a trained model."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+from palpate.bundle import bundle
+from palpate.core.clock import SystemClock
+from palpate.core.provenance import commit
+from palpate.inference.classifier import Classifier
+from palpate_train.data.sets import Dataset
+from palpate_train.evaluate.fold import BoxAnswers
+from palpate_train.export import bundle_score
+from palpate_train.export.quantized_bundle import export
+from palpate_train.models.methods import Model
+from palpate_train.models.recipe.fitted import FittedModel, finished
+
+
+def answers(model: Model, sweeps: Dataset) -> BoxAnswers | None:
+    """The answers to `sweeps`, as `export` and `score` give them; None for a model that is not a
+    fit. Raises FormatError or BundleError if export refuses the model."""
+    if not isinstance(model, FittedModel):
+        return None
+    fit, own = model.fit, model.fit.train.materials
+    # names that any bundle may have: they change no answer
+    names = tuple(f"m{number}" for number in range(len(own)))
+    sides = {side: replace(getattr(fit, side), materials=names) for side in ("train", "held")}
+    with tempfile.TemporaryDirectory() as folder:
+        target = Path(folder) / "bundle"
+        export(finished(replace(fit, **sides)), target, "fold", "1", commit(), proven=False)
+        classifier = Classifier(bundle.load(target), SystemClock())
+        found, sure = bundle_score.labels_of(classifier, sweeps)
+    labels = [sweeps.materials.index(own[k]) if k >= 0 else int(k) for k in found]
+    return BoxAnswers.of(labels, sure)

@@ -1,0 +1,86 @@
+"""Answers of a bundle to corrupted sweeps, through the classifier of the box, as curves like those
+of robustness."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.core.errors import FormatError
+from palpate.core.types import Status
+from palpate.inference.classifier import Classifier
+from palpate_train.data.progress import Progress
+from palpate_train.data.sets import Dataset
+from palpate_train.evaluate import robustness
+from palpate_train.evaluate.corruptions import Corruption, applicable
+from palpate_train.evaluate.evaluation_sweeps import EvaluationSweeps
+from palpate_train.export import bundle_score
+
+Array = NDArray[Any]
+Json = dict[str, Any]
+ANSWERS = ("rightly", "wrongly", "unsure", "unknown", "refused", "network")
+"""The outcomes of a sweep: named with status ok, or one of three ways not to be named; and whether
+the network alone is right, whose most probable label counts without the checks of the box."""
+
+
+def under_corruptions(
+    box: Classifier,
+    test: EvaluationSweeps,
+    seeds: Sequence[int],
+    log: Callable[[str], None] = lambda line: None,
+    corruptions: Sequence[Corruption] | None = None,
+) -> Json:
+    """Curves by answer (ANSWERS) and corruption, see robustness.merge; those of `falls` are of the
+    sweeps named rightly.
+
+    seeds: of the corruptions. corruptions: None for all that apply. Raises FormatError if the
+    sweeps are not of the bundle's format, or have a material that it lacks.
+    """
+    manifest, sweeps = box.bundle.manifest, test.sweeps
+    lacking = sorted({sweeps.materials[k] for k in np.unique(sweeps.labels)} - set(manifest.labels))
+    if sweeps.format != manifest.format or lacking:
+        raise FormatError(
+            f"bundle {box.bundle.id} "
+            f"({manifest.format}{', without ' * bool(lacking)}{', '.join(lacking)}) "
+            f"cannot answer {sweeps.source} ({sweeps.format}); name another with --bundle"
+        )
+    clean, tasks = answers(box, sweeps), []
+    corruptions = applicable(test) if corruptions is None else corruptions
+    progress = Progress(len(seeds) * len(corruptions), log)
+    for seed in seeds:
+        trials = {answer: robustness.CorruptionCounts(test) for answer in ANSWERS}
+        for corruption in corruptions:
+            progress.begin(f"{corruption.name} as the box answers, seed {seed}")
+            found = [clean]
+            for severity in corruption.severities[1:]:
+                samples = corruption.apply(test, severity, seed)
+                lost = round(severity * sweeps.format.window) * (corruption.name == "lost")
+                found.append(answers(box, replace(sweeps, samples=samples), lost))
+            for answer, counted in trials.items():
+                counted.add(corruption, [(given[answer], 0) for given in found])
+        tasks += [counted.task(answer, seed) for answer, counted in trials.items()]
+    return {name: entry["curves"] for name, entry in robustness.merge(tasks)["methods"].items()}
+
+
+def answers(box: Classifier, sweeps: Dataset, lost: int = 0) -> dict[str, Array]:
+    """The sweeps that get each of ANSWERS, bool [N] each; every sweep gets exactly one of the first
+    five. lost: frames of each sweep that never arrived."""
+    given = {answer: np.zeros(len(sweeps), bool) for answer in ANSWERS}
+    labels = box.bundle.manifest.labels
+    for i, verdict in bundle_score.verdicts(box, sweeps, lost=lost):
+        truth = sweeps.materials[sweeps.labels[i]]
+        if verdict.status is Status.OK:
+            answer = "rightly" if verdict.label == truth else "wrongly"
+        else:
+            answer = (
+                str(verdict.status)
+                if verdict.status in (Status.UNSURE, Status.UNKNOWN)
+                else "refused"
+            )
+        given[answer][i] = True
+        given["network"][i] = labels[int(box.logits(sweeps.samples[i]).argmax())] == truth
+    return given

@@ -1,0 +1,232 @@
+"""The cost of a packed model on this machine: time, size and memory.
+
+Run by its path, this file is also the separate process in which the memory of a model is read. It
+therefore imports at its top only packages that the box has.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import palpate
+from palpate.core.errors import BundleError
+
+Array = NDArray[Any]
+Call = Callable[[Array], Any]
+ROUNDS, BLOCK = 60, 6
+"""Number of rounds, and of sweeps of a model in a round. One more sweep before them is not counted,
+because the model before it has emptied the caches."""
+TIMED_SWEEPS = 60
+"""Approximate number of different sweeps, spread evenly over the given sweeps."""
+SWEEPS_BEFORE_MEMORY = 20
+"""Number of sweeps that a process answers before its memory is read."""
+MODEL, TORCH, AEON = "model.onnx", "model.pt", "model.npz"
+"""The model's file in a bundle, as TorchScript, and as aeon's parameters."""
+DESKTOP = ("torch", "sklearn", "scipy", "aeon", "numba", "onnx", "train")
+"""Packages that the box never has."""
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """The cost of a packed model on this machine.
+
+    ms_p50, ms_p99: processor time in ms of one sweep through the box's classifier, with its checks
+    and features, in one thread; for a model in its own library, of its logits. model_bytes: of the
+    model's file. bundle_bytes: of all files, golden sweeps included. rss_mib: resident memory
+    (VmRSS) in MiB of a separate process that has loaded the model and answered SWEEPS_BEFORE_MEMORY
+    sweeps. foreign: packages in that process that the box does not have.
+    """
+
+    ms_p50: float
+    ms_p99: float
+    model_bytes: int
+    bundle_bytes: int
+    rss_mib: float
+    foreign: tuple[str, ...] = ()
+
+    @property
+    def model_kb(self) -> float:
+        """Size of the model's file in units of 1000 bytes."""
+        return round(self.model_bytes / 1000, 2)
+
+    @property
+    def bundle_kb(self) -> float:
+        """Size of all files in units of 1000 bytes."""
+        return round(self.bundle_bytes / 1000, 2)
+
+
+def measure_all(folders: Sequence[Path], sweeps: Array, rounds: int = ROUNDS) -> list[Measurement]:
+    """The Measurement of the model in each of `folders`, in their order; all are timed in turns.
+
+    sweeps: raw counts [n, T, R, C], in the format of all models. Raises BundleError if a model does
+    not run.
+    """
+    some = sweeps[:: max(len(sweeps) // TIMED_SWEEPS, 1)]
+    took = timed({str(folder): load(folder) for folder in folders}, some, rounds)
+    return [_measurement(folder, took[str(folder)], memory(folder, some)) for folder in folders]
+
+
+def _measurement(folder: Path, took_ms: Array, process: Mapping[str, Any]) -> Measurement:
+    model, whole = sizes(folder)
+    p50, p99 = (round(float(np.percentile(took_ms, q)), 4) for q in (50, 99))
+    return Measurement(p50, p99, model, whole, process["rss_mib"], tuple(process["foreign"]))
+
+
+def sizes(folder: Path) -> tuple[int, int]:
+    """Bytes of the model's file, and of all files in its folder."""
+    files = {file.name: file.stat().st_size for file in folder.iterdir()}
+    return next(files[name] for name in (MODEL, TORCH, AEON) if name in files), sum(files.values())
+
+
+def timed(
+    calls: Mapping[str, Call], sweeps: Array, rounds: int = ROUNDS, block: int = BLOCK
+) -> dict[str, Array]:
+    """Times in ms [rounds * block] of each call with `sweeps` [n, T, R, C] one by one, by name.
+
+    All calls take turns, a block each, and every round begins with another call, so a slow machine
+    slows all of them alike. The time is processor time of one thread: in real time, slow models
+    would be interrupted by other programs and quick ones would not.
+    """
+    # here: it imports torch, which the process of `memory` must not load
+    from palpate_train.models.training import one_thread
+
+    names, took = list(calls), {name: np.empty(rounds * block) for name in calls}
+    with one_thread():
+        for turn in range(rounds):
+            for name in np.roll(names, -turn).tolist():
+                call = calls[name]
+                call(sweeps[turn % len(sweeps)])
+                for i in range(turn * block, (turn + 1) * block):
+                    counts = sweeps[i % len(sweeps)]
+                    start = time.process_time_ns()
+                    call(counts)
+                    took[name][i] = (time.process_time_ns() - start) / 1e6
+    return took
+
+
+def memory(folder: Path, sweeps: Array) -> dict[str, Any]:
+    """`rss_mib` of a fresh process that has loaded the model in `folder` and answered some of
+    `sweeps`, and the `foreign` packages there.
+
+    Raises BundleError if the model does not run in a process of its own.
+    """
+    with tempfile.TemporaryDirectory() as aside:
+        path = Path(aside) / "sweeps.npy"
+        np.save(path, sweeps[:SWEEPS_BEFORE_MEMORY])
+        # -P: the modules beside this file do not hide packages of their names
+        command = [sys.executable, "-P", __file__, str(folder), str(path)]
+        env = os.environ | dict.fromkeys(
+            ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
+        )
+        env |= {"PYTHONPATH": str(Path(palpate.__file__).parents[1])}
+        done = subprocess.run(command, capture_output=True, text=True, check=False, env=env)
+    if done.returncode:
+        raise BundleError(
+            f"the model in {folder} does not run in a process of its own: "
+            f"{done.stderr.strip()[-300:]}; pack it again"
+        )
+    found: dict[str, Any] = json.loads(done.stdout)
+    return found
+
+
+def load(folder: Path) -> Call:
+    """A function that answers raw counts [T, R, C]: the box's classifier for a bundle, else the
+    model in its own library.
+
+    Raises BundleError for an incomplete bundle, and ImportError if the model's own library is
+    missing.
+    """
+    if (folder / TORCH).is_file():
+        return _torch(folder / TORCH)
+    if (folder / AEON).is_file():
+        return _aeon(folder / AEON)
+    return _classifier(folder)
+
+
+def _classifier(folder: Path) -> Call:
+    """The box's classifier, which gets one sound sweep after another, each of another object."""
+    # here: a model in its own library runs without the box's code
+    from palpate.bundle import bundle
+    from palpate.core.clock import SystemClock
+    from palpate.core.types import Frames, Status, Sweep
+    from palpate.inference.classifier import Classifier
+
+    classifier = Classifier(bundle.load(folder), SystemClock())
+    format = classifier.bundle.format
+    seq = np.arange(format.window)
+    t_ns = (seq * format.period_ns).astype(np.int64)
+
+    def answer(counts: Array) -> Any:
+        return classifier(Sweep(0, 0, int(t_ns[-1]), Status.OK, Frames(t_ns, seq, counts)))
+
+    return answer
+
+
+def _torch(path: Path) -> Call:
+    import torch
+
+    with warnings.catch_warnings():
+        # of TorchScript, which is read without our code
+        warnings.simplefilter("ignore", DeprecationWarning)
+        network = torch.jit.load(path)
+
+    def answer(counts: Array) -> Any:
+        with torch.inference_mode():
+            return network(torch.from_numpy(counts[None])).numpy()[0]
+
+    return answer
+
+
+def _aeon(path: Path) -> Call:
+    from aeon.transformations.collection.convolution_based import MiniRocket
+
+    with np.load(path, allow_pickle=False) as z:
+        parameters, silence, weight, bias = (
+            tuple(z[f"p{i}"] for i in range(5)),
+            z["silence"],
+            z["weight"],
+            z["bias"],
+        )
+    features, before = MiniRocket(n_jobs=1), np.random.get_state()
+    features.fit(silence)  # it needs the shape of a sweep; its result is replaced
+    np.random.set_state(before)
+    features.parameters = parameters
+
+    def answer(counts: Array) -> Any:
+        series = np.ascontiguousarray(
+            counts.reshape(1, len(counts), -1).transpose(0, 2, 1), np.float32
+        )
+        return weight @ features.transform(series)[0] + bias
+
+    return answer
+
+
+def main(folder: str, sweeps: str) -> None:
+    """Answer some sweeps, and print the resident memory in MiB and the loaded packages of the
+    desktop as JSON."""
+    answer = load(Path(folder))
+    counts = np.load(sweeps)
+    for i in range(SWEEPS_BEFORE_MEMORY):
+        answer(counts[i % len(counts)])
+    resident = re.search(r"VmRSS:\s+(\d+) kB", Path(f"/proc/{os.getpid()}/status").read_text())
+    assert resident
+    foreign = sorted({name.split(".")[0] for name in sys.modules} & set(DESKTOP))
+    print(json.dumps({"rss_mib": round(int(resident[1]) / 1024, 1), "foreign": foreign}))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

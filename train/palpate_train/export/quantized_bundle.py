@@ -1,0 +1,288 @@
+"""A fit as a bundle in int8, or in float if its int8 model does not answer as the float model
+does."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+from numpy.typing import NDArray
+
+from palpate.bundle import bundle
+from palpate.core.errors import FormatError
+from palpate.core.storage import put
+from palpate_train.calibration import novelty
+from palpate_train.calibration.contact import Contacts
+from palpate_train.calibration.novelty import Embedding
+from palpate_train.calibration.nuisances import Space
+from palpate_train.data.sets import Dataset
+from palpate_train.export import nuisances
+from palpate_train.export.bundle_graph import bundle_graph
+from palpate_train.export.pack import Content, ExportRefused, pack
+from palpate_train.metrics.score import provenance
+from palpate_train.models.methods import model_inputs
+from palpate_train.models.recipe.calibrate import Calibration, CalibrationInputs
+from palpate_train.models.recipe.fitted import Fit, calibration_inputs, finished
+from palpate_train.onnx_tools import parity
+from palpate_train.onnx_tools.graph_builder import run, with_head
+from palpate_train.onnx_tools.parity import Parity
+
+Array = NDArray[Any]
+MOST_TORCH_DIFFERENCE = 0.01
+"""Largest difference of a logit between PyTorch and the float graph, which add the same numbers in
+another order."""
+MOST_LOST = 0.005
+"""Largest loss of accuracy on held-out sweeps by int8: as expected from float's probabilities
+(AnswerDifference.expected_loss), for any number of sweeps; and as counted, if that is significant.
+Counting alone is not enough: two uncertain sweeps of a hundred that change their label are two
+points lost or won."""
+CHANCE = 0.05
+"""Level of significance of the one-sided sign test on the sweeps on which both precisions differ,
+that int8 is not worse. The counted loss is used only if the probability is below it."""
+LEAST_AGREEMENT, MOST_PROBABILITY_DIFFERENCE, MOST_MEAN_DIFFERENCE = 0.96, 0.3, 0.025
+"""Least share of held-out sweeps with equal labels, of which one may always differ; largest change
+of a probability, and largest mean change. The worst of 14 fits of four sizes to five sets had
+0.974, 0.199 and 0.015."""
+
+SATURATED = 0.01
+"""A tensor with a larger share of values beyond the range of int8 is named as the cause, although
+the noise grows with every later layer."""
+
+
+def export(
+    fit: Fit,
+    target: Path,
+    name: str,
+    version: str,
+    commit: str,
+    full_scale: float | None = None,
+    pitch_mm: float | None = None,
+    proven: bool = True,
+) -> bundle.Manifest:
+    """Quantize `fit`, compare its precisions, and pack it; see pack.pack.
+
+    If int8 differs too much, the bundle holds the float model, whose trunk is calibrated for that,
+    and `made` says why. Raises FormatError if nothing was held out to judge the bundle by, and
+    ExportRefused if another check fails.
+    """
+    if fit.about["held_out_by"] == "nothing":
+        raise FormatError(fit.uncalibrated)
+    (reference, model), about = graphs(fit), fit.about
+    if fit.architecture.channels:
+        about = about | {"torch_difference": _torch_difference(fit, reference)}
+    content = Content(
+        model, "raw", fit.train, fit.held, about["held_out_by"], about, contacts=fit.contacts
+    )
+    try:
+        content = checked(content, reference)
+    except ExportRefused as e:
+        content = replace(content, model=reference, about=about | {"float_because": str(e)})
+        fit = finished(fit.in_float())
+    return pack(
+        _calibrated(content, fit, pitch_mm),
+        target,
+        name,
+        version,
+        commit,
+        full_scale,
+        pitch_mm,
+        proven,
+    )
+
+
+def _calibrated(content: Content, fit: Fit, pitch_mm: float | None) -> Content:
+    """`content` with the calibration of `fit`, if it has one: heads, early answers, novelty, and
+    the figures of heads that did not see the held-out sweeps. The rule for displaced contacts needs
+    contact positions, and these need the distance between taxels."""
+    calibration = fit.calibration
+    if calibration is None:
+        return content
+    if not (fit.contacts and fit.contacts.positions(pitch_mm)):
+        calibration = replace(calibration, displacement=None)
+    rule = calibration.rule
+    early = {"share": rule.share, "lost": rule.lost, "n": rule.n} if rule.early else rule.why
+    figures = fit.held_out_figures()
+    prefixes = fit.trunk(prefixes=True) if rule.early else None
+    content, given = replace(content, known=calibration.known()), calibration_inputs(fit)
+    apart = _unseen(given, calibration)
+    found = _widened(fit, given, apart.embedding, calibration.embedding)
+    classes = [apart.classes(), calibration.classes()]
+    if found:
+        known = replace(calibration.known(), limit=found.limit)
+        content = replace(content, known=known, disturbances=found.disturbances)
+        wider = zip(classes, found.shapes, found.changes, strict=True)
+        classes = [replace(of, shapes=shapes, changes=moved) for of, shapes, moved in wider]
+        figures |= {nuisances.FIGURES: found.figures}
+    return replace(
+        content,
+        unseen=replace(
+            content,
+            model=bundle_graph(apart, fit.trunk()),
+            classes=classes[0],
+        ),
+        model=bundle_graph(calibration, fit.trunk(), prefixes),
+        early=rule.early,
+        displacement=calibration.displacement_rule(),
+        classes=classes[1],
+        about=content.about | {"early": early},
+        figures=content.figures | figures,
+    )
+
+
+def _widened(
+    fit: Fit, given: CalibrationInputs, apart: Embedding, whole: Embedding
+) -> nuisances.Widened | None:
+    """Shapes of known materials that know how altered sweeps differ, and their limit; see
+    nuisances. apart: an embedding that did not see the held-out sweeps."""
+    trunk, spaces = fit.trunk(), map(Space.of, (apart, whole))
+    seed = int(fit.about["seed"])
+    contacts, shape = fit.contacts or Contacts.of(fit.train), fit.train.format.shape
+    known = contacts.limit.known_tare()
+    found = nuisances.measure(
+        lambda samples: run(trunk, samples),
+        fit.train,
+        fit.held,
+        *spaces,
+        tare=np.array(known).reshape(shape) if known else np.zeros(shape),
+        seed=seed,
+    )
+    return found and replace(found, limit=nuisances.limit_of_conditions(found, given))
+
+
+def _unseen(given: CalibrationInputs, calibration: Calibration) -> Calibration:
+    """`calibration` with a head and an embedding that did not see the groups of the held-out
+    sweeps."""
+    seen = ~np.isin(given.groups, given.groups[given.held])
+    weight, bias = given.naming_head(seen)
+    return replace(
+        calibration,
+        embedding=novelty.in_two_views(given.whole[seen], given.labels[seen], given.fixed),
+        weight=weight / calibration.temperature,
+        bias=bias / calibration.temperature,
+    )
+
+
+def _torch_difference(fit: Fit, reference: onnx.ModelProto) -> float:
+    """The largest difference of a logit between stages in PyTorch and the float graph; the other
+    features exist in the graph alone. Raises ExportRefused above MOST_TORCH_DIFFERENCE."""
+    # here: a fit without trained stages is exported without PyTorch
+    import torch
+
+    from palpate_train.models.recipe.stages import network_of
+
+    network, counts = network_of(fit), torch.from_numpy(fit.held.samples.astype(np.float32))
+    features = run(fit.trunk(int8=False), fit.held.samples)
+    with torch.no_grad():
+        features[:, : sum(fit.architecture.channels)] = network.features(network.prepare(counts))
+    wanted = features @ fit.weights["head.weight"].T + fit.weights["head.bias"]
+    difference = float(np.abs(wanted - parity.logits(reference, fit.held.samples)).max())
+    if not difference <= MOST_TORCH_DIFFERENCE:
+        raise ExportRefused(
+            f"the float graph differs from pytorch by {difference:.3g} in a logit (limit "
+            f"{MOST_TORCH_DIFFERENCE}); "
+            "fit again; if it stays, compare models/recipe/graph.py with stages.py"
+        )
+    return difference
+
+
+def graphs(fit: Fit) -> tuple[onnx.ModelProto, onnx.ModelProto]:
+    """(float, int8): `sweep` -> `logits`, each with a head fitted to the features of its own
+    trunk."""
+    reference = with_head(
+        fit.trunk(int8=False), fit.weights["head.weight"], fit.weights["head.bias"]
+    )
+    return reference, with_head(fit.trunk(), *fit.int8_head())
+
+
+def checked(content: Content, reference: onnx.ModelProto | None) -> Content:
+    """`content`, whose model is int8, with a comparison with the float model `reference`; unchanged
+    if that is None. Raises ExportRefused as `check`."""
+    if reference is None:
+        return content
+    held_out = content.held_out
+    found = parity.measure(
+        content.model,
+        model_inputs(content.input, held_out),
+        held_out.labels,
+        reference,
+        held_out.group(content.held_out_by),
+    )
+    check(found)
+    return replace(content, figures=content.figures | {"parity": found.summary()})
+
+
+def check(found: Parity) -> None:
+    """Raises ExportRefused, with the number, its limit and a remedy, if int8 differs too much from
+    float."""
+    apart, lost = found.answers, found.accuracy
+    if apart is None or lost is None:
+        raise ExportRefused("there is no float form that int8 could be compared with; export a fit")
+    hint = "drop training sweeps that are unlike all others, or record more"
+    if found.layers:
+        worst = min(found.layers, key=lambda layer: (layer.saturated < SATURATED, layer.sqnr_db))
+        hint = (
+            f"{worst.tensor} suffers most ({worst.sqnr_db:.0f} dB, {worst.saturated:.1%} beyond "
+            "what int8 reaches; "
+            f"see palpate-train parity): {hint}"
+        )
+    if lost.lost > MOST_LOST and lost.chance < CHANCE:
+        raise ExportRefused(
+            f"int8 is right on {lost.int8_right} of {lost.total} held-out sweeps, float on "
+            f"{lost.float_right}: "
+            f"{100 * lost.lost:.2f} points lost (limit {100 * MOST_LOST}); {hint}"
+        )
+    expected, largest, mean = (
+        apart.expected_loss,
+        apart.probability_difference,
+        apart.probability_mean,
+    )
+    if not expected <= MOST_LOST:
+        raise ExportRefused(
+            f"int8 loses {100 * expected:.2f} points on held-out sweeps, by float's own "
+            "probabilities "
+            f"(limit {100 * MOST_LOST}); {hint}"
+        )
+    if not (largest <= MOST_PROBABILITY_DIFFERENCE and mean <= MOST_MEAN_DIFFERENCE):
+        raise ExportRefused(
+            f"int8 moves a probability of held-out sweeps by up to {largest:.3f} (limit "
+            f"{MOST_PROBABILITY_DIFFERENCE}), "
+            f"by {mean:.3f} on average (limit {MOST_MEAN_DIFFERENCE}); {hint}"
+        )
+    if round(lost.total * (1 - apart.agreement)) > max(1, (1 - LEAST_AGREEMENT) * lost.total):
+        raise ExportRefused(
+            f"int8 agrees with float on {apart.agreement:.3f} of {lost.total} held-out sweeps "
+            f"(limit {LEAST_AGREEMENT}); {hint}"
+        )
+
+
+def compared(source: Path, sweeps: Dataset, file: Path | None = None) -> str:
+    """The table of float against int8 on `sweeps`. source: a fit, or a bundle, which has no float
+    model. file: for JSON.
+
+    Raises FormatError if formats or materials differ, or if nothing is in int8.
+    """
+    if source.is_dir():
+        loaded = bundle.load(source)
+        format, materials = loaded.format, loaded.manifest.labels
+        model, reference, kind = onnx.load_from_string(loaded.model), None, loaded.manifest.input
+    else:
+        made = Fit.load(source)
+        format, materials, kind = made.train.format, made.train.materials, "raw"
+        reference, model = graphs(made)
+    if (format, materials) != (sweeps.format, sweeps.materials):
+        raise FormatError(
+            f"{source.name} is of {format} and {', '.join(materials)}; {sweeps.source} of "
+            f"{sweeps.format} and "
+            f"{', '.join(sweeps.materials)}: name a set of the same kind"
+        )
+    found = parity.measure(
+        model, model_inputs(kind, sweeps), sweeps.labels, reference, sweeps.group("recording")
+    )
+    if file:
+        result = {"model": source.name, "set": sweeps.source} | found.json() | provenance()
+        put(file, (json.dumps(result, indent=1) + "\n").encode(), parents=True)
+    return parity.table(found)

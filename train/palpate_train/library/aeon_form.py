@@ -1,0 +1,61 @@
+"""Our recipe as a classifier of aeon, for its pipelines, ensembles and benchmarks. Needs aeon, the
+extra `minirocket`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from aeon.classification.base import BaseClassifier
+from numpy.typing import NDArray
+
+from palpate_train.library.estimator import PalpateClassifier
+
+Array = NDArray[Any]
+
+
+class AeonPalpateClassifier(BaseClassifier):  # type: ignore[misc]  # aeon has no types
+    """PalpateClassifier with aeon's base class, without groups. X: [n, channels, time] of sweeps of
+    equal length. The parameters are those of PalpateClassifier.
+
+    After `fit`: palpate_ (the fitted PalpateClassifier).
+    """
+
+    _tags = {  # noqa: RUF012  # aeon's name and form
+        "X_inner_type": "numpy3D",
+        "capability:multivariate": True,
+        "algorithm_type": "feature",
+    }
+
+    def __init__(
+        self,
+        rate_hz: float = 100.0,
+        grid: tuple[int, ...] | None = None,
+        reattached: bool = False,
+        mains_hz: float = 50.0,
+        steps: int = 600,
+        size: str | None = None,
+        random_state: int = 0,
+    ) -> None:
+        self.rate_hz = rate_hz
+        self.grid = grid
+        self.reattached = reattached
+        self.mains_hz = mains_hz
+        self.steps = steps
+        self.size = size
+        self.random_state = random_state
+        super().__init__()
+
+    def _fit(self, X: Array, y: Array) -> AeonPalpateClassifier:
+        self.palpate_ = PalpateClassifier(**self.get_params()).fit(X, y)
+        return self
+
+    def _predict(self, X: Array) -> Array:
+        return self.palpate_.predict(X)
+
+    def _predict_proba(self, X: Array) -> Array:
+        return self.palpate_.predict_proba(X)
+
+    @classmethod
+    def _get_test_params(cls, parameter_set: str = "default") -> dict[str, Any]:
+        """Parameters of a fit that takes seconds, for aeon's own checks."""
+        return {"steps": 0, "size": "64"}

@@ -1,0 +1,122 @@
+"""Counts of right answers, with 95 % intervals, as figures for results."""
+
+from __future__ import annotations
+
+import os
+import platform
+import time
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.bundle import bundle
+from palpate.core.provenance import commit
+from palpate.core.statistics import wilson
+from palpate.inference.classifier import LEAST_PROBABILITY, softmax
+
+Array = NDArray[Any]
+DRAWS = 2000
+"""Number of draws of the bootstrap."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """`right` of `total` answers are right."""
+
+    right: int
+    total: int
+
+    @classmethod
+    def of(cls, right: Array) -> Score:
+        """The score of answers that are right or wrong, bool [n]."""
+        return cls(int(right.sum()), len(right))
+
+    def json(self) -> dict[str, int]:
+        """The entry of a result file, as scripts read it."""
+        return {"right": self.right, "total": self.total}
+
+
+def interval(right: Array, clusters: Array | None = None) -> tuple[float, float]:
+    """The 95 % interval of the share of `right` [n] (booleans, or shares over seeds).
+
+    Without `clusters` it is Wilson's interval. Sweeps of one cluster (numbers [n], such as
+    positions) succeed or fail together; then it is the wider of Wilson's interval and that of the
+    cluster bootstrap (percentiles of DRAWS draws). The bootstrap alone is too narrow if there are
+    few clusters or all answers are right.
+    """
+    low, high = widen(wilson(float(right.sum()), len(right)), right, clusters)
+    return round(float(max(low, 0.0)), 4), round(float(min(high, 1.0)), 4)
+
+
+def widen(
+    bounds: tuple[float, float], values: Array, clusters: Array | None
+) -> tuple[float, float]:
+    """The interval `bounds` of the mean of `values` [n], extended to the interval of the bootstrap
+    over `clusters` [n].
+
+    The bootstrap's interval is from 2.5 to 97.5 % of DRAWS draws. Without clusters, `bounds` are
+    returned unchanged.
+    """
+    if clusters is None:
+        return bounds
+    member = np.unique(clusters, return_inverse=True)[1]
+    sums, size = np.bincount(member, values), np.bincount(member)
+    drawn = np.random.default_rng(0).integers(len(size), size=(DRAWS, len(size)))
+    means = sums[drawn].sum(1) / size[drawn].sum(1)
+    return min(bounds[0], float(np.quantile(means, 0.025))), max(
+        bounds[1], float(np.quantile(means, 0.975))
+    )
+
+
+def confusion(labels: Array, scores: Array) -> Array:
+    """Counts int64 [K, K], rows by `labels` [n], columns by the largest of `scores` [n, K]."""
+    counts = np.zeros((scores.shape[1],) * 2, np.int64)
+    np.add.at(counts, (labels, scores.argmax(1)), 1)
+    return counts
+
+
+def row_shares(counts: Array) -> Array:
+    """Each row of `counts` [K, K] divided by its sum; a row of zeros stays."""
+    shares: Array = counts / np.maximum(counts.sum(1, keepdims=True), 1)
+    return shares
+
+
+def fuse(logits: Array, together: Array) -> tuple[Array, Array]:
+    """Fuse the sweeps that have the same value in `together` [n].
+
+    Returns log scores [G, K], the logarithm of the product of the probabilities of `logits` [n, K],
+    and the number [G] of the first sweep of each value.
+    """
+    _, first, member = np.unique(together, return_index=True, return_inverse=True)
+    scores = np.zeros((len(first), logits.shape[1]))
+    np.add.at(scores, member, np.log(np.maximum(softmax(logits), LEAST_PROBABILITY)))
+    return scores, first
+
+
+def accuracy_figure(right: int, n: int) -> dict[str, Any]:
+    """The accuracy of `right` of `n` with its 95 % Wilson interval, as a manifest holds it."""
+    low, high = wilson(right, n)
+    return {"accuracy": round(right / n, 4), "n": n, "low": round(low, 4), "high": round(high, 4)}
+
+
+@cache
+def provenance() -> dict[str, str]:
+    """The origin that a result file records beside its sets and seeds. shipped: the id of the
+    packaged bundle.
+
+    Cached at the first call, because the commit and the day may change during a long run.
+    """
+    return {
+        "commit": commit(),
+        "shipped": shipped(),
+        "date": time.strftime("%Y-%m-%d", time.gmtime()),
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+    }
+
+
+def shipped() -> str:
+    """The id of the packaged bundle, as the box prints it."""
+    return bundle.identity((bundle.DEFAULT / "manifest.json").read_bytes())

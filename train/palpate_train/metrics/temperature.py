@@ -1,0 +1,95 @@
+"""Temperature scaling: the divisor of logits that makes their softmax a calibrated probability.
+
+All functions take logits [n, K] of sweeps that the head did not see, with their labels [n], and
+return a temperature. They differ in how they treat the little that held-out sweeps can show:
+
+- `platt_temperature`: the most likely temperature, with Platt's correction. For a head that is
+  judged by few held-out sweeps: all may be right, which would otherwise allow any confidence.
+- `weighted_platt_temperature`: the same with a weight for each sweep, continuous and in both
+  directions. For comparing candidates, whose logits have no natural size.
+- `sufficient_temperature`: the lowest temperature that held-out sweeps do not contradict. For heads
+  in a bundle: it never makes a calibrated head less confident.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+
+from palpate.inference.classifier import LEAST_PROBABILITY, softmax
+
+Array = NDArray[Any]
+TEMPERATURES = np.geomspace(1, 100, 200)
+"""Candidates of `platt_temperature` and `sufficient_temperature`. Posteriors of LDA (temperature 1)
+are never underconfident; at 100 they are almost uniform."""
+LOG_TEMPERATURES = (-6, 4)
+"""Range that `weighted_platt_temperature` searches."""
+SLACK = 0.5
+"""Standard errors by which the log loss of `sufficient_temperature` may exceed the smallest loss.
+With 0, four of fourteen calibrated heads got worse by more than 0.1 percentage points (simulated,
+seeds 301 to 316). With 1, heads judged by four positions stay overconfident."""
+TINY = 1e-12
+
+
+def platt_temperature(logits: Array, labels: Array) -> float:
+    """The element of TEMPERATURES with the highest likelihood of `labels`.
+
+    Each label counts as right with probability (n + 1) / (n + 2) (Platt 1999). Without this
+    correction a few held-out sweeps, all right, would allow any confidence.
+    """
+    wrong = 1 / (len(labels) + 2)
+    costs = []
+    for t in TEMPERATURES:
+        z = logits / t
+        z = z - z.max(axis=1, keepdims=True)
+        log_p = z - np.log(np.exp(z).sum(axis=1, keepdims=True))
+        right = log_p[np.arange(len(labels)), labels]
+        costs.append(-np.mean((1 - wrong) * right + wrong * log_p.mean(axis=1)))
+    return float(TEMPERATURES[np.argmin(costs)])
+
+
+def weighted_platt_temperature(logits: Array, labels: Array, weights: Array) -> float:
+    """The temperature with the lowest cross entropy, with Platt's correction as above and the
+    `weights` [n] of the sweeps, which sum to 1. It may be below 1."""
+    wrong = 1 / (len(labels) + 2)
+
+    def cost(log_temperature: float) -> float:
+        p = np.log(np.maximum(softmax(logits / np.exp(log_temperature)), TINY))
+        right = p[np.arange(len(p)), labels]
+        return float(-weights @ ((1 - wrong) * right + wrong * p.mean(axis=1)))
+
+    return float(np.exp(minimize_scalar(cost, bounds=LOG_TEMPERATURES).x))
+
+
+def sufficient_temperature(logits: Array, labels: Array, groups: Array) -> float:
+    """The lowest of TEMPERATURES whose log loss is within SLACK standard errors of the smallest
+    loss, after the rule of one standard error (Breiman et al. 1984).
+
+    The standard error is that of a mean over `groups` [n], because sweeps of a group are right or
+    wrong together; with a single group it is that of a mean over sweeps. Platt's correction is left
+    out: the logits of a good head are so large that its assumed share of wrong labels would
+    outweigh all sweeps, and the temperature would be three times too high.
+    """
+    if len(np.unique(groups)) < 2:
+        groups = np.arange(len(labels))
+    member = np.unique(groups, return_inverse=True)[1]
+    size = np.bincount(member)
+    losses = np.stack([_log_losses(logits / t, labels) for t in TEMPERATURES])
+    best = losses[losses.mean(axis=1).argmin()]
+    for temperature, loss in zip(TEMPERATURES, losses, strict=True):
+        worse = loss - best
+        spread = np.bincount(member, worse) - size * worse.mean()
+        error = np.sqrt((spread**2).sum() * len(size) / max(len(size) - 1, 1)) / len(labels)
+        if worse.mean() <= SLACK * error:
+            return float(temperature)
+    raise AssertionError("the best temperature is within an error of itself")
+
+
+def _log_losses(logits: Array, labels: Array) -> Array:
+    """Log loss [n] of each sweep."""
+    p = softmax(logits)[np.arange(len(labels)), labels]
+    losses: Array = -np.log(np.maximum(p, LEAST_PROBABILITY))
+    return losses

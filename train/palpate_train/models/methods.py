@@ -1,0 +1,197 @@
+"""All methods that name a material, behind one interface, by name.
+
+A model classifies many sweeps at once on the desktop. Its ONNX graph gives the same answers on the
+box.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Protocol
+
+import numpy as np
+import onnx
+from numpy.typing import NDArray
+
+from palpate.core.errors import FormatError
+from palpate.signal import features
+from palpate_train.data.progress import spoken as spoken  # for trainings
+from palpate_train.data.sets import Dataset
+from palpate_train.features import kinds
+
+Array = NDArray[Any]
+Log = Callable[[str], None]
+"""Shows a line of progress."""
+Cost = list[tuple[int, float]]
+"""(iteration, cross entropy of its batch), eq. 11 of the paper and its Fig. 9."""
+SHIPPED = "palpate"
+"""The method of `palpate-train fit`."""
+PACKAGED = "palpate-reattached"
+"""The method of `fit --reattached`, which made the packaged bundle."""
+MODULES = (
+    "palpate_train.models.peers.baselines",
+    "palpate_train.models.peers.prior_work",
+    "palpate_train.models.peers.sthmp",
+    "palpate_train.models.peers.minirocket",
+    "palpate_train.models.peers.minirocket_augmented",
+    "palpate_train.models.peers.aeon_peers",
+    "palpate_train.models.peers.ds_cnn",
+    "palpate_train.models.peers.lite",
+    "palpate_train.models.peers.edge_spectral",
+    "palpate_train.models.recipe.palpate",
+    "palpate_train.models.peers.paper_cnn",
+    "palpate_train.models.peers.recurrent",
+)
+"""Each defines METHODS, and methods(effort) if it trains networks."""
+
+
+@dataclass(frozen=True)
+class SkinUse:
+    """The use of the skin, as the user of `palpate-train fit` states it; our family trains for it.
+
+    reattached: the skin will be taken off and put back after the recordings; all heads then see
+    augmented copies. mains_hz: frequency of the mains, to whose hum features do not respond.
+    displaced, stretch: of recipe.augment.Augmentation; None for its default.
+    """
+
+    reattached: bool = False
+    mains_hz: float = 50.0
+    displaced: float | None = None
+    stretch: float | None = None
+
+    @property
+    def augmentation(self) -> dict[str, float]:
+        """The values that replace those of the default Augmentation, by name."""
+        stated = {"displaced": self.displaced, "stretch": self.stretch}
+        return {name: value for name, value in stated.items() if value is not None}
+
+
+AS_RECORDED = SkinUse()
+
+
+@dataclass(frozen=True)
+class Effort:
+    """The length of trainings, and the use of the skin.
+
+    share: of each network's default iterations. paper_steps: of the paper's CNN; None for the
+    paper's 4,000 on a GPU and fewer on a processor. bfloat16: compute the paper's CNN in bfloat16
+    if the processor can. unfinished: a file that keeps the training of the paper's CNN from time to
+    time, so that it goes on after an interruption. use: of the skin, for our family.
+    """
+
+    share: float = 1.0
+    paper_steps: int | None = None
+    bfloat16: bool = False
+    unfinished: Path | None = None
+    use: SkinUse = AS_RECORDED
+
+
+FULL_EFFORT = Effort()
+
+
+class Model(Protocol):
+    """A trained method. K: number of materials of the training set, including those that did not
+    occur in training.
+
+    It may have further attributes, which evaluate.fold reads: `ran` (a description of the
+    computation), `cost` (of the training) and `precisions` (the same model in other precisions, as
+    Models by name).
+    """
+
+    def logits(self, inputs: Array) -> Array:
+        """Inputs of n sweeps -> float32 [n, K]; their softmax is a calibrated probability.
+
+        inputs: raw counts [n, T, R, C] if the method's `input` is "raw", else features float32 [n,
+        F].
+        """
+        ...
+
+    def graph(self) -> onnx.ModelProto:
+        """The graph for the box: `sweep` [1, T, R, C] or `features` float32 [1, F] -> `logits`
+        float32 [1, K]. Raises FormatError if the method runs in its `library` alone."""
+        ...
+
+
+@dataclass(frozen=True)
+class Method:
+    """One way to name a material.
+
+    about: one line with its source. input: "raw" or a key of features.kinds.KINDS. train:
+    (training sweeps, their model_inputs, seed) -> Model; the same arguments give the same model.
+    extra: the optional dependency that it needs, named as in train/pyproject.toml. effort: the part
+    of an Effort that changes it. library: the library that runs its models if they have no graph;
+    they are timed there and cannot be packed.
+    """
+
+    name: str
+    about: str
+    input: str
+    train: Callable[[Dataset, Array, int], Model]
+    extra: str = ""
+    effort: str = ""
+    library: str = ""
+
+    @property
+    def why_not_on_the_box(self) -> str:
+        """The reason why the box cannot run it: no graph, or features that the box does not
+        compute; "" if it can."""
+        if self.library:
+            return f"runs in {self.library} alone and has no graph"
+        if self.input != "raw" and self.input not in features.KINDS:
+            return (
+                f"looks at the features {self.input!r} of prior work, which the box does not "
+                "compute"
+            )
+        return ""
+
+    @property
+    def runs_on_the_box(self) -> bool:
+        """Whether its models have a graph, and the box computes the graph's input."""
+        return not self.why_not_on_the_box
+
+
+def no_log(line: str) -> None:
+    """A log that drops every line."""
+
+
+def model_inputs(kind: str, sweeps: Dataset) -> Array:
+    """The inputs of a method with the input `kind` for `sweeps`: raw counts [N, T, R, C], or
+    features float32 [N, F]."""
+    if kind == "raw":
+        return sweeps.samples
+    return np.stack([kinds.compute(kind, counts, sweeps.rate_hz) for counts in sweeps.samples])
+
+
+def every(effort: Effort = FULL_EFFORT) -> dict[str, Method]:
+    """All methods by name."""
+    return {method.name: method for name in MODULES for method in _of(import_module(name), effort)}
+
+
+def module_of(name: str) -> str:
+    """The full name of the module that defines the method `name`, "" if none does."""
+    modules = (
+        module
+        for module in MODULES
+        if name in {m.name for m in _of(import_module(module), FULL_EFFORT)}
+    )
+    return next(modules, "")
+
+
+def find(names: Sequence[str], effort: Effort = FULL_EFFORT) -> list[Method]:
+    """The methods of these names. Raises FormatError with a name that is unknown."""
+    known = every(effort)
+    for name in names:
+        if name not in known:
+            raise FormatError(f"method {name!r} is unknown; use some of {', '.join(known)}")
+    return [known[name] for name in names]
+
+
+def _of(module: ModuleType, effort: Effort) -> Iterable[Method]:
+    found: Iterable[Method] = (
+        module.methods(effort) if hasattr(module, "methods") else module.METHODS
+    )
+    return found

@@ -1,0 +1,77 @@
+"""Methods of prior work that the paper compares itself with, and the exploration of Xu et al. 2013.
+
+palpate_train.features.prior_work computes their features as far as a pressure skin allows, and
+baselines.learn trains them. `explore` works with any method: sweeps are added until the posterior
+is high enough.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.core.errors import FormatError
+from palpate.inference.classifier import softmax
+from palpate_train.models.methods import Method
+from palpate_train.models.peers.baselines import ABSENT, Gauss, learn, svm
+
+Array = NDArray[Any]
+
+METHODS = (
+    Method(
+        "fishel-bayes",
+        "roughness and fineness, independent normal distributions for each class, Bayes (Fishel "
+        "and Loeb 2012)",
+        "L",
+        partial(learn, partial(Gauss, independent=True, first=2)),
+    ),
+    Method(
+        "static-svm",
+        "features that do not depend on the order of frames, linear SVM (Hoelscher et al. 2015)",
+        "static",
+        partial(learn, partial(svm, kernel="linear")),
+    ),
+    Method(
+        "spectrogram-svm",
+        "5 x 25 bins of log power, RBF SVM (Sinapov et al. 2011)",
+        "spectrogram",
+        partial(learn, svm),
+    ),
+    Method(
+        "correlation-svm",
+        "activity, mobility, complexity, correlations between taxels, RBF SVM (Kaboli, Chathuranga "
+        "et al. 2015)",
+        "correlation",
+        partial(learn, svm),
+    ),
+)
+"""Fishel and Loeb measured one property at a time, so their likelihoods are multiplied. SVMs are
+those of baselines.svm; that of Hoelscher et al. is linear."""
+
+
+def explore(log_probabilities: Array, min_posterior: float) -> tuple[int, int]:
+    """One object, sweep after sweep, until a label's posterior reaches `min_posterior`: (label,
+    number of sweeps used).
+
+    log_probabilities: [S, K] of its S sweeps in their order. Priors are equal and sweeps
+    independent, so log probabilities are added (Xu et al. 2013; the product that the box computes).
+    A probability counts as at least 1e-12, as on the box. If no posterior is high enough, all
+    sweeps are used. Raises FormatError without a sweep, or if `min_posterior` is not a probability.
+    """
+    if not 0 < min_posterior <= 1:
+        raise FormatError(
+            f"a posterior of {min_posterior} cannot be reached; use more than 0, at most 1"
+        )
+    if log_probabilities.ndim != 2 or 0 in log_probabilities.shape:
+        shape = list(log_probabilities.shape)
+        raise FormatError(
+            f"log probabilities have the shape {shape}; give [sweeps, materials], at least one of "
+            "each"
+        )
+    posterior = softmax(np.maximum(log_probabilities, ABSENT).cumsum(axis=0))
+    enough = posterior.max(axis=1) >= min_posterior
+    last = int(enough.argmax()) if enough.any() else len(enough) - 1
+    return int(posterior[last].argmax()), last + 1

@@ -1,0 +1,295 @@
+"""A finished model: a trunk, its heads, its calibration, the contact positions, and the sweeps that
+all of it was fitted to.
+
+`palpate-train fit` writes one to a file; `export` makes a bundle of it. PyTorch is not needed;
+stages.network_of gives the stages of a fit in PyTorch.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+from numpy.typing import NDArray
+from onnx import checker, shape_inference
+
+from palpate.core import storage
+from palpate.core.errors import BundleError, FormatError
+from palpate.core.sweep_set import read
+from palpate_train.calibration.contact import Contacts
+from palpate_train.calibration.displacement import AugmentedCopies
+from palpate_train.calibration.heads import HeadPlan
+from palpate_train.data.sets import Dataset
+from palpate_train.models.linear_head import hold_out
+from palpate_train.models.methods import Model
+from palpate_train.models.recipe import graph, spectrum
+from palpate_train.models.recipe.architectures import Architecture
+from palpate_train.models.recipe.augment import COPIES, Augmentation, copies
+from palpate_train.models.recipe.calibrate import Calibration, CalibrationInputs, fit_calibration
+from palpate_train.onnx_tools.graph_builder import run, with_head
+
+Array = NDArray[Any]
+Json = dict[str, Any]
+WHAT = "a fit (made by palpate-train fit)"
+HELD_COPIES_SEED, FAULTS_SEED = 1, 2
+"""Added to a fit's seed for the copies of its held-out sweeps, and for the copies with faults."""
+FAULTS = Augmentation(
+    displaced=0.0,
+    gain=0.1,
+    gains=0.05,
+    silent=0.06,
+    damped=0.0,
+    colour=0.0,
+    noise=0.4,
+    hum=0.3,
+    drift=0.1,
+)
+"""Changes of a known material in service: a worse amplifier, hum of the mains, a taxel that
+fails."""
+ONE_IN = 10
+"""One in this many training sweeps has a copy with faults; docs/decisions/0006 compares other
+shares."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A fitted trunk with its heads.
+
+    weights: of the trunk, as graph.trunk_graph takes them; `head.weight` [K, F] and `head.bias`
+    [K], fitted to the features of the float trunk, and `int8.weight` and `int8.bias`, fitted to
+    those of the int8 trunk, the temperature folded into both. architecture: only the parts that the
+    heads see. ranges: of int8; None for a float trunk alone. train, held: the training sweeps and
+    the held-out sweeps. about: JSON, how the fit was made and validated. plan: fits the heads
+    again, before a temperature. calibration: of the int8 trunk if there is one; None if the sweeps
+    do not suffice, with the reason in `uncalibrated`. contacts: None until the fit is `finished`.
+    """
+
+    weights: dict[str, Array]
+    scale: float
+    architecture: Architecture
+    ranges: graph.Ranges | None
+    train: Dataset
+    held: Dataset
+    about: Json
+    plan: HeadPlan
+    calibration: Calibration | None = None
+    uncalibrated: str = ""
+    contacts: Contacts | None = None
+
+    @property
+    def bands(self) -> int:
+        """Number of features of the spectrum, which are the last ones and were not trained."""
+        return self.architecture.spectrum * spectrum.count(self.train.format)
+
+    @property
+    def augmentation(self) -> Augmentation:
+        """The augmentation of its training."""
+        return Augmentation(**self.about["recipe"]["augmentation"])
+
+    def trunk(self, int8: bool = True, prefixes: bool = False) -> onnx.ModelProto:
+        """`sweep` -> `features` float32 [1, F]; with `prefixes` float32 [1, 10, F]. See
+        graph.trunk_graph."""
+        ranges, format = self.ranges if int8 else None, self.train.format
+        return graph.trunk_graph(
+            format, self.scale, self.weights, self.architecture, ranges, prefixes
+        )
+
+    def in_float(self) -> Fit:
+        """The same fit with its float trunk and float head instead of those in int8; not
+        calibrated yet."""
+        head = {f"int8.{name}": self.weights[f"head.{name}"] for name in ("weight", "bias")}
+        return replace(self, weights=self.weights | head, ranges=None, calibration=None)
+
+    def int8_head(self) -> tuple[Array, Array]:
+        """Weight [K, F] and bias [K] of the int8 trunk's head, the temperature folded in."""
+        return self.weights["int8.weight"], self.weights["int8.bias"]
+
+    def values(self, group: str) -> Array:
+        """The values of a group among all sweeps."""
+        return np.union1d(self.train.group(group), self.held.group(group))
+
+    def held_out_figures(self) -> Json:
+        """Figures of sweeps by heads that did not see their value of a condition, for each
+        condition, the hardest first, as a manifest holds them; none without a calibration."""
+        figures: Json = {}
+        if self.calibration:
+            labels = np.append(self.train.labels, self.held.labels)
+            recordings = np.append(self.train.group("recording"), self.held.group("recording"))
+            for name, held in self.calibration.held.items():
+                of, at = held.numbers, recordings[held.numbers]
+                figures |= held.answers(at).figures(labels[of], at, f"held-out {name}")
+        return figures
+
+    def save(self, path: Path) -> None:
+        """Write the fit as one .npz without pickle. Training and held-out sweeps are one set, the
+        training sweeps first."""
+        names = ("samples", "labels", *("unloaded",) * (self.train.unloaded is not None))
+        sides = self.train, self.held
+        arrays = {f"weight_{k}": v for k, v in self.weights.items()}
+        arrays |= {f"set_{k}": np.concatenate([getattr(s, k) for s in sides]) for k in names}
+        arrays |= {
+            f"group_{name}": np.concatenate([s.groups[name] for s in sides])
+            for name in self.train.groups
+        }
+        for kind, part in (("calibration", self.calibration), ("contacts", self.contacts)):
+            arrays |= {f"{kind}_{k}": v for k, v in (part.arrays() if part else {}).items()}
+        meta = {
+            "scale": self.scale,
+            "architecture": asdict(self.architecture),
+            "ranges": asdict(self.ranges) if self.ranges else None,
+            "materials": self.train.materials,
+            "rate_hz": self.train.rate_hz,
+            "source": self.train.source,
+            "units": self.train.units,
+            "displays": self.train.displays,
+            "trained_on": len(self.train),
+            "about": self.about,
+            "plan": self.plan.json(),
+            "calibration": self.calibration.figures() if self.calibration else None,
+            "uncalibrated": self.uncalibrated,
+            "contacts": self.contacts.figures() if self.contacts else None,
+        }
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with storage.file(path) as f:
+            np.savez_compressed(f, allow_pickle=False, meta=np.array(json.dumps(meta)), **arrays)
+
+    @classmethod
+    def load(cls, path: Path) -> Fit:
+        """Read the file that `save` wrote. Raises FormatError if it is another file."""
+        arrays = read(path, WHAT)
+        try:
+            fit = cls._read(arrays, json.loads(str(arrays["meta"])))
+        except (KeyError, ValueError, TypeError, BundleError) as e:
+            raise FormatError(
+                f"{path.name}: not {WHAT}, or of another version; fit again: {e}"
+            ) from e
+        try:
+            with_head(fit.trunk(), *fit.int8_head())
+        except (KeyError, ValueError, checker.ValidationError, shape_inference.InferenceError) as e:
+            raise FormatError(
+                f"{path.name}: its weights are not those of its {fit.architecture}; fit again"
+            ) from e
+        return fit
+
+    @classmethod
+    def _read(cls, arrays: Mapping[str, Array], meta: Json) -> Fit:
+        weights, groups, calibration, contacts = (
+            {k.removeprefix(p): v for k, v in arrays.items() if k.startswith(p)}
+            for p in ("weight_", "group_", "calibration_", "contacts_")
+        )
+        shape, ranges = meta["architecture"], meta["ranges"]
+        sweeps = Dataset(
+            arrays["set_samples"],
+            arrays["set_labels"],
+            tuple(meta["materials"]),
+            meta["rate_hz"],
+            groups,
+            meta["source"],
+            arrays.get("set_unloaded"),
+            meta.get("units", {}),
+            meta.get("displays", {}),
+        )
+        first = np.arange(len(sweeps)) < meta["trained_on"]
+        return cls(
+            weights,
+            meta["scale"],
+            Architecture(**shape | {"channels": tuple(shape["channels"])}),
+            ranges and graph.Ranges(ranges["counts"], tuple(ranges["responses"])),
+            sweeps.take(first),
+            sweeps.take(~first),
+            meta["about"],
+            HeadPlan.read(meta["plan"]),
+            calibration=meta["calibration"] and Calibration.of(calibration, meta["calibration"]),
+            uncalibrated=meta["uncalibrated"],
+            contacts=meta["contacts"] and Contacts.read(contacts, meta["contacts"]),
+        )
+
+
+def finished(fit: Fit) -> Fit:
+    """`fit` with its contacts, and with its calibration if there are sweeps to judge it by."""
+    contacts = fit.contacts or Contacts.of(fit.train)
+    try:
+        calibration = fit_calibration(calibration_inputs(fit))
+    except FormatError as e:  # nothing was held out, or of too few groups
+        return replace(fit, contacts=contacts, calibration=None, uncalibrated=str(e))
+    return replace(fit, contacts=contacts, calibration=calibration)
+
+
+def calibration_inputs(fit: Fit) -> CalibrationInputs:
+    """Features from the trunk of `fit`: of the training sweeps, the held-out sweeps and the copies
+    with faults, in this order, and of augmented copies of the first two. Raises FormatError if no
+    sweep was held out."""
+    train, held, seed = fit.train, fit.held, fit.about["seed"]
+    if (by := fit.about["held_out_by"]) == "nothing":
+        hold_out(train, seed)  # raises, with the reason
+    shuffled = np.random.default_rng(seed + FAULTS_SEED).permutation(len(train))
+    (faulty,) = copies(train.take(shuffled[::ONE_IN]), FAULTS, seed + FAULTS_SEED, 1)
+    of_all = train, held, faulty
+    role = np.repeat(np.arange(3), [len(sweeps) for sweeps in of_all])
+    conditions = {
+        name: np.unique(np.concatenate([s.group(name) for s in of_all]), return_inverse=True)[1]
+        for name in (by, *fit.about["conditions"])
+    }
+    return CalibrationInputs(
+        run(fit.trunk(prefixes=True), np.concatenate([s.samples for s in of_all])),
+        np.concatenate([s.labels for s in of_all]),
+        conditions,
+        role == 1,
+        bool(fit.architecture.channels),
+        fit.bands,
+        _augmented_copies(fit),
+        role == 2,
+        fit.plan,
+    )
+
+
+def _augmented_copies(fit: Fit) -> AugmentedCopies:
+    """Copies of the training sweeps as the heads see them, and displaced copies of the held-out
+    sweeps, whose numbers come after those of the training sweeps."""
+    trunk, seed, features = fit.trunk(), fit.about["seed"], []
+    for sweeps, change, drawn in (
+        (fit.train, fit.augmentation, seed),
+        (fit.held, fit.augmentation.without_faults(), seed + HELD_COPIES_SEED),
+    ):
+        features += [run(trunk, copy.samples) for copy in copies(sweeps, change, drawn, COPIES)]
+    labels = [np.tile(sweeps.labels, COPIES) for sweeps in (fit.train, fit.held)]
+    numbers = np.arange(len(fit.train)), len(fit.train) + np.arange(len(fit.held))
+    source = [np.tile(of, COPIES) for of in numbers]
+    is_held = np.repeat([False, True], [len(part) for part in labels])
+    return AugmentedCopies(
+        np.concatenate(features), np.concatenate(labels), np.concatenate(source), is_held
+    )
+
+
+@dataclass(frozen=True)
+class FittedModel:
+    """A fit as the box runs it.
+
+    fit: its origin, with training and held-out sweeps. weight [K, F], bias [K]: its head for all
+    materials. ran: a description of the computation. precisions: "float", the model before
+    quantization.
+    """
+
+    fit: Fit
+    weight: Array
+    bias: Array
+    ran: str
+    precisions: Mapping[str, Model] = field(default_factory=dict)
+
+    def features(self, inputs: Array, prefixes: bool = False) -> Array:
+        """Raw counts [n, T, R, C] -> the features that the head sees, float32 [n, F]; with
+        `prefixes` [n, 10, F], see graph.trunk_graph."""
+        return run(self.fit.trunk(prefixes=prefixes), inputs)
+
+    def logits(self, inputs: Array) -> Array:
+        """Raw counts [n, T, R, C] -> float32 [n, K]."""
+        return run(self.graph(), inputs)
+
+    def graph(self) -> onnx.ModelProto:
+        """`sweep` [1, T, R, C] -> `logits` float32 [1, K]."""
+        return with_head(self.fit.trunk(), self.weight, self.bias)

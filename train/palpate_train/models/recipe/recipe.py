@@ -1,0 +1,490 @@
+"""The default recipe: from the sweeps of a training set to a finished model.
+
+    training sweeps, and augmented copies of them
+       |   features:    filters, distribution, spectrum, loads and relations, in closed form
+       v
+    candidates:         sums of discriminants, each of some of the features
+       |   judged:      by groups that their heads did not see; then fewer filters
+       v
+    stages:             trained convolutions beside them, if there are many sweeps of
+       |                each material, too many of the held-out ones are named
+       |                wrongly, and stages do not make that worse
+       v
+    pruned:             a trunk with only the features that a discriminant sees
+       |   finished:    heads in float and int8, calibration, contact positions
+       v
+    Fit
+
+Without stages a fit takes seconds and does not need PyTorch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.core.errors import FormatError
+from palpate_train.calibration.heads import HeadData, HeadPlan, condition_values
+from palpate_train.data.progress import StageLine
+from palpate_train.data.sets import Dataset
+from palpate_train.data.splitters import InnerPart, inner_parts
+from palpate_train.data.thinning import thinned
+from palpate_train.metrics.score import interval
+from palpate_train.models.linear_head import hold_out_or_all
+from palpate_train.models.methods import AS_RECORDED, Log, SkinUse, no_log
+from palpate_train.models.recipe import (
+    bank,
+    choice,
+    distribution,
+    graph,
+    relations,
+    spectrum,
+    stage_heads,
+)
+from palpate_train.models.recipe.architectures import MAINS_HZ, STAGES, Architecture
+from palpate_train.models.recipe.augment import (
+    COPIES,
+    Augmentation,
+    copies,
+    default_augmentation,
+    texture_scale,
+)
+from palpate_train.models.recipe.bank import Bank
+from palpate_train.models.recipe.choice import Candidates, FeatureColumns, HeldOutScores, ScoredPlan
+from palpate_train.models.recipe.fitted import Fit, finished
+from palpate_train.models.recipe.memory import MOST_SWEEPS
+from palpate_train.models.recipe.sizes import UNLIMITED, ModelSize
+from palpate_train.onnx_tools.graph_builder import run
+from palpate_train.onnx_tools.quantize import calibration_sweeps
+
+Array = NDArray[Any]
+LEAST_EACH, LEAST_SWEEPS = 25, 100
+"""Smallest numbers of sweeps for training stages, of each material and of all. Stages overfit to a
+few sweeps of a material and to a few batches."""
+PARTS = "features", "choice of the model", "training of stages"
+"""Parts of a fit, for its progress."""
+ENOUGH = 0.99
+"""Accuracy on held-out parts from which on stages improve too little for their share of the
+bundle's size and time."""
+FIXED = Architecture((), planned=len(STAGES.channels))
+"""A trunk without stages that prepares counts as a trunk with STAGES does."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The settings of a fit.
+
+    steps: of the training of stages; 0 for no stages. unfinished: a file that keeps the training of
+    stages from time to time; from it an interrupted training goes on with the same bits. size:
+    limits the content of the model. use: of the skin. calibrate: whether the fit is finished with
+    calibration and contacts, which a bundle needs and `evaluate` does not. varies: the groups that
+    will have other values in service; without any, all that can be left out. most: largest number
+    of sweeps that are used; of more, some are drawn, see thinning.thinned.
+    """
+
+    steps: int = 600
+    unfinished: Path | None = None
+    size: ModelSize = UNLIMITED
+    use: SkinUse = AS_RECORDED
+    calibrate: bool = True
+    varies: tuple[str, ...] = ()
+    most: int = MOST_SWEEPS
+
+
+@dataclass(frozen=True)
+class Trunk:
+    """A trunk without heads, for sweeps of one set. weights: of stages and bank, as
+    graph.trunk_graph takes them."""
+
+    sweeps: Dataset
+    scale: float
+    weights: Mapping[str, Array]
+    architecture: Architecture
+    ranges: graph.Ranges
+
+    def features(self, sweeps: Dataset, int8: bool = True) -> Array:
+        """Features float32 [n, F] of `sweeps`."""
+        ranges = self.ranges if int8 else None
+        model = graph.trunk_graph(
+            sweeps.format, self.scale, self.weights, self.architecture, ranges
+        )
+        return run(model, sweeps.samples)
+
+    def layout(self) -> dict[str, slice]:
+        """See graph.layout."""
+        return graph.layout(self.sweeps.format, self.weights, self.architecture)
+
+
+@dataclass(frozen=True)
+class Setup:
+    """Everything that the steps of a fit share, each part computed when it is first needed."""
+
+    sweeps: Dataset
+    seed: int
+    settings: Settings
+    augmentation: Augmentation
+    log: Log
+
+    @classmethod
+    def of(cls, sweeps: Dataset, seed: int, settings: Settings, log: Log) -> Setup:
+        """Raises FormatError if the window is too short."""
+        groups = {"recording": sweeps.group("recording")} | sweeps.groups  # numbered before a split
+        sweeps = thinned(replace(sweeps, groups=groups), settings.most)
+        usual = default_augmentation(FIXED.zero_sum(sweeps.format.window))
+        return cls(sweeps, seed, settings, replace(usual, **settings.use.augmentation), log)
+
+    @cached_property
+    def copies(self) -> list[Dataset]:
+        """Augmented copies of the sweeps."""
+        return list(copies(self.sweeps, self.augmentation, self.seed, COPIES))
+
+    @cached_property
+    def fixed(self) -> FixedFeatures:
+        """Step 1: the features that need no training."""
+        self.part(1)(f"features of {len(self.sweeps)} sweeps and {COPIES} copies of each")
+        trunk = fixed_trunk(self.sweeps, self.seed, self.settings.use.mains_hz)
+        scales = trunk.architecture.relations
+        columns = FeatureColumns.of(trunk.layout(), Bank.of(trunk.weights).free, scales)
+        return FixedFeatures(trunk, self.data(trunk), columns)
+
+    @cached_property
+    def parts(self) -> list[InnerPart]:
+        """The parts by which candidates are judged."""
+        return inner_parts(self.sweeps, varies=self.settings.varies)
+
+    @cached_property
+    def left_out(self) -> tuple[str, ...]:
+        """The groups whose values the parts leave out."""
+        return tuple(dict.fromkeys(part.group for part in self.parts))
+
+    @cached_property
+    def values(self) -> Array:
+        """The value [N, C] of each condition of the parts, as HeadData has them."""
+        groups = {name: self.sweeps.group(name) for name in self.left_out}
+        return condition_values(groups, len(self.sweeps))
+
+    @cached_property
+    def held_out_scores(self) -> HeldOutScores:
+        """The scores of heads of fixed features on the parts by which candidates are judged."""
+        return self.scores(self.fixed.data, self.parts)
+
+    @cached_property
+    def conditions(self) -> tuple[str, ...]:
+        """The groups that can be left out, the hardest first: that whose sweeps the usual heads
+        name worst if they have not seen its value. Groups of two values come last: without one of
+        them, heads learn nothing of how the other varies."""
+        if len(self.left_out) < 2:
+            return self.left_out
+        scores = self.held_out_scores
+        right = scores.right(scores.score(candidates(self.fixed, self).usual()))
+
+        def order(name: str) -> tuple[bool, float]:
+            of = scores.own & (scores.groups == name)
+            return len(np.unique(self.sweeps.group(name))) < 3, float(right[of].mean())
+
+        return tuple(sorted(self.left_out, key=order))
+
+    @cached_property
+    def judging(self) -> InnerPart:
+        """The sweeps on which stages are not trained, and which judge them: some values of the
+        hardest condition. The group is "nothing" if there are too few groups."""
+        index = np.arange(len(self.sweeps))
+        numbered = replace(self.sweeps, groups=self.sweeps.groups | {"index": index})
+        _, held, by = hold_out_or_all(numbered, self.seed, self.conditions)
+        return InnerPart(by, np.isin(index, held.group("index")))
+
+    @cached_property
+    def sides(self) -> tuple[Dataset, Dataset]:
+        """The sweeps to train stages on, and those to judge them by."""
+        if self.judging.group == "nothing":
+            return self.sweeps, self.sweeps
+        return self.sweeps.take(~self.judging.out), self.sweeps.take(self.judging.out)
+
+    def wants_stages(self, size: ModelSize) -> bool:
+        """Whether a model of this size may have stages, and there are enough sweeps for them."""
+        each = np.unique(self.sweeps.labels, return_counts=True)[1]
+        enough = len(self.sweeps) >= LEAST_SWEEPS and each.min() >= LEAST_EACH
+        return bool(self.settings.steps and size.stages and enough and find_spec("torch"))
+
+    def may_train(self, size: ModelSize) -> bool:
+        """Whether stages can be trained for a model of this size, and judged."""
+        return self.wants_stages(size) and self.judging.group != "nothing"
+
+    @cached_property
+    def stages(self) -> tuple[Trunk, HeadData]:
+        """Stages trained on the sweeps that are not held out, as a trunk of their own, and their
+        features of all sweeps and copies."""
+        trunk = _trained(self)
+        return trunk, self.data(trunk)
+
+    def data(self, trunk: Trunk, int8: bool = True) -> HeadData:
+        """The features of all sweeps and copies."""
+        of_copies = [trunk.features(one, int8) for one in self.copies]
+        source = np.tile(np.arange(len(self.sweeps)), len(self.copies))
+        return HeadData(
+            trunk.features(self.sweeps, int8),
+            self.sweeps.labels,
+            np.concatenate(of_copies),
+            source,
+            self.values,
+        )
+
+    def scores(self, data: HeadData, parts: list[InnerPart]) -> HeldOutScores:
+        """The scores of heads of these features on these parts."""
+        classes, copied = len(self.sweeps.materials), self.settings.use.reattached
+        return HeldOutScores([data] * len(parts), parts, classes, copied)
+
+    def part(self, number: int) -> Log:
+        """The log of one part of the fit. The third part, the stages, takes most of the time; it is
+        left out if the first two suffice."""
+        parts = 3 if self.wants_stages(self.settings.size) else 2
+        return lambda line: self.log(StageLine.of(number, parts, PARTS[number - 1], line))
+
+
+@dataclass(frozen=True)
+class FixedFeatures:
+    """The fixed trunk with the features of all sweeps and copies, and where these are."""
+
+    trunk: Trunk
+    data: HeadData
+    columns: FeatureColumns
+
+    def limited(self, size: ModelSize) -> FixedFeatures:
+        """Only the features that a model of this size may see. Raises FormatError if there are
+        none."""
+        columns = self.columns.limited(size)
+        if not (columns.kinds or len(columns.bands)):
+            raise FormatError(
+                f"windows of {self.trunk.sweeps.format.window} frames are too short for a "
+                "spectrum, and this size has nothing else; use a size with filters"
+            )
+        return replace(self, columns=columns)
+
+
+@dataclass(frozen=True)
+class HeadChoice:
+    """The chosen heads, and the scores by which they were chosen."""
+
+    scores: HeldOutScores
+    chosen: ScoredPlan
+
+    def validation(self) -> dict[str, Any]:
+        """Accuracy on held-out parts of heads that did not see them, with its 95 % interval by
+        part; copies do not count."""
+        own = self.scores.own
+        right = (self.chosen.logits.argmax(axis=1) == self.scores.labels)[own]
+        low, high = interval(right, self.scores.clusters[own])
+        accuracy = round(float(right.mean()), 4)
+        return {"accuracy": accuracy, "n": len(right), "low": low, "high": high}
+
+
+def fit(sweeps: Dataset, seed: int, settings: Settings = Settings(), log: Log = no_log) -> Fit:
+    """A model for the materials of `sweeps`, which must all occur. A fifth of the groups is
+    held out from stages and calibration.
+
+    Raises FormatError if the window is shorter than a filter, if every taxel is constant, or if
+    materials have too few recordings to hold some out.
+    """
+    return fit_size(Setup.of(sweeps, seed, settings, log), settings.size)
+
+
+def fit_size(setup: Setup, size: ModelSize) -> Fit:
+    """The model of this size. Raises FormatError if the windows are too short for it."""
+    fixed = setup.fixed.limited(size)
+    stages, judged = judged_size(fixed, setup, size)
+    trunk, plan = pruned(fixed.trunk, stages, judged.chosen.plan)
+    return finish(trunk, plan, judged, setup)
+
+
+def judged_size(
+    fixed: FixedFeatures, setup: Setup, size: ModelSize
+) -> tuple[Trunk | None, HeadChoice]:
+    """Steps 2 to 4 for a model of this size, to whose features `fixed` is limited."""
+    judged = judge(candidates(fixed, setup), fixed, setup)
+    enough = judged.scores.accuracy(judged.chosen) >= ENOUGH
+    if enough or not setup.may_train(size):
+        return None, judged
+    return with_stages(judged, fixed, setup)
+
+
+def candidates(fixed: FixedFeatures, setup: Setup) -> Candidates:
+    """Step 2: the heads to choose from."""
+    groups = bool((setup.held_out_scores.groups != "recording").any())
+    reattached, size = setup.settings.use.reattached, setup.settings.size
+    return Candidates(fixed.columns, reattached, groups and size.loads)
+
+
+def judge(heads: Candidates, fixed: FixedFeatures, setup: Setup) -> HeadChoice:
+    """Step 3: the best candidate by held-out groups, with as few filters as suffice."""
+    scores = setup.held_out_scores
+    chosen = choice.choose(scores, heads, setup.part(2))
+    filters = fixed.columns.filters()
+    return HeadChoice(scores, choice.with_fewer_filters(scores, chosen, filters, setup.part(2)))
+
+
+def with_stages(
+    judged: HeadChoice, fixed: FixedFeatures, setup: Setup
+) -> tuple[Trunk | None, HeadChoice]:
+    """Step 4: trained stages and the heads beside them; None and `judged` if these are better.
+
+    If the skin will be reattached, or if there is nothing but the spectrum beside stages, each
+    stage and the spectrum suffice, unless held-out sweeps and their copies show that more is
+    better: a displaced contact changes the responses of filters more, and a spectrum alone is too
+    weak. Sweeps of the recorded positions alone could not show it. Stages stay away where sweeps
+    that they were not trained on are named worse than without them.
+    """
+    log, plan = setup.part(3), judged.chosen.plan
+    stages, responses = setup.stages
+    scores = setup.scores(responses.beside(fixed.data), [setup.judging])
+    beside = stage_heads.beside(plan)
+    joined = full = scores.score(beside)
+    columns = stage_heads.fixed_columns(fixed.columns, plan)
+    if setup.settings.use.reattached or set(plan.columns()) <= set(columns):
+        log("choosing: stages and the spectrum alone")
+        lean = scores.score(stage_heads.alone(columns))
+        joined = full if scores.better(full, lean) else lean
+    log("choosing: without stages")
+    if scores.worse(joined, scores.score(beside[1:])):
+        return None, judged
+    if joined is full:
+        filters = np.append(np.full(sum(STAGES.channels), -1), fixed.columns.filters())
+        joined = choice.with_fewer_filters(scores, full, filters, log)
+    return stages, HeadChoice(scores, joined)
+
+
+def pruned(fixed: Trunk, stages: Trunk | None, plan: HeadPlan) -> tuple[Trunk, HeadPlan]:
+    """Step 5: the trunk with only the features that discriminants of `plan` see, and the plan for
+    it."""
+    size, layout, used = sum(STAGES.channels) if stages else 0, fixed.layout(), plan.columns()
+    filters, shares, levels, loads, related, bands = (
+        used[(used >= size + part.start) & (used < size + part.stop)] - size - part.start
+        for part in (
+            layout.get(k, slice(0, 0))
+            for k in ("magnitudes", "shares", "levels", "loads", "relations", "bands")
+        )
+    )
+    architecture = replace(
+        stages.architecture if stages else fixed.architecture,
+        pools=(len(filters) > 0) + (len(shares) > 0),
+        distribution=len(levels) > 0,
+        loads=len(loads) > 0,
+        relations=len(related) // relations.each(fixed.sweeps.format),
+        spectrum=len(bands) > 0,
+    )
+    weights = dict(stages.weights) if stages else {}
+    weights |= Bank.of(fixed.weights).take(filters).weights() if architecture.pools else {}
+    weights |= distribution.Levels.of(fixed.weights).weights() if architecture.distribution else {}
+    ranges = replace(fixed.ranges, responses=stages.ranges.responses) if stages else fixed.ranges
+    return Trunk(fixed.sweeps, fixed.scale, weights, architecture, ranges), plan.renumbered(used)
+
+
+def finish(trunk: Trunk, plan: HeadPlan, judged: HeadChoice, setup: Setup) -> Fit:
+    """Step 6: heads of the float and the int8 trunk, calibration and contacts."""
+    settings, classes, heads = setup.settings, len(setup.sweeps.materials), {}
+    for name, int8 in (("head", False), ("int8", True)):
+        weight, bias = plan.fit(setup.data(trunk, int8), classes)
+        heads[f"{name}.weight"] = weight - weight.mean(axis=0)
+        heads[f"{name}.bias"] = bias - bias.mean()
+    about = {
+        "seed": setup.seed,
+        "recipe": {
+            "augmentation": vars(setup.augmentation),
+            "steps": settings.steps,
+            "reattached": settings.use.reattached,
+            "mains_hz": settings.use.mains_hz,
+        },
+        "held_out_by": setup.judging.group,
+        "conditions": list(setup.conditions),
+        "chosen": describe(trunk, plan),
+        "validation": judged.validation(),
+    }
+    made = Fit(
+        {**trunk.weights, **heads},
+        trunk.scale,
+        trunk.architecture,
+        trunk.ranges,
+        *setup.sides,
+        about,
+        plan=plan.uncooled(),
+    )
+    return finished(made) if settings.calibrate else made
+
+
+def fixed_trunk(sweeps: Dataset, seed: int, mains_hz: float = MAINS_HZ) -> Trunk:
+    """The trunk with the whole bank, the distribution and the spectrum.
+
+    Raises FormatError if the window is shorter than a filter, or if every taxel of every sweep is
+    constant.
+    """
+    format, rng = sweeps.format, np.random.default_rng(seed)
+    some = calibration_sweeps(sweeps.samples[rng.permutation(len(sweeps))])
+    if not np.ptp(sweeps.samples, axis=1).any():
+        raise FormatError("every taxel of every sweep is constant; check the skin")
+    scale = texture_scale(sweeps.samples)
+    architecture = replace(
+        FIXED,
+        spectrum=spectrum.count(format) > 0,
+        pools=2,
+        distribution=True,
+        loads=True,
+        relations=relations.scales(format),
+        mains_hz=mains_hz,
+    )
+    kinds = (False,) if architecture.zero_sum(format.window) else (False, True)
+    drawn = bank.draw(format, rng, kinds)
+    seen: list[Array] = [np.empty(0)] * len(drawn)
+    for numbers, model in graph.bank_responses(format, scale, architecture, drawn):
+        for number, values in zip(numbers, run(model, some).swapaxes(0, 2), strict=True):
+            seen[number] = values.ravel()
+    ranges = graph.Ranges(graph.count_range(some, architecture), ())
+    weights = (
+        bank.fitted(drawn, seen, rng).weights() | distribution.fitted(some, scale, rng).weights()
+    )
+    return Trunk(sweeps, scale, weights, architecture, ranges)
+
+
+def _trained(setup: Setup) -> Trunk:
+    """See Setup.stages."""
+    from palpate_train.models.recipe import stages  # here: the rest of the recipe needs no PyTorch
+
+    settings, sweeps = setup.settings, setup.sides[0]
+    scale = texture_scale(setup.sweeps.samples)
+    architecture = replace(STAGES, mains_hz=settings.use.mains_hz)
+    weights, ranges = stages.train_stages(
+        sweeps,
+        scale,
+        setup.seed,
+        settings.steps,
+        setup.augmentation,
+        setup.part(3),
+        architecture,
+        settings.unfinished,
+    )
+    return Trunk(sweeps, scale, weights, architecture, ranges)
+
+
+def describe(trunk: Trunk, plan: HeadPlan) -> str:
+    """The parts of the trunk, and how many discriminants see copies, in words."""
+    pools, channels = trunk.architecture.pools, trunk.architecture.channels
+    filters = Bank.of(trunk.weights).free if pools else np.empty(0, bool)
+    words = [
+        f"{int((filters == free).sum())} {name} filters"
+        for free, name in ((False, "zero-sum"), (True, "free"))
+        if (filters == free).any()
+    ]
+    words += ["magnitudes and shares" if pools > 1 else "magnitudes"] * (len(filters) > 0)
+    words += ["distribution"] * trunk.architecture.distribution
+    words += ["loads"] * trunk.architecture.loads
+    scales = trunk.architecture.relations
+    words += [f"relations at {scales} scales"] * (scales > 0)
+    words += ["spectrum"] * trunk.architecture.spectrum
+    words += [f"stages of {', '.join(map(str, channels))} channels"] * (len(channels) > 0)
+    copied = sum(part.copies for part in plan.parts)
+    return f"{', '.join(words)}; {len(plan.parts)} discriminants, {copied} with augmented copies"

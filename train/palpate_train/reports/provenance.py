@@ -1,0 +1,171 @@
+"""The header of pages, pictures and results with their commit, bundle, sets, seeds and date.
+
+`of` collects it from the figures of a results.json, whose parts name their origin
+(metrics.score.provenance). It is written into HTML as a script with JSON, into SVG as metadata and
+into Markdown as a comment; `read` reads it from each of them.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from palpate.core.errors import FormatError
+from palpate_train.metrics import score
+from palpate_train.models.methods import PACKAGED, SHIPPED
+
+NAME = "provenance"
+SETS, TEMPLATE = ("set", "sets", "test", "train"), "{"
+"""Keys of the names of sets; a name with TEMPLATE stands for several sets, which their results
+name."""
+FOUND = {
+    ".html": rf'<script type="application/json" id="{NAME}">(.*?)</script>',
+    ".svg": rf'<metadata id="{NAME}">(.*?)</metadata>',
+    ".md": rf"<!-- {NAME} (.*?) -->.*?<!-- /{NAME} -->",
+}
+"""Position of the header, by the file's suffix."""
+ESCAPED = {"<": "\\u003c", ">": "\\u003e", "&": "\\u0026", "--": "\\u002d\\u002d"}
+"""Characters that a header escapes, so that the same text is valid in HTML, in SVG and in a
+comment."""
+
+
+@dataclass(frozen=True, slots=True)
+class Provenance:
+    """The origin of figures, which may come from several runs.
+
+    bundle: ids of the bundles that were measured, or that were packaged when the default recipe
+    ran; empty if the figures do not state them, or if the default is not among their methods. date:
+    of the last run, YYYY-MM-DD or "".
+    """
+
+    commit: tuple[str, ...] = ()
+    bundle: tuple[str, ...] = ()
+    sets: tuple[str, ...] = ()
+    seeds: tuple[int, ...] = ()
+    date: str = ""
+
+    @property
+    def json(self) -> str:
+        """The header, in one line."""
+        text = json.dumps(asdict(self))
+        for sign, code in ESCAPED.items():
+            text = text.replace(sign, code)
+        return text
+
+    @property
+    def older(self) -> str:
+        """A warning for the first line of a page if these figures are not of the packaged default;
+        otherwise ""."""
+        now = score.shipped()
+        others = [name for name in self.bundle if name != now]
+        if others:
+            part = "in part " if now in self.bundle else ""
+            return (
+                f"Made {part}with an older default, bundle {' and '.join(others)}; "
+                f"the box ships bundle {now} now."
+            )
+        return (
+            "" if self.bundle else f"Made without the default that the box ships now, bundle {now}."
+        )
+
+
+def of(figures: Any) -> Provenance:
+    """The origin that `figures` state anywhere in them. Methods other than the default have no
+    bundle."""
+    found: dict[str, list[Any]] = {field.name: [] for field in fields(Provenance)}
+    for part in _parts(figures):
+        found["commit"] += _texts(part.get("commit"))
+        found["seeds"] += [
+            seed for key in ("seed", "seeds") for seed in _list(part.get(key)) if type(seed) is int
+        ]
+        found["sets"] += [
+            name for key in SETS for name in _texts(part.get(key)) if TEMPLATE not in name
+        ]
+        found["date"] += [
+            text[:10] for key in ("date", "started") for text in _texts(part.get(key))
+        ]
+        found["bundle"] += _bundle(part.get("bundle")) or (
+            _texts(part.get("shipped")) if _has_default(part) else []
+        )
+    commits, bundles, sets = (
+        tuple(dict.fromkeys(found[name])) for name in ("commit", "bundle", "sets")
+    )
+    return Provenance(
+        commits, bundles, sets, tuple(sorted(set(found["seeds"]))), max(found["date"], default="")
+    )
+
+
+def in_svg(svg: str, about: Provenance) -> str:
+    """The picture with its header, which replaces an earlier one."""
+    return without(svg).replace(
+        "</title>", f'</title><metadata id="{NAME}">{about.json}</metadata>', 1
+    )
+
+
+def in_markdown(text: str, about: Provenance) -> str:
+    """The page with its header below the title, and with a first line that warns if its figures are
+    older."""
+    title, _, rest = without(text).partition("\n")
+    first = f"\n> **{about.older}**\n" if about.older else ""
+    return f"{title}\n\n<!-- {NAME} {about.json} -->{first}<!-- /{NAME} -->\n\n{rest.lstrip()}"
+
+
+def without(text: str) -> str:
+    """A page or picture without its header."""
+    for pattern in FOUND.values():
+        text = re.sub(pattern + r"\n?", "", text, flags=re.DOTALL)
+    return text
+
+
+def read(path: Path) -> Provenance:
+    """The header of a page, of a picture or of a file of results. Raises FormatError if it has
+    none."""
+    try:
+        text = path.read_text(encoding="utf-8")
+        if path.suffix == ".json":
+            return of(json.loads(text))
+        header = re.search(FOUND[path.suffix], text, flags=re.DOTALL)
+        held: dict[str, Any] = json.loads(header[1] if header else "nothing")
+        known: dict[str, Any] = {
+            name: tuple(v) if isinstance(v, list) else v for name, v in held.items()
+        }
+        return Provenance(**known)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as e:
+        why = e.strerror if isinstance(e, OSError) else "no header that says where it is from"
+        raise FormatError(f"{path}: {why}; make it again: python -m palpate_studies reports") from e
+
+
+def _parts(figures: Any) -> Iterator[dict[str, Any]]:
+    """All objects in parsed JSON, the outer ones first; without the description of how a bundle was
+    made, which is another run."""
+    if isinstance(figures, dict):
+        yield figures
+    values = (
+        [v for k, v in figures.items() if k != "made"] if isinstance(figures, dict) else figures
+    )
+    for value in values if isinstance(values, list) else ():
+        yield from _parts(value)
+
+
+def _bundle(value: Any) -> list[str]:
+    """The id of a measured bundle, given alone or beside its name."""
+    return _texts(value.get("id") if isinstance(value, dict) else value)
+
+
+def _has_default(part: dict[str, Any]) -> bool:
+    """Whether the default recipe, or the recipe of the packaged bundle, is among the methods of a
+    part; True if the part names no method."""
+    methods = [name for key in ("method", "methods") for name in _list(part.get(key))]
+    return not methods or SHIPPED in methods or PACKAGED in methods
+
+
+def _list(value: Any) -> list[Any]:
+    return list(value) if isinstance(value, list | dict) else [] if value is None else [value]
+
+
+def _texts(value: Any) -> list[str]:
+    return [one for one in _list(value) if isinstance(one, str) and one]

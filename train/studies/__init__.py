@@ -1,8 +1,0 @@
-"""Experiments with the methods, and the pages and figures that publish their results.
-
-`python -m train.studies` runs them. They may use all of `train`; nothing uses them.
-"""
-
-from pathlib import Path
-
-TEMPLATES = Path(__file__).with_name("templates")

@@ -1,8 +1,0 @@
-"""`python -m train.studies`: experiments and their pages."""
-
-import sys
-
-from train.studies.command import main
-
-if __name__ == "__main__":
-    sys.exit(main())

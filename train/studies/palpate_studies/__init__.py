@@ -1,0 +1,8 @@
+"""Experiments with the methods, and the pages and figures that publish their results.
+
+`python -m palpate_studies` runs them. They may use all of `train`; nothing uses them.
+"""
+
+from pathlib import Path
+
+TEMPLATES = Path(__file__).with_name("templates")

@@ -1,0 +1,173 @@
+"""The box's answers to simulated sweeps whose contact is displaced.
+
+A bundle holds the contact positions of training, so the box can show how far a contact is from
+them. This module measures how well that distance predicts accuracy: the same simulated sweeps, with
+the skin moved further and further.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.core.errors import FormatError
+from palpate.core.types import Frames, Status, Sweep
+from palpate.inference.classifier import Classifier
+from palpate.signal.contact import centre
+from palpate.sim import skin
+from palpate_train.evaluate.evaluation_sweeps import EvaluationSweeps
+from palpate_train.metrics.score import interval, provenance
+
+Array = NDArray[Any]
+Json = dict[str, Any]
+OFF_MM = tuple(np.arange(0.5, 6.25, 0.5).tolist())
+"""Displacements of the skin in mm."""
+DIRECTIONS = {"rows": "dx_mm", "columns": "dy_mm"}
+LOSS = 0.05
+"""Accuracy counts as lost if it is this far below that of a skin that was not moved."""
+
+
+def measure(box: Classifier, unseen: str, seen: str, hard: str, log: Callable[[str], None]) -> Json:
+    """The box's answers to simulated sweeps: at positions that were not trained (`unseen`, whose
+    skin is then moved), at trained positions (`seen`), and at those of T-HARD (`hard`).
+
+    Raises FormatError if the bundle has no positions.
+    """
+    place = box.bundle.manifest.contact
+    if place is None:
+        raise FormatError(
+            f"bundle {box.bundle.id} has no positions to compare with; export it again"
+        )
+    result: Json = {
+        "bundle": box.bundle.id,
+        "limit_mm": place.limit_mm,
+        "positions": len(place.rows_mm),
+    }
+    result |= {
+        name: _point(box, EvaluationSweeps.simulated(spec)) | {"set": spec}
+        for name, spec in (
+            ("trained positions, other sweeps", seen),
+            ("other positions", unseen),
+            ("T-HARD", hard),
+        )
+    }
+    test, result["moved"] = EvaluationSweeps.simulated(unseen), {}
+    for direction, name in DIRECTIONS.items():
+        points = []
+        for mm in (*(-off for off in reversed(OFF_MM)), 0.0, *OFF_MM):
+            log(f"{direction} {mm:+g} mm")
+            points.append({"mm": mm} | _point(box, test, partial(_shifted, name=name, mm=mm)))
+        result["moved"][direction] = points
+        result |= {f"{direction}, {word}": _loss(part) for word, part in _halves(points)}
+    return result | provenance()
+
+
+def _shifted(placement: skin.Placement, name: str, mm: float) -> skin.Placement:
+    return replace(placement, **{name: getattr(placement, name) + mm})
+
+
+def _point(
+    box: Classifier,
+    test: EvaluationSweeps,
+    where: Callable[[skin.Placement], skin.Placement] = lambda p: p,
+) -> Json:
+    """The box's answers to the test sweeps, with the skin moved. The sweeps of an attachment are
+    one cluster.
+
+    accuracy, wrong: named with status ok, rightly and wrongly. unsure, unknown: the other answers.
+    network: most probable label of the network alone is right.
+    """
+    assert test.scene
+    sweeps, place, limits = test.sweeps, box.bundle.manifest.contact, box.bundle.manifest.thresholds
+    assert place
+    assert limits.contact is not None
+    right, moved, wrong, unsure, unknown, network, distance_mm = (
+        np.zeros(len(sweeps)) for _ in range(7)
+    )
+    for i, window in enumerate(test.scene.draw(where)):
+        n = np.arange(len(window))
+        verdict, truth = (
+            box(Sweep(i, 0, 0, Status.OK, Frames(n, n, window))),
+            sweeps.materials[sweeps.labels[i]],
+        )
+        named = verdict.status is Status.OK
+        right[i], wrong[i] = named and verdict.label == truth, named and verdict.label != truth
+        unsure[i], unknown[i] = bool(verdict.label) and not named, verdict.status is Status.UNKNOWN
+        moved[i] = bool(verdict.displacement)
+        network[i] = box.bundle.manifest.labels[int(box.logits(window).argmax())] == truth
+        found = centre(window, box.tare, limits.contact)
+        distance_mm[i] = np.hypot(*place.offset(found)) if found else np.nan
+    attachment = sweeps.group("position")
+    return {
+        "n": len(sweeps),
+        "attachments": len(np.unique(attachment)),
+        "accuracy": _share(right, attachment),
+        "network": _share(network, attachment),
+        "wrong_share": _share(wrong, attachment),
+        "unsure": int(unsure.sum()),
+        "unknown": int(unknown.sum()),
+        "moved": _share(moved, attachment),
+        "wrong": int(wrong.sum()),
+        "wrong_unflagged": int((wrong * (1 - moved)).sum()),
+        "told_mm": round(float(np.nanmedian(distance_mm)), 2)
+        if np.isfinite(distance_mm).any()
+        else None,
+    }
+
+
+def _share(values: Array, attachment: Array) -> list[float]:
+    """Mean and its 95 % interval."""
+    return [round(float(values.mean()), 4), *interval(values, attachment)]
+
+
+def _halves(points: Sequence[Json]) -> Iterator[tuple[str, list[Json]]]:
+    """The points from 0 mm outwards, in each of the two directions."""
+    middle = len(points) // 2
+    yield "forwards", list(points[middle:])
+    yield "backwards", list(points[middle::-1])
+
+
+def _loss(points: Sequence[Json]) -> Json:
+    """The first displacement where accuracy has fallen by LOSS, and the share of sweeps flagged
+    there and one step before."""
+    in_place = points[0]["accuracy"][0]
+    for before, point in pairwise(points):
+        if point["accuracy"][0] <= in_place - LOSS:
+            return {
+                "lost_at_mm": abs(point["mm"]),
+                "moved": point["moved"],
+                "moved_before": before["moved"],
+            }
+    return {"lost_at_mm": None, "moved": points[-1]["moved"], "moved_before": points[-2]["moved"]}
+
+
+def lines(result: Json) -> Iterator[str]:
+    """The report for the terminal: accuracy of the box and of the network alone, and share of
+    flagged sweeps, with intervals, at each displacement."""
+    yield (
+        f"bundle {result['bundle']}, {result['positions']} positions, limit {result['limit_mm']} mm"
+    )
+    named = {k: v for k, v in result.items() if isinstance(v, dict) and "attachments" in v}
+    rows = [(name, point) for name, point in named.items()]
+    rows += [
+        (f"{direction} {p['mm']:+.1f} mm", p)
+        for direction, points in result["moved"].items()
+        for p in points
+    ]
+    for name, point in rows:
+        right, wrong, network, moved = (
+            "{:.3f} [{:.3f}, {:.3f}]".format(*point[key])
+            for key in ("accuracy", "wrong_share", "network", "moved")
+        )
+        yield (
+            f"{name:<32} n {point['n']:>4}  right {right}  wrong {wrong}  unsure "
+            f"{point['unsure']:>3}  unknown "
+            f"{point['unknown']:>3}  network alone {network}  moved {moved}  distance "
+            f"{point['told_mm']} mm"
+        )

@@ -1,0 +1,352 @@
+"""The study of certainty: how far the probabilities of a method can be trusted.
+
+It covers calibration, the sequential test, unknown materials, enrolment and early decisions, each
+on test sweeps that nothing was fitted to.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.bundle.bundle import Early
+from palpate.inference.classifier import LEAST_PROBABILITY, softmax
+from palpate.inference.enrolment import LEAST
+from palpate.inference.enrolment import extended as enrolled_classes
+from palpate.inference.novelty import ClassDistances
+from palpate.inference.objects import EnrolledLabels
+from palpate_train.calibration.early_exit import LEVELS, decide
+from palpate_train.data.sets import Dataset, digest
+from palpate_train.evaluate import uncertainty
+from palpate_train.evaluate.evaluate import Where
+from palpate_train.evaluate.uncertainty import Trained
+from palpate_train.evaluate.uncertainty_cases import Case, Log, Trainings, cases
+from palpate_train.metrics.score import interval, provenance
+from palpate_train.models import methods
+from palpate_train.models.methods import Effort
+from palpate_train.models.recipe.calibrate import Calibration
+
+Array = NDArray[Any]
+Json = dict[str, Any]
+WANTED = (0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.999)
+MOST_SWEEPS = 5
+"""Number of sweeps of an object after which the answer is final."""
+ENROLLED = (1, 2, 3, 5, 7, 10)
+"""Numbers of sweeps from which a material is enrolled."""
+ORDERS = 20
+"""Random orders of the sweeps of one object, or of one enrolment."""
+
+
+def run(
+    sweeps: Dataset,
+    test: Dataset | None,
+    protocol: str,
+    method: str,
+    where: Where,
+    log: Log,
+    effort: Effort = methods.FULL_EFFORT,
+    seed: int = 1,
+) -> dict[str, Any]:
+    """All figures for the results. test: the set to test on; without it, `protocol` selects the
+    held-out sweeps.
+
+    Raises FormatError if the sets do not fit together, or if the method gives no such figures.
+    """
+    start = time.monotonic()
+    plan = Trainings.of(sweeps, test, protocol, seed)
+    whole_set = plan.sweeps
+    trained = cases(plan.tasks(method, effort, seed), whole_set, where, log)
+    log("figures")
+    result = figures(trained, whole_set.materials, seed)
+    about = {
+        "set": sweeps.source,
+        "test": test.source if test else "",
+        "protocol": "train and test" if test else protocol,
+        "method": method,
+        "effort": effort.share,
+        "seed": seed,
+        "folds": len(plan.folds),
+        "trainings": len(trained),
+        "sweeps": len(whole_set),
+        "tested": int(sum(len(test) for _, test in plan.folds)),
+        "digest": digest(whole_set),
+        "materials": list(whole_set.materials),
+        "format": str(whole_set.format),
+        "took_s": round(time.monotonic() - start, 1),
+    }
+    return about | provenance() | result
+
+
+def figures(trained: Sequence[Case], materials: Sequence[str], seed: int) -> Json:
+    """All figures. With two materials there are none that need a material left out."""
+    fitted = [(case, case.calibration()) for case in trained]
+    full = [one for one in fitted if one[0].left_out < 0]
+    result = {
+        "calibration": calibration(full),
+        "sequence": sequence(full, seed),
+        "early": early(full),
+    }
+    without = [one for one in fitted if one[0].left_out >= 0]
+    if without:
+        result["unknown"] = uncertainty.unknown(without, materials)
+        result["enrolment"] = enrolment(full, without, materials, seed)
+    return result
+
+
+def calibration(full: Sequence[Trained]) -> Json:
+    """Expected calibration error and reliability before the temperature (LDA's own posteriors) and
+    after."""
+    labels, places = uncertainty.joined(full, "labels"), uncertainty.placements(full)
+    result: Json = {
+        "n": len(labels),
+        "temperature": [round(done.temperature, 2) for _, done in full],
+    }
+    for name, undo in (("before", True), ("after", False)):
+        logits = np.concatenate(
+            [
+                done.logits(case.new[:, -1]) * (done.temperature if undo else 1)
+                for case, done in full
+            ]
+        )
+        p = softmax(logits)
+        confidence, right = p.max(1), p.argmax(1) == labels
+        low, high = uncertainty.bootstrap(partial(_error_of, confidence, right), places)
+        result[name] = {
+            "error": round(uncertainty.error(confidence, right), 4),
+            "low": low,
+            "high": high,
+            "bins": uncertainty.reliability(confidence, right),
+        }
+    result["accuracy"] = _accuracy(right, places)
+    return result
+
+
+def _error_of(confidence: Array, right: Array, some: Array) -> float:
+    return uncertainty.error(confidence[some], right[some])
+
+
+def sequence(full: Sequence[Trained], seed: int) -> Json:
+    """Mean number of sweeps and accuracy for each of the WANTED probabilities.
+
+    Sweeps of one object are fused until the probability is reached, at most MOST_SWEEPS. "same
+    place": all sweeps are of one attachment, and their errors are correlated. "several places":
+    they are drawn from all test sweeps.
+    """
+    log_p = np.log(
+        np.maximum(
+            softmax(np.concatenate([d.logits(c.new[:, -1]) for c, d in full])), LEAST_PROBABILITY
+        )
+    )
+    labels, places = uncertainty.joined(full, "labels"), uncertainty.placements(full)
+    rng, result = np.random.default_rng(seed), {}
+    for name, objects in (
+        ("same place", labels + places * (labels.max() + 1)),
+        ("several places", labels),
+    ):
+        members = [np.flatnonzero(objects == o) for o in np.unique(objects)]
+        repeat = max(ORDERS, 400 // len(members))
+        picks = [
+            rng.permutation(m)[:MOST_SWEEPS]
+            for m in members
+            for _ in range(repeat)
+            if len(m) >= MOST_SWEEPS
+        ]
+        if not picks:
+            continue
+        order = np.array(picks)
+        fused = softmax(log_p[order].cumsum(axis=1))  # [objects, MOST_SWEEPS, K]
+        truth = labels[order[:, 0]]
+        clusters = places[order[:, 0]] if name == "same place" else truth
+        result[name] = {
+            "objects": len(order),
+            "points": [_stopped(fused, truth, clusters, p) for p in (0.0, *WANTED)],
+        }
+    return result
+
+
+def _stopped(fused: Array, truth: Array, clusters: Array, wanted: float) -> Json:
+    """The result of a sequential test that stops at the probability `wanted` or after the last
+    sweep."""
+    enough = fused.max(2) >= wanted
+    decided = enough.any(axis=1)
+    enough[:, -1] = True
+    stop = enough.argmax(axis=1)
+    named = fused[np.arange(len(fused)), stop].argmax(1)
+    right = named == truth
+    return {
+        "wanted": wanted,
+        "sweeps": round(float(stop.mean() + 1), 3),
+        "decided": round(float(decided.mean()), 4),
+        "right_of_decided": round(float(right[decided].mean()), 4) if decided.any() else None,
+        **_accuracy(right, clusters),
+    }
+
+
+def early(full: Sequence[Trained]) -> Json:
+    """Accuracy and mean share of the sweep for the rules found in training, for other rules, and
+    for an answer after the first tenth."""
+    labels, places = uncertainty.joined(full, "labels"), uncertainty.placements(full)
+    p = np.concatenate([done.probabilities(case.new) for case, done in full])
+    whole = p[:, -1].argmax(1) == labels
+    steps = p.shape[1]
+    by_rule = [
+        decide(p_, done.rule.early) if done.rule.early else (p_[:, -1].argmax(1), np.ones(len(p_)))
+        for (_, done), p_ in zip(full, _parted(p, full), strict=True)
+    ]
+    named, share = (np.concatenate(part) for part in zip(*by_rule, strict=True))
+    lost = whole.astype(float) - (named == labels)
+    low, high = uncertainty.bootstrap(partial(_mean_of, lost), places)
+    rules = [
+        {
+            "least": r.early.least[0] if r.early else None,
+            "agree": r.early.agree if r.early else None,
+            "why": r.why,
+            "n": r.n,
+        }
+        for r in (done.rule for _, done in full)
+    ]
+    return {
+        "n": len(labels),
+        "share": round(float(share.mean()), 4),
+        "lost": round(float(lost.mean()), 4),
+        "lost_low": low,
+        "lost_high": high,
+        "rule": _accuracy(named == labels, places),
+        "whole": _accuracy(whole, places),
+        "rules": rules,
+        "always": [_accuracy(p[:, d].argmax(1) == labels, places) for d in range(steps)],
+        "curves": {str(agree): _levels(p, labels, agree) for agree in (1, 2, 3)},
+    }
+
+
+def _levels(p: Array, labels: Array, agree: int) -> list[Json]:
+    """Share of the sweep and accuracy for each of LEVELS by rules with `agree` steps."""
+    met = [decide(p, _same(level, agree, p.shape[1])) for level in LEVELS]
+    return [
+        {
+            "least": level,
+            "share": round(float(s.mean()), 4),
+            "accuracy": round(float(np.mean(k == labels)), 4),
+        }
+        for level, (k, s) in zip(LEVELS, met, strict=True)
+    ]
+
+
+def enrolment(
+    full: Sequence[Trained], without: Sequence[Trained], materials: Sequence[str], seed: int
+) -> Json:
+    """Enrolment of a material that was left out of training, from some sweeps of one placement.
+
+    Gives the balanced accuracy of all classes at the same placement and at others, as a share of
+    that of the model trained on all materials; and the accuracy lost by the old classes.
+    """
+    whole = {case.fold: (case, done) for case, done in full}
+    rows: dict[tuple[str, int], list[tuple[float, ...]]] = {}
+    for case, done in without:
+        rng = np.random.default_rng([seed, case.fold, case.left_out])
+        for n, where, row in _enrolled(case, done, *whole[case.fold], rng):
+            rows.setdefault((where, n), []).append((case.left_out, *row))
+    points: list[Json] = []
+    for (where, n), row_list in sorted(rows.items()):
+        values = np.array(row_list)
+        share, by_material = values[:, 1] / values[:, 2], values[:, 0].astype(int)
+        low, high = uncertainty.bootstrap(partial(_mean_of, share), by_material)
+        points.append(
+            {
+                "where": where,
+                "sweeps": n,
+                "share": round(float(share.mean()), 4),
+                "low": low,
+                "high": high,
+                "accuracy": round(float(values[:, 1].mean()), 4),
+                "trained": round(float(values[:, 2].mean()), 4),
+                "new": round(float(values[:, 3].mean()), 4),
+                "old_lost": round(float(values[:, 4].mean()), 4),
+                "draws": len(values),
+                "by_material": {
+                    materials[k]: round(float(share[by_material == k].mean()), 4)
+                    for k in np.unique(by_material)
+                },
+            }
+        )
+    return {"points": points}
+
+
+def _enrolled(
+    case: Case, done: Calibration, whole: Case, trained: Calibration, rng: np.random.Generator
+) -> Iterator[tuple[int, str, tuple[float, float, float, float]]]:
+    """For each random draw: (sweeps, where, (accuracy, accuracy of the model trained on all
+    materials, recall of the new material, loss of the old ones))."""
+    network, z = done.logits(case.new[:, -1]), done.embedding(case.new[:, -1])
+    k = case.left_out
+    as_trained = trained.logits(whole.new[:, -1]).argmax(1)
+    names = np.append(
+        np.delete(np.arange(case.labels.max() + 1), k), k
+    )  # the box puts the new label last
+    before = names[network.argmax(1)]
+    mine, places = np.flatnonzero(case.labels == k), np.unique(case.places)
+    for n in ENROLLED:
+        for _ in range(max(ORDERS // len(places), 2) if n <= len(mine) else 0):
+            for place in places:
+                there = mine[case.places[mine] == place]
+                if len(there) < n:
+                    continue
+                drawn = rng.permutation(there)[:n]
+                named = names[enrolled_probabilities(done, network, z, z[drawn]).argmax(1)]
+                for where, chosen in (
+                    ("same place", case.places == place),
+                    ("other places", case.places != place),
+                ):
+                    test = np.setdiff1d(np.flatnonzero(chosen), drawn)
+                    if (case.labels[test] == k).any() and (case.labels[test] != k).any():
+                        label, old = case.labels[test], test[case.labels[test] != k]
+                        yield (
+                            n,
+                            where,
+                            (
+                                _balanced(named[test], label),
+                                _balanced(as_trained[test], label),
+                                float(np.mean(named[test][label == k] == k)),
+                                float(
+                                    np.mean(before[old] == case.labels[old])
+                                    - np.mean(named[old] == case.labels[old])
+                                ),
+                            ),
+                        )
+
+
+def enrolled_probabilities(done: Calibration, network: Array, z: Array, sweeps: Array) -> Array:
+    """Probabilities [n, K + 1] of sweeps with these logits [n, K] and embeddings z [n, r], as the
+    box answers after the last label was enrolled from `sweeps` [m, r]."""
+    classes = enrolled_classes(done.embedding.classes(), sweeps)
+    labels = [*map(str, range(len(classes.means)))]
+    means = ClassDistances(classes, replace(done.known(), enrolled=LEAST), labels)
+    return EnrolledLabels(classes.sweeps > 0, LEAST).decided(softmax(means.joined(network, z)))
+
+
+def _balanced(named: Array, labels: Array) -> float:
+    return float(np.mean([np.mean(named[labels == k] == k) for k in np.unique(labels)]))
+
+
+def _parted(rows: Array, held: Sequence[Trained]) -> list[Array]:
+    """`rows` of all cases, split by case."""
+    return np.split(rows, np.cumsum([len(case.labels) for case, _ in held])[:-1])
+
+
+def _same(level: float, agree: int, steps: int) -> Early:
+    return Early((level,) * (steps - 1), agree)
+
+
+def _accuracy(right: Array, clusters: Array) -> Json:
+    low, high = interval(right, clusters)
+    return {"accuracy": round(float(right.mean()), 4), "low": low, "high": high}
+
+
+def _mean_of(values: Array, some: Array) -> float:
+    return float(values[some].mean())

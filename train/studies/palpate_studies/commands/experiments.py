@@ -1,0 +1,195 @@
+"""The studies that compare methods or views: paper, development, fabrics, recipe.
+
+Each writes one file of results. `python -m palpate_studies pages` draws them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+
+from palpate.core import outputs
+from palpate_studies import (
+    development_experiment,
+    development_times,
+    fabrics_experiment,
+    paper_experiment,
+    recipe_views,
+)
+from palpate_studies.pages import PAGES
+from palpate_studies.study import StudyRun, read, results_file, save
+from palpate_train.arguments import options
+from palpate_train.arguments.types import Add
+from palpate_train.models.methods import Effort
+
+
+def register(add: Add) -> None:
+    """Add all commands of this module."""
+    paper = add("paper", run_paper)
+    _add_method(paper)
+    paper.add_argument(
+        "--curve",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="FILE",
+        help="run nothing: take the CNN's newest point from results of cnn-curve --size whole into"
+        " those in --out; name all trainings",
+    )
+    development = add("development", run_development)
+    _add_development(development)
+    fabrics = add("fabrics", run_fabrics)
+    _add_method(fabrics)
+    fabrics.set_defaults(method="all")
+    for name, command in (
+        ("paper", paper),
+        ("development", development),
+        ("fabrics", fabrics),
+        ("recipe", add("recipe", run_recipe)),
+    ):
+        _add_run(command, name)
+
+
+def _add_run(command: argparse.ArgumentParser, name: str) -> None:
+    """Options of every study."""
+    file = results_file(name)
+    command.add_argument(
+        "--out",
+        type=outputs.file(".json"),
+        default=file,
+        metavar="FILE",
+        help=f"file of results ({file})",
+    )
+    if name in ("paper", "development"):
+        command.add_argument(
+            "--quick",
+            action="store_true",
+            help="small sets, hardly trained: to try everything out, not for figures",
+        )
+    command.add_argument(
+        "--kept", action="store_true", help="train nothing, report what an earlier run has finished"
+    )
+    if name != "paper":
+        command.add_argument(
+            "--data",
+            type=Path,
+            default=os.environ.get("PALPATE_DATA"),
+            metavar="DIR",
+            help="folder of real sweeps (PALPATE_DATA)",
+        )
+    options.add_effort(command)
+    options.add_where(command)
+
+
+def _add_method(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--method",
+        metavar="NAME[,NAME...]",
+        help="run these; all others stay as in the results in --out (all)",
+    )
+
+
+def _add_seeds(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--seeds", type=int, default=1, metavar="N", help="of training: 1 to N (1)"
+    )
+
+
+def _add_development(command: argparse.ArgumentParser) -> None:
+    _add_seeds(command)
+    command.add_argument(
+        "--method", metavar="NAME[,NAME...]", help="(ours, as fit trains it, and the peers)"
+    )
+    command.add_argument(
+        "--leave-out",
+        action="append",
+        default=[],
+        metavar="CASE",
+        help="a case, or a point of its learning curve, that is not run, as the page names it",
+    )
+    command.add_argument(
+        "--join",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="FILE",
+        help="results of an earlier run, whose methods join those of this one",
+    )
+    command.add_argument(
+        "--times",
+        action="store_true",
+        help="measure the times of the results in --out again, and keep their accuracies",
+    )
+
+
+def _run(args: argparse.Namespace, quick_effort: Effort | None = None) -> StudyRun:
+    quick: bool = getattr(args, "quick", False)
+    effort = quick_effort if quick and quick_effort else options.effort(args)
+    seeds = options.seeds(args) if hasattr(args, "seeds") else (1,)
+    data: Path | None = getattr(args, "data", None)
+    return StudyRun(options.where(args), options.Log(), data, effort, seeds, quick)
+
+
+def _done(run: StudyRun, path: Path) -> None:
+    """Print the names that were left out, and the path of the results."""
+    for name, why in run.left_out.items():
+        print(f"left out: {name}: {why}")
+    print(path)
+
+
+def run_paper(args: argparse.Namespace) -> None:
+    """Run the experiment and write its results. With --curve only add the CNN's trainings."""
+    run = _run(args)
+    keys = PAGES["paper"].keys
+    if args.curve:
+        curves = [read(path, "points", "world") for path in args.curve]
+        found = paper_experiment.with_curves(read(args.out, *keys), curves)
+    else:
+        only = options.names(args) if args.method else ()
+        earlier = read(args.out, *keys) if only else None
+        found = paper_experiment.results(run, only, earlier)
+    _done(run, save(args.out, found))
+
+
+def run_fabrics(args: argparse.Namespace) -> None:
+    """Evaluate and write the results."""
+    names, run = options.names(args), _run(args)
+    earlier = read(args.out) if args.out.exists() else ()
+    found = fabrics_experiment.results(names, run, earlier)
+    _done(run, save(args.out, found))
+
+
+def run_recipe(args: argparse.Namespace) -> None:
+    """Measure and write the results."""
+    run = _run(args)
+    _done(run, save(args.out, recipe_views.results(run)))
+
+
+def run_development(args: argparse.Namespace) -> None:
+    """Evaluate, time and write the results; with --times after timing alone."""
+    run = _run(args, development_experiment.QUICK_EFFORT)
+    keys = PAGES["development"].keys
+    study = development_experiment.QUICK if run.quick else development_experiment.STUDY
+    usual = development_experiment.usual_methods
+    names = options.names(args) if args.method else usual(study)
+    if args.times:
+        figures = read(args.out, *keys)
+    else:
+        made = development_experiment.results(study, run, tuple(names), args.leave_out)
+        earlier = [read(path, *keys) for path in args.join]
+        figures = development_experiment.join(made, earlier)
+    if args.times or not args.kept:
+        timed = development_times.QUICK if run.quick else development_times.TIMED
+        train = timed.load()
+        assert train is not None  # it is simulated
+        figures["times"] = development_times.measured(
+            figures["methods"], train, 1, run.where.cache, run.log, run.effort
+        )
+        if not run.quick:
+            # without the folder of real sweeps their panel keeps its times
+            figures["panel_times"] = figures.get("panel_times", {}) | development_times.of_panels(
+                figures["methods"], run.data, 1, run.where.cache, run.log, run.effort
+            )
+    run.left_out = dict(figures["left_out"])
+    _done(run, save(args.out, figures))

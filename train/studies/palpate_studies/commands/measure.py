@@ -1,0 +1,428 @@
+"""The studies that measure: stress, certainty, calibrate, cnn-curve, taxels, alignment,
+references."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from palpate.bundle import bundle
+from palpate.core import outputs
+from palpate.core.clock import SystemClock
+from palpate.core.errors import FormatError
+from palpate.core.provenance import commit
+from palpate.core.storage import put
+from palpate.inference.classifier import Classifier
+from palpate.sim import skin
+from palpate_studies import alignment, broken_taxels, certainty, references, sim_calibration
+from palpate_studies.study import read, results_file, save
+from palpate_train.arguments import numbers, options
+from palpate_train.arguments.types import Add
+from palpate_train.data import sets
+from palpate_train.data.progress import Progress
+from palpate_train.data.sets import Dataset
+from palpate_train.evaluate import robustness
+from palpate_train.evaluate.corruption_pairs import pairs
+from palpate_train.evaluate.corruptions import applicable
+from palpate_train.evaluate.evaluation_sweeps import EvaluationSweeps
+from palpate_train.export import bundle_stress
+from palpate_train.export.quantized_bundle import export
+from palpate_train.metrics import score
+from palpate_train.models import methods
+from palpate_train.models.methods import Log
+from palpate_train.models.recipe import recipe
+
+STRESSED = "sim:T-REAL/level-blind:101-104:1"
+"""At 36 attachments at which neither the methods nor the packaged bundle are trained."""
+OWN = "stressed"
+"""Name of a bundle that the study makes for itself."""
+TAXEL_SWEEPS = 216
+"""Sweeps of a file whose taxels are broken, as many as the simulated set has."""
+STRESSED_METHODS = (
+    "palpate-reattached,palpate,minirocket,minirocket-augmented,multirocket-hydra,ds-cnn,H-svm"
+)
+"""First the recipe of the packaged bundle."""
+
+
+def register(add: Add) -> None:
+    _add_stress(add)
+    _add_certainty(add)
+    _add_calibrate(add)
+    _add_cnn_curve(add)
+    _add_taxels(add)
+    _add_alignment(add)
+    command = add("references", run_references)
+    command.add_argument("--out", type=outputs.folder, required=True, metavar="DIR")
+
+
+def _add_out(command: argparse.ArgumentParser, name: str) -> None:
+    file = results_file(name)
+    command.add_argument(
+        "--out",
+        type=outputs.file(".json"),
+        default=file,
+        metavar="FILE",
+        help=f"file of results ({file})",
+    )
+
+
+def _add_calibrate(add: Add) -> None:
+    calibrate = add("calibrate", run_calibrate)
+    calibrate.add_argument(
+        "--seeds",
+        type=numbers.span("--seeds", "201-208"),
+        default=range(201, 209),
+        metavar="FIRST-LAST",
+        help="of the simulated worlds (201-208)",
+    )
+    calibrate.add_argument(
+        "--ablate", action="store_true", help="also without each of its effects in turn"
+    )
+    calibrate.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
+    options.add_jobs(calibrate)
+
+
+def _add_cnn_curve(add: Add) -> None:
+    follow = add("cnn-curve", run_cnn_curve)
+    follow.set_defaults(resumes=True)
+    follow.add_argument(
+        "--size",
+        choices=("small", "whole"),
+        default="small",
+        help="small (a stand-in of a minute) or whole (an hour of one core)",
+    )
+    follow.add_argument(
+        "--seed",
+        type=numbers.whole("--seed", 0),
+        default=1,
+        metavar="N",
+        help="of the simulated world and the training (1)",
+    )
+    _add_curve_sweeps(follow)
+    follow.add_argument(
+        "--steps",
+        type=numbers.whole("--steps", 1),
+        metavar="N",
+        help="iterations (those of the size)",
+    )
+    follow.add_argument(
+        "--out",
+        type=outputs.file(".json"),
+        required=True,
+        metavar="FILE",
+        help="where the curve goes; an interrupted training goes on from there",
+    )
+
+
+def _add_curve_sweeps(follow: argparse.ArgumentParser) -> None:
+    """The sweeps that the network is trained on and tested with."""
+    follow.add_argument(
+        "--remove-means", action="store_true", help="take each window's mean away, taxel by taxel"
+    )
+    follow.add_argument(
+        "--world",
+        choices=tuple(name for name in skin.WORLDS if name),
+        help="simulated world (the laboratory)",
+    )
+    follow.add_argument(
+        "--left",
+        type=numbers.whole("--left", 0),
+        metavar="P",
+        help="position of T-REAL to leave out and to test on, 0 to 8 (none)",
+    )
+
+
+def _add_alignment(add: Add) -> None:
+    command = add("alignment", run_alignment)
+    command.add_argument(
+        "--bundle", type=Path, default=bundle.DEFAULT, metavar="DIR", help="(the packaged one)"
+    )
+    command.add_argument(
+        "--seen",
+        default="sim:T-REAL/level-blind:1-6:2",
+        metavar="SET",
+        help="what it was trained on",
+    )
+    command.add_argument(
+        "--unseen",
+        default="sim:T-REAL/level-blind:101-104:2",
+        metavar="SET",
+        help="moved from these places",
+    )
+    command.add_argument(
+        "--hard", default="sim:T-HARD/level-blind:101-136:2", metavar="SET", help="a row ahead"
+    )
+    _add_out(command, "alignment")
+
+
+def _add_taxels(add: Add) -> None:
+    command = add("taxels", run_taxels)
+    command.add_argument(
+        "--bundle", type=Path, default=bundle.DEFAULT, metavar="DIR", help="(the packaged one)"
+    )
+    command.add_argument(
+        "--test",
+        default=STRESSED,
+        metavar="SET",
+        help=f"the set whose taxels are broken; a simulated one is drawn anew ({STRESSED})",
+    )
+    command.add_argument(
+        "--seed", type=numbers.whole("--seed", 0), default=1, help="of the places (1)"
+    )
+    command.add_argument("--times", action="store_true", help="measure the time instead")
+
+
+def _add_stress(add: Add) -> None:
+    command = add("stress", run_stress)
+    options.add_set(command, "sim:T-REAL/level-blind:1")
+    _add_corrupted(command)
+    command.add_argument(
+        "--method",
+        default=STRESSED_METHODS,
+        metavar="NAME[,NAME...]",
+        help="ours first; the first five are drawn; or all; "
+        f"see palpate-train evaluate --list ({STRESSED_METHODS})",
+    )
+    command.add_argument(
+        "--seeds", type=int, default=1, metavar="N", help="of training and corruptions: 1 to N (1)"
+    )
+    command.add_argument(
+        "--bundle",
+        type=Path,
+        metavar="DIR",
+        help="that answers as the box does (the packaged one; with --split that of `fit` and "
+        "`export` at their defaults)",
+    )
+    _add_out(command, "stress")
+    command.add_argument(
+        "--join",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="FILE",
+        help="results of an earlier run on the same sets, whose methods join those of this one",
+    )
+    command.add_argument(
+        "--kept", action="store_true", help="train nothing, report what an earlier run has finished"
+    )
+    options.add_effort(command)
+    options.add_where(command)
+
+
+def _add_corrupted(command: argparse.ArgumentParser) -> None:
+    """The options of the corrupted set."""
+    command.add_argument(
+        "--test",
+        default=STRESSED,
+        metavar="SET",
+        help=f"the set that is corrupted; a simulated one is drawn anew ({STRESSED})",
+    )
+    command.add_argument(
+        "--split",
+        metavar="GROUP:SHARE",
+        help="train on this share of the set's groups, as `fit --split` with seed 1, and corrupt "
+        "the rest instead of --test",
+    )
+
+
+def _add_certainty(add: Add) -> None:
+    command = add("certainty", run_certainty)
+    options.add_set(command)
+    command.add_argument("--test", metavar="SET", help="test on this set")
+    command.add_argument(
+        "--protocol",
+        default="leave:position",
+        help="what is tested on where --test is not given (leave:position)",
+    )
+    command.add_argument(
+        "--method",
+        default=methods.SHIPPED,
+        metavar="NAME",
+        help=f"{methods.SHIPPED} or one of its sizes ({methods.SHIPPED})",
+    )
+    command.add_argument(
+        "--seed", type=numbers.whole("--seed", 0), default=1, help="of training and draws (1)"
+    )
+    _add_out(command, "certainty")
+    command.add_argument(
+        "--kept", action="store_true", help="train nothing, report what an earlier run has finished"
+    )
+    options.add_effort(command)
+    options.add_where(command)
+
+
+def run_stress(args: argparse.Namespace) -> None:
+    """Write the results; print their path."""
+    names, seeds, log = options.names(args), options.seeds(args), options.Log()
+    train = options.load(args)
+    if args.split:
+        train, rest = train.split(*options.group_share(args.split), 1)
+        test = EvaluationSweeps.of(rest)
+    elif args.test.startswith("sim:"):
+        test = EvaluationSweeps.simulated(args.test)
+    else:
+        test = EvaluationSweeps.of(sets.load(args.test).select(args.only))
+    with tempfile.TemporaryDirectory() as own:
+        folder = _made_of(train, Path(own), log) if args.split and not args.bundle else args.bundle
+        box = _box_under_stress(folder, test, seeds, log)
+    result = robustness.run(
+        names,
+        train,
+        test,
+        options.where(args),
+        seeds=seeds,
+        effort=options.effort(args),
+        log=log,
+    )
+    positions = test.sweeps.groups.get("position")
+    result |= {
+        "box": box,
+        "only": list(args.only),
+        "split": args.split or "",
+        "train": train.source,
+        "train_sweeps": len(train),
+        "train_digest": sets.digest(train),
+        "test": test.sweeps.source,
+        "test_sweeps": len(test.sweeps),
+        "test_digest": sets.digest(test.sweeps),
+        "attachments": 0 if positions is None else len(np.unique(positions)),
+        "format": str(train.format),
+        "seeds": list(seeds),
+    } | score.provenance()
+    for path in args.join:
+        result = _joined(result, read(path, "methods", "train_digest", "test_digest"))
+    print(save(args.out, result))
+
+
+def _joined(result: dict[str, Any], earlier: dict[str, Any]) -> dict[str, Any]:
+    """The result with the methods of an earlier one that it does not have itself, and with the
+    origin of these in `earlier`. Raises FormatError if the earlier one was of other sweeps."""
+    for key in ("train_digest", "test_digest"):
+        if result[key] != earlier[key]:
+            raise FormatError(
+                f"the results to join have {key} {earlier[key]}, not {result[key]}; "
+                "name those of the same sets"
+            )
+    lacks = [name for name in earlier["methods"] if name not in result["methods"]]
+    origin = {key: earlier[key] for key in score.provenance() if key in earlier}
+    return result | {
+        "methods": earlier["methods"] | result["methods"],
+        "earlier": [*earlier.get("earlier", []), {"methods": lacks} | origin],
+    }
+
+
+def _made_of(train: Dataset, folder: Path, log: Log) -> Path:
+    """The bundle that `fit` and `export` make of these sweeps at their defaults."""
+    export(recipe.fit(train, 1, log=log), folder / "bundle", OWN, "1", commit())
+    return folder / "bundle"
+
+
+def _box_under_stress(
+    folder: Path | None, test: EvaluationSweeps, seeds: Sequence[int], log: Callable[[str], None]
+) -> dict[str, Any]:
+    """The answers of a bundle under corruption. Raises FormatError if it cannot answer these
+    sweeps; for the packaged one (None) the curves are then missing."""
+    box = Classifier(bundle.load(folder or bundle.DEFAULT), SystemClock(), slides=False)
+    try:
+        curves, paired = (
+            bundle_stress.under_corruptions(box, test, seeds, log, those)
+            for those in (applicable(test), pairs())
+        )
+    except FormatError:
+        if folder:
+            raise
+        curves, paired = {}, {}
+    manifest = box.bundle.manifest
+    number = box.bundle.id if manifest.name != OWN else ""  # this file is gone after the run
+    return {
+        "bundle": {"name": manifest.name, "version": manifest.version, "id": number},
+        "made": dict(manifest.made),
+        "uninformative": robustness.box_answers(box.bundle),
+        "curves": curves,
+        "pairs": paired,
+    }
+
+
+def run_certainty(args: argparse.Namespace) -> None:
+    """Write the results; print their path."""
+    test = sets.load(args.test).select(args.only) if args.test else None
+    result = certainty.run(
+        options.load(args),
+        test,
+        args.protocol,
+        args.method,
+        options.where(args),
+        options.Log(),
+        options.effort(args),
+        args.seed,
+    )
+    print(save(args.out, result))
+
+
+def run_calibrate(args: argparse.Namespace) -> None:
+    """Print the table; write the figures as JSON where a file is named."""
+    result = (
+        sim_calibration.measure(args.seeds, args.ablate, options.Log(), jobs=args.jobs)
+        | score.provenance()
+    )
+    if args.json:
+        put(args.json, (json.dumps(result, indent=1) + "\n").encode(), parents=True)
+    print(sim_calibration.table(result))
+
+
+def run_cnn_curve(args: argparse.Namespace) -> None:
+    """Train, write the curve, print it."""
+    log = options.Log()
+    from palpate_studies import cnn_curve  # here: it imports PyTorch
+
+    print(
+        cnn_curve.table(
+            cnn_curve.follow(
+                args.out,
+                args.size,
+                args.seed,
+                args.remove_means,
+                steps=args.steps,
+                log=log,
+                left=args.left,
+                world=skin.WORLDS[args.world or ""],
+            )
+        )
+    )
+
+
+def run_taxels(args: argparse.Namespace) -> None:
+    """Print the table, or the times."""
+    loaded = bundle.load(args.bundle)
+    if args.times:
+        print(broken_taxels.times(loaded))
+        return
+    test = (
+        EvaluationSweeps.simulated(args.test)
+        if args.test.startswith("sim:")
+        else EvaluationSweeps.of(sets.load(args.test), TAXEL_SWEEPS)
+    )
+    for line in broken_taxels.table(loaded, test, args.seed):
+        print(line)
+
+
+def run_alignment(args: argparse.Namespace) -> None:
+    """Measure, write the results, and print a summary."""
+    box = Classifier(bundle.load(args.bundle), SystemClock())
+    displacements = len(alignment.DIRECTIONS) * (2 * len(alignment.OFF_MM) + 1)
+    progress = Progress(displacements, options.Log())
+    result = alignment.measure(box, args.unseen, args.seen, args.hard, progress.begin)
+    save(args.out, result)
+    print("\n".join(alignment.lines(result)))
+
+
+def run_references(args: argparse.Namespace) -> None:
+    """Write the references and print their paths."""
+    for path in references.write(args.out):
+        print(path)

@@ -1,0 +1,267 @@
+"""The study `development`: all methods on all development sets.
+
+One set is never enough to tune on: a recipe that overfits one set shows it on the others. evaluate
+caches folds, so an interrupted command goes on where it was. T-HARD, the skin attached anew, is not
+among the sets, because the simulator cannot be trusted with it (decision 10).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from palpate.core.errors import FormatError
+from palpate_studies.fabrics_experiment import FABRICS, FOUR, SEVEN
+from palpate_studies.study import NO_DATA, Study, StudyCase, StudyRun
+from palpate_train.data.sets import Dataset, digest
+from palpate_train.evaluate import evaluate
+from palpate_train.evaluate.evaluate import Plan
+from palpate_train.metrics import score
+from palpate_train.models import methods
+from palpate_train.models.methods import PACKAGED, SHIPPED, Effort
+from palpate_train.models.recipe.sizes import SIZES
+
+Json = dict[str, Any]
+LINE = (*(f"{SHIPPED}-{name}" for name in SIZES), SHIPPED)
+"""The sizes of our family, from the smallest to everything."""
+OURS = (SHIPPED, PACKAGED, *LINE[:-1])
+"""Our methods. The first of them with results is compared with the peers."""
+PEERS = (
+    "minirocket",
+    "minirocket-augmented",
+    "multirocket-hydra",
+    "quant",
+    "ds-cnn",
+    "lite",
+    "edge-spectral",
+    "H-svm",
+    "paper-cnn-centred",
+)
+EACH = (5, 10, 20)
+"""Training sweeps of each material at the points of a learning curve, if a set has more of them."""
+
+
+def _fabrics(
+    protocol: str,
+    only: tuple[str, ...],
+    curve: tuple[int, ...] = (),
+    windows: tuple[int, ...] = (),
+) -> StudyCase:
+    return StudyCase((FABRICS,), protocol, only, True, True, curve, windows)
+
+
+def _published(name: str, curve: tuple[int, ...] = ()) -> StudyCase:
+    return StudyCase((f"aeon:{name}",), "split:split=0->1", means_removed=True, curve=curve)
+
+
+TUBES = "simulated tubes, a position out"
+CASES = {
+    "7 fabrics, a force out": _fabrics("leave:force", SEVEN, curve=EACH, windows=(16, 32, 64)),
+    "7 fabrics, a speed out": _fabrics("leave:speed", SEVEN),
+    "7 fabrics, a repetition out": _fabrics("leave:rep", SEVEN),
+    "4 fabrics, a force out": _fabrics("leave:force", FOUR),
+    "4 fabrics, a speed out": _fabrics("leave:speed", FOUR),
+    "4 fabrics, a direction out": _fabrics("leave:direction", FOUR),
+    "ACSF1, published split": _published("ACSF1", (5,)),
+    "OSULeaf, published split": _published("OSULeaf", (5, 10)),
+    "BasicMotions, published split": _published("BasicMotions", (5,)),
+    "ArrowHead, published split": _published("ArrowHead", (5, 10)),
+    "GunPoint, published split": _published("GunPoint", EACH),
+    TUBES: StudyCase(("sim:T-REAL/level-blind:1",), "leave:position", curve=EACH),
+}
+"""In the order of the page."""
+STUDY = Study("development", CASES, (*OURS, *PEERS))
+QUICK = Study(
+    "development",
+    {
+        "GunPoint, published split": _published("GunPoint"),
+        TUBES: StudyCase(
+            ("sim:T-REAL/level-blind:1001:3",), "leave:position", ("position<=2",), curve=EACH
+        ),
+    },
+    ("palpate-bands", "edge-spectral", "L-gauss"),
+)
+QUICK_EFFORT = Effort(share=0.02)
+
+
+def usual_methods(study: Study) -> tuple[str, ...]:
+    """The methods of a study that exist here."""
+    known = methods.every()
+    return tuple(name for name in study.methods if name in known)
+
+
+def results(study: Study, run: StudyRun, names: Sequence[str], skipped: Sequence[str] = ()) -> Json:
+    """The results of the methods `names`: `cases` with their sets, and entries by case, method and
+    number of training sweeps.
+
+    skipped: names of cases, or of points of their curves ("NAME, 5 each"), that are not run. Raises
+    FormatError for an unknown method, and for a skipped case that does not exist.
+    """
+    methods.find(names)
+    _require_known(study, skipped)
+    cases: list[Json] = []
+    found: list[Json] = []
+    for number, (name, case) in enumerate(study.cases.items(), 1):
+        sweeps = case.load(run.data)
+        if sweeps is None:
+            run.left_out[name] = NO_DATA
+            continue
+        cases.append(_about(name, case, sweeps))
+        for each, frames, point in _points(name, case):
+            if point in skipped or name in skipped:
+                run.left_out[point] = f"skipped in the run of {', '.join(names)}"
+            else:
+                plan = Plan(
+                    names, (case.protocol,), run.seeds, case.means_removed, run.effort, each
+                )
+                progress = f"{number}/{len(study.cases)} {point}"
+                for entry in _evaluated(name, _middle(sweeps, frames), plan, run, progress):
+                    found.append(entry | ({"frames": frames} if frames else {}))
+    known = {"methods": list(names), "seeds": list(run.seeds), "effort": run.effort.share}
+    return {
+        "methods": list(names),
+        "runs": [known | score.provenance()],
+        "cases": cases,
+        "results": found,
+        "left_out": run.left_out,
+    } | ({"quick": True} if run.quick else {})
+
+
+def _require_known(study: Study, names: Sequence[str]) -> None:
+    known = [point for name, case in study.cases.items() for *_, point in _points(name, case)]
+    for name in names:
+        if name not in known:
+            raise FormatError(f"{name!r} is not a case; leave out some of {'; '.join(known)}")
+
+
+def _evaluated(
+    name: str, sweeps: Dataset, plan: Plan, run: StudyRun, progress: str
+) -> Iterator[Json]:
+    """Yield one entry for each method that accepts the set, over all seeds that were found."""
+    by_method: dict[str, list[Json]] = {}
+
+    def log(line: str) -> None:
+        run.log(f"{progress}: {line}")
+
+    for result in evaluate.evaluate(sweeps, plan, run.where, log):
+        if result.refused:
+            run.left_out[f"{result.method}, {name}"] = result.refused
+        else:
+            by_method.setdefault(result.method, []).append(result.json() | {"seed": result.seed})
+    for method, several in by_method.items():
+        yield {"case": name, "each": plan.each, "method": method} | _entry(several)
+
+
+def _middle(sweeps: Dataset, frames: int) -> Dataset:
+    """The middle `frames` of each sweep; all of them for 0."""
+    start = (sweeps.format.window - frames) // 2
+    return replace(sweeps, samples=sweeps.samples[:, start:][:, :frames]) if frames else sweeps
+
+
+def _points(name: str, case: StudyCase) -> list[tuple[int, int, str]]:
+    """Training sweeps of each material, frames (0 for all), and the name, of a case and of each
+    point of its curves."""
+    points = [(0, 0), *((each, 0) for each in case.curve), *((0, n) for n in case.windows)]
+    return [(*point, _name(name, *point)) for point in points]
+
+
+def _name(case: str, each: int, frames: int) -> str:
+    """Name of a case, or of a point of its curves."""
+    return f"{case}, {each} each" if each else f"{case}, {frames} frames" if frames else case
+
+
+def _place(entry: Json) -> tuple[str, int, int]:
+    """The case and the point of its curves that an entry is of."""
+    return entry["case"], entry["each"], entry.get("frames", 0)
+
+
+def join(run: Json, earlier: Sequence[Json]) -> Json:
+    """`run` with the methods, entries, reasons, runs and times of `earlier` runs that it does not
+    have itself. Of a method whose entries are all replaced no run is named.
+
+    Raises FormatError if an earlier run was of other sweeps.
+    """
+    made = dict(run)
+    for one in earlier:
+        _require_same_sweeps(made, one)
+        there = {(_place(entry), entry["method"]) for entry in made["results"]}
+        more = [entry for entry in one["results"] if (_place(entry), entry["method"]) not in there]
+        names = dict.fromkeys([*made["methods"], *one["methods"]])
+        left = {entry["method"] for entry in more}
+        runs = [run | {"methods": [m for m in run["methods"] if m in left]} for run in one["runs"]]
+        made |= {
+            "methods": sorted(names, key=lambda name: (*OURS, *PEERS, name).index(name)),
+            "results": [*made["results"], *more],
+            "runs": [*made["runs"], *(run for run in runs if run["methods"])],
+        }
+        for times in ("times", "panel_times"):
+            if one.get(times):
+                made.setdefault(times, one[times])
+        done = {
+            name
+            for entry in made["results"]
+            for name in (f"{entry['method']}, {entry['case']}", _name(*_place(entry)))
+        }
+        made["left_out"] = {
+            k: why for k, why in (one["left_out"] | made["left_out"]).items() if k not in done
+        }
+    return made
+
+
+def _require_same_sweeps(run: Json, earlier: Json) -> None:
+    known = {case["case"]: case["digest"] for case in earlier["cases"]}
+    for case in run["cases"]:
+        if known.get(case["case"], case["digest"]) != case["digest"]:
+            raise FormatError(
+                f"{case['case']!r} was of other sweeps in a run that is joined; "
+                "run its methods again"
+            )
+
+
+def _about(name: str, case: StudyCase, sweeps: Dataset) -> Json:
+    """The sweeps and the protocol of a case."""
+    return {
+        "case": name,
+        "set": sweeps.source,
+        "only": list(case.only),
+        "protocol": case.protocol,
+        "means_removed": case.means_removed,
+        "simulated": case.simulated,
+        "sweeps": len(sweeps),
+        "materials": len(sweeps.materials),
+        "format": str(sweeps.format),
+        "digest": digest(sweeps),
+        "curve": list(case.curve),
+        "windows": list(case.windows),
+        "rate_hz": sweeps.rate_hz,
+    }
+
+
+def _entry(results: Sequence[Json]) -> Json:
+    """Accuracy with its interval, and costs, over the results of all seeds, for each precision."""
+    seeds = [result["seed"] for result in results]
+    forms = {
+        name: joined(
+            [
+                result["forms"][name] | {"seed": seed}
+                for result, seed in zip(results, seeds, strict=True)
+            ]
+        )
+        for name in results[0].get("forms", {})
+    }
+    costs = {name: max(float(result[name]) for result in results) for name in ("fit_s", "ms_p50")}
+    return joined(results) | costs | {"forms": forms}
+
+
+def joined(results: Sequence[Json]) -> Json:
+    """Results of several seeds of one protocol as one: means of accuracies and of the ends of
+    intervals."""
+    shares = [(r["window"]["right"] / r["window"]["total"], *r["interval"]) for r in results]
+    ends: Iterable[float] = np.mean(shares, axis=0)
+    return {
+        name: round(float(share), 4)
+        for name, share in zip(("mean", "low", "high"), ends, strict=True)
+    } | {"n": results[0]["window"]["total"], "seeds": sorted(r["seed"] for r in results)}

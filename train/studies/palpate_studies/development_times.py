@@ -1,0 +1,197 @@
+"""Costs of a sweep with each method, all timed in turns in one process.
+
+Features and graph are timed in a session like the box's, a method without a graph in its own
+library. The box checks every sweep before that, whatever the model; `box` has the time of the
+packaged bundle with these checks.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.bundle import bundle
+from palpate.core.errors import BundleError, FormatError
+from palpate.core.provenance import processor
+from palpate.inference.session import session
+from palpate_studies import cost, precisions
+from palpate_studies.development_chart import SERIES, TACTILE
+from palpate_studies.development_experiment import CASES, OURS
+from palpate_studies.precisions import Packed
+from palpate_studies.study import StudyCase
+from palpate_train.data.progress import Progress
+from palpate_train.data.sets import Dataset
+from palpate_train.export import measure
+from palpate_train.features import kinds
+from palpate_train.metrics import score
+from palpate_train.models import methods
+from palpate_train.models.methods import FULL_EFFORT, Effort, Method, Model, model_inputs
+
+Array = NDArray[Any]
+Json = dict[str, Any]
+Log = Callable[[str], None]
+TIMED = StudyCase(("sim:T-REAL/level-blind:1",))
+"""The sweeps that every method is trained on and timed with."""
+PANELS = {
+    TACTILE: CASES["7 fabrics, a repetition out"],
+    SERIES: CASES["OSULeaf, published split"],
+}
+"""For each panel of the chart the sweeps with which its methods are timed. Which views a model of
+ours has, and so its time, depends on the sweeps."""
+QUICK = StudyCase(("sim:T-REAL/level-blind:1001:3",), only=("position<=2",))
+ROUNDS = 10
+"""Rounds of timing. The slowest methods take a thousand times as long as the quickest."""
+EVERY, SHARE = 5, 0.25
+"""A peer of a library is trained on every fifth sweep, a network of a peer for a quarter of its
+iterations: training does not change the time of a sweep. Ours are trained as always, because
+training chooses their size."""
+BOX = "box"
+"""Name of the packaged bundle among the timed calls."""
+
+
+def measured(
+    names: Sequence[str],
+    sweeps: Dataset,
+    seed: int,
+    cache: Path | None,
+    log: Log,
+    effort: Effort = FULL_EFFORT,
+    rounds: int = ROUNDS,
+) -> Json:
+    """`entries` with the costs of a sweep, which docs/reference/file-formats.md describes, and the
+    methods that are `left_out`.
+
+    Bundles are cached in `cache`.
+    """
+    entries: list[Json] = []
+    calls: dict[str, measure.Call] = {}
+    left_out: dict[str, str] = {}
+    some = sweeps.samples[:: max(len(sweeps) // measure.TIMED_SWEEPS, 1)]
+    with tempfile.TemporaryDirectory() as work:
+        progress = Progress(len(names), log)
+        for method in [_briefly(name, effort) for name in names]:
+            progress.begin(f"{method.name} is trained for its time")
+            try:
+                for entry, call in _callable(method, sweeps, some, seed, cache or Path(work)):
+                    calls[str(len(entries))] = call
+                    entries.append(entry)
+            except (FormatError, BundleError) as e:
+                left_out[method.name] = str(e)
+        if bundle.load(bundle.DEFAULT).format == sweeps.format:
+            calls[BOX] = measure.load(bundle.DEFAULT)
+        log(f"{len(calls)} models take turns")
+        took = measure.timed(calls, some, rounds)
+    box = _quantiles(took.pop(BOX)) if BOX in took else {}
+    for entry, times in zip(entries, took.values(), strict=True):
+        entry |= _quantiles(times)
+    return {
+        "set": sweeps.source,
+        "format": str(sweeps.format),
+        "processor": processor(),
+        "box": box,
+        "entries": entries,
+        "left_out": left_out,
+    } | score.provenance()
+
+
+def of_panels(
+    names: Sequence[str], data: Path | None, seed: int, cache: Path | None, log: Log, effort: Effort
+) -> Json:
+    """`measured` for each panel of the chart. Panels of real sweeps need the folder `data`."""
+    found = {}
+    for kind, case in PANELS.items():
+        if (sweeps := case.load(data)) is not None:
+            log(f"times of {kind}")
+            sweeps = sweeps.without_means() if case.means_removed else sweeps
+            found[kind] = measured(names, sweeps, seed, cache, log, effort)
+    return found
+
+
+def _quantiles(times: Array) -> dict[str, float]:
+    return {f"ms_p{q}": round(float(np.percentile(times, q)), 4) for q in (50, 99)}
+
+
+def _briefly(name: str, effort: Effort) -> Method:
+    """The method, for a peer with SHARE of its iterations, unless the effort is smaller anyway."""
+    return methods.find(
+        [name],
+        effort if name in OURS else replace(effort, share=min(SHARE, effort.share), paper_steps=1),
+    )[0]
+
+
+def _callable(
+    method: Method, sweeps: Dataset, some: Array, seed: int, cache: Path
+) -> list[tuple[Json, measure.Call]]:
+    """The method in each precision of the box, and in its own library. A model that the box refuses
+    is timed all the same. some: raw counts [n, T, R, C] for its memory."""
+    if method.library:
+        few = sweeps.take(np.arange(0, len(sweeps), EVERY))
+        model = method.train(few, model_inputs(method.input, few), seed)
+        entry = {"method": method.name, "form": "", "precision": "float", "runtime": method.library}
+        return [(entry | {"runs_on_box": False}, partial(_alone, model))]
+    folder = precisions.kept_folder(method, sweeps, seed, cache)
+    try:
+        made = precisions.packed(method, sweeps, seed, folder)
+    except BundleError as e:
+        return list(_refused(method, sweeps, seed, str(e)))
+    return [(_entry(one, some), _call(method, one, sweeps.rate_hz)) for one in made]
+
+
+def _entry(one: Packed, some: Array) -> Json:
+    """The costs of a packed model but its time."""
+    return {
+        "method": one.method,
+        "form": one.form,
+        "precision": one.precision,
+        "runtime": one.runtime,
+        "runs_on_box": one.runtime == "onnx",
+        "weights": one.weights,
+        "macs": one.macs,
+        "file_kb": measure.sizes(one.folder)[0] / 1000,
+        "rss_mb": measure.memory(one.folder, some)["rss_mib"],
+    }
+
+
+def _call(method: Method, one: Packed, rate_hz: float) -> measure.Call:
+    """A packed model without the checks of the box."""
+    if one.runtime != "onnx":
+        return measure.load(one.folder)
+    return _graph(method, (one.folder / measure.MODEL).read_bytes(), rate_hz)
+
+
+def _refused(
+    method: Method, sweeps: Dataset, seed: int, why: str
+) -> Iterator[tuple[Json, measure.Call]]:
+    """Yield each precision of a method that the box refuses."""
+    few = sweeps.take(np.arange(0, len(sweeps), EVERY))
+    model = method.train(few, model_inputs(method.input, few), seed)
+    for form, one in {"": model, **getattr(model, "precisions", {})}.items():
+        graph = one.graph()
+        about = {"method": method.name, "form": form, "precision": cost.precision(graph)}
+        counts = {"weights": cost.weights(graph), "macs": cost.macs(graph)}
+        data = graph.SerializeToString()
+        more = {"runtime": "onnx", "runs_on_box": False, "refused": why}
+        entry = about | more | counts | {"file_kb": len(data) / 1000}
+        yield entry, _graph(method, data, sweeps.rate_hz)
+
+
+def _graph(method: Method, graph: bytes, rate_hz: float) -> measure.Call:
+    """Features and graph, which answer raw counts [T, R, C]."""
+    run = session(graph)
+    name = run.get_inputs()[0].name
+    return lambda counts: run.run(
+        None, {name: kinds.graph_input(method.input, counts, rate_hz)[None]}
+    )
+
+
+def _alone(model: Model, counts: Array) -> Array:
+    """Logits [K] from raw counts [T, R, C]."""
+    logits: Array = model.logits(counts[None])[0]
+    return logits

@@ -1,0 +1,89 @@
+"""Names beside the marks of a picture, each at the first place that is free."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from matplotlib.axes import Axes
+
+from palpate_train.reports.plot_style import GREY, SMALL
+
+PLACES = [
+    (7, 0, "left"),
+    (0, 10, "center"),
+    (-7, 0, "right"),
+    (0, -10, "center"),
+    (-4, 10, "left"),
+    (5, 9, "left"),
+    (5, -9, "left"),
+    (-5, 9, "right"),
+    (-5, -9, "right"),
+    (0, 20, "center"),
+    (0, -20, "center"),
+    (8, 18, "left"),
+    (8, -18, "left"),
+    (-8, 18, "right"),
+    (-8, -18, "right"),
+    (-16, 26, "right"),
+    (16, -26, "left"),
+    (24, -34, "left"),
+    (0, 34, "center"),
+]
+"""Places of a name relative to its mark, in units, and its alignment; the best first."""
+FAR = 15
+"""From this distance on a stroke joins name and mark."""
+SIDES = {"left": 0.0, "center": 0.5, "right": 1.0}
+"""The side of a name at which its mark is."""
+LETTER = 0.53
+"""Width of a letter, as a share of its size."""
+MARK = 4.0
+"""Half the width of a mark, in units."""
+LEADER: dict[str, Any] = {"arrowstyle": "-", "color": GREY, "linewidth": 0.6, "shrinkB": MARK}
+Box = tuple[float, float, float, float]
+Label = tuple[float, float, str, str, bool]
+"""A mark (x, y in the plot's units), its name or "", the name's colour, and whether it is bold."""
+
+
+def write(axes: Axes, labels: Sequence[Label], taken: Sequence[tuple[float, float]] = ()) -> None:
+    """Write names beside their marks, the most important first. A name is written once, at the
+    first of its marks with a free place; without one it is left out.
+
+    taken: points in the plot's units where lines run. The axes have their final limits.
+    """
+    at = [axes.transData.transform(label[:2]) for label in labels]
+    boxes: list[Box] = [(x - MARK, y - MARK, x + MARK, y + MARK) for x, y in at]
+    boxes += [(x - 1, y - 1, x + 1, y + 1) for x, y in map(axes.transData.transform, taken)]
+    left, bottom, right, top = map(float, axes.get_window_extent().extents)
+    written: set[str] = set()
+    for i, (x, y, text, colour, bold) in enumerate(labels):
+        width = LETTER * SMALL * len(text) * (1.1 if bold else 1.0)
+        for dx, dy, side in PLACES if text and text not in written else ():
+            start = at[i][0] + dx - SIDES[side] * width
+            middle = at[i][1] + dy
+            box = (start, middle - 0.5 * SMALL, start + width, middle + 0.5 * SMALL)
+            inside = (
+                box[0] >= left and box[2] <= right + 6 and box[1] >= bottom and box[3] <= top + 6
+            )
+            if inside and not any(_meet(box, other) for k, other in enumerate(boxes) if k != i):
+                boxes.append(box)
+                written.add(text)
+                axes.annotate(
+                    text,
+                    (x, y),
+                    (dx, dy),
+                    textcoords="offset points",
+                    size=SMALL,
+                    va="center",
+                    ha=side,
+                    color=colour,
+                    weight="bold" if bold else "normal",
+                    annotation_clip=False,
+                    zorder=6,
+                    arrowprops=LEADER | {"relpos": (SIDES[side], 0.5)} if abs(dy) > FAR else None,
+                )
+                break
+
+
+def _meet(a: Box, b: Box) -> bool:
+    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]

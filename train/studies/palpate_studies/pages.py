@@ -1,0 +1,95 @@
+"""The pages of results: each is a template on the results of one study.
+
+`make site` publishes them. A page needs no font and no address outside of its folder.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from palpate.core.errors import FormatError
+from palpate_studies import (
+    development_report,
+    paper_report,
+    stress_report,
+    uncertainty_report,
+)
+from palpate_studies.study import DATA, read, results_file
+from palpate_train.reports import html, provenance
+
+Rendered = tuple[Mapping[str, str], Mapping[str, str]]
+"""Pages (HTML) and pictures (SVG) by name."""
+BOX_ON_HARD = {"accuracy", "wrong_share", "network"}
+"""Keys of the box's answers to T-HARD's sweeps in the results of `alignment`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    """The page of a study. keys: that its results have. render: makes pages and pictures of the
+    results and of the folder that holds them."""
+
+    keys: tuple[str, ...]
+    render: Callable[[Any, Path], Rendered]
+
+
+def _single(render: Callable[[Any], tuple[str, dict[str, str]]]) -> Callable[[Any, Path], Rendered]:
+    def rendered(results: Any, folder: Path) -> Rendered:
+        page, pictures = render(results)
+        return {"index": page}, pictures
+
+    return rendered
+
+
+def _paper(results: Any, folder: Path) -> Rendered:
+    page, pictures = paper_report.render(results, box_on_hard(folder))
+    return {"index": page}, pictures
+
+
+def _development(results: Any, folder: Path) -> Rendered:
+    certainty = results_file("certainty", folder)
+    early = read(certainty, *PAGES["certainty"].keys) if certainty.exists() else None
+    return development_report.render(results, early)
+
+
+PAGES: Mapping[str, Page] = {
+    "development": Page(
+        ("methods", "runs", "cases", "results", "left_out"),
+        _development,
+    ),
+    "stress-fabrics": Page(
+        ("methods", "box"), _single(partial(stress_report.render, name="stress-fabrics"))
+    ),
+    "stress": Page(("methods", "box"), _single(stress_report.render)),
+    "certainty": Page(("calibration", "early"), _single(uncertainty_report.render)),
+    "paper": Page(("table", "results"), _paper),
+}
+
+
+def write(wanted: Sequence[str], out: Path, folder: Path = DATA) -> list[Path]:
+    """Write the pages `wanted`, or all, into folders of `out`, with their pictures and the results
+    that they link to; the paths of the pages.
+
+    Raises FormatError for an unknown page, and for results that are missing or of another study.
+    """
+    if unknown := [name for name in wanted if name not in PAGES]:
+        raise FormatError(f"no page {', '.join(unknown)}; there are {', '.join(PAGES)}")
+    made = []
+    for name in wanted or PAGES:
+        file, page = results_file(name, folder), PAGES[name]
+        results = read(file, *page.keys)
+        pages, pictures = page.render(results, folder)
+        made.append(html.publish(out / name, pages, pictures, provenance.of(results)))
+        (out / name / file.name).write_bytes(file.read_bytes())
+    return made
+
+
+def box_on_hard(folder: Path) -> Mapping[str, Any] | None:
+    """The answers of the packaged bundle to T-HARD's sweeps, from the results of `alignment` in
+    `folder`; None if they are not there."""
+    file = results_file("alignment", folder)
+    point = read(file).get("T-HARD", {}) if file.exists() else {}
+    return point if point.keys() >= BOX_ON_HARD else None

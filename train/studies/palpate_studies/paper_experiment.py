@@ -1,0 +1,451 @@
+"""The study `paper`: the paper's experiment on the simulated sets, with more methods.
+
+evaluate caches folds, so an interrupted run goes on where it was.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.core.errors import FormatError
+from palpate.inference.classifier import LEAST_PROBABILITY, fuse, softmax
+from palpate.sim import skin
+from palpate_studies import paper_values
+from palpate_studies.paper_values import CNN
+from palpate_studies.study import Study, StudyCase, StudyRun
+from palpate_train.data.progress import spoken
+from palpate_train.data.sets import Dataset
+from palpate_train.evaluate.evaluate import Plan, Result, evaluate
+from palpate_train.metrics import score
+from palpate_train.models import methods
+from palpate_train.models.methods import FULL_EFFORT, Effort
+from palpate_train.models.peers import prior_work
+
+Array = NDArray[Any]
+Json = dict[str, Any]
+BASELINES = ("L-gauss", "L-knn", "L-svm", "H-knn", "H-svm")
+NEIGHBOURS = ("fishel-bayes", "static-svm", "spectrogram-svm", "correlation-svm")
+NETWORKS = ("tactnet2", "recurrent")
+OWN = ("palpate-reattached", "palpate")
+BY_METHOD = ("costs", "confusion", "several", "explored", "methods")
+"""Tables of the results by method; all but the last are of the case "lopo"."""
+CURVE_CASES = {"lopo": ("left", "new"), "hard": ("hard",)}
+"""The sets of cnn_curve by the case that they stand for."""
+SURE = (0.9, 0.95, 0.99)
+"""Posteriors at which no more sweeps are added."""
+SEVERAL = 3
+ATTACHMENTS = 36
+"""Seeds of T-HARD for each seed of a case, 18 sweeps each."""
+COST_POINTS = 160
+PLACES = 10_000
+"""More than a seed has attachments."""
+LISTS = ("table", "results")
+"""Tables of the results that are lists."""
+
+
+def load(case: StudyCase, seed: int) -> Dataset:
+    """The sweeps of a case of one seed, which stands for {w} in the names of its sets; {a} and {b}
+    are its first and last seed of T-HARD."""
+    last = ATTACHMENTS * seed
+    sweeps = case.load(w=seed, a=last - ATTACHMENTS + 1, b=last)
+    assert sweeps is not None  # all are simulated
+    return sweeps
+
+
+@dataclass(frozen=True)
+class Step:
+    """Methods that are trained and tested in the same cases (`parts`) and with the same seeds.
+
+    fold_s: seconds of a fold on one core, to estimate the time left.
+    """
+
+    methods: tuple[str, ...]
+    parts: tuple[str, ...]
+    seeds: tuple[int, ...]
+    fold_s: float
+
+
+HARD, EASY = ("lopo", "hard"), ("lab", "random")
+BLIND = "/level-blind"
+"""End of the name of a case in the level-blind world."""
+HARD_BLIND = tuple(part + BLIND for part in HARD)
+
+
+def in_both_worlds(laboratory: Mapping[str, StudyCase]) -> dict[str, StudyCase]:
+    """The cases of the laboratory, and its HARD ones in the level-blind world too."""
+    return {
+        **laboratory,
+        **{
+            part + BLIND: replace(
+                laboratory[part],
+                sets=tuple(
+                    re.sub(r"^sim:[^:]*", rf"\g<0>{BLIND}", name) for name in laboratory[part].sets
+                ),
+            )
+            for part in HARD
+        },
+    }
+
+
+FULL = in_both_worlds(
+    {
+        "lopo": StudyCase(("sim:T-REAL:{w}",), "leave:position", folds=9),
+        "hard": StudyCase(("sim:T-REAL:{w}", "sim:T-HARD:{a}-{b}:3"), "split:set=0->1", folds=1),
+        "lab": StudyCase(("sim:T-LAB:{w}",), "random:10", folds=10),
+        "random": StudyCase(("sim:T-REAL:{w}",), "random:9", folds=9),
+    }
+)
+FULL_STEPS = (
+    Step(BASELINES, (*HARD, *EASY, *HARD_BLIND), (1, 2, 3, 4, 5), 1),
+    Step(NEIGHBOURS, (*HARD, *HARD_BLIND), (1, 2, 3), 1),
+    Step(OWN, ("hard", "hard" + BLIND), (1, 2, 3), 90),
+    Step(OWN[:1], ("lopo",), (1, 2, 3), 60),
+    Step(OWN[:1], ("lopo" + BLIND,), (1,), 130),
+    Step(("minirocket", "st-hmp"), (*HARD, *HARD_BLIND), (1,), 12),
+    Step(NETWORKS, (*HARD, *HARD_BLIND), (1,), 60),
+    Step(("paper-cnn-centred",), ("hard", "hard" + BLIND), (1,), 250),
+)
+"""The paper's CNN is not among them: cnn_curve trains it, and `with_curves` takes its results."""
+NEAR = ("position<=2",)
+QUICK = in_both_worlds(
+    {
+        "lopo": StudyCase(("sim:T-REAL:{w}:4",), "leave:position", NEAR, folds=3),
+        "hard": StudyCase(
+            ("sim:T-REAL:{w}:4", "sim:T-HARD:1-3:4"), "split:set=0->1", NEAR, folds=1
+        ),
+        "lab": StudyCase(("sim:T-LAB:{w}:10",), "random:3", folds=3),
+        "random": StudyCase(("sim:T-REAL:{w}:4",), "random:3", NEAR, folds=3),
+    }
+)
+QUICK_STEPS = (
+    Step(BASELINES, tuple(QUICK), (1, 2), 0.3),
+    Step(
+        (*NEIGHBOURS, "minirocket", "st-hmp", *OWN, *NETWORKS),
+        (*HARD, *HARD_BLIND),
+        (1,),
+        1,
+    ),
+    Step((CNN,), HARD, (1,), 15),
+)
+QUICK_EFFORT = Effort(share=0.01, paper_steps=4)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The result of a method in a case with one seed: labels [n] and logits [n, K] of the tested
+    sweeps.
+
+    place: int [n], the attachment of the skin, unique over seeds. costs: of each fold that has
+    them, [iterations, 2]. about: its entry in the results.
+    """
+
+    part: str
+    method: str
+    seed: int
+    labels: Array
+    logits: Array
+    place: Array
+    costs: list[Array] = field(repr=False)
+    about: dict[str, Any] = field(repr=False)
+
+    @classmethod
+    def of(cls, part: str, seed: int, result: Result) -> Outcome:
+        """From a result of evaluate."""
+        test, sweeps = result.test, result.sweeps
+        place = sweeps.group("position")[test] + PLACES * seed
+        costs = [_thinned(fold.cost) for fold in result.folds if len(fold.cost)]
+        about = result.json() | {"part": part}
+        return cls(
+            part, result.method, seed, sweeps.labels[test], result.logits, place, costs, about
+        )
+
+    @classmethod
+    def of_curve(cls, part: str, curve: Json) -> Outcome:
+        """From the newest point of cnn_curve, for "lopo" or "hard" of its world."""
+        seed, point = curve["about"][1], curve["points"][-1]
+        newest = [curve["newest"][key] for key in CURVE_CASES[part] if key in curve["newest"]]
+        labels, logits = (
+            np.concatenate([np.array(each[key]) for each in newest]) for key in ("labels", "logits")
+        )
+        places = [np.array(each["position"]) + PLACES * i for i, each in enumerate(newest)]
+        place = np.concatenate(places) + 2 * PLACES * seed
+        costs = [np.array([[p["step"], p["cost"]] for p in curve["points"]])]
+        about = {
+            "part": part + (BLIND if curve["world"] else ""),
+            "method": CNN,
+            "seed": seed,
+            "ran": f"{point['step']} of {curve['steps']} iterations of 50",
+            "confusion": score.confusion(labels, logits).tolist(),
+            **dict.fromkeys(("fit_s", "ms_p50", "agreement")),
+            "materials": list(skin.MATERIALS),
+            "commit": curve["commit"],
+            "machine": curve["machine"],
+        }
+        return cls(about["part"], CNN, seed, labels, logits, place, costs, about)
+
+    @cached_property
+    def explorations(self) -> Array:
+        """The explorations that `objects` draws of these sweeps."""
+        return objects(self.labels, self.place, self.seed)
+
+    @property
+    def right(self) -> Array:
+        """bool [n], whether the label is right."""
+        return np.asarray(self.logits.argmax(1) == self.labels)
+
+
+STUDY = Study("paper", FULL, tuple(dict.fromkeys(m for step in FULL_STEPS for m in step.methods)))
+
+
+def results(how: StudyRun, only: Sequence[str] = (), earlier: Json | None = None) -> Json:
+    """Train and test the whole plan; the results.
+
+    only: methods that are run; all others stay as in `earlier` results. Raises FormatError as
+    evaluate does, and for a name in `only` that the plan does not have.
+    """
+    cases, steps = (QUICK, QUICK_STEPS) if how.quick else (FULL, FULL_STEPS)
+    if how.quick:
+        how = replace(how, effort=QUICK_EFFORT)
+    outcomes = list(_outcomes(cases, narrowed(steps, only) if only else steps, how))
+    found = summary(outcomes, cases, how.effort) | score.provenance() | {"quick": how.quick}
+    return joined(found, planned(earlier, steps)) if only and earlier else found
+
+
+def narrowed(steps: Sequence[Step], only: Sequence[str]) -> list[Step]:
+    """The steps with these methods alone. Raises FormatError for a method without a step."""
+    known = dict.fromkeys(m for step in steps for m in step.methods)
+    for name in only:
+        if name not in known:
+            raise FormatError(
+                f"method {name!r} is not in the paper's experiment; use some of {', '.join(known)}"
+            )
+    kept = [replace(step, methods=tuple(m for m in step.methods if m in only)) for step in steps]
+    return [step for step in kept if step.methods]
+
+
+def planned(found: Json, steps: Sequence[Step]) -> Json:
+    """`found` without methods that are not in the plan any more."""
+    known = {CNN, *(m for step in steps for m in step.methods)}
+    lists = {key: [one for one in found[key] if one["method"] in known] for key in LISTS}
+    tables = {
+        key: {name: value for name, value in found[key].items() if name in known}
+        for key in BY_METHOD
+    }
+    return found | lists | tables
+
+
+def joined(found: Json, earlier: Json) -> Json:
+    """Two results as one. Entries of `found` replace those of `earlier`. Raises FormatError for a
+    quick run beside a whole one."""
+    if found["quick"] != earlier["quick"]:
+        raise FormatError(
+            "a quick run and a whole one cannot be joined; write the quick one to another --out"
+        )
+    lists = {
+        key: [
+            *(one for one in earlier[key] if _at(one) not in set(map(_at, found[key]))),
+            *found[key],
+        ]
+        for key in LISTS
+    }
+    tables = {k: earlier[k] | found[k] for k in BY_METHOD}
+    return earlier | found | tables | lists
+
+
+def _at(one: dict[str, Any]) -> tuple[Any, ...]:
+    """Key of an entry: part, method, seed."""
+    return one["part"], one["method"], one.get("seed")
+
+
+def with_curves(found: Json, curves: Sequence[Json]) -> Json:
+    """Results with the newest points of all files of cnn_curve for the paper's CNN. Raises
+    FormatError for the curve of another training."""
+    for curve in curves:
+        if curve["about"][0] != "whole" or curve["about"][2] or not curve["points"]:
+            raise FormatError(
+                "this curve is not of the CNN as printed; run python -m palpate_studies cnn-curve "
+                "--size whole"
+            )
+    outcomes = [Outcome.of_curve(part, curve) for curve in curves for part in CURVE_CASES]
+    taken = summary(outcomes, FULL) | {"curves": [_reached(curve) for curve in curves]}
+    return joined(taken | {"quick": found["quick"]}, found)
+
+
+def _reached(curve: Json) -> Json:
+    """How far a training has come, and its result at the position that it left out."""
+    reached = {
+        "seed": curve["about"][1],
+        "world": curve["world"],
+        "step": curve["points"][-1]["step"],
+        "steps": curve["steps"],
+        "commit": curve["commit"],
+    }
+    if curve["left"] is None:
+        return reached
+    out = curve["newest"]["left"]
+    right = np.array(out["logits"]).argmax(1) == np.array(out["labels"])
+    return reached | {"left": curve["left"], "right": int(right.sum()), "total": len(right)}
+
+
+def _outcomes(
+    cases: Mapping[str, StudyCase], steps: Sequence[Step], how: StudyRun
+) -> Iterator[Outcome]:
+    """Run step by step. After each fold `log` gets the progress and an estimate of the time
+    left."""
+    todo = [(step, part, seed) for step in steps for part in step.parts for seed in step.seeds]
+    expected = [len(step.methods) * cases[part].folds * step.fold_s for step, part, _ in todo]
+    pace = 1 / (os.cpu_count() or 1)
+    for i, (step, part, seed) in enumerate(todo):
+        start, done, folds = time.monotonic(), 0, len(step.methods) * cases[part].folds
+
+        def count(line: str) -> None:
+            nonlocal done
+            done += 1
+            left = sum(expected[i:]) - expected[i] * done / folds  # noqa: B023  # called within this turn of the loop
+            where_now = f"{i + 1}/{len(todo)} {part}, seed {seed}"  # noqa: B023
+            how.log(f"{where_now}: {line}; in all about {spoken(pace * left)} left")  # noqa: B023
+
+        protocols = (cases[part].protocol,)
+        plan = Plan(step.methods, protocols, (seed,), effort=how.effort)
+        for result in evaluate(load(cases[part], seed), plan, how.where, count):
+            yield Outcome.of(part, seed, result)
+        took = time.monotonic() - start
+        if took > expected[i] * pace / 10:  # else it came from the cache
+            pace = took / expected[i]
+
+
+def summary(
+    outcomes: Sequence[Outcome], cases: Mapping[str, StudyCase], effort: Effort = FULL_EFFORT
+) -> dict[str, Any]:
+    """All figures of the page, as plain numbers."""
+    groups: dict[tuple[str, str], list[Outcome]] = {}
+    for outcome in outcomes:
+        groups.setdefault((outcome.part, outcome.method), []).append(outcome)
+    lopo = {method: those for (part, method), those in groups.items() if part == "lopo"}
+    return {
+        "parts": {
+            name: {"sets": case.sets, "only": case.only, "protocol": case.protocol}
+            for name, case in cases.items()
+        },
+        "table": [_row(*key, those) for key, those in groups.items()],
+        "costs": {
+            m: [cost.tolist() for o in lopo[m] for cost in o.costs] for m in (CNN,) if m in lopo
+        },
+        "confusion": {
+            m: np.sum([o.about["confusion"] for o in those], 0).tolist()
+            for m, those in lopo.items()
+        },
+        "several": {m: several(those) for m, those in lopo.items()},
+        "explored": {m: explored(those) for m, those in lopo.items()},
+        "methods": {
+            name: method.about
+            for name, method in methods.every(effort).items()
+            if name in {m for _, m in groups}
+        },
+        "results": [outcome.about for outcome in outcomes],
+    }
+
+
+def _row(part: str, method: str, those: list[Outcome]) -> dict[str, Any]:
+    """One line of the table. attachments: their number, and the accuracy of the worst and the
+    best."""
+    right, place = (
+        np.concatenate([getattr(o, name) for o in those]) for name in ("right", "place")
+    )
+    each = [float(right[place == p].mean()) for p in np.unique(place)]
+    return {
+        "part": part,
+        "method": method,
+        "seeds": [o.seed for o in those],
+        "right": int(right.sum()),
+        "total": len(right),
+        "share": estimate(right, place),
+        "printed": paper_values.ACCURACY[part.removesuffix(BLIND)].get(method),
+        "attachments": [len(each), round(min(each), 4), round(max(each), 4)],
+        "ran": those[0].about["ran"],
+        **{k: _median([o.about[k] for o in those]) for k in ("fit_s", "ms_p50")},
+    }
+
+
+def _median(values: Sequence[float | None]) -> float | None:
+    """The median; None if a value was not measured."""
+    measured = [value for value in values if value is not None]
+    return round(float(np.median(measured)), 4) if len(measured) == len(values) else None
+
+
+def estimate(right: Array, place: Array) -> list[float]:
+    """Share of `right` [n] and its 95 % interval over attachments `place` [n] (score.interval)."""
+    return [round(float(right.mean()), 4), *score.interval(right, place)]
+
+
+def objects(labels: Array, place: Array, seed: int) -> Array:
+    """Explorations of one object each, indices of sweeps [n, S] (paper, sec. V.D: sweeps of one
+    material from the test set).
+
+    Every sweep comes first once. Others of its material and attachment follow in random order, as
+    many as the smallest group has.
+    """
+    rng = np.random.default_rng(seed)
+    alike = np.unique(np.stack([labels, place]), axis=1, return_inverse=True)[1].ravel()
+    least, rows = np.bincount(alike).min(), []
+    for i in range(len(labels)):
+        others = np.flatnonzero(alike == alike[i])
+        rows.append([i, *rng.permutation(others[others != i])[: least - 1]])
+    return np.array(rows)
+
+
+def several(those: Sequence[Outcome]) -> dict[str, list[list[float]]]:
+    """Accuracy after one, two and three sweeps of an object, by "vote" and by "product", the rules
+    of the box."""
+    estimates: dict[str, list[list[float]]] = {}
+    for rule in ("vote", "product"):
+        for n in range(1, SEVERAL + 1):
+            right = np.concatenate([_fused(o, n, rule) for o in those])
+            estimates.setdefault(rule, []).append(
+                estimate(right, np.concatenate([o.place for o in those]))
+            )
+    return estimates
+
+
+def _fused(outcome: Outcome, n: int, rule: str) -> Array:
+    """bool [n], whether the first `n` sweeps of each exploration give the right material."""
+    scores = softmax(outcome.logits)
+    drawn = outcome.explorations[:, :n]
+    named = np.array([fuse([scores[i] for i in row], rule).argmax() for row in drawn])
+    return np.asarray(named == outcome.labels)
+
+
+def explored(those: Sequence[Outcome]) -> list[dict[str, Any]]:
+    """Sweeps added until the posterior reaches SURE (Xu et al. 2013): estimate and mean number of
+    sweeps."""
+    points = []
+    for sure in SURE:
+        right, used = [], []
+        for o in those:
+            log_p = np.log(np.maximum(softmax(o.logits), LEAST_PROBABILITY))
+            ends = [prior_work.explore(log_p[row], sure) for row in o.explorations]
+            labels, counts = np.array(ends).T
+            right.append(labels == o.labels)
+            used.append(counts)
+        share = estimate(np.concatenate(right), np.concatenate([o.place for o in those]))
+        points.append(
+            {"sure": sure, "share": share, "sweeps": round(float(np.concatenate(used).mean()), 3)}
+        )
+    return points
+
+
+def _thinned(cost: Array) -> Array:
+    """A cost curve [n, 2] as means over at most COST_POINTS parts of equal length on a logarithmic
+    axis."""
+    ends = np.unique(np.geomspace(1, len(cost) + 1, COST_POINTS + 1).round().astype(int)) - 1
+    return np.array([cost[a:b].mean(0) for a, b in pairwise(ends)]).round(5)

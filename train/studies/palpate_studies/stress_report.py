@@ -1,0 +1,214 @@
+"""Renders the page of the study `stress`: which corruptions break each method first.
+
+It computes nothing but differences and orders. The first method is ours; five at most are drawn.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any
+
+from palpate.core.errors import FormatError
+from palpate_studies import TEMPLATES, stress_plots
+from palpate_studies.method_names import about, plain_name, short_name
+from palpate_studies.stress_targets import TARGETS, at_targets
+from palpate_train.evaluate.robustness import POINTS, breaks_first
+from palpate_train.reports import html, provenance
+from palpate_train.reports.formatting import exact_percent, level
+
+Json = Mapping[str, Any]
+BOX, NETWORK = "the box, as it answers", "its network alone"
+SHOWN = 3
+"""Corruptions of each method in the table of the first losses."""
+
+
+def render(result: Json, name: str = "stress") -> tuple[str, dict[str, str]]:
+    """The page (HTML) and its pictures (SVG) by name. name: of the file of results. Raises
+    FormatError if no method has a result."""
+    entries = {
+        plain_name(name): entry for name, entry in result["methods"].items() if entry["curves"]
+    }
+    if not entries:
+        raise FormatError(
+            "no method has a result; run the study without --kept, or with other methods"
+        )
+    curves = {name: entry["curves"] for name, entry in entries.items()}
+    ours, box = next(iter(curves)), result["box"]["curves"]
+    paired = _columns(result, "pairs")
+    pictures = {"matrix": stress_plots.matrix(_columns(result, "curves"))}
+    pictures |= {"pairs": stress_plots.pairs(paired)} if paired else {}
+    pictures |= {"curves": stress_plots.methods(curves)}
+    pictures |= {"box": stress_plots.box(box)} if box else {}
+    page = html.render(
+        "stress.html.j2",
+        TEMPLATES,
+        header=provenance.of(result),
+        home=html.HOME,
+        r=result,
+        name=name,
+        command=command(result, name),
+        worst_pair=worst_pair(paired),
+        ours=ours,
+        points=exact_percent(POINTS).removesuffix(" %"),
+        clean={name: _of(next(iter(those.values())), 0) for name, those in curves.items()},
+        pictures={name: html.picture(svg) for name, svg in pictures.items()},
+        headline=headline(curves[ours]),
+        first=[[name, *first(those)] for name, those in _with_box(curves, result["box"]).items()],
+        most_wrong=most_wrong(box["wrongly"]) if box else None,
+        lines=list(target_lines(curves, ours, box)),
+        falls=fall_lines(curves, box),
+        missing=missing(curves, ours),
+        methods=[[plain_name(name), about(name), name] for name in result["methods"]],
+        refused=_refused(result["methods"]),
+        trouble=trouble(entries, result["box"]["uninformative"]),
+    )
+    return page, pictures
+
+
+def _with_box(curves: Json, box: Json) -> Json:
+    """The curves of methods, and those of the box's right answers if there are any."""
+    which = "the packaged bundle" if box["bundle"]["name"] == "default" else "its bundle"
+    answered = {f"{which}, as the box answers": box["curves"]["rightly"]} if box["curves"] else {}
+    return {**curves, **answered}
+
+
+def _columns(result: Json, kind: str) -> Json:
+    """The columns of a matrix: the box as it answers, its network alone, and the methods. kind:
+    "curves", or "pairs" of corruptions, which older results lack."""
+    box = result["box"].get(kind)
+    own = {BOX: box["rightly"], NETWORK: box["network"]} if box else {}
+    methods = {short_name(name): entry.get(kind) for name, entry in result["methods"].items()}
+    return own | {name: curves for name, curves in methods.items() if curves}
+
+
+def worst_pair(columns: Json) -> Json | None:
+    """The hardest pair of corruptions for the first column, with its accuracy; None without
+    pairs."""
+    if not columns:
+        return None
+    hardest = min(next(iter(columns.values())).values(), key=lambda one: one["accuracy"][1])
+    return {"title": hardest["title"], "share": _of(hardest, 1)}
+
+
+def command(result: Json, name: str) -> str:
+    """The command line that measures the result again."""
+    words = ["python -m palpate_studies stress --set", result["train"]]
+    if only := result.get("only"):
+        words += ["--only", *(f"'{one}'" for one in only)]
+    words += ["--split", result["split"]] if result.get("split") else ["--test", result["test"]]
+    words += ["--method", ",".join(result["methods"]), "--seeds", str(len(result["seeds"]))]
+    words += ["--out", f"docs/data/{name}.json"] if name != "stress" else []
+    return " ".join(words)
+
+
+def _refused(methods: Json) -> Json:
+    """The reason of each refused method, by its plain name."""
+    return {
+        plain_name(name): entry["refused"] for name, entry in methods.items() if entry["refused"]
+    }
+
+
+def headline(curves: Json) -> Json:
+    """The corruptions that break a method first, and the number of all that do."""
+    falls, broken = first(curves)
+    return {"first": falls, "broken": broken, "all": len(curves)}
+
+
+def first(curves: Json) -> tuple[list[str], int]:
+    """The corruptions that break a method first, in order, and the number of all that do."""
+    broken = breaks_first(curves)
+    return [_fall(curves[name]) for name in broken[:SHOWN]], len(broken)
+
+
+def _fall(curve: Json) -> str:
+    return f"{curve['title']}: {level(curve, curve['falls'])}"
+
+
+def _of(curve: Json, i: int) -> tuple[float, float, float]:
+    """Share and interval at one severity."""
+    return curve["accuracy"][i], curve["low"][i], curve["high"][i]
+
+
+def most_wrong(curves: Json) -> Json:
+    """The corruption and severity with most wrong labels of the box, and their share."""
+    name, i = max(
+        ((name, i) for name, curve in curves.items() for i in range(len(curve["accuracy"]))),
+        key=lambda at: curves[at[0]]["accuracy"][at[1]],
+    )
+    curve = curves[name]
+    return {
+        "title": curve["title"],
+        "level": level(curve, curve["severities"][i]),
+        "share": _of(curve, i),
+    }
+
+
+def target_lines(curves: Mapping[str, Json], ours: str, box: Json) -> list[Json]:
+    """A line for each of TARGETS.
+
+    cells: by method. box: right, wrong, network alone.
+    """
+    found = {name: at_targets(those) for name, those in curves.items()}
+    answered = (
+        {answer: at_targets(box[answer]) for answer in ("rightly", "wrongly", "network")}
+        if box
+        else {}
+    )
+    lines: list[Json] = []
+    for key in found[ours]:
+        those = [
+            (curves[ours][name], severity)
+            for name, severity in TARGETS[key]
+            if name in curves[ours]
+        ]
+        what = " or ".join(dict.fromkeys(curve["title"] for curve, _ in those))
+        lines.append(
+            {
+                "what": "nothing" if key == "none" else f"{what}, {level(*those[0])}",
+                "cells": [found[name].get(key) for name in curves],
+                "box": [at[key] for at in answered.values()],
+            }
+        )
+    return lines
+
+
+def fall_lines(curves: Mapping[str, Json], box: Json) -> list[list[str]]:
+    """For each corruption its description, and the severity at which each method, and the box, has
+    lost five points."""
+    columns = [*curves.values(), *([box["rightly"]] if box else [])]
+    about = {name: curve for those in columns for name, curve in those.items()}
+    return [
+        [f"{curve['title']}: {curve['about']}", *(_cell(those.get(name)) for those in columns)]
+        for name, curve in about.items()
+    ]
+
+
+def _cell(curve: Json | None) -> str:
+    if curve is None:
+        return ""
+    return (
+        f"> {level(curve, curve['severities'][-1])}"
+        if curve["falls"] is None
+        else level(curve, curve["falls"])
+    )
+
+
+def missing(curves: Mapping[str, Json], ours: str) -> list[str]:
+    """Corruptions without a picture: they cost no drawn method five points."""
+    shown = stress_plots.shown(curves)
+    return [curve["title"] for name, curve in curves[ours].items() if name not in shown]
+
+
+def trouble(entries: Mapping[str, Json], box: Mapping[str, str]) -> list[list[str]]:
+    """For each uninformative sweep the answers of methods and of the box."""
+    rows = []
+    for name in dict.fromkeys(name for entry in entries.values() for name in entry["trouble"]):
+        answers: Counter[str] = Counter(
+            entry["trouble"][name].split(":")[0] for entry in entries.values()
+        )
+        desktop = ", ".join(
+            f"{n} {'answer' if answer == 'finite' else answer}" for answer, n in answers.items()
+        )
+        rows.append([name, desktop, box.get(name, "–")])
+    return rows

@@ -1,0 +1,140 @@
+"""A study: cases, methods, a run over them, and one file of results below docs/data.
+
+Commands measure and write results. Pages are templates on these results (`pages`), so no module
+both measures and draws.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from palpate.core.errors import FormatError
+from palpate.core.storage import put
+from palpate_train.data import sets
+from palpate_train.data.sets import Dataset
+from palpate_train.evaluate.evaluate import Where
+from palpate_train.models.methods import FULL_EFFORT, Effort
+
+DATA = Path("docs/data")
+"""Folder of all results, from the project's folder."""
+NO_DATA = "real sweeps; name their folder with --data or PALPATE_DATA"
+
+
+@dataclass(frozen=True, slots=True)
+class StudyCase:
+    """Sweeps and the protocol under which methods are tested on them.
+
+    sets: they are joined. only: selects sweeps of each set. real: the sets are files in the folder
+    of real sweeps. means_removed: each taxel's mean over the window is subtracted. curve: numbers
+    of training sweeps of each material along a learning curve, before all of them. windows: frames
+    of shorter windows, from the middle of each sweep. folds: of the protocol, to estimate the time
+    left.
+    """
+
+    sets: tuple[str, ...]
+    protocol: str = ""
+    only: tuple[str, ...] = ()
+    real: bool = False
+    means_removed: bool = False
+    curve: tuple[int, ...] = ()
+    windows: tuple[int, ...] = ()
+    folds: int = 0
+
+    @property
+    def simulated(self) -> bool:
+        """Whether the simulator draws its sweeps."""
+        return any(name.startswith("sim:") for name in self.sets)
+
+    def load(self, data: Path | None = None, **names: int) -> Dataset | None:
+        """Its sweeps; None if they are real and no folder is given. names: replace {NAME} in the
+        names of sets."""
+        if self.real and data is None:
+            return None
+        paths = [name.format(**names) for name in self.sets]
+        paths = [str(data / path) if self.real and data else path for path in paths]
+        return sets.join([sets.load(path).select(self.only) for path in paths])
+
+
+@dataclass(frozen=True, slots=True)
+class Study:
+    """An experiment with one file of results.
+
+    cases: by name, in the order of the page. methods: in the order in which they run. joining:
+    methods that are reported only if an earlier run has left their folds in the cache.
+    """
+
+    name: str
+    cases: Mapping[str, StudyCase]
+    methods: tuple[str, ...]
+    joining: tuple[str, ...] = ()
+
+
+@dataclass(slots=True)
+class StudyRun:
+    """One run of a study: where folds are computed and cached, on which sweeps, with which effort.
+
+    data: folder of real sweeps. quick: a few sweeps and iterations of everything; its figures mean
+    nothing. left_out: missing names, each with the reason; the run fills it.
+    """
+
+    where: Where
+    log: Callable[[str], None]
+    data: Path | None = None
+    effort: Effort = FULL_EFFORT
+    seeds: Sequence[int] = (1,)
+    quick: bool = False
+    left_out: dict[str, str] = field(default_factory=dict)
+
+
+def results_file(name: str, folder: Path = DATA) -> Path:
+    """Where the results of a study lie."""
+    return folder / f"{name}.json"
+
+
+def read(path: Path, *keys: str) -> Any:
+    """The results in a file. Raises FormatError if it cannot be read, or if `keys` are missing."""
+    try:
+        results = json.loads(path.read_bytes())
+    except (OSError, ValueError) as e:
+        why = e.strerror if isinstance(e, OSError) else f"not JSON: {e}"
+        raise FormatError(f"{path}: {why}; run the study that writes this file") from e
+    there = results if isinstance(results, dict) else ()
+    if missing := [key for key in keys if key not in there]:
+        raise FormatError(
+            f"{path} has no {', '.join(missing)}; name the results of the right study"
+        )
+    return results
+
+
+def save(path: Path, results: Any) -> Path:
+    """Write results as JSON, one line for each item of a list, so that differences can be read; the
+    path."""
+    put(path, text(results).encode(), parents=True)
+    return path
+
+
+def text(results: Any) -> str:
+    """Results as JSON. Raises ValueError for a number that is not finite."""
+    if isinstance(results, list):
+        return _lines(results) + "\n"
+    fields = (
+        f"{json.dumps(key)}: {_lines(value) if _is_table(value) else _json(value)}"
+        for key, value in results.items()
+    )
+    return "{\n" + ",\n".join(fields) + "\n}\n"
+
+
+def _is_table(value: Any) -> bool:
+    return isinstance(value, list) and bool(value) and isinstance(value[0], dict)
+
+
+def _lines(items: Sequence[Any]) -> str:
+    return "[\n" + ",\n".join(map(_json, items)) + "\n]"
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, allow_nan=False)
