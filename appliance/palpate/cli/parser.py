@@ -48,7 +48,7 @@ MENU = Menu(
             "bundles": "list, install, verify, commit, rollback or promote bundles of this box",
         },
         "devices": {
-            "skin": "list, detect, check, show or describe skins, without a bundle",
+            "skin": "list, detect, check or show skins, without a bundle",
             "bridge": "pass answers on to other machines of the cell: TCP, Modbus TCP, ROS 2",
         },
     },
@@ -66,9 +66,8 @@ BUNDLE_ACTIONS = {
 SKIN_ACTIONS = {
     "list": "show all profiles, with missing features, and whether a device was measured",
     "detect": "find connected skins and the profiles that fit; sends nothing",
-    "check": "compare the skin's firmware with PROTOCOL.md, part by part",
+    "check": "compare the skin with PROTOCOL.md part by part, or its bytes with its profile",
     "show": "show the skin live: heat map, rate, noise, dead and stuck taxels",
-    "new": "listen to a skin without a profile, propose one and write it; sends nothing",
 }
 WEB_PORT, TEACH_PORT = 8137, 8138
 """Default ports of pages. Both pages can be served side by side."""
@@ -97,8 +96,6 @@ def arguments(name: str, words: list[str]) -> argparse.Namespace:
     args = command.parse(words)
     if name == "enrol" and args.label is None and args.unknown is None:
         command.error("enrol needs LABEL, the name of the new material")
-    if name == "skin" and args.action == "new" and not args.skin_port:
-        command.error("new needs --port")
     return args
 
 
@@ -433,16 +430,16 @@ def _bundles(command: CommandParser) -> None:
 def _skin(command: CommandParser) -> None:
     command.choose("action", SKIN_ACTIONS)
     _skin_port(
-        command.only_for("detect", "check", "show", "new"),
-        "serial port of the skin; detect and new open no other port",
+        command.only_for("detect", "check", "show"),
+        "serial port of the skin; detect opens no other port",
     )
     _devices(command.only_for("check", "show"))
     _finger(command.only_for("check", "show"), default=argparse.SUPPRESS)
-    command.only_for("check", "new")(
+    command.only_for("check")(
         "--seconds",
         type=_seconds,
         metavar="S",
-        help="time to listen, 1 to 3600 (default: check 10, new 3)",
+        help="time to listen, 1 to 3600 (default: 10; a skin with a profile: 2)",
     )
     command.only_for("detect")(
         "--write",
@@ -450,34 +447,7 @@ def _skin(command: CommandParser) -> None:
         help="with --port: also ask the skin, and send start commands",
     )
     _web(command.only_for("show"), f"also as a page on localhost (default port {WEB_PORT})")
-    _new_skin(command)
     command.set_defaults(sweeps=None)
-
-
-def _new_skin(command: CommandParser) -> None:
-    new = command.only_for("new")
-    new("name", needed=True, nargs="?", metavar="NAME", help="name of the profile")
-    new(
-        "--baud", type=_count, metavar="N", help="the skin's speed (default: common speeds in turn)"
-    )
-    new(
-        "--grid",
-        metavar="RxC[xA]",
-        help="rows, columns and axes; without it, only proposals are printed",
-    )
-    new(
-        "--proposal",
-        type=_count,
-        metavar="N",
-        help="which of the proposals (default: the first that has this grid)",
-    )
-    new(
-        "--out",
-        type=outputs.folder,
-        metavar="DIR",
-        help="folder of the profile (/etc/palpate/skins)",
-    )
-    new("--replace", action="store_true", help="replace a profile of this name")
 
 
 _ARGUMENTS: Mapping[str, Callable[[CommandParser], None]] = {

@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import argparse
-import os
-import shlex
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing
-from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from palpate.cli.common import StopFlag, load_settings, local_page
 from palpate.cli.devices import open_devices
-from palpate.core import storage
 from palpate.core.clock import SystemClock
 from palpate.core.config import Config
-from palpate.core.errors import ConfigError, SensorMismatch
+from palpate.core.devices import Devices
+from palpate.core.errors import ConfigError
 from palpate.core.log import log
 from palpate.io import serial_port, skin_profile, skins
 from palpate.io.serial_port import PortInfo
@@ -25,20 +21,22 @@ from palpate.io.skin_profile import DEFAULT, SkinProfile
 
 if TYPE_CHECKING:
     from palpate.tools.skin_monitor import SkinDisplay
-    from palpate.tools.skin_new import PortSample
 
 CHECK_S = 10.0
 """Default of `palpate skin check --seconds`."""
-NEW_S = 3.0
-"""Default of `palpate skin new --seconds`, at each speed."""
+BYTES_S = 2.0
+"""The same for a skin with a profile."""
 
 
 def run_check(args: argparse.Namespace) -> int:
-    """Check each part of PROTOCOL.md; 1 if any fails."""
+    """Check each part of PROTOCOL.md, or the bytes of a skin with a profile; 1 if any fails."""
     from palpate.tools import skin_check
 
     devices = open_devices(args, None)
     settings = devices.wire(load_settings(args))
+    profile = skins.profile(settings)
+    if profile.codec != DEFAULT:
+        return _check_bytes(settings, profile, devices, args.seconds or BYTES_S)
     failed, port = 0, settings.skin.link == "serial"
     seconds = args.seconds or CHECK_S
     with closing(skins.open_readout(settings, devices)) as link:
@@ -51,6 +49,26 @@ def run_check(args: argparse.Namespace) -> int:
             print(f"{found.verdict:<7}  {found.part:<9} {found.detail}", flush=True)
             failed += found.verdict == "FAIL"
     return 1 if failed else 0
+
+
+def _check_bytes(settings: Config, profile: SkinProfile, devices: Devices, seconds: float) -> int:
+    """Print the first frames of a skin with a profile beside their bytes; 1 if a byte misfits."""
+    from palpate.io.serial_link import SerialLink, find
+    from palpate.tools import skin_bytes, skin_detect
+
+    path = settings.skin.port or find(profile.ids, settings.skin.serial, serial_port.ports())
+    log.info(f"listening at {path}: {seconds:g} s at {profile.baud} baud")
+    heard = skin_detect.listen(
+        path,
+        profile.baud,
+        profile,
+        lambda path, baud: SerialLink(path, baud, devices.clock, wait=devices.wait),
+        devices.clock,
+        seconds,
+    )
+    lines, good = skin_bytes.report(profile, heard.data)
+    print(*lines, sep="\n")
+    return 0 if good else 1
 
 
 def run_list(args: argparse.Namespace) -> int:
@@ -108,6 +126,8 @@ def _listen(ports: list[PortInfo], settings: Config, write: bool) -> int:
         seconds=skin_detect.LISTEN_S,
     ):
         print(f"{one.port}: {one.profile or 'no profile fits'}: {one.detail}", flush=True)
+        if one.proposal:
+            print(one.proposal, flush=True)
         fitting += bool(one.profile)
     return fitting
 
@@ -146,90 +166,11 @@ def run_show(args: argparse.Namespace) -> int:
     return stopped.exit_code
 
 
-def run_new(args: argparse.Namespace) -> int:
-    """Listen to a port and propose profiles; with a grid, write a profile."""
-    from palpate.io.serial_link import SerialLink
-    from palpate.tools import skin_new
-
-    settings, seconds = load_settings(args), args.seconds or NEW_S
-    path = (args.out or skins.OWN) / f"{_new_name(args, settings)}.toml"
-    if args.grid:
-        _make(path.parent)  # before a user has listened in vain
-    port, clock = args.skin_port, SystemClock()
-    bauds = (args.baud,) if args.baud else skin_new.BAUDS
-    log.info(
-        f"listening at {port}: {seconds:g} s at each speed, until one shows a pattern; touch the"
-        " skin"
-    )
-    heard = skin_new.listen(partial(SerialLink, port, clock=clock), bauds, seconds, clock)
-    for number, proposal in enumerate(heard.proposals[: skin_new.MOST_SHOWN], 1):
-        print(f"{number}: {skin_new.words(proposal)}")
-    if args.grid:
-        _write(path, heard, args)
-    else:
-        print(
-            f"at {heard.baud} baud; give the same command with --grid, and --proposal if the first"
-            " is not right"
-        )
-    return 0
-
-
-def _write(path: Path, heard: PortSample, args: argparse.Namespace) -> None:
-    """Write the profile of the chosen proposal, and print how it is used."""
-    from palpate.tools import skin_new
-
-    chosen, grid = skin_new.choose(heard, args.grid, args.proposal or 0)
-    port = args.skin_port
-    there = next((one for one in serial_port.ports() if one.path == port), PortInfo(port))
-    text = skin_new.profile(chosen, grid, heard.baud, there)
-    frames, garbage = skin_new.decoded(text, heard.reads)
-    if frames < skin_new.FEWEST:
-        raise SensorMismatch(
-            f"the profile reads {frames} frames of what the skin has just sent, so {path} is not "
-            "written; choose another --proposal or --grid, or listen longer with --seconds"
-        )
-    storage.put_all({path: text.encode()}, mode=0o644)
-    use = (
-        f"--skin {shlex.quote(str(path))}"
-        if args.out
-        else f'--skin {path.stem} (skin.profile = "{path.stem}")'
-    )
-    print(f"{path}: decodes {frames} frames, {garbage} bytes are left over; use it with {use}")
-
-
-def _make(folder: Path) -> None:
-    """Make the folder of a profile. Raises ConfigError if it cannot be written."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as e:
-        raise ConfigError(
-            f"{folder} cannot be made: {str(e.strerror).lower()}; name a folder with --out"
-        ) from e
-    if not os.access(folder, os.W_OK):
-        raise ConfigError(
-            f"{folder} may not be written by this user; name another folder with --out"
-        )
-
-
-def _new_name(args: argparse.Namespace, settings: Config) -> str:
-    """The name of the new profile. Raises ConfigError if it cannot be used."""
-    name: str = args.name
-    if not skin_profile.NAME.fullmatch(name):
-        raise ConfigError(
-            f"{name!r} cannot name a profile; use up to 32 small letters, digits and hyphens"
-        )
-    folders = [args.out] if args.out else skins.folders(settings)
-    if name in skin_profile.names(folders) and not args.replace:
-        raise ConfigError(f"there is a profile {name} already; take another name, or --replace")
-    return name
-
-
 RUNS: Mapping[str, Callable[[argparse.Namespace], int]] = {
     "list": run_list,
     "detect": run_detect,
     "check": run_check,
     "show": run_show,
-    "new": run_new,
 }
 
 

@@ -22,6 +22,7 @@ from palpate.io.serial_port import PortInfo
 from palpate.io.serial_sensor import BytePort
 from palpate.io.skin_codecs import Rest
 from palpate.io.skin_profile import DEFAULT, SkinProfile
+from palpate.tools import skin_text
 
 LISTEN_S = 2.0
 """Time for each speed of a port: 56 frames of the slowest skin."""
@@ -39,11 +40,12 @@ OpenPort = Callable[[str, int], BytePort]
 @dataclass(frozen=True, slots=True)
 class PortFinding:
     """The skin on a port. profile: its name, "" if no profile fits. detail: the evidence, and the
-    settings or the remedy."""
+    settings or the remedy. proposal: the text of a profile for lines of numbers, "" for others."""
 
     port: PortInfo
     profile: str
     detail: str
+    proposal: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,8 +104,8 @@ def detect(
 def _another_grid(port: PortInfo, name: str, taxels: int) -> str:
     return (
         f"the marks of {name}, but {taxels} taxels a frame; set skin.grid to their rows x columns,"
-        f' skin.profile = "{name}", skin.port = "{port.path}"; if it is another skin, describe it'
-        " with `palpate skin new`"
+        f' skin.profile = "{name}", skin.port = "{port.path}"; if it is another skin, copy'
+        " matrix.toml and describe it there"
     )
 
 
@@ -143,9 +145,9 @@ def _on_port(
             port, DEFAULT, f'{known}{who}; set skin.link = "serial", skin.port = "{port.path}"'
         )
         return
-    yield PortFinding(
-        port, "", known + _nothing(max(len(one.data) for one in heard.values()), others, write)
-    )
+    proposal = next(filter(None, map(_proposed, heard.items())), "")
+    most = max(len(one.data) for one in heard.values())
+    yield PortFinding(port, "", known + _nothing(most, others, write, bool(proposal)), proposal)
 
 
 def listen(
@@ -236,12 +238,27 @@ def _asked(path: str, open_port: OpenPort, clock: Clock) -> str:
         port.close()
 
 
-def _nothing(heard: int, profiles: Mapping[str, SkinProfile], write: bool) -> str:
+def _proposed(heard: tuple[int, HeardBytes]) -> str:
+    """The text of a profile for lines of numbers at a speed, "" for other bytes."""
+    baud, sample = heard
+    times = [t_ns for _, t_ns in sample.reads]
+    if len(times) < 2 or times[-1] == times[0]:
+        return ""
+    text = skin_text.proposed(sample.data, (times[-1] - times[0]) / 1e9)
+    return f"{text}baud = {baud}" if text else ""
+
+
+def _nothing(heard: int, profiles: Mapping[str, SkinProfile], write: bool, proposed: bool) -> str:
     """The reason why no profile fits, and the remedy."""
+    if proposed:
+        return (
+            "sends lines of numbers; write what follows to /etc/palpate/skins/NAME.toml, correct"
+            " rows and cols there, and check it with `palpate skin check --skin NAME`"
+        )
     if heard:
         return (
-            f"sends {heard} bytes, but no frames of a profile; try skin.grid, or describe it with"
-            " `palpate skin new`"
+            f"sends {heard} bytes, but no frames of a profile; try skin.grid, or copy matrix.toml,"
+            " describe the frames there and check it with `palpate skin check`"
         )
     if write:
         return "sends nothing and answers nothing"

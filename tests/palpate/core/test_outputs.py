@@ -25,7 +25,6 @@ DESKTOP = (
 BOX = (
     ("record", "--format", "4x4:uint8:750"),
     ("enrol", "felt"),
-    ("skin", "new", "mine"),
 )
 STUDIES = (("fabrics", "--method", "H-svm"), ("matrix", "none"))
 

@@ -58,7 +58,7 @@ def test_another_grid_of_a_known_skin():
     port = WirePort(clock, lambda i: b"\xaa\x55" + bytes((i + k) % 160 for k in range(384)), 1e7)
     found = found_on(port, clock)
     assert "384 taxels a frame; set skin.grid" in found.detail
-    assert "if it is another skin, describe it with `palpate skin new`" in found.detail
+    assert "matrix.toml" in found.detail
     assert found.profile in ("flexitac", "matrix")
 
 
@@ -100,7 +100,7 @@ def test_something_else_is_no_skin(sent: bytes):
     clock = VirtualClock()
     found = found_on(WirePort(clock, lambda i: sent, 1e7), clock)
     assert found.profile == ""
-    assert "palpate skin new" in found.detail
+    assert "matrix.toml" in found.detail
 
 
 def test_a_port_that_is_held():

@@ -55,7 +55,8 @@ class FixedLayout:
 
 
 @lru_cache(8)
-def _layout(p: SkinProfile) -> FixedLayout:
+def layout(p: SkinProfile) -> FixedLayout:
+    """The offsets of a profile's frames."""
     order = _SIGNS[p.sequence_order or p.byte_order]
     count = np.dtype(p.sequence).newbyteorder(order) if p.sequence else None
     mark, room = p.trailer + p.marker, count.itemsize if count else 0
@@ -80,7 +81,7 @@ def _layout(p: SkinProfile) -> FixedLayout:
 def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
     """Read frames: the bytes between two marks that are exactly one period apart, once the
     beginning of frames is known."""
-    layout = _layout(profile)
+    plan = layout(profile)
     data, synced = rest.data + new, rest.synced
     at = garbage = before = 0
     runs: list[NDArray[np.uint8]] = []
@@ -88,19 +89,17 @@ def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
     skipped: list[NDArray[np.int64]] = []
     while True:
         if not synced:
-            at, wasted, synced = _beginning(layout, data, at)
+            at, wasted, synced = _beginning(plan, data, at)
             garbage += wasted
             before += wasted
             if not synced:
                 break
-        n, broken = _run(layout, data, at)
+        n, broken = _run(plan, data, at)
         if n:
-            runs.append(
-                np.frombuffer(data, np.uint8, n * layout.period, at).reshape(n, layout.period)
-            )
-            ends.append(at + layout.period * np.arange(1, n + 1) + layout.tail)
+            runs.append(np.frombuffer(data, np.uint8, n * plan.period, at).reshape(n, plan.period))
+            ends.append(at + plan.period * np.arange(1, n + 1) + plan.tail)
             skipped.append(np.array([before, *[0] * (n - 1)], np.int64))
-            at, before = at + n * layout.period, 0
+            at, before = at + n * plan.period, 0
         if not broken:
             break
         # no mark follows one period later: bytes are missing, or this is not the beginning of a
@@ -108,13 +107,13 @@ def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
         at, garbage, before, synced = at + 1, garbage + 1, before + 1, False
     left = Rest(data[at:], synced)
     if not runs:
-        return collected(layout.profile, [], [], [], garbage, left, 0)
+        return collected(plan.profile, [], [], [], garbage, left, 0)
     table = np.concatenate(runs) if len(runs) > 1 else runs[0]
-    taxels, counts = _columns(layout, table)
+    taxels, counts = _columns(plan, table)
     found = Decoded(
-        taxels, np.concatenate(ends), np.concatenate(skipped), layout.period, garbage, left, counts
+        taxels, np.concatenate(ends), np.concatenate(skipped), plan.period, garbage, left, counts
     )
-    return _checked(layout, table, found) if layout.checksum else found
+    return _checked(plan, table, found) if plan.checksum else found
 
 
 def _checked(layout: FixedLayout, table: NDArray[np.uint8], found: Decoded) -> Decoded:

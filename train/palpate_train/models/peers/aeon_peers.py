@@ -137,9 +137,7 @@ def fit_quant(x: Array, labels: Array, seed: int) -> Callable[[Array], Array]:
 
 
 def _method(name: str, about: str, fit: Fit) -> Method:
-    return Method(
-        name, about, "raw", partial(train, name=name, fit=fit), "peers", library="aeon"
-    )
+    return Method(name, about, "raw", partial(train, name=name, fit=fit), "peers", library="aeon")
 
 
 METHODS = (
