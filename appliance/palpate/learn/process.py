@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from palpate.core.clock import Clock
+from palpate.core.config import TeachConfig
 from palpate.core.errors import ConfigError
 
 LEARNS = "palpate_train.teach"
@@ -27,8 +28,14 @@ NICE = 19
 """Priority of a process beside the loop: the lowest."""
 ENDED_S = 5.0
 """Longest wait for a killed process."""
+QUIET_S = 300.0
+"""Longest time without a line of news. The longest step takes far less with all sweeps that a
+person records."""
 MOST_LINE = 1 << 20
 """Most bytes of an unfinished line."""
+
+FREE = "free some memory, teach fewer sweeps, or use a desktop"
+"""The remedy where a process hangs: a library that gets no memory may ask for it for ever."""
 
 News = dict[str, Any]
 
@@ -42,22 +49,33 @@ def check_installed() -> None:
         )
 
 
-def learning(folder: Path, forgotten: dict[str, int], memory_mb: int, *more: str) -> list[str]:
+def learning(
+    folder: Path, forgotten: dict[str, int], settings: TeachConfig, *more: str
+) -> list[str]:
     """The command that assesses the sweeps in `folder`, or fits a bundle with the options `more`.
     forgotten: see TeachingState."""
-    options = ("--forgotten", json.dumps(forgotten), "--memory-mb", str(memory_mb))
+    limits = ("--memory-mb", str(settings.memory_mb), "--cpu-s", str(round(settings.limit_s)))
+    options = ("--forgotten", json.dumps(forgotten), *limits)
     return [sys.executable, "-P", "-m", LEARNS, str(folder), *options, *more]
 
 
 class TeachingProcess:
-    """A running process. limit_s: it is killed after this time. group: it gets a process group of
-    its own, with which it is killed. Raises ConfigError if it cannot be started."""
+    """A running process. limit_s: it is killed after this time, and after quiet_s without a line.
+    group: it gets a process group of its own, with which it is killed. Raises ConfigError if it
+    cannot be started."""
 
     def __init__(
-        self, command: Sequence[str], limit_s: float, clock: Clock, *, group: bool = False
+        self,
+        command: Sequence[str],
+        limit_s: float,
+        clock: Clock,
+        *,
+        group: bool = False,
+        quiet_s: float = QUIET_S,
     ) -> None:
-        self._clock, self._limit_s, self._group = clock, limit_s, group
+        self._clock, self._limit_s, self._quiet_s, self._group = clock, limit_s, quiet_s, group
         self._end_ns = clock.now_ns() + round(limit_s * 1e9)
+        self._heard_ns = clock.now_ns()
         self._rest, self._told, self.ended = b"", False, False
         threads = {f"{name}_NUM_THREADS": "1" for name in ("OPENBLAS", "OMP", "MKL")}
         try:
@@ -84,17 +102,26 @@ class TeachingProcess:
         found = self._read()
         self._told = self._told or any(one["type"] != "step" for one in found)
         code = self._process.poll()
-        if code is None and self._clock.now_ns() > self._end_ns:
-            self.close()
-            why = f"it was not done within {self._limit_s:g} s; teach fewer sweeps"
-        elif code is None:
+        if code is None and not (why := self._overdue(bool(found))):
             return found
+        if code is None:
+            self.close()
         else:
             found += self._read()
             self._told = self._told or any(one["type"] != "step" for one in found)
             why = _why(code)
             self.close()
         return found if self._told else [*found, {"type": "error", "text": why}]
+
+    def _overdue(self, heard: bool) -> str:
+        """Why the running process must end, "" if it may go on."""
+        now_ns = self._clock.now_ns()
+        self._heard_ns = now_ns if heard else self._heard_ns
+        if now_ns > self._end_ns:
+            return f"it was not done within {self._limit_s:g} s; teach fewer sweeps"
+        if now_ns > self._heard_ns + self._quiet_s * 1e9:
+            return f"it got no further for {self._quiet_s:g} s; {FREE}"
+        return ""
 
     def close(self) -> None:
         """Kill it, with the processes that it started."""
@@ -131,6 +158,8 @@ def _parsed(line: bytes) -> News | None:
 
 def _why(code: int) -> str:
     """The reason for an end without a result."""
-    if code == -9:
+    if code == -signal.SIGKILL:
         return "the process that learns was killed: there was not enough memory; teach fewer sweeps"
+    if code == -signal.SIGXCPU:
+        return f"the process that learns took more processor time than it may; {FREE}"
     return f"the process that learns ended with {code}; the log says why (journalctl -u palpate)"

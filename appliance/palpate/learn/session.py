@@ -174,7 +174,7 @@ class TeachingSession(Observer):
         """Begin an assessment; a failure is shown."""
         folder, forgotten = self._recording.folder, self._state.forgotten
         try:
-            own = learning(folder, forgotten, self._settings.memory_mb)
+            own = learning(folder, forgotten, self._settings)
             self._begin(self._learn("") if self._base else own)
         except ApplianceError as e:
             self._take({"type": "error", "text": str(e)})

@@ -72,7 +72,7 @@ def use(
         options = ("--out", str(out), "--version", version(store), "--by", by, "--at", day)
         forgotten = TeachingState.load(state.file(settings)).forgotten
         _wait(
-            learning(sweeps, forgotten, settings.teach.memory_mb, *options),
+            learning(sweeps, forgotten, settings.teach, *options),
             settings.teach.limit_s,
             clock,
             tell,
@@ -142,7 +142,7 @@ def assessed(settings: Config, store: Store, clock: Clock) -> News:
         except (ApplianceError, OSError) as e:
             raise TeachingFailed(f"{e}; the bundle in service stays") from e
     found: News = {}
-    words = learning(sweeps, forgotten, settings.teach.memory_mb)
+    words = learning(sweeps, forgotten, settings.teach)
     _wait(words, settings.teach.limit_s, clock, found.update)
     return found
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ import pytest
 from palpate.bundle import bundle
 from palpate.core.clock import SystemClock
 from palpate.inference.classifier import Classifier
+from palpate.learn.process import TeachingProcess
 from palpate_train.data.sets import Dataset
 from palpate_train.models.recipe import recipe
 from palpate_train.teach.lesson import Lesson
@@ -32,6 +34,8 @@ loaded = sorted({name.partition(".")[0] for name in sys.modules})
 print(" ".join(loaded), file=sys.stderr)
 sys.exit(code)
 """
+LONG_S = 900
+"""Limit of a process, far beyond its time on a loaded machine."""
 FORBIDDEN = {"torch", "sklearn", "pandas", "h5py", "joblib", "matplotlib", "skl2onnx", "aeon"}
 
 
@@ -43,6 +47,7 @@ def ran(*words: str | Path) -> tuple[int, list[dict[str, Any]], set[str]]:
         capture_output=True,
         text=True,
         check=False,
+        timeout=LONG_S,
     )
     lines = [json.loads(line) for line in done.stdout.splitlines()]
     return done.returncode, lines, set(done.stderr.split("\n")[-2].split())
@@ -140,26 +145,60 @@ def test_a_full_disk_leaves_no_bundle(tmp_path: Path):
         capture_output=True,
         text=True,
         check=False,
+        timeout=LONG_S,
     )
     assert done.returncode
     assert "cannot be written to" in json.loads(done.stdout.splitlines()[-1])["text"]
     assert [path.name for path in tmp_path.iterdir()] == ["sweeps"]
 
 
-def test_too_little_memory_is_said(tmp_path: Path):
-    """The limit holds: the process ends with a reason and leaves nothing."""
-    lessons.write(tmp_path / "sweeps", easy(12))
-    words = [tmp_path / "sweeps", "--out", tmp_path / "bundle", "--memory-mb", "100"]
+LOOKED = """
+import sys
+from pathlib import Path
+from palpate_train.teach import __main__ as teach
+teach.MEMINFO = Path(sys.argv.pop())
+code = teach.main(sys.argv[1:])
+sys.exit(9 if "numpy" in sys.modules else code)
+"""
+
+
+@pytest.mark.parametrize(
+    ("free_mb", "limit_mb", "why"),
+    [(4000, 100, "100 MB are too few"), (50, 768, "50 MB of memory are free"), (50, 0, "50 MB")],
+)
+def test_too_little_memory_is_said_before_numpy_is_loaded(
+    tmp_path: Path, free_mb: int, limit_mb: int, why: str
+):
+    """A library that is loaded without room may ask for memory for ever, so nothing is loaded."""
+    (tmp_path / "meminfo").write_text(f"MemFree: 3 kB\nMemAvailable: {free_mb << 10} kB\n")
+    words = [tmp_path, "--memory-mb", limit_mb, tmp_path / "meminfo"]
     done = subprocess.run(
-        [sys.executable, "-m", "palpate_train.teach", *map(str, words)],
-        cwd=ROOT,
+        [sys.executable, "-c", LOOKED, *map(str, words)],
         capture_output=True,
         text=True,
         check=False,
+        timeout=60,
     )
-    assert done.returncode
-    assert "100 MB are too few for these sweeps; use a desktop" in done.stdout
-    assert not (tmp_path / "bundle").exists()
+    assert done.returncode == 1, done.stderr
+    assert json.loads(done.stdout)["type"] == "error"
+    assert why in json.loads(done.stdout)["text"]
+
+
+def test_imports_that_spin_are_ended_by_the_kernel(tmp_path: Path):
+    """Their processor time is limited, whatever the library does; whoever started it says so."""
+    code = (
+        "from palpate_train.teach import __main__ as teach\n"
+        "def spin(args):\n    while True: pass\n"
+        "teach.LOAD_CPU_S, teach._run = 1, spin\n"
+        f"teach.main([{str(tmp_path)!r}])"
+    )
+    process = TeachingProcess([sys.executable, "-c", code], 300, SystemClock())
+    found: list[dict[str, Any]] = []
+    while not process.ended:
+        found += process.news()
+        time.sleep(0.05)
+    assert found[-1]["type"] == "error"
+    assert "more processor time" in found[-1]["text"]
 
 
 def test_up_to_twenty_sweeps_the_desktop_makes_the_same_model():

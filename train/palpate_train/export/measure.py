@@ -34,9 +34,11 @@ TIMED_SWEEPS = 60
 """Approximate number of different sweeps, spread evenly over the given sweeps."""
 SWEEPS_BEFORE_MEMORY = 20
 """Number of sweeps that a process answers before its memory is read."""
+MEMORY_S = 600
+"""Longest time in s of that process."""
 MODEL, TORCH, AEON = "model.onnx", "model.pt", "model.npz"
 """The model's file in a bundle, as TorchScript, and as aeon's parameters."""
-DESKTOP = ("torch", "sklearn", "scipy", "aeon", "numba", "onnx", "train")
+DESKTOP = ("torch", "sklearn", "scipy", "aeon", "numba", "onnx", "palpate_train")
 """Packages that the box never has."""
 
 
@@ -133,7 +135,14 @@ def memory(folder: Path, sweeps: Array) -> dict[str, Any]:
             ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
         )
         env |= {"PYTHONPATH": str(Path(palpate.__file__).parents[1])}
-        done = subprocess.run(command, capture_output=True, text=True, check=False, env=env)
+        try:
+            done = subprocess.run(
+                command, capture_output=True, text=True, check=False, env=env, timeout=MEMORY_S
+            )
+        except subprocess.TimeoutExpired as e:
+            raise BundleError(
+                f"the model in {folder} gave no answers within {MEMORY_S} s; pack it again"
+            ) from e
     if done.returncode:
         raise BundleError(
             f"the model in {folder} does not run in a process of its own: "

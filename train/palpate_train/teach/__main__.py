@@ -21,6 +21,15 @@ from palpate.core.errors import ApplianceError
 
 NICE = 19
 """Priority of the process: the lowest. The loop always comes first."""
+LEAST_MB = 256
+"""Private memory that a small lesson needs; numpy and scipy take most of it. Where they get less, a
+BLAS may ask for memory for ever, so the limit is compared before they are loaded."""
+LEAST_FREE_MB = 160
+"""Free memory that a small lesson needs."""
+LOAD_CPU_S = 60
+"""Longest processor time in s of the imports; 2 on a desktop. Beyond it the kernel ends the
+process."""
+MEMINFO = Path("/proc/meminfo")
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -34,15 +43,18 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--forgotten", type=json.loads, default={}, help="JSON, see Lesson.read")
     parser.add_argument("--memory-mb", type=int, default=0, help="limit of private memory")
+    parser.add_argument("--cpu-s", type=int, default=0, help="limit of processor time")
     args = parser.parse_args(argv)
-    _restrict(args.memory_mb)
     try:
+        _check_memory(args.memory_mb)
+        _restrict(args.memory_mb)
+        _limit_cpu(LOAD_CPU_S)
         _run(args)
     except ApplianceError as e:
         _say("error", text=str(e))
         return e.exit_code
     except MemoryError:
-        _say("error", text=f"{args.memory_mb} MB are too few for these sweeps; use a desktop")
+        _say("error", text=_too_few(args.memory_mb))
         return ApplianceError.exit_code
     except OSError as e:
         _say("error", text=f"{e.filename or args.folder}: {e.strerror}; nothing was changed")
@@ -56,6 +68,7 @@ def _run(args: argparse.Namespace) -> None:
     from palpate_train.teach.lesson import Lesson
     from palpate_train.teach.taught import teach
 
+    _limit_cpu(args.cpu_s)
     lesson = Lesson.read(args.folder, args.forgotten)
     if args.out is None:
         _say("assessed", **assess(lesson, args.seed).json())
@@ -79,12 +92,35 @@ def _run(args: argparse.Namespace) -> None:
     )
 
 
+def _too_few(memory_mb: int) -> str:
+    return f"{memory_mb} MB are too few for these sweeps; use a desktop"
+
+
+def _check_memory(memory_mb: int) -> None:
+    """Raises ApplianceError if the limit, or the free memory, is too little for any lesson."""
+    if 0 < memory_mb < LEAST_MB:
+        raise ApplianceError(_too_few(memory_mb))
+    found = MEMINFO.read_text().partition("MemAvailable:")[2].split()
+    if found and (free := int(found[0]) >> 10) < LEAST_FREE_MB:
+        raise ApplianceError(
+            f"{free} MB of memory are free, and teaching needs {LEAST_FREE_MB}; end other "
+            "programs, or use a desktop"
+        )
+
+
+def _limit_cpu(seconds: int) -> None:
+    """The kernel ends the process after this processor time, 0 for any; it may be called again."""
+    hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
+    resource.setrlimit(resource.RLIMIT_CPU, (seconds or hard, hard))
+
+
 def _restrict(memory_mb: int) -> None:
     """Take the lowest priority and the limit of memory; a system that forbids it has its own."""
     with suppress(OSError):
         os.nice(NICE)
     with suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text("1000")
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     if memory_mb:
         resource.setrlimit(resource.RLIMIT_DATA, (memory_mb << 20, memory_mb << 20))
 
