@@ -67,7 +67,6 @@ CHAPTERS = {
         "CONTRIBUTING",
         "docs/decisions/README",
         "docs/decisions/*",
-        "docs/data/trials/*",
     ],
 }
 """Captions of the contents, and their pages, without .md. Pages of one pattern are in the order of

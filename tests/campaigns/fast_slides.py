@@ -1,6 +1,6 @@
 """Measures how much accuracy a faster slide over the same path costs.
 
-`python -m tests.campaigns fast-slides` prints a table of docs/decisions/0025: the recipe without
+`python -m tests.campaigns fast-slides` prints a table of docs/decisions/0004: the recipe without
 trained stages, for windows of 2 s down to 0.5 s. A faster slide passes the same 60 mm in the
 shorter window; the shorter slide keeps 30 mm/s and passes less. Training has slides at 0.8, 1 and
 1.25 times the speed; the test has the speed itself, at other attachments. Takes twenty minutes.

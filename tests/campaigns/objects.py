@@ -1,7 +1,7 @@
 """Counts wrong answers with NEW OBJECT forgotten, and with NEW OBJECT before each object.
 
 `python -m tests.campaigns objects` prints a table for each of several rules by which an object ends
-by itself (docs/decisions/0020). All rules get the same simulated sweeps of the packaged bundle: in
+by itself (docs/decisions/0006). All rules get the same simulated sweeps of the packaged bundle: in
 place, displaced, attached a row further (T-HARD), and with noise. Takes a minute.
 """
 

@@ -1,6 +1,6 @@
 """Measures how well the speed of a slide is measured from the counts of the taxels.
 
-`python -m tests.campaigns slide-speed` prints the tables of docs/decisions/0021: simulated slides
+`python -m tests.campaigns slide-speed` prints the tables of docs/decisions/0007: simulated slides
 of two worlds at several speeds, displaced, noisy and with broken taxels; windows without a slide;
 real slides at 35.6 Hz, if PALPATE_DATA names the folder of FabricSlide; and the processor time.
 Takes two minutes. No sweep of it was used to choose the limits of `palpate/signal/slide.py`.

@@ -1,7 +1,7 @@
 """Measures whether bands over f/v, beside bands over f, help the recipe name materials.
 
 A texture is a pattern in space; its frequencies f are proportional to the speed v of the slide.
-`python -m tests.campaigns speed-bands` prints the tables of docs/decisions/0025: simulated slides
+`python -m tests.campaigns speed-bands` prints the tables of docs/decisions/0004: simulated slides
 at speeds outside of training, with the true and with the measured speed, and FabricSlide with a
 force, a speed, a direction or a repetition left out, if PALPATE_DATA names its folder. Trained
 stages join with `--steps 600`. Takes an hour with FabricSlide, or two with stages.

@@ -189,7 +189,7 @@ def test_the_page_is_one_file_that_a_phone_can_read(made):
     html, pictures = made
     read = PageReader(html)
     assert (read.wrong, read.open) == ([], [])
-    own = ("../../README.md", "../../docs/decisions/0010-what-the-simulator-lacked.md")
+    own = ("../../README.md", "../../docs/decisions/0002-two-simulated-worlds.md")
     assert all(link.startswith("#") or link in (*own, DOI) for link in read.links)
     assert {DOI, own[1]} <= set(read.links)
     assert not re.search(r"@import|url\((?!#)|<script>|<link", html)

@@ -30,7 +30,7 @@ from palpate.signal.slide_check import SlideCheck
 
 Embedded = NDArray[np.float64]
 LEAST = 0.7
-"""Known.enrolled of an enrolment. Decision 29 compares values and rules."""
+"""Known.enrolled of an enrolment. Decision 12 compares values and rules."""
 
 
 @dataclass(frozen=True, slots=True)

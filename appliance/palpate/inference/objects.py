@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from palpate.core.types import Sweep
 
 STRONG = 10.0
-"""Least Bayes factor for another object: strong evidence (Jeffreys 1961, appendix B). Decision 20
+"""Least Bayes factor for another object: strong evidence (Jeffreys 1961, appendix B). Decision 6
 compares it with other rules."""
 LEAST_PROBABILITY = 1e-12
 """Lower bound of probabilities in a fusion, so that one sweep with a probability of 0 cannot veto

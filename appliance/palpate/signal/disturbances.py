@@ -2,7 +2,7 @@
 
 Each moves the embedding of a known material further than the limit of known materials. Its size is
 known, so the means of the materials move with it and the limit grows with it. A sweep without
-disturbance is judged as before. docs/decisions/0031 has the gain and the cost.
+disturbance is judged as before. docs/decisions/0005 has the gain and the cost.
 """
 
 from __future__ import annotations

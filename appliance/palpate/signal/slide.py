@@ -3,7 +3,7 @@
 The phase between two taxels at a distance d along the slide is 2 pi f d / v at a frequency f and a
 speed v. Cross-spectra of pairs, divided by the square root of their magnitude, are summed at these
 phases for a grid of speeds, and the highest sum shows the speed (Knapp and Carter 1976, with an
-exponent of 0.5). docs/decisions/0021 has the accuracy. The box calls this once per sweep, `train`
+exponent of 0.5). docs/decisions/0007 has the accuracy. The box calls this once per sweep, `train`
 for the sweeps of a set.
 """
 
@@ -45,7 +45,7 @@ LEAST_TAXELS = 3
 taxels nothing is left that has a direction."""
 CHANCE = 5.0
 """Height that few windows of noise, of rests and of taxels from different slides exceed
-(docs/decisions/0024)."""
+(docs/decisions/0005)."""
 LEAST_HEIGHT = 7.0
 """Least height of a peak, in standard deviations of a sum with random phases."""
 RATIO = 1.5

@@ -2,7 +2,7 @@
 from noise, or from a single taxel.
 
 Unlike the checks of an answer, it does not know the material. Over a slide a pattern passes from
-taxel to taxel, which neither a resting finger nor noise gives. docs/decisions/0027 has the figures.
+taxel to taxel, which neither a resting finger nor noise gives. docs/decisions/0001 has the figures.
 """
 
 from __future__ import annotations

@@ -84,7 +84,7 @@ class World:
     EFFECTS to omit.
 
     A spread is a standard deviation, of the natural logarithm unless stated otherwise. They were
-    fitted as described in docs/decisions/0003 and 0010. Raises ConfigError if `off` names an
+    fitted as described in docs/decisions/0002 and 0010. Raises ConfigError if `off` names an
     unknown effect.
     """
 
@@ -142,7 +142,7 @@ class World:
 
 WORLD = World()
 """The simulated laboratory: it agrees with the twenty accuracies that the paper prints of spectral
-features, and gives the level a meaning, as the paper explains its network's (decision 10)."""
+features, and gives the level a meaning, as the paper explains its network's (decision 2)."""
 LEVEL_BLIND = World(
     tubes=LEVEL_BLIND_TUBES,
     pad_half_mm=8.5,

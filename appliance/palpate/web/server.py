@@ -4,7 +4,7 @@ The server runs in a thread of its own, so that no browser keeps the program wai
 of the paths it was given, and reads only the head of a request. A new browser gets the kept events,
 then the new events (server-sent events); a browser that comes back gets the events it has missed.
 The program alone decides about orders: a page without orders is read-only
-(docs/decisions/0016-labels-from-the-page.md).
+(docs/decisions/0011-pages.md).
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ from palpate_train.onnx_tools.quantize import sixteen_bits
 Array = NDArray[Any]
 KEPT = 0.995
 """Share of known sweeps within the limit. The robot gets no answer to the others, whatever the
-network computes (docs/decisions/0006)."""
+network computes (docs/decisions/0005)."""
 PARTS = 10
 """Largest number of parts of the groups; each part is judged by a fit to the others."""
 FLAT = 1e-9
@@ -171,7 +171,7 @@ def embed(features: Array, labels: Array, fixed: int = 0) -> Embedding:
 def in_two_views(features: Array, labels: Array, fixed: int = 0) -> Embedding:
     """As `embed`, with distances that are the sum of two: in the features that were not trained,
     and in the directions in which the means differ. Which of them shows an unknown material depends
-    on the skin (docs/decisions/0032). In both, each material has its own scatter, and the sweeps
+    on the skin (docs/decisions/0005). In both, each material has its own scatter, and the sweeps
     lie at r from their mean on average. Without untrained features it is `embed`."""
     z = embed(features, labels, fixed)
     if not z.shapes.shape[1]:

@@ -33,7 +33,7 @@ Embed = Callable[[Array], Array]
 WEIGHTS = (0.0, 0.3, 1.0, 3.0)
 """Weights of the scatter of a kind of alteration, before it is divided by the number of kinds.
 Larger weights let some materials pass that the model does not have: with 30, 72 % of plastic
-smooth, with 3, 22 %. Sweeps of known materials cannot show that (docs/decisions/0024)."""
+smooth, with 3, 22 %. Sweeps of known materials cannot show that (docs/decisions/0005)."""
 OWN = 0.5
 """Share of a material's own copies in its scatter; the rest is that of the copies of all
 materials."""

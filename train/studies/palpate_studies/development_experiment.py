@@ -2,7 +2,7 @@
 
 One set is never enough to tune on: a recipe that overfits one set shows it on the others. evaluate
 caches folds, so an interrupted command goes on where it was. T-HARD, the skin attached anew, is not
-among the sets, because the simulator cannot be trusted with it (decision 10).
+among the sets, because the simulator cannot be trusted with it (decision 2).
 """
 
 from __future__ import annotations

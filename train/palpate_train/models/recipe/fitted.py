@@ -52,7 +52,7 @@ FAULTS = Augmentation(
 """Changes of a known material in service: a worse amplifier, hum of the mains, a taxel that
 fails."""
 ONE_IN = 10
-"""One in this many training sweeps has a copy with faults; docs/decisions/0006 compares other
+"""One in this many training sweeps has a copy with faults; docs/decisions/0005 compares other
 shares."""
 
 

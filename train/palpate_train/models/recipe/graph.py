@@ -137,7 +137,7 @@ class _TrunkNodes:
         self._architecture, self._ranges, self._prefixes = architecture, ranges, prefixes
         self._zero_sum = architecture.zero_sum(format.window)
         self._rowwise = prefixes and not self._zero_sum
-        # a byte does not hold wider counts: fixed features of these stay in float (decision 11)
+        # a byte does not hold wider counts: fixed features of these stay in float (decision 4)
         self._own = ranges if format.dtype == "uint8" else None
         shape = self.g.constant([1, format.window, format.channels], "int64")
         self.raw = self.g("Reshape", "sweep", shape)

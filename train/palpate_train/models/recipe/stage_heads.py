@@ -14,7 +14,7 @@ from palpate_train.models.recipe.choice import FeatureColumns
 
 Array = NDArray[Any]
 STAGES_WEIGHT = 0.5
-"""Weight of the discriminant of stages beside others; docs/decisions/0023 compares others."""
+"""Weight of the discriminant of stages beside others; docs/decisions/0004 compares others."""
 
 
 def beside(plan: HeadPlan) -> list[HeadPart]:
