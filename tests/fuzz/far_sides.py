@@ -1,4 +1,4 @@
-"""The promises about a controller's requests over Modbus, and about files that a person imports;
+"""The promises about a controller's requests over Modbus, and about texts that a person imports;
 also seeds, and words of their formats.
 
 A target raises an error if a promise is broken, as in `targets`.
@@ -6,13 +6,10 @@ A target raises an error if a promise is broken, as in `targets`.
 
 from __future__ import annotations
 
-import io
 import struct
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from scipy.io import savemat
 
 from palpate.bridges import modbus_pdu
 from palpate.bridges.modbus_pdu import HEADER, MOST_PDU, ModbusRequest, Reading, RequestRefused
@@ -24,11 +21,6 @@ REGISTERS = [0] * 100
 WORDS = {
     "modbus": [struct.pack(">H", number) for number in (0, 1, 6, 125, 2000, 0xFF00, 0xFFFF)],
     "import-text": [b",", b";", b"\t", b"\n", b"1e999", b"nan", b"# ", b'"', b"-0.0", b"0x1p3"],
-    "import-mat": [
-        b"IM",
-        b"MI",
-        *(struct.pack("<II", kind, 8) for kind in (1, 2, 5, 6, 9, 14, 15)),
-    ],
 }
 """The words of each format."""
 
@@ -64,20 +56,17 @@ def _reply(request: ModbusRequest) -> bytes:
         return modbus_pdu.refusal(request.pdu, e.fault)
 
 
-def _imported(suffix: str) -> Callable[[bytes, Path], None]:
-    def target(data: bytes, folder: Path) -> None:
-        """raw_files.read: a table of numbers with a name for each column, or a FormatError."""
-        file = folder / f"recording{suffix}"
-        file.write_bytes(data)
-        try:
-            table = raw_files.read(file)
-        except FormatError as e:
-            one_line(e)
-            return
-        assert isinstance(table.values, np.ndarray)
-        assert table.values.dtype.kind in "biufc", f"{table.values.dtype} is no number"
-
-    return target
+def imported(data: bytes, folder: Path) -> None:
+    """raw_files.read: a table of numbers with a name for each column, or a FormatError."""
+    file = folder / "recording.csv"
+    file.write_bytes(data)
+    try:
+        table = raw_files.read(file)
+    except FormatError as e:
+        one_line(e)
+        return
+    assert isinstance(table.values, np.ndarray)
+    assert table.values.dtype.kind in "biufc", f"{table.values.dtype} is no number"
 
 
 def modbus_seeds() -> list[bytes]:
@@ -99,20 +88,6 @@ def text_seeds() -> list[bytes]:
     ]
 
 
-def mat_seeds() -> list[bytes]:
-    """MAT files of version 5, compressed and plain."""
-    found = []
-    for packed in (False, True):
-        file = io.BytesIO()
-        savemat(
-            file,
-            {"x": np.arange(6.0).reshape(2, 3), "y": np.arange(4, dtype=np.int16)},
-            do_compression=packed,
-        )
-        found.append(file.getvalue())
-    return found
-
-
 def requests_of(data: bytes) -> list[bytes]:
     """An empty first piece, then the requests in `data`, cut by the lengths in their headers."""
     found, at = [b""], 0
@@ -123,15 +98,5 @@ def requests_of(data: bytes) -> list[bytes]:
     return found
 
 
-def elements_of(data: bytes) -> list[bytes]:
-    """The head of a MAT file, then its elements, cut by the lengths in their tags."""
-    found, at = [data[:128]], 128
-    while at < len(data):
-        end = at + 8 + int.from_bytes(data[at + 4 : at + 8], "little")
-        found.append(data[at:end])
-        at = end
-    return found
-
-
-TARGETS = {"modbus": modbus, "import-text": _imported(".csv"), "import-mat": _imported(".mat")}
-SEEDS = {"modbus": modbus_seeds, "import-text": text_seeds, "import-mat": mat_seeds}
+TARGETS = {"modbus": modbus, "import-text": imported}
+SEEDS = {"modbus": modbus_seeds, "import-text": text_seeds}

@@ -188,6 +188,5 @@ MUTATORS: dict[str, Mutator] = {
     "profile": tables,
     "import-text": tables,
     "modbus": parts(far_sides.requests_of),
-    "import-mat": parts(far_sides.elements_of),
     **{f"skin-{name}": frames for name in GRIDS},
 }

@@ -26,7 +26,12 @@ Array = NDArray[Any]
 Set = TypeVar("Set", bound="SweepSet")
 
 
-@dataclass(frozen=True)
+def native(values: Array) -> Array:
+    """The same numbers in this machine's byte order; the array itself if it has it."""
+    return values.astype(values.dtype.newbyteorder("="), copy=False)
+
+
+@dataclass(frozen=True, eq=False)
 class SweepSet:
     """N sweeps with their labels and groups.
 
@@ -51,6 +56,12 @@ class SweepSet:
     displays: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        # torch and onnxruntime take only this machine's byte order, or read other numbers
+        for name in ("samples", "labels", "unloaded"):
+            if (values := getattr(self, name)) is not None:
+                object.__setattr__(self, name, native(values))
+        groups = {name: native(values) for name, values in self.groups.items()}
+        object.__setattr__(self, "groups", groups)
         self._check_samples()
         self._check_numbers()
         self._check_materials()
@@ -207,23 +218,21 @@ def build(arrays: dict[str, Array], source: str, kind: type[Set]) -> Set:
         raise FormatError(
             f"{source}: rate_hz holds {arrays['rate_hz']!r}; give one number, frames per second"
         )
-    # torch and onnxruntime accept only this machine's byte order
-    native = {k: v.astype(v.dtype.newbyteorder("="), copy=False) for k, v in arrays.items()}
     groups, units = (
-        {k.removeprefix(part): v for k, v in native.items() if k.startswith(part)}
+        {k.removeprefix(part): v for k, v in arrays.items() if k.startswith(part)}
         for part in ("group_", "unit_")
     )
     materials = tuple(unicodedata.normalize("NFC", str(m)) for m in arrays["materials"])
     return kind(
-        native["samples"],
-        native["labels"],
+        arrays["samples"],
+        arrays["labels"],
         materials,
         arrays["rate_hz"].item(),
         {name: _group(name, values) for name, values in groups.items()},
         source,
-        native.get("unloaded"),
+        arrays.get("unloaded"),
         {name: str(unit) for name, unit in units.items() if name in groups},
-        _displays(materials, native.get("displays"), source),
+        _displays(materials, arrays.get("displays"), source),
     )
 
 

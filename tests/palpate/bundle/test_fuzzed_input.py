@@ -22,7 +22,6 @@ from palpate.io.skin_codecs import fixed, papillarray, robotiq, text, xela
 from palpate.service import feed_reader
 from palpate.sweeps import capture
 from palpate_train.data import raw_files
-from palpate_train.data.files import mat_v5
 from palpate_train.data.files import text as text_files
 from tests.fuzz import corpus, enrolments, files, seeds, skins, targets
 from tests.fuzz.mutators import MUTATORS
@@ -64,8 +63,6 @@ BROKE = {
     "enrolment/member-that-is-no-array": "numpy gives the bytes of what does not begin as an "
     "array: "
     "AttributeError",
-    "import-mat/name-of-a-control-character": "an array called NUL: it stood in the message as it "
-    "is",
     "manifest/brackets-in-brackets": "5000 brackets: RecursionError",
     "manifest/dead-taxels-of-many-digits": "a number of 401 digits was taken",
     "manifest/figures-in-figures": "figures 800 levels deep were read, but enrolment could not "
@@ -187,7 +184,6 @@ READ: dict[str, Callable[[bytes, Path], Any]] = {
     "capture": lambda data, folder: capture.Playback(written(folder, "c", data)).format,
     "modbus": lambda data, folder: modbus_pdu.requests(data)[0],
     "import-text": lambda data, folder: raw_files.read(written(folder, "t.csv", data)).values.size,
-    "import-mat": lambda data, folder: raw_files.read(written(folder, "t.mat", data)).values.size,
     "profile": lambda data, folder: skin_profile.load(
         written(folder, "s.toml", data).stem, [folder]
     ),
@@ -502,7 +498,6 @@ def test_each_promise_can_be_seen_broken(
         ("enrolment", arrays, "summed"),
         ("modbus", modbus_pdu, "parse"),
         ("import-text", text_files, "is_number"),
-        ("import-mat", mat_v5, "_matrix"),
     ],
 )
 def test_another_error_is_not_kept_back(

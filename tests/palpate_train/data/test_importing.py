@@ -118,6 +118,21 @@ def test_columns_are_named_numbered_or_all_but_the_time(tmp_path: Path):
     np.testing.assert_array_equal(turned, whole.reshape(10, 4)[:, ::-1].reshape(10, 2, 2))
 
 
+@pytest.mark.parametrize("changes", [{}, {"variable": "{}"}])
+def test_a_pattern_without_a_field_matches(tmp_path: Path, changes: dict):
+    """The material stands in a column: `{}.npz` takes every such file, and no other."""
+    rows = np.zeros(40, [("what", "U4"), ("taxels", "i4", 4)])
+    for name in ("cork", "felt"):
+        rows["what"], rows["taxels"] = name, COUNTS + len(name) + (name == "felt")
+        np.savez(tmp_path / f"{name}.npz", rows)
+    np.savez(tmp_path / "other.zip.npz", COUNTS)
+    names = NamePattern("{}t.npz", ("material",))
+    given = {"pattern": names, "fields": {"material": "what"}} | changes
+    (tmp_path / "cork.npz").rename(tmp_path / "corkt.npz")
+    found = reasons(tmp_path, **given)
+    assert found.keys() == {"other.zip.npz"}
+
+
 def test_windows_are_cut_as_asked(tmp_path: Path):
     """The middle window, or a window at regular intervals from the start on; all belong to one
     recording."""
@@ -293,7 +308,7 @@ def test_each_bad_text_gets_one_exact_line(tmp_path: Path, name: str):
         (
             "mat",
             lambda p: p.write_bytes(b"MATLAB 5.0" + bytes(200)),
-            "is not a MAT file of version 4 to 7.3; save it with -v7",
+            "is damaged, or not a MAT file of version 4 to 7.3; save it with -v7",
         ),
         ("h5", lambda p: p.write_bytes(b"nothing"), "cannot be read: "),
         (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -99,6 +100,29 @@ def test_a_bundle_answers_with_the_boxs_code(fitted: PalpateClassifier, tmp_path
         box.predict(SWEEPS[36:, :, :50])
     with pytest.raises(FormatError, match="X holds float32, and the bundle takes uint8"):
         box.predict(SWEEPS[36:] + 0.5)
+
+
+FORMS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "highest byte first": lambda x: x.astype(x.dtype.newbyteorder(">")),
+    "by columns": np.asfortranarray,
+    "of a larger array": lambda x: np.repeat(x, 2, axis=2)[:, :, ::2],
+    "backwards": lambda x: x[:, :, ::-1].copy()[:, :, ::-1],
+    "read only": lambda x: np.frombuffer(x.tobytes(), x.dtype).reshape(x.shape),
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_counts_are_the_same_however_they_lie_in_memory(fitted: PalpateClassifier, form: str):
+    """A fit and its answers get the numbers that NumPy shows, in this machine's byte order."""
+    expected = fitted.predict_proba(SWEEPS[36:])
+    for kind in ("u2", "i2", "f4"):
+        x = FORMS[form](SWEEPS[36:].astype(kind))
+        np.testing.assert_array_equal(fitted.predict_proba(x), expected)
+        made = small()._dataset(x, LABELS[36:], GROUPS[36:])
+        np.testing.assert_array_equal(made.samples, raw_counts(SWEEPS[36:], (2, 2)))
+        assert made.samples.dtype.isnative
+    again = small().fit(FORMS[form](SWEEPS[:36].astype("u2")), LABELS[:36], groups=GROUPS[:36])
+    np.testing.assert_array_equal(again.predict_proba(SWEEPS[36:]), expected)
 
 
 @pytest.mark.parametrize(

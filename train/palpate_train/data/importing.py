@@ -38,7 +38,7 @@ Source = tuple[str, Fields, Callable[[], Table]]
 """Name of a recording, its fields that are known already, and a function that reads it."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Recording:
     """The contents of one file. frames: [n, R, C] or [n, R, C, A], as recorded. time_s: [n], or
     None if the file holds no times. notes: remarks of the reader."""
@@ -59,7 +59,7 @@ class LeftOut:
     broken: bool = False
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Cut:
     """Windows [k, T, R, C(, A)] of one recording, most of them views of its frames. notes: how its
     frames were changed."""
@@ -86,7 +86,7 @@ class Taken:
     notes: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Imported:
     """An imported sweep set. taken, left_out: one entry for each file. notes: remarks on the whole
     set."""
@@ -157,7 +157,7 @@ def _named(
         try:
             if plan.pattern is None:
                 found[name] = path, {}
-            elif fields := plan.pattern.read(name):
+            elif (fields := plan.pattern.read(name)) is not None:
                 found[name] = path, fields
             else:
                 left_out.append(LeftOut(name, "its name does not match the pattern"))
@@ -221,13 +221,9 @@ def _arrays(
         except FormatError as e:
             yield at, fields, partial(_refused, str(e))
             continue
-        if found:
+        if found is not None:
             matched, plan = True, replace(wanted, variable=array)
-            yield (
-                at,
-                {**fields, **found},
-                partial(raw_files.read, path, plan),
-            )
+            yield at, {**fields, **found}, partial(raw_files.read, path, plan)
     if not matched:
         listed = ", ".join(map(printable, held[:MOST_LISTED])) or "none"
         why = f"has no array of frames that matches --variable {pattern.text!r}; it holds {listed}"

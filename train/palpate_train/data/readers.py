@@ -53,7 +53,7 @@ are passed over too."""
 IMPORT = "palpate-train import {} makes a set of such files"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class RecordedSweep:
     """One sweep as the box recorded it. path: its .npy file; about: the contents of its sidecar."""
 

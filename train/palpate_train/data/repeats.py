@@ -27,7 +27,7 @@ MOST_KEPT = 512
 which are a random sample of all (a bottom-k sketch, Cohen and Kaplan 2007)."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Pairs:
     """Pairs of sweeps [P] that share `frames` [P] frames; the whole window if they are identical.
 

@@ -30,7 +30,7 @@ FEWEST_BURSTS = 5
 BURSTS = "its frames come in bursts, so their times are those at which a program read them"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Runs:
     """Evenly spaced frames. parts: [n, ...] each, in the recorded type or, if interpolated, float.
     gaps: number of gaps between the parts. interpolated: whether any part was interpolated."""

@@ -36,7 +36,7 @@ OWN_NUMBERS = ("recording", "position", "session", "object")
 LIMITS: dict[str, Callable[[Array, Any], Array]] = {"<=": np.less_equal, ">=": np.greater_equal}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Dataset(sweep_set.SweepSet):
     """A SweepSet that can be narrowed, split and saved."""
 

@@ -244,7 +244,7 @@ OF_THE_SET = ("recording", "set", "split", "trial", "world")
 RANDOM_PARTS = 5
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class InnerPart:
     """Sweeps of a training set that are held out to judge a model fitted to the other sweeps.
     group: the name of the group that is left out. out: bool [N]."""

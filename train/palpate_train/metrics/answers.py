@@ -30,7 +30,7 @@ def outcomes(named: Array, sure: Array, labels: Array) -> dict[str, Array]:
     }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Answers:
     """Answers to N sweeps. labels: int [N], a label, REFUSED or UNKNOWN. ok: bool [N], whether the
     box is certain of the label. fused: as `labels`, of the whole recording; UNKNOWN if uncertain.

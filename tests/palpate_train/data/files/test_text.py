@@ -102,6 +102,23 @@ def test_two_decimal_signs_in_one_text_are_refused():
         read("0,5\t0.25\n" * 4)
 
 
+@pytest.mark.parametrize(
+    ("usual", "cell", "decimal"),
+    [
+        ("0,5", "1.23,5", ""),
+        ("0,5", "1.23,5", ","),
+        ("0.5", "1,23.5", ""),
+        ("3", "1,01", "."),
+        ("3", "1.0.1", ","),
+    ],
+)
+def test_a_separator_at_a_wrong_place_is_a_fault(usual: str, cell: str, decimal: str):
+    """1.23,5 is neither 123.5 nor 1.235, whatever the decimal sign is."""
+    found = read(f"{usual};{usual}\n" * 5 + f"{usual};{cell}\n", decimal)
+    assert found.faults.keys() == {1}
+    assert "line 6, column 2" in found.faults[1]
+
+
 def test_quoted_thousands_between_commas_are_refused():
     """Spreadsheets quote 1,012 in a CSV."""
     with pytest.raises(FormatError, match="column 2 is '1,012'; say with --decimal"):

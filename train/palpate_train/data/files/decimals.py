@@ -20,6 +20,15 @@ DECISIVE_DOT = re.compile(
 )
 """A dot that can only be a decimal sign."""
 GROUPS = r"[+-]?[1-9]\d{{0,2}}(?:\{0}\d{{3}})+"
+_FORM = (
+    r"[+-]?(?:(?:\d+|\d{{1,3}}(?:\{thousands}\d{{3}})+)(?:\{sign}\d*)?|\{sign}\d+)(?:[eE][+-]?\d+)?"
+    r"|[+-]?(?:nan|inf|infinity)"
+)
+NUMBERS = {
+    sign: re.compile(_FORM.format(sign=sign, thousands=other), re.IGNORECASE)
+    for sign, other in (".,", ",.")
+}
+"""A number by the decimal sign of its text. 1.23,5 and 1,01.5 are none."""
 Row = tuple[int, str]
 
 
@@ -46,6 +55,12 @@ def decimal_sign(
     if "?." in found and (column := _mixed_column(rows, split)) is not None:
         raise _ambiguous(rows, split, lambda cell: _evidence(cell) == "?.", "", column)
     return "."
+
+
+def is_number(text: str, decimal: str = "") -> bool:
+    """Whether a cell is a number. decimal: "" for either sign."""
+    text = text.strip()
+    return any(NUMBERS[sign].fullmatch(text) for sign in decimal or NUMBERS)
 
 
 def plain(text: str, decimal: str) -> str:

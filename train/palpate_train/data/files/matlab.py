@@ -1,14 +1,22 @@
 """Reads MAT files of all versions and MATLAB's figures.
 
-mat_v4.py reads version 4, mat_v5.py versions 5 to 7; version 7.3 is HDF5. Arrays are found in
-structures and cells too, by a path such as data.skin or runs{2}.skin. Texts, dates, tables and
-other objects are passed over.
+Version 7.3 is HDF5; SciPy reads the others. It trusts the sizes in a damaged file: version 1.17.1
+ended its process with a segmentation fault in three of three runs of 3,000 damaged files. So a
+child process with limits reads the file and writes its arrays to an .npz.
+
+Arrays are found in structures and cells too, by a path such as data.skin or runs{2}.skin. Texts,
+dates, tables, other objects, sparse and complex arrays are passed over.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from functools import partial
+import resource
+import signal
+import tempfile
+import zipfile
+from collections.abc import Iterator, Mapping
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +24,12 @@ import h5py
 import numpy as np
 
 from palpate.core.errors import FormatError
-from palpate_train.data.files import hdf5, mat_v4, mat_v5
-from palpate_train.data.files.mat_v5 import Struct
-from palpate_train.data.files.table import Array, Entry, ReadPlan, Table, chosen, from_columns
+from palpate_train.data.files import hdf5, numpy_files
+from palpate_train.data.files.table import Array, ReadPlan, Table, chosen
 
+DEADLINE_S = 120.0
+MOST_BYTES = 16 << 30
+"""Address space of the child. An array of version 7 has 2 GB at most."""
 FIGURE = "hgS_070000"
 """The structure in which a .fig keeps its axes and lines."""
 REMEDY = (
@@ -29,48 +39,114 @@ REMEDY = (
 
 
 def read(path: Path, wanted: ReadPlan) -> Table:
-    """The wanted array of a MAT file, or the lines of a figure. Raises FormatError."""
+    """The wanted array of a MAT file, or the lines of a figure as columns, with their common x
+    values as the vector `x`. Raises FormatError."""
     if h5py.is_hdf5(path):
         with h5py.File(path, "r") as file:
             if FIGURE in file:
                 raise FormatError(f"is a figure of version 7.3; {REMEDY}")
             dotted = {name.replace("/", "."): e for name, e in hdf5.entries(file, True).items()}
             return chosen(dotted, wanted)
-    data = path.read_bytes()
-    content = mat_v4.variables(data) if mat_v4.is_version_4(data) else mat_v5.variables(data)
-    if FIGURE in content:
-        return _figure(content[FIGURE])
-    found = mat_v5.arrays_of(content)
-    return chosen(
-        {n: Entry.of(v.shape, v.dtype, partial(np.asarray, v)) for n, v in found.items()}, wanted
-    )
+    with tempfile.TemporaryDirectory() as folder:
+        converted = Path(folder, "arrays.npz")
+        _convert(path, converted)
+        return numpy_files.read_npz(converted, wanted)
 
 
-def _figure(tree: Any) -> Table:
-    """The lines of a figure as columns, in the order in which they were drawn; their common x
-    values are the vector `x`."""
-    lines = [(x, y) for x, y in _lines(tree) if y.size > 1]
+def _convert(path: Path, target: Path) -> None:
+    """Write the arrays of a MAT file to an .npz in a child process. Raises FormatError."""
+    import scipy.io  # noqa: F401  # the forks then have it
+
+    context = get_context("fork")
+    receiver, sender = context.Pipe(duplex=False)
+    child = context.Process(target=_child, args=(path, target, sender), daemon=True)
+    child.start()
+    sender.close()
+    child.join(DEADLINE_S)
+    if child.is_alive():
+        child.kill()
+        child.join()
+        raise FormatError(f"cannot be read within {DEADLINE_S:g} s; save its arrays alone")
+    if child.exitcode:
+        name = signal.Signals(-child.exitcode).name if child.exitcode < 0 else child.exitcode
+        raise FormatError(f"is damaged: it ended the process that read it ({name})")
+    if why := receiver.recv():
+        raise FormatError(why)
+
+
+def _child(path: Path, target: Path, sender: Connection) -> None:
+    """Convert with limits, and send what is wrong, "" if nothing."""
+    resource.setrlimit(resource.RLIMIT_AS, (MOST_BYTES, MOST_BYTES))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    try:
+        arrays = _arrays(path)
+        with zipfile.ZipFile(target, "w") as archive:
+            for name, values in arrays.items():
+                with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
+                    numpy_files.FORMAT.write_array(file, np.asarray(values), allow_pickle=False)
+        sender.send("")
+    except FormatError as e:
+        sender.send(str(e))
+    except Exception as e:  # SciPy raises errors of any type for damaged files
+        sender.send(
+            "is damaged, or not a MAT file of version 4 to 7.3; save it with -v7 "
+            f"({type(e).__name__}: {' '.join(str(e).split())})"
+        )
+
+
+def _arrays(path: Path) -> dict[str, Array]:
+    """The arrays of real numbers by their paths, in MATLAB's types."""
+    import scipy.io
+
+    stored, typed = (scipy.io.loadmat(path, mat_dtype=typed) for typed in (False, True))
+    if FIGURE in typed:
+        return _figure(typed[FIGURE])
+    real = dict(_walk_all(stored))  # with its types SciPy drops the imaginary parts
+    return {name: values for name, values in _walk_all(typed) if name in real}
+
+
+def _walk_all(content: Mapping[str, Any]) -> Iterator[tuple[str, Array]]:
+    for name, value in content.items():
+        if not name.startswith("__"):
+            yield from _walk(name, value)
+
+
+def _walk(name: str, value: Any) -> Iterator[tuple[str, Array]]:
+    from scipy.io.matlab import MatlabFunction, MatlabOpaque
+
+    if not isinstance(value, np.ndarray) or isinstance(value, MatlabOpaque | MatlabFunction):
+        return
+    if value.dtype.names:
+        for k, record in enumerate(value.ravel(order="F"), 1):
+            for field in value.dtype.names:
+                at = name if value.size == 1 else f"{name}({k})"
+                yield from _walk(f"{at}.{field}", record[field])
+    elif value.dtype.hasobject:
+        for k, item in enumerate(value.ravel(order="F"), 1):
+            yield from _walk(f"{name}{{{k}}}", item)
+    elif value.dtype.kind in "biuf":
+        yield name, value.astype(value.dtype.newbyteorder("="), copy=False)
+
+
+def _figure(tree: Array) -> dict[str, Array]:
+    """The lines of a figure [n, lines], in the order in which they were drawn, and their x [n]."""
+    lines = list(_lines(tree))
     if not lines:
         raise FormatError(f"is a figure without lines; {REMEDY}")
     x = lines[0][0]
     if any(not np.array_equal(x, other) for other, _ in lines):
         raise FormatError(f"is a figure whose lines differ in their x values; {REMEDY}")
-    names = [f"line {k}" for k in range(1, len(lines) + 1)]
-    table = from_columns(names, [y for _, y in lines], {})
-    note = f"is a figure: its {len(lines)} lines are the columns"
-    return Table(table.values, table.columns, {"x": x}, ("x",), notes=(note,))
+    return {"lines": np.stack([y for _, y in lines], axis=1), "x": x}
 
 
-def _lines(node: Any) -> Iterator[tuple[Array, Array]]:
+def _lines(tree: Any) -> Iterator[tuple[Array, Array]]:
     """x and y of all lines in a tree of graphics objects."""
-    for one in node.records if isinstance(node, Struct) else ():
-        properties = one.get("properties")
-        values = properties.records[0] if isinstance(properties, Struct) else {}
-        y = values.get("YData")
-        if str(one.get("type")).endswith(("line", "lineseries")) and isinstance(y, np.ndarray):
-            x = values.get("XData")
-            given = isinstance(x, np.ndarray) and x.size == y.size
-            at = np.asarray(x).ravel() if given else np.arange(1.0, y.size + 1)
-            yield at, y.ravel()
-        if values.get("Tag") != "legend":
-            yield from _lines(one.get("children"))
+    for one in tree.ravel() if tree.dtype.names else ():
+        about = one["properties"].ravel()
+        values = {name: about[0][name] for name in about.dtype.names or ()}
+        y = values.get("YData", np.empty(0)).ravel()
+        if str(one["type"].item()).endswith(("line", "lineseries")) and y.size > 1:
+            x = values.get("XData", np.empty(0)).ravel()
+            yield x if x.size == y.size else np.arange(1.0, y.size + 1), y
+        if "legend" not in values.get("Tag", ()):
+            yield from _lines(one["children"])

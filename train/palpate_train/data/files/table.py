@@ -38,7 +38,7 @@ class ReadPlan:
     names_only: bool = False
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Table:
     """One recording.
 

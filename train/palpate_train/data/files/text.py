@@ -10,16 +10,15 @@ import csv
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from itertools import pairwise
 
 import numpy as np
 
 from palpate.core.errors import FormatError
 from palpate_train.data.files import plain_lines
-from palpate_train.data.files.decimals import decimal_sign, plain
+from palpate_train.data.files.decimals import decimal_sign, is_number, plain
 from palpate_train.data.files.plain_lines import PlainText
 from palpate_train.data.files.table import Array, ReadPlan, Table, excerpt, normal
 
@@ -28,11 +27,6 @@ DELIMITERS = ("\t", ";", "|", ",", None)
 """What can separate columns. Without any of the signs, blanks do."""
 SHEET_ERROR = re.compile(r"[\"']?#(N/A|N/V|NV|[A-ZÄÖÜ0-9/]+[!?])")
 """How spreadsheets write a cell without a value. It is not a comment."""
-NUMBER = re.compile(
-    r"[+-]?(\d+([.]\d*|,\d+)?|\.\d+|\d{1,3}(,\d{3})+(\.\d+)?|\d{1,3}(\.\d{3})+(,\d+)?)([eE][+-]?\d+)?"
-    r"|[+-]?(nan|inf|infinity)",
-    re.IGNORECASE,
-)
 MISSING = {"", "na", "n/a", "null", "none", "-", "--", "?", "nil", "err", "error", "overflow"}
 UNIT = re.compile(
     r"[\[(].*[\])]|[kmuµn]?(s|sec|V|N|A|Pa|g|m|T)|%|°C|bar|psi|counts?|raw|lsb|digits?|a\.?u\.?|-?",
@@ -157,10 +151,6 @@ def cells(line: str, delimiter: str | None) -> list[str]:
         )
     except csv.Error as e:
         raise FormatError(f"the line {excerpt(line)} cannot be divided into cells: {e}") from e
-
-
-def is_number(text: str) -> bool:
-    return NUMBER.fullmatch(text.strip()) is not None
 
 
 def _labview(lines: Sequence[str], decimal: str) -> tuple[list[Row], tuple[str, ...], str]:
@@ -320,8 +310,10 @@ def _plain_numbers(rows: Sequence[Row], layout: Layout, decimal: str) -> Array |
     if layout.text_columns:
         return None
     lines = [line for _, line in rows]
-    if layout.delimiter != ",":
-        lines = [plain(line, ",") if decimal == "," else line.replace(",", "") for line in lines]
+    if layout.delimiter != "," and (decimal == "," or any("," in line for line in lines)):
+        if not all(is_number(cell, decimal) for line in lines for cell in layout.cells(line)):
+            return None
+        lines = [plain(line, decimal) for line in lines]
     if layout.delimiter and all(line.rstrip(" ").endswith(layout.delimiter) for line in lines):
         lines = [line.rstrip(" ")[:-1] for line in lines]
     try:
@@ -351,13 +343,12 @@ def _columns(
     values = np.full((len(rows), layout.wide), math.nan)
     texts: dict[int, list[str]] = {}
     faults: dict[int, str] = {}
-    convert = partial(_number, decimal=decimal)
     for c in range(layout.wide):
         column = [row[c].strip() for row in found]
         if c in layout.text_columns:
             texts[c] = [normal(cell) for cell in column]
             continue
-        bad = _into(values[:, c], column, convert)
+        bad = _into(values[:, c], column, decimal)
         if bad is not None:
             faults[c] = (
                 f"line {rows[bad][0]}, column {c + 1} is {excerpt(column[bad])}, "
@@ -366,17 +357,10 @@ def _columns(
     return values, texts, faults
 
 
-def _into(into: Array, column: Sequence[str], convert: Callable[[str], float]) -> int | None:
+def _into(into: Array, column: Sequence[str], decimal: str) -> int | None:
     """Write the numbers of a column; the index of the first cell that is not one."""
     for k, cell in enumerate(column):
-        if not is_number(cell):
+        if not is_number(cell, decimal):
             return k
-        try:
-            into[k] = convert(cell)
-        except ValueError:
-            return k
+        into[k] = float(plain(cell, decimal))
     return None
-
-
-def _number(cell: str, decimal: str) -> float:
-    return float(plain(cell, decimal))
