@@ -16,6 +16,7 @@ from palpate.core.clock import SystemClock
 from palpate.core.config import Config
 from palpate.core.errors import BundleDenied, ConfigError
 from palpate.core.interrupts import INTERRUPTED
+from palpate.core.log import log
 from palpate.runtime import assembly
 
 if TYPE_CHECKING:
@@ -108,4 +109,6 @@ def local_page(name: str, port: int | None, stack: ExitStack) -> list[PageServer
     from palpate.web.access import Access
     from palpate.web.server import PageServer
 
-    return [stack.enter_context(PageServer(name, Access(port), SystemClock().now_ns))]
+    server = stack.enter_context(PageServer(name, Access(port), SystemClock().now_ns))
+    log.info(f"page: {server.address}")
+    return [server]

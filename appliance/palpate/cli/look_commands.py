@@ -8,8 +8,8 @@ import sys
 from contextlib import ExitStack
 
 from palpate.alignment import live
+from palpate.alignment.lines import LinePrinter, line
 from palpate.alignment.live import Expected
-from palpate.alignment.terminal import Screen
 from palpate.alignment.view import Display
 from palpate.cli.common import (
     StopFlag,
@@ -74,10 +74,7 @@ def run_align(args: argparse.Namespace) -> int:
     stopped = StopFlag()  # before anybody can read the page's address
     with ExitStack() as stack:
         pages = local_page("watch.html", args.web, stack)
-        screen = stack.enter_context(
-            Screen(sys.stdout, devices.clock, *(page.address for page in pages))
-        )
-        displays: list[Display] = [screen, *pages]
+        displays: list[Display] = [LinePrinter(sys.stdout, devices.clock, line), *pages]
         live.run(devices.wire(settings), expected, devices, displays, stopped)
     return stopped.exit_code
 
@@ -147,11 +144,11 @@ def run_watch(args: argparse.Namespace) -> int:
         log.info(f"page: {watcher.server.address}")
         watcher.run(stopped)
         return stopped.exit_code
-    from palpate.web import terminal
+    from palpate.web import lines
 
     if args.json:
         trouble = TroubleLog("feed", end="feed: it is read", known=False)
-        terminal.pass_on(path, sys.stdout, clock, stopped, trouble.update)
+        lines.pass_on(path, sys.stdout, clock, stopped, trouble.update)
     else:
-        terminal.TerminalWatch(path, sys.stdout, clock).run(stopped)
+        lines.LineWatch(path, sys.stdout, clock).run(stopped)
     return stopped.exit_code

@@ -34,7 +34,7 @@ MENU = Menu(
         "look": {
             "check": "test bundle, golden sweeps and devices",
             "status": "show the state of the service, and its last verdicts",
-            "watch": "show the running box live: skin, verdicts, latency and loss",
+            "watch": "show the running box live: a line a verdict, or a page",
             "align": "show where the contact lies on the skin, and where it should",
             "replay": "classify a capture, a kept sweep or a folder of them again",
             "config": "print each setting with its source",
@@ -67,7 +67,7 @@ SKIN_ACTIONS = {
     "list": "show all profiles, with missing features, and whether a device was measured",
     "detect": "find connected skins and the profiles that fit; sends nothing",
     "check": "compare the skin with PROTOCOL.md part by part, or its bytes with its profile",
-    "show": "show the skin live: heat map, rate, noise, dead and stuck taxels",
+    "show": "show the skin live: rate, noise, dead and stuck taxels; --web with a heat map",
 }
 WEB_PORT, TEACH_PORT = 8137, 8138
 """Default ports of pages. Both pages can be served side by side."""

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import select
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TextIO
 
 from palpate.cli.common import Facts, StopFlag, load_settings
 from palpate.cli.devices import open_devices
@@ -20,7 +21,7 @@ from palpate.core.disk_thread import DiskThread
 from palpate.core.errors import ConfigError, SensorError
 from palpate.core.log import log
 from palpate.core.observer import Observer
-from palpate.core.types import SweepFormat
+from palpate.core.types import Sweep, SweepFormat, Verdict
 from palpate.io import skin_profile, skins
 from palpate.io.robot_link import Command, Port
 from palpate.runtime import assembly
@@ -105,19 +106,25 @@ def _observers(
     return [
         Notifier(SystemClock()),
         recording,
-        *_printer(format, recording),
+        *([SweepPrinter(sys.stdout, recording.about)] if sys.stdout.isatty() else []),
         *status(settings, facts),
         *feed(settings, format, source, {"bundle": "", "labels": []}, facts),
     ]
 
 
-def _printer(format: SweepFormat, recording: RecordingSession) -> list[Observer]:
-    """The printer of sweeps for a person at a terminal."""
-    if not sys.stdout.isatty():
-        return []
-    from palpate.web.sweep_text import SweepPrinter
+class SweepPrinter(Observer):
+    """Prints the counts of a recording after each sweep, for a person at a terminal. about: see
+    RecordingSession.about."""
 
-    return [SweepPrinter(sys.stdout, format.rate_hz, recording.about)]
+    def __init__(self, out: TextIO, about: Callable[[], Mapping[str, Any]]) -> None:
+        self._out, self._about = out, about
+
+    def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
+        """Print a line, unless the terminal accepts no output."""
+        if not select.select([], [self._out], [], 0)[1]:
+            return
+        counts = [f"{m}{f' at {p}' * bool(p)}: {n}" for m, p, n in self._about()["counts"]]
+        print(f"sweep {sweep.id}; {', '.join(counts) or 'none kept'}", file=self._out, flush=True)
 
 
 def _record_page(

@@ -143,9 +143,9 @@ def _profiles(settings: Config) -> Iterator[tuple[str, SkinProfile | ConfigError
 
 
 def run_show(args: argparse.Namespace) -> int:
-    """Show the skin live, in the terminal and on a page, until Ctrl-C."""
-    from palpate.tools import skin_show
-    from palpate.tools.skin_screen import SkinScreen
+    """Show the skin live, a line a second and on a page, until Ctrl-C."""
+    from palpate.alignment.lines import LinePrinter
+    from palpate.tools import skin_monitor, skin_show
 
     devices = open_devices(args, None)
     settings = devices.wire(load_settings(args))
@@ -155,11 +155,9 @@ def run_show(args: argparse.Namespace) -> int:
     stopped = StopFlag()
     with ExitStack() as stack:
         pages = local_page("skin.html", args.web, stack)
-        screen = stack.enter_context(
-            SkinScreen(sys.stdout, devices.clock, *(page.address for page in pages))
-        )
+        lines = LinePrinter(sys.stdout, devices.clock, skin_monitor.line)
         sensor = stack.enter_context(closing(skins.sensor(settings, format, devices)))
-        shown_on: list[SkinDisplay] = [screen, *pages]
+        shown_on: list[SkinDisplay] = [lines, *pages]
         unit = skins.profile(settings).unit
         name, source = settings.skin.profile, devices.source
         skin_show.run(sensor, format, name, source, devices.clock, shown_on, stopped, unit)

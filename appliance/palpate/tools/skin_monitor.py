@@ -5,6 +5,7 @@ No bundle is needed: the format is the skin's own, and the faults are visible in
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Protocol
 
@@ -23,6 +24,9 @@ MOVED = 10.0
 """The skin counts as touched once half of its taxels have moved this many times their noise."""
 DEAD = 0.1
 """After a touch, a taxel is dead if it has moved less than this share of the median."""
+
+MOST_NAMED = 8
+"""Most faulty taxels of a kind whose names are shown; of more, the number is shown."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +70,26 @@ class SkinDisplay(Protocol):
     def show(self, view: LiveView) -> None:
         """Show a view; it replaces the previous view."""
         ...
+
+
+def line(view: LiveView) -> str:
+    """A LiveView in one line: rate, frames, loss, noise and faulty taxels."""
+    rate = "" if view.rate_hz is None else f"{view.rate_hz:.1f} Hz, "
+    lost = "loss cannot be known" if view.lost is None else f"{view.lost:,} lost"
+    noise = sorted(value for axis in view.noise for row in axis for value in row)
+    unit = view.unit or "raw counts"
+    middle = (
+        f", noise {noise[len(noise) // 2]:.2g}, at most {noise[-1]:.2g} {unit}" if noise else ""
+    )
+    kinds = (("stuck", view.stuck), ("dead", view.dead), ("saturated", view.saturated))
+    faults = "".join(f"; {name}: {_named(taxels)}" for name, taxels in kinds if taxels)
+    text = view.trouble or f"{rate}{view.frames:,} frames, {lost}{middle}{faults}"
+    return f"{'SIMULATED  ' * (view.source == 'sim')}{view.skin}  {view.state}: {text}"
+
+
+def _named(taxels: Sequence[str]) -> str:
+    more = f" and {len(taxels) - MOST_NAMED} more" if len(taxels) > MOST_NAMED else ""
+    return ", ".join(taxels[:MOST_NAMED]) + more
 
 
 class SkinMonitor:

@@ -794,11 +794,7 @@ def test_skin_check_fails_with_a_part(
             69,
             "no port /dev/none",
         ),
-        (
-            ["--set", "skin.profile=anyskin"],
-            78,
-            'skin.profile = "anyskin" sends a protocol of its maker (codec "fixed")',
-        ),
+        (["--skin", "anyskin", "--port", "/dev/none"], 69, "no port /dev/none"),
     ],
 )
 def test_skin_check_refuses(

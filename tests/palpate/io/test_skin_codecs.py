@@ -414,7 +414,7 @@ def test_nothing_but_marks_is_passed_over(name: str, monkeypatch: pytest.MonkeyP
     data = (p.trailer + p.marker) * 15_000
     found = decoded(p, data)
     assert len(found) == 0
-    assert len(looked) <= len(data) // fixed._layout(p).period + 1
+    assert len(looked) <= len(data) // fixed.layout(p).period + 1
 
 
 @pytest.mark.parametrize(

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from palpate.core.types import Frames, SweepFormat
-from palpate.tools.skin_monitor import STUCK_S, SkinMonitor
+from palpate.tools.skin_monitor import STUCK_S, LiveView, SkinMonitor, line
 
 RATE = 100
 
@@ -100,3 +102,31 @@ def test_before_the_second_frame_nothing_is_measured_and_a_new_skin_starts_anew(
     assert watched.measured()["rate_hz"]
     watched.reset()
     assert watched.measured() == {}
+
+
+VIEW = LiveView(
+    *(7, "usb", "flexitac 2x3 uint8 at 100 Hz", "streaming", "", (2, 3, 1)),
+    load=(((0, 1, 2), (30, 60, 120)),),
+    full=120,
+    rate_hz=99.84,
+    noise=(((1, 1, 2), (1, 1, 9)),),
+    frames=12345,
+    lost=3,
+)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({}, "streaming: 99.8 Hz, 12,345 frames, 3 lost, noise 1, at most 9 raw counts"),
+        ({"lost": None, "unit": "N"}, "loss cannot be known, noise 1, at most 9 N"),
+        ({"stuck": ("1.2",), "dead": ("2.1", "2.2")}, "; stuck: 1.2; dead: 2.1, 2.2"),
+        ({"dead": tuple(f"1.{i}" for i in range(30))}, "1.7 and 22 more"),
+        ({"source": "sim", "state": "absent", "trouble": "plug it in"}, "absent: plug it in"),
+    ],
+)
+def test_a_line_has_rate_loss_noise_and_faults(changes: dict[str, object], words: str) -> None:
+    """Many faulty taxels are counted; a skin that does not stream says why."""
+    shown = line(replace(VIEW, **changes))
+    assert words in shown
+    assert shown.startswith("SIMULATED") == ("source" in changes)

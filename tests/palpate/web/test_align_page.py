@@ -68,11 +68,13 @@ def box(folder: Path) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
     """The running command with the simulated skin, and the address of its page."""
     command = [sys.executable, "-m", "palpate", "align", "--sim", "rest", "--web", "0"]
     with subprocess.Popen(
-        [*command, "--set", f"classifier.bundle={folder}"], stdout=subprocess.PIPE
+        [*command, "--set", f"classifier.bundle={folder}"],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
     ) as run:
-        address = run.stdout.readline().decode().removeprefix("page: ").strip()
+        address = run.stderr.readline().decode().partition("page: ")[2].strip()
         yield run, address
-        run.stdout.close()
+        run.stderr.close()
         run.kill()
 
 

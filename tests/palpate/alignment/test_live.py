@@ -1,19 +1,14 @@
-"""The View of the contact on the skin, and its picture in a terminal."""
+"""The View of the contact on the skin, and its line for a terminal."""
 
 from __future__ import annotations
 
 import errno
-import fcntl
 import io
 import math
-import os
-import re
 import signal
-import struct
 import subprocess
 import sys
-import termios
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,9 +16,9 @@ import numpy as np
 import pytest
 
 from palpate.alignment import live
+from palpate.alignment.lines import LinePrinter, line
 from palpate.alignment.live import Alignment, Expected
-from palpate.alignment.terminal import ASCII, BLOCKS, ENTER, LEAVE, Canvas, Screen, line
-from palpate.alignment.view import View
+from palpate.alignment.view import View, figure
 from palpate.bundle import bundle
 from palpate.bundle.bundle import Bundle, Manifest
 from palpate.cli.common import StopFlag
@@ -31,7 +26,6 @@ from palpate.cli.main import main
 from palpate.core import config
 from palpate.signal.contact import ContactPositions
 from palpate.sim import devices, rig, script, skin
-from tests.factories import terminals
 from tests.factories.paths import NO_SITE
 from tests.factories.simulated_box import SECOND, idle_devices
 
@@ -188,13 +182,14 @@ def test_without_a_bundle_the_contact_alone_is_shown(model: Bundle):
 
 
 @pytest.mark.parametrize(
-    ("source", "word"), [("usb", ""), ("sim", "SIMULATED"), ("replay", "REPLAYED")]
+    ("source", "word"), [("usb", ""), ("sim", "SIMULATED  "), ("replay", "REPLAYED  ")]
 )
-def test_a_view_says_what_it_is_of(source: str, word: str):
-    """A replayed set is not called simulated. A real skin has no note."""
-    shown = Canvas(replace(VIEW, source=source), ASCII, 80, 24, "").lines(False)[0]
-    assert shown.endswith(word or VIEW.bundle)
-    assert line(replace(VIEW, source=source)).startswith(f"{word}  " * bool(word) + VIEW.message)
+def test_a_line_says_what_it_is_of(source: str, word: str):
+    """A replayed set is not called simulated, a real skin has no note; a View without a contact has
+    no centre."""
+    shown = line(replace(VIEW, source=source))
+    assert shown == f"{word}too far  centre row 3.8 column 6.0 mm  (move it)"
+    assert line(replace(VIEW, source=source, centre=None)) == f"{word}too far  (move it)"
 
 
 @pytest.mark.slow
@@ -243,8 +238,6 @@ def test_another_skin_shape(model: Bundle):
     seen = views_of(simulated, other)(3)
     assert seen[-1].message == "2.0 mm too far towards column 3"
     assert seen[-1].load[0][0] == 0
-    screen = Canvas(seen[-1], ASCII, 80, 24, "").lines(False)
-    assert any("row 2" in line and "60" in line for line in screen)
 
 
 def test_only_the_normal_axis_is_looked_at(model: Bundle):
@@ -261,91 +254,21 @@ def test_only_the_normal_axis_is_looked_at(model: Bundle):
 
 
 VIEW = View(
-    7,
-    "sim",
-    "default 3, 9f3c2a1b",
-    "streaming",
-    "off",
-    "2.2 mm too far towards row 1",
-    "move it",
-    (4, 4),
-    tuple(tuple(float(20 * r + c) for c in range(4)) for r in range(4)),
-    80.0,
-    (3.8, 6.0),
-    (6.0, 6.0),
-    MIDDLE,
+    *(7, "sim", "default 3, 9f3c2a1b", "streaming", "off", "too far", "move it", (4, 4)),
+    centre=(3.8, 6.0),
+    contact=MIDDLE,
 )
 
 
-def test_a_pipe_gets_one_plain_line_a_second():
-    """The line has message, centre and the note that the skin is simulated, and no control
-    characters."""
+def test_one_line_a_second_is_printed():
+    """Views come more often than lines."""
     out, clock = io.StringIO(), rig.VirtualClock()
     begin_ns = clock.now_ns()
-    with Screen(out, clock, "http://127.0.0.1:8137") as screen:
-        for tenth in range(25):
-            clock.sleep_until(begin_ns + tenth * SECOND // 10)
-            screen.show(VIEW)
-    first, *lines = out.getvalue().splitlines()
-    assert first == "page: http://127.0.0.1:8137"
-    assert (
-        lines
-        == ["SIMULATED  2.2 mm too far towards row 1  centre row 3.8 column 6.0 mm  (move it)"] * 3
-    )
-
-
-@pytest.mark.parametrize(("width", "height"), [(80, 24), (132, 50), (40, 16), (20, 5), (1, 1)])
-@pytest.mark.parametrize("signs", [BLOCKS, ASCII])
-def test_the_picture_fits_the_terminal(width: int, height: int, signs: str):
-    """The number and length of the lines fit the terminal. At 80 x 24 all numbers, both points, the
-    texts and the key are shown."""
-    lines = Canvas(VIEW, signs, width, height, "http://127.0.0.1:8137").lines(False)
-    plain = [re.sub(r"\033\[[0-9;]*m", "", line) for line in lines]
-    assert len(lines) == height
-    assert all(len(line) <= width for line in plain)
-    if width < 80:
-        return
-    text = "\n".join(plain)
-    wanted = [
-        "SIMULATED",
-        "2.2 mm too far towards row 1",
-        "move it",
-        "row 4",
-        "col 4",
-        "Ctrl-C ends",
-        "http://127.0.0.1:8137",
-    ]
-    assert all(
-        word in text for word in wanted + [f"{20 * r + c} " for r in range(4) for c in range(4)]
-    )
-    row_1, row_4 = (
-        next(line for line in plain if f"row {n}" in line and "│" in line.replace("|", "│"))
-        for n in (1, 4)
-    )
-    assert signs[0] * 4 in row_1.replace(" ", signs[0])
-    assert signs[3] in row_4
-    assert f"({signs[5]})" in text
-    assert signs[6] in "\n".join(plain[9:14])
-    assert all(ord(sign) < 128 for sign in text) == (signs is ASCII)
-
-
-def test_a_place_beside_the_skin_is_shown_at_its_edge():
-    """At any distance, since a bundle may have any number."""
-    far = replace(VIEW, contact=replace(MIDDLE, rows_mm=(-50.0, 1e6), cols_mm=(6.0, -1e6)))
-    lines = Canvas(far, ASCII, 80, 24, "").lines(False)
-    assert [
-        line.index("+")
-        for plain in lines
-        if "+" in (line := re.sub(r"\033\[[0-9;]*m", "", plain)) and "|" in line
-    ] == [24, 8]
-
-
-def test_only_a_terminal_that_knows_colours_gets_them():
-    """38;5 for terminals with 256 colours; bold and inverse for all."""
-    assert any("38;5" in line for line in Canvas(VIEW, BLOCKS, 80, 24, "").lines(True))
-    plain = Canvas(VIEW, BLOCKS, 80, 24, "").lines(False)
-    assert not any("38;5" in line for line in plain)
-    assert any("\033[1;7m" in line for line in plain)
+    printer = LinePrinter(out, clock, line)
+    for tenth in range(25):
+        clock.sleep_until(begin_ns + tenth * SECOND // 10)
+        printer.show(VIEW)
+    assert out.getvalue().splitlines() == [line(VIEW)] * 3
 
 
 def test_a_slow_terminal_ends_nothing(model: Bundle, monkeypatch: pytest.MonkeyPatch):
@@ -353,13 +276,13 @@ def test_a_slow_terminal_ends_nothing(model: Bundle, monkeypatch: pytest.MonkeyP
     skin is released."""
     simulated, out = resting(), io.StringIO()
     end_ns = simulated.clock.now_ns() + 5 * SECOND
-    monkeypatch.setattr("palpate.alignment.terminal.LINE_NS", 0)
+    monkeypatch.setattr("palpate.alignment.lines.LINE_NS", 0)
     settings = simulated.wire(config.load(None, [], site=NO_SITE))
     live.run(
         settings,
         Expected.by(model),
         simulated,
-        [Screen(out, simulated.clock)],
+        [LinePrinter(out, simulated.clock, line)],
         lambda: simulated.clock.now_ns() >= end_ns,
     )
     assert 24 <= len(out.getvalue().splitlines()) <= 26
@@ -388,41 +311,30 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return target
 
 
-@pytest.fixture
-def terminal() -> Iterator[tuple[int, int]]:
-    """A terminal of 80 x 24: the far end, and the end for programs."""
-    far, near = os.openpty()
-    fcntl.ioctl(near, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
-    yield far, near
-    os.close(far)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["xterm-256color", "dumb"])
-def test_ctrl_c_ends_it_and_leaves_the_terminal_as_it_was(
-    folder: Path, terminal: tuple[int, int], kind: str
-):
-    """In a terminal the command ends with exit code 0 and leaves the alternate screen. A dumb
-    terminal gets no alternate screen."""
-    far, near = terminal
-    command = [
-        sys.executable,
-        "-m",
-        "palpate",
-        "align",
-        "--sim",
-        "rest",
-        "--set",
-        f"classifier.bundle={folder}",
-    ]
-    with subprocess.Popen(command, stdout=near, env=os.environ | {"TERM": kind}) as run:
-        os.close(near)
-        shown = terminals.read(far, run, lambda shown: b"SIMULATED" in shown)
+def test_ctrl_c_ends_it(folder: Path):
+    """The command prints plain lines until Ctrl-C."""
+    command = [sys.executable, "-m", "palpate", "align", "--sim", "rest"]
+    command += ["--set", f"classifier.bundle={folder}"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as run:
+        first = run.stdout.readline()
         run.send_signal(signal.SIGINT)
-        shown += terminals.read(far, run)
-        assert terminals.ended(run, shown) == 130
-    text = shown.decode()
-    live = kind != "dumb"
-    assert (text.startswith(ENTER), text.endswith(LEAVE)) == (live, live)
-    assert ("\033" in text) == live
-    assert text.count("reading the unloaded skin") >= 1
+        assert run.wait(60) == 130
+        assert (first + run.stdout.read()).count("reading the unloaded skin") >= 1
+    assert "\033" not in first
+
+
+@pytest.mark.parametrize(
+    ("value", "full", "unit", "text"),
+    [
+        (1.254, 2.0, "N", "1.25"),
+        (31.0, 200.0, "N", "31.00"),
+        (1.254, 2.0, "", "1"),
+        (1.254, 2.0, "uT", "1.25"),
+        (31.04, 60.0, "uT", "31.0"),
+        (310.4, 600.0, "uT", "310"),
+    ],
+)
+def test_newtons_have_two_digits(value: float, full: float, unit: str, text: str):
+    """Raw counts have none, other units as many as three digits in all leave."""
+    assert figure(value, full, unit) == text
