@@ -2,17 +2,22 @@
 
 Numerical libraries use one thread in tests. Their models are small: with two threads a fit took 2.5
 times the processor time, and four times as long beside another test.
+
+No test can hang: pytest-timeout fails a test after `timeout` of pyproject.toml or of its own mark,
+and a process that is stuck in C even then shows where and ends.
 """
 
 from __future__ import annotations
 
+import faulthandler
 import os
+import sys
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy and PyTorch are imported
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from collections.abc import Callable, Generator, Iterator
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from typing import Any
 
@@ -26,8 +31,41 @@ from palpate.sim import devices, rig, script, skin
 from palpate.tools import pseudo_terminal
 from tests.factories import browser as browsers
 from tests.factories import log_lines
+from tests.factories.paths import ROOT
 from tests.factories.settings import load as load_settings
 from tests.factories.simulated_box import OnSweep, Rigged
+
+LIMIT_S = 300
+"""Longest time of a test, as in pyproject.toml. One takes seconds, on a busy machine a minute."""
+BUILDING_S = 3600
+"""The same where the first test builds a Debian or a virtual machine."""
+GRACE_S = 60
+
+with suppress(ModuleNotFoundError):  # a board has no Hypothesis
+    import hypothesis
+
+    # A busy machine may take seconds for an example that takes milliseconds.
+    hypothesis.settings.register_profile("any machine", deadline=None)
+    hypothesis.settings.load_profile("any machine")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Give the tests in Debians and emulated machines the time to build them."""
+    for item in items:
+        if item.path.relative_to(ROOT).parts[1] in ("rig", "systemd", "campaigns"):
+            item.add_marker(pytest.mark.timeout(BUILDING_S))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    """End the process if a test runs on after its limit: no signal interrupts a stuck C call."""
+    mark = item.get_closest_marker("timeout")
+    limit_s = mark.args[0] if mark else LIMIT_S
+    faulthandler.dump_traceback_later(limit_s + GRACE_S, exit=True, file=sys.__stderr__)
+    try:
+        return (yield)
+    finally:
+        faulthandler.cancel_dump_traceback_later()
 
 
 @pytest.fixture(scope="module")

@@ -50,7 +50,9 @@ LONGEST = 500
 
 def run(*args: str | Path, cwd: Path, env: dict[str, str] | None = None) -> str:
     """Run a command; its output, or a failure that shows it."""
-    done = subprocess.run(args, cwd=cwd, env=env, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        args, cwd=cwd, env=env, capture_output=True, text=True, check=False, timeout=600
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
@@ -304,6 +306,28 @@ def test_every_test_asserts():
         if not asserts(test)
     ]
     assert idle == []
+
+
+def endless(node: ast.AST) -> bool:
+    """Whether a node runs a program, or waits for its end, without a limit of time."""
+    if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)):
+        return False
+    if any(keyword.arg in ("timeout", None) for keyword in node.keywords):
+        return False
+    name = ast.unparse(node.func)
+    return node.func.attr == "communicate" or bool(
+        re.fullmatch(r"subprocess\.(run|call|check_call|check_output)", name)
+    )
+
+
+def test_no_test_waits_for_a_program_without_a_limit():
+    """Each program that a test or a factory runs to its end has a timeout."""
+    assert endless(ast.parse("subprocess.run(['true'])").body[0].value)
+    paths = [p for p in TESTS if p in TEST_FILES or p.parent.name == "factories"]
+    found = [
+        f"{shown(path)}:{node.lineno}" for path in paths for node in nodes(path) if endless(node)
+    ]
+    assert found == []
 
 
 def test_each_class_name_stands_once():

@@ -97,6 +97,7 @@ def test_the_commands_of_the_tutorial_run(tmp_path: Path):
             capture_output=True,
             text=True,
             check=False,
+            timeout=120,
         )
         assert done.returncode == 0, done.stderr
         output += done.stdout

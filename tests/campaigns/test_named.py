@@ -25,6 +25,7 @@ def texts() -> dict[str, str]:
         capture_output=True,
         text=True,
         check=True,
+        timeout=120,
     ).stdout.splitlines()
     named = (name for name in listed if name.endswith(READ) or name.startswith(".ci/"))
     return {name: (ROOT / name).read_text() for name in named if (ROOT / name).exists()}

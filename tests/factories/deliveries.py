@@ -30,7 +30,9 @@ def key(folder: Path, name: str = "key", kind: str = "ed25519") -> Path:
     """A new private key."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / name
-    subprocess.run(["ssh-keygen", "-q", "-t", kind, "-N", "", "-C", name, "-f", path], check=True)
+    subprocess.run(
+        ["ssh-keygen", "-q", "-t", kind, "-N", "", "-C", name, "-f", path], check=True, timeout=120
+    )
     return path
 
 

@@ -217,7 +217,7 @@ def wheel(out: Path, source: Path) -> None:
 
 def run(*args: str | Path) -> str:
     """The output of a command. If it fails, its errors are in the exception."""
-    return subprocess.run(args, check=True, capture_output=True, text=True).stdout
+    return subprocess.run(args, check=True, capture_output=True, text=True, timeout=1800).stdout
 
 
 def work(given: Path, target: Path) -> None:

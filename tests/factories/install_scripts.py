@@ -23,6 +23,7 @@ def run_here(code: str) -> str:
         env=os.environ | {"PYTHONPATH": str(SCRIPTS)},
         capture_output=True,
         text=True,
+        timeout=120,
     )
     assert done.returncode == 0, done.stderr
     return done.stdout.strip()
@@ -32,11 +33,11 @@ def enrolment_key(folder: Path) -> EnrolmentKey:
     """The box's key for enrolments, as the install makes it, but owned by this user."""
     made = f"enrolment_key.make({str(folder)!r}, os.getuid(), os.getgid())"
     code = f"import enrolment_key, os; print({made})"
-    subprocess.run(["bash", "-euc", run_here(code)], check=True, capture_output=True)
+    subprocess.run(["bash", "-euc", run_here(code)], check=True, capture_output=True, timeout=120)
     return EnrolmentKey(folder)
 
 
 def page_secrets(folder: Path) -> None:
     """Token, key and certificate of the page, as the install makes them."""
     code = f"import page_secrets, os; print(page_secrets.make({str(folder)!r}, str(os.getgid())))"
-    subprocess.run(["bash", "-euc", run_here(code)], check=True, capture_output=True)
+    subprocess.run(["bash", "-euc", run_here(code)], check=True, capture_output=True, timeout=120)

@@ -217,7 +217,10 @@ def _make_ground(part: Path) -> None:
         word for word in about if word.startswith("linux-image-6") or word[12:13].isdigit()
     )
     subprocess.run(
-        [*apt, "apt-get", "-qq", "download", package, "busybox-static"], cwd=part, check=True
+        [*apt, "apt-get", "-qq", "download", package, "busybox-static"],
+        cwd=part,
+        check=True,
+        timeout=600,
     )
     for deb in part.glob("*.deb"):
         run("dpkg-deb", "-x", deb, part / ("kernel" if "linux-image" in deb.name else "busybox"))
@@ -249,7 +252,9 @@ def _make_root(part: Path, version: str) -> None:
     (part / "wheels").chmod(0o755)
     here = (
         []
-        if not subprocess.run(["arch-test", "arm64"], capture_output=True, check=False).returncode
+        if not subprocess.run(
+            ["arch-test", "arm64"], capture_output=True, check=False, timeout=600
+        ).returncode
         else [sys.executable, HERE / "arm.py"]
     )
     run(
@@ -305,6 +310,7 @@ def _modules(kernel: Path, root: Path, version: str, names: Iterable[str]) -> li
             capture_output=True,
             text=True,
             check=False,
+            timeout=600,
         ).stdout
         found |= dict.fromkeys(
             Path(line.split()[1]) for line in listing.splitlines() if line.startswith("insmod")

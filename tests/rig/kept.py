@@ -60,10 +60,16 @@ def found(disk: Path, folder: Path) -> tuple[int, list[Path]]:
     raw, out = folder / "disk.raw", folder / "found"
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir()
-    subprocess.run(["qemu-img", "convert", "-O", "raw", disk, raw], check=True)
-    subprocess.run(["e2fsck", "-y", "-E", "journal_only", raw], check=False, capture_output=True)
-    code = subprocess.run(["e2fsck", "-f", "-n", raw], check=False, capture_output=True).returncode
-    subprocess.run(["debugfs", "-R", f"rdump {KEPT} {out}", raw], check=False, capture_output=True)
+    subprocess.run(["qemu-img", "convert", "-O", "raw", disk, raw], check=True, timeout=120)
+    subprocess.run(
+        ["e2fsck", "-y", "-E", "journal_only", raw], check=False, capture_output=True, timeout=120
+    )
+    code = subprocess.run(
+        ["e2fsck", "-f", "-n", raw], check=False, capture_output=True, timeout=120
+    ).returncode
+    subprocess.run(
+        ["debugfs", "-R", f"rdump {KEPT} {out}", raw], check=False, capture_output=True, timeout=120
+    )
     raw.unlink()
     return code, sorted((out / "kept").glob("*"))
 

@@ -169,7 +169,7 @@ def disk(image: Image, tmp_path: Path) -> Path:
     with Guest(image, tmp_path, snapshot=True, disk=made) as machine:
         runs_with(machine, f"record --out {KEPT}")
         machine.run("systemctl stop --no-block palpate; sync; sync", check=True)
-    subprocess.run(["qemu-img", "snapshot", "-d", "ready", made], check=True)
+    subprocess.run(["qemu-img", "snapshot", "-d", "ready", made], check=True, timeout=120)
     return made
 
 

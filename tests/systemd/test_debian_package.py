@@ -53,6 +53,7 @@ def packed(folder: Path, wheels: list[Path], *architectures: str) -> list[Path]:
         capture_output=True,
         text=True,
         check=False,
+        timeout=120,
     )
     assert done.returncode == 0, done.stderr
     return [Path(line) for line in done.stdout.split()]
@@ -94,7 +95,7 @@ def test_both_architectures_hold_the_same(wheels: list[Path], tmp_path: Path, sa
         packed(tmp_path, wheels, "amd64", "arm64"), ("x86_64", "aarch64"), strict=True
     ):
         folder = tmp_path / machine
-        subprocess.run(["dpkg-deb", "-R", package, folder], check=True)
+        subprocess.run(["dpkg-deb", "-R", package, folder], check=True, timeout=120)
         control = (folder / "DEBIAN/control").read_text()
         assert f"Architecture: {package.stem.rpartition('_')[2]}\n" in control
         names = set()

@@ -182,7 +182,9 @@ def test_a_board_without_a_file_is_refused_before_any_box_is_asked():
         "--wheel",
         __file__,
     ]
-    done = subprocess.run([*command, "--board", "rpi9"], capture_output=True, text=True)
+    done = subprocess.run(
+        [*command, "--board", "rpi9"], capture_output=True, text=True, timeout=120
+    )
     assert (done.returncode, done.stdout) == (1, "")
     assert (
         "BOARD=rpi9 has no file firmware_config/board-rpi9.toml; boards there: rpi4, rpi5"
@@ -680,14 +682,21 @@ def test_the_self_test_of_a_release_speaks_of_the_setting(tmp_path: Path):
     (tmp_path / "skin.toml").write_text("[skin]\nbuad = 9600\n")
     script = run_here("import install; print(install.SELF_TEST)")
     done = subprocess.run(
-        [sys.executable, "-c", script, tmp_path], cwd=ROOT, capture_output=True, text=True
+        [sys.executable, "-c", script, tmp_path],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=120,
     )
     assert done.returncode == 1
     assert "buad" in done.stderr
     assert "Error" not in done.stderr
     assert len(done.stderr.splitlines()) == 1
     shutil.copy(ROOT / "firmware_config" / "skin.toml", tmp_path)
-    assert subprocess.run([sys.executable, "-c", script, tmp_path], cwd=ROOT).returncode == 0
+    assert (
+        subprocess.run([sys.executable, "-c", script, tmp_path], cwd=ROOT, timeout=120).returncode
+        == 0
+    )
 
 
 @pytest.mark.slow

@@ -15,7 +15,9 @@ pytest.importorskip("pyinfra", reason="no pyinfra here; pip install -e .[deploy]
 
 def shell(script: str) -> str:
     """The output of a script of the box, run here."""
-    done = subprocess.run(["sh", "-c", script], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        ["sh", "-c", script], capture_output=True, text=True, check=True, timeout=120
+    )
     return done.stdout.strip()
 
 

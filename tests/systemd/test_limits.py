@@ -95,7 +95,7 @@ def test_public_addresses_reach_nothing(open_units: Machine, unit: str):
     """A private address reaches page and bridges; another does not, although they listen there."""
     net = ("nsenter", "-t", open_units.first, "-n", "ip", "addr")
     for address in ("10.9.9.9/32", "203.0.113.9/32"):
-        subprocess.run([*net, "replace", address, "dev", "lo"], check=True)
+        subprocess.run([*net, "replace", address, "dev", "lo"], check=True, timeout=120)
     port = str(PORTS[unit])
     assert open_units.get(PYTHON, "-c", REACH, "10.9.9.9", port) == "reached"
     assert open_units.get(PYTHON, "-c", REACH, "203.0.113.9", port) == "nothing"

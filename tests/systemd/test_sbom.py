@@ -37,7 +37,7 @@ def test_the_command_writes_it(tmp_path: Path):
     """A valid document with Debian's part."""
     target = tmp_path / "dist" / "box.json"
     command = [sys.executable, ROOT / "systemd" / "sbom.py", target]
-    subprocess.run(command, check=True, env={"PYTHONPATH": str(ROOT)})
+    subprocess.run(command, check=True, env={"PYTHONPATH": str(ROOT)}, timeout=120)
     content = json.loads(target.read_text())
     assert (content["bomFormat"], content["specVersion"]) == ("CycloneDX", "1.5")
     assert {"numpy", "libusb-1.0-0"} <= {c["name"] for c in content["components"]}

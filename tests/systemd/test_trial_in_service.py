@@ -63,7 +63,9 @@ class DeliveredStore:
         self.machine, self._folder, self._counters = machine, folder, itertools.count(1)
         self._key = folder / "key"
         subprocess.run(
-            ["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", "me", "-f", self._key], check=True
+            ["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", "me", "-f", self._key],
+            check=True,
+            timeout=120,
         )
         kind, key, _ = self._key.with_suffix(".pub").read_text().split()
         machine.put("/etc/palpate/allowed_signers", f"me {kind} {key}\n")

@@ -332,6 +332,7 @@ def test_the_definition_is_what_was_built():
         capture_output=True,
         text=True,
         check=True,
+        timeout=120,
     ).stdout
     assert (
         told.strip()

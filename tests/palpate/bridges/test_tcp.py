@@ -333,6 +333,11 @@ def test_bridges_need_neither_numpy_nor_onnxruntime():
     )
     for text in (code, options):
         done = subprocess.run(
-            [sys.executable, "-c", text], cwd=ROOT, capture_output=True, text=True, check=True
+            [sys.executable, "-c", text],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=120,
         )
         assert done.stdout.strip() == "set()"

@@ -66,7 +66,9 @@ def test_numpy_starts_no_threads_in_a_command():
         "print(len(os.listdir('/proc/self/task')))"
     )
     env = {k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")}
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=env, capture_output=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, env=env, capture_output=True, timeout=120
+    )
     assert done.stdout.split()[-1] == b"1"
 
 
@@ -103,6 +105,7 @@ def test_run_on_a_serial_port():
             ],
             capture_output=True,
             check=True,
+            timeout=120,
         )
         assert done.stdout == b""
         assert os.read(far, 65536).count(b",RES,") == 3
@@ -718,7 +721,9 @@ def test_help_loads_neither_numpy_nor_devices(words: list[str]):
         f"with contextlib.suppress(SystemExit): main({words})\n"
         "print([m for m in ('numpy', 'onnxruntime', 'usb', 'serial', 'gpiod') if m in sys.modules])"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120
+    )
     assert done.stdout.splitlines()[-1] == "[]"
 
 
@@ -743,7 +748,9 @@ def test_unknown_arguments_are_usage_errors():
 def test_output_that_nobody_reads():
     """`palpate … | head` ends without a traceback."""
     command = f"{sys.executable} -m palpate run --sim skin --virtual --sweeps 30 | head -n 1"
-    done = subprocess.run(["sh", "-c", command], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        ["sh", "-c", command], capture_output=True, text=True, check=True, timeout=120
+    )
     assert done.stdout.startswith("$PPLP")
     assert "Traceback" not in done.stderr
 

@@ -310,7 +310,7 @@ def running(folder: Path) -> Iterator[Callable[..., str]]:
 
         def ask(*words: str) -> str:
             return subprocess.run(
-                [*command, *words, *more], capture_output=True, text=True, check=False
+                [*command, *words, *more], capture_output=True, text=True, check=False, timeout=120
             ).stdout
 
         try:

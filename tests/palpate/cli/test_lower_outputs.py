@@ -83,6 +83,11 @@ def test_it_is_quick_as_it_loads_little():
         "print({'numpy', 'onnxruntime', 'usb', 'serial'} & set(sys.modules))"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
+        [sys.executable, "-c", code],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=120,
     )
     assert done.stdout == "set()\n"

@@ -408,7 +408,12 @@ def test_the_client_needs_pyserial_alone():
         "sorted({n.split('.')[1] for n in names if n.startswith('palpate.')}))"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
+        [sys.executable, "-c", code],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=120,
     )
     assert done.stdout.strip() == "['serial'] ['client', 'core']"
 

@@ -11,7 +11,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from palpate.core import config, schema
@@ -233,7 +233,6 @@ _NAMES = ["skin.grid", "skin.usb", "serial.baud", "output.class_bits", "trigger.
 
 
 @pytest.mark.slow
-@settings(deadline=None)
 @given(st.text(max_size=30), st.sampled_from(_NAMES))
 def test_any_set_text_is_a_value_or_a_config_error(text: str, name: str) -> None:
     """No text raises another exception."""

@@ -96,6 +96,7 @@ def test_a_bundle_near_the_limit_leaves_the_service_alive(tmp_path: Path):
         text=True,
         cwd=ROOT,
         check=False,
+        timeout=120,
     )
     assert done.returncode == 0, done.stderr
     counted, most_kb = map(int, done.stdout.split())

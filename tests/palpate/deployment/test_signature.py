@@ -78,6 +78,7 @@ def test_a_signature_of_nobody_in_the_file_is_refused(signers: Signers):
         input=MESSAGE,
         stdout=-1,
         check=True,
+        timeout=120,
     )
     for signed, message, why in (
         (

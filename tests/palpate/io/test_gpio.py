@@ -10,7 +10,7 @@ from unittest import mock
 
 import gpiod
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from palpate.core.config import OutputConfig, TriggerConfig
@@ -477,7 +477,6 @@ def settled(times_ns: list[int]) -> list[tuple[int, bool]]:
 
 
 @pytest.mark.slow
-@settings(deadline=None)
 @given(st.tuples(gaps, gaps, gaps), st.integers(20, 5000))
 def test_any_edges(lines: tuple[list[int], list[int], list[int]], step_us: int) -> None:
     """For any edges on three lines of two chips and any times of calls: the edges of the reference,
@@ -494,7 +493,6 @@ def test_any_edges(lines: tuple[list[int], list[int], list[int]], step_us: int) 
     assert [t_ns for _, t_ns in reported] == sorted(t_ns for _, t_ns in wanted)
 
 
-@settings(deadline=None)
 @given(gaps, st.integers(20, 5000), st.integers(2, 30), st.sampled_from([2, 8, 64]), st.booleans())
 def test_any_losses(
     gaps_us: list[int], step_us: int, storm_edges: int, queue: int, high: bool

@@ -70,7 +70,7 @@ def test_the_units_name_the_file(tmp_path: Path, kind: str):
     unit = (ROOT / "systemd/palpate-teach.service").read_text()
     remove = re.search(rf"(?m)^ExecStartPre=-(.*) {path}$", unit)
     assert remove
-    subprocess.run([*remove[1].split(), here], check=True)
+    subprocess.run([*remove[1].split(), here], check=True, timeout=120)
     assert not os.path.lexists(here)
     assert (beside / "kept").exists()
 

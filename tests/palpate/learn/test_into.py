@@ -200,7 +200,9 @@ def test_a_reader_that_is_gone_gets_an_exit_code(box: TaughtDelivery):
     """Standard output is full: the result could not be told, and nothing hangs or is half done."""
     words = [sys.executable, "-P", "-m", "palpate", "teach", *box.words, "--json", "--use"]
     with open("/dev/full", "wb") as full:
-        done = subprocess.run(words, cwd=ROOT, stdout=full, stderr=subprocess.PIPE, text=True)
+        done = subprocess.run(
+            words, cwd=ROOT, stdout=full, stderr=subprocess.PIPE, text=True, timeout=120
+        )
     assert done.returncode
     assert "Traceback" not in done.stderr
     assert box.running.bundle.enrolled in ({}, {"cork": 5})

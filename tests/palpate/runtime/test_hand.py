@@ -237,7 +237,9 @@ main(["run", "--sim", "skin", "--virtual", "--sweeps", "1"])
 assert not [name for name in sys.modules if "hand_" in name or name.endswith("runtime.hand")]
 print("clean")
 """
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=120
+    )
     assert done.stdout.endswith("clean\n"), done.stderr
 
 

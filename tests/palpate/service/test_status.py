@@ -230,7 +230,10 @@ def test_a_program_that_has_ended_is_not_running(status_file: ClockedStatus):
     status_file.clock.sleep_until(status_file.clock.now_ns() + 11 * SECOND)
     assert "has written nothing for 11 s, so it hangs" in status_file.text()
     gone = subprocess.run(
-        [sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True
+        [sys.executable, "-c", "import os; print(os.getpid())"],
+        capture_output=True,
+        text=True,
+        timeout=120,
     )
     for wrong in ({"pid": int(gone.stdout)}, {"time_ns": 10**18}):
         status_file.path.write_text(

@@ -245,7 +245,7 @@ _DIGITS = st.sampled_from(["uint8", "int16", "uint16", "float32"]).flatmap(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(_DIGITS, st.floats(20, 300))
 def test_results_are_finite_for_any_counts(taxels: np.ndarray, rate_hz: float) -> None:
     """Weights sum to 1, centroids stay below Nyquist, H-features are as many as `h_shape` says, 0

@@ -285,7 +285,9 @@ def test_signing_does_without_the_imports_of_training():
     them."""
     code = "import sys; from palpate_train.cli.main import main; main(['sign', '--help'])"
     code = f"import sys\ntry:\n    {code}\nexcept SystemExit:\n    print(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120
+    )
     assert "usage: palpate-train sign" in done.stdout
     assert not {"sklearn", "scipy", "torch", "onnx", "pandas", "matplotlib"} & {
         *done.stdout.split()

@@ -359,6 +359,7 @@ def test_a_terminal_without_unicode_shows_replaced_characters(tmp_path: Path):
         env={**os.environ, "PYTHONIOENCODING": "ascii", "PYTHONPATH": str(ROOT)},
         capture_output=True,
         check=False,
+        timeout=120,
     )
     assert (done.returncode, done.stderr) == (0, b"")
     assert b"left out: k?per_?.txt: its name does not match the pattern" in done.stdout

@@ -440,7 +440,9 @@ def sshd(tmp_path: Path) -> list[str]:
         Path("/run/sshd").mkdir(exist_ok=True)  # normally made by its service
     for name in ("host", "mine"):
         subprocess.run(
-            ["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", tmp_path / name], check=True
+            ["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", tmp_path / name],
+            check=True,
+            timeout=120,
         )
     settings = {
         "HostKey": tmp_path / "host",

@@ -226,7 +226,7 @@ def test_select_names_what_is_wrong(condition: str, message: str):
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(1, 7), st.floats(0.05, 0.95), st.integers(0, 2**32 - 1))
 def test_split_never_separates_a_recording(pieces: int, share: float, seed: int):
     """No recording is on both sides, no sweep is lost or doubled, and both sides have each material

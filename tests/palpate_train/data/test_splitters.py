@@ -63,7 +63,7 @@ def test_split_trains_on_a_and_tests_on_b():
     assert set(GRID.groups["position"][test]) == {0}
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(2, 4), st.integers(0, 99), st.integers(1, 4))
 def test_random_folds_are_whole_recordings_and_everything_once(folds: int, seed: int, pieces: int):
     """Each sweep is tested once; no recording is cut; every fold holds every material."""
@@ -192,7 +192,7 @@ def test_a_learning_curve_adds_to_what_was_there():
     assert draw(train, labels, 99, 1).tolist() == train.tolist()
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(2, 5), st.integers(0, 99), st.integers(1, 4), st.booleans())
 def test_random_folds_are_scikit_learns(folds: int, seed: int, pieces: int, mixed: bool):
     """The folds of StratifiedGroupKFold, although scikit-learn is not imported: results of earlier

@@ -169,7 +169,7 @@ _DIGITS = st.sampled_from(["uint8", "int16", "uint16", "float32"]).flatmap(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(_DIGITS, st.floats(1, 5000), st.sampled_from(KINDS))
 def test_results_are_finite_for_any_digits(taxels: np.ndarray, rate_hz: float, kind: str):
     """Finite float32 numbers for any counts."""

@@ -292,7 +292,7 @@ def test_filters_need_no_pytorch(tmp_path: Path):
         "sys.exit(code or main(['export', fit, *args]))"
     )
     done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=False
+        [sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=120
     )
     assert done.returncode == 0, done.stderr
     assert "chosen: " in done.stdout
