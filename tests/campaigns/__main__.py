@@ -19,8 +19,6 @@ from dataclasses import dataclass, field
 from tests.factories.paths import ROOT
 from tests.rig import image
 
-SKINS = ("flexitac", "papillarray")
-"""Emulated skins whose bundles the campaign `load` runs."""
 ATHERIS = "atheris==3.0.0"
 BUILD = ROOT / "build"
 
@@ -55,13 +53,6 @@ def board_tests() -> None:
     """Install pytest; a board has no other tool of the desktop."""
     pip = (sys.executable, "-m", "pip", "--disable-pip-version-check", "install", "-q")
     subprocess.run([*pip, "-e", ".[board]"], check=True, cwd=ROOT)
-
-
-def skin_bundles() -> None:
-    """Train the bundles of the emulated skins that are not in build/skins yet."""
-    for skin in SKINS:
-        if not (BUILD / "skins" / skin / "bundle").is_dir():
-            subprocess.run([sys.executable, "-m", "tests.skins", "way", skin], check=True, cwd=ROOT)
 
 
 def rig_image() -> None:
@@ -171,11 +162,6 @@ CAMPAIGNS = {
         "compare a box whose page, bridges and feed are attacked with a box alone: docs/robots",
         _module("tests.robots.side_by_side", "--minutes", "5"),
     ),
-    "load": Campaign(
-        "load two skins with all clients and faults, beside boxes with none (as root): docs",
-        _module("tests.campaigns.full_load", "--minutes", "60", "--page", "docs/faults.md"),
-        prepare=skin_bundles,
-    ),
     "taught": Campaign(
         "compare taught bundles with palpate-train fit at 5, 10 and 20 sweeps (half an hour)",
         _module("tests.campaigns.taught"),
@@ -229,16 +215,6 @@ CAMPAIGNS = {
         _module("tests.campaigns.junk", "--out", "docs/data/junk.json", "--page", "docs/faults.md"),
         variables={"OMP_NUM_THREADS": "1"},
         nice=True,
-    ),
-    "promises": Campaign(
-        "compare the accuracy that fit prints with that of its bundle under a new condition",
-        _module("tests.campaigns.promises"),
-        variables={"OMP_NUM_THREADS": "1"},
-        nice=True,
-    ),
-    "examples": Campaign(
-        "write the examples in docs/ again with a run of the packaged bundle (3 minutes)",
-        _module("tests.campaigns.examples"),
     ),
     "fit-memory": Campaign(
         "measure peak memory and time of fit on 1,000 to 100,000 windows (docs/recipe.md)",

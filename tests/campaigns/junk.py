@@ -1,4 +1,4 @@
-"""Counts the answers of the packaged bundle to sweeps that no one can name.
+"""Counts the answers of the packaged bundle to junk: sweeps without a material that it knows.
 
 `python -m tests.campaigns junk` prints a row for each kind of sweep: how many the box names with
 status ok, and how many of these wrongly, for whole sweeps and with early answers. A sweep of two

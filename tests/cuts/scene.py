@@ -20,7 +20,7 @@ from tempfile import TemporaryDirectory
 from tests.cuts import calls, tree
 from tests.cuts.calls import NotFollowed, SystemCall, TracedRun
 from tests.cuts.disk import Disk
-from tests.factories.paths import ROOT
+from tests.factories.paths import SOURCES
 
 MEMORY = Path("/dev/shm")
 """Folder in memory for scenes: the effect of a sync is modelled, and on a real disk it would take
@@ -29,7 +29,7 @@ BETWEEN = "\n"
 """Printed before each command, so that the last line is its own."""
 SPARE_CALLS = 300
 """More calls than the wrapper of a command makes in its main thread."""
-ENVIRONMENT = {"PYTHONPATH": str(ROOT)}
+ENVIRONMENT = {"PYTHONPATH": SOURCES}
 
 
 def stage() -> TemporaryDirectory[str]:

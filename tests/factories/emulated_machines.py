@@ -20,7 +20,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
-from tests.factories.paths import ROOT
+from tests.factories.paths import ROOT, SOURCES
 
 LOCK = ROOT / "appliance" / "requirements.lock"
 HOME = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "palpate" / "machines"
@@ -88,7 +88,7 @@ def command(name: str, *args: str | Path) -> tuple[list[str], dict[str, str]]:
     kept = {
         name: value for name, value in os.environ.items() if not name.startswith("OPENBLAS_")
     }  # the features of this processor
-    env = kept | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
+    env = kept | {"PYTHONPATH": SOURCES, "OPENBLAS_NUM_THREADS": "1"}
     if kind == platform.machine():
         return [*run, sys.executable, __file__, *map(str, args)], env
     usr = folder() / "root" / "usr"
@@ -97,7 +97,7 @@ def command(name: str, *args: str | Path) -> tuple[list[str], dict[str, str]]:
             "no arm64 userland here; run python -m tests.factories.emulated_machines "
             "(30 s, 300 MB in ~/.cache/palpate)"
         )
-    env |= {"PYTHONPATH": f"{folder() / 'site'}:{ROOT}", "PYTHONHOME": str(usr)}
+    env |= {"PYTHONPATH": f"{folder() / 'site'}:{SOURCES}", "PYTHONHOME": str(usr)}
     return [*run, "-L", str(usr.parent), str(usr / "bin" / PYTHON), __file__, *map(str, args)], env
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from tests.factories.bridges import LONG_S, eventually
-from tests.factories.paths import ROOT
+from tests.factories.paths import ROOT, SOURCES
 
 PYTHON = ROOT / os.environ.get("PALPATE_ROS", "build/ros") / "bin" / "python"
 """The Python of `python -m tests.campaigns ros`. PALPATE_ROS names another environment; then a
@@ -44,7 +44,7 @@ def environment() -> dict[str, str]:
     domain = str(1 + os.getpid() % 100)
     return {
         **os.environ,
-        "PYTHONPATH": str(ROOT),
+        "PYTHONPATH": SOURCES,
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
         "ROS_DOMAIN_ID": domain,
     }
