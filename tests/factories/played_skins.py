@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core.clock import SystemClock
-from palpate.sim.skins.player import Player
-from palpate.sim.skins.wires import wire
+from tests.factories.skins.player import Player
+from tests.factories.skins.wires import wire
 
 SHAPES: dict[str, tuple[tuple[int, ...], str, float]] = {
     "flexitac": ((12, 32), "uint8", 100.0),

@@ -3,7 +3,7 @@
 For each skin: the expected content of its frames, their bytes after the makers' descriptions, and a
 port that delivers them with a driver's buffer and every fault.
 
-The bytes are on purpose not those of `palpate.sim.skins.wires`. The second implementation makes
+The bytes are on purpose not those of `tests.factories.skins.wires`. The second implementation makes
 other choices where a skin allows several (width of offsets, order of fields, separators), so a
 misreading in one of them shows.
 """

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core.clock import SystemClock
-from palpate.sim.skins.player import Player
-from palpate.sim.skins.wires import wire
 from tests.factories import install_scripts
 from tests.factories.paths import ROOT
+from tests.factories.skins.player import Player
+from tests.factories.skins.wires import wire
 
 PITCHES = {"oak": 0.04, "cork": 0.1, "felt": 0.19, "slate": 0.33}
 """Materials, with the frequency of each in periods per frame."""

@@ -37,12 +37,12 @@ from palpate.io.skin_profile import SkinProfile
 from palpate.runtime import assembly
 from palpate.runtime.loop import Box
 from palpate.sim import script
-from palpate.sim.skins import sweeps
-from palpate.sim.skins.devices import on_wire
-from palpate.sim.skins.player import Player
-from palpate.sim.skins.wires import wire
 from palpate.tools import pseudo_terminal
 from palpate.tools.bench_process import drain
+from tests.factories.skins import sweeps
+from tests.factories.skins.devices import on_wire
+from tests.factories.skins.player import Player
+from tests.factories.skins.wires import wire
 from tests.skins.subjects import PROFILES
 
 SETTLE_S = 3.0

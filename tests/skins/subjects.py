@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from palpate.io import skin_profile
 from palpate.io.skin_profile import SkinProfile
-from palpate.sim.skins.devices import on_wire
-from palpate.sim.skins.wires import WIRES, Wire, wire
 from tests.factories.paths import ROOT
+from tests.factories.skins.devices import on_wire
+from tests.factories.skins.wires import WIRES, Wire, wire
 
 PROFILES = ROOT / "firmware_config" / "skins"
 NAMES = tuple(WIRES)

@@ -27,7 +27,7 @@ LIMIT_S = 600
 
 def box(*arguments: object) -> str:
     """Run `palpate ARGUMENTS`; returns its output."""
-    return _command("palpate", *arguments)
+    return _command("tests.factories.skins.command", *arguments)
 
 
 def desktop(*arguments: object) -> str:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from palpate.cli.common import load_settings
 from palpate.core import fingers
-from palpate.core.clock import SystemClock
+from palpate.core.clock import Clock, SystemClock
 from palpate.core.config import Config
 from palpate.core.devices import Devices
 from palpate.core.errors import ConfigError
@@ -46,13 +46,13 @@ def simulated(
     spread: bool = False,
     touring: bool = False,
 ) -> RobotDevices:
-    """A simulated robot with the skin of the settings: a readout board on USB, or a skin on a
-    terminal. touring: the robot plays the tour of `palpate demo`; on a readout board only."""
+    """A simulated robot with the skin of the settings: a readout board on USB. touring:
+    the robot plays the tour of `palpate demo`."""
     from palpate.sim import devices, rig, script, tour
 
     profile = _played(settings)
     format = skins.hub_format(format, settings.part) if format else None
-    clock = rig.VirtualClock() if args.virtual else SystemClock()
+    clock: Clock = rig.VirtualClock() if args.virtual else SystemClock()
     follows = settings.trigger.mode == "serial"
     profile = skins.profile(settings)
     if profile.codec == "palpate":
@@ -69,23 +69,23 @@ def simulated(
         return devices.build(
             format, acts, clock, source, remember=remember, follows=follows, fingers=of_fingers
         )
-    from palpate.sim.skins import devices as terminal
-    from palpate.sim.skins import sweeps
+    return emulated(name, format, args, settings, clock, remember=remember, spread=spread)
 
-    seen = sweeps.view(settings.skin.profile, profile.format)
-    acts, source, format = script.named(
-        name, format, args.seed, spread=spread, seen=seen, follows=follows
-    )
-    acts = islice(acts, args.sweeps)
-    return terminal.build(
-        settings.skin.profile,
-        profile,
-        format,
-        acts,
-        clock,
-        source,
-        remember=remember,
-        follows=follows,
+
+def emulated(
+    name: str,
+    format: SweepFormat | None,
+    args: argparse.Namespace,
+    settings: Config,
+    clock: Clock,
+    *,
+    remember: bool,
+    spread: bool,
+) -> RobotDevices:
+    """Where tests put emulators of makers' skins. Raises ConfigError: the box has none."""
+    raise ConfigError(
+        f'--sim plays a readout board, not the skin "{settings.skin.profile}"; leave --skin out, or'
+        " connect this skin"
     )
 
 

@@ -120,8 +120,7 @@ def _devices(add: Callable[..., argparse.Action]) -> None:
     add(
         "--skin",
         metavar="NAME",
-        help="profile of the skin, or its file (skin.profile); "
-        "with --sim the name of an emulated skin",
+        help="profile of the skin, or its file (skin.profile)",
     )
     add("--virtual", action="store_true", help="with --sim: do not wait for the time to pass")
     add("--seed", type=int, default=0, help="seed of the simulated tubes (default 0)")

@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from palpate.bundle import bundle
@@ -24,7 +23,6 @@ from palpate.cli.parser import arguments
 from palpate.client.answers import Answer
 from palpate.core import sentences
 from palpate.core.errors import ConfigError
-from palpate.core.types import load as load_sweep
 from palpate.core.types import sidecar
 from palpate.deployment.trial import Trial
 from palpate.runtime import assembly
@@ -191,52 +189,15 @@ def test_sweeps_of_a_finger_lie_apart(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "is of a box with one skin; name another" in capsys.readouterr().err
 
 
-TSF = ["--skin", "robotiq-tsf", *VIRTUAL]
-ROWS = ["--set", "skins.left.part=1/2 rows", "--set", "skins.right.part=2/2 rows"]
-
-
-def test_a_finger_of_a_hub_records_its_part(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """Both parts together are the frames of the hub, in which each sweep has the same place."""
-    kept = {}
-    for finger in ("", *hands.TWO):
-        options = [*ROWS, "--finger", finger] if finger else []
-        out = tmp_path / (finger or "hub")
-        assert main(["record", *TSF, *options, "--out", str(out), "--material", "wood"]) == 0
-        kept[finger] = [load_sweep(path) for path in sorted(out.glob("*.npy"))]
-    assert len(kept["left"]) == 3
-    assert {format.shape for _, format in kept["left"] + kept["right"]} == {(7, 4)}
-    for (hub, _), (left, _), (right, _) in zip(*kept.values(), strict=True):
-        parts = np.concatenate([left.frames.taxels, right.frames.taxels], axis=1)
-        assert np.array_equal(hub.frames.taxels, parts)
-
-
-def test_what_a_part_of_a_hub_cannot_do_is_said(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
-    """A capture keeps the bytes of the whole hub; 14 rows are not cut into three or four."""
-    monkeypatch.chdir(tmp_path)
-    left = ["record", *TSF, "--finger", "left", "--out", "o"]
-    assert main([*left, *ROWS, "--capture", "c"]) == 78
-    assert 'skins.left.part is "1/2 rows"; leave it out' in capsys.readouterr().err
-    thirds = [word for part in (1, 2) for word in ("--set", f"skins.f{part}.part={part}/4 rows")]
-    assert main(["record", *TSF, "--finger", "f1", "--out", "o", *thirds]) == 78
-    said = capsys.readouterr().err
-    assert 'skins.f1.part = "1/4 rows" does not divide the frames of 14x4' in said
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("hub", [False, True])
-def test_align_shows_one_finger(hub: bool):
-    """With the bundle of a finger its contact positions; of a hub the part alone, which no bundle
-    here fits."""
-    options = ["--skin", "robotiq-tsf", *ROWS] if hub else TWO
-    words = ["align", "--sim", "rest", "--finger", "right", *options]
+def test_align_shows_one_finger():
+    """With the bundle of a finger its contact positions."""
+    words = ["align", "--sim", "rest", "--finger", "right", *TWO]
     with subprocess.Popen(
         [sys.executable, "-m", "palpate", *words], stdout=subprocess.PIPE, text=True
     ) as align:
         try:
-            wanted = "no bundle fits this skin" if hub else "row"
-            while wanted not in (line := align.stdout.readline()):
+            while "row" not in (line := align.stdout.readline()):
                 assert line, "it has ended"
         finally:
             align.terminate()

@@ -20,10 +20,10 @@ from palpate.io.robot_link import StdoutPort
 from palpate.io.sensor import SensorCounters
 from palpate.runtime import assembly, hand
 from palpate.sim import rig, skin
-from palpate.sim.skins import devices as played
 from tests.factories import hands, toy_bundle
 from tests.factories.settings import load
 from tests.factories.simulated_box import SECOND
+from tests.factories.skins import devices as played
 
 ROWS = ["skins.left.part=1/2 rows", "skins.right.part=2/2 rows"]
 TSF = SweepFormat(7, 4, 50.0, 50, "uint16")

@@ -17,8 +17,8 @@ from palpate.io import skin_profile
 from palpate.runtime import selftest
 from palpate.signal.slide import SpeedRange
 from palpate.sim import devices, rig, script
-from palpate.sim.skins import devices as played
-from palpate.sim.skins import sweeps
+from tests.factories.skins import devices as played
+from tests.factories.skins import sweeps
 
 
 def skin_of(share: float) -> selftest.CheckResult:

@@ -13,10 +13,10 @@ import pytest
 from palpate.bundle import bundle
 from palpate.core.types import Status, SweepFormat, Verdict
 from palpate.sim import devices, rig, skin
-from palpate.sim.skins.sweeps import SCALES, view
 from palpate.sweeps.recording import Labels, RecordingSession
 from palpate_train.cli.main import main
 from tests.factories.simulated_box import Rigged
+from tests.factories.skins.sweeps import SCALES, view
 
 FORMAT = SweepFormat(4, 4, 100.0, 200, "uint16", 3)
 SEEN, REST = view("xela-can", FORMAT), SCALES["xela-can"].rest

@@ -21,7 +21,7 @@ from typing import Any, Protocol
 from numpy.typing import NDArray
 
 from palpate.core.clock import Clock, wait_readable
-from palpate.sim.skins.wires import Wire
+from tests.factories.skins.wires import Wire
 
 DRIVER_BYTES = 65_536
 """Bytes that the kernel's driver of a real adapter keeps for a slow reader, about; further bytes

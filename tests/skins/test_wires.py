@@ -6,13 +6,11 @@ from __future__ import annotations
 import struct
 
 import numpy as np
-import pytest
 
-from palpate.core.errors import ConfigError
 from palpate.io import skin_profile
 from palpate.io.skin_codecs import Rest, codec
-from palpate.sim.skins import wires
 from tests.factories.paths import ROOT
+from tests.factories.skins import wires
 
 PREVIEW = bytes.fromhex(
     "556677880201001b0003002700040029020500630206000f0307002b0300004efa320031aa768f0000000002002d002b01"
@@ -164,12 +162,6 @@ def test_robotiq() -> None:
     assert skin.frame((taxels + 3).astype(np.uint16), 6)[61:64] == bytes.fromhex("200003")
     skin.receive(bytes.fromhex("9a00580100"))
     assert not skin.streaming
-
-
-def test_unknown_name() -> None:
-    """The error names what there is."""
-    with pytest.raises(ConfigError, match=r"'biotac'; there are flexitac, .*robotiq-tsf"):
-        wires.wire("biotac", 100)
 
 
 def test_a_zero_that_is_missing_makes_no_frame() -> None:

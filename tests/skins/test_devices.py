@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from palpate.cli.main import main
 from palpate.core import config, types
 from palpate.core.types import Status
 from palpate.io import skins
 from palpate.sim import rig, script
-from palpate.sim.skins import devices, sweeps
-from palpate.sim.skins.wires import WIRES
 from tests.factories.paths import NO_SITE
+from tests.factories.skins import devices, sweeps
+from tests.factories.skins.command import main
+from tests.factories.skins.wires import WIRES
 
 SEED, SWEEPS = 3, 2
 

@@ -17,8 +17,8 @@ from palpate.core.types import SweepFormat
 from palpate.io.skin_profile import SkinProfile
 from palpate.sim import rig
 from palpate.sim.devices import RobotDevices, robot_on_lines
-from palpate.sim.skins.player import Player, PlayerClock
-from palpate.sim.skins.wires import wire
+from tests.factories.skins.player import Player, PlayerClock
+from tests.factories.skins.wires import wire
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
