@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
 
 from tests import prose
+from tests.factories.paths import ROOT
 
 
 @pytest.mark.parametrize(
@@ -89,3 +91,16 @@ def test_the_clauses_of_a_package_are_listed(project: Path, capsys: pytest.Captu
         "docs/how-to/a.md: That is no answer.",
         "docs/how-to/a.md: It is what was sent.",
     ]
+
+
+def test_every_page_is_reached_from_the_readme():
+    """A person finds each page by links, without a search."""
+    reached, left = set[Path](), [ROOT / "README.md"]
+    while left:
+        page = left.pop().resolve()
+        if page not in reached:
+            reached.add(page)
+            links = re.findall(r"\]\(([^)#\s:]+\.md)", page.read_text())
+            left += [page.parent / link for link in links]
+    pages = {*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("firmware_config/**/*.md")}
+    assert pages - reached == set()
