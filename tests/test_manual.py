@@ -391,11 +391,7 @@ def test_the_trial_is_described_as_it_is():
 
 
 def test_the_change_log_knows_this_version():
-    """Versions go down, the newest is the present version. Each has its additions, changes or
-    fixes."""
+    """Versions go down, and the newest is the present version."""
     heads = re.findall(r"(?m)^## (\d+\.\d+\.\d+)", CHANGES)
     assert heads[0] == __version__
     assert heads == sorted(heads, key=lambda v: [*map(int, v.split("."))], reverse=True)
-    for part in re.split(r"(?m)^## ", CHANGES)[1:]:
-        assert set(re.findall(r"(?m)^### (.*)", part)) <= {"Added", "Changed", "Fixed", "Removed"}
-        assert "### Added" in part
