@@ -62,10 +62,8 @@ def test_the_last_axis_is_the_time_if_only_it_fits(
     last = np.moveaxis(x, 0, -1)
     name = f"{rows}x{columns}x{axes}" if axes else f"{rows}x{columns}"
     asked = plan(grid=name if grid else "")
-    for values, notes in (
-        (x, []),
-        (last, [f"its last axis is the time: frames of {[*x.shape[1:]]}"]),
-    ):
+    turned = f"its last axis is the time: frames of {[*x.shape[1:]]}"
+    for values, notes in ((x, []), (last, [turned])):
         found, time_s, said = frames.frames(stored(tmp_path / "a", values, how), asked)
         np.testing.assert_array_equal(found, x)
         square = how == "h5" and values is x and rows == columns and not axes
@@ -84,15 +82,11 @@ def test_the_last_axis_is_the_time_if_only_it_fits(
 def test_what_both_axes_could_be_is_asked_for(shape: tuple[int, ...], grid: str, answer: str):
     """The message shows the shape and both answers, and each of them works."""
     x = np.arange(np.prod(shape)).reshape(shape)
-    what = (
-        "the first and the last axis could both be" if answer == "first" else "neither end can be"
-    )
-    with pytest.raises(FormatError) as e:
+    what = "could both be the time" if answer == "first" else "neither end can be"
+    with pytest.raises(FormatError, match=what) as e:
         frames.frames(Table(x), plan(grid=grid))
-    assert str(e.value) == (
-        f"holds {list(shape)}: {what} the time; say with --axes frame,row,column or "
-        "--axes row,column,frame, or give --grid"
-    )
+    assert str(list(shape)) in str(e.value)
+    assert "--axes frame,row,column or --axes row,column,frame" in str(e.value)
     np.testing.assert_array_equal(frames.frames(Table(x), plan(axes="frame,row,column"))[0], x)
     last, _, _ = frames.frames(Table(x), plan(axes="row,column,frame"))
     np.testing.assert_array_equal(last, np.moveaxis(x, -1, 0))
@@ -103,13 +97,11 @@ def test_what_both_axes_could_be_is_asked_for(shape: tuple[int, ...], grid: str,
 def test_square_arrays_of_taxels_and_frames_are_asked_for():
     """16 frames of 16 taxels: no axis shows its kind."""
     x = np.arange(256).reshape(16, 16)
-    with pytest.raises(
-        FormatError, match="both axes could be the 16 taxels; say which with --axes"
-    ):
+    with pytest.raises(FormatError, match="could be the 16 taxels"):
         frames.frames(Table(x), plan(grid="4x4"))
     asked = plan(grid="4x4", axes="taxel,frame")
     np.testing.assert_array_equal(frames.frames(Table(x), asked)[0], x.T.reshape(16, 4, 4))
-    with pytest.raises(FormatError, match=r"holds \[2, 3, 4\], but --transpose names 2 axes"):
+    with pytest.raises(FormatError, match=r"holds \[2, 3, 4\], but"):
         frames.frames(Table(np.zeros((2, 3, 4))), plan(transpose=True))
 
 
@@ -138,9 +130,9 @@ def test_a_name_that_occurs_twice_needs_numbers(option: str):
         "time": {"time": "s:ms"},
         "field": {"fields": {"session": "s"}},
     }[option]
-    with pytest.raises(FormatError, match="columns 2 and 4 are all called 's'; use their numbers"):
+    with pytest.raises(FormatError, match="and 4 are all called 's'"):
         frames.frames(table, plan(grid="2x2", **asked))
-    with pytest.raises(FormatError, match="columns 2 and 4 are all called 's'; use their numbers"):
+    with pytest.raises(FormatError, match="and 4 are all called 's'"):
         frames.fields(table, {"session": "s"}, 40)
     found, _, _ = frames.frames(table, plan(grid="2x2", columns="2-5"))
     np.testing.assert_array_equal(found.reshape(40, 4), table.values[:, 1:])
@@ -148,7 +140,7 @@ def test_a_name_that_occurs_twice_needs_numbers(option: str):
 
 def test_a_name_that_is_the_number_of_another_column_is_refused():
     """pandas calls the columns 0, 1, 2, 3: is 2 a name or a number?"""
-    with pytest.raises(FormatError, match="'2' is the name of column 3 and the number of another"):
+    with pytest.raises(FormatError, match="'2' is the name of"):
         frames.frames(text(("0", "1", "2", "3")), plan(grid="2x1", columns="2,3"))
 
 
@@ -178,9 +170,9 @@ def test_text_columns_are_no_taxels():
     table = text(("label", "a", "b"), texts={0: ["wood"] * 40})
     found, _, _ = frames.frames(table, plan(grid="1x2"))
     np.testing.assert_array_equal(found[:, 0], table.values[:, 1:])
-    with pytest.raises(FormatError, match="column 1 'label' holds text, such as 'wood'"):
+    with pytest.raises(FormatError, match="column 1 'label' holds"):
         frames.frames(table, plan(grid="1x1", columns="label"))
-    with pytest.raises(FormatError, match=r"holds text, such as 'wood'; for dates .* label:date"):
+    with pytest.raises(FormatError, match="text, such as 'wood'"):
         frames.frames(table, plan(grid="1x2", time="label:s"))
 
 
@@ -191,7 +183,7 @@ def test_a_column_of_dates_gives_the_times():
     _, time_s, _ = frames.frames(table, plan(grid="1x1", time="when:date", rate_hz=None))
     np.testing.assert_allclose(time_s, np.arange(40) / 10)
     dates[3] = "noon"
-    with pytest.raises(FormatError, match="frame 4: 'noon' in column when is not a date"):
+    with pytest.raises(FormatError, match="4: 'noon' in column when"):
         frames.frames(table, plan(grid="1x1", time="when:date", rate_hz=None))
 
 
@@ -215,10 +207,7 @@ def test_dates_of_other_forms_give_the_times(form: str):
     np.testing.assert_allclose(time_s, np.arange(40) / 4)
 
 
-@pytest.mark.parametrize(
-    "form",
-    ["2026-01-{0} {1}", "{0}.1.2026 {1}", "2026/1/{0} {1}", "{1}"],
-)
+@pytest.mark.parametrize("form", ["2026-01-{0} {1}", "{0}.1.2026 {1}", "2026/1/{0} {1}", "{1}"])
 def test_dates_go_on_at_midnight(form: str):
     """Days that change, and a clock that begins again."""
     clock = [(23, 59, 59), (0, 0, 0), (0, 0, 1)]
@@ -237,7 +226,7 @@ def test_days_that_could_be_months_are_refused():
     """Only where they change, since the time between frames then depends on it."""
     texts = ["01/02/2026 12:00:00"] * 39 + ["02/02/2026 12:00:00"]
     table = text(("when", "a"), texts={0: texts})
-    with pytest.raises(FormatError, match="the day changes from '01/02/2026' to '02/02/2026'"):
+    with pytest.raises(FormatError, match="from '01/02/2026' to"):
         frames.frames(table, plan(grid="1x1", time="when:date", rate_hz=None))
 
 
@@ -251,7 +240,7 @@ def test_fields_cut_a_table_where_they_change():
     assert [(part.start, part.stop) for part, _ in found] == [(0, 10), (10, 30), (30, 35), (35, 40)]
     assert found[1][1] == {"material": "felt", "session": "2026-01-30", "trial": "7"}
     labels[4] = ""
-    with pytest.raises(FormatError, match="frame 5 has no material in column l"):
+    with pytest.raises(FormatError, match="frame 5 has no material"):
         frames.fields(table, {"material": "l"}, 40)
 
 
@@ -267,20 +256,17 @@ def test_a_reading_that_cannot_be_is_named(value: float, shown: str):
 @pytest.mark.parametrize(
     ("changes", "why"),
     [
-        ({"axes": "row,column"}, "--axes row,column cannot be read; name each axis"),
-        ({"axes": "frame,frame"}, "--axes frame,frame cannot be read"),
-        ({"axes": "frame,time"}, "--axes frame,time cannot be read"),
+        ({"axes": "row,column"}, "--axes row,column cannot"),
+        ({"axes": "frame,frame"}, "--axes frame,frame"),
+        ({"axes": "frame,time"}, "--axes frame,time cannot"),
         ({"axes": "taxel,frame", "transpose": True}, "--axes already says"),
-        ({"decimal": "'"}, "--decimal ' is unknown; use . or ,"),
-        ({"pattern": None}, "where the material stands is not known; give --pattern"),
-        (
-            {"fields": {"material": "l"}},
-            "material stands in --pattern or --variable and in --field",
-        ),
+        ({"decimal": "'"}, "--decimal ' is unknown"),
+        ({"pattern": None}, "give --pattern"),
+        ({"fields": {"material": "l"}}, "--pattern or --variable"),
     ],
 )
 def test_an_option_that_cannot_be_read_is_named(changes: dict, why: str):
     """Before any file is read."""
     with pytest.raises(FormatError) as e:
         plan(**changes)
-    assert str(e.value).startswith(why)
+    assert why in str(e.value)

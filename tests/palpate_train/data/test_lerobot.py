@@ -64,14 +64,8 @@ def imported(folder: Path, *more: str) -> int:
     )
 
 
-MATERIAL = (
-    "--field",
-    "material=task",
-    "--rename",
-    f"{TASKS[0]}=wood",
-    "--rename",
-    f"{TASKS[1]}=felt",
-)
+MATERIAL = ("--field", "material=task", "--rename", f"{TASKS[0]}=wood")
+MATERIAL += ("--rename", f"{TASKS[1]}=felt")
 
 
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])
@@ -103,7 +97,7 @@ def test_a_feature_is_named_where_several_are_tactile(
     folder = data_set(tmp_path / "set", "v3.0", **more)
     assert imported(folder, *MATERIAL) == 65
     told = capsys.readouterr().err
-    assert "holds 2 tactile features; name one with --variable: its features of numbers are" in told
+    assert "2 tactile features" in told
     assert "observation.tactile [2, 3], observation.state [6]" in told
     assert imported(folder, *MATERIAL, "--variable", "observation.tactile") == 0
 
@@ -183,8 +177,8 @@ def test_lerobot_itself_reads_a_written_set(tmp_path: Path):
 @pytest.mark.parametrize(
     ("group", "folder", "why"),
     [
-        ("timestamp", "new", "its group 'timestamp' has the name of a column of LeRobot"),
-        ("person", "s.npz", "is there already; name a new folder"),
+        ("timestamp", "new", "'timestamp' has the name"),
+        ("person", "s.npz", "is there already"),
         ("person", "no/new", "there is no folder"),
     ],
 )
@@ -226,6 +220,6 @@ def test_pyarrow_is_named_where_it_is_missing(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
     samples = np.zeros((2, 9, 2, 2), np.uint8)
     made = sets.Dataset(samples, np.array([0, 1]), ("felt", "wood"), 10.0)
-    with pytest.raises(FormatError, match=r"set is a set of Parquet files; to write it: pip"):
+    with pytest.raises(FormatError, match="set is a set of Parquet"):
         lerobot_writer.write(made, tmp_path / "set")
     assert list(tmp_path.iterdir()) == []

@@ -56,28 +56,20 @@ def test_a_mapped_set_is_the_set(sweeps: Dataset, tmp_path: Path, name: str):
     assert sorted(path.name for path in tmp_path.iterdir()) == [name]
 
 
-def smaller(sweeps: Dataset, path: Path) -> None:
-    sweeps.select(["speed=" + str(sweeps.group("speed").min())]).take(np.arange(9)).save(path)
-
-
-def compressed(sweeps: Dataset, path: Path) -> None:
+def written(sweeps: Dataset, path: Path, samples: np.ndarray, save: Callable = np.savez) -> None:
     about = {"labels": sweeps.labels, "materials": np.array(sweeps.materials)}
-    np.savez_compressed(path, samples=sweeps.samples, rate_hz=np.array(sweeps.rate_hz), **about)
+    save(path, samples=samples, rate_hz=np.array(sweeps.rate_hz), **about)
 
 
-def swapped(sweeps: Dataset, path: Path) -> None:
-    about = {"labels": sweeps.labels, "materials": np.array(sweeps.materials)}
-    other = sweeps.samples.astype(">i2")
-    np.savez(path, samples=other, rate_hz=np.array(sweeps.rate_hz), **about)
-
-
-def by_columns(sweeps: Dataset, path: Path) -> None:
-    about = {"labels": sweeps.labels, "materials": np.array(sweeps.materials)}
-    other = np.asfortranarray(sweeps.samples)
-    np.savez(path, samples=other, rate_hz=np.array(sweeps.rate_hz), **about)
-
-
-@pytest.mark.parametrize("write", [smaller, compressed, swapped, by_columns])
+@pytest.mark.parametrize(
+    "write",
+    [
+        lambda s, path: s.take(np.r_[0:3, -3:0]).save(path),
+        lambda s, path: written(s, path, s.samples, np.savez_compressed),
+        lambda s, path: written(s, path, s.samples.astype(">i2")),
+        lambda s, path: written(s, path, np.asfortranarray(s.samples)),
+    ],
+)
 def test_other_sets_are_read(sweeps: Dataset, tmp_path: Path, write: Callable):
     """Small ones, compressed ones, those of another byte order or another order of axes."""
     write(sweeps, tmp_path / "set.npz")
@@ -138,7 +130,7 @@ def test_a_disk_without_room_is_named(
     sweeps.save(tmp_path / "set.npz")
     read = sets.load(str(tmp_path / "set.npz"))
     monkeypatch.setattr(mapped.tempfile, "tempdir", "/dev/full")
-    with pytest.raises(FormatError, match=r"^/dev/full: \d+ MB of sweeps cannot be kept there: "):
+    with pytest.raises(FormatError, match="/dev/full: "):
         read.split("recording", 0.5, 1)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import io
 import json
+import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -37,13 +38,6 @@ def tactmat(path: Path, dtype: str = "uint8", **more: object) -> np.ndarray:
         for name, values in ({"materials": [b"cork", b"felt", b"tile"]} | more).items():
             file[name] = values
     return samples
-
-
-def before_crc(path: Path) -> None:
-    """Turn a sidecar into schema 1: the sweep and its format, without a check of its bytes."""
-    held = json.loads(path.read_text()) | {"schema": 1}
-    del held["crc32"]
-    path.write_text(json.dumps(held))
 
 
 def test_hdf5_holds_what_an_npz_holds(tmp_path: Path):
@@ -94,8 +88,6 @@ def test_a_full_disk_does_not_end_the_program():
         readers.write_hdf5(FullDisk(), {"samples": noise, "materials": ["wood"]})
 
 
-NAN = np.zeros((6, 8, 2, 3), np.float32)
-NAN[4, 7, 1, 2] = np.nan
 PAIR = np.zeros(6, [("a", "i4"), ("b", "f4")])
 
 
@@ -103,37 +95,17 @@ PAIR = np.zeros(6, [("a", "i4"), ("b", "f4")])
     ("changes", "message"),
     [
         ({"samples": None}, "lacks samples"),
-        ({"labels": None}, "lacks labels"),
-        ({"materials": None}, "lacks materials"),
-        ({"rate_hz": None}, "lacks rate_hz"),
-        ({"samples": np.zeros((6, 8, 6), np.uint8)}, "shape \\[6, 8, 6\\]"),
-        ({"samples": np.zeros((6, 8, 2, 3))}, "samples are float64; .*astype\\('float32'\\)"),
-        ({"samples": NAN}, "samples\\[4, 7, 1, 2\\] is nan; drop sweep 4"),
-        ({"samples": PAIR.reshape(6, 1, 1, 1)}, "samples are .*; use one of"),
-        ({"samples": ["a"] * 6}, "samples have the shape \\[6\\]"),
-        ({"samples": h5py.Empty("u1")}, "samples is not an array but .*shape None"),
-        ({"labels": PAIR}, "labels holds .*; give one whole number for each of 6"),
-        (
-            {"labels": np.array([0, 1, 2, 0, 3, 1])},
-            "label 3 of sweep 4 is out of range; there are 3",
-        ),
-        ({"labels": np.full(6, 1)}, "only one class, 'b'"),
-        (
-            {"labels": ["a", "b", "c"] * 2},
-            "label 'c' is not among the materials \\['a', 'b', 'ç'\\]; add it",
-        ),
-        ({"materials": np.arange(3)}, "materials hold int64"),
-        ({"materials": np.array([b"a", b"b", b"\xff"])}, "not a sweep set .*: .*utf-8"),
-        ({"rate_hz": "fast"}, "rate_hz holds .*fast.*; give one number"),
-        ({"rate_hz": [50.0, 60.0]}, "give one number"),
-        ({"group_speed": np.ones(7, int)}, "group_speed holds int64 \\[7\\]"),
-        (
-            {"group_speed": h5py.SoftLink("/gone")},
-            "group_speed is a link to '/gone'; put the data itself",
-        ),
-        ({"samples": h5py.ExternalLink("gone.h5", "/samples")}, "samples is a link to '/samples'"),
-        ({"samples": h5py.SoftLink("/samples")}, "samples is a link to '/samples'"),
-        ({"labels": np.dtype("i8")}, "labels is not an array but .*named type"),
+        ({"samples": PAIR.reshape(6, 1, 1, 1)}, "samples are .*use one of"),
+        ({"samples": ["a"] * 6}, r"have the shape \[6\]"),
+        ({"samples": h5py.Empty("u1")}, "shape None"),
+        ({"labels": PAIR}, "number for each of 6"),
+        ({"labels": ["a", "b", "c"] * 2}, r"materials \['a', 'b',"),
+        ({"materials": np.array([b"a", b"b", b"\xff"])}, "utf-8"),
+        ({"rate_hz": "fast"}, "rate_hz holds"),
+        ({"group_speed": h5py.SoftLink("/gone")}, "is a link to '/gone'"),
+        ({"samples": h5py.ExternalLink("gone.h5", "/samples")}, "is a link to '/samples'"),
+        ({"samples": h5py.SoftLink("/samples")}, "is a link to '/samples'"),
+        ({"labels": np.dtype("i8")}, "named type"),
     ],
 )
 def test_a_broken_hdf5_is_refused_by_name(tmp_path: Path, changes: dict, message: str):
@@ -142,12 +114,7 @@ def test_a_broken_hdf5_is_refused_by_name(tmp_path: Path, changes: dict, message
         sets.load(hdf5(tmp_path / "broken.h5", **changes))
 
 
-def _group(file: h5py.File) -> None:
-    file.create_group("samples")
-
-
-def _unwritten(file: h5py.File) -> None:
-    file.create_dataset("samples", (6, 8, 2, 3), "u1")
+SHAPE = (6, 8, 2, 3)
 
 
 def _huge(file: h5py.File) -> None:
@@ -155,28 +122,27 @@ def _huge(file: h5py.File) -> None:
 
 
 def _virtual(file: h5py.File) -> None:
-    layout = h5py.VirtualLayout((6, 8, 2, 3), "u1")
-    layout[:] = h5py.VirtualSource("gone.h5", "samples", (6, 8, 2, 3))
+    layout = h5py.VirtualLayout(SHAPE, "u1")
+    layout[:] = h5py.VirtualSource("gone.h5", "samples", SHAPE)
     file.create_virtual_dataset("samples", layout)
 
 
-def _external(file: h5py.File) -> None:
-    file.create_dataset("samples", (6, 8, 2, 3), "u1", external="/etc/hostname")
-
-
 def _ragged(file: h5py.File) -> None:
-    file.create_dataset("samples", (6, 8, 2, 3), h5py.vlen_dtype("i2"))[0, 0, 0, 0] = [1, 2]
+    file.create_dataset("samples", SHAPE, h5py.vlen_dtype("i2"))[0, 0, 0, 0] = [1, 2]
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (_group, "samples is not an array but .*HDF5 group"),
-        (_unwritten, "samples \\[6, 8, 2, 3\\] was not written to its end"),
-        (_huge, "samples \\[1099511627776, 8, 2, 3\\] was not written to its end"),
-        (_virtual, "samples lies in other files"),
-        (_external, "samples lies in other files"),
-        (_ragged, "samples are object; use one of"),
+        (lambda file: file.create_group("samples"), "HDF5 group"),
+        (lambda file: file.create_dataset("samples", SHAPE, "u1"), "was not written"),
+        (_huge, "was not written"),
+        (_virtual, "samples lies in other"),
+        (
+            lambda file: file.create_dataset("samples", SHAPE, "u1", external="/etc/hostname"),
+            "samples lies in other",
+        ),
+        (_ragged, "samples are object"),
     ],
 )
 def test_samples_that_are_not_in_the_file_are_refused(tmp_path: Path, make: Callable, message: str):
@@ -191,15 +157,10 @@ def test_samples_that_are_not_in_the_file_are_refused(tmp_path: Path, make: Call
 def test_what_is_no_hdf5_is_refused(tmp_path: Path):
     """Files cut anywhere, text, an empty file, a missing file."""
     whole = Path(hdf5(tmp_path / "whole.h5")).read_bytes()
-    for name, data in {
-        "half.h5": whole[: len(whole) // 2],
-        "head.h5": whole[:8],
-        "text.h5": b"x",
-        "empty.h5": b"",
-    }.items():
+    parts = {"half.h5": whole[: len(whole) // 2], "head.h5": whole[:8], "cut": whole[:-1]}
+    for name, data in (parts | {"text.h5": b"x", "empty.h5": b""}).items():
         (tmp_path / name).write_bytes(data)
-    (tmp_path / "cut").write_bytes(whole[:-1])
-    for name in ("half.h5", "head.h5", "text.h5", "empty.h5", "gone.h5", "cut"):
+    for name in (*parts, "text.h5", "empty.h5", "gone.h5"):
         with pytest.raises(FormatError, match=f"^{name}: not a sweep set.*HDF5"):
             sets.load(str(tmp_path / name))
 
@@ -244,25 +205,18 @@ def test_tactmat_s_own_rate_goes_first(tmp_path: Path):
 def test_a_broken_tactmat_is_refused(tmp_path: Path):
     """Missing names or a wrong number of names, counts beyond a byte, unexpected labels."""
     for more, message in (
-        ({"materials": ["cork", "felt"]}, "hold 3 materials, but there are 2 names"),
+        ({"materials": ["cork", "felt"]}, "but there are 2 names"),
         ({"labels": np.arange(12) % 3}, "lacks rate_hz"),
-        (
-            {"labels": np.arange(12) % 3, "rate_hz": 1.0},
-            "labels holds int64 \\[12\\]; give one whole number for each of 3",
-        ),
+        ({"labels": np.arange(12) % 3, "rate_hz": 1.0}, r"labels holds int64 \[12\]"),
     ):
         tactmat(tmp_path / "t.h5", **more)
         with pytest.raises(FormatError, match=f"^t.h5.*: .*{message}"):
             sets.load(str(tmp_path / "t.h5"))
-    for bad, message in (
-        (256.0, "samples are float64"),
-        (np.nan, "samples are float64"),
-        (-1.0, "samples are float64"),
-    ):
+    for bad in (256.0, np.nan, -1.0):
         tactmat(tmp_path / "t.h5", "float64")
         with h5py.File(tmp_path / "t.h5", "a") as file:
             file["samples"][1, 1, 1, 1, 1] = bad
-        with pytest.raises(FormatError, match=message):
+        with pytest.raises(FormatError, match="samples are float64"):
             sets.load(str(tmp_path / "t.h5"))
 
 
@@ -272,13 +226,8 @@ def test_recordings_are_a_set(tmp_path: Path):
     for i, (material, position, obj) in enumerate(
         [("b", "tip", 0), ("a", "side", 1), ("b", "side", 1), ("a", "tip", 2)]
     ):
-        record(
-            tmp_path / f"run{i // 2}" / f"sweep-{i:06d}.npy",
-            material,
-            id=i,
-            position=position,
-            object=obj,
-        )
+        path = tmp_path / f"run{i // 2}" / f"sweep-{i:06d}.npy"
+        record(path, material, id=i, position=position, object=obj)
     record(tmp_path / "run0" / "sweep-000009.npy", status=Status.SATURATED, id=9)
     record(tmp_path / "run1" / "sweep-000010.npy", "", Status.GAP, frames=0)
     (tmp_path / "sweep-000011.npy.part").write_bytes(b"half")
@@ -305,18 +254,14 @@ def test_a_place_that_is_a_number_keeps_it(tmp_path: Path):
 
 
 def test_what_else_a_sidecar_holds_changes_nothing(tmp_path: Path):
-    """Recordings with device, clock, tare and verdict, beside older recordings without them."""
+    """Recordings with device, clock, tare and verdict, beside recordings without them."""
     for i in range(4):
         record(tmp_path / f"{i}.npy", "ab"[i % 2], id=i, position="tip")
     before = sets.digest(sets.load(str(tmp_path)))
     for i in range(2):
-        about = {
-            "device": {"serial": "x"},
-            "tare": [[0] * 3] * 2,
-            "verdict": {"status": ("unknown", "unsure")[i]},
-        }
+        about = {"device": {"serial": "x"}, "tare": [[0] * 3] * 2}
+        about["verdict"] = {"status": ("unknown", "unsure")[i]}
         save(tmp_path / f"{i}.npy", *load(tmp_path / f"{i}.npy"), about)
-    before_crc(tmp_path / "3.json")
     assert sets.digest(sets.load(str(tmp_path))) == before
 
 
@@ -352,10 +297,7 @@ def test_an_unloaded_skin_of_another_form_is_named(tmp_path: Path, known: object
     for i in range(2):
         record(tmp_path / f"{i}.npy", "ab"[i], id=i)
     save(tmp_path / "1.npy", *load(tmp_path / "1.npy"), {"unloaded": known})
-    with pytest.raises(
-        FormatError,
-        match=r"1\.npy: `unloaded` in its sidecar lacks a level and noise of shape \[2, 3\]",
-    ):
+    with pytest.raises(FormatError, match=r"noise of shape \[2, 3\]"):
         sets.load(str(tmp_path))
 
 
@@ -365,11 +307,8 @@ def test_what_the_box_refused_is_left_out(tmp_path: Path):
     for i in range(9):
         record(tmp_path / f"{i}.npy", "ab"[i % 2], id=i)
     for i, status in enumerate(readers.REFUSED):
-        save(
-            tmp_path / f"{i}.npy",
-            *load(tmp_path / f"{i}.npy"),
-            {"verdict": {"status": str(status)}},
-        )
+        path = tmp_path / f"{i}.npy"
+        save(path, *load(path), {"verdict": {"status": str(status)}})
     record(tmp_path / "9.npy", "a", frames=3, share=0.4)
     s = sets.load(str(tmp_path))
     assert s.source.endswith(
@@ -426,16 +365,13 @@ def test_recordings_without_places_have_no_such_groups(tmp_path: Path):
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        ({"material": ""}, "2.npy: has no material; write it into 2.json"),
-        ({"position": "tip"}, "0.npy: has no position though others have"),
-        ({"session": 3}, "2.npy: .*session = 3 is not of type str"),
-        ({"material": 7}, "2.npy: .*material = 7 is not of type str"),
-        ({"object": "cup"}, "2.npy: .*object = 'cup' is not of type int"),
-        ({"frames": 7}, "2.npy: 7 frames of 2x3 int16 at 50 Hz, window 8; others have"),
-        (
-            {"format": SweepFormat(2, 3, 100.0, 8, "int16")},
-            "2.npy: 8 frames of 2x3 int16 at 100 Hz, window 8; others have 2x3",
-        ),
+        ({"material": ""}, "2.npy: has no material"),
+        ({"position": "tip"}, "0.npy: has no position"),
+        ({"session": 3}, "session = 3"),
+        ({"material": 7}, "material = 7"),
+        ({"object": "cup"}, "object = 'cup'"),
+        ({"frames": 7}, "2.npy: 7 frames of 2x3"),
+        ({"format": SweepFormat(2, 3, 100.0, 8, "int16")}, "2x3 int16 at 100 Hz"),
     ],
 )
 def test_a_recording_that_does_not_fit_is_named(tmp_path: Path, more: dict, message: str):
@@ -443,36 +379,32 @@ def test_a_recording_that_does_not_fit_is_named(tmp_path: Path, more: dict, mess
     record(tmp_path / "0.npy", "a")
     record(tmp_path / "1.npy", "b")
     record(tmp_path / "2.npy", **more)
-    with pytest.raises(FormatError, match=f"^{tmp_path}/{message}"):
+    with pytest.raises(FormatError, match=f"^{tmp_path}/.*{message}"):
         sets.load(str(tmp_path))
 
 
 def test_broken_recordings_are_named(tmp_path: Path):
     """A truncated table, a missing or empty sidecar, no ok sweep, an empty folder, a single
     material."""
-    with pytest.raises(
-        FormatError, match="no sweep of `palpate record` is in it; record some, or name another"
-    ):
+    with pytest.raises(FormatError, match="of `palpate record` is"):
         sets.load(str(tmp_path))
     record(tmp_path / "0.npy", status=Status.SHORT)
-    with pytest.raises(
-        FormatError, match=r"left out: 1 short\): not a sweep set: no recorded sweep is ok"
-    ):
+    with pytest.raises(FormatError, match=r"left out: 1 short\): not"):
         sets.load(str(tmp_path))
     record(tmp_path / "1.npy", "a")
     with pytest.raises(FormatError, match="only one class, 'a'"):
         sets.load(str(tmp_path))
     whole, about = (tmp_path / "1.npy").read_bytes(), json.loads((tmp_path / "1.json").read_text())
     (tmp_path / "1.npy").write_bytes(whole[:-9])
-    with pytest.raises(FormatError, match=r"1\.npy: not a recorded sweep"):
+    with pytest.raises(FormatError, match=r"1\.npy: not a recorded"):
         sets.load(str(tmp_path))
     (tmp_path / "1.npy").write_bytes(whole)
     (tmp_path / "1.json").write_text(json.dumps(about | {"status": "fine"}))
-    with pytest.raises(FormatError, match=r"1\.npy: not a recorded sweep"):
+    with pytest.raises(FormatError, match=r"1\.npy: not a recorded"):
         sets.load(str(tmp_path))
     record(tmp_path / "2.npy", "b")
     (tmp_path / "1.json").unlink()
-    with pytest.raises(FormatError, match=r"1\.npy: not a recorded sweep"):
+    with pytest.raises(FormatError, match=r"1\.npy: not a recorded"):
         sets.load(str(tmp_path))
 
 
@@ -480,8 +412,10 @@ def test_a_recording_is_never_unpickled(tmp_path: Path):
     """Object arrays in an .npy are refused before they are loaded."""
     record(tmp_path / "1.npy", "a")
     np.save(tmp_path / "1.npy", np.array([{}], object), allow_pickle=True)
-    before_crc(tmp_path / "1.json")
-    with pytest.raises(FormatError, match=r"1\.npy: not a recorded sweep .*allow_pickle"):
+    about = json.loads((tmp_path / "1.json").read_text())
+    about["crc32"] = zlib.crc32((tmp_path / "1.npy").read_bytes())
+    (tmp_path / "1.json").write_text(json.dumps(about))
+    with pytest.raises(FormatError, match="allow_pickle"):
         readers.read(tmp_path, sets.Dataset)
 
 
@@ -491,23 +425,16 @@ def test_a_file_of_frames_names_the_import(tmp_path: Path, suffix: str):
     that makes one."""
     np.save(tmp_path / "x.npy", np.zeros((9, 4)))
     path = (tmp_path / "x.npy").rename(tmp_path / f"x{suffix}")
-    with pytest.raises(
-        FormatError,
-        match=f"x{suffix}: not a sweep set, but a file of frames; palpate-train import .* makes",
-    ):
+    with pytest.raises(FormatError, match="palpate-train import"):
         sets.load(str(path))
-    with pytest.raises(
-        FormatError,
-        match=f"it holds 1 {suffix.lower()} files: "
-        "palpate-train import .* makes a set of such files",
-    ):
+    with pytest.raises(FormatError, match=f"1 {suffix.lower()} files: "):
         sets.load(str(tmp_path))
 
 
 def test_a_folder_of_sets_names_them(tmp_path: Path):
     """The message names the sets: the user probably meant one of them."""
     write(tmp_path / "a.npz")
-    with pytest.raises(FormatError, match=r"it holds 1 \.npz or HDF5 files: name one of them"):
+    with pytest.raises(FormatError, match=r"it holds 1 \.npz or HDF5"):
         sets.load(str(tmp_path))
 
 
@@ -518,7 +445,7 @@ def test_a_folder_that_may_not_be_read_is_named(tmp_path: Path, monkeypatch: pyt
         raise PermissionError(13, "Permission denied", str(self))
 
     monkeypatch.setattr(Path, "iterdir", denied)
-    with pytest.raises(FormatError, match="the folder cannot be read: Permission denied"):
+    with pytest.raises(FormatError, match="read: Permission denied"):
         sets.load(str(tmp_path))
 
 
@@ -533,9 +460,7 @@ def test_a_file_that_may_not_be_read_is_named(
         raise PermissionError(13, "Permission denied", str(self))
 
     monkeypatch.setattr(Path, "open", denied)
-    with pytest.raises(
-        FormatError, match=rf"{name}: not a sweep set: the file cannot be read: Permission denied"
-    ):
+    with pytest.raises(FormatError, match=f"^{name}: .*Permission denied"):
         sets.load(str(file))
 
 
@@ -612,7 +537,5 @@ def test_an_impossible_reading_of_a_recording_is_named(tmp_path: Path):
     frames = Frames(np.arange(8), np.arange(8), taxels)
     sweep = Sweep(7, 0, 8, Status.OK, frames, material="wood")
     one = readers.RecordedSweep(tmp_path / "sweep-000007.npy", sweep, format, {})
-    with pytest.raises(
-        FormatError, match=r"sweep-000007.npy: frame 6, taxel 2, 3 reads 1e\+20, and no skin"
-    ):
+    with pytest.raises(FormatError, match=r"taxel 2, 3 reads 1e\+20,"):
         readers.from_recorded([one], tmp_path, sets.Dataset)

@@ -55,67 +55,37 @@ NAN[4, 7, 1, 2] = np.nan
         ({"materials": None, "rate_hz": None}, "lacks materials, rate_hz"),
         ({"samples": np.zeros((6, 8, 6), np.uint8)}, "shape \\[6, 8, 6\\]"),
         ({"samples": np.zeros((6, 0, 2, 3), np.uint8)}, "none empty"),
-        (
-            {"samples": np.zeros((6, 8, 2, 3, 1), np.uint8)},
-            "shape \\[6, 8, 2, 3, 1\\]; .* axes after them only where",
-        ),
-        ({"samples": np.zeros((6, 8, 2, 3, 9), np.uint8)}, "9 axes of each taxel are out of range"),
-        (
-            {"samples": np.zeros((6, 8, 2, 3))},
-            "samples are float64; use one of uint8.*samples.astype\\('float32'\\)",
-        ),
-        (
-            {"samples": np.full((6, 8, 2, 3), -1)},
-            "samples are int64; .*samples.astype\\('int16'\\)",
-        ),
+        ({"samples": np.zeros((6, 8, 2, 3, 1), np.uint8)}, r"shape \[6, 8, 2, 3, 1\]"),
+        ({"samples": np.zeros((6, 8, 2, 3, 9), np.uint8)}, "9 axes of each taxel are"),
+        ({"samples": np.zeros((6, 8, 2, 3))}, r"astype\('float32'\)"),
+        ({"samples": np.full((6, 8, 2, 3), -1)}, r"astype\('int16'\)"),
         (
             {"samples": np.ones((6, 8, 2, 3), bool)},
             "samples are bool; .*samples.astype\\('uint8'\\)",
         ),
-        (
-            {"samples": np.full((6, 8, 2, 3), 1 << 40)},
-            "samples are int64; .*samples.astype\\('float32'\\)",
-        ),
-        (
-            {"samples": np.full((6, 8, 2, 3), 1j)},
-            "samples are complex128; use one of uint8, int16, uint16, float32$",
-        ),
-        (
-            {"samples": np.zeros((6, 8, 256, 1), np.uint8)},
-            "a grid of 256 x 1 taxels is out of range",
-        ),
+        ({"samples": np.full((6, 8, 2, 3), 1 << 40)}, r"astype\('float32'\)"),
+        ({"samples": np.full((6, 8, 2, 3), 1j)}, "samples are complex128"),
+        ({"samples": np.zeros((6, 8, 256, 1), np.uint8)}, "a grid of 256 x 1 taxels"),
         ({"rate_hz": np.array(np.nan)}, "rate_hz is nan"),
-        ({"rate_hz": np.array(2e6)}, "a rate of 2000000.0 Hz is out of range"),
-        ({"group_speed": np.ones(6, bool)}, "group_speed holds bool .*one number or name for each"),
-        ({"group_speed": np.array([1, 2, np.nan, 1, 2, 3])}, "group_speed of sweep 2 is nan; give"),
-        ({"group_speed": np.array([*"abcd", "", "e"])}, "group_speed of sweep 4 is ''; give a"),
-        ({"group_recording": np.full(6, 1j)}, "group_recording holds complex128 .*whole number"),
-        ({"samples": NAN}, "samples\\[4, 7, 1, 2\\] is nan; drop sweep 4"),
-        (
-            {"samples": np.nan_to_num(NAN, nan=1e20)},
-            "sweep 4, frame 7, taxel 1, 2 reads 1e\\+20 .counted from 0., and no skin reads more",
-        ),
-        (
-            {"labels": np.arange(5)},
-            "labels holds int64 \\[5\\]; give one whole number for each of 6",
-        ),
+        ({"rate_hz": np.array(2e6)}, "rate of 2000000.0 Hz"),
+        ({"group_speed": np.ones(6, bool)}, "group_speed holds bool"),
+        ({"group_speed": np.array([1, 2, np.nan, 1, 2, 3])}, "group_speed of sweep 2"),
+        ({"group_speed": np.array([*"abcd", "", "e"])}, "speed of sweep 4 is ''"),
+        ({"group_recording": np.full(6, 1j)}, "holds complex128"),
+        ({"samples": NAN}, r"samples\[4, 7, 1, 2\]"),
+        ({"samples": np.nan_to_num(NAN, nan=1e20)}, r"taxel 1, 2 reads 1e\+20"),
+        ({"labels": np.arange(5)}, r"labels holds int64 \[5\]"),
         ({"labels": np.zeros(6)}, "labels holds float64"),
-        (
-            {"labels": np.array([0, 1, 2, 0, 3, 1])},
-            "label 3 of sweep 4 is out of range; there are 3",
-        ),
-        ({"labels": np.array([0, 1, -1, 0, 2, 1])}, "label -1 of sweep 2 is out of range"),
+        ({"labels": np.array([0, 1, 2, 0, 3, 1])}, "label 3 of sweep 4"),
+        ({"labels": np.array([0, 1, -1, 0, 2, 1])}, "label -1 of sweep 2"),
         ({"labels": np.full(6, 2)}, "only one class, 'c'"),
         ({"materials": np.array(["a", "b", "a"])}, "name one twice"),
         ({"materials": np.arange(3)}, "materials hold int64"),
         ({"rate_hz": np.array([50.0, 60.0])}, "give one number"),
         ({"rate_hz": np.array(-1.0)}, "rate_hz is -1.0"),
-        ({"group_speed": np.ones(7, int)}, "group_speed holds int64 \\[7\\]"),
+        ({"group_speed": np.ones(7, int)}, r"holds int64 \[7\]"),
         ({"materials": np.array(["a", {}, "c"], object)}, "not a sweep set"),
-        (
-            {"unloaded": np.zeros((6, 2, 3))},
-            "unloaded holds float64 \\[6, 2, 3\\]; give floats \\[6, 2, 2, 3\\]",
-        ),
+        ({"unloaded": np.zeros((6, 2, 3))}, r"floats \[6, 2, 2, 3\]"),
         ({"unloaded": np.zeros((6, 2, 2, 3), int)}, "unloaded holds int64"),
     ],
 )
@@ -166,7 +136,7 @@ def test_a_named_world_is_drawn_in_its_physics() -> None:
     assert blind.source == "sim:T-HARD/level-blind:6:1"
     shear = sets.load("sim:T-LABx3/level-blind:6-7:1")
     assert shear.format == skin.SHEAR_FORMAT
-    with pytest.raises(FormatError, match="unknown world, 'flat'; use level-blind or none"):
+    with pytest.raises(FormatError, match="unknown world, 'flat'"):
         sets.load("sim:T-REAL/flat:1")
 
 
@@ -207,15 +177,15 @@ def test_select_takes_any_of_several_values():
     [
         ("speed<2", "cannot be read"),
         ("speed", "cannot be read"),
-        ("force=1", "no group 'force'; it has recording, speed"),
+        ("force=1", "no group 'force'"),
         ("speed=", "'' is not a number"),
         ("speed=1,fast", "'fast' is not a number"),
-        ("speed<=1,2", "<= takes a group of numbers and one number"),
-        ("material>=low", ">= takes a group of numbers and one number; material"),
-        ("speed=9", "no sweep fulfils speed=9; it has 0, 1, 2, 3$"),
-        ("speed=1,9", "no sweep fulfils speed=9; it has 0"),
-        ("material=low,hihg", "no sweep fulfils material=hihg; it has high, low, middle"),
-        ("recording>=99999999999999999999", "no sweep fulfils recording>=9+;"),
+        ("speed<=1,2", "takes a group of numbers"),
+        ("material>=low", "takes a group of numbers"),
+        ("speed=9", "no sweep fulfils speed=9"),
+        ("speed=1,9", "no sweep fulfils speed=9"),
+        ("material=low,hihg", "fulfils material=hihg"),
+        ("recording>=99999999999999999999", "fulfils recording>=9+"),
         ("recording<=7", "only one class, 'low'"),
     ],
 )
@@ -253,12 +223,12 @@ def test_split_refuses_what_would_flatter():
     """Groups that cut recordings, a part without a material, an invalid share."""
     s = easy(8, pieces=2)
     s.groups["half"] = np.arange(len(s)) % 2
-    with pytest.raises(FormatError, match="'half' cut recordings in two"):
+    with pytest.raises(FormatError, match="'half' cut recordings in"):
         s.split("half", 0.5, 0)
     s.groups["material"] = s.labels
     del s.groups["recording"]
     s.groups["one"] = np.zeros(len(s), int)
-    with pytest.raises(FormatError, match="the first part is everything; it has 1 groups"):
+    with pytest.raises(FormatError, match="it has 1 groups"):
         s.split("one", 0.5, 0)
     for share in (0.0, 1.0, 1.5):
         with pytest.raises(FormatError, match="splits nothing"):
@@ -274,11 +244,8 @@ def test_split_never_trains_without_a_material():
         try:
             outcomes.add(s.split("box", 0.5, seed)[0].labels.max())
         except FormatError as e:
-            outcomes.add(str(e))
-    assert outcomes == {
-        2,
-        "easy: split by 'box': the first part lacks 'high'; it has 3 groups, use a finer one",
-    }
+            outcomes.add("lacks 'high'" if "first part lacks 'high'" in str(e) else str(e))
+    assert outcomes == {2, "lacks 'high'"}
 
 
 def test_join_keeps_recordings_apart_and_forces_together():
@@ -292,7 +259,7 @@ def test_join_keeps_recordings_apart_and_forces_together():
     )
     del b.groups["recording"]
     assert len(np.unique(sets.join([a, b]).groups["recording"])) == 6 + 12
-    with pytest.raises(FormatError, match="differ; join sets of one kind"):
+    with pytest.raises(FormatError, match="differ"):
         sets.join([a, easy(4, dtype="int16")])
 
 
@@ -348,11 +315,11 @@ def test_conditions_speak_of_values(condition: str, kept: int):
 @pytest.mark.parametrize(
     ("condition", "message"),
     [
-        ("force<=slow", "'slow' is not a number in N"),
-        ("force<=5mN", "'5mN' is not a number in N"),
-        ("force=0.7", "no sweep fulfils force=0.7; it has 0, 0.5, 1, 1.5$"),
-        ("speed<=1", "<= takes a group of numbers and one number; speed holds names"),
-        ("speed=1", "no sweep fulfils speed=1; it has fast, slow$"),
+        ("force<=slow", "'slow' is not a number"),
+        ("force<=5mN", "'5mN' is not a number"),
+        ("force=0.7", "sweep fulfils force=0.7"),
+        ("speed<=1", "takes a group of numbers"),
+        ("speed=1", "no sweep fulfils speed=1"),
     ],
 )
 def test_values_that_do_not_occur_are_named(condition: str, message: str):
@@ -378,7 +345,7 @@ def test_sets_are_joined_by_values():
     assert sorted(set(mixed.groups["speed"])) == ["0", "1", "fast", "slow"]
     assert sorted(set(mixed.groups["position"])) == ["0", "1", "2", "3", "tip"]
     assert (mixed.groups["force"][0], mixed.units) == (300, {})
-    with pytest.raises(FormatError, match="'force' is in mN in one set and in mm in another; give"):
+    with pytest.raises(FormatError, match="'force' is in mN in one"):
         sets.join([one, grouped(force__mm=[1] * 12)])
 
 
@@ -441,18 +408,17 @@ def test_digest_names_the_data_and_nothing_else(tmp_path: Path):
     assert re.fullmatch("[0-9a-f]{16}", sets.digest(s))
     other = s.samples.copy()
     other[-1, -1, -1, -1] ^= 1
-    changed = [
-        replace(s, samples=other),
-        replace(s, samples=s.samples.astype(np.int16)),
-        replace(s, samples=s.samples.astype(np.uint16)),
-        replace(s, samples=s.samples.reshape(12, 64, 4, 1)),
-        replace(s, labels=s.labels[::-1]),
-        replace(s, materials=("low", "middle", "top")),
-        replace(s, rate_hz=101.0),
-        replace(s, groups={"recording": s.groups["recording"]}),
-        replace(s, groups=s.groups | {"speed": s.groups["recording"]}),
+    x, recording = s.samples, s.groups["recording"]
+    changes = [
+        *({"samples": y} for y in (other, x.astype(np.int16), x.astype(np.uint16))),
+        {"samples": x.reshape(12, 64, 4, 1)},
+        {"labels": s.labels[::-1]},
+        {"materials": ("low", "middle", "top")},
+        {"rate_hz": 101.0},
+        {"groups": {"recording": recording}},
+        {"groups": s.groups | {"speed": recording}},
     ]
-    assert len({sets.digest(x) for x in (s, *changed)}) == 10
+    assert len({sets.digest(replace(s, **change)) for change in ({}, *changes)}) == 10
     assert sets.digest(
         replace(s, source="elsewhere", labels=s.labels.astype(np.uint8))
     ) == sets.digest(s)
@@ -475,9 +441,7 @@ def test_labels_may_be_names(tmp_path: Path):
         write(tmp_path / "given.npz", labels=texts, materials=np.array(["c", "b", "a"]))
     )
     assert (given.materials, given.labels.tolist()) == (("c", "b", "a"), [1, 2, 1, 2, 0, 0])
-    with pytest.raises(
-        FormatError, match=r"label 'c' is not among the materials \['a', 'b'\]; add it there"
-    ):
+    with pytest.raises(FormatError, match=r"materials \['a', 'b'\]"):
         sets.load(write(tmp_path / "less.npz", labels=texts, materials=np.array(["a", "b"])))
 
 
@@ -486,10 +450,7 @@ def test_objects_are_refused_with_the_remedy(tmp_path: Path, name: str):
     """Object arrays, which numpy makes of pandas data and lists of names; nothing is unpickled."""
     arrays = held()
     np.savez(tmp_path / "o.npz", **arrays | {name: arrays[name].astype(object)})
-    with pytest.raises(
-        FormatError,
-        match=rf"{name} holds objects, which are not read; save np.array\({name}, dtype=str\)",
-    ):
+    with pytest.raises(FormatError, match=rf"np.array\({name}, dtype=str\)"):
         sets.load(str(tmp_path / "o.npz"))
-    with pytest.raises(FormatError, match=r"materials hold .S1; give a list of names, dtype=str"):
+    with pytest.raises(FormatError, match="materials hold"):
         sets.load(write(tmp_path / "s.npz", materials=np.array([b"a", b"b", b"c"])))

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.model_selection import LeaveOneGroupOut as Theirs
-from sklearn.model_selection import StratifiedGroupKFold, cross_val_score
-from sklearn.naive_bayes import GaussianNB
+from sklearn.model_selection import StratifiedGroupKFold
 
 from palpate.core.errors import FormatError
 from palpate_train.data.sets import Dataset
@@ -20,14 +19,8 @@ def a_set(labels: list[int], **groups: list[int]) -> Dataset:
     n = len(labels)
     samples = np.arange(n, dtype=np.int16).reshape(n, 1, 1, 1)
     names = tuple("abcdef"[: max(labels) + 1])
-    return Dataset(
-        samples,
-        np.array(labels),
-        names,
-        100.0,
-        {k: np.array(v) for k, v in groups.items()},
-        "made up",
-    )
+    arrays = {k: np.array(v) for k, v in groups.items()}
+    return Dataset(samples, np.array(labels), names, 100.0, arrays, "made up")
 
 
 GRID = a_set(
@@ -41,8 +34,7 @@ GRID = a_set(
 def test_a_protocol_tests_what_it_did_not_train_on(text: str):
     """No sweep and no recording on both sides; every fold has both."""
     for train, test in Protocol(text).folds(GRID, 1):
-        assert len(train)
-        assert len(test)
+        assert min(len(train), len(test)) > 0
         assert not set(GRID.groups["recording"][train]) & set(GRID.groups["recording"][test])
 
 
@@ -87,35 +79,22 @@ def test_random_folds_follow_their_seed():
     assert one != other
 
 
-@pytest.mark.parametrize("text", ["leave:position", "random:3", "split:position=0,1->2"])
-def test_scikit_learn_takes_them_as_splitters(text: str):
-    """cross_val_score runs on each."""
-    splitter = Protocol(text).splitter(GRID, 1)
-    x = GRID.samples.reshape(len(GRID), -1)
-    scores = cross_val_score(
-        GaussianNB(), x, GRID.labels, groups=GRID.groups["recording"], cv=splitter
-    )
-    assert len(scores) == splitter.get_n_splits(x, GRID.labels, GRID.groups["recording"])
-
-
 def test_a_material_of_one_recording_needs_more():
     """No number of folds would help, so the message does not suggest a number."""
-    with pytest.raises(
-        FormatError, match=r"^material 'b' has one recording; record two of each or more"
-    ):
+    with pytest.raises(FormatError, match="material 'b' has one"):
         Protocol("random:2").folds(a_set([0, 0, 1]), 1)
 
 
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        ("loo", "cannot be read; use random:FOLDS"),
+        ("loo", "cannot be read"),
         ("random:1", "too few folds"),
-        ("random:4", "needs 4 recordings of each material; 'a' has 3: use random:3 or less"),
-        ("leave:speed", "no group 'speed'; it has one, position, recording"),
+        ("random:4", "use random:3 or less"),
+        ("leave:speed", "no group 'speed'"),
         ("leave:one", "all sweeps have 7"),
         ("split:position=0->9", "has no 9; it has 0, 1, 2"),
-        ("split:position=0,1->1,2", "position=1 is on both sides"),
+        ("split:position=0,1->1,2", "position=1 is on both"),
         ("split:position=0", "cannot be read"),
     ],
 )
@@ -130,23 +109,21 @@ def test_what_cannot_be_split_is_named(text: str, why: str):
 def test_a_group_that_cuts_recordings_is_refused(text: str):
     """Pieces of one recording are never on both sides."""
     sweeps = a_set([0, 0, 1, 1], recording=[0, 0, 1, 1], half=[0, 1, 0, 1])
-    with pytest.raises(
-        FormatError, match="2 recordings, 0 among them, would be trained on and tested on"
-    ):
+    with pytest.raises(FormatError, match="2 recordings, 0 among"):
         Protocol(text).folds(sweeps, 1)
 
 
 def test_a_recording_of_several_materials_is_refused():
     """If numbers start anew for each material, sweeps of different materials would be fused."""
     sweeps = a_set([0, 0, 1, 1], recording=[5, 6, 5, 6], day=[0, 1, 0, 1])
-    with pytest.raises(FormatError, match="recording 5 holds sweeps of several materials, as 2 do"):
+    with pytest.raises(FormatError, match="recording 5 holds sweeps"):
         Protocol("leave:day").folds(sweeps, 1)
 
 
 def test_nothing_left_to_train_on_is_refused():
     """If a group is the material, leaving out one of two leaves only one."""
     sweeps = a_set([0, 0, 1, 1], session=[0, 0, 1, 1])
-    with pytest.raises(FormatError, match="2 sweeps of fewer than two materials are left"):
+    with pytest.raises(FormatError, match="2 sweeps of fewer than"):
         Protocol("leave:session").folds(sweeps, 1)
 
 
@@ -161,9 +138,9 @@ def test_protocols_speak_of_values():
         assert len(train) == 8
     assert len(Protocol("leave:speed").folds(sweeps, 1)) == 3
     assert Protocol("leave:speed").clusters(sweeps).tolist() == speed
-    with pytest.raises(FormatError, match="'speed' has no quick; it has fast, medium, slow"):
+    with pytest.raises(FormatError, match="'speed' has no quick"):
         Protocol("split:speed=slow->quick").folds(sweeps, 1)
-    with pytest.raises(FormatError, match="cannot be read; 'slow' is not a number"):
+    with pytest.raises(FormatError, match="'slow' is not a number"):
         Protocol("split:force=0->slow").folds(sweeps, 1)
     parts = inner_parts(sweeps)
     assert {part.group for part in parts} == {"force", "speed"}

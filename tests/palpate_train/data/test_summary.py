@@ -19,11 +19,6 @@ from tests.factories.recordings import record
 from tests.factories.sweep_sets import easy, write
 
 
-def lines(s: sets.Dataset) -> list[str]:
-    """The text lines of a set's description."""
-    return summary.description(s)
-
-
 def command(*words: str) -> None:
     """The command `sets`."""
     args = parser("sets").parse_args(["sets", *words])
@@ -35,18 +30,16 @@ def test_a_set_is_described():
     are shortened."""
     s = easy(20, pieces=2)
     s.groups["force"] = np.arange(60) % 12 * 10
-    first, *more = lines(s)
-    assert (
-        first
-        == f"easy: 60 sweeps of 0.64 s; 2x2 uint8 at 100 Hz, window 64; digest {sets.digest(s)}"
-    )
+    first, *more = summary.description(s)
+    about = "60 sweeps of 0.64 s; 2x2 uint8 at 100 Hz, window 64"
+    assert first == f"easy: {about}; digest {sets.digest(s)}"
     assert more == [
         "  recordings: 30, of 2 each",
         "  materials: 3: low 20, middle 20, high 20",
         "  force: 12: 0, 10, 20, 30, 40, 50, 60, 70, …, 110",
         "  speed: 4: 0, 1, 2, 3",
     ]
-    assert "  recordings: 29, of 1 to 2 each" in lines(s.take(np.arange(1, 58)))
+    assert "  recordings: 29, of 1 to 2 each" in summary.description(s.take(np.arange(1, 58)))
 
 
 def test_what_is_confounded_is_told():
@@ -60,7 +53,7 @@ def test_what_is_confounded_is_told():
         "    confounded: 'middle' only at 0; without it the material cannot be trained on",
         "    confounded: 'high' only at 1; without it the material cannot be trained on",
     ]
-    assert lines(s)[1:] == [
+    assert summary.description(s)[1:] == [
         "  recordings: 2, of 4 to 8 each",
         "    1 of them hold sweeps of several materials: number recordings within one material",
         "  materials: 3: low 4, middle 4, high 4",
@@ -77,7 +70,7 @@ def test_positions_and_sessions_are_counted_in_tables():
     there is no table."""
     s = easy(4)
     s.groups.update(position=np.array([0, 0, 0, 10] + [10] * 8), speed=np.zeros(12, int))
-    assert lines(s)[3:] == [
+    assert summary.description(s)[3:] == [
         "  position: 2: 0, 10",
         "    confounded: one material only at 0",
         "    confounded: 'middle' only at 10; without it the material cannot be trained on",
@@ -90,17 +83,12 @@ def test_positions_and_sessions_are_counted_in_tables():
         "  speed: 1: 0",
     ]
     s.groups.update(session=s.labels, position=np.arange(12))
-    assert "    all     4  4  4   12" in lines(s)
-    assert "    low     1  1  1  1  ·  ·  ·  ·  ·  ·   ·   ·    4" in lines(s)
+    assert "    all     4  4  4   12" in summary.description(s)
+    assert "    low     1  1  1  1  ·  ·  ·  ·  ·  ·   ·   ·    4" in summary.description(s)
     many = easy(13)
     many.groups["position"] = np.arange(39) % 13
-    assert [line.split()[0] for line in lines(many)] == [
-        "easy:",
-        "recordings:",
-        "materials:",
-        "position:",
-        "speed:",
-    ]
+    first = [line.split()[0] for line in summary.description(many)]
+    assert first == ["easy:", "recordings:", "materials:", "position:", "speed:"]
 
 
 def test_recordings_are_described_by_name(tmp_path: Path):
@@ -108,14 +96,8 @@ def test_recordings_are_described_by_name(tmp_path: Path):
     verdicts."""
     for i in range(6):
         path = tmp_path / f"run{i // 3}" / f"{i}.npy"
-        record(
-            path,
-            "ab"[i % 2],
-            id=i,
-            position=("tip", "side", "tip")[i % 3],
-            session="7",
-            lost=i // 4,
-        )
+        position = ("tip", "side", "tip")[i % 3]
+        record(path, "ab"[i % 2], id=i, position=position, session="7", lost=i // 4)
     record(tmp_path / "run0" / "9.npy", "", Status.GAP, frames=0, lost=100)
     s = sets.load(str(tmp_path))
     assert summary.describe(str(tmp_path)).splitlines() == [
@@ -147,12 +129,9 @@ def test_recordings_without_a_tare_are_told(tmp_path: Path):
         path = tmp_path / f"{i}.json"
         rest = {"level": [[1.0] * 3] * 2, "noise": [[0.5] * 3] * 2}
         path.write_text(json.dumps(json.loads(path.read_text()) | {"unloaded": rest}))
-        (found,) = [
-            line for line in summary.describe(str(tmp_path)).splitlines() if "warning" in line
-        ] or [""]
-        assert found.startswith(
-            f"  warning: {i + 1} sweeps know the unloaded skin and {4 - i} do not; "
-        ) == (i < 4)
+        warning = f"  warning: {i + 1} sweeps know the unloaded skin and {4 - i} do not; "
+        assert (warning in summary.describe(str(tmp_path))) == (i < 4)
+        assert ("warning" in summary.describe(str(tmp_path))) == (i < 4)
     sets.load(str(tmp_path)).save(tmp_path / "whole.npz")
     assert "warning" not in summary.describe(str(tmp_path / "whole.npz"))
 
@@ -163,10 +142,7 @@ def test_recordings_are_described_while_they_grow(tmp_path: Path):
     record(tmp_path / "0.npy", "a", position="2")
     text = summary.describe(str(tmp_path)).splitlines()
     assert "  materials: 1: a 1" in text
-    assert (
-        text[-1]
-        == f"  cannot be trained on yet: {tmp_path}: only one class, 'a'; a classifier needs two"
-    )
+    assert text[-1].startswith(f"  cannot be trained on yet: {tmp_path}: only one class, 'a'")
     record(tmp_path / "1.npy", "")
     text = summary.describe(str(tmp_path)).splitlines()
     assert "  materials: 2: (none) 1, a 1" in text
@@ -176,9 +152,7 @@ def test_recordings_are_described_while_they_grow(tmp_path: Path):
     record(tmp_path / "2.npy", status=Status.SHORT)
     (tmp_path / "0.npy").unlink()
     (tmp_path / "1.npy").unlink()
-    with pytest.raises(
-        FormatError, match=r"left out: 1 short\): not a sweep set: no recorded sweep is ok"
-    ):
+    with pytest.raises(FormatError, match=r"left out: 1 short\): not"):
         summary.describe(str(tmp_path))
 
 
@@ -203,12 +177,8 @@ def test_what_is_known_can_be_loaded():
     """Every simulated set in the list has the stated number of sweeps (for the large set: sixty for
     each scene)."""
     stated = dict(re.findall(r"(sim:T-\S+) +(\d+) sweeps", summary.known()))
-    assert stated == {
-        "sim:T-LAB": "240",
-        "sim:T-REAL": "540",
-        "sim:T-HARD": "60",
-        "sim:T-HARD:1-20": "1200",
-    }
+    sizes = {"sim:T-LAB": "240", "sim:T-REAL": "540", "sim:T-HARD": "60", "sim:T-HARD:1-20": "1200"}
+    assert stated == sizes
     assert len(sets.load("sim:T-LAB", 1001)) == 240
     assert len(sets.load("sim:T-HARD:1001-1002")) == 120
 

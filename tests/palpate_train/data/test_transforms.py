@@ -35,12 +35,7 @@ def test_the_window_is_the_middle():
     """The inner six of twelve frames; rate and everything else stay."""
     part = Change(window=0.5).of(counting())
     assert part.samples[0, :, 0, 0].tolist() == [30, 40, 50, 60, 70, 80]
-    assert (part.rate_hz, part.format.rows, part.format.cols, part.samples.dtype) == (
-        60,
-        2,
-        3,
-        np.int16,
-    )
+    assert str(part.format).startswith("2x3 int16 at 60 Hz")
     assert part.groups["day"].tolist() == [0, 1]
     assert Change(window=0.01).of(counting()).format.window == 1
 
@@ -146,10 +141,7 @@ def test_one_of_two_that_tell_the_same_stays():
 def test_any_sweeps_have_an_order(kind: str):
     """Silent sweeps, one taxel, one frame: every taxel occurs once."""
     shape = {"silent": (4, 20, 2, 2), "one taxel": (4, 20, 1, 1), "one frame": (4, 1, 2, 2)}[kind]
-    x = (
-        np.zeros(shape, np.uint8)
-        if kind == "silent"
-        else np.random.default_rng(1).integers(0, 255, shape, np.uint8)
-    )
+    most = 1 if kind == "silent" else 255
+    x = np.random.default_rng(1).integers(0, most, shape, np.uint8)
     found = transforms.rank_taxels(Dataset(x, np.array([0, 0, 1, 1]), ("a", "b"), 10.0))
     assert sorted(found) == list(range(shape[2] * shape[3]))

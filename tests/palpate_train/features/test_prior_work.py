@@ -26,11 +26,8 @@ RATE = 750.0
 def noise(frames: int = 300, rows: int = 2, cols: int = 3) -> np.ndarray:
     """Taxels that share a part of their noise, float32, each with another mean."""
     rng = np.random.default_rng(4)
-    x = (
-        rng.normal(0, 5, (frames, rows, cols))
-        + rng.normal(0, 4, (frames, 1, 1))
-        + rng.uniform(20, 90, (rows, cols))
-    )
+    x = rng.normal(0, 5, (frames, rows, cols)) + rng.normal(0, 4, (frames, 1, 1))
+    x += rng.uniform(20, 90, (rows, cols))
     return x.astype(np.float32)
 
 
@@ -179,14 +176,9 @@ def test_results_are_finite_for_any_digits(taxels: np.ndarray, rate_hz: float, k
 @pytest.mark.parametrize(
     ("kind", "shape", "rate_hz", "message"),
     [
-        ("static", (0, 2, 2), RATE, r"shape \(0, 2, 2\) is not a sweep"),
-        (
-            "spectrogram",
-            (19, 2, 2),
-            RATE,
-            "19 frames are too few for a spectrogram; use at least 20",
-        ),
-        ("correlation", (2, 2, 2), RATE, "2 frames are too few .* use at least 3"),
+        ("static", (0, 2, 2), RATE, r"shape \(0, 2, 2\) is not"),
+        ("spectrogram", (19, 2, 2), RATE, "19 frames are too few"),
+        ("correlation", (2, 2, 2), RATE, "2 frames are too few"),
         ("correlation", (20, 2, 2), 0.0, "rate of 0.0 Hz"),
     ],
 )
@@ -202,12 +194,8 @@ def test_exploring_stops_when_the_posterior_is_sure():
     """.6, then .6 * .6 over the sum (.69), then .77: two sweeps for .65, three for .7, all of them
     for .99."""
     log_p = np.log(np.array([[0.6, 0.4]] * 3))
-    assert [explore(log_p, sure) for sure in (0.55, 0.65, 0.7, 0.99)] == [
-        (0, 1),
-        (0, 2),
-        (0, 3),
-        (0, 3),
-    ]
+    found = [explore(log_p, sure) for sure in (0.55, 0.65, 0.7, 0.99)]
+    assert found == [(0, 1), (0, 2), (0, 3), (0, 3)]
 
 
 def test_later_sweeps_correct_the_first():

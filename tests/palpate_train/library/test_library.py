@@ -45,7 +45,7 @@ def test_scikit_learn_accepts_it(fitted: PalpateClassifier):
         estimator_checks.check_estimator_repr,
     ):
         check("PalpateClassifier", PalpateClassifier())
-    with pytest.warns(UserWarning, match="Can't test estimator PalpateClassifier"):
+    with pytest.warns(UserWarning, match="Can't test estimator"):
         estimator_checks.check_estimator(PalpateClassifier())
     copy = clone(fitted)
     assert copy.get_params() == fitted.get_params()
@@ -96,9 +96,9 @@ def test_a_bundle_answers_with_the_boxs_code(fitted: PalpateClassifier, tmp_path
     ):
         if verdict.label:
             assert found.max() == pytest.approx(verdict.probability)
-    with pytest.raises(FormatError, match="the bundle takes 2x2 uint8 at 100 Hz, window 100"):
+    with pytest.raises(FormatError, match="takes 2x2 uint8"):
         box.predict(SWEEPS[36:, :, :50])
-    with pytest.raises(FormatError, match="X holds float32, and the bundle takes uint8"):
+    with pytest.raises(FormatError, match="X holds float32, and the"):
         box.predict(SWEEPS[36:] + 0.5)
 
 
@@ -128,11 +128,11 @@ def test_counts_are_the_same_however_they_lie_in_memory(fitted: PalpateClassifie
 @pytest.mark.parametrize(
     ("x", "y", "why"),
     [
-        (np.zeros((4, 4)), LABELS[:4], r"X holds float64 \[4, 4\]; give numbers"),
-        (np.zeros((4, 3, 9)), LABELS[:4], "X has 3 channels, but the grid 2x2 has 4 places"),
-        (np.zeros((4, 4, 9)), LABELS[:3], r"y holds \[3\] values for 4 sweeps"),
+        (np.zeros((4, 4)), LABELS[:4], r"X holds float64 \[4, 4\]"),
+        (np.zeros((4, 3, 9)), LABELS[:4], "but the grid 2x2 has 4"),
+        (np.zeros((4, 4, 9)), LABELS[:3], r"holds \[3\] values for 4"),
         (np.zeros((4, 4, 9)), None, "y is missing"),
-        ([[[1, 2], [3]]], ["a"], "objects; give one array|inhomogeneous"),
+        ([[[1, 2], [3]]], ["a"], "objects|inhomogeneous"),
     ],
 )
 def test_what_cannot_be_fitted_is_named(x: object, y: object, why: str):

@@ -1,9 +1,7 @@
 """Evaluation protocols: a text such as "leave:position" says which sweeps train and which test.
 
-Each protocol is a splitter over the numbers of the sweeps that scikit-learn can use:
-split(X, y, groups) yields pairs (training, test); `groups` are the recordings. A splitter never
-puts parts of one recording on both sides. Nothing here imports scikit-learn, because a box that is
-taught does not have it.
+A protocol never puts parts of one recording on both sides. Nothing here imports scikit-learn,
+because a box that is taught does not have it.
 """
 
 from __future__ import annotations
@@ -29,37 +27,27 @@ LEAVE = re.compile(r"leave:(\w+)")
 SPLIT = re.compile(r"split:(\w+)=(.+?)->(.+)")
 
 
-class RandomFolds:
-    """Whole recordings divided into `folds` parts at random, materials in equal shares. The paper's
-    protocol, which overestimates accuracy."""
+def _random_folds(sweeps: Dataset, folds: int, seed: int) -> Iterator[Fold]:
+    """Whole recordings divided into `folds` parts at random, materials in equal shares: the paper's
+    protocol, which overestimates accuracy.
 
-    def __init__(self, folds: int, seed: int, materials: Sequence[str]) -> None:
-        self.folds, self.seed, self.materials = folds, seed, materials
-
-    def get_n_splits(self, X: Any = None, y: Any = None, groups: Any = None) -> int:
-        """The number of folds."""
-        return self.folds
-
-    def split(self, X: Any, y: Array, groups: Array) -> Iterator[Fold]:
-        """Pairs (training, test) of sweep numbers. y: labels [N]; groups: recordings [N].
-
-        Raises FormatError if a material has fewer recordings than there are folds.
-        """
-        for label in np.unique(y):
-            if (n := len(np.unique(groups[y == label]))) < 2:
-                raise FormatError(
-                    f"material {self.materials[label]!r} has one recording; "
-                    "record two of each or more, to test on one"
-                )
-            if n < self.folds:
-                raise FormatError(
-                    f"random:{self.folds} needs {self.folds} recordings of each material; "
-                    f"{self.materials[label]!r} has {n}: "
-                    f"use random:{n} or less"
-                )
-        fold = _spread_evenly(y, groups, self.folds, self.seed)
-        for k in range(self.folds):
-            yield np.flatnonzero(fold != k), np.flatnonzero(fold == k)
+    Raises FormatError if a material has fewer recordings than there are folds.
+    """
+    recordings, labels = sweeps.group("recording"), sweeps.labels
+    for label in np.unique(labels):
+        if (n := len(np.unique(recordings[labels == label]))) < 2:
+            raise FormatError(
+                f"material {sweeps.materials[label]!r} has one recording; "
+                "record two of each or more, to test on one"
+            )
+        if n < folds:
+            raise FormatError(
+                f"random:{folds} needs {folds} recordings of each material; "
+                f"{sweeps.materials[label]!r} has {n}: use random:{n} or less"
+            )
+    fold = _spread_evenly(labels, recordings, folds, seed)
+    for k in range(folds):
+        yield np.flatnonzero(fold != k), np.flatnonzero(fold == k)
 
 
 def _spread_evenly(labels: Array, groups: Array, folds: int, seed: int) -> Array:
@@ -96,63 +84,36 @@ def _spread_evenly(labels: Array, groups: Array, folds: int, seed: int) -> Array
     return dealt
 
 
-class LeaveOneGroupOut:
-    """Test on one value of the group `name` at a time and train on all others, as in
-    leave-one-position-out."""
-
-    def __init__(self, name: str, group: Array) -> None:
-        self.name, self.group = name, group
-
-    def get_n_splits(self, X: Any = None, y: Any = None, groups: Any = None) -> int:
-        """The number of values of the group."""
-        return len(np.unique(self.group))
-
-    def split(self, X: Any, y: Array, groups: Array) -> Iterator[Fold]:
-        """Pairs (training, test) of sweep numbers. Raises FormatError if the group has only one
-        value or cuts a recording in two."""
-        if (n := self.get_n_splits()) < 2:
-            raise FormatError(
-                f"leave:{self.name} needs two values of the group {self.name!r}; "
-                f"all sweeps have {text_of(self.group[0])} "
-                f"({n} value): choose another group"
-            )
-        for value in np.unique(self.group):
-            out = self.group == value
-            yield _checked(f"leave:{self.name}, {text_of(value)} left out", ~out, out, y, groups)
-
-
-class TrainTest:
-    """Train on some values of the group `name` and test on others, such as T-REAL and T-HARD, or
-    the first and the last block."""
-
-    def __init__(self, name: str, group: Array, train: Sequence[Any], test: Sequence[Any]) -> None:
-        self.name, self.group, self.train, self.test = name, group, tuple(train), tuple(test)
-
-    def get_n_splits(self, X: Any = None, y: Any = None, groups: Any = None) -> int:
-        """There is one fold."""
-        return 1
-
-    def split(self, X: Any, y: Array, groups: Array) -> Iterator[Fold]:
-        """The pair (training, test) of sweep numbers. Raises FormatError if a value is unknown or
-        on both sides."""
-        present = np.unique(self.group)
-        for value in (*self.train, *self.test):
-            if value not in present:
-                raise FormatError(
-                    f"group {self.name!r} has no {text_of(value)}; "
-                    f"it has {', '.join(map(text_of, present[:20]))}"
-                )
-        if both := set(self.train) & set(self.test):
-            raise FormatError(
-                f"{self.name}={text_of(min(both))} is on both sides of the split; name it once"
-            )
-        yield _checked(
-            f"split:{self.name}",
-            np.isin(self.group, self.train),
-            np.isin(self.group, self.test),
-            y,
-            groups,
+def _leave_one_out(sweeps: Dataset, name: str) -> Iterator[Fold]:
+    """Test on one value of the group `name` at a time and train on all others. Raises FormatError
+    if the group has only one value or cuts a recording in two."""
+    group = sweeps.group(name)
+    if len(values := np.unique(group)) < 2:
+        raise FormatError(
+            f"leave:{name} needs two values of the group {name!r}; "
+            f"all sweeps have {text_of(group[0])}: choose another group"
         )
+    for value in values:
+        out = group == value
+        yield _checked(f"leave:{name}, {text_of(value)} left out", ~out, out, sweeps)
+
+
+def _train_test(sweeps: Dataset, name: str, train: list[Any], test: list[Any]) -> Fold:
+    """Train on some values of the group `name` and test on others, such as T-REAL and T-HARD.
+    Raises FormatError if a value is unknown or on both sides."""
+    group = sweeps.group(name)
+    present = np.unique(group)
+    for value in (*train, *test):
+        if value not in present:
+            raise FormatError(
+                f"group {name!r} has no {text_of(value)}; "
+                f"it has {', '.join(map(text_of, present[:20]))}"
+            )
+    if both := set(train) & set(test):
+        raise FormatError(
+            f"{name}={text_of(min(both))} is on both sides of the split; name it once"
+        )
+    return _checked(f"split:{name}", np.isin(group, train), np.isin(group, test), sweeps)
 
 
 @dataclass(frozen=True)
@@ -167,13 +128,14 @@ class Protocol:
         if (found := RANDOM.fullmatch(self.text)) and int(found[1]) < 2:
             raise FormatError(f"protocol {self.text!r} has too few folds; use random:2 or more")
 
-    def splitter(self, sweeps: Dataset, seed: int) -> RandomFolds | LeaveOneGroupOut | TrainTest:
-        """The splitter for `sweeps`. seed: for random folds. Raises FormatError for an
-        unknown group."""
+    def folds(self, sweeps: Dataset, seed: int) -> list[Fold]:
+        """All pairs (training, test) of sweep numbers. seed: for random folds. Raises FormatError
+        if the protocol cannot split `sweeps`."""
+        sweeps.require_materials().require_pure_recordings()
         if found := RANDOM.fullmatch(self.text):
-            return RandomFolds(int(found[1]), seed, sweeps.materials)
+            return list(_random_folds(sweeps, int(found[1]), seed))
         if found := LEAVE.fullmatch(self.text):
-            return LeaveOneGroupOut(found[1], sweeps.group(found[1]))
+            return list(_leave_one_out(sweeps, found[1]))
         found = SPLIT.fullmatch(self.text)
         assert found
         name, *sides = found.groups()
@@ -181,17 +143,7 @@ class Protocol:
             train, test = (sweeps.listed(name, side) for side in sides)
         except FormatError as e:
             raise FormatError(f"protocol {self.text!r} cannot be read; {e}") from None
-        return TrainTest(name, sweeps.group(name), train, test)
-
-    def folds(self, sweeps: Dataset, seed: int) -> list[Fold]:
-        """All pairs (training, test) of sweep numbers. Raises FormatError if the protocol cannot
-        split `sweeps`."""
-        sweeps.require_materials().require_pure_recordings()
-        return list(
-            self.splitter(sweeps, seed).split(
-                sweeps.samples, sweeps.labels, sweeps.group("recording")
-            )
-        )
+        return [_train_test(sweeps, name, train, test)]
 
     def left_out(self, sweeps: Dataset, test: Array) -> dict[str, list[Any]]:
         """The values that the tested sweeps have of the group that the protocol leaves out; {} for
@@ -223,16 +175,16 @@ def draw(train: Array, labels: Array, each: int, seed: int) -> Array:
     )
 
 
-def _checked(what: str, train: Array, test: Array, labels: Array, recordings: Array) -> Fold:
+def _checked(what: str, train: Array, test: Array, sweeps: Dataset) -> Fold:
     """The masks as numbers. Raises FormatError if both sides share a recording or there is too
     little to train on."""
+    recordings = sweeps.group("recording")
     if shared := set(recordings[train].tolist()) & set(recordings[test].tolist()):
         raise FormatError(
-            f"{what}: {len(shared)} recordings, {min(shared)} among them, "
-            "would be trained on and tested on; "
-            "choose a group that does not cut recordings"
+            f"{what}: {len(shared)} recordings, {min(shared)} among them, would be trained on and "
+            "tested on; choose a group that does not cut recordings"
         )
-    if len(np.unique(labels[train])) < 2:
+    if len(np.unique(sweeps.labels[train])) < 2:
         raise FormatError(
             f"{what}: {train.sum()} sweeps of fewer than two materials are left to train on"
         )

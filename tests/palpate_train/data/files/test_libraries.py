@@ -33,7 +33,7 @@ def test_a_missing_library_is_named_with_its_extra(
     """The message says which format it is and what to install."""
     monkeypatch.setitem(sys.modules, module, None)
     (tmp_path / name).write_bytes(b"")
-    with pytest.raises(FormatError, match=r"is a.*; to read it: pip install .*train\[files\]"):
+    with pytest.raises(FormatError, match="to read it: pip install"):
         raw_files.read(tmp_path / name)
 
 
@@ -64,7 +64,7 @@ def test_a_spreadsheet_is_read_as_a_text(tmp_path: Path):
     np.testing.assert_allclose(found.values[:, 0], TIMES)
     assert found.texts[1][0] == "wood"
     path = book(tmp_path / "b.xlsx", {"one": ROWS, "two": ROWS})
-    with pytest.raises(FormatError, match="holds 2 sheets of frames, one, two; name one with"):
+    with pytest.raises(FormatError, match="2 sheets of frames, one,"):
         raw_files.read(path)
     np.testing.assert_array_equal(raw_files.read(path, ReadPlan("two")).values[:, 2:], SKIN)
 
@@ -142,13 +142,10 @@ def test_a_list_column_that_changes_its_length_is_a_fault(tmp_path: Path):
 def test_tdms_is_read(tmp_path: Path):
     """Channels of a group are columns; their interval gives the times; groups are named."""
     nptdms = pytest.importorskip("nptdms")
+    step = {"wf_increment": 0.1}
     with nptdms.TdmsWriter(tmp_path / "a.tdms") as writer:
-        writer.write_segment(
-            [
-                nptdms.ChannelObject("skin", name, SKIN[:, k], {"wf_increment": 0.1})
-                for k, name in enumerate("abcd")
-            ]
-        )
+        channels = [nptdms.ChannelObject("skin", c, SKIN[:, k], step) for k, c in enumerate("abcd")]
+        writer.write_segment(channels)
     found = raw_files.read(tmp_path / "a.tdms")
     assert found.columns == tuple("abcd")
     np.testing.assert_array_equal(found.values, SKIN)
@@ -156,7 +153,7 @@ def test_tdms_is_read(tmp_path: Path):
     with nptdms.TdmsWriter(tmp_path / "b.tdms") as writer:
         for group in ("one", "two"):
             writer.write_segment([nptdms.ChannelObject(group, "a", SKIN[:, 0])])
-    with pytest.raises(FormatError, match="holds 2 groups with numbers, one, two; name one"):
+    with pytest.raises(FormatError, match="2 groups with numbers,"):
         raw_files.read(tmp_path / "b.tdms")
 
 
@@ -176,34 +173,25 @@ def bag(path: Path, kind: str, messages: str = "sensor_msgs/msg/Image") -> Path:
         plugin = rosbags.StoragePlugin.MCAP if kind == "mcap" else rosbags.StoragePlugin.SQLITE3
         writer = rosbags.Writer(path, version=9, storage_plugin=plugin)
     write = store.serialize_ros1 if ros1 else store.serialize_cdr
+    names = {"/skin": messages, "/note": "std_msgs/msg/String", "/camera": "sensor_msgs/msg/Image"}
+    image = types["sensor_msgs/msg/Image"]
     with writer:
-        topics = {
-            "/skin": messages,
-            "/note": "std_msgs/msg/String",
-            "/camera": "sensor_msgs/msg/Image",
-        }
-        made = {t: writer.add_connection(t, m, typestore=store) for t, m in topics.items()}
+        made = {t: writer.add_connection(t, m, typestore=store) for t, m in names.items()}
         for k, row in enumerate(SKIN):
             stamp = time(sec=5 + k // 10, nanosec=k % 10 * 10**8)
-            extra = {"seq": k} if ros1 else {}
-            head = header(stamp=stamp, frame_id="skin", **extra)
-            image = types["sensor_msgs/msg/Image"]
+            head = header(stamp=stamp, frame_id="skin", **({"seq": k} if ros1 else {}))
             if messages.endswith("Image"):
-                padded = np.concatenate(
-                    [row.reshape(2, 2).view(np.uint8), np.full((2, 4), 77, np.uint8)], axis=1
-                )
+                padding = np.full((2, 4), 77, np.uint8)
+                padded = np.concatenate([row.reshape(2, 2).view(np.uint8), padding], axis=1)
                 one = image(head, 2, 2, "mono16", 0, 8, padded.ravel())
             else:
                 layout = types["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
                 one = types[messages](layout=layout, data=row.astype(np.float32))
-            writer.write(made["/skin"], k * 10**8 + 10**9, write(one, messages))
-            text = types["std_msgs/msg/String"]("here")
-            writer.write(made["/note"], k * 10**8 + 10**9, write(text, "std_msgs/msg/String"))
-            picture = image(head, 400, 640, "rgb8", 0, 1920, np.zeros(768000, np.uint8))
+            sent = {"/skin": one, "/note": types["std_msgs/msg/String"]("here")}
             if k < 2:
-                writer.write(
-                    made["/camera"], k * 10**8 + 10**9, write(picture, "sensor_msgs/msg/Image")
-                )
+                sent["/camera"] = image(head, 400, 640, "rgb8", 0, 1920, np.zeros(768000, np.uint8))
+            for topic, message in sent.items():
+                writer.write(made[topic], k * 10**8 + 10**9, write(message, names[topic]))
     return path
 
 
@@ -221,7 +209,7 @@ def test_recordings_of_ros_are_read(tmp_path: Path, kind: str, messages: str):
     np.testing.assert_allclose(found.vectors["received"], TIMES)
     if messages.endswith("Image"):
         np.testing.assert_allclose(found.vectors["time"], TIMES, atol=1e-6)
-    with pytest.raises(FormatError, match=r"has no topic 'skin'; it holds /skin \(.*/note"):
+    with pytest.raises(FormatError, match="has no topic 'skin'"):
         raw_files.read(path, ReadPlan("skin"))
     moved = path.rename(tmp_path / f"moved{path.suffix}")
     if kind == "db3":
