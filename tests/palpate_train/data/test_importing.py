@@ -96,16 +96,6 @@ def test_every_format_gives_the_same_sweeps(tmp_path: Path, suffix: str):
     assert sets.digest(sets.load(str(tmp_path / "set.npz"))) == sets.digest(s)
 
 
-def test_a_mat_file_of_version_7_3_has_its_axes_back(tmp_path: Path):
-    """MATLAB stores columns first; HDF5 shows the arrays as [taxels, frames]."""
-    for name in ("cork_1", "felt_1"):
-        with h5py.File(tmp_path / f"{name}.mat", "w") as file:
-            file["frames"] = COUNTS.T
-    np.testing.assert_array_equal(
-        taken(tmp_path).sweeps.samples[0], COUNTS[15:25].reshape(10, 2, 2)
-    )
-
-
 def test_columns_are_named_numbered_or_all_but_the_time(tmp_path: Path):
     """By name, by number from 1 on, by range, by a pattern; in the given order."""
     both(tmp_path, lambda path: write(path, COUNTS, 100.0))
@@ -316,22 +306,6 @@ def test_times_that_cannot_be_are_named(tmp_path: Path, times: np.ndarray, why: 
     ((name, said),) = reasons(tmp_path, time="time:ms", rate_hz=None).items()
     assert name == "felt_2.csv"
     assert why in said
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"rate_hz": None}, "--rate HZ, or --time"),
-        ({"time": "t"}, "--time t names no unit"),
-        ({"grid": "4"}, "--grid 4 cannot be read"),
-        ({"dtype": "int8"}, "--dtype int8 is unknown"),
-    ],
-)
-def test_an_option_that_cannot_be_read_is_named(changes: dict, message: str):
-    """Before any file is read."""
-    with pytest.raises(FormatError) as e:
-        plan(**changes)
-    assert message in str(e.value)
 
 
 @pytest.mark.parametrize("length", ["", "0s", "-1s", "2 s", "0", "x"])

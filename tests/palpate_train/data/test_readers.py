@@ -355,13 +355,6 @@ def test_speed_and_force_are_groups_if_all_have_them(tmp_path: Path):
     assert s.source == f"{tmp_path} (1 of 4 have force_n: no group force)"
 
 
-def test_recordings_without_places_have_no_such_groups(tmp_path: Path):
-    """Without names, the recording is the only group."""
-    for i in range(4):
-        record(tmp_path / f"{i}.npy", "ab"[i % 2])
-    assert list(sets.load(str(tmp_path)).groups) == ["recording"]
-
-
 @pytest.mark.parametrize(
     ("more", "message"),
     [

@@ -20,6 +20,31 @@ from palpate_train.data.importing import Imported, LeftOut, Taken, import_folder
 SHOWN = 5
 """Largest number of files with a line each that were left out for the same reason."""
 
+OPTIONS = {
+    "--grid": ("ROWSxCOLUMNS[xAXES]", "how the columns lie: 4x4, 5x3x3"),
+    "--columns": (
+        "COLUMNS",
+        "columns of the taxels, in the grid's order: 2-17, s0,s1, s* (all but the time)",
+    ),
+    "--variable": (
+        "NAME",
+        "the array to read if a file holds several; with a pattern, each that matches is a "
+        "recording: '{material}_{trial:d}'",
+    ),
+    "--axes": ("AXES", "the axes of an array in their order: row,column,frame"),
+    "--decimal": ("SIGN", "the decimal sign of texts, . or ,"),
+    "--dtype": (
+        "TYPE",
+        f"type of the counts: {', '.join(DATA_TYPES)} (as recorded, else the first that holds all)",
+    ),
+    "--time": ("COLUMN:UNIT", "column of the sampling times, in s, ms, us or ns: t:ms, 1:s"),
+    "--every": (
+        "LENGTH",
+        "cut windows from the start on, one each LENGTH (the middle window alone)",
+    ),
+}
+"""Options that are texts, "" without them."""
+
 
 def register(add: Add) -> None:
     """Add the command import."""
@@ -45,56 +70,9 @@ def register(add: Add) -> None:
     command.add_argument(
         "--report", type=Path, metavar="FILE", help="a line for each file, imported or not"
     )
-    _add_layout(command)
-    _add_windows(command)
-    options.add_rename(command)
-
-
-def _add_layout(command: argparse.ArgumentParser) -> None:
-    """Options that say where the counts stand in a file."""
-    command.add_argument(
-        "--grid", default="", metavar="ROWSxCOLUMNS[xAXES]", help="how the columns lie: 4x4, 5x3x3"
-    )
-    command.add_argument(
-        "--columns",
-        default="",
-        metavar="COLUMNS",
-        help="columns of the taxels, in the grid's order: 2-17, s0,s1, s* (all but the time)",
-    )
-    command.add_argument(
-        "--variable",
-        default="",
-        metavar="NAME",
-        help="the array to read if a file holds several; with a pattern, each that matches is a "
-        "recording: '{material}_{trial:d}'",
-    )
-    command.add_argument(
-        "--axes",
-        default="",
-        metavar="AXES",
-        help="the axes of an array in their order: row,column,frame",
-    )
-    command.add_argument(
-        "--decimal", default="", metavar="SIGN", help="the decimal sign of texts, . or ,"
-    )
     command.add_argument("--transpose", action="store_true", help="arrays are taxels x frames")
-    command.add_argument(
-        "--dtype",
-        default="",
-        metavar="TYPE",
-        help=f"type of the counts: {', '.join(DATA_TYPES)} "
-        "(as recorded, else the first that holds all)",
-    )
-
-
-def _add_windows(command: argparse.ArgumentParser) -> None:
-    """Options that say when frames were recorded and which become sweeps."""
-    command.add_argument(
-        "--time",
-        default="",
-        metavar="COLUMN:UNIT",
-        help="column of the sampling times, in s, ms, us or ns: t:ms, 1:s",
-    )
+    for option, (metavar, text) in OPTIONS.items():
+        command.add_argument(option, default="", metavar=metavar, help=text)
     command.add_argument(
         "--rate", type=numbers.above_zero("--rate"), metavar="HZ", help="frames per second"
     )
@@ -104,11 +82,7 @@ def _add_windows(command: argparse.ArgumentParser) -> None:
         metavar="LENGTH",
         help="length of a sweep: 2s, 500ms or 1500 frames (2s)",
     )
-    command.add_argument(
-        "--every",
-        metavar="LENGTH",
-        help="cut windows from the start on, one each LENGTH (the middle window alone)",
-    )
+    options.add_rename(command)
 
 
 def run(args: argparse.Namespace) -> None:
