@@ -165,14 +165,7 @@ def pages() -> Iterator[str]:
 
 def training_commands() -> str:
     """The reference of `palpate-train`."""
-    parts = []
-    for heading, commands in PROGRAM.groups.items():
-        parts.append(f"## {heading[:1].upper()}{heading[1:]}\n")
-        parts += [
-            manual.command_sections(list(manual.leaves(PROGRAM.parser(name))), "###")
-            for name in commands
-        ]
-    return "\n".join(parts)
+    return manual.command_sections(list(manual.leaves(PROGRAM.parser(*PROGRAM.commands))), "##")
 
 
 def library() -> str:

@@ -63,7 +63,7 @@ def test_files_name_campaigns_and_studies_that_exist():
     """The same for campaigns and studies."""
     names = set(campaigns.CAMPAIGNS)
     assert unknown(r"(?:-m tests\.campaigns|\$campaign) ([a-z][a-z-]*)", names) == []
-    studies = {*PROGRAM.descriptions()}
+    studies = {*PROGRAM.commands}
     assert unknown(r"(?:-m palpate_studies|\$study) ([a-z][a-z-]*)", studies) == []
 
 

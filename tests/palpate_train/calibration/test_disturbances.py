@@ -10,7 +10,7 @@ from numpy.random import Generator
 
 from palpate.core.types import SweepFormat
 from palpate_train.calibration.disturbances import DisturbanceMeter, Judge, fit
-from palpate_train.calibration.nuisances import AlteredSweeps
+from palpate_train.calibration.widened_shapes import DisturbedSweeps
 
 MEANS = np.array([[0.0, 0, 0, 0], [12, 0, 0, 0], [0, 12, 0, 0]])
 CHANGE = np.array([[0.0, 0, 0, 60], [0, 0, 0, 30], [0, 0, 0, 60]])
@@ -18,7 +18,9 @@ CHANGE = np.array([[0.0, 0, 0, 60], [0, 0, 0, 30], [0, 0, 0, 60]])
 MOST = 0.2
 
 
-def sweeps(rng: Generator, each: int = 80, kind: str = "lost", worst: float = 0.0) -> AlteredSweeps:
+def sweeps(
+    rng: Generator, each: int = 80, kind: str = "lost", worst: float = 0.0
+) -> DisturbedSweeps:
     """Sweeps of covariance 1 and copies with rising severity, which move by CHANGE. worst: the
     last third moves towards another material by this much more."""
     labels = np.repeat(np.arange(3), each)
@@ -28,10 +30,10 @@ def sweeps(rng: Generator, each: int = 80, kind: str = "lost", worst: float = 0.
     moved = z[source] + size[:, None] * CHANGE[labels[source]]
     moved[2 * len(z) // 3 :, :2] += worst
     values = size, np.zeros(len(z))
-    return AlteredSweeps(z, labels, {kind: (moved, source)}, {kind: values})
+    return DisturbedSweeps(z, labels, {kind: (moved, source)}, {kind: values})
 
 
-def judge(altered: AlteredSweeps) -> Judge:
+def judge(altered: DisturbedSweeps) -> Judge:
     return Judge(altered, MEANS, np.stack([np.eye(4)] * 3), 14.0)
 
 
@@ -98,7 +100,7 @@ def test_nothing_is_allowed_for_what_was_not_measured(rng: Generator):
 def test_changes_that_do_not_help_are_left_out(rng: Generator):
     """The copies move in random directions, so the means stay and the limit grows."""
 
-    def jittered(seed: int) -> AlteredSweeps:
+    def jittered(seed: int) -> DisturbedSweeps:
         given = sweeps(np.random.default_rng(seed))
         z, source = given.copies["lost"]
         size = given.disturbed["lost"][0]

@@ -14,7 +14,7 @@ import pytest
 
 from palpate_train.arguments import options
 from palpate_train.calibration import level_check
-from palpate_train.cli.main import main, parser
+from palpate_train.cli.main import PROGRAM, main
 from palpate_train.data.sets import Dataset
 from tests.factories.recordings import record
 
@@ -228,8 +228,8 @@ def test_the_commands_print_the_line(tmp_path: Path, capsys: pytest.CaptureFixtu
     described = capsys.readouterr().out.splitlines()
     assert len([line for line in described if SESSIONS.fullmatch(line.strip())]) == 2
     words = ["fit", "--seed", "1", "--set", str(file), "--out", str(tmp_path / "fit.npz")]
-    options.load(parser("fit").parse_args(words))
+    options.load(PROGRAM.parser("fit").parse_args(words))
     check_sessions([capsys.readouterr().err.removeprefix("palpate-train: ").strip()])
-    options.load(parser("fit").parse_args([*words, "--only", "session=1"]))
+    options.load(PROGRAM.parser("fit").parse_args([*words, "--only", "session=1"]))
     alone = f"palpate-train: warning: recorded in one session: {ALONE}\n"
     assert capsys.readouterr().err == alone

@@ -7,7 +7,6 @@ import re
 import subprocess
 import sys
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -156,22 +155,24 @@ def test_a_reader_that_closes_the_pipe_ends_the_command_quietly():
             "written to /proc/none/b",
         ),
         (
+            ["fit", "--set", "none", "--seed", "1", "--out", "b.npz", "--method", "magic"],
+            "method 'magic' is unknown; use some of ",
+        ),
+        (
             [
-                "pack",
+                "fit",
                 "--set",
                 "none",
-                "--method",
-                "H-svm",
                 "--seed",
                 "1",
                 "--out",
-                "/proc/none/b",
-                "--name",
-                "b",
-                "--version",
-                "1",
+                "b.npz",
+                "--method",
+                "H-svm",
+                "--size",
+                "bands",
             ],
-            "written to /proc/none/b",
+            "--size is of our recipe",
         ),
         (
             ["score", "none", "--set", "none.npz", "--json", "/proc/none/x.json"],
@@ -204,6 +205,10 @@ def test_a_reader_that_closes_the_pipe_ends_the_command_quietly():
                 "0",
             ],
             "--effort 0 is out of",
+        ),
+        (
+            ["evaluate", "--set", "none", "--protocol", "random:2", "--method", "magic"],
+            "method 'magic' is unknown; use some of ",
         ),
     ],
 )
@@ -265,19 +270,21 @@ def test_more_labels_than_the_boards_wire_are_told_with_the_bundle(
     assert (line in capsys.readouterr().out) == told
 
 
-def test_each_command_is_found_in_the_module_that_registers_it():
-    """One command needs the imports of one module; `palpate-train --help` shows all commands."""
-    for group, names in PROGRAM.modules.items():
-        assert registered_by(group) == sorted(names)
-
-
-def registered_by(group: str) -> list[str]:
-    """The commands that a module of palpate_train.cli registers."""
-    commands = argparse.ArgumentParser().add_subparsers()
-    import_module(f"palpate_train.cli.{group}").register(
-        lambda name, run: commands.add_parser(name)
-    )
-    return sorted(commands.choices)
+def test_each_command_has_options_of_its_own(capsys: pytest.CaptureFixture[str]):
+    """Help lists all commands without their imports; each has its parser and its function. A word
+    that is no command is refused."""
+    parser = PROGRAM.parser(*PROGRAM.commands)
+    (commands,) = (a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
+    assert {*commands.choices} == {*PROGRAM.commands}
+    assert len(PROGRAM.commands) == 9
+    assert all(one.get_default("run") for one in commands.choices.values())
+    for words, code in (([], 0), (["widen", "b"], 2)):
+        with pytest.raises(SystemExit) as ended:
+            main(words)
+        assert ended.value.code == code
+    said = capsys.readouterr()
+    assert all(name in said.out for name in PROGRAM.commands)
+    assert "'widen'" in said.err
 
 
 def test_signing_does_without_the_imports_of_training():
@@ -392,23 +399,6 @@ def test_too_little_memory_is_one_line(
         "palpate-train: not enough memory: Unable to allocate 9.00 TiB; use fewer"
     )
     assert said.count("\n") == 1
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ("evaluate", "--protocol", "random:2"),
-        ("pack", "--seed", "1", "--name", "a", "--version", "1", "--out", "b"),
-    ],
-)
-def test_an_unknown_method_is_refused_before_sets_are_read(
-    words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
-):
-    """Its name and the known ones are in the message; the set, which is not there, is not."""
-    assert main([*words, "--set", "nowhere.npz", "--method", "magic"]) != 0
-    said = capsys.readouterr().err
-    assert "method 'magic' is unknown; use some of " in said
-    assert "nowhere" not in said
 
 
 @pytest.mark.slow

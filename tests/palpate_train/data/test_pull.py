@@ -21,7 +21,7 @@ import pytest
 
 from palpate.core.errors import ApplianceError, FormatError
 from palpate.core.types import Status, load
-from palpate_train.cli.main import parser
+from palpate_train.cli.main import PROGRAM
 from palpate_train.data import pull
 from palpate_train.data.pull import PullReport, RecordingHost
 from tests.factories.recordings import record
@@ -56,7 +56,7 @@ class Ground:
 
     def pull(self, *more: str) -> None:
         """Run the command."""
-        args = parser("pull").parse_args(
+        args = PROGRAM.parser("pull").parse_args(
             ["pull", "user@box", "--from", str(self.box), "--out", str(self.here), *more]
         )
         args.run(args)

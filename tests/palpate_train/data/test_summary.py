@@ -13,7 +13,7 @@ import pytest
 
 from palpate.core.errors import FormatError
 from palpate.core.types import Status
-from palpate_train.cli.main import parser
+from palpate_train.cli.main import PROGRAM
 from palpate_train.data import sets, summary
 from tests.factories.recordings import record
 from tests.factories.sweep_sets import easy, write
@@ -21,7 +21,7 @@ from tests.factories.sweep_sets import easy, write
 
 def command(*words: str) -> None:
     """The command `sets`."""
-    args = parser("sets").parse_args(["sets", *words])
+    args = PROGRAM.parser("sets").parse_args(["sets", *words])
     args.run(args)
 
 

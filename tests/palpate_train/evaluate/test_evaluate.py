@@ -17,8 +17,8 @@ from palpate_train.cli.main import main
 from palpate_train.data.sets import Dataset
 from palpate_train.evaluate import evaluate, fold
 from palpate_train.evaluate.evaluate import Plan, Where
-from palpate_train.export import pack
 from palpate_train.models import methods
+from palpate_train.models.method_fit import MethodFit
 from tests.factories.sweep_sets import tones
 
 KEYS = {
@@ -489,7 +489,7 @@ def test_a_model_without_a_graph_is_timed_in_its_library(monkeypatch: pytest.Mon
     with pytest.raises(
         FormatError, match="method 'alone' runs in its library alone and has no graph"
     ):
-        pack.trained(alone, tones(), 1)
+        MethodFit.of(alone, tones(), 1)
 
 
 def test_a_point_of_a_learning_curve_is_trained_on_so_many(monkeypatch: pytest.MonkeyPatch):

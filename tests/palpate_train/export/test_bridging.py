@@ -3,7 +3,6 @@ box."""
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,11 +12,10 @@ import pytest
 
 from palpate.bundle import bundle
 from palpate.core.clock import SystemClock
-from palpate.core.errors import BundleError, FormatError
+from palpate.core.errors import BundleError
 from palpate.core.types import Status
 from palpate.inference.classifier import Classifier
 from palpate.signal.broken_taxels import bridged
-from palpate_train.cli.main import main
 from palpate_train.data import sets
 from palpate_train.data.sets import Dataset
 from palpate_train.evaluate.corruptions import dead
@@ -173,47 +171,6 @@ def test_the_packaged_bundle_bridges_what_its_manifest_says():
         name = f"silent taxel {place // 4 + 1}.{place % 4 + 1}"
         assert {verdict.degraded for verdict in verdicts} == {name}
         assert sum(verdict.status is Status.OK for verdict in verdicts) >= 11
-
-
-def test_the_command_writes_the_figure_and_nothing_else(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
-    """`palpate-train bridge` changes the manifest of a bundle; its model and its other entries stay
-    as they are."""
-    folder, sweeps = toy(tmp_path), tmp_path / "set.npz"
-    windows("a", "b").save(sweeps)
-    before = {file.name: file.read_bytes() for file in folder.iterdir()}
-    assert main(["bridge", str(folder), "--set", str(sweeps)]) == 0
-    after = {file.name: file.read_bytes() for file in folder.iterdir()}
-    assert {name for name in after if after[name] != before.get(name)} == {bundle.MANIFEST}
-    was, now = (json.loads(files[bundle.MANIFEST]) for files in (before, after))
-    assert now.pop("bridging")["taxels"] == 0
-    assert now["figures"].pop(bridging.FIGURES)["set"] == "set.npz"
-    assert now == was
-    said = capsys.readouterr().out
-    assert "broken taxels: no broken taxel bridged" in said
-    assert "1 taxel (taxel " in said
-    assert bundle.load(folder).id in said
-
-
-@pytest.mark.parametrize(
-    ("spoil", "why"),
-    [
-        (lambda folder: (folder / bundle.SIGNATURE).write_bytes(b"x"), "before it is signed"),
-        (lambda folder: None, "does not fit"),
-    ],
-)
-def test_what_cannot_be_measured_is_refused(tmp_path: Path, spoil, why: str):
-    """A signed bundle, and sweeps of another kind; the manifest stays as it was."""
-    folder = toy(tmp_path)
-    spoil(folder)
-    before = (folder / bundle.MANIFEST).read_bytes()
-    sweeps = windows("a")
-    if why == "does not fit":
-        sweeps = replace(sweeps, materials=("steel",))
-    with pytest.raises(FormatError, match=why):
-        bridging.write(folder, sweeps)
-    assert (folder / bundle.MANIFEST).read_bytes() == before
 
 
 def test_a_bundle_without_the_figure_says_so(tmp_path: Path):

@@ -15,8 +15,10 @@ from palpate.core.clock import SystemClock
 from palpate.core.errors import BundleError, FormatError
 from palpate.inference.classifier import Classifier, softmax
 from palpate_train.cli.main import main
+from palpate_train.data.sets import Dataset
 from palpate_train.export import bundle_score, pack
 from palpate_train.models import methods
+from palpate_train.models.method_fit import MethodFit
 from tests.factories.costly import quick_first
 from tests.factories.sweep_sets import tones
 
@@ -27,11 +29,16 @@ METHODS = methods.every(HARDLY)
 ON_THE_BOX = [name for name, method in METHODS.items() if method.runs_on_the_box]
 
 
+def trained(name: str, sweeps: Dataset) -> pack.Content:
+    """The content of a bundle of this method."""
+    return pack.content_of(MethodFit.of(METHODS[name], sweeps, 1)[1])
+
+
 @pytest.mark.parametrize("name", quick_first(ON_THE_BOX))
 def test_the_box_answers_as_the_desktop(name: str, tmp_path: Path):
     """The bundle passes its golden sweeps; each held-out sweep gets the label that the model
     gives."""
-    content = pack.trained(METHODS[name], tones(), 1)
+    content = trained(name, tones())
     manifest = pack.pack(content, tmp_path / "b", "any", "1", "0123abcd")
     assert manifest.input == METHODS[name].input
     assert manifest.made["method"] == name
@@ -55,33 +62,16 @@ def test_what_the_box_cannot_run_is_refused(name: str):
     if method.library:
         why = f"runs in {method.library} alone and has no graph"
     with pytest.raises(FormatError, match=f"'{name}' {why}"):
-        pack.trained(method, tones(), 1)
+        MethodFit.of(method, tones(), 1)
 
 
 def test_the_command_packs_what_the_box_plays(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """`palpate-train pack`, then `palpate check` and a demo with the bundle: features of the paper,
-    SVM in ONNX."""
-    folder = str(tmp_path / "h")
-    assert (
-        main(
-            [
-                "pack",
-                "--set",
-                "sim:T-LAB:1001:12",
-                "--method",
-                "H-svm",
-                "--seed",
-                "1",
-                "--out",
-                folder,
-                "--name",
-                "h",
-                "--version",
-                "2",
-            ]
-        )
-        == 0
-    )
+    """`fit --method` and `export`, then `palpate check` and a demo with the bundle: features of the
+    paper, SVM in ONNX."""
+    folder, fit = str(tmp_path / "h"), str(tmp_path / "h.npz")
+    given = ["--set", "sim:T-LAB:1001:12", "--seed", "1", "--out", fit]
+    assert main(["fit", "--method", "H-svm", *given]) == 0
+    assert main(["export", fit, "--out", folder, "--name", "h", "--version", "2"]) == 0
     assert "bundle: h 2," in capsys.readouterr().out
     manifest = bundle.load(tmp_path / "h").manifest
     assert manifest.input == "H"
@@ -96,7 +86,7 @@ def test_the_command_packs_what_the_box_plays(tmp_path: Path, capsys: pytest.Cap
 def test_golden_sweeps_are_rounded():
     """Steps are at most COARSEST usual changes. The file is smaller, its logits are those of the
     rounded sweeps, and their probabilities are near those of the exact ones."""
-    content = pack.trained(METHODS["L-gauss"], tones(), 1)
+    content = trained("L-gauss", tones())
     rng = np.random.default_rng(1)
     noisy = content.train.samples + rng.normal(0, 0.3, content.train.samples.shape)
     train = replace(content.train, samples=noisy.astype(np.float32))
@@ -136,7 +126,7 @@ def test_rounded_sweeps_keep_their_type(dtype: str):
 def test_a_method_that_never_names_a_material_is_no_bundle(tmp_path: Path):
     """It is refused, and nothing is left behind."""
     noise = tones(noise=0.0)
-    content = pack.trained(METHODS["L-gauss"], noise, 1)
+    content = trained("L-gauss", noise)
     content.train.samples[content.train.labels == 0] = 0
     with pytest.raises(
         BundleError,

@@ -16,7 +16,7 @@ from palpate_train.arguments import numbers
 from palpate_train.data import labels, readers, sets
 from palpate_train.data.progress import ProgressLine, StageLine, spoken
 from palpate_train.data.summary import warnings_of
-from palpate_train.evaluate import evaluate, traps
+from palpate_train.evaluate import evaluate, set_warnings
 from palpate_train.models import methods
 
 SET = (
@@ -153,14 +153,14 @@ def load(args: argparse.Namespace, seed: int = 1) -> sets.Dataset:
     sets without one.
 
     Warns of materials without sweeps, which are left out, of taxels that never change, and of the
-    traps of traps.of_set.
+    traps of set_warnings.of_set.
     """
     pairs = labels.parse_renames(args.rename)
     loaded = [sets.load(spec, seed) for spec in args.sets or [args.usual_set]]
     labels.check_renames(pairs, (name for sweeps in loaded for name in sweeps.materials))
     whole = sets.join([labels.renamed(sweeps, pairs) for sweeps in loaded])
     part = whole.select(args.only)
-    for line in [*warnings_of(part if args.only else whole), *traps.of_set(part)]:
+    for line in [*warnings_of(part if args.only else whole), *set_warnings.of_set(part)]:
         print(f"palpate-train: {line}", file=sys.stderr)
     return part
 

@@ -16,24 +16,24 @@ from palpate.signal import disturbances
 from palpate.signal.disturbances import TINY, Allowance
 from palpate.signal.hum import HumFilter
 from palpate.signal.slide import SlideMeter
-from palpate_train.calibration.nuisances import AlteredSweeps
+from palpate_train.calibration.widened_shapes import DisturbedSweeps
 
 Array = NDArray[Any]
 MADE_BY = {
     ("noise", 1): ("noise", "bits"),
-    ("load", -1): ("gain-down", "force-down"),
-    ("load", 1): ("gain-up", "force-up"),
-    ("speed", -1): ("stretch", "speed-down"),
-    ("speed", 1): ("shorten", "speed-up"),
+    ("load", -1): ("gain-down",),
+    ("load", 1): ("gain-up",),
+    ("speed", -1): ("stretch",),
+    ("speed", 1): ("shorten",),
     ("lost", 1): ("lost",),
     ("hum", 1): ("hum",),
 }
 """Disturbance and its sign, and the kinds of copies that have it."""
 OF_KIND = {kind: name for (name, _), kinds in MADE_BY.items() for kind in kinds}
-STRETCHED = {"stretch", "shorten"}
-"""Kinds of copies that stretch the counts in time. In them the vibrations of skin and finger change
-their frequency, too, which they do not at another speed. Such copies are harder than a real slide:
-the means must not follow them, and where they fail nothing is refused."""
+HARDER = "speed"
+"""The disturbance whose copies stretch the counts in time. In them the vibrations of skin and
+finger change their frequency, too, which they do not at another speed. Such copies are harder than
+a real slide: the means must not follow them, and where they fail nothing is refused."""
 OUTER = {"noise": 0.02, "load": 0.1, "speed": 0.02}
 """Share of the training sweeps beyond each edge. Loads spread widely, and a lower gain looks like
 a lower load; hum and lost frames begin at 0."""
@@ -103,7 +103,7 @@ class _Tried:
     moved: Array
 
     @classmethod
-    def of(cls, altered: AlteredSweeps, kinds: Sequence[str], sign: int, start: float) -> _Tried:
+    def of(cls, altered: DisturbedSweeps, kinds: Sequence[str], sign: int, start: float) -> _Tried:
         parts = []
         for kind in kinds:
             z, source = altered.copies[kind]
@@ -135,7 +135,7 @@ class Judge:
     """Judges allowances by copies that training has not seen. shapes: [K, r, r] of the class means
     [K, r]; limit: of known materials."""
 
-    altered: AlteredSweeps
+    altered: DisturbedSweeps
     means: Array
     shapes: Array
     limit: float
@@ -167,7 +167,7 @@ class Judge:
         return np.concatenate(kept)
 
 
-def fit(judge: Judge, *training: AlteredSweeps) -> AllowanceFit:
+def fit(judge: Judge, *training: DisturbedSweeps) -> AllowanceFit:
     """The allowances that `judge` finds, and the changes in the embedding of each of `training`:
     the same sweeps, first in the embedding of the judge."""
     found, changes, figures = [], [], {}
@@ -180,14 +180,13 @@ def fit(judge: Judge, *training: AlteredSweeps) -> AllowanceFit:
         copies = [_Tried.of(altered, made, sign, start) for altered in training]
         moved = [_changes(one.take(one.size <= end), len(judge.means)) for one in copies]
         still = [np.zeros_like(moved[0])] * len(moved)
-        stretched = bool(STRETCHED & set(made))
-        ways = (still,) if stretched else (moved, still)
+        ways = (still,) if name == HARDER else (moved, still)
         choices = [(_slope(judge, tried, of[0]), of) for of in ways]
         judged, moved = max(choices, key=lambda choice: choice[0].worth)
         slope, figures[f"{name}{'+' if sign > 0 else '-'}"] = judged.slope, judged.figures
         furthest = MARGIN * float(every.size.max())
         at = [round(start + sign * size, 4) for size in (0.0, end, furthest)]
-        further = at[2] if stretched and at[2] != at[1] else None
+        further = at[2] if name == HARDER and at[2] != at[1] else None
         found.append(Allowance(name, at[0], at[1], slope, further))
         changes.append(moved)
     none = np.zeros((0, *judge.means.shape))
@@ -197,7 +196,7 @@ def fit(judge: Judge, *training: AlteredSweeps) -> AllowanceFit:
     return AllowanceFit(tuple(found), stacked, figures)
 
 
-def unnoticed(training: AlteredSweeps, altered: AlteredSweeps) -> AlteredSweeps:
+def unnoticed(training: DisturbedSweeps, altered: DisturbedSweeps) -> DisturbedSweeps:
     """`altered` without the copies whose disturbance is beyond the edge of `training`. The box
     notices it and allows for it; other copies have to count as known without that."""
     copies = dict(altered.copies)
@@ -209,7 +208,7 @@ def unnoticed(training: AlteredSweeps, altered: AlteredSweeps) -> AlteredSweeps:
     return replace(altered, copies={kind: of for kind, of in copies.items() if len(of[1])})
 
 
-def _edges(training: AlteredSweeps) -> dict[tuple[str, int], tuple[float, list[str]]]:
+def _edges(training: DisturbedSweeps) -> dict[tuple[str, int], tuple[float, list[str]]]:
     """Where training ends, and the kinds of copies beyond it, by disturbance and sign."""
     edges = {}
     for (name, sign), kinds in MADE_BY.items():

@@ -11,9 +11,9 @@ from typing import Any
 from palpate.core.errors import FormatError
 from palpate.core.storage import put
 from palpate_train.arguments import options
-from palpate_train.arguments.types import Add
+from palpate_train.arguments.program import Add
 from palpate_train.data.sets import Dataset
-from palpate_train.evaluate import evaluate, traps, trivial
+from palpate_train.evaluate import evaluate, set_warnings, trivial
 from palpate_train.export import box_answers
 from palpate_train.models import methods
 
@@ -145,7 +145,7 @@ def _beside(sweeps: Dataset, plan: evaluate.Plan, log: options.Log) -> dict[str,
     known = sweeps.without_means() if plan.means_removed else sweeps
     folds = {text: plan.folds(sweeps, text, plan.seeds[0]) for text in plan.protocols}
     for text in plan.protocols:
-        for line in traps.of_protocol(sweeps, text, folds[text]):
+        for line in set_warnings.of_protocol(sweeps, text, folds[text]):
             log.keep(f"palpate-train: {line}")
     found = {text: trivial.figures(known, folds[text]) for text in plan.protocols}
     print(evaluate.HEADER)

@@ -14,8 +14,8 @@ from typing import Any
 from palpate.core.errors import FormatError
 from palpate.core.storage import put
 from palpate_train.arguments import numbers, options, scene_file
-from palpate_train.arguments.types import Add
-from palpate_train.data import labels
+from palpate_train.arguments.program import Add
+from palpate_train.data import extras, labels
 from palpate_train.data.sets import Dataset, digest
 from palpate_train.data.splitters import OF_THE_SET
 from palpate_train.data.transforms import WHOLE, Change
@@ -23,11 +23,13 @@ from palpate_train.evaluate import trivial
 from palpate_train.evaluate.evaluate import CACHE
 from palpate_train.evaluate.fold import fingerprint
 from palpate_train.metrics import score
+from palpate_train.models import methods
+from palpate_train.models.method_fit import MethodFit
 from palpate_train.models.methods import SkinUse
 from palpate_train.models.recipe import memory, recipe
 from palpate_train.models.recipe.fitted import Fit
 from palpate_train.models.recipe.sizes import SIZES, UNLIMITED
-from palpate_train.reports import formatting, selection_report
+from palpate_train.reports import formatting
 from palpate_train.selection import dial, reduction_curves
 from palpate_train.selection.dial import Budget, SizeWish
 
@@ -71,6 +73,12 @@ def register(add: Add) -> None:
         help="largest number of sweeps that the model is fitted to; of more, some of each "
         f"recording are drawn (default {MOST}); memory and time grow with it",
     )
+    command.add_argument(
+        "--method",
+        metavar="NAME",
+        help="train this method instead of our recipe; see palpate-train evaluate --list",
+    )
+    options.add_effort(command)
     _add_use(command)
     _add_dial(command)
 
@@ -173,6 +181,11 @@ def run(args: argparse.Namespace) -> None:
     sweeps, rest = labels.check(options.load(args, args.seed)), None
     if args.split:
         sweeps, rest = sweeps.split(*options.group_share(args.split), args.seed)
+    if args.method:
+        _fit_method(args, sweeps)
+        return
+    if args.steps and not extras.installed("torch"):
+        print(f"no trained stages, which need torch: {extras.advice('torch')}, or --steps 0")
     memory.check(sweeps, min(len(sweeps), args.most_sweeps))
     made, change, unfinished = _fitted(args, sweeps)
     if args.rest and rest:
@@ -195,6 +208,15 @@ def run(args: argparse.Namespace) -> None:
     print(_next_commands(args.out, [str(args.rest)] if args.rest and rest else args.sets))
 
 
+def _fit_method(args: argparse.Namespace, sweeps: Dataset) -> None:
+    """Train a method that is not our recipe, and save it for export."""
+    (method,) = methods.find([args.method], options.effort(args))
+    _, made = MethodFit.of(method, sweeps, args.seed)
+    made.save(args.out)
+    print(f"fit: {made.about['method']} to {len(made.train)} sweeps; {args.out}")
+    print(_next_commands(args.out, args.sets))
+
+
 def _next_commands(out: Path, judges: Sequence[str]) -> str:
     """The commands after a fit, as they can be pasted. judges: the sets to judge the bundle on."""
     folder = out.with_suffix("") if out.suffix else out.with_name(f"{out.name}-bundle")
@@ -212,6 +234,12 @@ def _check(args: argparse.Namespace) -> None:
     """Refuse options that do not go together, before hours of work. Raises FormatError."""
     if not args.sets:
         raise FormatError("no sweeps; name a set with --set, or with set in the file of --scene")
+    if args.method:
+        methods.find([args.method])
+        ours = ("rest", "split", "varies", "size", "budget_ms", "budget_kb", "accuracy", "reduce")
+        if given := [name for name in ours if getattr(args, name)]:
+            option = given[0].replace("_", "-")
+            raise FormatError(f"--{option} is of our recipe; leave it out with --method")
     if args.rest and not args.split:
         raise FormatError("--rest needs --split; without it nothing is left over")
     if args.slower and not args.budget_ms:
@@ -250,6 +278,8 @@ def _chosen(
 ) -> tuple[Fit, Change]:
     """The fit of the smallest size that suffices, on reduced sweeps if they suffice; writes the
     page with the reasons."""
+    with extras.needed_for("the page with the reasons for a size"):
+        from palpate_train.reports import selection_report
     log = options.Log()
     budget = Budget(args.budget_ms or math.inf, args.budget_kb or math.inf, args.slower or 1.0)
     sizes = (args.size,) if args.size else tuple(dial.FAMILY)

@@ -11,7 +11,7 @@ from palpate.core.errors import FormatError
 from palpate.core.storage import put
 from palpate.core.types import DATA_TYPES
 from palpate_train.arguments import numbers, options
-from palpate_train.arguments.types import Add
+from palpate_train.arguments.program import Add
 from palpate_train.data import labels, lerobot, summary
 from palpate_train.data.file_names import EXAMPLE, FIELD, GROUP, NamePattern
 from palpate_train.data.import_plan import ImportPlan, Length

@@ -12,11 +12,10 @@ from pathlib import Path
 from palpate.core.provenance import commit
 from palpate.core.storage import put
 from palpate_train.arguments import options
-from palpate_train.arguments.types import Add
-from palpate_train.data import sets
+from palpate_train.arguments.program import Add
+from palpate_train.data import extras, sets
 from palpate_train.export import quantized_bundle
 from palpate_train.models.recipe.fitted import Fit
-from palpate_train.reports import bundle_experiment, bundle_report, bundle_trainings
 
 
 def register(add: Add) -> None:
@@ -54,6 +53,8 @@ def run_report(args: argparse.Namespace) -> None:
     for option, *endings in (("out", ".html", ".htm"), ("json", ".json")):
         if path := getattr(args, option):
             options.writable_file(path, f"--{option}", *endings)
+    with extras.needed_for("a report"):
+        from palpate_train.reports import bundle_experiment, bundle_report, bundle_trainings
     sweeps, log = options.load(args), options.Log()
     train = sets.join([sets.load(spec, 1) for spec in args.train]) if args.train else None
     with tempfile.TemporaryDirectory() as folder:

@@ -9,10 +9,9 @@ from palpate.core import outputs
 from palpate.core.errors import FormatError
 from palpate.core.storage import put
 from palpate_train.arguments import numbers, options
-from palpate_train.arguments.types import Add
-from palpate_train.data import lerobot_writer, pull, sets, summary
-from palpate_train.evaluate import traps
-from palpate_train.reports import sweep_pages, sweep_plot
+from palpate_train.arguments.program import Add
+from palpate_train.data import extras, lerobot_writer, pull, sets, summary
+from palpate_train.evaluate import set_warnings
 
 
 def register(add: Add) -> None:
@@ -88,11 +87,13 @@ def run_known(args: argparse.Namespace) -> None:
 
 def run_describe(args: argparse.Namespace) -> None:
     """Print the content of the named sets."""
-    print("\n\n".join(summary.describe(spec, traps.of_set) for spec in args.sets))
+    print("\n\n".join(summary.describe(spec, set_warnings.of_set) for spec in args.sets))
 
 
 def run_view(args: argparse.Namespace) -> None:
     """Write the picture or the page and print its path."""
+    with extras.needed_for("a picture of sweeps"):
+        from palpate_train.reports import sweep_pages, sweep_plot
     kind, span = args.out.suffix.lower(), args.number
     if kind not in (".svg", ".html"):
         raise FormatError(

@@ -12,7 +12,7 @@ from palpate_train.arguments import numbers
 from palpate_train.export import sign
 
 if TYPE_CHECKING:
-    from palpate_train.arguments.types import Add
+    from palpate_train.arguments.program import Add
 
 
 def register(add: Add) -> None:

@@ -114,14 +114,6 @@ class EvaluationSweeps:
         scene = SimulatedScene(tuple(base.materials[k] for k in base.labels), places, own, physics)
         return cls(replace(base, samples=scene.draw()), scene)
 
-    @classmethod
-    def drawn_again(cls, sweeps: Dataset, seed: int = 0) -> EvaluationSweeps | None:
-        """A whole simulated set as `simulated` draws it; None for other sweeps."""
-        if not sets.SIMULATED.fullmatch(sweeps.source):
-            return None
-        drawn = cls.simulated(sweeps.source, seed)
-        return drawn if np.array_equal(drawn.sweeps.labels, sweeps.labels) else None
-
     def take(self, kept: Array) -> EvaluationSweeps:
         """The sweeps with the numbers `kept`, whose faults are as strong as among all sweeps."""
         some = EvaluationSweeps(self.sweeps.take(kept), self.scene and self.scene.take(kept))

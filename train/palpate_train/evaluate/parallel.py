@@ -16,6 +16,7 @@ from joblib import Parallel, delayed
 from threadpoolctl import threadpool_limits
 
 from palpate.core.errors import FormatError
+from palpate_train.data import extras
 from palpate_train.data.progress import Progress as Progress  # tasks use it to show progress
 
 Task = TypeVar("Task")
@@ -58,13 +59,9 @@ def _run(task: Task, call: Callable[..., Result], *shared: Any) -> tuple[Task, R
 def _on_cluster(
     call: Callable[..., Result], tasks: Sequence[Task], shared: Sequence[Any], scheduler: str
 ) -> Iterator[tuple[Task, Result]]:
-    try:
+    with extras.needed_for("--scheduler"):
         # not through joblib: its Dask backend waits for ever if a task cannot run any more
         from distributed import Client, KilledWorker
-    except ImportError as e:
-        raise FormatError(
-            "--scheduler needs dask; install it with pip install 'palpate-train[dask]'"
-        ) from e
     try:
         client: Any = Client(scheduler, timeout=CONNECT_S)  # type: ignore[no-untyped-call]
     except (OSError, ValueError) as e:

@@ -12,24 +12,21 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.bundle.bundle import MANIFEST, OPTIONAL, Bundle, load
+from palpate.bundle.bundle import Bundle
 from palpate.bundle.manifest import Manifest
 from palpate.core.clock import SystemClock
-from palpate.core.errors import FormatError
-from palpate.core.storage import put
 from palpate.core.types import Status, digitized
 from palpate.inference.classifier import Classifier
 from palpate.signal.broken_taxels import Bridging, Comparison, places
 from palpate.signal.load_modes import LoadModes
 from palpate.signal.taxel_statistics import TaxelStatistics
 from palpate.signal.window_check import MANY_FULL
-from palpate_train.data.sets import Dataset, digest
+from palpate_train.data.sets import Dataset
 from palpate_train.evaluate.corruptions import CORRUPTIONS, TAXEL_FAULTS
 from palpate_train.evaluate.evaluation_sweeps import EvaluationSweeps
 from palpate_train.export import bundle_score
@@ -73,11 +70,11 @@ class Tolerance:
     saturated: float | None
     figures: dict[str, Any]
 
-    def written(self, manifest: Manifest, **about: Any) -> Manifest:
-        """`manifest` with all of it. about: more figures."""
+    def written(self, manifest: Manifest) -> Manifest:
+        """`manifest` with all of it."""
         saturated = max(MANY_FULL, self.saturated or 0.0)
         limits = replace(manifest.thresholds, saturated=saturated)
-        figures = manifest.figures | {FIGURES: self.figures | about}
+        figures = manifest.figures | {FIGURES: self.figures}
         return replace(manifest, bridging=self.bridging, thresholds=limits, figures=figures)
 
 
@@ -330,45 +327,3 @@ def text(manifest: Manifest) -> str:
             "scale"
         )
     return "\n".join(lines)
-
-
-def write(folder: Path, sweeps: Dataset, seed: int = 0) -> Manifest:
-    """Measure the bundle in `folder` on `sweeps` of a sound skin, best of none that it has seen,
-    and write the result into its manifest; its other files stay as they are.
-
-    Raises FormatError as `measurable`.
-    """
-    loaded = measurable(folder, sweeps)
-    found = measure(loaded, sweeps, sweeps, seed)
-    manifest = found.written(loaded.manifest, set=sweeps.source, digest=digest(sweeps))
-    put(folder / MANIFEST, manifest.json())
-    return manifest
-
-
-def rewritten(folder: Path, sweeps: Dataset, change: Callable[[Manifest], Manifest]) -> Manifest:
-    """Write the manifest of the bundle in `folder` as `change` makes it; its other files stay as
-    they are. Raises FormatError as `measurable`."""
-    manifest = change(measurable(folder, sweeps).manifest)
-    put(folder / MANIFEST, manifest.json())
-    return manifest
-
-
-def measurable(folder: Path, sweeps: Dataset) -> Bundle:
-    """The bundle in `folder`, to measure it on `sweeps` and to write the result into it.
-
-    Raises FormatError if the sweeps are of another format or of materials that it lacks, or if the
-    bundle is signed or has enrolled materials, which hold for the manifest as it is.
-    """
-    loaded = load(folder)
-    lacking = sorted(set(sweeps.materials) - set(loaded.manifest.labels))
-    if sweeps.format != loaded.format or lacking:
-        raise FormatError(
-            f"{sweeps.source} ({sweeps.format}, {', '.join(sweeps.materials)}) does not fit the "
-            f"bundle ({loaded.format}, {', '.join(loaded.manifest.labels)}); name a set of its kind"
-        )
-    if bound := [name for name in OPTIONAL if (folder / name).exists()]:
-        raise FormatError(
-            f"{folder} has {', '.join(bound)}, made for its manifest as it is; measure the bundle "
-            "before it is signed"
-        )
-    return loaded

@@ -71,19 +71,6 @@ def bundle_graph(
     return model
 
 
-def turn_of(model: onnx.ModelProto) -> Array | None:
-    """The matrix `turn` [r, r] of the embedding in a bundle's model, see novelty.Embedding; None if
-    no feature is selected."""
-    made = {output: node for node in model.graph.node for output in node.output}
-    constants = {part.name: part for part in model.graph.initializer}
-    if "embedding.whole" not in made:
-        return None
-    floats, steps = made[made["embedding.whole"].input[1]].input
-    whole = numpy_helper.to_array(constants[made[floats].input[0]])
-    turn: Array = whole * numpy_helper.to_array(constants[steps])
-    return turn
-
-
 def _early(add: Add, steps: Heads, z: str) -> None:
     """The output `early` [1, D, K] from embeddings z [1, D + 1, r]."""
     count = len(steps.weight)

@@ -13,7 +13,7 @@ import numpy as np
 
 from palpate.bundle.manifest import Manifest
 from palpate_train.data.sets import Dataset, digest
-from palpate_train.export import bridging, nuisances
+from palpate_train.export import bridging, disturbed_sweeps
 
 NAME = "card.md"
 NOT_STATED = "not stated"
@@ -93,7 +93,7 @@ def _sentences(manifest: Manifest, protocol: str, figure: Json) -> list[str]:
         ]
     lines += ["## What breaks it", "", bridging.text(manifest), ""]
     if manifest.known:
-        lines += [nuisances.text(manifest.figures), ""]
+        lines += [disturbed_sweeps.text(manifest.figures), ""]
     else:
         lines += ["It cannot tell an unknown material: each gets the label of a known one.", ""]
     if why := manifest.made.get("contact_unknown_because"):

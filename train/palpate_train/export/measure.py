@@ -103,11 +103,11 @@ def timed(
     slows all of them alike. The time is processor time of one thread: in real time, slow models
     would be interrupted by other programs and quick ones would not.
     """
-    # here: it imports torch, which the process of `memory` must not load
-    from palpate_train.models.training import one_thread
+    # here: the process of `memory` loads only what the box has
+    from threadpoolctl import threadpool_limits
 
     names, took = list(calls), {name: np.empty(rounds * block) for name in calls}
-    with one_thread():
+    with threadpool_limits(1):
         for turn in range(rounds):
             for name in np.roll(names, -turn).tolist():
                 call = calls[name]

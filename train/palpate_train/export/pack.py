@@ -14,7 +14,6 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from importlib import metadata
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -26,13 +25,13 @@ from numpy.typing import NDArray
 from palpate.bundle import arrays, bundle
 from palpate.core import provenance, storage
 from palpate.core.clock import SystemClock
-from palpate.core.errors import BundleError, FormatError
+from palpate.core.errors import BundleError
 from palpate.inference.classifier import Classifier, softmax
 from palpate.inference.novelty import shaped_distances
 from palpate.signal.disturbances import Disturbances
 from palpate_train.calibration.contact import Contacts
 from palpate_train.calibration.slide_speeds import trained_speeds
-from palpate_train.data import repeats
+from palpate_train.data import extras, repeats
 from palpate_train.data.readers import counted
 from palpate_train.data.sets import Dataset
 from palpate_train.export import (
@@ -44,8 +43,8 @@ from palpate_train.export import (
     sliding,
 )
 from palpate_train.metrics.answers import REFUSED, UNKNOWN
-from palpate_train.models.linear_head import hold_out
-from palpate_train.models.methods import Method, Model, model_inputs
+from palpate_train.models.method_fit import MethodFit
+from palpate_train.models.methods import model_inputs
 from palpate_train.onnx_tools.graph_builder import run, run_output, slim
 
 Array = NDArray[Any]
@@ -80,7 +79,7 @@ class Content:
     as in the manifest. train, held_out: the training sweeps and the others, split by the group
     `held_out_by`. about: description of the training; figures: its results; both for the manifest.
     early, known, displacement, disturbances: for the manifest. classes: of the embedding, if there
-    is `known`. reference: the float model of an int8 model. contacts: of the training sweeps; None
+    is `known`. contacts: of the training sweeps; None
     to find them. unseen: the same content with heads that did not see the held-out sweeps; None if
     no part of the model has seen them.
     """
@@ -97,7 +96,6 @@ class Content:
     displacement: bundle.DisplacementRule | None = None
     disturbances: Disturbances | None = None
     classes: bundle.Classes | None = None
-    reference: onnx.ModelProto | None = None
     contacts: Contacts | None = None
     unseen: Content | None = None
 
@@ -233,7 +231,7 @@ def _made(content: Content, commit: str, unknown: dict[str, str]) -> dict[str, A
         "sweeps": repeats.sketch(content.train, content.held_out),
         "machine": platform.machine(),
         "cpus": os.cpu_count(),
-        "torch": metadata.version("torch") if find_spec("torch") else None,
+        "torch": metadata.version("torch") if extras.installed("torch") else None,
         "onnxruntime": onnxruntime.__version__,
     }
     made |= {f"{part}_unknown_because": why for part, why in unknown.items() if why}
@@ -241,28 +239,15 @@ def _made(content: Content, commit: str, unknown: dict[str, str]) -> dict[str, A
     return made | about | {"data": card.data(content.train, content.about.get(LICENCE, ""))}
 
 
-def trained(method: Method, sweeps: Dataset, seed: int) -> Content:
-    """`method`, trained on four fifths of the positions (else recordings) of `sweeps`; the others
-    test it.
-
-    Raises FormatError for a method that the box cannot run.
-    """
-    return train_content(method, sweeps, seed)[1]
-
-
-def train_content(method: Method, sweeps: Dataset, seed: int) -> tuple[Model, Content]:
-    """The model of `trained`, and its content."""
-    if why := method.why_not_on_the_box:
-        raise FormatError(
-            f"method {method.name!r} {why}; compare it with evaluate, and pack another"
-        )
-    train, held_out, held_out_by = hold_out(sweeps, seed)
-    model = method.train(train, model_inputs(method.input, train), seed)
-    about = {"method": method.name, "seed": seed, "ran": getattr(model, "ran", "")}
-    precisions = getattr(model, "precisions", {})
-    reference = precisions["float"].graph() if "float" in precisions else None
-    return model, Content(
-        model.graph(), method.input, train, held_out, held_out_by, about, reference=reference
+def content_of(fit: MethodFit) -> Content:
+    """The content of a bundle of this method."""
+    return Content(
+        fit.model,
+        fit.input,
+        fit.train,
+        fit.held,
+        fit.held_out_by,
+        fit.about,
     )
 
 

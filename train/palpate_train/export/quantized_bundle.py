@@ -3,7 +3,6 @@ does."""
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,16 +13,15 @@ from numpy.typing import NDArray
 
 from palpate.bundle import bundle
 from palpate.core.errors import FormatError
-from palpate.core.storage import put
 from palpate_train.calibration import novelty
 from palpate_train.calibration.contact import Contacts
 from palpate_train.calibration.novelty import Embedding
-from palpate_train.calibration.nuisances import Space
-from palpate_train.data.sets import Dataset
-from palpate_train.export import nuisances
+from palpate_train.calibration.widened_shapes import Space
+from palpate_train.data import extras
+from palpate_train.export import disturbed_sweeps, pack
 from palpate_train.export.bundle_graph import bundle_graph
-from palpate_train.export.pack import Content, ExportRefused, pack
-from palpate_train.metrics.score import provenance
+from palpate_train.export.pack import Content, ExportRefused
+from palpate_train.models.method_fit import MethodFit
 from palpate_train.models.methods import model_inputs
 from palpate_train.models.recipe.calibrate import Calibration, CalibrationInputs
 from palpate_train.models.recipe.fitted import Fit, calibration_inputs, finished
@@ -47,10 +45,6 @@ LEAST_AGREEMENT, MOST_PROBABILITY_DIFFERENCE, MOST_MEAN_DIFFERENCE = 0.96, 0.3, 
 """Least share of held-out sweeps with equal labels, of which one may always differ; largest change
 of a probability, and largest mean change. The worst of 14 fits of four sizes to five sets had
 0.974, 0.199 and 0.015."""
-
-SATURATED = 0.01
-"""A tensor with a larger share of values beyond the range of int8 is named as the cause, although
-the noise grows with every later layer."""
 
 
 def export(
@@ -82,7 +76,7 @@ def export(
     except ExportRefused as e:
         content = replace(content, model=reference, about=about | {"float_because": str(e)})
         fit = finished(fit.in_float())
-    return pack(
+    return pack.pack(
         _calibrated(content, fit, pitch_mm),
         target,
         name,
@@ -92,6 +86,23 @@ def export(
         pitch_mm,
         proven,
     )
+
+
+def export_method(
+    fit: MethodFit,
+    target: Path,
+    name: str,
+    version: str,
+    commit: str,
+    full_scale: float | None = None,
+    pitch_mm: float | None = None,
+) -> bundle.Manifest:
+    """As `export`, of a method that is not of our family; it has no form in float to keep instead.
+    Raises ExportRefused if a check fails."""
+    content = pack.content_of(fit)
+    if fit.reference is not None:
+        content = checked(content, fit.reference)
+    return pack.pack(content, target, name, version, commit, full_scale, pitch_mm)
 
 
 def _calibrated(content: Content, fit: Fit, pitch_mm: float | None) -> Content:
@@ -116,7 +127,7 @@ def _calibrated(content: Content, fit: Fit, pitch_mm: float | None) -> Content:
         content = replace(content, known=known, disturbances=found.disturbances)
         wider = zip(classes, found.shapes, found.changes, strict=True)
         classes = [replace(of, shapes=shapes, changes=moved) for of, shapes, moved in wider]
-        figures |= {nuisances.FIGURES: found.figures}
+        figures |= {disturbed_sweeps.FIGURES: found.figures}
     return replace(
         content,
         unseen=replace(
@@ -135,14 +146,14 @@ def _calibrated(content: Content, fit: Fit, pitch_mm: float | None) -> Content:
 
 def _widened(
     fit: Fit, given: CalibrationInputs, apart: Embedding, whole: Embedding
-) -> nuisances.Widened | None:
+) -> disturbed_sweeps.Widened | None:
     """Shapes of known materials that know how altered sweeps differ, and their limit; see
-    nuisances. apart: an embedding that did not see the held-out sweeps."""
+    disturbed_sweeps. apart: an embedding that did not see the held-out sweeps."""
     trunk, spaces = fit.trunk(), map(Space.of, (apart, whole))
     seed = int(fit.about["seed"])
     contacts, shape = fit.contacts or Contacts.of(fit.train), fit.train.format.shape
     known = contacts.limit.known_tare()
-    found = nuisances.measure(
+    found = disturbed_sweeps.measure(
         lambda samples: run(trunk, samples),
         fit.train,
         fit.held,
@@ -150,7 +161,7 @@ def _widened(
         tare=np.array(known).reshape(shape) if known else np.zeros(shape),
         seed=seed,
     )
-    return found and replace(found, limit=nuisances.limit_of_conditions(found, given))
+    return found and replace(found, limit=disturbed_sweeps.limit_of_conditions(found, given))
 
 
 def _unseen(given: CalibrationInputs, calibration: Calibration) -> Calibration:
@@ -169,10 +180,10 @@ def _unseen(given: CalibrationInputs, calibration: Calibration) -> Calibration:
 def _torch_difference(fit: Fit, reference: onnx.ModelProto) -> float:
     """The largest difference of a logit between stages in PyTorch and the float graph; the other
     features exist in the graph alone. Raises ExportRefused above MOST_TORCH_DIFFERENCE."""
-    # here: a fit without trained stages is exported without PyTorch
-    import torch
+    with extras.needed_for("the check of trained stages"):
+        import torch
 
-    from palpate_train.models.recipe.stages import network_of
+        from palpate_train.models.recipe.stages import network_of
 
     network, counts = network_of(fit), torch.from_numpy(fit.held.samples.astype(np.float32))
     features = run(fit.trunk(int8=False), fit.held.samples)
@@ -198,91 +209,60 @@ def graphs(fit: Fit) -> tuple[onnx.ModelProto, onnx.ModelProto]:
     return reference, with_head(fit.trunk(), *fit.int8_head())
 
 
-def checked(content: Content, reference: onnx.ModelProto | None) -> Content:
-    """`content`, whose model is int8, with a comparison with the float model `reference`; unchanged
-    if that is None. Raises ExportRefused as `check`."""
-    if reference is None:
-        return content
+def checked(content: Content, reference: onnx.ModelProto) -> Content:
+    """`content`, whose model is int8, with a comparison with the float model `reference`. Raises
+    ExportRefused as `check`."""
     held_out = content.held_out
     found = parity.measure(
         content.model,
+        reference,
         model_inputs(content.input, held_out),
         held_out.labels,
-        reference,
         held_out.group(content.held_out_by),
     )
     check(found)
-    return replace(content, figures=content.figures | {"parity": found.summary()})
+    return replace(content, figures=content.figures | {"parity": found.json()})
 
 
 def check(found: Parity) -> None:
     """Raises ExportRefused, with the number, its limit and a remedy, if int8 differs too much from
     float."""
     apart, lost = found.answers, found.accuracy
-    if apart is None or lost is None:
-        raise ExportRefused("there is no float form that int8 could be compared with; export a fit")
-    hint = "drop training sweeps that are unlike all others, or record more"
-    if found.layers:
-        worst = min(found.layers, key=lambda layer: (layer.saturated < SATURATED, layer.sqnr_db))
-        hint = (
-            f"{worst.tensor} suffers most ({worst.sqnr_db:.0f} dB, {worst.saturated:.1%} beyond "
-            "what int8 reaches; "
-            f"see palpate-train parity): {hint}"
-        )
+    largest, mean = apart.probability_difference, apart.probability_mean
+    why = ""
     if lost.lost > MOST_LOST and lost.chance < CHANCE:
-        raise ExportRefused(
-            f"int8 is right on {lost.int8_right} of {lost.total} held-out sweeps, float on "
-            f"{lost.float_right}: "
-            f"{100 * lost.lost:.2f} points lost (limit {100 * MOST_LOST}); {hint}"
+        why = (
+            f"is right on {lost.int8_right} of {lost.total} held-out sweeps, float on "
+            f"{lost.float_right}: {100 * lost.lost:.2f} points lost (limit {100 * MOST_LOST})"
         )
-    expected, largest, mean = (
-        apart.expected_loss,
-        apart.probability_difference,
-        apart.probability_mean,
+    elif not apart.expected_loss <= MOST_LOST:
+        why = (
+            f"loses {100 * apart.expected_loss:.2f} points on held-out sweeps, by float's own "
+            f"probabilities (limit {100 * MOST_LOST})"
+        )
+    elif not (largest <= MOST_PROBABILITY_DIFFERENCE and mean <= MOST_MEAN_DIFFERENCE):
+        why = (
+            f"moves a probability of held-out sweeps by up to {largest:.3f} (limit "
+            f"{MOST_PROBABILITY_DIFFERENCE}), by {mean:.3f} on average (limit "
+            f"{MOST_MEAN_DIFFERENCE})"
+        )
+    elif round(lost.total * (1 - apart.agreement)) > max(1, (1 - LEAST_AGREEMENT) * lost.total):
+        why = (
+            f"agrees with float on {apart.agreement:.3f} of {lost.total} held-out sweeps (limit "
+            f"{LEAST_AGREEMENT})"
+        )
+    if why:
+        raise ExportRefused(
+            f"int8 {why}; drop training sweeps that are unlike all others, or record more"
+        )
+
+
+def text(manifest: bundle.Manifest) -> str:
+    """What int8 changes in the answers, in words; "" for a model in float."""
+    if (found := manifest.figures.get("parity")) is None:
+        return ""
+    return (
+        f"int8 against float: {100 * found['agreement']:.1f} % of {found['total']} labels equal, "
+        f"a probability differs by up to {found['probability_difference']:.3f}; right on "
+        f"{found['int8_right']}, float on {found['float_right']}"
     )
-    if not expected <= MOST_LOST:
-        raise ExportRefused(
-            f"int8 loses {100 * expected:.2f} points on held-out sweeps, by float's own "
-            "probabilities "
-            f"(limit {100 * MOST_LOST}); {hint}"
-        )
-    if not (largest <= MOST_PROBABILITY_DIFFERENCE and mean <= MOST_MEAN_DIFFERENCE):
-        raise ExportRefused(
-            f"int8 moves a probability of held-out sweeps by up to {largest:.3f} (limit "
-            f"{MOST_PROBABILITY_DIFFERENCE}), "
-            f"by {mean:.3f} on average (limit {MOST_MEAN_DIFFERENCE}); {hint}"
-        )
-    if round(lost.total * (1 - apart.agreement)) > max(1, (1 - LEAST_AGREEMENT) * lost.total):
-        raise ExportRefused(
-            f"int8 agrees with float on {apart.agreement:.3f} of {lost.total} held-out sweeps "
-            f"(limit {LEAST_AGREEMENT}); {hint}"
-        )
-
-
-def compared(source: Path, sweeps: Dataset, file: Path | None = None) -> str:
-    """The table of float against int8 on `sweeps`. source: a fit, or a bundle, which has no float
-    model. file: for JSON.
-
-    Raises FormatError if formats or materials differ, or if nothing is in int8.
-    """
-    if source.is_dir():
-        loaded = bundle.load(source)
-        format, materials = loaded.format, loaded.manifest.labels
-        model, reference, kind = onnx.load_from_string(loaded.model), None, loaded.manifest.input
-    else:
-        made = Fit.load(source)
-        format, materials, kind = made.train.format, made.train.materials, "raw"
-        reference, model = graphs(made)
-    if (format, materials) != (sweeps.format, sweeps.materials):
-        raise FormatError(
-            f"{source.name} is of {format} and {', '.join(materials)}; {sweeps.source} of "
-            f"{sweeps.format} and "
-            f"{', '.join(sweeps.materials)}: name a set of the same kind"
-        )
-    found = parity.measure(
-        model, model_inputs(kind, sweeps), sweeps.labels, reference, sweeps.group("recording")
-    )
-    if file:
-        result = {"model": source.name, "set": sweeps.source} | found.json() | provenance()
-        put(file, (json.dumps(result, indent=1) + "\n").encode(), parents=True)
-    return parity.table(found)

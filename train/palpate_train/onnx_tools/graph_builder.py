@@ -268,7 +268,7 @@ def joined(first: onnx.ModelProto, second: onnx.ModelProto) -> onnx.ModelProto:
 
 def slim(model: onnx.ModelProto) -> onnx.ModelProto:
     """The same model in fewer bytes: equal constants are merged, and only multiplying nodes keep
-    the names of their outputs, which `palpate-train parity` prints."""
+    the names of their outputs."""
     small = onnx.ModelProto()
     small.CopyFrom(model)
     graph = small.graph

@@ -4,50 +4,57 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from palpate_train.arguments.runner import Program
+from palpate_train.arguments.program import Program
 
 PROGRAM = Program(
     "python -m palpate_studies",
     "Experiments with the methods of Palpate, and the pages that publish their results.",
     "palpate_studies.commands",
     {
-        "experiments": {
-            "paper": "run the paper's experiment on the simulated skin",
-            "development": "evaluate methods on all development sets",
-            "fabrics": "evaluate methods on real fabrics, one condition left out at a time",
-            "recipe": "measure the cost of each view of the recipe, and which views sets ask for",
-            "stress": "test trained methods, and a bundle, on corrupted sweeps, one corruption at"
-            " a time",
-            "certainty": "measure how far a model's probabilities can be trusted: calibration,"
-            " more sweeps, unknown materials, enrolment",
-            "taxels": "break taxels of sweeps, and count the answers of a bundle with and without"
-            " bridging",
-            "alignment": "measure whether a displaced contact is flagged before accuracy is lost"
-            " (simulated)",
-            "cnn-curve": "follow the paper's CNN while it learns the simulated skin",
-            "calibrate": "compare the simulator with the twenty accuracies that the paper prints",
-            "references": "write the models that palpate bench times beside the bundle",
-        },
-        "pages": {
-            "reports": "make the project's results again: the stale ones, or some by name",
-            "pages": "draw the pages of results, with their pictures",
-            "figures": "write figures and pictures of results into README and written pages",
-            "matrix": "draw the results of evaluate: methods by protocols",
-            "overview": "draw the README's picture: a simulated sweep and the box's answers",
-        },
-    },
-    {
-        "measure": (
-            "stress",
-            "certainty",
-            "calibrate",
-            "cnn-curve",
-            "taxels",
-            "alignment",
-            "references",
+        "paper": ("experiments", "run the paper's experiment on the simulated skin"),
+        "development": ("experiments", "evaluate methods on all development sets"),
+        "fabrics": (
+            "experiments",
+            "evaluate methods on real fabrics, one condition left out at a time",
         ),
-        "experiments": ("paper", "development", "fabrics", "recipe"),
-        "publish": ("reports", "pages", "figures", "matrix", "overview"),
+        "recipe": (
+            "experiments",
+            "measure the cost of each view of the recipe, and which views sets ask for",
+        ),
+        "stress": (
+            "measure",
+            "test trained methods, and a bundle, on corrupted sweeps, one corruption at a time",
+        ),
+        "certainty": (
+            "measure",
+            "measure how far a model's probabilities can be trusted: calibration, more sweeps, "
+            "unknown materials, enrolment",
+        ),
+        "taxels": (
+            "measure",
+            "break taxels of sweeps, and count the answers of a bundle with and without bridging",
+        ),
+        "alignment": (
+            "measure",
+            "measure whether a displaced contact is flagged before accuracy is lost (simulated)",
+        ),
+        "cnn-curve": ("measure", "follow the paper's CNN while it learns the simulated skin"),
+        "calibrate": (
+            "measure",
+            "compare the simulator with the twenty accuracies that the paper prints",
+        ),
+        "references": ("measure", "write the models that palpate bench times beside the bundle"),
+        "reports": ("publish", "make the project's results again: the stale ones, or some by name"),
+        "pages": ("publish", "draw the pages of results, with their pictures"),
+        "figures": (
+            "publish",
+            "write figures and pictures of results into README and written pages",
+        ),
+        "matrix": ("publish", "draw the results of evaluate: methods by protocols"),
+        "overview": (
+            "publish",
+            "draw the README's picture: a simulated sweep and the box's answers",
+        ),
     },
 )
 

@@ -22,6 +22,7 @@ from palpate_train.data.sets import Dataset
 from palpate_train.evaluate.fold import fingerprint
 from palpate_train.export import measure, pack
 from palpate_train.models import methods
+from palpate_train.models.method_fit import MethodFit
 from palpate_train.models.methods import Method
 from palpate_train.models.peers import minirocket
 
@@ -90,7 +91,8 @@ def _packed_forms(
 ) -> Iterator[dict[str, Any]]:
     """Each precision packed in a folder of its own; then the method in its own library, if it has
     one."""
-    model, content = pack.train_content(method, sweeps, seed)
+    model, made = MethodFit.of(method, sweeps, seed)
+    content = pack.content_of(made)
     counted: dict[str, dict[str, Any]] = {}
     for form, graphed in {"": model, **getattr(model, "precisions", {})}.items():
         graph = graphed.graph()
@@ -99,7 +101,7 @@ def _packed_forms(
             continue  # nothing in it is int8: both precisions are the same
         folder = work / precision
         about = content.about | ({"form": form} if form else {})
-        pack.pack_to_measure(replace(content, model=graph, about=about, reference=None), folder)
+        pack.pack_to_measure(replace(content, model=graph, about=about), folder)
         counted[form] = {
             "form": form,
             "precision": precision,

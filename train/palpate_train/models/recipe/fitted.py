@@ -128,26 +128,14 @@ class Fit:
     def save(self, path: Path) -> None:
         """Write the fit as one .npz without pickle. Training and held-out sweeps are one set, the
         training sweeps first."""
-        names = ("samples", "labels", *("unloaded",) * (self.train.unloaded is not None))
-        sides = self.train, self.held
-        arrays = {f"weight_{k}": v for k, v in self.weights.items()}
-        arrays |= {f"set_{k}": np.concatenate([getattr(s, k) for s in sides]) for k in names}
-        arrays |= {
-            f"group_{name}": np.concatenate([s.groups[name] for s in sides])
-            for name in self.train.groups
-        }
+        arrays, meta = sides_of(self.train, self.held)
+        arrays |= {f"weight_{k}": v for k, v in self.weights.items()}
         for kind, part in (("calibration", self.calibration), ("contacts", self.contacts)):
             arrays |= {f"{kind}_{k}": v for k, v in (part.arrays() if part else {}).items()}
-        meta = {
+        meta |= {
             "scale": self.scale,
             "architecture": asdict(self.architecture),
             "ranges": asdict(self.ranges) if self.ranges else None,
-            "materials": self.train.materials,
-            "rate_hz": self.train.rate_hz,
-            "source": self.train.source,
-            "units": self.train.units,
-            "displays": self.train.displays,
-            "trained_on": len(self.train),
             "about": self.about,
             "plan": self.plan.json(),
             "calibration": self.calibration.figures() if self.calibration else None,
@@ -161,53 +149,73 @@ class Fit:
     @classmethod
     def load(cls, path: Path) -> Fit:
         """Read the file that `save` wrote. Raises FormatError if it is another file."""
-        arrays = read(path, WHAT)
+        return cls.read(path.name, read(path, WHAT))
+
+    @classmethod
+    def read(cls, name: str, arrays: Mapping[str, Array]) -> Fit:
+        """The arrays of the file `name`. Raises FormatError as `load`."""
         try:
             fit = cls._read(arrays, json.loads(str(arrays["meta"])))
         except (KeyError, ValueError, TypeError, BundleError) as e:
-            raise FormatError(
-                f"{path.name}: not {WHAT}, or of another version; fit again: {e}"
-            ) from e
+            raise FormatError(f"{name}: not {WHAT}, or of another version; fit again: {e}") from e
         try:
             with_head(fit.trunk(), *fit.int8_head())
         except (KeyError, ValueError, checker.ValidationError, shape_inference.InferenceError) as e:
             raise FormatError(
-                f"{path.name}: its weights are not those of its {fit.architecture}; fit again"
+                f"{name}: its weights are not those of its {fit.architecture}; fit again"
             ) from e
         return fit
 
     @classmethod
     def _read(cls, arrays: Mapping[str, Array], meta: Json) -> Fit:
-        weights, groups, calibration, contacts = (
-            {k.removeprefix(p): v for k, v in arrays.items() if k.startswith(p)}
-            for p in ("weight_", "group_", "calibration_", "contacts_")
+        weights, calibration, contacts = (
+            named(arrays, prefix) for prefix in ("weight_", "calibration_", "contacts_")
         )
         shape, ranges = meta["architecture"], meta["ranges"]
-        sweeps = Dataset(
-            arrays["set_samples"],
-            arrays["set_labels"],
-            tuple(meta["materials"]),
-            meta["rate_hz"],
-            groups,
-            meta["source"],
-            arrays.get("set_unloaded"),
-            meta.get("units", {}),
-            meta.get("displays", {}),
-        )
-        first = np.arange(len(sweeps)) < meta["trained_on"]
         return cls(
             weights,
             meta["scale"],
             Architecture(**shape | {"channels": tuple(shape["channels"])}),
             ranges and graph.Ranges(ranges["counts"], tuple(ranges["responses"])),
-            sweeps.take(first),
-            sweeps.take(~first),
+            *read_sides(arrays, meta),
             meta["about"],
             HeadPlan.read(meta["plan"]),
             calibration=meta["calibration"] and Calibration.of(calibration, meta["calibration"]),
             uncalibrated=meta["uncalibrated"],
             contacts=meta["contacts"] and Contacts.read(contacts, meta["contacts"]),
         )
+
+
+def sides_of(train: Dataset, held: Dataset) -> tuple[dict[str, Array], Json]:
+    """The arrays and the JSON that the file of a fit has of its training and held-out sweeps."""
+    names = ("samples", "labels", *("unloaded",) * (train.unloaded is not None))
+    arrays = {f"set_{k}": np.concatenate([getattr(s, k) for s in (train, held)]) for k in names}
+    for name in train.groups:
+        arrays[f"group_{name}"] = np.concatenate([s.groups[name] for s in (train, held)])
+    about = ("materials", "rate_hz", "source", "units", "displays")
+    return arrays, {k: getattr(train, k) for k in about} | {"trained_on": len(train)}
+
+
+def read_sides(arrays: Mapping[str, Array], meta: Json) -> tuple[Dataset, Dataset]:
+    """The training and held-out sweeps of `sides_of`. Raises KeyError if something is missing."""
+    sweeps = Dataset(
+        arrays["set_samples"],
+        arrays["set_labels"],
+        tuple(meta["materials"]),
+        meta["rate_hz"],
+        named(arrays, "group_"),
+        meta["source"],
+        arrays.get("set_unloaded"),
+        meta["units"],
+        meta["displays"],
+    )
+    first = np.arange(len(sweeps)) < meta["trained_on"]
+    return sweeps.take(first), sweeps.take(~first)
+
+
+def named(arrays: Mapping[str, Array], prefix: str) -> dict[str, Array]:
+    """The arrays whose names begin so, without this prefix."""
+    return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
 
 
 def finished(fit: Fit) -> Fit:

@@ -23,7 +23,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +31,7 @@ from numpy.typing import NDArray
 
 from palpate.core.errors import FormatError
 from palpate_train.calibration.heads import HeadData, HeadPlan, condition_values
+from palpate_train.data import extras
 from palpate_train.data.progress import StageLine
 from palpate_train.data.sets import Dataset
 from palpate_train.data.splitters import InnerPart, inner_parts
@@ -211,7 +211,7 @@ class Setup:
         """Whether a model of this size may have stages, and there are enough sweeps for them."""
         each = np.unique(self.sweeps.labels, return_counts=True)[1]
         enough = len(self.sweeps) >= LEAST_SWEEPS and each.min() >= LEAST_EACH
-        return bool(self.settings.steps and size.stages and enough and find_spec("torch"))
+        return bool(self.settings.steps and size.stages and enough and extras.installed("torch"))
 
     def may_train(self, size: ModelSize) -> bool:
         """Whether stages can be trained for a model of this size, and judged."""
@@ -452,7 +452,8 @@ def fixed_trunk(sweeps: Dataset, seed: int, mains_hz: float = MAINS_HZ) -> Trunk
 
 def _trained(setup: Setup) -> Trunk:
     """See Setup.stages."""
-    from palpate_train.models.recipe import stages  # here: the rest of the recipe needs no PyTorch
+    with extras.needed_for("the training of stages"):
+        from palpate_train.models.recipe import stages
 
     settings, sweeps = setup.settings, setup.sides[0]
     scale = texture_scale(setup.sweeps.samples)

@@ -20,7 +20,7 @@ from palpate_studies import (
 from palpate_studies.pages import PAGES
 from palpate_studies.study import StudyRun, read, results_file, save
 from palpate_train.arguments import options
-from palpate_train.arguments.types import Add
+from palpate_train.arguments.program import Add
 from palpate_train.models.methods import Effort
 
 

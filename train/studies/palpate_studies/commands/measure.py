@@ -23,7 +23,7 @@ from palpate.sim import skin
 from palpate_studies import alignment, broken_taxels, certainty, references, sim_calibration
 from palpate_studies.study import read, results_file, save
 from palpate_train.arguments import numbers, options
-from palpate_train.arguments.types import Add
+from palpate_train.arguments.program import Add
 from palpate_train.data import sets
 from palpate_train.data.progress import Progress
 from palpate_train.data.sets import Dataset

@@ -13,7 +13,7 @@ from palpate.core.storage import put
 from palpate_studies import document_figures, matrix_table, overview_plot, pages, reports
 from palpate_studies.study import DATA
 from palpate_train.arguments import options
-from palpate_train.arguments.types import Add
+from palpate_train.arguments.program import Add
 from palpate_train.metrics import score
 from palpate_train.reports import provenance
 

@@ -12,13 +12,13 @@ import pytest
 from palpate_train.cli.main import main
 from palpate_train.data.sets import Dataset
 from palpate_train.data.splitters import Protocol
-from palpate_train.evaluate import traps, trivial
+from palpate_train.evaluate import set_warnings, trivial
 from tests.factories.sweep_sets import easy, tones
 
 
 def of_protocol(sweeps: Dataset, text: str) -> list[str]:
     """The warnings about a protocol."""
-    return list(traps.of_protocol(sweeps, text, Protocol(text).folds(sweeps, 1)))
+    return list(set_warnings.of_protocol(sweeps, text, Protocol(text).folds(sweeps, 1)))
 
 
 def test_materials_that_cannot_be_named_are_counted():
@@ -31,9 +31,9 @@ def test_materials_that_cannot_be_named_are_counted():
     (line,) = of_protocol(half, "leave:session")
     assert "leave:session: 24 of 24 tested sweeps are of a material that their fold is not" in line
     assert of_protocol(half, "random:4") == []
-    (line,) = [line for line in traps.of_set(half) if "session" in line]
+    (line,) = [line for line in set_warnings.of_set(half) if "session" in line]
     assert "24 of 24 sweeps are of materials with one session only (low, middle, high)" in line
-    assert not any("session only" in line for line in traps.of_set(sweeps))
+    assert not any("session only" in line for line in set_warnings.of_set(sweeps))
 
 
 def test_shared_frames_are_counted_for_the_folds():
@@ -46,7 +46,7 @@ def test_shared_frames_are_counted_for_the_folds():
     sweeps = Dataset(samples, labels, ("a", "b"), 100.0, {}, "noise")
     (line,) = of_protocol(sweeps, "random:5")
     assert "294 of 296 tested sweeps are identical to a training sweep or share frames" in line
-    assert any("296 of 296 sweeps share frames" in line for line in traps.of_set(sweeps))
+    assert any("296 of 296 sweeps share frames" in line for line in set_warnings.of_set(sweeps))
     stated = replace(sweeps, groups={"recording": recording})
     assert of_protocol(stated, "random:4") == []
 

@@ -10,7 +10,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from palpate.inference.novelty import shaped_distances
-from palpate_train.calibration.nuisances import AlteredSweeps, Scatters, Space, choose
+from palpate_train.calibration.widened_shapes import DisturbedSweeps, Scatters, Space, choose
 
 MEANS = np.array([[0.0, 0, 0, 0], [12, 0, 0, 0], [0, 12, 0, 0]])
 """Means of three materials, which differ in two of four directions."""
@@ -19,13 +19,13 @@ SPACE = Space(lambda z: z, MEANS, np.eye(4)[:, 2:])
 HUM, LIKE_ANOTHER = np.array([0.0, 0, 8, 0]), np.array([-6.0, 6, 0, 0])
 
 
-def sweeps(rng: Generator, each: int = 60, **moves: NDArray[np.float64]) -> AlteredSweeps:
+def sweeps(rng: Generator, each: int = 60, **moves: NDArray[np.float64]) -> DisturbedSweeps:
     """Sweeps of covariance 1 and copies of all, moved by up to each of `moves`."""
     labels = np.repeat(np.arange(3), each)
     z = MEANS[labels] + rng.standard_normal((3 * each, 4))
     source = np.arange(len(z))
     copies = {name: (z + rng.random((len(z), 1)) * move, source) for name, move in moves.items()}
-    return AlteredSweeps(z, labels, copies)
+    return DisturbedSweeps(z, labels, copies)
 
 
 @pytest.fixture

@@ -2,43 +2,32 @@
 in its check of unknown materials.
 
 Copies of training sweeps are altered as in a test of robustness: hum, noise, gain, speed, lost
-frames, fewer bits, displacement. Copies of held-out sweeps judge; see calibration.nuisances.
+frames, fewer bits, displacement. Copies of held-out sweeps judge; see calibration.disturbed_sweeps.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import onnx
 from numpy.typing import NDArray
 
-from palpate.bundle import arrays
-from palpate.bundle.bundle import file_entry
-from palpate.bundle.manifest import MANIFEST, MEANS, Manifest
-from palpate.core.clock import SystemClock
-from palpate.core.errors import FormatError
-from palpate.core.storage import put_all
-from palpate.inference.classifier import Classifier
 from palpate.inference.novelty import shaped_distances
 from palpate.signal.disturbances import Disturbances, hum
 from palpate_train.calibration import disturbances, novelty
-from palpate_train.calibration.nuisances import (
-    AlteredSweeps,
+from palpate_train.calibration.widened_shapes import (
+    DisturbedSweeps,
     Embed,
-    NuisanceRule,
     Scatters,
+    ShapeRule,
     Space,
     choose,
 )
-from palpate_train.data.sets import Dataset, digest
+from palpate_train.data.sets import Dataset
 from palpate_train.evaluate.corruptions import TAXEL_FAULTS, Corruption, applicable
 from palpate_train.evaluate.evaluation_sweeps import EvaluationSweeps
-from palpate_train.export.bridging import measurable
-from palpate_train.export.bundle_graph import turn_of
 from palpate_train.models.recipe.calibrate import CalibrationInputs
 
 Array = NDArray[Any]
@@ -60,8 +49,8 @@ class Widened:
 
     shapes: tuple[NDArray[np.float16], ...]
     limit: float
-    rule: NuisanceRule
-    training: AlteredSweeps
+    rule: ShapeRule
+    training: DisturbedSweeps
     figures: dict[str, Any]
     disturbances: Disturbances
     changes: tuple[NDArray[np.float16], ...]
@@ -75,15 +64,13 @@ def measure(
     *others: Space,
     tare: Array,
     seed: int = 0,
-    again: bool = False,
 ) -> Widened | None:
     """The widened shapes in the embedding `judge`, best one that has not seen `held_out`, and in
     others, by the rule that `judge` finds; None if it finds none. features: of raw counts, which
-    the embeddings take. tare: counts [R, C] or [R, C, A] of the unloaded skin, 0 if unknown. again:
-    draw simulated sets again, so that their speed and force can change."""
+    the embeddings take. tare: counts [R, C] or [R, C, A] of the unloaded skin, 0 if unknown."""
     meter = disturbances.DisturbanceMeter(train.format, tare, train.samples)
-    given = (drawn_again if again else _as_recorded)(train, held_out)
-    training, held = (altered(features, of, seed + i, meter) for i, of in enumerate(given))
+    given = enumerate(map(EvaluationSweeps, (train, held_out)))
+    training, held = (disturbed(features, of, seed + i, meter) for i, of in given)
     held, spaces = held.seen_by(judge.embed), (judge, *others)
     seen = [training.seen_by(space.embed) for space in spaces]
     unnoticed = disturbances.unnoticed(training, training)
@@ -124,52 +111,31 @@ def limit_of_conditions(found: Widened, given: CalibrationInputs) -> float:
     return novelty.limit(np.concatenate(every))
 
 
-def drawn_again(*given: Dataset) -> list[EvaluationSweeps]:
-    """The sets as they are drawn again if all are simulated, else as they are recorded: their
-    copies then have the same kinds."""
-    drawn = [of for sweeps in given if (of := EvaluationSweeps.drawn_again(sweeps))]
-    return drawn if len(drawn) == len(given) else _as_recorded(*given)
-
-
-def _as_recorded(*given: Dataset) -> list[EvaluationSweeps]:
-    return [EvaluationSweeps(sweeps) for sweeps in given]
-
-
-def altered(
+def disturbed(
     features: Embed, every: EvaluationSweeps, seed: int, meter: disturbances.DisturbanceMeter
-) -> AlteredSweeps:
-    """The features of sweeps and of copies with each fault of CORRUPTIONS that applies to them,
-    with the disturbances that `meter` measures. Broken taxels are left out, because the box
-    bridges them."""
+) -> DisturbedSweeps:
+    """The features of sweeps and of copies with each fault of CORRUPTIONS that applies to recorded
+    counts, with the disturbances that `meter` measures. Broken taxels are left out, because the
+    box bridges them."""
     sweeps, rng = every.sweeps, np.random.default_rng(seed)
-    still = replace(every, scene=None)
-    copies, disturbed, usual = {}, {}, dict[str, Array]()
-    for corruption in _corruptions(every):
+    copies, sizes, usual = {}, {}, dict[str, Array]()
+    for corruption in applicable(every):
+        if (kind := corruption.name) in TAXEL_FAULTS:
+            continue
         source = rng.permutation(len(sweeps))[:COPIES]
-        scene = every if corruption.only == "simulated" else still
-        samples, severity = _copies(corruption, scene, source, seed)
-        name, counts = disturbances.OF_KIND.get(corruption.name), np.empty(0)
+        samples, severity = _copies(corruption, every, source, seed)
+        name, counts = disturbances.OF_KIND.get(kind), np.empty(0)
         if name == "hum":
             samples, counts = meter.clean(samples)
-        copies[corruption.name] = features(samples), source
+        copies[kind] = features(samples), source
         if name in ("lost", "hum"):
             value = severity if name == "lost" else np.array([hum(one) for one in counts])
-            disturbed[corruption.name] = value, np.zeros(len(sweeps))
+            sizes[kind] = value, np.zeros(len(sweeps))
         elif name:
             if name not in usual:
                 usual[name] = meter.values(name, sweeps.samples)
-            disturbed[corruption.name] = meter.values(name, samples), usual[name]
-    return AlteredSweeps(features(sweeps.samples), sweeps.labels, copies, disturbed)
-
-
-def _corruptions(every: EvaluationSweeps) -> list[Corruption]:
-    """The corruptions of recorded counts, without broken taxels. Sweeps that can be drawn again
-    get another speed and force by that instead of by stretched counts."""
-    found = list(applicable(EvaluationSweeps(every.sweeps)))
-    if every.scene:
-        drawn = [c for c in applicable(every) if c.only and c.name in disturbances.OF_KIND]
-        found = [c for c in found if disturbances.OF_KIND.get(c.name) != "speed"] + drawn
-    return [corruption for corruption in found if corruption.name not in TAXEL_FAULTS]
+            sizes[kind] = meter.values(name, samples), usual[name]
+    return DisturbedSweeps(features(sweeps.samples), sweeps.labels, copies, sizes)
 
 
 def _copies(
@@ -186,7 +152,7 @@ def _copies(
     return np.concatenate(copies), np.repeat(severities, [len(one) for one in copies])
 
 
-def _figures(rule: NuisanceRule, held: AlteredSweeps) -> dict[str, Any]:
+def _figures(rule: ShapeRule, held: DisturbedSweeps) -> dict[str, Any]:
     before, after = rule.passed
     return {
         "sweeps": len(held.labels),
@@ -219,46 +185,3 @@ def text(figures: Mapping[str, Any]) -> str:
             f"materials {100 * passes:.1f} %, before {100 * passed:.1f} %"
         )
     return "\n".join(lines)
-
-
-def write(folder: Path, trained_on: Dataset, fresh: Dataset) -> Manifest:
-    """Widen the shapes of the bundle in `folder`, and write them into its class means and its
-    manifest; the model stays as it is.
-
-    trained_on: its training sweeps. fresh: sweeps that it has not seen. Raises FormatError as
-    bridging.measurable, if the bundle does not detect unknown materials, or if the fresh sweeps are
-    too few to find a rule.
-    """
-    measurable(folder, trained_on)
-    loaded = measurable(folder, fresh)
-    classes, known = loaded.classes, loaded.manifest.known
-    if classes is None or known is None:
-        raise FormatError(
-            f"bundle {loaded.id} does not detect unknown materials; export it from a fit"
-        )
-    box = Classifier(loaded, SystemClock())
-
-    def embed(samples: Array) -> Array:
-        return np.stack([box.embedding(sweep) for sweep in samples]).astype(np.float64)
-
-    turn, r = turn_of(onnx.load_from_string(loaded.model)), classes.means.shape[1]
-    view = novelty.untrained(turn, r, r + 1 - len(classes.means))
-    space = Space(lambda z: z, classes.means.astype(np.float64), view)
-    found = measure(embed, trained_on, fresh, space, tare=loaded.manifest.tare, again=True)
-    if found is None:
-        raise FormatError(
-            f"{fresh.source} does not show how altered sweeps differ from other materials; name a "
-            "larger set"
-        )
-    wider = replace(classes, shapes=found.shapes[0], changes=found.changes[0])
-    means = arrays.packed(**wider.arrays())
-    named = {"trained on": trained_on.source, "set": fresh.source, "digest": digest(fresh)}
-    manifest = replace(
-        loaded.manifest,
-        known=replace(known, limit=found.limit),
-        disturbances=found.disturbances,
-        files=loaded.manifest.files | {MEANS: file_entry(means)},
-        figures=loaded.manifest.figures | {FIGURES: found.figures | named},
-    )
-    put_all({folder / MEANS: means, folder / MANIFEST: manifest.json()})
-    return manifest

@@ -1,7 +1,6 @@
-"""Runs one command of a program: help in groups, the command's own parser, exit codes.
+"""A program with commands: an argparse parser for each, and exit codes.
 
-A table holds the names and descriptions of all commands, so that help needs no import. The module
-of a command is imported only if the command is called, since training takes seconds to import.
+Only the module of the command that is called is imported, since training takes seconds to import.
 """
 
 from __future__ import annotations
@@ -9,71 +8,65 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
+from io import TextIOWrapper
 
 from palpate.core.errors import ApplianceError
 from palpate.core.interrupts import INTERRUPTED, during_imports, during_work
-from palpate.core.menu import Menu
-from palpate_train.arguments.types import Run
+
+Run = Callable[[argparse.Namespace], None]
+"""Runs a command."""
+Add = Callable[[str, Run], argparse.ArgumentParser]
+"""The parser of a command, given its name and the function that runs it."""
 
 
 @dataclass(frozen=True)
 class Program:
-    """A program and its commands.
-
-    groups: the commands with their descriptions, by heading. modules: by module below `package`,
-    the commands that it registers.
-    """
+    """A program and its commands. package: where the modules of the commands are. commands: by
+    name, the module and a description. The function `register(add)` of a module adds the options
+    of its commands."""
 
     name: str
     about: str
     package: str
-    groups: Mapping[str, Mapping[str, str]]
-    modules: Mapping[str, tuple[str, ...]]
+    commands: Mapping[str, tuple[str, str]]
 
-    @property
-    def menu(self) -> Menu:
-        """All commands in groups; no command is imported."""
-        return Menu(self.name, self.about, self.groups)
-
-    def descriptions(self) -> dict[str, str]:
-        """The description of each command."""
-        return self.menu.commands
-
-    def parser(self, wanted: str) -> argparse.ArgumentParser:
-        """The parser of one command; `args.run` is the function of the command."""
+    def parser(self, *wanted: str) -> argparse.ArgumentParser:
+        """The parser, with the options of the commands `wanted` alone; `args.run` is the function
+        of the command."""
         parser = argparse.ArgumentParser(prog=self.name, description=self.about)
-        commands = parser.add_subparsers(required=True, metavar="COMMAND")
-        descriptions = self.descriptions()
-
-        def add(name: str, run: Run) -> argparse.ArgumentParser:
-            text = descriptions[name]
-            command = commands.add_parser(
+        subparsers = parser.add_subparsers(required=True, metavar="COMMAND")
+        parsers = {
+            name: subparsers.add_parser(
                 name, help=text, description=f"{text[0].upper()}{text[1:]}."
             )
-            command.set_defaults(run=run)
-            return command
+            for name, (_, text) in self.commands.items()
+        }
 
-        module = next(name for name, commands in self.modules.items() if wanted in commands)
-        import_module(f"{self.package}.{module}").register(add)
+        def add(name: str, run: Run) -> argparse.ArgumentParser:
+            parsers[name].set_defaults(run=run)
+            return parsers[name]
+
+        for module in {self.commands[name][0] for name in wanted if name in self.commands}:
+            import_module(f"{self.package}.{module}").register(add)
         return parser
 
     def run(self, argv: Sequence[str] | None = None) -> int:
         """Run one command; its exit code. An error of this project is a line on standard error."""
         words = sys.argv[1:] if argv is None else list(argv)
-        answered = self.menu.answer(words)
-        return self._run(words) if answered is None else answered
-
-    def _run(self, words: Sequence[str]) -> int:
+        for stream in (sys.stdout, sys.stderr):
+            if isinstance(stream, TextIOWrapper):  # show ? for what the terminal's encoding lacks
+                stream.reconfigure(errors="replace")
         args = argparse.Namespace()
         try:
             with during_imports(self.name):
-                parser = self.parser(words[0])
-                from palpate_train.metrics import score  # here: it imports onnxruntime
-            args = parser.parse_args(words)
+                parser = self.parser(*words[:1])
+            args = parser.parse_args(words or ["--help"])
             args.words = words
+            with during_imports(self.name):
+                from palpate_train.metrics import score  # here: it imports onnxruntime
             score.provenance()  # read now: a later commit is not of the code that runs
             with during_work():
                 args.run(args)

@@ -49,7 +49,7 @@ MOST_LEFT_OUT = 12
 
 
 @dataclass(frozen=True)
-class AlteredSweeps:
+class DisturbedSweeps:
     """Embeddings of sweeps and of altered copies of some of them.
 
     z: [N, r], labels: int [N]. copies: by kind of alteration, the embeddings [M, r] of copies and
@@ -62,12 +62,12 @@ class AlteredSweeps:
     copies: Mapping[str, tuple[Array, Array]]
     disturbed: Mapping[str, tuple[Array, Array]] = field(default_factory=dict)
 
-    def seen_by(self, embed: Callable[[Array], Array]) -> AlteredSweeps:
+    def seen_by(self, embed: Callable[[Array], Array]) -> DisturbedSweeps:
         """The same in another embedding: of each row."""
         copies = {kind: (embed(z), source) for kind, (z, source) in self.copies.items()}
-        return AlteredSweeps(embed(self.z), self.labels, copies, self.disturbed)
+        return DisturbedSweeps(embed(self.z), self.labels, copies, self.disturbed)
 
-    def take(self, kept: Array, labels: Array) -> AlteredSweeps:
+    def take(self, kept: Array, labels: Array) -> DisturbedSweeps:
         """The sweeps `kept` (bool [N]) of these labels (ascending), and their copies; a label
         becomes its number among `labels`."""
         kept = kept & np.isin(self.labels, labels)
@@ -75,7 +75,7 @@ class AlteredSweeps:
         for kind, (z, source) in self.copies.items():
             copies[kind] = z[kept[source]], number[source[kept[source]]]
         numbered = np.searchsorted(labels, self.labels[kept])
-        return AlteredSweeps(self.z[kept], numbered, copies)
+        return DisturbedSweeps(self.z[kept], numbered, copies)
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ class Scatters:
     by_kind: Mapping[str, Array]
 
     @classmethod
-    def of(cls, altered: AlteredSweeps, space: Space) -> Scatters:
+    def of(cls, altered: DisturbedSweeps, space: Space) -> Scatters:
         """The scatter of sweeps in this space."""
         means = space.means
         away = altered.z - means[altered.labels]
@@ -131,7 +131,7 @@ class Scatters:
         squares += trained * within(covariances, self.space.trained())
         return shapes_of(squares)
 
-    def weight_of_trained(self, judged: AlteredSweeps) -> float:
+    def weight_of_trained(self, judged: DisturbedSweeps) -> float:
         """The one of TRAINED that tells `judged` sweeps of materials that are left out in turn best
         from the others (mean AUROC)."""
         k, areas = len(self.own), []
@@ -147,7 +147,7 @@ class Scatters:
 
 
 @dataclass(frozen=True)
-class NuisanceRule:
+class ShapeRule:
     """Weights of the kinds of alterations, and of the trained directions.
 
     scale: of the shapes, so that a held-out sweep lies r from its mean on average, as it does
@@ -168,7 +168,7 @@ class NuisanceRule:
         return (self.scale * scatters.shapes(self.weights, self.trained)).astype(np.float16)
 
 
-def choose(scatters: Scatters, judged: AlteredSweeps) -> NuisanceRule | None:
+def choose(scatters: Scatters, judged: DisturbedSweeps) -> ShapeRule | None:
     """The rule with the largest sum of the share of judged copies that are kept and the share of
     judged sweeps that are refused if their material is left out.
 
@@ -190,7 +190,7 @@ def choose(scatters: Scatters, judged: AlteredSweeps) -> NuisanceRule | None:
     rounded = (scale * shapes).astype(np.float16).astype(np.float64)
     beyond = limit(trial.distances(judged.z, rounded).min(axis=1))
     kept = {kind: (share, after.kept[kind]) for kind, share in before.kept.items()}
-    return NuisanceRule(weights, trial.trained, scale, beyond, kept, (before.passed, after.passed))
+    return ShapeRule(weights, trial.trained, scale, beyond, kept, (before.passed, after.passed))
 
 
 def _search(trial: _Trial, weights: dict[str, float]) -> dict[str, float]:
@@ -209,7 +209,7 @@ def _search(trial: _Trial, weights: dict[str, float]) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class _Shares:
-    """kept: share of copies within the limit, by kind. passed: see NuisanceRule."""
+    """kept: share of copies within the limit, by kind. passed: see ShapeRule."""
 
     kept: Mapping[str, float]
     passed: float
@@ -224,7 +224,7 @@ class _Trial:
     """Judges weights by sweeps and copies that the scatters have not seen."""
 
     scatters: Scatters
-    judged: AlteredSweeps
+    judged: DisturbedSweeps
     trained: float
 
     def distances(self, z: Array, shapes: Array) -> Array:
