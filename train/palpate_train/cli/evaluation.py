@@ -86,7 +86,7 @@ def _add_grid(command: argparse.ArgumentParser) -> None:
 
 
 def method_lines() -> Iterator[str]:
-    """A line for each method that `evaluate` and `pack` take."""
+    """A line for each method that `evaluate` and `fit` take."""
     for method in methods.every().values():
         extra = f" (needs pip install 'palpate-train[{method.extra}]')" if method.extra else ""
         yield f"{method.name:<20} {method.about}{extra}"
