@@ -271,8 +271,8 @@ def test_more_labels_than_the_boards_wire_are_told_with_the_bundle(
 
 
 def test_each_command_has_options_of_its_own(capsys: pytest.CaptureFixture[str]):
-    """Help lists all commands without their imports; each has its parser and its function. A word
-    that is no command is refused."""
+    """Help lists all commands without their imports; each has its parser and its function. An
+    unknown command is refused."""
     parser = PROGRAM.parser(*PROGRAM.commands)
     (commands,) = (a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
     assert {*commands.choices} == {*PROGRAM.commands}

@@ -1,4 +1,4 @@
-"""palpate-train without its extras: what works, and what the messages about them say."""
+"""palpate-train without its extras, and the messages about them."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_each_extra_that_a_message_names_exists():
 
 
 def test_a_missing_library_is_told_with_its_extra():
-    """Of a library without an extra the error stays what it is."""
+    """Any other error stays the same."""
     told = pytest.raises(extras.FormatError, match=r"torch.*\[stages\]")
     with told, extras.needed_for("the cluster"):
         raise ModuleNotFoundError("no torch", name="torch.nn")

@@ -257,7 +257,7 @@ def test_weights_that_are_no_numbers_are_refused(fitted: Fit, tmp_path: Path):
 
 
 def test_stages_are_compared_with_pytorch_beside_any_feature(fitted: Fit):
-    """Loads, which PyTorch does not compute, are no obstacle; the head here ignores them."""
+    """PyTorch computes no loads; the head here ignores them."""
     size, at = loads.count(fitted.train.format), sum(fitted.architecture.channels)
     weight = np.insert(fitted.weights["head.weight"], [at] * size, 0, axis=1)
     more = replace(
@@ -333,8 +333,8 @@ def test_a_head_that_was_not_refitted_is_refused(tight: Fit):
 
 
 def found(n: int = 100, lost: int = 0, won: int = 0, **apart: float) -> parity.Parity:
-    """A Parity of `n` sweeps, of which int8 loses and wins some; all else is perfect unless it is
-    named."""
+    """A comparison on `n` sweeps with some lost and some won by int8; the rest is perfect by
+    default."""
     right = np.arange(n) >= won, np.arange(n) < n - lost
     usual = {"agreement": 1, "expected_loss": 0, "probability_difference": 0, "probability_mean": 0}
     difference = parity.AnswerDifference(**(usual | apart), logit_difference=0, logit_mean=0)
@@ -653,8 +653,7 @@ def test_fabrics_go_the_whole_way(tmp_path: Path, capsys: pytest.CaptureFixture[
 
 
 def test_a_fit_does_not_see_offsets(tmp_path: Path):
-    """It cannot distinguish materials that differ only in their offset, without groups that show
-    what loads are good for."""
+    """Without groups to judge loads by, it cannot distinguish materials by their offset."""
     whole = easy(seed=3)
     del whole.groups["speed"]
     rng = np.random.default_rng(4)
