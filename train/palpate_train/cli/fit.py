@@ -73,14 +73,19 @@ def register(add: Add) -> None:
         help="largest number of sweeps that the model is fitted to; of more, some of each "
         f"recording are drawn (default {MOST}); memory and time grow with it",
     )
+    _add_method(command)
+    _add_use(command)
+    _add_dial(command)
+
+
+def _add_method(command: argparse.ArgumentParser) -> None:
+    """Options for another method than our recipe."""
     command.add_argument(
         "--method",
         metavar="NAME",
         help="train this method instead of our recipe; see palpate-train evaluate --list",
     )
     options.add_effort(command)
-    _add_use(command)
-    _add_dial(command)
 
 
 def _add_use(command: argparse.ArgumentParser) -> None:
