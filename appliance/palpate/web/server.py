@@ -15,7 +15,7 @@ import json
 import logging
 import secrets
 import threading
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from heapq import merge
@@ -30,7 +30,6 @@ from palpate.web.access import Access
 
 try:
     from tornado.httpserver import HTTPServer
-    from tornado.ioloop import PeriodicCallback
     from tornado.iostream import StreamClosedError
     from tornado.netutil import bind_sockets
     from tornado.template import Loader
@@ -61,13 +60,10 @@ HEADERS = {
 HEAD_S = 5.0
 """Time limit for a request's head, including the handshake of TLS, and for a connection without a
 request."""
-TAKEN_S = 30
-"""Time after which a browser that reads nothing is disconnected."""
 MOST_HEAD = 8192
 """Most bytes of a request."""
-MOST_OPEN, MOST_OF_ONE = 64, 24
-"""Most connections at a time, and most of an address; further connections are closed at once. A
-browser opens up to six."""
+MOST_OPEN = 64
+"""Most connections at a time. A browser opens up to six."""
 MOST_WAITING = 100
 """Most events that wait for a browser. A browser that is further behind is disconnected, and gets
 the kept events when it comes back."""
@@ -232,12 +228,9 @@ class PageServer:
             chunk_size=MOST_HEAD,
         )
         server.add_sockets(self._sockets)
-        tick = PeriodicCallback(server.drop_those_who_take_nothing, 1000)
-        tick.start()
         await self._stop.wait()
         if self.answering:
             await asyncio.wait(self.answering, timeout=DONE_S)
-        tick.stop()
         server.stop()
         await server.close_all_connections()
         await asyncio.sleep(0)  # cancelled handlers end
@@ -265,51 +258,24 @@ def _checked(port: int) -> int:
 
 
 class LimitedServer(HTTPServer):
-    """tornado's server with limits for connections and for the time without reading. admitted:
-    connections that have sent an allowed request; they are not closed for others."""
+    """tornado's server with at most MOST_OPEN connections. A further connection takes the place of
+    the oldest that has sent no allowed request, else of the oldest. admitted: connections that have
+    sent an allowed request."""
 
     def initialize(self, *args: Any, **options: Any) -> None:
         """As HTTPServer.initialize."""
         super().initialize(*args, **options)
-        self._open: dict[Any, str] = {}  # stream -> address, the oldest first
+        self._open: list[Any] = []  # the oldest first
         self.admitted: WeakSet[Any] = WeakSet()
-        self._since: Counter[Any] = Counter()  # stream -> seconds without reading
 
     def handle_stream(self, stream: Any, address: Any) -> None:
-        """Accept a connection if there is room, or if another can be closed for it."""
-        self._open = {one: ip for one, ip in self._open.items() if not one.closed()}
-        own = sum(ip == address[0] for ip in self._open.values())
-        if own >= MOST_OF_ONE and not self._close_one(address[0]):
-            stream.close()
-            return
-        if len(self._open) >= MOST_OPEN and not self._close_one(self._busiest(own)):
-            stream.close()
-            return
-        self._open[stream] = address[0]
+        """Accept a connection, and close another if there is no room."""
+        self._open = [one for one in self._open if not one.closed()]
+        if len(self._open) >= MOST_OPEN:
+            waiting = (one for one in self._open if one not in self.admitted)
+            next(waiting, self._open[0]).close()
+        self._open.append(stream)
         super().handle_stream(stream, address)
-
-    def _busiest(self, own: int) -> str:
-        """The address with the most connections, "" if none has more than `own`."""
-        address, most = Counter(self._open.values()).most_common(1)[0]
-        return address if most > own else ""
-
-    def _close_one(self, address: str) -> bool:
-        """Close the oldest connection of an address that has sent no allowed request so far.
-        Returns whether there was one."""
-        for stream, ip in self._open.items():
-            if ip == address and stream not in self.admitted:
-                stream.close()
-                del self._open[stream]
-                return True
-        return False
-
-    def drop_those_who_take_nothing(self) -> None:
-        """Close connections whose other side has read nothing for TAKEN_S. It is called once a
-        second."""
-        self._since = Counter({one: self._since[one] + 1 for one in self._open if one.writing()})
-        for stream, seconds in self._since.items():
-            if seconds >= TAKEN_S:
-                stream.close()
 
 
 class _Handler(RequestHandler):

@@ -1,19 +1,18 @@
-"""The page on loopback is for the users who may read the feed; slow connections lock nobody out."""
+"""The page on loopback is for the users who may read the feed."""
 
 from __future__ import annotations
 
 import os
 import socket
-import time
 from collections.abc import Iterator
 from http.client import HTTPConnection
 
 import pytest
 
 from palpate.core.clock import SystemClock
-from palpate.web import local_users, server
+from palpate.web import local_users
 from palpate.web.access import Access
-from palpate.web.server import MOST_OF_ONE, MOST_OPEN, PageServer
+from palpate.web.server import PageServer
 
 
 @pytest.fixture
@@ -66,39 +65,3 @@ def test_another_user_gets_nothing(page: PageServer, monkeypatch: pytest.MonkeyP
     assert status(page)[0] == 200
     monkeypatch.setattr(local_users, "owner", lambda peer, own: 987_654)
     assert status(page) == (403, "only for root and group palpate")
-
-
-def test_slow_connections_lock_nobody_out(page: PageServer):
-    """Three addresses hold all places with connections that say nothing: another address, and one
-    of the three, are served at once."""
-    slow = []
-    try:
-        for number in range(MOST_OPEN + 8):
-            host = f"127.0.0.{2 + number % 3}"
-            slow.append(
-                socket.create_connection(("127.0.0.1", port(page)), source_address=(host, 0))
-            )
-        time.sleep(0.3)
-        assert [status(page)[0], status(page, "127.0.0.2")[0]] == [200, 200]
-    finally:
-        for one in slow:
-            one.close()
-
-
-def test_connections_that_were_served_stay(page: PageServer):
-    """A browser that reads events is not closed for connections that say nothing."""
-    events = socket.create_connection(("127.0.0.1", port(page)))
-    events.sendall(f"GET /events HTTP/1.1\r\nHost: 127.0.0.1:{port(page)}\r\n\r\n".encode())
-    assert events.recv(4096).startswith(b"HTTP/1.1 200")
-    slow = [socket.create_connection(("127.0.0.1", port(page))) for _ in range(2 * MOST_OF_ONE)]
-    time.sleep(0.3)
-    events.setblocking(False)
-    try:
-        while data := events.recv(4096):
-            assert data
-    except BlockingIOError:
-        data = b"open"
-    assert data == b"open"
-    assert server.MOST_OF_ONE < MOST_OPEN
-    for one in [events, *slow]:
-        one.close()
