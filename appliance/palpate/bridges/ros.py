@@ -70,12 +70,7 @@ def verdict_status(answer: Answer, code: int) -> DiagnosticStatus:
     ERROR if nothing was learned about the object."""
     level = DiagnosticStatus.ERROR if answer.faulty else DiagnosticStatus.WARN
     fields = {name: v for name, v in asdict(answer).items() if name not in ("finger", "fingers")}
-    fields |= {
-        "early": answer.early,
-        "known": answer.known,
-        "unsure": answer.unsure,
-        "code": code,
-    }
+    fields |= {"early": answer.early, "known": answer.known, "unsure": answer.unsure, "code": code}
     return DiagnosticStatus(
         level=DiagnosticStatus.OK if answer.known else level,
         name=f"palpate: verdict {answer.finger}".rstrip(),

@@ -63,7 +63,6 @@ def run_demo(args: argparse.Namespace) -> int:
         show = demo.Demo(
             devices.robot.played,
             far_end,
-            devices.clock,
             sys.stdout,
             bundle.manifest.labels,
             raw=args.raw,

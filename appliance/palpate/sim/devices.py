@@ -66,11 +66,7 @@ class SimDevices(RobotDevices):
 
     def wire(self, settings: Config) -> Config:
         """The settings with the simulated GPIO lines and skin."""
-        ids = {
-            "usb": f"{usb.VENDOR_ID:04x}:{usb.PRODUCT_ID:04x}",
-            "profile": "palpate",
-            "grid": "",
-        }
+        ids = {"usb": f"{usb.VENDOR_ID:04x}:{usb.PRODUCT_ID:04x}", "profile": "palpate", "grid": ""}
         link = "acm" if self.backend.acm else "vendor"
         skin_config = replace(settings.skin, **ids, rate_hz=0.0, link=link)  # type: ignore[arg-type]
         return replace(RobotDevices.wire(self, settings), skin=skin_config)

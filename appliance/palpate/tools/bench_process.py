@@ -36,11 +36,7 @@ class Build(Protocol):
     of its serial line."""
 
     def __call__(
-        self,
-        simulated: devices.SimDevices,
-        stack: ExitStack,
-        /,
-        observers: Iterable[Observer] = (),
+        self, simulated: devices.SimDevices, stack: ExitStack, /, observers: Iterable[Observer] = ()
     ) -> tuple[Box, int]:
         """Build it."""
         ...

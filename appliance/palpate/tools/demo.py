@@ -1,68 +1,24 @@
-"""`palpate demo`: the skin live in the terminal during a sweep, then a line with the answer, at the
-end their sum.
-
-A terminal shows pictures and colours; other outputs get plain lines.
-"""
+"""`palpate demo`: a line for each sweep with its answer, coloured on a terminal, at the end their
+sum."""
 
 from __future__ import annotations
 
 import os
 import select
 from collections.abc import Callable, Collection, Sequence
-from contextlib import nullcontext, redirect_stderr
-from io import StringIO
-from typing import IO, Any
-
-from numpy.typing import NDArray
+from typing import IO
 
 from palpate.client.answers import Answer
-from palpate.core.clock import Clock
 from palpate.core.status import REASONS, Status
-from palpate.core.types import normal
 from palpate.runtime.loop import Box
 from palpate.sim.rig import Act
 from palpate.tools.score import AnswerScore
 
-FRAME_NS = 66_000_000
-"""Time between two pictures of the skin."""
 ARRIVAL_S = 1.0
 """Longest time of a sentence from one end of the serial line to the other."""
 HEAD = f"{'':5}{'felt':<20}{'answer':<16}{'sure':>8}"
 """Heads of the columns."""
 GREEN, YELLOW, RED, GREY, PLAIN = "\033[32m", "\033[33m", "\033[31m", "\033[90m", "\033[0m"
-BRIGHT = 160
-"""Raw counts that are shown white; the skin seldom has more."""
-
-
-def picture(frame: NDArray[Any]) -> list[str]:
-    """A frame [R, C] or [R, C, A] of raw counts as shaded cells with numbers, two lines a row; of
-    several axes, the normal axis."""
-    lines = []
-    for row in normal(frame, 0).astype(int):
-        level = [min(23, max(0, count) * 24 // BRIGHT) for count in row]
-        shade = [f"\033[48;5;{232 + v}m\033[38;5;{16 if v > 11 else 250}m" for v in level]
-        lines.append("  " + "".join(f"{colour}{'':6}\033[0m" for colour in shade))
-        lines.append(
-            "  "
-            + "".join(
-                f"{colour}{count:^6}\033[0m" for colour, count in zip(shade, row, strict=True)
-            )
-        )
-    return lines
-
-
-class LogLines(StringIO):
-    """Takes the log while a picture is drawn, and prints its lines above the picture."""
-
-    def __init__(self, show: Callable[[str], None]) -> None:
-        super().__init__()
-        self._show = show
-
-    def write(self, text: str) -> int:
-        """Print the lines of `text`."""
-        for line in filter(None, text.splitlines()):
-            self._show(f"     {GREY}{line}{PLAIN}")
-        return len(text)
 
 
 class Demo:
@@ -76,32 +32,26 @@ class Demo:
         self,
         played: Sequence[Act],
         far_end: int,
-        clock: Clock,
         out: IO[str],
         labels: Collection[str],
         *,
         raw: bool,
     ) -> None:
         self.score = AnswerScore(frozenset(labels))
-        self._played, self._clock, self._out = played, clock, out
+        self._played, self._out = played, out
         self._far_end, self._raw = far_end, raw
-        self._live = not raw and out.isatty()
+        self._colours = not raw and out.isatty()
         self._ticks = "✓✗" if str(getattr(out, "encoding", "")).lower().startswith("utf") else "+-"
         self._rest = b""
-        self._drawn = 0
-        self._next_ns = 0
 
     def run(self, box: Box, sweeps: int, stopped: Callable[[], bool]) -> None:
         """Step `box` until `sweeps` answers were read or `stopped()`."""
         sent = 0
         if not self._raw:
             self._print("", HEAD)
-        with redirect_stderr(LogLines(self._print)) if self._live else nullcontext():
-            while self.score.answers < sweeps and not stopped():
-                sent += len(box.step())
-                self._read(sent, sweeps)
-                if (frame := box.newest_frame()) is not None:
-                    self._draw(frame)
+        while self.score.answers < sweeps and not stopped():
+            sent += len(box.step())
+            self._read(sent, sweeps)
         if not self._raw and self.score.answers:
             self._print("", *self._ending(box))
 
@@ -157,25 +107,8 @@ class Demo:
         return f"{row}  {self._coloured(why, GREY)}" if why else row
 
     def _coloured(self, text: str, colour: str) -> str:
-        return f"{colour}{text}{PLAIN}" if self._live else text
-
-    def _draw(self, frame: NDArray[Any]) -> None:
-        """Draw a frame over the previous picture, in one write against flicker, if it is time."""
-        if not self._live or self._clock.now_ns() < self._next_ns:
-            return
-        self._next_ns = self._clock.now_ns() + FRAME_NS
-        felt = self._played[-1].label
-        lines = ["", f"  under the finger: {felt}", "", *picture(frame), ""]
-        self._out.write(self._back() + "".join(f"{line}\033[K\n" for line in lines))
-        self._out.flush()
-        self._drawn = len(lines)
-
-    def _back(self) -> str:
-        """The control sequence that returns to the picture's first line."""
-        drawn, self._drawn = self._drawn, 0
-        return f"\033[{drawn}A" if drawn else ""
+        return f"{colour}{text}{PLAIN}" if self._colours else text
 
     def _print(self, *lines: str) -> None:
-        erase = "\033[J" if self._drawn else ""
-        self._out.write(self._back() + erase + "\n".join(lines) + "\n")
+        self._out.write("\n".join(lines) + "\n")
         self._out.flush()

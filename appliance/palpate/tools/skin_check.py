@@ -74,6 +74,18 @@ class Reception:
         return [(arrivals[id(p)], number, p) for number, p in fresh], lost, stale, position.epoch
 
 
+def _ok(part: str, detail: str) -> PartResult:
+    return PartResult(part, "ok", detail)
+
+
+def _fail(part: str, detail: str) -> PartResult:
+    return PartResult(part, "FAIL", detail)
+
+
+def _unknown(part: str, detail: str) -> PartResult:
+    return PartResult(part, "unknown", detail)
+
+
 class Listener:
     """Reads a link for a while. The leftover of a stretch belongs to the next stretch."""
 
@@ -133,9 +145,8 @@ def check(link: SkinLink, clock: Clock, seconds: float, *, port: bool) -> Iterat
     heard = listener.listen(seconds)
     yield _crc(heard)
     if sent is None or not heard.packets:
-        yield PartResult(
+        yield _unknown(
             "packets",
-            "unknown",
             "nothing more can be judged without FORMAT and whole packets; mend these first",
         )
         return
@@ -149,19 +160,15 @@ def _identity(link: SkinLink) -> PartResult:
     try:
         who = packets.unpack_identity(link.request(Request.IDENTITY, 64))
     except (SensorMismatch, FormatError) as e:
-        return PartResult("identity", "FAIL", f"{e}; PROTOCOL.md, IDENTITY, has its 36 bytes")
+        return _fail("identity", f"{e}; PROTOCOL.md, IDENTITY, has its 36 bytes")
     if who.protocol != packets.VERSION:
-        return PartResult(
-            "identity", "FAIL", f"protocol version {who.protocol}; byte 0 must be {packets.VERSION}"
+        return _fail(
+            "identity", f"protocol version {who.protocol}; byte 0 must be {packets.VERSION}"
         )
     if not who.board:
-        return PartResult(
-            "identity", "FAIL", "the board's name is empty; write it to bytes 4 to 19"
-        )
+        return _fail("identity", "the board's name is empty; write it to bytes 4 to 19")
     number = who.serial or "no serial number: two such boards look the same"
-    return PartResult(
-        "identity", "ok", f"{who.board}, firmware {'.'.join(map(str, who.firmware))}, {number}"
-    )
+    return _ok("identity", f"{who.board}, firmware {'.'.join(map(str, who.firmware))}, {number}")
 
 
 def _format(link: SkinLink) -> tuple[SkinFormat | None, PartResult]:
@@ -170,25 +177,22 @@ def _format(link: SkinLink) -> tuple[SkinFormat | None, PartResult]:
         sent = packets.unpack_format(link.request(Request.FORMAT, 64))
         format = _sweep_format(sent)
     except (SensorMismatch, FormatError) as e:
-        return None, PartResult("format", "FAIL", f"{e}; PROTOCOL.md, FORMAT, has its 16 bytes")
+        return None, _fail("format", f"{e}; PROTOCOL.md, FORMAT, has its 16 bytes")
     size = sent.packet_frames * sent.rows * sent.cols * sent.axes * format.numpy_type.itemsize
-    fifo_s, packet_s = (
-        sent.fifo_frames / sent.rate_hz,
-        sent.packet_frames / sent.rate_hz,
-    )
+    fifo_s, packet_s = (sent.fifo_frames / sent.rate_hz, sent.packet_frames / sent.rate_hz)
     text = (
         f"{sent.rows}x{sent.cols} {sent.dtype} at {sent.rate_hz:g} Hz,"
         f" FIFO {fifo_s:.2f} s, {sent.packet_frames} a packet"
     )
     if not (1 <= sent.packet_frames <= packets.MAX_FRAMES and size <= packets.MAX_PAYLOAD):
-        return sent, PartResult(
-            "format", "FAIL", f"{text}: {size} bytes a packet; use 1 to {packets.MAX_PAYLOAD}"
+        return sent, _fail(
+            "format", f"{text}: {size} bytes a packet; use 1 to {packets.MAX_PAYLOAD}"
         )
     if fifo_s < LEAST_FIFO_S:
-        return sent, PartResult("format", "FAIL", f"{text}; the FIFO must hold {LEAST_FIFO_S} s")
+        return sent, _fail("format", f"{text}; the FIFO must hold {LEAST_FIFO_S} s")
     if packet_s > LONGEST_PACKET_S and sent.packet_frames > 1:
         text += f"; {packet_s * 1000:.0f} ms a packet delay the answer, 2 to 8 ms are better"
-    return sent, PartResult("format", "ok", text)
+    return sent, _ok("format", text)
 
 
 def _sweep_format(sent: SkinFormat) -> SweepFormat:
@@ -197,41 +201,34 @@ def _sweep_format(sent: SkinFormat) -> SweepFormat:
 
 def _start(silent: bool, first: Reception, listener: Listener) -> PartResult:
     if not silent:
-        return PartResult(
-            "start", "FAIL", "it sends before START; begin with request 3, end with request 4"
-        )
+        return _fail("start", "it sends before START; begin with request 3, end with request 4")
     if not first.size:
-        return PartResult(
-            "start", "FAIL", f"no byte within {ANSWER_S:g} s of START; send frames after request 3"
+        return _fail(
+            "start", f"no byte within {ANSWER_S:g} s of START; send frames after request 3"
         )
     listener.link.request(Request.START, 0)
     again = listener.listen(QUIET_S)
     _, _, stale, restarts = Reception(first.packets + again.packets).followed()
     if not first.packets:
-        return PartResult(
-            "start",
-            "unknown",
-            f"{first.size} bytes came after it, and no whole packet; mend that first",
+        return _unknown(
+            "start", f"{first.size} bytes came after it, and no whole packet; mend that first"
         )
     if stale or restarts or not again.packets:
-        return PartResult(
+        return _fail(
             "start",
-            "FAIL",
             "a second START disturbs the stream; it must have no effect while frames are sent",
         )
-    return PartResult(
-        "start", "ok", "silent before it, frames after it, a second START changes nothing"
-    )
+    return _ok("start", "silent before it, frames after it, a second START changes nothing")
 
 
 def _crc(heard: Reception) -> PartResult:
     if not heard.garbage and heard.packets:
-        return PartResult("crc", "ok", f"{len(heard.packets)} packets, no byte between them")
+        return _ok("crc", f"{len(heard.packets)} packets, no byte between them")
     share = f"{heard.garbage} of {heard.size} bytes are in no packet"
     if fault := _crc_fault(heard.sample):
-        return PartResult("crc", "FAIL", f"{share}: {fault}")
+        return _fail("crc", f"{share}: {fault}")
     if not heard.size:
-        return PartResult("crc", "unknown", "no byte came: nothing to judge")
+        return _unknown("crc", "no byte came: nothing to judge")
     if not heard.packets:
         hint = "each packet begins with 50 C1 01 00, its length in bytes 4 and 5"
     else:
@@ -239,7 +236,7 @@ def _crc(heard: Reception) -> PartResult:
             "bytes were lost or added on the way: check cable and baud rate, and that nothing"
             " else prints to this port"
         )
-    return PartResult("crc", "FAIL", f"{share}; {hint}")
+    return _fail("crc", f"{share}; {hint}")
 
 
 def _crc_fault(sample: bytes) -> str:
@@ -280,9 +277,9 @@ def _stream(heard: Reception, sent: SkinFormat) -> Iterator[PartResult]:
             else "no packet reports an overflow: the frames were never taken"
         )
         detail = f"{lost} of {heard.frames + lost} frames are missing, {why}; lower the rate"
-        yield PartResult("loss", "FAIL", detail)
+        yield _fail("loss", detail)
     else:
-        yield PartResult("loss", "ok", f"none of {heard.frames} frames is missing")
+        yield _ok("loss", f"none of {heard.frames} frames is missing")
     period_ns, device = 1e9 / sent.rate_hz, DeviceClock()
     by_count = [(round(number * period_ns), arrival) for arrival, number, _ in fresh]
     by_clock = [(device.unwrap(p.t_us) * 1000, arrival) for arrival, _, p in fresh]
@@ -296,7 +293,7 @@ def _stream(heard: Reception, sent: SkinFormat) -> Iterator[PartResult]:
     yield rate
     clock = _compared("clock", by_clock, CLOCK_TOLERANCE, "bytes 16 to 19", "count microseconds")
     trouble = _refused(heard, sent) if rate.verdict == "ok" and clock.verdict != "FAIL" else ""
-    yield PartResult("clock", "FAIL", trouble) if trouble else clock
+    yield _fail("clock", trouble) if trouble else clock
 
 
 def _packets(heard: Reception, sent: SkinFormat) -> PartResult:
@@ -304,42 +301,33 @@ def _packets(heard: Reception, sent: SkinFormat) -> PartResult:
     for _, p in heard.packets:
         if p.taxels.shape[1:] != sent.shape or p.taxels.dtype != _sweep_format(sent).numpy_type:
             found = f"{shown(p.taxels.shape[1:])} {p.taxels.dtype}"
-            return PartResult(
-                "packets",
-                "FAIL",
-                f"it sends {found}, FORMAT announces another format; correct one of them",
+            return _fail(
+                "packets", f"it sends {found}, FORMAT announces another format; correct one of them"
             )
     sizes = [len(p.taxels) for _, p in heard.packets]
     if max(sizes) > sent.packet_frames:
-        return PartResult(
+        return _fail(
             "packets",
-            "FAIL",
             f"{max(sizes)} frames in a packet, FORMAT says {sent.packet_frames}; correct it",
         )
-    return PartResult("packets", "ok", f"{len(sizes)} packets of {median(sizes):g} frames")
+    return _ok("packets", f"{len(sizes)} packets of {median(sizes):g} frames")
 
 
 def _sequence(heard: Reception, stale: int, restarts: int) -> PartResult:
     runs = [p for _, p in heard.packets]
     steps = {(b.seq - a.seq) % (1 << 32) for a, b in pairwise(runs)}
     if steps == {1} and max(len(p.taxels) for p in runs) > 1:
-        return PartResult(
+        return _fail(
             "sequence",
-            "FAIL",
             "it counts packets; bytes 12 to 15 are the number of the first frame, count frames",
         )
     if steps == {0}:
-        return PartResult(
-            "sequence", "FAIL", "the number never changes; count every frame that is taken"
-        )
+        return _fail("sequence", "the number never changes; count every frame that is taken")
     if restarts or stale:
         text = f"{restarts} restarts of the count, {stale} frames repeated or out of order"
-        return PartResult(
-            "sequence", "FAIL", f"{text}; count on, whatever is sent, and wrap at 2^32"
-        )
-    return PartResult(
+        return _fail("sequence", f"{text}; count on, whatever is sent, and wrap at 2^32")
+    return _ok(
         "sequence",
-        "ok",
         f"from {runs[0].seq} to {runs[-1].seq + len(runs[-1].taxels) - 1}, always forwards",
     )
 
@@ -351,9 +339,7 @@ def _compared(
     relative."""
     third = len(points) // 3
     if third < 3:
-        return PartResult(
-            part, "unknown", f"only {len(points)} packets; listen longer with --seconds"
-        )
+        return _unknown(part, f"only {len(points)} packets; listen longer with --seconds")
     # a packet may be late, never early: compare the most prompt packets of first and last third
     late = [arrival - at for at, arrival in points]
     first, last = (
@@ -372,10 +358,10 @@ def _compared(
         f"allowed are {tolerance * scale:g} {unit}"
     )
     if abs(off) - spread > tolerance:
-        return PartResult(part, "FAIL", f"{text}; {hint}")
+        return _fail(part, f"{text}; {hint}")
     if abs(off) + spread > tolerance:
-        return PartResult(part, "unknown", f"{text}; listen longer with --seconds")
-    return PartResult(part, "ok", text)
+        return _unknown(part, f"{text}; listen longer with --seconds")
+    return _ok(part, text)
 
 
 def _refused(heard: Reception, sent: SkinFormat) -> str:
@@ -400,37 +386,28 @@ def _requests(listener: Listener) -> PartResult:
         for request in (Request.IDENTITY, Request.FORMAT):
             listener.link.request(request, 64)
     except SensorMismatch as e:
-        return PartResult(
-            "requests", "FAIL", f"while frames are sent: {e}; put the reply between two packets"
-        )
+        return _fail("requests", f"while frames are sent: {e}; put the reply between two packets")
     heard = listener.listen(QUIET_S)
     if not heard.packets:
-        return PartResult(
-            "requests",
-            "FAIL",
-            "no frames after requests; go on sending, and leave unknown requests alone",
+        return _fail(
+            "requests", "no frames after requests; go on sending, and leave unknown requests alone"
         )
-    return PartResult(
-        "requests", "ok", "answered while frames are sent; an unknown request changes nothing"
-    )
+    return _ok("requests", "answered while frames are sent; an unknown request changes nothing")
 
 
 def _overflow(listener: Listener, sent: SkinFormat, before: Reception, *, port: bool) -> PartResult:
     """Let the FIFO run over, then look for the gap and its flag."""
     if any(map(_flagged, before.packets)) and not before.followed()[1]:
-        return PartResult(
+        return _fail(
             "overflow",
-            "FAIL",
             "bit 1 of byte 6 is set while no frame is missing; clear it after one packet",
         )
     fifo_s = sent.fifo_frames / sent.rate_hz
     rate = before.size / max(1e-9, (before.transfers[-1][0] - before.transfers[0][0]) / 1e9)
     pause_s = 1.5 * fifo_s + (PORT_BYTES / rate if port else 0.1)
     if pause_s > LONGEST_PAUSE_S:
-        return PartResult(
-            "overflow",
-            "unknown",
-            f"the port keeps {PORT_BYTES / rate:.0f} s of this stream; not waited for",
+        return _unknown(
+            "overflow", f"the port keeps {PORT_BYTES / rate:.0f} s of this stream; not waited for"
         )
     start = listener.listen(QUIET_S)
     listener.clock.sleep_until(listener.clock.now_ns() + round(pause_s * 1e9))
@@ -460,12 +437,12 @@ def _gap(lost: int, flagged: bool, pause_s: float, kept_s: float, fifo_s: float)
         )
     if not flagged:
         text = f"{lost} frames were dropped; set bit 1 of byte 6 in the next packet"
-        return PartResult("overflow", "FAIL", text)
+        return _fail("overflow", text)
     if kept_s < 0.8 * fifo_s:
         text = f"{kept_s:.2f} s were kept, FORMAT says {fifo_s:.2f} s"
-        return PartResult("overflow", "FAIL", f"{text}; drop the oldest frames, not the newest")
+        return _fail("overflow", f"{text}; drop the oldest frames, not the newest")
     text = f"{lost} frames dropped in a pause of {pause_s:.1f} s, flagged, {kept_s:.2f} s kept"
-    return PartResult("overflow", "ok", text)
+    return _ok("overflow", text)
 
 
 def _age_s(before: Reception, packet: Packet, now_ns: int) -> float:
@@ -479,16 +456,13 @@ def _age_s(before: Reception, packet: Packet, now_ns: int) -> float:
 def _stop(listener: Listener) -> PartResult:
     listener.link.request(Request.STOP, 0)
     if not listener.quiet():
-        return PartResult(
+        return _fail(
             "stop",
-            "FAIL",
             "frames come after STOP; end with request 4, once the packet under way is complete",
         )
     listener.link.request(Request.START, 0)
     again = listener.listen(ANSWER_S)
     listener.link.request(Request.STOP, 0)
     if not again.packets:
-        return PartResult(
-            "stop", "FAIL", "no frames after STOP and another START; it must begin again"
-        )
-    return PartResult("stop", "ok", "silent after it, frames after another START")
+        return _fail("stop", "no frames after STOP and another START; it must begin again")
+    return _ok("stop", "silent after it, frames after another START")

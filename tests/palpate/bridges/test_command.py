@@ -124,8 +124,7 @@ def test_options_hold():
 def test_no_way_to_the_box(sets: tuple[str, ...]):
     """Commands without a line, or neither line nor feed: refused, with what to set."""
     with pytest.raises(
-        ConfigError,
-        match=r'feed is read-only; set serial\.port = "/run/palpate-modbus/line"',
+        ConfigError, match=r'feed is read-only; set serial\.port = "/run/palpate-modbus/line"'
     ):
         settled("modbus", sets=sets)
 

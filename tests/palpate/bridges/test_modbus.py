@@ -19,15 +19,7 @@ from hypothesis import strategies as st
 from pymodbus.client import ModbusTcpClient
 
 from palpate.bridges import modbus, modbus_pdu
-from palpate.bridges.modbus import (
-    ADDRESSES,
-    COILS,
-    INPUTS,
-    STALE,
-    STATUS_CODES,
-    inputs,
-    registers,
-)
+from palpate.bridges.modbus import ADDRESSES, COILS, INPUTS, STALE, STATUS_CODES, inputs, registers
 from palpate.bridges.options import MOST
 from palpate.bridges.source import BoxView, noted
 from palpate.cli.main import main
@@ -413,11 +405,7 @@ def test_the_feed_in_place_of_the_line(tmp_path: Path):
                 word(client, "label code"),
                 word(client, "likeliest label code"),
                 word(client, "early"),
-            ) == (
-                0,
-                2,
-                1,
-            )
+            ) == (0, 2, 1)
             assert client.registers(ADDRESSES["frames"], 2) == [1, 70_000 - 65_536]
             assert client.registers(MEASURED_AT, 2) == [612, 4]
             assert client.ask(bytes.fromhex("050000ff00")) == b"\x85\x04"

@@ -237,10 +237,7 @@ def test_ros(box: SpeakingBox, block: int, program: str, settings: dict[str, flo
         json.dumps(settings),
     ]
     pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    with (
-        ros.bridge("-p", f"port:={box.path}", "-p", "allow_writes:=true"),
-        ros.peer() as peer,
-    ):
+    with ros.bridge("-p", f"port:={box.path}", "-p", "allow_writes:=true"), ros.peer() as peer:
         eventually(lambda: bool(box.say(state()) or peer.on("state")))
         with subprocess.Popen(command, env=ros.environment(), **pipes) as cell:
             cell.stdin.write(page_blocks("ros2.md", "python")[block])

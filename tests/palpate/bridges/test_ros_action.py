@@ -273,12 +273,7 @@ def test_with_the_box_itself(tmp_path: Path):
     """The box's program on a simulated skin, a bridge on its serial line, another node: the box
     numbers, times and answers sweeps, whatever the simulated finger did; it decides about a second
     START."""
-    quiet = [
-        "--set",
-        "store.runtime=",
-        "--set",
-        "store.folder=/nonexistent",
-    ]
+    quiet = ["--set", "store.runtime=", "--set", "store.folder=/nonexistent"]
     line = tmp_path / "line"
     command = [
         sys.executable,

@@ -640,7 +640,6 @@ def test_the_demo_shows_what_it_saves(rigged: Callable[..., Rigged]):
         show = demo.Demo(
             simulated.robot.played,
             box.far_end,
-            simulated.clock,
             out,
             toy().manifest.labels,
             raw=False,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 
 from palpate.io.checksums import NAMED, Checksum, parsed
@@ -13,32 +12,16 @@ CHECK = {
     "xor8": 0x31,
     "crc8": 0xF4,
     "crc8-maxim": 0xA1,
-    "crc8-nrsc5": 0xF7,
     "crc8-sae-j1850": 0x4B,
-    "crc8-autosar": 0xDF,
-    "crc8-dvb-s2": 0xBC,
     "crc8-rohc": 0xD0,
-    "crc8-itu": 0xA1,
-    "crc8-cdma2000": 0xDA,
-    "crc8-wcdma": 0x25,
-    "crc8-darc": 0x15,
-    "crc8-bluetooth": 0x26,
     "crc16-ccitt-false": 0x29B1,
     "crc16-xmodem": 0x31C3,
     "crc16-kermit": 0x2189,
     "crc16-x25": 0x906E,
-    "crc16-mcrf4xx": 0x6F91,
-    "crc16-genibus": 0xD64E,
-    "crc16-aug-ccitt": 0xE5CC,
     "crc16-modbus": 0x4B37,
     "crc16-arc": 0xBB3D,
-    "crc16-usb": 0xB4C8,
-    "crc16-maxim": 0x44C2,
-    "crc16-buypass": 0xFEE8,
-    "crc16-dnp": 0xEA82,
     "crc32": 0xCBF43926,
     "crc32-mpeg2": 0x0376E6E7,
-    "crc32-bzip2": 0xFC891918,
     "crc32c": 0xE3069283,
 }
 """Of the nine bytes "123456789", from the catalogue named in `checksums`; sums by hand."""
@@ -48,8 +31,6 @@ CHECK = {
 def test_the_check_values_of_the_catalogue(name: str) -> None:
     """Each name gives the value that the catalogue prints."""
     assert NAMED[name].of(b"123456789") == CHECK[name]
-    table = np.frombuffer(b"123456789" * 2, np.uint8).reshape(2, 9)
-    assert NAMED[name].of_each(table).tolist() == [CHECK[name]] * 2
 
 
 def test_a_negated_sum_makes_the_sum_of_all_bytes_zero() -> None:
@@ -60,19 +41,21 @@ def test_a_negated_sum_makes_the_sum_of_all_bytes_zero() -> None:
     assert (sum(data) + NAMED["sum8-inverted"].of(data)) & 0xFF == 0xFF
 
 
-@pytest.mark.parametrize("checksum", NAMED.values())
-def test_a_checksum_is_read_from_its_text(checksum: Checksum) -> None:
-    """Name or parameters describe the whole checksum."""
-    assert parsed(checksum.text) == checksum
-
-
 def test_parameters_describe_a_checksum_without_a_name() -> None:
     """A polynomial, initial value and final exclusive or in hexadecimal; other values are
     refused."""
     icode = Checksum("crc8", 0x1D, 0xFD)
     assert parsed("crc8 poly=1d init=fd xorout=00") == icode
     assert icode.of(b"123456789") == 0x7E  # CRC-8/I-CODE
-    assert parsed(icode.text) == icode
+    # those of the catalogue that have no name here
+    for text, value in {
+        "crc8 poly=31 init=ff": 0xF7,
+        "crc8 poly=39 reflected": 0x15,
+        "crc16 poly=1021 init=1d0f": 0xE5CC,
+        "crc16 poly=3d65 xorout=ffff reflected": 0xEA82,
+        "crc32 poly=04c11db7 init=ffffffff xorout=ffffffff": 0xFC891918,
+    }.items():
+        assert parsed(text).of(b"123456789") == value
     assert parsed("sum8 init=5a") == Checksum("sum8", init=0x5A)
     for text in ("", "crc8 poly=0", "crc7", "crc8 poly=1d1", "crc8 poly=xx", "sum8 fast", "crc16"):
         assert parsed(text) is None, text

@@ -232,10 +232,7 @@ def test_space_starts_and_stops(browser: Any, recorded: RecordedPage):
     until(lambda: seen.text("#call") == "Press Start, Space or the pedal")
     seen.page.click("#counts button[aria-label='metal at 2: 3 of 3']")
     until(lambda: seen.text("#said") == "now metal at 2")
-    for state, words in (
-        ("sweeping", "Slide now"),
-        ("ready", "Press Start, Space or the pedal"),
-    ):
+    for state, words in (("sweeping", "Slide now"), ("ready", "Press Start, Space or the pedal")):
         seen.page.keyboard.press("Space")
         until(lambda state=state: seen.text("#state") == state)
         assert seen.text("#call") == words

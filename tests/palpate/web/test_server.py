@@ -18,14 +18,7 @@ from palpate.core.config import WatchConfig
 from palpate.core.errors import ConfigError
 from palpate.web import server
 from palpate.web.access import Access
-from palpate.web.server import (
-    FOLDER,
-    MOST_HEAD,
-    MOST_OPEN,
-    MOST_WAITING,
-    EventLog,
-    PageServer,
-)
+from palpate.web.server import FOLDER, MOST_HEAD, MOST_OPEN, MOST_WAITING, EventLog, PageServer
 from tests.factories.browser import WAIT_S, until
 from tests.factories.install_scripts import page_secrets
 from tests.factories.page_client import EventReader, ask, connected, port, received_by, status
