@@ -212,7 +212,7 @@ CAMPAIGNS = {
     ),
     "junk": Campaign(
         "count the answers to sweeps that no one can name, early ones too (docs/decisions/0005)",
-        _module("tests.campaigns.junk", "--out", "docs/data/junk.json", "--page", "docs/faults.md"),
+        _module("tests.campaigns.junk", "--out", "docs/data/junk.json"),
         variables={"OMP_NUM_THREADS": "1"},
         nice=True,
     ),

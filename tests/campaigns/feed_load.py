@@ -32,7 +32,6 @@ from palpate.client.answers import Answer
 from palpate.core import storage
 from palpate.core.provenance import commit
 from palpate.sim import skin
-from palpate_studies import marked_text
 from tests.campaigns.feed_inside import spent_ns
 from tests.campaigns.feed_readers import KINDS
 from tests.factories.paths import ROOT
@@ -298,9 +297,6 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path("build/feed.json"))
     parser.add_argument(
-        "--page", type=Path, help="also put the table there, between the markers named after --out"
-    )
-    parser.add_argument(
         "--draw", action="store_true", help="measure nothing: the table of --out as it is"
     )
     args = parser.parse_args()
@@ -308,11 +304,6 @@ def main() -> int:
         _measured(args)
     content = json.loads(args.out.read_text())
     print(table(content))
-    if args.page:
-        page = marked_text.insert(
-            args.page.read_text("utf-8"), args.out.stem, table(content), str(args.page)
-        )
-        args.page.write_text(page, "utf-8")
     for text in (bad := missed(content["readers"])):
         print(f"FAIL {text}")
     return 1 if bad else 0

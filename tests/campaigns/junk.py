@@ -27,7 +27,6 @@ from palpate.inference.classifier import Classifier
 from palpate.inference.early_exit import EarlyExit
 from palpate.sim import skin
 from palpate.sim.rig import VirtualClock
-from palpate_studies import marked_text
 
 Counts = NDArray[np.float64]
 N, RATE = skin.FORMAT.window, skin.FORMAT.rate_hz
@@ -472,15 +471,12 @@ def table(content: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    """Count, write the figures, and put the table on a page."""
+    """Count, write the figures, and print the table."""
     parser = argparse.ArgumentParser(prog="python -m tests.campaigns junk", description=__doc__)
     parser.add_argument("--each", type=int, default=EACH, help="sweeps of a kind (default: 200)")
     parser.add_argument("--bundle", type=Path, default=bundle.DEFAULT)
     parser.add_argument("--world", choices=skin.WORLDS, default="level-blind")
     parser.add_argument("--out", type=Path, default=Path("build/junk.json"))
-    parser.add_argument(
-        "--page", type=Path, help="put the table there, between <!-- junk --> marks"
-    )
     parser.add_argument("--draw", action="store_true", help="count nothing: the table of --out")
     options = parser.parse_args()
     if not options.draw:
@@ -489,10 +485,6 @@ def main() -> None:
         content = {"commit": commit(), "bundle": model.id, "world": options.world, "kinds": kinds}
         storage.put(options.out, json.dumps(content, indent=1).encode() + b"\n", parents=True)
     content = json.loads(options.out.read_text("utf-8"))
-    if options.page:
-        text = options.page.read_text("utf-8")
-        page = marked_text.insert(text, "junk", table(content), str(options.page))
-        options.page.write_text(page, "utf-8")
     print(table(content))
 
 
