@@ -196,6 +196,7 @@ def test_a_column_of_dates_gives_the_times():
         "1/31/2026 12:59:{0:06.3f} PM",
         "12:59:{0:06.3f}",
         "12:59:{1:02d},{2:03d}",
+        "12:59:{1:02d}:{2:03d}",
     ],
 )
 def test_dates_of_other_forms_give_the_times(form: str):

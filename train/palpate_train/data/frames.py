@@ -24,7 +24,7 @@ DAY = re.compile(r"(\d{4}-\d\d-\d\d|\d{1,2}[./]\d{1,2}[./]\d{2,4})[T ].*")
 DAY_S = 86_400
 MOMENT = re.compile(
     r"(?:(?P<day>\d{1,4}[-./]\d{1,2}[-./]\d{1,4})[T ]+)?(?P<hour>\d{1,2}):(?P<minute>\d\d)"
-    r"(?::(?P<second>\d\d(?:[.,]\d+)?))?\s?(?P<noon>[aApP][mM])?(?P<zone>Z|[+-]\d\d:?\d\d)?"
+    r"(?::(?P<second>\d\d(?:[.,]\d+|:\d{3})?))?\s?(?P<noon>[aApP][mM])?(?P<zone>Z|[+-]\d\d:?\d\d)?"
 )
 """A time of the day, perhaps with its date and zone."""
 
@@ -217,7 +217,7 @@ def _clock_s(parts: Mapping[str, str]) -> float:
     hours = hours % 12 + 12 * (noon == "pm") if noon else hours
     zone = re.fullmatch(r"([+-])(\d\d):?(\d\d)", parts["zone"])
     offset = 60 * (60 * int(zone[2]) + int(zone[3])) * (1 if zone[1] == "+" else -1) if zone else 0
-    seconds = float(parts["second"].replace(",", ".") or 0)
+    seconds = float(re.sub("[,:]", ".", parts["second"]) or 0)
     return 3600 * hours + 60 * int(parts["minute"]) + seconds - offset
 
 

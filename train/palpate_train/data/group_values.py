@@ -21,27 +21,22 @@ WHOLE = re.compile(r"-?[1-9][0-9]{0,8}|0")
 NUMBER = re.compile(r"-?(?:0|[1-9][0-9]{0,8})(?:\.[0-9]+)?")
 """Texts that are numbers. 07 is not, or it would equal 7."""
 MEASURED = re.compile(r"(-?[0-9.]+) ?([A-Za-zµ%/_]+)")
-UNITS: dict[str, tuple[str, Fraction]] = {
-    "N": ("N", Fraction(1)),
-    "mN": ("N", Fraction(1, 1000)),
-    "kPa": ("kPa", Fraction(1)),
-    "Pa": ("kPa", Fraction(1, 1000)),
-    "mm/s": ("mm/s", Fraction(1)),
-    "um/s": ("mm/s", Fraction(1, 1000)),
-    "cm/s": ("mm/s", Fraction(10)),
-    "m/s": ("mm/s", Fraction(1000)),
-    "mm": ("mm", Fraction(1)),
-    "um": ("mm", Fraction(1, 1000)),
-    "cm": ("mm", Fraction(10)),
-    "s": ("s", Fraction(1)),
-    "ms": ("s", Fraction(1, 1000)),
-    "Hz": ("Hz", Fraction(1)),
-    "kHz": ("Hz", Fraction(1000)),
-    "g": ("g", Fraction(1)),
-    "kg": ("g", Fraction(1000)),
-    "deg": ("deg", Fraction(1)),
-    "rpm": ("rpm", Fraction(1)),
-    "%": ("%", Fraction(1)),
+_SCALES = {
+    "N": {"N": "1", "mN": "1/1000"},
+    "kPa": {"kPa": "1", "Pa": "1/1000"},
+    "mm/s": {"mm/s": "1", "um/s": "1/1000", "cm/s": "10", "m/s": "1000"},
+    "mm": {"mm": "1", "um": "1/1000", "cm": "10"},
+    "s": {"s": "1", "ms": "1/1000"},
+    "Hz": {"Hz": "1", "kHz": "1000"},
+    "g": {"g": "1", "kg": "1000"},
+    "deg": {"deg": "1"},
+    "rpm": {"rpm": "1"},
+    "%": {"%": "1"},
+}
+UNITS = {
+    unit: (base, Fraction(factor))
+    for base, units in _SCALES.items()
+    for unit, factor in units.items()
 }
 """Each unit as a multiple of the one that units of its kind are compared in."""
 SPELLED = (

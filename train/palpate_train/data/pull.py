@@ -67,47 +67,43 @@ class RecordingHost:
     folder: str = FOLDER
     options: Sequence[str] = ()
 
-    def run(
-        self, script: str, stdin: IO[bytes] | int, stderr: IO[bytes]
-    ) -> subprocess.Popen[bytes]:
-        """Start a script in the folder, with sudo if the user cannot read the folder.
-
-        Raises ApplianceError if ssh is not installed.
-        """
-        ours = [part for option in SSH_OPTIONS for part in ("-o", option)]
-        remote = shlex.join(["sh", "-c", AS_READER, "sh", self.folder, script])
-        try:
-            return subprocess.Popen(
-                ["ssh", *self.options, *ours, "--", self.host, remote],
-                stdin=stdin,
-                stdout=subprocess.PIPE,
-                stderr=stderr,
-            )
-        except FileNotFoundError:
-            raise ApplianceError("ssh is not installed; apt install openssh-client") from None
-
     @contextmanager
     def output(
         self, script: str, stdin: IO[bytes] | int = subprocess.DEVNULL
     ) -> Iterator[IO[bytes]]:
-        """A context with the script's output; leaving it waits for the script's end.
+        """A context with the output of a script that runs in the folder, with sudo if the user
+        cannot read the folder; leaving it waits for the script's end.
 
-        The script's messages go to stderr. Raises ApplianceError if the box cannot be reached or
-        the script fails.
+        The script's messages go to stderr. Raises ApplianceError if ssh is not installed, the box
+        cannot be reached or the script fails.
         """
-        with tempfile.TemporaryFile() as errors, self.run(script, stdin, errors) as process:
+        ours = [part for option in SSH_OPTIONS for part in ("-o", option)]
+        remote = shlex.join(["sh", "-c", AS_READER, "sh", self.folder, script])
+        command = ["ssh", *self.options, *ours, "--", self.host, remote]
+        with tempfile.TemporaryFile() as errors:
             try:
-                assert process.stdout
-                yield process.stdout
-                process.stdout.read()
-            except BaseException:
-                process.kill()
-                raise
-            code = process.wait()
+                process = subprocess.Popen(
+                    command, stdin=stdin, stdout=subprocess.PIPE, stderr=errors
+                )
+            except FileNotFoundError:
+                raise ApplianceError("ssh is not installed; apt install openssh-client") from None
+            with process:
+                try:
+                    assert process.stdout
+                    yield process.stdout
+                    process.stdout.read()
+                except BaseException:
+                    process.kill()
+                    raise
+                code = process.wait()
             errors.seek(0)
             messages = " / ".join(errors.read().decode(errors="replace").split("\n")).strip(" /")
         if messages:
             print(f"{self.host}: {messages}", file=sys.stderr)
+        self._check(code)
+
+    def _check(self, code: int) -> None:
+        """Raise ApplianceError for an exit code of a script."""
         if code == 255:
             raise ApplianceError(
                 f"{self.host}: no connection; see that `ssh {self.host} true` works"

@@ -56,6 +56,7 @@ REMEDIES = {
     (".pt", ".pth"): "a file of PyTorch; save the tensor with numpy.save(path, tensor.numpy())",
     (".rds", ".rdata", ".rda"): "a file of R; save the table with write.csv",
     (".zip", ".gz", ".bz2", ".xz", ".zst", ".7z", ".tar", ".tgz", ".rar"): "packed; unpack it",
+    (".ts", ".tsf", ".arff"): "a set of series; save its arrays with numpy.savez, one a recording",
     (".sav", ".dta", ".sas7bdat"): "a file of a statistics program; export it as CSV",
     (".ulg", ".tlog"): "a flight log; export it as CSV",
     (".wav", ".flac", ".mp3"): "a sound; export its samples as CSV or .npy",

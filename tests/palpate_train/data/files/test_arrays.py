@@ -218,6 +218,7 @@ def test_null_in_json_is_a_fault(tmp_path: Path):
     [
         ("a.pkl", b"", "a pickle, which can run"),
         ("a.rds", b"", "is a file of R"),
+        ("a.ts", b"@data\n1,2,3:a\n", "is a set of series"),
         ("a.csv", b"PK\3\4...", "is a zip archive"),
         ("a.csv", b"\x1f\x8b...", "is packed with gzip"),
         ("a.fsx", b"", "is Tekscan's own format"),

@@ -338,7 +338,8 @@ def _columns(
             raise FormatError(f"line {i}: {e}") from e
         if len(found[-1]) != layout.wide:
             raise FormatError(
-                f"line {i} has {len(found[-1])} columns, line {rows[0][0]} has {layout.wide}"
+                f"line {i} has {len(found[-1])} columns, line {rows[0][0]} has {layout.wide}; "
+                "write one row for each frame"
             )
     values = np.full((len(rows), layout.wide), math.nan)
     texts: dict[int, list[str]] = {}
