@@ -34,8 +34,6 @@ DISPLAY = "display name"
 BATCH = 4096
 """Number of frames that are converted at a time."""
 Fields = dict[str, str]
-Source = tuple[str, Fields, Callable[[], Table]]
-"""Name of a recording, its fields that are known already, and a function that reads it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +57,23 @@ class LeftOut:
     broken: bool = False
 
 
+Source = tuple[str, Fields, Callable[[], Table]] | LeftOut
+"""Name of a recording, its fields that are known already, and a function that reads it; or why it
+cannot be read."""
+
+
+@dataclass(frozen=True)
+class Taken:
+    """A recording that was imported: its numbers of windows and frames. said: remarks of the
+    reader. notes: how its frames were changed."""
+
+    name: str
+    windows: int
+    frames: int
+    said: Sequence[str]
+    notes: str
+
+
 @dataclass(frozen=True, eq=False)
 class Cut:
     """Windows [k, T, R, C(, A)] of one recording, most of them views of its frames. notes: how its
@@ -72,18 +87,6 @@ class Cut:
         """The counts and remarks, without windows and frames."""
         one = self.recording
         return Taken(one.name, len(self.windows), len(one.frames), one.notes, self.notes)
-
-
-@dataclass(frozen=True)
-class Taken:
-    """A recording that was imported: its numbers of windows and frames. said: remarks of the
-    reader. notes: how its frames were changed."""
-
-    name: str
-    windows: int
-    frames: int
-    said: Sequence[str]
-    notes: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,15 +109,21 @@ def import_folder(
     even after an error. Raises FormatError if the box cannot send a material's name, or if no file
     remains.
     """
+    sources: Iterator[Source]
     if plan.pattern is None and lerobot.is_data_set(folder):
         plan = lerobot.with_grid(folder, plan)
-        sources = _episodes(folder, plan)
+        episodes = lerobot.episodes(folder, plan)
+        sources = ((name, {}, partial(replace, table)) for name, table in episodes)
     else:
         sources = _files(_named(folder, plan, left_out), plan, log)
     recordings, count = [], 0
     orders: dict[tuple[str, ...], tuple[str, ...]] = {}
-    for name, known, read in sources:
+    for source in sources:
         count += 1
+        if isinstance(source, LeftOut):
+            left_out.append(source)
+            continue
+        name, known, read = source
         try:
             table = read()
             _check_order(table, orders, plan)
@@ -211,7 +220,7 @@ def _arrays(
     try:
         held = raw_files.arrays_of(path)
     except FormatError as e:
-        return (yield name, fields, partial(_refused, str(e)))
+        return (yield LeftOut(name, str(e), broken=True))
     matched = False
     for array in held:
         short = array if "/" in pattern.text else array.rpartition("/")[2]
@@ -219,7 +228,7 @@ def _arrays(
         try:
             found = pattern.read(short)
         except FormatError as e:
-            yield at, fields, partial(_refused, str(e))
+            yield LeftOut(at, str(e), broken=True)
             continue
         if found is not None:
             matched, plan = True, replace(wanted, variable=array)
@@ -227,16 +236,7 @@ def _arrays(
     if not matched:
         listed = ", ".join(map(printable, held[:MOST_LISTED])) or "none"
         why = f"has no array of frames that matches --variable {pattern.text!r}; it holds {listed}"
-        yield name, fields, partial(_refused, why)
-
-
-def _refused(why: str) -> Table:
-    raise FormatError(why)
-
-
-def _episodes(folder: Path, plan: ImportPlan) -> Iterator[Source]:
-    for name, table in lerobot.episodes(folder, plan):
-        yield name, {}, partial(replace, table)
+        yield LeftOut(name, why, broken=True)
 
 
 def _recordings(table: Table, name: str, known: Fields, plan: ImportPlan) -> list[Recording]:
@@ -324,12 +324,14 @@ def _cuts(
     for one in recordings:
         try:
             even = one.time_s is not None and sampling.runs(one.frames, one.time_s, rate_hz)
-            cuts.append(_cut(one, even or sampling.Runs((one.frames,)), rate_hz, plan))
+            cut = _cut(one, even or sampling.Runs((one.frames,)), rate_hz, plan)
         except FormatError as e:
             left_out.append(LeftOut(one.name, str(e), broken=True))
-    for cut in [cut for cut in cuts if not len(cut.windows)]:
-        left_out.append(LeftOut(cut.recording.name, cut.notes))
-        cuts.remove(cut)
+            continue
+        if len(cut.windows):
+            cuts.append(cut)
+        else:
+            left_out.append(LeftOut(one.name, cut.notes))
     return cuts, rate_hz
 
 
@@ -338,28 +340,21 @@ def _cut(one: Recording, runs: sampling.Runs, rate_hz: float, plan: ImportPlan) 
     window, longest = plan.window.frames(rate_hz), max(runs.parts, key=len)
     if plan.every:
         hop = plan.every.frames(rate_hz)
-        starts = [
-            (part, start) for part in runs.parts for start in range(0, len(part) - window + 1, hop)
-        ]
+        ends = ((part, len(part) - window + 1) for part in runs.parts)
+        starts = [(part, start) for part, end in ends for start in range(0, end, hop)]
     else:
         starts = [(longest, (len(longest) - window) // 2)] if len(longest) >= window else []
     if not starts:
         between = f" in a row ({runs.gaps} gaps)" if runs.gaps else ""
-        return Cut(
-            one,
-            np.empty(0),
-            f"has {len(longest)} frames{between}, but a window needs {window}; see --window",
-        )
+        why = f"has {len(longest)} frames{between}, but a window needs {window}; see --window"
+        return Cut(one, np.empty(0), why)
     windows = _windows(starts, window)
     if runs.interpolated and not (one.frames % 1).any():
         windows = np.rint(windows)  # whole counts stay whole
     if one.frames.dtype.kind in "iu":
         windows = windows.astype(one.frames.dtype, copy=False)
-    notes = [
-        *one.notes,
-        *["interpolated onto even times"] * runs.interpolated,
-        *[f"{runs.gaps} gaps"] * (runs.gaps > 0),
-    ]
+    notes = [*one.notes, *["interpolated onto even times"] * runs.interpolated]
+    notes += [f"{runs.gaps} gaps"] * (runs.gaps > 0)
     return Cut(one, windows, ", ".join(notes))
 
 

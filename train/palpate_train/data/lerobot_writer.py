@@ -55,7 +55,8 @@ def write(sweeps: Dataset, out: Path) -> None:
     with storage.folder(out) as folder:
         (folder / INFO).parent.mkdir()
         episodes = [row for rows in _files(sweeps, folder) for row in rows]
-        _put(folder / "meta/episodes" / FILE.format(chunk_index=0, file_index=0), _listed(episodes))
+        columns = {name: [row[name] for row in episodes] for name in episodes[0]}
+        _put(folder / "meta/episodes" / FILE.format(chunk_index=0, file_index=0), columns)
         _put_tasks(folder / TASKS[1], sweeps.materials)
         stats = {name: _stats(values) for name, values in _columns(sweeps, slice(None)).items()}
         (folder / "meta/stats.json").write_text(json.dumps(stats))
@@ -159,10 +160,6 @@ def _stats(values: Array) -> dict[str, Any]:
         name: column.reshape(shape).tolist() for name, column in zip(names, rows.T, strict=True)
     }
     return found | {"count": [len(values)]}
-
-
-def _listed(rows: list[dict[str, Any]]) -> dict[str, list[Any]]:
-    return {name: [row[name] for row in rows] for name in rows[0]}
 
 
 def _put(path: Path, columns: Mapping[str, Any]) -> None:

@@ -116,7 +116,9 @@ def read(path: Path, kind: type[Set]) -> Set:
         raise FormatError(
             f"{path.name}: not a sweep set: the file cannot be read: {e.strerror}"
         ) from e
-    if path.suffix in HDF5 or _is_hdf5(path):
+    import h5py  # here, and below: the box, which reads folders alone, does not have it
+
+    if path.suffix in HDF5 or h5py.is_hdf5(path):
         return read_hdf5(path, kind)
     if path.suffix.lower() in FRAMES:
         raise FormatError(
@@ -125,16 +127,10 @@ def read(path: Path, kind: type[Set]) -> Set:
     return load_file(path, kind, mapped.of_npz(path))
 
 
-def _is_hdf5(path: Path) -> bool:
-    import h5py
-
-    return bool(h5py.is_hdf5(path))
-
-
 def read_hdf5(path: Path, kind: type[Set]) -> Set:
     """The set in an HDF5 file with the keys of an .npz, or in the TactMat layout. Raises
     FormatError."""
-    import h5py  # here, and below: the box, which reads folders alone, does not have it
+    import h5py
 
     try:
         with h5py.File(path, "r") as file:

@@ -10,7 +10,7 @@ from typing import Any
 
 import h5py
 
-from palpate_train.data.files.table import Array, Entry, ReadPlan, Table, chosen
+from palpate_train.data.files.table import Entry, ReadPlan, Table, chosen
 from palpate_train.data.readers import array_in
 
 CLASS = "MATLAB_class"
@@ -50,13 +50,9 @@ def entries(file: h5py.File, matlab: bool = False) -> Mapping[str, Entry]:
         if kind is None and not (matlab and one.dtype.kind in "biuf"):
             found[name] = Entry.of(one.shape, one.dtype, partial(array_in, file, name))
         elif kind in (None, *NUMERIC) and "MATLAB_empty" not in one.attrs:
-            read = partial(_reversed, file, name)
+            # MATLAB stores by columns, with its own order of axes
+            read = partial(lambda name: array_in(file, name).T, name)
             found[name] = Entry.of(one.shape[::-1], one.dtype, read)
 
     file.visititems(keep)
     return found
-
-
-def _reversed(file: h5py.File, name: str) -> Array:
-    """An array that MATLAB stored by columns, with its own order of axes."""
-    return array_in(file, name).T
