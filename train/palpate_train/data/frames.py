@@ -54,18 +54,12 @@ def frames(table: Table, plan: ImportPlan) -> tuple[Array, Array | None, list[st
     values, notes = _time_first(values, table, plan)
     at, time_s = _times(values, table, plan)
     chosen = _taxels(values, table, plan, at)
-    bad = ~np.isfinite(chosen) if chosen.dtype.kind == "f" else np.zeros(0, bool)
-    what = "fill it in or cut it away"
-    if chosen.dtype.kind == "f" and not bad.any():
-        bad, what = (
-            np.abs(chosen) > LARGEST_READING,
-            (f"no skin reads more than {LARGEST_READING:g}: fill it in or cut it away"),
-        )
-    if bad.any():
+    if chosen.dtype.kind == "f" and (bad := ~(np.abs(chosen) <= LARGEST_READING)).any():
         index = np.argwhere(bad)[0]
-        taxel = ", ".join(map(str, index[1:] + 1))
+        value, taxel = chosen[tuple(index)], ", ".join(map(str, index[1:] + 1))
+        limit = "" if not np.isfinite(value) else f"no skin reads more than {LARGEST_READING:g}: "
         raise FormatError(
-            f"frame {index[0] + 1}, taxel {taxel} is {chosen[tuple(index)]:g}; {what}"
+            f"frame {index[0] + 1}, taxel {taxel} is {value:g}; {limit}fill it in or cut it away"
         )
     return chosen, time_s, notes
 
@@ -232,11 +226,6 @@ def _taxels(values: Array, table: Table, plan: ImportPlan, time_column: int | No
                 "or name the axes with --axes"
             )
         return values
-    others = [
-        column_numbers(column, table.columns, values.shape[1], "--field", 1)[0]
-        for column in plan.fields.values()
-        if table.columns
-    ]
     if not shape:
         count = values.shape[1] - len(table.texts)
         raise GridMissing(
@@ -246,9 +235,10 @@ def _taxels(values: Array, table: Table, plan: ImportPlan, time_column: int | No
     if plan.columns:
         numbers = column_numbers(plan.columns, table.columns, wide, "--columns")
     else:
-        numbers = [
-            i for i in range(wide) if i not in (time_column, *others) and i not in table.texts
-        ]
+        fields = plan.fields.values() if table.columns else ()
+        others = [column_numbers(one, table.columns, wide, "--field", 1)[0] for one in fields]
+        others += [*table.texts, -1 if time_column is None else time_column]
+        numbers = [i for i in range(wide) if i not in others]
     _check_numbers(table, numbers)
     if len(numbers) != want:
         raise FormatError(_mismatch(len(numbers), len(values), plan, time_column))
@@ -257,17 +247,11 @@ def _taxels(values: Array, table: Table, plan: ImportPlan, time_column: int | No
 
 def _mismatch(count: int, rows: int, plan: ImportPlan, time_column: int | None) -> str:
     """The message about a number of columns that does not fill the grid."""
-    which = (
-        "--columns names"
-        if plan.columns
-        else "it has"
-        if time_column is None
-        else "beside the time it has"
-    )
+    which = "it has" if time_column is None else "without the time it has"
+    which = "--columns gives" if plan.columns else which
     want = int(np.prod(plan.shape))
-    advice = (
-        f"it has {want} rows, so add --transpose" if rows == want else "see --columns and --grid"
-    )
+    turned = f"it has {want} rows, so add --transpose"
+    advice = turned if rows == want else "see --columns and --grid"
     return f"{which} {count} columns, but a grid of {plan.grid} needs {want}; {advice}"
 
 
@@ -308,11 +292,8 @@ def column_numbers(
                 _named(names[i], names, option)
             found += matching
         else:
-            known = (
-                f"its columns are {', '.join(names)}"
-                if names
-                else f"its {wide} columns have no names: use numbers"
-            )
+            known = f"its {wide} columns have no names: use numbers"
+            known = f"its columns are {', '.join(names)}" if names else known
             raise FormatError(f"{option}: there is no column {part!r}; {known}")
     if len(set(found)) < len(found) or len(found) > most:
         raise FormatError(

@@ -144,11 +144,9 @@ class ImportPlan:
     @property
     def order(self) -> tuple[str, ...]:
         """The axes that --axes or --transpose gives, () without them."""
-        return (
-            ("taxel", "frame")
-            if self.transpose
-            else tuple(self.axes.split(","))[: 8 * bool(self.axes)]
-        )
+        if self.transpose:
+            return "taxel", "frame"
+        return tuple(self.axes.split(",")) if self.axes else ()
 
     @property
     def names(self) -> list[str]:

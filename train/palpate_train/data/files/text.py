@@ -119,7 +119,11 @@ def table(
     layout = _layout(kept, delimiter)
     start, end = _body(kept, layout)
     said = [*notes, *bare.notes, *_remarks(kept, start, end, layout)]
-    rows = [(i, line) for i, line in kept[start:end] if not _is_comment(line, layout)]
+    rows = [  # a frame that begins with # is no comment
+        (i, line)
+        for i, line in kept[start:end]
+        if not _marked(line) or len(layout.cells(line)) == layout.wide
+    ]
     if between := end - start - len(rows):
         said.append(f"{between} comments between its frames are passed over")
     decimal = decimal or decimal_sign(rows, layout.delimiter, layout.cells)
@@ -178,7 +182,7 @@ def _labview(lines: Sequence[str], decimal: str) -> tuple[list[Row], tuple[str, 
 def _layout(kept: Sequence[Row], delimiter: str) -> Layout:
     """The layout that most lines at the start and the end share."""
     sample = [line for _, line in (*kept[:SAMPLED], *kept[max(SAMPLED, len(kept) - SAMPLED) :])]
-    sample = [line for line in sample if not line.lstrip().startswith(COMMENTS)]
+    sample = [line for line in sample if not _marked(line)]
     ways = (delimiter,) if delimiter else DELIMITERS
     shares = {way: sum(_share(line, way) for line in sample) for way in ways}
     best = next(way for way, share in shares.items() if share >= CLEAR * max(shares.values()))
@@ -212,11 +216,10 @@ def _trimmed(found: list[str]) -> list[str]:
     return found[:-1] if len(found) > 1 and not found[-1].strip() else found
 
 
-def _is_comment(line: str, layout: Layout) -> bool:
-    """Whether a line among frames is a comment; a frame that begins with # is not."""
-    return line.lstrip().startswith(COMMENTS) and not (
-        SHEET_ERROR.match(line.lstrip()) or len(layout.cells(line)) == layout.wide
-    )
+def _marked(line: str) -> bool:
+    """Whether a line begins as a comment; the error of a spreadsheet does not."""
+    line = line.lstrip()
+    return line.startswith(COMMENTS) and not SHEET_ERROR.match(line)
 
 
 def _body(kept: Sequence[Row], layout: Layout) -> tuple[int, int]:
@@ -225,7 +228,7 @@ def _body(kept: Sequence[Row], layout: Layout) -> tuple[int, int]:
         (
             k
             for k, (_, line) in enumerate(kept)
-            if (SHEET_ERROR.match(line.lstrip()) or not line.lstrip().startswith(COMMENTS))
+            if not _marked(line)
             and layout.is_frame(line)
             and not _counts_columns(layout.cells(line))
         ),
@@ -241,14 +244,12 @@ def _body(kept: Sequence[Row], layout: Layout) -> tuple[int, int]:
 
 def _counts_columns(found: Sequence[str]) -> bool:
     """Whether a line is the head that pandas writes for nameless columns: ,0,1,2,3."""
-    return not found[0].strip() and [c.strip() for c in found[1:]] == [
-        str(i) for i in range(len(found) - 1)
-    ]
+    return [cell.strip() for cell in found] == ["", *map(str, range(len(found) - 1))]
 
 
 def _is_footer(line: str, layout: Layout, last: bool) -> bool:
     """Whether a line after the frames is text, a comment or, as the last one, cut off."""
-    if line.lstrip().startswith(COMMENTS) and not SHEET_ERROR.match(line.lstrip()):
+    if _marked(line):
         return len(layout.cells(line)) != layout.wide or not layout.is_frame(line)
     found = _trimmed(layout.cells(line))
     given = [is_number(cell) for cell in found]
@@ -259,7 +260,7 @@ def _is_footer(line: str, layout: Layout, last: bool) -> bool:
 
 def _remarks(kept: Sequence[Row], start: int, end: int, layout: Layout) -> list[str]:
     """Remarks on the lines after the frames."""
-    rest = [(i, line) for i, line in kept[end:] if not line.lstrip().startswith(COMMENTS)]
+    rest = [(i, line) for i, line in kept[end:] if not _marked(line)]
     if not rest:
         return []
     i, line = rest[0]
@@ -272,10 +273,10 @@ def _remarks(kept: Sequence[Row], start: int, end: int, layout: Layout) -> list[
 def _heads(lines: Sequence[str], before: Sequence[Row], layout: Layout) -> tuple[str, ...]:
     """The names of the columns: the cells of the last line before the frames that has as many, or
     one fewer as in R. A line of units is passed over."""
-    comments = [line.lstrip("#% ") for _, line in before if line.lstrip().startswith(COMMENTS)]
-    plain_lines = [line for _, line in before if not line.lstrip().startswith(COMMENTS)]
+    comments = [line.lstrip("#% ") for _, line in before if _marked(line)]
+    others = [line for _, line in before if not _marked(line)]
     for wide in (layout.wide, layout.wide - 1):
-        for group in (plain_lines, comments):
+        for group in (others, comments):
             heads = [
                 [c.strip().strip("\"'") for c in cells(line, layout.delimiter)] for line in group
             ]
