@@ -17,14 +17,16 @@ from tempfile import TemporaryDirectory
 from typing import Any
 from unittest import mock
 
+import numpy as np
+
 from palpate.bundle import bundle
 from palpate.cli.main import main
 from palpate.core import storage
 from palpate.core.clock import Clock
 from palpate.core.errors import FormatError
 from palpate.core.types import load
-from palpate.learn import use
-from palpate.learn.state import TeachingState
+from palpate.learn import install
+from palpate.sweeps.sweep_folder import FORGOTTEN, forgotten_in
 from tests.cuts import delivery
 from tests.cuts.calls import NotFollowed
 from tests.cuts.delivery import STORE, Shop
@@ -32,9 +34,9 @@ from tests.cuts.scene import CutScene, Found, SceneStep
 from tests.factories import lessons
 from tests.factories.sweep_sets import easy
 
-FORGOTTEN = "low"
+MATERIAL = "low"
 """The material that is forgotten."""
-FORGET, USE = ("teach", "--forget", FORGOTTEN), ("teach", "--use", "--by", "anna")
+FORGET, USE = ("teach", "--forget", MATERIAL), ("teach", "--use", "--by", "anna")
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +52,8 @@ class TeachingShop(Shop):
             ran = {found.heard} if found.heard else {ids[name] for name in may[found.step]}
             later = found.step != steps[0].name
             # the next forget overwrites it
-            (found.folder / STORE / f"teaching.json{storage.PART}").unlink(missing_ok=True)
+            part = f"{FORGOTTEN}{storage.PART}"
+            (found.folder / STORE / "sweeps" / part).unlink(missing_ok=True)
             return (
                 _lost(found.folder / STORE, forgotten=later)
                 or self._comes_back(found.folder, ran)
@@ -103,7 +106,7 @@ class TeachingShop(Shop):
         return ids
 
     def _taught(self, folder: Path) -> tuple[int, str]:
-        with mock.patch.object(use, "_wait", at_once):
+        with mock.patch.object(install, "_wait", at_once):
             return delivery._apart(self.words(folder, *USE))
 
     def _taught_again(self, folder: Path) -> list[str]:
@@ -121,12 +124,14 @@ def _lost(store: Path, *, forgotten: bool) -> list[str]:
     """Sweeps and decisions that are gone. forgotten: whether the material must be forgotten."""
     try:
         sweeps = [load(path)[0] for path in sorted((store / "sweeps").glob("*.npy"))]
-        state = TeachingState.load(store / "teaching.json").forgotten
+        gone = forgotten_in(store / "sweeps")
     except FormatError as e:
         return [str(e)]
     wrong = [] if len(sweeps) == len(easy(1)) else [f"{len(sweeps)} sweeps are left"]
-    if state not in ([{FORGOTTEN: len(easy(1))}] if forgotten else [{FORGOTTEN: len(easy(1))}, {}]):
-        wrong.append(f"forgotten are {state}")
+    low = np.flatnonzero(easy(1).labels == easy(1).materials.index(MATERIAL)) + 1
+    held = {MATERIAL: low.tolist()}
+    if gone not in ([held] if forgotten else [held, {}]):
+        wrong.append(f"forgotten are {gone}")
     return wrong
 
 
@@ -149,5 +154,5 @@ def at_once(
 
 
 if __name__ == "__main__":
-    with mock.patch.object(use, "_wait", at_once):
+    with mock.patch.object(install, "_wait", at_once):
         sys.exit(main(sys.argv[1:]))

@@ -13,8 +13,3 @@ ONE_AXIS = Path(__file__).with_name("one_axis")
 """Files of a version without axes: a recorded sweep, a capture of three sweeps with the toy bundle,
 and its verdicts.
 """
-SIDECARS_2 = Path(__file__).with_name("sidecars_2")
-"""Three sweeps with the toy bundle from a version that wrote sidecars of schema 2.
-
-Sweeps 1 and 2 are of one object and fused by vote. The contact of sweep 2 is displaced.
-"""

@@ -23,7 +23,7 @@ from palpate.deployment.enrolment_key import EnrolmentKey
 from palpate.deployment.signed import SignedBundle
 from palpate.inference import enrolment
 from palpate.inference.enrolment import Enrolment, SweepCollector
-from palpate.learn import into
+from palpate.learn import materials
 from palpate.runtime import assembly
 from palpate.sweeps import unknown_sweeps
 
@@ -88,7 +88,7 @@ def _check_store(settings: Config) -> None:
 def _taught(args: argparse.Namespace, start: SignedBundle, sweeps: NDArray[Any]) -> Enrolment:
     """The enrolment of these sweeps, with its warnings and its accuracy in the log. Raises
     BundleError if they disagree."""
-    new = into.taught(start, {args.label: sweeps})
+    new = materials.taught(start, {args.label: sweeps})
     if new.disagreement and not args.scattered:
         raise BundleError(
             f"{new.disagreement}, or give --scattered if all are of {args.label!r}; nothing was"
@@ -97,9 +97,9 @@ def _taught(args: argparse.Namespace, start: SignedBundle, sweeps: NDArray[Any])
     for warning in filter(None, (new.disagreement, *new.warnings)):
         log.warning(f"warning: {warning}")
     if len(sweeps) > 1:
-        numbers = [*range(len(sweeps))]
-        alone = into.NewSweeps({args.label: sweeps}, {args.label: numbers}, [])
-        log.info(into.assessed(start, alone)["text"])
+        files = [*map(str, range(len(sweeps)))]
+        alone = materials.NewSweeps({args.label: sweeps}, {args.label: files})
+        log.info(materials.assessed(start, alone).text())
     return new
 
 
@@ -123,7 +123,7 @@ def _enrolment_key(args: argparse.Namespace, settings: Config) -> EnrolmentKey |
             )
         return None
     if not args.out:
-        into.check_settings(settings)
+        materials.check_settings(settings)
     key = EnrolmentKey(settings.store.enrolment_key)
     key.check()
     return key

@@ -31,16 +31,16 @@ from palpate.inference.enrolment import slide_check
 from palpate.io import skins
 from palpate.io.robot_link import Command, Port
 from palpate.io.verdict_lines import check_bits
-from palpate.learn import into, state, use
+from palpate.learn import install, materials
 from palpate.learn.hand_over import HandOver
 from palpate.learn.process import News
 from palpate.learn.session import TeachingSession, refuse_trained
-from palpate.learn.state import TeachingState
 from palpate.learn.teacher import Teacher
 from palpate.runtime import assembly
 from palpate.service.systemd import Notifier
 from palpate.signal.slide_check import SlidesAmong
 from palpate.sweeps.recording import Labels, RecordingSession
+from palpate.sweeps.sweep_folder import SweepFolder
 
 if TYPE_CHECKING:
     from palpate.web.record import RecordPage
@@ -52,7 +52,7 @@ NOTHING, GOOD = "nothing taught yet", 8
 def run(args: argparse.Namespace) -> int:
     """Teach the box, until its bundle is made, Ctrl-C or SIGTERM."""
     settings = load_settings(args)
-    use.check_allowed(settings)
+    install.check_allowed(settings)
     if args.forget is not None:
         return _forget(settings, args.forget)
     if args.use and not args.labels and args.web is None:
@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
             return 0
         try:
             _assess(args, settings)
-        except use.TeachingFailed as e:  # the sweeps are stored; there are too few so far
+        except install.TeachingFailed as e:  # the sweeps are stored; there are too few so far
             print(f"teach: {e}")
         return _use(args, settings) if args.use else 0
     return _in_json(args, lambda: _assess(args, settings))
@@ -97,29 +97,33 @@ def page_address(settings: Config) -> str:
     if not find_spec("tornado"):
         return "no page (pages need palpate[page])"
     try:
-        use.check_allowed(settings)
+        install.check_allowed(settings)
         return Access.configured(settings.watch, TEACH_PORT, secret=False).url(TEACH_PORT)
     except ConfigError as e:
         return f"no page ({e})"
 
 
 def _forget(settings: Config, material: str) -> int:
-    sweeps, file = settings.kept("sweeps"), state.file(settings)
-    numbers = [
-        int(path.stem.rpartition("-")[2])
-        for path in sweeps.glob("sweep-*.npy")
-        if path.stem.rpartition("-")[2].isdecimal()
-    ]
+    """Teach the sweeps of a material so far no longer. Raises ConfigError if they are in use."""
     Labels(material=material)
-    TeachingState.load(file).forget(file, material, max(numbers, default=0))
+    sweeps = settings.kept("sweeps")
+    try:
+        folder = SweepFolder(sweeps, None)
+        own = [n for n, about in folder.sidecars() if about.get("material") == material]
+        folder.forget(material, own)
+        folder.close()
+    except OSError as e:
+        raise ConfigError(
+            f"{sweeps}: {e.strerror}; forget it on the page, or stop the program"
+        ) from e
     print(f"{material}: its sweeps so far are no longer taught; they stay in {sweeps}")
     return 0
 
 
 def _assess(args: argparse.Namespace, settings: Config) -> None:
     """Print the assessment of the recorded sweeps."""
-    found = use.assessed(settings, assembly.store(settings), SystemClock())
-    print(json.dumps(found) if args.json else use.described(found), flush=True)
+    found = install.assessed(settings, assembly.store(settings), SystemClock())
+    print(json.dumps(found) if args.json else install.described(found), flush=True)
 
 
 def _in_json(args: argparse.Namespace, act: Callable[[], object]) -> int:
@@ -151,7 +155,7 @@ def _use(args: argparse.Namespace, settings: Config) -> int:
 
     def teach() -> None:
         by = args.by or getpass.getuser()
-        sha = use.use(settings, assembly.store(settings), by, SystemClock(), tell)
+        sha = install.install(settings, assembly.store(settings), by, SystemClock(), tell)
         text = f"bundle {sha[:8]} with {', '.join(told['labels'])} is installed, on trial"
         if args.json:
             print(json.dumps({**told, "type": "taught", "sha": sha, "text": text}), flush=True)
@@ -197,10 +201,10 @@ class Session:
         """Run until all sweeps are recorded; with a page until DONE."""
         with ExitStack() as stack:
             devices, format = record_command.open_skin(self._args, self._settings)
-            self._base = use.base(assembly.store(self._settings), format)
+            self._base = install.base(assembly.store(self._settings), format)
             if self._base:  # sweeps as long as those of its materials
                 format = self._base.bundle.format
-                into.check_settings(self._settings)
+                materials.check_settings(self._settings)
             pages = self._page(format, devices)
             for page in pages:
                 stack.enter_context(page)
@@ -283,17 +287,16 @@ class Session:
     def _lesson(self, recording: RecordingSession, say: Callable[[bytes], None]) -> TeachingSession:
         """The session beside a recording. Raises ConfigError for a --label that it refuses."""
         if self._base:  # it has the materials of an earlier session by now
-            self._base = use.base(assembly.store(self._settings), self._base.bundle.format)
+            self._base = install.base(assembly.store(self._settings), self._base.bundle.format)
         base = self._base.bundle if self._base else None
         session = TeachingSession(
             recording,
-            state.file(self._settings),
             self._settings.teach,
             self._command,
             say,
             codes=self._codes,
             base=base.manifest.labels if base else (),
-            trained=into.trained(base) if base else (),
+            trained=materials.trained(base) if base else (),
         )
         if self._args.labels:
             session.admit(*self._args.labels)
@@ -393,12 +396,12 @@ class Session:
         options += ["--finger", self._settings.alone] if self._settings.alone else []
         sets = [*args.set, *([f"skin.profile={args.skin}"] if args.skin else [])]
         options += [word for one in sets for word in ("--set", one)]
-        return use.command(options, by)
+        return install.command(options, by)
 
     def _teach_again(self, label: str) -> list[object]:
         label = label.strip()
         Labels(material=label)
-        refuse_trained(into.trained(self._base.bundle) if self._base else (), [label])
+        refuse_trained(materials.trained(self._base.bundle) if self._base else (), [label])
         if self._codes:
             check_bits(self._codes, [*dict.fromkeys((*self._tried, label))])
         self._again = label

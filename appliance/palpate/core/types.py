@@ -38,9 +38,8 @@ EPOCH_BITS = 40
 enumerations of the skin are never adjacent."""
 EPOCHS = 1 << 22
 """Enumerations are counted modulo this number, so that a frame number always fits int64."""
-SCHEMA = 3
-"""Version of a recorded sweep's sidecar. Versions 1 and 2 are still read: version 1 holds only the
-sweep, and in version 2 the classifier's settings had other names (`runtime.replay`)."""
+SCHEMA = 1
+"""Version of a recorded sweep's sidecar."""
 UNREADABLE = (ValueError, TypeError, EOFError, SyntaxError, TokenError, MemoryError)
 """Errors of numpy for a broken .npy, beside OSError; MemoryError if its header gives an impossible
 size."""
@@ -400,27 +399,20 @@ def load(path: Path) -> tuple[Sweep, SweepFormat]:
     content = sidecar(path)
     try:
         data = path.read_bytes()
-        if content.get("crc32", crc32(data)) != crc32(data):
+        if content["crc32"] != crc32(data):
             raise FormatError("its bytes are not those that were recorded: the file was altered")
         table = np.load(io.BytesIO(data), allow_pickle=False)
         format = typed(SweepFormat, content.pop("format"))
         schema = content.pop("schema")
         status = Status(content.pop("status"))
-        if type(schema) is not int or not 1 <= schema <= SCHEMA:
-            raise FormatError(
-                f"schema {schema!r} is unknown to this version, which reads 1 to {SCHEMA}: update "
-                "one of them"
-            )
+        if schema != SCHEMA:
+            raise FormatError(f"schema {schema!r} is unknown to this version; update one of them")
         if table.dtype != _record_dtype(format) or table.ndim != 1:
             raise FormatError(
                 f"records of {table.dtype} do not fit the format {format} of its sidecar"
             )
         frames = Frames(table["t_ns"].copy(), table["seq"].copy(), table["taxels"].copy())
-        own = (
-            content
-            if schema == 1
-            else {name: content[name] for name in Sweep.__slots__ if name in content}
-        )
+        own = {name: content[name] for name in Sweep.__slots__ if name in content}
         return typed(Sweep, own | {"status": status, "frames": frames}), format
     except (*UNREADABLE, OSError, KeyError, AttributeError, RecursionError, FormatError) as e:
         raise FormatError(

@@ -29,7 +29,7 @@ from palpate.core.types import Status, Sweep, Verdict
 from palpate.inference.classifier import Classifier
 from palpate.inference.early_exit import EarlyExit
 from palpate.signal.broken_taxels import BrokenTaxels
-from palpate.sweeps.recording import SweepFolder
+from palpate.sweeps.sweep_folder import SweepFolder
 
 FILE = "agreement.json"
 KEPT = 100

@@ -49,14 +49,10 @@ def check_installed() -> None:
         )
 
 
-def learning(
-    folder: Path, forgotten: dict[str, int], settings: TeachConfig, *more: str
-) -> list[str]:
-    """The command that assesses the sweeps in `folder`, or fits a bundle with the options `more`.
-    forgotten: see TeachingState."""
+def learning(folder: Path, settings: TeachConfig, *more: str) -> list[str]:
+    """The command that assesses the sweeps in `folder`, or with options fits a bundle."""
     limits = ("--memory-mb", str(settings.memory_mb), "--cpu-s", str(round(settings.limit_s)))
-    options = ("--forgotten", json.dumps(forgotten), *limits)
-    return [sys.executable, "-P", "-m", LEARNS, str(folder), *options, *more]
+    return [sys.executable, "-P", "-m", LEARNS, str(folder), *limits, *more]
 
 
 class TeachingProcess:

@@ -8,7 +8,6 @@ bundle in service as they are.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from pathlib import Path
 from typing import Any
 
 from palpate.core.clock import Clock, SystemClock
@@ -21,7 +20,6 @@ from palpate.core.sentences import sentence
 from palpate.core.types import Sweep, Verdict
 from palpate.io.verdict_lines import check_bits
 from palpate.learn.process import News, TeachingProcess, learning
-from palpate.learn.state import TeachingState
 from palpate.sweeps.recording import Labels, RecordingSession
 
 FEWEST = 2
@@ -30,8 +28,8 @@ PAUSE_NS = 300_000_000
 """Time without a new sweep before an assessment begins."""
 
 Learn = Callable[[str], list[str]]
-"""The command of a process that does all of `use`, for the person or program that asks; for "" of a
-process that only assesses the sweeps."""
+"""The command of a process that does all of `install`, for the person or program that asks; for ""
+of a process that only assesses the sweeps."""
 
 
 def refuse_trained(trained: Iterable[str], labels: Iterable[str]) -> None:
@@ -47,7 +45,7 @@ def refuse_trained(trained: Iterable[str], labels: Iterable[str]) -> None:
 class TeachingSession(Observer):
     """Observes a recording and teaches the stored sweeps.
 
-    state: the file of TeachingState. learn: makes the command of USE. say: called with TCH
+    learn: makes the command of USE. say: called with TCH
     sentences. clock: the real clock, because processes run in real time. codes: number of codes of
     the class bits, 0 without class bits. base: labels of the delivered bundle into which new
     materials are taught, () without one. trained: those of them that it was trained on. It must
@@ -57,7 +55,6 @@ class TeachingSession(Observer):
     def __init__(
         self,
         recording: RecordingSession,
-        state: Path,
         settings: TeachConfig,
         learn: Learn,
         say: Callable[[bytes], None],
@@ -66,11 +63,10 @@ class TeachingSession(Observer):
         base: tuple[str, ...] = (),
         trained: tuple[str, ...] = (),
     ) -> None:
-        self._recording, self._file, self._settings = recording, state, settings
+        self._recording, self._settings = recording, settings
         self._codes, self._base, self._trained = codes, base, trained
         self._fewest = 1 if base else FEWEST
         self._learn, self._clock, self._say = learn, clock or SystemClock(), say
-        self._state = TeachingState.load(state)
         self._named: dict[str, None] = {}  # materials without a sweep so far, in order
         self._process: TeachingProcess | None = None
         self._using, self._stored = False, 0
@@ -115,7 +111,7 @@ class TeachingSession(Observer):
 
     def materials(self) -> dict[str, int]:
         """The number of sweeps of each new material, those without one included."""
-        counts = self._recording.materials(self._state.forgotten)
+        counts = self._recording.materials()
         counts = {name: n for name, n in counts.items() if name not in self._trained}
         return dict.fromkeys(self._named, 0) | counts
 
@@ -134,7 +130,7 @@ class TeachingSession(Observer):
         refuse_trained(self._trained, labels)
         if self._codes:
             wanted = dict.fromkeys((*self._base, *self.materials(), *labels))
-            for name in self._state.forgotten.keys() - self.materials().keys() - {*labels}:
+            for name in self._recording.forgotten - self.materials().keys() - {*labels}:
                 if name not in self._trained:
                     wanted.pop(name, None)
             check_bits(self._codes, [*wanted])
@@ -172,9 +168,8 @@ class TeachingSession(Observer):
 
     def _assess(self) -> None:
         """Begin an assessment; a failure is shown."""
-        folder, forgotten = self._recording.folder, self._state.forgotten
         try:
-            own = learning(folder, forgotten, self._settings)
+            own = learning(self._recording.folder, self._settings)
             self._begin(self._learn("") if self._base else own)
         except ApplianceError as e:
             self._take({"type": "error", "text": str(e)})
@@ -247,7 +242,7 @@ class TeachingSession(Observer):
         if self._using:
             raise ApplianceError("a bundle is being made; forget it afterwards")
         try:
-            self._state = self._state.forget(self._file, label, self._recording.last)
+            self._recording.forget(label)
         except OSError as e:
             raise ApplianceError(f"{label!r} is not forgotten: {e.strerror}; make room") from e
         self._named.pop(label, None)

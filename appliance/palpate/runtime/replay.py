@@ -8,7 +8,7 @@ sweeps of its object. So the verdict must equal the verdict in its sidecar, bit 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
@@ -20,7 +20,7 @@ from palpate.bundle.bundle import Bundle
 from palpate.core.config import ClassifierConfig, Config
 from palpate.core.errors import FormatError
 from palpate.core.schema import typed
-from palpate.core.types import Status, Sweep, SweepFormat, Verdict, load, sidecar
+from palpate.core.types import Status, Sweep, SweepFormat, Verdict
 from palpate.inference.classifier import Classifier
 from palpate.inference.early_exit import EarlyExit
 from palpate.io.robot_link import StdoutPort, result
@@ -28,14 +28,13 @@ from palpate.runtime import assembly
 from palpate.runtime.loop import Box, Pipeline
 from palpate.signal.broken_taxels import BrokenTaxels
 from palpate.sweeps.capture import Playback
+from palpate.sweeps.sweep_folder import RecordedSweep
 from palpate.sweeps.sweep_window import SweepCutter
 
 SAME, ALONE, DIFFERENT = "the same", "the same by itself", "DIFFERENT"
 """Outcomes of a comparison. SAME: the verdict is the same, bit for bit. ALONE: the scores of this
 sweep are the same, but earlier sweeps of its object are missing."""
 SILENT, OTHER, BROKEN = "no verdict to compare with", "of another bundle", "not readable"
-OLD_RULE_KEYS = {"how": "fuse", "sure": "min_probability", "most_sweeps": "max_sweeps"}
-"""Keys of the rule in sidecars up to schema 2, with the present keys."""
 CHOICES = {name: get_args(get_type_hints(ClassifierConfig)[name]) for name in ("fuse", "conflict")}
 
 
@@ -62,40 +61,24 @@ def replay(path: Path, settings: Config, bundle: Bundle, out: Callable[[str], ob
 
 @dataclass(frozen=True, slots=True)
 class ReplayRule:
-    """The classifier's settings at the time of the sweep. The fields are the sidecar's keys; older
-    sidecars have only the first three, and only NEW OBJECT ended an object.
-
-    Raises TypeError for an unknown fusion or conflict.
-    """
+    """The classifier's settings at the time of the sweep. The fields are the sidecar's keys. Raises
+    TypeError for an unknown fusion or conflict."""
 
     fuse: str
     min_probability: float
     max_sweeps: int
-    conflict: str = "fuse"
-    object_s: float = 0.0
+    conflict: str
+    object_s: float
 
     def __post_init__(self) -> None:
         for name, known in CHOICES.items():
             if (value := getattr(self, name)) not in known:
                 raise TypeError(f"{name} {value!r} is not one of {', '.join(known)}")
 
-    @classmethod
-    def read(cls, about: Mapping[str, Any]) -> ReplayRule | None:
-        """The rule of a sidecar, None if the sidecar has no rule. Raises TypeError or ValueError.
-
-        Sidecars up to schema 2 are read under the names that the settings had then.
-        """
-        rule = about.get("rule")
-        if "rule" not in about:
-            return None
-        if isinstance(rule, dict) and about["schema"] < 3:
-            rule = {OLD_RULE_KEYS.get(name, name): value for name, value in rule.items()}
-        return typed(cls, rule)
-
 
 @dataclass(frozen=True, slots=True)
 class KeptSweep:
-    """A kept sweep with the content of its sidecar; older sidecars have fewer entries.
+    """A kept sweep with the content of its sidecar; without a bundle it has fewer entries.
 
     object: the folder, run and object number that fused sweeps share. rule: None without an entry.
     tare: [R, C] or [R, C, A] raw counts, None without an entry. bundle: its id, or "". verdict: as
@@ -114,15 +97,15 @@ class KeptSweep:
     @classmethod
     def read(cls, path: Path) -> KeptSweep:
         """The sweep at `path`. Raises FormatError."""
-        sweep, format = load(path)
-        about = sidecar(path)
+        recorded = RecordedSweep.load(path, {})
+        sweep, format, about = recorded.sweep, recorded.format, recorded.about
         try:
             tare = (
                 np.broadcast_to(np.asarray(about["tare"], np.float64), format.shape)
                 if "tare" in about
                 else None
             )
-            rule = ReplayRule.read(about)
+            rule = typed(ReplayRule, about["rule"]) if "rule" in about else None
             touched = path.parent, int(about.get("run", 0)), sweep.object
             verdict = dict(about.get("verdict", {}))
             if any(type(verdict.get(name, 0)) is not int for name in ("fused", "after", "time_ns")):
@@ -181,11 +164,10 @@ class SweepReplay:
         _check_length(kept.sweep, kept.format)
         was = kept.verdict
         fused = was.get("fused", 0)
-        # verdicts without `after` count the sweeps of an object instead
-        number, after = (kept.sweep.id, was["after"]) if "after" in was else (fused, fused - 1)
+        after = was.get("after", 0)
         whole = after <= 0 or self._last == (kept.object, after)
         if (fused or was.get("own")) and (whole or fused == 1):
-            self._last = kept.object, number
+            self._last = kept.object, kept.sweep.id
         classifier = self._prepared(kept)
         if not whole:
             classifier.forget()

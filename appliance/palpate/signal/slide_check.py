@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core.types import SweepFormat, normal
-from palpate.signal.slide import LEAST_HEIGHT, NO_PATTERN, SlideMeter
+from palpate.signal.slide import CHANCE, NO_PATTERN, SlideMeter
 from palpate.signal.vibration import PARTS, SlideLimits, vibration
 
 FEW = 4
 """A skin of at least so many taxels touches a finger with more than one."""
-MANY, CLEAR = 4, 2 * LEAST_HEIGHT
+MANY, CLEAR = 4, 2 * CHANCE
 """Fewest sweeps by which others are judged, and the least median height of their patterns. The
 median of simulated slides is 20, that of skins whose slides show no pattern 3 to 6."""
 NO_SLIDE = f"no slide: {NO_PATTERN}, as with a resting finger"
@@ -65,7 +65,7 @@ class SlideCheck:
         if self._meter.why:
             return ""
         slide = self._meter(taxels)
-        if slide.height < LEAST_HEIGHT:
+        if slide.height < CHANCE:
             return NO_SLIDE
         return ""
 
@@ -82,7 +82,7 @@ class SlidesAmong:
         if self._meter.why:
             return ""
         height = self._meter(taxels).height
-        if _patterned(self._heights) and height < LEAST_HEIGHT:
+        if _patterned(self._heights) and height < CHANCE:
             return NO_SLIDE
         self._heights.append(height)
         return ""
@@ -92,7 +92,7 @@ class SlidesAmong:
         for taxels in windows:
             self._heights.append(0.0 if self._meter.why else self._meter(taxels).height)
         skin = _patterned(self._heights)
-        return [NO_SLIDE if skin and one < LEAST_HEIGHT else "" for one in self._heights]
+        return [NO_SLIDE if skin and one < CHANCE else "" for one in self._heights]
 
 
 def _patterned(heights: Sequence[float]) -> bool:

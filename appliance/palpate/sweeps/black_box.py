@@ -14,7 +14,8 @@ from palpate.core.disk_thread import AtOnce, DiskWork
 from palpate.core.log import TroubleLog
 from palpate.core.observer import Observer
 from palpate.core.types import Sweep, SweepFormat, Verdict
-from palpate.sweeps.recording import FULL, SweepFolder
+from palpate.sweeps.recording import FULL
+from palpate.sweeps.sweep_folder import SweepFolder
 
 
 class BlackBox(Observer):

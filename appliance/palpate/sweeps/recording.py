@@ -7,29 +7,26 @@ Each sweep becomes sweep-NNNNNN.npy and .json in one folder, and is reported in 
 from __future__ import annotations
 
 import errno
-import fcntl
 import os
-import re
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from palpate.core import storage, wall_clock
 from palpate.core.clock import Clock
 from palpate.core.disk_thread import AtOnce, DiskWork
-from palpate.core.errors import ApplianceError, ConfigError, FormatError, TemporaryError
+from palpate.core.errors import ApplianceError, ConfigError, TemporaryError
 from palpate.core.log import TroubleLog, log
 from palpate.core.names import LABEL, TypedNames
 from palpate.core.observer import Observer
 from palpate.core.patience import passes
 from palpate.core.sentences import sentence
-from palpate.core.types import Status, Sweep, SweepFormat, Verdict, entries, save, sidecar
+from palpate.core.types import Status, Sweep, SweepFormat, Verdict, entries
 from palpate.service.systemd import words
 from palpate.sweeps.progress import RecordingProgress
+from palpate.sweeps.sweep_folder import SweepFolder, exclusion
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
 """Error numbers of a full disk."""
@@ -41,97 +38,6 @@ TARGET = 10
 MOST_CHANGES = 1024
 """Largest number of label changes that are kept until the sweeps before them are answered; far more
 than a person makes."""
-DISCARDED = ".discarded"
-"""Suffix of the file that reserves the number of a discarded sweep. It is the renamed sidecar,
-since a rename needs no space, and is removed once a later number is in use."""
-_KEPT = re.compile(
-    rf"sweep-([0-9]+)(\.npy|\.json|{re.escape(DISCARDED)})({re.escape(storage.PART)})?"
-)
-
-
-class SweepFolder:
-    """A folder of sweeps with their verdicts. Numbers continue after a restart, and no number is
-    used twice.
-
-    Unfinished files of a program that was killed are removed. Only one program at a time can use
-    the folder; its lock ends with the program. numbers: of the sweeps in the folder, in order. run:
-    offset of this run's sweep numbers in the folder; sidecars have it, since each run counts its
-    sweeps and objects from 1. Raises OSError if the folder cannot be made, read or locked.
-    """
-
-    def __init__(self, folder: Path, format: SweepFormat) -> None:
-        self.folder, self._format = folder, format
-        _make(folder)
-        self._lock = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-        try:
-            self._take()
-        except OSError:
-            self.close()
-            raise
-
-    def put(self, sweep: Sweep, verdict: Verdict, about: Mapping[str, Any]) -> int:
-        """Write a sweep with its verdict and `about`, completely or not at all; returns its number.
-        Raises OSError."""
-        number = self.run + sweep.id
-        save(
-            self.path(number),
-            sweep,
-            self._format,
-            {**about, "date": wall_clock.date(), "run": self.run, "verdict": verdict.as_dict()},
-        )
-        self.numbers.append(number)
-        return number
-
-    def remove(self, number: int, *, reserve: bool = False) -> None:
-        """Remove a sweep, its .npy first, so that no .npy is ever without its sidecar. Raises
-        OSError.
-
-        reserve: do not use its number again after a restart, even if it was the highest.
-        """
-        path = self.path(number)
-        path.unlink(missing_ok=True)
-        with suppress(FileNotFoundError):
-            if reserve:
-                path.with_suffix(".json").replace(path.with_suffix(DISCARDED))
-            else:
-                path.with_suffix(".json").unlink()
-        storage.sync(self.folder)
-        self.numbers.remove(number)
-
-    def path(self, number: int) -> Path:
-        """Path of the sweep of this number."""
-        return self.folder / f"sweep-{number:06d}.npy"
-
-    def close(self) -> None:
-        """Release the folder."""
-        os.close(self._lock)
-
-    def _take(self) -> None:
-        try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as e:
-            raise BlockingIOError(
-                e.errno, "another program keeps sweeps there", str(self.folder)
-            ) from e
-        names = [name for path in self.folder.iterdir() if (name := _KEPT.fullmatch(path.name))]
-        # an unfinished sweep was never reported as stored, but its number is not used again
-        self.run = max((int(name[1]) for name in names), default=0)
-        self.numbers = sorted(
-            {int(name[1]) for name in names if name[2] != DISCARDED and not name[3]}
-        )
-        for name in names:
-            if name[3] or (name[2] == DISCARDED and int(name[1]) < self.run):
-                (self.folder / name[0]).unlink()
-
-
-def _make(folder: Path) -> None:
-    """Make the folder and those above it, and sync them to the disk."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for above in (
-        folder.resolve().parents
-    ):  # all folders: a run that was killed may have made folders without syncing them
-        with suppress(PermissionError):  # a folder that we may not open is not ours
-            storage.sync(above)
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,7 +85,8 @@ class RecordingSession(Observer):
         finger: str = "",
     ) -> None:
         self.names, self._finger = names or TypedNames(), finger or None
-        self._disk, self._writing = disk or AtOnce(), 0
+        self._disk = disk or AtOnce()
+        self._writing: dict[int, str] = {}  # number and material of each sweep that is not put yet
         try:
             self._folder = SweepFolder(folder, format)
         except OSError as e:
@@ -215,24 +122,29 @@ class RecordingSession(Observer):
         return self._folder.folder
 
     @property
-    def last(self) -> int:
-        """The highest number of a sweep that is used in the folder."""
-        return max([self._folder.run, *self._folder.numbers])
+    def forgotten(self) -> set[str]:
+        """Materials that were forgotten, also if sweeps of them were recorded again."""
+        return {*self._folder.forgotten}
 
-    def materials(self, forgotten: Mapping[str, int]) -> dict[str, int]:
-        """The number of sweeps in the folder of each material, without those up to the number in
-        `forgotten`."""
-        kept = (
-            labels.material
-            for number, labels in sorted(self._counted.items())
-            if labels.material and number > forgotten.get(labels.material, -1)
-        )
+    def materials(self) -> dict[str, int]:
+        """The number of sweeps in the folder of each material, without forgotten ones."""
+        kept = (labels.material for _, labels in sorted(self._counted.items()) if labels.material)
         return dict(Counter(kept))
 
     def leave_out(self, number: int) -> None:
-        """Count a stored sweep no longer: it is discarded, or was found not to be a slide."""
+        """Count a stored sweep no longer: it is discarded or forgotten, or was found not to be a
+        slide."""
         if labels := self._counted.pop(number, None):
             self._progress.add(labels.material, labels.position, -1)
+
+    def forget(self, material: str) -> None:
+        """Learn no longer from the sweeps of a material so far, those that are still being written
+        included; they stay in the folder. Raises OSError."""
+        held = [n for n, labels in self._counted.items() if labels.material == material]
+        waiting = [n for n, label in self._writing.items() if label == material]
+        self._folder.forget(material, [*held, *waiting])
+        for number in held:
+            self.leave_out(number)
 
     def about(self) -> dict[str, Any]:
         """The progress of the recording, for JSON.
@@ -267,7 +179,7 @@ class RecordingSession(Observer):
             session=labels.session,
             finger=self._finger,
         )
-        self._writing += 1
+        self._writing[self._folder.run + sweep.id] = labels.material
         report = partial(self._report_outcome, sweep, verdict, labels)
         if not self._disk(partial(self._write, sweep, verdict, circumstances), report):
             report(("failed", "the disk is too slow"))
@@ -276,7 +188,7 @@ class RecordingSession(Observer):
         self, sweep: Sweep, verdict: Verdict, labels: Labels, written: tuple[str, str] | int
     ) -> None:
         """Count, log and send the outcome of a sweep. written: as returned by `_write`."""
-        self._writing -= 1
+        self._writing.pop(self._folder.run + sweep.id)
         if isinstance(written, int):
             outcome, detail = "stored", self._count_stored(written, labels, verdict.status)
         else:
@@ -304,14 +216,13 @@ class RecordingSession(Observer):
     def _count_earlier(self, format: SweepFormat) -> None:
         """Count the sweeps of earlier runs in the folder. Raises ConfigError for a sweep of another
         format or finger."""
-        for number in self._folder.numbers:
+        for number, about in self._folder.sidecars():
             path = self._folder.path(number)
             try:
-                about = sidecar(path)
-                status, labels = Status(about["verdict"]["status"]), _labels(about)
-                stored, finger = about["format"], about.get("finger")
-            except (FormatError, ConfigError, KeyError, TypeError, ValueError):
-                continue  # not a sweep of ours, or damaged: training reports it
+                Status(about["verdict"]["status"])
+                labels, stored, finger = _labels(about), about["format"], about.get("finger")
+            except (ConfigError, KeyError, TypeError, ValueError):
+                continue  # not a sweep of ours: training reports it
             if stored != format.json():
                 self._folder.close()
                 raise ConfigError(
@@ -324,11 +235,12 @@ class RecordingSession(Observer):
                     f"{path} is of {f'the finger {finger}' if finger else 'a box with one skin'}; "
                     "name another folder with --out"
                 )
-            self._count(number, labels, status)
+            gone = self._folder.is_forgotten(number, labels.material)
+            self._count(number, labels, exclusion(about, forgotten=gone))
             self.names.add(labels.material, about.get("display"))
 
-    def _count(self, number: int, labels: Labels, status: Status) -> None:
-        if not status.faulty:  # a faulty sweep is not used in training
+    def _count(self, number: int, labels: Labels, excluded: str) -> None:
+        if not excluded:
             self._progress.add(labels.material, labels.position)
             self._counted[number] = labels
 
@@ -363,7 +275,8 @@ class RecordingSession(Observer):
     def _count_stored(self, number: int, labels: Labels, status: Status) -> str:
         """Count a stored sweep; its file's name with remarks, for a person."""
         self._stored.append((number, labels, status))
-        self._count(number, labels, status)
+        gone = "forgotten" * self._folder.is_forgotten(number, labels.material)
+        self._count(number, labels, str(status) if status.faulty else gone)
         fault = f" {status}" if status.faulty else ""
         return self._folder.path(number).stem + fault + " no material" * (not labels.material)
 

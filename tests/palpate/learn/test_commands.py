@@ -14,7 +14,7 @@ from palpate.cli.parser import arguments
 from palpate.core import config
 from palpate.core.types import sidecar
 from palpate.io.robot_link import command
-from palpate.learn import state, use
+from palpate.learn import install
 from palpate.runtime import assembly
 from tests.factories import deliveries, hands, install_scripts, lessons
 from tests.factories.paths import ROOT
@@ -134,8 +134,6 @@ def test_the_process_learns_from_the_same_finger(tmp_path: Path):
     again = load_settings(arguments("teach", made[made.index("teach") + 1 :]))
     assert again == settings
     assert again.kept("sweeps") == tmp_path / "sweeps" / "right"
-    assert state.file(again) == tmp_path / "teaching-right.json"
-    assert state.file(load_settings(arguments("teach", words[4:-3]))).name == "teaching.json"
 
 
 @deliveries.NEEDED
@@ -184,6 +182,6 @@ def test_recorded_sweeps_become_the_bundle_of_the_box(
     running = assembly.store(settings).running()
     assert running.signer == "taught here"
     assert running.bundle.manifest.taught.startswith("taught here by anna, 20")
-    assert use.version(assembly.store(settings)) == "2"
+    assert install.version(assembly.store(settings)) == "2"
     left = {path.name for path in (tmp_path / "store").iterdir()}
     assert left == {"sweeps", "bundles", "bundles.json", "current"}

@@ -25,7 +25,7 @@ from palpate.signal.broken_taxels import Bridging, BrokenTaxels
 from palpate.sim import devices, rig, script, skin
 from palpate.sweeps.black_box import BlackBox
 from tests.factories import toy_bundle
-from tests.factories.paths import NO_SITE, SIDECARS_2
+from tests.factories.paths import NO_SITE
 from tests.factories.simulated_box import Rigged
 
 SWEEPS = 30
@@ -204,24 +204,6 @@ def test_objects_end_in_a_replay_as_they_did(tmp_path: Path, conflict: str):
             assert outcomes[-1] == "15 sweeps: 14 the same, 1 the same by itself"
 
 
-def test_a_rule_without_the_end_of_objects(tmp_path: Path):
-    """Sidecars of versions before it: all sweeps until NEW OBJECT are fused, also after
-    max_sweeps and a pause."""
-    model = toy_bundle.load(tmp_path / "bundle")
-    it, after = Classifier(model, rig.VirtualClock(), max_sweeps=2), []
-    for n, z in enumerate([(0, 0), (6, 0), (0, 0), (0, 0)], 1):
-        sweep = replace(toy_bundle.sweep(*z, number=n, object=1), start_ns=n * 10**12)
-        verdict = it(sweep).as_dict()
-        after.append(verdict.pop("after"))
-        rule = {name: it.rule[name] for name in ("fuse", "min_probability", "max_sweeps")}
-        about = {"rule": rule, "bundle": model.id, "verdict": verdict}
-        save(tmp_path / f"sweep-{n:06d}.npy", sweep, toy_bundle.FORMAT, about)
-    assert after == [0, 1, 2, 3]
-    assert played(tmp_path, model)[2][-1] == "4 sweeps: 4 the same"
-    (tmp_path / "sweep-000002.npy").unlink()
-    assert played(tmp_path, model)[2][-1] == "3 sweeps: 1 the same, 2 the same by itself"
-
-
 def test_every_other_bit_is_told(in_service, default_bundle: bundle.Bundle):
     """For a score one bit off, another label or another tare the output names the difference, and
     the exit code is 1."""
@@ -352,38 +334,6 @@ def test_taxels_that_were_broken_over_the_stream_are_bridged_again(tmp_path: Pat
     assert played(kept, model)[0] == 1
 
 
-def test_sidecars_of_schema_2_replay_to_the_same_verdicts(tmp_path: Path):
-    """The rule is read under its old keys; the present settings would give other verdicts."""
-    arrays = toy_bundle.means(**toy_bundle.displaced_arrays())
-    made = toy_bundle.load(
-        tmp_path / "bundle",
-        arrays=arrays,
-        displacement=toy_bundle.DISPLACEMENT,
-        contact=toy_bundle.IN_PLACE,
-    )
-    abouts = [sidecar(path) for path in sorted(SIDECARS_2.glob("*.npy"))]
-    assert [(about["schema"], about["verdict"]["fused"]) for about in abouts] == [
-        (2, 1),
-        (2, 2),
-        (2, 1),
-    ]
-    assert all(about["rule"]["how"] == "vote" for about in abouts)
-    # another release of onnx may write the same graph in other bytes, and the id follows the bytes
-    model = replace(made, id=abouts[0]["bundle"])
-    code, sentences, outcomes = played(SIDECARS_2, model)
-    assert (code, outcomes[-1]) == (0, "3 sweeps: 3 the same")
-    assert all(
-        f",{status}," in line
-        for status, line in zip(("unsure", "ok", "unsure"), sentences, strict=True)
-    )
-    kept = Path(shutil.copytree(SIDECARS_2, tmp_path / "kept"))
-    for path in kept.glob("*.npy"):
-        about = sidecar(path)
-        del about["rule"]
-        path.with_suffix(".json").write_text(json.dumps(about))
-    assert played(kept, model)[0] == 1
-
-
 @pytest.mark.parametrize(
     ("about", "hint"),
     [
@@ -403,11 +353,11 @@ def test_sidecars_of_schema_2_replay_to_the_same_verdicts(tmp_path: Path):
                     "min_probability": 0.5,
                     "max_sweeps": 0,
                     "conflict": "guess",
+                    "object_s": 0.0,
                 }
             },
             "conflict 'guess' is not one of new, refuse, fuse",
         ),
-        ({"rule": {"how": "vote", "sure": 0.5, "most_sweeps": 0}}, "sidecar cannot be used"),
         ({"rule": 3}, "sidecar cannot be used"),
         ({"run": "first"}, "sidecar cannot be used"),
         ({"verdict": 7}, "sidecar cannot be used"),

@@ -14,7 +14,7 @@ import pytest
 
 from palpate.core.types import Frames, Status, Sweep, SweepFormat, Verdict, sidecar
 from palpate.sim import devices, rig, script, skin
-from palpate.sweeps import recording
+from palpate.sweeps import sweep_folder
 from palpate.sweeps.black_box import BlackBox
 from tests.factories import toy_bundle
 from tests.factories.simulated_box import OnSweep, Rigged
@@ -98,8 +98,8 @@ def test_a_full_disk_drops_the_oldest_first(
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         save(path, sweep, format, about)
 
-    save = recording.save
-    monkeypatch.setattr(recording, "save", tight)
+    save = sweep_folder.save
+    monkeypatch.setattr(sweep_folder, "save", tight)
     for n in range(1, 5):
         black.sweep(*judged(n))
     assert numbers(tmp_path) == [3, 4]
@@ -128,7 +128,7 @@ def test_another_error_removes_no_sweep(
     def broken(*args: object) -> None:
         raise OSError(errno.EIO, os.strerror(errno.EIO))
 
-    monkeypatch.setattr(recording, "save", broken)
+    monkeypatch.setattr(sweep_folder, "save", broken)
     black.sweep(*judged(2))
     assert numbers(tmp_path) == [1]
     assert "Input/output error" in logged[0]

@@ -311,7 +311,7 @@ def test_saved_sweeps_are_read_as_they_were(rigged: Callable[..., Rigged], tmp_p
         (lambda d: (d / "s.json").write_text("{}"), "not a recorded sweep"),
         (
             lambda d: (d / "s.json").write_text(
-                (d / "s.json").read_text().replace('"schema": 3', '"schema": 7')
+                (d / "s.json").read_text().replace('"schema": 1', '"schema": 7')
             ),
             "schema 7",
         ),

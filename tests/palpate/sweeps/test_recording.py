@@ -20,8 +20,9 @@ from palpate.core.errors import ApplianceError, ConfigError, FormatError
 from palpate.core.types import Frames, Status, Sweep, Verdict, load, sidecar
 from palpate.service.feed import FeedServer
 from palpate.sim import devices, rig, script, skin
-from palpate.sweeps import recording
-from palpate.sweeps.recording import Labels, RecordingSession, SweepFolder
+from palpate.sweeps import recording, sweep_folder
+from palpate.sweeps.recording import Labels, RecordingSession
+from palpate.sweeps.sweep_folder import SweepFolder
 from palpate_train.data import sets
 from tests.factories import toy_bundle
 from tests.factories.feeds import FeedPeer
@@ -511,7 +512,7 @@ def test_a_disk_that_refuses(
     def refused(*args: object) -> None:
         raise OSError(code, os.strerror(code))
 
-    monkeypatch.setattr(recording, "save", refused)
+    monkeypatch.setattr(sweep_folder, "save", refused)
     assert desk.sweep(1) == ["1", outcome, "0", "wood", "", "", os.strerror(code)]
     assert len(logged) == 1
 
@@ -561,7 +562,7 @@ def test_folders_are_on_the_disk_before_their_sweeps(
     """Each folder is synced into its parent at every start, so a power failure cannot remove the
     sweeps later."""
     synced: list[Path] = []
-    monkeypatch.setattr(recording.storage, "sync", synced.append)
+    monkeypatch.setattr(sweep_folder.storage, "sync", synced.append)
     for _ in range(2):
         SweepFolder(tmp_path / "a" / "b", toy_bundle.FORMAT).close()
         assert {tmp_path, tmp_path / "a"} <= set(synced)
@@ -576,7 +577,7 @@ def test_a_disk_that_is_full_costs_no_answer(
     def full(path: Path, sweep: Sweep, format: object, about: Mapping[str, object]) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(recording, "save", full)
+    monkeypatch.setattr(sweep_folder, "save", full)
     simulated = devices.build(skin.FORMAT, script.tubes(4, 2), rig.VirtualClock(), "sim")
     box = recorded(simulated, Labels("wood"))
     verdicts = box.until(lambda: simulated.finished(box.box.answered))

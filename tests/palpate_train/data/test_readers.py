@@ -16,6 +16,7 @@ import pytest
 
 from palpate.core.errors import FormatError
 from palpate.core.types import Frames, Status, Sweep, SweepFormat, load, save
+from palpate.sweeps.sweep_folder import REFUSED, RecordedSweep
 from palpate_train.data import readers, sets
 from tests.factories.recordings import FORMAT, record
 from tests.factories.sweep_sets import held, write
@@ -306,7 +307,7 @@ def test_what_the_box_refused_is_left_out(tmp_path: Path):
     early answer."""
     for i in range(9):
         record(tmp_path / f"{i}.npy", "ab"[i % 2], id=i)
-    for i, status in enumerate(readers.REFUSED):
+    for i, status in enumerate(REFUSED):
         path = tmp_path / f"{i}.npy"
         save(path, *load(path), {"verdict": {"status": str(status)}})
     record(tmp_path / "9.npy", "a", frames=3, share=0.4)
@@ -529,6 +530,6 @@ def test_an_impossible_reading_of_a_recording_is_named(tmp_path: Path):
     taxels[5, 1, 2] = 1e20
     frames = Frames(np.arange(8), np.arange(8), taxels)
     sweep = Sweep(7, 0, 8, Status.OK, frames, material="wood")
-    one = readers.RecordedSweep(tmp_path / "sweep-000007.npy", sweep, format, {})
+    one = RecordedSweep(tmp_path / "sweep-000007.npy", sweep, format, {})
     with pytest.raises(FormatError, match=r"taxel 2, 3 reads 1e\+20,"):
         readers.from_recorded([one], tmp_path, sets.Dataset)

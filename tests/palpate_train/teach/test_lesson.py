@@ -40,15 +40,6 @@ def test_sweeps_that_cannot_be_taught_are_left_out_and_counted(tmp_path: Path):
         "damaged": 1,
         "another format": 1,
     }
-    assert lesson.number(2) == 2
-
-
-def test_forgotten_materials_stay_away_until_they_are_recorded_again(tmp_path: Path):
-    """Sweeps up to the number are left out; later ones of the same name are taught."""
-    sweeps(tmp_path, "a", "b", "a", "a")
-    lesson = Lesson.read(tmp_path, {"a": 3})
-    assert lesson.names == ("sweep-000002", "sweep-000004")
-    assert lesson.left_out["forgotten"] == 2
 
 
 def test_a_missing_position_is_a_place_of_its_own(tmp_path: Path):

@@ -9,8 +9,7 @@ from __future__ import annotations
 import io
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
@@ -18,9 +17,9 @@ import numpy as np
 
 from palpate.core.errors import FormatError
 from palpate.core.sweep_set import Array, Set, build, load_file
-from palpate.core.types import LARGEST_READING, Status, Sweep, SweepFormat, sidecar
-from palpate.core.types import load as load_recording
+from palpate.core.types import LARGEST_READING, SweepFormat
 from palpate.signal.unloaded import UnloadedSkin
+from palpate.sweeps.sweep_folder import RecordedSweep
 from palpate_train.data import mapped
 from palpate_train.data.group_values import typed
 
@@ -39,8 +38,6 @@ NO_FINGER = "none"
 SLIDE_GROUPS = {"speed": "speed_mm_s", "force": "force_n"}
 """Groups of the speed and the force of the slide, in thousandths: um/s and mN."""
 SLIDE_UNITS = {"speed": "um/s", "force": "mN"}
-REFUSED = tuple(status for status in Status if status.faulty)
-"""The box's answers to windows that it does not classify."""
 FRAMES = (
     ".csv", ".tsv", ".txt", ".dat", ".mat", ".npy", ".asf", ".lvm", ".tdms", ".jsonl", ".xlsx",
     ".parquet", ".bag", ".mcap", ".db3",
@@ -51,53 +48,6 @@ JUNK = ("__MACOSX", "Thumbs.db", "desktop.ini", "Icon\r")
 """Names of files and folders that systems leave beside recordings. Names that begin with . or ~$
 are passed over too."""
 IMPORT = "palpate-train import {} makes a set of such files"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RecordedSweep:
-    """One sweep as the box recorded it. path: its .npy file; about: the contents of its sidecar."""
-
-    path: Path
-    sweep: Sweep
-    format: SweepFormat
-    about: Mapping[str, Any]
-
-    @classmethod
-    def load(cls, path: Path) -> RecordedSweep:
-        """Read an .npy with its sidecar. Raises FormatError if either is broken."""
-        return cls(path, *load_recording(path), sidecar(path))
-
-    @property
-    def exclusion(self) -> str:
-        """One word that says why we do not train on this sweep; "" if we do.
-
-        Reasons are an incomplete window or a skin that the box refused. Sweeps whose answer was
-        unsure or unknown are kept: they were recorded to teach the box their material.
-        """
-        verdict = self.about.get("verdict")
-        answer = verdict.get("status") if isinstance(verdict, dict) else ""
-        if self.sweep.status is not Status.OK:
-            return str(self.sweep.status)
-        return str(answer) if answer in REFUSED else "early" if self.sweep.share < 1 else ""
-
-    @property
-    def unloaded(self) -> Array:
-        """Mean and standard deviation of the unloaded skin, float [2, R, C] or [2, R, C, A]; NaN if
-        the sidecar does not hold them. Raises FormatError if their shape is wrong."""
-        found = self.about.get("unloaded")
-        shape = self.format.shape
-        if found is None:
-            return np.full((2, *shape), np.nan)
-        try:
-            level = np.stack([np.asarray(found[name], np.float64) for name in ("level", "noise")])
-        except (TypeError, KeyError, ValueError):
-            level = np.empty(0)
-        if level.shape != (2, *shape):
-            raise FormatError(
-                f"{self.path}: `unloaded` in its sidecar lacks a level and noise of shape "
-                f"{list(shape)}; restore the original sidecar, or remove the entry"
-            )
-        return level if np.isfinite(level).all() else np.full(level.shape, np.nan)
 
 
 def read(path: Path, kind: type[Set]) -> Set:

@@ -16,9 +16,9 @@ import numpy as np
 from palpate.core.errors import FormatError
 from palpate.core.sweep_set import Array
 from palpate.sim import skin
+from palpate.sweeps.sweep_folder import RecordedSweep
 from palpate_train.data import labels, published, readers, sets
 from palpate_train.data.group_values import text_of
-from palpate_train.data.readers import RecordedSweep
 from palpate_train.data.sets import Dataset, shortened
 
 Check = Callable[[Dataset], Sequence[str]]

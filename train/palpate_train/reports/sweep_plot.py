@@ -22,9 +22,9 @@ from scipy.signal import spectrogram, welch
 from palpate.core.errors import FormatError
 from palpate.core.sweep_set import Array
 from palpate.core.types import SweepFormat
+from palpate.sweeps.sweep_folder import RecordedSweep
 from palpate_train.data import readers, sets
 from palpate_train.data.group_values import text_of
-from palpate_train.data.readers import RecordedSweep
 from palpate_train.reports.plot_style import (
     ACCENT,
     BLACK,
@@ -110,7 +110,7 @@ def source(what: str) -> SweepSource:
     there are none."""
     path = Path(what)
     if path.suffix == ".npy":
-        one = _recorded(readers.RecordedSweep.load(path))
+        one = _recorded(RecordedSweep.load(path))
         return SweepSource(what, 1, lambda number: one)
     if path.is_dir():
         found = readers.usable(readers.read_recorded(path))

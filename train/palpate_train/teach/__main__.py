@@ -41,7 +41,6 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--by", default="", help="who teaches, for the manifest")
     parser.add_argument("--at", default="", help="when, for the manifest")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--forgotten", type=json.loads, default={}, help="JSON, see Lesson.read")
     parser.add_argument("--memory-mb", type=int, default=0, help="limit of private memory")
     parser.add_argument("--cpu-s", type=int, default=0, help="limit of processor time")
     args = parser.parse_args(argv)
@@ -69,7 +68,7 @@ def _run(args: argparse.Namespace) -> None:
     from palpate_train.teach.taught import teach
 
     _limit_cpu(args.cpu_s)
-    lesson = Lesson.read(args.folder, args.forgotten)
+    lesson = Lesson.read(args.folder)
     if args.out is None:
         _say("assessed", **assess(lesson, args.seed).json())
         return

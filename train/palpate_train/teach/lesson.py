@@ -8,7 +8,7 @@ have. Such sweeps are left out and counted, or completed.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,26 +16,13 @@ import numpy as np
 
 from palpate.core.errors import FormatError
 from palpate.signal.slide_check import SlidesAmong
+from palpate.sweeps.sweep_folder import NoSlide, RecordedSweep, slides_alone, taught
 from palpate_train.data import labels
-from palpate_train.data.readers import (
-    NAMED_GROUPS,
-    RecordedSweep,
-    check_folder,
-    counted,
-    from_recorded,
-)
+from palpate_train.data.readers import NAMED_GROUPS, check_folder, counted, from_recorded
 from palpate_train.data.sets import Dataset
 
 NOWHERE = "not named"
 """Position or session of a sweep without one, beside sweeps that have one."""
-
-
-@dataclass(frozen=True, slots=True)
-class NoSlide:
-    """A sweep that is not a slide. number: of its file."""
-
-    number: int
-    text: str
 
 
 @dataclass(frozen=True)
@@ -49,27 +36,21 @@ class Lesson:
     no_slides: tuple[NoSlide, ...] = ()
 
     @classmethod
-    def read(cls, folder: Path, forgotten: Mapping[str, int] = {}) -> Lesson:
-        """The sweeps in `folder`. forgotten: number of the last sweep of each material that is no
-        longer taught.
-
-        Raises FormatError if there is none, or if a label cannot be sent.
-        """
+    def read(cls, folder: Path) -> Lesson:
+        """The sweeps in `folder`. Raises FormatError if there is none, or if a label cannot be
+        sent."""
         check_folder(folder)
         left_out: Counter[str] = Counter()
-        kept = list(_usable(folder, forgotten, left_out))
+        kept = list(taught(folder, left_out))
         if not kept:
             why = f" ({counted(left_out)})" if left_out else ""
             raise FormatError(f"{folder}: no sweep can be taught{why}; record some with a material")
         kept = _of_one_format(kept, left_out)
-        kept, no_slides = _slides_alone(kept)
+        slides = SlidesAmong(kept[0].format).among(one.sweep.frames.taxels for one in kept)
+        kept, no_slides = slides_alone(kept, slides)
         left_out |= {"no slide": len(no_slides)} if no_slides else {}
         sweeps = from_recorded(_named(kept), folder, Dataset)
         return cls(labels.check(sweeps), tuple(one.path.stem for one in kept), left_out, no_slides)
-
-    def number(self, sweep: int) -> int:
-        """The number of a sweep among those of its material, from 1."""
-        return int((self.sweeps.labels[: sweep + 1] == self.sweeps.labels[sweep]).sum())
 
     @property
     def _beside(self) -> str:
@@ -97,24 +78,6 @@ class Lesson:
         return replace(self, sweeps=part, names=names)
 
 
-def _usable(
-    folder: Path, forgotten: Mapping[str, int], left_out: Counter[str]
-) -> Iterator[RecordedSweep]:
-    for path in sorted(folder.glob("sweep-*.npy")):
-        try:
-            one = RecordedSweep.load(path)
-        except FormatError:
-            left_out["damaged"] += 1
-            continue
-        number = path.stem.rpartition("-")[2]
-        old = number.isdecimal() and int(number) <= forgotten.get(one.sweep.material, -1)
-        why = "no material" if not one.sweep.material else "forgotten" if old else one.exclusion
-        if not why:
-            yield one
-        else:
-            left_out[why] += 1
-
-
 def _of_one_format(kept: Sequence[RecordedSweep], left_out: Counter[str]) -> list[RecordedSweep]:
     """The sweeps of the format of the last one."""
     wanted = kept[-1].format
@@ -122,24 +85,6 @@ def _of_one_format(kept: Sequence[RecordedSweep], left_out: Counter[str]) -> lis
     if len(same) < len(kept):
         left_out["another format"] = len(kept) - len(same)
     return same
-
-
-def _slides_alone(
-    kept: Sequence[RecordedSweep],
-) -> tuple[list[RecordedSweep], tuple[NoSlide, ...]]:
-    """The sweeps that are slides, as far as they show it by one another, and the others."""
-    slides, no_slides, number = [], [], Counter[str]()
-    reasons = SlidesAmong(kept[0].format).among(one.sweep.frames.taxels for one in kept)
-    for one, why in zip(kept, reasons, strict=True):
-        material = one.sweep.material
-        number[material] += 1
-        if not why:
-            slides.append(one)
-            continue
-        file = one.path.stem.rpartition("-")[2]
-        text = f"sweep {number[material]} of {material} is not learnt from: {why}"
-        no_slides.append(NoSlide(int(file) if file.isdecimal() else -1, text))
-    return slides, tuple(no_slides)
 
 
 def _named(kept: Sequence[RecordedSweep]) -> list[RecordedSweep]:

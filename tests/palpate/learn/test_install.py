@@ -14,7 +14,7 @@ import pytest
 from palpate.cli.main import main
 from palpate.core import storage
 from palpate.core.config import load
-from palpate.learn import use
+from palpate.learn import install
 from palpate.runtime import assembly
 from tests.cuts.teaching import at_once
 from tests.factories import deliveries, install_scripts, lessons
@@ -32,7 +32,7 @@ def box(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The settings of a box with recorded sweeps and a taught bundle in service."""
     install_scripts.enrolment_key(tmp_path / "enrolment")
     lessons.write(tmp_path / "store" / "sweeps", easy(1))
-    monkeypatch.setattr(use, "_wait", at_once)
+    monkeypatch.setattr(install, "_wait", at_once)
     sets = [f"store.folder={tmp_path / 'store'}", f"store.keys={tmp_path}"]
     words = [word for one in sets for word in ("--set", one)]
     assert main(["teach", "--use", *words]) == 0

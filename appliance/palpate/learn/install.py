@@ -1,7 +1,7 @@
 """From recorded sweeps to a bundle of this box, signed with the box's key and installed on trial.
 
-New materials are taught into a delivered bundle (into.py). Without one, a process of its own fits
-all sweeps.
+New materials are taught into a delivered bundle (materials.py). Without one, a process of its own
+fits all sweeps.
 """
 
 from __future__ import annotations
@@ -10,22 +10,23 @@ import shutil
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 
 from palpate.bundle import bundle
 from palpate.core.clock import Clock
 from palpate.core.config import Config
-from palpate.core.errors import ApplianceError, BundleError, ConfigError, FormatError
+from palpate.core.errors import ApplianceError, BundleError, ConfigError
 from palpate.core.log import log
-from palpate.core.types import SweepFormat, load
+from palpate.core.types import SweepFormat
 from palpate.deployment.enrolment_key import TAUGHT, EnrolmentKey
 from palpate.deployment.signed import SignedBundle
 from palpate.deployment.store import Store
 from palpate.inference import enrolment
 from palpate.io.usb_sensor import fits
-from palpate.learn import into, state
+from palpate.learn import materials
 from palpate.learn.process import News, TeachingProcess, check_installed, learning
-from palpate.learn.state import TeachingState
+from palpate.sweeps import sweep_folder
 
 POLL_NS = 50_000_000
 """Time between two looks at the process."""
@@ -48,7 +49,7 @@ def check_allowed(settings: Config) -> None:
     check_installed()
 
 
-def use(
+def install(
     settings: Config, store: Store, by: str, clock: Clock, tell: Callable[[News], object]
 ) -> str:
     """Teach all recorded sweeps. The bundle runs on trial from the next start on; returns its name
@@ -61,7 +62,7 @@ def use(
     """
     check_allowed(settings)
     sweeps, key = settings.kept("sweeps"), EnrolmentKey(settings.store.enrolment_key)
-    if running := base(store, _format(sweeps)):
+    if running := base(store, sweep_folder.last_format(sweeps)):
         return _into(settings, store, running, key, tell)
     key.check(TAUGHT)
     scratch = Path(settings.store.folder) / "teaching"
@@ -70,13 +71,8 @@ def use(
         out = scratch / "bundle"
         day = time.strftime("%Y-%m-%d %H:%M", time.gmtime())
         options = ("--out", str(out), "--version", version(store), "--by", by, "--at", day)
-        forgotten = TeachingState.load(state.file(settings)).forgotten
-        _wait(
-            learning(sweeps, forgotten, settings.teach, *options),
-            settings.teach.limit_s,
-            clock,
-            tell,
-        )
+        words = learning(sweeps, settings.teach, *options)
+        _wait(words, settings.teach.limit_s, clock, tell)
         files = bundle.files(out)
         files[bundle.TAUGHT_SIGNATURE] = key.sign(files[bundle.MANIFEST], TAUGHT)
         return store.learn(files)
@@ -92,7 +88,7 @@ def base(store: Store, format: SweepFormat | None) -> SignedBundle | None:
     except (ApplianceError, OSError):  # a damaged bundle is replaced
         return None
     suits = format is None or fits(format, running.bundle.format)
-    return running if suits and into.delivered(running) else None
+    return running if suits and materials.delivered(running) else None
 
 
 def _into(
@@ -102,13 +98,13 @@ def _into(
     key: EnrolmentKey,
     tell: Callable[[News], object],
 ) -> str:
-    """Teach the new materials among the recorded sweeps into a delivered bundle, as `use`."""
-    into.check_settings(settings)
+    """Teach the new materials among the recorded sweeps into a delivered bundle, as `install`."""
+    materials.check_settings(settings)
     key.check()
-    forgotten = TeachingState.load(state.file(settings)).forgotten
     try:
-        found = into.recorded(running.bundle, settings.kept("sweeps"), forgotten)
-        new = into.taught(running, found.windows, tuple(forgotten))
+        found = materials.recorded(running.bundle, sweeps := settings.kept("sweeps"))
+        gone = tuple(sweep_folder.forgotten_in(sweeps))
+        new = materials.taught(running, found.windows, gone)
         if new.disagreement:
             raise BundleError(new.disagreement)
     except (ApplianceError, OSError) as e:
@@ -117,32 +113,23 @@ def _into(
         log.warning(f"teach: {warning}")
     sha = store.learn(enrolment.files(running.files, new, key.sign(new.file)))
     labels = [*new.bundle.manifest.labels]
-    tell({"type": "taught", "no_slides": found.no_slides, "labels": labels, "figures": {}})
+    no_slides = [asdict(one) for one in found.no_slides]
+    tell({"type": "taught", "no_slides": no_slides, "labels": labels, "figures": {}})
     return sha
-
-
-def _format(folder: Path) -> SweepFormat | None:
-    """The format of the last sweep in a folder, None without one."""
-    for path in sorted(folder.glob("sweep-*.npy"), reverse=True):
-        try:
-            return load(path)[1]
-        except FormatError:
-            continue  # damaged
-    return None
 
 
 def assessed(settings: Config, store: Store, clock: Clock) -> News:
     """The assessment of the recorded sweeps, as news of type `assessed`. Raises TeachingFailed if
     they are too few."""
     sweeps = settings.kept("sweeps")
-    forgotten = TeachingState.load(state.file(settings)).forgotten
-    if running := base(store, _format(sweeps)):
+    if running := base(store, sweep_folder.last_format(sweeps)):
         try:
-            return into.assessed(running, into.recorded(running.bundle, sweeps, forgotten))
+            held = materials.recorded(running.bundle, sweeps)
+            return {"type": "assessed", **materials.assessed(running, held).json()}
         except (ApplianceError, OSError) as e:
             raise TeachingFailed(f"{e}; the bundle in service stays") from e
     found: News = {}
-    words = learning(sweeps, forgotten, settings.teach)
+    words = learning(sweeps, settings.teach)
     _wait(words, settings.teach.limit_s, clock, found.update)
     return found
 
@@ -167,8 +154,8 @@ def version(store: Store) -> str:
 
 
 def command(options: list[str], by: str = "") -> list[str]:
-    """The command of a process that does all of `use`, or without `by` of `assessed`. options: of
-    the settings."""
+    """The command of a process that does all of `install`, or without `by` of `assessed`. options:
+    of the settings."""
     asked = ["--use", "--by", by] if by else []
     return [sys.executable, "-P", "-m", "palpate", "teach", *options, *asked, "--json"]
 

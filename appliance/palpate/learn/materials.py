@@ -1,0 +1,169 @@
+"""Teaches new materials into the delivered bundle in service: its model and its materials stay.
+
+Each new material is the mean of its sweeps in the embedding (inference/enrolment.py), so this needs
+seconds, and nothing of the desktop.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.bundle import bundle, enrolled
+from palpate.bundle.bundle import Bundle
+from palpate.core.clock import SystemClock
+from palpate.core.config import Config
+from palpate.core.errors import BundleError, ConfigError
+from palpate.deployment.signed import SignedBundle
+from palpate.inference import enrolment
+from palpate.inference.classifier import Classifier, softmax
+from palpate.inference.enrolment import Enrolment
+from palpate.inference.novelty import ClassDistances
+from palpate.inference.objects import EnrolledLabels
+from palpate.learn.assessment import Assessment
+from palpate.sweeps import sweep_folder
+from palpate.sweeps.sweep_folder import NoSlide, slides_alone
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NewSweeps:
+    """Recorded sweeps of materials that a bundle has not been trained on. windows: raw counts [n,
+    T, R, C] or [n, T, R, C, A] of each material; files: their names, without suffix. no_slides:
+    sweeps that are not learnt from."""
+
+    windows: Mapping[str, Array]
+    files: Mapping[str, list[str]]
+    no_slides: tuple[NoSlide, ...] = ()
+
+
+def check_settings(settings: Config) -> None:
+    """Raises ConfigError if the box would refuse a bundle with enrolled labels."""
+    if settings.classifier.early:
+        raise ConfigError("early answers cannot name enrolled labels; set classifier.early = false")
+
+
+def delivered(running: SignedBundle) -> bool:
+    """Whether new materials are taught into this bundle: a person has signed it, and it has an
+    embedding."""
+    return bundle.SIGNATURE in running.files and running.bundle.classes is not None
+
+
+def trained(running: Bundle) -> tuple[str, ...]:
+    """The labels that a bundle was trained on."""
+    return tuple(name for name in running.manifest.labels if name not in running.enrolled)
+
+
+def recorded(running: Bundle, folder: Path) -> NewSweeps:
+    """The sweeps in `folder` of new materials and of the format of the bundle."""
+    check, known = enrolment.slide_check(running), trained(running)
+    new = [
+        one
+        for one in sweep_folder.taught(folder, Counter())
+        if one.format == running.format and one.sweep.material not in known
+    ]
+    slides, no_slides = slides_alone(new, [check(one.sweep.frames.taxels) for one in new])
+    windows: dict[str, list[Array]] = {}
+    files: dict[str, list[str]] = {}
+    for one in slides:
+        windows.setdefault(one.sweep.material, []).append(one.sweep.frames.taxels)
+        files.setdefault(one.sweep.material, []).append(one.path.stem)
+    return NewSweeps({name: np.stack(of) for name, of in windows.items()}, files, no_slides)
+
+
+def taught(
+    running: SignedBundle, windows: Mapping[str, Array], forgotten: tuple[str, ...] = ()
+) -> Enrolment:
+    """The bundle with these materials. One that was enrolled before is learnt anew, and a forgotten
+    one is left out. Raises BundleError and FormatError as `enrolment.enrol`."""
+    new = _without(running, {*windows, *forgotten})
+    warnings, disagreements = list[str](), list[str]()
+    made: Enrolment | None = None
+    for label, of in windows.items():
+        made = enrolment.enrol(new, label, of)
+        new, warnings = made.bundle, [*warnings, *made.warnings]
+        disagreements += [made.disagreement] if made.disagreement else []
+    if made is None:
+        raise BundleError(
+            f"bundle {new.manifest.name} {new.manifest.version} gets no new material; record one "
+            "that it does not have yet"
+        )
+    warnings = [*dict.fromkeys(warnings)]
+    return replace(made, warnings=tuple(warnings), disagreement="; ".join(disagreements))
+
+
+def _without(running: SignedBundle, labels: set[str]) -> Bundle:
+    """The bundle without these enrolled labels."""
+    old = running.bundle
+    added = old.added
+    if added is None or not labels & {*added.labels}:
+        return old
+    signed = {
+        name: data
+        for name, data in running.files.items()
+        if name not in (bundle.ENROLMENT, bundle.ENROLMENT_SIGNATURE)
+    }
+    new = bundle.from_files(signed, old.manifest.name)
+    kept = [k for k, label in enumerate(added.labels) if label not in labels]
+    for k in kept:
+        mean, n, spread = added.means[k], int(added.sweeps[k]), float(added.spread[k])
+        new = enrolled.with_label(new, added.labels[k], mean, n, spread, added.golden[k])
+    still = replace(
+        added,
+        labels=tuple(added.labels[k] for k in kept),
+        means=added.means[kept],
+        sweeps=added.sweeps[kept],
+        spread=added.spread[kept],
+        golden=added.golden[kept],
+    )
+    return replace(new, added=still if kept else None)
+
+
+def assessed(running: SignedBundle, sweeps: NewSweeps) -> Assessment:
+    """The answers to sweeps of new materials, each left out in turn, among all labels. Raises
+    BundleError if no material has two sweeps."""
+    many = {name: of for name, of in sweeps.windows.items() if len(of) > 1}
+    if not many:
+        raise BundleError("no new material has two sweeps; record another of it")
+    old = _without(running, {*many})
+    run, names = Classifier(old, SystemClock()), (*old.manifest.labels, *many)
+    outputs = {
+        name: enrolment.network_outputs(run, enrolment.cleaned(run, of))
+        for name, of in many.items()
+    }
+    chances = np.concatenate([_left_out(old, outputs, name) for name in outputs])
+    late = {*old.enrolled, *many}
+    rule = EnrolledLabels(np.array([name in late for name in names]), enrolment.LEAST)
+    return Assessment(
+        names,
+        np.concatenate([np.full(len(of), names.index(name)) for name, of in many.items()]),
+        tuple(file for name in many for file in sweeps.files[name]),
+        np.eye(len(names))[rule.decided(chances).argmax(axis=1)],
+        chances,
+        no_slides=sweeps.no_slides,
+    )
+
+
+def _left_out(old: Bundle, outputs: Mapping[str, tuple[Array, Array]], of: str) -> Array:
+    """Probabilities [n, K] of all labels for the sweeps of a material, each left out in turn.
+
+    outputs: as of `enrolment.network_outputs`, of each material.
+    """
+    assert old.classes
+    assert old.manifest.known
+    known, labels = replace(old.manifest.known, enrolled=enrolment.LEAST), old.manifest.labels
+    network, answers = outputs[of][0], []
+    for i in range(len(network)):
+        classes = old.classes
+        for name, (_, z) in outputs.items():
+            classes = enrolment.extended(classes, np.delete(z, i, axis=0) if name == of else z)
+        means = ClassDistances(classes, known, [*labels, *outputs])
+        answers.append(softmax(means.joined(network[i], outputs[of][1][i])))
+    return np.stack(answers)

@@ -1,0 +1,132 @@
+"""The one reader and writer of a folder of recordings: which sweeps are learnt from."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from palpate.core.clock import SystemClock
+from palpate.core.errors import FormatError
+from palpate.core.types import Status, save
+from palpate.sweeps import sweep_folder
+from palpate.sweeps.recording import Labels, RecordingSession
+from palpate.sweeps.sweep_folder import FORGOTTEN, SweepFolder
+from tests.cuts.recording import SHORT, taken
+
+
+class SlowDisk:
+    """A disk that writes when a test says so."""
+
+    def __init__(self) -> None:
+        self._work: list[tuple[Callable[[], Any], Callable[[Any], object]]] = []
+
+    def __call__(self, work: Callable[[], Any], done: Callable[[Any], object]) -> bool:
+        self._work.append((work, done))
+        return True
+
+    def settle(self) -> bool:
+        """Write all."""
+        while self._work:
+            work, done = self._work.pop(0)
+            done(work())
+        return True
+
+
+def recording(folder: Path, disk: SlowDisk | None = None) -> RecordingSession:
+    """A recording of cork."""
+    labels = Labels("cork")
+    return RecordingSession(folder, SHORT, labels, SystemClock(), lambda line: None, disk=disk)
+
+
+def learnt(folder: Path) -> tuple[list[int], dict[str, int]]:
+    """The numbers of the sweeps that are learnt from, and the reasons of the others."""
+    left_out = Counter[str]()
+    return [one.number for one in sweep_folder.taught(folder, left_out)], dict(left_out)
+
+
+def test_each_state_of_a_sweep(tmp_path: Path):
+    """One of each: whoever learns from a folder leaves out the same sweeps for the same reasons."""
+    for number, change in enumerate(
+        [
+            {},
+            {"status": Status.GAP},
+            {"share": 0.5},
+            {"material": ""},
+            {"material": "felt"},
+            {},
+        ],
+        1,
+    ):
+        one = replace(taken(number, SHORT)[0], material="cork")
+        verdict = {"status": str(Status.NO_CONTACT if number == 6 else Status.UNKNOWN)}
+        save(
+            tmp_path / f"sweep-{number:06d}.npy",
+            replace(one, **change),
+            SHORT,
+            {"verdict": verdict},
+        )
+    (tmp_path / "sweep-000007.npy").write_bytes(b"half")
+    folder = SweepFolder(tmp_path, None)
+    folder.forget("felt", [5])
+    folder.close()
+    others = {"gap": 1, "early": 1, "no material": 1, "forgotten": 1, "no-contact": 1, "damaged": 1}
+    assert learnt(tmp_path) == ([1], others)
+
+
+def test_forgotten_sweeps_of_an_emptied_folder_hide_no_later_ones(tmp_path: Path):
+    """A person removes all sweeps, and the program starts again: later ones are taught."""
+    first = recording(tmp_path)
+    for number in (1, 2):
+        first.sweep(*taken(number, SHORT), {})
+    first.forget("cork")
+    first.close()
+    assert learnt(tmp_path)[0] == []
+    for path in tmp_path.glob("sweep-*"):
+        path.unlink()
+    again = recording(tmp_path)
+    for number in (1, 2):
+        again.sweep(*taken(number, SHORT), {})
+    assert again.materials() == {"cork": 2}
+    assert learnt(tmp_path)[0] == [3, 4]
+    again.close()
+
+
+def test_a_sweep_that_waits_for_the_card_is_forgotten_too(tmp_path: Path):
+    """FORGET comes before it is written: it is stored and stays forgotten, also after a start."""
+    disk = SlowDisk()
+    one = recording(tmp_path, disk)
+    one.sweep(*taken(1, SHORT), {})
+    one.forget("cork")
+    disk.settle()
+    assert one.stored == 1
+    assert one.materials() == {}
+    one.sweep(*taken(2, SHORT), {})
+    disk.settle()
+    assert one.materials() == {"cork": 1}
+    one.close()
+    again = recording(tmp_path)
+    assert again.materials() == {"cork": 1}
+    assert learnt(tmp_path) == ([2], {"forgotten": 1})
+    again.close()
+
+
+@pytest.mark.parametrize("content", ["", "[]", '{"cork": 3}', '{"cork": ["x"]}', "[" * 9999])
+def test_a_damaged_list_of_forgotten_sweeps_is_named(tmp_path: Path, content: str):
+    """Nothing is taught by mistake, and the folder is free again."""
+    (tmp_path / FORGOTTEN).write_text(content)
+    for _ in range(2):
+        with pytest.raises(FormatError, match=f"{FORGOTTEN} cannot be read"):
+            SweepFolder(tmp_path, SHORT)
+
+
+def test_sweeps_of_a_folder_in_use_are_not_forgotten_from_outside(tmp_path: Path):
+    """The program that records would not know."""
+    one = recording(tmp_path)
+    with pytest.raises(OSError, match="another program"):
+        SweepFolder(tmp_path, None)
+    one.close()
