@@ -132,7 +132,11 @@ def assessed(running: SignedBundle, sweeps: NewSweeps) -> Assessment:
     many = {name: of for name, of in sweeps.windows.items() if len(of) > 1}
     if not many:
         raise BundleError("no new material has two sweeps; record another of it")
-    old = _without(running, {*many})
+    return left_out(_without(running, {*many}), many, sweeps)
+
+
+def left_out(old: Bundle, many: Mapping[str, Array], sweeps: NewSweeps) -> Assessment:
+    """The same for a bundle without the materials of `many`, each with its windows."""
     run, names = Classifier(old, SystemClock()), (*old.manifest.labels, *many)
     outputs = {
         name: enrolment.network_outputs(run, enrolment.cleaned(run, of))

@@ -17,7 +17,7 @@ from palpate.inference.classifier import Classifier, softmax
 from palpate.inference.hand_classifier import HandClassifier
 from palpate.inference.novelty import ClassDistances
 from palpate.inference.objects import EnrolledLabels, ObjectRule
-from palpate.learn import into
+from palpate.learn import materials
 from palpate.sim.rig import VirtualClock
 from tests.factories import toy_bundle
 
@@ -210,16 +210,18 @@ def test_left_out_sweeps_are_answered_as_the_box_would(new: Bundle, tmp_path: Pa
     felt gets b, because felt does not have its least probability."""
     old, near = toy_bundle.load(tmp_path / "old"), toy_bundle.window(*near_b(new, 0.55))
     sweeps = np.stack([*FELT, *FELT, near])
-    p, answers = into._judged(old, {"felt": sweeps})
+    many = {"felt": sweeps}
+    found = materials.left_out(old, many, materials.NewSweeps(many, {"felt": [*"12345"]}))
+    answers = [found.materials[k] for k in found.named.argmax(axis=1)]
     for i, one in enumerate(sweeps):
         without = enrolment.enrol(old, "felt", np.delete(sweeps, i, axis=0)).bundle
         box = Classifier(without, VirtualClock())
         n = np.arange(len(one))
         verdict = box(Sweep(1, 0, 0, Status.OK, Frames(n, n, one)))
-        assert answers["felt"][i] == verdict.label
-        assert p["felt"][i] == pytest.approx(verdict.own, abs=1e-6)
-    assert answers["felt"] == ["felt"] * 4 + ["b"]
-    assert p["felt"][4].argmax() == 3
+        assert answers[i] == verdict.label
+        assert found.chances[i] == pytest.approx(verdict.own, abs=1e-6)
+    assert answers == ["felt"] * 4 + ["b"]
+    assert found.chances[4].argmax() == 3
 
 
 def test_a_hand_applies_the_rule_of_its_fingers(new: Bundle):
