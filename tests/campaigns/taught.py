@@ -24,8 +24,8 @@ from palpate.bundle.bundle import Bundle
 from palpate.core.clock import SystemClock
 from palpate.core.errors import ApplianceError
 from palpate.core.types import Status
-from palpate.inference import enrolment
 from palpate.inference.classifier import Classifier
+from palpate.learn import enrolment
 from palpate_train.data import sets
 from palpate_train.data.sets import Dataset
 from palpate_train.data.splitters import draw

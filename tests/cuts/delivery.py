@@ -8,7 +8,6 @@ wrong on purpose.
 
 from __future__ import annotations
 
-import argparse
 import os
 import re
 import shutil
@@ -23,12 +22,9 @@ from types import MappingProxyType
 
 from palpate.bundle import bundle
 from palpate.bundle.manifest import SCHEMA
-from palpate.cli import enrol_command
 from palpate.cli.main import main
 from palpate.core import storage
-from palpate.core.config import Config
 from palpate.deployment import signature
-from palpate.deployment.enrolment_key import EnrolmentKey
 from palpate.deployment.store import SHA
 from palpate.deployment.trial import Trial
 from tests.cuts.calls import DEADLINE_S, NotFollowed
@@ -152,32 +148,34 @@ class Shop:
         gets another bundle; each command is cut short."""
         return self._scene("enrolment", self._delivered, list(self._enrolments()), self._learned())
 
+    def records(self, label: str) -> SceneStep:
+        """The box records a sweep of a new material on the simulated skin."""
+        seed = str(LABELS.index(label) + 1)
+        skin = ("--sim", "skin", "--virtual", "--seed", seed)
+        return self.palpate(f"record {label}", "teach", "--label", label, "--sweeps", "1", *skin)
+
     def enrols(self, label: str, way: str = "right", name: str = "") -> SceneStep:
-        """The box learns a label from a sweep of the simulated skin, and signs it."""
-        words = (
-            "enrol",
-            label,
-            "--sweeps",
-            "1",
-            "--sim",
-            "skin",
-            "--virtual",
-            "--seed",
-            str(LABELS.index(label) + 1),
-        )
-        return self.palpate(name or f"enrol {label}", *words, way=way, code=0)
+        """The box learns the label from its sweep, and signs it."""
+        return self.palpate(name or f"enrol {label}", "teach", "--use", way=way, code=0)
 
     def learns(self, way: str) -> CutScene:
         """A single enrolment, in one of WAYS, on a box that runs the first bundle."""
+
+        def recorded(folder: Path) -> None:
+            self._delivered(folder)
+            _done(self.records(LABELS[0]), folder)
+
         steps = [("first cork", self.enrols(LABELS[0], way))]
-        return self._scene("enrolment", self._delivered, steps, self._learned(LABELS[:1]))
+        return self._scene("enrolment", recorded, steps, self._learned(LABELS[:1]))
 
     def _enrolments(self) -> Iterator[tuple[str, SceneStep]]:
         """As `steps`; a label stands for the bundle that has learned up to it."""
         do = self.palpate
+        yield "first", self.records("cork")
         yield "first cork", self.enrols("cork")
         yield "cork", do("start it and end in order", *START)
         yield "cork", do("start and commit it", *START_AND_COMMIT)
+        yield "cork", self.records("felt")
         yield "cork felt", self.enrols("felt")
         yield "felt cork", do("roll back from the trial", "bundles", "rollback")
         yield "cork first", do("roll back", "bundles", "rollback")
@@ -194,18 +192,10 @@ class Shop:
             self._delivered(folder := Path(aside))
             ids = {}
             for label in labels:
-                done = run(
-                    self.enrols(label).command(folder),
-                    cwd=ROOT,
-                    capture_output=True,
-                    text=True,
-                    check=False,
-                )
-                ids[label] = _promised(done.stdout + done.stderr)
+                _done(self.records(label), folder)
+                ids[label] = _promised(output := _done(self.enrols(label), folder))
                 if not ids[label]:
-                    raise NotFollowed(
-                        f"{label} cannot be enrolled: {_end(done.stdout + done.stderr)}"
-                    )
+                    raise NotFollowed(f"{label} cannot be enrolled: {_end(output)}")
         return ids
 
     def alone(self, way: str) -> CutScene:
@@ -288,6 +278,15 @@ def _promised(output: str) -> str:
     return next(filter(None, reported.groups())) if reported else ""
 
 
+def _done(step: SceneStep, folder: Path) -> str:
+    """The output of a step that is not cut short."""
+    words = step.command(folder)
+    done = run(words, cwd=ROOT, capture_output=True, text=True, check=False, timeout=DEADLINE_S)
+    if done.returncode:
+        raise NotFollowed(f"{step.name} ended with {done.returncode}: {_end(done.stderr)}")
+    return done.stdout + done.stderr
+
+
 def _end(output: str) -> str:
     return output.strip().rpartition("\n")[2][-300:]
 
@@ -311,12 +310,6 @@ def _apart(words: list[str]) -> tuple[int, str]:
         return os.waitstatus_to_exitcode(status), file.read().decode("utf-8", "replace")
 
 
-def _signs(args: argparse.Namespace, settings: Config) -> EnrolmentKey:
-    """Signs labels from a simulated skin like labels from a real skin; the box itself refuses
-    to."""
-    return EnrolmentKey(settings.store.enrolment_key)
-
-
 def _gone_for_a_moment(path: Path, target: str) -> None:
     path.unlink(missing_ok=True)
     path.symlink_to(target)
@@ -334,6 +327,5 @@ the judge must find that."""
 
 
 if __name__ == "__main__":
-    enrol_command._enrolment_key = _signs
     setattr(*WAYS[sys.argv[1]])
     sys.exit(main(sys.argv[2:]))

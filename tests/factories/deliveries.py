@@ -17,7 +17,7 @@ from palpate.core.config import StoreConfig
 from palpate.deployment import signature
 from palpate.deployment.enrolment_key import EnrolmentKey
 from palpate.deployment.store import Store
-from palpate.inference import enrolment
+from palpate.learn import enrolment
 from tests.factories.install_scripts import enrolment_key
 
 SIGNER = "anna@lab"

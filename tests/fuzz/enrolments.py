@@ -21,7 +21,7 @@ from palpate.bundle import arrays as packing
 from palpate.bundle import bundle, enrolled
 from palpate.bundle.bundle import Bundle
 from palpate.core.errors import BundleError
-from palpate.inference import enrolment
+from palpate.learn import enrolment
 from tests.factories import toy_bundle
 from tests.factories.mutated_enrolments import changed
 from tests.fuzz.files import one_line

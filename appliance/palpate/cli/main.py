@@ -25,7 +25,6 @@ COMMANDS: Mapping[str, str] = {
     "config": "cli.look_commands.run_config",
     "record": "cli.record_command.run",
     "teach": "cli.teach_command.run",
-    "enrol": "cli.enrol_command.run",
     "bundles": "cli.bundle_commands.run",
     "skin": "cli.skin_commands.run",
     "bridge": "bridges.command.run",

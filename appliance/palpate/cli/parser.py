@@ -42,7 +42,6 @@ MENU = Menu(
         "record and learn": {
             "record": "keep each sweep with its label, for training; needs no bundle",
             "teach": "learn materials from sweeps beside the robot, without a desktop",
-            "enrol": "learn one more material from a few sweeps, without training",
         },
         "bundles": {
             "bundles": "list, install, verify, commit, rollback or promote bundles of this box",
@@ -71,8 +70,6 @@ SKIN_ACTIONS = {
 }
 WEB_PORT, TEACH_PORT = 8137, 8138
 """Default ports of pages. Both pages can be served side by side."""
-MOST_SWEEPS = 10
-"""Most sweeps for an enrolment; a mean of more would hardly be better."""
 
 
 def parser(name: str) -> CommandParser:
@@ -93,10 +90,7 @@ def arguments(name: str, words: list[str]) -> argparse.Namespace:
     command = parser(name)
     if name == "bridge":
         return bridges.parse(command, words)
-    args = command.parse(words)
-    if name == "enrol" and args.label is None and args.unknown is None:
-        command.error("enrol needs LABEL, the name of the new material")
-    return args
+    return command.parse(words)
 
 
 def add_settings(command: argparse.ArgumentParser) -> None:
@@ -363,51 +357,19 @@ def _teach(command: CommandParser) -> None:
         action="store_true",
         help="make a bundle of all sweeps, after those of --label; it runs on trial",
     )
-    add("--forget", metavar="NAME", help="teach the sweeps of this material no longer; they stay")
-    add("--by", default="", metavar="NAME", help="who teaches, for the bundle (default: this user)")
-    add("--json", action="store_true", help="with --use alone: print its steps as JSON")
-    _web(add, f"also as a page, for a person at the robot (default port {TEACH_PORT})", TEACH_PORT)
-    command.set_defaults(sweeps=None)
-
-
-def _enrol(command: CommandParser) -> None:
-    _one_skin(command)
-    _trigger(command)
-    command.add_argument(
-        "label",
-        nargs="?",
-        metavar="LABEL",
-        help="name of the new material; all sweeps are of this material",
-    )
-    command.add_argument(
+    add(
         "--unknown",
         nargs="?",
         const=0,
         type=_count,
         metavar="NUMBER",
-        help="learn it from kept sweeps (store.black_box) that were answered `unknown, as sweep N`:"
-        " those that sweep NUMBER belongs to. Without LABEL, list them",
+        help="take kept sweeps (store.black_box) that were answered `unknown, as sweep N` as sweeps"
+        " of --label: those that sweep NUMBER belongs to. Without --label, list them",
     )
-    command.add_argument(
-        "--out",
-        type=outputs.folder,
-        metavar="DIR",
-        help="write the new bundle to DIR instead of installing it; without it the bundle runs on"
-        " trial from the next start on",
-    )
-    command.add_argument("--replace", action="store_true", help="replace a bundle at DIR")
-    command.add_argument(
-        "--sweeps",
-        type=int,
-        choices=range(1, MOST_SWEEPS + 1),
-        default=5,
-        dest="good",
-        metavar="N",
-        help=f"number of good sweeps, 1 to {MOST_SWEEPS} (default 5)",
-    )
-    command.add_argument(
-        "--scattered", action="store_true", help="even if the sweeps are unlike one another"
-    )
+    add("--forget", metavar="NAME", help="teach the sweeps of this material no longer; they stay")
+    add("--by", default="", metavar="NAME", help="who teaches, for the bundle (default: this user)")
+    add("--json", action="store_true", help="with --use alone: print its steps as JSON")
+    _web(add, f"also as a page, for a person at the robot (default port {TEACH_PORT})", TEACH_PORT)
     command.set_defaults(sweeps=None)
 
 
@@ -460,7 +422,6 @@ _ARGUMENTS: Mapping[str, Callable[[CommandParser], None]] = {
     "replay": _replay,
     "record": _record,
     "teach": _teach,
-    "enrol": _enrol,
     "bundles": _bundles,
     "skin": _skin,
     "bridge": bridges.add_arguments,

@@ -6,8 +6,8 @@ import argparse
 import getpass
 import json
 import sys
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
@@ -20,18 +20,18 @@ from palpate.core.clock import SystemClock
 from palpate.core.config import Config
 from palpate.core.devices import Devices
 from palpate.core.disk_thread import DiskThread
-from palpate.core.errors import ApplianceError, ConfigError
+from palpate.core.errors import ApplianceError, ConfigError, FormatError
 from palpate.core.log import log
 from palpate.core.names import TypedNames
 from palpate.core.observer import Observer
 from palpate.core.types import SweepFormat
 from palpate.deployment.enrolment_key import TAUGHT, EnrolmentKey
 from palpate.deployment.signed import SignedBundle
-from palpate.inference.enrolment import slide_check
 from palpate.io import skins
 from palpate.io.robot_link import Command, Port
 from palpate.io.verdict_lines import check_bits
 from palpate.learn import install, materials
+from palpate.learn.enrolment import slide_check
 from palpate.learn.hand_over import HandOver
 from palpate.learn.process import News
 from palpate.learn.session import TeachingSession, refuse_trained
@@ -39,8 +39,9 @@ from palpate.learn.teacher import Teacher
 from palpate.runtime import assembly
 from palpate.service.systemd import Notifier
 from palpate.signal.slide_check import SlidesAmong
+from palpate.sweeps import unknown_sweeps
 from palpate.sweeps.recording import Labels, RecordingSession
-from palpate.sweeps.sweep_folder import SweepFolder
+from palpate.sweeps.sweep_folder import RecordedSweep, SweepFolder
 
 if TYPE_CHECKING:
     from palpate.web.record import RecordPage
@@ -55,6 +56,8 @@ def run(args: argparse.Namespace) -> int:
     install.check_allowed(settings)
     if args.forget is not None:
         return _forget(settings, args.forget)
+    if args.unknown is not None and not _adopt(args, settings):
+        return 0
     if args.use and not args.labels and args.web is None:
         return _use(args, settings)
     if args.sim and settings.sources["store.folder"] == "code":
@@ -84,7 +87,7 @@ def until_taught(args: argparse.Namespace, settings: Config) -> int:
         "palpate-teach starts it at once), or by palpate teach; or deploy a bundle"
     )
     defaults = {"labels": [], "good": GOOD, "position": "1", "session": "", "web": None}
-    defaults |= {"use": False, "by": "", "format": None, "window": None}
+    defaults |= {"unknown": None, "use": False, "by": "", "format": None, "window": None}
     taught = argparse.Namespace(**vars(args) | defaults)
     Session(taught, without_lines(args, settings), waits=address).run()
     return 0
@@ -103,21 +106,54 @@ def page_address(settings: Config) -> str:
         return f"no page ({e})"
 
 
-def _forget(settings: Config, material: str) -> int:
-    """Teach the sweeps of a material so far no longer. Raises ConfigError if they are in use."""
-    Labels(material=material)
-    sweeps = settings.kept("sweeps")
+@contextmanager
+def _sweeps(settings: Config) -> Iterator[SweepFolder]:
+    """The folder of the recorded sweeps. Raises ConfigError if another program uses it."""
+    path = settings.kept("sweeps")
     try:
-        folder = SweepFolder(sweeps, None)
+        folder = SweepFolder(path, None)
+        try:
+            yield folder
+        finally:
+            folder.close()
+    except OSError as e:
+        raise ConfigError(f"{path}: {e.strerror}; use the page, or stop that program") from e
+
+
+def _forget(settings: Config, material: str) -> int:
+    """Teach the sweeps of a material so far no longer."""
+    Labels(material=material)
+    with _sweeps(settings) as folder:
         own = [n for n, about in folder.sidecars() if about.get("material") == material]
         folder.forget(material, own)
-        folder.close()
-    except OSError as e:
-        raise ConfigError(
-            f"{sweeps}: {e.strerror}; forget it on the page, or stop the program"
-        ) from e
-    print(f"{material}: its sweeps so far are no longer taught; they stay in {sweeps}")
+    print(f"{material}: its sweeps so far are no longer taught; they stay in {folder.folder}")
     return 0
+
+
+def _adopt(args: argparse.Namespace, settings: Config) -> bool:
+    """Take kept sweeps of one unknown material as sweeps of the label, which then needs no more of
+    them; returns whether there is a label. Without one, list them."""
+    kept = settings.kept("black-box")
+    found = unknown_sweeps.groups(kept, assembly.running(settings).bundle.id)
+    if not args.labels:
+        print("\n".join(map(str, found)) or "no unknown material was seen twice")
+        return False
+    group, (label, *others) = unknown_sweeps.chosen(found, args.unknown, kept), args.labels
+    if others:
+        raise ConfigError(f"--unknown takes sweeps of one material; leave out --label {others[0]}")
+    Labels(material=label)
+    store = assembly.store(settings)
+    base = install.base(store, None)
+    refuse_trained(materials.trained(base.bundle) if base else (), [label])
+    with _sweeps(settings) as folder:
+        for path in group.paths.values():
+            try:
+                folder.adopt(RecordedSweep.load(path), label)
+            except FormatError as e:
+                log.warning(f"teach: left out: {e}")
+    log.info(f"teach: {label}: {group}")
+    args.labels = []
+    return True
 
 
 def _assess(args: argparse.Namespace, settings: Config) -> None:

@@ -22,9 +22,8 @@ from palpate.core.types import SweepFormat
 from palpate.deployment.enrolment_key import TAUGHT, EnrolmentKey
 from palpate.deployment.signed import SignedBundle
 from palpate.deployment.store import Store
-from palpate.inference import enrolment
 from palpate.io.usb_sensor import fits
-from palpate.learn import materials
+from palpate.learn import enrolment, materials
 from palpate.learn.process import News, TeachingProcess, check_installed, learning
 from palpate.sweeps import sweep_folder
 

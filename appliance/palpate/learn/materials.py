@@ -1,6 +1,6 @@
 """Teaches new materials into the delivered bundle in service: its model and its materials stay.
 
-Each new material is the mean of its sweeps in the embedding (inference/enrolment.py), so this needs
+Each new material is the mean of its sweeps in the embedding (learn/enrolment.py), so this needs
 seconds, and nothing of the desktop.
 """
 
@@ -21,12 +21,12 @@ from palpate.core.clock import SystemClock
 from palpate.core.config import Config
 from palpate.core.errors import BundleError, ConfigError
 from palpate.deployment.signed import SignedBundle
-from palpate.inference import enrolment
 from palpate.inference.classifier import Classifier, softmax
-from palpate.inference.enrolment import Enrolment
 from palpate.inference.novelty import ClassDistances
 from palpate.inference.objects import EnrolledLabels
+from palpate.learn import enrolment
 from palpate.learn.assessment import Assessment
+from palpate.learn.enrolment import Enrolment
 from palpate.sweeps import sweep_folder
 from palpate.sweeps.sweep_folder import NoSlide, slides_alone
 

@@ -14,7 +14,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -213,6 +213,15 @@ class SweepFolder:
             self._format,
             {**about, "date": wall_clock.date(), "run": self.run, "verdict": verdict.as_dict()},
         )
+        self.numbers.append(number)
+        return number
+
+    def adopt(self, one: RecordedSweep, material: str) -> int:
+        """Copy a sweep of another folder as one of a material; returns its number. Raises
+        OSError."""
+        number = max([self.run, *self.numbers]) + 1
+        about = {**one.about, "run": number - one.sweep.id}
+        save(self.path(number), replace(one.sweep, material=material), one.format, about)
         self.numbers.append(number)
         return number
 

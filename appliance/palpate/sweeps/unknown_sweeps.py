@@ -58,7 +58,7 @@ def chosen(found: list[UnknownGroup], number: int, folder: Path) -> UnknownGroup
     if not found:
         raise ApplianceError(
             f"no unknown material was seen twice in {folder}: store.black_box = 500 keeps the last "
-            "500 sweeps; make sweeps of the material, or enrol it without --unknown"
+            "500 sweeps; make sweeps of the material, or teach it without --unknown"
         )
     fitting = [one for one in found if number in one.paths or not number]
     if len(fitting) != 1:

@@ -13,8 +13,8 @@ import pytest
 from palpate.bundle import arrays, bundle, enrolled
 from palpate.core.clock import SystemClock
 from palpate.core.errors import BundleError
-from palpate.inference import enrolment
 from palpate.inference.classifier import Classifier
+from palpate.learn import enrolment
 from tests.factories import toy_bundle
 
 SWEEPS = np.stack([toy_bundle.window(7, 8), toy_bundle.window(8, 9)])

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import pytest
 
-from palpate.bundle import bundle
 from palpate.bundle.bundle import Bundle
 from palpate.cli import run_command
 from palpate.cli.common import load_settings
@@ -128,7 +127,6 @@ FOR_ONE = [
     ["align", "--sim", "skin"],
     ["teach", "--web", "0"],
     ["teach", "--use"],
-    ["enrol", "felt", *VIRTUAL[:3], "--out", "o"],
 ]
 
 
@@ -230,18 +228,8 @@ def test_skin_check_of_a_finger(capsys: pytest.CaptureFixture[str]):
     assert all(line.startswith("ok ") for line in capsys.readouterr().out.splitlines())
 
 
-def test_a_finger_is_enrolled(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """From its sweeps, into the bundle of the box."""
-    words = ["enrol", "felt", *VIRTUAL[:3], *TWO, "--sweeps", "2", "--finger", "right"]
-    assert main([*words, "--out", str(tmp_path / "felt"), "--sim", "skin:wood"]) == 0
-    made = bundle.from_files(bundle.files(tmp_path / "felt"), "")
-    assert made.enrolled == {"felt": 2}
-
-
-@pytest.mark.parametrize("command", [["teach", "--use"], ["enrol", "felt"]], ids=" ".join)
 @pytest.mark.parametrize("setting", ["skins.left.bundle", "classifier.bundle"])
 def test_a_bundle_of_the_settings_is_not_taught_into(
-    command: list[str],
     setting: str,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
@@ -249,7 +237,9 @@ def test_a_bundle_of_the_settings_is_not_taught_into(
     """The store has another bundle, which would not run: the setting is named, nothing is
     written."""
     keys = ["--set", f"store.folder={tmp_path / 'store'}", "--set", f"store.keys={tmp_path}"]
-    assert main([*command, *TWO, *keys, "--set", f"{setting}=/own", "--finger", "left"]) == 78
+    assert (
+        main(["teach", "--use", *TWO, *keys, "--set", f"{setting}=/own", "--finger", "left"]) == 78
+    )
     assert f"{setting} names the bundle that runs, so a" in capsys.readouterr().err
     assert not (tmp_path / "store").exists()
 

@@ -3,20 +3,12 @@ so."""
 
 from __future__ import annotations
 
-import argparse
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from palpate.bundle import bundle
-from palpate.cli import devices as cli_devices
-from palpate.cli.common import load_settings
 from palpate.cli.main import main
-from palpate.core.devices import Devices
-from palpate.core.types import SweepFormat
-from palpate.deployment.enrolment_key import KEY
 from palpate.service.status import StatusFile
 from tests.factories import deliveries, hands, toy_bundle
 from tests.factories.deliveries import Delivery
@@ -43,9 +35,7 @@ def of(box: Delivery) -> list[str]:
     return [word for name, value in how.items() for word in ("--set", f"{name}={value}")]
 
 
-@pytest.mark.parametrize(
-    "command", [("run",), ("check",), ("enrol", "felt", "--out", "new"), ("run", "--shadow")]
-)
+@pytest.mark.parametrize("command", [("run",), ("check",), ("run", "--shadow")])
 def test_a_robot_is_answered_by_signed_bundles_alone(
     box: Delivery, command: tuple[str, ...], capsys: pytest.CaptureFixture[str]
 ):
@@ -138,75 +128,3 @@ def test_a_bench_may_allow_unsigned_bundles(box: Delivery, capsys: pytest.Captur
     warning, *_, end = capsys.readouterr().err.splitlines()
     assert SAID in warning
     assert "trigger.start has no GPIO line" in end
-
-
-@pytest.fixture
-def sliding(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The simulator replaces the real devices; the command does not know it."""
-
-    def played(args: argparse.Namespace, format: Callable[[], SweepFormat]) -> Devices:
-        args.virtual = True
-        return cli_devices.simulated(
-            "skin:wood", format(), args, load_settings(args), remember=False
-        )
-
-    monkeypatch.setattr("palpate.cli.enrol_command.open_devices", played)
-
-
-@pytest.mark.slow
-def test_an_enrolled_label_comes_into_the_store(
-    box: Delivery, sliding: None, capsys: pytest.CaptureFixture[str]
-):
-    """The new bundle is signed by the box and on trial; the list shows the signers."""
-    before = box.committed(1)
-    assert main(["enrol", "cork", *of(box)]) == 0
-    assert (
-        "7 labels; it runs on trial from the next start on: systemctl restart palpate"
-        in capsys.readouterr().err
-    )
-    running = box.store.running()
-    assert running.bundle.enrolled == {"cork": 5}
-    assert main(["bundles", *of(box)]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[1].split()[:2] == ["on", "trial"]
-    assert "anna@lab, enrolled here" in lines[1]
-    assert before[:8] in lines[2]
-
-
-@pytest.mark.slow
-def test_an_enrolled_folder_is_signed(
-    box: Delivery, sliding: None, capsys: pytest.CaptureFixture[str]
-):
-    """--out DIR: `palpate bundles install DIR` takes it."""
-    box.committed(1)
-    out = box.folder / "with-cork"
-    assert main(["enrol", "cork", "--out", str(out), *of(box)]) == 0
-    assert f"use it with palpate bundles install {out}" in capsys.readouterr().err
-    assert (out / bundle.ENROLMENT_SIGNATURE).is_file()
-    assert main(["bundles", "verify", str(out), *of(box)]) == 0
-    assert "signed by anna@lab, enrolled here; all is well" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("options", "why"),
-    [
-        ((), "key: No such file or directory, so nothing can be enrolled"),
-        (("--set", "classifier.early=true"), "early answers cannot name enrolled labels"),
-        (ALLOWED, "with classifier.allow_unsigned the enrolment is not signed"),
-        (
-            VIRTUAL[:3],
-            "with --sim the enrolment is not signed, and a box refuses it; give --out DIR",
-        ),
-    ],
-)
-def test_what_cannot_be_enrolled_is_told_before_the_robot_sweeps(
-    box: Delivery, options: tuple[str, ...], why: str, capsys: pytest.CaptureFixture[str]
-):
-    """Without a key, with early answers, or unsigned without a folder: one line, exit code 78, no
-    sweep."""
-    (box.enrolment_key.folder / KEY).unlink()
-    assert main(["enrol", "cork", *of(box), *options]) == 78
-    output = capsys.readouterr()
-    assert why in output.err
-    assert len(output.err.splitlines()) == 1
-    assert output.out == ""

@@ -22,10 +22,7 @@ DESKTOP = (
     ("sets", "view", "none"),
     ("pull", "none"),
 )
-BOX = (
-    ("record", "--format", "4x4:uint8:750"),
-    ("enrol", "felt"),
-)
+BOX = (("record", "--format", "4x4:uint8:750"),)
 STUDIES = (("fabrics", "--method", "H-svm"), ("matrix", "none"))
 
 

@@ -13,8 +13,8 @@ from palpate.bundle.manifest import Manifest
 from palpate.core.clock import SystemClock
 from palpate.core.errors import ApplianceError, BundleError, ConfigError
 from palpate.deployment import signature
-from palpate.inference import enrolment
 from palpate.inference.classifier import Classifier
+from palpate.learn import enrolment
 from palpate_train.export import sign
 from tests.factories import deliveries
 from tests.factories.deliveries import SIGNER, line

@@ -11,8 +11,8 @@ import pytest
 from palpate.bundle import bundle
 from palpate.core.errors import BundleError
 from palpate.core.types import Status, Sweep, SweepFormat, Verdict
-from palpate.inference import enrolment
 from palpate.inference.classifier import Classifier
+from palpate.learn import enrolment
 from palpate.signal.disturbances import Allowance, Disturbances
 from palpate.sim.rig import VirtualClock
 from tests.factories import toy_bundle

@@ -12,8 +12,8 @@ from palpate.core.errors import BundleError
 from palpate.inference import session
 from palpate.inference.classifier import Classifier
 from palpate.inference.early_exit import EarlyExit
-from palpate.inference.enrolment import enrol
 from palpate.inference.session import ModelRunner
+from palpate.learn.enrolment import enrol
 from palpate.sim.rig import VirtualClock
 from tests.factories import toy_bundle
 

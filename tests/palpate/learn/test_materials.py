@@ -23,9 +23,8 @@ from palpate.core.config import load
 from palpate.core.errors import BundleError, ConfigError, ModelError
 from palpate.deployment.enrolment_key import EnrolmentKey
 from palpate.deployment.signed import SignedBundle
-from palpate.inference import enrolment
 from palpate.inference.classifier import Classifier
-from palpate.learn import install, materials
+from palpate.learn import enrolment, install, materials
 from palpate.learn.session import TeachingSession
 from palpate.runtime import assembly
 from palpate.runtime.hand import classifier
@@ -141,6 +140,22 @@ def test_a_label_without_recorded_sweeps_stays(box: TaughtDelivery, capsys: Any)
         assert box.running.bundle.enrolled == {"wool": 2, "cork": 5}
         assert box.running.bundle.classes
         assert np.array_equal(box.running.bundle.classes.means[-2], new.bundle.classes.means[-1])
+
+
+def test_kept_sweeps_of_an_unknown_material_are_taught(box: TaughtDelivery, capsys: Any):
+    """Listed, and chosen by one of them; without the skin they become a material."""
+    record(box.store, "", slides(FELT, 3), 1, "../black-box")
+    for number in (1, 2, 3):
+        path = box.store / "black-box" / f"sweep-{number:06d}.json"
+        verdict = {"status": "unknown", "bundle": box.running.bundle.id, "detail": "; as sweep 1"}
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"verdict": verdict}))
+    (box.store / "black-box" / "sweep-000002.npy").write_bytes(b"damaged")
+    assert main(["teach", *box.words, "--unknown"]) == 0
+    assert capsys.readouterr().out.startswith("3 sweeps: 1, 2, 3")
+    assert main(["teach", *box.words, "--unknown", "3", "--label", "foam"]) == 78
+    code, news = box.teach(capsys, "--unknown", "3", "--label", "felt", "--use")
+    assert code == 0, news
+    assert box.running.bundle.enrolled == {"cork": 5, "felt": 2}
 
 
 def test_nothing_new_leaves_the_bundle_in_service(box: TaughtDelivery, capsys: Any):

@@ -8,16 +8,14 @@ import pytest
 from palpate.bundle import bundle
 from palpate.bundle.bundle import Bundle
 from palpate.core.errors import FormatError
-from palpate.core.types import Frames, Status, Sweep, SweepFormat, Verdict
-from palpate.inference import enrolment
+from palpate.core.types import Frames, Status, Sweep, SweepFormat
 from palpate.inference.classifier import Classifier
-from palpate.inference.enrolment import SweepCollector
+from palpate.learn import enrolment
 from palpate.signal.slide import CHANCE, LEAST_HEIGHT, SlideMeter
 from palpate.signal.slide_check import MANY, SlideCheck, SlidesAmong
 from palpate.sim import skin
 from palpate.sim.rig import VirtualClock
 from tests.campaigns.junk import KINDS, window
-from tests.factories import toy_bundle
 
 JUNK = [
     *("finger rests", "rests, noise", "rests, common noise", "rests, 50 Hz hum", "rests, clicks"),
@@ -65,16 +63,6 @@ def test_enrolment_names_the_sweep_that_was_none(model: Bundle, kind: str):
     sweeps[1] = window(kind, skin.WORLDS["level-blind"], 1)[0]
     with pytest.raises(FormatError, match=r"sweep 2 of 3 is not a slide over 'cork': "):
         enrolment.enrol(model, "cork", np.stack(sweeps))
-
-
-def test_the_collector_does_not_take_it(logged: list[str]):
-    """It says why, and waits for another sweep."""
-    taken = SweepCollector(1, lambda taxels: "no slide: it rests")
-    sweep = toy_bundle.sweep(1, 0)
-    unknown = Verdict.without_label(sweep, Status.UNKNOWN, "", 0, "")
-    taken.sweep(sweep, unknown, {})
-    assert not taken.enough
-    assert logged == [f"sweep {sweep.id} not taken: no slide: it rests"]
 
 
 def test_a_sweep_that_is_answered_can_be_taught(model: Bundle):

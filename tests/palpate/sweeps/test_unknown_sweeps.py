@@ -1,15 +1,11 @@
-"""Kept sweeps of unknown materials: how they are grouped, and enrolled without a new sweep."""
+"""Kept sweeps of unknown materials: how they are grouped."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from palpate.bundle import bundle
-from palpate.cli.main import main
 from palpate.core.errors import ApplianceError
 from palpate.inference.classifier import Classifier
 from palpate.sim.rig import VirtualClock
@@ -99,59 +95,3 @@ def test_which_group_is_never_guessed(tmp_path: Path, box: Classifier):
     with pytest.raises(ApplianceError, match="name one of these by a sweep of it"):
         unknown_sweeps.chosen(found, 0, tmp_path)
     assert [*unknown_sweeps.chosen(found, 4, tmp_path).paths] == [3, 4]
-
-
-@pytest.fixture
-def enrol(tmp_path: Path, box: Classifier, capsys: pytest.CaptureFixture[str]) -> Any:
-    """`palpate enrol` with kept sweeps; exit code and output."""
-    kept(tmp_path / "black-box", box, *FELT, *CORK)
-    sets = {"store.folder": tmp_path, "classifier.bundle": tmp_path / "old"}
-    sets |= {"classifier.allow_unsigned": "true"}
-    options = [word for k, v in sets.items() for word in ("--set", f"{k}={v}")]
-
-    def run(*words: str) -> tuple[int, str]:
-        code = main(["enrol", *words, *options, "--out", str(tmp_path / "new")])
-        return code, "".join(capsys.readouterr())
-
-    return run
-
-
-def test_kept_sweeps_become_a_label(tmp_path: Path, box: Classifier, enrol: Any):
-    """Listed, chosen by one of them, and enrolled without the skin; then the box knows the
-    material."""
-    code, text = enrol("--unknown")
-    assert code == 0
-    assert [line.partition(";")[0] for line in text.splitlines()] == [
-        "6 sweeps: 1, 2, 3, 4, 5, 6",
-        "2 sweeps: 7, 8",
-    ]
-    code, text = enrol("felt", "--unknown", "3")
-    assert code == 0, text
-    assert "taken: 6 sweeps: 1, 2, 3, 4, 5, 6" in text
-    new = bundle.load(tmp_path / "new")
-    assert new.enrolled == {"felt": 6}
-    assert Classifier(new, VirtualClock())(toy_bundle.sweep(*FELT[0])).label == "felt"
-
-
-def test_sweeps_that_cannot_be_used_are_named(tmp_path: Path, enrol: Any):
-    """One is left out; with fewer than two nothing is written."""
-    (tmp_path / "black-box/sweep-000007.npy").write_bytes(b"")
-    code, text = enrol("cork", "--unknown", "8")
-    assert code == 1
-    assert "sweep 7 not taken" in text
-    assert "1 of these sweeps can be used, and 2 are needed; make others" in text
-    assert not (tmp_path / "new").exists()
-    about = tmp_path / "black-box/sweep-000002.json"
-    held = json.loads(about.read_text())
-    about.write_text(json.dumps(held | {"format": held["format"] | {"rate_hz": 50.0}}))
-    code, text = enrol("felt", "--unknown", "1")
-    assert code == 0, text
-    assert "sweep 2 not taken: of another format" in text
-    assert bundle.load(tmp_path / "new").enrolled == {"felt": 5}
-
-
-def test_a_label_is_needed_without_kept_sweeps(capsys: pytest.CaptureFixture[str]):
-    """`palpate enrol` alone says so."""
-    with pytest.raises(SystemExit, match="2"):
-        main(["enrol"])
-    assert "enrol needs LABEL, the name of the new material" in capsys.readouterr().err

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from palpate.bundle.bundle import Early
 from palpate.inference.classifier import LEAST_PROBABILITY, softmax
-from palpate.inference.enrolment import LEAST
-from palpate.inference.enrolment import extended as enrolled_classes
 from palpate.inference.novelty import ClassDistances
 from palpate.inference.objects import EnrolledLabels
+from palpate.learn.enrolment import LEAST
+from palpate.learn.enrolment import extended as enrolled_classes
 from palpate_train.calibration.early_exit import LEVELS, decide
 from palpate_train.data.sets import Dataset, digest
 from palpate_train.evaluate import uncertainty

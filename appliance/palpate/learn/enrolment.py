@@ -7,10 +7,8 @@ change; the new mean is stored in enrolment.npz (bundle/enrolled.py).
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,12 +16,8 @@ from numpy.typing import NDArray
 
 from palpate.bundle import bundle, enrolled
 from palpate.bundle.bundle import AddedLabels, Bundle, Classes
-from palpate.core import storage
 from palpate.core.clock import SystemClock
-from palpate.core.errors import ApplianceError, BundleError, FormatError
-from palpate.core.log import log
-from palpate.core.observer import Observer
-from palpate.core.types import Status, Sweep, Verdict
+from palpate.core.errors import BundleError, FormatError
 from palpate.inference.classifier import Classifier, softmax
 from palpate.inference.novelty import ClassDistances
 from palpate.signal.slide_check import SlideCheck
@@ -239,79 +233,3 @@ def _closeness(means: ClassDistances, label: str, z: NDArray[np.float64]) -> str
         f"{label!r} lies close to {means.labels[k]!r}: squared distance {max(to_old[k], 0):.1f}, "
         f"limit {means.limit:.1f}; its sweeps will often be called that"
     )
-
-
-class SweepCollector(Observer):
-    """Collects `wanted` good sweeps of a running box, and logs each sweep. check: the reason why a
-    window is not a slide, "" if it is one."""
-
-    def __init__(self, wanted: int, check: Callable[[NDArray[Any]], str] = lambda x: "") -> None:
-        self._wanted, self._check = wanted, check
-        self._windows: list[NDArray[Any]] = []
-
-    @property
-    def enough(self) -> bool:
-        return len(self._windows) >= self._wanted
-
-    def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
-        """Collect the sweep's window if the box found no fault in it."""
-        if self.enough:
-            return
-        why = f"{verdict.status} {verdict.detail}".rstrip()
-        if verdict.status.classified or verdict.status in (Status.UNKNOWN, Status.CONFLICT):
-            why = self._check(sweep.frames.taxels)
-        if not why:
-            self._windows.append(sweep.frames.taxels)
-            log.info(f"sweep {sweep.id} taken: {len(self._windows)} of {self._wanted}")
-        else:
-            log.info(f"sweep {sweep.id} not taken: {why}")
-
-    def windows(self) -> NDArray[Any]:
-        """The raw counts [n, T, R, C]. Raises ApplianceError if there are too few."""
-        if not self.enough:
-            raise ApplianceError(
-                f"{len(self._windows)} of {self._wanted} good sweeps had come when it ended; "
-                "nothing was written: enrol again"
-            )
-        return np.stack(self._windows)
-
-
-def check_target(target: Path, swap: bool) -> None:
-    """Raises BundleError if no bundle may be written to `target`. It is also called before the
-    robot sweeps.
-
-    swap: a bundle that exists there may be replaced.
-    """
-    if target.exists() and not swap:
-        raise BundleError(
-            f"{target} is there already; name another folder with --out, or give --replace"
-        )
-    if target.exists() and not (target / bundle.MANIFEST).is_file():
-        raise BundleError(
-            f"{target} is not a bundle and will not be replaced; name another folder with --out"
-        )
-    if not os.access(target.resolve().parent, os.W_OK):
-        raise BundleError(
-            f"{target.resolve().parent} is not a folder that you may write to; name another with "
-            "--out"
-        )
-
-
-def write(files: Mapping[str, bytes], target: Path, swap: bool) -> None:
-    """Write the bundle of `files` to the folder `target`, after its self-test has passed.
-
-    At every moment, and after a power failure, `target` is either the old or the complete new
-    bundle (`storage.folder`). Raises BundleError.
-    """
-    check_target(target, swap)
-    target = target.resolve()
-    try:
-        with storage.folder(target) as new:
-            for name, data in files.items():
-                (new / name).write_bytes(data)
-            Classifier(bundle.load(new), SystemClock()).self_test()
-    except OSError as e:
-        why = e.strerror or e
-        raise BundleError(
-            f"the bundle cannot be written to {target}: {why}; name another folder with --out"
-        ) from e

@@ -12,12 +12,11 @@ import pytest
 from palpate.bundle import bundle, enrolled
 from palpate.bundle.bundle import Bundle
 from palpate.core.types import Frames, Status, Sweep
-from palpate.inference import enrolment
 from palpate.inference.classifier import Classifier, softmax
 from palpate.inference.hand_classifier import HandClassifier
 from palpate.inference.novelty import ClassDistances
 from palpate.inference.objects import EnrolledLabels, ObjectRule
-from palpate.learn import materials
+from palpate.learn import enrolment, materials
 from palpate.sim.rig import VirtualClock
 from tests.factories import toy_bundle
 

@@ -1,0 +1,279 @@
+"""Enrolment: a label is added by arithmetic, unsuitable sweeps give warnings, and the new bundle is
+complete or absent."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from palpate.bundle import bundle
+from palpate.bundle.bundle import Bundle, Early
+from palpate.core.errors import BundleError, FormatError
+from palpate.core.types import Status
+from palpate.inference.classifier import Classifier
+from palpate.inference.novelty import ClassDistances
+from palpate.learn import enrolment
+from palpate.sim.rig import VirtualClock
+from tests.factories import toy_bundle
+
+FELT = [(7.0, 8.0), (8.0, 9.0), (6.5, 7.5), (7.5, 8.5), (6.0, 7.0)]
+"""Embeddings of five sweeps; their mean is (7, 8), (6.5, 7.5) and (7.5, 8.5) are the next to it."""
+
+
+@pytest.fixture
+def old(tmp_path: Path) -> Bundle:
+    """The toy bundle."""
+    return toy_bundle.load(tmp_path / "old")
+
+
+def counts(*at: tuple[float, float]) -> np.ndarray:
+    """Windows [n, T, R, C] with these embeddings."""
+    return np.stack([toy_bundle.window(*z) for z in at])
+
+
+def test_a_label_is_added_by_arithmetic(old: Bundle, tmp_path: Path):
+    """Mean, bias, count, version, golden sweeps, `made`; the old rows unchanged."""
+    new = enrolment.enrol(old, "felt", counts(*FELT))
+    assert new.warnings == ()
+    c, m = new.bundle.classes, new.bundle.manifest
+    assert c is not None
+    assert c.means[:3].tolist() == toy_bundle.MEANS.tolist()
+    assert c.means[3] == pytest.approx([7, 8], abs=1e-5)
+    assert c.bias[3] == pytest.approx(-(49 + 64) / 2 + 2 / 10, abs=1e-4)
+    assert c.sweeps.tolist() == [0, 0, 0, 5]
+    assert c.spread.tolist() == [1, 1, 1, 1]
+    assert (m.labels, m.version, m.figures, m.early, m.known) == (
+        ("a", "b", "c", "felt"),
+        "1+felt",
+        {},
+        None,
+        replace(toy_bundle.KNOWN, enrolled=enrolment.LEAST),
+    )
+    assert m.made == {"seed": 1, "enrolled": {"felt": 5}}
+    assert new.bundle.enrolled == {"felt": 5}
+    assert new.bundle.golden[:2].tolist() == old.golden.tolist()
+    assert new.bundle.golden_logits.shape == (3, 4)
+    assert enrolment.files(toy_bundle.files(), new, None) == toy_bundle.files() | {
+        bundle.ENROLMENT: new.file
+    }
+
+
+def test_a_label_for_a_skin_with_axes(tmp_path: Path):
+    """As with one axis. Sweeps without the axes are refused with the format."""
+    old = toy_bundle.load(tmp_path / "old", format=toy_bundle.THREE_AXES)
+    sweeps = np.stack([toy_bundle.window(*z, format=toy_bundle.THREE_AXES) for z in FELT])
+    new = enrolment.enrol(old, "felt", sweeps)
+    files = enrolment.files(toy_bundle.files(format=toy_bundle.THREE_AXES), new, None)
+    toy_bundle.put(tmp_path / "new", files)
+    it = Classifier(bundle.load(tmp_path / "new"), VirtualClock())
+    assert it(toy_bundle.sweep(7, 8, format=toy_bundle.THREE_AXES)).label == "felt"
+    for wrong in (sweeps[..., 2], sweeps[0], sweeps[:0]):
+        with pytest.raises(
+            FormatError, match="cannot be enrolled; the bundle wants \\[n\\] of 2x2x3 int16"
+        ):
+            enrolment.enrol(old, "felt", wrong)
+
+
+def test_the_new_bundle_runs(old: Bundle, tmp_path: Path):
+    """Written and read again, the bundle equals the result of `enrol` and passes its self-test. It
+    gives the new label, the old labels, and unknown."""
+    new = enrolment.enrol(old, "felt", counts(*FELT))
+    toy_bundle.put(tmp_path / "new", enrolment.files(toy_bundle.files(), new, None))
+    read = bundle.load(tmp_path / "new")
+    assert (read.id, read.manifest) == (new.bundle.id, new.bundle.manifest)
+    for name in ("golden", "golden_logits"):
+        assert getattr(read, name).tolist() == getattr(new.bundle, name).tolist()
+    it = Classifier(read, VirtualClock())
+    assert it.self_test() < 1e-5
+    assert [it(toy_bundle.sweep(*z)).label for z in [(7, 8), (0, 0), (6, 0), (0, 6)]] == [
+        "felt",
+        "a",
+        "b",
+        "c",
+    ]
+    assert Classifier(old, VirtualClock())(toy_bundle.sweep(7, 8)).status is Status.UNKNOWN
+    assert it(toy_bundle.sweep(-30, 0)).status is Status.UNKNOWN
+
+
+def test_same_sweeps_same_bytes(old: Bundle):
+    """The files depend on neither clock nor random numbers."""
+    assert (
+        enrolment.enrol(old, "felt", counts(*FELT)).file
+        == enrolment.enrol(old, "felt", counts(*FELT)).file
+    )
+
+
+def test_a_material_that_scatters_is_kept(old: Bundle):
+    """Its spread is computed from its sweeps and one assumed sweep at the trained distance: (2 + 4
+    * 9) / (2 * 4)."""
+    new = enrolment.enrol(old, "felt", counts((23, 20), (17, 20), (20, 23), (20, 17)))
+    assert new.bundle.classes is not None
+    assert new.bundle.classes.spread[3] == pytest.approx(38 / 8, abs=1e-4)
+    it = Classifier(new.bundle, VirtualClock())
+    edge = np.sqrt(9 * 38 / 8 * 5 / 4)
+    assert it(toy_bundle.sweep(20 + edge - 0.1, 20)).label == "felt"
+    assert it(toy_bundle.sweep(20 + edge + 0.1, 20)).status is Status.UNKNOWN
+
+
+def test_the_golden_sweep_is_the_median_of_those_recognised(old: Bundle):
+    """The median of the new label's probability, over the sweeps that get the new label."""
+    near = [(3.0, 5.0), (3.0, 5.5), (4.0, 8.0), (3.2, 6.0), (0.5, 6.0)]
+    new = enrolment.enrol(old, "felt", counts(*near))
+    it = Classifier(new.bundle, VirtualClock())
+    scores = [it(toy_bundle.sweep(*z)) for z in near]
+    assert scores[4].label == "c"
+    mine = sorted((s.probability, i) for i, s in enumerate(scores[:4]))
+    assert new.bundle.golden[2].tolist() == toy_bundle.window(*near[mine[2][1]]).tolist()
+
+
+def test_one_sweep_is_enough_and_labels_add_up(old: Bundle):
+    """With one sweep the mean is that sweep; a second label is added to the first."""
+    first = enrolment.enrol(old, "felt", counts((7, 8)))
+    assert first.warnings == ()
+    second = enrolment.enrol(first.bundle, "cork", counts((-8, 0), (-9, 0))).bundle
+    assert second.enrolled == {"felt": 1, "cork": 2}
+    assert second.manifest.labels == ("a", "b", "c", "felt", "cork")
+    assert second.manifest.version == "1+felt+cork"
+    assert second.manifest.made["enrolled"] == {"felt": 1, "cork": 2}
+    it = Classifier(second, VirtualClock())
+    assert it.self_test() < 1e-5
+    assert [it(toy_bundle.sweep(*z)).label for z in [(7, 8), (-8.5, 0), (0, 0)]] == [
+        "felt",
+        "cork",
+        "a",
+    ]
+
+
+@pytest.mark.parametrize("n", [1, 2, 5, 10])
+def test_the_limit_keeps_as_many_sweeps_of_an_enrolled_label_as_of_a_trained_one(n: int):
+    """In two dimensions a share 1 - exp(-limit / 2) is within the limit, around a known mean or the
+    mean of n sweeps."""
+    rng, known = np.random.default_rng(1), replace(toy_bundle.KNOWN, limit=4.0)
+    kept = []
+    for _ in range(100):
+        mean = rng.normal(size=(n, 2)).mean(axis=0)
+        classes = bundle.Classes(
+            np.vstack([toy_bundle.MEANS + 100, mean]),
+            np.zeros(4),
+            np.array([0, 0, 0, n]),
+            np.ones(4),
+            np.zeros((4, 0, 0), np.float16),
+        )
+        means = ClassDistances(classes, known, ("a", "b", "c", "felt"))
+        kept += [not means.novelty(z) for z in rng.normal(size=(40, 2))]
+    assert np.mean(kept) == pytest.approx(1 - np.exp(-2), abs=0.025)
+
+
+def test_an_enrolled_label_has_the_common_shape_and_moves_as_the_others(tmp_path: Path):
+    """Its shape is 1. For displaced contacts its mean is turned and shifted like the means of the
+    trained labels."""
+    arrays = toy_bundle.means(**toy_bundle.displaced_arrays())
+    signed = toy_bundle.files(
+        arrays=arrays, displacement=toy_bundle.DISPLACEMENT, contact=toy_bundle.IN_PLACE
+    )
+    new = enrolment.enrol(
+        bundle.load(toy_bundle.put(tmp_path / "old", signed)), "felt", counts(*FELT)
+    )
+    classes = bundle.load(
+        toy_bundle.put(tmp_path / "new", enrolment.files(signed, new, None))
+    ).classes
+    assert classes is not None
+    assert classes.displaced is not None
+    assert classes.shapes.ravel().tolist() == [0.5, 1, 1, 1]
+    assert classes.displaced.shapes.ravel().tolist() == [1, 1, 1, 1]
+    assert classes.displaced.means[3] == pytest.approx([0.7 + 0.1, 8], abs=1e-5)
+    assert classes.displaced.means[:3].tolist() == arrays["moved_means"].tolist()
+
+
+def test_early_answers_end_with_an_enrolment(tmp_path: Path):
+    """The early heads do not have the label; the command says so."""
+    quick = toy_bundle.load(
+        tmp_path / "q", early=Early((0.9,) * 3, 1), outputs=("logits", "embedding", "early")
+    )
+    new = enrolment.enrol(quick, "felt", counts(*FELT))
+    assert new.bundle.manifest.early is None
+    assert len(new.warnings) == 1
+    assert "early answers end" in new.warnings[0]
+    Classifier(new.bundle, VirtualClock())
+
+
+@pytest.mark.parametrize(
+    ("at", "hints"),
+    [
+        ([(1, 0)] * 3, ["close to 'a': squared distance 0.3, limit 9.0"]),
+        ([(6, 2.9)] * 100, ["close to 'b': squared distance 8.4"]),
+        ([(6, 3.1)] * 100, []),
+        ([(20, 20), (20, 24.2)], []),  # 4.2^2 / 2 = 8.8
+        ([(20, 20), (20, 24.3)], ["disagree: they lie 9.2 from their mean"]),
+        ([(20, 20), (20, 20), (30, 20), (20, 20)], ["number 3 most of all"]),
+        ([(0, 0), (6.2, 0)], ["disagree", "close to"]),
+    ],
+)
+def test_unsuitable_sweeps_are_told_with_numbers(
+    old: Bundle, at: list[tuple[float, float]], hints: list[str]
+):
+    """Sweeps that are like a trained material, or unlike each other, give a warning and are
+    enrolled."""
+    new = enrolment.enrol(old, "felt", counts(*at))
+    found = [text for text in (new.disagreement, *new.warnings) if text]
+    assert len(found) == len(hints), found
+    assert all(hint in text for hint, text in zip(hints, found, strict=True))
+    assert bool(new.disagreement) == any("close" not in hint for hint in hints)
+    assert "felt" in new.bundle.manifest.labels
+
+
+def test_materials_that_lie_close_anyway_make_no_warning(tmp_path: Path):
+    """Closer than the limit, but no closer than two trained materials are, which the bundle accepts
+    already."""
+    arrays = toy_bundle.means(
+        means=np.float32([[0, 0], [6, 0], [0, 2]]), bias=np.float32([0, -18, -2])
+    )
+    made = toy_bundle.load(tmp_path / "x", arrays=arrays)
+    assert enrolment.enrol(made, "felt", counts((8.2, 0), (8.2, 0), (8.2, 0))).warnings == ()
+    assert len(enrolment.enrol(made, "felt", counts((7.8, 0), (7.8, 0), (7.8, 0))).warnings) == 1
+
+
+@pytest.mark.parametrize(
+    ("label", "hint"),
+    [
+        ("b", "label 'b' is taken"),
+        ("a,b", "cannot be sent"),
+        ("", "cannot be sent"),
+        ("x" * 25, "cannot be sent"),
+    ],
+)
+def test_labels_that_cannot_be_enrolled(old: Bundle, label: str, hint: str):
+    """Labels that are used already, or not allowed in a sentence, are reported before the first
+    sweep."""
+    with pytest.raises(BundleError, match=hint):
+        enrolment.admit(old, label)
+    with pytest.raises(BundleError, match=hint):
+        enrolment.enrol(old, label, counts((7, 8)))
+
+
+def test_a_bundle_without_embedding(tmp_path: Path):
+    """A bundle without class means is refused."""
+    plain = toy_bundle.load(tmp_path / "p", known=None, outputs=("logits",))
+    with pytest.raises(BundleError, match=r"toy 1 has no embedding .*palpate-train"):
+        enrolment.enrol(plain, "felt", counts((7, 8)))
+
+
+@pytest.mark.parametrize(
+    "sweeps",
+    [counts((7, 8))[0], counts((7, 8))[:0], counts((7, 8))[:, 1:], counts((7, 8)).astype(np.uint8)],
+)
+def test_sweeps_of_another_format(old: Bundle, sweeps: np.ndarray):
+    """Sweeps with a dimension too few, no sweeps, another window, another type."""
+    with pytest.raises(FormatError, match="cannot be enrolled; the bundle wants"):
+        enrolment.enrol(old, "felt", sweeps)
+
+
+def test_sweeps_that_give_no_number(tmp_path: Path):
+    """A mean that is NaN would make every later answer invalid."""
+    format = replace(toy_bundle.FORMAT, dtype="float32")
+    made = toy_bundle.load(tmp_path / "f", format=format)
+    with pytest.raises(FormatError, match="no number"):
+        enrolment.enrol(made, "felt", np.full((1, 20, 2, 2), 3e38, np.float32))
