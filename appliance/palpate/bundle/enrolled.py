@@ -27,7 +27,7 @@ ARRAYS, BY_MEANS = (*COMMON, "joint", "least"), (*COMMON, "logits")
 logits have another name there. So such a program refuses a file that it would misread."""
 MOST_SWEEPS = 1_000_000
 """Largest number of sweeps for a label that the file may give."""
-AGAIN = "enrol again (palpate enrol)"
+AGAIN = "teach again (palpate teach)"
 
 
 def file(added: AddedLabels) -> bytes:

@@ -48,7 +48,7 @@ class EnrolmentKey:
         private."""
         path = self.folder / KEY
         again = (
-            "enrol as the user palpate (sudo -u palpate palpate enrol); if the key does not "
+            "teach as the user palpate (sudo -u palpate palpate teach); if the key does not "
             f"exist, run make install, which makes a key unless {SIGNER} exists"
         )
         try:
@@ -86,7 +86,7 @@ class EnrolmentKey:
                 ) from e
             raise BundleError(
                 "the labels were not enrolled on this box, or altered since "
-                f"({e.args[0].partition(';')[0]}); enrol them here (palpate enrol)"
+                f"({e.args[0].partition(';')[0]}); teach them here (palpate teach)"
             ) from e
         except TemporaryError:
             raise  # ssh-keygen may run at the next attempt

@@ -85,8 +85,8 @@ class BundleFolder:
         if enrolled:
             if bundle.ENROLMENT_SIGNATURE not in files:
                 raise BundleError(
-                    f"{folder}: {bundle.ENROLMENT} is not signed; enrol again on this box "
-                    "(palpate enrol)"
+                    f"{folder}: {bundle.ENROLMENT} is not signed; teach again on this box "
+                    "(palpate teach)"
                 )
             self._key.verify(files[bundle.ENROLMENT], files[bundle.ENROLMENT_SIGNATURE])
         if bundle.SIGNATURE in files:

@@ -98,7 +98,7 @@ def test_no_part_can_be_exchanged(box: Delivery, tmp_path: Path):
     box.committed(1)
     good, unsigned = grown(box), deliveries.enrolled(dict(box.store.running().files), None)
     other_box = install_scripts.enrolment_key(tmp_path / "other")
-    check_refused(box, unsigned, "enrolment.npz is not signed; enrol again on this box")
+    check_refused(box, unsigned, "enrolment.npz is not signed; teach again on this box")
     for signed in (
         other_box.sign(good[bundle.ENROLMENT]),
         deliveries.signature.sign(good[bundle.ENROLMENT], box.key),

@@ -55,7 +55,7 @@ def test_two_boxes_do_not_believe_each_other(key: EnrolmentKey, tmp_path: Path):
         (DATA, b""),
     ):
         with pytest.raises(
-            BundleError, match=r"not enrolled on this box, or altered since .*palpate enrol"
+            BundleError, match=r"not enrolled on this box, or altered since .*palpate teach"
         ):
             key.verify(data, signed)
     key.verify(DATA, good)
