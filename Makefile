@@ -29,7 +29,7 @@ PYTEST = $(BIN)/python -m pytest -q -n $(shell expr `nproc` + 1)
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 	@echo "Campaigns and the virtual box: $(BIN)/python -m tests.campaigns lists them."
-	@echo "Studies, result pages and figures: $(BIN)/python -m palpate_studies lists them."
+	@echo "Studies, result pages and tables: $(BIN)/python -m palpate_studies lists them."
 
 demo: $(RUNTIME) ## watch simulated sweeps being classified, live
 	$(BIN)/palpate demo
@@ -65,7 +65,7 @@ bundle: $(DESKTOP) ## train, quantize and pack the default bundle again
 
 bench: $(DESKTOP) ## measure this machine: docs/data/bench.json, and the tables of README and manual
 	$(BIN)/palpate bench --json docs/data/bench.json
-	$(BIN)/python -m palpate_studies figures
+	$(BIN)/python -m palpate_studies tables
 
 site: $(SITE) ## build the documents and the pages of results as a site: build/site/index.html
 	PYTHONPATH=systemd $(BIN)/python docs/site/build.py build

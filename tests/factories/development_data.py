@@ -1,5 +1,5 @@
 """Results for the page of development: a tactile, a simulated and a published test, four methods, a
-learning curve and shorter windows."""
+learning curve."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def times(*entries: dict[str, Any]) -> dict[str, Any]:
 
 
 def figures(**changes: Any) -> dict[str, Any]:
-    """Three tests and four methods, with a learning curve and a shorter window of the first test.
+    """Three tests and four methods, with a learning curve of the first test.
 
     The third method cannot run the second test.
     """
@@ -89,7 +89,6 @@ def figures(**changes: Any) -> dict[str, Any]:
         entry(SERIES, "quant", 0.93),
         entry("one", "palpate", 0.5, each=5),
         entry("one", "quant", 0.61, each=5),
-        entry("one", "palpate", 0.75, frames=100),
     ]
     names = ["palpate", "quick <b>", "quant"]
     runs = [

@@ -46,23 +46,9 @@ def data(tmp_path: Path) -> Path:
 
 def run(data: Path, *more: str, method: str = "static-svm") -> int:
     """Run the command on this set, with the folds cached beside it."""
-    out, cache = data / "fabrics.json", data / "cache"
-    return main(
-        [
-            "fabrics",
-            "--data",
-            str(data),
-            "--method",
-            method,
-            "--out",
-            str(out),
-            "--jobs",
-            "1",
-            "--cache",
-            str(cache),
-            *more,
-        ]
-    )
+    folder = ["--data", str(data), "--out", str(data / "fabrics.json")]
+    cache = ["--jobs", "1", "--cache", str(data / "cache")]
+    return main(["fabrics", "--method", method, *folder, *cache, *more])
 
 
 def results(data: Path) -> list[dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""The study `recipe`: the cost of views, the views of sets, and their table and picture."""
+"""The study `recipe`: the cost of views, the views of sets, and their table."""
 
 from __future__ import annotations
 
@@ -85,13 +85,6 @@ def test_the_table_has_a_row_for_each_view_with_its_sets():
     assert rows[3].endswith("| 2 of 2: 7 fabrics, tubes |")
     assert rows[-1].endswith("| 1 of 2: 7 fabrics |")
     assert rows[0].endswith("| no set |")
-
-
-def test_the_picture_has_every_view_with_its_time():
-    """From raw counts to the sum of logits."""
-    svg = recipe_page.draw(RESULTS)
-    for text in (*recipe_page.VIEWS, "23.5 µs", "raw counts", "sum of logits,"):
-        assert f">{text}</text>" in svg, text
 
 
 def test_results_without_a_view_are_refused():

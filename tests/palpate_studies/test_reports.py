@@ -9,34 +9,22 @@ from typing import Any
 import pytest
 
 from palpate.core.errors import FormatError
-from palpate_studies import document_figures, reports
+from palpate_studies import reports, tables
 from palpate_studies.command import main
 from palpate_studies.reports import ResultFile
 from palpate_studies.study import save
 from palpate_train.metrics import score
 
-TODAY: dict[str, Any] = {
-    "method": "palpate",
-    "seed": 1,
-    "set": "sim:T-REAL:1",
-    "commit": "abc",
-    "date": "2026-11-22",
-}
+RESULTS: dict[str, Any] = {"method": "palpate", "seed": 1, "set": "sim:T-REAL:1", "commit": "abc"}
 NEED = "a thing that is not here"
-
-
-def today() -> dict[str, Any]:
-    """Results of the packaged default."""
-    return TODAY | {"shipped": score.shipped()}
 
 
 @pytest.fixture
 def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A project with four reports: current, older, never made, and with an unmet requirement."""
+    """A project with four reports: older, current, with an unmet requirement, and never made."""
     (tmp_path / "README.md").write_text("# Project\n")
-    (tmp_path / "docs" / "data").mkdir(parents=True)
-    for name, results in (("current", today()), ("older", TODAY | {"shipped": "0badbead"})):
-        save(tmp_path / "docs" / "data" / f"{name}.json", results)
+    for name, bundle in (("current", score.shipped()), ("older", "0badbead")):
+        save(tmp_path / "docs" / "data" / f"{name}.json", RESULTS | {"shipped": bundle})
     monkeypatch.setitem(reports.NEEDS, NEED, lambda: False)
     made = (
         ResultFile("older", "data/older.json", ("palpate_train", "older"), folds=True),
@@ -45,7 +33,7 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ResultFile("new", "data/new.json", ("palpate", "new")),
     )
     monkeypatch.setattr(reports, "REPORTS", made)
-    monkeypatch.setattr(document_figures, "write", list)
+    monkeypatch.setattr(tables, "write", list)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -64,78 +52,64 @@ class RunCommands:
 
 
 def test_the_list_says_what_would_run_and_why(project: Path, capsys: pytest.CaptureFixture[str]):
-    """Each page has its command as a person types it, and its state: current, older or missing.
-
-    A missing page has its requirement.
-    """
+    """Each has its command as a person types it, and its state with the unmet requirement."""
     assert main(["reports", "--list"]) == 0
-    assert capsys.readouterr().out.splitlines() == [
-        "older    stale: Made with an older default, bundle 0badbead; "
-        f"the box ships bundle {score.shipped()} now",
-        "         palpate-train older",
-        "current  of today",
-        "         palpate-train current --out x",
-        "lacking  stale: docs/data/lacking.json: No such file or directory; "
-        f"left out: it needs {NEED}",
-        "         python -m tests.lacking",
-        "new      stale: docs/data/new.json: No such file or directory",
-        "         palpate new",
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert [line[:2] for line in lines[::2]] == [
+        ["older", "stale:"],
+        ["current", "of"],
+        ["lacking", "stale:"],
+        ["new", "stale:"],
     ]
-    assert main(["reports", "--list", "current"]) == 0
-    assert "older" not in capsys.readouterr().out
+    assert [" ".join(line) for line in lines[1::2]] == [
+        "palpate-train older",
+        "palpate-train current --out x",
+        "python -m tests.lacking",
+        "palpate new",
+    ]
+    assert "0badbead;" in lines[0]
+    assert " ".join(lines[4]).endswith(NEED)
 
 
-def test_stale_pages_are_made_in_order(project: Path):
-    """The order is that of the list. Current pages are not made.
-
-    Only commands of folds get the options of the machine that runs them.
-    """
+def test_stale_results_are_made_in_order_and_none_twice(project: Path):
+    """Only commands of folds get the options of the machine that runs them."""
     run, lines = RunCommands(), []
     reports.make((), ("--scheduler", "tcp://here"), lines.append, run)
-    assert run.words == [
-        ["palpate_train", "older", "--scheduler", "tcp://here"],
-        ["palpate", "new"],
-    ]
-    assert lines[0].startswith("1/3 older: Made with an older default")
-    assert lines[1] == f"lacking is left out: it needs {NEED}"
+    older = ["palpate_train", "older", "--scheduler", "tcp://here"]
+    assert run.words == [older, ["palpate", "new"]]
+    assert NEED in lines[1]
+    save(project / "docs" / "data" / "older.json", RESULTS | {"shipped": score.shipped()})
+    again = RunCommands()
+    reports.make((), (), lines.append, again)
+    assert again.words == [["palpate", "new"]]
 
 
-def test_after_an_interruption_only_what_is_left_is_made(project: Path):
-    """A finished page is current, so the next run begins after it."""
-    save(project / "docs" / "data" / "older.json", today())
-    run = RunCommands()
-    reports.make((), (), lambda line: None, run)
-    assert run.words == [["palpate", "new"]]
-
-
-def test_a_named_page_is_made_again_whatever_it_is(project: Path):
-    """The pages are made in the order of the list, not of the names."""
+def test_a_named_result_is_made_again_whatever_it_is(project: Path):
+    """In the order of the list, not of the names."""
     run = RunCommands()
     reports.make(("current", "older"), (), lambda line: None, run)
     assert [words[1] for words in run.words] == ["older", "current"]
 
 
-def test_a_failure_is_named_and_the_others_are_made(project: Path):
-    """The error lists all missing pages: those that failed, and those with an unmet requirement."""
+def test_a_failure_is_reported_and_the_others_are_made(project: Path):
+    """The error has what failed with its exit code, and what a named report needs."""
     run = RunCommands(older=3)
-    with pytest.raises(
-        FormatError, match="older ended with exit code 3; see above, and run the command again"
-    ):
+    with pytest.raises(FormatError, match=r"older .* 3"):
         reports.make((), (), lambda line: None, run)
     assert len(run.words) == 2
-    with pytest.raises(FormatError, match="lacking is left out"):
+    with pytest.raises(FormatError, match="lacking"):
         reports.make(("lacking",), (), lambda line: None, RunCommands())
 
 
 def test_an_unknown_report_or_another_folder_is_an_error(
     project: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    """One line lists the reports, or names the right folder."""
+    """One line lists the reports, or says which folder is wrong."""
     assert main(["reports", "olde"]) == FormatError.exit_code
-    assert "no report olde; there are older, current, lacking, new" in capsys.readouterr().err
+    assert "older, current, lacking, new" in capsys.readouterr().err
     monkeypatch.chdir(project / "docs")
     assert main(["reports"]) == FormatError.exit_code
-    assert "has no docs/ and README.md; run this in the project's folder" in capsys.readouterr().err
+    assert str(project / "docs") in capsys.readouterr().err
 
 
 def test_a_process_runs_the_command(project: Path, monkeypatch: pytest.MonkeyPatch):
@@ -145,6 +119,6 @@ def test_a_process_runs_the_command(project: Path, monkeypatch: pytest.MonkeyPat
     )
     report = ResultFile("made", "data/made.json", ("made", "word"))
     monkeypatch.setattr(reports, "REPORTS", (report,))
-    with pytest.raises(FormatError, match="made ended with exit code 7"):
+    with pytest.raises(FormatError, match=r"made .* 7"):
         reports.make((), (), lambda line: None)
     assert (project / "said").read_text() == "word"

@@ -30,27 +30,17 @@ PROGRAM = Program(
             "measure how far a model's probabilities can be trusted: calibration, more sweeps, "
             "unknown materials, enrolment",
         ),
-        "taxels": (
-            "measure",
-            "break taxels of sweeps, and count the answers of a bundle with and without bridging",
-        ),
         "alignment": (
             "measure",
             "measure whether a displaced contact is flagged before accuracy is lost (simulated)",
         ),
-        "cnn-curve": ("measure", "follow the paper's CNN while it learns the simulated skin"),
-        "calibrate": (
-            "measure",
-            "compare the simulator with the twenty accuracies that the paper prints",
-        ),
         "references": ("measure", "write the models that palpate bench times beside the bundle"),
         "reports": ("publish", "make the project's results again: the stale ones, or some by name"),
         "pages": ("publish", "draw the pages of results, with their pictures"),
-        "figures": (
+        "tables": (
             "publish",
-            "write figures and pictures of results into README and written pages",
+            "write tables and the chart of results into README and written pages",
         ),
-        "matrix": ("publish", "draw the results of evaluate: methods by protocols"),
         "overview": (
             "publish",
             "draw the README's picture: a simulated sweep and the box's answers",

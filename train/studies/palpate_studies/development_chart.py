@@ -87,7 +87,7 @@ class Spot:
 
 
 def _front(spots: Iterable[Spot]) -> list[Spot]:
-    """The spots than which none is as quick and more accurate, the quickest first."""
+    """The Pareto front of time and accuracy, the quickest first."""
     best: list[Spot] = []
     for spot in sorted(spots, key=lambda s: (s.ms, -s.mean)):
         if not best or spot.mean > best[-1].mean:
@@ -97,14 +97,12 @@ def _front(spots: Iterable[Spot]) -> list[Spot]:
 
 @dataclass(frozen=True, slots=True)
 class ChartPanel:
-    """The methods on tests of one kind. cases: the tests as in the results. absent: time in ms of
-    methods that were run in too few of them. sweep: format of the sweeps that they were timed
-    with."""
+    """The methods on tests of one kind. cases: the tests as in the results. sweep: format of the
+    sweeps that the methods were timed with."""
 
     kind: str
     cases: tuple[Json, ...]
     spots: tuple[Spot, ...]
-    absent: Mapping[str, float]
     sweep: str = ""
 
     @property
@@ -114,7 +112,7 @@ class ChartPanel:
 
     @property
     def front(self) -> list[Spot]:
-        """The spots of all forms than which none is as quick and more accurate."""
+        """The Pareto front of all forms."""
         return _front(self.whole)
 
     @property
@@ -125,8 +123,7 @@ class ChartPanel:
 
     @property
     def line(self) -> list[Spot]:
-        """The packaged recipe and the sizes of our family, without those than which another of them
-        is as quick and more accurate."""
+        """The Pareto front of the packaged recipe and the sizes of our family."""
         packaged = [s for s in self.whole if s.method == PACKAGED and not s.form]
         return _front([*self.sizes, *packaged])
 
@@ -140,18 +137,6 @@ class ChartPanel:
         """The most accurate of the peers, chosen in hindsight."""
         peers = [spot for spot in self.whole if spot.method not in OURS]
         return max(peers, key=lambda s: s.mean, default=None)
-
-    @property
-    def dominated(self) -> list[Spot]:
-        """The sizes of our family than which a peer is quicker and more accurate."""
-        peers = [spot for spot in self.whole if spot.method not in OURS]
-        return [
-            one for one in self.sizes if any(p.ms < one.ms and p.mean > one.mean for p in peers)
-        ]
-
-    def within(self, ms: float) -> Spot | None:
-        """The most accurate model that needs at most `ms`."""
-        return max((s for s in self.whole if s.ms <= ms), key=lambda s: s.mean, default=None)
 
     def lacking(self) -> dict[str, int]:
         """By method the number of tests that it was not run in, of the spots with gaps."""
@@ -178,10 +163,8 @@ def panels(figures: Json) -> list[ChartPanel]:
         timed = of_kind["entries"]
         cases = tuple(case for case in figures["cases"] if kind_of(case) == kind)
         spots = _spots(timed, table, cases)
-        shown = {spot.method for spot in spots}
-        absent = {name: ms for name, ms in quickest(timed).items() if name not in shown}
         if spots:
-            found.append(ChartPanel(kind, cases, tuple(spots), absent, of_kind["format"]))
+            found.append(ChartPanel(kind, cases, tuple(spots), of_kind["format"]))
     return found
 
 

@@ -8,7 +8,6 @@ among the sets, because the simulator cannot be trusted with it (decision 2).
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -44,13 +43,8 @@ EACH = (5, 10, 20)
 """Training sweeps of each material at the points of a learning curve, if a set has more of them."""
 
 
-def _fabrics(
-    protocol: str,
-    only: tuple[str, ...],
-    curve: tuple[int, ...] = (),
-    windows: tuple[int, ...] = (),
-) -> StudyCase:
-    return StudyCase((FABRICS,), protocol, only, True, True, curve, windows)
+def _fabrics(protocol: str, only: tuple[str, ...], curve: tuple[int, ...] = ()) -> StudyCase:
+    return StudyCase((FABRICS,), protocol, only, True, True, curve)
 
 
 def _published(name: str, curve: tuple[int, ...] = ()) -> StudyCase:
@@ -59,7 +53,7 @@ def _published(name: str, curve: tuple[int, ...] = ()) -> StudyCase:
 
 TUBES = "simulated tubes, a position out"
 CASES = {
-    "7 fabrics, a force out": _fabrics("leave:force", SEVEN, curve=EACH, windows=(16, 32, 64)),
+    "7 fabrics, a force out": _fabrics("leave:force", SEVEN, curve=EACH),
     "7 fabrics, a speed out": _fabrics("leave:speed", SEVEN),
     "7 fabrics, a repetition out": _fabrics("leave:rep", SEVEN),
     "4 fabrics, a force out": _fabrics("leave:force", FOUR),
@@ -110,7 +104,7 @@ def results(study: Study, run: StudyRun, names: Sequence[str], skipped: Sequence
             run.left_out[name] = NO_DATA
             continue
         cases.append(_about(name, case, sweeps))
-        for each, frames, point in _points(name, case):
+        for each, point in _points(name, case):
             if point in skipped or name in skipped:
                 run.left_out[point] = f"skipped in the run of {', '.join(names)}"
             else:
@@ -118,8 +112,7 @@ def results(study: Study, run: StudyRun, names: Sequence[str], skipped: Sequence
                     names, (case.protocol,), run.seeds, case.means_removed, run.effort, each
                 )
                 progress = f"{number}/{len(study.cases)} {point}"
-                for entry in _evaluated(name, _middle(sweeps, frames), plan, run, progress):
-                    found.append(entry | ({"frames": frames} if frames else {}))
+                found += _evaluated(name, sweeps, plan, run, progress)
     known = {"methods": list(names), "seeds": list(run.seeds), "effort": run.effort.share}
     return {
         "methods": list(names),
@@ -131,7 +124,7 @@ def results(study: Study, run: StudyRun, names: Sequence[str], skipped: Sequence
 
 
 def _require_known(study: Study, names: Sequence[str]) -> None:
-    known = [point for name, case in study.cases.items() for *_, point in _points(name, case)]
+    known = [point for name, case in study.cases.items() for _, point in _points(name, case)]
     for name in names:
         if name not in known:
             raise FormatError(f"{name!r} is not a case; leave out some of {'; '.join(known)}")
@@ -155,27 +148,20 @@ def _evaluated(
         yield {"case": name, "each": plan.each, "method": method} | _entry(several)
 
 
-def _middle(sweeps: Dataset, frames: int) -> Dataset:
-    """The middle `frames` of each sweep; all of them for 0."""
-    start = (sweeps.format.window - frames) // 2
-    return replace(sweeps, samples=sweeps.samples[:, start:][:, :frames]) if frames else sweeps
+def _points(name: str, case: StudyCase) -> list[tuple[int, str]]:
+    """Training sweeps of each material (0 for all) and the name, of a case and of each point of
+    its curve."""
+    return [(each, _name(name, each)) for each in (0, *case.curve)]
 
 
-def _points(name: str, case: StudyCase) -> list[tuple[int, int, str]]:
-    """Training sweeps of each material, frames (0 for all), and the name, of a case and of each
-    point of its curves."""
-    points = [(0, 0), *((each, 0) for each in case.curve), *((0, n) for n in case.windows)]
-    return [(*point, _name(name, *point)) for point in points]
+def _name(case: str, each: int) -> str:
+    """Name of a case, or of a point of its curve."""
+    return f"{case}, {each} each" if each else case
 
 
-def _name(case: str, each: int, frames: int) -> str:
-    """Name of a case, or of a point of its curves."""
-    return f"{case}, {each} each" if each else f"{case}, {frames} frames" if frames else case
-
-
-def _place(entry: Json) -> tuple[str, int, int]:
-    """The case and the point of its curves that an entry is of."""
-    return entry["case"], entry["each"], entry.get("frames", 0)
+def _place(entry: Json) -> tuple[str, int]:
+    """The case and the point of its curve that an entry is of."""
+    return entry["case"], entry["each"]
 
 
 def join(run: Json, earlier: Sequence[Json]) -> Json:
@@ -235,7 +221,6 @@ def _about(name: str, case: StudyCase, sweeps: Dataset) -> Json:
         "format": str(sweeps.format),
         "digest": digest(sweeps),
         "curve": list(case.curve),
-        "windows": list(case.windows),
         "rate_hz": sweeps.rate_hz,
     }
 

@@ -1,4 +1,4 @@
-"""Pictures of the page "Speed against accuracy" (SVG)."""
+"""The picture of README and of the page "Speed against accuracy" (SVG)."""
 
 from __future__ import annotations
 
@@ -11,12 +11,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from palpate_studies import comparison, label_places
-from palpate_studies.development_chart import ChartPanel, Json, Spot, finding, plain_case
-from palpate_studies.development_experiment import EACH, OURS
+from palpate_studies import label_places
+from palpate_studies.development_chart import ChartPanel, Spot, finding
+from palpate_studies.development_experiment import OURS
 from palpate_studies.label_places import Label
-from palpate_studies.method_names import plain_name, short_name
-from palpate_studies.ranks import Ranking
+from palpate_studies.method_names import short_name
 from palpate_train.models.methods import PACKAGED
 from palpate_train.reports.plot_style import (
     ACCENT,
@@ -29,16 +28,10 @@ from palpate_train.reports.plot_style import (
     WIDTH,
     add_axes,
     round_ticks,
-    set_categories,
     set_ticks,
-    single_axes,
     to_svg,
 )
 
-LOOKS: tuple[Mapping[str, Any], ...] = (
-    {"color": ACCENT, "linewidth": 2.0, "marker": "o", "markersize": 4},
-    {"color": BLACK, "linewidth": 1.4, "linestyle": (0, (3, 1.5)), "marker": "o", "markersize": 3},
-)
 RING: Mapping[str, Any] = {
     "marker": "o",
     "markersize": 13,
@@ -47,25 +40,22 @@ RING: Mapping[str, Any] = {
     "color": ACCENT,
     "clip_on": False,
 }
-THIN: Mapping[str, Any] = {"color": GREY, "linewidth": 0.7, "alpha": 0.7}
 MARKERS = {"int8": "o", "float": "s"}
 HEAD, HEIGHT, FOOT = 0.56, 2.2, 0.42
 """Inches above a panel, of its plot, and below it."""
-TOUCHED = (0.1, 0.2, 0.5, 1, 2, 4)
-"""Ticks of seconds of touch."""
 STEPS = 40
 """Points between two marks of a line that keep names away from it."""
 SPAN = 0.22
 """Longest axis of accuracy. What is less accurate is drawn at its end and named below."""
 LETTERS = 74
 """Most letters of a line of small text."""
-KEY = "━ Pareto front of all forms   ● int8   ■ float   ◯ ships   ╷ not run here"
+KEY = "━ Pareto front of all forms   ● int8   ■ float   ◯ ships"
 
 
-def speed(panels: Sequence[ChartPanel], machine: str) -> str:
+def speed(panels: Sequence[ChartPanel], machine: str, plain: bool = False) -> str:
     """Mean accuracy over the time of a sweep: a panel for each kind of tests, on one axis.
 
-    machine: processor and threads, in words.
+    machine: processor and threads, in words. plain: in fixed colours, for a viewer of Markdown.
     """
     spots = [spot.ms for panel in panels for spot in panel.spots]
     ends = min(spots) / 1.7, max(spots) * 1.7
@@ -80,7 +70,7 @@ def speed(panels: Sequence[ChartPanel], machine: str) -> str:
         _panel(axes, panel, ends)
     for number, line in enumerate(reversed(lines)):
         figure.text(0.012, (0.07 + 0.17 * number) / height, line, color=GREY, size=SMALL)
-    return to_svg(figure, "; ".join(f"{panel.kind}: {finding(panel)}" for panel in panels))
+    return to_svg(figure, "; ".join(f"{panel.kind}: {finding(panel)}" for panel in panels), plain)
 
 
 def _below(panels: Sequence[ChartPanel]) -> str:
@@ -123,7 +113,7 @@ def _panel(axes: Axes, panel: ChartPanel, ends: tuple[float, float]) -> None:
     shape, frames = panel.sweep.partition(" ")[0], panel.sweep.rpartition(" ")[2]
     timed = f"← faster: processor time of a sweep of {shape} taxels, {frames} frames"
     axes.set_xlabel(timed, color=GREY, size=SMALL, labelpad=3)
-    about = f"named rightly, mean of {len(panel.cases)} tests: {panel.kind}"
+    about = f"classified correctly, mean of {len(panel.cases)} tests: {panel.kind}"
     axes.set_ylabel(about, color=GREY, size=SMALL, rotation=0, ha="left", va="bottom")
     axes.yaxis.set_label_coords(-0.115, 1.03)
     _text(axes, finding(panel), (-0.115, 1.03), (0, 13), BLACK, weight="bold", size=MEDIUM)
@@ -133,8 +123,7 @@ def _panel(axes: Axes, panel: ChartPanel, ends: tuple[float, float]) -> None:
     line = [(spot.ms, spot.mean) for spot in panel.line]
     for path, shade, width in ((stairs, BLACK, 1.1), (line, ACCENT, 1.8)):
         axes.plot([x for x, _ in path], [y for _, y in path], color=shade, linewidth=width)
-    labels = [*_marks(axes, panel), *_absent(axes, panel)]
-    label_places.write(axes, labels, _between(line) + _between(stairs))
+    label_places.write(axes, list(_marks(axes, panel)), _between(line) + _between(stairs))
 
 
 def _ends(panel: ChartPanel) -> tuple[float, float]:
@@ -168,16 +157,6 @@ def _shade(panel: ChartPanel, spot: Spot) -> str:
     return ACCENT if spot.method in OURS else BLACK if spot in panel.front else GREY
 
 
-def _absent(axes: Axes, panel: ChartPanel) -> Iterator[Label]:
-    """Draw a stroke on the axis at the time of each method that has no accuracy; yield their
-    names."""
-    low, high = axes.get_ylim()
-    for method, ms in panel.absent.items():
-        at = low + 0.035 * (high - low)
-        axes.plot([ms, ms], [low, at], color=GREY, linewidth=1.2)
-        yield ms, at, short_name(method), GREY, False
-
-
 def _between(line: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
     """Points along a line, where no name may stand."""
     return [
@@ -185,103 +164,6 @@ def _between(line: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
         for a, b in pairwise(line)
         for t in np.linspace(0, 1, STEPS)
     ]
-
-
-def dumbbells(lines: Sequence[Json]) -> str:
-    """Ours and the best peer in each test, joined by a bar, with their difference and its interval.
-
-    lines: of comparison.line, with a peer each.
-    """
-    figure, axes = single_axes(0.36 * len(lines) + 0.85, left=0.53, right=0.72, top=0.3, bottom=0.5)
-    beside: dict[str, Any] = {"va": "center", "xycoords": ("axes fraction", "data")}
-    for y, line in enumerate(lines):
-        ours, peer = line["ours"]["mean"], line["leader"]["mean"]
-        axes.plot([peer, ours], [y, y], color=ACCENT if ours >= peer else GREY, linewidth=2.2)
-        axes.plot(peer, y, "o", color=BLACK, markersize=5, clip_on=False)
-        axes.plot(ours, y, "o", color=ACCENT, markersize=6.5, clip_on=False)
-        _text(axes, line["what"], (0, y), (-8, 6), BLACK, ha="right", **beside)
-        _text(axes, line["best"], (0, y), (-8, -6), GREY, ha="right", **beside)
-        _text(axes, comparison.shown(line["gap"]), (1, y), (8, 0), BLACK, ha="left", **beside)
-    low = min(min(line["ours"]["mean"], line["leader"]["mean"]) for line in lines)
-    axes.set_xlim(low - 0.02, 1.005)
-    axes.set_ylim(len(lines) - 0.5, -0.5)
-    set_ticks(axes.xaxis, round_ticks(low - 0.02, 1, 4), percent=True)
-    axes.set_xlabel("sweeps named rightly", color=GREY, size=SMALL, labelpad=3)
-    axes.grid(axis="x", color=FAINT, linewidth=0.6)
-    set_ticks(axes.yaxis, [])
-    _text(axes, "● ours", (0, 1), (-132, 8), ACCENT)
-    _text(axes, "● best peer of the test", (0, 1), (-98, 8), BLACK)
-    _text(axes, "points ahead", (1, 1), (8, 8), GREY)
-    return to_svg(figure, "our accuracy and the best peer’s in each test")
-
-
-def ranks(rankings: Mapping[str, Ranking]) -> str:
-    """Mean rank of each method; bars join methods that the tests cannot tell apart.
-
-    rankings: by the kind of tests.
-    """
-    heights = [0.2 * len(one.ranks) + 0.85 for one in rankings.values()]
-    figure = Figure((WIDTH, sum(heights)))
-    top = sum(heights)
-    for (kind, one), height in zip(rankings.items(), heights, strict=True):
-        whole = figure.get_figheight()
-        axes = add_axes(figure, 0.42, 0.93, (top - 0.35) / whole, (top - height + 0.45) / whole)
-        top -= height
-        names = list(one.ranks)
-        for y, (name, rank) in enumerate(one.ranks.items()):
-            shade = ACCENT if name in OURS else GREY
-            axes.plot(rank, y, "o", color=shade, markersize=5, clip_on=False)
-            place = {"xycoords": ("axes fraction", "data"), "ha": "right", "va": "center"}
-            _text(axes, plain_name(name), (0, y), (-6, 0), shade, **place)
-        for number, group in enumerate(one.cliques):
-            ends = names.index(group[0]) - 0.2, names.index(group[-1]) + 0.2
-            look: dict[str, Any] = {"transform": axes.get_yaxis_transform(), "clip_on": False}
-            axes.plot([1 + 0.03 * number] * 2, ends, color=BLACK, linewidth=2, **look)
-        axes.set_xlim(0.8, len(names) + 0.6)
-        axes.set_ylim(len(names) - 0.5, -0.5)
-        axes.grid(axis="x", color=FAINT, linewidth=0.6)
-        set_ticks(axes.xaxis, range(1, len(names) + 1, 2))
-        set_ticks(axes.yaxis, [])
-        title = f"mean rank in {one.tests} tests; below {one.difference:.1f} apart: chance"
-        axes.set_xlabel(title, color=GREY, size=SMALL, labelpad=3)
-        _text(axes, kind, (-0.72, 1), (0, 8), BLACK, weight="bold")
-    return to_svg(figure, "mean ranks of methods, with cliques")
-
-
-def touch(curves: Mapping[str, Mapping[str, Sequence[tuple[float, float]]]]) -> str:
-    """Accuracy over seconds of touch: a plot for each test.
-
-    curves: by title and by the name of a line its points (s, accuracy). The first line is ours. A
-    line of one point is a ring.
-    """
-    each = 2.35
-    figure = Figure((WIDTH, each * len(curves)), dpi=72)
-    inch = 1 / figure.get_figheight()
-    for number, (title, lines) in enumerate(curves.items()):
-        top = 1 - inch * (0.5 + each * number)
-        axes = add_axes(figure, 0.1, 0.95, top, top - inch * 1.35)
-        every = [point for line in lines.values() for point in line]
-        axes.set_xscale("log")
-        axes.set_xlim(min(x for x, _ in every) / 1.15, max(x for x, _ in every) * 1.15)
-        low, high = min(y for _, y in every), max(y for _, y in every)
-        room = 0.12 * max(high - low, 0.02)
-        axes.set_ylim(low - room, high + room)
-        axes.grid(color=FAINT, linewidth=0.6)
-        set_ticks(
-            axes.xaxis, [s for s in TOUCHED if axes.get_xlim()[0] <= s <= axes.get_xlim()[1]], "s"
-        )
-        set_ticks(axes.yaxis, round_ticks(low - room, high + room, 4), percent=True)
-        axes.set_xlabel("seconds of touch", color=GREY, size=SMALL, labelpad=3)
-        axes.set_ylabel(title, color=BLACK, size=MEDIUM, rotation=0, ha="left", va="bottom")
-        axes.yaxis.set_label_coords(-0.1, 1.07)
-        labels: list[Label] = []
-        for i, (name, line) in enumerate(lines.items()):
-            look = RING if len(line) == 1 else LOOKS[min(i, 1)]
-            axes.plot(*zip(*line, strict=True), **look)
-            x, y = line[len(line) // 2]
-            labels.append((x, y, name, str(look["color"]), i == 0))
-        label_places.write(axes, labels, [p for line in lines.values() for p in _between(line)])
-    return to_svg(figure, "accuracy over seconds of touch")
 
 
 def _text(
@@ -296,47 +178,3 @@ def _text(
     look: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points"}
     look |= {"size": SMALL} | style
     axes.annotate(text, at, offset, color=shade, **look)
-
-
-def curves(cases: Mapping[str, Json], found: Mapping[str, Any], ours: str) -> str:
-    """A plot for each case: accuracy over training sweeps of each material. Ours and the peer with
-    the best end stand out.
-
-    found: {case: {method: {training sweeps, 0 for all: entry}}}.
-    """
-    each = 2.5
-    figure = Figure((WIDTH, each * len(found)))
-    inch = 1 / figure.get_figheight()
-    at = {n: x for x, n in enumerate((*EACH, 0))}
-    for number, (case, those) in enumerate(found.items()):
-        top = 1 - inch * (0.65 + each * number)
-        axes = add_axes(figure, 0.12, 0.97, top, top - inch * 1.35)
-        peer = _leader(those, ours)
-        for name in sorted(those, key=lambda name: name in (ours, peer)):
-            look = LOOKS[0] if name == ours else LOOKS[1] if name == peer else THIN
-            line = sorted(those[name].items(), key=lambda item: at[item[0]])
-            places = [at[n] for n, _ in line]
-            axes.plot(places, [entry["mean"] for _, entry in line], clip_on=False, **look)
-        title = f"Named rightly: {plain_case(cases[case])}"
-        axes.set_ylabel(title, color=BLACK, size=MEDIUM, rotation=0, ha="left", va="bottom")
-        axes.yaxis.set_label_coords(-0.11, 1.19)
-        _text(axes, f"━ {plain_name(ours)}", (-0.11, 1), (0, 9), ACCENT)
-        _text(axes, f"╍ {plain_name(peer)}" if peer else "", (0.3, 1), (0, 9), BLACK)
-        _text(axes, "thin: other peers", (0.72, 1), (0, 9), GREY)
-        axes.grid(axis="y", color=FAINT, linewidth=0.6)
-        axes.set_xlim(-0.1, len(EACH) + 0.1)
-        low = min(e["mean"] for line in those.values() for e in line.values()) - 0.03
-        axes.set_ylim(low, 1.01)
-        set_ticks(axes.yaxis, round_ticks(low, 1, 5), percent=True)
-        set_categories(axes.xaxis, range(len(EACH) + 1), [*map(str, EACH), "all"])
-        axes.set_xlabel("training sweeps of each material", color=GREY, size=SMALL, labelpad=3)
-    return to_svg(figure, "accuracy over training sweeps of each material")
-
-
-def _leader(those: Mapping[str, Mapping[int, Json]], ours: str) -> str:
-    """The peer with a complete curve that is most accurate with all sweeps; "" without peers."""
-    most = max(map(len, those.values()))
-    whole = [
-        name for name, line in those.items() if name not in (ours, *OURS) and len(line) == most
-    ]
-    return max(whole, key=lambda name: float(those[name][0]["mean"]), default="")

@@ -1,11 +1,10 @@
 """Renders the page "Speed against accuracy" from the results of the study `development`.
 
-It computes nothing but means, differences and ranks of the measured figures.
+It computes nothing but means and differences of the measured figures.
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -13,11 +12,7 @@ import numpy as np
 
 from palpate.core.errors import FormatError
 from palpate_studies import TEMPLATES, comparison, development_plots, differences
-from palpate_studies.comparison import ROUNDING
 from palpate_studies.development_chart import (
-    SERIES,
-    TACTILE,
-    UNIT,
     Accuracies,
     ChartPanel,
     Json,
@@ -26,56 +21,27 @@ from palpate_studies.development_chart import (
     finding,
     panels,
     plain_case,
-    quickest,
-    ratio,
     relative_times,
 )
-from palpate_studies.development_experiment import EACH, LINE, OURS, PEERS
-from palpate_studies.method_names import about, plain_name, short_name
-from palpate_studies.ranks import Ranking, ranking
-from palpate_train.models.methods import PACKAGED
+from palpate_studies.development_experiment import EACH, OURS, PEERS
+from palpate_studies.method_names import about, plain_name
 from palpate_train.reports import html, provenance
-from palpate_train.reports.formatting import amount, estimate, exact_percent, percent, points
+from palpate_train.reports.formatting import amount, percent, points
 
-WANTED = {
-    "7 fabrics, a force out": 0.91,
-    "7 fabrics, a speed out": 0.94,
-    "7 fabrics, a repetition out": 0.985,
-    "4 fabrics, a direction out": 0.84,
-    "4 fabrics, a force out": 0.87,
-    "4 fabrics, a speed out": 0.90,
-}
-"""Target accuracy of our largest size, by case."""
-NEAREST, SIZES = 0.01, 6
-"""Targets: largest distance to the best peer on published series; sizes of the family."""
-PAPER_CNN = "paper-cnn-centred"
-FASTER = (
-    ("smallest", PAPER_CNN, 80),
-    ("packaged", PAPER_CNN, 40),
-    ("packaged", UNIT, 100),
-    ("largest", UNIT, 20),
-)
-"""Targets of time: a size, the method that it is compared with, and how many times faster it is."""
-BUDGETS_MS = (0.2, 0.5, 1.0, 10.0, 100.0, 1000.0)
-"""Times of a sweep for which the page names the best model."""
 SIZES_OF = (("file_kb", "KB"), ("rss_mb", "MB"))
 """Costs of a model in bytes, with their units."""
-WINDOW = re.compile(r"at ([\d.]+) Hz, window (\d+)")
 
 
-def render(figures: Json, early: Json | None = None) -> tuple[dict[str, str], dict[str, str]]:
-    """The page (HTML) and its pictures (SVG) by name.
-
-    early: results of the study certainty, for the time of early answers. Raises FormatError without
-    a result of a method of ours.
-    """
+def render(figures: Json) -> tuple[str, dict[str, str]]:
+    """The page (HTML) and its pictures (SVG) by name. Raises FormatError without a result of a
+    method of ours."""
     table = by_case(figures["results"])
     ours = subject(table)
     names = [name for name in figures["methods"] if any(name in row for row in table.values())]
     cases = {case["case"]: case for case in figures["cases"] if ours in table.get(case["case"], {})}
     lines = [comparison_line(one, table[case], ours, names) for case, one in cases.items()]
     shown = panels(figures)
-    pictures = _pictures(figures, cases, lines, early, ours)
+    pictures = {"front": front(figures)} if shown else {}
     page = html.render(
         "development.html.j2",
         TEMPLATES,
@@ -85,8 +51,6 @@ def render(figures: Json, early: Json | None = None) -> tuple[dict[str, str], di
         quick=bool(figures.get("quick")),
         pictures={name: html.picture(svg) for name, svg in pictures.items()},
         panels=[[panel.kind, finding(panel), len(panel.cases)] for panel in shown],
-        budgets=budgets(shown),
-        targets=list(targets(table, cases, shown, _times(figures)["entries"])),
         ours=ours,
         names=names,
         table=table,
@@ -100,12 +64,12 @@ def render(figures: Json, early: Json | None = None) -> tuple[dict[str, str], di
         **_costs(figures, table, names),
         **_words(cases, names, _missing(table, cases, names, figures["left_out"])),
     )
-    return {"index": page}, pictures
+    return page, pictures
 
 
-def front(figures: Json) -> str:
-    """The picture of README."""
-    return development_plots.speed(panels(figures), machine(figures))
+def front(figures: Json, plain: bool = False) -> str:
+    """The chart of README and of the page. plain: in fixed colours."""
+    return development_plots.speed(panels(figures), machine(figures), plain)
 
 
 def caption(figures: Json) -> str:
@@ -126,25 +90,6 @@ def _times(figures: Json) -> Json:
     return figures.get("times") or {"entries": [], "left_out": {}}
 
 
-def _pictures(
-    figures: Json, cases: Mapping[str, Json], lines: Sequence[Json], early: Json | None, ours: str
-) -> dict[str, str]:
-    """All pictures that the results allow."""
-    shown, pictures = panels(figures), {}
-    if shown:
-        pictures["front"] = front(figures)
-    if beside := [line for line in lines if line["best"]]:
-        pictures["accuracy"] = development_plots.dumbbells(beside)
-    table = by_case(figures["results"])
-    if ordered := {panel.kind: one for panel in shown if (one := rank(panel, table))}:
-        pictures["ranks"] = development_plots.ranks(ordered)
-    if touched := touch_curves(figures, early):
-        pictures["touch"] = development_plots.touch(touched)
-    if curves := learning_curves(figures["results"], ours):
-        pictures["curves"] = development_plots.curves(cases, curves, ours)
-    return pictures
-
-
 def subject(table: Mapping[str, Accuracies]) -> str:
     """The first of OURS with a result. Raises FormatError if none has one."""
     for name in OURS:
@@ -159,122 +104,6 @@ def comparison_line(case: Json, row: Accuracies, ours: str, names: Sequence[str]
     """Ours beside the best peer in one test."""
     peers = {plain_name(name): row[name] for name in names if name not in OURS and name in row}
     return comparison.line(plain_case(case), row[ours], peers)
-
-
-def rank(panel: ChartPanel, table: Mapping[str, Accuracies]) -> Ranking | None:
-    """The ranking of our two recipes and of the peers that were run in every test; None for fewer
-    than two."""
-    names = {spot.method for spot in panel.whole} - set(LINE[:-1])
-    cases = [case["case"] for case in panel.cases]
-    accuracies = {
-        name: [float(table[case][name]["mean"]) for case in cases] for name in sorted(names)
-    }
-    return ranking(accuracies) if len(accuracies) > 1 else None
-
-
-def touch_curves(figures: Json, early: Json | None) -> dict[str, Any]:
-    """Accuracy over seconds of touch by test and method: shorter windows, ours with all views
-    first, then the peers; and in simulation windows of different length, and the early answers of
-    the box."""
-    found: dict[str, Any] = {}
-    known = {case["case"]: case for case in figures["cases"]}
-    shorter = {(e["case"], e["method"]) for e in figures["results"] if e.get("frames")}
-    shown = [name for name in (OURS[0], *PEERS) if name in {name for _, name in shorter}]
-    for case, name in ((case, name) for case in known for name in shown):
-        if (case, name) not in shorter:
-            continue
-        window = int(known[case]["format"].rpartition(" ")[2])
-        line = sorted(
-            ((e.get("frames") or window) / known[case]["rate_hz"], e["mean"])
-            for e in figures["results"]
-            if (e["case"], e["method"], e["each"]) == (case, name, 0)
-        )
-        found.setdefault(plain_case(known[case]), {})[plain_name(name)] = line
-    if early and (format := WINDOW.search(early["format"])):
-        window_s = int(format[2]) / float(format[1])
-        parts, rule = early["early"]["always"], early["early"]["rule"]
-        found["simulated tubes: other skins than in training"] = {
-            "after a set time": [
-                (window_s * (i + 1) / len(parts), one["accuracy"]) for i, one in enumerate(parts)
-            ],
-            "early answers": [(window_s * early["early"]["share"], rule["accuracy"])],
-        }
-    return found
-
-
-def budgets(shown: Sequence[ChartPanel]) -> list[list[str]]:
-    """Rows of a table: a time of a sweep, and for each panel the best model within it."""
-    rows = []
-    for ms in BUDGETS_MS:
-        cells = []
-        for panel in shown:
-            best = panel.within(ms)
-            cells.append(
-                f"{plain_name(best.method)}, {best.precision}: "
-                f"{percent(best.mean)} in {amount(best.ms, 'ms')}"
-                if best
-                else "none"
-            )
-        rows.append([amount(ms, "ms"), *cells])
-    return rows
-
-
-def targets(
-    table: Mapping[str, Accuracies],
-    cases: Mapping[str, Json],
-    shown: Sequence[ChartPanel],
-    times: Sequence[Json],
-) -> Iterator[Json]:
-    """A line for each target: wanted, reached, and whether it is met."""
-    for case, wanted in WANTED.items():
-        if case in cases and (one := table[case].get(OURS[0])):
-            yield {
-                "what": f"{plain_case(cases[case])}, {_seeds(one)}",
-                "target": f"≥ {exact_percent(wanted)}",
-                "met": one["mean"] >= wanted - ROUNDING,
-                "here": estimate(differences.of(one)),
-            }
-    for panel in shown:
-        if panel.kind == SERIES and panel.ours and panel.peer:
-            gap = differences.difference(panel.ours.accuracy, panel.peer.accuracy)
-            yield {
-                "what": f"points ahead of {short_name(panel.peer.method)}, mean of {SERIES}",
-                "target": f"≥ {points(-NEAREST)}",
-                "met": gap[0] >= -NEAREST - ROUNDING,
-                "here": comparison.shown(gap),
-            }
-        elif panel.kind == TACTILE and panel.sizes:
-            beaten = panel.dominated
-            yield {
-                "what": f"sizes on {TACTILE} than which no peer is faster and more accurate",
-                "target": f"all of {SIZES} or more",
-                "met": not beaten and len(panel.sizes) >= SIZES,
-                "here": f"{len(panel.sizes) - len(beaten)} of {len(panel.sizes)}",
-            }
-    yield from time_targets(times)
-
-
-def _seeds(entry: Json) -> str:
-    count = len(entry["seeds"])
-    return f"{count} seed" if count == 1 else f"{count} seeds"
-
-
-def time_targets(times: Sequence[Json]) -> Iterator[Json]:
-    """Lines for the targets of time whose methods were timed. The paper's CNN counts in int8."""
-    ms, whole = quickest(times), quickest(times, "int8")
-    sizes = {name: ms[name] for name in OURS if name in ms and name != PACKAGED}
-    own = {"packaged": ms.get(PACKAGED)}
-    if sizes:
-        own |= {"smallest": min(sizes.values()), "largest": max(sizes.values())}
-    for size, peer, wanted in FASTER:
-        other, mine = (whole if peer == PAPER_CNN else ms).get(peer), own.get(size)
-        if other and mine:
-            yield {
-                "what": f"time of our {size} model, {short_name(peer)}’s = 1",
-                "target": f"≤ 1/{wanted}",
-                "met": mine * wanted <= other,
-                "here": ratio(mine / other),
-            }
 
 
 def _mean_rows(shown: Sequence[ChartPanel], names: Sequence[str]) -> list[Json]:

@@ -1,37 +1,20 @@
-"""Methods by protocols, from the list of `evaluate --json`: a picture, and a table for a page."""
+"""Ours and the best of the others by protocol: a table of the list of `evaluate --json`."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from palpate.core.storage import put
-from palpate_studies import comparison, differences, marked_text, plots
+from palpate_studies import comparison, differences
 from palpate_studies.development_chart import PROTOCOLS
 from palpate_studies.method_names import plain_name
 from palpate_train.models.methods import SHIPPED
-from palpate_train.reports import provenance
 from palpate_train.reports.formatting import estimate
 
 Json = Mapping[str, Any]
 HEAD = ("test", "means", "{ours}", "best of the others", "difference, points", "verdict")
-
-
-def draw(results: Sequence[Json], out: Path, recordings: bool = False) -> None:
-    """Write the picture of all methods as SVG. recordings: count recordings instead of windows."""
-    picture = plots.matrix(results, count="recording" if recordings else "window")
-    put(out, provenance.in_svg(picture, provenance.of(results)).encode(), parents=True)
-
-
-def insert(results: Sequence[Json], page: Path) -> None:
-    """Write the table between the markers of a page. Raises FormatError if it has no markers."""
-    text = marked_text.insert(
-        page.read_text(encoding="utf-8"), "matrix", headline(results), str(page)
-    )
-    put(page, provenance.in_markdown(text, provenance.of(results)).encode())
 
 
 def headline(results: Sequence[Json], ours: str = SHIPPED) -> str:

@@ -68,7 +68,7 @@ def draw(material: str, seed: int = SEED) -> str:
         f"A finger slides along a tube of {material}; the signal of 16 taxels; "
         f"the box answers {verdict.label}"
     )
-    return to_svg(figure, about + " (simulated)")
+    return to_svg(figure, about + " (simulated)", plain=True)
 
 
 def _verdict(loaded: bundle.Bundle, samples: NDArray[Any]) -> Verdict:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,50 +20,38 @@ from palpate_studies import (
 from palpate_studies.study import DATA, read, results_file
 from palpate_train.reports import html, provenance
 
-Rendered = tuple[Mapping[str, str], Mapping[str, str]]
-"""Pages (HTML) and pictures (SVG) by name."""
+Rendered = tuple[str, dict[str, str]]
+"""A page (HTML), and its pictures (SVG) by name."""
 BOX_ON_HARD = {"accuracy", "wrong_share", "network"}
 """Keys of the box's answers to T-HARD's sweeps in the results of `alignment`."""
 
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """The page of a study. keys: that its results have. render: makes pages and pictures of the
+    """The page of a study. keys: that its results have. render: makes page and pictures of the
     results and of the folder that holds them."""
 
     keys: tuple[str, ...]
     render: Callable[[Any, Path], Rendered]
 
 
-def _single(render: Callable[[Any], tuple[str, dict[str, str]]]) -> Callable[[Any, Path], Rendered]:
-    def rendered(results: Any, folder: Path) -> Rendered:
-        page, pictures = render(results)
-        return {"index": page}, pictures
-
-    return rendered
-
-
 def _paper(results: Any, folder: Path) -> Rendered:
-    page, pictures = paper_report.render(results, box_on_hard(folder))
-    return {"index": page}, pictures
+    return paper_report.render(results, box_on_hard(folder))
 
 
-def _development(results: Any, folder: Path) -> Rendered:
-    certainty = results_file("certainty", folder)
-    early = read(certainty, *PAGES["certainty"].keys) if certainty.exists() else None
-    return development_report.render(results, early)
+def _alone(render: Callable[..., Rendered], **more: Any) -> Callable[[Any, Path], Rendered]:
+    """A page that needs no other results."""
+    return lambda results, folder: render(results, **more)
 
 
 PAGES: Mapping[str, Page] = {
     "development": Page(
         ("methods", "runs", "cases", "results", "left_out"),
-        _development,
+        _alone(development_report.render),
     ),
-    "stress-fabrics": Page(
-        ("methods", "box"), _single(partial(stress_report.render, name="stress-fabrics"))
-    ),
-    "stress": Page(("methods", "box"), _single(stress_report.render)),
-    "certainty": Page(("calibration", "early"), _single(uncertainty_report.render)),
+    "stress-fabrics": Page(("methods", "box"), _alone(stress_report.render, name="stress-fabrics")),
+    "stress": Page(("methods", "box"), _alone(stress_report.render)),
+    "certainty": Page(("calibration", "early"), _alone(uncertainty_report.render)),
     "paper": Page(("table", "results"), _paper),
 }
 
@@ -81,8 +68,8 @@ def write(wanted: Sequence[str], out: Path, folder: Path = DATA) -> list[Path]:
     for name in wanted or PAGES:
         file, page = results_file(name, folder), PAGES[name]
         results = read(file, *page.keys)
-        pages, pictures = page.render(results, folder)
-        made.append(html.publish(out / name, pages, pictures, provenance.of(results)))
+        text, pictures = page.render(results, folder)
+        made.append(html.publish(out / name, {"index": text}, pictures, provenance.of(results)))
         (out / name / file.name).write_bytes(file.read_bytes())
     return made
 

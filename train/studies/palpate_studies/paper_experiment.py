@@ -11,7 +11,6 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,6 @@ from numpy.typing import NDArray
 
 from palpate.core.errors import FormatError
 from palpate.inference.classifier import LEAST_PROBABILITY, fuse, softmax
-from palpate.sim import skin
 from palpate_studies import paper_values
 from palpate_studies.paper_values import CNN
 from palpate_studies.study import Study, StudyCase, StudyRun
@@ -37,16 +35,13 @@ BASELINES = ("L-gauss", "L-knn", "L-svm", "H-knn", "H-svm")
 NEIGHBOURS = ("fishel-bayes", "static-svm", "spectrogram-svm", "correlation-svm")
 NETWORKS = ("tactnet2", "recurrent")
 OWN = ("palpate-reattached", "palpate")
-BY_METHOD = ("costs", "confusion", "several", "explored", "methods")
+BY_METHOD = ("confusion", "several", "explored", "methods")
 """Tables of the results by method; all but the last are of the case "lopo"."""
-CURVE_CASES = {"lopo": ("left", "new"), "hard": ("hard",)}
-"""The sets of cnn_curve by the case that they stand for."""
 SURE = (0.9, 0.95, 0.99)
 """Posteriors at which no more sweeps are added."""
 SEVERAL = 3
 ATTACHMENTS = 36
 """Seeds of T-HARD for each seed of a case, 18 sweeps each."""
-COST_POINTS = 160
 PLACES = 10_000
 """More than a seed has attachments."""
 LISTS = ("table", "results")
@@ -113,9 +108,8 @@ FULL_STEPS = (
     Step(OWN[:1], ("lopo" + BLIND,), (1,), 130),
     Step(("minirocket", "st-hmp"), (*HARD, *HARD_BLIND), (1,), 12),
     Step(NETWORKS, (*HARD, *HARD_BLIND), (1,), 60),
-    Step(("paper-cnn-centred",), ("hard", "hard" + BLIND), (1,), 250),
+    Step((CNN, "paper-cnn-centred"), ("hard", "hard" + BLIND), (1,), 250),
 )
-"""The paper's CNN is not among them: cnn_curve trains it, and `with_curves` takes its results."""
 NEAR = ("position<=2",)
 QUICK = in_both_worlds(
     {
@@ -145,8 +139,8 @@ class Outcome:
     """The result of a method in a case with one seed: labels [n] and logits [n, K] of the tested
     sweeps.
 
-    place: int [n], the attachment of the skin, unique over seeds. costs: of each fold that has
-    them, [iterations, 2]. about: its entry in the results.
+    place: int [n], the attachment of the skin, unique over seeds. about: its entry in the
+    results.
     """
 
     part: str
@@ -155,7 +149,6 @@ class Outcome:
     labels: Array
     logits: Array
     place: Array
-    costs: list[Array] = field(repr=False)
     about: dict[str, Any] = field(repr=False)
 
     @classmethod
@@ -163,35 +156,8 @@ class Outcome:
         """From a result of evaluate."""
         test, sweeps = result.test, result.sweeps
         place = sweeps.group("position")[test] + PLACES * seed
-        costs = [_thinned(fold.cost) for fold in result.folds if len(fold.cost)]
         about = result.json() | {"part": part}
-        return cls(
-            part, result.method, seed, sweeps.labels[test], result.logits, place, costs, about
-        )
-
-    @classmethod
-    def of_curve(cls, part: str, curve: Json) -> Outcome:
-        """From the newest point of cnn_curve, for "lopo" or "hard" of its world."""
-        seed, point = curve["about"][1], curve["points"][-1]
-        newest = [curve["newest"][key] for key in CURVE_CASES[part] if key in curve["newest"]]
-        labels, logits = (
-            np.concatenate([np.array(each[key]) for each in newest]) for key in ("labels", "logits")
-        )
-        places = [np.array(each["position"]) + PLACES * i for i, each in enumerate(newest)]
-        place = np.concatenate(places) + 2 * PLACES * seed
-        costs = [np.array([[p["step"], p["cost"]] for p in curve["points"]])]
-        about = {
-            "part": part + (BLIND if curve["world"] else ""),
-            "method": CNN,
-            "seed": seed,
-            "ran": f"{point['step']} of {curve['steps']} iterations of 50",
-            "confusion": score.confusion(labels, logits).tolist(),
-            **dict.fromkeys(("fit_s", "ms_p50", "agreement")),
-            "materials": list(skin.MATERIALS),
-            "commit": curve["commit"],
-            "machine": curve["machine"],
-        }
-        return cls(about["part"], CNN, seed, labels, logits, place, costs, about)
+        return cls(part, result.method, seed, sweeps.labels[test], result.logits, place, about)
 
     @cached_property
     def explorations(self) -> Array:
@@ -235,7 +201,7 @@ def narrowed(steps: Sequence[Step], only: Sequence[str]) -> list[Step]:
 
 def planned(found: Json, steps: Sequence[Step]) -> Json:
     """`found` without methods that are not in the plan any more."""
-    known = {CNN, *(m for step in steps for m in step.methods)}
+    known = {m for step in steps for m in step.methods}
     lists = {key: [one for one in found[key] if one["method"] in known] for key in LISTS}
     tables = {
         key: {name: value for name, value in found[key].items() if name in known}
@@ -265,36 +231,6 @@ def joined(found: Json, earlier: Json) -> Json:
 def _at(one: dict[str, Any]) -> tuple[Any, ...]:
     """Key of an entry: part, method, seed."""
     return one["part"], one["method"], one.get("seed")
-
-
-def with_curves(found: Json, curves: Sequence[Json]) -> Json:
-    """Results with the newest points of all files of cnn_curve for the paper's CNN. Raises
-    FormatError for the curve of another training."""
-    for curve in curves:
-        if curve["about"][0] != "whole" or curve["about"][2] or not curve["points"]:
-            raise FormatError(
-                "this curve is not of the CNN as printed; run python -m palpate_studies cnn-curve "
-                "--size whole"
-            )
-    outcomes = [Outcome.of_curve(part, curve) for curve in curves for part in CURVE_CASES]
-    taken = summary(outcomes, FULL) | {"curves": [_reached(curve) for curve in curves]}
-    return joined(taken | {"quick": found["quick"]}, found)
-
-
-def _reached(curve: Json) -> Json:
-    """How far a training has come, and its result at the position that it left out."""
-    reached = {
-        "seed": curve["about"][1],
-        "world": curve["world"],
-        "step": curve["points"][-1]["step"],
-        "steps": curve["steps"],
-        "commit": curve["commit"],
-    }
-    if curve["left"] is None:
-        return reached
-    out = curve["newest"]["left"]
-    right = np.array(out["logits"]).argmax(1) == np.array(out["labels"])
-    return reached | {"left": curve["left"], "right": int(right.sum()), "total": len(right)}
 
 
 def _outcomes(
@@ -338,9 +274,6 @@ def summary(
             for name, case in cases.items()
         },
         "table": [_row(*key, those) for key, those in groups.items()],
-        "costs": {
-            m: [cost.tolist() for o in lopo[m] for cost in o.costs] for m in (CNN,) if m in lopo
-        },
         "confusion": {
             m: np.sum([o.about["confusion"] for o in those], 0).tolist()
             for m, those in lopo.items()
@@ -442,10 +375,3 @@ def explored(those: Sequence[Outcome]) -> list[dict[str, Any]]:
             {"sure": sure, "share": share, "sweeps": round(float(np.concatenate(used).mean()), 3)}
         )
     return points
-
-
-def _thinned(cost: Array) -> Array:
-    """A cost curve [n, 2] as means over at most COST_POINTS parts of equal length on a logarithmic
-    axis."""
-    ends = np.unique(np.geomspace(1, len(cost) + 1, COST_POINTS + 1).round().astype(int)) - 1
-    return np.array([cost[a:b].mean(0) for a, b in pairwise(ends)]).round(5)

@@ -1,16 +1,11 @@
-"""The table and the picture of the recipe's views, from the results of the study `recipe`."""
+"""The tables of the recipe's views, from the results of the study `recipe`."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
-
 from palpate_train.reports.formatting import amount
-from palpate_train.reports.plot_style import ACCENT, BLACK, FAINT, GREY, SMALL, WIDTH, to_svg, write
 
 Json = Mapping[str, Any]
 VIEWS = {
@@ -27,12 +22,12 @@ VIEWS = {
     "distribution": (
         "shares of counts and of their differences above thresholds, of each taxel",
         "roughness and friction of fast and slow skins",
-        "unless held-out sweeps are named better without it",
+        "unless accuracy is better without it",
     ),
     "spectrum": (
         "log power in bands, averaged over taxels",
         "vibration; it carries over to a skin that was put back",
-        "unless held-out sweeps are named better without it",
+        "unless accuracy is better without it",
     ),
     "relations": (
         "deviations of taxels and correlations of their pairs, at up to seven time scales",
@@ -47,11 +42,10 @@ VIEWS = {
     "stages": (
         "log mean responses of three trained convolutions",
         "patterns that no fixed filter has",
-        "from 25 sweeps of each material on, unless held-out sweeps are named worse",
+        "from 25 sweeps of each material on, unless accuracy is worse",
     ),
 }
 """Features, purpose and condition of each view."""
-LOW, HIGH = 0.0, 3.1
 
 
 def table(results: Json) -> str:
@@ -90,50 +84,3 @@ def loads(results: Json) -> str:
             f"| {row['world']} | {row['condition']} | {row['sweeps']} | {told[0]} | {told[1]} |"
         )
     return "\n".join(rows)
-
-
-def draw(results: Json) -> str:
-    """The way from raw counts to the answer, with the time of each view."""
-    figure = Figure((WIDTH, WIDTH * 0.42))
-    page = figure.add_axes((0, 0, 1, 1))
-    page.set(xlim=(0, 10), ylim=(LOW, HIGH))
-    page.axis("off")
-    costs = {view["view"]: view["us"] for view in results["views"]}
-    middle, height = HIGH / 2, 0.34
-    _box(page, 0.8, middle, 1.5, 0.8, "raw counts\n[T, R, C]", BLACK)
-    step = (HIGH - 0.2) / len(VIEWS)
-    for i, name in enumerate(VIEWS):
-        y = HIGH - 0.1 - (i + 0.5) * step
-        _arrow(page, (1.55, middle), (2.25, y))
-        _box(page, 3.15, y, 1.8, height, name, ACCENT)
-        write(page, 4.12, y, amount(costs[name], "µs"), GREY, SMALL - 0.5, ha="left")
-        _arrow(page, (5.08, y), (5.45, middle))
-    _box(page, 6.4, middle, 1.9, 0.8, "discriminants\nin closed form", BLACK)
-    _arrow(page, (7.35, middle), (7.95, middle))
-    _box(page, 8.9, middle, 1.9, 0.8, "sum of logits,\nprobability", BLACK)
-    for line, text in enumerate(("held-out groups choose", "the views of each")):
-        write(page, 6.75, middle - 0.75 - 0.25 * line, text, GREY, SMALL - 0.5)
-    return to_svg(figure, "The views of the recipe between raw counts and the answer")
-
-
-def _box(page: Axes, x: float, y: float, width: float, height: float, text: str, edge: str) -> None:
-    page.add_patch(
-        FancyBboxPatch(
-            (x - width / 2, y - height / 2),
-            width,
-            height,
-            boxstyle="round,pad=0,rounding_size=0.08",
-            fc=FAINT,
-            ec=edge,
-            lw=1,
-        )
-    )
-    lines = text.split("\n")
-    for line, words in enumerate(lines):
-        write(page, x, y + 0.13 * (len(lines) - 1) - 0.26 * line, words, BLACK, SMALL - 0.5)
-
-
-def _arrow(page: Axes, start: tuple[float, float], end: tuple[float, float]) -> None:
-    page.add_patch(
-        FancyArrowPatch(start, end, arrowstyle="-|>", mutation_scale=7, color=GREY, lw=0.8)
-    )

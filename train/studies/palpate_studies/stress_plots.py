@@ -11,8 +11,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from palpate_train.evaluate.robustness import POINTS, breaks_first
-from palpate_train.reports.confusion_plot import shade
-from palpate_train.reports.formatting import level
 from palpate_train.reports.plot_style import (
     ACCENT,
     BLACK,
@@ -25,10 +23,7 @@ from palpate_train.reports.plot_style import (
     WIDTH,
     add_axes,
     set_ticks,
-    single_axes,
-    tiles,
     to_svg,
-    write,
 )
 
 Json = Mapping[str, Any]
@@ -41,10 +36,10 @@ LOOKS: tuple[Mapping[str, Any], ...] = (
 )
 """Lines of the first methods, told apart by style as well as by colour."""
 AREAS: Mapping[str, tuple[tuple[str, ...], dict[str, Any]]] = {
-    "named rightly": (("rightly",), {"color": ACCENT, "alpha": 0.5}),
+    "classified correctly": (("rightly",), {"color": ACCENT, "alpha": 0.5}),
     "unsure, unknown": (("unsure", "unknown"), {"color": FAINT, "alpha": 0.7}),
     "refused": (("refused",), {"color": GREY, "alpha": 0.6}),
-    "named wrongly": (("wrongly",), {"color": ORANGE}),
+    "wrong label": (("wrongly",), {"color": ORANGE}),
 }
 """The kinds of answers of the box, from below."""
 AREA = 8.0
@@ -52,9 +47,7 @@ AREA = 8.0
 NETWORK: Mapping[str, Any] = {"color": BLACK, "linewidth": 1.0, "linestyle": (0, (3, 1.5))}
 COLUMNS, HEIGHT = 3, 1.42
 """Small pictures in a row; height of each in inches, with title and labels."""
-LONGEST_CELL = 4
-"""Letters that fit into a tile."""
-LINE, LONGEST = 0.2, 16
+LINE, LONGEST = 0.2, 22
 """In a legend: length of a line in inches, and the letters of a text if three fit in a row."""
 
 
@@ -82,92 +75,8 @@ def methods(curves: Mapping[str, Json]) -> str:
         {name: any_curves[name] for name in shown(curves)},
         draw,
         legend,
-        "share of corrupted sweeps that each method names rightly",
+        "share of corrupted sweeps that each method classifies correctly",
     )
-
-
-def matrix(columns: Mapping[str, Json]) -> str:
-    """Corruptions by methods: the severity at which five points are lost, in a deeper colour the
-    less of the tested range it takes. A point stands for a method that loses less in the whole
-    range.
-
-    columns: curves by corruption, by the name of the method; the box comes first.
-    """
-    about = _every(columns)
-    rows = {
-        name: f"{about[name]['title']}, to {level(about[name], about[name]['severities'][-1])}"
-        for name in sorted(about, key=lambda name: _endurance(columns, name))
-    }
-    said = "severity of each corruption at which a method loses five points"
-    return _table(columns, rows, _cell, said)
-
-
-def pairs(columns: Mapping[str, Json]) -> str:
-    """Pairs of corruptions by methods: the sweeps that are named rightly in per cent, in a deeper
-    colour the more are lost. columns: as of `matrix`."""
-    about = _every(columns)
-    order = sorted(about, key=lambda name: -_lost(columns, name))
-    rows = {name: about[name]["title"] for name in order}
-    said = "share of sweeps that each method names rightly under two corruptions at once"
-    return _table(columns, rows, _share, said)
-
-
-def _every(columns: Mapping[str, Json]) -> Json:
-    """One curve of each name, of any column."""
-    return {name: curve for curves in columns.values() for name, curve in curves.items()}
-
-
-def _table(
-    columns: Mapping[str, Json], rows: Mapping[str, str], cell: Callable[..., None], said: str
-) -> str:
-    """Tiles of corruptions by methods. rows: the text of each corruption, by its name. cell: draws
-    a tile of (axes, row, column, curve). said: a description of the picture."""
-    above = 1.7
-    figure, axes = single_axes(
-        above + 0.24 * len(rows) + 0.05, left=0.42, right=0.88, top=above, bottom=0.05
-    )
-    for i, (name, label) in enumerate(rows.items()):
-        write(axes, -0.15, i + 0.5, label, size=SMALL, ha="right")
-        for j, curves in enumerate(columns.values()):
-            if name in curves:
-                cell(axes, i, j, curves[name])
-    for j, method in enumerate(columns):
-        look: dict[str, Any] = {"rotation": 60, "ha": "left", "va": "bottom"}
-        write(axes, j + 0.3, -0.15, method, BLACK if j > 1 else ACCENT, SMALL, **look)
-    tiles(axes, len(rows), len(columns))
-    return to_svg(figure, said)
-
-
-def _lost(columns: Mapping[str, Json], name: str) -> float:
-    """The mean loss of accuracy of all methods under one pair."""
-    those = [curves[name] for curves in columns.values() if name in curves]
-    return float(np.mean([curve["lost"] for curve in those]))
-
-
-def _share(axes: Axes, i: int, j: int, curve: Json) -> None:
-    """Row i, column j: the accuracy on its shade, which is full where half is lost."""
-    shade(axes, i, j, min(max(2 * curve["lost"], 0), 1))
-    write(axes, j + 0.5, i + 0.5, f"{100 * curve['accuracy'][1]:.0f}", BLACK, SMALL)
-
-
-def _reach(curve: Json) -> float:
-    """The share of the tested range that a method endures; 1 for all of it."""
-    return 1.0 if curve["falls"] is None else curve["falls"] / curve["severities"][-1]
-
-
-def _endurance(columns: Mapping[str, Json], name: str) -> float:
-    """The mean share of the range that methods endure under one corruption."""
-    return float(np.mean([_reach(curves[name]) for curves in columns.values() if name in curves]))
-
-
-def _cell(axes: Axes, i: int, j: int, curve: Json) -> None:
-    """Row i, column j: the severity on its shade."""
-    falls = curve["falls"]
-    shade(axes, i, j, 1 - _reach(curve))
-    text = "·" if falls is None else level(curve, falls).partition(" ")[0]
-    text = f"{falls:.1g}" if len(text) > LONGEST_CELL else text
-    text = text[1:] if text.startswith("0.") else text  # many methods leave little room
-    write(axes, j + 0.5, i + 0.5, text, GREY if falls is None else BLACK, SMALL)
 
 
 def shown(curves: Mapping[str, Json]) -> list[str]:

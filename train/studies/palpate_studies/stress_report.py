@@ -12,7 +12,6 @@ from typing import Any
 from palpate.core.errors import FormatError
 from palpate_studies import TEMPLATES, stress_plots
 from palpate_studies.method_names import about, plain_name, short_name
-from palpate_studies.stress_targets import TARGETS, at_targets
 from palpate_train.evaluate.robustness import POINTS, breaks_first
 from palpate_train.reports import html, provenance
 from palpate_train.reports.formatting import exact_percent, level
@@ -36,9 +35,7 @@ def render(result: Json, name: str = "stress") -> tuple[str, dict[str, str]]:
     curves = {name: entry["curves"] for name, entry in entries.items()}
     ours, box = next(iter(curves)), result["box"]["curves"]
     paired = _columns(result, "pairs")
-    pictures = {"matrix": stress_plots.matrix(_columns(result, "curves"))}
-    pictures |= {"pairs": stress_plots.pairs(paired)} if paired else {}
-    pictures |= {"curves": stress_plots.methods(curves)}
+    pictures = {"curves": stress_plots.methods(curves)}
     pictures |= {"box": stress_plots.box(box)} if box else {}
     page = html.render(
         "stress.html.j2",
@@ -48,7 +45,8 @@ def render(result: Json, name: str = "stress") -> tuple[str, dict[str, str]]:
         r=result,
         name=name,
         command=command(result, name),
-        worst_pair=worst_pair(paired),
+        pairs=pair_lines(paired),
+        pair_heads=list(paired),
         ours=ours,
         points=exact_percent(POINTS).removesuffix(" %"),
         clean={name: _of(next(iter(those.values())), 0) for name, those in curves.items()},
@@ -56,7 +54,6 @@ def render(result: Json, name: str = "stress") -> tuple[str, dict[str, str]]:
         headline=headline(curves[ours]),
         first=[[name, *first(those)] for name, those in _with_box(curves, result["box"]).items()],
         most_wrong=most_wrong(box["wrongly"]) if box else None,
-        lines=list(target_lines(curves, ours, box)),
         falls=fall_lines(curves, box),
         missing=missing(curves, ours),
         methods=[[plain_name(name), about(name), name] for name in result["methods"]],
@@ -82,13 +79,25 @@ def _columns(result: Json, kind: str) -> Json:
     return own | {name: curves for name, curves in methods.items() if curves}
 
 
-def worst_pair(columns: Json) -> Json | None:
-    """The hardest pair of corruptions for the first column, with its accuracy; None without
-    pairs."""
-    if not columns:
-        return None
-    hardest = min(next(iter(columns.values())).values(), key=lambda one: one["accuracy"][1])
-    return {"title": hardest["title"], "share": _of(hardest, 1)}
+def pair_lines(columns: Json) -> list[list[str]]:
+    """For each pair of corruptions its title, and the accuracy of each column in per cent. The
+    pair that costs most comes first."""
+    about = {name: one for curves in columns.values() for name, one in curves.items()}
+    lost = {
+        name: [curves[name]["lost"] for curves in columns.values() if name in curves]
+        for name in about
+    }
+    order = sorted(about, key=lambda name: -sum(lost[name]) / len(lost[name]))
+    return [
+        [
+            about[name]["title"],
+            *(
+                f"{100 * curves[name]['accuracy'][1]:.0f}" if name in curves else ""
+                for curves in columns.values()
+            ),
+        ]
+        for name in order
+    ]
 
 
 def command(result: Json, name: str) -> str:
@@ -142,35 +151,6 @@ def most_wrong(curves: Json) -> Json:
         "level": level(curve, curve["severities"][i]),
         "share": _of(curve, i),
     }
-
-
-def target_lines(curves: Mapping[str, Json], ours: str, box: Json) -> list[Json]:
-    """A line for each of TARGETS.
-
-    cells: by method. box: right, wrong, network alone.
-    """
-    found = {name: at_targets(those) for name, those in curves.items()}
-    answered = (
-        {answer: at_targets(box[answer]) for answer in ("rightly", "wrongly", "network")}
-        if box
-        else {}
-    )
-    lines: list[Json] = []
-    for key in found[ours]:
-        those = [
-            (curves[ours][name], severity)
-            for name, severity in TARGETS[key]
-            if name in curves[ours]
-        ]
-        what = " or ".join(dict.fromkeys(curve["title"] for curve, _ in those))
-        lines.append(
-            {
-                "what": "nothing" if key == "none" else f"{what}, {level(*those[0])}",
-                "cells": [found[name].get(key) for name in curves],
-                "box": [at[key] for at in answered.values()],
-            }
-        )
-    return lines
 
 
 def fall_lines(curves: Mapping[str, Json], box: Json) -> list[list[str]]:

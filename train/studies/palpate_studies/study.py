@@ -30,9 +30,8 @@ class StudyCase:
 
     sets: they are joined. only: selects sweeps of each set. real: the sets are files in the folder
     of real sweeps. means_removed: each taxel's mean over the window is subtracted. curve: numbers
-    of training sweeps of each material along a learning curve, before all of them. windows: frames
-    of shorter windows, from the middle of each sweep. folds: of the protocol, to estimate the time
-    left.
+    of training sweeps of each material along a learning curve, before all of them. folds: of the
+    protocol, to estimate the time left.
     """
 
     sets: tuple[str, ...]
@@ -41,7 +40,6 @@ class StudyCase:
     real: bool = False
     means_removed: bool = False
     curve: tuple[int, ...] = ()
-    windows: tuple[int, ...] = ()
     folds: int = 0
 
     @property

@@ -28,15 +28,6 @@ def register(add: Add) -> None:
     """Add all commands of this module."""
     paper = add("paper", run_paper)
     _add_method(paper)
-    paper.add_argument(
-        "--curve",
-        type=Path,
-        action="append",
-        default=[],
-        metavar="FILE",
-        help="run nothing: take the CNN's newest point from results of cnn-curve --size whole into"
-        " those in --out; name all trainings",
-    )
     development = add("development", run_development)
     _add_development(development)
     fabrics = add("fabrics", run_fabrics)
@@ -139,17 +130,11 @@ def _done(run: StudyRun, path: Path) -> None:
 
 
 def run_paper(args: argparse.Namespace) -> None:
-    """Run the experiment and write its results. With --curve only add the CNN's trainings."""
+    """Run the experiment and write its results."""
     run = _run(args)
-    keys = PAGES["paper"].keys
-    if args.curve:
-        curves = [read(path, "points", "world") for path in args.curve]
-        found = paper_experiment.with_curves(read(args.out, *keys), curves)
-    else:
-        only = options.names(args) if args.method else ()
-        earlier = read(args.out, *keys) if only else None
-        found = paper_experiment.results(run, only, earlier)
-    _done(run, save(args.out, found))
+    only = options.names(args) if args.method else ()
+    earlier = read(args.out, *PAGES["paper"].keys) if only else None
+    _done(run, save(args.out, paper_experiment.results(run, only, earlier)))
 
 
 def run_fabrics(args: argparse.Namespace) -> None:

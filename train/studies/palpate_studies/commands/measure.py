@@ -1,10 +1,8 @@
-"""The studies that measure: stress, certainty, calibrate, cnn-curve, taxels, alignment,
-references."""
+"""The studies that measure: stress, certainty, alignment, references."""
 
 from __future__ import annotations
 
 import argparse
-import json
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -17,10 +15,8 @@ from palpate.core import outputs
 from palpate.core.clock import SystemClock
 from palpate.core.errors import FormatError
 from palpate.core.provenance import commit
-from palpate.core.storage import put
 from palpate.inference.classifier import Classifier
-from palpate.sim import skin
-from palpate_studies import alignment, broken_taxels, certainty, references, sim_calibration
+from palpate_studies import alignment, certainty, references
 from palpate_studies.study import read, results_file, save
 from palpate_train.arguments import numbers, options
 from palpate_train.arguments.program import Add
@@ -42,8 +38,6 @@ STRESSED = "sim:T-REAL/level-blind:101-104:1"
 """At 36 attachments at which neither the methods nor the packaged bundle are trained."""
 OWN = "stressed"
 """Name of a bundle that the study makes for itself."""
-TAXEL_SWEEPS = 216
-"""Sweeps of a file whose taxels are broken, as many as the simulated set has."""
 STRESSED_METHODS = (
     "palpate-reattached,palpate,minirocket,minirocket-augmented,multirocket-hydra,ds-cnn,H-svm"
 )
@@ -51,11 +45,9 @@ STRESSED_METHODS = (
 
 
 def register(add: Add) -> None:
+    """Add all commands of this module."""
     _add_stress(add)
     _add_certainty(add)
-    _add_calibrate(add)
-    _add_cnn_curve(add)
-    _add_taxels(add)
     _add_alignment(add)
     command = add("references", run_references)
     command.add_argument("--out", type=outputs.folder, required=True, metavar="DIR")
@@ -69,72 +61,6 @@ def _add_out(command: argparse.ArgumentParser, name: str) -> None:
         default=file,
         metavar="FILE",
         help=f"file of results ({file})",
-    )
-
-
-def _add_calibrate(add: Add) -> None:
-    calibrate = add("calibrate", run_calibrate)
-    calibrate.add_argument(
-        "--seeds",
-        type=numbers.span("--seeds", "201-208"),
-        default=range(201, 209),
-        metavar="FIRST-LAST",
-        help="of the simulated worlds (201-208)",
-    )
-    calibrate.add_argument(
-        "--ablate", action="store_true", help="also without each of its effects in turn"
-    )
-    calibrate.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
-    options.add_jobs(calibrate)
-
-
-def _add_cnn_curve(add: Add) -> None:
-    follow = add("cnn-curve", run_cnn_curve)
-    follow.set_defaults(resumes=True)
-    follow.add_argument(
-        "--size",
-        choices=("small", "whole"),
-        default="small",
-        help="small (a stand-in of a minute) or whole (an hour of one core)",
-    )
-    follow.add_argument(
-        "--seed",
-        type=numbers.whole("--seed", 0),
-        default=1,
-        metavar="N",
-        help="of the simulated world and the training (1)",
-    )
-    _add_curve_sweeps(follow)
-    follow.add_argument(
-        "--steps",
-        type=numbers.whole("--steps", 1),
-        metavar="N",
-        help="iterations (those of the size)",
-    )
-    follow.add_argument(
-        "--out",
-        type=outputs.file(".json"),
-        required=True,
-        metavar="FILE",
-        help="where the curve goes; an interrupted training goes on from there",
-    )
-
-
-def _add_curve_sweeps(follow: argparse.ArgumentParser) -> None:
-    """The sweeps that the network is trained on and tested with."""
-    follow.add_argument(
-        "--remove-means", action="store_true", help="take each window's mean away, taxel by taxel"
-    )
-    follow.add_argument(
-        "--world",
-        choices=tuple(name for name in skin.WORLDS if name),
-        help="simulated world (the laboratory)",
-    )
-    follow.add_argument(
-        "--left",
-        type=numbers.whole("--left", 0),
-        metavar="P",
-        help="position of T-REAL to leave out and to test on, 0 to 8 (none)",
     )
 
 
@@ -159,23 +85,6 @@ def _add_alignment(add: Add) -> None:
         "--hard", default="sim:T-HARD/level-blind:101-136:2", metavar="SET", help="a row ahead"
     )
     _add_out(command, "alignment")
-
-
-def _add_taxels(add: Add) -> None:
-    command = add("taxels", run_taxels)
-    command.add_argument(
-        "--bundle", type=Path, default=bundle.DEFAULT, metavar="DIR", help="(the packaged one)"
-    )
-    command.add_argument(
-        "--test",
-        default=STRESSED,
-        metavar="SET",
-        help=f"the set whose taxels are broken; a simulated one is drawn anew ({STRESSED})",
-    )
-    command.add_argument(
-        "--seed", type=numbers.whole("--seed", 0), default=1, help="of the places (1)"
-    )
-    command.add_argument("--times", action="store_true", help="measure the time instead")
 
 
 def _add_stress(add: Add) -> None:
@@ -363,53 +272,6 @@ def run_certainty(args: argparse.Namespace) -> None:
         args.seed,
     )
     print(save(args.out, result))
-
-
-def run_calibrate(args: argparse.Namespace) -> None:
-    """Print the table; write the figures as JSON where a file is named."""
-    result = (
-        sim_calibration.measure(args.seeds, args.ablate, options.Log(), jobs=args.jobs)
-        | score.provenance()
-    )
-    if args.json:
-        put(args.json, (json.dumps(result, indent=1) + "\n").encode(), parents=True)
-    print(sim_calibration.table(result))
-
-
-def run_cnn_curve(args: argparse.Namespace) -> None:
-    """Train, write the curve, print it."""
-    log = options.Log()
-    from palpate_studies import cnn_curve  # here: it imports PyTorch
-
-    print(
-        cnn_curve.table(
-            cnn_curve.follow(
-                args.out,
-                args.size,
-                args.seed,
-                args.remove_means,
-                steps=args.steps,
-                log=log,
-                left=args.left,
-                world=skin.WORLDS[args.world or ""],
-            )
-        )
-    )
-
-
-def run_taxels(args: argparse.Namespace) -> None:
-    """Print the table, or the times."""
-    loaded = bundle.load(args.bundle)
-    if args.times:
-        print(broken_taxels.times(loaded))
-        return
-    test = (
-        EvaluationSweeps.simulated(args.test)
-        if args.test.startswith("sim:")
-        else EvaluationSweeps.of(sets.load(args.test), TAXEL_SWEEPS)
-    )
-    for line in broken_taxels.table(loaded, test, args.seed):
-        print(line)
 
 
 def run_alignment(args: argparse.Namespace) -> None:

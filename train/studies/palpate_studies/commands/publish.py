@@ -1,16 +1,13 @@
-"""The commands that publish: reports, pages, figures, matrix, overview."""
+"""The commands that publish: reports, pages, tables, overview."""
 
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
-from typing import Any
 
 from palpate.core import outputs
-from palpate.core.errors import FormatError
 from palpate.core.storage import put
-from palpate_studies import document_figures, matrix_table, overview_plot, pages, reports
+from palpate_studies import overview_plot, pages, reports, tables
 from palpate_studies.study import DATA
 from palpate_train.arguments import options
 from palpate_train.arguments.program import Add
@@ -46,8 +43,7 @@ def register(add: Add) -> None:
         metavar="DIR",
         help=f"folder of the files of results ({DATA})",
     )
-    add("figures", run_figures)
-    _add_matrix(add)
+    add("tables", run_tables)
     overview = add("overview", run_overview)
     overview.add_argument(
         "--out",
@@ -59,30 +55,8 @@ def register(add: Add) -> None:
     overview.add_argument("--material", default="wood", metavar="NAME", help="of the tube (wood)")
 
 
-def _add_matrix(add: Add) -> None:
-    matrix = add("matrix", run_matrix)
-    matrix.add_argument(
-        "results",
-        type=Path,
-        nargs="+",
-        metavar="FILE",
-        help="of evaluate --json; several are joined",
-    )
-    matrix.add_argument("--out", type=outputs.file(".svg"), required=True, metavar="FILE.svg")
-    matrix.add_argument(
-        "--recordings", action="store_true", help="count recordings instead of windows"
-    )
-    matrix.add_argument(
-        "--page",
-        type=Path,
-        metavar="FILE.md",
-        help="write a table, ours beside the best of the others, between its <!-- matrix --> "
-        "markers",
-    )
-
-
 def run_reports(args: argparse.Namespace) -> None:
-    """List results, or make them one after another, and write the figures in documents. Raises
+    """List results, or make them one after another, and write the tables in documents. Raises
     FormatError for an unknown name, and at the end if one failed."""
     reports.require_project()
     if args.list:
@@ -92,7 +66,7 @@ def run_reports(args: argparse.Namespace) -> None:
         ["--scheduler", args.scheduler] if args.scheduler else []
     )
     reports.make(args.names, where, options.Log().keep)
-    run_figures(args)
+    run_tables(args)
 
 
 def run_pages(args: argparse.Namespace) -> None:
@@ -101,27 +75,12 @@ def run_pages(args: argparse.Namespace) -> None:
         print(path)
 
 
-def run_figures(args: argparse.Namespace) -> None:
-    """Print each document and picture that has changed. Raises FormatError outside of the project's
-    folder."""
+def run_tables(args: argparse.Namespace) -> None:
+    """Write tables and the chart of results; print each file that has changed. Raises FormatError
+    outside of the project's folder."""
     reports.require_project()
-    for name in document_figures.write():
+    for name in tables.write():
         print(name)
-
-
-def run_matrix(args: argparse.Namespace) -> None:
-    """Write the plot, and the table into a page; print their paths."""
-    results: list[dict[str, Any]] = []
-    for path in args.results:
-        try:
-            results += json.loads(path.read_bytes())
-        except ValueError as e:
-            raise FormatError(f"{path.name}: not of evaluate --json: {e}") from e
-    matrix_table.draw(results, args.out, args.recordings)
-    print(args.out)
-    if args.page:
-        matrix_table.insert(results, args.page)
-        print(args.page)
 
 
 def run_overview(args: argparse.Namespace) -> None:

@@ -1,0 +1,58 @@
+"""The report of a choice of model: the same sentences on a page and in a terminal."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from palpate_train.reports import selection_report
+from tests.factories import choice_data
+from tests.factories.page_reader import PageReader
+
+FACTS = (
+    "pairs with 0.5 s of each sweep is enough to distinguish 3 materials",
+    "a bundle of 12 kB, 0.118 ms a sweep",
+    "relations at 3 scales, spectrum <i>",
+    "tested on it (4 × pairs, 1 × 64).",
+    "Reached: 90 % is wanted; it is not certain",
+    "bands names 12.3 [10.3, 14.3] points fewer rightly",
+    "64 names 0.8 [−1.2, 2.8] points more rightly",
+    "0.5 s: 93.0 % of 93.5 %; 0.2 s loses 12.0 [10.0, 14.0] points.",
+    "1 % of 50 ms, 2 % of 500 kB",
+    "all sweeps are simulated.",
+)
+
+
+@pytest.mark.parametrize("fact", FACTS)
+def test_page_and_terminal_say_the_same(fact: str):
+    """The choice with its reason, its neighbours in size, target, budget and notes."""
+    assert fact in selection_report.text(choice_data.choice())
+    assert fact in PageReader(selection_report.page(choice_data.choice())).text
+
+
+def test_the_page_is_sound_and_the_terminal_has_a_line_for_each_model():
+    """Tags close and foreign names cannot become tags."""
+    read = PageReader(selection_report.page(choice_data.choice()))
+    assert (read.wrong, read.open) == ([], [])
+    assert not re.search(r"[{}]|\bNone\b|\bnan\b", read.text)
+    evil = selection_report.page(choice_data.choice(set="</title><script>"))
+    assert "&lt;/title&gt;" in evil
+    assert "<script>" not in evil
+    lines = selection_report.text(choice_data.choice()).split("\n")
+    table = [line.split()[0] for line in lines if line.startswith("  ")]
+    assert table == ["size", "bands", "pairs", "64", "all"]
+
+
+def test_a_choice_that_is_not_good_enough_says_so_first():
+    """It has no smaller or larger model, curve or budget."""
+    text = selection_report.text(choice_data.missed())
+    page = selection_report.page(choice_data.missed())
+    for fact in (
+        "Not reached: 99 % is wanted, 51.0 %",
+        "no size is cheaper",
+        "No budget was given",
+    ):
+        assert fact in text
+        assert fact in PageReader(page).text
+    assert '<p class="stop">Not reached' in page
