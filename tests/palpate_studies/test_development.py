@@ -1,4 +1,4 @@
-"""The study `development`: its runs, its cache, what it leaves out, and the figures of its page."""
+"""The study `development`: its runs, its cache, its omissions, and the figures of its page."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def test_the_page_is_sound_and_marks_a_quick_run_and_the_best_peer():
 
 
 def test_a_part_of_the_results_makes_a_page():
-    """Without peers there is no difference, without times no chart; without ours no page."""
+    """A page without peers has no difference, a page without times no chart."""
     alone = [entry("one", "palpate-bands", 0.9), entry("two", "quant", 0.7)]
     made = figures(results=alone, methods=["palpate-bands", "quant"], times=None)
     assert "no peer was run 90.0 % 85.0 – 95.0 % –" in shown(made)
@@ -106,7 +106,7 @@ def test_a_part_of_the_results_makes_a_page():
 
 
 def test_the_chart_has_findings_methods_gaps_and_the_processor():
-    """A method with gaps is hollow and listed; what the axis does not show is listed, too."""
+    """A method with gaps is hollow and listed. So are accuracies below the axis."""
     results = [
         entry(c, m, a)
         for c in ("one", "three")
@@ -313,7 +313,7 @@ def test_other_precisions_of_a_method_are_counted_with_it():
 
 
 def test_a_run_is_joined_by_what_it_lacks_of_another():
-    """Each entry comes once, from the run itself if it has it; reasons stay for what is missing."""
+    """Each entry comes once, from the run itself if it has it. Missing entries keep their reasons."""
     run = figures(methods=["palpate"], results=[entry("one", "palpate", 0.9)], left_out={})
     del run["times"]
     others = [("one", "palpate", 0.1), ("one", "quant", 0.8), ("two", "minirocket", 0.7)]

@@ -92,7 +92,7 @@ def test_a_named_result_is_made_again_whatever_it_is(project: Path):
 
 
 def test_a_failure_is_reported_and_the_others_are_made(project: Path):
-    """The error has what failed with its exit code, and what a named report needs."""
+    """The error has the failed report with its exit code, and the unmet requirement."""
     run = RunCommands(older=3)
     with pytest.raises(FormatError, match=r"older .* 3"):
         reports.make((), (), lambda line: None, run)

@@ -1,4 +1,4 @@
-"""The study `stress`: its page by what each corruption costs, and the command."""
+"""The study `stress`: its page by the cost of each corruption, and the command."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def test_the_page_holds_the_figures():
 
 
 def test_without_a_box_and_with_nothing_that_breaks():
-    """The box's column and picture are missing; without any method there is no page."""
+    """The box's column and picture are missing. Results of no method make no page."""
     figures = stress_data.figures()
     figures["box"]["curves"] = figures["box"]["pairs"] = {}
     figures["methods"] = {"H-svm": figures["methods"]["H-svm"]}
