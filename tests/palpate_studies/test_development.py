@@ -313,7 +313,7 @@ def test_other_precisions_of_a_method_are_counted_with_it():
 
 
 def test_a_run_is_joined_by_what_it_lacks_of_another():
-    """Each entry comes once, from the run itself if it has it. Missing entries keep their reasons."""
+    """Each entry comes once, from the run itself if it has it. Missing ones keep their reasons."""
     run = figures(methods=["palpate"], results=[entry("one", "palpate", 0.9)], left_out={})
     del run["times"]
     others = [("one", "palpate", 0.1), ("one", "quant", 0.8), ("two", "minirocket", 0.7)]
