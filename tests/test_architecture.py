@@ -138,7 +138,7 @@ def test_packages_import_downwards_only():
 @pytest.mark.slow
 def test_every_module_of_training_serves_a_command():
     """All of train but the studies is imported for a command of palpate-train, by the library or by
-    the program that teaches a box; a method is imported by its name for `evaluate --method`. A
+    the program that teaches a box. A
     module that only a study uses is not."""
     graph = module_imports("palpate_train")
     commands = {
@@ -146,7 +146,7 @@ def test_every_module_of_training_serves_a_command():
     }
     found, left = (
         set(),
-        ["palpate_train.__main__", "palpate_train.teach.__main__", *commands, *methods.MODULES],
+        ["palpate_train.__main__", "palpate_train.teach.__main__", *commands, methods.OWN],
     )
     while left:
         if (name := left.pop()) not in found:

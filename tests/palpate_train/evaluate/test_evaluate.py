@@ -214,7 +214,7 @@ def test_a_fold_depends_on_the_code_that_its_method_runs():
         not {"paper_cnn", "recurrent", "networks", "network", "evaluate", "score", "main"}
         & classical
     )
-    assert all(methods.module_of(name) in methods.MODULES for name in methods.every())
+    assert all(methods.module_of(name) in methods.modules() for name in methods.every())
 
 
 @pytest.mark.parametrize(
@@ -247,7 +247,7 @@ def test_a_fold_depends_on_the_versions_of_all_libraries_that_its_method_uses(
 @pytest.mark.parametrize(
     ("names", "protocol", "why"),
     [
-        (["L-gaus"], "leave:session", "method 'L-gaus' is unknown; use some of L-gauss, L-knn"),
+        (["L-gaus"], "leave:session", "method 'L-gaus' is unknown; use some of palpate-bands"),
         (["L-gauss"], "leave:speed", "no group 'speed'"),
         (["L-gauss"], "random:7", "needs 7 recordings of each material; 'a' has 6"),
     ],

@@ -498,7 +498,7 @@ def test_methods_run_side_by_side_and_are_kept(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(
         methods, "find", lambda names, effort: [replace(FAKE, name=name) for name in names]
     )
-    monkeypatch.setattr(methods, "module_of", lambda name: "palpate_train.models.peers.baselines")
+    monkeypatch.setattr(methods, "module_of", lambda name: "palpate_studies.peers.baselines")
     lines: list[str] = []
     where = Where(jobs=1, cache=tmp_path)
     first = robustness.run(["a", "b"], sweeps, trial, where, seeds=(1, 2), log=lines.append)

@@ -13,8 +13,8 @@ from palpate.bundle import bundle
 from palpate.core.clock import SystemClock
 from palpate.inference.classifier import Classifier
 from palpate_studies import precisions
+from palpate_studies.peers import minirocket
 from palpate_train.export import measure
-from palpate_train.models.peers import minirocket
 from tests.factories.loud_model import loud, sweeps
 
 

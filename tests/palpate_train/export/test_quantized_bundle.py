@@ -26,6 +26,7 @@ from palpate.inference.session import session
 from palpate.sim import skin
 from palpate_studies import cost
 from palpate_studies.command import main as study
+from palpate_studies.peers import paper_cnn
 from palpate_train.calibration.heads import HeadData
 from palpate_train.cli.main import main
 from palpate_train.data import sets
@@ -35,7 +36,6 @@ from palpate_train.metrics.answers import REFUSED
 from palpate_train.metrics.temperature import platt_temperature
 from palpate_train.models import methods
 from palpate_train.models.method_fit import MethodFit
-from palpate_train.models.peers import paper_cnn
 from palpate_train.models.recipe import loads, recipe, stages
 from palpate_train.models.recipe.fitted import Fit, finished
 from palpate_train.models.recipe.sizes import SIZES

@@ -15,9 +15,9 @@ from hypothesis.extra import numpy as hnp
 
 from palpate.core.errors import FormatError
 from palpate.signal import features, time_series
+from palpate_studies.peers.prior_work import explore
 from palpate_train.features import kinds
 from palpate_train.features.prior_work import correlation, spectrogram, static
-from palpate_train.models.peers.prior_work import explore
 
 KINDS = ("static", "spectrogram", "correlation")
 RATE = 750.0

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import torch
 
+from palpate_studies.peers import paper_cnn
+from palpate_studies.peers.paper_cnn import ImageLayers, ImageNetwork
 from palpate_train.evaluate import evaluate
 from palpate_train.evaluate.evaluate import Plan, Where
 from palpate_train.models import checkpoint, training
 from palpate_train.models.methods import Effort
-from palpate_train.models.peers import paper_cnn
-from palpate_train.models.peers.paper_cnn import ImageLayers, ImageNetwork
 from palpate_train.models.training import TrainingRecipe
 from tests.factories.sweep_sets import tones
 

@@ -16,11 +16,11 @@ from palpate.core.errors import FormatError
 from palpate.core.types import SweepFormat
 from palpate.inference.classifier import softmax
 from palpate.sim import skin
+from palpate_studies.peers import ds_cnn, edge_spectral, lite, paper_cnn, recurrent
 from palpate_train.data.sets import Dataset
 from palpate_train.evaluate import evaluate, fold
 from palpate_train.models import methods, training
 from palpate_train.models.methods import Effort, Method
-from palpate_train.models.peers import ds_cnn, edge_spectral, lite, paper_cnn, recurrent
 from palpate_train.models.recipe.stages import StagesNetwork
 from palpate_train.models.training import TrainingRecipe
 from palpate_train.onnx_tools import graph_builder

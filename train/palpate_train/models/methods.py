@@ -8,7 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from importlib import import_module
+from importlib.metadata import entry_points
+from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Protocol
@@ -32,21 +35,14 @@ SHIPPED = "palpate"
 """The method of `palpate-train fit`."""
 PACKAGED = "palpate-reattached"
 """The method of `fit --reattached`, which made the packaged bundle."""
-MODULES = (
-    "palpate_train.models.peers.baselines",
-    "palpate_train.models.peers.prior_work",
-    "palpate_train.models.peers.sthmp",
-    "palpate_train.models.peers.minirocket",
-    "palpate_train.models.peers.minirocket_augmented",
-    "palpate_train.models.peers.aeon_peers",
-    "palpate_train.models.peers.ds_cnn",
-    "palpate_train.models.peers.lite",
-    "palpate_train.models.peers.edge_spectral",
-    "palpate_train.models.recipe.palpate",
-    "palpate_train.models.peers.paper_cnn",
-    "palpate_train.models.peers.recurrent",
-)
-"""Each defines METHODS, and methods(effort) if it trains networks."""
+OWN = "palpate_train.models.recipe.palpate"
+"""The module of the methods that `fit` and `export` need. Each such module defines METHODS, and
+methods(effort) if it trains networks."""
+GROUP = "palpate_train.methods"
+"""Entry points of packages with further methods. Each has MODULES, the names of its modules."""
+STUDIES = "palpate_studies.peers"
+"""The methods of the paper and of the field. They are found without an entry point, too, so that a
+checkout on the path is enough."""
 
 
 @dataclass(frozen=True)
@@ -166,27 +162,43 @@ def model_inputs(kind: str, sweeps: Dataset) -> Array:
     return np.stack([kinds.compute(kind, counts, sweeps.rate_hz) for counts in sweeps.samples])
 
 
+@cache
+def modules() -> tuple[str, ...]:
+    """The modules of all methods that are installed: OWN, and what packages of GROUP add."""
+    named = [point.value for point in entry_points(group=GROUP)]
+    packages = dict.fromkeys(named + [STUDIES] * _is_there(STUDIES))
+    return (OWN, *(name for package in packages for name in import_module(package).MODULES))
+
+
+def _is_there(package: str) -> bool:
+    return find_spec(package.partition(".")[0]) is not None and find_spec(package) is not None
+
+
 def every(effort: Effort = FULL_EFFORT) -> dict[str, Method]:
     """All methods by name."""
-    return {method.name: method for name in MODULES for method in _of(import_module(name), effort)}
+    return {
+        method.name: method for name in modules() for method in _of(import_module(name), effort)
+    }
 
 
 def module_of(name: str) -> str:
     """The full name of the module that defines the method `name`, "" if none does."""
-    modules = (
-        module
-        for module in MODULES
-        if name in {m.name for m in _of(import_module(module), FULL_EFFORT)}
-    )
-    return next(modules, "")
+    for module in (OWN, *modules()):
+        if name in {method.name for method in _of(import_module(module), FULL_EFFORT)}:
+            return module
+    return ""
 
 
 def find(names: Sequence[str], effort: Effort = FULL_EFFORT) -> list[Method]:
-    """The methods of these names. Raises FormatError with a name that is unknown."""
-    known = every(effort)
+    """The methods of these names; other packages are imported only for other methods than ours.
+    Raises FormatError with a name that is unknown."""
+    known = {method.name: method for method in _of(import_module(OWN), effort)}
+    if not known.keys() >= set(names):
+        known = every(effort)
     for name in names:
         if name not in known:
-            raise FormatError(f"method {name!r} is unknown; use some of {', '.join(known)}")
+            more = "" if _is_there(STUDIES) else "; pip install palpate-studies brings more"
+            raise FormatError(f"method {name!r} is unknown; use some of {', '.join(known)}{more}")
     return [known[name] for name in names]
 
 

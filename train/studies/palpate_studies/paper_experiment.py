@@ -20,6 +20,7 @@ from palpate.core.errors import FormatError
 from palpate.inference.classifier import LEAST_PROBABILITY, fuse, softmax
 from palpate_studies import paper_values
 from palpate_studies.paper_values import CNN
+from palpate_studies.peers import prior_work
 from palpate_studies.study import Study, StudyCase, StudyRun
 from palpate_train.data.progress import spoken
 from palpate_train.data.sets import Dataset
@@ -27,7 +28,6 @@ from palpate_train.evaluate.evaluate import Plan, Result, evaluate
 from palpate_train.metrics import score
 from palpate_train.models import methods
 from palpate_train.models.methods import FULL_EFFORT, Effort
-from palpate_train.models.peers import prior_work
 
 Array = NDArray[Any]
 Json = dict[str, Any]

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from palpate.core import storage
 from palpate_studies import cost
+from palpate_studies.peers import minirocket
 from palpate_train.data import sets
 from palpate_train.data.sets import Dataset
 from palpate_train.evaluate.fold import fingerprint
@@ -24,7 +25,6 @@ from palpate_train.export import measure, pack
 from palpate_train.models import methods
 from palpate_train.models.method_fit import MethodFit
 from palpate_train.models.methods import Method
-from palpate_train.models.peers import minirocket
 
 Array = NDArray[Any]
 INDEX = "dots.json"

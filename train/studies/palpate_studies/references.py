@@ -24,7 +24,7 @@ def write(folder: Path, seed: int = 0) -> tuple[Path, Path]:
     filters. The second is the paper's CNN in int8. Both take sweeps of the packaged bundle.
     """
     # here: both import PyTorch
-    from palpate_train.models.peers.paper_cnn import INT8_NODES, random_paper_cnn
+    from palpate_studies.peers.paper_cnn import INT8_NODES, random_paper_cnn
     from palpate_train.models.recipe.stages import StagesNetwork
 
     rng, format, classes = np.random.default_rng(seed), skin.FORMAT, len(skin.MATERIALS)

@@ -13,9 +13,9 @@ from palpate.core.errors import FormatError
 from palpate.core.types import SweepFormat
 from palpate.inference.classifier import softmax
 from palpate.inference.session import session
+from palpate_studies.peers import minirocket
 from palpate_train.data.sets import Dataset
 from palpate_train.models import linear_head
-from palpate_train.models.peers import minirocket
 from palpate_train.onnx_tools import graph_builder
 from tests.factories.sweep_sets import easy
 

@@ -11,9 +11,9 @@ import torch
 
 from palpate.core.errors import FormatError
 from palpate.inference.classifier import softmax
+from palpate_studies.peers import aeon_peers
 from palpate_train.data.sets import Dataset
 from palpate_train.models import methods
-from palpate_train.models.peers import aeon_peers
 from tests.factories.sweep_sets import easy
 
 NAMES = ("multirocket-hydra", "quant")

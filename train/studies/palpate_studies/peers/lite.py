@@ -23,9 +23,9 @@ from torch.nn import functional
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from palpate.core.types import SweepFormat
+from palpate_studies.peers.ds_cnn import INT8_NODES, RECIPE
 from palpate_train.models.methods import FULL_EFFORT, Effort, Log, Method, no_log
 from palpate_train.models.networks import Network, layer_constants
-from palpate_train.models.peers.ds_cnn import INT8_NODES, RECIPE
 from palpate_train.models.recipe.augment import texture_scale
 from palpate_train.models.training import network_method, scale_steps
 from palpate_train.onnx_tools.graph_builder import GraphBuilder, centred

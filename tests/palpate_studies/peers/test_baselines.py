@@ -20,12 +20,12 @@ from palpate.bundle import bundle
 from palpate.core.clock import SystemClock
 from palpate.core.errors import FormatError
 from palpate.inference.classifier import Classifier, softmax
+from palpate_studies.peers import baselines, prior_work
+from palpate_studies.peers.baselines import ABSENT, FeatureModel, Gauss, knn, svm, to_onnx
 from palpate_train.data import sets
 from palpate_train.data.sets import Dataset
 from palpate_train.models import methods
 from palpate_train.models.methods import Method
-from palpate_train.models.peers import baselines, prior_work
-from palpate_train.models.peers.baselines import ABSENT, FeatureModel, Gauss, knn, svm, to_onnx
 
 METHODS = (*baselines.METHODS, *prior_work.METHODS)
 by_name = pytest.mark.parametrize("method", METHODS, ids=lambda m: m.name)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from palpate.core.errors import FormatError
+from palpate_studies.peers import minirocket, minirocket_augmented
 from palpate_train.data.sets import Dataset
-from palpate_train.models.peers import minirocket, minirocket_augmented
 from palpate_train.models.recipe.architectures import STAGES
 from palpate_train.models.recipe.augment import COPIES, SLOW, copies, default_augmentation
 from tests.factories.sweep_sets import easy

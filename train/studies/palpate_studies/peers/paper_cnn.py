@@ -20,9 +20,9 @@ from torch.nn import functional
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from palpate.core.types import SweepFormat
+from palpate_studies.peers import fourier_convolution
 from palpate_train.models.methods import FULL_EFFORT, Effort, Log, Method, no_log
 from palpate_train.models.networks import Network, layer_constants
-from palpate_train.models.peers import fourier_convolution
 from palpate_train.models.recipe.augment import texture_scale
 from palpate_train.models.training import (
     MIN_STEPS,

@@ -12,8 +12,8 @@ from palpate.core.errors import FormatError
 from palpate.core.types import SweepFormat
 from palpate.inference.classifier import softmax
 from palpate.inference.session import session
+from palpate_studies.peers import sthmp
 from palpate_train.data.sets import Dataset
-from palpate_train.models.peers import sthmp
 from palpate_train.onnx_tools import graph_builder
 from tests.factories.sweep_sets import easy
 

@@ -11,8 +11,8 @@ from palpate.bundle.onnx_check import reader
 from palpate.core.types import SweepFormat
 from palpate.inference.classifier import softmax
 from palpate_studies import cost
+from palpate_studies.peers import ds_cnn, edge_spectral
 from palpate_train.models import methods
-from palpate_train.models.peers import ds_cnn, edge_spectral
 from palpate_train.onnx_tools import graph_builder
 from palpate_train.onnx_tools.quantize import quantize
 from tests.factories.sweep_sets import easy

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from palpate.core.errors import FormatError
 from palpate.inference.classifier import softmax
+from palpate_studies.peers.baselines import ABSENT, Gauss, learn, svm
 from palpate_train.models.methods import Method
-from palpate_train.models.peers.baselines import ABSENT, Gauss, learn, svm
 
 Array = NDArray[Any]
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 from torch.nn import functional
 
-from palpate_train.models.peers import paper_cnn
-from palpate_train.models.peers.fourier_convolution import convolve
+from palpate_studies.peers import paper_cnn
+from palpate_studies.peers.fourier_convolution import convolve
 
 SHAPES = [
     (150, 16, 15, 5),
