@@ -25,7 +25,7 @@ from palpate.core.provenance import commit
 from palpate.core.sentences import checksum
 from palpate.sim import skin
 from palpate_train.metrics import score
-from palpate_train.reports import html, provenance
+from palpate_train.reports import html
 from tests.factories.paths import ROOT
 from tests.rig import soak_judge, soak_page
 from tests.rig.soak_boxes import BoxUnderTest, Gone, Script, ThisMachine
@@ -318,8 +318,8 @@ def draw(works: Sequence[Path], out: Path, page: Path) -> bool:
         "boxes": boxes,
     }
     write(out, results)
-    rendered, svg = soak_page.render(results)
-    html.publish(page, {"index": rendered}, {"soak": svg}, provenance.of(results))
+    rendered, _ = soak_page.render(results)
+    html.publish(page, rendered)
     reached = True
     for name, box in results["boxes"].items():
         for what, wanted, came, met in soak_judge.targets(box["sums"]):

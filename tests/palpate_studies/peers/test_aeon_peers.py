@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
-from palpate.core.errors import FormatError
-from palpate.inference.classifier import softmax
 from palpate_studies.peers import aeon_peers
 from palpate_train.data.sets import Dataset
 from palpate_train.models import methods
@@ -70,63 +66,3 @@ def test_small_windows_and_one_channel(name: str, frames: int, taxels: int):
     np.testing.assert_allclose(
         np.concatenate([model.logits(x[None]) for x in samples]), logits, atol=1e-2
     )
-
-
-@pytest.mark.slow
-@names
-def test_silence_and_single_sweeps_are_no_trouble(name: str):
-    """Logits are finite for a training set without any signal, a taxel without a signal, and one
-    sweep of each material."""
-    pytest.importorskip("aeon")
-    sweeps = easy(4)
-    silent = replace(sweeps, samples=np.full_like(sweeps.samples, 7))
-    dead = replace(sweeps, samples=sweeps.samples * np.array([[0, 1], [1, 1]], np.uint8))
-    for given in (silent, dead, easy(1)):
-        assert np.isfinite(train(name, given).logits(sweeps.samples)).all()
-
-
-@pytest.mark.slow
-@names
-def test_a_seed_gives_one_model_and_random_states_stay(name: str):
-    """The same seed gives the same logits, another seed others; the random streams of numpy and
-    PyTorch go on."""
-    pytest.importorskip("aeon")
-    sweeps, other = hard(20).split("recording", 0.3, 0)
-    np.random.seed(4)
-    before = np.random.get_state()[1].copy(), torch.get_rng_state(), torch.get_num_threads()
-    first, again, another = (train(name, sweeps, seed).logits(other.samples) for seed in (1, 1, 2))
-    np.testing.assert_array_equal(first, again)
-    assert not np.array_equal(first, another)
-    assert np.array_equal(np.random.get_state()[1], before[0])
-    assert torch.equal(torch.get_rng_state(), before[1])
-    assert torch.get_num_threads() == before[2]
-
-
-@pytest.mark.slow
-@names
-def test_a_material_not_trained_on_is_never_said(name: str):
-    """Its logit is far below the others, which keep their places."""
-    pytest.importorskip("aeon")
-    sweeps = easy(8)
-    logits = train(name, sweeps.take(sweeps.labels != 1)).logits(sweeps.samples)
-    assert softmax(logits)[:, 1].max() < 1e-8
-    assert np.mean(logits.argmax(1)[sweeps.labels != 1] == sweeps.labels[sweeps.labels != 1]) > 0.9
-
-
-@names
-def test_what_cannot_be_trained_is_named(name: str, monkeypatch: pytest.MonkeyPatch):
-    """A window that is too short, one material, and a missing aeon are refused; so is a graph."""
-    sweeps = easy(4)
-    short = replace(sweeps, samples=sweeps.samples[:, :9])
-    with pytest.raises(
-        FormatError, match=f"a window of 9 frames is too short for {name}; record at least 10"
-    ):
-        train(name, short)
-    with pytest.raises(FormatError, match="only one class, 'high'"):
-        train(name, sweeps.take(sweeps.labels == 2))
-    for module in ("convolution_based", "interval_based"):
-        monkeypatch.setitem(sys.modules, f"aeon.classification.{module}", None)
-    with pytest.raises(FormatError, match=r"needs aeon .*pip install 'palpate-train\[peers\]'"):
-        train(name, sweeps)
-    with pytest.raises(FormatError, match=f"{name} runs in aeon alone and has no graph"):
-        aeon_peers.AeonModel(name, np.zeros_like, np.arange(3), 3).graph()

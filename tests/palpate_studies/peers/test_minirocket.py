@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 import pytest
 
-from palpate.core.errors import FormatError
 from palpate.core.types import SweepFormat
 from palpate.inference.classifier import softmax
-from palpate.inference.session import session
 from palpate_studies.peers import minirocket
 from palpate_train.data.sets import Dataset
 from palpate_train.models import linear_head
@@ -126,30 +123,6 @@ def head(sweeps: Dataset) -> linear_head.LinearHeadModel:
     return linear_head.train_linear_head(graph, minirocket._ridge, sweeps, sweeps.samples, 0)
 
 
-def test_the_box_gives_the_logits():
-    """The graph in the box's session names an easy set with high probability, and is finite for
-    constant sweeps."""
-    sweeps, other = easy(20), easy(20, seed=1)
-    model = head(sweeps)
-    run = session(model.graph().SerializeToString())
-    box = np.concatenate([run.run(None, {"sweep": sweep[None]})[0] for sweep in other.samples])
-    np.testing.assert_array_equal(box, model.logits(other.samples))
-    assert np.mean(box.argmax(1) == other.labels) > 0.95
-    assert softmax(box).max(1).mean() > 0.9
-    assert np.isfinite(model.logits(np.full((1, 64, 2, 2), 255, np.uint8))).all()
-
-
-def test_a_material_not_trained_on_is_never_said():
-    """Its logit is far below the others. The two trained materials are separated, although
-    scikit-learn gives one row for them."""
-    sweeps = easy(20)
-    two = sweeps.take(sweeps.labels != 1)
-    logits = head(two).logits(sweeps.samples)
-    assert logits.shape == (60, 3)
-    assert softmax(logits)[:, 1].max() < 1e-12
-    assert np.mean(logits[sweeps.labels != 1].argmax(1) == two.labels) > 0.95
-
-
 def test_the_temperature_comes_from_held_out_groups():
     """The first head misses whole recordings, the second none; random labels give uncertain
     probabilities."""
@@ -171,35 +144,3 @@ def test_the_temperature_comes_from_held_out_groups():
         sweeps, labels=np.random.default_rng(0).permutation(np.repeat(np.arange(3), 5)).repeat(4)
     )
     assert softmax(head(blind).logits(easy(20, seed=1).samples)).max(1).mean() < 0.6
-
-
-@pytest.mark.slow
-def test_a_seed_gives_one_model_and_leaves_numpy_alone(monkeypatch: pytest.MonkeyPatch):
-    """The same seed gives the same bytes, another seed others; numpy's global stream goes on
-    unchanged."""
-    pytest.importorskip("aeon")
-    monkeypatch.setattr(minirocket, "FEATURES", 168)
-    sweeps = easy(8)
-    np.random.seed(4)
-    want = np.random.random(3)
-    np.random.seed(4)
-    graphs = [
-        minirocket.train(sweeps, sweeps.samples, seed).graph().SerializeToString()
-        for seed in (1, 1, 2)
-    ]
-    np.testing.assert_array_equal(np.random.random(3), want)
-    assert graphs[0] == graphs[1] != graphs[2]
-
-
-def test_what_cannot_be_trained_is_named(monkeypatch: pytest.MonkeyPatch):
-    """A window that is too short, a missing aeon, and one material are refused."""
-    sweeps = easy(8)
-    short = replace(sweeps, samples=sweeps.samples[:, :8])
-    with pytest.raises(FormatError, match="a window of 8 frames is too short for minirocket"):
-        minirocket.train(short, short.samples, 0)
-    one = sweeps.take(sweeps.labels == 2)
-    with pytest.raises(FormatError, match="only one class, 'high'"):
-        minirocket.train(one, one.samples, 0)
-    monkeypatch.setitem(sys.modules, "aeon.transformations.collection.convolution_based", None)
-    with pytest.raises(FormatError, match=r"pip install 'palpate-train\[peers\]'"):
-        minirocket.train(sweeps, sweeps.samples, 0)

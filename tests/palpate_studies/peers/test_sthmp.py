@@ -2,20 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from sklearn.linear_model import orthogonal_mp
 
-from palpate.core.errors import FormatError
 from palpate.core.types import SweepFormat
-from palpate.inference.classifier import softmax
-from palpate.inference.session import session
 from palpate_studies.peers import sthmp
-from palpate_train.data.sets import Dataset
 from palpate_train.onnx_tools import graph_builder
-from tests.factories.sweep_sets import easy
 
 SETS = {"uint8": (4, 4, 90), "int16": (3, 3, 24), "uint16": (1, 1, 20), "float32": (16, 1, 128)}
 
@@ -170,57 +163,3 @@ def test_the_dictionary_finds_what_patches_are_made_of(monkeypatch: pytest.Monke
     left = x - np.tensordot(sthmp.encode(x, found), found, 1)
     assert np.square(left).sum() < 0.1 * np.square(x).sum()
     np.testing.assert_allclose(found.mean(axis=1), 0, atol=1e-6)
-
-
-def test_the_box_gives_the_logits():
-    """The graph in the box's session names an easy set with high probability; logits are finite for
-    silence and saturation."""
-    sweeps, other = easy(20), easy(20, seed=1)
-    model = sthmp.train(sweeps, sweeps.samples, 0)
-    run = session(model.graph().SerializeToString())
-    box = np.concatenate([run.run(None, {"sweep": sweep[None]})[0] for sweep in other.samples])
-    np.testing.assert_array_equal(box, model.logits(other.samples))
-    assert np.mean(box.argmax(1) == other.labels) > 0.95
-    assert softmax(box).max(1).mean() > 0.9
-    for level in (0, 255):
-        assert np.isfinite(model.logits(np.full((1, 64, 2, 2), level, np.uint8))).all()
-
-
-def test_a_material_not_trained_on_is_never_said():
-    """Its logit is far below the others, and the others are separated."""
-    sweeps = easy(20)
-    two = sweeps.take(sweeps.labels != 1)
-    logits = sthmp.train(two, two.samples, 0).logits(sweeps.samples)
-    assert softmax(logits)[:, 1].max() < 1e-12
-    assert np.mean(logits[sweeps.labels != 1].argmax(1) == two.labels) > 0.95
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("dtype", SETS)
-def test_any_set_can_be_trained_on(dtype: str):
-    """Logits are finite for any grid, length and data type, even for a silent skin, and the same
-    for the same seed."""
-    rows, cols, window = SETS[dtype]
-    labels = np.arange(12) % 2
-    silent = np.full((12, window, rows, cols), 7, dtype)
-    moving = silent + np.random.default_rng(1).integers(0, 9, silent.shape).astype(dtype)
-    for samples in (silent, moving):
-        sweeps = Dataset(samples, labels, ("a", "b"), 35.6)
-        logits = [sthmp.train(sweeps, samples, 3).logits(samples[:3]) for _ in range(2)]
-        assert np.isfinite(logits[0]).all()
-        np.testing.assert_array_equal(*logits)
-
-
-def test_what_cannot_be_trained_is_named():
-    """A window that is too short, and one material, are refused."""
-    sweeps = easy(8)
-    short = replace(sweeps, samples=sweeps.samples[:, :7])
-    with pytest.raises(
-        FormatError, match="a window of 7 frames is too short for st-hmp; record at least 8"
-    ):
-        sthmp.train(short, short.samples, 0)
-    least = replace(sweeps, samples=sweeps.samples[:, :8])
-    assert np.isfinite(sthmp.train(least, least.samples, 0).logits(least.samples[:1])).all()
-    one = sweeps.take(sweeps.labels == 2)
-    with pytest.raises(FormatError, match="only one class, 'high'"):
-        sthmp.train(one, one.samples, 0)

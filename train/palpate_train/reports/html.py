@@ -9,7 +9,7 @@ are of an older default, a warning in the first line.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +17,8 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from palpate.core.storage import put
-from palpate_train.reports import formatting, provenance
-from palpate_train.reports.plot_style import DARK, FONT, LIGHT, SCHEMES
+from palpate_train.reports import formatting
+from palpate_train.reports.plot_style import DARK, FONT, LIGHT
 from palpate_train.reports.provenance import Provenance
 
 TEMPLATES = Path(__file__).with_name("templates")
@@ -84,20 +84,13 @@ def render_text(template: str, **data: Any) -> str:
 
 
 def picture(svg: str) -> Markup:
-    """An SVG of plot_style.to_svg, whose texts are escaped already, for a page to hold as it is;
-    the colours are the page's."""
-    return Markup(svg.replace(SCHEMES, "", 1))
+    """An SVG of plot_style.to_svg, whose texts are escaped already, for a page to hold as it is."""
+    return Markup(svg)
 
 
-def publish(
-    out: Path, pages: Mapping[str, str], pictures: Mapping[str, str], about: Provenance
-) -> Path:
-    """Write the pictures, NAME.svg, each with its header, and the pages, NAME.html, into the folder
-    `out`; the path of "index"."""
-    for name, svg in pictures.items():
-        put(out / f"{name}.svg", provenance.in_svg(svg, about).encode(), parents=True)
-    for name, page in pages.items():
-        put(out / f"{name}.html", page.encode(), parents=True)
+def publish(out: Path, page: str) -> Path:
+    """Write a page into the folder `out`; its path."""
+    put(out / "index.html", page.encode(), parents=True)
     return out / "index.html"
 
 

@@ -1,8 +1,7 @@
 """The style of all pictures: turns matplotlib figures into SVG text that is the same in every run.
 
-A picture is 360 units wide, the width of a phone. Its colours are roles (--text, --accent …). A
-page sets them for light and dark. A picture outside of a page sets them itself: in Markdown it
-follows the reader's choice of light or dark.
+A picture is 360 units wide, the width of a phone. Its colours are roles (--text, --accent …), which
+a page sets for light and dark. A picture outside of a page has plain colours.
 """
 
 from __future__ import annotations
@@ -62,12 +61,6 @@ def _variables(roles: Mapping[str, str]) -> str:
 
 
 LIGHT, DARK = _variables(ROLES), _variables(DARK_ROLES)
-SCHEMES = (
-    f"<style>:root {{ {LIGHT} }} "
-    f"@media (prefers-color-scheme: dark) {{ :root {{ {DARK} }} }}</style>"
-)
-"""The rules that make a picture light or dark by itself. A page has the same rules, so that they
-change nothing there."""
 AXIS = "axis:"
 """Prefix of the id of an axis with numbers while it is drawn; the axis title follows."""
 SVG, XLINK = "http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"
@@ -118,14 +111,6 @@ def add_axes(figure: Figure, left: float, right: float, top: float, bottom: floa
     for spine in axes.spines.values():
         spine.set_visible(False)
     return axes
-
-
-def set_titles(axes: Axes, x: str = "", y: str = "") -> None:
-    """Write the titles of the axes, with units: below the horizontal axis, and horizontally above
-    the upper end of the vertical one."""
-    axes.set_xlabel(x, color=GREY, size=SMALL)
-    axes.set_ylabel(y, color=GREY, size=SMALL, rotation=0, ha="left", va="bottom")
-    axes.yaxis.set_label_coords(0, 1.02)
 
 
 def tiles(axes: Axes, rows: int, columns: int) -> None:
@@ -206,7 +191,7 @@ def write(
 
 def to_svg(figure: Figure, about: str, plain: bool = False) -> str:
     """The picture as SVG text. about: its title, for readers who cannot see it. plain: use fixed
-    colours instead of roles, for programs that ignore style sheets.
+    colours instead of roles, for a picture outside of a page.
 
     Each axis with numbers has its title as the attribute data-axis, "" if it has none.
     """
@@ -232,8 +217,7 @@ def to_svg(figure: Figure, about: str, plain: bool = False) -> str:
     title.text = about
     root.insert(0, title)
     ElementTree.indent(root, space="")
-    text = ElementTree.tostring(root, encoding="unicode")
-    return text if plain else text.replace("</title>", f"</title>{SCHEMES}", 1)
+    return ElementTree.tostring(root, encoding="unicode")
 
 
 def _named(axis: Axis, shared: str) -> str | None:

@@ -145,29 +145,3 @@ def _loss(points: Sequence[Json]) -> Json:
                 "moved_before": before["moved"],
             }
     return {"lost_at_mm": None, "moved": points[-1]["moved"], "moved_before": points[-2]["moved"]}
-
-
-def lines(result: Json) -> Iterator[str]:
-    """The report for the terminal: accuracy of the box and of the network alone, and share of
-    flagged sweeps, with intervals, at each displacement."""
-    yield (
-        f"bundle {result['bundle']}, {result['positions']} positions, limit {result['limit_mm']} mm"
-    )
-    named = {k: v for k, v in result.items() if isinstance(v, dict) and "attachments" in v}
-    rows = [(name, point) for name, point in named.items()]
-    rows += [
-        (f"{direction} {p['mm']:+.1f} mm", p)
-        for direction, points in result["moved"].items()
-        for p in points
-    ]
-    for name, point in rows:
-        right, wrong, network, moved = (
-            "{:.3f} [{:.3f}, {:.3f}]".format(*point[key])
-            for key in ("accuracy", "wrong_share", "network", "moved")
-        )
-        yield (
-            f"{name:<32} n {point['n']:>4}  right {right}  wrong {wrong}  unsure "
-            f"{point['unsure']:>3}  unknown "
-            f"{point['unknown']:>3}  network alone {network}  moved {moved}  distance "
-            f"{point['told_mm']} mm"
-        )

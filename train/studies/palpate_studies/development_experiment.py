@@ -20,7 +20,7 @@ from palpate_train.evaluate import evaluate
 from palpate_train.evaluate.evaluate import Plan
 from palpate_train.metrics import score
 from palpate_train.models import methods
-from palpate_train.models.methods import PACKAGED, SHIPPED, Effort
+from palpate_train.models.methods import PACKAGED, SHIPPED
 from palpate_train.models.recipe.sizes import SIZES
 
 Json = dict[str, Any]
@@ -68,17 +68,6 @@ CASES = {
 }
 """In the order of the page."""
 STUDY = Study("development", CASES, (*OURS, *PEERS))
-QUICK = Study(
-    "development",
-    {
-        "GunPoint, published split": _published("GunPoint"),
-        TUBES: StudyCase(
-            ("sim:T-REAL/level-blind:1001:3",), "leave:position", ("position<=2",), curve=EACH
-        ),
-    },
-    ("palpate-bands", "edge-spectral", "L-gauss"),
-)
-QUICK_EFFORT = Effort(share=0.02)
 
 
 def usual_methods(study: Study) -> tuple[str, ...]:
@@ -120,7 +109,7 @@ def results(study: Study, run: StudyRun, names: Sequence[str], skipped: Sequence
         "cases": cases,
         "results": found,
         "left_out": run.left_out,
-    } | ({"quick": True} if run.quick else {})
+    }
 
 
 def _require_known(study: Study, names: Sequence[str]) -> None:

@@ -48,7 +48,6 @@ def render(figures: Json) -> tuple[str, dict[str, str]]:
         header=provenance.of(figures),
         home=html.HOME,
         figures=figures,
-        quick=bool(figures.get("quick")),
         pictures={name: html.picture(svg) for name, svg in pictures.items()},
         panels=[[panel.kind, finding(panel), len(panel.cases)] for panel in shown],
         ours=ours,

@@ -45,7 +45,6 @@ PANELS = {
 }
 """For each panel of the chart the sweeps with which its methods are timed. Which views a model of
 ours has, and so its time, depends on the sweeps."""
-QUICK = StudyCase(("sim:T-REAL/level-blind:1001:3",), only=("position<=2",))
 ROUNDS = 10
 """Rounds of timing. The slowest methods take a thousand times as long as the quickest."""
 EVERY, SHARE = 5, 0.25

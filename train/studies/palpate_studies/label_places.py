@@ -10,25 +10,10 @@ from matplotlib.axes import Axes
 from palpate_train.reports.plot_style import GREY, SMALL
 
 PLACES = [
-    (7, 0, "left"),
-    (0, 10, "center"),
-    (-7, 0, "right"),
-    (0, -10, "center"),
-    (-4, 10, "left"),
-    (5, 9, "left"),
-    (5, -9, "left"),
-    (-5, 9, "right"),
-    (-5, -9, "right"),
-    (0, 20, "center"),
-    (0, -20, "center"),
-    (8, 18, "left"),
-    (8, -18, "left"),
-    (-8, 18, "right"),
-    (-8, -18, "right"),
-    (-16, 26, "right"),
-    (16, -26, "left"),
-    (24, -34, "left"),
-    (0, 34, "center"),
+    (dx, dy, side)
+    for right, up in ((7, 0), (0, 10), (5, 9), (0, 20), (8, 18), (16, 26), (24, 34))
+    for dx, dy in dict.fromkeys(((right, up), (-right, up), (right, -up), (-right, -up)))
+    for side in (("left" if dx > 0 else "right" if dx < 0 else "center"),)
 ]
 """Places of a name relative to its mark, in units, and its alignment; the best first."""
 FAR = 15

@@ -18,7 +18,7 @@ from palpate_studies import (
     uncertainty_report,
 )
 from palpate_studies.study import DATA, read, results_file
-from palpate_train.reports import html, provenance
+from palpate_train.reports import html
 
 Rendered = tuple[str, dict[str, str]]
 """A page (HTML), and its pictures (SVG) by name."""
@@ -57,8 +57,8 @@ PAGES: Mapping[str, Page] = {
 
 
 def write(wanted: Sequence[str], out: Path, folder: Path = DATA) -> list[Path]:
-    """Write the pages `wanted`, or all, into folders of `out`, with their pictures and the results
-    that they link to; the paths of the pages.
+    """Write the pages `wanted`, or all, into folders of `out`, with the results that they
+    link to; the paths of the pages.
 
     Raises FormatError for an unknown page, and for results that are missing or of another study.
     """
@@ -68,8 +68,8 @@ def write(wanted: Sequence[str], out: Path, folder: Path = DATA) -> list[Path]:
     for name in wanted or PAGES:
         file, page = results_file(name, folder), PAGES[name]
         results = read(file, *page.keys)
-        text, pictures = page.render(results, folder)
-        made.append(html.publish(out / name, {"index": text}, pictures, provenance.of(results)))
+        text, _ = page.render(results, folder)
+        made.append(html.publish(out / name, text))
         (out / name / file.name).write_bytes(file.read_bytes())
     return made
 

@@ -5,12 +5,10 @@ evaluate caches folds, so an interrupted run goes on where it was.
 
 from __future__ import annotations
 
-import os
 import re
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -22,12 +20,11 @@ from palpate_studies import paper_values
 from palpate_studies.paper_values import CNN
 from palpate_studies.peers import prior_work
 from palpate_studies.study import Study, StudyCase, StudyRun
-from palpate_train.data.progress import spoken
 from palpate_train.data.sets import Dataset
 from palpate_train.evaluate.evaluate import Plan, Result, evaluate
 from palpate_train.metrics import score
 from palpate_train.models import methods
-from palpate_train.models.methods import FULL_EFFORT, Effort
+from palpate_train.models.methods import FULL_EFFORT, Effort, Log
 
 Array = NDArray[Any]
 Json = dict[str, Any]
@@ -59,15 +56,11 @@ def load(case: StudyCase, seed: int) -> Dataset:
 
 @dataclass(frozen=True)
 class Step:
-    """Methods that are trained and tested in the same cases (`parts`) and with the same seeds.
-
-    fold_s: seconds of a fold on one core, to estimate the time left.
-    """
+    """Methods that are trained and tested in the same cases (`parts`) and with the same seeds."""
 
     methods: tuple[str, ...]
     parts: tuple[str, ...]
     seeds: tuple[int, ...]
-    fold_s: float
 
 
 HARD, EASY = ("lopo", "hard"), ("lab", "random")
@@ -94,44 +87,22 @@ def in_both_worlds(laboratory: Mapping[str, StudyCase]) -> dict[str, StudyCase]:
 
 FULL = in_both_worlds(
     {
-        "lopo": StudyCase(("sim:T-REAL:{w}",), "leave:position", folds=9),
-        "hard": StudyCase(("sim:T-REAL:{w}", "sim:T-HARD:{a}-{b}:3"), "split:set=0->1", folds=1),
-        "lab": StudyCase(("sim:T-LAB:{w}",), "random:10", folds=10),
-        "random": StudyCase(("sim:T-REAL:{w}",), "random:9", folds=9),
+        "lopo": StudyCase(("sim:T-REAL:{w}",), "leave:position"),
+        "hard": StudyCase(("sim:T-REAL:{w}", "sim:T-HARD:{a}-{b}:3"), "split:set=0->1"),
+        "lab": StudyCase(("sim:T-LAB:{w}",), "random:10"),
+        "random": StudyCase(("sim:T-REAL:{w}",), "random:9"),
     }
 )
 FULL_STEPS = (
-    Step(BASELINES, (*HARD, *EASY, *HARD_BLIND), (1, 2, 3, 4, 5), 1),
-    Step(NEIGHBOURS, (*HARD, *HARD_BLIND), (1, 2, 3), 1),
-    Step(OWN, ("hard", "hard" + BLIND), (1, 2, 3), 90),
-    Step(OWN[:1], ("lopo",), (1, 2, 3), 60),
-    Step(OWN[:1], ("lopo" + BLIND,), (1,), 130),
-    Step(("minirocket", "st-hmp"), (*HARD, *HARD_BLIND), (1,), 12),
-    Step(NETWORKS, (*HARD, *HARD_BLIND), (1,), 60),
-    Step((CNN, "paper-cnn-centred"), ("hard", "hard" + BLIND), (1,), 250),
+    Step(BASELINES, (*HARD, *EASY, *HARD_BLIND), (1, 2, 3, 4, 5)),
+    Step(NEIGHBOURS, (*HARD, *HARD_BLIND), (1, 2, 3)),
+    Step(OWN, ("hard", "hard" + BLIND), (1, 2, 3)),
+    Step(OWN[:1], ("lopo",), (1, 2, 3)),
+    Step(OWN[:1], ("lopo" + BLIND,), (1,)),
+    Step(("minirocket", "st-hmp"), (*HARD, *HARD_BLIND), (1,)),
+    Step(NETWORKS, (*HARD, *HARD_BLIND), (1,)),
+    Step((CNN, "paper-cnn-centred"), ("hard", "hard" + BLIND), (1,)),
 )
-NEAR = ("position<=2",)
-QUICK = in_both_worlds(
-    {
-        "lopo": StudyCase(("sim:T-REAL:{w}:4",), "leave:position", NEAR, folds=3),
-        "hard": StudyCase(
-            ("sim:T-REAL:{w}:4", "sim:T-HARD:1-3:4"), "split:set=0->1", NEAR, folds=1
-        ),
-        "lab": StudyCase(("sim:T-LAB:{w}:10",), "random:3", folds=3),
-        "random": StudyCase(("sim:T-REAL:{w}:4",), "random:3", NEAR, folds=3),
-    }
-)
-QUICK_STEPS = (
-    Step(BASELINES, tuple(QUICK), (1, 2), 0.3),
-    Step(
-        (*NEIGHBOURS, "minirocket", "st-hmp", *OWN, *NETWORKS),
-        (*HARD, *HARD_BLIND),
-        (1,),
-        1,
-    ),
-    Step((CNN,), HARD, (1,), 15),
-)
-QUICK_EFFORT = Effort(share=0.01, paper_steps=4)
 
 
 @dataclass(frozen=True)
@@ -179,12 +150,9 @@ def results(how: StudyRun, only: Sequence[str] = (), earlier: Json | None = None
     only: methods that are run; all others stay as in `earlier` results. Raises FormatError as
     evaluate does, and for a name in `only` that the plan does not have.
     """
-    cases, steps = (QUICK, QUICK_STEPS) if how.quick else (FULL, FULL_STEPS)
-    if how.quick:
-        how = replace(how, effort=QUICK_EFFORT)
-    outcomes = list(_outcomes(cases, narrowed(steps, only) if only else steps, how))
-    found = summary(outcomes, cases, how.effort) | score.provenance() | {"quick": how.quick}
-    return joined(found, planned(earlier, steps)) if only and earlier else found
+    outcomes = list(_outcomes(FULL, narrowed(FULL_STEPS, only) if only else FULL_STEPS, how))
+    found = summary(outcomes, FULL, how.effort) | score.provenance()
+    return joined(found, planned(earlier, FULL_STEPS)) if only and earlier else found
 
 
 def narrowed(steps: Sequence[Step], only: Sequence[str]) -> list[Step]:
@@ -211,12 +179,7 @@ def planned(found: Json, steps: Sequence[Step]) -> Json:
 
 
 def joined(found: Json, earlier: Json) -> Json:
-    """Two results as one. Entries of `found` replace those of `earlier`. Raises FormatError for a
-    quick run beside a whole one."""
-    if found["quick"] != earlier["quick"]:
-        raise FormatError(
-            "a quick run and a whole one cannot be joined; write the quick one to another --out"
-        )
+    """Two results as one. Entries of `found` replace those of `earlier`."""
     lists = {
         key: [
             *(one for one in earlier[key] if _at(one) not in set(map(_at, found[key]))),
@@ -236,28 +199,17 @@ def _at(one: dict[str, Any]) -> tuple[Any, ...]:
 def _outcomes(
     cases: Mapping[str, StudyCase], steps: Sequence[Step], how: StudyRun
 ) -> Iterator[Outcome]:
-    """Run step by step. After each fold `log` gets the progress and an estimate of the time
-    left."""
+    """Run step by step. After each fold `log` gets the progress."""
     todo = [(step, part, seed) for step in steps for part in step.parts for seed in step.seeds]
-    expected = [len(step.methods) * cases[part].folds * step.fold_s for step, part, _ in todo]
-    pace = 1 / (os.cpu_count() or 1)
-    for i, (step, part, seed) in enumerate(todo):
-        start, done, folds = time.monotonic(), 0, len(step.methods) * cases[part].folds
-
-        def count(line: str) -> None:
-            nonlocal done
-            done += 1
-            left = sum(expected[i:]) - expected[i] * done / folds  # noqa: B023  # called within this turn of the loop
-            where_now = f"{i + 1}/{len(todo)} {part}, seed {seed}"  # noqa: B023
-            how.log(f"{where_now}: {line}; in all about {spoken(pace * left)} left")  # noqa: B023
-
-        protocols = (cases[part].protocol,)
-        plan = Plan(step.methods, protocols, (seed,), effort=how.effort)
-        for result in evaluate(load(cases[part], seed), plan, how.where, count):
+    for i, (step, part, seed) in enumerate(todo, 1):
+        plan = Plan(step.methods, (cases[part].protocol,), (seed,), effort=how.effort)
+        log = partial(_log, how.log, f"{i}/{len(todo)} {part}, seed {seed}")
+        for result in evaluate(load(cases[part], seed), plan, how.where, log):
             yield Outcome.of(part, seed, result)
-        took = time.monotonic() - start
-        if took > expected[i] * pace / 10:  # else it came from the cache
-            pace = took / expected[i]
+
+
+def _log(log: Log, where: str, line: str) -> None:
+    log(f"{where}: {line}")
 
 
 def summary(

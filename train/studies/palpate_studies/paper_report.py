@@ -50,7 +50,6 @@ def render(
         home=html.HOME,
         pictures={name: html.picture(svg) for name, svg in drawn.items()},
         box_on_hard=box_on_hard,
-        quick=summary["quick"],
         own=own,
         reference=BEST,
         short=[TITLES[part] for part in (*HARD, *HARD_BLIND)],

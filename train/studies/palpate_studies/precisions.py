@@ -36,7 +36,7 @@ class Packed:
     of a peer.
 
     form: "" for the method itself, else the name of another of its precisions. precision, weights,
-    macs: as palpate_studies.cost counts them. window_s: length of a sweep in s.
+    macs: as palpate_studies.cost counts them.
     """
 
     method: str
@@ -46,7 +46,6 @@ class Packed:
     folder: Path
     weights: int
     macs: int
-    window_s: float
 
     @property
     def name(self) -> str:
@@ -107,7 +106,6 @@ def _packed_forms(
             "precision": precision,
             "weights": cost.weights(graph),
             "macs": cost.macs(graph) + cost.feature_macs(method.input, content.train.format),
-            "window_s": content.train.format.window / content.train.format.rate_hz,
         }
         yield counted[form] | {"runtime": "onnx", "folder": folder.name}
     if method.name in PEERS:

@@ -51,9 +51,9 @@ class ResultFile:
         first, *rest = (shlex.quote(w) if w.strip("$") == w else w for w in self.words)
         return " ".join([COMMANDS.get(first, f"python -m {first}"), *rest])
 
-    def lacks(self) -> list[str]:
-        """The needs that are not met here."""
-        return [need for need in self.needs if not NEEDS[need]()]
+    def lacks(self) -> str:
+        """The needs that are not met here; "" if all are."""
+        return " and ".join(need for need in self.needs if not NEEDS[need]())
 
     def stale(self) -> str:
         """Why it has to be made again; "" if it is of today's default."""
@@ -139,9 +139,8 @@ def table(reports: Sequence[ResultFile]) -> str:
 
 
 def _state(report: ResultFile) -> str:
-    why = report.stale()
-    lacks = report.lacks() if why else []
-    left_out = f"; left out: it needs {' and '.join(lacks)}" if lacks else ""
+    why, lacks = report.stale(), report.lacks()
+    left_out = f"; left out: it needs {lacks}" if lacks else ""
     return f"stale: {why.rstrip('.')}{left_out}" if why else "of today"
 
 
@@ -158,7 +157,7 @@ def make(
     left: dict[str, str] = {}
     for number, report in enumerate(reports, 1):
         if lacks := report.lacks():
-            log(f"{report.name} is left out: it needs {' and '.join(lacks)}")
+            log(f"{report.name} is left out: it needs {lacks}")
             left |= {report.name: "is left out"} if wanted else {}
             continue
         log(f"{number}/{len(reports)} {report.name}: {report.stale() or 'named'}")

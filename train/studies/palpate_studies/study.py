@@ -30,8 +30,7 @@ class StudyCase:
 
     sets: they are joined. only: selects sweeps of each set. real: the sets are files in the folder
     of real sweeps. means_removed: each taxel's mean over the window is subtracted. curve: numbers
-    of training sweeps of each material along a learning curve, before all of them. folds: of the
-    protocol, to estimate the time left.
+    of training sweeps of each material along a learning curve, before all of them.
     """
 
     sets: tuple[str, ...]
@@ -40,7 +39,6 @@ class StudyCase:
     real: bool = False
     means_removed: bool = False
     curve: tuple[int, ...] = ()
-    folds: int = 0
 
     @property
     def simulated(self) -> bool:
@@ -61,22 +59,19 @@ class StudyCase:
 class Study:
     """An experiment with one file of results.
 
-    cases: by name, in the order of the page. methods: in the order in which they run. joining:
-    methods that are reported only if an earlier run has left their folds in the cache.
+    cases: by name, in the order of the page. methods: in the order in which they run.
     """
 
     name: str
     cases: Mapping[str, StudyCase]
     methods: tuple[str, ...]
-    joining: tuple[str, ...] = ()
 
 
 @dataclass(slots=True)
 class StudyRun:
     """One run of a study: where folds are computed and cached, on which sweeps, with which effort.
 
-    data: folder of real sweeps. quick: a few sweeps and iterations of everything; its figures mean
-    nothing. left_out: missing names, each with the reason; the run fills it.
+    data: folder of real sweeps. left_out: missing names, each with the reason; the run fills it.
     """
 
     where: Where
@@ -84,7 +79,6 @@ class StudyRun:
     data: Path | None = None
     effort: Effort = FULL_EFFORT
     seeds: Sequence[int] = (1,)
-    quick: bool = False
     left_out: dict[str, str] = field(default_factory=dict)
 
 

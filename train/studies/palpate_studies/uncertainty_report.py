@@ -6,38 +6,15 @@ run.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
-
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from palpate_studies import TEMPLATES
 from palpate_train.calibration.novelty import KEPT
 from palpate_train.models.methods import PACKAGED, SHIPPED
-from palpate_train.reports import formatting, html, provenance
-from palpate_train.reports.plot_style import (
-    ACCENT,
-    BLACK,
-    FAINT,
-    GREY,
-    SMALL,
-    round_ticks,
-    set_ticks,
-    single_axes,
-    to_svg,
-)
+from palpate_train.reports import bundle_report, formatting, html, provenance
 
 Json = Mapping[str, Any]
-LINE: dict[str, Any] = {"color": ACCENT, "linewidth": 2.0, "marker": "o", "markersize": 3.5}
-OTHER: dict[str, Any] = {
-    "color": BLACK,
-    "linewidth": 1.4,
-    "linestyle": (0, (3, 1.5)),
-    "marker": "o",
-    "markersize": 2.5,
-}
-PALE: dict[str, Any] = {"color": GREY, "linewidth": 0.9}
 ORIGIN = {
     "set": "trained on",
     "test": "tested on",
@@ -56,16 +33,12 @@ ORIGIN = {
     "took_s": "seconds that it took",
 }
 """The run: names in the results and on the page."""
-FLOORS = {0.0: 0.2, 0.5: 0.1, 0.8: 0.05, 0.9: 0.02, 0.95: 0.01}
-"""Possible starts of an axis of shares, and the step of its ticks."""
 
 
 def render(figures: Json) -> tuple[str, dict[str, str]]:
     """The page (HTML) and its pictures (SVG) by name."""
-    pictures = {
-        "reliability": reliability(figures),
-        "touch": touch(figures),
-    }
+    after = figures["calibration"]["after"] | {"n": figures["calibration"]["n"]}
+    pictures = {"reliability": bundle_report.calibration(after)}
     heat, rules = figures["calibration"]["temperature"], figures["early"]["rules"]
     page = html.render(
         "uncertainty.html.j2",
@@ -168,102 +141,3 @@ def _distinct(rules: Iterable[Json]) -> list[Json]:
     """Each rule once, by rising probability."""
     pairs = sorted({(rule["least"], rule["agree"]) for rule in rules})
     return [{"least": least, "agree": agree} for least, agree in pairs]
-
-
-def reliability(figures: Json) -> str:
-    """Predicted probability against the share right, before and after temperature scaling."""
-    figure, axes = _plot(3.1)
-    axes.plot([0, 1], [0, 1], color=FAINT, linewidth=1.2)
-    for name, look in (("before", OTHER), ("after", LINE)):
-        bins = figures["calibration"][name]["bins"]
-        predicted, right = [b["said"] for b in bins], [b["right"] for b in bins]
-        n = [6 + 60 * (b["n"] / figures["calibration"]["n"]) ** 0.5 for b in bins]
-        axes.plot(predicted, right, **(look | {"marker": ""}))
-        axes.scatter(predicted, right, n, color=look["color"], zorder=3)
-    _legend(axes, (("● after", ACCENT), ("╍ before", BLACK)))
-    _frame(axes, (0, 1), (0, 1), "predicted probability", "classified correctly", percent=True)
-    return to_svg(
-        figure,
-        "share right against the predicted probability, before and after temperature scaling",
-    )
-
-
-def touch(figures: Json) -> str:
-    """Accuracy against the mean share of the sweep."""
-    e = figures["early"]
-    figure, axes = _plot(2.9)
-    for points in e["curves"].values():
-        axes.plot([p["share"] for p in points], [p["accuracy"] for p in points], **PALE)
-    always = [a["accuracy"] for a in e["always"]]
-    axes.plot([(d + 1) / len(always) for d in range(len(always))], always, **OTHER)
-    axes.plot(e["share"], e["rule"]["accuracy"], "D", color=ACCENT, markersize=7, zorder=4)
-    _legend(
-        axes,
-        (("◆ the rules found", ACCENT), ("╍ always at a tenth", BLACK), ("— other rules", GREY)),
-    )
-    others = [p["accuracy"] for points in e["curves"].values() for p in points]
-    _frame(
-        axes,
-        (0, 1),
-        (_floor([*always, *others]), 1),
-        "mean share of the window",
-        "classified correctly",
-        percent=True,
-    )
-    return to_svg(figure, "accuracy against touch time")
-
-
-def _plot(height: float) -> tuple[Figure, Axes]:
-    """A picture of this height in inches with one plot, with room for a legend and the names of
-    both axes."""
-    return single_axes(height, left=0.15, right=0.97, top=0.35, bottom=0.5)
-
-
-def _frame(
-    axes: Axes,
-    x: tuple[float, float],
-    y: tuple[float, float],
-    across: str,
-    up: str,
-    *,
-    percent: bool = False,
-) -> None:
-    """Set limits, ticks, grid and the names of both axes. The vertical axis is always a share.
-
-    percent: the horizontal axis is a share too.
-    """
-    (left, right), (low, high) = x, y
-    margin = 0.03 * max(right - left, 1e-3)
-    axes.set_xlim(left - margin, right + margin)
-    axes.set_ylim(low, high + 0.02 * (high - low))
-    axes.grid(color=FAINT, linewidth=0.6)
-    set_ticks(axes.xaxis, round_ticks(left, right, 5), percent=percent)
-    set_ticks(axes.yaxis, _steps(low), percent=True)
-    axes.set_xlabel(across, color=GREY, size=SMALL)
-    axes.set_ylabel(up, color=GREY, size=SMALL)
-
-
-def _legend(axes: Axes, entries: Sequence[tuple[str, str]]) -> None:
-    """Write names in their colours above the plot."""
-    for i, (text, colour) in enumerate(entries):
-        axes.annotate(
-            text,
-            (i / 3, 1),
-            (0, 8),
-            "axes fraction",
-            textcoords="offset points",
-            color=colour,
-            size=SMALL + 0.5,
-        )
-
-
-def _floor(lows: Sequence[float]) -> float:
-    """Start of an axis of shares: the highest of FLOORS below all values."""
-    return max(floor for floor in FLOORS if floor <= max(min(lows, default=0), 0))
-
-
-def _steps(floor: float) -> list[float]:
-    """Ticks of an axis of shares that begins at one of FLOORS."""
-    return [
-        round(floor + k * FLOORS[floor], 3) for k in range(round((1 - floor) / FLOORS[floor]) + 1)
-    ]

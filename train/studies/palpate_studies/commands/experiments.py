@@ -21,7 +21,6 @@ from palpate_studies.pages import PAGES
 from palpate_studies.study import StudyRun, read, results_file, save
 from palpate_train.arguments import options
 from palpate_train.arguments.program import Add
-from palpate_train.models.methods import Effort
 
 
 def register(add: Add) -> None:
@@ -52,12 +51,6 @@ def _add_run(command: argparse.ArgumentParser, name: str) -> None:
         metavar="FILE",
         help=f"file of results ({file})",
     )
-    if name in ("paper", "development"):
-        command.add_argument(
-            "--quick",
-            action="store_true",
-            help="small sets, hardly trained: to try everything out, not for figures",
-        )
     command.add_argument(
         "--kept", action="store_true", help="train nothing, report what an earlier run has finished"
     )
@@ -114,12 +107,10 @@ def _add_development(command: argparse.ArgumentParser) -> None:
     )
 
 
-def _run(args: argparse.Namespace, quick_effort: Effort | None = None) -> StudyRun:
-    quick: bool = getattr(args, "quick", False)
-    effort = quick_effort if quick and quick_effort else options.effort(args)
+def _run(args: argparse.Namespace) -> StudyRun:
     seeds = options.seeds(args) if hasattr(args, "seeds") else (1,)
     data: Path | None = getattr(args, "data", None)
-    return StudyRun(options.where(args), options.Log(), data, effort, seeds, quick)
+    return StudyRun(options.where(args), options.Log(), data, options.effort(args), seeds)
 
 
 def _done(run: StudyRun, path: Path) -> None:
@@ -153,28 +144,23 @@ def run_recipe(args: argparse.Namespace) -> None:
 
 def run_development(args: argparse.Namespace) -> None:
     """Evaluate, time and write the results; with --times after timing alone."""
-    run = _run(args, development_experiment.QUICK_EFFORT)
-    keys = PAGES["development"].keys
-    study = development_experiment.QUICK if run.quick else development_experiment.STUDY
-    usual = development_experiment.usual_methods
-    names = options.names(args) if args.method else usual(study)
+    run, keys = _run(args), PAGES["development"].keys
+    study = development_experiment.STUDY
+    names = options.names(args) if args.method else development_experiment.usual_methods(study)
     if args.times:
         figures = read(args.out, *keys)
     else:
         made = development_experiment.results(study, run, tuple(names), args.leave_out)
-        earlier = [read(path, *keys) for path in args.join]
-        figures = development_experiment.join(made, earlier)
+        figures = development_experiment.join(made, [read(path, *keys) for path in args.join])
     if args.times or not args.kept:
-        timed = development_times.QUICK if run.quick else development_times.TIMED
-        train = timed.load()
+        train = development_times.TIMED.load()
         assert train is not None  # it is simulated
         figures["times"] = development_times.measured(
             figures["methods"], train, 1, run.where.cache, run.log, run.effort
         )
-        if not run.quick:
-            # without the folder of real sweeps their panel keeps its times
-            figures["panel_times"] = figures.get("panel_times", {}) | development_times.of_panels(
-                figures["methods"], run.data, 1, run.where.cache, run.log, run.effort
-            )
+        # without the folder of real sweeps their panel keeps its times
+        figures["panel_times"] = figures.get("panel_times", {}) | development_times.of_panels(
+            figures["methods"], run.data, 1, run.where.cache, run.log, run.effort
+        )
     run.left_out = dict(figures["left_out"])
     _done(run, save(args.out, figures))

@@ -16,8 +16,8 @@ from palpate.core.clock import SystemClock
 from palpate.core.errors import FormatError
 from palpate.core.provenance import commit
 from palpate.inference.classifier import Classifier
-from palpate_studies import alignment, certainty, references
-from palpate_studies.study import read, results_file, save
+from palpate_studies import alignment, certainty, contact_table, references
+from palpate_studies.study import results_file, save
 from palpate_train.arguments import numbers, options
 from palpate_train.arguments.program import Add
 from palpate_train.data import sets
@@ -110,14 +110,6 @@ def _add_stress(add: Add) -> None:
     )
     _add_out(command, "stress")
     command.add_argument(
-        "--join",
-        type=Path,
-        action="append",
-        default=[],
-        metavar="FILE",
-        help="results of an earlier run on the same sets, whose methods join those of this one",
-    )
-    command.add_argument(
         "--kept", action="store_true", help="train nothing, report what an earlier run has finished"
     )
     options.add_effort(command)
@@ -204,26 +196,7 @@ def run_stress(args: argparse.Namespace) -> None:
         "format": str(train.format),
         "seeds": list(seeds),
     } | score.provenance()
-    for path in args.join:
-        result = _joined(result, read(path, "methods", "train_digest", "test_digest"))
     print(save(args.out, result))
-
-
-def _joined(result: dict[str, Any], earlier: dict[str, Any]) -> dict[str, Any]:
-    """The result with the methods of an earlier one that it does not have itself, and with the
-    origin of these in `earlier`. Raises FormatError if the earlier one was of other sweeps."""
-    for key in ("train_digest", "test_digest"):
-        if result[key] != earlier[key]:
-            raise FormatError(
-                f"the results to join have {key} {earlier[key]}, not {result[key]}; "
-                "name those of the same sets"
-            )
-    lacks = [name for name in earlier["methods"] if name not in result["methods"]]
-    origin = {key: earlier[key] for key in score.provenance() if key in earlier}
-    return result | {
-        "methods": earlier["methods"] | result["methods"],
-        "earlier": [*earlier.get("earlier", []), {"methods": lacks} | origin],
-    }
 
 
 def _made_of(train: Dataset, folder: Path, log: Log) -> Path:
@@ -275,13 +248,13 @@ def run_certainty(args: argparse.Namespace) -> None:
 
 
 def run_alignment(args: argparse.Namespace) -> None:
-    """Measure, write the results, and print a summary."""
+    """Measure, write the results, and print their table."""
     box = Classifier(bundle.load(args.bundle), SystemClock())
     displacements = len(alignment.DIRECTIONS) * (2 * len(alignment.OFF_MM) + 1)
     progress = Progress(displacements, options.Log())
     result = alignment.measure(box, args.unseen, args.seen, args.hard, progress.begin)
     save(args.out, result)
-    print("\n".join(alignment.lines(result)))
+    print(contact_table.table(result))
 
 
 def run_references(args: argparse.Namespace) -> None:

@@ -1,0 +1,143 @@
+"""What every peer on features or on small filters has to hold; tests of networks are beside the
+networks."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from palpate.core.errors import FormatError
+from palpate.inference.classifier import softmax
+from palpate.inference.session import session
+from palpate_studies.peers import minirocket, sthmp
+from palpate_train.data.sets import Dataset
+from palpate_train.models import methods
+from palpate_train.models.methods import Model
+from tests.factories.sweep_sets import easy
+
+FEATURES = ("L-gauss", "L-knn", "L-svm", "static-svm", "spectrogram-svm", "fishel-bayes")
+AEON = ("minirocket", "minirocket-augmented", "multirocket-hydra", "quant")
+ALONE = ("multirocket-hydra", "quant")
+"""Methods without a graph."""
+every = pytest.mark.parametrize("name", [*FEATURES, "st-hmp", *AEON])
+with_graph = pytest.mark.parametrize("name", [*FEATURES, "st-hmp", *AEON[:2]])
+
+
+@pytest.fixture(autouse=True)
+def light(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Models that are fitted in a moment."""
+    monkeypatch.setattr(minirocket, "FEATURES", 500)
+    for key, value in {"ATOMS": 20, "SAMPLED": 300, "ROUNDS": 3}.items():
+        monkeypatch.setattr(sthmp, key, value)
+
+
+def inputs(name: str, sweeps: Dataset) -> Any:
+    """What the method looks at."""
+    (method,) = methods.find([name])
+    return methods.model_inputs(method.input, sweeps)
+
+
+def fitted(name: str, sweeps: Dataset, seed: int = 1) -> Model:
+    """The method trained on all sweeps."""
+    if name in AEON:
+        pytest.importorskip("aeon")
+    (method,) = methods.find([name])
+    return method.train(sweeps, inputs(name, sweeps), seed)
+
+
+def long(n: int) -> Dataset:
+    """Easy sweeps with enough frames for every feature."""
+    sweeps = easy(n)
+    return replace(sweeps, samples=np.concatenate([sweeps.samples] * 3, axis=1))
+
+
+@every
+def test_what_is_easy_is_learnt(name: str):
+    """Sweeps of another seed are classified correctly, with logits float32 [n, K]."""
+    other = replace(easy(8, seed=1), samples=np.concatenate([easy(8, seed=1).samples] * 3, axis=1))
+    logits = fitted(name, long(12)).logits(inputs(name, other))
+    assert (logits.dtype, logits.shape) == (np.float32, (24, 3))
+    assert np.mean(logits.argmax(1) == other.labels) > 0.8
+
+
+@every
+def test_a_material_not_trained_on_is_never_given(name: str):
+    """Its logit is far below the others, which keep their places."""
+    sweeps = long(8)
+    two = sweeps.labels != 1
+    logits = fitted(name, sweeps.take(two)).logits(inputs(name, sweeps))
+    assert logits.shape == (24, 3)
+    assert softmax(logits)[:, 1].max() < 1e-8
+    assert np.mean(logits.argmax(1)[two] == sweeps.labels[two]) > 0.8
+
+
+@every
+def test_silence_and_saturation_get_finite_logits(name: str):
+    """Of a model that has seen signals, and of one that has seen none."""
+    sweeps = long(4)
+    still = replace(sweeps, samples=np.full_like(sweeps.samples, 7))
+    full = replace(sweeps, samples=np.full_like(sweeps.samples, 255))
+    model = fitted(name, sweeps)
+    for shown in (still, full):
+        assert np.isfinite(model.logits(inputs(name, shown))).all()
+    if name in (*AEON, "st-hmp"):
+        assert np.isfinite(fitted(name, still).logits(inputs(name, sweeps))).all()
+
+
+@every
+def test_a_seed_gives_one_model_and_random_states_stay(name: str):
+    """numpy's global stream goes on unchanged."""
+    sweeps = long(6)
+    np.random.seed(4)
+    before = np.random.get_state()[1].copy()
+    one, two = (fitted(name, sweeps).logits(inputs(name, sweeps)) for _ in range(2))
+    np.testing.assert_array_equal(one, two)
+    assert np.array_equal(np.random.get_state()[1], before)
+
+
+@with_graph
+def test_the_box_gives_the_logits(name: str):
+    """The graph in the box's session, sweep by sweep."""
+    sweeps = long(6)
+    model, given = fitted(name, sweeps), inputs(name, sweeps)
+    run = session(model.graph().SerializeToString())
+    feed = run.get_inputs()[0].name
+    box = np.concatenate([run.run(None, {feed: one[None]})[0] for one in given])
+    np.testing.assert_allclose(box, model.logits(given), atol=1e-4)
+
+
+@every
+def test_too_little_to_learn_from_is_refused(name: str):
+    """One material."""
+    with pytest.raises(FormatError):
+        fitted(name, long(4).take(np.arange(4)))
+
+
+@pytest.mark.parametrize(("name", "frames"), [*((name, 8) for name in AEON), ("st-hmp", 7)])
+def test_a_window_that_is_too_short_is_refused(name: str, frames: int):
+    """The error says how long it is."""
+    sweeps = easy(4)
+    with pytest.raises(FormatError, match=f"{frames} frames"):
+        fitted(name, replace(sweeps, samples=sweeps.samples[:, :frames]))
+
+
+@pytest.mark.parametrize("name", AEON)
+def test_without_aeon_the_extra_is_advised(name: str, monkeypatch: pytest.MonkeyPatch):
+    """aeon comes with the extra `peers`; what runs in aeon alone has no graph."""
+    if name in ALONE:
+        with pytest.raises(FormatError, match="aeon"):
+            fitted(name, easy(4)).graph()
+    for part in (
+        "transformations.collection.convolution_based",
+        "classification.convolution_based",
+        "classification.interval_based",
+    ):
+        monkeypatch.setitem(sys.modules, f"aeon.{part}", None)
+    sweeps = easy(4)
+    (method,) = methods.find([name])
+    with pytest.raises(FormatError, match=r"palpate-train\[peers\]"):
+        method.train(sweeps, sweeps.samples, 1)
