@@ -53,9 +53,6 @@ def test_moving_is_measured(model: Bundle, monkeypatch: pytest.MonkeyPatch):
         ] == pytest.approx(12, abs=0.01)
         assert point["wrong_share"][0] == pytest.approx(point["wrong"] / 12, abs=1e-3)
         assert point["network"][0] >= point["accuracy"][0]
-    text = "\n".join(alignment.lines(figures))
-    assert "rows +8.0 mm" in text
-    assert "network alone" in text
     table = contact_table.table(figures)
     assert [line.split(" | ")[0] for line in table.splitlines()[4:]] == [
         "| T-HARD, a row ahead and all else anew",

@@ -32,7 +32,6 @@ from palpate_train.models import methods
 from palpate_train.reports.plot_style import SVG
 from tests.factories.development_data import SERIES, case, entry, figures, timed, times
 from tests.factories.page_reader import PageReader
-from tests.factories.study_pages import published
 from tests.factories.sweep_sets import tones
 
 
@@ -83,16 +82,15 @@ def test_the_page_shows_every_figure(fact: str):
     assert fact in shown(figures())
 
 
-def test_the_page_is_sound_and_marks_a_quick_run_and_the_best_peer():
+def test_the_page_is_sound_and_marks_the_best_peer():
     """Its tags close and no value is missing. The best peer of each test and mean is bold."""
     page, pictures = development_report.render(figures())
     read = PageReader(page)
     assert set(pictures) == {"front"}
-    assert not re.search(r"[{}]|\bNone\b|\bnan\b|Markup|Undefined|mean nothing", read.text)
+    assert not re.search(r"[{}]|\bNone\b|\bnan\b|Markup|Undefined", read.text)
     assert (read.wrong, read.open) == ([], [])
     bold = re.findall(r'<td class="best">([\d.]+)', page)
     assert bold == ["85.0", "75.5", "93.0", "85.0", "93.0"]
-    assert "mean nothing" in development_report.render(figures(quick=True))[0]
 
 
 def test_a_part_of_the_results_makes_a_page():
@@ -441,20 +439,3 @@ def test_times_alone_are_measured_again(tmp_path: Path, monkeypatch: pytest.Monk
     assert found["times"]["format"] == "again"
     assert found["panel_times"] == before | {SERIES: {"format": "again"}}
     assert found["results"] == figures()["results"]
-
-
-@pytest.mark.slow
-@pytest.mark.thorough  # a whole study
-def test_the_quick_form_writes_everything(tmp_path: Path):
-    """Its page has a warning. --kept with fewer methods reports only these."""
-    args = ["development", "--quick", "--jobs", "1", "--cache", str(tmp_path / "cache")]
-    file, quick = tmp_path / "a.json", set(development_experiment.QUICK.methods)
-    assert main([*args, "--out", str(file)]) == 0
-    found = json.loads(file.read_text())
-    assert {r["method"] for r in found["results"]} == quick
-    assert {one["method"] for one in found["times"]["entries"]} == quick
-    assert "mean nothing" in published("development", found, tmp_path).read_text()
-    kept = ["--kept", "--method", "palpate-bands,L-gauss", "--out", str(tmp_path / "b.json")]
-    assert main([*args, *kept]) == 0
-    again = json.loads((tmp_path / "b.json").read_text())
-    assert again["results"] == [r for r in found["results"] if r["method"] != "edge-spectral"]

@@ -32,8 +32,8 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the pages of all results in docs/data."""
     out = tmp_path_factory.mktemp("site") / "results"
     pages.write((), out, RESULTS)
-    page, svg = soak_page.render(committed("soak"))
-    html.publish(out / "soak", {"index": page}, {"soak": svg}, provenance.of(committed("soak")))
+    page, _ = soak_page.render(committed("soak"))
+    html.publish(out / "soak", page)
     return out
 
 

@@ -44,7 +44,7 @@ def outcome(part: str, method: str, seed: int = 1, right: float = 0.8, places: i
     return Outcome(part, method, seed, labels, logits, place, about)
 
 
-def summary(quick: bool = False, cnn: bool = True) -> dict[str, Any]:
+def summary(cnn: bool = True) -> dict[str, Any]:
     """The results of invented outcomes, read back from their file."""
     outcomes = [
         outcome(p, m, w)
@@ -53,8 +53,7 @@ def summary(quick: bool = False, cnn: bool = True) -> dict[str, Any]:
         for w in (1, 2)
     ]
     outcomes += [outcome(p, "paper-cnn", right=0.9) for p in ("lopo", "hard") if cnn]
-    found = paper_experiment.summary(outcomes, paper_experiment.FULL) | {"quick": quick}
-    return json.loads(study.text(found))
+    return json.loads(study.text(paper_experiment.summary(outcomes, paper_experiment.FULL)))
 
 
 @pytest.fixture(scope="module")
@@ -144,14 +143,12 @@ def test_the_page_is_one_file_with_ours_and_the_printed_values(results: dict[str
     titles = (">T-REAL, leave one", ">trained on T-REAL", ">level-blind", "<summary>T-LAB")
     places = [page.index(title) for title in titles]
     assert places == sorted(places)  # hard protocols first
-    assert 'class="stop"' not in page
 
 
-def test_a_quick_run_and_a_plan_without_the_network_make_a_page():
-    """The quick one says that it means nothing; without the CNN its confusions are missing."""
-    page, pictures = paper_report.render(summary(quick=True, cnn=False))
+def test_a_plan_without_the_network_makes_a_page():
+    """Without the CNN its confusions are missing."""
+    page, pictures = paper_report.render(summary(cnn=False))
     assert set(pictures) == {"figure-12"}
-    assert 'class="stop"' in page
     assert "The CNN was not run" in page
 
 
@@ -171,7 +168,7 @@ def test_both_worlds_stand_side_by_side(results: dict[str, Any]):
 
 
 def test_some_methods_are_run_again_and_the_others_stay():
-    """The new result replaces the old. A quick run is not mixed with a full run."""
+    """The new result replaces the old."""
     earlier, new = summary(), summary(cnn=False)
     for row in new["table"]:
         row["right"] = 1
@@ -182,11 +179,9 @@ def test_some_methods_are_run_again_and_the_others_stay():
     assert {row["method"] for row in both["table"] if row["right"] == 1} == {"palpate-reattached"}
     assert len(both["results"]) == len(earlier["results"])
     assert both["several"].keys() == earlier["several"].keys()
-    left = paper_experiment.planned(earlier, [Step(("palpate-reattached",), ("lopo",), (1,), 1)])
+    left = paper_experiment.planned(earlier, [Step(("palpate-reattached",), ("lopo",), (1,))])
     assert {row["method"] for row in left["table"]} == {"palpate-reattached"}
     assert left["confusion"].keys() == {"palpate-reattached"}
-    with pytest.raises(FormatError, match="quick"):
-        paper_experiment.joined(new, earlier | {"quick": True})
 
 
 def test_only_methods_of_the_plan_are_run():
@@ -197,18 +192,12 @@ def test_only_methods_of_the_plan_are_run():
         paper_experiment.narrowed(paper_experiment.FULL_STEPS, ["quant"])
 
 
-@pytest.mark.parametrize(
-    ("parts", "steps"),
-    [
-        (paper_experiment.FULL, paper_experiment.FULL_STEPS),
-        (paper_experiment.QUICK, paper_experiment.QUICK_STEPS),
-    ],
-)
-def test_plans_hold_methods_and_parts_that_exist(parts: Any, steps: Any):
+def test_the_plan_holds_methods_and_parts_that_exist():
     """Every part is run and shown, and every classical accuracy that the paper prints."""
+    steps = paper_experiment.FULL_STEPS
     ran = {(part, m) for step in steps for part in step.parts for m in step.methods}
     assert {m for _, m in ran} <= methods.every().keys()
-    assert {part for part, _ in ran} == set(parts) == set(paper_report.TITLES)
+    assert {part for part, _ in ran} == set(paper_experiment.FULL) == set(paper_report.TITLES)
     assert {(p, m) for p in paper_values.FIGURES for m in paper_values.FIVE} <= ran
     assert ("hard", "paper-cnn") in ran
 
@@ -220,21 +209,21 @@ def test_run_writes_everything_and_goes_on_where_it_was(
     """A second run uses the cached folds and gives the same figures."""
     real, one = "sim:T-REAL:100{w}:2", ("position<=1",)
     parts = {
-        "lopo": StudyCase((real,), "leave:position", one, folds=2),
-        "hard": StudyCase((real, "sim:T-HARD:100{w}:2"), "split:set=0->1", one, folds=1),
-        "lab": StudyCase(("sim:T-LAB:100{w}:2",), "random:2", folds=2),
-        "random": StudyCase((real,), "random:2", one, folds=2),
+        "lopo": StudyCase((real,), "leave:position", one),
+        "hard": StudyCase((real, "sim:T-HARD:100{w}:2"), "split:set=0->1", one),
+        "lab": StudyCase(("sim:T-LAB:100{w}:2",), "random:2"),
+        "random": StudyCase((real,), "random:2", one),
     }
-    step = Step(("L-gauss", "H-svm"), tuple(parts), (1,), 0.1)
-    monkeypatch.setattr(paper_experiment, "QUICK", parts)
-    monkeypatch.setattr(paper_experiment, "QUICK_STEPS", (step,))
+    step = Step(("L-gauss", "H-svm"), tuple(parts), (1,))
+    monkeypatch.setattr(paper_experiment, "FULL", parts)
+    monkeypatch.setattr(paper_experiment, "FULL_STEPS", (step,))
     lines: list[str] = []
-    run = StudyRun(Where(jobs=1, cache=tmp_path / "cache"), lines.append, quick=True)
+    run = StudyRun(Where(jobs=1, cache=tmp_path / "cache"), lines.append)
     results = paper_experiment.results(run)
-    assert 'class="stop"' in published("paper", results, tmp_path).read_text()
+    assert "L-gauss" in published("paper", results, tmp_path).read_text()
     assert len(results["results"]) == 8
     assert len(lines) == 14
-    assert all(" left" in line for line in lines)
+    assert lines[-1].startswith("4/4 random, seed 1")
     kept = {p: p.stat().st_mtime_ns for p in (tmp_path / "cache").iterdir()}
     assert paper_experiment.results(run) == results
     assert kept == {p: p.stat().st_mtime_ns for p in (tmp_path / "cache").iterdir()}

