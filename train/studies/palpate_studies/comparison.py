@@ -19,7 +19,7 @@ def line(what: str, ours: Json, peers: Mapping[str, Json]) -> dict[str, Any]:
     """A line of the table: the best of `peers` by name, chosen in hindsight, the difference, and a
     verdict.
 
-    Entries have `mean`, `low` and `high`. If there are no peers, there is no verdict either.
+    Entries have `mean`, `low` and `high`. Without peers the verdict says so.
     """
     if not peers:
         return {

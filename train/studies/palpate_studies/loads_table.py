@@ -1,4 +1,4 @@
-"""What the loads of taxels gain and cost, in both worlds of the simulator, as the box answers."""
+"""Gain and cost of the loads of taxels, in both worlds of the simulator, as the box answers."""
 
 from __future__ import annotations
 

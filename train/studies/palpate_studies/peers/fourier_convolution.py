@@ -2,7 +2,7 @@
 
 The paper's second convolution is 83 % of its work; here it takes a fifth of the time of PyTorch's
 direct one. The product of spectra is a circular convolution: its edges wrap around, and the padding
-only has to keep what wraps away from what is used.
+only has to keep its edges away from the result.
 """
 
 from __future__ import annotations
