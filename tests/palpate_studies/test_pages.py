@@ -124,16 +124,13 @@ PACKAGED = re.compile(
 
 
 def test_no_document_shows_another_bundle_as_the_packaged_one_or_a_brace():
-    """Examples come from today's bundle. Every picture is on a page."""
+    """Examples come from today's bundle."""
     texts = {name(path): path.read_text("utf-8") for path in MARKDOWN}
     for page, text in texts.items():
         found = {found[found.lastgroup or 0] for found in PACKAGED.finditer(text)}
         assert found <= {score.shipped()}, page
         plain = re.sub(r"(?ms)^```.*?^```|^ {4}.*?$|`[^`]*`|<!--.*?-->", "", text)
         assert re.findall(r"\{[a-z_]*\}", plain) == [], page
-    together = "".join(texts.values())
-    pictures = [*SVG, *DOCS.rglob("*.png")]
-    assert [name(path) for path in pictures if f"{path.name})" not in together] == []
 
 
 def test_the_soak_is_drawn_of_its_results(tmp_path: Path):
