@@ -205,11 +205,6 @@ CAMPAIGNS = {
         _module("tests.campaigns.slow_disk"),
         variables={"OMP_NUM_THREADS": "1"},
     ),
-    "objects": Campaign(
-        "count wrong answers with NEW OBJECT forgotten, by several rules (docs/decisions/0006)",
-        _module("tests.campaigns.objects"),
-        nice=True,
-    ),
     "junk": Campaign(
         "count the answers to sweeps that no one can name, early ones too (docs/decisions/0005)",
         _module("tests.campaigns.junk", "--out", "docs/data/junk.json"),
@@ -220,22 +215,6 @@ CAMPAIGNS = {
         "measure peak memory and time of fit on 1,000 to 100,000 windows (docs/recipe.md)",
         _module("tests.campaigns.fit_memory"),
         variables={"OMP_NUM_THREADS": "1"},
-        nice=True,
-    ),
-    "slide-speed": Campaign(
-        "measure how well the speed of a slide is measured from the counts (docs/decisions/0007)",
-        _module("tests.campaigns.slide_speed"),
-        variables={"OMP_NUM_THREADS": "1"},
-        nice=True,
-    ),
-    "speed-bands": Campaign(
-        "measure whether bands over f/v help the recipe (docs/decisions/0004)",
-        _module("tests.campaigns.speed_bands"),
-        nice=True,
-    ),
-    "fast-slides": Campaign(
-        "measure how much accuracy a faster slide costs (docs/decisions/0004)",
-        _module("tests.campaigns.fast_slides"),
         nice=True,
     ),
     "ros": Campaign(
