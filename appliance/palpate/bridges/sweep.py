@@ -157,8 +157,7 @@ class CommandedSweep:
 
 def _slide(terms: Terms) -> dict[str, float]:
     """The values of START that are not 0."""
-    # a goal of palpate_msgs 1.0 does not have these fields
-    values = {name: getattr(terms, name, 0.0) for name in ("speed_mm_s", "force_n")}
+    values = {"speed_mm_s": terms.speed_mm_s, "force_n": terms.force_n}
     return {name: value for name, value in values.items() if value}
 
 

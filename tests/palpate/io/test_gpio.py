@@ -44,7 +44,7 @@ def test_lines_without_names_are_given_by_chip_and_offset() -> None:
         with pytest.raises(LineError, match=why):
             find_lines(chips, names)
     nameless = SimGpio(VirtualClock(), {CHIP0: ("", "")})
-    with pytest.raises(LineError, match="no line has a name here; give chip and offset"):
+    with pytest.raises(LineError, match="no line has a name"):
         find_lines(nameless, ["START"])
 
 
@@ -114,52 +114,197 @@ class TriggerSetup:
             )
 
 
-# ---------------------------------------------------------------- clean edges
+# ---------------------------------------------------------------- edges, bursts and losses
+TWO_CHIPS = {CHIP0: ("START",), CHIP1: ("STOP",)}
+ONE = {"mode": "one-line", "stop": ""}
+Call = tuple[int, list[tuple[EdgeKind, int]]]
 
 
-def test_two_lines() -> None:
-    """A rise of START is START, a rise of STOP is STOP, with the kernel's time stamps; a rise of
-    NEW is NEW OBJECT, falls have no meaning."""
-    setup = TriggerSetup(new_object="NEW")
-    setup.drive("NEW", 3 * MS + 1, 5 * MS)
-    setup.drive("START", 10 * MS + 7, 30 * MS)
-    setup.drive("STOP", 200 * MS + 13, 220 * MS)
-    assert setup.run(300 * MS) == [
-        (NEW_OBJECT, 3 * MS + 1),
-        (START, 10 * MS + 7),
-        (STOP, 200 * MS + 13),
-    ]
+def us(*times: int) -> list[int]:
+    """Times in microseconds as ns."""
+    return [t * US for t in times]
 
 
-def test_one_line() -> None:
-    """A rise is START and a fall is STOP; a configured stop line is not requested."""
-    setup = TriggerSetup(mode="one-line", stop="NOWHERE")
-    setup.drive("START", 10 * MS + 7, 200 * MS + 13)
-    assert setup.run(300 * MS) == [(START, 10 * MS + 7), (STOP, 200 * MS + 13)]
+def ms(*times: int) -> list[int]:
+    """Times in milliseconds as ns."""
+    return [t * MS for t in times]
 
 
-def test_reported_when_settled() -> None:
-    """A clean edge is reported exactly `glitch_us` after it, and once."""
-    setup = TriggerSetup()
-    setup.drive("START", MS)
-    assert [setup.poll(t) for t in (MS, MS + GLITCH - 1, MS + GLITCH, 9 * MS)] == [
-        [],
-        [],
-        [(START, MS)],
-        [],
-    ]
+CASES: dict[str, tuple[dict[str, Any], dict[str, list[int]], list[Call], dict[str, int]]] = {
+    "two lines; a fall has no meaning": (
+        {"new_object": "NEW"},
+        {
+            "NEW": [3 * MS + 1, 5 * MS],
+            "START": [10 * MS + 7, 30 * MS],
+            "STOP": [200 * MS + 13, 220 * MS],
+        },
+        [(300 * MS, [(NEW_OBJECT, 3 * MS + 1), (START, 10 * MS + 7), (STOP, 200 * MS + 13)])],
+        {},
+    ),
+    "one line; its stop line is not requested": (
+        {"mode": "one-line", "stop": "NOWHERE"},
+        {"START": [10 * MS + 7, 200 * MS + 13]},
+        [(300 * MS, [(START, 10 * MS + 7), (STOP, 200 * MS + 13)])],
+        {},
+    ),
+    "reported once, exactly when settled": (
+        {},
+        {"START": [MS]},
+        [(MS, []), (MS + GLITCH - 1, []), (MS + GLITCH, [(START, MS)]), (9 * MS, [])],
+        {},
+    ),
+    "complete sweeps between two calls": (
+        ONE,
+        {"START": ms(10, 200, 300, 400)},
+        [(500 * MS, list(zip((START, STOP) * 2, ms(10, 200, 300, 400), strict=True)))],
+        {},
+    ),
+    "active low": (
+        ONE | {"active_low": True},
+        {"-START": ms(10, 200)},
+        [(300 * MS, [(START, 10 * MS), (STOP, 200 * MS)])],
+        {},
+    ),
+    "high at start-up": (
+        ONE | {"high": "START"},
+        {"-START": ms(100, 200)},
+        [(50 * MS, []), (300 * MS, [(STOP, 100 * MS), (START, 200 * MS)])],
+        {},
+    ),
+    "bounce keeps the first stamp": (
+        ONE,
+        {"START": [10 * MS + t * US for t in (0, 20, 90, 300, 420, 900, 1300)] + [100 * MS]},
+        [(200 * MS, [(START, 10 * MS), (STOP, 100 * MS)])],
+        {"glitches": 0},
+    ),
+    "a pulse of exactly glitch_us": (
+        ONE,
+        {"START": [10 * MS, 10 * MS + GLITCH]},
+        [(20 * MS, [(START, 10 * MS), (STOP, 10 * MS + GLITCH)])],
+        {},
+    ),
+    **{
+        f"a pulse of {width} ns, {'down' if high else 'up'}": (
+            ONE | ({"high": "START"} if high else {}),
+            {"-START" if high else "START": [10 * MS, 10 * MS + width]},
+            [(20 * MS, [])],
+            {"glitches": 1},
+        )
+        for width in (10 * US, 100 * US, GLITCH - 1)
+        for high in (False, True)
+    },
+    **{
+        f"a clean STOP waits for an older START that bounces, {len(chips)} chips": (
+            {"chips": chips},
+            {"START": us(10_000, 10_400, 10_800, 11_200, 11_600), "STOP": us(10_100)},
+            [
+                (11 * MS, []),
+                (12 * MS, []),
+                (13 * MS, [(START, 10 * MS), (STOP, 10 * MS + 100 * US)]),
+            ],
+            {},
+        )
+        for chips in ({CHIP0: INPUTS}, {CHIP0: ("START",), CHIP1: ("NEW", "STOP")})
+    },
+    "dropped events are one LOST": (
+        ONE | {"queue": 4},
+        {"START": ms(5, *range(10, 17), 30, 40)},
+        [
+            (6 * MS, [(START, 5 * MS)]),
+            (20 * MS, [(LOST, 13 * MS)]),  # the first that was left
+            # it is low now, though a START was reported last
+            (50 * MS, [(START, 30 * MS), (STOP, 40 * MS)]),
+        ],
+        {"lost_edges": 3, "glitches": 0, "storms": 0},
+    ),
+    "a loss upon a loss is only counted": (
+        {"queue": 32},
+        {"START": [10 * MS + i * US for i in range(100)]},
+        [(10 * MS + 49 * US, [(LOST, 10 * MS + 18 * US)]), (10 * MS + 99 * US, []), (20 * MS, [])],
+        {"lost_edges": 50 - 32 + 50 - 32},
+    ),
+    "a loss discards open bursts, after a settled edge": (
+        {"chips": TWO_CHIPS, "queue": 4},
+        {"START": us(*range(5000, 8000, 400)), "STOP": us(5100)},
+        [(5_900 * US, []), (10 * MS, [(STOP, 5_100 * US), (LOST, 6_600 * US)]), (20 * MS, [])],
+        {},
+    ),
+    "nothing counts between a loss and quiet": (
+        {"chips": TWO_CHIPS, "queue": 4},
+        {"STOP": ms(*range(10, 15)), "START": ms(15, 17)},
+        [(20 * MS, [(LOST, 11 * MS)]), (30 * MS, [])],
+        {},
+    ),
+    "storm_edges edges are no storm": (
+        {"storm_edges": 5},
+        {"START": [10 * MS + i * US for i in range(5)]},
+        [(20 * MS, []), (21 * MS, []), (22 * MS, [(START, 10 * MS)])],
+        {"storms": 0},
+    ),
+    "of a storm between two calls the kernel keeps the last": (
+        {},
+        {"START": [*(10 * MS + i * US for i in range(10_000)), 60 * MS]},
+        [(50 * MS, [(LOST, 10 * MS + 8976 * US)]), (51 * MS, []), (70 * MS, [(START, 60 * MS)])],
+        {"lost_edges": 8976},
+    ),
+    "a burst with unread events is not settled": (
+        {"chips": TWO_CHIPS, "storm_edges": 3},  # one event of each chip a call
+        {"START": us(10_000, 10_100, 10_200), "STOP": us(11_000)},
+        [
+            (50 * MS, []),
+            (51 * MS, []),
+            (52 * MS, []),
+            (53 * MS, [(START, 10 * MS), (STOP, 11 * MS)]),
+        ],
+        {"glitches": 0},
+    ),
+    "edges are reported while another chip is read": (
+        {"chips": TWO_CHIPS, "storm_edges": 2},  # one event of each chip a call
+        {"START": ms(10, 20), "STOP": ms(1, 2, 3, 4)},
+        list(
+            zip(
+                ms(*range(50, 56)),
+                [[], [(STOP, MS)], [], [(STOP, 3 * MS)], [(START, 10 * MS)], []],
+                strict=True,
+            )
+        ),
+        {},
+    ),
+    "each of three chips is read in each call": (
+        {"chips": TWO_CHIPS | {"/dev/gpiochip2": ("NEW",)}, "new_object": "NEW", "storm_edges": 2},
+        {"START": [MS]},
+        [(MS, []), (2 * MS, [(START, MS)])],
+        {},
+    ),
+}
+"""Set-up, edges by line ("-": the first is a fall), the edges that a call at a time reports, and
+counters at the end."""
 
 
-def test_start_and_stop_in_one_call() -> None:
-    """Complete sweeps between two calls are reported by the second one, in order."""
-    setup = TriggerSetup(mode="one-line", stop="")
-    setup.drive("START", 10 * MS, 200 * MS, 300 * MS, 400 * MS)
-    assert setup.poll(500 * MS) == [
-        (START, 10 * MS),
-        (STOP, 200 * MS),
-        (START, 300 * MS),
-        (STOP, 400 * MS),
-    ]
+@pytest.mark.parametrize(("how", "edges", "calls", "counters"), CASES.values(), ids=CASES)
+def test_what_calls_report(
+    how: dict[str, Any], edges: dict[str, list[int]], calls: list[Call], counters: dict[str, int]
+) -> None:
+    """Edges with the kernel's time stamps, in order; glitches, losses and storms are counted."""
+    setup = TriggerSetup(**how)
+    for name, times in edges.items():
+        setup.drive(name.removeprefix("-"), *times, level=not name.startswith("-"))
+    assert [(t, setup.poll(t)) for t, _ in calls] == calls
+    for name, count in counters.items():
+        assert getattr(setup.trigger.edge_counters, name) == count
+    assert setup.poll(calls[-1][0] + 10 * MS) == []
+
+
+@pytest.mark.parametrize("step_ns", [US, 10 * US])
+def test_storm(step_ns: int) -> None:
+    """10,000 edges in a burst are one LOST at the first one above the limit; the line works again
+    when it is quiet."""
+    setup = TriggerSetup(**ONE)
+    setup.drive("START", *(10 * MS + i * step_ns for i in range(10_000)))
+    assert setup.run(200 * MS) == [(LOST, 10 * MS + 2000 * step_ns)]
+    assert (setup.trigger.edge_counters.storms, setup.trigger.edge_counters.lost_edges) == (1, 0)
+    setup.drive("START", 300 * MS, 400 * MS)
+    assert setup.run(500 * MS) == [(START, 300 * MS), (STOP, 400 * MS)]
 
 
 def test_both_edges_undebounced() -> None:
@@ -192,51 +337,6 @@ def test_bias(active_low: bool, wanted: str) -> None:
     assert setup.gpio.requests[0].settings[1].bias is gpiod.line.Bias[wanted]
 
 
-def test_active_low() -> None:
-    """With active_low and a pull-up a fall is START; the high level at rest is not an edge."""
-    setup = TriggerSetup(mode="one-line", stop="", active_low=True)
-    setup.drive("START", 10 * MS, 200 * MS, level=False)
-    assert setup.run(300 * MS) == [(START, 10 * MS), (STOP, 200 * MS)]
-
-
-def test_high_at_start_up() -> None:
-    """A line that is high when the box comes up makes no START; its fall is a STOP and its next
-    rise a START."""
-    setup = TriggerSetup(high="START", mode="one-line", stop="")
-    assert setup.run(50 * MS) == []
-    setup.drive("START", 100 * MS, 200 * MS, level=False)
-    assert setup.run(300 * MS) == [(STOP, 100 * MS), (START, 200 * MS)]
-
-
-# ---------------------------------------------------------------- bounce and glitches
-
-
-def test_bounce_keeps_first_stamp() -> None:
-    """A bouncing contact is one START with the stamp of its first edge."""
-    setup = TriggerSetup(mode="one-line", stop="")
-    bounce = [10 * MS + us * US for us in (0, 20, 90, 300, 420, 900, 1300)]
-    setup.drive("START", *bounce, 100 * MS)
-    assert setup.run(200 * MS) == [(START, 10 * MS), (STOP, 100 * MS)]
-    assert setup.trigger.edge_counters.glitches == 0
-
-
-@pytest.mark.parametrize("width_ns", [10 * US, 100 * US, GLITCH - 1])
-@pytest.mark.parametrize("high", [False, True])
-def test_glitch(width_ns: int, high: bool) -> None:
-    """A pulse shorter than `glitch_us`, up or down, is only counted."""
-    setup = TriggerSetup(high="START" if high else "", mode="one-line", stop="")
-    setup.drive("START", 10 * MS, 10 * MS + width_ns, level=not high)
-    assert setup.run(20 * MS) == []
-    assert setup.trigger.edge_counters.glitches == 1
-
-
-def test_pulse_of_glitch_us() -> None:
-    """A pulse of exactly `glitch_us` is an edge."""
-    setup = TriggerSetup(mode="one-line", stop="")
-    setup.drive("START", 10 * MS, 10 * MS + GLITCH)
-    assert setup.run(20 * MS) == [(START, 10 * MS), (STOP, 10 * MS + GLITCH)]
-
-
 def test_level_seen_too_late() -> None:
     """The kernel may read the level too late: the same edge twice is one edge, and a return to the
     level is not an edge."""
@@ -246,20 +346,6 @@ def test_level_seen_too_late() -> None:
     assert setup.trigger.edge_counters.glitches == 1
     setup.queue((True, 4 * MS, 3), (True, 4 * MS + US, 4))
     assert setup.poll(6 * MS) == [(START, 4 * MS)]
-
-
-# ---------------------------------------------------------------- order
-
-
-@pytest.mark.parametrize("chips", [{CHIP0: INPUTS}, {CHIP0: ("START",), CHIP1: ("NEW", "STOP")}])
-def test_order_across_lines(chips: dict[str, tuple[str, ...]]) -> None:
-    """A clean STOP waits for an older START that still bounces, on one chip and on two."""
-    setup = TriggerSetup(chips)
-    setup.drive("START", *(10 * MS + us * US for us in (0, 400, 800, 1200, 1600)))
-    setup.drive("STOP", 10 * MS + 100 * US)
-    assert setup.poll(11 * MS) == []
-    assert setup.poll(12 * MS) == []
-    assert setup.poll(13 * MS) == [(START, 10 * MS), (STOP, 10 * MS + 100 * US)]
 
 
 def test_interrupts_overtake() -> None:
@@ -304,23 +390,6 @@ def test_event_numbers_wrap() -> None:
     assert setup.trigger.edge_counters.lost_edges == 0
 
 
-# ---------------------------------------------------------------- losses and storms
-
-
-def test_overrun() -> None:
-    """Dropped events are counted and reported as one LOST; no edge is derived from the rest or from
-    the level."""
-    setup = TriggerSetup(mode="one-line", stop="", queue=4)
-    setup.drive("START", 5 * MS)
-    assert setup.run(6 * MS) == [(START, 5 * MS)]
-    setup.drive("START", *(t * MS for t in range(10, 17)), level=False)
-    assert setup.poll(20 * MS) == [(LOST, 13 * MS)]  # the first that was left
-    assert setup.trigger.edge_counters.lost_edges == 3
-    setup.drive("START", 30 * MS, 40 * MS)  # it is low now, though a START was reported last
-    assert setup.run(50 * MS) == [(START, 30 * MS), (STOP, 40 * MS)]
-    assert setup.trigger.edge_counters.glitches == setup.trigger.edge_counters.storms == 0
-
-
 def test_blind_until_quiet() -> None:
     """After a loss nothing counts until all lines have been quiet for `glitch_us`; then the levels
     are read again."""
@@ -334,68 +403,6 @@ def test_blind_until_quiet() -> None:
     assert setup.poll(30 * MS) == [(STOP, 20 * MS)]
 
 
-def test_loss_upon_loss() -> None:
-    """A loss is reported as soon as it is certain; further losses before the lines are quiet are
-    only counted."""
-    setup = TriggerSetup(queue=32)
-    setup.drive("START", *(10 * MS + i * US for i in range(100)))
-    assert setup.poll(10 * MS + 49 * US) == [(LOST, 10 * MS + 18 * US)]
-    assert setup.trigger.edge_counters.lost_edges == 50 - 32
-    assert setup.run(20 * MS) == []
-    assert setup.trigger.edge_counters.lost_edges == 100 - 32 - 32
-
-
-def test_loss_ends_what_is_open() -> None:
-    """A loss discards bursts that are still open; a settled edge that waited for them is reported
-    before it."""
-    setup = TriggerSetup({CHIP0: ("START",), CHIP1: ("STOP",)}, queue=4)
-    setup.drive("START", *(t * 100 * US for t in (50, 54, 58, 62, 66, 70, 74, 78)))
-    setup.drive("STOP", 5_100 * US)
-    assert setup.poll(5_900 * US) == []
-    assert setup.poll(10 * MS) == [(STOP, 5_100 * US), (LOST, 6_600 * US)]
-    assert setup.poll(20 * MS) == []
-
-
-def test_nothing_between_loss_and_quiet() -> None:
-    """An edge of another chip that came after the loss is not reported: its STOP might be among the
-    lost events."""
-    setup = TriggerSetup({CHIP0: ("START",), CHIP1: ("STOP",)}, queue=4)
-    setup.drive("STOP", *(t * MS for t in range(10, 15)))
-    setup.drive("START", 15 * MS, 17 * MS)
-    assert setup.poll(20 * MS) == [(LOST, 11 * MS)]
-    assert setup.run(30 * MS) == []
-
-
-@pytest.mark.parametrize("step_ns", [US, 10 * US])
-def test_storm(step_ns: int) -> None:
-    """10,000 edges in a burst are one LOST at the first one above the limit; the line works again
-    when it is quiet."""
-    setup = TriggerSetup(mode="one-line", stop="")
-    setup.drive("START", *(10 * MS + i * step_ns for i in range(10_000)))
-    assert setup.run(200 * MS) == [(LOST, 10 * MS + 2000 * step_ns)]
-    assert (setup.trigger.edge_counters.storms, setup.trigger.edge_counters.lost_edges) == (1, 0)
-    setup.drive("START", 300 * MS, 400 * MS)
-    assert setup.run(500 * MS) == [(START, 300 * MS), (STOP, 400 * MS)]
-
-
-def test_storm_of_just_storm_edges() -> None:
-    """A burst of `storm_edges` edges and not more is an edge or a glitch like any other."""
-    setup = TriggerSetup(storm_edges=5)
-    setup.drive("START", *(10 * MS + i * US for i in range(5)))
-    assert setup.run(20 * MS) == [(START, 10 * MS)]
-
-
-def test_storm_between_two_calls() -> None:
-    """Of 10,000 edges between two calls the kernel keeps the last 1024: one LOST, and all the
-    others counted."""
-    setup = TriggerSetup()
-    setup.drive("START", *(10 * MS + i * US for i in range(10_000)))
-    assert setup.poll(50 * MS) == [(LOST, 10 * MS + 8976 * US)]
-    assert setup.trigger.edge_counters.lost_edges == 8976
-    setup.drive("START", 60 * MS)
-    assert setup.run(70 * MS) == [(START, 60 * MS)]
-
-
 def test_reading_is_bounded() -> None:
     """A call reads no more than `storm_edges` events and leaves the rest to the next one."""
     setup = TriggerSetup(storm_edges=100)
@@ -406,46 +413,12 @@ def test_reading_is_bounded() -> None:
     assert not setup.trigger.blind
 
 
-def test_unread_rest_of_a_burst() -> None:
-    """A burst with events still in the queue is not settled, though the call is long after it."""
-    # one event of each chip a call
-    setup = TriggerSetup({CHIP0: ("START",), CHIP1: ("STOP",)}, storm_edges=3)
-    setup.drive("START", 10 * MS, 10 * MS + 100 * US, 10 * MS + 200 * US)
-    setup.drive("STOP", 11 * MS)
-    reported = [setup.poll((50 + i) * MS) for i in range(5)]
-    assert [edge for edges in reported for edge in edges] == [(START, 10 * MS), (STOP, 11 * MS)]
-    assert reported[0] == reported[1] == []
-    assert setup.trigger.edge_counters.glitches == 0
-
-
-def test_unread_edges_of_another_chip() -> None:
-    """While one chip's queue is being read, edges are reported as they become certain, and later
-    ones wait."""
-    # one event of each chip a call
-    setup = TriggerSetup({CHIP0: ("START",), CHIP1: ("STOP",)}, storm_edges=2)
-    setup.drive("START", 10 * MS, 20 * MS)
-    setup.drive("STOP", *(t * MS for t in (1, 2, 3, 4)))
-    reported = [setup.poll((50 + i) * MS) for i in range(6)]
-    assert reported == [[], [(STOP, 1 * MS)], [], [(STOP, 3 * MS)], [(START, 10 * MS)], []]
-
-
-def test_three_chips() -> None:
-    """Each chip is read in each call, however few edges make a storm."""
-    setup = TriggerSetup(
-        {CHIP0: ("START",), CHIP1: ("STOP",), "/dev/gpiochip2": ("NEW",)},
-        new_object="NEW",
-        storm_edges=2,
-    )
-    setup.drive("START", MS)
-    assert setup.run(5 * MS) == [(START, MS)]
-
-
 def test_chip_pulled_out() -> None:
     """A chip that is unplugged while it is read is a LineError that names its line and the
     errno."""
     setup = TriggerSetup()
     setup.gpio.refuse[CHIP0] = 19
-    with pytest.raises(LineError, match=r"cannot read gpio lines START: .*errno 19.*plug it in"):
+    with pytest.raises(LineError, match="START.*errno 19"):
         setup.poll(MS)
 
 
@@ -547,13 +520,13 @@ def test_find_through_link() -> None:
 
 def test_missing_line() -> None:
     """A missing line is named together with the most similar names."""
-    with pytest.raises(LineError, match=r"no gpio line is named 'GPIO71'; nearest: GPIO17"):
+    with pytest.raises(LineError, match="GPIO71.*GPIO17"):
         find_lines(sim({CHIP0: ("", "ID_SDA", "GPIO17")}), ["GPIO71"])
 
 
 def test_nothing_like_it() -> None:
     """If no name is similar, some existing names are listed."""
-    with pytest.raises(LineError, match=r"'START'; nearest: PA0, PA1, PA2;"):
+    with pytest.raises(LineError, match=r"'START'; nearest: PA0"):
         find_lines(sim({CHIP0: ("PA0", "PA1", "PA2", "PA3")}), ["START"])
 
 
@@ -578,7 +551,7 @@ def test_ambiguous_line(chips: dict[str, tuple[str, ...]], where: str) -> None:
 
 def test_one_line_two_roles() -> None:
     """A line that is given two roles is refused before it is requested."""
-    with pytest.raises(LineError, match="two roles in START, START"):
+    with pytest.raises(LineError, match="START, START"):
         GpioTrigger(trigger_config(stop="START"), sim({CHIP0: INPUTS}))
 
 
@@ -602,10 +575,7 @@ def test_unreadable_chip() -> None:
 
 def test_no_chip() -> None:
     """A machine without GPIO is an error, unless no line is wanted."""
-    with pytest.raises(
-        LineError,
-        match=r"no /dev/gpiochip.*; without lines leave `board` out and set trigger\.mode",
-    ):
+    with pytest.raises(LineError, match=r"no /dev/gpiochip"):
         find_lines(sim({}), ["START"])
     assert find_lines(sim({}), []) == {}
 
@@ -618,7 +588,7 @@ def test_binding_of_libgpiod_1(module: Any) -> None:
     version = getattr(module, "__version__", "of unknown version")
     with pytest.raises(LineError, match=f"module gpiod {version} is not.*pip install 'gpiod>=2'"):
         GpioTrigger(trigger_config(), module)
-    with pytest.raises(LineError, match="is not the libgpiod v2 binding"):
+    with pytest.raises(LineError, match="is not the libgpiod v2"):
         Lines(output_config(), module, VirtualClock())
 
 
@@ -632,9 +602,7 @@ def test_busy_line() -> None:
     """A line that is in use is a LineError with errno 16, and the free lines are released."""
     gpio = sim({CHIP0: ("START",), CHIP1: ("STOP",)})
     with GpioTrigger(trigger_config(stop="", start="STOP", mode="one-line"), gpio):
-        with pytest.raises(
-            LineError, match=r"cannot request gpio lines STOP: .*errno 16.*gpioinfo"
-        ):
+        with pytest.raises(LineError, match="STOP.*errno 16"):
             GpioTrigger(trigger_config(), gpio)
         assert [request.names for request in gpio.requests] == [{0: "STOP"}]
     assert gpio.requests == []
@@ -774,50 +742,7 @@ def test_close_of_a_dead_chip(panel: tuple[SimGpio, VirtualClock, Lines]) -> Non
     gpio, _, lines = panel
     lines.show(ready=True, busy=False, fault=False)
     gpio.refuse[CHIP0] = 19
-    with pytest.raises(LineError, match=r"cannot write gpio lines READY: .*errno 19"):
+    with pytest.raises(LineError, match="READY.*errno 19"):
         lines.close()
     assert gpio.requests == []
     lines.close()
-
-
-# ---------------------------------------------------------------- the double itself
-
-
-def test_double_releases_low(panel: tuple[SimGpio, VirtualClock, Lines]) -> None:
-    """An output that is released while it is high falls, by its pull-down."""
-    gpio, clock, lines = panel
-    lines.show(ready=True, busy=False, fault=False)
-    clock.sleep_until(MS)
-    for request in list(gpio.requests):
-        request.release()
-    assert gpio.written == [(0, "READY", True), (MS, "READY", False)]
-    with pytest.raises(gpiod.RequestReleasedError):
-        lines.show(ready=False, busy=False, fault=False)
-
-
-@pytest.mark.parametrize(("asked", "granted"), [(0, 32), (5, 8), (64, 64), (5000, 1024)])
-def test_double_queues_as_the_kernel(asked: int, granted: int) -> None:
-    """16 events a line unless asked otherwise, rounded up to a power of two, at most 1024; the
-    oldest is dropped."""
-    clock = VirtualClock(0)
-    gpio = SimGpio(clock, {CHIP0: INPUTS})
-    request = gpio.request_lines(
-        CHIP0, {(1, 2): gpiod.LineSettings(edge_detection=gpiod.line.Edge.RISING)}, "", asked
-    )
-    for t_ns in range(2 * granted + 2):
-        gpio.drive("START", t_ns % 2 == 0, t_ns)
-    clock.sleep_until(MS)
-    events = request.read_edge_events(5000)
-    assert [(e.timestamp_ns, e.global_seqno, e.line_seqno) for e in events] == [
-        (2 * i, i + 1, i + 1) for i in range(1, granted + 1)
-    ]
-
-
-def test_double_never_waits() -> None:
-    """Reading from an empty queue, where gpiod would wait for ever, and driving an unknown line are
-    mistakes."""
-    gpio = SimGpio(VirtualClock(), {CHIP0: INPUTS})
-    with pytest.raises(RuntimeError, match="empty queue"):
-        gpio.request_lines(CHIP0, {(1,): gpiod.LineSettings()}).read_edge_events(1)
-    with pytest.raises(ValueError, match="no simulated gpio line is named 'START1'"):
-        gpio.drive("START1", True, 0)

@@ -331,7 +331,7 @@ def test_what_is_not_ok_is_code_zero(status: Status):
 def test_too_few_class_bits():
     """Labels that do not fit the bits are refused at start, with the numbers."""
     lines, _ = lines_on(1)
-    with pytest.raises(ConfigError, match="3 labels and the code 0 do not fit"):
+    with pytest.raises(ConfigError, match="3 labels and the code 0"):
         LineSink(lines, LABELS)
 
 

@@ -80,9 +80,7 @@ def test_names(tmp_path: Path):
     """A misspelt name, a name that leads out of the folder, an empty name. The first folder has
     priority; palpate needs no file; a name with the ending .toml is a file."""
     folder = written(tmp_path, GOOD)
-    with pytest.raises(
-        ConfigError, match=r"skin\.profile = 'oven' has no profile in .*did you mean own"
-    ):
+    with pytest.raises(ConfigError, match=r"skin\.profile = 'oven'"):
         load("oven", [folder])
     for name in ("../own", ""):
         with pytest.raises(ConfigError, match="has no profile"):

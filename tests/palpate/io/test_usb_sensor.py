@@ -133,26 +133,6 @@ def test_serial_number_that_cannot_be_read(code: int):
     assert "absent" not in str(sensor.trouble)
 
 
-def test_unplug_and_replug_in_mid_read():
-    """errno 19 while reading; back again: a new epoch, numbers never look adjacent, and the content
-    is right."""
-    simulated = idle_devices()
-    sensor = sensor_on(simulated)
-    now = simulated.clock.now_ns()
-    simulated.backend.at(now + 2 * SECOND, simulated.backend.unplug)
-    simulated.backend.at(now + 3 * SECOND, simulated.backend.plug)
-    frames = read_for(sensor, simulated, 2.5)
-    assert sensor.state in ("lost", "absent")
-    later = read_for(sensor, simulated, 2)
-    assert sensor.state == "streaming"
-    assert sensor.counters.enumerations == 2
-    assert set(frames.seq >> EPOCH_BITS) == {0}
-    assert set(later.seq >> EPOCH_BITS) == {1}
-    check_content(frames)
-    check_content(later)
-    assert sensor.counters.lost_frames == 0
-
-
 def test_timeouts_with_partial_data():
     """Transfers cut anywhere by a timeout: the parts are joined, no frame is lost or counted."""
     simulated = idle_devices()
@@ -228,18 +208,6 @@ def test_overflow_loses_one_transfer():
     check_content(frames)
 
 
-def test_garbage_on_the_cable():
-    """Corrupted transfers are counted in bytes and frames; intact frames are correct."""
-    simulated = idle_devices()
-    sensor = sensor_on(simulated)
-    count = iter(range(10**6))
-    simulated.backend.mangle = lambda data: bytes(len(data)) if next(count) % 10 == 9 else data
-    frames = read_for(sensor, simulated, 3)
-    assert sensor.counters.garbage_bytes > 0
-    assert sensor.counters.lost_frames == 4 * (next(count) // 10)
-    check_content(frames)
-
-
 def test_a_host_that_pauses_too_long():
     """Two seconds without a read overflow the FIFO: the newest frames come, the gap is counted, and
     the flag OVERFLOW is counted."""
@@ -295,15 +263,6 @@ def test_a_skin_with_three_axes(acm: bool):
     flat = sensor_on(simulated, replace(pillars, axes=1))
     read_for(flat, simulated, 1)
     assert "the skin sends 3x3x3 float32" in str(flat.trouble)
-
-
-def test_frames_with_other_axes_than_announced():
-    """A skin that announces one axis and sends three: mismatch, naming both."""
-    simulated = idle_devices(format=replace(FMT, axes=3))
-    simulated.backend.board.skin = replace(simulated.backend.board.skin, axes=1)
-    sensor = sensor_on(simulated)
-    read_for(sensor, simulated, 1)
-    assert "the skin sent 4x4x3 uint8, but it had announced 4x4 uint8" in str(sensor.trouble)
 
 
 def test_a_board_that_answers_nonsense(monkeypatch: pytest.MonkeyPatch):
