@@ -199,7 +199,7 @@ def test_canceled_and_not_answered(swept: Swept, monkeypatch: pytest.MonkeyPatch
 def test_no_answer_in_time(swept: Swept):
     """The reason names the time limit, and the box is not left with an open sweep."""
     swept.box.script = saying()
-    with pytest.raises(NoAnswer, match="timeout_s = 0.3"):
+    with pytest.raises(NoAnswer, match=r"timeout_s = 0\.3"):
         swept.run(timeout_s=0.3)
     assert swept.has_heard("START", "STOP", "ABORT")
 
@@ -228,7 +228,7 @@ def test_a_box_that_falls_silent(swept: Swept):
     """Without a sentence for 3.5 s the sweep ends, long before its time limit."""
     swept.use(Hurried())
     swept.box.script = saying()
-    with pytest.raises(NoAnswer, match="nothing for 3.5 s"):
+    with pytest.raises(NoAnswer, match=r"nothing for 3\.5 s"):
         swept.run(slide_s=0.0, timeout_s=1000.0)
     assert swept.has_heard("START", "ABORT")
 
@@ -253,7 +253,7 @@ def test_a_box_that_refuses(swept: Swept):
         if s.kind == "START"
         else obeying(s)
     )
-    with pytest.raises(CommandRefused, match="trigger.mode"):
+    with pytest.raises(CommandRefused, match=r"trigger\.mode"):
         swept.run()
     assert swept.has_heard("START")
 

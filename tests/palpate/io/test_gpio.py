@@ -418,7 +418,7 @@ def test_chip_pulled_out() -> None:
     errno."""
     setup = TriggerSetup()
     setup.gpio.refuse[CHIP0] = 19
-    with pytest.raises(LineError, match="START.*errno 19"):
+    with pytest.raises(LineError, match=r"START.*errno 19"):
         setup.poll(MS)
 
 
@@ -520,7 +520,7 @@ def test_find_through_link() -> None:
 
 def test_missing_line() -> None:
     """A missing line is named together with the most similar names."""
-    with pytest.raises(LineError, match="GPIO71.*GPIO17"):
+    with pytest.raises(LineError, match=r"GPIO71.*GPIO17"):
         find_lines(sim({CHIP0: ("", "ID_SDA", "GPIO17")}), ["GPIO71"])
 
 
@@ -602,7 +602,7 @@ def test_busy_line() -> None:
     """A line that is in use is a LineError with errno 16, and the free lines are released."""
     gpio = sim({CHIP0: ("START",), CHIP1: ("STOP",)})
     with GpioTrigger(trigger_config(stop="", start="STOP", mode="one-line"), gpio):
-        with pytest.raises(LineError, match="STOP.*errno 16"):
+        with pytest.raises(LineError, match=r"STOP.*errno 16"):
             GpioTrigger(trigger_config(), gpio)
         assert [request.names for request in gpio.requests] == [{0: "STOP"}]
     assert gpio.requests == []
@@ -742,7 +742,7 @@ def test_close_of_a_dead_chip(panel: tuple[SimGpio, VirtualClock, Lines]) -> Non
     gpio, _, lines = panel
     lines.show(ready=True, busy=False, fault=False)
     gpio.refuse[CHIP0] = 19
-    with pytest.raises(LineError, match="READY.*errno 19"):
+    with pytest.raises(LineError, match=r"READY.*errno 19"):
         lines.close()
     assert gpio.requests == []
     lines.close()
