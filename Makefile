@@ -42,7 +42,8 @@ test: $(TOOLS) ## run the tests, without those marked `thorough`
 	TMPDIR=$(SCRATCH) $(PYTEST) --dist worksteal -m "not thorough"
 
 test-fast: $(TOOLS) ## run the tests that are neither `slow` nor `thorough`
-	TMPDIR=$(SCRATCH) $(PYTEST) --dist worksteal -m "not slow and not thorough"
+	TMPDIR=$(SCRATCH) $(PYTEST) --dist worksteal -m "not slow and not thorough" \
+	  $(PYTEST_OPTIONS)
 
 test-all: test ## run all tests; those on real sweeps need their folder in PALPATE_DATA
 	$(PYTEST) --dist loadfile -m thorough
@@ -84,10 +85,11 @@ install: $(FLEET) ## install or upgrade Debian boxes, HOST= or HOSTS=; BOARD=rpi
 	$(BIN)/python systemd/install.py $(WHERE) $(if $(value BOARD),--board $(call quoted,BOARD)) \
 	  $(if $(value SIGNERS),--signers $(call quoted,SIGNERS)) $(if $(filter 0,$(TEACH)),--no-teach)
 
-deb: $(FLEET) $(DESKTOP) ## pack the same as dist/palpate_*.deb for arm64 and amd64, with a list of what is in it
+deb: $(FLEET) $(DESKTOP) ## pack the same as dist/palpate_*.deb for arm64 and amd64, a list of what is in it, and the notes
 	$(WHEELS)
 	$(BIN)/python systemd/debian.py dist
 	PYTHONPATH=. $(BIN)/python systemd/sbom.py dist/palpate.cdx.json
+	awk '/^## / { part++ } part == 1' CHANGELOG.md >dist/notes.md
 
 clean: ## remove everything that was built, the virtual environment too
 	rm -rf $(VENV) build dist *.egg-info appliance/*.egg-info train/*.egg-info train/studies/*.egg-info

@@ -143,6 +143,11 @@ CAMPAIGNS = {
         prepare=containers,
         variables={"PALPATE_SYSTEMD": "1"},
     ),
+    "debian13": Campaign(
+        "run the fast tests in a Debian 13 with Python 3.13 (as root; 6 GB)",
+        _module("tests.campaigns.debian13"),
+        prepare=containers,
+    ),
     "machines": Campaign(
         "run the same bundles on older x86 and on arm64, both emulated (190 MB)",
         (*PYTEST, "-rP"),

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
+
+import pytest
 
 from palpate.deployment.enrolment_key import EnrolmentKey
 from tests.factories.paths import ROOT
@@ -31,6 +34,8 @@ def run_here(code: str) -> str:
 
 def enrolment_key(folder: Path) -> EnrolmentKey:
     """The box's key for enrolments, as the install makes it, but owned by this user."""
+    if not shutil.which("ssh-keygen"):
+        pytest.skip("needs ssh-keygen (apt-get install openssh-client)")
     made = f"enrolment_key.make({str(folder)!r}, os.getuid(), os.getgid())"
     code = f"import enrolment_key, os; print({made})"
     subprocess.run(["bash", "-euc", run_here(code)], check=True, capture_output=True, timeout=120)

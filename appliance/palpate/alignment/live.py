@@ -30,7 +30,7 @@ SHOWN = 10
 """Initial value of the strongest load shown, in multiples of the contact threshold."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Expected:
     """The skin as the bundle describes it.
 

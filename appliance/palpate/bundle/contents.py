@@ -13,7 +13,7 @@ from palpate.bundle.manifest import Manifest
 from palpate.core.types import SweepFormat
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class DisplacedClasses:
     """The classes for sweeps whose contact is displaced, in a turned embedding in which these
     sweeps have covariance 1.
@@ -27,7 +27,7 @@ class DisplacedClasses:
     shapes: NDArray[np.float16]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class EarlyClasses:
     """The classes after each of D steps of an unfinished sweep. means: float32 [D, K, r]. shapes:
     float16 [D, r, r] of all materials together, see Classes."""
@@ -36,7 +36,7 @@ class EarlyClasses:
     shapes: NDArray[np.float16]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Classes:
     """Content of means.npz: the class means in the embedding, in the order of the labels.
 
@@ -79,7 +79,7 @@ class Classes:
         return arrays | ({"changes": self.changes} if len(self.changes) else {})
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class AddedLabels:
     """Content of enrolment.npz: the labels that a box has enrolled into a bundle, in the order of
     enrolment.
@@ -105,7 +105,7 @@ class AddedLabels:
     least: float | None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Bundle:
     """A bundle whose files agree with its manifest.
 

@@ -142,7 +142,7 @@ def shown(shape: Sequence[int]) -> str:
     return "x".join(map(str, shape))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Frames:
     """n frames: t_ns int64 [n] host monotonic, seq int64 [n] unwrapped numbers, taxels [n, R, C] or
     [n, R, C, A] raw counts. finger: whose skin sent them, "" in a box with one skin."""
@@ -244,7 +244,7 @@ class Sweep:
     fingers: tuple[Sweep, ...] | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Verdict:
     """The answer to one sweep.
 

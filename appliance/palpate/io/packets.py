@@ -58,7 +58,7 @@ class Request(IntEnum):
     STOP = 4
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Packet:
     """Consecutive frames. seq, t_us: sequence number and time of the first frame, 32 bits as sent.
     flags: bits of Flag. taxels: raw counts [n, R, C] or [n, R, C, A]."""

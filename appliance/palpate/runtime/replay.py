@@ -76,7 +76,7 @@ class ReplayRule:
                 raise TypeError(f"{name} {value!r} is not one of {', '.join(known)}")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class KeptSweep:
     """A kept sweep with the content of its sidecar; without a bundle it has fewer entries.
 

@@ -135,7 +135,7 @@ def places(mask: Mask) -> str:
     return "taxel " + " ".join(f"{r + 1}.{c + 1}" for r, c in np.argwhere(mask))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Comparison:
     """A stretch of the signal, each value of a frame beside the values of its neighbours on the
     same axis.

@@ -16,7 +16,7 @@ TRIPLES = 100
 change the result by less than a tenth."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class TaxelStatistics:
     """Statistics of a stretch of T frames with V values each, in the order of a frame.
 

@@ -31,7 +31,7 @@ LEAST_SHARE = 0.1
 is noise."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class UnloadedSkin:
     """The skin without contact. level, noise: mean and standard deviation of the counts of each
     taxel, of the shape of a frame. contact: least difference from `level` that is a load, in

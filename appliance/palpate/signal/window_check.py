@@ -45,7 +45,7 @@ class WindowLimits:
     dead_taxels: int = 0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Finding:
     """Result of the check of a window: status ok, or another status with the taxels in `detail`.
 

@@ -63,7 +63,7 @@ class SkippingClock:
         self._skipped_ns += max(0, t_ns - self.now_ns())
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Act:
     """One sweep of the robot. frames: raw counts [n, R, C] or [n, R, C, A]. start, stop: frames at
     which its edges come. label: the material. new_object: NEW OBJECT comes with the first frame.

@@ -24,7 +24,7 @@ MOST_BYTES = 1 << 20
 """Fields of a window."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Window:
     """The window of a sweep. taxels: raw counts [T, R, C] or [T, R, C, A]."""
 

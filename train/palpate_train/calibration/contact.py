@@ -34,7 +34,7 @@ the centre by this much (0.5 mm of 4 mm include over 95 % of the simulated attac
 or equal positions suggest less."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class ContactLimit:
     """The load from which a taxel is in contact.
 
@@ -51,7 +51,7 @@ class ContactLimit:
         return tuple(self.tare.ravel().tolist()) if self.tare.any() else ()
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class ContactCentres:
     """Centres of contact in training, in taxels. centres: [P, 2], row and column. limit: distance
     from the nearest centre up to which a contact is in place."""

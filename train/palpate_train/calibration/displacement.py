@@ -30,7 +30,7 @@ NEVER = 1.01
 """A least probability that no sweep reaches."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class AugmentedCopies:
     """Augmented copies of sweeps: features [M, F], labels [M], source [M], the number of the sweep
     of each.

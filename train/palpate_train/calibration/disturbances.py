@@ -91,7 +91,7 @@ class DisturbanceMeter:
         return np.array([disturbances.speed(self._slide(window).taxels_s) for window in samples])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Tried:
     """Copies with one disturbance: labels, embeddings and sizes; more: the change of the size by
     the alteration; moved: that of the embedding."""
@@ -119,7 +119,7 @@ class _Tried:
         return _Tried(*(getattr(self, name)[kept] for name in self.__dataclass_fields__))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class AllowanceFit:
     """Allowances, and the changes [D, K, r] of the means in each embedding. figures: by
     disturbance the furthest value, the share of judged copies within the limit before and after,
@@ -130,7 +130,7 @@ class AllowanceFit:
     figures: dict[str, Any]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Judge:
     """Judges allowances by copies that training has not seen. shapes: [K, r, r] of the class means
     [K, r]; limit: of known materials."""

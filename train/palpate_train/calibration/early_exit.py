@@ -41,7 +41,7 @@ MAX_SHARE = 0.95
 """Largest mean share of the window that a rule may need."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Heads:
     """One linear head for each step: logits = z @ weight + bias. weight: float32 [D, r, K]; bias:
     float32 [D, K]."""

@@ -58,7 +58,7 @@ class HeadPart:
         return weight * np.float32(self.factor), bias * np.float32(self.factor)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class HeadData:
     """Sweeps that a head is fitted to. features: [N, F], labels [N]. copied: [M, F] of augmented
     copies; source: the number [M] of the sweep of each copy. conditions: int [N, C], the value of

@@ -33,7 +33,7 @@ FLAT = 1e-9
 finite."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Embedding:
     """z = features @ projection + offset. offset: float32 [r]; means: float32 [K, r], of each
     label.
@@ -231,7 +231,7 @@ def embed_present(features: Array, labels: Array, fixed: int = 0) -> tuple[Embed
     return in_two_views(features, numbered, fixed), present
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Whitening:
     """W [F, F] with W' C W = 1, where C is the covariance within materials: a diagonal matrix plus
     a matrix of a few directions.

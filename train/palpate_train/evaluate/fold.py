@@ -57,7 +57,7 @@ COUNTED = ("palpate_train", "palpate_studies", "palpate.signal")
 with the desktop's."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class BoxAnswers:
     """The answers of the box to n sweeps. labels: int [n], or REFUSED or UNKNOWN of
     palpate_train.metrics.answers. sure: bool [n], whether it is certain of the label."""
@@ -76,7 +76,7 @@ AsTheBox = Callable[[methods.Model, Dataset], BoxAnswers | None]
 pack."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FoldTask:
     """One fold. train, test: numbers of sweeps. as_the_box: a function of a module, or None to
     leave the box's answers out."""
@@ -93,7 +93,7 @@ class FoldTask:
         return replace(self, effort=replace(self.effort, unfinished=path))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Fold:
     """The result of one fold.
 

@@ -39,7 +39,7 @@ NONE_LEFT_OUT = -1
 """The value of left_out if no material is left out."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CaseTask:
     """One training. train, test: numbers of sweeps. left_out: a material, or NONE_LEFT_OUT."""
 
@@ -52,7 +52,7 @@ class CaseTask:
     left_out: int = NONE_LEFT_OUT
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Case:
     """The result of one training. left_out: the material without training sweeps. fixed: number of
     features that were not trained; they are the last ones.
@@ -158,7 +158,7 @@ def learn(task: CaseTask, sweeps: Dataset) -> Case:
     )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Trainings:
     """The sweeps of a study and its folds, pairs (training, test) of sweep numbers."""
 

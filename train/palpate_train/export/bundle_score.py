@@ -71,7 +71,7 @@ def labels_of(
     return answers, ok
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class BundleScore:
     """The answers of a bundle to the sweeps of a set.
 

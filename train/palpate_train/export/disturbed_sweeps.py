@@ -37,7 +37,7 @@ COPIES = 360
 """Largest number of copies of each kind; of judged sweeps there are as many at most."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Widened:
     """Shapes of materials that alterations have widened.
 

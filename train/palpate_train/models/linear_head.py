@@ -31,7 +31,7 @@ SHARPENING = 30.0
 be sharpened."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LinearHeadModel:
     """A trained model: features that a graph computes, and a linear head with the temperature
     folded in.

@@ -70,7 +70,7 @@ SHADES = LinearSegmentedColormap.from_list("shades", [to_rgba(ACCENT, 0.0), to_r
 """From transparent to the accent, so that an image fits a light and a dark page."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ShownSweep:
     """One sweep with its title and notes.
 

@@ -144,7 +144,7 @@ def estimate(right: Array, clusters: Array) -> dict[str, float]:
     }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class JudgedSize:
     """A size with its answers to the held-out sweeps. named: int [n], their labels. trunk: of the
     stages, None without stages."""
@@ -154,7 +154,7 @@ class JudgedSize:
     named: Array
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Judgement:
     """All sizes on the same held-out sweeps.
 

@@ -105,7 +105,7 @@ FULL_STEPS = (
 )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Outcome:
     """The result of a method in a case with one seed: labels [n] and logits [n, K] of the tested
     sweeps.

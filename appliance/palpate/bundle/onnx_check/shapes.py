@@ -42,7 +42,7 @@ Shape = tuple[int, ...]
 Out = tuple[str, Shape]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Value:
     """A tensor. kind: type, of KINDS. numbers: of a constant of the file. index: an int64 that is
     never negative."""

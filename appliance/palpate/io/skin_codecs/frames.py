@@ -26,7 +26,7 @@ class Rest:
     layout: Any = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Decoded:
     """The content of bytes.
 

@@ -25,7 +25,7 @@ _LOW_32 = np.uint64(0xFFFFFFFF)
 Span = tuple[int, int]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class PtsLayout:
     """Offsets in the content of a packet. size: its bytes. clock: offset of count and time.
     numbers: offsets of the bytes of all numbers of all pillars. fixed: offsets of the bytes that

@@ -42,7 +42,7 @@ SHARES = (0.1, 0.9)
 uniformly."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Bank:
     """Filters for one format, in the order of `free`, then `dilations`.
 

@@ -39,7 +39,7 @@ NUMBERS = ("temperature", "class_mean_temperature", "limit")
 """Attributes of a Calibration that are numbers."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class HeldOut:
     """Answers to the held-out sweeps, by heads and embedding that were fitted without the sweep's
     value of one condition.
@@ -68,7 +68,7 @@ class HeldOut:
         return Answers(np.where(self.known, labels, UNKNOWN), ok, fused, labels)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Calibration:
     """The calibration of a trunk.
 
@@ -156,7 +156,7 @@ class Calibration:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CalibrationInputs:
     """Features that a calibration is fitted to.
 

@@ -35,7 +35,7 @@ chosen."""
 Columns = tuple[int, ...]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ScoredPlan:
     """A candidate with its scores. logits: [n, K] of the held-out sweeps at the best temperature.
     losses: cross entropy [n] of each."""
@@ -207,7 +207,7 @@ def _error(x: Array) -> float:
     return float(np.sqrt(len(x) / max(len(x) - 1, 1) * ((x - x.mean()) ** 2).sum()))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FeatureColumns:
     """Numbers of the features of a trunk, by their source.
 

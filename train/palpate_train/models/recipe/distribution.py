@@ -36,7 +36,7 @@ APART = 1e-3
 never equal it."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Levels:
     """taxels: int [n], ascending, the taxels that are used. levels: float32 [SIGNALS, n, k], of
     scaled counts."""

@@ -56,7 +56,7 @@ ONE_IN = 10
 shares."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Fit:
     """A fitted trunk with its heads.
 
@@ -274,7 +274,7 @@ def _augmented_copies(fit: Fit) -> AugmentedCopies:
     )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FittedModel:
     """A fit as the box runs it.
 

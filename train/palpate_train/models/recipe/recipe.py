@@ -98,7 +98,7 @@ class Settings:
     most: int = MOST_SWEEPS
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Trunk:
     """A trunk without heads, for sweeps of one set. weights: of stages and bank, as
     graph.trunk_graph takes them."""

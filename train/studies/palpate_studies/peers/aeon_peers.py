@@ -38,7 +38,7 @@ Fit = Callable[[Array, Array, int], Callable[[Array], Array]]
 [n, k]."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class AeonModel:
     """A classifier of aeon. scores: see Fit; present [k]: labels that were trained, among
     `classes`."""

@@ -1,0 +1,81 @@
+"""The fast tests in a Debian 13 with its Python 3.13, as on a Raspberry Pi of today.
+
+`python -m tests.campaigns debian13 [OPTION ...]` runs them as root on a clone of the last commit;
+options go to pytest. The Debian with its virtual environment is made once, in ~/.cache/palpate: it
+takes some minutes and 6 GB.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shlex
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from tests.factories.emulated_machines import HOME, ROOT, Missing, run, whole
+
+SUITE = "trixie"
+PACKAGES = ("ca-certificates", "git", "libusb-1.0-0", "make", "openssh-client", "python3-venv")
+LOCKS = ("appliance/requirements.lock", "train/desktop.lock", "tests/tools.lock")
+SHARED = ("/etc/resolv.conf", "/etc/ssl/certs", "/dev", "/sys")
+"""Of this machine, for its network and its devices."""
+SOURCE, VENV = "/palpate/source", "/palpate/venv"
+ENTER = """
+mount --make-rprivate /
+for path in {shared}; do mount --rbind "$path" "$0$path"; done
+mount -t proc proc "$0/proc"
+exec chroot "$0" env -i {env} sh -euc "$1"
+"""
+
+
+def inside(root: Path, command: str) -> int:
+    """Run a shell command in the Debian, with the network of this machine; its exit code."""
+    kept = {name: value for name, value in os.environ.items() if name.startswith("PIP_")}
+    env = kept | {"HOME": "/root", "LANG": "C.UTF-8", "PATH": "/usr/sbin:/usr/bin:/sbin:/bin"}
+    words = " ".join(f"{name}={shlex.quote(value)}" for name, value in env.items())
+    script = ENTER.format(shared=" ".join(SHARED), env=words)
+    apart = ("unshare", "--mount", "--pid", "--fork", "--kill-child", "sh", "-euc", script)
+    return subprocess.run([*apart, root, command], check=False).returncode
+
+
+def folder() -> Path:
+    """The folder of the Debian; it depends on its packages and on the locks."""
+    total = hashlib.sha256(repr((SUITE, PACKAGES, SHARED)).encode())
+    for name in (*LOCKS, "pyproject.toml", "train/pyproject.toml"):
+        total.update((ROOT / name).read_bytes())
+    return HOME.parent / "debian13" / total.hexdigest()[:16]
+
+
+def _clone(root: Path) -> None:
+    source = root / SOURCE[1:]
+    run("rm", "-rf", source)
+    run("git", "clone", "-q", "--depth", "1", f"file://{ROOT}", source)
+
+
+def _make(root: Path) -> None:
+    options = ("--variant=minbase", "--format=directory", "--aptopt=Acquire::Languages none")
+    run("mmdebstrap", *options, f"--include={','.join(PACKAGES)}", SUITE, root)
+    (root / "etc" / "resolv.conf").touch()
+    _clone(root)
+    if inside(root, f"cd {SOURCE}; make VENV={VENV} {VENV}/tools.done"):
+        raise Missing("the virtual environment in Debian 13 could not be made")
+
+
+def main(options: Sequence[str]) -> int:
+    """Run the fast tests there; the exit code of pytest."""
+    if os.geteuid():
+        raise Missing("a Debian needs root; use sudo")
+    root = whole(folder(), _make)
+    _clone(root)
+    more = shlex.quote(shlex.join(options))
+    return inside(root, f"cd {SOURCE}; make VENV={VENV} PYTEST_OPTIONS={more} test-fast")
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main(sys.argv[1:]))
+    except Missing as e:
+        sys.exit(str(e))
