@@ -154,6 +154,10 @@ CAMPAIGNS = {
         paths=("tests/campaigns/test_machines.py",),
         variables={"PALPATE_MACHINES": "1"},
     ),
+    "processors": Campaign(
+        "run the tests with the arithmetic of other processors, and on a busy machine",
+        _module("tests.campaigns.processors"),
+    ),
     "lock": Campaign(
         "lock the versions of all packages again, with uv, which has to be installed",
         _module("tests.campaigns.lock"),

@@ -1,0 +1,55 @@
+"""The numerical tests with the arithmetic of other processors, and all fast tests beside busy loops.
+
+`python -m tests.campaigns processors [OPTION ...]` runs pytest once for each kind of processor that
+OpenBLAS knows and this one can imitate, with one thread and with eight, and once beside BUSY
+endless loops; options go to pytest. Takes a quarter of an hour on two cores.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from itertools import product
+from pathlib import Path
+
+from tests.factories.paths import ROOT
+
+KINDS = {"Nehalem": "sse4_2", "Haswell": "avx2", "Zen": "avx2", "SkylakeX": "avx512f"}
+"""Names of OPENBLAS_CORETYPE, each with the flag of /proc/cpuinfo that it needs."""
+THREADS = ("1", "8")
+BUSY = 8
+NUMERICAL = ("tests/palpate/signal", "tests/palpate/inference", "tests/palpate_train")
+FAST = ("-m", "pytest", "-q", "-n", str((os.cpu_count() or 1) + 1), "--dist", "worksteal")
+FAST += ("-m", "not slow and not thorough")
+
+
+def tested(paths: Sequence[str], **variables: str) -> bool:
+    """Run the fast tests of these paths with these variables; whether they passed."""
+    print(f"== {variables or f'beside {BUSY} busy loops'}", flush=True)
+    command = [sys.executable, *FAST, *paths]
+    return not subprocess.run(command, cwd=ROOT, env=os.environ | variables, check=False).returncode
+
+
+def main(options: Sequence[str]) -> int:
+    """Run all; 1 if a test failed."""
+    flags = Path("/proc/cpuinfo").read_text().split()
+    able = [kind for kind, flag in KINDS.items() if flag in flags]
+    if left := KINDS.keys() - able:
+        print(f"this processor cannot imitate {', '.join(sorted(left))}")
+    passed = [
+        tested((*NUMERICAL, *options), OPENBLAS_CORETYPE=kind, OPENBLAS_NUM_THREADS=threads)
+        for kind, threads in product(able, THREADS)
+    ]
+    loops = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(BUSY)]
+    try:
+        passed.append(tested(options))
+    finally:
+        for loop in loops:
+            loop.kill()
+    return 0 if all(passed) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
