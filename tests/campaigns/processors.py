@@ -1,4 +1,4 @@
-"""The numerical tests with the arithmetic of other processors, and all fast tests beside busy loops.
+"""The numerical tests with the arithmetic of other processors, and all fast tests under load.
 
 `python -m tests.campaigns processors [OPTION ...]` runs pytest once for each kind of processor that
 OpenBLAS knows and this one can imitate, with one thread and with eight, and once beside BUSY
