@@ -296,36 +296,6 @@ def test_settings_that_cannot_be(options: dict[str, Any], message: str) -> None:
     assert ended.returncode == 1
 
 
-def test_the_page_has_the_budget_that_is_calculated() -> None:
-    """Each line of README.md's table is one that `budget.py` prints, and its measurements run."""
-    done = pico.run("budget.py")
-    lines = done.stdout.splitlines()
-    table = [line for line in lines if line.startswith("|")]
-    page = (pico.FIRMWARE / "README.md").read_text()
-    assert len(table) == 3
-    assert all(line in page for line in table), done.stdout + done.stderr
-    assert sum(line.startswith("measured here: ") for line in lines) == 3
-    assert lines[-1] == "a reading is measured on a Pico alone"
-
-
-def test_the_page_names_pins_and_settings_as_they_are() -> None:
-    """The wiring table and the settings agree, and settle times are those of the budget."""
-    done = pico.run(
-        "-c",
-        "import settings, budget; print(settings.ROW_PINS, settings.COL_PINS, settings.ADC_PIN, "
-        "settings.SERVICE_PIN, settings.SETTLE_US, budget.settle_us(8), budget.settle_us(12))",
-    )
-    assert done.stdout.startswith("(2, 3, 4, 5) (6, 7, 8, 9) 26 22 5 4.39"), done.stderr
-    page = (pico.FIRMWARE / "README.md").read_text()
-    for row in (
-        "| GP2, GP3, GP4, GP5 | 4, 5, 6, 7 |",
-        "| GP6, GP7, GP8, GP9 |",
-        "| GP26 / ADC0 |",
-        "| GP22 |",
-    ):
-        assert row in page
-
-
 CTRL_C = """
 import sys
 sys.path.append({folder!r})  # after the folder of the firmware, which has settings, too

@@ -225,14 +225,12 @@ def test_hardware_that_is_not_there_is_looked_for_again(machine: Machine, servic
 
 
 def test_a_stop_answers_the_open_sweep(machine: Machine, service: Service):
-    """The open sweep is answered `aborted`, and the program ends well within the limit."""
+    """The open sweep is answered `aborted`, and systemd does not have to kill the program."""
     service.start()
     end = time.monotonic() + WAIT_S
     while not (status := service.status()).get("sweeping") or not status["answered"]:
         assert time.monotonic() < end, status
-    begin = time.monotonic()
     machine.get("systemctl", "stop", "palpate")
-    assert time.monotonic() - begin < 10
     assert "palpate.service: Deactivated successfully." in service.journal()
     answers = service.answers()
     assert [line.split(":")[0] for line in answers] == [

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -35,12 +34,10 @@ def test_results_come_back_in_order(make: Callable[[], AtOnce | DiskThread]):
 
 
 def test_work_beyond_the_bound_is_refused_counted_and_told(logged: list[str]):
-    """The caller does not wait; the loss is logged once, and so is its end."""
+    """The caller does not wait, or the test would not end. The loss is logged once, as is its end."""
     disk, free = held()
     done: list[int] = []
-    began = time.monotonic()
     accepted = [disk(lambda n=n: n, done.append) for n in range(5)]
-    assert time.monotonic() - began < 1
     assert accepted == [True, True, False, False, False]
     assert (disk.refused, "3 times" in disk.text) == (3, True)
     free.set()
