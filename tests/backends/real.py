@@ -21,7 +21,7 @@ class Real:
 
     gpio = gpiod
     backend = None  # None: pyusb picks libusb
-    slack_s = 2.0  # a shared machine may stall for a second
+    slack_s = 30.0  # a busy machine may stall for seconds
     pulse_s = 0.02
     sensor: SkinConfig
     format: SweepFormat = skin.FORMAT
