@@ -34,7 +34,7 @@ def test_results_come_back_in_order(make: Callable[[], AtOnce | DiskThread]):
 
 
 def test_work_beyond_the_bound_is_refused_counted_and_told(logged: list[str]):
-    """The caller does not wait, or the test would not end. Its loss is logged once, as is its end."""
+    """The caller does not wait, or the test would not end. The loss and its end are logged once."""
     disk, free = held()
     done: list[int] = []
     accepted = [disk(lambda n=n: n, done.append) for n in range(5)]
