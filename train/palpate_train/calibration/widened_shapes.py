@@ -48,7 +48,7 @@ MOST_LEFT_OUT = 12
 """Largest number of materials that are left out in turn to choose this weight."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class DisturbedSweeps:
     """Embeddings of sweeps and of altered copies of some of them.
 
@@ -78,7 +78,7 @@ class DisturbedSweeps:
         return DisturbedSweeps(self.z[kept], numbered, copies)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Space:
     """An embedding with class means [K, r]. untrained: [r, b], multiplies differences of embeddings
     to give differences of the features that were not trained; of all if it is not known."""
@@ -99,7 +99,7 @@ class Space:
         return differing(means)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scatters:
     """Scatter of each material in a space. own: covariances [K, r, r] of its sweeps around its
     mean. by_kind: second moments [K, r, r] of the changes by each kind of alteration."""
