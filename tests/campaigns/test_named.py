@@ -62,7 +62,7 @@ def test_files_name_targets_that_exist():
 def test_files_name_campaigns_and_studies_that_exist():
     """The same for campaigns and studies."""
     names = set(campaigns.CAMPAIGNS)
-    assert unknown(r"(?:-m tests\.campaigns|\$campaign) ([a-z][a-z-]*)", names) == []
+    assert unknown(r"(?:-m tests\.campaigns|\$campaign) ([a-z][a-z0-9-]*)", names) == []
     studies = {*PROGRAM.commands}
     assert unknown(r"(?:-m palpate_studies|\$study) ([a-z][a-z-]*)", studies) == []
 
