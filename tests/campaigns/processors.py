@@ -1,8 +1,8 @@
 """The numerical tests with the arithmetic of other processors, and all fast tests under load.
 
 `python -m tests.campaigns processors [OPTION ...]` runs pytest once for each kind of processor that
-OpenBLAS knows and this one can imitate, with one thread and with eight, and once beside BUSY
-endless loops; options go to pytest. Takes a quarter of an hour on two cores.
+OpenBLAS knows and this one can imitate, with one thread or with eight in turn (`--all`: with both),
+and once beside BUSY endless loops; options go to pytest. Takes ten minutes on two cores.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Sequence
-from itertools import product
+from itertools import cycle, product
 from pathlib import Path
 
 from tests.factories.paths import ROOT
@@ -38,9 +38,11 @@ def main(options: Sequence[str]) -> int:
     able = [kind for kind, flag in KINDS.items() if flag in flags]
     if left := KINDS.keys() - able:
         print(f"this processor cannot imitate {', '.join(sorted(left))}")
+    pairs = product(able, THREADS) if "--all" in options else zip(able, cycle(THREADS))
+    options = [option for option in options if option != "--all"]
     passed = [
         tested((*NUMERICAL, *options), OPENBLAS_CORETYPE=kind, OPENBLAS_NUM_THREADS=threads)
-        for kind, threads in product(able, THREADS)
+        for kind, threads in pairs
     ]
     loops = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(BUSY)]
     try:
