@@ -31,7 +31,7 @@ START_S = 240
 """Longest wait for a service that has to start, also where the emulator shares its processor."""
 ANSWER_S = 60
 RULES = "/etc/udev/rules.d/70-palpate.rules"
-BUNDLE = f"/opt/palpate/lib/python{GUEST_PYTHON}/site-packages/appliance/palpate/default_bundle"
+BUNDLE = f"/opt/palpate/lib/python{GUEST_PYTHON}/site-packages/palpate/default_bundle"
 SITE = "/etc/palpate/palpate.toml"
 SECOND = "echo {} > /sys/devices/system/cpu/cpu1/online"
 """Turns the guest's second processor on or off."""
