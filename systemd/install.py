@@ -21,7 +21,7 @@ from fleet import Failed, FleetBox, each, options, remedy
 from manual import write as write_manual
 from page_secrets import make as make_page_secrets
 from palpate import __version__
-from palpate.core.config import boards
+from palpate.core.settings_files import boards
 from release import ROOT, ReleaseArchives
 
 WHEEL = ROOT / "dist" / f"palpate-{__version__}-py3-none-any.whl"

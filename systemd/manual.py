@@ -16,9 +16,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args, get_origin
 
-from palpate.cli.parser import MENU, parser
+from palpate.cli.parser import parser
 from palpate.core import config
-from palpate.core.menu import CommandParser
 from palpate.core.schema import Key
 from palpate.core.storage import put
 
@@ -72,9 +71,7 @@ def references() -> dict[str, str]:
     """The text for each marker that a page of the box may hold."""
     return {
         "settings": settings_tables(),
-        "commands": command_sections(
-            [(f"palpate {name}", text, parser(name)) for name, text in MENU.commands.items()]
-        ),
+        "commands": command_sections([*leaves(parser())]),
     }
 
 
@@ -189,7 +186,7 @@ def allowed(key: Key) -> str:
 
 
 def command_sections(found: Sequence[Command], level: str = "##") -> str:
-    """A section for each command: its description, actions and options. Options that more than half
+    """A section for each command: its description and options. Options that more than half
     of the commands share come first, once."""
     counts = Counter(
         (_option(option), option.help) for _, _, command in found for option in command._actions
@@ -202,17 +199,8 @@ def command_sections(found: Sequence[Command], level: str = "##") -> str:
         own = _options([(name, text, command)], lambda option: option not in shared)
         about = (text or command.description or "").strip()
         sentence = f"{about[:1].upper()}{about[1:].rstrip('.')}."
-        actions = _actions(command)
-        parts.append("\n".join(filter(None, [f"{level} {name}\n", sentence + "\n", actions, own])))
+        parts.append("\n".join(filter(None, [f"{level} {name}\n", sentence + "\n", own])))
     return "\n".join(parts)
-
-
-def _actions(command: argparse.ArgumentParser) -> str:
-    """The table of a command's actions; "" without any."""
-    if not isinstance(command, CommandParser) or not command.actions:
-        return ""
-    lines = [f"| `{name}` | {_cell(text)} |" for name, text in command.actions.items()]
-    return "\n".join(["| action | effect |", "|---|---|", *lines, ""])
 
 
 def leaves(top: argparse.ArgumentParser, prefix: str = "") -> Iterator[Command]:
@@ -244,8 +232,6 @@ def _options(found: Sequence[Command], wanted: Callable[[str], bool]) -> str:
             name = _option(option)
             if wanted(name) and option.dest != "help" and option.help != argparse.SUPPRESS:
                 text = option.help or ""
-                if isinstance(command, CommandParser) and command.actions_of(option):
-                    text = f"{', '.join(command.actions_of(option))}: {text}"
                 given = {**vars(option), "prog": command.prog}
                 rows[name] = text % given if "%" in text else text
     if not rows:

@@ -200,9 +200,9 @@ def test_a_fresh_process_loads_nothing_of_the_desktop():
 
 
 def test_the_simulator_is_not_loaded_unless_named():
-    """`palpate config` and everything it imports leave palpate.sim alone."""
+    """`palpate check --settings` and everything it imports leave palpate.sim alone."""
     code = (
-        "import sys; from palpate.__main__ import main; main(['config']); "
+        "import sys; from palpate.__main__ import main; main(['check', '--settings']); "
         "print([m for m in sys.modules if '.sim' in m])"
     )
     assert run(sys.executable, "-c", code, cwd=ROOT).splitlines()[-1] == "[]"

@@ -14,9 +14,9 @@ from types import ModuleType
 import pytest
 
 from palpate import __version__
+from palpate.bridges import options as bridges
 from palpate.cli import parser
-from palpate.cli.main import COMMANDS
-from palpate.cli.parser import MENU
+from palpate.cli.parser import COMMANDS
 from palpate.core import config, errors, sentences
 from palpate.core.types import Status
 from palpate.io import robot_link
@@ -85,9 +85,13 @@ def test_sentences_are_as_the_box_forms_and_reads_them():
 def test_every_command_has_its_section(manual: ModuleType):
     """The reference holds each command of the parser; a command in a text exists."""
     text = manual.references()["commands"]
-    assert re.findall(r"(?m)^## palpate (.*)$", text) == [*MENU.commands]
-    assert set(MENU.commands) == set(COMMANDS)
-    assert set(re.findall(r"`palpate ([a-z]+)", MANUAL)) <= set(MENU.commands)
+    kinds = {name: [*command.actions] for name, command in COMMANDS.items()}
+    kinds["bridge"] = [*bridges.TEXTS]
+    names = [f"{name} {kind}".strip() for name, of in kinds.items() for kind in of or [""]]
+    assert re.findall(r"(?m)^## palpate (.*)$", text) == names
+    assert set(re.findall(r"`palpate ([a-z]+)", MANUAL)) <= set(COMMANDS)
+    for name in ("bundles", "skin"):
+        assert set(re.findall(rf"`palpate {name} ([a-z]+)", MANUAL)) <= set(kinds[name])
 
 
 @pytest.mark.parametrize("words", spoken(), ids=" ".join)

@@ -73,7 +73,7 @@ class RecordedPage:
         teaching: bool = False,
     ) -> None:
         clock = SystemClock()
-        self.health, self.sweeps = replace(HEALTH, bundle="", source="sim"), 0
+        self.health, self.sweeps = HEALTH._replace(bundle="", source="sim"), 0
         self.recording = RecordingSession(
             folder, skin.FORMAT, labels, clock, lambda line: None, target
         )
@@ -97,7 +97,7 @@ class RecordedPage:
         self.done.append(command.line)
         if command.name in ("START", "STOP"):
             sweeping = command.name == "START"
-            self.health = replace(self.health, sweeping=sweeping, ready=not sweeping)
+            self.health = self.health._replace(sweeping=sweeping, ready=not sweeping)
             return []
         return self.recording.commands[command.name](command.text)
 

@@ -1,4 +1,4 @@
-"""Shows the position of the contact on displays, five times a second, for `palpate align`."""
+"""Shows the position of the contact on displays, five times a second, for `palpate skin align`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The View, the picture of `palpate align` at one moment, and the interface of its displays."""
+"""The View, the picture of `palpate skin align` at one moment, and its displays' interface."""
 
 from __future__ import annotations
 

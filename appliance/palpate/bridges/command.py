@@ -12,7 +12,7 @@ from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 
-from palpate.bridges.options import LINKS, PORTS, add_arguments, parse
+from palpate.bridges.options import LINKS, PORTS, add_arguments
 from palpate.bridges.server import TcpServer, address, stop_event, until
 from palpate.bridges.source import FeedSource, LineSource, LinkPort, Source
 from palpate.client.line import open_port
@@ -20,9 +20,9 @@ from palpate.core import config
 from palpate.core.clock import SystemClock
 from palpate.core.config import Config
 from palpate.core.errors import ApplianceError, ConfigError
-from palpate.core.log import log, printable, to_stderr
-from palpate.core.menu import CommandParser
-from palpate.core.patience import patiently
+from palpate.core.log import log, to_stderr
+from palpate.core.retry import retried
+from palpate.core.text import printable
 
 EVERY_S = 1.0
 
@@ -93,7 +93,7 @@ def run_modbus(args: argparse.Namespace) -> int:
         return stop.code
 
     codes: list[int] = []
-    patiently(lambda: codes.append(asyncio.run(serve())), SystemClock())
+    retried(lambda: codes.append(asyncio.run(serve())), SystemClock())
     return codes[-1]
 
 
@@ -120,7 +120,7 @@ def run_tcp(args: argparse.Namespace) -> int:
         return stop.code
 
     codes: list[int] = []
-    patiently(lambda: codes.append(asyncio.run(serve())), SystemClock())
+    retried(lambda: codes.append(asyncio.run(serve())), SystemClock())
     return codes[-1]
 
 
@@ -160,9 +160,11 @@ def _say(kind: str, server: TcpServer, box: str, args: argparse.Namespace) -> No
 
 def main(argv: Sequence[str] | None = None) -> int:
     """`python -m palpate.bridges`."""
-    parser = CommandParser("python -m palpate.bridges", description="Bridges from a Palpate box.")
+    parser = argparse.ArgumentParser(
+        "python -m palpate.bridges", description="Bridges from a Palpate box."
+    )
     add_arguments(parser)
-    args = parse(parser, sys.argv[1:] if argv is None else argv)
+    args = parser.parse_args(argv)
     to_stderr()
     try:
         return run(args)

@@ -4,11 +4,9 @@ bridge."""
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from pathlib import Path
 
 from palpate.core.config import SerialConfig, StoreConfig
-from palpate.core.menu import CommandParser
 
 FEED, BAUD = str(StoreConfig().feed), SerialConfig().baud
 MOST = 16
@@ -24,74 +22,73 @@ TEXTS = {
 }
 
 
-def add_arguments(command: CommandParser) -> None:
-    """Add the kind of bridge and the options of all kinds."""
-    command.choose("kind", TEXTS)
-    lines = command.only_for("tcp", "modbus")
-    lines("--port", metavar="PORT", help="the box's serial line: a device, or socket://HOST:PORT")
-    links = " or ".join(map(str, LINKS.values()))
-    lines(
+def add_arguments(command: argparse.ArgumentParser) -> None:
+    """Add the kinds of bridges, with the options of each."""
+    kinds = command.add_subparsers(dest="kind", metavar="KIND", required=True)
+    for kind, text in TEXTS.items():
+        about = f"{text[0].upper()}{text[1:]}."
+        one = kinds.add_parser(kind, help=text, description=about)
+        if kind == "ros":
+            one.add_argument(
+                "--ros-args",
+                nargs=argparse.REMAINDER,
+                default=[],
+                metavar="...",
+                help="parameters and names of ROS; the last option",
+            )
+        else:
+            _add_ways(one, kind)
+            _add_server(one, kind)
+
+
+def _add_ways(one: argparse.ArgumentParser, kind: str) -> None:
+    """Add the ways to the box."""
+    way = one.add_mutually_exclusive_group()
+    way.add_argument(
+        "--port", metavar="PORT", help="the box's serial line: a device, or socket://HOST:PORT"
+    )
+    way.add_argument(
         "--link",
         type=Path,
         metavar="PATH",
-        help=f"on the box: make the link PATH; default if serial.port is {links}",
+        help=f"on the box: make the link PATH; default if serial.port is {LINKS[kind]}",
     )
-    lines(
+    one.set_defaults(feed=None)
+    if kind == "modbus":
+        way.add_argument(
+            "--feed",
+            nargs="?",
+            const=FEED,
+            metavar="PATH",
+            help=f"on the box: read the feed at PATH (default {FEED})",
+        )
+
+
+def _add_server(one: argparse.ArgumentParser, kind: str) -> None:
+    one.add_argument(
         "--baud",
         type=int,
         default=BAUD,
         metavar="N",
         help=f"baud rate of the serial line (default {BAUD})",
     )
-    ports = ", ".join(f"{kind} {port}" for kind, port in PORTS.items())
-    lines(
+    one.add_argument(
         "--listen",
         metavar="HOST:PORT",
-        help=f"default: bridge.address of the settings, and the port of the kind ({ports})",
+        help=f"default: bridge.address of the settings, and port {PORTS[kind]}",
     )
-    lines(
+    one.add_argument(
         "--allow-writes",
         action="store_true",
         help="peers may start, stop, tare and abort, even if bridge.allow_writes is false",
     )
-    lines(
+    one.add_argument(
         "--most",
         type=_number,
         default=MOST,
         metavar="N",
         help=f"most connections at a time (default {MOST})",
     )
-    _add_feed(command)
-    _add_ros(command)
-
-
-def _add_feed(command: CommandParser) -> None:
-    command.only_for("modbus")(
-        "--feed",
-        nargs="?",
-        const=FEED,
-        metavar="PATH",
-        help=f"on the box: read the feed at PATH (default {FEED})",
-    )
-
-
-def _add_ros(command: CommandParser) -> None:
-    command.only_for("ros")(
-        "--ros-args",
-        nargs=argparse.REMAINDER,
-        default=[],
-        metavar="...",
-        help="parameters and names of ROS; the last option",
-    )
-
-
-def parse(command: CommandParser, words: Sequence[str]) -> argparse.Namespace:
-    """The arguments of a bridge; ends the program if they are wrong, or with help."""
-    args = command.parse(words)
-    ways = [name for name in ("port", "link", "feed") if getattr(args, name)]
-    if len(ways) > 1:
-        command.error(f"--{ways[0]} and --{ways[1]} both name a way to the box; use one of them")
-    return args
 
 
 def _number(text: str) -> int:

@@ -22,8 +22,7 @@ from palpate.client.box import BAUD, Heard, Palpate
 from palpate.client.feed import Feed
 from palpate.client.line import READ_S
 from palpate.core.clock import Clock, SystemClock
-from palpate.core.errors import ApplianceError, CommandRefused, ConfigError, TemporaryError
-from palpate.core.patience import passes
+from palpate.core.errors import ApplianceError, CommandRefused, ConfigError, TemporaryError, passes
 from palpate.core.status import Status
 from palpate.tools import pseudo_terminal
 

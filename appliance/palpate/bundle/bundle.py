@@ -53,9 +53,8 @@ from palpate.bundle.manifest import (
     Thresholds,
 )
 from palpate.bundle.onnx_check import check
-from palpate.core.errors import BundleError, TemporaryError
+from palpate.core.errors import BundleError, TemporaryError, passes
 from palpate.core.names import LABEL
-from palpate.core.patience import passes
 from palpate.signal import features
 
 try:  # not from hashlib, which loads OpenSSL (4 MB) although Python has this function built in

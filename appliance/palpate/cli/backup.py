@@ -11,7 +11,7 @@ from typing import IO
 
 from palpate.core import storage
 from palpate.core.errors import ApplianceError
-from palpate.core.log import printable
+from palpate.core.text import printable
 from palpate.deployment import backup
 
 SERVICES = ("palpate", "palpate-teach")

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from palpate.bundle import bundle
-from palpate.cli.common import load_settings, status_file
+from palpate.cli.common import load_settings
 from palpate.core.clock import SystemClock
 from palpate.core.errors import ApplianceError, BundleError
 from palpate.deployment.signed import PACKAGER
@@ -155,7 +155,9 @@ def streaming(settings: Config, store: Store) -> SweepFormat | None:
     """The format of the skin that streams into the service, which is the format of the running
     bundle. None if it is not known."""
     try:
-        report = status.read(status_file(settings), SystemClock().now_ns())
+        if not settings.store.status:
+            return None
+        report = status.read(settings.store.status, SystemClock().now_ns())
         running = store.running().bundle
     except ApplianceError:  # `palpate status` and `palpate bundles` say what is wrong with them
         return None
@@ -206,18 +208,3 @@ def run_promote(args: argparse.Namespace) -> int:
     """Run the candidate on trial."""
     print(f"bundle {assembly.store(load_settings(args)).promote()[:8]} runs on trial {NEXT}")
     return 0
-
-
-RUNS: Mapping[str, Callable[[argparse.Namespace], int]] = {
-    "list": run_list,
-    "install": run_install,
-    "verify": run_verify,
-    "commit": run_commit,
-    "rollback": run_rollback,
-    "promote": run_promote,
-}
-
-
-def run(args: argparse.Namespace) -> int:
-    """`palpate bundles ACTION`."""
-    return RUNS[args.action](args)

@@ -1,25 +1,22 @@
-"""Steps that several commands share: settings, bundle, signals, a local page."""
+"""Steps that several commands share: settings, bundle, a local page."""
 
 from __future__ import annotations
 
 import argparse
-import signal
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from palpate.bundle.bundle import Bundle
 from palpate.core import config, fingers, storage
 from palpate.core.clock import SystemClock
 from palpate.core.config import Config
 from palpate.core.errors import BundleDenied, ConfigError
-from palpate.core.interrupts import INTERRUPTED
 from palpate.core.log import log
-from palpate.runtime import assembly
 
 if TYPE_CHECKING:
+    from palpate.bundle.bundle import Bundle
     from palpate.web.server import PageServer
 
 Facts = Mapping[str, Callable[[], object]]
@@ -57,18 +54,10 @@ def load_settings(args: argparse.Namespace) -> Config:
     return replace(settings, skin=replace(settings.skin, **given))
 
 
-def status_file(settings: Config) -> Path:
-    """The file with the state of the service. Raises ConfigError if it is turned off."""
-    if not settings.store.status:
-        raise ConfigError(
-            'store.runtime = "" turns the status file off; set it to a folder, and restart the'
-            " service"
-        )
-    return settings.store.status
-
-
 def load_bundle(settings: Config, *, answers: bool = True) -> Bundle:
     """The bundle of the settings; see assembly.running. Raises BundleDenied without the rights."""
+    from palpate.runtime import assembly
+
     try:
         return assembly.running(settings, answers=answers).bundle
     except PermissionError as e:
@@ -83,23 +72,6 @@ def check_output(path: Path) -> None:
     why = storage.refused(path)
     if why:
         raise ConfigError(f"{path} cannot be written: {why}; name a file in a folder of yours")
-
-
-class StopFlag:
-    """A function that is true once SIGTERM or SIGINT came. The loop then ends within one turn."""
-
-    def __init__(self) -> None:
-        self._received: list[int] = []
-        for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, lambda n, frame: self._received.append(n))
-
-    def __call__(self) -> bool:
-        return bool(self._received)
-
-    @property
-    def exit_code(self) -> int:
-        """130 after Ctrl-C, otherwise 0: SIGTERM ends a service in order."""
-        return INTERRUPTED if self._received[:1] == [signal.SIGINT] else 0
 
 
 def local_page(name: str, port: int | None, stack: ExitStack) -> list[PageServer]:

@@ -10,12 +10,12 @@ from collections.abc import Callable
 from itertools import islice
 from typing import TYPE_CHECKING
 
-from palpate.cli.common import load_settings
+from palpate.cli.common import load_bundle, load_settings
 from palpate.core import fingers
 from palpate.core.clock import Clock, SystemClock
 from palpate.core.config import Config
 from palpate.core.devices import Devices
-from palpate.core.errors import ConfigError
+from palpate.core.errors import BundleError, ConfigError, FormatError
 from palpate.core.types import SweepFormat
 from palpate.io import skins
 from palpate.io.skin_profile import SkinProfile
@@ -34,6 +34,15 @@ def open_devices(args: argparse.Namespace, format: Callable[[], SweepFormat] | N
     if args.virtual:
         raise ConfigError("--virtual needs --sim: real devices run in real time")
     return Devices(SystemClock())
+
+
+def open_any(args: argparse.Namespace, settings: Config) -> Devices:
+    """The devices. A simulated skin has the format of the bundle, if there is a bundle and the skin
+    can send this format."""
+    try:
+        return open_devices(args, lambda: load_bundle(settings, answers=False).format)
+    except (BundleError, FormatError):
+        return open_devices(args, None)
 
 
 def simulated(

@@ -9,6 +9,7 @@ robot acts on them.
 
 from __future__ import annotations
 
+import argparse
 import os
 import sys
 from collections.abc import Mapping
@@ -16,13 +17,12 @@ from typing import Any
 
 import gpiod
 
-from palpate.cli.parser import add_settings
+from palpate.cli.options import NO_SETTINGS, add_settings
 from palpate.core import config
 from palpate.core.clock import Clock, SystemClock
 from palpate.core.errors import EX_CONFIG, ApplianceError
-from palpate.core.menu import CommandParser
 from palpate.io.gpio_lines import Lines
-from palpate.service import ended
+from palpate.service import last_failure
 
 
 def main(
@@ -36,8 +36,9 @@ def main(
     If the program has failed several times in a row, wait before systemd starts it again.
     """
     about = "Sets all output lines low. Options as for palpate run."
-    parser = CommandParser("python -m palpate.cli.lower_outputs", description=about)
+    parser = argparse.ArgumentParser("python -m palpate.cli.lower_outputs", description=about)
     add_settings(parser)
+    parser.set_defaults(**NO_SETTINGS)
     args = parser.parse_args(argv)
     try:
         loaded = config.load(args.board, args.set, folder=args.config_dir)
@@ -46,7 +47,7 @@ def main(
     except ApplianceError as e:
         print(f"palpate: outputs may not be low: {e}", file=sys.stderr)
         return e.exit_code
-    last = ended.read(loaded.store.runtime_folder)
+    last = last_failure.read(loaded.store.runtime_folder)
     # systemd sets EXIT_STATUS (systemd.exec(5)); a stop by hand is not delayed
     if last and environ.get("EXIT_STATUS") == str(last.code) and last.code != EX_CONFIG:
         clock.sleep_until(clock.now_ns() + round(last.pause_s * 1e9))

@@ -5,48 +5,30 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
 
 from palpate.cli import parser
 from palpate.core.errors import ApplianceError
 from palpate.core.interrupts import INTERRUPTED, during_imports
-from palpate.core.log import printable, to_stderr
-
-COMMANDS: Mapping[str, str] = {
-    "run": "cli.run_command.run",
-    "demo": "cli.simulated_commands.run_demo",
-    "bench": "cli.simulated_commands.run_bench",
-    "check": "cli.look_commands.run_check",
-    "status": "cli.look_commands.run_status",
-    "watch": "cli.look_commands.run_watch",
-    "align": "cli.look_commands.run_align",
-    "replay": "cli.look_commands.run_replay",
-    "config": "cli.look_commands.run_config",
-    "record": "cli.record_command.run",
-    "teach": "cli.teach_command.run",
-    "bundles": "cli.bundle_commands.run",
-    "skin": "cli.skin_commands.run",
-    "bridge": "bridges.command.run",
-}
-"""The functions of the commands, below `palpate`. They are imported when they are needed."""
+from palpate.core.text import printable, replace_unprintable
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; its exit code."""
     _fill_streams()
+    replace_unprintable()
     # One loop, one thread. Otherwise OpenBLAS starts a thread for each core when numpy is imported,
     # and a product in the loop waits for a thread that a busy processor does not run.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     words = sys.argv[1:] if argv is None else list(argv)
     try:
-        if (answered := parser.MENU.answer(words)) is not None:
-            sys.stdout.flush()
-            return answered
+        if not words or words == ["help"]:
+            words = ["--help"]
         with during_imports("palpate"):
             args = parser.arguments(words[0], words[1:])
-            to_stderr()
-            run = _function(words[0])
+            run = _function(args.run)
+            _show_log()
         code = run(args)
         _flush()
         return code
@@ -66,6 +48,14 @@ def main(argv: Sequence[str] | None = None) -> int:
             file=sys.stderr,
         )
         return 1
+
+
+def _show_log() -> None:
+    """Print the log from now on, if the command has loaded it. `status` starts sooner without."""
+    if "palpate.core.log" in sys.modules:
+        from palpate.core.log import to_stderr
+
+        to_stderr()
 
 
 def _fill_streams() -> None:
@@ -98,8 +88,8 @@ def _give_up_output() -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 
 
-def _function(name: str) -> Callable[[argparse.Namespace], int]:
-    module, _, function = COMMANDS[name].rpartition(".")
+def _function(path: str) -> Callable[[argparse.Namespace], int]:
+    module, _, function = path.rpartition(".")
     found: Callable[[argparse.Namespace], int] = getattr(
         import_module(f"palpate.{module}"), function
     )

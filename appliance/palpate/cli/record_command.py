@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from palpate.cli.common import Facts, StopFlag, load_settings
+from palpate.cli.common import Facts, load_settings
 from palpate.cli.devices import open_devices
 from palpate.cli.reporting import capture, done, feed, status
 from palpate.core.clock import SystemClock
@@ -19,6 +19,7 @@ from palpate.core.config import Config
 from palpate.core.devices import Devices
 from palpate.core.disk_thread import DiskThread
 from palpate.core.errors import ConfigError, SensorError
+from palpate.core.interrupts import StopFlag
 from palpate.core.log import log
 from palpate.core.observer import Observer
 from palpate.core.types import Sweep, SweepFormat, Verdict

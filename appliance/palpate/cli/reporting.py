@@ -19,7 +19,7 @@ from palpate.core.errors import ConfigError
 from palpate.core.observer import Observer
 from palpate.core.types import SweepFormat
 from palpate.io import skins
-from palpate.service.status import StatusFile
+from palpate.service.status_file import StatusFile
 from palpate.sweeps.capture import CaptureWriter
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from palpate.bundle.bundle import DEFAULT, Bundle
 from palpate.bundle.manifest import Manifest
-from palpate.cli.common import Facts, StopFlag, load_bundle, load_settings
+from palpate.cli.common import Facts, load_bundle, load_settings
 from palpate.cli.devices import open_devices
 from palpate.cli.reporting import capture, done, feed, status
 from palpate.core import fingers
@@ -20,12 +20,13 @@ from palpate.core.config import Config
 from palpate.core.devices import Devices
 from palpate.core.disk_thread import DiskThread
 from palpate.core.errors import ApplianceError
+from palpate.core.interrupts import StopFlag
 from palpate.core.log import in_journal, log
 from palpate.core.observer import Observer
 from palpate.io import skins
 from palpate.io.usb_sensor import fits
 from palpate.runtime import assembly
-from palpate.service import ended
+from palpate.service import last_failure
 from palpate.service.systemd import Notifier, VerdictLog
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
 def run(args: argparse.Namespace) -> int:
     """Classify sweeps until SIGTERM, or with --sim until all sweeps of the script are answered."""
     settings = load_settings(args)
-    with ended.noted(None if args.sim else settings.store.runtime_folder, SystemClock()):
+    with last_failure.recorded(None if args.sim else settings.store.runtime_folder, SystemClock()):
         choice = None if settings.classifier.bundle else assembly.store(settings).choose()
         if choice and choice.folder == DEFAULT and untaught(args, settings, choice.bundle):
             from palpate.cli import teach_command  # here: a box in service does without it

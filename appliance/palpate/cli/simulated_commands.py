@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING
 
 from palpate.bundle import bundle as bundles
 from palpate.bundle.bundle import Bundle
-from palpate.cli.common import StopFlag, check_output, load_bundle, load_settings
+from palpate.cli.common import check_output, load_bundle, load_settings
 from palpate.cli.devices import simulated
 from palpate.core import storage
 from palpate.core.config import Config, FingerConfig
 from palpate.core.errors import BundleDenied
+from palpate.core.interrupts import StopFlag
 from palpate.core.log import log
 from palpate.core.observer import Observer
 from palpate.io import skins
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
 
 TOUR = 8
 """Sweeps of the tour."""
+SEED = 2000
+"""Seed of the sweeps of the benchmark by default."""
 NEXT = """\
 next: palpate demo --raw     the sentences that the robot reads
       make desktop           then docs/tutorials/first-model.md: your first model in 15 minutes"""
@@ -75,7 +78,7 @@ def run_demo(args: argparse.Namespace) -> int:
 
 
 def run_bench(args: argparse.Namespace) -> int:
-    """Measure this machine; see appliance/palpate/tools/bench.py."""
+    """`palpate check --bench`: measure this machine (tools/bench.py)."""
     from palpate.tools import bench_process, pseudo_terminal
 
     if args.json:
@@ -106,7 +109,7 @@ def run_bench(args: argparse.Namespace) -> int:
     from palpate.tools import bench
 
     figures = bench.run(
-        bundle, build, args.references, args.seed, lambda line: print(line, flush=True)
+        bundle, build, args.references, args.seed or SEED, lambda line: print(line, flush=True)
     )
     if args.json:
         storage.put(args.json, (json.dumps(figures, indent=1) + "\n").encode())

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from typing import TYPE_CHECKING
 
-from palpate.cli.common import StopFlag, load_settings, local_page
+from palpate.cli.common import load_settings, local_page
 from palpate.cli.devices import open_devices
 from palpate.core.clock import SystemClock
 from palpate.core.config import Config
 from palpate.core.devices import Devices
 from palpate.core.errors import ConfigError
+from palpate.core.interrupts import StopFlag
 from palpate.core.log import log
 from palpate.io import serial_port, skin_profile, skins
 from palpate.io.serial_port import PortInfo
@@ -162,16 +163,3 @@ def run_show(args: argparse.Namespace) -> int:
         name, source = settings.skin.profile, devices.source
         skin_show.run(sensor, format, name, source, devices.clock, shown_on, stopped, unit)
     return stopped.exit_code
-
-
-RUNS: Mapping[str, Callable[[argparse.Namespace], int]] = {
-    "list": run_list,
-    "detect": run_detect,
-    "check": run_check,
-    "show": run_show,
-}
-
-
-def run(args: argparse.Namespace) -> int:
-    """`palpate skin ACTION`."""
-    return RUNS[args.action](args)

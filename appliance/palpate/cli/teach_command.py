@@ -13,14 +13,15 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 from palpate.cli import record_command
-from palpate.cli.common import Facts, StopFlag, load_settings
-from palpate.cli.parser import TEACH_PORT
+from palpate.cli.common import Facts, load_settings
+from palpate.cli.options import TEACH_PORT
 from palpate.cli.reporting import capture, feed, status
 from palpate.core.clock import SystemClock
 from palpate.core.config import Config
 from palpate.core.devices import Devices
 from palpate.core.disk_thread import DiskThread
 from palpate.core.errors import ApplianceError, ConfigError, FormatError
+from palpate.core.interrupts import StopFlag
 from palpate.core.log import log
 from palpate.core.names import TypedNames
 from palpate.core.observer import Observer

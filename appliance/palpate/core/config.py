@@ -9,30 +9,18 @@ from __future__ import annotations
 
 import json
 import re
-import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, is_dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal, get_type_hints
 
-from palpate.core import fingers
+from palpate.core import fingers, settings_files
 from palpate.core.errors import ConfigError
-from palpate.core.schema import (
-    Key,
-    closest,
-    custom,
-    fixed,
-    gpio_line,
-    keys,
-    number,
-    read_table,
-    read_toml,
-    shown,
-)
+from palpate.core.schema import Key, custom, fixed, gpio_line, keys, number, read_table
+from palpate.core.settings_files import RUNTIME, SITE
+from palpate.core.text import closest, shown
 
-SITE = Path("/etc/palpate/palpate.toml")
-"""The settings of this robot's installation; the file may be missing."""
 FEED_SCHEMA = 1
 """Version of the feed's lines (PROTOCOL.md, part 4), for writer and readers."""
 
@@ -214,7 +202,7 @@ class StoreConfig:
 
     folder: str = "/var/lib/palpate"
     keys: str = "/etc/palpate"
-    runtime: str = "/run/palpate"
+    runtime: str = RUNTIME
     black_box: int = number(0, 0, 100_000)
     trial_sweeps: int = number(20, 1, 100_000)
     trial_s: float = fixed(600.0)  # streaming time after which the trial ends as well
@@ -356,33 +344,20 @@ def load(
     installation `/etc/palpate`. site: must exist unless it is SITE. Raises ConfigError with file,
     key, value and the allowed values.
     """
-    if folder and not folder.is_dir():
-        raise ConfigError(
-            f"--config-dir {folder}: no such folder; name that of skin.toml and the board files"
-        )
-    folder = folder or _folder()
-    of_site = read_toml(site, needed=site != SITE)
-    in_site = of_site.pop("board", "")
-    board, named_in = (
-        (board, "--board") if board else (in_site, "code" if in_site == "" else str(site))
-    )
-    layers = [(folder / "skin.toml", read_toml(folder / "skin.toml", needed=False))]
-    if board != "":
-        path = _board_file(folder, board, named_in)
-        layers.append((path, read_toml(path)))
-    layers += [(site, of_site), *((Path("--set"), _parse_set(text)) for text in sets)]
+    layers = settings_files.read(board, sets, folder=folder, site=site)
     values = {name: key.default for name, key in _KEYS.items()}
-    sources = {"board": Path(named_in).name} | dict.fromkeys(_KEYS, "code")
+    sources = {"board": Path(layers.named_in).name} | dict.fromkeys(_KEYS, "code")
     own: dict[str, dict[str, Any]] = {}  # values of the fingers
     last = ""  # layer that has named one
-    for where, table in layers:
-        for finger, read in fingers.read(table.pop("skins", {}), str(where), _FINGER_KEYS).items():
+    for where, table in layers.tables:
+        name_of = Path(where).name
+        for finger, read in fingers.read(table.pop("skins", {}), where, _FINGER_KEYS).items():
             own.setdefault(finger, {}).update(read)
-            last = str(where)
-            sources |= {f"skins.{finger}.{key}": where.name for key in read}
+            last = where
+            sources |= {f"skins.{finger}.{key}": name_of for key in read}
             sources.setdefault(f"skins.{finger}.part", "code")  # describe shows each finger
-        for name, value in _checked(table, str(where)):
-            values[name], sources[name] = value, where.name
+        for name, value in _checked(table, where):
+            values[name], sources[name] = value, name_of
     _check_lines(values, sources)
     groups = {
         section: group(**{key: values[f"{section}.{key}"] for key in keys(group)})
@@ -391,7 +366,11 @@ def load(
     common = {name: getattr(groups["skin"], name) for name in keys(SkinConfig)}
     skins = {f: FingerConfig(**it) for f, it in fingers.whole(common, own, last).items()}
     return Config(
-        board=board, sources=MappingProxyType(sources), folder=folder, skins=skins, **groups
+        board=layers.board,
+        sources=MappingProxyType(sources),
+        folder=layers.folder,
+        skins=skins,
+        **groups,
     )
 
 
@@ -410,46 +389,6 @@ def describe(config: Config) -> str:
     return "\n".join(
         f"{f'{name} = {value}':<36}   # {config.sources[name]}" for name, value in values.items()
     )
-
-
-def boards(folder: Path | None = None) -> dict[str, Path]:
-    """The delivered boards' files by name; folder: as for `load`."""
-    return {
-        path.stem.removeprefix("board-"): path
-        for path in sorted((folder or _folder()).glob("board-*.toml"))
-    }
-
-
-def _folder() -> Path:
-    beside = Path(__file__).resolve().parents[3] / "firmware_config"
-    return beside if beside.is_dir() else SITE.parent
-
-
-def _board_file(folder: Path, board: Any, where: str) -> Path:
-    known = boards(folder)
-    if not (isinstance(board, str) and board in known):
-        there = ", ".join(known) or "none"
-        raise ConfigError(
-            f"{where}: board = {shown(board)} has no board-NAME.toml in {folder}; boards there: "
-            f"{there}"
-        )
-    return known[board]
-
-
-def _parse_set(text: str) -> dict[str, Any]:
-    """`section.key=value` as the table that a file with this line gives."""
-    name, equals, value = text.partition("=")
-    section, dot, key = name.strip().partition(".")
-    if not (equals and dot):
-        raise ConfigError(f"--set {text}: not understood; use --set section.key=value")
-    try:
-        (parsed,) = tomllib.loads(f"value = {value}").values()
-    except (ValueError, RecursionError):
-        parsed = value.strip()
-    if section == "skins":
-        finger, _, key = key.partition(".")
-        return {section: {finger: {key: parsed}}}
-    return {section: {key: parsed}}
 
 
 def _checked(table: Mapping[str, Any], where: str) -> Iterator[tuple[str, Any]]:

@@ -4,8 +4,19 @@ line.
 Messages are lower case, name the wrong value and the remedy. Exit codes are those of sysexits.h.
 """
 
+import errno
+
 # `os` has them on Unix only, but the client also runs elsewhere
 EX_DATAERR, EX_UNAVAILABLE, EX_SOFTWARE, EX_TEMPFAIL, EX_CONFIG = 65, 69, 70, 75, 78
+
+PASSING = frozenset(
+    getattr(errno, name)
+    for name in (
+        *("EIO", "ENOMEM", "ENOSPC", "EDQUOT", "EMFILE", "ENFILE", "EAGAIN", "EINTR", "EBUSY"),
+        *("ESTALE", "ETIMEDOUT", "ENOBUFS", "ENETDOWN", "EADDRINUSE", "EADDRNOTAVAIL"),
+    )
+)
+"""Numbers of errors of the system that may be gone at the next attempt."""
 
 
 class ApplianceError(Exception):
@@ -134,3 +145,8 @@ class FormatError(ApplianceError):
     """An array, file or sentence is invalid."""
 
     exit_code = EX_DATAERR
+
+
+def passes(e: BaseException) -> bool:
+    """Whether an error of the system may be gone at the next attempt, without a person."""
+    return isinstance(e, OSError) and e.errno in PASSING

@@ -7,7 +7,8 @@ from collections.abc import Collection, Mapping
 from typing import Any
 
 from palpate.core.errors import ConfigError
-from palpate.core.schema import Key, closest, read_table, shown
+from palpate.core.schema import Key, read_table
+from palpate.core.text import closest, shown
 
 MOST = 4
 """Largest number of fingers."""

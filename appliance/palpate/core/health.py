@@ -3,11 +3,10 @@ status."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 
-@dataclass(frozen=True, slots=True)
-class Health:
+class Health(NamedTuple):
     """State of the box at the end of a turn.
 
     time_ns: host monotonic. skin: sensor state (PROTOCOL.md). trouble: the reason why the skin does

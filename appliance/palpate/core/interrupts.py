@@ -1,4 +1,5 @@
-"""Ctrl-C during imports: extension modules turn an exception during their import into other errors.
+"""Signals that end a program: SIGTERM and Ctrl-C in a loop, and Ctrl-C during imports, where
+extension modules turn an exception into other errors.
 
 While a program is imported, Ctrl-C raises nothing; it prints one line and ends with exit code 130.
 Where a command imports later, the other error becomes KeyboardInterrupt again.
@@ -58,3 +59,20 @@ def during_work() -> Iterator[None]:
         raise
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+class StopFlag:
+    """A function that is true once SIGTERM or SIGINT came. The loop then ends within one turn."""
+
+    def __init__(self) -> None:
+        self._received: list[int] = []
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, lambda n, frame: self._received.append(n))
+
+    def __call__(self) -> bool:
+        return bool(self._received)
+
+    @property
+    def exit_code(self) -> int:
+        """130 after Ctrl-C, otherwise 0: SIGTERM ends a service in order."""
+        return INTERRUPTED if self._received[:1] == [signal.SIGINT] else 0

@@ -13,6 +13,8 @@ import sys
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 
+from palpate.core.text import printable
+
 log = logging.getLogger("palpate")
 """The only logger of the box."""
 log.setLevel(logging.INFO)
@@ -31,12 +33,6 @@ def in_journal(environ: Mapping[str, str] = os.environ, stream: int = 2) -> bool
     except OSError:  # closed
         return False
     return environ.get("JOURNAL_STREAM") == f"{status.st_dev}:{status.st_ino}"
-
-
-def printable(text: str) -> str:
-    """`text` with "?" for each character that is not printable: a device may send characters that
-    control a terminal."""
-    return "".join(c if c.isprintable() else "?" for c in text)
 
 
 class LineHandler(logging.Handler):

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from palpate.core.health import Health
-from palpate.core.types import Edge, Frames, Sweep, Verdict
+if TYPE_CHECKING:
+    from palpate.core.health import Health
+    from palpate.core.types import Edge, Frames, Sweep, Verdict
 
 
 class Observer:

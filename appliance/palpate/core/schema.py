@@ -2,23 +2,19 @@
 of fields.
 
 A field is the only place for a value's type, default and limits. TOML tables are read with `keys`
-and `read_table`, JSON objects with `typed`. `closest` finds names similar to a misspelt name.
+and `read_table`, JSON objects with `typed`.
 """
 
 from __future__ import annotations
 
 import json
 import sys
-import tomllib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
-from difflib import get_close_matches
-from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
-from palpate.core.errors import ConfigError, TemporaryError
-from palpate.core.patience import passes
+from palpate.core.text import shown
 
 _Number = TypeVar("_Number", int, float)
 _Kind = TypeVar("_Kind")
@@ -117,44 +113,6 @@ def read_table(
         if values[name] is None:
             raise refused(f"{name} = {shown(value)} is not allowed; use {known[name].allowed}")
     return values
-
-
-def read_toml(path: Path, *, needed: bool = True) -> dict[str, Any]:
-    """The table in a TOML file; {} for a missing file that is not needed. Raises ConfigError, or
-    TemporaryError if it may be readable later."""
-    try:
-        return tomllib.loads(path.read_text("utf-8-sig"))
-    except FileNotFoundError as e:
-        if not needed:
-            return {}
-        raise ConfigError(f"{path}: no such file; check the path") from e
-    except OSError as e:
-        raise (TemporaryError if passes(e) else ConfigError)(
-            f"{path}: cannot be read: {str(e.strerror).lower()}; check who may read it"
-        ) from e
-    except (ValueError, RecursionError) as e:  # no TOML or no UTF-8; deeply nested brackets
-        raise ConfigError(
-            f"{path}: not TOML: {str(e).lower()}; write key = value, strings in quotes"
-        ) from e
-
-
-def shown(value: object) -> str:
-    """A value from a file for a message of one line, cut at 80 characters."""
-    try:
-        text = repr(value)
-    except (ValueError, RecursionError):  # an integer of over 4300 digits; deeply nested tables
-        return "(too large to show)"
-    return text if len(text) <= 80 else f"{text[:77]}..."
-
-
-def closest(name: str, known: Iterable[str], most: int = 1, cutoff: float = 0.5) -> list[str]:
-    """Up to `most` of the `known` names that a misspelt `name` may stand for, the most similar
-    first; case is ignored.
-
-    cutoff: least similarity, 0 to 1 (difflib's ratio).
-    """
-    by_folded = {k.casefold(): k for k in known}
-    return [by_folded[k] for k in get_close_matches(name.casefold(), by_folded, most, cutoff)]
 
 
 def typed(kind: type[_Kind], table: Any) -> _Kind:

@@ -7,7 +7,6 @@ the caller knows the consequences.
 
 from __future__ import annotations
 
-import ctypes
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -151,6 +150,8 @@ def link(path: Path, target: str) -> None:
 
 def exchange(one: Path, other: Path) -> None:
     """Swap two names in one step (renameat2), which Python's os does not offer."""
+    import ctypes
+
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.renameat2(AT_FDCWD, os.fsencode(one), AT_FDCWD, os.fsencode(other), RENAME_EXCHANGE):
         raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()), str(other))

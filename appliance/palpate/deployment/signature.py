@@ -17,8 +17,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from palpate.core.errors import BundleError, ConfigError, TemporaryError
-from palpate.core.patience import passes
+from palpate.core.errors import BundleError, ConfigError, TemporaryError, passes
 
 if TYPE_CHECKING:
     from subprocess import CompletedProcess

@@ -14,7 +14,7 @@ from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any, Self
 
 from palpate.core.errors import LineError
-from palpate.core.schema import closest
+from palpate.core.text import closest
 
 if TYPE_CHECKING:
     from gpiod import LineRequest

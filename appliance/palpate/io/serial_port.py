@@ -14,7 +14,7 @@ from typing import Any
 
 import serial
 
-from palpate.core.log import printable
+from palpate.core.text import printable
 
 PSEUDO_TERMINALS = range(136, 144)
 """Major device numbers of pseudo-terminals."""

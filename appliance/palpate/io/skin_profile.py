@@ -14,8 +14,10 @@ from typing import Any, Literal
 
 from palpate.core.config import SkinConfig
 from palpate.core.errors import ConfigError
-from palpate.core.schema import closest, custom, keys, read_table, read_toml, shown
+from palpate.core.schema import custom, keys, read_table
 from palpate.core.schema import number as limited
+from palpate.core.settings_files import read_toml
+from palpate.core.text import closest, shown
 from palpate.core.types import MOST_AXES, SweepFormat
 from palpate.io import checksums, wire_numbers
 

@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, overload
 
 from palpate.core import fingers
-from palpate.core.config import SITE, Config, SkinConfig
+from palpate.core.config import Config, SkinConfig
 from palpate.core.devices import Devices
 from palpate.core.errors import ConfigError, FormatError, SensorAbsent, SensorMismatch
+from palpate.core.settings_files import SITE
 from palpate.core.types import SweepFormat
 from palpate.io import skin_profile
 from palpate.io.link import SkinLink

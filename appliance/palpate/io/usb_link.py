@@ -24,7 +24,7 @@ from palpate.core.errors import (
     SensorMismatch,
     SensorOverflow,
 )
-from palpate.core.log import printable
+from palpate.core.text import printable
 from palpate.io import packets
 from palpate.io.link import REPLY_MS, reply_to
 

@@ -28,7 +28,7 @@ from palpate.core.log import TroubleLog
 from palpate.core.observer import Observer
 from palpate.core.types import Frames, Sweep, SweepFormat, Verdict
 from palpate.service.feed_reader import MOST_HZ, QUEUE_BYTES, Reader, encode, sweep_line
-from palpate.service.status import Report
+from palpate.service.status_file import Report
 
 MOST_READERS = 64
 SWEEP_BYTES = 640 * 1024

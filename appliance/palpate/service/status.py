@@ -1,107 +1,31 @@
-"""The content of `palpate status`: writes the state of the box and its last verdicts as a small
-JSON file, and shows this file in words.
-
-The file is in memory (/run). It is written aside and renamed, so that a reader always gets a whole
-file, and never synced.
-"""
+"""The content of `palpate status`: reads the file with the state of the box (`status_file`), and
+shows it in words. It needs neither numpy nor the settings' schema."""
 
 from __future__ import annotations
 
 import json
 import os
-from collections import deque
-from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from palpate import __version__
-from palpate.core import storage
-from palpate.core.clock import Clock
 from palpate.core.errors import ApplianceError, FormatError
 from palpate.core.health import Health
-from palpate.core.log import TroubleLog
-from palpate.core.observer import Observer
-from palpate.core.status import REASONS
-from palpate.core.types import Status, Verdict
-from palpate.service import ended
+from palpate.core.status import REASONS, Status
+from palpate.service import last_failure
 
 SCHEMA = 1
 VERDICTS = 20
 """Number of the latest verdicts in the file."""
-PERIOD_NS = 1_000_000_000
-SOON_NS = 100_000_000
-"""Least time between two writes if there is a new verdict or state of the skin."""
+FILE = "status.json"
+"""Name of the file in the runtime folder."""
 STALE_NS = 10_000_000_000
 """A file that has not changed for this long belongs to a program that hangs; it is the unit's
 watchdog time."""
 MOST_BYTES = 1 << 20
 _START = "systemctl start palpate, then see journalctl -u palpate"
 WELL, NOT_RUNNING, SKIN_AWAY = os.EX_OK, 1, os.EX_UNAVAILABLE
-
-
-class Report:
-    """The state of the box as an object for JSON, in the status file and in the feed.
-
-    clock: the real clock of the host, which a reader in another process shares. more: further facts
-    for JSON; `lines` shows each text among them as a line of its own, unless it is empty.
-    """
-
-    def __init__(self, clock: Clock, more: Callable[[], Mapping[str, Any]] = dict) -> None:
-        self._clock, self._more = clock, more
-        self._since_ns = clock.now_ns()
-
-    def __call__(self, health: Health) -> dict[str, Any]:
-        return {
-            **self._more(),
-            **asdict(health),
-            "time_ns": self._clock.now_ns(),
-            "since_ns": self._since_ns,
-            "pid": os.getpid(),
-            "version": __version__,
-        }
-
-
-class StatusFile(Observer):
-    """Writes the state of the box and its latest answers. The file is removed when the program ends
-    in order.
-
-    clock, more: as for Report.
-    """
-
-    def __init__(
-        self, path: Path, clock: Clock, more: Callable[[], Mapping[str, Any]] = dict
-    ) -> None:
-        self._path, self._clock, self._report = path, clock, Report(clock, more)
-        self._next_ns = clock.now_ns()
-        self._verdicts: deque[dict[str, Any]] = deque(maxlen=VERDICTS)
-        self._fresh, self._skin = False, ""
-        self._log = TroubleLog(f"status: {path} cannot be written", "classifying goes on")
-
-    def answered(self, verdict: Verdict) -> None:
-        """Note a verdict; it is written at the end of the turn."""
-        self._verdicts.append(verdict.as_dict(arrays=False))
-        self._fresh = True
-
-    def turn(self, health: Health) -> None:
-        """Write once a second, and soon after a verdict or a new state of the skin."""
-        now_ns = self._clock.now_ns()
-        if health.skin != self._skin:
-            self._skin, self._fresh = health.skin, True
-        if now_ns < self._next_ns - (PERIOD_NS - SOON_NS if self._fresh else 0):
-            return
-        self._next_ns, self._fresh = now_ns + PERIOD_NS, False
-        report = self._report(health) | {"schema": SCHEMA, "verdicts": list(self._verdicts)}
-        # every user of the box may read it; it is in memory (/run), so a card does not wear from a
-        # sync a second
-        self._log.attempt(
-            lambda: storage.put(self._path, json.dumps(report).encode(), durable=False, mode=0o644)
-        )
-
-    def stopping(self) -> None:
-        """Remove the file, which is not true any more."""
-        self._log.attempt(lambda: self._path.unlink(missing_ok=True))
 
 
 def read(path: Path, now_ns: int) -> dict[str, Any]:
@@ -117,9 +41,10 @@ def read(path: Path, now_ns: int) -> dict[str, Any]:
             raise TypeError(f"not an object of schema {SCHEMA}")
         pid, age_ns = int(report["pid"]), now_ns - int(report["time_ns"])
         report["verdicts"] = [v | {"status": Status(v["status"])} for v in report["verdicts"]]
-        Health(**{name: report[name] for name in Health.__slots__})
+        if missing := set(Health._fields) - report.keys():
+            raise KeyError(min(missing))
     except FileNotFoundError:
-        last = ended.read(path.parent)
+        last = last_failure.read(path.parent)
         why = f"the service does not run, or has just started (no {path}); {_START}"
         return {"running": False, "why": last.text if last else why}
     except OSError as e:
@@ -131,7 +56,7 @@ def read(path: Path, now_ns: int) -> dict[str, Any]:
     why = ""
     # a file from before the last boot can be ahead of this boot's clock
     if not _alive(pid) or age_ns < 0:
-        last = ended.read(path.parent)
+        last = last_failure.read(path.parent)
         why = last.text if last else f"process {pid} has ended without closing down; {_START}"
     elif age_ns > STALE_NS:
         why = (
@@ -181,7 +106,7 @@ def lines(report: Mapping[str, Any], now_ns: int) -> list[str]:
         facts["serial"] = (
             f"{report['dropped']} sentences dropped, since nobody read them; check the robot's end"
         )
-    shown = {"version", "why", *Health.__slots__}
+    shown = {"version", "why", *Health._fields}
     facts |= {
         name: text
         for name, text in report.items()

@@ -22,10 +22,10 @@ from palpate.core.errors import (
     SensorError,
     SensorMismatch,
     TemporaryError,
+    passes,
 )
 from palpate.core.log import TroubleLog, log
 from palpate.core.observer import Observer
-from palpate.core.patience import passes
 from palpate.core.schema import typed
 from palpate.core.types import Edge, EdgeKind, Frames, SweepFormat
 from palpate.io import skin_profile, skin_stream

@@ -17,11 +17,10 @@ from typing import Any
 
 from palpate.core.clock import Clock
 from palpate.core.disk_thread import AtOnce, DiskWork
-from palpate.core.errors import ApplianceError, ConfigError, TemporaryError
+from palpate.core.errors import ApplianceError, ConfigError, TemporaryError, passes
 from palpate.core.log import TroubleLog, log
 from palpate.core.names import LABEL, TypedNames
 from palpate.core.observer import Observer
-from palpate.core.patience import passes
 from palpate.core.sentences import sentence
 from palpate.core.types import Status, Sweep, SweepFormat, Verdict, entries
 from palpate.service.systemd import words

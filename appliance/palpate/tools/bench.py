@@ -1,5 +1,5 @@
-"""`palpate bench`: latency, inference, memory, start and processor share of this machine, with the
-simulated skin.
+"""`palpate check --bench`: latency, inference, memory, start and processor share of this machine,
+with the simulated skin.
 
 Each figure is printed in a line, and all of them are returned with plain keys. Memory, start and
 processor share are measured in processes of their own, without parts of the bench.
@@ -183,7 +183,7 @@ def _child(name: str, seed: int) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         acts = Path(folder) / "acts.npz"
         bench_process.write_acts(acts, script.tubes(seed, 6))
-        words = ["bench", "--part", name, "--acts", str(acts)]
+        words = ["check", "--bench", "--part", name, "--acts", str(acts)]
         command = [sys.executable, "-P", "-m", "palpate", *words]
         done = subprocess.run(command, capture_output=True, text=True, check=True)
     result: dict[str, Any] = json.loads(done.stdout)

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from palpate.core.config import WatchConfig
-from palpate.core.errors import ConfigError, TemporaryError
-from palpate.core.patience import passes
+from palpate.core.errors import ConfigError, TemporaryError, passes
 
 HERE = "127.0.0.1"
 NAMES = ("localhost", HERE, "[::1]")

@@ -10,7 +10,7 @@ from typing import Any, TextIO
 from palpate.client.feed import Feed
 from palpate.core.clock import Clock
 from palpate.core.errors import FormatError
-from palpate.core.log import printable
+from palpate.core.text import printable
 from palpate.core.types import Status
 from palpate.service import status
 

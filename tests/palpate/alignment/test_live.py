@@ -21,9 +21,9 @@ from palpate.alignment.live import Alignment, Expected
 from palpate.alignment.view import View, figure
 from palpate.bundle import bundle
 from palpate.bundle.bundle import Bundle, Manifest
-from palpate.cli.common import StopFlag
 from palpate.cli.main import main
 from palpate.core import config
+from palpate.core.interrupts import StopFlag
 from palpate.signal.contact import ContactPositions
 from palpate.sim import devices, rig, script, skin
 from tests.factories.paths import NO_SITE
@@ -214,7 +214,7 @@ def test_align_with_what_is_simulated(
     turns = iter(range(1200))
     monkeypatch.setattr(StopFlag, "__call__", lambda flag: next(turns, None) is None)
     name = which if which == "skin" else f"replay:{tmp_path / 's.npz'}"
-    assert main(["align", "--sim", name, "--virtual"]) == 0
+    assert main(["skin", "align", "--sim", name, "--virtual"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert all(text.startswith(want) for text in lines)
     assert any("centre row" in text for text in lines)
@@ -314,7 +314,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.slow
 def test_ctrl_c_ends_it(folder: Path):
     """The command prints plain lines until Ctrl-C."""
-    command = [sys.executable, "-m", "palpate", "align", "--sim", "rest"]
+    command = [sys.executable, "-m", "palpate", "skin", "align", "--sim", "rest"]
     command += ["--set", f"classifier.bundle={folder}"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as run:
         first = run.stdout.readline()

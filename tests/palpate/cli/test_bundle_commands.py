@@ -17,7 +17,7 @@ from palpate.core.config import Config
 from palpate.core.errors import BundleError
 from palpate.core.health import Health
 from palpate.deployment.store import Store
-from palpate.service.status import StatusFile
+from palpate.service.status_file import StatusFile
 from tests.factories import deliveries, hands, toy_bundle
 from tests.factories.deliveries import Delivery
 
@@ -63,8 +63,8 @@ def test_the_skin_that_streams_is_known_by_the_bundle_that_runs(settings: Config
     """Without a service, without a skin, or with a bundle from elsewhere, the format is unknown."""
     assert streaming(settings, None) is None
     assert streaming(settings, HEALTH) == RUNNING.format
-    assert streaming(settings, replace(HEALTH, skin="mismatch", streams=False)) is None
-    assert streaming(settings, replace(HEALTH, bundle="9f3c2a1b")) is None
+    assert streaming(settings, HEALTH._replace(skin="mismatch", streams=False)) is None
+    assert streaming(settings, HEALTH._replace(bundle="9f3c2a1b")) is None
 
 
 def test_a_bundle_for_another_skin_is_refused_with_both_formats():

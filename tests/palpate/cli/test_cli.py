@@ -18,13 +18,11 @@ from unittest import mock
 import numpy as np
 import pytest
 
-from palpate.bridges import command as bridges
-from palpate.bridges import options
 from palpate.bundle import bundle
 from palpate.bundle.bundle import Early
-from palpate.cli import bundle_commands, parser, skin_commands
 from palpate.cli import devices as cli_devices
 from palpate.cli import main as main_module
+from palpate.cli import parser
 from palpate.cli.main import main
 from palpate.core import config, statistics, storage
 from palpate.core.clock import SystemClock
@@ -61,7 +59,8 @@ def test_numpy_starts_no_threads_in_a_command():
     """OpenBLAS threads of a process that has run a command and imported numpy: none. In an emulated
     box a product in the loop once waited for one until the watchdog ended the service."""
     code = (
-        "import os; from palpate.cli.main import main; main(['config']); import numpy; "
+        "import os; from palpate.cli.main import main; main(['check', '--settings']); "
+        "import numpy; "
         "print(len(os.listdir('/proc/self/task')))"
     )
     env = {k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")}
@@ -370,14 +369,14 @@ def test_folders_and_files_that_are_not_there(tmp_path: Path, capsys: pytest.Cap
     """A folder of settings that does not exist is an error; the message names a file that is no
     set, without advice on pickles; a result that could not be written is refused before the
     work."""
-    assert main(["config", "--config-dir", str(tmp_path / "none")]) == 78
+    assert main(["check", "--settings", "--config-dir", str(tmp_path / "none")]) == 78
     assert f"--config-dir {tmp_path / 'none'}: no such folder" in capsys.readouterr().err
     assert main(["run", "--sim", "replay:/etc/passwd", "--set", "store.runtime="]) == 65
     told = capsys.readouterr().err
     assert "passwd: not a sweep set (an .npz of samples, labels, materials, rate_hz)" in told
     assert "pickle" not in told
     for path, why in ((tmp_path, "it is a folder"), (tmp_path / "no" / "x.json", "no folder")):
-        assert main(["bench", "--json", str(path)]) == 78
+        assert main(["check", "--bench", "--json", str(path)]) == 78
         assert why in capsys.readouterr().err
     assert not (tmp_path / "no").exists()
 
@@ -551,7 +550,7 @@ def test_the_space_bar_in_a_real_terminal(tmp_path: Path):
 
 def test_config_names_sources(capsys: pytest.CaptureFixture[str]):
     """Each value with the file it comes from."""
-    assert main(["config", "--board", "rpi5", "--set", "sweep.max_duration_s=9"]) == 0
+    assert main(["check", "--settings", "--board", "rpi5", "--set", "sweep.max_duration_s=9"]) == 0
     out = capsys.readouterr().out
     assert "# --set" in next(
         line for line in out.splitlines() if line.startswith("sweep.max_duration_s")
@@ -724,21 +723,29 @@ def test_help_loads_neither_numpy_nor_devices(words: list[str]):
     assert done.stdout.splitlines()[-1] == "[]"
 
 
-def test_each_command_and_action_has_a_function():
-    """The menu, the table of functions and the actions agree."""
-    assert set(main_module.COMMANDS) == set(parser.MENU.commands)
-    assert all(callable(main_module._function(name)) for name in main_module.COMMANDS)
-    assert set(bundle_commands.RUNS) == set(parser.BUNDLE_ACTIONS)
-    assert set(skin_commands.RUNS) == set(parser.SKIN_ACTIONS)
-    assert set(bridges.RUNS) == set(options.TEXTS)
+def test_each_command_has_a_function():
+    """Each command and action names a function that exists."""
+    for command in parser.COMMANDS.values():
+        for one in command.actions.values() or [command]:
+            assert callable(main_module._function(one.run))
+
+
+def test_status_imports_little():
+    """`palpate status` prints a file: neither numpy nor the network's runtime is loaded for it."""
+    code = (
+        "import sys; from palpate.__main__ import main; main(['status']); "
+        "print({'numpy', 'onnxruntime', 'dataclasses', 'logging', 'msgspec'} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "set()"
 
 
 def test_unknown_arguments_are_usage_errors():
     """argparse's own exit code, for commands and options alike."""
-    assert main(["fly"]) == 2
-    with pytest.raises(SystemExit) as e:
-        main(["run", "--fly"])
-    assert e.value.code == 2
+    for words in (["fly"], ["run", "--fly"], ["bundles", "fly"], ["skin"], ["bundles", "verify"]):
+        with pytest.raises(SystemExit) as e:
+            main(words)
+        assert e.value.code == 2
 
 
 @pytest.mark.slow

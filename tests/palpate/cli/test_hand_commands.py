@@ -124,7 +124,7 @@ def test_a_shadow_is_refused_and_the_box_runs(capsys: pytest.CaptureFixture[str]
 
 FOR_ONE = [
     ["record", *VIRTUAL, "--out", "o"],
-    ["align", "--sim", "skin"],
+    ["skin", "align", "--sim", "skin"],
     ["teach", "--web", "0"],
     ["teach", "--use"],
 ]
@@ -190,7 +190,7 @@ def test_sweeps_of_a_finger_lie_apart(tmp_path: Path, capsys: pytest.CaptureFixt
 @pytest.mark.slow
 def test_align_shows_one_finger():
     """With the bundle of a finger its contact positions."""
-    words = ["align", "--sim", "rest", "--finger", "right", *TWO]
+    words = ["skin", "align", "--sim", "rest", "--finger", "right", *TWO]
     with subprocess.Popen(
         [sys.executable, "-m", "palpate", *words], stdout=subprocess.PIPE, text=True
     ) as align:
@@ -207,7 +207,9 @@ def test_the_port_of_the_command_is_that_of_the_finger():
     args = arguments("record", [*own, "--finger", "right", "--port", "/dev/c", "--skin", "matrix"])
     settings = load_settings(args)
     assert (settings.skin.port, settings.skin.profile) == ("/dev/c", "matrix")
-    assert load_settings(arguments("align", [*own, "--finger", "right"])).skin.port == "/dev/b"
+    assert (
+        load_settings(arguments("skin", ["align", *own, "--finger", "right"])).skin.port == "/dev/b"
+    )
 
 
 @pytest.mark.parametrize("command", [["skin", "check"], ["skin", "show"], ["replay", "x"]])

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from palpate.cli.main import main
-from palpate.service.status import StatusFile
+from palpate.service.status_file import StatusFile
 from tests.factories import deliveries, hands, toy_bundle
 from tests.factories.deliveries import Delivery
 

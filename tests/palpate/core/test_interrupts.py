@@ -47,7 +47,7 @@ def _loading(
 @pytest.mark.parametrize(
     ("program", "module", "argv", "library"),
     [
-        ("palpate", "palpate", ["skin", "list"], "onnxruntime"),
+        ("palpate", "palpate", ["skin", "list"], "numpy"),
         (
             "palpate-train",
             "palpate_train",
@@ -79,7 +79,7 @@ def test_ctrl_c_during_a_late_import_is_one_line(tmp_path: Path):
 
 def test_ctrl_c_that_is_ignored_stays_ignored(tmp_path: Path):
     """A program in the background of a script goes on importing; SIGTERM ends it."""
-    process = _loading("palpate", ["skin", "list"], "onnxruntime", tmp_path, ignored=True)
+    process = _loading("palpate", ["skin", "list"], "numpy", tmp_path, ignored=True)
     process.send_signal(signal.SIGINT)
     process.send_signal(signal.SIGTERM)
     _, err = process.communicate(timeout=60)

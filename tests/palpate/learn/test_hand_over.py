@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 import subprocess
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -24,8 +23,8 @@ from tests.factories.paths import ROOT
 def test_the_file_comes_once_between_two_sweeps(tmp_path: Path):
     """Not before an installation has seen the service run, and not during a sweep."""
     clock = VirtualClock()
-    one, quiet = HandOver(tmp_path, clock), replace(HEALTH, sweeping=False)
-    sweeping: Health = replace(HEALTH, sweeping=True)
+    one, quiet = HandOver(tmp_path, clock), HEALTH._replace(sweeping=False)
+    sweeping: Health = HEALTH._replace(sweeping=True)
     one.turn(quiet)
     assert not (tmp_path / FILE).exists()
     clock.sleep_until(clock.now_ns() + hand_over.AFTER_NS)
@@ -44,7 +43,7 @@ def test_a_file_that_cannot_be_written_ends_nothing(tmp_path: Path, logged: list
     one = HandOver(tmp_path / "nowhere", clock)
     clock.sleep_until(clock.now_ns() + hand_over.AFTER_NS)
     for _ in range(2):
-        one.turn(replace(HEALTH, sweeping=False))
+        one.turn(HEALTH._replace(sweeping=False))
     assert len(logged) == 1
     assert "no page by itself: " in logged[0]
 

@@ -4,7 +4,6 @@ beside each sweep."""
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -87,7 +86,7 @@ def test_it_is_said_everywhere(rigged: Callable[..., Rigged], monkeypatch: pytes
     assert beside.kept[0]["loss_known"] is False
     assert beside.kept[0]["device"]["board"] == "matrix"
     assert len(box.kept[0].frames) == skin.FORMAT.window
-    health = asdict(box.box.health)
+    health = box.box.health._asdict()
     assert health["loss_known"] is False
     report = {**health, "running": True, "pid": 1, "version": "", "since_ns": 0, "verdicts": []}
     assert any(

@@ -82,11 +82,11 @@ def test_health_comes_once_a_second_and_a_state_with_each_change(offered: Offere
     peer.lines()
     offered.turns(375, step_s=0.008)
     assert kinds(peer.lines()) == ["health"] * 3
-    offered.turns(2, replace(HEALTH, sweeping=True, ready=False))
+    offered.turns(2, HEALTH._replace(sweeping=True, ready=False))
     assert peer.lines() == [
         {"type": "state", "skin": "streaming", "trouble": "", "sweeping": True, "ready": False}
     ]
-    offered.turns(2, replace(HEALTH, skin="absent", trouble="no skin on USB", ready=False))
+    offered.turns(2, HEALTH._replace(skin="absent", trouble="no skin on USB", ready=False))
     assert [(line["skin"], line["trouble"]) for line in peer.lines()] == [
         ("absent", "no skin on USB")
     ]

@@ -15,13 +15,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from palpate import __version__
 from palpate.core.errors import ApplianceError, FormatError
 from palpate.core.health import Health
 from palpate.core.sentences import MAX_LINE, sentence
 from palpate.core.status import REASONS
 from palpate.core.types import Status, Verdict
 from palpate.service import status
-from palpate.service.status import StatusFile
+from palpate.service.status_file import StatusFile
 from palpate.service.systemd import VerdictLog
 from palpate.sim import devices, rig
 from tests.factories.simulated_box import SECOND, Rigged, idle_devices
@@ -47,7 +48,7 @@ HEALTH = Health(
     lost_edges=0,
     storms=0,
 )
-AWAY = replace(HEALTH, skin="absent", trouble="no skin on USB; check cable", streams=False)
+AWAY = HEALTH._replace(skin="absent", trouble="no skin on USB; check cable", streams=False)
 OK = Verdict(
     sweep=7,
     time_ns=0,
@@ -113,7 +114,7 @@ def test_a_bridged_taxel_has_a_line(status_file: ClockedStatus):
     """With its remedy; a sound skin has none."""
     status_file.turns(2)
     assert "degraded" not in status_file.text()
-    status_file.turns(2, replace(HEALTH, degraded="silent taxel 2.3"))
+    status_file.turns(2, HEALTH._replace(degraded="silent taxel 2.3"))
     assert "degraded silent taxel 2.3: bridged by its neighbours; check the skin" in (
         status_file.text()
     )
@@ -125,7 +126,7 @@ def test_the_answers_of_fingers_stand_in_the_line_of_their_sweep(status_file: Cl
     left, right = replace(OK, finger="left"), replace(SHORT, finger="right", status="sensor-lost")
     hand = replace(OK, detail="right sensor-lost", fingers=(left, right))
     status_file.file.answered(hand)
-    away = replace(HEALTH, degraded="right absent", trouble="right: no skin on USB")
+    away = HEALTH._replace(degraded="right absent", trouble="right: no skin on USB")
     status_file.turns(2, away)
     text = status_file.text()
     assert "right sensor-lost; left plastic rough 98.7 %, right sensor-lost" in text
@@ -187,8 +188,7 @@ def test_in_words_it_says_how_it_is_and_what_to_do(tmp_path: Path):
     status_file.turns(135)
     text = status_file.text().splitlines()
     assert (
-        text[0]
-        == f"running for 2 min 15 s (process {os.getpid()}, palpate {status.__version__}, source "
+        text[0] == f"running for 2 min 15 s (process {os.getpid()}, palpate {__version__}, source "
         "usb)"
     )
     assert text[1:5] == [
@@ -202,7 +202,7 @@ def test_in_words_it_says_how_it_is_and_what_to_do(tmp_path: Path):
     assert text[6].split()[-6:] == ["plastic", "rough", "98.7", "%", "1.2", "ms"]
     assert text[7].endswith("1.2 ms; moved 2.1 mm too far towards row 4")
     assert status.exit_code(status_file.read()) == 0
-    status_file.turns(1.5, replace(AWAY, garbage_bytes=9, enumerations=2, dropped=4, bundle=""))
+    status_file.turns(1.5, AWAY._replace(garbage_bytes=9, enumerations=2, dropped=4, bundle=""))
     text = status_file.text()
     assert "bundle   none" in text  # while sweeps are recorded
     assert (
@@ -215,7 +215,7 @@ def test_in_words_it_says_how_it_is_and_what_to_do(tmp_path: Path):
 
 def test_text_of_a_device_does_not_steer_a_terminal(status_file: ClockedStatus):
     """Escape characters from outside are shown as question marks."""
-    status_file.turns(0.01, replace(AWAY, trouble="\x1b[2Jgone\n"))
+    status_file.turns(0.01, AWAY._replace(trouble="\x1b[2Jgone\n"))
     assert "?[2Jgone?" in status_file.text()
 
 

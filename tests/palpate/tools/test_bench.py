@@ -1,5 +1,5 @@
-"""`palpate bench`: the keys of its JSON, and the parts that are measured in processes of their
-own."""
+"""`palpate check --bench`: the keys of its JSON, and the parts that are measured in processes of
+their own."""
 
 from __future__ import annotations
 
@@ -24,7 +24,12 @@ def test_bench_writes_its_figures(
         monkeypatch.setattr(bench, name, value)
     monkeypatch.setattr(bench, "_child", lambda name, seed: {name: {"seed": seed}})
     monkeypatch.setattr(bench, "_make_references", lambda folder: None)
-    assert main(["bench", "--json", str(tmp_path / "b.json"), "--references", str(tmp_path)]) == 0
+    assert (
+        main(
+            ["check", "--bench", "--json", str(tmp_path / "b.json"), "--references", str(tmp_path)]
+        )
+        == 0
+    )
     figures = json.loads((tmp_path / "b.json").read_text())
     assert figures["accuracy"]["total"] == 6
     assert figures["frames_lost"] == 0
@@ -55,13 +60,13 @@ def test_bench_parts(
     monkeypatch.setattr(bench_process, "MEMORY_SWEEPS", 20)
     monkeypatch.setattr(bench_process, "STREAM_S", 0.5)
     bench_process.write_acts(tmp_path / "acts.npz", script.tubes(1, 2))
-    assert main(["bench", "--part", "memory", "--acts", str(tmp_path / "acts.npz")]) == 0
+    assert main(["check", "--bench", "--part", "memory", "--acts", str(tmp_path / "acts.npz")]) == 0
     memory = json.loads(capsys.readouterr().out)["rss_mb"]
     assert 10 < memory["without_board"] <= memory["after_1000"]
-    assert main(["bench", "--part", "stream", "--acts", str(tmp_path / "acts.npz")]) == 0
+    assert main(["check", "--bench", "--part", "stream", "--acts", str(tmp_path / "acts.npz")]) == 0
     shares = json.loads(capsys.readouterr().out)
     assert 0 < shares["cpu_share_streaming"] < shares["cpu_share_with_simulated_board"]
-    assert main(["bench", "--part", "hand", "--acts", str(tmp_path / "acts.npz")]) == 0
+    assert main(["check", "--bench", "--part", "hand", "--acts", str(tmp_path / "acts.npz")]) == 0
     shares = json.loads(capsys.readouterr().out)["cpu_share_by_skins"]
     assert [*shares] == ["1", "2", "4"]
     assert 0 < shares["1"] < shares["4"]

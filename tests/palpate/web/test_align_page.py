@@ -1,4 +1,4 @@
-"""The page of `palpate align` in a headless browser: alone, and as the command serves it."""
+"""The page of `palpate skin align` in a headless browser: alone, and as the command serves it."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def box(folder: Path) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
     """The running command with the simulated skin, and the address of its page."""
-    command = [sys.executable, "-m", "palpate", "align", "--sim", "rest", "--web", "0"]
+    command = [sys.executable, "-m", "palpate", "skin", "align", "--sim", "rest", "--web", "0"]
     with subprocess.Popen(
         [*command, "--set", f"classifier.bundle={folder}"],
         stdout=subprocess.DEVNULL,

@@ -6,7 +6,6 @@ import io
 import json
 import re
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -90,7 +89,7 @@ def test_connection_events_end_and_return_of_the_box(
         watch.step()
     assert all(reader.frames_hz == 0 for reader in offered.feed._readers.values())
     offered.feed.answered(OK)
-    offered.turns(2, replace(HEALTH, sweeping=True, ready=False))
+    offered.turns(2, HEALTH._replace(sweeping=True, ready=False))
     for _ in range(3):
         watch.step()
     offered.feed.stopping()

@@ -258,7 +258,7 @@ def test_timed_sweeps_are_counted_down(
         seen = BrowsedPage(context, one.page.server.address)
         for sweeping, words in ((False, "Next sweep in"), (True, "Slide now")):
             due_ns = SystemClock().now_ns() + 60 * SECOND
-            one.health = replace(one.health, due_ns=due_ns, sweeping=sweeping, ready=not sweeping)
+            one.health = one.health._replace(due_ns=due_ns, sweeping=sweeping, ready=not sweeping)
             until(lambda words=words: seen.text("#call") == words and seen.text("#countdown"))
             before = float(seen.text("#countdown"))
             assert 5 < before < 70  # the page learns the clock late by the delay of an event
@@ -267,7 +267,7 @@ def test_timed_sweeps_are_counted_down(
             assert box["height"] >= 96
             assert box["y"] + box["height"] <= height
             assert seen.legibility()[1] == []
-        one.health = replace(one.health, skin="lost", trouble="unplugged", due_ns=0)
+        one.health = one.health._replace(skin="lost", trouble="unplugged", due_ns=0)
         until(lambda: seen.text("#call") == seen.text("#countdown") == "")
         assert not seen.errors
         context.close()
@@ -437,7 +437,7 @@ def test_every_text_of_it_can_be_read(
     seen.page.fill("#session", "-")
     seen.page.click("#set")
     until(lambda: "cannot be used" in seen.text("#said"))
-    away = replace(recorded.health, skin="lost", trouble="the skin was unplugged", ready=False)
+    away = recorded.health._replace(skin="lost", trouble="the skin was unplugged", ready=False)
     for act in (lambda: None, lambda: setattr(recorded, "health", away)):
         act()
         until(lambda act=act: seen.page.is_visible("#banner") == (recorded.health is away))

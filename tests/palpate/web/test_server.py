@@ -344,7 +344,7 @@ def test_the_pages_hold_everything_they_show():
 
 
 @pytest.mark.parametrize(
-    "command", [["align", "--sim", "rest"], ["record", "--sim", "skin", "--virtual"]]
+    "command", [["skin", "align", "--sim", "rest"], ["record", "--sim", "skin", "--virtual"]]
 )
 def test_without_tornado_it_says_what_to_install(tmp_path: Path, command: list[str]):
     """One line that names the extra; nothing else of the box needs it."""

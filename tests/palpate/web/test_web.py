@@ -12,7 +12,6 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -173,7 +172,7 @@ def test_a_skin_that_is_lost_comes_with_its_reason(watcher: PageWatcher, path: P
     offered = Offered(path)
     reader = EventReader(watcher.server)
     heard(watcher, offered, "health", reader)
-    offered.turns(3, replace(HEALTH, skin="lost", trouble="the skin was unplugged", ready=False))
+    offered.turns(3, HEALTH._replace(skin="lost", trouble="the skin was unplugged", ready=False))
     assert heard(watcher, None, "state", reader)["trouble"] == "the skin was unplugged"
 
 

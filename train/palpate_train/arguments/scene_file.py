@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from palpate.core.errors import FormatError
-from palpate.core.schema import closest
+from palpate.core.text import closest
 
 PATHS = ("--set",)
 """Options whose values may be files relative to the scene's folder."""

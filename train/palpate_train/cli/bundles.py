@@ -10,7 +10,7 @@ from pathlib import Path
 
 from palpate.bundle import bundle
 from palpate.bundle.manifest import Manifest
-from palpate.core import config, outputs
+from palpate.core import config, outputs, settings_files
 from palpate.core.clock import SystemClock
 from palpate.core.errors import FormatError
 from palpate.core.provenance import commit
@@ -64,8 +64,8 @@ def _add_export(export: argparse.ArgumentParser) -> None:
     export.add_argument(
         "--pitch-mm",
         type=numbers.above_zero("--pitch-mm"),
-        help="distance between taxels; without it `palpate align` cannot show mm (known for the "
-        "simulated skin)",
+        help="distance between taxels; without it `palpate skin align` cannot show mm (known for "
+        "the simulated skin)",
     )
     export.add_argument(
         "--licence", default="", metavar="NAME", help="of the recordings, for card.md: CC-BY-4.0"
@@ -165,5 +165,5 @@ def _class_bits() -> dict[str, int]:
     """The number of GPIO lines for the class code in each delivered board file."""
     return {
         name: len(config.load(name, site=Path(os.devnull)).output.class_bits)
-        for name in config.boards()
+        for name in settings_files.boards()
     }

@@ -10,7 +10,7 @@ import numpy as np
 from palpate.core import names as core
 from palpate.core.errors import FormatError
 from palpate.core.names import LABEL
-from palpate.core.schema import closest
+from palpate.core.text import closest
 from palpate_train.data.files.table import normal
 from palpate_train.data.sets import Dataset
 

@@ -1,5 +1,5 @@
-"""The table of the box's time and memory, in Markdown, from docs/data/bench.json (`palpate bench
---json`). document_figures writes it into the documents."""
+"""The table of the box's time and memory, in Markdown, from docs/data/bench.json (`palpate check
+--bench --json`). document_figures writes it into the documents."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ PROGRAM = Program(
             "measure",
             "measure whether a displaced contact is flagged before accuracy is lost (simulated)",
         ),
-        "references": ("measure", "write the models that palpate bench times beside the bundle"),
+        "references": ("measure", "write the models that palpate check --bench times"),
         "reports": ("publish", "make the project's results again: the stale ones, or some by name"),
         "pages": ("publish", "draw the pages of results, with their pictures"),
         "tables": (

@@ -1,4 +1,4 @@
-"""The models with random weights that `palpate bench` times beside the bundle."""
+"""The models with random weights that `palpate check --bench` times beside the bundle."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from palpate_train.onnx_tools.quantize import quantize
 
 
 def write(folder: Path, seed: int = 0) -> tuple[Path, Path]:
-    """Write the models that `palpate bench` times beside the bundle: fp32.onnx and paper_int8.onnx,
-    both with random weights.
+    """Write the models that `palpate check --bench` times beside the bundle: fp32.onnx and
+    paper_int8.onnx, both with random weights.
 
     The first is a trunk like that of the packaged bundle in float32, with stages and the fewest
     filters. The second is the paper's CNN in int8. Both take sweeps of the packaged bundle.

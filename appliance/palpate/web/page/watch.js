@@ -61,7 +61,7 @@ function trouble() {
   return "";
 }
 
-/* Which view is shown: the box at work, or the skin alone to align it; `palpate align` has the second only. */
+/* Which view is shown: the box at work, or the skin alone to align it; `palpate skin align` has the second only. */
 function sees(view) { return view === (!known.box && known.view ? "align" : location.hash === "#align" ? "align" : "watch"); }
 
 function choose() {
@@ -129,7 +129,7 @@ function drawWords() {
   if (news || !view) {
     document.body.dataset.state = "no-connection";
     if (news) put("message", known.box && reached ? "the box is off or restarting" : "no connection");
-    if (news) put("hint", known.box || answers ? news : "see that palpate align still runs on the box, and the tunnel to it");
+    if (news) put("hint", known.box || answers ? news : "see that palpate skin align still runs on the box, and the tunnel to it");
     byId("push").toggleAttribute("hidden", true);
     return;
   }

@@ -1,8 +1,7 @@
-"""Errors that pass by themselves, and a program that waits for their end."""
+"""A service that tries again until an address can be used."""
 
 from __future__ import annotations
 
-import errno
 from collections.abc import Callable
 from typing import TypeVar
 
@@ -11,24 +10,11 @@ from palpate.core.errors import AddressError
 from palpate.core.log import in_journal, log
 
 Made = TypeVar("Made")
-PASSING = frozenset(
-    getattr(errno, name)
-    for name in (
-        *("EIO", "ENOMEM", "ENOSPC", "EDQUOT", "EMFILE", "ENFILE", "EAGAIN", "EINTR", "EBUSY"),
-        *("ESTALE", "ETIMEDOUT", "ENOBUFS", "ENETDOWN", "EADDRINUSE", "EADDRNOTAVAIL"),
-    )
-)
-"""Numbers of errors of the system that may be gone at the next attempt."""
 FIRST_S, MOST_S, STEP_S = 1.0, 60.0, 0.2
 """The first pause, the longest one, and the time between two looks at `stopped`."""
 
 
-def passes(e: BaseException) -> bool:
-    """Whether an error of the system may be gone at the next attempt, without a person."""
-    return isinstance(e, OSError) and e.errno in PASSING
-
-
-def patiently(
+def retried(
     make: Callable[[], Made], clock: Clock, stopped: Callable[[], bool] = lambda: False
 ) -> Made:
     """`make()`; a service tries again with a growing pause as long as an address cannot be used.

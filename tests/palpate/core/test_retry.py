@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import pytest
 
-from palpate.core import patience
+from palpate.core import errors, retry
 from palpate.core.clock import SystemClock
 from palpate.core.errors import AddressError, ConfigError
 from palpate.sim.rig import VirtualClock
@@ -35,9 +35,9 @@ def test_a_service_tries_again_with_a_growing_pause(
     monkeypatch: pytest.MonkeyPatch, logged: list[str]
 ):
     """The pause doubles up to a minute; the log has one line."""
-    monkeypatch.setattr(patience, "in_journal", lambda: True)
+    monkeypatch.setattr(retry, "in_journal", lambda: True)
     clock, calls, make = refusing(9)
-    assert patience.patiently(make, clock) == "open"
+    assert retry.retried(make, clock) == "open"
     pauses = [(b - a) / SECOND for a, b in pairwise(calls)]
     assert pauses == [1, 2, 4, 8, 16, 32, 60, 60, 60]
     assert len(logged) == 1
@@ -47,17 +47,17 @@ def test_a_person_is_told_at_once():
     """In a terminal the error ends the command."""
     clock, calls, make = refusing(1)
     with pytest.raises(AddressError):
-        patience.patiently(make, clock)
+        retry.retried(make, clock)
     assert len(calls) == 1
 
 
 def test_a_stop_ends_the_wait(monkeypatch: pytest.MonkeyPatch):
     """A service that waits ends within a step when it is stopped."""
-    monkeypatch.setattr(patience, "in_journal", lambda: True)
+    monkeypatch.setattr(retry, "in_journal", lambda: True)
     clock, _, make = refusing(99)
     end_ns = clock.now_ns() + 3 * SECOND
     with pytest.raises(AddressError):
-        patience.patiently(make, clock, lambda: clock.now_ns() > end_ns)
+        retry.retried(make, clock, lambda: clock.now_ns() > end_ns)
     assert clock.now_ns() - end_ns < SECOND
 
 
@@ -65,8 +65,8 @@ def test_which_errors_pass():
     """A full disk and too many files pass; a missing file and a missing right do not."""
     passing = [OSError(n, "") for n in (errno.ENOSPC, errno.EMFILE, errno.EIO, errno.ENOMEM)]
     staying = [OSError(n, "") for n in (errno.ENOENT, errno.EACCES, errno.EROFS)]
-    assert all(map(patience.passes, passing))
-    assert not any(map(patience.passes, [*staying, ValueError("x")]))
+    assert all(map(errors.passes, passing))
+    assert not any(map(errors.passes, [*staying, ValueError("x")]))
 
 
 def test_a_page_whose_port_is_in_use_or_whose_address_is_missing():

@@ -11,19 +11,19 @@ import pytest
 
 from palpate.cli import lower_outputs
 from palpate.core.errors import AddressError, ApplianceError, BundleError, LineError
-from palpate.service import ended, status
-from palpate.service.ended import PAUSES_S, Ended
+from palpate.service import last_failure, status
+from palpate.service.last_failure import PAUSES_S, Failure
 from palpate.sim import gpio
 from palpate.sim.rig import VirtualClock
 
 SECOND = 1_000_000_000
 
 
-def failed(folder: Path, clock: VirtualClock, error: Exception) -> Ended:
+def failed(folder: Path, clock: VirtualClock, error: Exception) -> Failure:
     """The note of one more end by this error."""
-    with suppress(type(error)), ended.noted(folder, clock):
+    with suppress(type(error)), last_failure.recorded(folder, clock):
         raise error
-    found = ended.read(folder)
+    found = last_failure.read(folder)
     assert found
     return found
 
@@ -57,24 +57,27 @@ def test_the_pause_grows_and_begins_anew(tmp_path: Path):
 def test_an_end_in_order_leaves_nothing(tmp_path: Path):
     """The next start is not delayed, and status says nothing of an older end."""
     failed(tmp_path, VirtualClock(), LineError("no chip"))
-    with ended.noted(tmp_path, VirtualClock()):
+    with last_failure.recorded(tmp_path, VirtualClock()):
         pass
-    assert ended.read(tmp_path) is None
+    assert last_failure.read(tmp_path) is None
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"[]", b'{"why": 3}', b"\xff" * 99])
 def test_a_damaged_note_is_none(tmp_path: Path, content: bytes):
     """Whatever is in the file, it is ignored and written anew."""
-    (tmp_path / ended.FILE).write_bytes(content)
-    assert ended.read(tmp_path) is None
+    (tmp_path / last_failure.FILE).write_bytes(content)
+    assert last_failure.read(tmp_path) is None
     assert failed(tmp_path, VirtualClock(), LineError("no chip")).failures == 1
 
 
 def test_a_note_that_cannot_be_written_changes_nothing(tmp_path: Path):
     """The error itself is raised, without the folder as well."""
     for folder in (None, tmp_path / "not there"):
-        with pytest.raises(LineError, match="no chip"), ended.noted(folder, VirtualClock()):
+        with (
+            pytest.raises(LineError, match="no chip"),
+            last_failure.recorded(folder, VirtualClock()),
+        ):
             raise LineError("no chip")
 
 
@@ -104,4 +107,4 @@ def test_the_start_after_a_failure_waits(
 def test_the_note_is_readable_json(tmp_path: Path):
     """Long reasons are cut, so that the file stays small."""
     failed(tmp_path, VirtualClock(), LineError("x" * 100_000))
-    assert len(json.loads((tmp_path / ended.FILE).read_text())["why"]) == 1000
+    assert len(json.loads((tmp_path / last_failure.FILE).read_text())["why"]) == 1000

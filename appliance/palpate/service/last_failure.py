@@ -9,15 +9,15 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
-from palpate.core import storage
-from palpate.core.clock import Clock
 from palpate.core.errors import EX_CONFIG, ApplianceError
-from palpate.core.schema import typed
 
-FILE = "ended.json"
+if TYPE_CHECKING:
+    from palpate.core.clock import Clock
+
+FILE = "last-failure.json"
 AGAIN_NS = 60_000_000_000
 """A failure within this time after the last one lengthens the pause."""
 PAUSES_S = (0.0, 1.0, 2.0, 4.0, 6.0)
@@ -26,8 +26,7 @@ shorter than TimeoutStopSec."""
 MOST_BYTES = 1 << 14
 
 
-@dataclass(frozen=True, slots=True)
-class Ended:
+class Failure(NamedTuple):
     """The last end of the service that was not in order. failures: in a row. time_ns: host
     monotonic."""
 
@@ -55,39 +54,44 @@ class Ended:
         return PAUSES_S[min(self.failures, len(PAUSES_S)) - 1]
 
 
-def read(folder: Path | None) -> Ended | None:
+def read(folder: Path | None) -> Failure | None:
     """The content of the file in the runtime folder; None if there is none, or none that can be
     read."""
     if not folder:
         return None
     try:
         with (folder / FILE).open("rb") as f:
-            return typed(Ended, json.loads(f.read(MOST_BYTES)))
+            found = Failure(**json.loads(f.read(MOST_BYTES)))
+        right = [type(v) is type(w) for v, w in zip(found, Failure("", 0, 0), strict=True)]
+        return found if all(right) and found.why.isprintable() else None
     except (OSError, ValueError, TypeError, RecursionError):
         return None
 
 
 @contextmanager
-def noted(folder: Path | None, clock: Clock) -> Iterator[None]:
+def recorded(folder: Path | None, clock: Clock) -> Iterator[None]:
     """Write the file if the block ends by an error, and remove it at an end in order. A file that
     cannot be written is left out: the journal has the reason, too."""
     try:
         yield
     except Exception as e:
-        _note(folder, e, clock.now_ns())
+        _record(folder, e, clock.now_ns())
         raise
     if folder:
         with suppress(OSError):
             (folder / FILE).unlink()
 
 
-def _note(folder: Path | None, e: Exception, now_ns: int) -> None:
+def _record(folder: Path | None, e: Exception, now_ns: int) -> None:
     if not (folder and folder.is_dir()):
         return
     before = read(folder)
     again = before and 0 <= now_ns - before.time_ns < AGAIN_NS
     code = e.exit_code if isinstance(e, ApplianceError) else ApplianceError.exit_code
     why = str(e) if isinstance(e, ApplianceError) else f"{type(e).__name__}: {e}"
-    ended = Ended(why[:1000], code, now_ns, before.failures + 1 if before and again else 1)
+    failure = Failure(why[:1000], code, now_ns, before.failures + 1 if before and again else 1)
+    from palpate.core import storage
+
+    data = json.dumps(failure._asdict()).encode()
     with suppress(OSError):
-        storage.put(folder / FILE, json.dumps(asdict(ended)).encode(), durable=False, mode=0o644)
+        storage.put(folder / FILE, data, durable=False, mode=0o644)

@@ -1,0 +1,42 @@
+"""Texts for people: characters of a device or a file that are safe to print, and close names for a
+misspelt one."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable
+from io import TextIOWrapper
+
+
+def replace_unprintable() -> None:
+    """Show ? for a character that the terminal's encoding lacks: it must not end the program."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="replace")
+
+
+def printable(text: str) -> str:
+    """`text` with "?" for each character that is not printable: a device may send characters that
+    control a terminal."""
+    return "".join(c if c.isprintable() else "?" for c in text)
+
+
+def shown(value: object) -> str:
+    """A value from a file for a message of one line, cut at 80 characters."""
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # an integer of over 4300 digits; deeply nested tables
+        return "(too large to show)"
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def closest(name: str, known: Iterable[str], most: int = 1, cutoff: float = 0.5) -> list[str]:
+    """Up to `most` of the `known` names that a misspelt `name` may stand for, the most similar
+    first; case is ignored.
+
+    cutoff: least similarity, 0 to 1 (difflib's ratio).
+    """
+    from difflib import get_close_matches
+
+    by_folded = {k.casefold(): k for k in known}
+    return [by_folded[k] for k in get_close_matches(name.casefold(), by_folded, most, cutoff)]
