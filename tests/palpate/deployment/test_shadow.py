@@ -30,7 +30,7 @@ from tests.factories import toy_bundle
 from tests.factories.simulated_box import SECOND
 
 IDLE = Health(0, "streaming", "", True, False, 0, 0, 0, 0, 1, 0, "", "sim", *[0] * 6)
-SWEEPING = replace(IDLE, sweeping=True)
+SWEEPING = IDLE._replace(sweeping=True)
 
 
 class Side:
