@@ -26,14 +26,14 @@ from palpate.core.directions import DIRECTIONS
 from palpate.core.errors import ApplianceError, FormatError
 from palpate.core.fingers import MOST
 from palpate.core.log import SparseLog
-from palpate.core.status import Status
+from palpate.core.status import WORDS, Status
 
 VERSION = 1
 """Version of the map of registers. It only grows at the end; the meaning of an entry never
 changes."""
 STATES = ("streaming", "absent", "busy", "denied", "mismatch", "silent", "lost")
 """States of the skin; the code is the index + 1. 0: the box is not heard."""
-STATUS_CODES: Mapping[Status, int] = {status: code for code, status in enumerate(Status, 1)}
+STATUS_CODES: Mapping[Status, int] = {status: words.code for status, words in WORDS.items()}
 STALE = 99
 """Status code while the box is not heard."""
 COILS = ("START", "STOP", "NEW", "TARE", "ABORT")

@@ -8,14 +8,7 @@ from dataclasses import dataclass, replace
 
 from palpate.core import sentences
 from palpate.core.errors import FormatError
-from palpate.core.status import REASONS, Status
-
-ADVICE = {
-    Status.OK: "use the label",
-    Status.UNSURE: "sweep the same object once more",
-    Status.UNDECIDED: "sort the object out: it has been swept as often as is allowed",
-}
-"""Advice for an answer with a label; for other answers see `status.REASONS`."""
+from palpate.core.status import WORDS, Status
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +121,7 @@ class Answer:
     @property
     def what_to_do(self) -> str:
         """The reason for the status and its remedy, with the box's detail."""
-        text = ADVICE[self.status] if self.status in ADVICE else REASONS[self.status]
+        text = WORDS[self.status].reason or WORDS[self.status].robot
         return f"{text} ({self.detail})" if self.detail else text
 
 

@@ -1,15 +1,16 @@
-"""The outcomes of a sweep: a Status for each, with the reason why it has no label."""
+"""The outcomes of a sweep: one table with all that is said about each, for robots and people."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from enum import StrEnum
 from types import MappingProxyType
+from typing import NamedTuple
 
 
 class Status(StrEnum):
-    """The outcome of a sweep, in sentences, on GPIO lines and in files. PROTOCOL.md explains each;
-    a test compares the lists."""
+    """The outcome of a sweep, in sentences, on GPIO lines and in files, in the order of their
+    codes. PROTOCOL.md explains each."""
 
     OK = "ok"
     UNSURE = "unsure"
@@ -51,26 +52,76 @@ class Status(StrEnum):
         )
 
 
+USE, AGAIN, ASIDE = "use the label", "sweep again", "set the object aside"
+HALT, NOTHING = "stop and call a person", "nothing"
+
+
+class Words(NamedTuple):
+    """What is said about a status.
+
+    code: for Modbus. colour: of the page's card: good, warn, bad or plain. word, advice: for an
+    operator, on the page. robot: what the robot's program does. reason: why there is no label, and
+    the remedy, for logs; "" with a label.
+    """
+
+    code: int
+    colour: str
+    word: str
+    advice: str
+    robot: str
+    reason: str
+
+
+# fmt: off
+_ROWS = {  # by status: colour, word, advice, robot, reason
+    Status.OK: ("good", "", "", USE, ""),
+    Status.UNSURE: ("warn", "Unsure", "Sweep again.", "sweep the same object once more", ""),
+    Status.UNDECIDED: ("warn", "Undecided", "More sweeps will not help: set the object aside.",
+        ASIDE, ""),
+    Status.UNKNOWN: ("warn", "Unknown", "Not like any taught material.", ASIDE,
+        "it differs from all trained and enrolled materials"),
+    Status.SHORT: ("bad", "Too short", "Slide for longer.", AGAIN,
+        "the stop edge came before a window's length had passed"),
+    Status.LONG: ("bad", "Too long", "No stop signal came: check the robot.", AGAIN,
+        "no stop edge came in time"),
+    Status.GAP: ("bad", "Gaps", "Frames are missing: check the skin's cable.", AGAIN,
+        "too many frames in a row are missing; check the skin's cable"),
+    Status.NO_CONTACT: ("bad", "No contact", "The finger did not touch the object.", AGAIN,
+        "no taxel is loaded; check that the finger touches the object"),
+    Status.SATURATED: ("bad", "Too much force", "Press less.", AGAIN,
+        "too many raw counts at full scale; press less"),
+    Status.STUCK_TAXEL: ("bad", "Skin faulty", "A taxel is stuck: check the skin.", HALT,
+        "a loaded taxel shows a constant count; check the skin"),
+    Status.DEAD_TAXEL: ("bad", "Skin faulty", "A taxel is dead: check the skin.", HALT,
+        "a taxel between loaded taxels is dead; check the skin"),
+    Status.SENSOR_LOST: ("bad", "Skin lost", "Check the skin's cable.", HALT,
+        "the skin was lost during the sweep; check its cable"),
+    Status.NO_START: ("bad", "No start", "A stop signal came alone: check the wire START.", HALT,
+        "a stop edge without a start; check the GPIO line START"),
+    Status.NO_STOP: ("bad", "No stop", "A second start signal came: check the wire STOP.", HALT,
+        "a second start edge came; check the GPIO line STOP"),
+    Status.NOT_READY: ("bad", "Too early", "The robot must wait until the box is ready.", AGAIN,
+        "a start edge while READY was low; the robot must wait for READY"),
+    Status.EDGES_LOST: ("bad", "Signals lost", "Check the wires of START and STOP.", HALT,
+        "trigger edges were lost; check the GPIO lines of the trigger"),
+    Status.ABORTED: ("plain", "Aborted", "By command, or because the box was stopping.", AGAIN,
+        "by command, or because the box was stopping"),
+    Status.RECORDED: ("plain", "Recorded", "The box records now, and names nothing.", NOTHING,
+        "sweeps are recorded, not classified"),
+    Status.CONFLICT: ("warn", "Contradiction",
+        "Not like the sweeps before it: is this a new object?", AGAIN,
+        "it contradicts the sweeps before it; signal NEW OBJECT for each object"),
+    Status.NO_SLIDE: ("bad", "No slide", "The finger rested: slide all the way.", AGAIN,
+        "the finger rests in a part of the window; slide through all of it"),
+    Status.FAILED: ("bad", "Failed", "The box could not compute this sweep: sweep again.", AGAIN,
+        "the box could not compute an answer; sweep again"),
+}
+# fmt: on
+WORDS: Mapping[Status, Words] = MappingProxyType(
+    {status: Words(code, *_ROWS[status]) for code, status in enumerate(Status, 1)}
+)
+"""The table. Client, pages, bridges, logs and documents are made from it, or tested against it."""
 REASONS: Mapping[Status, str] = MappingProxyType(
-    {
-        Status.UNKNOWN: "it differs from all trained and enrolled materials",
-        Status.SHORT: "the stop edge came before a window's length had passed",
-        Status.LONG: "no stop edge came in time",
-        Status.GAP: "too many frames in a row are missing; check the skin's cable",
-        Status.NO_CONTACT: "no taxel is loaded; check that the finger touches the object",
-        Status.SATURATED: "too many raw counts at full scale; press less",
-        Status.STUCK_TAXEL: "a loaded taxel shows a constant count; check the skin",
-        Status.DEAD_TAXEL: "a taxel between loaded taxels is dead; check the skin",
-        Status.SENSOR_LOST: "the skin was lost during the sweep; check its cable",
-        Status.NO_START: "a stop edge without a start; check the GPIO line START",
-        Status.NO_STOP: "a second start edge came; check the GPIO line STOP",
-        Status.NOT_READY: "a start edge while READY was low; the robot must wait for READY",
-        Status.EDGES_LOST: "trigger edges were lost; check the GPIO lines of the trigger",
-        Status.ABORTED: "by command, or because the box was stopping",
-        Status.RECORDED: "sweeps are recorded, not classified",
-        Status.NO_SLIDE: "the finger rests in a part of the window; slide through all of it",
-        Status.FAILED: "the box could not compute an answer; sweep again",
-        Status.CONFLICT: "it contradicts the sweeps before it; signal NEW OBJECT for each object",
-    }
+    {status: words.reason for status, words in WORDS.items() if words.reason}
 )
 """The reason why a sweep has no label, and the remedy; PROTOCOL.md has the details."""

@@ -25,6 +25,7 @@ from weakref import WeakSet
 
 from palpate.core.errors import AddressError, ApplianceError, ConfigError, FormatError, NoAnswer
 from palpate.core.log import TroubleLog
+from palpate.core.status import WORDS
 from palpate.web import local_users
 from palpate.web.access import Access
 
@@ -238,9 +239,10 @@ class PageServer:
 
 def page_files() -> dict[str, tuple[str, bytes]]:
     """Type and content of each file of FOLDER, by its path. Pages are in the frame that all of them
-    share, frame.html."""
+    share, frame.html; /statuses.js holds the words of the table of statuses."""
     frames = Loader(str(FOLDER), autoescape=None, whitespace="all")
-    return {
+    statuses = {str(s): [w.colour, w.word, w.advice] for s, w in WORDS.items()}
+    files = {
         f"/{f.name}": (
             KINDS[f.suffix],
             frames.load(f.name).generate() if f.suffix == ".html" else f.read_bytes(),
@@ -248,6 +250,8 @@ def page_files() -> dict[str, tuple[str, bytes]]:
         for f in FOLDER.iterdir()
         if f.suffix in KINDS and f.name != "frame.html"
     }
+    script = f"export const STATUSES = {json.dumps(statuses)};\n".encode()
+    return files | {"/statuses.js": (KINDS[".js"], script)}
 
 
 def _checked(port: int) -> int:

@@ -529,10 +529,6 @@ def test_the_document_has_the_map():
         re.M,
     ) == [*INPUTS]
     assert tuple(re.findall(r"^\| \d+ \| ([A-Z]+) \|", text.partition("Coils")[2], re.M)) == COILS
-    codes = dict(
-        re.findall(r"(\d+)\s`([a-z-]+)`", text.partition("Status codes")[2].partition("\n\n")[0])
-    )
-    assert codes == {str(code): str(status) for status, code in STATUS_CODES.items()}
 
 
 @pytest.mark.parametrize(

@@ -72,7 +72,7 @@ def test_python_prints_what_to_do(box: SpeakingBox, capsys: pytest.CaptureFixtur
     box.unplug()
     names["main"](str(box.path), lambda: None)
     out = capsys.readouterr().out.splitlines()
-    assert out[:2] == ["wood", "sort it out"]
+    assert out[:2] == ["wood", "set it aside"]
     assert out[2].startswith("no answer: ")
 
 

@@ -19,7 +19,6 @@ from palpate import __version__
 from palpate.core.errors import ApplianceError, FormatError
 from palpate.core.health import Health
 from palpate.core.sentences import MAX_LINE, sentence
-from palpate.core.status import REASONS
 from palpate.core.types import Status, Verdict
 from palpate.service import status
 from palpate.service.status_file import StatusFile
@@ -336,11 +335,6 @@ def test_the_log_has_one_line_a_verdict(verdict: Verdict, line: str, logged: lis
     """In words; a verdict that needs attention is a warning."""
     VerdictLog().answered(verdict)
     assert logged == [line]
-
-
-def test_every_status_without_a_label_has_its_reason():
-    """One list: a new status needs its advice."""
-    assert set(REASONS) == {s for s in Status if not s.classified}
 
 
 def once(change: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:

@@ -212,6 +212,7 @@ FILES = {
     "/",
     "/tablet.js",
     "/verdict.js",
+    "/statuses.js",
     "/shift.js",
     "/page.css",
     "/watch.js",

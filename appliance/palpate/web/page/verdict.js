@@ -1,32 +1,10 @@
 /* The card that is read from two metres: what the box said, whether that can be trusted, and what to do now. */
 
 import {ago, byId, clock, made, mark, percent, put} from "/parts.js";
+import {STATUSES} from "/statuses.js";
 
 /* By status: how the card is coloured, what the box says in words, and what to do. */
-export const WORDS = {
-  ok: ["good", "", ""],
-  unsure: ["warn", "Unsure", "Sweep again."],
-  undecided: ["warn", "Undecided", "More sweeps will not help: put the object aside."],
-  unknown: ["warn", "Unknown", "Not like any taught material."],
-  displaced: ["warn", "Displaced", "The skin has moved: align it."],
-  conflict: ["warn", "Contradiction", "Not like the sweeps before it: is this a new object?"],
-  short: ["bad", "Too short", "Slide for longer."],
-  long: ["bad", "Too long", "No stop signal came: check the robot."],
-  gap: ["bad", "Gaps", "Frames are missing: check the skin's cable."],
-  "no-contact": ["bad", "No contact", "The finger did not touch the object."],
-  "no-slide": ["bad", "No slide", "The finger rested: slide all the way."],
-  saturated: ["bad", "Too much force", "Press less."],
-  "stuck-taxel": ["bad", "Skin faulty", "A taxel is stuck: check the skin."],
-  "dead-taxel": ["bad", "Skin faulty", "A taxel is dead: check the skin."],
-  failed: ["bad", "Failed", "The box could not compute this sweep: sweep again."],
-  "sensor-lost": ["bad", "Skin lost", "Check the skin's cable."],
-  "no-start": ["bad", "No start", "A stop signal came alone: check the wire START."],
-  "no-stop": ["bad", "No stop", "A second start signal came: check the wire STOP."],
-  "not-ready": ["bad", "Too early", "The robot must wait until the box is ready."],
-  "edges-lost": ["bad", "Signals lost", "Check the wires of START and STOP."],
-  aborted: ["plain", "Aborted", "By command, or because the box was stopping."],
-  recorded: ["plain", "Recorded", "The box records now, and names nothing."],
-};
+export const WORDS = {...STATUSES, displaced: ["warn", "Displaced", "The skin has moved: align it."]};
 
 /* By state of the skin: what is wrong, and what to do. */
 const SKINS = {

@@ -1,0 +1,50 @@
+"""The table of statuses, and whatever else says something about a status."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import pytest
+
+from palpate.bridges.modbus import STATUS_CODES
+from palpate.client.answers import Answer
+from palpate.core.status import ASIDE, HALT, REASONS, USE, WORDS, Status
+from palpate.web.server import page_files
+from tests.factories.paths import ROOT
+
+
+def test_all_that_is_said_of_a_status_is_of_the_table():
+    """PROTOCOL.md's list, the page of statuses, Modbus in code and page, the card of the page:
+    each has every status in the order of the codes, with the words of the table."""
+    protocol = (ROOT / "firmware_config" / "PROTOCOL.md").read_text()
+    listed = protocol.split("| status | meaning")[1].split("\n\n")[0]
+    assert re.findall(r"(?m)^\| `([a-z-]+)` \|", listed) == [*Status]
+    page = (ROOT / "docs" / "reference" / "statuses.md").read_text()
+    rows = re.findall(r"(?m)^\| `([a-z-]+)` \| (\d+) \| ([^|]*) \| [^|]+ \| [^|]+ \|$", page)
+    assert rows == [(s, str(w.code), w.robot) for s, w in WORDS.items()]
+    assert {s: w.code for s, w in WORDS.items()} == STATUS_CODES
+    modbus = (ROOT / "docs" / "robots" / "modbus.md").read_text()
+    codes = modbus.partition("Status codes")[2].partition("\n\n")[0]
+    assert re.findall(r"(\d+)\s`([a-z-]+)`", codes) == [(str(w.code), s) for s, w in WORDS.items()]
+    _, script = page_files()["/statuses.js"]
+    shown = json.loads(script.decode().removeprefix("export const STATUSES = ").rstrip(";\n"))
+    assert shown == {s: [w.colour, w.word, w.advice] for s, w in WORDS.items()}
+
+
+def test_the_table_is_whole():
+    """A sweep without a label has a reason; an operator gets words for all but `ok`; only `ok` is
+    used."""
+    assert set(REASONS) == {s for s in Status if not s.classified}
+    assert all(w.word and w.advice for s, w in WORDS.items() if s is not Status.OK)
+    assert [s for s, w in WORDS.items() if w.robot == USE] == [Status.OK]
+    assert all(w.colour == "bad" for w in WORDS.values() if w.robot == HALT)
+
+
+@pytest.mark.parametrize("status", Status)
+def test_a_client_hears_what_to_do(status: Status):
+    """A robot's program gets a text for each status, with the detail of the box."""
+    fields = ["1", "0", status, "wood", "0.5", "0.1", "1", "0", "1", "b", "sim", "1", "taxel 2.3"]
+    text = Answer.of(fields).what_to_do
+    assert text.endswith("(taxel 2.3)")
+    assert (ASIDE in text) == (status is Status.UNDECIDED)
