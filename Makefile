@@ -25,7 +25,7 @@ SCRATCH = $(or $(shell df -Pk /dev/shm 2>/dev/null | awk 'NR > 1 && $$4 > 100000
 PYTEST = PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -n $(shell expr `nproc` + 1)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo desktop test test-fast test-all lint types bundle bench site deploy install deb clean
+.PHONY: help demo desktop test test-fast test-all lint types bundle bench site deploy install deb client clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -91,6 +91,10 @@ deb: $(FLEET) $(DESKTOP) ## pack the same as dist/palpate_*.deb for arm64 and am
 	$(BIN)/python systemd/debian.py dist
 	PYTHONPATH=. $(BIN)/python systemd/sbom.py dist/palpate.cdx.json
 	awk '/^## / { part++ } part == 1' CHANGELOG.md >dist/notes.md
+
+client: $(RUNTIME) ## build the robot's client alone: dist/palpate_client-*.whl
+	$(PIP) wheel --no-deps --no-build-isolation -w dist ./appliance/plugins/client
+	rm -rf appliance/plugins/client/build appliance/plugins/client/*.egg-info
 
 clean: ## remove everything that was built, the virtual environment too
 	rm -rf $(VENV) build dist *.egg-info appliance/*.egg-info train/*.egg-info train/studies/*.egg-info

@@ -24,8 +24,8 @@ from palpate.client.answers import Answer
 from palpate.core.clock import Clock
 from palpate.core.directions import DIRECTIONS
 from palpate.core.errors import ApplianceError, FormatError
-from palpate.core.fingers import MOST
 from palpate.core.log import SparseLog
+from palpate.core.sentences import MOST_FINGERS
 from palpate.core.status import WORDS, Status
 
 VERSION = 1
@@ -140,7 +140,7 @@ FINGERS = (
     Register("fingers", lambda view: len(view.answer.fingers) if view.answer else 0),
     *(
         register
-        for i in range(MOST)
+        for i in range(MOST_FINGERS)
         for register in (
             Register(f"finger {i + 1}", _of_finger(i, _name), 4),
             Register(f"status {i + 1}", _of_finger(i, lambda view, of: STATUS_CODES[of.status])),

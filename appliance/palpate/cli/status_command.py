@@ -7,6 +7,7 @@ import time
 
 from palpate.core import settings_files
 from palpate.core.errors import ConfigError
+from palpate.core.runtime_folder import STATUS
 from palpate.service import status
 
 
@@ -20,7 +21,7 @@ def run(args: argparse.Namespace) -> int:
             " service"
         )
     now_ns = time.monotonic_ns()
-    report = status.read(folder / status.FILE, now_ns)
+    report = status.read(folder / STATUS, now_ns)
     if args.json:
         import json
 

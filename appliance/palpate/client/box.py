@@ -23,8 +23,7 @@ from palpate.client.answers import Answer, BoxIdentity, BoxState
 from palpate.client.line import Line, open_port
 from palpate.core.clock import Clock, SystemClock
 from palpate.core.errors import CommandRefused, FormatError, LinkLost, NoAnswer
-from palpate.core.fingers import MOST
-from palpate.core.sentences import Sentence, sentence
+from palpate.core.sentences import MOST_FINGERS, Sentence, sentence
 
 BAUD = 115200
 KEPT = 256
@@ -68,7 +67,7 @@ class Palpate:
         self._asking = threading.Lock()
         self._replies: deque[list[str]] = deque(maxlen=KEPT)
         self._answers: deque[Answer] = deque()
-        self._fingers: deque[Answer] = deque(maxlen=MOST)  # of the next answer
+        self._fingers: deque[Answer] = deque(maxlen=MOST_FINGERS)  # of the next answer
         # the number of the newest answer, numbers of missing answers before it, and the count of
         # answers in the last STA
         self._sweep: int | None = None

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from palpate.core.clock import Clock, SystemClock, wait_readable
-from palpate.core.config import FEED_SCHEMA, StoreConfig
 from palpate.core.errors import FeedError, FormatError
+from palpate.core.runtime_folder import FEED, FEED_SCHEMA, RUNTIME
 
-DEFAULT = str(StoreConfig().feed)
+DEFAULT = f"{RUNTIME}/{FEED}"
 MOST_LINE = 1 << 20
 """Longest line in bytes; the box sends far shorter lines."""
 RETRY_NS = 500_000_000

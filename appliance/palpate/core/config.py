@@ -17,13 +17,10 @@ from typing import Any, Literal, get_type_hints
 
 from palpate.core import fingers, settings_files
 from palpate.core.errors import ConfigError
+from palpate.core.runtime_folder import FEED, RUNTIME, STATUS
 from palpate.core.schema import Key, custom, fixed, gpio_line, keys, number, read_table
-from palpate.core.settings_files import RUNTIME, SITE
+from palpate.core.settings_files import SITE
 from palpate.core.text import closest, shown
-
-FEED_SCHEMA = 1
-"""Version of the feed's lines (PROTOCOL.md, part 4), for writer and readers."""
-
 
 _USB = re.compile(r"([0-9a-f]{4}):([0-9a-f]{4})(?::(.+))?", re.ASCII | re.IGNORECASE)
 
@@ -220,7 +217,7 @@ class StoreConfig:
     @property
     def status(self) -> Path | None:
         """The file that `palpate status` reads."""
-        return Path(self.runtime) / "status.json" if self.runtime else None
+        return Path(self.runtime) / STATUS if self.runtime else None
 
     @property
     def runtime_folder(self) -> Path | None:
@@ -230,7 +227,7 @@ class StoreConfig:
     @property
     def feed(self) -> Path | None:
         """The socket of the feed."""
-        return Path(self.runtime) / "feed.sock" if self.runtime else None
+        return Path(self.runtime) / FEED if self.runtime else None
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,10 +8,9 @@ from typing import Any
 
 from palpate.core.errors import ConfigError
 from palpate.core.schema import Key, read_table
+from palpate.core.sentences import MOST_FINGERS
 from palpate.core.text import closest, shown
 
-MOST = 4
-"""Largest number of fingers."""
 _NAME = re.compile(r"[a-z][a-z0-9-]{0,7}", re.ASCII)
 """A name; longer ones would leave no room for the label in a sentence."""
 _PART = re.compile(r"([1-4])/([2-4]) (rows|columns)", re.ASCII)
@@ -72,12 +71,12 @@ def whole(
     common: Mapping[str, Any], own: Mapping[str, Mapping[str, Any]], where: str
 ) -> dict[str, dict[str, Any]]:
     """All values of each finger: `common`, with those of its `own`. where: the last layer that
-    names a finger. Raises ConfigError unless there are no fingers, or 2 to MOST that differ in
-    their skins."""
-    if len(own) == 1 or len(own) > MOST:
+    names a finger. Raises ConfigError unless there are no fingers, or 2 to MOST_FINGERS that differ
+    in their skins."""
+    if len(own) == 1 or len(own) > MOST_FINGERS:
         raise ConfigError(
-            f"{where}: [skins] has {len(own)} finger(s), {', '.join(own)}; use 2 to {MOST}, or "
-            "[skin] for one skin"
+            f"{where}: [skins] has {len(own)} finger(s), {', '.join(own)}; use 2 to "
+            f"{MOST_FINGERS}, or [skin] for one skin"
         )
     fingers = {finger: {**common, "part": "", **values} for finger, values in own.items()}
     seen: dict[tuple[Any, ...], str] = {}

@@ -9,6 +9,8 @@ from functools import reduce
 from operator import xor
 
 TALKER = "PPLP"
+MOST_FINGERS = 4
+"""Largest number of fingers of a hand."""
 MAX_LINE = 128
 """Longest sentence or command, in characters."""
 UNSAFE = re.compile(r"[^ -~]|[$*,!\\~^]")

@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from palpate.core.errors import ConfigError, TemporaryError, passes
+from palpate.core.runtime_folder import RUNTIME
 from palpate.core.text import shown
 
 SITE = Path("/etc/palpate/palpate.toml")
 """The settings of this robot's installation; the file may be missing."""
-RUNTIME = "/run/palpate"
-"""Default of store.runtime."""
 
 
 class Layers(NamedTuple):

@@ -18,8 +18,6 @@ from palpate.service import last_failure
 SCHEMA = 1
 VERDICTS = 20
 """Number of the latest verdicts in the file."""
-FILE = "status.json"
-"""Name of the file in the runtime folder."""
 STALE_NS = 10_000_000_000
 """A file that has not changed for this long belongs to a program that hangs; it is the unit's
 watchdog time."""

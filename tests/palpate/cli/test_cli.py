@@ -736,7 +736,9 @@ def test_status_imports_little():
         "import sys; from palpate.__main__ import main; main(['status']); "
         "print({'numpy', 'onnxruntime', 'dataclasses', 'logging', 'msgspec'} & set(sys.modules))"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
+    )
     assert done.stdout.splitlines()[-1] == "set()"
 
 
