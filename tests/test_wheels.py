@@ -1,5 +1,4 @@
-"""The three distributions as a user has them: installed from their wheels, beside files of the user
-whose names are plain words."""
+"""The three distributions, installed from their wheels, in a folder with modules of the user."""
 
 from __future__ import annotations
 
@@ -58,8 +57,8 @@ def wheels(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 def run(wheels: list[Path], program: str, folder: Path) -> str:
-    """What a program prints that has these wheels and the libraries of this environment, in a
-    folder with files of the user."""
+    """Run a program with these wheels and the libraries of this environment, in a folder with
+    files of the user; its output."""
     for name in OWN:
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_text("raise ImportError('a file of the user')\n")
