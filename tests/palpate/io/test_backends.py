@@ -9,10 +9,8 @@ test_gpio.py and test_robot_link.py.
 from __future__ import annotations
 
 import os
-import socket
 import subprocess
 import sys
-import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
@@ -29,7 +27,7 @@ from palpate.io.robot_link import Command, SerialSink
 from palpate.io.trigger import GpioTrigger
 from palpate.io.usb_sensor import UsbSensor
 from tests import backends
-from tests.backends import Backend, Skin, mocks, remote, skins
+from tests.backends import Backend, Skin, mocks, skins
 
 SECOND = 1_000_000_000
 LIMIT_S = 10
@@ -633,70 +631,6 @@ def test_a_port_that_goes_and_comes(need: Need, sink_on: Callable[..., SerialSin
 
 
 # ---------------------------------------------------------------- the backends themselves
-
-
-def test_controls_over_a_wire():
-    """Each control of the virtual box reaches the bench outside, with arguments and results; a
-    failure is reported."""
-    asked: list[tuple[Any, ...]] = []
-
-    class FakeControls:
-        def __getattr__(self, name: str) -> Callable[..., Any]:
-            return lambda *given: (
-                asked.append((name, *given)),
-                {"able": ["lines"], "level": True, "hear": b"\x00\xff"}.get(name),
-            )[1]
-
-        def put(self) -> None:
-            raise OSError(5, "no")
-
-    here, there = socket.socketpair()
-    with here, there, there.makefile("rwb") as stream:
-        outside = threading.Thread(target=remote.serve, args=(stream, FakeControls()))
-        outside.start()
-        ask = remote.Asker(here.fileno()).ask
-        assert ask("able") == ["lines"]
-        assert ask("plug", Skin(serial="0042")) is None
-        assert ask("drive", "START", True) is None
-        assert ask("say", b"\r\n") is None
-        assert ask("level", "READY") is True
-        assert ask("hear") == b"\x00\xff"
-        with pytest.raises(AssertionError, match="put failed outside"):
-            ask("put")
-        with pytest.raises(AssertionError, match="'close' is not a control"):
-            ask("close")
-        here.shutdown(socket.SHUT_RDWR)
-        outside.join(10)
-    assert asked == [
-        ("able",),
-        ("plug", Skin(serial="0042")),
-        ("drive", "START", True),
-        ("say", b"\r\n"),
-        ("level", "READY"),
-        ("hear",),
-    ]
-
-
-@pytest.mark.parametrize(
-    ("name", "there", "hint"),
-    [
-        ("wired", "/dev/gpiochip0", "wired as tests"),
-        ("remote", remote.PORT, "python -m tests.campaigns test-rig"),
-    ],
-)
-def test_a_missing_backend_says_what_to_do(name: str, there: str, hint: str):
-    """If a backend is not available, one line gives the remedy."""
-    if os.path.exists(there):
-        pytest.skip(f"{there} is here")
-    with pytest.raises(backends.BackendMissing, match=hint), backends.opened(name):
-        pass
-
-
-def test_an_unknown_backend(monkeypatch: pytest.MonkeyPatch):
-    """An unknown name is refused, and the known names are listed."""
-    monkeypatch.setenv(backends.VARIABLE, "real")
-    with pytest.raises(backends.BackendMissing, match="'real' is unknown"):
-        backends.chosen()
 
 
 @pytest.mark.slow

@@ -172,15 +172,6 @@ def test_a_user_who_may_not_read_the_store_sees_the_packaged_bundle(
     assert output.out.count("-> ") == 3
 
 
-@pytest.mark.parametrize("text", ["0", "-3", "many", "1.5"])
-def test_a_number_of_sweeps_is_a_number(text: str, capsys: pytest.CaptureFixture[str]):
-    """Other values are usage errors that name the value."""
-    with pytest.raises(SystemExit) as e:
-        main(["demo", "--sweeps", text])
-    assert e.value.code == 2
-    assert f"{text} is not a number of sweeps" in capsys.readouterr().err
-
-
 def test_the_order_of_a_set_depends_on_the_seed_alone():
     """Each sweep once; in each round each material that has one left."""
     labels = np.array([0, 0, 0, 0, 1, 1, 2])

@@ -87,9 +87,3 @@ def test_a_material_that_the_bundle_does_not_know_is_unknown_at_best():
         "  all sweeps          1 / 1     100.0 % [20.7, 100.0]",
         "  not in the bundle: 1 of 3 sweeps called unknown (cork, felt)",
     ]
-
-
-def test_another_sentence_is_no_answer():
-    """A state sentence and half a line do not count as answers."""
-    assert Answer.read("$PPLP,STA,1,streaming*00") is None
-    assert Answer.read("$PP") is None
