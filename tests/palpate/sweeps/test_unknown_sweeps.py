@@ -83,15 +83,15 @@ def test_a_damaged_sidecar_is_named_and_left_out(
 
 def test_which_group_is_never_guessed(tmp_path: Path, box: Classifier):
     """Without a number there has to be one only; the message lists what there is."""
-    with pytest.raises(ApplianceError, match=r"store\.black_box = 500 keeps the last 500 sweeps"):
+    with pytest.raises(ApplianceError, match=r"store.black_box = 500"):
         unknown_sweeps.chosen([], 0, tmp_path)
     kept(tmp_path, box, *FELT[:2])
     found = unknown_sweeps.groups(tmp_path, box.bundle.id)
     assert unknown_sweeps.chosen(found, 0, tmp_path) is found[0]
-    with pytest.raises(ApplianceError, match=r"--unknown NUMBER: 2 sweeps: 1, 2; the last 20"):
+    with pytest.raises(ApplianceError, match=r"2 sweeps: 1, 2"):
         unknown_sweeps.chosen(found, 3, tmp_path)
     kept(tmp_path, Classifier(box.bundle, VirtualClock()), *CORK)
     found = unknown_sweeps.groups(tmp_path, box.bundle.id)
-    with pytest.raises(ApplianceError, match="name one of these by a sweep of it"):
+    with pytest.raises(ApplianceError, match="--unknown NUMBER"):
         unknown_sweeps.chosen(found, 0, tmp_path)
     assert [*unknown_sweeps.chosen(found, 4, tmp_path).paths] == [3, 4]

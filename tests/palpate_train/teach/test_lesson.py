@@ -53,7 +53,7 @@ def test_a_missing_position_is_a_place_of_its_own(tmp_path: Path):
 def test_nothing_to_teach_is_an_error_with_the_reasons(tmp_path: Path):
     """The message counts the omitted sweeps."""
     sweeps(tmp_path, "", "")
-    with pytest.raises(FormatError, match=r"no sweep can be taught \(2 no material\); record some"):
+    with pytest.raises(FormatError, match=r"2 no material"):
         Lesson.read(tmp_path)
     with pytest.raises(FormatError, match="cannot be read"):
         Lesson.read(tmp_path / "nowhere")
@@ -66,7 +66,7 @@ def test_a_single_sweep_is_not_judged_yet(tmp_path: Path):
     assert lesson.sweeps.materials == ("a", "b")
     assert lesson.sweeps.format == FORMAT
     sweeps(tmp_path / "one", "a", "a", "b")
-    with pytest.raises(FormatError, match="1 of the materials have two sweeps or more"):
+    with pytest.raises(FormatError, match="1 of the materials"):
         Lesson.read(tmp_path / "one").repeated()
 
 
@@ -89,5 +89,5 @@ def test_sweeps_without_a_slide_are_not_learnt_from_and_named(tmp_path: Path):
     assert one.text.startswith("sweep 1 of foam is not learnt from: no slide: no pattern passes")
     only = tmp_path / "only"
     lessons.write(only, replace(sweeps.take(np.arange(4)), materials=("wood", "foam")))
-    with pytest.raises(FormatError, match=r"record two of another material \(sweep 1 of foam is"):
+    with pytest.raises(FormatError, match=r"sweep 1 of foam"):
         Lesson.read(only).repeated()
