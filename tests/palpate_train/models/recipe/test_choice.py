@@ -115,7 +115,7 @@ def test_what_is_clearly_better_is_chosen():
     at = HeldOutScores([replace(given, features=x, copied=x)] * 3, parts, 3)
     chosen = choice.choose(at, candidates([[0, 1]], NOISE, NOISE, bands=GOOD), print)
     assert all(set(GOOD) <= set(part.columns) for part in chosen.plan.parts)
-    assert at.better(chosen, at.score([HeadPart(NOISE, False)]))
+    assert at.paired(chosen, at.score([HeadPart(NOISE, False)])).better
 
 
 def test_the_usual_one_stays_where_nothing_is_clearly_better():
@@ -145,7 +145,7 @@ def test_loss_alone_is_no_reason():
     wrong = one.logits.argmax(axis=1) != at.labels
     surer = replace(one, losses=one.losses + 5.0 * wrong)
     assert at.loss(surer) > at.loss(one)
-    assert not at.better(one, surer)
+    assert not at.paired(one, surer).better
 
 
 def test_fewer_filters_where_held_out_parts_show_no_loss():
@@ -178,12 +178,12 @@ def test_too_few_sweeps_show_nothing():
     given, parts = known(99)
     at = HeldOutScores([given] * 3, parts, 3)
     sure = at.score([HeadPart(GOOD, False)])
-    assert not at.holds(sure, sure)
+    assert not at.paired(sure, sure).holds
     many, parts = known(600)
     at = HeldOutScores([many] * 3, parts, 3)
     sure = at.score([HeadPart(GOOD, False)])
-    assert at.holds(sure, sure)
-    assert not at.holds(at.score([HeadPart(NOISE, False)]), sure)
+    assert at.paired(sure, sure).holds
+    assert not at.paired(at.score([HeadPart(NOISE, False)]), sure).holds
 
 
 def test_no_group_loses_for_the_gain_of_another():
@@ -195,11 +195,11 @@ def test_no_group_loses_for_the_gain_of_another():
     force, right = at.groups == "force", at.right(full)
     better = np.where(force[:, None], full.logits, np.eye(3)[at.labels])
     less = replace(full, logits=better)
-    assert at.holds(less, full)
+    assert at.paired(less, full).holds
     lost = np.flatnonzero(force & right)[:6]  # a hundredth of the group
     better[lost] = -np.eye(3)[at.labels[lost]]
     assert at.accuracy(less) > at.accuracy(full)
-    assert not at.holds(less, full)
+    assert not at.paired(less, full).holds
 
 
 def test_no_sweep_is_judged_by_a_head_that_saw_its_part():
@@ -237,8 +237,8 @@ def test_copies_of_held_out_sweeps_count_as_much_as_these():
     assert in_place.accuracy(in_place.score(fails)) == in_place.accuracy(in_place.score(stands))
     assert moved.own.sum() == len(given.labels) == (~moved.own).sum()
     assert moved.weights[moved.own].sum() == pytest.approx(0.5)
-    assert moved.better(moved.score(stands), moved.score(fails))
-    assert not moved.holds(moved.score(fails), moved.score(stands))
+    assert moved.paired(moved.score(stands), moved.score(fails)).better
+    assert not moved.paired(moved.score(fails), moved.score(stands)).holds
     own = moved.score(fails).logits[moved.own].argmax(axis=1) == moved.labels[moved.own]
     assert own.mean() == pytest.approx(in_place.accuracy(in_place.score(fails)))
 
@@ -438,8 +438,8 @@ def test_relations_join_where_they_name_more_although_one_group_is_less_sure(
     right = np.eye(3)[at.labels] * 4
     losses = usual.losses - np.where(at.groups == "speed", -0.05, 0.8)
     named = replace(usual, logits=right, losses=losses)
-    assert at.better(named, usual)
-    assert not at.helps(named, usual)
+    assert at.paired(named, usual).better
+    assert not at.paired(named, usual).helps
     score, heads = at.score, candidates([[0]], NOISE, NOISE, loads=[4])
     monkeypatch.setattr(
         at, "score", lambda heads: named if isinstance(heads, str) else score(heads)
@@ -466,8 +466,10 @@ def test_one_group_that_shows_the_opposite_suffices_against_loads():
     at = HeldOutScores([given] * 5, [*parts, *halves], 3)
     one = at.score([HeadPart(GOOD, False)])
     better = replace(one, losses=one.losses - np.where(at.groups == "speed", -0.05, 0.4))
-    assert not at.helps(better, one)
-    assert at.helps(replace(one, losses=one.losses - np.where(at.groups == "speed", 0, 0.4)), one)
+    assert not at.paired(better, one).helps
+    assert at.paired(
+        replace(one, losses=one.losses - np.where(at.groups == "speed", 0, 0.4)), one
+    ).helps
 
 
 def test_worse_is_more_than_chance():
@@ -482,6 +484,6 @@ def test_worse_is_more_than_chance():
         logits[right[:: len(right) // n][:n]] = wrong[right[:: len(right) // n][:n]]
         return replace(one, logits=logits)
 
-    assert at.worse(spoiled_by(40), one)
-    assert not at.worse(one, one)
-    assert not at.worse(one, spoiled_by(40))
+    assert at.paired(spoiled_by(40), one).worse
+    assert not at.paired(one, one).worse
+    assert not at.paired(one, spoiled_by(40)).worse

@@ -7,7 +7,7 @@ heads did not see, at its best temperature; every group counts the same.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -106,61 +106,14 @@ class HeldOutScores:
         """Accuracy on held-out sweeps; every group counts the same."""
         return float(self.weights @ self.right(scored))
 
-    def better(self, one: ScoredPlan, other: ScoredPlan) -> bool:
-        """Whether `one` has a lower loss and a higher accuracy, by more than ERRORS standard errors
-        of the paired difference.
-
-        The standard error is the larger of that over parts and that over sweeps, because a few
-        parts may agree by chance. The loss alone decides nothing: in a sum of discriminants it
-        depends on the size of their logits.
-        """
-        gain = self._lost(other, one)
-        by_part = np.bincount(self.clusters, gain)
-        return self.loss(one) < self.loss(other) and bool(
-            gain.sum() > ERRORS * max(map(_error, (gain, by_part)))
+    def paired(self, one: ScoredPlan, other: ScoredPlan) -> PairedDifference:
+        """How `one` differs from `other`."""
+        won = self.weights * (self.right(one).astype(float) - self.right(other))
+        saved = self.weights * (other.losses - one.losses)
+        members = [self.groups == name for name in np.unique(self.groups)]
+        return PairedDifference(
+            won, saved, self.clusters, [(of, self.weights[of]) for of in members]
         )
-
-    def worse(self, one: ScoredPlan, other: ScoredPlan) -> bool:
-        """Whether `one` is less accurate than `other` by more than chance: one standard error of
-        the paired difference over sweeps. Something that joins has to show less than something that
-        replaces, but it must not harm, not even in a single part."""
-        lost = self._lost(one, other)
-        return bool(lost.sum() > max(_error(lost), TINY))
-
-    def helps(self, one: ScoredPlan, other: ScoredPlan) -> bool:
-        """Whether `one` has a lower loss than `other` by more than ERRORS standard errors of the
-        paired difference, no group of the sweeps shows the opposite, and the accuracy is not worse.
-
-        Here the loss decides, because a level shows in margins long before it shows in labels: the
-        held-out sweeps may all be right without it, and those of a new condition not.
-        """
-        gain = self.weights * (other.losses - one.losses)
-        by_part = np.bincount(self.clusters, gain)
-        groups = [gain[self.groups == name] for name in np.unique(self.groups)]
-        return (
-            bool(gain.sum() > ERRORS * max(map(_error, (gain, by_part))))
-            and all(part.sum() >= -_error(part) for part in groups)
-            and not self.worse(one, other)
-        )
-
-    def holds(self, one: ScoredPlan, other: ScoredPlan) -> bool:
-        """Whether held-out sweeps show that `one` has at most MOST_LOST less accuracy than `other`
-        and at most MOST_WORSE more cross entropy. One standard error of the paired difference is
-        added to the lost accuracy, or one sweep if that is more. No group may lose more than
-        MOST_LOST either: an easier group does not make up for what a new force would lose."""
-        lost = self._lost(one, other)
-        worse = self.loss(one) - self.loss(other)
-        of_groups = [self.groups == name for name in np.unique(self.groups)]
-        return bool(
-            max(lost.sum(), 0) + max(_error(lost), 1 / len(lost)) <= MOST_LOST
-            and worse <= MOST_WORSE
-            and all(lost[of].sum() <= MOST_LOST * self.weights[of].sum() for of in of_groups)
-        )
-
-    def _lost(self, one: ScoredPlan, other: ScoredPlan) -> Array:
-        """The share [n] of each sweep in the accuracy of `other` minus that of `one`."""
-        lost: Array = self.weights * (self.right(other).astype(float) - self.right(one))
-        return lost
 
     def right(self, scored: ScoredPlan) -> Array:
         """bool [n], what it names rightly."""
@@ -205,6 +158,60 @@ class HeldOutScores:
 def _error(x: Array) -> float:
     """Standard error of the sum of `x` [n]."""
     return float(np.sqrt(len(x) / max(len(x) - 1, 1) * ((x - x.mean()) ** 2).sum()))
+
+
+@dataclass(frozen=True, eq=False)
+class PairedDifference:
+    """How one candidate differs from another on the same held-out sweeps, and the rules by which
+    it takes the place of the other.
+
+    won, saved: the share [n] of each sweep in the gain of accuracy and in the fall of the loss.
+    clusters: int [n], the part of each sweep. groups: for each group its sweeps (bool [n]) and
+    their weights.
+    """
+
+    won: Array
+    saved: Array
+    clusters: Array
+    groups: Sequence[tuple[Array, Array]]
+
+    @property
+    def better(self) -> bool:
+        """A lower loss, and a higher accuracy by more than ERRORS standard errors. The loss alone
+        decides nothing: in a sum of discriminants it depends on the size of their logits."""
+        return bool(self.saved.sum() > 0) and self._clear(self.won)
+
+    @property
+    def worse(self) -> bool:
+        """Less accurate by more than chance: one standard error over sweeps. Something that joins
+        has to show less than something that replaces, but it must not harm, not even in a single
+        part."""
+        return bool(-self.won.sum() > max(_error(self.won), TINY))
+
+    @property
+    def helps(self) -> bool:
+        """A lower loss by more than ERRORS standard errors, no group shows the opposite, and the
+        accuracy is not worse. Here the loss decides, because a level shows in margins long before
+        it shows in labels: the held-out sweeps may all be right without it, and those of a new
+        condition not."""
+        each = [self.saved[of] for of, _ in self.groups]
+        alike = all(saved.sum() >= -_error(saved) for saved in each)
+        return self._clear(self.saved) and alike and not self.worse
+
+    @property
+    def holds(self) -> bool:
+        """At most MOST_LOST less accuracy, one standard error or one sweep included, and at most
+        MOST_WORSE more loss. No group may lose more than MOST_LOST either: an easier group does
+        not make up for what a new force would lose."""
+        lost = max(-self.won.sum(), 0) + max(_error(self.won), 1 / len(self.won))
+        each = all(-self.won[of].sum() <= MOST_LOST * of_them.sum() for of, of_them in self.groups)
+        return bool(lost <= MOST_LOST and -self.saved.sum() <= MOST_WORSE and each)
+
+    def _clear(self, gain: Array) -> bool:
+        """Whether a gain [n] is more than ERRORS standard errors, the larger of that over parts and
+        that over sweeps, because a few parts may agree by chance."""
+        by_part = np.bincount(self.clusters, gain)
+        return bool(gain.sum() > ERRORS * max(map(_error, (gain, by_part))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -366,35 +373,34 @@ class Candidates:
         return tuple(HeadPart(tuple(columns.tolist()), self.copies) for columns in seen)
 
 
+STEPS: tuple[tuple[str, Callable[[PairedDifference], bool]], ...] = (
+    ("extended", lambda found: found.better),
+    ("related", lambda found: found.helps or found.better),
+    ("loaded", lambda found: found.helps),
+)
+"""The methods of Candidates that add to the choice so far, and when the best of theirs takes its
+place."""
+
+
 def choose(scores: HeldOutScores, candidates: Candidates, log: Log) -> ScoredPlan:
-    """The candidate with the lowest loss if it is `better` than the usual candidate, else the
-    latter. Plain candidates are compared first, then extensions of the best of them; relations
-    join where they help or are better, and last the form of loads with the lower loss, where it
-    helps."""
+    """The usual candidate without what makes it worse, then the steps of STEPS, each from the
+    candidate with the lowest loss."""
 
-    def scored(heads: Mapping[str, Heads]) -> Iterator[ScoredPlan]:
-        for name, parts in heads.items():
-            log(f"choosing: {name}")
-            yield scores.score(parts)
+    def score(name: str, parts: Heads) -> ScoredPlan:
+        log(f"choosing: {name}")
+        return scores.score(parts)
 
-    usual, *others = scored(candidates.plain())
+    chosen, *rivals = [score(*named) for named in candidates.plain().items()]
     for name, lessen in candidates.reduced().items():
-        if parts := lessen(usual.plan.parts):
-            (less,) = scored({name: parts})
-            usual = less if scores.worse(usual, less) else usual
-    best = min([usual, *others], key=scores.loss)
-    extended = list(scored(candidates.extended(best.plan.parts)))
-    best = min([usual, *others, *extended], key=scores.loss)
-    chosen = best if scores.better(best, usual) else usual
-    joinings = (
-        (candidates.related, (scores.helps, scores.better)),
-        (candidates.loaded, (scores.helps,)),
-    )
-    for joining, rules in joinings:
-        joined = list(scored(joining(chosen.plan.parts)))
-        best = min(joined, key=scores.loss, default=chosen)
-        if any(rule(best, chosen) for rule in rules):
-            chosen = best
+        if parts := lessen(chosen.plan.parts):
+            less = score(name, parts)
+            chosen = less if scores.paired(chosen, less).worse else chosen
+    for step, accepts in STEPS:
+        start = min([chosen, *rivals], key=scores.loss)
+        heads: dict[str, Heads] = getattr(candidates, step)(start.plan.parts)
+        rivals += [score(*named) for named in heads.items()]
+        best = min(rivals, key=scores.loss, default=chosen)
+        chosen, rivals = best if accepts(scores.paired(best, chosen)) else chosen, []
     return chosen
 
 
@@ -435,7 +441,7 @@ def with_fewer_filters(
             replace(p, columns=tuple(c for c in p.columns if kept[c])) for p in full.plan.parts
         ]
         less = scores.score(parts)
-        if not scores.holds(less, full):
+        if not scores.paired(less, full).holds:
             break
         chosen = less
     return chosen

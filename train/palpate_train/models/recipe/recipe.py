@@ -349,9 +349,9 @@ def with_stages(
     if setup.settings.use.reattached or set(plan.columns()) <= set(columns):
         log("choosing: stages and the spectrum alone")
         lean = scores.score(stage_heads.alone(columns))
-        joined = full if scores.better(full, lean) else lean
+        joined = full if scores.paired(full, lean).better else lean
     log("choosing: without stages")
-    if scores.worse(joined, scores.score(beside[1:])):
+    if scores.paired(joined, scores.score(beside[1:])).worse:
         return None, judged
     if joined is full:
         filters = np.append(np.full(sum(STAGES.channels), -1), fixed.columns.filters())
