@@ -27,6 +27,7 @@ from palpate.core.types import Status
 from palpate.inference.classifier import Classifier
 from palpate.learn import enrolment
 from palpate_train.data import sets
+from palpate_train.data.run import Run
 from palpate_train.data.sets import Dataset
 from palpate_train.data.splitters import draw
 from palpate_train.export import bundle_score, quantized_bundle
@@ -64,9 +65,9 @@ def main() -> None:
 def compared(sweeps: Dataset, each: int, seed: int) -> str:
     """The results of both models in words."""
     given, others = _parts(sweeps, each, seed)
-    taught = recipe.fit(given, seed, recipe.Settings(steps=0))
+    taught = recipe.fit(given, Run(seed), recipe.Settings(steps=0))
     text = f"taught {_answers(taught, others)}"
-    default = recipe.fit(given, seed, recipe.Settings())
+    default = recipe.fit(given, Run(seed), recipe.Settings())
     if all(np.array_equal(v, default.weights.get(k)) for k, v in taught.weights.items()):
         return f"{text}; palpate-train fit: the same model"
     return f"{text}; palpate-train fit {_answers(default, others)}"
@@ -110,7 +111,7 @@ def _later(
 def exported(sweeps: Dataset, folder: Path, seed: int, steps: int = 0) -> Bundle:
     """The bundle of a fit of sweeps, written to a folder. Taxels that may be bridged are not
     measured. steps: of the training of stages."""
-    fit = recipe.fit(sweeps, seed, recipe.Settings(steps=steps))
+    fit = recipe.fit(sweeps, Run(seed), recipe.Settings(steps=steps))
     quantized_bundle.export(fit, folder, "taught", "1", "", proven=False)
     return bundle.load(folder)
 

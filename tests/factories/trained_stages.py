@@ -7,6 +7,7 @@ from contextlib import contextmanager
 
 import pytest
 
+from palpate_train.data.run import Run
 from palpate_train.data.sets import Dataset
 from palpate_train.models.recipe import choice, recipe
 from palpate_train.models.recipe.fitted import Fit
@@ -26,4 +27,4 @@ def joining() -> Iterator[None]:
 def with_stages(sweeps: Dataset, steps: int = 40) -> Fit:
     """A fit of trained stages and the spectrum, of seed 1."""
     with joining():
-        return recipe.fit(sweeps, 1, recipe.Settings(steps=steps, size=SIZES["stages"]))
+        return recipe.fit(sweeps, Run(1), recipe.Settings(steps=steps, size=SIZES["stages"]))

@@ -30,6 +30,7 @@ from palpate_studies.peers import paper_cnn
 from palpate_train.calibration.heads import HeadData
 from palpate_train.cli.main import main
 from palpate_train.data import sets
+from palpate_train.data.run import Run
 from palpate_train.export import bundle_score, pack, quantized_bundle
 from palpate_train.export.pack import ExportRefused
 from palpate_train.metrics.answers import REFUSED
@@ -548,7 +549,7 @@ def test_the_command_exports_what_fit_wrote(
 def test_a_fit_without_a_convolution_is_exported(tmp_path: Path):
     """Nothing in it is int8: both precisions are equal, the labels of box and fit agree, and no
     tensor is reported. A spoilt head is reported here as well."""
-    made = recipe.fit(easy(), 1, recipe.Settings(steps=0, size=SIZES["bands"]))
+    made = recipe.fit(easy(), Run(1), recipe.Settings(steps=0, size=SIZES["bands"]))
     quantized_bundle.export(made, tmp_path / "b", "easy", "1", "0123abcd")
     it = box(tmp_path / "b")
     assert it.self_test() < 1e-6

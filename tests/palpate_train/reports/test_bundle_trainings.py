@@ -11,6 +11,7 @@ import pytest
 
 from palpate.core.errors import FormatError
 from palpate_train.cli.main import main
+from palpate_train.data.run import Run
 from palpate_train.data.sets import Dataset
 from palpate_train.evaluate.evaluate import Where
 from palpate_train.models.recipe import recipe
@@ -82,7 +83,7 @@ def test_materials_are_matched_by_name():
 def test_a_fit_gives_back_all_its_sweeps():
     """The training sweeps come first, then the held-out ones, with their groups."""
     whole = easy(20)
-    made = recipe.fit(whole, 1, recipe.Settings(0), NOTHING)
+    made = recipe.fit(whole, Run(1), recipe.Settings(0))
     again = bundle_trainings.whole(made)
     assert len(again) == len(whole)
     np.testing.assert_array_equal(

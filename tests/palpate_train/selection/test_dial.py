@@ -15,6 +15,7 @@ import pytest
 from palpate.core.errors import FormatError
 from palpate_train.cli.main import main
 from palpate_train.data import sets
+from palpate_train.data.run import Run
 from palpate_train.data.sets import Dataset
 from palpate_train.data.transforms import WHOLE, Change
 from palpate_train.export import measure
@@ -149,7 +150,7 @@ def test_cheap_is_what_takes_little_of_the_scarcer():
 @cache
 def judged_skin() -> Judgement:
     """Three sizes in closed form, judged on the skin."""
-    return dial.judge(skin(), 1, CLOSED, ["bands", "pairs", "all"], nothing)
+    return dial.judge(skin(), Run(1), CLOSED, ["bands", "pairs", "all"])
 
 
 def test_all_sizes_are_judged_on_the_same_sweeps():
@@ -170,13 +171,13 @@ def test_equal_models_are_fitted_once():
     """A single taxel has no relations: `pairs` chooses what `bands` chose, `all` more."""
     sweeps = skin()
     one = replace(sweeps, samples=sweeps.samples[:, :, :1])
-    judged = dial.judge(one, 1, CLOSED, ["bands", "pairs", "all"], nothing)
+    judged = dial.judge(one, Run(1), CLOSED, ["bands", "pairs", "all"])
     assert judged.first_equals() == {"bands": "bands", "pairs": "bands", "all": "all"}
 
 
 def test_a_size_alone_is_the_same_model():
     """The fit of a judged size has the weights of `recipe.fit` with that size."""
-    alone = recipe.fit(skin(), 1, replace(CLOSED, size=dial.FAMILY["pairs"]))
+    alone = recipe.fit(skin(), Run(1), replace(CLOSED, size=dial.FAMILY["pairs"]))
     made = judged_skin().fit("pairs")
     assert alone.weights.keys() == made.weights.keys()
     for name, value in alone.weights.items():
@@ -196,7 +197,7 @@ def test_sizes_with_stages_are_judged_where_stages_were_not_trained(
     monkeypatch.setattr(recipe, "_trained", lambda setup: trained.append(1) or train(setup))
     sweeps = skin(each=8)
     sweeps = replace(sweeps, groups={"position": sweeps.group("place")})
-    judged = dial.judge(sweeps, 1, Settings(steps=2), ["bands", "stages", "all"], nothing)
+    judged = dial.judge(sweeps, Run(1), Settings(steps=2), ["bands", "stages", "all"])
     assert (judged.staged, len(trained)) == (True, 1)
     assert judged.sizes["bands"].trunk is None
     assert judged.sizes["stages"].trunk is not None
@@ -213,11 +214,11 @@ def test_a_size_that_the_windows_do_not_allow_is_named():
     named."""
     short = skin()
     short = replace(short, samples=short.samples[:, :30])
-    judged = dial.judge(short, 1, CLOSED, ["bands", "64"], nothing)
+    judged = dial.judge(short, Run(1), CLOSED, ["bands", "64"])
     assert list(judged.sizes) == ["64"]
     assert "too short for a spectrum" in judged.refused["bands"]
     with pytest.raises(FormatError, match=r"^bands: windows of 30 frames are too short"):
-        dial.judge(short, 1, CLOSED, ["bands"], nothing)
+        dial.judge(short, Run(1), CLOSED, ["bands"])
 
 
 @pytest.fixture
@@ -237,7 +238,7 @@ def costs(monkeypatch: pytest.MonkeyPatch) -> None:
 def chosen(**budget: float) -> dial.Selection:
     """The choice on the skin within these limits."""
     wanted = SizeWish(Budget(**budget), sizes=tuple(judged_skin().sizes))
-    return dial.choose(skin(), 1, CLOSED, wanted, nothing)
+    return dial.choose(skin(), Run(1), CLOSED, wanted)
 
 
 @pytest.mark.usefixtures("costs")
@@ -281,11 +282,11 @@ def test_the_result_has_every_size_with_its_reason():
 
 def reduced(sweeps: Dataset, kind: str, wanted: float = 0.0) -> tuple[dict[str, Any], Change]:
     """The curve of one kind for the size "pairs", and the change of the fit."""
-    judged = dial.judge(sweeps, 1, CLOSED, ["pairs"], nothing)
+    judged = dial.judge(sweeps, Run(1), CLOSED, ["pairs"])
     some = SizeWish(accuracy=wanted, sizes=("pairs",))
     cost = {"pairs": BundleCost(0.1, 10, 50)}
     choice = dial.Selection(judged, some, ["pairs"], cost, {}, "pairs", cast(Any, None))
-    (curve,), change = reduction_curves.curves(choice, [kind], nothing)
+    (curve,), change = reduction_curves.curves(choice, [kind])
     return curve, change
 
 

@@ -17,6 +17,7 @@ from palpate.bundle import bundle
 from palpate.core.clock import SystemClock
 from palpate.inference.classifier import Classifier
 from palpate.learn.process import TeachingProcess
+from palpate_train.data.run import Run
 from palpate_train.data.sets import Dataset
 from palpate_train.models.recipe import recipe
 from palpate_train.teach.lesson import Lesson
@@ -76,7 +77,7 @@ def test_a_bundle_is_made_without_a_desktops_libraries(tmp_path: Path):
     box = Classifier(made, SystemClock())
     box.self_test()
     lesson = Lesson.read(tmp_path / "sweeps")
-    fit = recipe.fit(lesson.sweeps, 0, recipe.Settings(steps=0))
+    fit = recipe.fit(lesson.sweeps, Run(0), recipe.Settings(steps=0))
     assert made.manifest.made["chosen"] == fit.about["chosen"]
     assert made.manifest.known
     assert lines[-1]["peak_mb"] < 700
@@ -156,6 +157,7 @@ LOOKED = """
 import sys
 from pathlib import Path
 from palpate_train.teach import __main__ as teach
+from palpate_train.data.run import Run
 teach.MEMINFO = Path(sys.argv.pop())
 code = teach.main(sys.argv[1:])
 sys.exit(9 if "numpy" in sys.modules else code)
@@ -208,7 +210,7 @@ def test_up_to_twenty_sweeps_the_desktop_makes_the_same_model():
     plain = replace(sweeps, groups={"recording": np.arange(len(sweeps))})
     assert recipe.Settings().steps > 0
     default, taught = (
-        recipe.fit(plain, 0, settings) for settings in (recipe.Settings(), recipe.Settings(steps=0))
+        recipe.fit(plain, Run(0), recipe.Settings(**steps)) for steps in ({}, {"steps": 0})
     )
     assert default.weights.keys() == taught.weights.keys()
     for name, values in taught.weights.items():

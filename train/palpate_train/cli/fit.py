@@ -6,6 +6,7 @@ import argparse
 import json
 import math
 import shlex
+import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from palpate.core.storage import put
 from palpate_train.arguments import numbers, options, scene_file
 from palpate_train.arguments.program import Add
 from palpate_train.data import extras, labels
+from palpate_train.data.run import Run
 from palpate_train.data.sets import Dataset, digest
 from palpate_train.data.splitters import OF_THE_SET
 from palpate_train.data.transforms import WHOLE, Change
@@ -41,7 +43,7 @@ STEPS, MOST = recipe.Settings().steps, memory.MOST_SWEEPS
 
 def register(add: Add) -> None:
     """fit."""
-    command = add("fit", run)
+    command = add("fit", run_fit)
     command.set_defaults(resumes=True, parser=command)
     options.add_set(command, required=False)
     command.add_argument(
@@ -177,7 +179,7 @@ def _add_wish(command: argparse.ArgumentParser) -> None:
     )
 
 
-def run(args: argparse.Namespace) -> None:
+def run_fit(args: argparse.Namespace) -> None:
     """Train, save the fit and print its accuracy on the held-out sweeps."""
     if args.scene:
         words = [*scene_file.words(args.scene, args.parser), *args.words[1:]]
@@ -197,7 +199,7 @@ def run(args: argparse.Namespace) -> None:
         change.of(rest).save(args.rest)
         made = replace(made, about=made.about | {"rest": str(args.rest)})
     made.save(args.out)
-    unfinished.unlink(missing_ok=True)
+    shutil.rmtree(unfinished, ignore_errors=True)
     print(f"fit: {len(made.train)} sweeps, {made.train.format}; {args.out}")
     if len(sweeps) > args.most_sweeps:
         print(
@@ -255,13 +257,13 @@ def _check(args: argparse.Namespace) -> None:
 
 
 def _fitted(args: argparse.Namespace, sweeps: Dataset) -> tuple[Fit, Change, Path]:
-    """The fit for these options, the reduction of its sweeps, and the file that keeps its training
-    until the fit is written."""
+    """The fit for these options, the reduction of its sweeps, and the folder that keeps its
+    training until the fit is written."""
     use = SkinUse(args.reattached, float(args.mains), args.displaced, args.stretch)
-    unfinished = _unfinished(args, sweeps, use)
+    log, unfinished = options.Log(), _unfinished(args, sweeps, use)
+    run = Run(args.seed, log, unfinished)
     settings = recipe.Settings(
         args.steps,
-        unfinished=unfinished,
         size=SIZES.get(args.size, UNLIMITED),
         use=use,
         varies=args.varies,
@@ -269,9 +271,10 @@ def _fitted(args: argparse.Namespace, sweeps: Dataset) -> tuple[Fit, Change, Pat
     )
     wish = (args.budget_ms, args.budget_kb, args.accuracy, args.reduce)
     if any(wish):
-        return *_chosen(args, sweeps, settings), unfinished
-    log = options.Log()
-    made = recipe.fit(sweeps, args.seed, settings, log)
+        made, change = _chosen(args, sweeps, run, settings)
+        log.end()
+        return made, change, unfinished
+    made = recipe.fit(sweeps, run, settings)
     log.end()
     held_out = formatting.counted(made.about["validation"])
     print(f"chosen: {made.about['chosen']}; {held_out} of held-out parts")
@@ -279,26 +282,23 @@ def _fitted(args: argparse.Namespace, sweeps: Dataset) -> tuple[Fit, Change, Pat
 
 
 def _chosen(
-    args: argparse.Namespace, sweeps: Dataset, settings: recipe.Settings
+    args: argparse.Namespace, sweeps: Dataset, run: Run, settings: recipe.Settings
 ) -> tuple[Fit, Change]:
     """The fit of the smallest size that suffices, on reduced sweeps if they suffice; writes the
     page with the reasons."""
     with extras.needed_for("the page with the reasons for a size"):
         from palpate_train.reports import selection_report
-    log = options.Log()
     budget = Budget(args.budget_ms or math.inf, args.budget_kb or math.inf, args.slower or 1.0)
     sizes = (args.size,) if args.size else tuple(dial.FAMILY)
-    choice = dial.choose(
-        sweeps, args.seed, settings, SizeWish(budget, args.accuracy or 0.0, sizes), log
-    )
-    less, change = reduction_curves.curves(choice, args.reduce or (), log)
+    wish = SizeWish(budget, args.accuracy or 0.0, sizes)
+    choice = dial.choose(sweeps, run, settings, wish)
+    less, change = reduction_curves.curves(choice, args.reduce or ())
     made, cost, refused = choice.fit, choice.costs[choice.chosen], ""
     if change != WHOLE:
         try:
-            made, cost = dial.reduced(choice, change, log)
+            made, cost = dial.reduced(choice, change)
         except FormatError as e:
             refused, change = str(e), WHOLE
-    log.end()
     result = choice.json() | {"less": less, "applied": asdict(change)}
     result |= {"bundle": _described(made, cost, budget, refused)} | _origin(args, sweeps, budget)
     page = args.out.with_name(f"{args.out.stem}-why") / "index.html"
@@ -332,12 +332,12 @@ def _origin(args: argparse.Namespace, sweeps: Dataset, budget: Budget) -> Json:
 
 
 def _unfinished(args: argparse.Namespace, sweeps: Dataset, use: SkinUse) -> Path:
-    """The file that keeps a training until the fit is written. Its name is a fingerprint of all
+    """The folder that keeps a training until the fit is written. Its name is a fingerprint of all
     that the training depends on."""
     about = [digest(sweeps), args.seed, args.size, args.steps, args.varies, asdict(use)]
     about += [args.most_sweeps] * (len(sweeps) > args.most_sweeps)
     modules = (f"palpate_train.models.recipe.{name}" for name in ("recipe", "stages"))
-    return CACHE / f"{fingerprint(about, *modules)}.pt"
+    return CACHE / fingerprint(about, *modules)
 
 
 def _print_held_out(made: Fit) -> None:

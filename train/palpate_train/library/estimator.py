@@ -17,6 +17,7 @@ from palpate.core import provenance
 from palpate.core.errors import FormatError
 from palpate.inference.classifier import softmax
 from palpate_train.data import labels
+from palpate_train.data.run import Run
 from palpate_train.data.sets import Dataset
 from palpate_train.export import pack, quantized_bundle
 from palpate_train.library.sweeps import raw_counts
@@ -85,7 +86,7 @@ class PalpateClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  
         use = SkinUse(self.reattached, float(self.mains_hz))
         size = SIZES[self.size] if self.size else UNLIMITED
         settings = recipe.Settings(self.steps, size=size, use=use, calibrate=False)
-        self.fit_ = recipe.fit(sweeps.require_materials(), int(self.random_state), settings)
+        self.fit_ = recipe.fit(sweeps.require_materials(), Run(int(self.random_state)), settings)
         self.sweeps_ = sweeps
         return self
 

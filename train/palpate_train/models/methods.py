@@ -23,12 +23,12 @@ from numpy.typing import NDArray
 from palpate.core.errors import FormatError
 from palpate.signal import features
 from palpate_train.data.progress import spoken as spoken  # for trainings
+from palpate_train.data.run import Log as Log
+from palpate_train.data.run import no_log as no_log
 from palpate_train.data.sets import Dataset
 from palpate_train.features import kinds
 
 Array = NDArray[Any]
-Log = Callable[[str], None]
-"""Shows a line of progress."""
 Cost = list[tuple[int, float]]
 """(iteration, cross entropy of its batch), eq. 11 of the paper and its Fig. 9."""
 SHIPPED = "palpate"
@@ -148,10 +148,6 @@ class Method:
     def runs_on_the_box(self) -> bool:
         """Whether its models have a graph, and the box computes the graph's input."""
         return not self.why_not_on_the_box
-
-
-def no_log(line: str) -> None:
-    """A log that drops every line."""
 
 
 def model_inputs(kind: str, sweeps: Dataset) -> Array:

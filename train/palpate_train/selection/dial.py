@@ -22,6 +22,7 @@ from scipy.stats import t as student
 
 from palpate.core.errors import ApplianceError, BundleError, FormatError
 from palpate.core.provenance import commit
+from palpate_train.data.run import Run
 from palpate_train.data.sets import Dataset
 from palpate_train.data.transforms import Change
 from palpate_train.export import measure, quantized_bundle
@@ -194,7 +195,7 @@ class Judgement:
         """The settings for a fit of this size to reduced sweeps: stages only if the size has them
         for the whole ones."""
         steps = self.setup.settings.steps if self.sizes[name].trunk else 0
-        return replace(self.setup.settings, size=FAMILY[name], steps=steps, unfinished=None)
+        return replace(self.setup.settings, size=FAMILY[name], steps=steps)
 
     @property
     def staged(self) -> bool:
@@ -234,10 +235,9 @@ class Judgement:
 
 def judge(
     sweeps: Dataset,
-    seed: int,
+    run: Run,
     settings: Settings,
     sizes: Sequence[str],
-    log: Log,
     staged: bool = False,
 ) -> Judgement:
     """Judge these sizes. Features, copies and stages are computed once for all of them.
@@ -246,7 +246,7 @@ def judge(
     `staged` is set, all sizes are judged on these sweeps. Raises FormatError as recipe.fit, or if
     the windows are too short for every size.
     """
-    setup = Setup.of(sweeps, seed, settings, log)
+    setup = Setup.of(sweeps, run, settings)
     found, refused = {}, {}
     for name in sizes:
         try:
@@ -368,15 +368,15 @@ class Selection:
         ]
 
 
-def choose(sweeps: Dataset, seed: int, settings: Settings, wanted: SizeWish, log: Log) -> Selection:
+def choose(sweeps: Dataset, run: Run, settings: Settings, wanted: SizeWish) -> Selection:
     """Judge the sizes, measure their bundles, and choose.
 
     Raises NothingFits if no size can be used, and FormatError as recipe.fit.
     """
-    judged = judge(sweeps, seed, settings, wanted.sizes, log)
+    judged = judge(sweeps, run, settings, wanted.sizes)
     first = judged.first_equals()
     fits = {name: judged.fit(name) for name in dict.fromkeys(first.values())}
-    measured, unpacked = bundle_costs(fits, sweeps, log)
+    measured, unpacked = bundle_costs(fits, sweeps, run.log)
     costs = {name: measured[same] for name, same in first.items() if same in measured}
     refused = {name: unpacked[same] for name, same in first.items() if same in unpacked}
     over = {name: why for name, cost in costs.items() if (why := wanted.budget.over(cost))}
@@ -389,13 +389,13 @@ def choose(sweeps: Dataset, seed: int, settings: Settings, wanted: SizeWish, log
     return Selection(judged, wanted, order, costs, why_not, chosen, fits[first[chosen]])
 
 
-def reduced(choice: Selection, change: Change, log: Log) -> tuple[Fit, BundleCost]:
+def reduced(choice: Selection, change: Change) -> tuple[Fit, BundleCost]:
     """The chosen size fitted to reduced sweeps, and the cost of its bundle. Raises FormatError if
     the reduced sweeps cannot be fitted or packed."""
     setup = choice.judgement.setup
-    sweeps = change.of(setup.sweeps)
-    made = recipe.fit(sweeps, setup.seed, choice.judgement.reduced(choice.chosen), log)
-    costs, refused = bundle_costs({choice.chosen: made}, sweeps, log)
+    sweeps, run = change.of(setup.sweeps), replace(setup.run, folder=None)
+    made = recipe.fit(sweeps, run, choice.judgement.reduced(choice.chosen))
+    costs, refused = bundle_costs({choice.chosen: made}, sweeps, run.log)
     for why in refused.values():
         raise FormatError(why)
     return made, costs[choice.chosen]

@@ -8,7 +8,7 @@ standard error; the strongest accepted reduction is kept.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,6 @@ from palpate_train.data import transforms
 from palpate_train.data.sets import Dataset
 from palpate_train.data.transforms import WHOLE, Change
 from palpate_train.metrics.score import confusion
-from palpate_train.models.methods import Log
 from palpate_train.selection.dial import Judgement, Selection, difference, estimate, judge
 
 Array = NDArray[Any]
@@ -59,15 +58,15 @@ class ReducedFits:
     whole: Judgement
     chosen: str
     wanted: float
-    log: Log
 
     def right(self, change: Change) -> Array:
         """bool [n], the held-out sweeps that are named rightly with `change`. Raises FormatError if
         the reduced sweeps are too short."""
-        self.log(f"with less: {change}")
         whole, name = self.whole, self.chosen
+        run = replace(whole.setup.run, folder=None)
+        run.log(f"with less: {change}")
         sweeps, settings = change.of(whole.setup.sweeps), whole.reduced(name)
-        found = judge(sweeps, whole.setup.seed, settings, [name], self.log, whole.staged)
+        found = judge(sweeps, run, settings, [name], whole.staged)
         return found.right(name)
 
     def fine(self, full: Array, less: Array) -> bool:
@@ -88,9 +87,9 @@ class ReducedFits:
         }
 
 
-def curves(choice: Selection, kinds: Collection[str], log: Log) -> tuple[list[Json], Change]:
+def curves(choice: Selection, kinds: Collection[str]) -> tuple[list[Json], Change]:
     """The curves of these kinds, and the reductions of APPLIED among them as one Change."""
-    fits = ReducedFits(choice.judgement, choice.chosen, choice.wanted.accuracy, log)
+    fits = ReducedFits(choice.judgement, choice.chosen, choice.wanted.accuracy)
     found: list[Json] = []
     applied = WHOLE
     for kind in kinds:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from palpate.inference.classifier import softmax
 from palpate.learn.assessment import Assessment
+from palpate_train.data.run import Run
 from palpate_train.data.splitters import InnerPart, recording_parts
 from palpate_train.models.methods import Log, no_log
 from palpate_train.models.recipe import recipe
@@ -28,7 +29,7 @@ def assess(lesson: Lesson, seed: int = 0, log: Log = no_log) -> Assessment:
     two materials have."""
     lesson = lesson.repeated()
     settings = recipe.Settings(steps=0, most=len(lesson.sweeps))
-    setup = recipe.Setup.of(lesson.sweeps, seed, settings, log)
+    setup = recipe.Setup.of(lesson.sweeps, Run(seed, log), settings)
     fixed = setup.fixed
     choice = recipe.judge(recipe.candidates(fixed, setup), fixed, setup)
     parts, scores, chosen = setup.parts, choice.scores, choice.chosen

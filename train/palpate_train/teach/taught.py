@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from palpate.bundle.bundle import Manifest
 from palpate.core.errors import FormatError
 from palpate.core.provenance import commit
+from palpate_train.data.run import Run
 from palpate_train.export import quantized_bundle
 from palpate_train.models.recipe import recipe
 from palpate_train.teach.lesson import Lesson
@@ -65,7 +66,7 @@ def teach(
             "more of each material, or forget it"
         )
     sweeps.require_materials()
-    setup = recipe.Setup.of(sweeps, seed, recipe.Settings(steps=0), lambda line: None)
+    setup = recipe.Setup.of(sweeps, Run(seed), recipe.Settings(steps=0))
     times.begin("features")
     _ = setup.fixed  # computed here, for the time of this step
     times.begin("heads")

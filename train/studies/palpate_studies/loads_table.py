@@ -15,6 +15,7 @@ from palpate.core.clock import SystemClock
 from palpate.core.provenance import commit
 from palpate.inference.classifier import Classifier
 from palpate_train.data import sets
+from palpate_train.data.run import Run
 from palpate_train.data.sets import Dataset
 from palpate_train.export import bundle_score, quantized_bundle
 from palpate_train.metrics.answers import outcomes
@@ -71,7 +72,7 @@ def _row(
 
 def _fit(sweeps: Dataset, loads: bool) -> Fit:
     size = replace(UNLIMITED, loads=loads)
-    return recipe.fit(sweeps, SEED, Settings(steps=0, size=size, use=REATTACHED))
+    return recipe.fit(sweeps, Run(SEED), Settings(steps=0, size=size, use=REATTACHED))
 
 
 def answers(made: Fit, test: Dataset) -> Json:

@@ -14,6 +14,7 @@ from palpate_studies import loads_table
 from palpate_studies.development_experiment import CASES
 from palpate_studies.study import NO_DATA, StudyRun
 from palpate_train.data import sets
+from palpate_train.data.run import Run
 from palpate_train.data.sets import Dataset
 from palpate_train.export import measure
 from palpate_train.metrics import score
@@ -102,9 +103,7 @@ def alone(sweeps: Dataset) -> Mapping[str, Trunk]:
 def _stages(sweeps: Dataset, every: Trunk) -> Trunk:
     """Stages that are hardly trained, which costs a sweep the same time."""
     augmentation = default_augmentation(FIXED.zero_sum(sweeps.format.window))
-    weights, ranges = stages.train_stages(
-        sweeps, every.scale, SEED, 2, augmentation, lambda line: None, STAGES
-    )
+    weights, ranges = stages.train_stages(sweeps, every.scale, Run(SEED), 2, augmentation, STAGES)
     return Trunk(sweeps, every.scale, weights, STAGES, ranges)
 
 
@@ -122,7 +121,7 @@ def choices(run: StudyRun) -> Iterator[Json]:
             continue
         sweeps = sweeps.without_means() if case.means_removed else sweeps
         run.log(f"views of {title}")
-        made = recipe.fit(sweeps, SEED, Settings(calibrate=False))
+        made = recipe.fit(sweeps, Run(SEED), Settings(calibrate=False))
         yield {
             "set": title,
             "real": case.real,

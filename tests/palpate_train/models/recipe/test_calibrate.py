@@ -11,6 +11,7 @@ import pytest
 from palpate.bundle.bundle import Early
 from palpate_train.calibration.displacement import AugmentedCopies
 from palpate_train.calibration.early_exit import EarlyRule
+from palpate_train.data.run import Run
 from palpate_train.models.recipe import recipe
 from palpate_train.models.recipe.calibrate import Calibration, fit_calibration
 from palpate_train.models.recipe.fitted import ONE_IN, calibration_inputs
@@ -62,7 +63,7 @@ def test_a_disturbed_sweep_of_a_known_material_stays_known():
 def test_disturbed_sweeps_are_of_those_that_were_trained_on():
     """One in ten training sweeps has a changed copy of the same material and group; none of the
     copies judges."""
-    fit = recipe.fit(easy(), 1, recipe.Settings(steps=0))
+    fit = recipe.fit(easy(), Run(1), recipe.Settings(steps=0))
     given = calibration_inputs(fit)
     prefixes, labels, groups, held, faulty = (
         given.prefixes,

@@ -17,6 +17,7 @@ from palpate.core.errors import FormatError
 from palpate_train.cli import fit as fit_command
 from palpate_train.cli.main import main
 from palpate_train.data import sets
+from palpate_train.data.run import Run
 from palpate_train.data.sets import Dataset
 from palpate_train.data.splitters import inner_parts
 from palpate_train.models import checkpoint, training
@@ -36,7 +37,7 @@ INTERRUPTED = 130
 @pytest.fixture(scope="module")
 def fitted() -> Fit:
     """A fit on the easy set, without stages."""
-    return recipe.fit(easy(), 1, CLOSED)
+    return recipe.fit(easy(), Run(1), CLOSED)
 
 
 def test_an_easy_set_is_named_rightly(fitted: Fit):
@@ -146,7 +147,7 @@ def test_the_same_seed_gives_the_same_fit(fitted: Fit):
     """Another seed gives other filters. If no stages can follow, the choice is the second part of
     two."""
     told: list[str] = []
-    again, other = (recipe.fit(easy(), seed, CLOSED, told.append) for seed in (1, 2))
+    again, other = (recipe.fit(easy(), Run(seed, told.append), CLOSED) for seed in (1, 2))
     assert told[0].startswith("part 1 of 2, features of")
     assert told[1].startswith("part 2 of 2, choosing: ")
     for name, values in fitted.weights.items():
@@ -163,10 +164,10 @@ def test_stages_join_in(monkeypatch: pytest.MonkeyPatch):
     first, with a discriminant of their own; a fifth of the sweeps is held out from them, and their
     scale is that of the filters."""
     for name, value in (("LEAST_SWEEPS", 1), ("ENOUGH", 1.01)):
-        assert not recipe.fit(easy(), 1, Settings(steps=20)).architecture.channels
+        assert not recipe.fit(easy(), Run(1), Settings(steps=20)).architecture.channels
         monkeypatch.setattr(recipe, name, value)
     told: list[str] = []
-    fit = recipe.fit(easy(), 1, Settings(steps=20), told.append)
+    fit = recipe.fit(easy(), Run(1, told.append), Settings(steps=20))
     assert [int(line.split()[1]) for line in told] == sorted(int(line.split()[1]) for line in told)
     assert told[0] == f"part 1 of 3, features of {len(easy())} sweeps and 2 copies of each"
     steps = [line for line in told if " step " in line]
@@ -196,7 +197,7 @@ def test_stages_and_the_spectrum_are_enough_unless_more_is_better(
     for name, value in (("LEAST_SWEEPS", 1), ("ENOUGH", 1.01)):
         monkeypatch.setattr(recipe, name, value)
     monkeypatch.setattr(choice.HeldOutScores, "better", lambda *_: better)
-    fit = recipe.fit(easy(), 1, Settings(steps=20, use=SkinUse(reattached=True)))
+    fit = recipe.fit(easy(), Run(1), Settings(steps=20, use=SkinUse(reattached=True)))
     bands = fit.bands
     assert bands
     assert bool(fit.architecture.pools) == better
@@ -376,7 +377,7 @@ def varied() -> Dataset:
 def test_the_hardest_condition_judges():
     """The sweeps of a new force are the hardest, so some force is held out; a group of two values
     comes last. Each condition has figures of its own."""
-    made = recipe.fit(varied(), 1, CLOSED)
+    made = recipe.fit(varied(), Run(1), CLOSED)
     assert made.about["conditions"] == ["force", "batch", "tool"]
     assert made.about["held_out_by"] == "force"
     assert not set(made.train.group("force")) & set(made.held.group("force"))
@@ -391,7 +392,7 @@ def test_the_hardest_condition_judges():
 
 def test_sweeps_without_recordings_are_numbered_before_they_are_divided():
     """Each sweep is then a recording of its own on both sides, and counts by itself."""
-    made = recipe.fit(replace(easy(), groups={}), 1, CLOSED)
+    made = recipe.fit(replace(easy(), groups={}), Run(1), CLOSED)
     numbers = [side.group("recording") for side in (made.train, made.held)]
     assert len(np.unique(np.concatenate(numbers))) == len(easy())
     assert "held-out recording, by recording" not in made.held_out_figures()
@@ -399,20 +400,20 @@ def test_sweeps_without_recordings_are_numbered_before_they_are_divided():
 
 def test_only_named_conditions_judge():
     """The varying conditions may be named; a group that cannot be left out is refused by name."""
-    made = recipe.fit(varied(), 1, replace(CLOSED, varies=("batch",)))
+    made = recipe.fit(varied(), Run(1), replace(CLOSED, varies=("batch",)))
     assert made.about["conditions"] == ["batch"]
     assert next(iter(made.held_out_figures())) == "held-out batch"
     for name in ("recording ", "speed"):
         with pytest.raises(FormatError, match=name):
-            recipe.fit(varied(), 1, replace(CLOSED, varies=(name,)))
+            recipe.fit(varied(), Run(1), replace(CLOSED, varies=(name,)))
 
 
 def test_what_cannot_be_fitted_is_named():
     """A constant skin and a window that is too short are refused at once."""
     still = replace(easy(), samples=np.full_like(easy().samples, 7))
     with pytest.raises(FormatError, match="every taxel of every sweep is constant; check the skin"):
-        recipe.fit(still, 1, CLOSED)
+        recipe.fit(still, Run(1), CLOSED)
     with pytest.raises(
         FormatError, match="a window of 12 frames is too short for the network; record at least 16"
     ):
-        recipe.fit(replace(easy(), samples=easy().samples[:, :12]), 1, CLOSED)
+        recipe.fit(replace(easy(), samples=easy().samples[:, :12]), Run(1), CLOSED)

@@ -11,6 +11,7 @@ import pytest
 
 from palpate.core.errors import FormatError
 from palpate_train.data import sets
+from palpate_train.data.run import Run
 from palpate_train.data.sets import Dataset
 from palpate_train.models import methods
 from palpate_train.models.methods import Effort
@@ -32,7 +33,7 @@ def tubes() -> Dataset:
 def test_a_fit_contains_at_most_its_size(name: str):
     """Its trunk has no view that the size excludes, and it names sweeps at held-out positions."""
     size = SIZES[name]
-    made = recipe.fit(tubes(), 1, recipe.Settings(steps=0, size=size, calibrate=False))
+    made = recipe.fit(tubes(), Run(1), recipe.Settings(steps=0, size=size, calibrate=False))
     found = made.architecture
     filters = len(bank.Bank.of(made.weights).free) if found.pools else 0
     assert size.filters is None or filters <= size.filters
@@ -72,8 +73,8 @@ def test_a_size_without_filters_needs_windows_with_a_spectrum():
     short = replace(tubes(), samples=tubes().samples[:, 700:730])
     settings = recipe.Settings(steps=0, calibrate=False)
     with pytest.raises(FormatError, match="windows of 30 frames are too short for a spectrum"):
-        recipe.fit(short, 1, replace(settings, size=SIZES["bands"]))
-    assert recipe.fit(short, 1, replace(settings, size=SIZES["64"])).architecture.pools
+        recipe.fit(short, Run(1), replace(settings, size=SIZES["bands"]))
+    assert recipe.fit(short, Run(1), replace(settings, size=SIZES["64"])).architecture.pools
 
 
 def test_each_size_is_a_method():
@@ -93,7 +94,7 @@ def test_each_size_is_a_method():
 def test_a_fit_of_the_spectrum_alone_survives_its_file(tmp_path: Path):
     """Its weights are those of its heads. Nothing in its graph is int8, both precisions agree, and
     it learns an easy set."""
-    made = recipe.fit(easy(), 1, recipe.Settings(steps=0, size=SIZES["bands"]))
+    made = recipe.fit(easy(), Run(1), recipe.Settings(steps=0, size=SIZES["bands"]))
     assert (made.architecture, made.bands) == (replace(recipe.FIXED, spectrum=True), 5)
     assert sorted(made.weights) == ["head.bias", "head.weight", "int8.bias", "int8.weight"]
     made.save(tmp_path / "fit.npz")

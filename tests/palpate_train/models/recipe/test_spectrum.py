@@ -14,6 +14,7 @@ import pytest
 
 from palpate.core.types import SweepFormat
 from palpate.sim import skin
+from palpate_train.data.run import Run
 from palpate_train.models.recipe import graph, recipe, spectrum
 from palpate_train.models.recipe.architectures import Architecture
 from palpate_train.models.recipe.sizes import SIZES
@@ -228,9 +229,9 @@ def test_a_window_too_short_has_no_spectrum():
     short = replace(easy(12), samples=easy(12).samples[:, :39])
     assert spectrum.count(short.format) == 0
     settings = recipe.Settings(steps=0, calibrate=False)
-    made = recipe.fit(short, 1, replace(settings, size=SIZES["64"]))
+    made = recipe.fit(short, Run(1), replace(settings, size=SIZES["64"]))
     assert (made.architecture.spectrum, made.bands) == (False, 0)
     assert made.architecture.pools
     enough = replace(easy(12), samples=easy(12).samples[:, :40])
     assert spectrum.count(enough.format) == 3
-    assert recipe.fit(enough, 1, replace(settings, size=SIZES["bands"])).bands == 3
+    assert recipe.fit(enough, Run(1), replace(settings, size=SIZES["bands"])).bands == 3

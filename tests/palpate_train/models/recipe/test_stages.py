@@ -18,8 +18,9 @@ from palpate.core.errors import FormatError
 from palpate.core.types import SweepFormat
 from palpate.sim import skin
 from palpate_studies import cost
+from palpate_train.data.run import Run
 from palpate_train.models import methods
-from palpate_train.models.methods import Effort, no_log
+from palpate_train.models.methods import Effort
 from palpate_train.models.recipe import architectures, graph, spectrum, stages
 from palpate_train.models.recipe.architectures import STAGES, Architecture
 from palpate_train.models.recipe.augment import Augmentation
@@ -360,7 +361,7 @@ def test_trained_stages_depend_on_their_seed_alone():
     gives other bits."""
 
     def trained(seed: int) -> dict[str, np.ndarray]:
-        return stages.train_stages(easy(8), 0.1, seed, 4, Augmentation(), no_log)[0]
+        return stages.train_stages(easy(8), 0.1, Run(seed), 4, Augmentation())[0]
 
     first = trained(1)
     torch.manual_seed(99)
@@ -377,7 +378,7 @@ def test_positions_are_held_out_where_there_are_several():
     """Stages are judged by a position that their training never saw."""
     s = easy()
     s.groups["position"] = np.arange(len(s)) % 5
-    setup = Setup.of(s, 1, Settings(), no_log)
+    setup = Setup.of(s, Run(1), Settings())
     seen, held = (side.groups["position"] for side in setup.sides)
     assert setup.judging.group == "position"
     assert len(np.unique(held)) == 1

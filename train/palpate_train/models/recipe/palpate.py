@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate_train.data.run import Run
 from palpate_train.data.sets import Dataset
 from palpate_train.models.linear_head import expanded_head
 from palpate_train.models.methods import (
@@ -41,7 +42,7 @@ def train(
     Raises FormatError as recipe.fit, and if only one material occurs.
     """
     known = replace(sweeps, samples=inputs).select(())
-    fit = recipe.fit(known, seed, replace(settings, calibrate=False), log)
+    fit = recipe.fit(known, Run(seed, log), replace(settings, calibrate=False))
     present = np.unique(sweeps.labels)
     heads = {
         name: expanded_head(

@@ -23,7 +23,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -33,12 +32,13 @@ from palpate.core.errors import FormatError
 from palpate_train.calibration.heads import HeadData, HeadPlan, condition_values
 from palpate_train.data import extras
 from palpate_train.data.progress import StageLine
+from palpate_train.data.run import Log, Run
 from palpate_train.data.sets import Dataset
 from palpate_train.data.splitters import InnerPart, inner_parts
 from palpate_train.data.thinning import thinned
 from palpate_train.metrics.score import interval
 from palpate_train.models.linear_head import hold_out_or_all
-from palpate_train.models.methods import AS_RECORDED, Log, SkinUse, no_log
+from palpate_train.models.methods import AS_RECORDED, SkinUse
 from palpate_train.models.recipe import (
     bank,
     choice,
@@ -81,16 +81,13 @@ FIXED = Architecture((), planned=len(STAGES.channels))
 class Settings:
     """The settings of a fit.
 
-    steps: of the training of stages; 0 for no stages. unfinished: a file that keeps the training of
-    stages from time to time; from it an interrupted training goes on with the same bits. size:
-    limits the content of the model. use: of the skin. calibrate: whether the fit is finished with
-    calibration and contacts, which a bundle needs and `evaluate` does not. varies: the groups that
+    steps: of the training of stages; 0 for no stages. size: limits the content of
+    the model. use: of the skin. calibrate: whether the fit is finished with calibration and contacts, which a bundle needs and `evaluate` does not. varies: the groups that
     will have other values in service; without any, all that can be left out. most: largest number
     of sweeps that are used; of more, some are drawn, see thinning.thinned.
     """
 
     steps: int = 600
-    unfinished: Path | None = None
     size: ModelSize = UNLIMITED
     use: SkinUse = AS_RECORDED
     calibrate: bool = True
@@ -127,29 +124,28 @@ class Setup:
     """Everything that the steps of a fit share, each part computed when it is first needed."""
 
     sweeps: Dataset
-    seed: int
+    run: Run
     settings: Settings
     augmentation: Augmentation
-    log: Log
 
     @classmethod
-    def of(cls, sweeps: Dataset, seed: int, settings: Settings, log: Log) -> Setup:
+    def of(cls, sweeps: Dataset, run: Run, settings: Settings) -> Setup:
         """Raises FormatError if the window is too short."""
         groups = {"recording": sweeps.group("recording")} | sweeps.groups  # numbered before a split
         sweeps = thinned(replace(sweeps, groups=groups), settings.most)
         usual = default_augmentation(FIXED.zero_sum(sweeps.format.window))
-        return cls(sweeps, seed, settings, replace(usual, **settings.use.augmentation), log)
+        return cls(sweeps, run, settings, replace(usual, **settings.use.augmentation))
 
     @cached_property
     def copies(self) -> list[Dataset]:
         """Augmented copies of the sweeps."""
-        return list(copies(self.sweeps, self.augmentation, self.seed, COPIES))
+        return list(copies(self.sweeps, self.augmentation, self.run.seed, COPIES))
 
     @cached_property
     def fixed(self) -> FixedFeatures:
         """Step 1: the features that need no training."""
         self.part(1)(f"features of {len(self.sweeps)} sweeps and {COPIES} copies of each")
-        trunk = fixed_trunk(self.sweeps, self.seed, self.settings.use.mains_hz)
+        trunk = fixed_trunk(self.sweeps, self.run.seed, self.settings.use.mains_hz)
         scales = trunk.architecture.relations
         columns = FeatureColumns.of(trunk.layout(), Bank.of(trunk.weights).free, scales)
         return FixedFeatures(trunk, self.data(trunk), columns)
@@ -197,7 +193,7 @@ class Setup:
         hardest condition. The group is "nothing" if there are too few groups."""
         index = np.arange(len(self.sweeps))
         numbered = replace(self.sweeps, groups=self.sweeps.groups | {"index": index})
-        _, held, by = hold_out_or_all(numbered, self.seed, self.conditions)
+        _, held, by = hold_out_or_all(numbered, self.run.seed, self.conditions)
         return InnerPart(by, np.isin(index, held.group("index")))
 
     @cached_property
@@ -245,7 +241,7 @@ class Setup:
         """The log of one part of the fit. The third part, the stages, takes most of the time; it is
         left out if the first two suffice."""
         parts = 3 if self.wants_stages(self.settings.size) else 2
-        return lambda line: self.log(StageLine.of(number, parts, PARTS[number - 1], line))
+        return lambda line: self.run.log(StageLine.of(number, parts, PARTS[number - 1], line))
 
 
 @dataclass(frozen=True)
@@ -285,14 +281,14 @@ class HeadChoice:
         return {"accuracy": accuracy, "n": len(right), "low": low, "high": high}
 
 
-def fit(sweeps: Dataset, seed: int, settings: Settings = Settings(), log: Log = no_log) -> Fit:
+def fit(sweeps: Dataset, run: Run, settings: Settings = Settings()) -> Fit:
     """A model for the materials of `sweeps`, which must all occur. A fifth of the groups is
     held out from stages and calibration.
 
     Raises FormatError if the window is shorter than a filter, if every taxel is constant, or if
     materials have too few recordings to hold some out.
     """
-    return fit_size(Setup.of(sweeps, seed, settings, log), settings.size)
+    return fit_size(Setup.of(sweeps, run, settings), settings.size)
 
 
 def fit_size(setup: Setup, size: ModelSize) -> Fit:
@@ -393,7 +389,7 @@ def finish(trunk: Trunk, plan: HeadPlan, judged: HeadChoice, setup: Setup) -> Fi
         heads[f"{name}.weight"] = weight - weight.mean(axis=0)
         heads[f"{name}.bias"] = bias - bias.mean()
     about = {
-        "seed": setup.seed,
+        "seed": setup.run.seed,
         "recipe": {
             "augmentation": vars(setup.augmentation),
             "steps": settings.steps,
@@ -461,12 +457,10 @@ def _trained(setup: Setup) -> Trunk:
     weights, ranges = stages.train_stages(
         sweeps,
         scale,
-        setup.seed,
+        replace(setup.run, log=setup.part(3)),
         settings.steps,
         setup.augmentation,
-        setup.part(3),
         architecture,
-        settings.unfinished,
     )
     return Trunk(sweeps, scale, weights, architecture, ranges)
 

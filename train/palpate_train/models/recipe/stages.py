@@ -9,7 +9,6 @@ The sizes of the stages are in architectures.py; graph.py writes their graphs, i
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,8 +19,8 @@ from torch import Generator, Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from palpate.core.types import SweepFormat
+from palpate_train.data.run import Run
 from palpate_train.data.sets import Dataset
-from palpate_train.models.methods import Log
 from palpate_train.models.networks import Network
 from palpate_train.models.recipe.architectures import FLOOR, NOISE_LIMIT, STAGES, Architecture
 from palpate_train.models.recipe.augment import Augmentation, augment
@@ -206,25 +205,28 @@ def network_of(fit: Fit) -> StagesNetwork:
     return model.eval()
 
 
+UNFINISHED = "stages.pt"
+"""Name of the file that keeps an unfinished training; see training.learn."""
+
+
 def train_stages(
     sweeps: Dataset,
     scale: float,
-    seed: int,
+    run: Run,
     steps: int,
     augmentation: Augmentation,
-    log: Log,
     architecture: Architecture = STAGES,
-    unfinished: Path | None = None,
 ) -> tuple[dict[str, Array], Ranges]:
     """Stages trained on all of `sweeps`, whose counts are multiplied by `scale`: their weights as
-    graph.trunk_graph takes them, and ranges for int8. unfinished: see training.learn."""
+    graph.trunk_graph takes them, and ranges for int8."""
     recipe, change = replace(TRAINING, steps=steps), augmenter(sweeps.format, augmentation)
     with one_thread(), torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
+        torch.manual_seed(run.seed)
         model = StagesNetwork(
             sweeps.format, len(sweeps.materials), scale, architecture=architecture
         )
-        model, _ = learn(model, sweeps, recipe, seed, log, augment=change, unfinished=unfinished)
+        kept = run.file(UNFINISHED)
+        model, _ = learn(model, sweeps, recipe, run.seed, run.log, augment=change, unfinished=kept)
         weights = {k: v for k, v in model.weights().items() if k.startswith("convs.")}
         return weights, model.ranges(sweeps.samples)
 

@@ -22,6 +22,7 @@ from palpate_train.arguments import numbers, options
 from palpate_train.arguments.program import Add
 from palpate_train.data import sets
 from palpate_train.data.progress import Progress
+from palpate_train.data.run import Run
 from palpate_train.data.sets import Dataset
 from palpate_train.evaluate import robustness
 from palpate_train.evaluate.corruption_pairs import pairs
@@ -201,7 +202,7 @@ def run_stress(args: argparse.Namespace) -> None:
 
 def _made_of(train: Dataset, folder: Path, log: Log) -> Path:
     """The bundle that `fit` and `export` make of these sweeps at their defaults."""
-    export(recipe.fit(train, 1, log=log), folder / "bundle", OWN, "1", commit())
+    export(recipe.fit(train, Run(1, log)), folder / "bundle", OWN, "1", commit())
     return folder / "bundle"
 
 
