@@ -27,25 +27,10 @@ def test_the_command_splits_and_keeps_the_rest(tmp_path: Path, capsys: pytest.Ca
     """fit writes the sweeps that it did not train on as a set. Recordings stay whole, and training,
     held-out and written sweeps together are the whole set."""
     easy(20, pieces=2).save(tmp_path / "easy.npz")
-    args = [
-        "fit",
-        "--set",
-        str(tmp_path / "easy.npz"),
-        "--seed",
-        "1",
-        "--steps",
-        "4",
-        "--only",
-        "speed<=2",
-    ]
-    args += [
-        "--split",
-        "recording:0.7",
-        "--rest",
-        str(tmp_path / "rest.npz"),
-        "--out",
-        str(tmp_path / "new" / "fit.npz"),
-    ]
+    args = f"fit --set {tmp_path / 'easy.npz'} --seed 1 --steps 4 --only speed<=2".split()
+    args += (
+        f"--split recording:0.7 --rest {tmp_path / 'rest.npz'} --out {tmp_path / 'new' / 'fit.npz'}"
+    ).split()
     assert main(args) == 0
     made, rest = Fit.load(tmp_path / "new" / "fit.npz"), sets.load(str(tmp_path / "rest.npz"))
     parts = [set(s.groups["recording"]) for s in (made.train, made.held, rest)]
@@ -159,19 +144,7 @@ def test_a_reader_that_closes_the_pipe_ends_the_command_quietly():
             "method 'magic' is unknown; use some of ",
         ),
         (
-            [
-                "fit",
-                "--set",
-                "none",
-                "--seed",
-                "1",
-                "--out",
-                "b.npz",
-                "--method",
-                "H-svm",
-                "--size",
-                "bands",
-            ],
+            "fit --set none --seed 1 --out b.npz --method H-svm --size bands".split(),
             "--size is of our recipe",
         ),
         (
@@ -179,31 +152,11 @@ def test_a_reader_that_closes_the_pipe_ends_the_command_quietly():
             "--json /proc/none/x.json: cannot be",
         ),
         (
-            [
-                "evaluate",
-                "--set",
-                "none",
-                "--protocol",
-                "random:2",
-                "--method",
-                "H-svm",
-                "--jobs",
-                "0",
-            ],
+            "evaluate --set none --protocol random:2 --method H-svm --jobs 0".split(),
             "--jobs 0 is out of range",
         ),
         (
-            [
-                "evaluate",
-                "--set",
-                "none",
-                "--protocol",
-                "random:2",
-                "--method",
-                "H-svm",
-                "--effort",
-                "0",
-            ],
+            "evaluate --set none --protocol random:2 --method H-svm --effort 0".split(),
             "--effort 0 is out of",
         ),
         (
@@ -316,17 +269,7 @@ def test_what_a_set_lacks_is_told_by_each_command_that_reads_it(
 ):
     """Materials without sweeps, which are left out, and constant taxels cause a warning. Materials
     that --only leaves out do not."""
-    args = [
-        "evaluate",
-        "--set",
-        str(few(tmp_path)),
-        "--method",
-        "L-svm",
-        "--protocol",
-        "leave:speed",
-        "--jobs",
-        "1",
-    ]
+    args = f"evaluate --set {few(tmp_path)} --method L-svm --protocol leave:speed --jobs 1".split()
     assert main([*args, "--cache", str(tmp_path), *only]) == 0
     err = capsys.readouterr().err
     assert "warning: taxels that never change in any sweep: 1.2;" in err
@@ -354,17 +297,10 @@ def test_a_material_of_one_recording_is_told_by_its_name(
     assert "material 'high' has one recording" in capsys.readouterr().err
     assert (
         main(
-            [
-                "evaluate",
-                "--set",
-                str(tmp_path / "few.npz"),
-                "--only",
-                "material=low,middle",
-                "--method",
-                "L-svm",
-                "--protocol",
-                "random:9",
-            ]
+            (
+                f"evaluate --set {tmp_path / 'few.npz'} --only material=low,middle --method "
+                "L-svm --protocol random:9"
+            ).split()
         )
         == 65
     )

@@ -45,18 +45,7 @@ def test_from_a_set_to_the_answers_of_the_box(
     assert (
         main(["fit", "--set", str(tmp_path / "set.npz"), "--seed", "1", "--out", fit, *steps]) == 0
     )
-    export = [
-        "export",
-        fit,
-        "--out",
-        str(out),
-        "--name",
-        "sheared",
-        "--version",
-        "1",
-        "--full-scale",
-        "2047",
-    ]
+    export = f"export {fit} --out {out} --name sheared --version 1 --full-scale 2047".split()
     assert main([*export, "--pitch-mm", str(PITCH_MM)]) == 0
     model = bundle.load(out)
     assert str(model.format) == "2x2x3 int16 at 750 Hz, window 600"
@@ -100,19 +89,7 @@ def test_the_demo_slides_a_skin_that_feels_shear(
     and names most tubes."""
     fit, out = str(tmp_path / "fit.npz"), str(tmp_path / "bundle")
     assert (
-        main(
-            [
-                "fit",
-                "--set",
-                "sim:T-REALx3/level-blind:1001:1",
-                "--seed",
-                "1",
-                "--out",
-                fit,
-                "--size",
-                "bands",
-            ]
-        )
+        main(f"fit --set sim:T-REALx3/level-blind:1001:1 --seed 1 --out {fit} --size bands".split())
         == 0
     )
     assert main(["export", fit, "--out", out, "--name", "shear", "--version", "1"]) == 0

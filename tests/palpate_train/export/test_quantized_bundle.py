@@ -589,40 +589,13 @@ def test_fabrics_go_the_whole_way(tmp_path: Path, capsys: pytest.CaptureFixture[
     over the USB wire into sentences, with materials in turn, so that nearly each is another object;
     as many are right as by the classifier itself."""
     path = Path(os.environ["PALPATE_DATA"]) / "fabricslide" / "fabricslide.npz"
-    args = [
-        "--set",
-        str(path),
-        "--only",
-        "direction=0",
-        "--only",
-        "force<=180",
-        "--seed",
-        "1",
-        "--steps",
-        "300",
-    ]
-    args += [
-        "--split",
-        "recording:0.7",
-        "--rest",
-        str(tmp_path / "rest.npz"),
-        "--out",
-        str(tmp_path / "fit.npz"),
-    ]
+    args = f"--set {path} --only direction=0 --only force<=180 --seed 1 --steps 300".split()
+    args += (
+        f"--split recording:0.7 --rest {tmp_path / 'rest.npz'} --out {tmp_path / 'fit.npz'}"
+    ).split()
     assert main(["fit", *args]) == 0
     assert (
-        main(
-            [
-                "export",
-                str(tmp_path / "fit.npz"),
-                "--out",
-                str(tmp_path / "b"),
-                "--name",
-                "f",
-                "--version",
-                "1",
-            ]
-        )
+        main(f"export {tmp_path / 'fit.npz'} --out {tmp_path / 'b'} --name f --version 1".split())
         == 0
     )
     it, rest = box(tmp_path / "b"), sets.load(str(tmp_path / "rest.npz"))

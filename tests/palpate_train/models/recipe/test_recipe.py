@@ -238,16 +238,7 @@ def test_an_interrupted_fit_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
     def fitted(name: str, seed: int = 1) -> Fit | None:
         out = tmp_path / f"{name}.npz"
-        args = [
-            "--set",
-            str(tmp_path / "easy.npz"),
-            "--seed",
-            str(seed),
-            "--steps",
-            "12",
-            "--out",
-            str(out),
-        ]
+        args = f"--set {tmp_path / 'easy.npz'} --seed {seed} --steps 12 --out {out}".split()
         assert main(["fit", *args]) == (0 if stop < 0 else INTERRUPTED)
         return Fit.load(out) if stop < 0 else None
 
