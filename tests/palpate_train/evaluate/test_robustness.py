@@ -150,7 +150,7 @@ def test_a_corruption_only_grows(name: str):
 @pytest.mark.parametrize("severity", [-1, 5, np.nan])
 def test_no_severity_beyond_the_scale(severity: float):
     """A severity out of range is refused by name."""
-    with pytest.raises(FormatError, match=r"of stress 'dead' is out of range; use 0 to 4"):
+    with pytest.raises(FormatError, match="out of range; use 0 to 4"):
         BY_NAME["dead"].apply(EvaluationSweeps(small()), severity, 0)
 
 
@@ -158,7 +158,7 @@ def test_corruptions_by_name():
     """Corruptions are found by name, and unknown names are refused. Simulated sweeps are drawn
     again; the raw counts of a file are changed."""
     assert [s.name for s in corruptions.find(["hum", "dead"])] == ["hum", "dead"]
-    with pytest.raises(FormatError, match="stress 'cold' is unknown; use some of shift-rows, "):
+    with pytest.raises(FormatError, match="use some of shift-rows,"):
         corruptions.find(["cold"])
     physical = {"shift-rows", "turn", "force-down", "force-up", "speed-down", "speed-up", "window"}
     instead = {"shift-grid", "turn-grid", "window-held", "stretch", "shorten"}
@@ -553,9 +553,7 @@ def test_a_pair_is_both_corruptions_at_once():
 def test_what_cannot_be_done_is_said():
     """A set of another kind is an error of the caller; a method that refuses its set is a
     result."""
-    with pytest.raises(
-        FormatError, match=r"small .*3x3 uint8.* is not of the kind of small .*3x3 int16"
-    ):
+    with pytest.raises(FormatError, match=r".*3x3 uint8.* is not of"):
         robustness.evaluate_method(FAKE, small(), EvaluationSweeps(small("uint8")), None, 0)
     short = small(shape=(4, 10, 3, 3))
     entry = robustness.merge(

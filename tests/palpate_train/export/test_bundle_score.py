@@ -107,14 +107,9 @@ def test_windows_of_a_recording_are_fused_too(classifier: Classifier):
 def test_a_set_of_another_form_is_refused(classifier: Classifier):
     """Both formats are named; so are the materials if none is the same."""
     s = sweeps(*HERE, labels=[0, 1, 2])
-    with pytest.raises(
-        FormatError,
-        match=r"s.npz is of 2x2 int16 at 50 Hz, window 20, the bundle of 2x2 int16 at 100 Hz",
-    ):
+    with pytest.raises(FormatError, match="the bundle of 2x2 int16"):
         bundle_score.score(classifier, replace(s, rate_hz=50.0))
-    with pytest.raises(
-        FormatError, match=r"s.npz has x, y, z, the bundle a, b, c; none is the same"
-    ):
+    with pytest.raises(FormatError, match="has x, y, z, the bundle"):
         bundle_score.score(classifier, replace(s, materials=tuple("xyz")))
 
 

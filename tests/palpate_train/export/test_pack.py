@@ -128,22 +128,17 @@ def test_a_method_that_never_names_a_material_is_no_bundle(tmp_path: Path):
     noise = tones(noise=0.0)
     content = trained("L-gauss", noise)
     content.train.samples[content.train.labels == 0] = 0
-    with pytest.raises(
-        BundleError,
-        match="no training sweep of 'a' is recognised: every taxel of its sweeps is constant",
-    ):
+    with pytest.raises(BundleError, match="training sweep of 'a'"):
         pack.pack(content, tmp_path / "b", "any", "1", "")
     logits = np.eye(3)[(content.train.labels + 1) % 3]
     content.train.samples[content.train.labels == 0, 0] = 1
-    with pytest.raises(
-        BundleError, match="'a' is recognised: they look like others; record it at more positions"
-    ):
+    with pytest.raises(BundleError, match="'a' is recognised: they"):
         pack.golden_sweeps(content.train, logits, logits)
     few = (
         np.flatnonzero(content.train.labels > 0).tolist()
         + np.flatnonzero(content.train.labels == 0)[:2].tolist()
     )
-    with pytest.raises(BundleError, match="'a' is recognised: there are 2 of it; record 5 or more"):
+    with pytest.raises(BundleError, match="recognised: there are 2"):
         pack.golden_sweeps(content.train.take(np.array(few)), logits[few], logits[few])
     assert not (tmp_path / "b").exists()
     assert np.isin(content.held_out.labels, [0, 1, 2]).all()

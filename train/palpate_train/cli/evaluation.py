@@ -53,10 +53,7 @@ def _add_grid(command: argparse.ArgumentParser) -> None:
         help="random:10, leave:GROUP or split:GROUP=a,b->c; prefer those that leave groups out",
     )
     command.add_argument(
-        "--method",
-        required=True,
-        metavar="NAME[,NAME...]",
-        help="or all; see --list",
+        "--method", required=True, metavar="NAME[,NAME...]", help="or all; see --list"
     )
     command.add_argument(
         "--remove-means", action="store_true", help="subtract the mean of each taxel in each window"

@@ -73,8 +73,7 @@ def _on_cluster(
             client.wait_for_workers(1, timeout=CONNECT_S)
             everywhere = client.scatter(list(shared), broadcast=True) if shared else ()
             yield from _finished(
-                client,
-                {client.submit(_run, task, call, *everywhere, pure=False) for task in tasks},
+                client, {client.submit(_run, task, call, *everywhere, pure=False) for task in tasks}
             )
         except TimeoutError as e:
             start = f"dask worker {scheduler}"

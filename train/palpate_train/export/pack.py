@@ -241,14 +241,7 @@ def _made(content: Content, commit: str, unknown: dict[str, str]) -> dict[str, A
 
 def content_of(fit: MethodFit) -> Content:
     """The content of a bundle of this method."""
-    return Content(
-        fit.model,
-        fit.input,
-        fit.train,
-        fit.held,
-        fit.held_out_by,
-        fit.about,
-    )
+    return Content(fit.model, fit.input, fit.train, fit.held, fit.held_out_by, fit.about)
 
 
 def pack_to_measure(content: Content, target: Path) -> bundle.Manifest:

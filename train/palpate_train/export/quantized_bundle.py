@@ -130,11 +130,7 @@ def _calibrated(content: Content, fit: Fit, pitch_mm: float | None) -> Content:
         figures |= {disturbed_sweeps.FIGURES: found.figures}
     return replace(
         content,
-        unseen=replace(
-            content,
-            model=bundle_graph(apart, fit.trunk()),
-            classes=classes[0],
-        ),
+        unseen=replace(content, model=bundle_graph(apart, fit.trunk()), classes=classes[0]),
         model=bundle_graph(calibration, fit.trunk(), prefixes),
         early=rule.early,
         displacement=calibration.displacement_rule(),

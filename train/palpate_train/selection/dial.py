@@ -234,11 +234,7 @@ class Judgement:
 
 
 def judge(
-    sweeps: Dataset,
-    run: Run,
-    settings: Settings,
-    sizes: Sequence[str],
-    staged: bool = False,
+    sweeps: Dataset, run: Run, settings: Settings, sizes: Sequence[str], staged: bool = False
 ) -> Judgement:
     """Judge these sizes. Features, copies and stages are computed once for all of them.
 

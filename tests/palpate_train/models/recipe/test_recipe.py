@@ -349,7 +349,7 @@ def test_groups_that_can_be_left_out_judge():
     assert [part.group for part in parts] == ["recording"] * 5
     assert np.sum([part.out for part in parts], axis=0).tolist() == [1] * n
     one = replace(pure, labels=(recording == 3).astype(int))
-    with pytest.raises(FormatError, match="one recording; choosing a model needs two of each"):
+    with pytest.raises(FormatError, match="one recording; choosing"):
         inner_parts(one)
 
 
@@ -402,9 +402,7 @@ def test_only_named_conditions_judge():
 def test_what_cannot_be_fitted_is_named():
     """A constant skin and a window that is too short are refused at once."""
     still = replace(easy(), samples=np.full_like(easy().samples, 7))
-    with pytest.raises(FormatError, match="every taxel of every sweep is constant; check the skin"):
+    with pytest.raises(FormatError, match="constant; check the skin"):
         recipe.fit(still, Run(1), CLOSED)
-    with pytest.raises(
-        FormatError, match="a window of 12 frames is too short for the network; record at least 16"
-    ):
+    with pytest.raises(FormatError, match="window of 12 frames is"):
         recipe.fit(replace(easy(), samples=easy().samples[:, :12]), Run(1), CLOSED)

@@ -423,11 +423,7 @@ def _with(parts: Heads, more: Array) -> Heads:
 
 
 def with_fewer_filters(
-    scores: HeldOutScores,
-    chosen: ScoredPlan,
-    filters: Array,
-    log: Log,
-    least: int = LEAST_FILTERS,
+    scores: HeldOutScores, chosen: ScoredPlan, filters: Array, log: Log, least: int = LEAST_FILTERS
 ) -> ScoredPlan:
     """`chosen` with half of its filters, a quarter and so on, but at least `least`, as long as
     this `holds` on held-out parts. filters: the filter [F] of each feature, -1 if it has none."""

@@ -99,9 +99,7 @@ def trunk_graph(
 
 
 def layout(
-    format: SweepFormat,
-    weights: Mapping[str, Array],
-    architecture: Architecture,
+    format: SweepFormat, weights: Mapping[str, Array], architecture: Architecture
 ) -> dict[str, slice]:
     """The features of each part of a trunk, by name: `stages`, `magnitudes` and `shares` of the
     bank, `levels` of the distribution, `loads`, `relations`, `bands`."""
