@@ -81,10 +81,11 @@ FIXED = Architecture((), planned=len(STAGES.channels))
 class Settings:
     """The settings of a fit.
 
-    steps: of the training of stages; 0 for no stages. size: limits the content of
-    the model. use: of the skin. calibrate: whether the fit is finished with calibration and contacts, which a bundle needs and `evaluate` does not. varies: the groups that
-    will have other values in service; without any, all that can be left out. most: largest number
-    of sweeps that are used; of more, some are drawn, see thinning.thinned.
+    steps: of the training of stages; 0 for no stages. size: limits the content of the model. use:
+    of the skin. calibrate: whether the fit is finished with calibration and contacts, which a
+    bundle needs and `evaluate` does not. varies: the groups that will have other values in service;
+    without any, all that can be left out. most: largest number of sweeps that are used; of more,
+    some are drawn, see thinning.thinned.
     """
 
     steps: int = 600
