@@ -10,14 +10,13 @@ import ast
 import hashlib
 import io
 import json
-import re
-import sys
 import time
 import zipfile
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cache
-from importlib.metadata import PackageNotFoundError, packages_distributions, requires, version
+from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -51,10 +50,21 @@ NOT_COUNTED = (
 )
 """Modules that methods use and that do not change the result of a fold: it stays valid when their
 code changes. Sets are fingerprinted by their data."""
-OWN = ("palpate_train", "palpate_studies", "palpate")
 COUNTED = ("palpate_train", "palpate_studies", "palpate.signal")
 """Packages whose code may change the result of a fold. `agreement` compares the box's other code
 with the desktop's."""
+LIBRARIES = (
+    "aeon",
+    "numba",
+    "numpy",
+    "onnx",
+    "onnxruntime",
+    "scikit-learn",
+    "scipy",
+    "skl2onnx",
+    "torch",
+)
+"""Distributions whose version may change the result of a fold."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,52 +236,18 @@ def key(task: FoldTask, data: str) -> str:
 
 def fingerprint(about: Any, *modules: str) -> str:
     """32 hex digits of a hash over `about` (for JSON), the code of `modules`, the code that they
-    import from this project, and the versions of the libraries that this code uses."""
-    versions = {name: version(name) for name in libraries(modules)}
-    return hashlib.sha256(json.dumps([about, versions]).encode() + _code(modules)).hexdigest()[:32]
+    import from this project, and the versions of LIBRARIES."""
+    text = json.dumps([about, versions()]).encode()
+    return hashlib.sha256(text + _code(modules)).hexdigest()[:32]
 
 
-@cache
-def libraries(modules: tuple[str, ...]) -> tuple[str, ...]:
-    """The installed distributions that can change a result of `modules`.
-
-    These are the distributions that `modules` import, directly or through other code of this
-    project, and numerical distributions beneath them, such as SciPy beneath scikit-learn. Imports
-    of the box's code count as well: `agreement` guards its code, but the libraries that it calls
-    can change a result. A requirement is numerical if it requires numpy itself. All others, such as
-    Jinja beneath PyTorch, do not change a fold.
-    """
-    closure = _closure(modules, OWN, NOT_COUNTED)
-    roots = {name.partition(".")[0] for module in closure for name in _import_names(module)}
-    known = packages_distributions()
-    named = [name for root in roots - sys.stdlib_module_names for name in known.get(root, ())]
-    left = [name for name in map(_normal, named) if not name.startswith("palpate")]
-    found: set[str] = set()
-    while left:
-        if (name := left.pop()) not in found and _installed(name):
-            found.add(name)
-            left += [one for one in _required(name) if "numpy" in (one, *_required(one))]
-    return tuple(sorted(found))
-
-
-def _normal(name: str) -> str:
-    """The name of a distribution in the normal form of PEP 503."""
-    return re.sub(r"[-_.]+", "-", name).lower()
-
-
-def _installed(name: str) -> bool:
-    try:
-        version(name)
-    except PackageNotFoundError:
-        return False
-    return True
-
-
-def _required(name: str) -> list[str]:
-    """The distributions that `name` requires without its extras; none if it is not installed."""
-    lines = (requires(name) or ()) if _installed(name) else ()
-    own = [line for line in lines if not re.search(r";.*\bextra\b", line)]
-    return [_normal(re.split(r"[^A-Za-z0-9._-]", line, maxsplit=1)[0]) for line in own]
+def versions() -> dict[str, str]:
+    """The versions of the installed LIBRARIES."""
+    found = {}
+    for name in LIBRARIES:
+        with suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found
 
 
 @cache
@@ -287,18 +263,12 @@ def _code(modules: tuple[str, ...]) -> bytes:
 def reached(modules: Sequence[str]) -> set[str]:
     """`modules` and all modules of the packages COUNTED that they import, directly or indirectly,
     without NOT_COUNTED."""
-    return _closure(modules, COUNTED, NOT_COUNTED)
-
-
-def _closure(modules: Sequence[str], packages: Sequence[str], without: Sequence[str]) -> set[str]:
-    """`modules` and all modules of `packages` that they import, directly or indirectly, except
-    `without`."""
-    found, left = set(without), list(modules)
+    found, left = set(NOT_COUNTED), list(modules)
     while left:
         if (module := left.pop()) not in found:
             found.add(module)
-            left += _imported(module, packages)
-    return found - set(without)
+            left += _imported(module)
+    return found - set(NOT_COUNTED)
 
 
 def _file(module: str) -> Path:
@@ -308,23 +278,18 @@ def _file(module: str) -> Path:
     return Path(spec.origin)
 
 
-def _imported(module: str, packages: Sequence[str]) -> list[str]:
-    """The modules of `packages` that `module` imports."""
-    ours = tuple(f"{package}." for package in packages)
-    return [name for name in _import_names(module) if name.startswith(ours) and _is_module(name)]
-
-
 @cache
-def _import_names(module: str) -> tuple[str, ...]:
-    """All names in the import statements of a module and of its functions: `a.b` and `a.b.c` for
-    `from a.b import c`."""
+def _imported(module: str) -> tuple[str, ...]:
+    """The modules of COUNTED that the import statements of a module and of its functions name:
+    `a.b` and `a.b.c` for `from a.b import c`, where these are modules."""
     names: list[str] = []
     for node in ast.walk(ast.parse(_file(module).read_bytes())):
         if isinstance(node, ast.Import):
             names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
             names += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
-    return tuple(names)
+    ours = tuple(f"{package}." for package in COUNTED)
+    return tuple(name for name in names if name.startswith(ours) and _is_module(name))
 
 
 def _is_module(name: str) -> bool:
