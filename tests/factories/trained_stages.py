@@ -20,7 +20,7 @@ def joining() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         for name, value in (("LEAST_SWEEPS", 1), ("LEAST_EACH", 1), ("ENOUGH", 1.01)):
             patch.setattr(recipe, name, value)
-        patch.setattr(choice.HeldOutScores, "worse", lambda *_: False)
+        patch.setattr(choice.PairedDifference, "worse", property(lambda _: False))
         yield
 
 

@@ -193,7 +193,7 @@ def test_sizes_with_stages_are_judged_where_stages_were_not_trained(
     trained = []
     train = recipe._trained
     monkeypatch.setattr(recipe, "ENOUGH", 1.1)
-    monkeypatch.setattr(head_choice.HeldOutScores, "worse", lambda *pair: False)
+    monkeypatch.setattr(head_choice.PairedDifference, "worse", property(lambda _: False))
     monkeypatch.setattr(recipe, "_trained", lambda setup: trained.append(1) or train(setup))
     sweeps = skin(each=8)
     sweeps = replace(sweeps, groups={"position": sweeps.group("place")})

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from importlib.util import find_spec
+from typing import Any
 
 from palpate.core.errors import FormatError
 
@@ -35,6 +37,15 @@ def installed(library: str) -> bool:
         return find_spec(library) is not None
     except ModuleNotFoundError:
         return False
+
+
+def library(name: str, what: str, use: str = "read") -> Any:
+    """The module `name`, which can `use` `what`. Raises FormatError with the extra that has it."""
+    try:
+        return import_module(name)
+    except ImportError as e:
+        why = advice(name.partition(".")[0])
+        raise FormatError(f"is {what}; to {use} it: {why} ({e})") from e
 
 
 @contextmanager

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from palpate.core.errors import FormatError
+from palpate_train.data.extras import library
 from palpate_train.data.files import json_lines, parquet
-from palpate_train.data.files.optional import library
 from palpate_train.data.files.table import ReadPlan, Table, from_columns
 from palpate_train.data.import_plan import ImportPlan
 

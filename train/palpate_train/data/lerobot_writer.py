@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from palpate.core import storage
 from palpate.core.errors import FormatError
-from palpate_train.data.files.optional import library
+from palpate_train.data.extras import library
 from palpate_train.data.lerobot import EPISODE, FRAME, INFO, TASK, TASK_INDEX, TASKS, TIME
 from palpate_train.data.sets import Dataset
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from palpate.core.errors import FormatError
 from palpate.core.sweep_set import Array
+from palpate_train.data import extras
 
 PREFIX = "aeon:"
 RATE_HZ = 100.0
@@ -57,18 +58,12 @@ def load(name: str) -> tuple[Array, Array, tuple[str, ...], dict[str, Array]]:
 
 def _part(name: str, split: str) -> tuple[Array, Array]:
     """(series [n, channels, T], classes [n])."""
-    try:
+    with extras.needed_for(f"set {PREFIX + name!r}"):
         import aeon.datasets
-    except ImportError as e:
-        raise FormatError(
-            f"set {PREFIX + name!r} needs aeon ({e}); try pip install 'palpate-train[peers]'"
-        ) from e
     # load_classification would download a missing file
     if not (
         Path(aeon.datasets.__file__).parent / "data" / name / f"{name}_{split.upper()}.ts"
     ).is_file():
-        raise FormatError(
-            f"this version of aeon does not hold {name}; try pip install 'palpate-train[peers]'"
-        )
+        raise FormatError(f"this version of aeon does not hold {name}; try {extras.advice('aeon')}")
     series, classes = aeon.datasets.load_classification(name, split=split)
     return series, classes

@@ -196,7 +196,7 @@ def test_stages_and_the_spectrum_are_enough_unless_more_is_better(
     holds no filters."""
     for name, value in (("LEAST_SWEEPS", 1), ("ENOUGH", 1.01)):
         monkeypatch.setattr(recipe, name, value)
-    monkeypatch.setattr(choice.HeldOutScores, "better", lambda *_: better)
+    monkeypatch.setattr(choice.PairedDifference, "better", property(lambda _: better))
     fit = recipe.fit(easy(), Run(1), Settings(steps=20, use=SkinUse(reattached=True)))
     bands = fit.bands
     assert bands

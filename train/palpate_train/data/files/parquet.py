@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from palpate.core.errors import FormatError
-from palpate_train.data.files.optional import library
+from palpate_train.data.extras import library
 from palpate_train.data.files.table import Array, ReadPlan, Table, from_columns
 
 SUFFIXES = (".parquet", ".pq", ".feather", ".arrow")

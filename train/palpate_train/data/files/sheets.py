@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from palpate.core.errors import FormatError
+from palpate_train.data.extras import library
 from palpate_train.data.files import text
-from palpate_train.data.files.optional import library
 from palpate_train.data.files.table import ReadPlan, Table, normal
 
 SUFFIXES = (".xlsx", ".xlsm", ".xlsb", ".xls", ".ods")
