@@ -64,7 +64,7 @@ def test_the_five_commands_of_the_page_make_a_bundle(
         f"to score it on the sweeps that fit --split left out: {shlex.join(commands[-1])}\n" in out
     )
     assert "left out: README.md: its name does not match the pattern" in out
-    found = re.search(r"named rightly: (\d+) of 18: ", out)
+    found = re.search(r"classified correctly: (\d+) of 18: ", out)
     assert found
     assert int(found[1]) >= 12
 

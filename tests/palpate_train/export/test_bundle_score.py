@@ -70,7 +70,7 @@ def test_what_is_named_is_counted(classifier: Classifier):
     }
     assert found.by == "position"
     lines = found.text().splitlines()
-    assert lines[1].startswith("named rightly: 3 of 6: 50.0 % [")
+    assert lines[1].startswith("classified correctly: 3 of 6: 50.0 % [")
     assert lines[1].endswith("95 % interval, by position (3)")
     assert "  a     2 of 3     b 1" in lines
     assert (
@@ -122,7 +122,10 @@ def test_the_command_prints_and_writes_what_it_found(
     sweeps(*HERE, labels=[0, 1, 2], materials="Abc").save(tmp_path / "s.npz")
     args = ["score", str(tmp_path / "toy"), "--set", str(tmp_path / "s.npz")]
     assert main([*args, "--rename", "A=a", "--json", str(tmp_path / "out.json")]) == 0
-    assert "named rightly: 3 of 3: 100.0 % [43.9, 100.0], 95 % interval" in capsys.readouterr().out
+    assert (
+        "classified correctly: 3 of 3: 100.0 % [43.9, 100.0], 95 % interval"
+        in capsys.readouterr().out
+    )
     told = json.loads((tmp_path / "out.json").read_text())
     assert told["named_rightly"]["right"] == 3
     assert told["answers"] == {"a": {"a": 1}, "b": {"b": 1}, "c": {"c": 1}}

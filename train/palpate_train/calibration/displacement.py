@@ -21,7 +21,7 @@ from palpate_train.metrics.temperature import sufficient_temperature
 
 Array = NDArray[Any]
 MOST_WRONG = 0.0125
-"""Share of held-out copies that may be named wrongly with status ok. Heads that were fitted to
+"""Share of held-out copies that may get a wrong label with status ok. Heads that were fitted to
 copies name copies better than sweeps of a skin that was really displaced: with .0125 a fit for a
 reattached skin names 4 % of sim:T-HARD:201-236:2 wrongly."""
 UNSURE = np.arange(50, 100) / 100

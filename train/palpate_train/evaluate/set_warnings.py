@@ -58,6 +58,6 @@ def of_protocol(sweeps: Dataset, text: str, folds: Sequence[tuple[Array, Array]]
     if shared:
         yield (
             f"warning: {text}: {shared} of {tested} tested sweeps are identical to a training "
-            "sweep or share frames with one, so even noise would be named rightly; give windows of "
+            "sweep or share frames with one, so even noise would get its label; give windows of "
             "one recording the same number in the group recording"
         )

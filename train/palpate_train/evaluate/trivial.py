@@ -45,8 +45,8 @@ def features(sweeps: Dataset) -> dict[str, Array]:
 
 
 def right(x: Array, labels: Array, train: Array, test: Array) -> int:
-    """How many of the sweeps `test` a discriminant of the features `x` [N, F] names rightly that is
-    fitted to the sweeps `train`; 0 if these are too few. train, test: masks or numbers."""
+    """How many of the sweeps `test` are classified correctly by a discriminant of the features `x`
+    [N, F], fitted to the sweeps `train`; 0 if these are too few. train, test: masks or numbers."""
     try:
         weight, bias = fit_discriminant(x[train], labels[train], int(labels.max()) + 1)
     except FormatError:

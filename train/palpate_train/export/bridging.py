@@ -313,11 +313,13 @@ def text(manifest: Manifest) -> str:
     figures = manifest.figures.get(FIGURES, {})
     if figures:
         right, wrong = figures["sound"]
-        lines.append(f"  sound skin: {right} of {figures['sweeps']} named rightly, {wrong} wrongly")
+        lines.append(
+            f"  sound skin: {right} of {figures['sweeps']} classified correctly, {wrong} wrongly"
+        )
     for name, counts in figures.items():
         if isinstance(counts, dict) and name != CLIPPED:
             answers = "; ".join(
-                f"{fault} {counts[fault][0]} rightly, {counts[fault][1]} wrongly"
+                f"{fault} {counts[fault][0]} correct, {counts[fault][1]} wrong"
                 for fault in TAXEL_FAULTS
             )
             lines.append(f"  {name} ({counts['at']}): {answers}")

@@ -1,6 +1,6 @@
 """Answers of a bundle to a sweep set, through the classifier of the box.
 
-A sweep counts as named rightly if the box names its material with status ok.
+A sweep is classified correctly if the box gives its material with status ok.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ class BundleScore:
             f"{self.about['name']} {self.about['version']}, {self.about['id']}, on "
             f"{self.sweeps.source}: "
             f"{len(self.sweeps)} sweeps of {len(self.answered) + len(self.foreign)} materials",
-            f"named rightly: {_share(self.right, self.clusters)}, 95 % interval{by}",
+            f"classified correctly: {_share(self.right, self.clusters)}, 95 % interval{by}",
         ]
         if self.recordings is not None:
             lines.append(f"recordings, their sweeps fused: {_share(self.recordings)}")

@@ -34,8 +34,8 @@ def under_corruptions(
     log: Callable[[str], None] = lambda line: None,
     corruptions: Sequence[Corruption] | None = None,
 ) -> Json:
-    """Curves by answer (ANSWERS) and corruption, see robustness.merge; those of `falls` are of the
-    sweeps named rightly.
+    """Curves by answer (ANSWERS) and corruption, see robustness.merge; `falls` is of correctly
+    classified sweeps.
 
     seeds: of the corruptions. corruptions: None for all that apply. Raises FormatError if the
     sweeps are not of the bundle's format, or have a material that it lacks.

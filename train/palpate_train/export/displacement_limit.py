@@ -45,10 +45,8 @@ def limited(manifest: Manifest, train: Dataset, seed: int = 0) -> Manifest:
 
 
 def _shift(made: Mapping[str, Any]) -> float:
-    """Largest displacement of training copies in rows. Older bundles call the augmentation
-    `scene`."""
-    recipe = made.get("recipe", {})
-    used = recipe.get("augmentation", recipe.get("scene", {}))
+    """Largest displacement of training copies in rows."""
+    used = made.get("recipe", {}).get("augmentation", {})
     return float(used.get("shift", Augmentation().shift))
 
 

@@ -122,7 +122,7 @@ class Difference:
 def difference(better: Array, worse: Array, clusters: Array) -> Difference:
     """The difference of two models on the same sweeps, which removes the effect of hard sweeps.
 
-    better, worse: bool [n], whether each sweep was named rightly. clusters: int [n]; sweeps of a
+    better, worse: bool [n], whether each sweep is right. clusters: int [n]; sweeps of a
     cluster succeed or fail together. The standard error is that over clusters, or that over sweeps
     if this is larger, because a few clusters may agree by chance.
     """
@@ -171,7 +171,7 @@ class Judgement:
     by: tuple[str, ...]
 
     def right(self, name: str) -> Array:
-        """bool [n], the held-out sweeps that this size names rightly."""
+        """bool [n], the held-out sweeps that this size classifies correctly."""
         right: Array = self.sizes[name].named == self.labels
         return right
 

@@ -60,7 +60,7 @@ class ReducedFits:
     wanted: float
 
     def right(self, change: Change) -> Array:
-        """bool [n], the held-out sweeps that are named rightly with `change`. Raises FormatError if
+        """bool [n], the held-out sweeps that are right with `change`. Raises FormatError if
         the reduced sweeps are too short."""
         whole, name = self.whole, self.chosen
         run = replace(whole.setup.run, folder=None)

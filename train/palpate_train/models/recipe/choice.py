@@ -116,7 +116,7 @@ class HeldOutScores:
         )
 
     def right(self, scored: ScoredPlan) -> Array:
-        """bool [n], what it names rightly."""
+        """bool [n], the sweeps that it classifies correctly."""
         right: Array = scored.logits.argmax(axis=1) == self.labels
         return right
 

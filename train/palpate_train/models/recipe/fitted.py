@@ -157,7 +157,7 @@ class Fit:
         try:
             fit = cls._read(arrays, json.loads(str(arrays["meta"])))
         except (KeyError, ValueError, TypeError, BundleError) as e:
-            raise FormatError(f"{name}: not {WHAT}, or of another version; fit again: {e}") from e
+            raise FormatError(f"{name}: not {WHAT}; fit again: {e}") from e
         try:
             with_head(fit.trunk(), *fit.int8_head())
         except (KeyError, ValueError, checker.ValidationError, shape_inference.InferenceError) as e:

@@ -7,8 +7,8 @@
        |   judged:      by groups that their heads did not see; then fewer filters
        v
     stages:             trained convolutions beside them, if there are many sweeps of
-       |                each material, too many of the held-out ones are named
-       |                wrongly, and stages do not make that worse
+       |                each material, too many of the held-out ones get a
+       |                wrong label, and stages do not make that worse
        v
     pruned:             a trunk with only the features that a discriminant sees
        |   finished:    heads in float and int8, calibration, contact positions
