@@ -1,5 +1,5 @@
-"""The site: its sources hold every page, each link leads somewhere, the references are those of the
-code, and the workflow publishes what `make site` builds."""
+"""The site: its sources hold every page, each link leads somewhere, and the references are
+of the code."""
 
 from __future__ import annotations
 
@@ -15,8 +15,6 @@ import pytest
 
 from palpate_train import library
 from tests.factories.paths import ROOT
-
-WORKFLOW = ROOT / ".github" / "workflows" / "site.yml"
 
 
 @pytest.fixture(scope="module")
@@ -94,22 +92,6 @@ def test_links_of_the_built_site_are_followed(build: ModuleType, tmp_path: Path)
     (tmp_path / "there.html").write_text('<a href="https://e.org"><img src="data:x">')
     (tmp_path / "a.html").write_text('<a href="there.html#x"> <a href="gone.html"> <a href="#b">')
     assert build.broken(tmp_path) == ["a.html: gone.html is not in the site"]
-
-
-def test_the_workflow_publishes_what_make_builds():
-    """On main and by hand, with the rights that publishing needs and no more."""
-    text = WORKFLOW.read_text()
-    assert "branches: [main]" in text
-    assert "workflow_dispatch:" in text
-    assert "- run: make site\n" in text
-    assert "path: build/site\n" in text
-    assert re.findall(r"^  ([a-z-]+): (read|write)$", text, re.M) == [
-        ("contents", "read"),
-        ("pages", "write"),
-        ("id-token", "write"),
-    ]
-    used = re.findall(r"uses: (\S+)@v\d+", text)
-    assert [action for action in used if not action.startswith("actions/")] == []
 
 
 def test_the_reference_of_the_library_is_complete(sources: Path):
