@@ -28,7 +28,7 @@ PYTHONS = ("3.11.2", "3.13.5")
 """Python of Debian 12 and of Debian 13, and so of the Raspberry Pi OS of the same names."""
 ARCHIVES = "/usr/lib/palpate"
 """Folder of the archives on a box."""
-UNITS = "palpate-teach.path palpate palpate-teach palpate-watch 'palpate-bridge@*'"
+UNITS = "palpate-teach.path palpate 'palpate@*' palpate-teach palpate-watch 'palpate-bridge@*'"
 READY_S = 60
 """Longest wait for the service at the end of an installation, in seconds."""
 
@@ -239,7 +239,7 @@ def _comes_up() -> str:
   exit 0
 fi
 {install.tidy()}
-systemctl try-restart palpate-watch 'palpate-bridge@*' || true
+systemctl try-restart 'palpate@*' palpate-watch 'palpate-bridge@*' || true
 if [ "$state" = active ]; then
   {LINK}/bin/palpate status || true
 else

@@ -36,6 +36,7 @@ LINK = "/opt/palpate"
 """The link to the release in use."""
 PATHS = {
     "systemd/palpate.service": "/etc/systemd/system/palpate.service",
+    "systemd/palpate@.service": "/etc/systemd/system/palpate@.service",
     "systemd/palpate-watch.service": "/etc/systemd/system/palpate-watch.service",
     "systemd/palpate-teach.path": "/etc/systemd/system/palpate-teach.path",
     "systemd/palpate-teach.service": "/etc/systemd/system/palpate-teach.service",
@@ -378,7 +379,7 @@ def switch(box: FleetBox, name: str, release: str, *, restart: bool) -> str:
     # until then they belong to the earlier release; disabled units stay off
     box.run(
         "restarting page and bridges",
-        "systemctl try-restart palpate-watch 'palpate-bridge@*'",
+        "systemctl try-restart 'palpate@*' palpate-watch 'palpate-bridge@*'",
         user="root",
     )
     box.run("removing older releases", tidy(), user="root", limit_s=120)

@@ -130,18 +130,7 @@ def settings_tables() -> str:
             if name.startswith(f"{section}.")
         )
         parts.append(f"## {section}\n\n{about}\n\n{head}{rows}")
-    return "\n".join([*parts, _finger_table(head)])
-
-
-def _finger_table(head: str) -> str:
-    """The keys of a finger that a box with one skin does not have."""
-    about, meanings = described(config.FingerConfig)
-    rows = "".join(
-        f"| `skins.NAME.{name}` | {_default(key)} | {_cell(allowed(key))} | {meanings[name]} |\n"
-        for name, key in config._FINGER_KEYS.items()
-        if f"skin.{name}" not in config._KEYS
-    )
-    return f"## skins.NAME\n\n{about}\n\n{head}{rows}"
+    return "\n".join(parts)
 
 
 def described(group: Any) -> tuple[str, dict[str, str]]:

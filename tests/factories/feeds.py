@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import select
 import socket
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -96,14 +96,13 @@ class FeedPeer:
 
 
 class Offered:
-    """A feed whose turns a test takes. cost_ns: processor time of each look at the sockets. hand:
-    formats of the fingers. known: more of the first line."""
+    """A feed whose turns a test takes. cost_ns: processor time of each look at the sockets.
+    known: more of the first line."""
 
     def __init__(
         self,
         path: Path,
         format: SweepFormat = skin.FORMAT,
-        hand: Sequence[SweepFormat] = (),
         known: Mapping[str, Any] = MappingProxyType({}),
         **facts: Any,
     ) -> None:
@@ -116,9 +115,7 @@ class Offered:
             **known,
         }
         self.cost_ns = self._spent_ns = 0
-        self.feed = FeedServer(
-            path, format, known, self.clock, lambda: facts, self._spent, fingers=hand
-        )
+        self.feed = FeedServer(path, format, known, self.clock, lambda: facts, self._spent)
 
     def turns(
         self, n: int = 1, health: Health = HEALTH, step_s: float = PERIOD_NS / SECOND

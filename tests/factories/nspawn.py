@@ -46,6 +46,7 @@ TOOLS = {
 }
 PLACES = {
     "palpate.service": "/etc/systemd/system/palpate.service",
+    "palpate@.service": "/etc/systemd/system/palpate@.service",
     "palpate-watch.service": "/etc/systemd/system/palpate-watch.service",
     "palpate-teach.path": "/etc/systemd/system/palpate-teach.path",
     "palpate-teach.service": "/etc/systemd/system/palpate-teach.service",

@@ -142,9 +142,8 @@ def settings() -> list[bytes]:
         "".join(re.findall(r"^[^#\n].*\n", file.read_text("utf-8"), re.MULTILINE)) for file in files
     ]
     whole = config.describe(config.load(None, site=Path("/dev/null")))
-    hub = '[skins.left]\n[skins.right]\nport = "a"\n[skins.c]\npart = "1/2 rows"\ntare = true\n'
     board = 'board = "a"\n[sweep]\nmax_duration_s = 3\n'
-    return [text.encode() for text in (*values, whole, board, hub)]
+    return [text.encode() for text in (*values, whole, board)]
 
 
 def manifest() -> list[bytes]:

@@ -211,7 +211,7 @@ class Alignment:
     """Reads the skin and makes Views of it."""
 
     def __init__(self, settings: Config, expected: Expected, devices: Devices) -> None:
-        self._sensor = skins.own_sensor(settings, expected.format, devices)
+        self._sensor = skins.sensor(settings, expected.format, devices)
         self._tracker = ContactTracker(expected, devices.source)
         self._enumerations = self._sensor.counters.enumerations
 

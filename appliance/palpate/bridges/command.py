@@ -1,4 +1,4 @@
-"""`palpate bridge tcp|modbus|ros`: completes the options from the settings and starts the
+"""`palpate bridge tcp|modbus|ros|fuse`: completes the options from the settings and starts the
 bridge."""
 
 from __future__ import annotations
@@ -6,22 +6,25 @@ from __future__ import annotations
 import argparse
 import asyncio
 import sys
+from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 
-from palpate.bridges.options import LINKS, PORTS, add_arguments
+from palpate.bridges.options import LINKS, MOST, PORTS, add_arguments
 from palpate.bridges.server import TcpServer, address, stop_event, until
 from palpate.bridges.source import FeedSource, LineSource, LinkPort, Source
-from palpate.client.line import open_port
-from palpate.core import config
+from palpate.client.feed import Feed
+from palpate.client.line import Line, open_port
+from palpate.core import config, sentences
 from palpate.core.clock import SystemClock
-from palpate.core.config import Config
-from palpate.core.errors import ApplianceError, ConfigError
+from palpate.core.config import Config, StoreConfig
+from palpate.core.errors import ApplianceError, ConfigError, LinkLost
 from palpate.core.log import log, to_stderr
 from palpate.core.retry import retried
+from palpate.core.sentences import MOST_FINGERS, Sentence
 from palpate.core.text import printable
 
 EVERY_S = 1.0
@@ -137,7 +140,70 @@ def run_ros(args: argparse.Namespace) -> int:
     return 0
 
 
-RUNS = {"tcp": run_tcp, "modbus": run_modbus, "ros": run_ros}
+def feeds(given: Sequence[str]) -> dict[str, Feed]:
+    """The feeds of NAME or NAME=PATH. Raises ConfigError."""
+    found = {}
+    for text in given:
+        name, _, path = text.partition("=")
+        if not config.UNIT.fullmatch(name):
+            raise ConfigError(
+                f"--fingers {text}: not a unit's name; use up to 8 small letters, digits and "
+                "hyphens"
+            )
+        found[name] = Feed(path or f"{StoreConfig().runtime}-{name}/feed.sock")
+    if not 2 <= len(found) <= MOST_FINGERS or len(found) < len(given):
+        raise ConfigError(
+            f"--fingers {' '.join(given)}: give 2 to {MOST_FINGERS} units with different names, as "
+            "in --fingers left right, or bridge.fingers in the settings"
+        )
+    return found
+
+
+def _sent(line: Line | None, text: bytes) -> bool:
+    """Send a sentence on a line, or on standard output; whether it was sent."""
+    try:
+        line.write(text) if line else sys.stdout.buffer.write(text)
+        sys.stdout.flush()
+    except (LinkLost, BlockingIOError):
+        return False
+    return True
+
+
+def run_fuse(args: argparse.Namespace) -> int:
+    """`palpate bridge fuse`, until SIGTERM."""
+    from palpate.bridges.fuse import UNSURE, FingerFusion, listen
+
+    settings, clock = config.load(None), SystemClock()
+    each = feeds(args.fingers or settings.bridge.fingers.split())
+    port = args.port or settings.serial.port
+    heard: deque[Sentence] = deque(maxlen=MOST)
+    line = None
+    if port:
+        line = Line(partial(open_port, port, args.baud), heard.append, lambda: None, name=port)
+    send = partial(_sent, line)
+    hand = FingerFusion(each, settings.classifier.min_probability or UNSURE, clock, send)
+
+    def work() -> None:
+        listen(each, hand)
+        while heard:
+            if (command := heard.popleft()).kind not in sentences.OWN:
+                send(hand.reply(command))
+
+    async def serve() -> int:
+        stop = stop_event()
+        await until(stop, 0, partial(asyncio.to_thread, work))
+        return stop.code
+
+    log.info(f"fuse: {' and '.join(each)}, sentences to {port or 'standard output'}")
+    try:
+        return asyncio.run(serve())
+    finally:
+        for one in (*each.values(), line):
+            if one is not None:
+                one.close()
+
+
+RUNS = {"tcp": run_tcp, "modbus": run_modbus, "ros": run_ros, "fuse": run_fuse}
 
 
 def run(args: argparse.Namespace) -> int:

@@ -19,6 +19,7 @@ TEXTS = {
     "tcp": "the sentences of the serial line on a TCP port",
     "modbus": "the box as a Modbus TCP server",
     "ros": "the box as a ROS 2 node",
+    "fuse": "the answers of several fingers, each with a unit of its own, as those of one hand",
 }
 
 
@@ -36,9 +37,32 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
                 metavar="...",
                 help="parameters and names of ROS; the last option",
             )
+        elif kind == "fuse":
+            _add_fingers(one)
         else:
             _add_ways(one, kind)
             _add_server(one, kind)
+
+
+def _add_fingers(one: argparse.ArgumentParser) -> None:
+    one.add_argument(
+        "--fingers",
+        nargs="+",
+        metavar="NAME[=FEED]",
+        help="2 to 4 units, as in palpate@NAME, or the paths of their feeds (bridge.fingers)",
+    )
+    one.add_argument("--port", metavar="PORT", help="the serial line to the robot (serial.port)")
+    _add_baud(one)
+
+
+def _add_baud(one: argparse.ArgumentParser) -> None:
+    one.add_argument(
+        "--baud",
+        type=int,
+        default=BAUD,
+        metavar="N",
+        help=f"baud rate of the serial line (default {BAUD})",
+    )
 
 
 def _add_ways(one: argparse.ArgumentParser, kind: str) -> None:
@@ -65,13 +89,7 @@ def _add_ways(one: argparse.ArgumentParser, kind: str) -> None:
 
 
 def _add_server(one: argparse.ArgumentParser, kind: str) -> None:
-    one.add_argument(
-        "--baud",
-        type=int,
-        default=BAUD,
-        metavar="N",
-        help=f"baud rate of the serial line (default {BAUD})",
-    )
+    _add_baud(one)
     one.add_argument(
         "--listen",
         metavar="HOST:PORT",

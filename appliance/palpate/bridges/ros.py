@@ -280,11 +280,9 @@ class PalpateNode(LifecycleNode):  # type: ignore[misc]
 
     def _publish_frame(self, line: Mapping[str, Any]) -> None:
         source: FeedSource = self._source  # type: ignore[assignment]
-        format = source.fingers.get(str(line.get("finger")), source.format)
-        message = image(line["taxels"], format["dtype"])
+        message = image(line["taxels"], source.format["dtype"])
         message.header.stamp = self.get_clock().now().to_msg()
-        finger = line.get("finger")
-        message.header.frame_id = self.setting("frame_id") + (f"/{finger}" if finger else "")
+        message.header.frame_id = self.setting("frame_id")
         self._frames.publish(message)
         self._optional.frame(line["taxels"], message.header)
 

@@ -165,7 +165,6 @@ class FeedSource:
     ) -> None:
         self.name = path
         self.format: Mapping[str, Any] = {}
-        self.fingers: Mapping[str, Mapping[str, Any]] = {}  # format of each finger's frames
         self._clock, self._also, self._frame = clock or SystemClock(), heard, frame
         self._view = BoxView()
         self._feed = Feed(path, frames_hz=frames_hz, clock=self._clock)
@@ -212,7 +211,6 @@ class FeedSource:
         kind = line["type"]
         if kind == "hello":
             self.format = line["format"]
-            self.fingers = {name: of["format"] for name, of in line.get("fingers", {}).items()}
             self._view = replace(self._view, labels=tuple(line["labels"]), bundle=line["bundle"])
         elif kind == "lost":
             self._view = replace(self._view, missed=self._view.missed + int(line["lines"]))
@@ -241,7 +239,7 @@ class FeedSource:
         return self._answer(line)
 
     def _answer(self, line: Mapping[str, Any]) -> Answer:
-        """The answer in a verdict line, or in that of a finger in it."""
+        """The answer in a verdict line."""
         state = self._view.state
         return Answer(
             line["sweep"],
@@ -259,8 +257,6 @@ class FeedSource:
             line["detail"],
             measured_mm_s=line.get("measured_mm_s"),
             direction=line.get("direction", ""),
-            finger=line.get("finger", ""),
-            fingers=tuple(self._answer(of) for of in line.get("fingers", ())),
         )
 
 

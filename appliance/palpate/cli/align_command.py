@@ -46,7 +46,7 @@ def _expected(settings: Config, devices: Devices) -> Expected:
     except BundleError as e:
         log.warning(f"no bundle: {e}")
     try:
-        format = skins.part_of(settings, devices.format or skins.announced(settings, devices))
+        format = devices.format or skins.announced(settings, devices)
     except SensorError:
         if not current:
             raise

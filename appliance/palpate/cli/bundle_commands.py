@@ -144,11 +144,9 @@ def run_install(args: argparse.Namespace) -> int:
 
 
 def _elsewhere(settings: Config) -> str:
-    """The settings that name another bundle than that of the store, as the end of a message."""
-    fingers = (settings.finger(name) for name in settings.skins)
-    each = [own.bundle_setting for own in fingers] or [settings.bundle_setting]
-    named = ", ".join(filter(None, dict.fromkeys(each)))
-    return f"; it does not run where the settings name another bundle: {named}" if named else ""
+    """Whether the settings name another bundle than that of the store, as the end of a message."""
+    named = "; it does not run while the settings name another bundle: classifier.bundle"
+    return named if settings.classifier.bundle else ""
 
 
 def streaming(settings: Config, store: Store) -> SweepFormat | None:

@@ -7,7 +7,7 @@ import argparse
 from palpate.cli.common import load_bundle, load_settings
 from palpate.cli.devices import open_any
 from palpate.core.text import printable
-from palpate.runtime.selftest import check, check_hand
+from palpate.runtime.selftest import check
 
 
 def run(args: argparse.Namespace) -> int:
@@ -16,12 +16,6 @@ def run(args: argparse.Namespace) -> int:
     devices = open_any(args, settings)
     failed, answers = 0, not args.sim
     results = check(devices.wire(settings), lambda: load_bundle(settings, answers=answers), devices)
-    if settings.skins:
-        results = check_hand(
-            devices.wire(settings),
-            lambda finger: load_bundle(settings.finger(finger), answers=answers),
-            devices,
-        )
     for result in results:
         line = f"{'ok  ' if result.ok else 'FAIL'}  {result.component:<14} {result.detail}"
         print(printable(line), flush=True)

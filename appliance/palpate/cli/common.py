@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from palpate.core import config, fingers, storage
+from palpate.core import config, storage
 from palpate.core.clock import SystemClock
 from palpate.core.config import Config
 from palpate.core.errors import BundleDenied, ConfigError
@@ -24,8 +24,7 @@ Facts = Mapping[str, Callable[[], object]]
 
 
 def load_settings(args: argparse.Namespace) -> Config:
-    """The settings with the changes that a command's options make. With --finger they are those of
-    one skin; a command that needs one always has this option. Raises ConfigError."""
+    """The settings with the changes that a command's options make. Raises ConfigError."""
     given = {
         key: value
         for key, option in (("profile", "skin"), ("port", "skin_port"))
@@ -41,17 +40,11 @@ def load_settings(args: argparse.Namespace) -> Config:
             )
         mode = "timed"
     sets += [f"trigger.mode={mode}"] if mode else []
-    settings = config.load(args.board, sets, folder=args.config_dir)
+    settings = config.load(args.board, sets, folder=args.config_dir, unit=args.unit)
     times = {name: s for name, s in (("every_s", every), ("sweep_s", sweep)) if s is not None}
     if times:
         settings = replace(settings, trigger=replace(settings.trigger, **times))
-    if "finger" not in args:
-        return settings
-    fingers.check_chosen(settings.skins, args.finger)
-    if not args.finger:
-        return settings
-    settings = settings.finger(args.finger)
-    return replace(settings, skin=replace(settings.skin, **given))
+    return settings
 
 
 def load_bundle(settings: Config, *, answers: bool = True) -> Bundle:

@@ -11,14 +11,12 @@ from itertools import islice
 from typing import TYPE_CHECKING
 
 from palpate.cli.common import load_bundle, load_settings
-from palpate.core import fingers
 from palpate.core.clock import Clock, SystemClock
 from palpate.core.config import Config
 from palpate.core.devices import Devices
 from palpate.core.errors import BundleError, ConfigError, FormatError
 from palpate.core.types import SweepFormat
 from palpate.io import skins
-from palpate.io.skin_profile import SkinProfile
 
 if TYPE_CHECKING:
     from palpate.sim.devices import RobotDevices
@@ -59,8 +57,6 @@ def simulated(
     the robot plays the tour of `palpate demo`."""
     from palpate.sim import devices, rig, script, tour
 
-    profile = _played(settings)
-    format = skins.hub_format(format, settings.part) if format else None
     clock: Clock = rig.VirtualClock() if args.virtual else SystemClock()
     follows = settings.trigger.mode == "serial"
     profile = skins.profile(settings)
@@ -71,13 +67,9 @@ def simulated(
             args.seed,
             spread=spread,
             follows=follows,
-            fingers=len(settings.skins) or 1,
         )
         acts = islice(tour.tour(format, args.seed) if touring else acts, args.sweeps)
-        of_fingers = dict.fromkeys(settings.skins, format)
-        return devices.build(
-            format, acts, clock, source, remember=remember, follows=follows, fingers=of_fingers
-        )
+        return devices.build(format, acts, clock, source, remember=remember, follows=follows)
     return emulated(name, format, args, settings, clock, remember=remember, spread=spread)
 
 
@@ -96,11 +88,3 @@ def emulated(
         f'--sim plays a readout board, not the skin "{settings.skin.profile}"; leave --skin out, or'
         " connect this skin"
     )
-
-
-def _played(settings: Config) -> SkinProfile:
-    """The profile of the simulated skin. Raises ConfigError for a hand that cannot be simulated."""
-    profile = skins.profile(settings)
-    if profile.codec != "palpate" or any(own.part for own in settings.skins.values()):
-        fingers.refuse(settings.skins, "--sim with this skin or with parts of a hub")
-    return profile

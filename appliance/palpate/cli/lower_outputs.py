@@ -41,7 +41,7 @@ def main(
     parser.set_defaults(**NO_SETTINGS)
     args = parser.parse_args(argv)
     try:
-        loaded = config.load(args.board, args.set, folder=args.config_dir)
+        loaded = config.load(args.board, args.set, folder=args.config_dir, unit=args.unit)
         clock = clock or SystemClock()
         Lines(loaded.output, gpio, clock).close()  # requested as low, then released
     except ApplianceError as e:

@@ -12,7 +12,7 @@ from palpate.core import outputs
 
 WEB_PORT, TEACH_PORT = 8137, 8138
 """Default ports of pages. Both pages can be served side by side."""
-NO_SETTINGS: Mapping[str, Any] = {"board": None, "set": [], "config_dir": None}
+NO_SETTINGS: Mapping[str, Any] = {"board": None, "set": [], "config_dir": None, "unit": ""}
 """The options of `add_settings` where none is given."""
 Parser = argparse.ArgumentParser
 Add = Callable[..., argparse.Action]
@@ -68,7 +68,7 @@ def check(command: Parser) -> None:
     )
     command.add_argument(
         "--part",
-        choices=("memory", "stream", "hand"),
+        choices=("memory", "stream"),
         help="bench: measure a part alone, as JSON, with the sweeps of --acts",
     )
     command.add_argument("--acts", type=Path, metavar="FILE", help=argparse.SUPPRESS)
@@ -91,7 +91,6 @@ def watch(command: Parser) -> None:
 
 def replay(command: Parser) -> None:
     command.add_argument("file", type=Path, metavar="FILE")
-    _finger(command.add_argument, default=argparse.SUPPRESS)
 
 
 def record(command: Parser) -> None:
@@ -242,7 +241,6 @@ def skin_check(command: Parser) -> None:
 
 def _looked_at(command: Parser) -> None:
     _devices(command.add_argument)
-    _finger(command.add_argument, default=argparse.SUPPRESS)
     command.set_defaults(sweeps=None)
 
 
@@ -268,6 +266,7 @@ def add_settings(command: Parser) -> None:
     add("--board", help="board file to use: firmware_config/board-NAME.toml")
     add("--set", action="append", metavar="SECTION.KEY=VALUE", help="override one value")
     add("--config-dir", type=Path, metavar="DIR", help="where skin.toml and the board files are")
+    add("--unit", metavar="NAME", help="the unit palpate@NAME, with its own settings")
 
 
 def _devices(add: Add) -> None:
@@ -297,16 +296,9 @@ def _web(add: Add, text: str, port: int = WEB_PORT) -> None:
 
 
 def _one_skin(command: Parser) -> None:
-    """Add the options of a command that uses one skin, also of several."""
+    """Add the options of a command that uses the skin."""
     _devices(command.add_argument)
-    _finger(command.add_argument)
     command.set_defaults(sweeps=None)
-
-
-def _finger(add: Add, **more: Any) -> None:
-    """Add --finger. more: `default=argparse.SUPPRESS` for a command that does not need one."""
-    text = "of a box with several skins: the finger to use, [skins.NAME]"
-    add("--finger", metavar="NAME", help=text, **more)
 
 
 def _answers(command: Parser) -> None:

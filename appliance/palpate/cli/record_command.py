@@ -45,14 +45,7 @@ def run(args: argparse.Namespace) -> int:
         port = assembly.port(settings, devices) if sentences else None
         folder, disk = args.out or settings.kept("sweeps"), DiskThread()
         recording = RecordingSession(
-            folder,
-            format,
-            labels,
-            devices.clock,
-            _sentences(port),
-            args.target,
-            disk,
-            finger=settings.alone,
+            folder, format, labels, devices.clock, _sentences(port), args.target, disk
         )
         stack.callback(recording.close)
         page = _record_page(
@@ -81,7 +74,7 @@ def open_skin(args: argparse.Namespace, settings: Config) -> tuple[Devices, Swee
     long as the window."""
     asked = skins.described(args.format) if args.format else None
     devices = open_devices(args, (lambda: asked) if asked else None)
-    format = asked or skins.part_of(settings, devices.format) or _announced(settings, devices)
+    format = asked or devices.format or _announced(settings, devices)
     if args.window is not None:
         format = replace(format, window=round(args.window * format.rate_hz))
     _check_length(format, settings)
@@ -161,7 +154,7 @@ def _record_page(
 def _announced(settings: Config, devices: Devices) -> SweepFormat:
     """The format that the skin announces. Raises SensorError with advice if it announces none."""
     try:
-        return skins.part_of(settings, skins.announced(devices.wire(settings), devices))
+        return skins.announced(devices.wire(settings), devices)
     except SensorError as e:
         raise type(e)(
             f"{e}; or name its format with --format 4x4:uint8:750; then the command waits for it"

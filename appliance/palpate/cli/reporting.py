@@ -6,16 +6,12 @@ import argparse
 import os
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from palpate.bundle.bundle import Bundle
 from palpate.cli.common import Facts
-from palpate.core import fingers
 from palpate.core.clock import SystemClock
 from palpate.core.config import Config
 from palpate.core.devices import Devices
-from palpate.core.errors import ConfigError
 from palpate.core.observer import Observer
 from palpate.core.types import SweepFormat
 from palpate.io import skins
@@ -29,13 +25,6 @@ if TYPE_CHECKING:
 def capture(
     args: argparse.Namespace, settings: Config, format: SweepFormat, stack: ExitStack
 ) -> CaptureWriter | None:
-    if args.capture:
-        fingers.refuse(settings.skins, "--capture")
-        if settings.part:
-            raise ConfigError(
-                f"--capture keeps the frames of the whole hub, and skins.{settings.alone}.part is "
-                f'"{settings.part}"; leave it out'
-            )
     capture = CaptureWriter(args.capture, format, skins.profile(settings)) if args.capture else None
     if capture:
         stack.callback(capture.close)
@@ -67,11 +56,9 @@ def feed(
     source: str,
     model: Mapping[str, Any],
     facts: Facts,
-    bundles: Mapping[str, Bundle] = MappingProxyType({}),
 ) -> list[Observer]:
     """The server of the feed, if the settings name its folder. The default folder exists in a
-    service only. model: facts about the bundle for the first line of the feed. bundles: by
-    finger."""
+    service only. model: facts about the bundle for the first line of the feed."""
     path = settings.store.feed
     default = settings.sources["store.runtime"] == "code"
     if not path or (default and not os.access(path.parent, os.W_OK)):
@@ -80,8 +67,6 @@ def feed(
 
     known = {"source": source, "skin": settings.skin.profile, **model}
     known["unit"] = skins.profile(settings).unit
-    if bundles:
-        known["fingers"] = {finger: _finger(settings, finger, of) for finger, of in bundles.items()}
     return [
         FeedServer(
             path,
@@ -89,21 +74,5 @@ def feed(
             known,
             SystemClock(),
             lambda: {name: fact() for name, fact in facts.items()},
-            fingers=[of.format for of in bundles.values()],
         )
     ]
-
-
-def _finger(settings: Config, finger: str, bundle: Bundle) -> dict[str, Any]:
-    """The facts about a finger for the first line of the feed."""
-    from palpate.alignment.live import Expected
-
-    own = settings.finger(finger)
-    unit = skins.profile(own).unit
-    return {
-        "skin": own.skin.profile,
-        "unit": unit,
-        "bundle": bundle.id,
-        "format": bundle.format.json(),
-        "alignment": Expected.by(bundle, own.skin.fingertip, unit).json(),
-    }

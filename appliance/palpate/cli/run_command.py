@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,7 +13,6 @@ from palpate.bundle.manifest import Manifest
 from palpate.cli.common import Facts, load_bundle, load_settings
 from palpate.cli.devices import open_devices
 from palpate.cli.reporting import capture, done, feed, status
-from palpate.core import fingers
 from palpate.core.clock import SystemClock
 from palpate.core.config import Config
 from palpate.core.devices import Devices
@@ -51,9 +49,6 @@ def _classify(args: argparse.Namespace, settings: Config, choice: Choice | None)
     with ExitStack() as stack:
         trial = stack.enter_context(choice.trial) if choice and choice.trial else None
         current = choice.bundle if choice else load_bundle(settings, answers=not args.sim)
-        of_fingers = assembly.of_fingers(settings, current, answers=not args.sim)
-        # labels have the order of the first finger's bundle
-        current = next(iter(of_fingers.values()), current)
         if unsigned := assembly.UNSIGNED if settings.classifier.allow_unsigned else "":
             log.warning(f"unsigned {unsigned}")
         devices = open_devices(args, lambda: current.format)
@@ -69,7 +64,7 @@ def _classify(args: argparse.Namespace, settings: Config, choice: Choice | None)
             "disk": lambda: disk.text,
             "unsigned": lambda: unsigned,
         }
-        reports = _reports(settings, current, of_fingers, devices.source, facts, stack, disk)
+        reports = _reports(settings, current, devices.source, facts, stack, disk)
         observers = disk, Notifier(SystemClock()), trial, shadow, *reports
         box = assembly.box(
             settings,
@@ -77,7 +72,6 @@ def _classify(args: argparse.Namespace, settings: Config, choice: Choice | None)
             devices,
             port,
             stack,
-            bundles=of_fingers,
             capture=capture(args, settings, current.format, stack),
             observers=[o for o in observers if o],
         )
@@ -90,7 +84,7 @@ def untaught(args: argparse.Namespace, settings: Config, packaged: Bundle) -> bo
     another skin. A skin of PROTOCOL.md announces its format later, so it does not count."""
     profile = skins.profile(settings)
     return (
-        not (args.sim or settings.skins)
+        not args.sim
         and settings.teach.allow
         and profile.codec != "palpate"
         and not fits(profile.format, packaged.format)
@@ -100,20 +94,24 @@ def untaught(args: argparse.Namespace, settings: Config, packaged: Bundle) -> bo
 def _reports(
     settings: Config,
     current: Bundle,
-    bundles: Mapping[str, Bundle],
     source: str,
     facts: Facts,
     stack: ExitStack,
     disk: DiskThread,
 ) -> list[Observer]:
     """The observers that the settings ask for: log, black box, status file, feed with `facts`.
-    bundles: by finger. source: origin of the frames."""
+    source: origin of the frames."""
     # without a serial port, a terminal shows the sentences
     shown = in_journal() or bool(settings.serial.port and sys.stderr.isatty())
     observers: list[Observer] = [VerdictLog()] if shown else []
     if settings.store.black_box:
-        observers += _black_boxes(settings, current, bundles, stack, disk)
-    m, model = current.manifest, _model(current, bundles)
+        from palpate.sweeps.black_box import BlackBox
+
+        folder = settings.kept("black-box")
+        kept = BlackBox(folder, current.format, settings.store.black_box, disk)
+        stack.callback(kept.close)
+        observers.append(kept)
+    m, model = current.manifest, _named(current.manifest)
     facts = {"model": lambda: model, **facts}
     from palpate.alignment.live import Expected
 
@@ -123,38 +121,13 @@ def _reports(
     return [
         *observers,
         *status(settings, facts),
-        *feed(settings, current.format, source, known, facts, bundles),
+        *feed(settings, current.format, source, known, facts),
     ]
 
 
-def _model(current: Bundle, bundles: Mapping[str, Bundle]) -> str:
-    """The bundle in words; of fingers with different bundles each, with its name."""
-    if len({of.id for of in bundles.values()}) < 2:
-        return _named(current.manifest)
-    return "; ".join(f"{finger}: {_named(of.manifest)}" for finger, of in bundles.items())
-
-
 def _named(m: Manifest) -> str:
+    """The bundle in words."""
     return f"{m.name} {m.version}, {len(m.labels)} labels{f', {m.taught}' if m.taught else ''}"
-
-
-def _black_boxes(
-    settings: Config,
-    current: Bundle,
-    bundles: Mapping[str, Bundle],
-    stack: ExitStack,
-    disk: DiskThread,
-) -> list[Observer]:
-    """The black box; of several fingers one for each, in a folder of its name."""
-    from palpate.sweeps.black_box import BlackBox, FingerBox
-
-    folder, most = Path(settings.store.folder) / "black-box", settings.store.black_box
-    boxes: list[BlackBox] = [
-        FingerBox(finger, folder / finger, of.format, most, disk) for finger, of in bundles.items()
-    ] or [BlackBox(folder, current.format, most, disk)]
-    for one in boxes:
-        stack.callback(one.close)
-    return [*boxes]
 
 
 def _shadow(
@@ -168,8 +141,6 @@ def _shadow(
     candidate, and for a candidate that cannot run."""
     try:
         candidate = None
-        if args.shadow is not None:
-            fingers.refuse(settings.skins, "--shadow")
         if args.shadow:
             candidate = assembly.named(settings, Path(args.shadow), answers=not args.sim).bundle
         elif args.shadow is not None:

@@ -15,7 +15,7 @@ from palpate.bundle.bundle import Bundle
 from palpate.cli.common import check_output, load_bundle, load_settings
 from palpate.cli.devices import simulated
 from palpate.core import storage
-from palpate.core.config import Config, FingerConfig
+from palpate.core.config import Config
 from palpate.core.errors import BundleDenied
 from palpate.core.interrupts import StopFlag
 from palpate.core.log import log
@@ -53,7 +53,7 @@ def run_demo(args: argparse.Namespace) -> int:
     the sweeps of --sim."""
     from palpate.tools import demo, pseudo_terminal
 
-    settings = replace(load_settings(args), skins={})
+    settings = load_settings(args)
     bundle = _played_bundle(settings)
     touring = not args.sim and skins.profile(settings).codec == "palpate"
     args.sweeps = args.sweeps or (TOUR if touring else 12)
@@ -91,16 +91,7 @@ def run_bench(args: argparse.Namespace) -> int:
     ) -> tuple[Box, int]:
         far_end, name = stack.enter_context(pseudo_terminal.pair())
         port = SerialSink(replace(settings.serial, port=name), devices.clock, devices.source)
-        fingers = {name: FingerConfig() for name in devices.buses}
-        box = assembly.box(
-            replace(_on_lines(settings), skins=fingers),
-            bundle,
-            devices,
-            port,
-            stack,
-            bundles=dict.fromkeys(fingers, bundle),
-            observers=observers,
-        )
+        box = assembly.box(_on_lines(settings), bundle, devices, port, stack, observers=observers)
         return box, far_end
 
     if args.part:
@@ -117,6 +108,5 @@ def run_bench(args: argparse.Namespace) -> int:
 
 
 def _on_lines(settings: Config) -> Config:
-    """The settings with one skin, and the trigger on GPIO lines, which the simulated robot
-    drives."""
-    return replace(settings, trigger=replace(settings.trigger, mode="two-lines"), skins={})
+    """The settings with the trigger on GPIO lines, which the simulated robot drives."""
+    return replace(settings, trigger=replace(settings.trigger, mode="two-lines"))

@@ -287,9 +287,7 @@ class Session:
             say = port.say if port else lambda line: None
             labels = Labels(self._again, args.position, args.session)
             to, names = (settings.kept("sweeps"), format, labels), self._names
-            recording = RecordingSession(
-                *to, devices.clock, say, args.good, disk, names, finger=settings.alone
-            )
+            recording = RecordingSession(*to, devices.clock, say, args.good, disk, names)
             stack.callback(recording.close)
             session = self._lesson(recording, say)
             stack.callback(session.close)
@@ -430,7 +428,7 @@ class Session:
         args = self._args
         options = ["--board", args.board] if args.board else []
         options += ["--config-dir", str(args.config_dir)] if args.config_dir else []
-        options += ["--finger", self._settings.alone] if self._settings.alone else []
+        options += ["--unit", args.unit] if args.unit else []
         sets = [*args.set, *([f"skin.profile={args.skin}"] if args.skin else [])]
         options += [word for one in sets for word in ("--set", one)]
         return install.command(options, by)

@@ -10,18 +10,20 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, is_dataclass, replace
+from dataclasses import dataclass, field, is_dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal, get_type_hints
 
-from palpate.core import fingers, settings_files
+from palpate.core import settings_files
 from palpate.core.errors import ConfigError
 from palpate.core.runtime_folder import FEED, RUNTIME, STATUS
 from palpate.core.schema import Key, custom, fixed, gpio_line, keys, number, read_table
 from palpate.core.settings_files import SITE
 from palpate.core.text import closest, shown
 
+UNIT = re.compile(r"[a-z][a-z0-9-]{0,7}", re.ASCII)
+"""Name of a unit (palpate@NAME); longer ones would leave no room for the label in a sentence."""
 _USB = re.compile(r"([0-9a-f]{4}):([0-9a-f]{4})(?::(.+))?", re.ASCII | re.IGNORECASE)
 
 
@@ -74,18 +76,6 @@ class SkinConfig:
     def serial(self) -> str:
         """Serial number of the board, "" for any."""
         return self.usb[10:]
-
-
-@dataclass(frozen=True, slots=True)
-class FingerConfig(SkinConfig):
-    """The skin of one finger, `[skins.NAME]`. A key that is missing has the value of `[skin]`.
-
-    bundle: path of the finger's own bundle; "" for the bundle of the box. part: the finger's part
-    of the frames of a hub, as in "1/2 rows"; "" for whole frames.
-    """
-
-    bundle: str = ""
-    part: str = custom("", 'a part of a hub such as "1/2 rows" or "2/2 columns"', fingers.part)
 
 
 @dataclass(frozen=True, slots=True)
@@ -262,20 +252,20 @@ class BridgeConfig:
     """`palpate bridge` on the box; its options override these values.
 
     address: where it listens, at the port of its kind. allow_writes: whether peers may start, stop,
-    tare and abort. A bridge has no password.
+    tare and abort. A bridge has no password. fingers: units whose answers `palpate bridge fuse`
+    fuses and sends on serial.port, separated by spaces, as in "left right".
     """
 
     address: str = "127.0.0.1"
     allow_writes: bool = False
+    fingers: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class Config:
     """All settings. board: the board file's name, "" for none. folder: where the files are, skins/
     among them. sources: "section.key" -> "code", the file's name or "--set"; "board" -> "code", the
-    file's name or "--board". skins: of a box with several fingers, by name; else empty. alone:
-    the finger whose settings these are, "" for those of the box. hand: the settings with all
-    fingers then, else None."""
+    file's name or "--board"."""
 
     board: str
     skin: SkinConfig
@@ -290,37 +280,15 @@ class Config:
     bridge: BridgeConfig
     sources: Mapping[str, str] = field(compare=False)
     folder: Path = field(default=SITE.parent, compare=False)
-    skins: Mapping[str, FingerConfig] = field(default_factory=dict)
-    alone: str = ""
-    hand: Config | None = field(default=None, compare=False)
-
-    def finger(self, name: str) -> Config:
-        """The settings of a box that has the skin of this finger only."""
-        own = self.skins[name]
-        classifier = replace(self.classifier, bundle=own.bundle or self.classifier.bundle)
-        return replace(self, skin=own, skins={}, classifier=classifier, alone=name, hand=self)
-
-    @property
-    def part(self) -> str:
-        """The part of a hub's frames that these settings are for; "" for whole frames."""
-        return self.skin.part if isinstance(self.skin, FingerConfig) else ""
-
-    @property
-    def bundle_setting(self) -> str:
-        """The setting that names the bundle; "" if the store has it."""
-        if self.hand and self.hand.skins[self.alone].bundle:
-            return f"skins.{self.alone}.bundle"
-        return "classifier.bundle" if self.classifier.bundle else ""
 
     def kept(self, folder: str) -> Path:
-        """A folder of sweeps in the store; that of one finger alone is below it."""
-        return Path(self.store.folder) / folder / self.alone
+        """A folder of sweeps in the store."""
+        return Path(self.store.folder) / folder
 
 
 _SECTIONS: Mapping[str, Any] = MappingProxyType(
     {n: h for n, h in get_type_hints(Config).items() if is_dataclass(h)}
 )
-_FINGER_KEYS: Mapping[str, Key] = MappingProxyType(keys(FingerConfig))
 _KEYS: Mapping[str, Key] = MappingProxyType(
     {
         f"{section}.{last}": key
@@ -331,28 +299,36 @@ _KEYS: Mapping[str, Key] = MappingProxyType(
 
 
 def load(
-    board: str | None, sets: Sequence[str] = (), *, folder: Path | None = None, site: Path = SITE
+    board: str | None,
+    sets: Sequence[str] = (),
+    *,
+    folder: Path | None = None,
+    site: Path = SITE,
+    unit: str = "",
 ) -> Config:
     """All layers as one Config.
 
     board: NAME of a `board-NAME.toml`. None or "" takes `board = "NAME"` in `site`; without it no
     GPIO line is wired. sets: "section.key=value", the value in TOML or a bare string. folder: where
     `skin.toml` and the boards' files are; None means `firmware_config/` beside the package, in an
-    installation `/etc/palpate`. site: must exist unless it is SITE. Raises ConfigError with file,
-    key, value and the allowed values.
+    installation `/etc/palpate`. site: must exist unless it is SITE. unit: name of one of several
+    units; its settings are NAME.toml beside SITE, its default folders have its name. Raises
+    ConfigError with file, key, value and the allowed values.
     """
+    if unit:
+        if not UNIT.fullmatch(unit):
+            raise ConfigError(
+                f"--unit {shown(unit)} is not a unit's name; use up to 8 small letters, digits and "
+                "hyphens, as in palpate@left"
+            )
+        site = SITE.with_name(f"{unit}.toml")
     layers = settings_files.read(board, sets, folder=folder, site=site)
     values = {name: key.default for name, key in _KEYS.items()}
+    if unit:
+        values |= {name: f"{values[name]}-{unit}" for name in ("store.folder", "store.runtime")}
     sources = {"board": Path(layers.named_in).name} | dict.fromkeys(_KEYS, "code")
-    own: dict[str, dict[str, Any]] = {}  # values of the fingers
-    last = ""  # layer that has named one
     for where, table in layers.tables:
         name_of = Path(where).name
-        for finger, read in fingers.read(table.pop("skins", {}), where, _FINGER_KEYS).items():
-            own.setdefault(finger, {}).update(read)
-            last = where
-            sources |= {f"skins.{finger}.{key}": name_of for key in read}
-            sources.setdefault(f"skins.{finger}.part", "code")  # describe shows each finger
         for name, value in _checked(table, where):
             values[name], sources[name] = value, name_of
     _check_lines(values, sources)
@@ -360,13 +336,10 @@ def load(
         section: group(**{key: values[f"{section}.{key}"] for key in keys(group)})
         for section, group in _SECTIONS.items()
     }
-    common = {name: getattr(groups["skin"], name) for name in keys(SkinConfig)}
-    skins = {f: FingerConfig(**it) for f, it in fingers.whole(common, own, last).items()}
     return Config(
         board=layers.board,
         sources=MappingProxyType(sources),
         folder=layers.folder,
-        skins=skins,
         **groups,
     )
 
@@ -378,10 +351,6 @@ def describe(config: Config) -> str:
     for name in _KEYS:
         section, _, last = name.partition(".")
         value = getattr(getattr(config, section), last)
-        values[name] = json.dumps(value, ensure_ascii=False)
-    for name in [n for n in config.sources if n not in values]:
-        _, finger, last = name.split(".")
-        value = getattr(config.skins[finger], last)
         values[name] = json.dumps(value, ensure_ascii=False)
     return "\n".join(
         f"{f'{name} = {value}':<36}   # {config.sources[name]}" for name, value in values.items()
@@ -396,7 +365,7 @@ def _checked(table: Mapping[str, Any], where: str) -> Iterator[tuple[str, Any]]:
                 raise ConfigError(
                     f"{where}: board is chosen in {SITE}, or with --board; move it there"
                 )
-            raise _unknown(section, [*_SECTIONS, "skins", "board"], where)
+            raise _unknown(section, [*_SECTIONS, "board"], where)
         if not isinstance(content, dict):
             raise ConfigError(
                 f"{where}: {section} = {shown(content)} is not a section; write [{section}], its "

@@ -34,10 +34,6 @@ class Devices:
         nothing."""
         return settings
 
-    def finger(self, name: str) -> Devices:
-        """The devices of the skin of this finger. Real skins differ by their settings alone."""
-        return self
-
     def commanded(self, t_ns: int, *, start: bool) -> None:
         """START or STOP has come as a command at `t_ns`. Only a simulated finger follows."""
 

@@ -9,6 +9,9 @@ from functools import reduce
 from operator import xor
 
 TALKER = "PPLP"
+OWN = ("RES", "FIN", "STA", "ANS", "REC", "TCH")
+"""Kinds of sentences that the box sends. A line that sends them back, an echo, must not be
+answered: the answer would come back as well, without end."""
 MOST_FINGERS = 4
 """Largest number of fingers of a hand."""
 MAX_LINE = 128
@@ -58,6 +61,29 @@ def sentence(kind: str, *fields: object) -> bytes:
             return sentence(kind, *fields[:-1])
         body = body[: MAX_LINE - 6]
     return f"${body}*{checksum(body)}\r\n".encode("ascii")
+
+
+def answer(
+    *fields: object, detail: str, slide: tuple[float | None, str | None], loss_known: bool
+) -> bytes:
+    """RES or FIN with its first fields, from the kind on. slide: measured speed and direction, None
+    without. loss_known: whether lost frames of the skin can be seen.
+
+    Optional fields follow the detail: that losses cannot be seen, and the measured slide. The
+    detail is shortened to make room for them. If an empty detail does not suffice, the slide is
+    left out.
+    """
+    kind, *first = fields
+    unseen: list[object] = [] if loss_known else [1]
+    if slide[0] is not None:
+        measured = [*(unseen or [""]), f"{slide[0]:.1f}", slide[1]]
+        # a sentence of full length may have been cut
+        if (room := MAX_LINE - len(sentence(str(kind), *first, "", *measured))) > 0:
+            return sentence(str(kind), *first, detail[:room], *measured)
+    if loss_known:
+        return sentence(str(kind), *first, detail)
+    room = MAX_LINE - len(sentence(str(kind), *first, "", 1))
+    return sentence(str(kind), *first, detail[: max(0, room)], 1)
 
 
 def parse(data: bytes, rest: bytes = b"") -> tuple[list[Sentence], bytes]:

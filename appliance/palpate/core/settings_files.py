@@ -122,7 +122,4 @@ def _parse_set(text: str) -> dict[str, Any]:
         (parsed,) = tomllib.loads(f"value = {value}").values()
     except (ValueError, RecursionError):
         parsed = value.strip()
-    if section == "skins":
-        finger, _, key = key.partition(".")
-        return {section: {finger: {key: parsed}}}
     return {section: {key: parsed}}

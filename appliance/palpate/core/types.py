@@ -145,12 +145,11 @@ def shown(shape: Sequence[int]) -> str:
 @dataclass(frozen=True, slots=True, eq=False)
 class Frames:
     """n frames: t_ns int64 [n] host monotonic, seq int64 [n] unwrapped numbers, taxels [n, R, C] or
-    [n, R, C, A] raw counts. finger: whose skin sent them, "" in a box with one skin."""
+    [n, R, C, A] raw counts."""
 
     t_ns: NDArray[np.int64]
     seq: NDArray[np.int64]
     taxels: NDArray[Any]
-    finger: str = ""
 
     def __len__(self) -> int:
         return len(self.seq)
@@ -168,7 +167,6 @@ class Frames:
             np.concatenate([run.t_ns for run in runs]),
             np.concatenate([run.seq for run in runs]),
             np.concatenate([run.taxels for run in runs]),
-            runs[0].finger,
         )
 
 
@@ -221,8 +219,6 @@ class Sweep:
     number of NEW OBJECT signals so far; 0 before the first, when sweeps are not fused. material,
     position, session: labels given while recording, "" for none. speed_mm_s, force_n: as in the
     start edge. filled: indices of the interpolated frames in `frames`; None if there are none.
-    finger: the finger whose skin sent the frames; None in a box with one skin. fingers: the same
-    sweep as each finger has it; None except in a sweep of several fingers, which has no frames.
     """
 
     id: int
@@ -240,8 +236,6 @@ class Sweep:
     speed_mm_s: float | None = None
     force_n: float | None = None
     filled: tuple[int, ...] | None = None
-    finger: str | None = None
-    fingers: tuple[Sweep, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -261,7 +255,6 @@ class Verdict:
     it that had probabilities, since NEW OBJECT; 0 for none. speed_mm_s, force_n: as in Sweep.
     measured_mm_s: speed of the slide, measured from the window; None if that was not possible, and
     in early answers. direction: one of `directions.DIRECTIONS`; None without a measured speed.
-    finger, fingers: as in Sweep; `fingers` are the verdicts that this one was fused from.
     """
 
     sweep: int
@@ -285,8 +278,6 @@ class Verdict:
     force_n: float | None = None
     measured_mm_s: float | None = None
     direction: str | None = None
-    finger: str | None = None
-    fingers: tuple[Verdict, ...] | None = None
 
     @classmethod
     def without_label(
@@ -309,25 +300,17 @@ class Verdict:
             share=sweep.share,
             speed_mm_s=sweep.speed_mm_s,
             force_n=sweep.force_n,
-            finger=sweep.finger,
-            fingers=None
-            if sweep.fingers is None
-            else tuple(
-                cls.without_label(of, status, detail, now_ns, bundle) for of in sweep.fingers
-            ),
         )
 
     def as_dict(self, *, arrays: bool = True) -> dict[str, Any]:
         """All fields by name, for JSON, which keeps numbers bit for bit; without fields that are
-        None. arrays: include `scores` and `own`, as lists. fingers: each as an object as well."""
+        None. arrays: include `scores` and `own`, as lists."""
         # sidecars, the feed and the status file call the displacement `moved`
         values = {
             "moved" if name == "displacement" else name: value
             for name in Verdict.__slots__
             if (value := getattr(self, name)) is not None
         }
-        if self.fingers:
-            values["fingers"] = [of.as_dict(arrays=arrays) for of in self.fingers]
         lists = {
             name: value.tolist() for name, value in values.items() if isinstance(value, np.ndarray)
         }
@@ -362,7 +345,7 @@ def save(
     own = {
         name: value
         for name in Sweep.__slots__
-        if name not in ("frames", "fingers") and (value := getattr(sweep, name)) is not None
+        if name != "frames" and (value := getattr(sweep, name)) is not None
     }
     # np.save writes to a file without Python's I/O, and a full disk then gives no errno
     packed = io.BytesIO()

@@ -471,7 +471,6 @@ class Classifier(Observer):
             force_n=sweep.force_n,
             measured_mm_s=touch.slide.speed_mm_s,
             direction=touch.slide.direction or None,
-            finger=sweep.finger,
         )
 
     def _detail(self, finding: Finding, touch: Touched) -> str:

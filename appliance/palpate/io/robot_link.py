@@ -22,7 +22,7 @@ import serial
 from palpate.core import sentences
 from palpate.core.clock import Clock
 from palpate.core.config import SerialConfig
-from palpate.core.sentences import MAX_LINE, TALKER, UNSAFE, sentence
+from palpate.core.sentences import TALKER, UNSAFE
 from palpate.core.types import Verdict
 from palpate.io import serial_port
 
@@ -47,9 +47,6 @@ COMMANDS = (
 )
 TEXT_COMMANDS = ("LABEL", "MATERIAL", "POSITION", "SESSION", "TEACH", "FORGET")
 """The commands that need a text after a comma. START may have one: speed and force of the slide."""
-OWN = ("RES", "FIN", "STA", "ANS", "REC", "TCH")
-"""Kinds of sentences that the box sends. A line that sends them back, an echo, must not be
-answered: the answer would come back as well, without end."""
 MOST_REFUSED, REFUSAL_NS = 8, 1_000_000_000
 """After so many bad lines without a command, one in this time is answered. A line that echoes with
 changes would otherwise be answered without end."""
@@ -69,7 +66,7 @@ class Port(Protocol):
     trouble: str
 
     def send(self, verdict: Verdict, *, loss_known: bool = True) -> None:
-        """Send a verdict's sentences without waiting. loss_known: see `result`."""
+        """Send a verdict's sentence without waiting. loss_known: see `result`."""
         ...
 
     def say(self, line: bytes) -> None:
@@ -99,22 +96,11 @@ class Command:
         return f"{self.name},{self.text}" if with_text else self.name
 
 
-def results(v: Verdict, source: str, *, loss_known: bool = True) -> list[bytes]:
-    """The sentences of a verdict: FIN for each finger, then RES. Parameters as of `result`."""
-    return [result(of, source, loss_known=loss_known) for of in (*(v.fingers or ()), v)]
-
-
 def result(v: Verdict, source: str, *, loss_known: bool = True) -> bytes:
-    """The RES sentence of a verdict; FIN of a verdict on one finger. source: of the frames (usb,
-    sim, replay). loss_known: whether lost frames of the skin can be seen.
-
-    Optional fields follow the detail: that losses cannot be seen, and the measured slide. The
-    detail is shortened to make room for them. If an empty detail does not suffice, the slide is
-    left out.
-    """
-    kind = "FIN" if v.finger else "RES"
-    fields = (
-        *([v.finger] if v.finger else ()),
+    """The RES sentence of a verdict. source: of the frames (usb, sim, replay). loss_known: whether
+    lost frames of the skin can be seen."""
+    return sentences.answer(
+        "RES",
         v.sweep,
         f"{v.time_ns / 1e9:.3f}",
         v.status,
@@ -127,17 +113,10 @@ def result(v: Verdict, source: str, *, loss_known: bool = True) -> bytes:
         v.bundle,
         source,
         f"{v.share:.2f}",
+        detail=v.detail,
+        slide=(v.measured_mm_s, v.direction),
+        loss_known=loss_known,
     )
-    unseen: list[object] = [] if loss_known else [1]
-    if v.measured_mm_s is not None:
-        slide = [*(unseen or [""]), f"{v.measured_mm_s:.1f}", v.direction]
-        # a sentence of full length may have been cut
-        if (room := MAX_LINE - len(sentence(kind, *fields, "", *slide))) > 0:
-            return sentence(kind, *fields, v.detail[:room], *slide)
-    if loss_known:
-        return sentence(kind, *fields, v.detail)
-    room = MAX_LINE - len(sentence(kind, *fields, "", 1))
-    return sentence(kind, *fields, v.detail[: max(0, room)], 1)
 
 
 def parse(data: bytes, rest: bytes = b"") -> tuple[list[Command], bytes]:
@@ -147,7 +126,7 @@ def parse(data: bytes, rest: bytes = b"") -> tuple[list[Command], bytes]:
     return [
         Command(s.kind, error=s.error) if s.error else command(s.kind, s.text)
         for s in found
-        if s.kind not in OWN
+        if s.kind not in sentences.OWN
     ], rest
 
 
@@ -181,9 +160,8 @@ class StdoutPort:
         self._gone = False  # the reader of a pipe
 
     def send(self, verdict: Verdict, *, loss_known: bool = True) -> None:
-        """Print a verdict's sentences."""
-        for line in results(verdict, self._source, loss_known=loss_known):
-            self.say(line)
+        """Print a verdict's sentence."""
+        self.say(result(verdict, self._source, loss_known=loss_known))
 
     def say(self, line: bytes) -> None:
         """Print a sentence. It is dropped and counted if nobody reads the output, or the disk
@@ -250,9 +228,8 @@ class SerialSink:
         self._refusal_ns = clock.now_ns()
 
     def send(self, verdict: Verdict, *, loss_known: bool = True) -> None:
-        """Queue a verdict's sentences and send as many as the port accepts now."""
-        for line in results(verdict, self._source, loss_known=loss_known):
-            self.say(line)
+        """Queue a verdict's sentence and send as much as the port accepts now."""
+        self.say(result(verdict, self._source, loss_known=loss_known))
 
     def say(self, line: bytes) -> None:
         """Queue a sentence. If the queue is full, the oldest sentence is dropped and counted,

@@ -7,9 +7,7 @@ import re
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, overload
 
-from palpate.core import fingers
 from palpate.core.config import Config, SkinConfig
 from palpate.core.devices import Devices
 from palpate.core.errors import ConfigError, FormatError, SensorAbsent, SensorMismatch
@@ -20,9 +18,6 @@ from palpate.io.link import SkinLink
 from palpate.io.sensor import TransferObserver
 from palpate.io.skin_profile import SkinProfile
 from palpate.io.usb_sensor import LinkSensor, UsbSensor, ask, open_link
-
-if TYPE_CHECKING:
-    from palpate.io.hand_sensor import HandSensor
 
 OWN = SITE.parent / "skins"
 """Profiles written by the owner of the box. They replace delivered profiles of the same name."""
@@ -57,45 +52,6 @@ def sensor(
         return SerialLink(path, baud, devices.clock, wait=devices.wait)
 
     return SerialSensor(settings.skin, chosen, format, devices.clock, tap, open_port=opened)
-
-
-def own_sensor(
-    settings: Config, format: SweepFormat, devices: Devices, tap: TransferObserver | None = None
-) -> LinkSensor | HandSensor:
-    """As `sensor`, for the skin of a box with one skin, or for the part of a hub that is the skin
-    of one finger alone. format: of the part."""
-    if not settings.part:
-        return sensor(settings, format, devices, tap)
-    from palpate.io.hand_sensor import HandSensor, HandSkin
-
-    hub = sensor(settings, hub_format(format, settings.part), devices, tap)
-    return HandSensor([HandSkin(hub, ("",), part=settings.part)])
-
-
-def hub_format(format: SweepFormat, part: str) -> SweepFormat:
-    """The format of the frames of a hub, by that of a part; "" for no hub."""
-    _, n, axis = fingers.cut(part) if part else (0, 1, 0)
-    return replace(format, cols=format.cols * n) if axis else replace(format, rows=format.rows * n)
-
-
-@overload
-def part_of(settings: Config, format: SweepFormat) -> SweepFormat: ...
-@overload
-def part_of(settings: Config, format: None) -> None: ...
-def part_of(settings: Config, format: SweepFormat | None) -> SweepFormat | None:
-    """The format of the settings' part of a hub, by that of the hub; `format` itself for whole
-    frames. Raises ConfigError if the hub cannot be cut."""
-    if not (settings.part and format):
-        return format
-    _, n, axis = fingers.cut(settings.part)
-    if format.shape[axis] % n:
-        raise ConfigError(
-            f'skins.{settings.alone}.part = "{settings.part}" does not divide the frames of '
-            f"{format}; use another part, or the hub's own skin.grid"
-        )
-    return (
-        replace(format, cols=format.cols // n) if axis else replace(format, rows=format.rows // n)
-    )
 
 
 def open_readout(settings: Config, devices: Devices) -> SkinLink:

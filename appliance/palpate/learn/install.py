@@ -41,9 +41,10 @@ def check_allowed(settings: Config) -> None:
         raise ConfigError(
             "teach.allow = false forbids teaching on this box; set it to true, or deploy a bundle"
         )
-    if name := settings.bundle_setting:
+    if settings.classifier.bundle:
         raise ConfigError(
-            f"{name} names the bundle that runs, so a taught one would not; remove this setting"
+            "classifier.bundle names the bundle that runs, so a taught one would not; remove this "
+            "setting"
         )
     check_installed()
 

@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from numpy.typing import NDArray
 
@@ -43,9 +43,6 @@ from palpate.sweeps.capture import CaptureWriter
 from palpate.sweeps.sweep_check import SweepCheck
 from palpate.sweeps.sweep_window import SweepCutter
 
-if TYPE_CHECKING:
-    from palpate.runtime.hand import HandParts
-
 UNSIGNED = (
     "bundles are allowed: classifier.allow_unsigned = true; remove it from the settings once the "
     "bundle is signed"
@@ -73,7 +70,6 @@ def box(
     port: Port | None,
     stack: ExitStack,
     *,
-    bundles: Mapping[str, Bundle] = MappingProxyType({}),
     capture: CaptureWriter | None = None,
     observers: Iterable[Observer] = (),
     labels: tuple[str, ...] = (),
@@ -83,14 +79,10 @@ def box(
 ) -> Box:
     """The box that classifies; `stack` closes it again.
 
-    bundles: by finger (`of_fingers`); empty without fingers. capture: records all inputs. labels:
-    labels that the class bits must hold in addition to the bundle's. commands, ordered, announce:
-    as for `recorder`.
+    capture: records all inputs. labels: labels that the class bits must hold in addition to the
+    bundle's. commands, ordered, announce: as for `recorder`.
     """
-    hand = _hand(settings, bundles, devices) if settings.skins else None
-    one = None if hand else classifier(settings, bundle, devices.clock)
-    run = hand.answerer if hand else one
-    assert run
+    run = classifier(settings, bundle, devices.clock)
     run.self_test()
     return _assembled(
         devices.wire(settings),
@@ -101,18 +93,11 @@ def box(
         capture,
         [run, *observers],
         commands,
-        codes=(*(hand.answerer.labels if hand else bundle.manifest.labels), *labels),
-        early=early_exit(settings, one) if one else None,
+        codes=(*bundle.manifest.labels, *labels),
+        early=early_exit(settings, run),
         ordered=ordered,
         announce=announce,
-        hand=hand,
     )
-
-
-def _hand(settings: Config, bundles: Mapping[str, Bundle], devices: Devices) -> HandParts:
-    from palpate.runtime import hand  # here: a box with one skin does without it
-
-    return hand.assembled(settings, bundles, devices)
 
 
 def recorder(
@@ -168,10 +153,8 @@ def _assembled(
     ordered: bool = False,
     serving: bool = True,
     announce: Callable[[str], object] = log.info,
-    hand: HandParts | None = None,
 ) -> Box:
-    """Put the components together. codes: number of labels that the class bits hold. hand: the
-    parts for several fingers."""
+    """Put the components together. codes: labels that the class bits hold."""
     commands = {**commands, "LABEL": partial(_label, codes)}
     trigger = _trigger(
         settings.trigger, answerer.format, devices, port, stack, announce, ordered=ordered
@@ -180,13 +163,13 @@ def _assembled(
     if isinstance(trigger, CommandTrigger):
         commands = {**commands, **trigger.commands}
     lines = _outputs(settings, devices, stack)
-    sensor = hand.sensor if hand else skins.own_sensor(settings, answerer.format, devices, capture)
+    sensor = skins.sensor(settings, answerer.format, devices, capture)
     stack.callback(sensor.close)
     if port:
         stack.callback(port.close)
     if lines and settings.output.class_bits:  # last: it waits for output.settle_us
         watching.append(LineSink(lines, codes))
-    cutter = hand.cutter if hand else SweepCutter(answerer.format, settings.sweep)
+    cutter = SweepCutter(answerer.format, settings.sweep)
     return Box(
         Pipeline(sensor, trigger, cutter, answerer, early),
         devices.clock,
@@ -293,24 +276,18 @@ def early_exit(settings: Config, run: Classifier) -> EarlyExit | None:
 def prove(settings: Config, bundle: Bundle) -> None:
     """Raises BundleError or ConfigError if this machine, with these settings, does not run a bundle
     correctly."""
-    if settings.skins:
-        from palpate.runtime import hand
-
-        of = of_fingers(settings, bundle, answers=True)
-        hand.classifier(settings, of, SystemClock()).self_test()
-    else:
-        run = classifier(settings, bundle, SystemClock())
-        run.self_test()
-        early_exit(settings, run)
+    run = classifier(settings, bundle, SystemClock())
+    run.self_test()
+    early_exit(settings, run)
     if settings.output.class_bits:
         check_bits(1 << len(settings.output.class_bits), bundle.manifest.labels)
 
 
 def store(settings: Config) -> Store:
-    """The store of bundles that the settings name. Its bundle serves all fingers, so those of one
-    alone do not suffice to prove one."""
-    box = settings.hand or settings
-    return Store(settings.store, lambda bundle: prove(box, bundle), taught=settings.teach.allow)
+    """The store of bundles that the settings name."""
+    return Store(
+        settings.store, lambda bundle: prove(settings, bundle), taught=settings.teach.allow
+    )
 
 
 def running(settings: Config, *, answers: bool = True) -> SignedBundle:
@@ -334,15 +311,6 @@ def named(settings: Config, folder: Path, *, answers: bool) -> SignedBundle:
         raise type(e)(
             f"{e}; a bench may allow unsigned bundles, by classifier.allow_unsigned = true"
         ) from e
-
-
-def of_fingers(settings: Config, common: Bundle, *, answers: bool) -> dict[str, Bundle]:
-    """The bundle of each finger: its own, or else `common`. answers: as for `running`. Raises
-    BundleError or ConfigError."""
-    return {
-        finger: named(settings, Path(own.bundle), answers=answers).bundle if own.bundle else common
-        for finger, own in settings.skins.items()
-    }
 
 
 def port(settings: Config, devices: Devices) -> Port | None:

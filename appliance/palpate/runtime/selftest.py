@@ -5,8 +5,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 
 from palpate.bundle.bundle import Bundle, Manifest
 from palpate.core.config import Config
@@ -66,36 +65,6 @@ def check(
     yield _try(
         "skin", lambda: _skin(settings, loaded[0].format if loaded else None, devices, spent_ns)
     )
-    yield from _wiring(settings, devices)
-
-
-def check_hand(
-    settings: Config,
-    load: Callable[[str], Bundle],
-    devices: Devices,
-    spent_ns: Callable[[], int] = time.thread_time_ns,
-) -> Iterator[CheckResult]:
-    """As `check`, of a box with several fingers: bundle and skin of each. load: gives the bundle of
-    a finger."""
-    from palpate.runtime import hand
-
-    formats: dict[str, SweepFormat] = {}
-    for finger in settings.skins:
-        loaded: list[Bundle] = []
-        own = settings.finger(finger)
-        for found in _of_bundle(own, partial(load, finger), devices, loaded):
-            yield replace(found, component=f"{finger} {found.component}")
-        if loaded:
-            formats[finger] = loaded[0].format
-
-    def skin(group: tuple[str, ...]) -> str:
-        known = all(finger in formats for finger in group)
-        wanted = hand.whole(settings, group, formats)[0] if known else None
-        there = devices.finger(group[0])
-        return _skin(there.wire(settings.finger(group[0])), wanted, there, spent_ns)
-
-    for group in hand.groups(settings):
-        yield _try(f"{' '.join(group)} skin", partial(skin, group))
     yield from _wiring(settings, devices)
 
 

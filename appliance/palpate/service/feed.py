@@ -14,7 +14,7 @@ import socket
 import stat
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -66,9 +66,8 @@ class FeedServer(Observer):
 
     A *round* takes up connections and requests, and sends to some of the readers.
 
-    format: of the sweeps. fingers: of each finger's sweeps; empty for a box with one skin. facts:
-    source, bundle, labels and skin for the first line (PROTOCOL.md). clock, more: as for Report.
-    spent_ns: processor time that this thread has used so far.
+    format: of the sweeps. facts: source, bundle, labels and skin for the first line (PROTOCOL.md).
+    clock, more: as for Report. spent_ns: processor time that this thread has used so far.
     """
 
     def __init__(
@@ -79,18 +78,16 @@ class FeedServer(Observer):
         clock: Clock,
         more: Callable[[], Mapping[str, Any]] = dict,
         spent_ns: Callable[[], int] = time.thread_time_ns,
-        fingers: Collection[SweepFormat] = (),
     ) -> None:
         self._path, self._clock, self._spent_ns = path, clock, spent_ns
         self._report = Report(clock, more)
-        values = sum(of.channels for of in fingers or (format,))
-        self._most_hz = min(MOST_HZ, MOST_VALUES_S / values)
+        self._most_hz = min(MOST_HZ, MOST_VALUES_S / format.channels)
         self._hello = _hello(format, facts, self._most_hz)
         self._listener: socket.socket | None = None
         self._poll = select.epoll()
         self._readers: dict[int, Reader] = {}
         self._due: deque[Reader] = deque()  # readers to write to, in the order of their turns
-        self._newest: dict[str, Frames] = {}  # by finger
+        self._newest: Frames | None = None
         self._shared, self._shared_ns = b"", 0  # the last line above QUEUE_BYTES, and its time
         self._retry_ns = self._health_ns = self._next_ns = clock.now_ns()
         self._health = b""  # the line of this second
@@ -103,7 +100,7 @@ class FeedServer(Observer):
         )
 
     def frames(self, frames: Frames) -> None:
-        self._newest[frames.finger] = frames
+        self._newest = frames
 
     def answered(self, verdict: Verdict) -> None:
         """Queue a verdict; it is sent at the end of the turn."""
@@ -112,12 +109,8 @@ class FeedServer(Observer):
             self._fresh = True
 
     def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
-        """Queue the window of a sweep, or of each finger, for the readers that requested windows. A
-        reader without room for it loses it."""
-        for own in sweep.fingers or (sweep,):
-            self._put_sweep(own)
-
-    def _put_sweep(self, sweep: Sweep) -> None:
+        """Queue the window of a sweep for the readers that requested windows. A reader without room
+        for it loses it."""
         asked = [reader for reader in self._readers.values() if reader.sweeps]
         if not (asked and len(sweep.frames)):
             return
@@ -215,18 +208,17 @@ class FeedServer(Observer):
         all of them."""
         tick = int(now_ns * self._most_hz) // 1_000_000_000
         before, self._tick = self._tick, tick
-        if tick == before or not self._newest:
+        if tick == before or self._newest is None:
             return
         due = [r for r in self._readers.values() if _due(r.frames_hz / self._most_hz, before, tick)]
         if not due:
             return
-        newest, self._newest = self._newest, {}  # so they are not sent again
-        for finger, frames in newest.items():
-            frame = {"time_ns": int(frames.t_ns[-1]), "taxels": frames.taxels[-1].tolist()}
-            line = encode("frame", frame | ({"finger": finger} if finger else {}))
-            for reader in due:
-                reader.put(line)
-                self._let_wait(reader)
+        frames, self._newest = self._newest, None  # so it is not sent again
+        frame = {"time_ns": int(frames.t_ns[-1]), "taxels": frames.taxels[-1].tolist()}
+        line = encode("frame", frame)
+        for reader in due:
+            reader.put(line)
+            self._let_wait(reader)
 
     def _take_up(self, listener: socket.socket, health: Health) -> None:
         """Accept one connection; its first lines are `hello` and `health`."""

@@ -95,7 +95,6 @@ def sweep_line(sweep: Sweep) -> bytes:
         "start_ns": sweep.start_ns,
         "shape": taxels.shape,
         "dtype": str(taxels.dtype),
-        **({"finger": sweep.finger} if sweep.finger else {}),
     }
     data = b2a_base64(
         taxels.astype(taxels.dtype.newbyteorder("<"), order="C", copy=False).data, newline=False

@@ -7,7 +7,6 @@ import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 from palpate.core.errors import ApplianceError, FormatError
@@ -94,10 +93,7 @@ def lines(report: Mapping[str, Any], now_ns: int) -> list[str]:
         "sweeps": f"{report['answered']} answered",
     }
     if report.get("degraded"):
-        how = "bridged by its neighbours; check the skin"
-        if report["trouble"] and report["streams"]:  # of a hand
-            how = "the other fingers answer; check its cable"
-        facts["degraded"] = f"{report['degraded']}: {how}"
+        facts["degraded"] = f"{report['degraded']}: bridged by its neighbours; check the skin"
     if edges := _trigger(report):
         facts["trigger"] = edges
     if report["dropped"]:
@@ -147,20 +143,9 @@ def verdict_line(v: Mapping[str, Any], now_ns: int) -> str:
     what = REASONS.get(v["status"], "")
     if v["status"].classified:
         what = f"{v['label']:<24}  {100 * v['probability']:5.1f} %  {v['latency_ns'] / 1e6:6.1f} ms"
-    what = "; ".join(filter(None, (what, v["detail"], fingers(v))))
+    what = "; ".join(filter(None, (what, v["detail"])))
     return (
         f"sweep {v['sweep']:>6}  {_span(now_ns - v['time_ns']):>11} ago  {v['status']:<11}  {what}"
-    )
-
-
-def fingers(v: Mapping[str, Any], names: Mapping[str, str] = MappingProxyType({})) -> str:
-    """The answers of the fingers to a sweep in words, "" for one skin. v: a verdict as in the file
-    or the feed. names: for people, of labels that have one."""
-    return ", ".join(
-        f"{of['finger']} {names.get(of['label'], of['label'])} {100 * of['probability']:.1f} %"
-        if of["label"]
-        else f"{of['finger']} {of['status']}"
-        for of in v.get("fingers", ())
     )
 
 

@@ -3,9 +3,8 @@ lines (a double of gpiod) and the readout board (a pyusb backend)."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
-from types import MappingProxyType
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 from palpate.core.clock import Clock
 from palpate.core.config import Config
@@ -54,15 +53,9 @@ class RobotDevices(Devices):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SimDevices(RobotDevices):
-    """The robot's cell with a readout board on a simulated USB bus. buses: of each finger, by
-    name; empty with one skin."""
+    """The robot's cell with a readout board on a simulated USB bus."""
 
     backend: usb.RigBackend
-    buses: Mapping[str, usb.RigBackend] = field(default_factory=dict)
-
-    def finger(self, name: str) -> SimDevices:
-        """The devices with the board of this finger."""
-        return replace(self, backend=self.buses[name])
 
     def wire(self, settings: Config) -> Config:
         """The settings with the simulated GPIO lines and skin."""
@@ -110,27 +103,16 @@ def build(
     stops: bool = True,
     remember: bool = True,
     follows: bool = False,
-    fingers: Mapping[str, SweepFormat] = MappingProxyType({}),
 ) -> SimDevices:
     """Devices on which a robot plays `acts`. source: name of the source in sentences. acm: the
     readout board is a CDC-ACM device. stops: the robot ends its slide after DECIDED. follows: the
     finger slides from the command START to STOP, instead of in its own time.
 
     remember: keep all acts and all output levels, to examine them later; without it memory does not
-    grow. fingers: format of each finger's frames, for a robot with several; the acts have frames
-    for each (Act.others).
+    grow.
     """
     robot, lines = robot_on_lines(acts, clock, stops=stops, remember=remember, follows=follows)
-    film = rig.Film(robot, *(fingers.values() or [format]))
-    buses = {
-        finger: usb.RigBackend(
-            rig.ReadoutBoard(own, robot, clock, serial=f"SIM000{i + 1}", film=film, finger=i),
-            clock,
-            acm=acm,
-        )
-        for i, (finger, own) in enumerate((fingers or {"": format}).items())
-    }
-    backend = next(iter(buses.values()))
+    backend = usb.RigBackend(rig.ReadoutBoard(format, robot, clock), clock, acm=acm)
 
     def cable(out_ns: int, in_ns: int) -> None:
         backend.at(out_ns, backend.unplug)
@@ -144,5 +126,4 @@ def build(
         source=source,
         robot=robot,
         format=format,
-        buses=buses if fingers else {},
     )

@@ -71,7 +71,7 @@ class Act:
 
     about: what is special about it, for a person. wanted: the right status; "" for `ok`, or
     `unknown` if the bundle lacks the material. unplugged: frames [from, to) for which the
-    skin is unplugged; None for none. others: as `frames`, for the second finger and further ones.
+    skin is unplugged; None for none.
     """
 
     frames: NDArray[Any]
@@ -83,11 +83,10 @@ class Act:
     wanted: str = ""
     unplugged: tuple[int, int] | None = None
     lifted: int = 1
-    others: tuple[NDArray[Any], ...] = ()
 
     def part(self, of: slice) -> Act:
-        """The same act with a part of its frames, of all fingers."""
-        return replace(self, frames=self.frames[of], others=tuple(x[of] for x in self.others))
+        """The same act with a part of its frames."""
+        return replace(self, frames=self.frames[of])
 
 
 class EdgeLines(Protocol):
@@ -225,22 +224,14 @@ class Robot:
 
 
 class Film:
-    """The frames of a robot's acts, one after the other, as seen by the skins of the fingers.
+    """The frames of a robot's acts, one after the other."""
 
-    formats: of each finger's frames. Boards of several fingers may be HISTORY frames apart.
-    """
-
-    HISTORY = 1500
-
-    def __init__(self, robot: Robot, *formats: SweepFormat) -> None:
+    def __init__(self, robot: Robot, format: SweepFormat) -> None:
         self._robot = robot
-        self._history = self.HISTORY if len(formats) > 1 else 0
-        self._frames = [np.zeros((0, *format.shape), format.numpy_type) for format in formats]
+        self._frames = np.zeros((0, *format.shape), format.numpy_type)
         self._base = 0  # number of the first frame in _frames
 
-    def frames(
-        self, first: int, n: int, frame_ns: Callable[[int], int], finger: int = 0
-    ) -> NDArray[Any]:
+    def frames(self, first: int, n: int, frame_ns: Callable[[int], int]) -> NDArray[Any]:
         """Frames `first` to `first + n` of the script [n, *shape], requested in order; after its
         end all counts are 0.
 
@@ -249,21 +240,15 @@ class Film:
         """
         if self._robot.skipped:
             begin, end = (i - self._base for i in self._robot.skipped)
-            self._frames = [np.delete(x, slice(begin, end), axis=0) for x in self._frames]
+            self._frames = np.delete(self._frames, slice(begin, end), axis=0)
             self._robot.skipped = None
-        while first + n > self._base + len(self._frames[0]):
-            act = self._robot.next_act(self._base + len(self._frames[0]), frame_ns)
-            keep = max(0, min(first - self._history - self._base, len(self._frames[0])))
-            more = (act.frames, *act.others) if act else [self._dark(x) for x in self._frames]
-            self._frames = [
-                np.concatenate([x[keep:], new]) for x, new in zip(self._frames, more, strict=True)
-            ]
+        while first + n > self._base + len(self._frames):
+            act = self._robot.next_act(self._base + len(self._frames), frame_ns)
+            keep = max(0, min(first - self._base, len(self._frames)))
+            dark = np.zeros((4096, *self._frames.shape[1:]), self._frames.dtype)
+            self._frames = np.concatenate([self._frames[keep:], act.frames if act else dark])
             self._base += keep
-        return self._frames[finger][first - self._base :][:n]
-
-    @staticmethod
-    def _dark(like: NDArray[Any]) -> NDArray[Any]:
-        return np.zeros((4096, *like.shape[1:]), like.dtype)
+        return self._frames[first - self._base :][:n]
 
 
 class ReadoutBoard:
@@ -272,7 +257,7 @@ class ReadoutBoard:
 
     packet_frames, fifo_frames: frames per packet and in the FIFO. ppm: error of its crystal.
     latency: draws the time in ns from a packet's last frame to its arrival. first_seq: number of
-    its first frame. film, finger: of a board beside those of other fingers.
+    its first frame.
     """
 
     def __init__(
@@ -287,8 +272,6 @@ class ReadoutBoard:
         latency: Callable[[], int] = lambda: 150_000,
         serial: str = "SIM0001",
         first_seq: int = 0,
-        film: Film | None = None,
-        finger: int = 0,
     ) -> None:
         self.identity = packets.Identity(packets.VERSION, (1, 0, 0), "palpate-sim", serial)
         self.skin = packets.SkinFormat(
@@ -310,7 +293,7 @@ class ReadoutBoard:
         self._next = 0  # number of the next frame to send
         # arrival of the packet that begins with this frame, once drawn
         self._arrival_ns: int | None = None
-        self._film, self._finger = film or Film(robot, format), finger
+        self._film = Film(robot, format)
 
     def frame_ns(self, i: int) -> int:
         """Host time at which frame `i` is taken."""
@@ -356,6 +339,6 @@ class ReadoutBoard:
         return packets.pack(
             self._first_seq + first,
             device_us,
-            self._film.frames(first, n, self.frame_ns, self._finger),
+            self._film.frames(first, n, self.frame_ns),
             flags,
         )

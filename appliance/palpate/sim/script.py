@@ -64,14 +64,13 @@ def named(
     spread: bool = False,
     seen: SeenTubes | None = None,
     follows: bool = False,
-    fingers: int = 1,
 ) -> tuple[Iterator[Act], str, SweepFormat]:
     """The script with this name after `--sim`, the name of the source in sentences, and the format
     of its sweeps.
 
     format: wanted by the bundle, None without a bundle. spread: play the sweeps of a set in a drawn
     order, the materials in turn. seen: the skin on the finger, None for the simulator's own.
-    follows: slides last FOLLOWED_S, since commands end them. fingers: their number. Raises
+    follows: slides last FOLLOWED_S, since commands end them. Raises
     ConfigError for an unknown name, FormatError if the bundle needs another skin.
     """
     kind, _, only = name.partition(":")
@@ -99,23 +98,16 @@ def named(
                 seen=by,
                 only=only,
                 slide_s=FOLLOWED_S if follows else SLIDE_S,
-                fingers=fingers,
             )
         )
-        return _in_hand(acts, fingers), "sim", format
+        return acts, "sim", format
     if name.startswith(SETS):
         sweeps = load(Path(name.removeprefix(SETS)), format)
         acts = play(sweeps, in_turn(sweeps.labels, seed) if spread else range(len(sweeps)))
-        return _in_hand(acts, fingers), "replay", sweeps.format
+        return acts, "replay", sweeps.format
     raise ConfigError(
         f"--sim {name} is unknown; use skin, skin:MATERIAL, rest, or replay:FILE with a sweep set"
     )
-
-
-def _in_hand(acts: Iterator[Act], fingers: int) -> Iterator[Act]:
-    """Acts with frames for each finger: the same ones where the script has none of its own."""
-    for act in acts:
-        yield replace(act, others=act.others or (act.frames,) * (fingers - 1))
 
 
 class SeenTubes(Protocol):
@@ -154,13 +146,12 @@ def tubes(
     seen: SeenTubes = skin,
     only: str = "",
     slide_s: float = SLIDE_S,
-    fingers: int = 1,
 ) -> Iterator[Act]:
     """Sweeps over the six tubes in random order; each begins at another spot of its tube.
 
     sweeps: their number; None for no end. places: positions of the skin, the next for each round of
     six tubes; by default one position drawn from `seed`. seen: the skin on the finger. only: over
-    this tube alone. fingers: their number. Raises ConfigError for an unknown tube.
+    this tube alone. Raises ConfigError for an unknown tube.
     """
     materials = (world.tube(only).name,) if only else skin.MATERIALS
     return _tubes(
@@ -171,7 +162,6 @@ def tubes(
         seen,
         materials,
         slide_s,
-        fingers,
     )
 
 
@@ -183,14 +173,13 @@ def _tubes(
     seen: SeenTubes,
     materials: Sequence[str],
     slide_s: float,
-    fingers: int,
 ) -> Iterator[Act]:
     rounds = itertools.cycle(places)
     tubes_left: list[str] = []
     for _ in itertools.count() if sweeps is None else range(sweeps):
         if not tubes_left:
             tubes_left, place = [str(m) for m in rng.permutation(materials)], next(rounds)
-        yield slide(tubes_left.pop(), place, rng, world, seen, slide_s, fingers)
+        yield slide(tubes_left.pop(), place, rng, world, seen, slide_s)
 
 
 def slide(
@@ -200,22 +189,15 @@ def slide(
     world: skin.World,
     seen: SeenTubes = skin,
     slide_s: float = SLIDE_S,
-    fingers: int = 1,
 ) -> Act:
-    """One sweep over the tube `label`, with the finger lifted before and after it. fingers: each
-    slides over another spot of the tube."""
+    """One sweep over the tube `label`, with the finger lifted before and after it."""
     rate = seen.FORMAT.rate_hz
     off = seen.idle(max(PAUSE_FRAMES, round(rng.uniform(*PAUSE_S) * rate)), rng, world)
-    frames, *others = (
-        np.concatenate([off, on, off])
-        for on in (
-            seen.sweep(label, place, rng, world, rest_s=REST_S, slide_s=slide_s, after_s=REST_S)
-            for _ in range(fingers)
-        )
-    )
+    on = seen.sweep(label, place, rng, world, rest_s=REST_S, slide_s=slide_s, after_s=REST_S)
+    frames = np.concatenate([off, on, off])
     start = len(off) + round(REST_S * rate)
     stop = start + round(slide_s * rate)
-    return Act(frames, start, stop, label, lifted=len(off), others=tuple(others))
+    return Act(frames, start, stop, label, lifted=len(off))
 
 
 def rests(seed: int, world: skin.World = PLAYED, seen: SeenTubes = skin) -> Iterator[Act]:

@@ -77,21 +77,3 @@ class BlackBox(Observer):
             folder.remove(folder.numbers[0])
         while len(folder.numbers) > self._most:
             folder.remove(folder.numbers[0])
-
-
-class FingerBox(BlackBox):
-    """The black box of one finger: its part of each sweep, with its own verdict."""
-
-    def __init__(
-        self, finger: str, folder: Path, format: SweepFormat, most: int, disk: DiskWork
-    ) -> None:
-        super().__init__(folder, format, most, disk)
-        self._finger = finger
-
-    def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
-        """Write the finger's sweep if it has a window."""
-        each = zip(sweep.fingers or (), verdict.fingers or (), strict=True)
-        about = {name: value for name, value in circumstances.items() if name != "fingers"}
-        for own, answer in each:
-            if own.finger == self._finger:
-                super().sweep(own, answer, about | circumstances["fingers"][self._finger])

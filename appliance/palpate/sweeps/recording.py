@@ -65,9 +65,8 @@ class RecordingSession(Observer):
     say: called with REC sentences. disk: writes the sweeps; a REC sentence follows once its sweep
     is on the disk. target: wanted number of sweeps of each material at each position; sweeps of
     earlier runs in the folder count. names: of materials that were typed, to which those of earlier
-    sweeps are added; sidecars keep them. finger: whose skin is recorded, for the sidecars; "" for
-    the only skin. Raises ConfigError if the folder cannot be used, or has sweeps of another format
-    or of another finger.
+    sweeps are added; sidecars keep them. Raises ConfigError if the folder cannot be used, or has
+    sweeps of another format.
     """
 
     def __init__(
@@ -80,10 +79,8 @@ class RecordingSession(Observer):
         target: int = TARGET,
         disk: DiskWork | None = None,
         names: TypedNames | None = None,
-        *,
-        finger: str = "",
     ) -> None:
-        self.names, self._finger = names or TypedNames(), finger or None
+        self.names = names or TypedNames()
         self._disk = disk or AtOnce()
         self._writing: dict[int, str] = {}  # number and material of each sweep that is not put yet
         try:
@@ -172,11 +169,7 @@ class RecordingSession(Observer):
             Labels(),
         )
         sweep = replace(
-            sweep,
-            material=labels.material,
-            position=labels.position,
-            session=labels.session,
-            finger=self._finger,
+            sweep, material=labels.material, position=labels.position, session=labels.session
         )
         self._writing[self._folder.run + sweep.id] = labels.material
         report = partial(self._report_outcome, sweep, verdict, labels)
@@ -214,12 +207,12 @@ class RecordingSession(Observer):
 
     def _count_earlier(self, format: SweepFormat) -> None:
         """Count the sweeps of earlier runs in the folder. Raises ConfigError for a sweep of another
-        format or finger."""
+        format."""
         for number, about in self._folder.sidecars():
             path = self._folder.path(number)
             try:
                 Status(about["verdict"]["status"])
-                labels, stored, finger = _labels(about), about["format"], about.get("finger")
+                labels, stored = _labels(about), about["format"]
             except (ConfigError, KeyError, TypeError, ValueError):
                 continue  # not a sweep of ours: training reports it
             if stored != format.json():
@@ -227,12 +220,6 @@ class RecordingSession(Observer):
                 raise ConfigError(
                     f"{path} has another format than {format}, and a model is trained on one "
                     "format; name another folder with --out"
-                )
-            if finger != self._finger:
-                self._folder.close()
-                raise ConfigError(
-                    f"{path} is of {f'the finger {finger}' if finger else 'a box with one skin'}; "
-                    "name another folder with --out"
                 )
             gone = self._folder.is_forgotten(number, labels.material)
             self._count(number, labels, exclusion(about, forgotten=gone))

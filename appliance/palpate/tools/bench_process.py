@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack, suppress
 from itertools import cycle
 from pathlib import Path
@@ -26,9 +26,7 @@ if TYPE_CHECKING:
     from palpate.sim import devices, rig
 
 MEMORY_SWEEPS, STREAM_S = 1000, 15.0
-NAMES = ("memory", "stream", "hand")
-HANDS = (1, 2, 4)
-"""Numbers of skins whose processor time is compared."""
+NAMES = ("memory", "stream")
 
 
 class Build(Protocol):
@@ -50,23 +48,17 @@ def write_acts(path: Path, acts: Iterable[rig.Act]) -> None:
 
 def measure(name: str, format: SweepFormat, build: Build, path: Path) -> dict[str, Any]:
     """The part `name` of NAMES, measured in this process, which repeats the acts in `path`."""
-    parts = {"memory": _memory, "stream": _stream, "hand": _hand}
+    parts = {"memory": _memory, "stream": _stream}
     return parts[name](format, build, path)
 
 
-def _board(
-    format: SweepFormat, path: Path, clock: Clock | None = None, fingers: Sequence[str] = ()
-) -> devices.SimDevices:
-    """Devices that play the acts in `path`; in virtual time without a clock. fingers: each has a
-    board, which plays the same frames."""
+def _board(format: SweepFormat, path: Path, clock: Clock | None = None) -> devices.SimDevices:
+    """Devices that play the acts in `path`; in virtual time without a clock."""
     from palpate.sim import devices, rig
 
     with np.load(path, allow_pickle=False) as z:
         played = ((z[key], *map(int, key.split()[1:])) for key in z)
-        acts = [
-            rig.Act(frames, start, stop, "", others=(frames,) * (len(fingers) - 1))
-            for frames, start, stop in played
-        ]
+        acts = [rig.Act(frames, start, stop, "") for frames, start, stop in played]
     # the simulator's memory of acts is not part of the box
     return devices.build(
         format,
@@ -74,7 +66,6 @@ def _board(
         clock or rig.VirtualClock(),
         "sim",
         remember=False,
-        fingers=dict.fromkeys(fingers, format),
     )
 
 
@@ -123,17 +114,8 @@ def _stream(format: SweepFormat, build: Build, path: Path) -> dict[str, Any]:
     return {"cpu_share_streaming": box, "cpu_share_with_simulated_board": whole}
 
 
-def _hand(format: SweepFormat, build: Build, path: Path) -> dict[str, Any]:
-    """Share of one core by number of skins, without the simulated readout boards."""
-    shares = {}
-    for n in HANDS:
-        fingers = [f"finger-{i}" for i in range(n)] if n > 1 else []
-        shares[str(n)] = _shares(_board(format, path, SystemClock(), fingers), build)[0]
-    return {"cpu_share_by_skins": shares}
-
-
 def _shares(simulated: devices.SimDevices, build: Build) -> tuple[float, float]:
-    """Share of one core while the skins stream, without and with the simulated readout boards."""
+    """Share of one core while the skin streams, without and with the simulated readout board."""
     board_ns = 0
 
     def timed(read: Callable[..., int]) -> Callable[..., int]:
@@ -147,8 +129,8 @@ def _shares(simulated: devices.SimDevices, build: Build) -> tuple[float, float]:
 
         return timed_read
 
-    for bus in simulated.buses.values() or [simulated.backend]:
-        bus.bulk_read = timed(bus.bulk_read)  # type: ignore[method-assign]
+    bus = simulated.backend
+    bus.bulk_read = timed(bus.bulk_read)  # type: ignore[method-assign]
     with ExitStack() as stack:
         box, far_end = build(simulated, stack)
         box.step()

@@ -18,7 +18,6 @@ from palpate.core.errors import FormatError
 from palpate.core.schema import typed
 from palpate.core.status import REASONS
 from palpate.core.types import SweepFormat
-from palpate.service import status
 from palpate.web.sweep_picture import Window, picture, window
 
 SHIFT = 5000
@@ -54,9 +53,9 @@ class PageBoard:
 
     hello: with the `names` of its labels for people. health, state: unchanged. box: whether there
     is a feed. verdict: with rounded `scores`, the `name` of its label, the `reason` for a sweep
-    without a label, and the answers of the `fingers` in words. minute: frames and lost frames of
+    without a label. minute: frames and lost frames of
     the last minute. signal: a sweep's window is available. view: see alignment.view. note: another
-    bundle or program. Of a box with several fingers `view` and `signal` show the first.
+    bundle or program.
     """
 
     def __init__(self, publish: Publish) -> None:
@@ -148,15 +147,13 @@ class PageBoard:
             "name": self._names.get(line["label"], line["label"]),
             "scores": [round(float(p), 4) for p in line["scores"]],
         }
-        if fingers := status.fingers(line, self._names):
-            shown["fingers"] = fingers
         self._publish(
             "verdict",
             shown | {"reason": REASONS.get(line["status"], ""), "pid": self._hello.get("pid")},
         )
 
     def _take_frame(self, line: Mapping[str, Any]) -> None:
-        if not self._tracker or self._of_another(line):
+        if not self._tracker:
             return
         format = typed(SweepFormat, dict(self._hello["format"]))
         frame = np.array(line["taxels"], np.float64)  # null, of a float skin, becomes nan
@@ -168,13 +165,7 @@ class PageBoard:
             self._view_ns = now_ns
             self._publish("view", self._tracker.view(self._skin, self._trouble).json())
 
-    def _of_another(self, line: Mapping[str, Any]) -> bool:
-        """Whether a line is of another finger than the first, which alone is drawn."""
-        return line.get("finger") != next(iter(self._hello.get("fingers", ())), None)
-
     def _take_sweep(self, line: Mapping[str, Any]) -> None:
-        if self._of_another(line):
-            return
         kept = window(line, float(self._hello["format"]["rate_hz"]))
         self._taken += 1
         self._windows[self._taken] = kept

@@ -41,7 +41,7 @@ CHANNELS = 3
 @dataclass(kw_only=True)
 class PalpateCameraConfig(CameraConfig):  # type: ignore[misc]  # lerobot has no types
     """feed: socket of the box, or its end of `ssh -L`. fps: 1 to 20. low, high: raw counts that are
-    black and white. width, height: of the image, in pixels. finger: as in LastTouch."""
+    black and white. width, height: of the image, in pixels."""
 
     feed: str = DEFAULT
     fps: int | None = MOST_HZ
@@ -49,7 +49,6 @@ class PalpateCameraConfig(CameraConfig):  # type: ignore[misc]  # lerobot has no
     height: int | None = 160
     low: float = 0.0
     high: float = 255.0
-    finger: str = ""
 
     def __post_init__(self) -> None:
         if not 0 < (self.fps or 0) <= MOST_HZ:
@@ -66,17 +65,11 @@ class LastTouch:
     hello: the first line of the feed. frame: raw counts [R, C] or [R, C, A], None before the first.
     status, label: of the last sweep, "" while a sweep runs and before the first. moved_mm: along
     rows and columns, from the nearest position of the training, None if that is unknown. trouble:
-    why the skin does not stream. finger: whose skin is shown, of a box with several; "" for the
-    first or only one. The answer is that of the box. Raises KeyError, TypeError, ValueError or
-    ApplianceError for a line that does not fit its type.
+    why the skin does not stream. Raises KeyError, TypeError, ValueError or ApplianceError for a
+    line that does not fit its type.
     """
 
-    def __init__(self, hello: Mapping[str, Any], finger: str = "") -> None:
-        fingers = hello.get("fingers", {})
-        if finger and finger not in fingers:
-            raise ValueError(f"no finger {finger!r} among {', '.join(fingers) or 'one skin'}")
-        self._finger = finger or next(iter(fingers), "")
-        hello = {**hello, **fingers.get(self._finger, {})}
+    def __init__(self, hello: Mapping[str, Any]) -> None:
         self.format = typed(SweepFormat, dict(hello["format"]))
         self.labels = tuple(map(str, hello["labels"]))
         self.frame: NDArray[np.float64] | None = None
@@ -106,7 +99,7 @@ class LastTouch:
         elif kind == "verdict":
             self.status, self.label = str(line["status"]), str(line["label"])
             self.probability = float(line["probability"])
-        elif kind == "frame" and line.get("finger", "") == self._finger:
+        elif kind == "frame":
             self._put(np.array(line["taxels"], np.float64))
             return True
         return False
@@ -294,7 +287,7 @@ class PalpateCamera(Camera):  # type: ignore[misc]  # lerobot has no types
         self._trouble = ""
         try:
             if line["type"] == "hello":  # another program or bundle: nothing of the last holds
-                self.touch = LastTouch(line, self.config.finger)
+                self.touch = LastTouch(line)
                 return False
             return self.touch is not None and self.touch.take(line)
         except (KeyError, TypeError, ValueError, ApplianceError) as e:

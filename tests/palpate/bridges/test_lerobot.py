@@ -99,33 +99,6 @@ def test_the_image(camera: Any):
     assert np.abs(image[150, 120, :2].astype(int) - 128).max() <= 3
 
 
-def test_the_skin_of_one_finger_is_shown(plugin: Any):
-    """The first finger's, or that of `finger`, in its own form; frames of the others leave it as it
-    is. The answer is that of the box. An unknown finger is an error with the known ones."""
-    forms = {
-        name: {"rows": rows, "cols": 1, "dtype": "uint8", "rate_hz": 100, "window": 9}
-        for name, rows in (("left", 1), ("right", 2))
-    }
-    hands = {
-        name: {"format": form, "bundle": name, "alignment": None} for name, form in forms.items()
-    }
-    hello = feed_lines.hello(fingers=hands)
-    frames = [
-        {"type": "frame", "finger": "left", "taxels": [[7]]},
-        {"type": "frame", "finger": "right", "taxels": [[8], [9]]},
-    ]
-    for finger, wanted in (("", [[7]]), ("left", [[7]]), ("right", [[8], [9]])):
-        touch = plugin.LastTouch(hello, finger)
-        touch.take(feed_lines.health(1))
-        assert [touch.take(line) for line in frames] == [finger != "right", finger == "right"]
-        assert touch.frame.tolist() == wanted
-        touch.take(feed_lines.verdict(1, 2.5, "wood"))
-        assert touch.label == "wood"
-    for made, known in ((hello, "left, right"), (feed_lines.hello(), "one skin")):
-        with pytest.raises(ValueError, match=f"no finger 'lft' among {known}"):
-            plugin.LastTouch(made, "lft")
-
-
 def test_three_axes_have_colours(plugin: Any):
     """Counts between `low` and `high`; without a frame the image is black, and an unknown
     displacement is marked as such."""

@@ -15,7 +15,7 @@ import pytest
 
 from palpate.cli.main import main
 from palpate.core.sentences import sentence
-from tests.factories import feed_lines, ros, ros_launch
+from tests.factories import ros, ros_launch
 from tests.factories.bridges import LONG_S, eventually
 from tests.factories.paths import ROOT
 from tests.factories.ros import RosPeer
@@ -226,55 +226,6 @@ def test_frames_from_the_feed(tmp_path: Path):
         assert bytes(heard["data"][:8]) == b"\0\0\x80\x3f\0\0\0\x40"
         assert bytes(heard["data"][16:20]) == b"\0\0\xc0\x7f"
         assert not node.call("start")["success"]
-
-
-def test_the_fingers_of_the_feed(tmp_path: Path):
-    """Frames of skins of different forms, each with the name of its finger in the frame; a verdict
-    with those of its fingers."""
-    forms = {
-        name: {"rows": rows, "cols": 1, "dtype": dtype, "rate_hz": 100, "window": 200}
-        for name, rows, dtype in (("left", 2, "uint8"), ("right", 3, "int16"))
-    }
-    hello = {"type": "hello", "schema": 1, "labels": ["wood"], "bundle": "b1"}
-    hello |= {
-        "format": forms["left"],
-        "fingers": {name: {"format": f} for name, f in forms.items()},
-    }
-    frames = [
-        {"type": "frame", "time_ns": 1, "finger": "left", "taxels": [[1], [2]]},
-        {"type": "frame", "time_ns": 2, "finger": "right", "taxels": [[3], [4], [-5]]},
-    ]
-    with fed(tmp_path) as (connection, node):
-
-        def send(*lines: dict) -> None:
-            connection.sendall(b"".join(json.dumps(one).encode() + b"\n" for one in lines))
-
-        def sent() -> bool:
-            send(*frames)
-            return len({heard["frame_id"] for heard in node.on("frames")}) == 2
-
-        send(hello)
-        eventually(sent)
-        of = {heard["frame_id"]: heard for heard in node.on("frames")}
-        assert of["palpate/left"]["shape"] == [2, 1]
-        assert (of["palpate/left"]["encoding"], of["palpate/left"]["data"]) == ("8UC1", [1, 2])
-        assert of["palpate/right"]["shape"] == [3, 1]
-        assert of["palpate/right"]["encoding"] == "16SC1"
-        assert bytes(of["palpate/right"]["data"]) == b"\3\0\4\0\xfb\xff"
-        fingers = [
-            {"finger": "left", "label": "wood", "probability": 0.912, "status": "ok"},
-            {"finger": "right", "label": "", "probability": 0.0, "status": "no-contact"},
-        ]
-        line = feed_lines.verdict(1, 390.0, "wood")
-        send(line | {"fingers": [line | one for one in fingers]})
-        eventually(lambda: node.on("verdict") != [])
-        heard = node.on("verdict")[0]
-        assert heard["message"] == "wood"
-        assert [one["name"] for one in heard["fingers"]] == [
-            "palpate: verdict left",
-            "palpate: verdict right",
-        ]
-        assert [one["level"] for one in heard["fingers"]] == [OK, ERROR]
 
 
 def test_no_box_is_named():

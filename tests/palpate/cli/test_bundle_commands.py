@@ -18,7 +18,7 @@ from palpate.core.errors import BundleError
 from palpate.core.health import Health
 from palpate.deployment.store import Store
 from palpate.service.status_file import StatusFile
-from tests.factories import deliveries, hands, toy_bundle
+from tests.factories import deliveries, toy_bundle
 from tests.factories.deliveries import Delivery
 
 RUNNING = bundle.load(bundle.DEFAULT)
@@ -125,10 +125,8 @@ def test_the_command_refuses_it_unless_it_is_told(
     [
         ([], ""),
         (["classifier.bundle=/own"], "classifier.bundle"),
-        (hands.of(*hands.TWO), ""),
-        ([*hands.of(*hands.TWO), "skins.right.bundle={own}"], "skins.right.bundle"),
     ],
-    ids=["store", "box", "hand", "finger"],
+    ids=["store", "box"],
 )
 def test_a_bundle_that_the_settings_name_stays(
     sets: list[str], named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -10,7 +10,7 @@ import pytest
 
 from palpate.cli.main import main
 from palpate.service.status_file import StatusFile
-from tests.factories import deliveries, hands, toy_bundle
+from tests.factories import deliveries, toy_bundle
 from tests.factories.deliveries import Delivery
 
 pytestmark = deliveries.NEEDED
@@ -53,21 +53,6 @@ def test_a_robot_is_answered_by_signed_bundles_alone(
     assert f"{folder} is not signed; sign the bundle (palpate-train sign)" in text
     assert "classifier.allow_unsigned = true" in text
     assert SAID not in text
-
-
-@pytest.mark.parametrize("command", ["run", "check"])
-def test_a_finger_is_answered_by_signed_bundles_alone(
-    box: Delivery, command: str, capsys: pytest.CaptureFixture[str]
-):
-    """The bundle of one finger has to be signed as well as that of the box."""
-    folder = toy_bundle.put(box.folder / "toy", toy_bundle.files())
-    two = [*hands.of(*hands.TWO), f"skins.right.bundle={folder}"]
-    sets = [word for text in two for word in ("--set", text)]
-    assert main([command, *of(box), *sets]) == (1 if command == "check" else 78)
-    output = capsys.readouterr()
-    assert f"{folder} is not signed; sign the bundle" in output.out + output.err
-    main(["check", *of(box), *sets, *ALLOWED])
-    assert f"right signatures warning: {SAID}" in capsys.readouterr().out
 
 
 def test_words_of_a_bundle_do_not_steer_a_terminal(

@@ -13,7 +13,7 @@ from palpate.core import sentences
 from palpate.core.errors import FormatError
 from palpate.core.status import Status
 from palpate.core.types import Verdict
-from palpate.io.robot_link import result, results
+from palpate.io.robot_link import result
 from tests.factories import speaking_box
 from tests.factories.paths import ROOT
 
@@ -50,16 +50,14 @@ def test_an_answer_survives_its_sentence(status: Status):
 
 def test_the_answer_of_a_finger_survives_its_sentence():
     """FIN is RES with the finger in front of its fields; `read` takes RES alone."""
-    of = replace(verdict(Status.OK, "moved"), finger="left", measured_mm_s=30.5, direction="rows+")
-    whole = replace(verdict(Status.OK), fingers=(of, replace(of, finger="right")))
-    left, right, hand = (sentences.read(line.strip()) for line in results(whole, "usb"))
-    assert [left.kind, right.kind, hand.kind] == ["FIN", "FIN", "RES"]
-    answer = Answer.of_finger(left.fields)
+    of = replace(verdict(Status.OK, "moved"), measured_mm_s=30.5, direction="rows+")
+    whole = sentences.read(result(of, "usb").strip())
+    fin = sentences.sentence("FIN", "left", *whole.fields)
+    answer = Answer.of_finger(sentences.read(fin.strip()).fields)
     assert (answer.finger, answer.label, answer.detail) == ("left", "wood", "moved")
     assert (answer.measured_mm_s, answer.direction) == (30.5, "rows+")
-    assert replace(answer, finger="") == Answer.of(left.fields[1:])
-    assert Answer.read(result(of, "usb").decode()) is None
-    assert Answer.of_finger(right.fields).finger == "right"
+    assert replace(answer, finger="") == Answer.of(whole.fields)
+    assert Answer.read(fin.decode()) is None
     with pytest.raises(FormatError, match="RES"):
         Answer.of_finger(["left"])
 
@@ -78,10 +76,9 @@ def test_the_fingers_of_the_pages_can_be_read(page: str):
 
 def test_a_finger_with_the_longest_name_keeps_all_its_fields():
     """A label of 24 characters, a name of 8: the sentence is not cut before the detail."""
-    longest = replace(
-        verdict(Status.UNSURE), sweep=99999, label="w" * 24, finger="f" * 8, time_ns=10**14
-    )
-    line = result(longest, "replay")
+    longest = replace(verdict(Status.UNSURE), sweep=99999, label="w" * 24, time_ns=10**14)
+    whole = sentences.read(result(longest, "replay").strip())
+    line = sentences.sentence("FIN", "f" * 8, *whole.fields)
     assert len(line) <= sentences.MAX_LINE
     found = Answer.of_finger(sentences.read(line.strip()).fields)
     assert (found.label, found.source, found.share) == ("w" * 24, "replay", 1.0)

@@ -64,7 +64,7 @@ def test_later_layers_win_and_each_value_knows_its_source(folder: Path) -> None:
     for name, (value, want, source) in got.items():
         assert (value, c.sources[name]) == (want, source), name
     assert len(c.sources) == 1 + sum(
-        len(schema.keys(type(getattr(c, s)))) for s in config.Config.__slots__[1:-5]
+        len(schema.keys(type(getattr(c, s)))) for s in config.Config.__slots__[1:-2]
     )
 
 
@@ -276,11 +276,7 @@ def test_usb_ids_and_serial_number(folder: Path, usb: str, ids: tuple[int, int, 
 
 @pytest.mark.parametrize(
     "section",
-    [
-        n
-        for n in config.Config.__slots__
-        if n not in ("board", "sources", "folder", "skins", "alone", "hand")
-    ],
+    [n for n in config.Config.__slots__ if n not in ("board", "sources", "folder")],
 )
 def test_each_field_is_explained(section: str) -> None:
     """The name of each setting stands in the docstring of its group."""
@@ -405,3 +401,18 @@ def test_rules_and_unit_agree_with_the_settings() -> None:
     groups = set(re.findall(r"^SupplementaryGroups=(.*)$", unit, re.MULTILINE)[0].split())
     assert groups == set(re.findall(r"^g (\w+)", users, re.MULTILINE))
     assert set(re.findall(r'GROUP="(\w+)"', rules)) <= groups
+
+
+def test_a_unit_has_settings_and_folders_of_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """left.toml in place of palpate.toml, over default folders with the name; it must be there."""
+    monkeypatch.setattr(config, "SITE", tmp_path / "palpate.toml")
+    (tmp_path / "palpate.toml").write_text("[skin]\nport = '/dev/a'")
+    (tmp_path / "left.toml").write_text("[skin]\nport = '/dev/b'\n[store]\nruntime = '/r'")
+    left = config.load(None, unit="left")
+    assert (left.skin.port, left.store.folder) == ("/dev/b", "/var/lib/palpate-left")
+    assert str(left.store.feed) == "/r/feed.sock"
+    for wrong, word in (("right", "right.toml"), ("Left", "Left"), ("../left", "left")):
+        with pytest.raises(ConfigError, match=word):
+            config.load(None, unit=wrong)

@@ -12,11 +12,10 @@ from palpate.cli.common import load_settings
 from palpate.cli.main import main
 from palpate.cli.parser import arguments
 from palpate.core import config
-from palpate.core.types import sidecar
 from palpate.io.robot_link import command
 from palpate.learn import install
 from palpate.runtime import assembly
-from tests.factories import deliveries, hands, install_scripts, lessons
+from tests.factories import deliveries, install_scripts, lessons
 from tests.factories.paths import ROOT
 from tests.factories.sweep_sets import easy
 
@@ -124,35 +123,6 @@ def test_a_box_without_lines_waits_to_be_taught(
     assert modes == [mode]
 
 
-def test_the_process_learns_from_the_same_finger(tmp_path: Path):
-    """The command of USE has the finger of the session, and finds its sweeps and its state."""
-    sets = [word for one in hands.of(*hands.TWO) for word in ("--set", one)]
-    words = [*sets, "--set", f"store.folder={tmp_path}", "--finger", "right", "--web"]
-    args = arguments("teach", words)
-    settings = load_settings(args)
-    made = teach_command.Session(args, settings)._command("anna")
-    again = load_settings(arguments("teach", made[made.index("teach") + 1 :]))
-    assert again == settings
-    assert again.kept("sweeps") == tmp_path / "sweeps" / "right"
-
-
-@deliveries.NEEDED
-def test_sweeps_of_a_session_are_of_its_finger(
-    options: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
-    """Recorded into the folder of the finger, with its name in the sidecars; a single material
-    cannot be judged yet."""
-    install_scripts.enrolment_key(tmp_path / "enrolment")
-    sets = [word for one in hands.of(*hands.TWO) for word in ("--set", one)]
-    words = ["--label", "cork", "--sweeps", "2", "--finger", "right", "--sim", "skin:wood"]
-    code, text = said([*options, *sets, *words, "--virtual"], capsys)
-    assert code == 0, text
-    assert "record two of another material" in text
-    kept = sorted((tmp_path / "store" / "sweeps").rglob("*.npy"))
-    assert [path.parent.name for path in kept] == ["right"] * 2
-    assert {sidecar(path)["finger"] for path in kept} == {"right"}
-
-
 def test_its_commands_are_commands_of_the_line():
     """TEACH and FORGET need a name, USE none."""
     assert command("TEACH", "cork").line == "TEACH,cork"
@@ -163,19 +133,14 @@ def test_its_commands_are_commands_of_the_line():
 @deliveries.NEEDED
 @pytest.mark.slow
 @pytest.mark.thorough  # a fit with all checks of an export
-@pytest.mark.parametrize("finger", ["", "left"])
 def test_recorded_sweeps_become_the_bundle_of_the_box(
-    finger: str, options: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    options: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     """Signed by the box, on trial, with who has taught it; taught again, the version counts up.
-    Scratch files are gone, the sweeps are not. The sweeps of one finger alone make a bundle of all
-    fingers."""
+    Scratch files are gone, the sweeps are not."""
     install_scripts.enrolment_key(tmp_path / "enrolment")
-    lessons.write(tmp_path / "store" / "sweeps" / finger, easy(8))
-    if finger:
-        options += [word for one in hands.of(*hands.TWO) for word in ("--set", one)]
-    chosen = ["--finger", finger] if finger else []
-    code, text = said([*options, *chosen, "--use", "--by", "anna"], capsys)
+    lessons.write(tmp_path / "store" / "sweeps", easy(8))
+    code, text = said([*options, "--use", "--by", "anna"], capsys)
     assert code == 0, text
     assert "with high, low, middle is installed, on trial" in text
     settings = config.load(None, [*options[1::2]], site=ROOT / "tests/factories/no-site.toml")

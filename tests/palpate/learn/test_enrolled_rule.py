@@ -13,9 +13,8 @@ from palpate.bundle import bundle, enrolled
 from palpate.bundle.bundle import Bundle
 from palpate.core.types import Frames, Status, Sweep
 from palpate.inference.classifier import Classifier, softmax
-from palpate.inference.hand_classifier import HandClassifier
 from palpate.inference.novelty import ClassDistances
-from palpate.inference.objects import EnrolledLabels, ObjectRule
+from palpate.inference.objects import EnrolledLabels
 from palpate.learn import enrolment, materials
 from palpate.sim.rig import VirtualClock
 from tests.factories import toy_bundle
@@ -221,23 +220,3 @@ def test_left_out_sweeps_are_answered_as_the_box_would(new: Bundle, tmp_path: Pa
         assert found.chances[i] == pytest.approx(verdict.own, abs=1e-6)
     assert answers == ["felt"] * 4 + ["b"]
     assert found.chances[4].argmax() == 3
-
-
-def test_a_hand_applies_the_rule_of_its_fingers(new: Bundle):
-    """Two fingers that are not sure enough of felt are so together. One alone is not."""
-    clock = VirtualClock()
-    fingers = {name: Classifier(new, clock, "none") for name in ("left", "right")}
-    it = HandClassifier(fingers, clock, str, "product", ObjectRule())
-    z = near_b(new, 0.62)
-
-    def sweep(*embeddings: tuple[float, float]) -> Sweep:
-        own = [
-            replace(toy_bundle.sweep(*at), finger=name)
-            for name, at in zip(fingers, embeddings, strict=True)
-        ]
-        whole = replace(own[0], finger=None, frames=Frames.empty(toy_bundle.FORMAT))
-        return replace(whole, fingers=tuple(own))
-
-    both = it(sweep(z, z))
-    assert [v.label for v in both.fingers].count("felt") == 0
-    assert both.label == "felt"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import json
-import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -27,11 +26,10 @@ from palpate.inference.classifier import Classifier
 from palpate.learn import enrolment, install, materials
 from palpate.learn.session import TeachingSession
 from palpate.runtime import assembly
-from palpate.runtime.hand import classifier
 from palpate.sim import skin
 from palpate_train.data.sets import Dataset
 from tests.campaigns import junk
-from tests.factories import deliveries, hands, lessons
+from tests.factories import deliveries, lessons
 from tests.factories.paths import ROOT
 
 pytestmark = [deliveries.NEEDED, pytest.mark.slow]
@@ -55,11 +53,11 @@ def rests(count: int) -> list[np.ndarray]:
     return [junk.window("finger rests", WORLD, n)[0] for n in range(count)]
 
 
-def record(store: Path, material: str, of: list[np.ndarray], first: int, finger: str = "") -> None:
+def record(store: Path, material: str, of: list[np.ndarray], first: int) -> None:
     """Write recorded sweeps of a material, numbered from `first`."""
     labels = np.zeros(len(of), int)
     sweeps = Dataset(np.stack(of), labels, (material,), skin.FORMAT.rate_hz, {}, material)
-    lessons.write(store / "sweeps" / finger, sweeps, first=first)
+    lessons.write(store / "sweeps", sweeps, first=first)
 
 
 class TaughtDelivery:
@@ -220,57 +218,6 @@ def test_a_reader_that_is_gone_gets_an_exit_code(box: TaughtDelivery):
     assert done.returncode
     assert "Traceback" not in done.stderr
     assert box.running.bundle.enrolled in ({}, {"cork": 5})
-
-
-FINGERS = [word for text in hands.of(*hands.TWO) for word in ("--set", text)]
-
-
-@pytest.fixture
-def hand(tmp_path: Path) -> TaughtDelivery:
-    """A box with two fingers, the left one with sweeps of cork and felt, the right one of oak."""
-    box = TaughtDelivery(tmp_path)
-    for finger, material, of in (
-        ("left", "cork", slides(CORK, 5)),
-        ("left", "felt", slides(FELT, 2)),
-        ("right", "oak", slides(CORK, 5)),
-    ):
-        record(box.store, material, of, 1 if material != "felt" else 10, finger)
-    box.words += FINGERS
-    return box
-
-
-def test_a_hand_is_taught_with_one_finger(hand: TaughtDelivery, capsys: Any):
-    """By its sweeps alone; what it has forgotten the other has not. The bundle names the material
-    for all fingers without a bundle of their own."""
-    assert main(["teach", *hand.words, "--finger", "left", "--forget", "felt"]) == 0
-    code, learnt = hand.teach(capsys, "--finger", "left")
-    assert code == 0
-    assert learnt["materials"] == {"cork": 5}
-    code, news = hand.teach(capsys, "--finger", "left", "--use")
-    assert code == 0, news
-    assert hand.running.bundle.enrolled == {"cork": 5}
-    settings = load(None, hand.words[1::2], site=ROOT / "tests/factories/no-site.toml")
-    both = assembly.of_fingers(settings, hand.running.bundle, answers=True)
-    run = classifier(settings, both, SystemClock())
-    assert {*run.labels} == {*skin.MATERIALS, "cork"}
-    code, news = hand.teach(capsys, "--finger", "right", "--use")
-    assert code == 0, news
-    assert hand.running.bundle.enrolled == {"cork": 5, "oak": 5}
-
-
-def test_a_bundle_that_does_not_suit_the_other_finger_is_not_used(
-    hand: TaughtDelivery, tmp_path: Path, capsys: Any
-):
-    """The right finger has a bundle of its own, which lacks the new label: the service would not
-    start with both."""
-    own = tmp_path / "own"
-    shutil.copytree(hand.store / (hand.store / "current").readlink(), own)
-    hand.words += ["--set", f"skins.right.bundle={own}"]
-    before = hand.running.sha
-    code, news = hand.teach(capsys, "--finger", "left", "--use")
-    assert code == 78, news
-    assert "the bundle of skins.right has other labels than that of the first" in news["text"]
-    assert hand.running.sha == before
 
 
 def test_a_taught_bundle_and_another_skin_are_fitted_anew(box: TaughtDelivery):

@@ -116,33 +116,6 @@ def test_a_verdict_has_the_probabilities_of_all_labels(offered: Offered) -> None
     assert (line["force_n"], "speed_mm_s" in line) == (1.5, False)
 
 
-def test_each_finger_has_its_frames_and_windows(tmp_path: Path) -> None:
-    """Lines of their own, with the name. Fewer frames a second are offered, by the counts of all
-    fingers."""
-    large = SweepFormat(40, 40, 100.0, 100, "uint8")
-    offered = Offered(tmp_path / "feed.sock", skin.FORMAT, hand=[skin.FORMAT, large])
-    peer = offered.peer()
-    peer.ask('{"frames": 20, "sweeps": true}')
-    offered.turns(2)
-    (hello, *_) = peer.lines()
-    assert hello["frames_hz"] == pytest.approx(10_000 / 1616, abs=0.1)
-    offered.feed.frames(replace(frames(2), finger="left"))
-    offered.feed.frames(replace(frames(3, large), finger="right"))
-    offered.feed.frames(replace(frames(4), finger="left"))
-    offered.turns(5)
-    found = {line["finger"]: line for line in peer.lines() if line["type"] == "frame"}
-    assert [*found] == ["left", "right"]
-    assert found["left"]["taxels"] == frames(4).taxels[-1].tolist()
-    assert np.shape(found["right"]["taxels"]) == (40, 40)
-    left, right = (replace(cut(), finger=finger) for finger in ("left", "right"))
-    none = Frames.empty(skin.FORMAT)
-    hand = replace(cut(), frames=none, fingers=(left, replace(right, frames=none)))
-    offered.feed.sweep(hand, OK, {})
-    offered.turns(5)
-    assert [line["finger"] for line in peer.lines() if line["type"] == "sweep"] == ["left"]
-    offered.feed.stopping()
-
-
 @pytest.mark.parametrize("hz", [0.5, 1, 5, 8, 20])
 def test_frames_come_at_the_rate_that_was_asked_for(offered: Offered, hz: float) -> None:
     """In ten seconds at 125 turns a second: the newest frame so often, and none once 0 was asked

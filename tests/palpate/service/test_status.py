@@ -119,21 +119,6 @@ def test_a_bridged_taxel_has_a_line(status_file: ClockedStatus):
     )
 
 
-def test_the_answers_of_fingers_stand_in_the_line_of_their_sweep(status_file: ClockedStatus):
-    """Label and probability of each, or its status; and a finger that is away, with the remedy,
-    while the box is in service."""
-    left, right = replace(OK, finger="left"), replace(SHORT, finger="right", status="sensor-lost")
-    hand = replace(OK, detail="right sensor-lost", fingers=(left, right))
-    status_file.file.answered(hand)
-    away = HEALTH._replace(degraded="right absent", trouble="right: no skin on USB")
-    status_file.turns(2, away)
-    text = status_file.text()
-    assert "right sensor-lost; left plastic rough 98.7 %, right sensor-lost" in text
-    assert "degraded right absent: the other fingers answer; check its cable" in text
-    assert "streaming: right: no skin on USB" in text
-    assert status.exit_code(status_file.read()) == 0
-
-
 def test_a_storm_of_verdicts_writes_ten_times_a_second_at_most(status_file: ClockedStatus):
     """Verdicts with every turn: one write in a tenth of a second, and the last twenty are kept."""
     written = 0

@@ -595,7 +595,6 @@ def test_numbers_in_a_verdict_come_back_bit_for_bit():
     assert again == verdict.as_dict()
     assert np.array(again["scores"]).tobytes() == verdict.scores.tobytes()
     absent = {"displacement", "speed_mm_s", "force_n", "measured_mm_s", "direction"}
-    absent |= {"finger", "fingers"}
     assert again.keys() == {*Verdict.__slots__, "moved"} - absent
     assert replace(verdict, speed_mm_s=30.0).as_dict()["speed_mm_s"] == 30.0
 

@@ -90,22 +90,6 @@ def test_people_read_display_names_and_programs_labels(browser: Any, shown: Show
     assert not seen.errors
 
 
-def test_the_answers_of_the_fingers_stand_below_that_of_the_hand(browser: Any, shown: Shown):
-    """In the card, and in the row of the sweep, with the names of materials for people."""
-    shown.board.take(feed_lines.hello(displays={"wood": "Holz, geölt"}))
-    seen = opened(browser, shown)
-    fingers = [
-        {"finger": "left", "label": "wood", "probability": 0.912, "status": "ok"},
-        {"finger": "right", "label": "", "probability": 0.0, "status": "no-contact"},
-    ]
-    shown.board.take(feed_lines.verdict(41, 390.0, "wood", fingers=fingers))
-    until(lambda: seen.text("#label") == "Holz, geölt")
-    said = "left Holz, geölt 91.2 %, right no-contact"
-    assert seen.text("#sure").endswith(f", {said}")
-    assert seen.page.locator(".row").first.locator(".more").inner_text() == said
-    assert not seen.errors
-
-
 def test_a_sweep_without_a_label_says_why(browser: Any, shown: Shown):
     """The card has words for an operator, the fold the reason; the probabilities are gone."""
     seen = opened(browser, shown)

@@ -326,20 +326,6 @@ def test_objects_of_several_runs_in_one_folder_stay_apart(tmp_path: Path):
     assert list(sets.load(str(tmp_path)).groups["object"]) == [0, 0, 1, 2]
 
 
-def test_sweeps_of_several_fingers_stay_apart(tmp_path: Path):
-    """As `record --finger` keeps them, each finger in a folder of its name: the finger is a group,
-    so that a protocol can leave one out; sweeps of a single finger have none."""
-    for finger in (None, "left", "right"):
-        folder = tmp_path / (finger or "")
-        folder.mkdir(exist_ok=True)
-        for i in range(2):
-            record(folder / f"{i}.npy", "ab"[i], id=i, finger=finger)
-    s = sets.load(str(tmp_path))
-    assert s.groups["finger"].tolist() == ["none", "none", "left", "left", "right", "right"]
-    assert len(s.select(["finger=left"])) == 2
-    assert "finger" not in sets.load(str(tmp_path / "left")).groups
-
-
 def test_speed_and_force_are_groups_if_all_have_them(tmp_path: Path):
     """In um/s and mN, rounded; a value that only some have is a remark in the source and no
     group."""

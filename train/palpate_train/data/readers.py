@@ -33,8 +33,6 @@ the same laboratory's skin in the paper (sec. II.A). A `rate_hz` in the file tak
 SET_ARRAYS = ("samples", "labels", "materials", "displays", "rate_hz", "unloaded")
 NAMED_GROUPS = ("position", "session")
 """Names that a recording can have beside its material. Each becomes a group."""
-NO_FINGER = "none"
-"""Value of the group finger for a recording of a box with one skin."""
 SLIDE_GROUPS = {"speed": "speed_mm_s", "force": "force_n"}
 """Groups of the speed and the force of the slide, in thousandths: um/s and mN."""
 SLIDE_UNITS = {"speed": "um/s", "force": "mN"}
@@ -267,8 +265,7 @@ def read_folder(folder: Path, kind: type[Set]) -> Set:
     """The set of all sweeps that the box recorded in and below `folder`; each sweep is a recording.
 
     Labels are materials. Groups are position and session, numbers if all their names are numbers
-    (see group_values.typed). A third group is the object, if NEW OBJECT was ever signalled, and a
-    fourth the finger, if the recordings are of different ones. Groups
+    (see group_values.typed). A third group is the object, if NEW OBJECT was ever signalled. Groups
     speed (um/s) and force (mN) exist if every sweep has the value; `source` says if only some have
     it. Sweeps that we do not train on are counted in `source`. Raises FormatError with the name of
     a file that is broken, lacks a name or has another format.
@@ -306,7 +303,7 @@ def from_recorded(recorded: Sequence[RecordedSweep], folder: Path, kind: type[Se
 
 
 def _groups(kept: Sequence[RecordedSweep]) -> dict[str, Array]:
-    """The groups recording, position, session, object and finger. Raises FormatError for a
+    """The groups recording, position, session and object. Raises FormatError for a
     recording without the name that others have."""
     groups = {"group_recording": np.arange(len(kept))}
     for name in NAMED_GROUPS:
@@ -325,9 +322,6 @@ def _groups(kept: Sequence[RecordedSweep]) -> dict[str, Array]:
                 for one in kept
             ]
         )
-    fingers = [one.sweep.finger or NO_FINGER for one in kept]
-    if len({*fingers}) > 1:
-        groups["group_finger"] = np.array(fingers)
     return groups
 
 

@@ -90,11 +90,6 @@ def _resource_rows(figures: Json) -> Iterator[tuple[str, str]]:
         "share of one core while the skin streams, without the simulated readout board",
         f"{100 * figures['cpu_share_streaming']:.1f} %",
     )
-    if by := figures.get("cpu_share_by_skins"):
-        yield (
-            "the same of a box with 1, 2 and 4 such skins",
-            f"{', '.join(f'{100 * share:.1f}' for share in by.values())} %",
-        )
     yield (
         "start of the process to READY with a streaming skin",
         f"median {figures['cold_start_s']:.2f} s, longest {figures['cold_start_worst_s']:.2f} s",

@@ -102,7 +102,7 @@ function row(one) {
   if (!one.label) what.title = one.reason;
   made("span", "number", one.label ? percent(one.probability) : "", made_row);
   made("span", "ms number", one.label ? `${(one.latency_ns / 1e6).toFixed(1)} ms` : "", made_row);
-  for (const more of [one.moved, one.fingers]) if (more) made("span", "more", more, made_row);
+  if (one.moved) made("span", "more", one.moved, made_row);
   return made_row;
 }
 
@@ -123,7 +123,7 @@ export function csv(verdicts) {
     time: (one) => stamp(one.at), box_process: (one) => one.pid, sweep: (one) => one.sweep, status: (one) => one.status, material: (one) => one.label,
     probability: (one) => (one.label ? one.probability.toFixed(4) : ""), fused: (one) => one.fused, lost_frames: (one) => one.lost,
     latency_ms: (one) => (one.label ? (one.latency_ns / 1e6).toFixed(2) : ""), bundle: (one) => one.bundle, moved: (one) => one.moved,
-    detail: (one) => [one.detail, one.fingers].filter(Boolean).join("; "),
+    detail: (one) => one.detail,
   };
   return [Object.keys(columns), ...verdicts.map((one) => Object.values(columns).map((of) => of(one)))]
     .map((values) => `${values.map(cell).join(",")}\r\n`).join("");

@@ -67,7 +67,7 @@ function answer(verdict, windowS, next, now) {
   if (verdict.status === "short" && windowS) advice = `Slide for longer than ${windowS} s.`;
   const named = verdict.status === "ok", candidate = verdict.label ? `${verdict.name}, ${percent(verdict.probability)}` : "";
   const more = [named ? percent(verdict.probability) : candidate && `Perhaps ${candidate}`,
-    verdict.fused > 1 ? `${verdict.fused} sweeps of one object` : "", verdict.share < 1 ? `early, at ${percent(verdict.share)} of the window` : "", verdict.fingers];
+    verdict.fused > 1 ? `${verdict.fused} sweeps of one object` : "", verdict.share < 1 ? `early, at ${percent(verdict.share)} of the window` : ""];
   return {tone, status: named && !verdict.moved ? "ok" : status, words: named ? verdict.name : words, advice, next, of: of(verdict, now),
     small: more.filter(Boolean).join(", "), moved: verdict.moved,
     detail: [verdict.detail === verdict.moved ? "" : verdict.detail, verdict.reason].filter(Boolean).join("; ")};
