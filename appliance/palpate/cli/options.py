@@ -176,6 +176,13 @@ def teach(command: Parser) -> None:
         metavar="S",
         help="seconds of each sweep that are learnt (default 2)",
     )
+    _lesson(add)
+    _web(add, f"also as a page, for a person at the robot (default port {TEACH_PORT})", TEACH_PORT)
+    command.set_defaults(sweeps=None)
+
+
+def _lesson(add: Add) -> None:
+    """Add what is done with the sweeps."""
     add(
         "--use",
         action="store_true",
@@ -193,8 +200,6 @@ def teach(command: Parser) -> None:
     add("--forget", metavar="NAME", help="teach the sweeps of this material no longer; they stay")
     add("--by", default="", metavar="NAME", help="who teaches, for the bundle (default: this user)")
     add("--json", action="store_true", help="with --use alone: print its steps as JSON")
-    _web(add, f"also as a page, for a person at the robot (default port {TEACH_PORT})", TEACH_PORT)
-    command.set_defaults(sweeps=None)
 
 
 def nothing(command: Parser) -> None:
