@@ -123,7 +123,7 @@ $(DESKTOP): $(RUNTIME) train/pyproject.toml train/desktop.lock
 	@touch $@
 
 # The same with tests, studies, and the tools that check the code. flexitac has no wheel.
-$(TOOLS): $(DESKTOP) tests/tools.lock
+$(TOOLS): $(DESKTOP) tests/tools.lock train/studies/pyproject.toml
 	$(LOCKED) --no-binary flexitac --no-build-isolation -r tests/tools.lock
 	$(INSTALL) --no-build-isolation -e train/studies
 	@touch $@
