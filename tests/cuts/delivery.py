@@ -284,7 +284,7 @@ def _done(step: SceneStep, folder: Path) -> str:
     done = run(words, cwd=ROOT, capture_output=True, text=True, check=False, timeout=DEADLINE_S)
     if done.returncode:
         raise NotFollowed(f"{step.name} ended with {done.returncode}: {_end(done.stderr)}")
-    return done.stdout + done.stderr
+    return done.stderr + done.stdout
 
 
 def _end(output: str) -> str:
