@@ -9,7 +9,6 @@ import json
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -325,8 +324,8 @@ def test_a_recorder_that_ends_and_comes_back_while_the_page_is_open(browser: Any
 def test_a_skin_that_is_away(browser: Any, recorded: RecordedPage):
     """The banner says why."""
     seen = opened(browser, recorded)
-    recorded.health = replace(
-        recorded.health, skin="lost", trouble="the skin was unplugged", ready=False
+    recorded.health = recorded.health._replace(
+        skin="lost", trouble="the skin was unplugged", ready=False
     )
     until(lambda: seen.page.is_visible("#banner"))
     assert seen.text("#banner") == "no skin: lost; the skin was unplugged"
