@@ -2,7 +2,7 @@
 
 They ask for unlimited memory or time, for files beside the model or for foreign code, or they are
 not models (hostile_bytes.py). onnx makes some of them. It refuses to write the others, so they are
-made byte by byte. All declare the sweep of `grown_models.FORMAT` as their input.
+made byte by byte. All declare the sweep of `hostile_bytes.FORMAT` as their input.
 """
 
 from __future__ import annotations
@@ -10,10 +10,11 @@ from __future__ import annotations
 import numpy as np
 from onnx import TensorProto, helper
 
-from tests.factories.grown_models import FORMAT
 from tests.factories.hostile_bytes import (
+    FORMAT,
     OPSETS,
     SWEEP,
+    TRIED,
     Models,
     broken,
     declared,
@@ -42,7 +43,7 @@ def tiny() -> bytes:
 def every() -> dict[str, tuple[bytes, str]]:
     """All harmful models by name: bytes, and a regular expression for the message."""
     found: dict[str, tuple[bytes, str]] = {
-        "152 bytes for 6 GB": (tiny(), "node 0 .*ConstantOfShape")
+        "152 bytes for 6 GB": (tiny(), r"6000000000 bytes \(limit")
     }
     for kind in (outside, foreign, endless, giant, busy, crooked, dangerous, misfits, broken):
         for name, made, words in kind():
@@ -166,49 +167,53 @@ def endless() -> Models:
 def giant() -> Models:
     """Models with huge tensors, by every operator whose result size is a number in the model."""
     large, column = [3 * MILLION, 1000], np.zeros((MILLION // 10, 1), np.float32)
-    limit = r"bytes \(limit"
+    same = "does not depend on the sweep"
     one = helper.make_tensor("one", 1, [1], [1.0])
     yield (
         "ConstantOfShape",
         model([node("ConstantOfShape", ["n"], ["y"], value=one)], {"n": large}),
-        limit,
+        same,
     )
     yield (
         "ConstantOfShape beyond 63 bits",
         model([node("ConstantOfShape", ["n"], ["y"], value=one)], {"n": [2**62, 2**62]}),
-        limit,
+        same,
     )
     yield (
         "ConstantOfShape of less than nothing",
         model([node("ConstantOfShape", ["n"], ["y"], value=one)], {"n": [-4, -4]}),
-        "holds nothing",
+        same,
     )
-    yield "Expand", model([node("Expand", ["x", "n"], ["y"])], {"n": [MILLION, *SWEEP]}), limit
+    yield "Expand", model([node("Expand", ["x", "n"], ["y"])], {"n": [MILLION, *SWEEP]}), TRIED
     ends = {"a": np.int64(0), "b": np.int64(2**31 - 1), "c": np.int64(1)}
     yield (
         "Range",
         model([node("Range", ["a", "b", "c"], ["r"]), node("Cast", ["r"], ["y"], to=1)], ends),
-        limit,
+        same,
     )
-    yield "Range without end", model([node("Range", ["a", "b", "a"], ["y"])], ends), "steps of 0"
+    yield (
+        "Range without end",
+        model([node("Range", ["a", "b", "a"], ["y"])], ends),
+        "int64, not float32",
+    )
     yield (
         "outer product",
         model([node("MatMul", ["c", "r"], ["y"])], {"c": column, "r": column.T}),
-        limit,
+        same,
     )
-    yield "outer sum", model([node("Add", ["c", "r"], ["y"])], {"c": column, "r": column.T}), limit
+    yield "outer sum", model([node("Add", ["c", "r"], ["y"])], {"c": column, "r": column.T}), same
     yes = node("Greater", ["c", "c"], ["b"])
     yield (
         "outer choice",
         model([yes, node("Where", ["b", "c", "r"], ["y"])], {"c": column, "r": column.T}),
-        limit,
+        same,
     )
     yield (
         "Gather",
         model(
             [node("Gather", ["c", "i"], ["y"])], {"c": column.T, "i": np.zeros((40, 50), np.int64)}
         ),
-        limit,
+        same,
     )
     yield (
         "distances",
@@ -216,18 +221,15 @@ def giant() -> Models:
             [node("CDist", ["c", "c"], ["y"], domain="com.microsoft", metric=b"euclidean")],
             {"c": column},
         ),
-        limit,
+        same,
     )
     wide = [node("Concat", [f"x{i}"] * 2, [f"x{i + 1}"], axis=0) for i in range(40)]
-    yield "doubled forty times", model([node("Identity", ["x"], ["x0"]), *wide], last="x40"), limit
+    yield "doubled forty times", model([node("Identity", ["x"], ["x0"]), *wide], last="x40"), TRIED
     yield (
         "Tile",
         model([node("Tile", ["x", "n"], ["y"])], {"n": [MILLION] * 4}),
         "'Tile'.*no such operator",
     )
-    fan = [node("Expand", ["s", "n"], [f"f{i}"]) for i in range(200)]
-    first = node("ReduceMean", ["x"], ["s"], axes=[1, 2, 3], keepdims=0)
-    yield "fanned out", model([first, *fan], {"n": [MILLION]}, "f0"), r"bytes of memory \(limit"
     yield (
         "pads",
         model(
@@ -254,23 +256,13 @@ def giant() -> Models:
 
 def busy() -> Models:
     """Models with endless work in little memory."""
-    wide = {"w": np.zeros((1000, 1000), np.float32), "n": [4000, 1000]}
+    wide = {"w": np.zeros((4000, 4000), np.float32), "n": [2000, 4000]}
     start = [
         node("ReduceMean", ["x"], ["s"], axes=[1, 2, 3], keepdims=0),
         node("Expand", ["s", "n"], ["m0"]),
     ]
-    cascade = [node("MatMul", [f"m{i}", "w"], [f"m{i + 1}"]) for i in range(20)]
-    yield (
-        "cascade of products",
-        model([*start, *cascade], wide | {"n": [1000, 1000]}, "m20"),
-        r"products \(limit",
-    )
-    kernel = {"w": np.zeros((1, 1, 60_000), np.float32), "n": [1, 1, 120_000]}
-    yield "long kernel", model([*start, node("Conv", ["m0", "w"], ["y"])], kernel), r"\(limit"
-    pool = node("MaxPool", ["m0"], ["y"], kernel_shape=[60_000], strides=[1])
-    yield "long pool", model([*start, pool], {"n": [1, 1, 120_000]}), r"products \(limit"
-    again = [node("ReduceMax", ["m0"], [f"r{i}"], axes=[0, 1]) for i in range(900)]
-    yield "read again and again", model([*start, *again], wide, "r0"), r"products \(limit"
+    cascade = [node("MatMul", [f"m{i}", "w"], [f"m{i + 1}"]) for i in range(200)]
+    yield "cascade of products", model([*start, *cascade], wide, "m200"), TRIED
     yield (
         "10,000 nodes",
         model([node("Relu", ["x"], [f"y{i}"]) for i in range(10_000)], last="y0"),
@@ -346,7 +338,6 @@ def dangerous() -> Models:
         {"strides": [0, 0]},
         {"dilations": [0, 1]},
         {"pads": [-1, 0, 0, 0]},
-        {"strides": [1]},
         {"group": 0},
     ):
         name = next(iter(setting))
@@ -356,12 +347,12 @@ def dangerous() -> Models:
             name,
         )
     yield "no kernel", model([node("MaxPool", ["x"], ["y"], kernel_shape=[0, 0])]), "kernel_shape"
-    yield "k of all", model([node("TopK", ["x", "k"], ["y", "at"])], {"k": [3]}), "cannot be chosen"
+    yield "k of all", model([node("TopK", ["x", "k"], ["y", "at"])], {"k": [3]}), TRIED
     yield "k of a sweep", model([*ints, node("TopK", ["x", "i"], ["y", "at"])]), "not a constant"
     yield "shape of a sweep", model([*ints, node("Reshape", ["x", "i"], ["y"])]), "not a constant"
-    yield "place beyond", model([node("Gather", ["x", "n"], ["y"])], {"n": [1]}), "out of 1"
+    yield "place beyond", model([node("Gather", ["x", "n"], ["y"])], {"n": [1]}), TRIED
     pick = node("ArrayFeatureExtractor", ["t", "i"], ["j"], domain="ai.onnx.ml")
-    yield "places of a sweep", model([*ints, pick, back], {"t": [1, 2]}), "TopK or ArgMax"
+    yield "places of a sweep", model([*ints, pick, back], {"t": [1, 2]}), "int64, not index"
     tables = {
         "classlabels_ints": [0, 1],
         "vectors_per_class": [1, 1],

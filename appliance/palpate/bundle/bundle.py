@@ -209,11 +209,9 @@ def from_files(files: Mapping[str, bytes], where: str) -> Bundle:
     untrained, rank = (
         (int(np.count_nonzero(classes.sweeps)), classes.means.shape[1]) if classes else (0, None)
     )
-    memory = check.check(model, manifest, numbers, untrained, rank)
+    check.check(model, manifest, numbers, untrained, rank)
     text = files[MANIFEST]
-    made = Bundle(
-        manifest, identity(text), model, samples, logits, classes, base=digest(text), memory=memory
-    )
+    made = Bundle(manifest, identity(text), model, samples, logits, classes, base=digest(text))
     return (
         enrolled.applied(made, files[ENROLMENT], identity(files[ENROLMENT]))
         if ENROLMENT in files

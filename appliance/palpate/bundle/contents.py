@@ -117,7 +117,6 @@ class Bundle:
         classes include them.
     base: sha256 of manifest.json in the bundle's folder, "" for a bundle that was not read from a
         folder.
-    memory: upper bound of the bytes that the model needs, computed by onnx_check.
     """
 
     manifest: Manifest
@@ -128,7 +127,6 @@ class Bundle:
     classes: Classes | None = None
     added: AddedLabels | None = None
     base: str = ""
-    memory: int = 0
 
     @property
     def enrolled(self) -> dict[str, int]:

@@ -52,6 +52,7 @@ from palpate.deployment.state import (
     StoreState,
 )
 from palpate.deployment.trial import Trial
+from palpate.inference.session import try_all
 
 BOOT = Path("/proc/sys/kernel/random/boot_id")
 """The kernel's id of this boot (random(4))."""
@@ -138,7 +139,11 @@ class Store:
         return self._proven(self.bundles.read(folder))
 
     def _proven(self, signed: SignedBundle) -> SignedBundle:
-        run_limited(lambda: self._prove(signed.bundle))
+        def tried() -> None:
+            try_all(signed.bundle)
+            self._prove(signed.bundle)
+
+        run_limited(tried)
         return signed
 
     def install(

@@ -5,6 +5,7 @@ Errors of onnxruntime become BundleErrors. Only the outputs that are requested a
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,9 +13,15 @@ import onnxruntime as ort
 from numpy.typing import NDArray
 from onnxruntime.capi import onnxruntime_pybind11_state
 
+from palpate.bundle.bundle import Bundle
+from palpate.bundle.onnx_check import check
 from palpate.bundle.pruning import prune
 from palpate.core.errors import BundleError, ModelError
 from palpate.inference.code_pages import give_back
+from palpate.signal import features
+
+MOST_S = 3.0
+"""Longest processor time for a sweep. The service's watchdog waits 10 s for the loop."""
 
 
 def session(model: bytes) -> ort.InferenceSession:
@@ -79,6 +86,33 @@ def run(opened: ort.InferenceSession, outputs: Sequence[str], given: dict[str, A
             f"onnxruntime {ort.__version__} cannot run the model: {why}; export the bundle again"
         ) from e
     return values
+
+
+def try_all(bundle: Bundle) -> None:
+    """Compute all outputs of the model for each golden sweep, in a process that may die. Raises
+    BundleError for an output of another shape than was declared, and for a model that is slow."""
+    opened, m = session(bundle.model), bundle.manifest
+    names = [output.name for output in opened.get_outputs()]
+    rank = None if bundle.classes is None else bundle.classes.means.shape[1]
+    patterns = check.expected(m, len(bundle.enrolled), rank)
+    for window in bundle.golden:
+        numbers = (
+            window if m.input == "raw" else features.compute(m.input, window, m.format.rate_hz)
+        )
+        begun_s = time.process_time()
+        values = run(opened, names, {opened.get_inputs()[0].name: numbers[None]})
+        took_s = time.process_time() - begun_s
+        for name, value in zip(names, values, strict=True):
+            if not check.fits(value.shape, patterns[name]):
+                raise BundleError(
+                    f"the model gives {name} {list(value.shape)} instead of "
+                    f"{list(patterns[name])}; export the bundle again"
+                )
+        if took_s > MOST_S:
+            raise BundleError(
+                f"the model takes {took_s:.1f} s for a sweep, {MOST_S:g} are allowed; export a "
+                "smaller one"
+            )
 
 
 def _lacks_memory(e: Exception) -> bool:

@@ -21,10 +21,12 @@ from palpate.core.errors import ApplianceError, ConfigError, FormatError
 from palpate.core.log import in_journal, log
 from palpate.core.observer import Observer
 from palpate.core.types import SweepFormat
+from palpate.deployment.sandbox import run_limited
 from palpate.deployment.signed import SignedBundle
 from palpate.deployment.store import Store
 from palpate.inference.classifier import Classifier
 from palpate.inference.early_exit import EarlyExit
+from palpate.inference.session import try_all
 from palpate.io import skins
 from palpate.io.gpio_lines import Lines
 from palpate.io.lineless_triggers import (
@@ -301,16 +303,20 @@ def running(settings: Config, *, answers: bool = True) -> SignedBundle:
 
 
 def named(settings: Config, folder: Path, *, answers: bool) -> SignedBundle:
-    """The bundle in `folder`, from a setting or an option; otherwise as `running`."""
+    """The bundle in `folder`, from a setting or an option, tried in a limited process; otherwise
+    as `running`."""
     if settings.classifier.allow_unsigned or not answers:
         files = bundles.files(folder)
-        return SignedBundle(bundles.from_files(files, str(folder)), "", files)
-    try:
-        return store(settings).bundles.read(folder)
-    except ApplianceError as e:
-        raise type(e)(
-            f"{e}; a bench may allow unsigned bundles, by classifier.allow_unsigned = true"
-        ) from e
+        found = SignedBundle(bundles.from_files(files, str(folder)), "", files)
+    else:
+        try:
+            found = store(settings).bundles.read(folder)
+        except ApplianceError as e:
+            raise type(e)(
+                f"{e}; a bench may allow unsigned bundles, by classifier.allow_unsigned = true"
+            ) from e
+    run_limited(partial(try_all, found.bundle))
+    return found
 
 
 def port(settings: Config, devices: Devices) -> Port | None:

@@ -363,15 +363,15 @@ def test_a_full_disk_costs_the_record_alone(
 
 
 def test_a_candidate_that_cannot_be_one_is_named(side, tmp_path: Path, default_bundle: Bundle):
-    """Another format, too much memory for two models, failing golden sweeps, and a folder that is a
+    """Another format, two large models, failing golden sweeps, and a folder that is a
     file are errors that say what to try."""
     with pytest.raises(BundleError, match="wants 4x4 uint8"):
         side(lambda b: default_bundle)
     with pytest.raises(
         BundleError,
-        match=r"bbbbbbbb may need 179 MB and the bundle in service \d+, .* without a shadow",
+        match=r"bbbbbbbb .* \d+ bytes together",
     ):
-        side(lambda b: replace(b, id="bbbbbbbb", memory=shadow.MOST_MEMORY - b.memory + 1))
+        side(lambda b: replace(b, id="bbbbbbbb", model=bytes(shadow.MOST_MODELS)))
     with pytest.raises(BundleError, match="golden sweeps"):
         side(lambda b: replace(b, golden_logits=b.golden_logits[:, ::-1].copy()))
     assert shadow.read(tmp_path / "shadow").starts == 0  # a refusal does not count as a crash

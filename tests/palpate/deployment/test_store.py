@@ -289,7 +289,7 @@ def test_what_was_checked_is_what_is_written(box: Delivery):
             lambda b: os.kill(os.getpid(), signal.SIGKILL),
             "killed the process that tried it .SIGKILL",
         ),
-        (lambda b: bytearray(1 << 30), "asks for more than 256 MB"),
+        (lambda b: bytearray(1 << 30), "asks for more than 192 MB"),
         (lambda b: [][0], "cannot be run: IndexError"),
     ],
     ids=["dies", "asks for memory", "raises"],
