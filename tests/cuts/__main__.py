@@ -1,8 +1,7 @@
 """Cuts every scene at every crash point: `python -m tests.cuts [SCENE ...]`.
 
 Prints a line for each command, and writes to build/cuts.jsonl a line for each crash point, with the
-machine and the commit. An interrupted run is continued as long as neither the box nor the scenes
-have changed. The exit code is 1 if anything is wrong.
+machine and the commit. The exit code is 1 if anything is wrong.
 """
 
 from __future__ import annotations
@@ -11,16 +10,16 @@ import argparse
 import json
 import os
 import platform
-import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
-from tests.cuts import black_box, calls, delivery, recording, teaching, tree
-from tests.cuts.scene import ROOT, CrashPoint, CutScene, ScenePlay, stage
+from palpate.core.provenance import commit
+from tests.cuts import black_box, calls, delivery, recording, teaching
+from tests.cuts.scene import CrashPoint, CutScene, ScenePlay, stage
+from tests.factories.paths import ROOT
 
 SCENES: dict[str, Callable[[Path], CutScene]] = {
     "recording": lambda beside: recording.scene(),
@@ -57,79 +56,41 @@ def main() -> int:
         parser.error(f"no scene {', '.join(sorted(wrong))}; there are {', '.join(SCENES)}")
     if lack := calls.lacking():
         sys.exit(f"cuts: needs {lack}")
-    ledger = CrashPointLog(given.out)
-    for name in given.scenes or SCENES:
-        with TemporaryDirectory(prefix="cuts-") as beside:
-            for point in cut(SCENES[name](Path(beside)), ledger, HOWS if given.twice else HOWS[:2]):
-                print(".", end="", flush=True)
-                for wrong in point.wrong:
-                    print(
-                        f"\n{point.scene}: {point.step}: {point.how} before {point.call}: {wrong}",
-                        flush=True,
-                    )
-    print("", *figures(ledger.points()), sep="\n")
-    return 1 if any(point.wrong for point in ledger.points()) else 0
-
-
-class CrashPointLog:
-    """Crash points by their moments: one line of a file each, under a head that names the code and
-    the machine."""
-
-    def __init__(self, path: Path) -> None:
-        self._path, head = path, json.dumps(_head())
-        path.parent.mkdir(parents=True, exist_ok=True)
-        first, *lines = path.read_text().splitlines() if path.exists() else [""]
-        lines = [
-            line for line in lines if first == head and line.endswith("}")
-        ]  # the last line may be incomplete
-        path.write_text("".join(f"{line}\n" for line in (head, *lines)))
-        self._points = [_point(json.loads(line)) for line in lines]
-
-    def points(self, scene: str = "") -> list[CrashPoint]:
-        """The points of a scene, or of all scenes."""
-        return [point for point in self._points if scene in ("", point.scene)]
-
-    def add(self, point: CrashPoint) -> None:
-        """Append a point to the file."""
-        self._points.append(point)
-        with self._path.open("a") as file:
-            file.write(json.dumps(asdict(point)) + "\n")
-
-
-def _point(reported: dict[str, Any]) -> CrashPoint:
-    return CrashPoint(**reported | {"wrong": tuple(reported["wrong"])})
+    given.out.parent.mkdir(parents=True, exist_ok=True)
+    points = []
+    with given.out.open("w") as out:
+        print(json.dumps(_head()), file=out)
+        for name in given.scenes or SCENES:
+            with TemporaryDirectory(prefix="cuts-") as beside:
+                for point in cut(SCENES[name](Path(beside)), HOWS if given.twice else HOWS[:2]):
+                    points.append(point)
+                    print(json.dumps(asdict(point)), file=out, flush=True)
+                    print(".", end="", flush=True)
+                    for wrong in point.wrong:
+                        where = f"{point.scene}: {point.step}: {point.how} before {point.call}"
+                        print(f"\n{where}: {wrong}", flush=True)
+    print("", *figures(points), sep="\n")
+    return 1 if any(point.wrong for point in points) else 0
 
 
 def _head() -> dict[str, str]:
-    """The head of a log: the commit, a digest of the code itself, and the machine."""
-    git = ("git", "-C", str(ROOT), "describe", "--always", "--dirty")
-    commit = subprocess.run(git, capture_output=True, text=True, check=False).stdout.strip()
-    sources = (tree.read(ROOT / folder) for folder in ("appliance/palpate", "tests/cuts"))
-    digests = [
-        tree.digest({name: held for name, held in s.items() if "__pycache__" not in name})
-        for s in sources
-    ]
+    """The commit and the machine."""
     return {
-        "commit": commit,
-        "source": "".join(d[:16] for d in digests),
+        "commit": commit(),
         "kernel": platform.platform(),
         "machine": f"{platform.machine()}, {os.cpu_count()} cores",
         "python": platform.python_version(),
     }
 
 
-def cut(scene: CutScene, ledger: CrashPointLog, hows: Sequence[str] = HOWS) -> Iterator[CrashPoint]:
-    """Cut a scene in these ways at all points that are not in the log yet; each is appended to
-    it."""
-    done = {(point.step, point.how, point.moment) for point in ledger.points(scene.name)}
+def cut(scene: CutScene, hows: Sequence[str] = HOWS) -> Iterator[CrashPoint]:
+    """Cut a scene in these ways at all its points."""
     with stage() as work:
         play = ScenePlay(scene, Path(work))
         for how in hows:
             for moment in play.moments():
-                at = scene.steps[moment.step].name, how, moment.number
-                if at not in done and (how == "power" or moment.call):
-                    ledger.add(point := getattr(play, how)(moment))
-                    yield point
+                if how == "power" or moment.call:
+                    yield getattr(play, how)(moment)
 
 
 def figures(points: Iterable[CrashPoint]) -> Iterator[str]:

@@ -1,7 +1,7 @@
 """`python -m tests.rig.soak --hours 1`: boxes sweep without pause, and each sentence is judged.
 
 The results are a record of each box, a page with four charts, and exit code 1 if a target was
-missed. A process of its own records each box. An interrupted soak is continued by the next run.
+missed. A process of its own records each box.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ import math
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, replace
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -41,8 +41,6 @@ GRACE_S = 5.0
 awaited."""
 MARGIN_S = 0.5
 """A box is stopped this far inside a sweep, so that the sweep has certainly begun."""
-SAME = ("box", "commit", "bundle", "format", "machine", "versions")
-"""Entries that must be equal in records whose runs are joined."""
 NOTED = 200
 """Largest number of faults of a run that are recorded in full; a permanent fault would fill the
 disk."""
@@ -194,16 +192,6 @@ def progress(run: SoakRun) -> str:
     )
 
 
-def restore(path: Path, about: Mapping[str, Any]) -> tuple[list[SoakRun], str]:
-    """The runs of an interrupted soak and its start time. The list is empty and the time is now if
-    there is no record, or if its code, seed or machine differ."""
-    if path.exists():
-        held = json.loads(path.read_text())
-        if all(held.get(name) == value for name, value in about.items()):
-            return [SoakRun(**run) for run in held["runs"]], held["started"]
-    return [], datetime.now(UTC).isoformat(timespec="seconds")
-
-
 def write(path: Path, content: Mapping[str, Any]) -> None:
     """Write JSON whole or not at all, one row on each line."""
     storage.put(path, (_text(content) + "\n").encode(), parents=True)
@@ -235,7 +223,7 @@ def soak(
     stopped: Callable[[], bool] = lambda: False,
     log: Callable[[str], None] = print,
 ) -> Path:
-    """Record one box for the rest of `hours`; returns its record."""
+    """Record one box for `hours`; returns its record."""
     path = _record(work, box.name)
     about = {
         "box": box.name,
@@ -245,68 +233,24 @@ def soak(
         "format": str(skin.FORMAT),
         **box.about(),
     }
-    runs, started = restore(path, about)
-    done_s = sum(run.length_s for run in runs)
-    if done_s >= hours * 3600 - 1:
-        log(f"{box.name}: {done_s / 3600:.2f} h are there already; remove {path} to begin anew")
-        return path
-    run = SoakRun(seed + len(runs), done_s)
-    runs.append(run)
+    run, started = SoakRun(seed, 0.0), datetime.now(UTC).isoformat(timespec="seconds")
 
     def save() -> None:
-        write(path, about | {"started": started, "hours": hours, "runs": [asdict(r) for r in runs]})
+        write(path, about | {"started": started, "hours": hours, "runs": [asdict(run)]})
 
-    record(box, run, hours * 3600 - done_s, save, stopped=stopped, log=log)
+    record(box, run, hours * 3600, save, stopped=stopped, log=log)
     log(f"{box.name}: ended ({run.ended}); {progress(run)}")
     return path
 
 
-def joined(records: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """One record made of soaks that ran side by side. Their runs follow each other as if they had
-    been interrupted.
+def draw(work: Path, out: Path, page: Path) -> bool:
+    """Check the records against the targets, and write results and page; False if a target was
+    missed.
 
-    Raises ValueError if boxes or code differ, or if two have the same seed.
+    out: the file of results. A box without a record in `work` keeps its record in `out`.
     """
-    first, *others = records
-    runs = [SoakRun(**run) for run in first["runs"]]
-    for other in others:
-        for name in SAME:
-            if other[name] != first[name]:
-                raise ValueError(
-                    f"{name} is {other[name]!r} in one record, {first[name]!r} in another; "
-                    "join like ones"
-                )
-        for run in (SoakRun(**run) for run in other["runs"]):
-            if any(run.seed == held.seed for held in runs):
-                raise ValueError(
-                    f"two runs have the seed {run.seed}: the same sweeps; "
-                    "give each soak its own --seed"
-                )
-            runs.append(_moved(run, sum(held.length_s for held in runs)))
-    return first | {"runs": [asdict(run) for run in runs]}
-
-
-def _moved(run: SoakRun, began_s: float) -> SoakRun:
-    later_s = began_s - run.began_s
-    rows = {
-        name: [[round(s + later_s, 2), *rest] for s, *rest in getattr(run, name)]
-        for name in ("answers", "samples", "faults")
-    }
-    return replace(run, began_s=began_s, **rows)
-
-
-def draw(works: Sequence[Path], out: Path, page: Path) -> bool:
-    """Join the records, check them against the targets, and write results and page; False if a
-    target was missed.
-
-    out: the file of results. A box without a record in `works` keeps its record in `out`.
-    """
-    records = _drawn(out)
-    for name in BOXES:
-        if held := [
-            json.loads(path.read_text()) for work in works if (path := _record(work, name)).exists()
-        ]:
-            records.append(joined(held))
+    paths = [path for name in BOXES if (path := _record(work, name)).exists()]
+    records = _drawn(out) + [json.loads(path.read_text()) for path in paths]
     boxes = {box["box"]: box | {"sums": soak_judge.sums(box)} for box in records}
     results = {
         "columns": {"answers": soak_judge.ANSWER, "samples": soak_judge.SAMPLE},
@@ -360,15 +304,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--box", choices=BOXES, help="record this one alone, and draw nothing")
     parser.add_argument(
-        "--beside",
-        type=Path,
-        action="append",
-        default=[],
-        metavar="WORK",
-        help="where a soak with another --seed is kept, whose runs are joined when the page is "
-        "drawn",
-    )
-    parser.add_argument(
         "--draw",
         action="store_true",
         help="only draw the records that are there, and those in --out",
@@ -396,10 +331,7 @@ def main() -> int:
     arguments = ["--seed", str(args.seed), "--hours", repr(hours)]
     arguments += ["--work", str(args.work.resolve())]
     recorded = args.draw or _together(arguments)
-    try:
-        reached = draw([args.work, *args.beside], args.out, args.page)
-    except ValueError as e:  # records stay where they are
-        parser.error(str(e))
+    reached = draw(args.work, args.out, args.page)
     return 0 if reached and recorded else 1
 
 

@@ -37,7 +37,6 @@ from tests.factories.bridges import bridge
 from tests.factories.paths import ROOT
 from tests.rig.soak_boxes import Script, ThisMachine
 from tests.robots import page
-from tests.robots.attacked import attack, said
 from tests.robots.shared_line import SharedLine
 from tests.skins.load import BOX, hurry
 
@@ -148,6 +147,20 @@ def listen(both: dict[str, BoxSide], seconds: float, *, measured: bool) -> None:
         raise failed[0]
     for side in both.values() if measured else ():
         side.look()
+
+
+def attack(stack: ExitStack, kind: str, port: int) -> subprocess.Popen[bytes]:
+    """Start hostile peers; they end with their input, and then report their counts."""
+    command, pipe = (
+        [sys.executable, "-m", "tests.robots.attackers", kind, str(port)],
+        subprocess.PIPE,
+    )
+    return stack.enter_context(subprocess.Popen(command, stdin=pipe, stdout=pipe, cwd=ROOT))
+
+
+def said(attackers: subprocess.Popen[bytes]) -> dict[str, int]:
+    """End the peers; returns their counts."""
+    return dict(json.loads(attackers.communicate(b"\n", timeout=30)[0]))
 
 
 @contextmanager
