@@ -137,7 +137,7 @@ def test_the_soak_is_drawn_of_its_results(tmp_path: Path):
     """Without a new record its results stay the same, as the build of the site needs."""
     file = tmp_path / "soak.json"
     file.write_bytes((RESULTS / "soak.json").read_bytes())
-    assert soak.draw([tmp_path], file, tmp_path / "page")
+    assert soak.draw(tmp_path, file, tmp_path / "page")
     assert file.read_bytes() == (RESULTS / "soak.json").read_bytes()
 
 
