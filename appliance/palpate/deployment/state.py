@@ -7,14 +7,14 @@ This module only computes; `store` reads and writes the file. Bundles are identi
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from palpate.core.errors import BundleError
 from palpate.core.schema import typed
 
-STATE_FILE, OLD_STATE_FILE = "bundles.json", "ledger.json"
-"""The file of a StoreState, and its name in earlier versions."""
+STATE_FILE = "bundles.json"
+"""The file of a StoreState."""
 PACKAGED = ""
 """The bundle that comes with the program. It is never on trial."""
 MOST_STARTS = 3
@@ -135,28 +135,8 @@ class StoreState:
     @classmethod
     def parse(cls, text: bytes) -> StoreState:
         """The state in the content of bundles.json. Raises ValueError or TypeError for wrong
-        content.
-
-        Unknown fields are ignored: after a downgrade the program must still read the file of a
-        newer version. The file that this version writes does not have them, and a newer version
-        takes their defaults.
-        """
+        content."""
         raw = json.loads(text)
-        if isinstance(raw, dict):
-            if "standings" not in raw:
-                raise TypeError("it has no standings")
-            if isinstance(raw["standings"], dict):
-                raw["standings"] = {
-                    sha: _known(Standing, one) for sha, one in raw["standings"].items()
-                }
-        return typed(cls, _known(cls, raw))
-
-
-def _known(kind: type[Standing | StoreState], raw: Any) -> Any:
-    """The JSON object `raw` without the fields that `kind` does not have."""
-    names = {f.name for f in fields(kind)}
-    return (
-        {name: value for name, value in raw.items() if name in names}
-        if isinstance(raw, dict)
-        else raw
-    )
+        if isinstance(raw, dict) and "standings" not in raw:
+            raise TypeError("it has no standings")
+        return typed(cls, raw)

@@ -46,7 +46,6 @@ from palpate.deployment.signed import PACKAGER, BundleFolder, SignedBundle
 from palpate.deployment.state import (
     MOST_CUTS,
     MOST_STARTS,
-    OLD_STATE_FILE,
     PACKAGED,
     STATE_FILE,
     StoreState,
@@ -93,7 +92,6 @@ class Store:
         key = EnrolmentKey(settings.enrolment_key)
         self.bundles = BundleFolder(self.folder / "bundles", settings.signers, key, taught=taught)
         self._link, self._state_file = self.folder / "current", self.folder / STATE_FILE
-        self._old_state_file = self.folder / OLD_STATE_FILE
         self._clock, self._boot_file = clock or SystemClock(), boot
 
     @property
@@ -113,21 +111,13 @@ class Store:
 
     @property
     def state(self) -> StoreState:
-        """The state of the bundles; empty if nothing was ever deployed.
-
-        In a store of an earlier version the old file is read until the first write.
-        """
-        # the new file is tried twice: a writer may replace the old file between the two reads
-        for path in (self._state_file, self._old_state_file, self._state_file):
-            with suppress(FileNotFoundError):
-                return self._parsed(path)
-        return StoreState()
-
-    def _parsed(self, path: Path) -> StoreState:
-        """The state in a file. Raises FileNotFoundError, and BundleError for invalid content."""
-        text = path.read_bytes()
+        """The state of the bundles; empty if nothing was ever deployed. Raises BundleError for
+        invalid content."""
+        path = self._state_file
         try:
-            return StoreState.parse(text)
+            return StoreState.parse(path.read_bytes())
+        except FileNotFoundError:
+            return StoreState()
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as e:
             raise BundleError(
                 f"{path} cannot be read: {e}; without this file the current bundle counts as "
@@ -328,8 +318,7 @@ class Store:
 
     def _warn_of_removed_state(self) -> None:
         """Say so if bundles were deployed and their state is gone."""
-        files = (self._state_file, self._old_state_file)
-        if os.path.lexists(self._link) and not any(map(os.path.lexists, files)):
+        if os.path.lexists(self._link) and not os.path.lexists(self._state_file):
             log.warning(
                 f"{self._state_file} is missing although bundles were deployed: it is not known"
                 " which counters were committed, so older bundles are accepted again; find out who"
@@ -374,8 +363,6 @@ class Store:
 
     def _write(self, state: StoreState) -> None:
         storage.put(self._state_file, state.json())
-        # removed last: while both files exist, the new file is valid
-        self._old_state_file.unlink(missing_ok=True)
 
     def _set_current(self, sha: str) -> None:
         """Make `current` lead to a bundle, in one step."""

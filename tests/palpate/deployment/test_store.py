@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import signal
@@ -455,92 +454,6 @@ def test_a_state_that_cannot_be_read_is_named(box: Delivery, text: str):
     box.installed(1)
     Path(box.how.folder, "bundles.json").write_text(text)
     with pytest.raises(BundleError, match=r"bundles\.json cannot be read"):
-        box.start()
-
-
-@pytest.mark.slow
-def test_a_program_that_was_gone_back_to_reads_what_a_newer_one_wrote(box: Delivery):
-    """After a downgrade the program ignores unknown fields of the store and its bundles. Bundle,
-    trial and counter are unchanged, and the newer program can read the file of the older
-    program."""
-    one, two = box.committed(1), box.installed(2)
-    ledger = Path(box.how.folder, "bundles.json")
-    newer = json.loads(ledger.read_text()) | {"format": 9, "kept": {"a": [1]}}
-    newer["standings"] = {
-        sha: held | {"heat": 4.5, "owner": {"name": "x"}}
-        for sha, held in newer["standings"].items()
-    }
-    assert two in newer["standings"]
-    ledger.write_text(json.dumps(newer))
-    assert box.start() == two
-    assert box.store.state.of(two).starts == 1
-    assert box.store.commit()
-    assert box.store.rollback() == one == box.start()
-    assert "heat" not in ledger.read_text()
-    with pytest.raises(BundleError, match="counter 1, and 2 was committed"):
-        box.store.install(box.made(1, name="older"))
-
-
-@pytest.mark.slow
-def test_a_box_that_is_upgraded_keeps_its_trial_and_its_counter(box: Delivery):
-    """An earlier version named the file ledger.json. The trial goes on, the counter holds, and one
-    file is left."""
-    one, two = box.committed(1), box.installed(2)
-    assert box.start() == two
-    new, old = (Path(box.how.folder, name) for name in ("bundles.json", "ledger.json"))
-    new.rename(old)
-    before = box.store.state
-    assert (before.counter, before.of(two).starts, before.of(two).previous) == (1, 1, one)
-    assert not new.exists()  # reading writes nothing
-    assert box.start() == two
-    assert box.store.state.of(two).starts == 2
-    assert new.exists()
-    assert not old.exists()
-    assert box.start() == two
-    assert box.start() == one  # after three starts without a commit
-    with pytest.raises(BundleError, match="counter 0, and 1 was committed"):
-        box.store.install(box.made(0, name="older"))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("cut", ["before the new file", "before the old one goes"])
-def test_a_power_cut_during_the_upgrade_loses_no_state(
-    box: Delivery, cut: str, monkeypatch: pytest.MonkeyPatch
-):
-    """The start may be counted or not. Bundle, counter and the way back are kept."""
-    one, two = box.committed(1), box.installed(2)
-    new, old = (Path(box.how.folder, name) for name in ("bundles.json", "ledger.json"))
-    new.rename(old)
-
-    class PowerCutError(BaseException):
-        """Ends the program at once, as a power cut does."""
-
-    def off(*_: object, **__: object) -> None:
-        raise PowerCutError
-
-    with monkeypatch.context() as patch:
-        if cut == "before the new file":
-            patch.setattr(store.storage, "put", off)
-        else:
-            patch.setattr(Path, "unlink", off)
-        with pytest.raises(PowerCutError):
-            box.store.choose()
-    counted = int(cut != "before the new file")
-    assert (old.exists(), new.exists()) == (True, bool(counted))
-    state = box.store.state
-    assert (state.counter, state.of(two).starts, state.of(two).previous) == (1, counted, one)
-    assert box.start() == two
-    assert box.store.state.of(two).starts == counted + 1
-    assert not old.exists()
-
-
-def test_an_old_state_that_cannot_be_read_is_named(box: Delivery):
-    """The state of an earlier version is not guessed either."""
-    box.installed(1)
-    new, old = (Path(box.how.folder, name) for name in ("bundles.json", "ledger.json"))
-    new.unlink()
-    old.write_text("{")
-    with pytest.raises(BundleError, match=r"ledger\.json cannot be read"):
         box.start()
 
 
