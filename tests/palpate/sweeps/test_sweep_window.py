@@ -1,6 +1,8 @@
 """SweepCutter: every trigger gets one answer, and the window is the middle of the sweep to the
 frame."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -14,12 +16,12 @@ from palpate.sweeps.sweep_window import SweepCutter
 from tests.factories.simulated_box import SECOND, numbered
 
 FMT = skin.FORMAT
-PERIOD = FMT.period_ns
+START, STOP = EdgeKind.START, EdgeKind.STOP
 
 
 def t_ns(frame: float) -> int:
     """The time at which a frame is taken."""
-    return 10 * SECOND + round(frame * PERIOD)
+    return 10 * SECOND + round(frame * FMT.period_ns)
 
 
 def frames(
@@ -27,18 +29,14 @@ def frames(
 ) -> Frames:
     """Frames `first` to `first + n` without those in `drop`."""
     seq = np.array([i for i in range(first, first + n) if i not in drop])
-    taxels = numbered(first + n, format)[seq]
-    return Frames(
-        10 * SECOND + np.rint(seq * format.period_ns).astype(np.int64),
-        seq + (epoch << EPOCH_BITS),
-        taxels,
-    )
+    at_ns = 10 * SECOND + np.rint(seq * format.period_ns).astype(np.int64)
+    return Frames(at_ns, seq + (epoch << EPOCH_BITS), numbered(first + n, format)[seq])
 
 
 class Bench:
     """A SweepCutter with its own time."""
 
-    def __init__(self, format: SweepFormat = FMT, **settings) -> None:
+    def __init__(self, format: SweepFormat = FMT, **settings: Any) -> None:
         self.recorder = SweepCutter(format, SweepConfig(**settings))
         self.now = 10 * SECOND
 
@@ -57,64 +55,95 @@ class Bench:
         self.now += round(after_s * SECOND)
         return self.recorder.finished(self.now)
 
+    def steps(self, steps: int = 9) -> list[Sweep]:
+        """The open sweep at the steps that were reached."""
+        return list(self.recorder.so_far(steps, self.now))
 
-def sweep_of(drop: tuple[int, ...] = (), start: int = 500, stop: int = 2750) -> Sweep:
-    """A three-second sweep with some missing frames."""
-    bench = Bench()
-    bench.put(frames(0, 3000, drop))
-    bench.edge(EdgeKind.START, start)
-    bench.edge(EdgeKind.STOP, stop)
+
+def sweep_of(some: Frames, start: float = 500, stop: float = 2750, format: Any = FMT) -> Sweep:
+    """The sweep between two edges, three seconds by default."""
+    bench = Bench(format)
+    bench.put(some)
+    bench.edge(START, start)
+    bench.edge(STOP, stop)
     (sweep,) = bench.done()
     return sweep
 
 
+SCRIPTS = {
+    "one frame less than the window": """frames 0 3000; start 500; stop 1999; due short;
+        start 500; stop 2000; due ok""",
+    "a gap outside of the window": "frames 0 600; frames 800 2200; start 500; stop 2750; due ok",
+    "frames that never come": """frames 0 2000; start 500; stop 2750; wait 0.4; due; wait 0.2;
+        due gap""",
+    "no frames at all": "start 0; stop 2000; wait 1; due gap",
+    "start without stop": """frames 0 3000; start 100; due; wait 6.2; due long; stop 6000; wait 1;
+        due; frames 7000 3000; start 7100; stop 9400; due ok""",
+    "longer than the limit": "frames 0 4600; start 0; stop 4599; due long",
+    "stop without start": "stop 100; due no-start",
+    "double start": "frames 0 3000; start 100; start 600; due no-stop; stop 2600; due ok",
+    "not ready": "blind 100; due not-ready; stop 2500; wait 1; due",
+    "lost edges": """start 100; lost 200; due edges-lost; stop 2500; wait 1; due; lost 2600;
+        due edges-lost""",
+    "another enumeration": """frames 0 1000; start 500; again 1500 1000; due sensor-lost;
+        stop 2750; wait 1; due""",
+    "two sweeps in flight": """frames 0 1700; start 0; stop 2000; start 2010; due;
+        frames 1700 2900; stop 4400; due ok ok""",
+}
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_each_trigger_is_answered_once(name: str):
+    """In the order of the triggers, and at the time at which it is due. The numbers of the sweeps
+    count from 1."""
+    bench, answers = Bench(late_ms=500, max_duration_s=6), []
+    for step in SCRIPTS[name].split(";"):
+        what, *words = step.split()
+        if what == "due":
+            due = bench.done()
+            assert [str(sweep.status) for sweep in due] == words
+            answers += due
+            continue
+        numbers = [float(word) for word in words]
+        if what in ("frames", "again"):
+            bench.put(frames(*map(int, numbers), epoch=int(what == "again")))
+        elif what == "wait":
+            bench.now += round(numbers[0] * SECOND)
+        else:
+            kind = EdgeKind.LOST if what == "lost" else STOP if what == "stop" else START
+            bench.edge(kind, *numbers, ready=what != "blind")
+    assert [sweep.id for sweep in answers] == list(range(1, len(answers) + 1))
+    assert not bench.recorder.sweeping
+
+
 def test_middle_window():
-    """Start at frame 500, stop at 2750: the window is frames 875 to 2374, unchanged."""
-    sweep = sweep_of()
-    assert sweep.status is Status.OK
+    """Start at frame 500, stop at 2750: the window is frames 875 to 2374, unchanged. A window of an
+    odd number of frames has one frame in its middle."""
+    sweep = sweep_of(frames(0, 3000))
+    assert (sweep.status, sweep.lost) == (Status.OK, 0)
     assert (sweep.frames.seq == np.arange(875, 2375)).all()
     assert (sweep.frames.taxels == numbered(3000)[875:2375]).all()
-    assert sweep.lost == 0
+    odd = SweepFormat(4, 4, 750.0, 101, "uint8")
+    sweep = sweep_of(frames(0, 400, format=odd), 100, 300, odd)
+    assert (len(sweep.frames), sweep.frames.seq[50]) == (101, 200)
 
 
 @given(start=st.integers(100, 1000), length=st.integers(1500, 1900), offset=st.floats(-0.45, 0.45))
 def test_window_lies_in_the_middle_to_the_frame(start: int, length: int, offset: float):
     """For any sweep, the window's middle is the sweep's to one frame, whatever the edges' phase."""
-    bench = Bench()
-    bench.put(frames(0, 3000))
-    bench.edge(EdgeKind.START, start + offset)
-    bench.edge(EdgeKind.STOP, start + length + offset)
-    (sweep,) = bench.done()
+    sweep = sweep_of(frames(0, 3000), start + offset, start + length + offset)
     middle = (sweep.frames.seq[0] + sweep.frames.seq[-1]) / 2
     assert abs(middle - (start + length / 2)) <= 1
-
-
-def test_odd_window():
-    """A window of an odd number of frames has one frame in its middle."""
-    format = SweepFormat(4, 4, 750.0, 101, "uint8")
-    bench = Bench(format)
-    bench.put(frames(0, 400, format=format))
-    bench.edge(EdgeKind.START, 100)
-    bench.edge(EdgeKind.STOP, 300)
-    (sweep,) = bench.done()
-    assert sweep.frames.seq[50] == 200
-    assert len(sweep.frames) == 101
 
 
 def test_every_axis_is_interpolated():
     """A missing frame of a skin with three axes lies between its neighbours on each of them."""
     format = SweepFormat(2, 2, 750.0, 100, "int16", 3)
-    bench = Bench(format)
     whole = frames(0, 400, format=format)
-    whole.taxels[:] = np.arange(400)[:, None, None, None] * np.array([-4, 2, 10]) + np.arange(
-        4
-    ).reshape(2, 2, 1)
-    bench.put(
-        Frames(*(np.delete(x, [200, 201], axis=0) for x in (whole.t_ns, whole.seq, whole.taxels)))
-    )
-    bench.edge(EdgeKind.START, 100)
-    bench.edge(EdgeKind.STOP, 300)
-    (sweep,) = bench.done()
+    slopes = np.arange(400)[:, None, None, None] * np.array([-4, 2, 10])
+    whole.taxels[:] = slopes + np.arange(4).reshape(2, 2, 1)
+    kept = [np.delete(x, [200, 201], axis=0) for x in (whole.t_ns, whole.seq, whole.taxels)]
+    sweep = sweep_of(Frames(*kept), 100, 300, format)
     assert (sweep.status, sweep.lost) == (Status.OK, 2)
     np.testing.assert_array_equal(sweep.frames.taxels, whole.taxels[150:250])
 
@@ -125,9 +154,8 @@ def test_every_axis_is_interpolated():
 def test_short_gaps_are_interpolated_and_counted(drop: tuple[int, ...]):
     """One or two missing frames, also at the window's ends: filled on the line between neighbours,
     counted as lost."""
-    sweep = sweep_of(drop)
-    assert sweep.status is Status.OK
-    assert sweep.lost == len(drop)
+    sweep = sweep_of(frames(0, 3000, drop))
+    assert (sweep.status, sweep.lost) == (Status.OK, len(drop))
     assert sweep.filled is not None
     assert [sweep.frames.seq[i] for i in sweep.filled] == sorted(drop)
     whole = numbered(3000).astype(float)
@@ -143,195 +171,52 @@ def test_short_gaps_are_interpolated_and_counted(drop: tuple[int, ...]):
 def test_wider_gaps_are_not_interpolated(first: int):
     """Three frames in a row that are missing, wholly or partly in the window, make the status
     `gap`, without frames."""
-    sweep = sweep_of(tuple(range(first, first + MAX_GAP + 1)))
-    assert sweep.status is Status.GAP
-    assert len(sweep.frames) == 0
+    sweep = sweep_of(frames(0, 3000, tuple(range(first, first + MAX_GAP + 1))))
+    assert (sweep.status, len(sweep.frames)) == (Status.GAP, 0)
     assert 0 < sweep.lost <= MAX_GAP + 1
 
 
-def test_gap_outside_the_window_does_not_matter():
-    """Frames that the network does not need may be missing."""
-    assert sweep_of(tuple(range(600, 800))).status is Status.OK
-
-
 def test_frames_that_come_after_the_stop_edge_are_waited_for():
-    """The window's last frames are late: no answer until they come; `complete_ns` is the time at
-    which they do."""
+    """The window's last frames are late: `complete_ns` is the time at which they come."""
     bench = Bench()
     bench.put(frames(0, 2000))
-    bench.edge(EdgeKind.START, 500)
-    bench.edge(EdgeKind.STOP, 2750)
+    bench.edge(START, 500)
+    bench.edge(STOP, 2750)
     assert bench.done() == []
     assert bench.recorder.sweeping
     bench.put(frames(2000, 1000))
     (sweep,) = bench.done()
-    assert sweep.status is Status.OK
-    assert sweep.complete_ns == bench.now
-
-
-def test_frames_that_never_come():
-    """After `late_ms` the sweep is answered `gap`."""
-    bench = Bench(late_ms=500)
-    bench.put(frames(0, 2000))
-    bench.edge(EdgeKind.START, 500)
-    bench.edge(EdgeKind.STOP, 2750)
-    assert bench.done(0.4) == []
-    (sweep,) = bench.done(0.2)
-    assert sweep.status is Status.GAP
-
-
-def test_no_frames_at_all():
-    """Edges on a skin that never sent a frame: `gap`."""
-    bench = Bench()
-    bench.edge(EdgeKind.START, 0)
-    bench.edge(EdgeKind.STOP, 2000)
-    (sweep,) = bench.done(1)
-    assert (sweep.status, sweep.lost) == (Status.GAP, 1500)
-
-
-def one(bench: Bench, after_s: float = 0) -> Status:
-    """The one answer that is due."""
-    (sweep,) = bench.done(after_s)
-    return sweep.status
-
-
-def test_short():
-    """A sweep that is one frame shorter than the window is refused, a sweep of the window's length
-    is not."""
-    bench = Bench()
-    bench.put(frames(0, 3000))
-    bench.edge(EdgeKind.START, 500)
-    bench.edge(EdgeKind.STOP, 1999)
-    assert one(bench) is Status.SHORT
-    bench.edge(EdgeKind.START, 500)
-    bench.edge(EdgeKind.STOP, 2000)
-    assert one(bench) is Status.OK
-
-
-def test_start_without_stop():
-    """No stop edge within `max_duration_s`: `long`, once; the late stop edge gives no answer, the
-    next sweep is cut as usual."""
-    bench = Bench(max_duration_s=4)
-    bench.put(frames(0, 3000))
-    bench.edge(EdgeKind.START, 100)
-    assert bench.done() == []
-    assert one(bench, 4.2) is Status.LONG
-    bench.edge(EdgeKind.STOP, 4000)
-    assert bench.done(1) == []
-    bench.put(frames(5000, 3000))
-    bench.edge(EdgeKind.START, 5100)
-    bench.edge(EdgeKind.STOP, 7400)
-    assert one(bench) is Status.OK
-
-
-def test_longer_than_the_limit():
-    """Both edges come at once, but lie too far apart: `long`."""
-    bench = Bench(max_duration_s=3)
-    bench.put(frames(0, 3000))
-    bench.edge(EdgeKind.START, 0)
-    bench.recorder.trigger([Edge(EdgeKind.STOP, t_ns(2999))], True, bench.now)
-    assert one(bench) is Status.LONG
-
-
-def test_stop_without_start():
-    """A lone stop edge is answered."""
-    bench = Bench()
-    bench.edge(EdgeKind.STOP, 100)
-    assert one(bench) is Status.NO_START
-
-
-def test_double_start():
-    """The first sweep is answered `no-stop`, the second goes on."""
-    bench = Bench()
-    bench.put(frames(0, 3000))
-    bench.edge(EdgeKind.START, 100)
-    bench.edge(EdgeKind.START, 600)
-    first = bench.done()
-    bench.edge(EdgeKind.STOP, 2600)
-    second = bench.done()
-    assert [(s.id, s.status) for s in first + second] == [(1, Status.NO_STOP), (2, Status.OK)]
-    assert second[0].frames.seq[0] == 850
-
-
-def test_not_ready():
-    """A start edge is answered at once if the box is not ready. Its stop edge gives no second
-    answer."""
-    bench = Bench()
-    bench.edge(EdgeKind.START, 100, ready=False)
-    assert one(bench) is Status.NOT_READY
-    assert not bench.recorder.sweeping
-    bench.edge(EdgeKind.STOP, 2500)
-    assert bench.done(1) == []
-
-
-def test_lost_edges():
-    """Edges dropped by the kernel end the open sweep. Without an open sweep the loss is answered,
-    too."""
-    bench = Bench()
-    bench.edge(EdgeKind.START, 100)
-    bench.edge(EdgeKind.LOST, 200)
-    assert one(bench) is Status.EDGES_LOST
-    bench.edge(EdgeKind.STOP, 2500)
-    assert bench.done(1) == []
-    bench.edge(EdgeKind.LOST, 2600)
-    assert one(bench) is Status.EDGES_LOST
+    assert (sweep.status, sweep.complete_ns) == (Status.OK, bench.now)
 
 
 @pytest.mark.parametrize("ready", [False, True])
-def test_a_start_beside_lost_edges_gets_one_answer(ready: bool):
+def test_a_start_with_lost_edges_gets_one_answer(ready: bool):
     """Both come in one turn, with the trigger blind already or not: the sweep is answered once."""
     bench = Bench()
-    edges = [Edge(EdgeKind.START, t_ns(100)), Edge(EdgeKind.LOST, t_ns(101))]
+    edges = [Edge(START, t_ns(100)), Edge(EdgeKind.LOST, t_ns(101))]
     bench.recorder.trigger(edges, ready, bench.now)
-    assert one(bench) is (Status.EDGES_LOST if ready else Status.NOT_READY)
-
-
-def test_new_enumeration_cuts_the_sweep():
-    """Frames of a skin that was plugged in again end the sweep that began before, at once."""
-    bench = Bench()
-    bench.put(frames(0, 1000))
-    bench.edge(EdgeKind.START, 500)
-    bench.put(frames(1500, 1000, epoch=1))
-    assert one(bench) is Status.SENSOR_LOST
-    bench.edge(EdgeKind.STOP, 2750)
-    assert bench.done(1) == []
-
-
-def test_two_sweeps_in_flight_keep_their_order():
-    """A second sweep starts before the frames of the first have arrived: both are answered, in
-    order."""
-    bench = Bench()
-    bench.put(frames(0, 1700))
-    bench.edge(EdgeKind.START, 0)
-    bench.edge(EdgeKind.STOP, 2000)
-    bench.edge(EdgeKind.START, 2010)
-    assert bench.done() == []
-    bench.put(frames(1700, 2900))
-    bench.edge(EdgeKind.STOP, 4400)
-    assert [(s.id, s.status) for s in bench.done()] == [(1, Status.OK), (2, Status.OK)]
+    want = Status.EDGES_LOST if ready else Status.NOT_READY
+    assert [sweep.status for sweep in bench.done()] == [want]
 
 
 def test_objects_are_counted():
     """NEW OBJECT numbers the sweeps that start after it."""
     bench = Bench()
     bench.put(frames(0, 3000))
-    seen = []
     for begin in (0, 700):
-        bench.edge(EdgeKind.START, begin)
+        bench.edge(START, begin)
         bench.edge(EdgeKind.NEW_OBJECT, begin + 5)
-        bench.edge(EdgeKind.STOP, begin + 1600)
-        seen += [s.object for s in bench.done()]
-    assert seen == [0, 1]
+        bench.edge(STOP, begin + 1600)
+    assert [s.object for s in bench.done()] == [0, 1]
 
 
 def test_the_ring_overwrites_only_old_frames():
-    """After many turns of the ring a window is still cut correctly. An overwritten window is a
-    `gap`."""
+    """After many turns of the ring a window is still cut correctly."""
     bench = Bench(max_duration_s=4)
     for first in range(0, 30_000, 750):
         bench.put(frames(first, 750))
-    bench.edge(EdgeKind.START, 27_000)
-    bench.edge(EdgeKind.STOP, 29_000)
+    bench.edge(START, 27_000)
+    bench.edge(STOP, 29_000)
     (sweep,) = bench.done()
     assert (sweep.frames.seq == np.arange(27_250, 28_750)).all()
     assert (sweep.frames.taxels == numbered(30_000)[27_250:28_750]).all()
@@ -347,51 +232,41 @@ def test_latest_is_complete_or_none():
     assert bench.recorder.latest(10) is None
 
 
-def steps_of(bench: Bench, steps: int = 9) -> list[Sweep]:
-    """The open sweep at the steps that were reached."""
-    return list(bench.recorder.so_far(steps, bench.now))
-
-
 @pytest.mark.parametrize("packet", [1, 6, 40, 1000])
 def test_an_open_sweep_so_far(packet: int):
     """Nine steps of 150 frames, counted from `lead_ms` after the start edge, each once, however the
     frames come."""
-    bench = Bench(lead_ms=400)
+    bench, seen = Bench(lead_ms=400), []
     bench.put(frames(0, 510))
-    assert steps_of(bench) == []
-    bench.edge(EdgeKind.START, 500)
-    seen = []
+    assert bench.steps() == []
+    bench.edge(START, 500)
     for first in range(510, 2600, packet):
         bench.put(frames(first, packet))
-        for sweep in steps_of(bench):
-            assert sweep.complete_ns == bench.now
-            seen.append(sweep)
-    assert [(len(s.frames), s.share) for s in seen] == [(150 * d, d / 10) for d in range(1, 10)]
-    for s in seen:
-        assert (s.frames.seq[0], s.start_ns, s.stop_ns) == (
-            800,
-            t_ns(500),
-            t_ns(800 + len(s.frames) - 1),
-        )
-        assert (s.frames.taxels == numbered(3000)[800 : 800 + len(s.frames)]).all()
-    bench.edge(EdgeKind.STOP, 2750)
+        seen += [(sweep, bench.now) for sweep in bench.steps()]
+    assert [s.share for s, _ in seen] == [d / 10 for d in range(1, 10)]
+    for d, (s, now) in enumerate(seen, 1):
+        last = 800 + 150 * d
+        assert (s.frames.taxels == numbered(3000)[800:last]).all()
+        assert (s.frames.seq[0], s.start_ns, s.stop_ns) == (800, t_ns(500), t_ns(last - 1))
+        assert s.complete_ns == now
+    bench.edge(STOP, 2750)
     bench.put(frames(2600, 400))
-    assert steps_of(bench) == []
-    assert one(bench) is Status.OK
+    assert bench.steps() == []
+    assert [sweep.status for sweep in bench.done()] == [Status.OK]
 
 
 def test_a_sweep_has_the_speed_and_force_of_its_start_edge():
     """While it is open and finished, with a window or without; the next sweep has its own."""
     bench = Bench()
     bench.put(frames(0, 1500))
-    bench.edge(EdgeKind.START, 500, speed_mm_s=30.0)
-    bench.edge(EdgeKind.START, 600, speed_mm_s=60.0, force_n=1.5)
-    (early, *_) = steps_of(bench)
+    bench.edge(START, 500, speed_mm_s=30.0)
+    bench.edge(START, 600, speed_mm_s=60.0, force_n=1.5)
+    (early, *_) = bench.steps()
     bench.put(frames(1500, 1500))
-    bench.edge(EdgeKind.STOP, 2750)
-    bench.edge(EdgeKind.START, 2760)
-    bench.edge(EdgeKind.STOP, 2770)
-    bench.edge(EdgeKind.STOP, 2780)
+    bench.edge(STOP, 2750)
+    bench.edge(START, 2760)
+    bench.edge(STOP, 2770)
+    bench.edge(STOP, 2780)
     found = [(s.status, s.speed_mm_s, s.force_n) for s in (early, *bench.done())]
     assert found == [
         (Status.OK, 60.0, 1.5),
@@ -406,80 +281,70 @@ def test_steps_of_a_window_that_does_not_divide():
     """Ten frames in three steps: 3, 5 and 8 of them, so that no head lacks a frame of its step."""
     format = SweepFormat(4, 4, 750.0, 10, "uint8")
     bench = Bench(format, lead_ms=0)
-    bench.edge(EdgeKind.START, 0)
+    bench.edge(START, 0)
     bench.put(frames(0, 7, format=format))
-    assert [len(s.frames) for s in steps_of(bench, 3)] == [3, 5]
+    assert [len(s.frames) for s in bench.steps(3)] == [3, 5]
     bench.put(frames(7, 1, format=format))
-    assert [len(s.frames) for s in steps_of(bench, 3)] == [8]
+    assert [len(s.frames) for s in bench.steps(3)] == [8]
 
 
 def test_no_step_lies_beyond_a_gap():
     """Three missing frames end the steps, also later ones; two are interpolated, from both
     sides."""
     bench = Bench(lead_ms=0)
-    bench.edge(EdgeKind.START, 0)
+    bench.edge(START, 0)
     bench.put(frames(0, 1000, (148, 149, 400, 401, 402)))
-    seen = steps_of(bench)
+    seen = bench.steps()
     assert [(len(s.frames), s.lost) for s in seen] == [(150, 2), (300, 2)]
     assert abs(int(seen[0].frames.t_ns[-1]) - t_ns(149)) < 2
     bench.put(frames(1000, 600))
-    assert steps_of(bench) == []
+    assert bench.steps() == []
 
 
 def test_a_sweep_that_is_settled_has_had_its_answer():
     """No further step, no answer to the stop edge or to any later fault."""
     bench = Bench(lead_ms=0)
     bench.put(frames(0, 400))
-    bench.edge(EdgeKind.START, 0)
+    bench.edge(START, 0)
     for _ in bench.recorder.so_far(9, bench.now):
         bench.recorder.settle()
     assert not bench.recorder.sweeping
     bench.put(frames(400, 400))
-    assert steps_of(bench) == []
+    assert bench.steps() == []
     assert not bench.recorder.interrupt(Status.ABORTED, bench.now)
     assert bench.done(60) == []
-    bench.edge(EdgeKind.STOP, 3000)
+    bench.edge(STOP, 3000)
     assert bench.done(1) == []
 
 
-def test_a_sweep_whose_answer_is_still_to_come_goes_first():
-    """The previous sweep waits for frames after a gap: the open sweep has no step before the
-    previous sweep is answered."""
+def test_steps_wait_for_the_previous_answer_and_for_the_same_skin():
+    """While an earlier sweep waits for frames after a gap the open sweep has no step. Frames of a
+    skin that was plugged in again do not belong to the sweep that was open before."""
     bench = Bench(lead_ms=0)
     bench.put(frames(0, 1700))
-    bench.edge(EdgeKind.START, 0)
-    bench.edge(EdgeKind.STOP, 2000)
-    bench.edge(EdgeKind.START, 2010)
+    bench.edge(START, 0)
+    bench.edge(STOP, 2000)
+    bench.edge(START, 2010)
     bench.put(frames(2000, 400))
-    assert steps_of(bench) == []
-    assert one(bench) is Status.GAP
-    assert [len(s.frames) for s in steps_of(bench)] == [150, 300]
+    assert bench.steps() == []
+    assert [sweep.status for sweep in bench.done()] == [Status.GAP]
+    assert [len(s.frames) for s in bench.steps()] == [150, 300]
+    bench.put(frames(2400, 500, epoch=1))
+    assert bench.steps() == []
+    assert [sweep.status for sweep in bench.done()] == [Status.SENSOR_LOST]
+    bench.edge(START, 2800)
+    bench.put(frames(2900, 100, epoch=1))
+    assert [int(s.frames.seq[0]) - (1 << EPOCH_BITS) for s in bench.steps()] == [2800]
 
 
-def test_steps_begin_with_a_new_enumeration():
-    """Frames of a skin that was plugged in again do not belong to the sweep that was open
-    before."""
-    bench = Bench(lead_ms=0)
-    bench.put(frames(0, 100))
-    bench.edge(EdgeKind.START, 0)
-    bench.put(frames(100, 500, epoch=1))
-    assert steps_of(bench) == []
-    assert one(bench) is Status.SENSOR_LOST
-    bench.edge(EdgeKind.START, 500)
-    bench.put(frames(600, 100, epoch=1))
-    assert [int(s.frames.seq[0]) - (1 << EPOCH_BITS) for s in steps_of(bench)] == [500]
+EDGES = st.tuples(
+    st.sampled_from(list(EdgeKind)), st.booleans(), st.integers(1, 3000), st.integers(0, 8)
+)
 
 
 @pytest.mark.slow
-@given(
-    st.lists(
-        st.tuples(
-            st.sampled_from(list(EdgeKind)), st.booleans(), st.integers(1, 3000), st.integers(0, 8)
-        ),
-        max_size=30,
-    )
-)
-def test_every_start_gets_exactly_one_answer(script):
+@given(st.lists(EDGES, max_size=30))
+def test_every_start_gets_exactly_one_answer(script: list[tuple[EdgeKind, bool, int, int]]):
     """For any edges in any order, with some sweeps settled at a step: each number is answered
     once."""
     bench = Bench(max_duration_s=5, lead_ms=0)
@@ -493,7 +358,7 @@ def test_every_start_gets_exactly_one_answer(script):
                 bench.recorder.settle()
                 answers.append(sweep)
         bench.edge(kind, frame, ready)
-        starts += kind is EdgeKind.START
+        starts += kind is START
         answers += bench.done()
     answers += bench.done(10)
     numbers = [s.id for s in answers]
