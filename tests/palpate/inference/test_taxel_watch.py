@@ -166,7 +166,7 @@ def test_a_bundle_without_the_figure_refuses_as_before(tmp_path: Path):
 
 
 def test_a_bridged_window_without_contact_is_refused(tmp_path: Path):
-    """A stuck taxel alone is no contact."""
+    """A single stuck taxel does not count as contact."""
     taxels = np.where(np.arange(100) % 2, 5, 0).astype(np.int16)[:, None, None] * np.ones(
         (4, 4), np.int16
     )

@@ -361,7 +361,7 @@ def test_trouble_is_logged_once(rigged: Make, logged: list[str]):
 
 
 def test_a_box_without_a_port_logs_none(default_bundle: bundle.Bundle, logged: list[str]):
-    """It runs all the same."""
+    """The box runs without it."""
     simulated = quiet()
     with ExitStack() as stack:
         settings = config.load(None, site=NO_SITE)

@@ -81,7 +81,7 @@ def test_which_speeds_are_measured(changes: dict[str, Any], detail: str):
 
 @pytest.mark.parametrize("proven", [True, False])
 def test_check_says_how_many_broken_taxels_are_bridged(proven: bool):
-    """And that a bundle without this figure refuses them; it passes all the same."""
+    """And that a bundle without this figure refuses them; it still passes."""
     acts, source, format = script.named("skin", None, 1, spread=False)
     built = devices.build(format, acts, rig.VirtualClock(), source)
     packaged = bundle.load(bundle.DEFAULT)

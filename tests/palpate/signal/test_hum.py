@@ -35,7 +35,7 @@ def counts(x: NDArray[np.float64], format: SweepFormat = FORMAT) -> NDArray[np.u
 
 @pytest.mark.parametrize("hz", [50.0, 60.0, 49.85, 60.2])
 def test_hum_is_removed(hz: float):
-    """At the frequencies of mains and somewhat beside them. The sweep remains, but for
+    """At the frequencies of mains and somewhat beside them. The sweep remains except for
     rounding."""
     filter, clean = HumFilter(FORMAT), sweep()
     found, amplitude = filter(counts(clean + hum(hz=hz)), LIMIT)

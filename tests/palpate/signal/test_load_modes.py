@@ -1,4 +1,4 @@
-"""What the loads of sound taxels tell of a broken one."""
+"""The load of a broken taxel follows from the loads of sound taxels."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_filled_counts_stay_in_the_range_of_their_type():
     ],
 )
 def test_values_that_cannot_be_computed_with_are_refused(change: dict[str, Any], why: str):
-    """With the name of what is wrong."""
+    """The error has the wrong field."""
     with pytest.raises(BundleError, match=why):
         replace(LOADS, **change)
 
