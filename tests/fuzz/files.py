@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 
 from palpate.bundle import bundle
-from palpate.bundle.manifest import FILE_KEYS
 from palpate.core import config, sentences, types
 from palpate.core.errors import BundleError, ConfigError, FormatError
 from palpate.io import robot_link
@@ -140,10 +139,7 @@ def _usable(read: bundle.Manifest) -> None:
         assert isinstance(entry, dict)
     assert isinstance(read.figures, dict)
     again = read.json()
-    optional = {"unloaded", "speeds", "bridging", "sliding", "disturbances", "displays"}
-    assert json.loads(again).keys() | optional == {
-        FILE_KEYS.get(field.name, field.name) for field in fields(read)
-    }
+    assert json.loads(again).keys() == {field.name for field in fields(read)}
     assert bundle.Manifest.parse(again).json() == again, (
         "what a manifest writes reads as something else"
     )

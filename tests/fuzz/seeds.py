@@ -14,7 +14,6 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from palpate.bundle import bundle
-from palpate.bundle.manifest import FILE_KEYS
 from palpate.core import config, schema, sentences
 from palpate.core.types import (
     DATA_TYPES,
@@ -147,12 +146,12 @@ def settings() -> list[bytes]:
 
 
 def manifest() -> list[bytes]:
-    """The default bundle's manifest, the smallest valid manifest, and the older schema."""
+    """The default bundle's manifest, the smallest valid one, and one without optional rules."""
     whole = (bundle.DEFAULT / bundle.MANIFEST).read_bytes()
     least = json.loads(whole) | {"figures": {}, "made": {}}
-    older = {k: v for k, v in least.items() if k not in ("early", "known")} | {"schema": 1}
-    older["files"] = {name: entry for name, entry in least["files"].items() if name != bundle.MEANS}
-    return [whole, *(json.dumps(m).encode() for m in (least, older))]
+    bare = {k: v for k, v in least.items() if k not in ("early", "known", "displacement")}
+    bare["files"] = {name: entry for name, entry in least["files"].items() if name != bundle.MEANS}
+    return [whole, *(json.dumps(m).encode() for m in (least, bare))]
 
 
 def recording() -> list[bytes]:
@@ -240,9 +239,7 @@ def _settings() -> list[bytes]:
 
 def _file(target: str) -> list[bytes]:
     """Keys of a JSON file, values, and punctuation."""
-    names = [FILE_KEYS.get(f.name, f.name) for kind in FILES[target] for f in fields(kind)]
-    if target == "manifest":
-        names.append("contact")  # key of Thresholds; a field of Manifest has the same name
+    names = [f.name for kind in FILES[target] for f in fields(kind)]
     texts = (*(f'"{name}"' for name in names), *JSON_VALUES)
     return [*MAGICS.get(target, []), *(text.encode() for text in texts)]
 

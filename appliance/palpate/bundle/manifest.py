@@ -6,7 +6,7 @@ import json
 import re
 import sys
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -24,12 +24,8 @@ from palpate.signal.slide import SpeedRange
 from palpate.signal.vibration import SlideLimits
 from palpate.signal.window_check import WindowLimits
 
-SCHEMA = 4
-"""Schema version that is written. Also read are 1 (without `early`, `known`), 2 (without `runtime`,
-`counter`, `place`) and 3 (without `moved`)."""
-FILE_KEYS = {"displacement": "moved", "contact": "place"}
-"""Fields of Manifest whose keys in manifest.json have other names. Signed bundles have these keys,
-so the file keeps them. Messages use the keys, too."""
+SCHEMA = 1
+"""Version of the schema."""
 MANIFEST, MODEL, GOLDEN, MEANS = "manifest.json", "model.onnx", "golden.npz", "means.npz"
 INPUTS = ("raw", *features.KINDS)
 UNSURE = 0.5
@@ -60,7 +56,7 @@ class Early:
     least: [D], least probability for an answer at each step; above 1 a step never answers. agree:
     number of steps in a row, including the newest, that must give the same label, and be of a known
     material. limits: [D], largest squared distance of a known material at each step; () if unknown
-    materials are not detected before the end of a sweep, then `Manifest.json` omits it.
+    materials are not detected before the end of a sweep.
     """
 
     least: tuple[float, ...]
@@ -89,7 +85,7 @@ class Known:
     limit: largest squared distance from a sweep's embedding to the nearest class mean; beyond it
     the material is unknown. temperature: divisor of the logits from class means. enrolled: least
     probability of all enrolled labels together at which a sweep gets one of them; None if all
-    labels are compared by distances alone, as before 0.2, then `Manifest.json` omits it.
+    labels are compared by distances alone.
     """
 
     limit: float
@@ -111,9 +107,8 @@ class DisplacementRule:
 
     limit: as in Known, for the distances of displaced sweeps. temperature: divisor of logits that
     are calibrated for sweeps without displacement. unsure: least probability for status ok; above 1
-    a single displaced sweep is never ok. farthest_mm: displacement from which on a sweep is not
-    named, because no training copy is displaced as far; None if unknown, then `Manifest.json` omits
-    it.
+    a single displaced sweep is never ok. farthest_mm: displacement from which on a sweep gets
+    no label, because no training copy is displaced as far; None if unknown.
     """
 
     limit: float
@@ -122,7 +117,7 @@ class DisplacementRule:
     farthest_mm: float | None = None
 
     def __post_init__(self) -> None:
-        _check_positive(self, "moved")
+        _check_positive(self, "displacement")
 
 
 def _check_positive(rule: Known | DisplacementRule, where: str) -> None:
@@ -151,15 +146,13 @@ class Manifest:
     counter: increases with each signed bundle, so that an older bundle cannot be installed
         unnoticed; 0 for a bundle that was never signed.
     unloaded: raw counts of the skin without contact, the values of a frame in their order; () if
-        unknown, then `json` omits it.
-    speeds: range of the measured speeds in training; None if unknown, then `json` omits it.
-    bridging: broken taxels that the model tolerates; None if that was not measured, then `json`
-        omits it.
-    sliding: what tells a slide from a rest; None if unknown, then `json` omits it.
+        unknown.
+    speeds: range of the measured speeds in training; None if unknown.
+    bridging: broken taxels that the model tolerates; None if that was not measured.
+    sliding: what tells a slide from a rest; None if unknown.
     disturbances: allowances for noise, load, speed, lost frames and hum; None if they were not
-        measured, then `json` omits it.
-    displays: names of materials for people, in any language, by label; {} if labels are shown, then
-        `json` omits it.
+        measured.
+    displays: names of materials for people, in any language, by label; {} if labels are shown.
     """
 
     name: str
@@ -186,16 +179,15 @@ class Manifest:
     schema: int = SCHEMA
 
     def __post_init__(self) -> None:
-        if type(self.schema) is not int or not 1 <= self.schema <= SCHEMA:
+        if type(self.schema) is not int or self.schema != SCHEMA:
             raise BundleError(
-                f"manifest schema {self.schema} is unknown; this version reads 1 to {SCHEMA}: "
-                "update one of them"
+                f"manifest schema {self.schema} is unknown; this version reads {SCHEMA}: update "
+                "one of them"
             )
         if self.input not in INPUTS:
             raise BundleError(
                 f"manifest input {self.input!r} is unknown; use one of {', '.join(INPUTS)}"
             )
-        _check_age(self)
         _check_files(self.files)
         _check_labels(self.labels)
         _check_displays(self.displays, self.labels)
@@ -228,25 +220,7 @@ class Manifest:
 
     def json(self) -> bytes:
         """The bytes of manifest.json; equal manifests give equal bytes."""
-        values = {FILE_KEYS.get(name, name): value for name, value in asdict(self).items()}
-        values["format"] = self.format.json()
-        for name in ("unloaded", "speeds", "bridging", "sliding", "disturbances", "displays"):
-            if not values[name]:
-                del values[name]
-        added_later = (
-            ("early", "limits"),
-            ("moved", "farthest_mm"),
-            ("known", "enrolled"),
-            ("bridging", "loads"),
-            ("sliding", "pattern"),
-            ("disturbances", "hum"),
-        )
-        for name, added in added_later:
-            if values.get(name) and not values[name][added]:
-                del values[name][added]
-        for allowance in values.get("disturbances", {}).get("allowances", ()):
-            if allowance["tried"] is None:
-                del allowance["tried"]
+        values = asdict(self) | {"format": self.format.json()}
         return (json.dumps(values, indent=1, sort_keys=True) + "\n").encode()
 
     @property
@@ -260,22 +234,11 @@ class Manifest:
         """Read a manifest. Raises BundleError if a key is missing or unknown, or a value has the
         wrong type."""
         try:
-            made = typed(cls, _by_field(json.loads(text)))
+            made = typed(cls, json.loads(text))
             made.json()  # raises if it is nested too deeply to be written again after enrolment
             return made
         except (ValueError, TypeError, AttributeError, RecursionError, FormatError) as e:
             raise BundleError(f"manifest cannot be read: {e}; export the bundle again") from e
-
-
-def _by_field(raw: Any) -> Any:
-    """The content of manifest.json under the names of Manifest's fields. Raises TypeError for an
-    unknown key."""
-    if not isinstance(raw, dict):
-        return raw
-    names = {FILE_KEYS.get(f.name, f.name): f.name for f in fields(Manifest)}
-    if unknown := sorted(raw.keys() - names.keys()):
-        raise TypeError(f"{unknown!r} is none of {', '.join(names)}")
-    return {names[key]: value for key, value in raw.items()}
 
 
 def version(text: object) -> tuple[int, ...]:
@@ -296,7 +259,7 @@ def _check_parts(manifest: Manifest) -> None:
         raise BundleError("manifest has `early.limits` without `known`; export the bundle again")
     if manifest.displacement and not (manifest.known and manifest.contact):
         raise BundleError(
-            "manifest has `moved` without `known` and `place`; export the bundle again"
+            "manifest has `displacement` without `known` and `contact`; export the bundle again"
         )
     taxels = manifest.format.rows * manifest.format.cols
     if manifest.bridging and manifest.bridging.taxels >= taxels:
@@ -317,23 +280,8 @@ def _check_parts(manifest: Manifest) -> None:
         )
     if manifest.contact and manifest.thresholds.contact is None:
         raise BundleError(
-            "manifest has `place` without `thresholds.contact`; export the bundle again"
+            "manifest has `contact` without `thresholds.contact`; export the bundle again"
         )
-
-
-def _check_age(m: Manifest) -> None:
-    """Raises BundleError if a manifest has keys that its schema version does not have."""
-    if m.schema == 1 and (m.early or m.known):
-        raise BundleError(
-            "manifest schema 1 has no `early` and no `known`; export the bundle again"
-        )
-    if m.schema < 3 and (m.contact or m.counter or m.runtime != "0.0.0"):
-        raise BundleError(
-            f"manifest schema {m.schema} has no `place`, `counter`, `runtime`; export the bundle "
-            "again"
-        )
-    if m.schema < 4 and m.displacement:
-        raise BundleError(f"manifest schema {m.schema} has no `moved`; export the bundle again")
 
 
 def _check_files(files: Mapping[str, Mapping[str, Any]]) -> None:

@@ -176,13 +176,16 @@ PLACE = {"pitch_mm": 4.0, "rows_mm": [1.0], "cols_mm": [1.0], "limit_mm": 1.0}
         ({"labels": ["one"]}, "at least two"),
         ({"labels": ["a,b", "c"]}, "label 'a,b'"),
         ({"labels": ["a", 3]}, "label 3 "),
-        ({"files": {}, "early": None, "known": None, "moved": None}, "name model.onnx"),
+        ({"files": {}, "early": None, "known": None, "displacement": None}, "name model.onnx"),
         ({"format": {"rows": 4}}, UNREAD),
         ({"extra": 1}, "extra"),
         ({"unloaded": [1.0, 2.0]}, "2 counts .* have 16"),
         ({"unloaded": 16}, UNREAD),
         ({"unloaded": ["1"] * 16}, UNREAD),
-        ({"thresholds": {"contact": None, "full_scale": 255.0}, "place": PLACE}, "`place` without"),
+        (
+            {"thresholds": {"contact": None, "full_scale": 255.0}, "contact": PLACE},
+            "without `thresh",
+        ),
         ({"labels": ["a", "b"], "sliding": None}, "logits"),
     ],
 )
@@ -194,11 +197,10 @@ def test_broken_manifests_are_named(folder: Path, changes: dict, hint: str):
 
 
 def test_a_bundle_may_know_the_unloaded_skin(folder: Path):
-    """The box uses it as its first tare. Without it the manifest has no such key."""
+    """The box uses it as its first tare. Without it the first tare is 0."""
     before = bundle.load(folder)
     assert not box(before).tare.any()
     assert before.manifest.json() == (folder / bundle.MANIFEST).read_bytes()
-    assert b"unloaded" not in before.manifest.json()
     level = [float(i) for i in range(16)]
     after = bundle.load(edit(folder, unloaded=level))
     assert box(after).tare.tolist() == np.reshape(level, (4, 4)).tolist()
@@ -254,13 +256,13 @@ def test_golden_sweeps_of_another_shape_are_refused(shape: tuple[int, ...] | Non
         bundle._golden(toy_bundle.npz(logits=np.zeros((2, 2)), **more), manifest)
 
 
-def test_a_bundle_of_schema_1_is_still_read(tmp_path: Path, folder: Path):
-    """It does not have the new fields."""
+def test_optional_rules_may_be_missing(folder: Path):
+    """A bundle without rules has none."""
     old = json.loads((folder / bundle.MANIFEST).read_text())
-    for name in ("early", "known", "place", "moved", "runtime", "counter"):
+    for name in ("early", "known", "contact", "displacement", "runtime", "counter"):
         old.pop(name, None)
     del old["files"][bundle.MEANS]
-    (folder / bundle.MANIFEST).write_text(json.dumps(old | {"schema": 1}))
+    (folder / bundle.MANIFEST).write_text(json.dumps(old))
     read = bundle.load(folder)
     assert (read.manifest.early, read.manifest.known) == (None, None)
     assert (read.classes, read.enrolled) == (None, {})
@@ -288,7 +290,7 @@ MOVED = {"limit": 4.0, "temperature": 3.0, "unsure": 0.75}
 
 def moved(**changes: Any) -> dict[str, Any]:
     contact = {"pitch_mm": 1.0, "rows_mm": [0.5], "cols_mm": [0.5], "limit_mm": 0.1}
-    return {"moved": MOVED | changes, "place": contact}
+    return {"displacement": MOVED | changes, "contact": contact}
 
 
 @pytest.mark.parametrize(
@@ -312,14 +314,11 @@ def moved(**changes: Any) -> dict[str, Any]:
         ({"known": KNOWN | {"temperature": None}}, "known.temperature None "),
         ({"known": {"limit": 9.0}}, "temperature"),
         ({"known": None}, "both `known` and"),
-        ({"schema": 1}, "schema 1 has no"),
-        ({"moved": MOVED}, "`moved` without `known`"),
-        ({"displacement": MOVED, "place": moved()["place"]}, r"\['displacement'\]"),
-        (moved(limit=0), "moved.limit 0 "),
-        (moved(temperature=-1), "moved.temperature -1 "),
+        ({"displacement": MOVED}, "`displacement` without `known`"),
+        (moved(limit=0), "displacement.limit 0 "),
+        (moved(temperature=-1), "displacement.temperature -1 "),
         (moved(unsure="0.5"), "unsure"),
-        (moved() | {"moved": {"limit": 4.0}}, "temperature"),
-        (moved() | {"schema": 3}, "schema 3 has no `moved`"),
+        (moved() | {"displacement": {"limit": 4.0}}, "temperature"),
         (moved(), "npz cannot be read"),
     ],
 )
@@ -359,7 +358,7 @@ def test_broken_early_and_known_are_named(toy_folder: Path, changes: dict, hint:
 )
 def test_broken_means_are_named(toy_folder: Path, arrays: dict, hint: str):
     """Wrong number of labels, wrong types, NaN, wrong order, pickled objects."""
-    more = toy_bundle.displaced_arrays() if "moved" in str([*arrays]) else {}
+    more = toy_bundle.displaced_arrays() if "displacement" in str([*arrays]) else {}
     given = toy_bundle.means(**(more | arrays))
     data = toy_bundle.npz(**{k: v for k, v in given.items() if v is not None})
     with pytest.raises(BundleError, match=hint):
