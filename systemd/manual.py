@@ -25,7 +25,6 @@ ROOT = Path(__file__).resolve().parent.parent
 BOX_PAGES = (
     "explanation/what-it-is.md",
     "tutorials/first-day.md",
-    "tutorials/first-start.md",
     "how-to/wire.md",
     "reference/pins.md",
     "how-to/trigger-without-lines.md",

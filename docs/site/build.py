@@ -43,7 +43,6 @@ CHAPTERS = {
     "Tutorials": [
         "docs/tutorials/first-model",
         "docs/tutorials/first-day",
-        "docs/tutorials/first-start",
         "docs/tutorials/library",
     ],
     "How-to": [
