@@ -5,84 +5,91 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from palpate.core.types import Frames, Status, Sweep, SweepFormat, Verdict, sidecar
+from palpate.core.types import Frames, Status, Sweep, Verdict, sidecar
 from palpate.sim import devices, rig, script, skin
 from palpate.sweeps import sweep_folder
 from palpate.sweeps.black_box import BlackBox
 from tests.factories import toy_bundle
 from tests.factories.simulated_box import OnSweep, Rigged
 
-MOST = 3
 
-
-def box(folder: Path, most: int = MOST) -> BlackBox:
+def box(folder: Path, most: int = 3) -> BlackBox:
     """A black box for the toy skin."""
     return BlackBox(folder, toy_bundle.FORMAT, most)
 
 
-def judged(
-    number: int, status: Status = Status.OK, window: bool = True
-) -> tuple[Sweep, Verdict, dict[str, Any]]:
-    """A sweep, its verdict and its circumstances."""
+def put(black: BlackBox, *numbers: int, status: Status = Status.OK, window: bool = True) -> None:
+    """Sweeps with these numbers are answered."""
     frames = toy_bundle.sweep(0, 0).frames if window else Frames.empty(toy_bundle.FORMAT)
-    sweep = Sweep(number, 0, 1, Status.OK if window else status, frames)
-    return (
-        sweep,
-        Verdict(number, 5, status, "", 0.0, 0.0, np.empty(0), 0, 0, 1, "b"),
-        {"bundle": "b"},
-    )
+    for number in numbers:
+        sweep = Sweep(number, 0, 1, Status.OK if window else status, frames)
+        verdict = Verdict(number, 5, status, "", 0.0, 0.0, np.empty(0), 0, 0, 1, "b")
+        black.sweep(sweep, verdict, {"bundle": "b"})
 
 
 def numbers(folder: Path) -> list[int]:
     """The numbers of the complete sweeps in a folder."""
     numbers = sorted(int(path.stem[6:]) for path in folder.glob("*.npy"))
-    assert sorted(path.name for path in folder.iterdir()) == sorted(
-        f"sweep-{n:06d}.{kind}" for n in numbers for kind in ("json", "npy")
-    )
+    files = [f"sweep-{n:06d}.{kind}" for n in numbers for kind in ("json", "npy")]
+    assert sorted(path.name for path in folder.iterdir()) == files
     return numbers
+
+
+def failing(monkeypatch: pytest.MonkeyPatch, code: int, fails: Callable[[], bool]) -> None:
+    """A disk that refuses sweeps with this error while `fails()`."""
+    save = sweep_folder.save
+
+    def tight(*given: Any) -> None:
+        if fails():
+            raise OSError(code, os.strerror(code))
+        save(*given)
+
+    monkeypatch.setattr(sweep_folder, "save", tight)
 
 
 def test_the_last_sweeps_are_kept_over_restarts(tmp_path: Path):
     """Each new sweep pushes out the oldest sweep, also in a later run and for any status. A sweep
-    without a window does not."""
-    first = box(tmp_path / "b")
-    for n in range(1, 6):
-        first.sweep(*judged(n, Status.STUCK_TAXEL if n == 4 else Status.OK))
-    first.sweep(*judged(6, Status.SHORT, window=False))
-    assert numbers(tmp_path / "b") == [3, 4, 5]
-    assert sidecar(tmp_path / "b" / "sweep-000004.npy")["verdict"]["status"] == "stuck-taxel"
+    without a window does not. The folder is there before the first sweep, and free at the end."""
+    folder = tmp_path / "b"
+    first = box(folder)
+    assert folder.is_dir()
+    put(first, 1, 2, 3)
+    put(first, 4, status=Status.STUCK_TAXEL)
+    put(first, 5)
+    put(first, 6, status=Status.SHORT, window=False)
+    assert numbers(folder) == [3, 4, 5]
+    assert sidecar(folder / "sweep-000004.npy")["verdict"]["status"] == "stuck-taxel"
     first.close()
-    second = box(tmp_path / "b")
-    second.sweep(*judged(1))
-    assert numbers(tmp_path / "b") == [4, 5, 6]
+    second = box(folder)
+    put(second, 1)
+    assert numbers(folder) == [4, 5, 6]
     second.close()
-    box(tmp_path / "b", most=1).sweep(*judged(1))
-    assert numbers(tmp_path / "b") == [7]
+    put(box(folder, most=1), 1)
+    assert numbers(folder) == [7]
 
 
 def test_the_oldest_goes_once_the_newest_is_safe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """The last sweeps exist at every moment: a sweep is removed only after the new sweep has its
     name."""
     black = box(tmp_path)
-    for n in range(1, 4):
-        black.sweep(*judged(n))
-    there: list[list[str]] = []
+    put(black, 1, 2, 3)
+    there: list[int] = []
     unlink = Path.unlink
 
     def noted(path: Path, missing_ok: bool = False) -> None:
-        there.append(sorted(p.name for p in tmp_path.glob("*.npy")))
+        there.append(len(list(tmp_path.glob("*.npy"))))
         unlink(path, missing_ok)
 
     monkeypatch.setattr(Path, "unlink", noted)
-    black.sweep(*judged(4))
-    assert [len(names) for names in there] == [4, 3]
+    put(black, 4)
+    assert there == [4, 3]
 
 
 def test_a_full_disk_drops_the_oldest_first(
@@ -90,32 +97,21 @@ def test_a_full_disk_drops_the_oldest_first(
 ):
     """The oldest sweep is removed for a new sweep. If that does not help, one line is logged, and
     another when writing works again."""
-    black = box(tmp_path)
-    limit = [2]
-
-    def tight(path: Path, sweep: Sweep, format: SweepFormat, about: Mapping[str, object]) -> None:
-        if len(list(tmp_path.glob("*.npy"))) >= limit[0]:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        save(path, sweep, format, about)
-
-    save = sweep_folder.save
-    monkeypatch.setattr(sweep_folder, "save", tight)
-    for n in range(1, 5):
-        black.sweep(*judged(n))
-    assert numbers(tmp_path) == [3, 4]
-    assert logged == []
+    black, limit = box(tmp_path), [2]
+    failing(monkeypatch, errno.ENOSPC, lambda: len(list(tmp_path.glob("*.npy"))) >= limit[0])
+    put(black, 1, 2, 3, 4)
+    assert (numbers(tmp_path), logged) == ([3, 4], [])
     limit[0] = 0
-    for n in range(5, 8):
-        black.sweep(*judged(n))
+    put(black, 5, 6, 7)
     assert numbers(tmp_path) == []
     limit[0] = 9
-    for n in range(8, 10):
-        black.sweep(*judged(n))
+    put(black, 8, 9)
     assert numbers(tmp_path) == [8, 9]
-    assert logged == [
-        f"<4>black box: no sweep is kept: No space left on device; see to {tmp_path}",
-        "black box: sweeps are kept again",
-    ]
+    trouble, end = logged
+    assert trouble.startswith("<4>black box: ")
+    assert "No space left" in trouble
+    assert str(tmp_path) in trouble
+    assert "kept again" in end
 
 
 def test_another_error_removes_no_sweep(
@@ -123,13 +119,9 @@ def test_another_error_removes_no_sweep(
 ):
     """If the disk fails although it is not full, existing sweeps are kept."""
     black = box(tmp_path)
-    black.sweep(*judged(1))
-
-    def broken(*args: object) -> None:
-        raise OSError(errno.EIO, os.strerror(errno.EIO))
-
-    monkeypatch.setattr(sweep_folder, "save", broken)
-    black.sweep(*judged(2))
+    put(black, 1)
+    failing(monkeypatch, errno.EIO, lambda: True)
+    put(black, 2)
     assert numbers(tmp_path) == [1]
     assert "Input/output error" in logged[0]
 
@@ -137,31 +129,19 @@ def test_another_error_removes_no_sweep(
 def test_a_folder_that_cannot_be_used_yet(tmp_path: Path, logged: list[str]):
     """With a file instead of the folder, or another program in it, the box starts and logs one
     line. Later the folder can be used."""
-    (tmp_path / "b").write_text("in the way")
-    black = box(tmp_path / "b")
-    for n in (1, 2):
-        black.sweep(*judged(n))
-    (tmp_path / "b").unlink()
-    other = box(tmp_path / "b")
-    other.sweep(*judged(1))
-    black.sweep(*judged(3))
+    folder = tmp_path / "b"
+    folder.write_text("in the way")
+    black = box(folder)
+    put(black, 1, 2)
+    folder.unlink()
+    other = box(folder)
+    put(other, 1)
+    put(black, 3)
     other.close()
-    black.sweep(*judged(4))
-    assert numbers(tmp_path / "b") == [1, 5]
-    assert [line.split(": ", 2)[-1].split(";")[0] for line in logged] == [
-        "File exists",
-        "another program keeps sweeps there",
-        "sweeps are kept again",
-    ]
-
-
-def test_its_folder_is_ready_before_the_first_sweep(tmp_path: Path):
-    """Slow accesses to the disk come before the box runs, and the folder is released at the end."""
-    black = box(tmp_path / "b")
-    assert (tmp_path / "b").is_dir()
-    black.close()
-    box(tmp_path / "b").sweep(*judged(1))
-    assert numbers(tmp_path / "b") == [1]
+    put(black, 4)
+    assert numbers(folder) == [1, 5]
+    told = ["File exists", "another program", "kept again"]
+    assert [text in line for text, line in zip(told, logged, strict=True)] == [True] * 3
 
 
 def test_on_the_whole_box_answers_go_out_first(rigged: Callable[..., Rigged], tmp_path: Path):
