@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -18,9 +17,6 @@ from palpate.core.log import log
 if TYPE_CHECKING:
     from palpate.bundle.bundle import Bundle
     from palpate.web.server import PageServer
-
-Facts = Mapping[str, Callable[[], object]]
-"""Additional facts of status and feed, by name. A text is shown to a person."""
 
 
 def load_settings(args: argparse.Namespace) -> Config:

@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from palpate.cli.common import Facts, load_settings
+from palpate.cli.common import load_settings
 from palpate.cli.devices import open_devices
 from palpate.cli.reporting import capture, done, feed, status
 from palpate.core.clock import SystemClock
@@ -21,7 +21,7 @@ from palpate.core.disk_thread import DiskThread
 from palpate.core.errors import ConfigError, SensorError
 from palpate.core.interrupts import StopFlag
 from palpate.core.log import log
-from palpate.core.observer import Observer
+from palpate.core.observer import Facts, Observer
 from palpate.core.types import Sweep, SweepFormat, Verdict
 from palpate.io import skin_profile, skins
 from palpate.io.robot_link import Command, Port
@@ -48,8 +48,14 @@ def run(args: argparse.Namespace) -> int:
             folder, format, labels, devices.clock, _sentences(port), args.target, disk
         )
         stack.callback(recording.close)
-        page = _record_page(
-            args, settings, format, devices, recording, lambda command: box.obey(command)
+        pages = page(
+            args.web,
+            settings,
+            format,
+            devices,
+            recording.about,
+            lambda command: box.obey(command),
+            recording.names.label,
         )
         _announce(format, folder)
         box = assembly.recorder(
@@ -59,11 +65,11 @@ def run(args: argparse.Namespace) -> int:
             port,
             stack,
             capture=capture(args, settings, format, stack),
-            observers=[disk, *_observers(settings, format, devices.source, recording), *page],
+            observers=[disk, *_observers(settings, format, devices.source, recording), *pages],
             commands=recording.commands,
-            ordered=bool(page),
+            ordered=bool(pages),
         )
-        for shown in page:
+        for shown in pages:
             stack.enter_context(shown)
         box.run(done(args, box, devices, stopped))
     return stopped.exit_code
@@ -72,11 +78,12 @@ def run(args: argparse.Namespace) -> int:
 def open_skin(args: argparse.Namespace, settings: Config) -> tuple[Devices, SweepFormat]:
     """The devices, and the format of the recorded sweeps. Raises ConfigError if no sweep can be as
     long as the window."""
-    asked = skins.described(args.format) if args.format else None
+    given, window = getattr(args, "format", None), getattr(args, "window", None)
+    asked = skins.described(given) if given else None
     devices = open_devices(args, (lambda: asked) if asked else None)
     format = asked or devices.format or _announced(settings, devices)
-    if args.window is not None:
-        format = replace(format, window=round(args.window * format.rate_hz))
+    if window is not None:
+        format = replace(format, window=round(window * format.rate_hz))
     _check_length(format, settings)
     return devices, format
 
@@ -121,34 +128,37 @@ class SweepPrinter(Observer):
         print(f"sweep {sweep.id}; {', '.join(counts) or 'none kept'}", file=self._out, flush=True)
 
 
-def _record_page(
-    args: argparse.Namespace,
+def page(
+    port: int | None,
     settings: Config,
     format: SweepFormat,
     devices: Devices,
-    recording: RecordingSession,
+    about: Callable[[], Mapping[str, Any]],
     obey: Callable[[Command], list[object]],
+    named: Callable[[str], str],
+    *,
+    teaching: bool = False,
 ) -> list[RecordPage]:
-    """The page of `--web`, which shows the recording and sets its labels."""
-    if args.web is None:
+    """The page of `--web`, if there is a port. about, obey, named, teaching: see RecordPage."""
+    if port is None:
         return []
     from palpate.web.access import Access
     from palpate.web.record import RecordPage
 
-    access = Access.configured(settings.watch, args.web)
-    page = RecordPage(
-        access,
+    shown = RecordPage(
+        Access.configured(settings.watch, port),
         format,
         devices.source,
         devices.wire(settings).trigger,
-        recording.about,
+        about,
         obey,
         SystemClock(),
         skins.profile(settings).unit,
-        recording.names.label,
+        named,
+        teaching=teaching,
     )
-    log.info(f"page: {page.server.address}")
-    return [page]
+    log.info(f"page: {shown.server.address}")
+    return [shown]
 
 
 def _announced(settings: Config, devices: Devices) -> SweepFormat:

@@ -8,11 +8,10 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
-from palpate.cli.common import Facts
 from palpate.core.clock import SystemClock
 from palpate.core.config import Config
 from palpate.core.devices import Devices
-from palpate.core.observer import Observer
+from palpate.core.observer import Facts, Observer
 from palpate.core.types import SweepFormat
 from palpate.io import skins
 from palpate.service.status_file import StatusFile

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from palpate.bundle.bundle import DEFAULT, Bundle
 from palpate.bundle.manifest import Manifest
-from palpate.cli.common import Facts, load_bundle, load_settings
+from palpate.cli.common import load_bundle, load_settings
 from palpate.cli.devices import open_devices
 from palpate.cli.reporting import capture, done, feed, status
 from palpate.core.clock import SystemClock
@@ -20,7 +20,7 @@ from palpate.core.disk_thread import DiskThread
 from palpate.core.errors import ApplianceError
 from palpate.core.interrupts import StopFlag
 from palpate.core.log import in_journal, log
-from palpate.core.observer import Observer
+from palpate.core.observer import Facts, Observer
 from palpate.io import skins
 from palpate.io.usb_sensor import fits
 from palpate.runtime import assembly

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from palpate.core.health import Health
     from palpate.core.types import Edge, Frames, Sweep, Verdict
+
+Facts = Mapping[str, Callable[[], object]]
+"""Additional facts of status and feed, by name. A text is shown to a person."""
 
 
 class Observer:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import shutil
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -153,7 +153,7 @@ def version(store: Store) -> str:
     return str(int(held) + 1) if running.taught and held.isdecimal() else "1"
 
 
-def command(options: list[str], by: str = "") -> list[str]:
+def command(options: Sequence[str], by: str = "") -> list[str]:
     """The command of a process that does all of `install`, or without `by` of `assessed`. options:
     of the settings."""
     asked = ["--use", "--by", by] if by else []

@@ -74,15 +74,12 @@ def box(
     *,
     capture: CaptureWriter | None = None,
     observers: Iterable[Observer] = (),
-    labels: tuple[str, ...] = (),
     commands: Mapping[str, CommandHandler] = NO_COMMANDS,
     ordered: bool = False,
-    announce: Callable[[str], object] = log.info,
 ) -> Box:
     """The box that classifies; `stack` closes it again.
 
-    capture: records all inputs. labels: labels that the class bits must hold in addition to the
-    bundle's. commands, ordered, announce: as for `recorder`.
+    capture: records all inputs. commands, ordered: as for `recorder`.
     """
     run = classifier(settings, bundle, devices.clock)
     run.self_test()
@@ -95,10 +92,9 @@ def box(
         capture,
         [run, *observers],
         commands,
-        codes=(*bundle.manifest.labels, *labels),
+        codes=bundle.manifest.labels,
         early=early_exit(settings, run),
         ordered=ordered,
-        announce=announce,
     )
 
 
@@ -115,14 +111,11 @@ def recorder(
     ordered: bool = False,
     serving: bool = True,
     slides: Callable[[NDArray[Any]], str] | None = None,
-    announce: Callable[[str], object] = log.info,
 ) -> Box:
     """The box that records sweeps of a format and needs no bundle; the class bits stay 0.
 
     ordered: commands also come from another source than the port. serving: whether READY may rise.
-    slides: as for SweepCheck.
-    announce: called with the messages of a trigger without lines to a person. Other parameters as
-    for `box`."""
+    slides: as for SweepCheck. Other parameters as for `box`."""
     check = SweepCheck(format, devices.clock, slides)
     watching = [check, *observers]
     return _assembled(
@@ -136,7 +129,6 @@ def recorder(
         commands,
         ordered=ordered,
         serving=serving,
-        announce=announce,
     )
 
 
@@ -154,13 +146,10 @@ def _assembled(
     early: EarlyExit | None = None,
     ordered: bool = False,
     serving: bool = True,
-    announce: Callable[[str], object] = log.info,
 ) -> Box:
     """Put the components together. codes: labels that the class bits hold."""
     commands = {**commands, "LABEL": partial(_label, codes)}
-    trigger = _trigger(
-        settings.trigger, answerer.format, devices, port, stack, announce, ordered=ordered
-    )
+    trigger = _trigger(settings.trigger, answerer.format, devices, port, stack, ordered=ordered)
     watching = [*observers, *([capture] if capture else []), *_watches(trigger)]
     if isinstance(trigger, CommandTrigger):
         commands = {**commands, **trigger.commands}
@@ -197,7 +186,6 @@ def _trigger(
     devices: Devices,
     port: Port | None,
     stack: ExitStack,
-    announce: Callable[[str], object],
     *,
     ordered: bool,
 ) -> Trigger:
@@ -211,7 +199,7 @@ def _trigger(
             )
         return CommandTrigger(devices.clock, devices.commanded)
     if config.mode == "key":
-        return stack.enter_context(KeyTrigger(standard_input(), devices.clock, announce))
+        return stack.enter_context(KeyTrigger(standard_input(), devices.clock, log.info))
     if config.mode == "timed":
         window_s = format.window / format.rate_hz
         if config.sweep_s < window_s:
@@ -219,7 +207,7 @@ def _trigger(
                 f"a sweep of {config.sweep_s:g} s is shorter than the window of {window_s:g} s; "
                 "use a longer --sweep"
             )
-        return TimedTrigger(config, devices.clock, announce)
+        return TimedTrigger(config, devices.clock, log.info)
     missing = next((k for k in ("start", "stop") if not getattr(config, k)), None)
     if missing == "start" or (missing and config.mode == "two-lines"):
         raise ConfigError(

@@ -98,7 +98,6 @@ def test_a_box_without_a_bundle_for_its_skin_is_taught_first(words: list[str], u
     ("words", "mode"),
     [
         (["--web"], "serial"),
-        ([], "two-lines"),
         (["--web", "--board", "rpi5"], "two-lines"),
         (["--web", "--trigger", "timed"], "timed"),
     ],
@@ -106,7 +105,7 @@ def test_a_box_without_a_bundle_for_its_skin_is_taught_first(words: list[str], u
 def test_the_page_triggers_where_no_line_is_wired(words: list[str], mode: str):
     """With lines, or another trigger by choice, the page waits for it."""
     args = arguments("teach", words)
-    assert teach_command.by_page(args, load_settings(args)).trigger.mode == mode
+    assert teach_command.without_lines(args, load_settings(args)).trigger.mode == mode
 
 
 @pytest.mark.parametrize(("board", "mode"), [([], "serial"), (["--board", "rpi5"], "two-lines")])
@@ -116,7 +115,9 @@ def test_a_box_without_lines_waits_to_be_taught(
     """It does not end because no line can start a sweep: the page or a command does later."""
     modes = []
     monkeypatch.setattr(
-        teach_command.Session, "run", lambda self: modes.append(self._settings.trigger.mode)
+        teach_command.TeachingProgram,
+        "run",
+        lambda self, outputs: modes.append(self.settings.trigger.mode),
     )
     args = arguments("run", ["--skin", "flexitac", *board])
     assert teach_command.until_taught(args, load_settings(args)) == 0

@@ -6,6 +6,7 @@ import errno
 import json
 import subprocess
 import sys
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,16 +15,18 @@ import numpy as np
 import pytest
 
 from palpate.bundle import bundle
-from palpate.cli import teach_command
 from palpate.cli.main import main
-from palpate.cli.parser import arguments
 from palpate.core.clock import SystemClock
 from palpate.core.config import load
+from palpate.core.devices import Devices
 from palpate.core.errors import BundleError, ConfigError, ModelError
+from palpate.core.observer import Observer
 from palpate.deployment.enrolment_key import EnrolmentKey
 from palpate.deployment.signed import SignedBundle
 from palpate.inference.classifier import Classifier
+from palpate.io.robot_link import command
 from palpate.learn import enrolment, install, materials
+from palpate.learn.program import Lesson, Outputs, TeachingProgram, Trying
 from palpate.learn.session import TeachingSession
 from palpate.runtime import assembly
 from palpate.sim import skin
@@ -53,11 +56,13 @@ def rests(count: int) -> list[np.ndarray]:
     return [junk.window("finger rests", WORLD, n)[0] for n in range(count)]
 
 
-def record(store: Path, material: str, of: list[np.ndarray], first: int) -> None:
+def record(
+    store: Path, material: str, of: list[np.ndarray], first: int, folder: str = "sweeps"
+) -> None:
     """Write recorded sweeps of a material, numbered from `first`."""
     labels = np.zeros(len(of), int)
     sweeps = Dataset(np.stack(of), labels, (material,), skin.FORMAT.rate_hz, {}, material)
-    lessons.write(store / "sweeps", sweeps, first=first)
+    lessons.write(store / folder, sweeps, first=first)
 
 
 class TaughtDelivery:
@@ -142,7 +147,7 @@ def test_a_label_without_recorded_sweeps_stays(box: TaughtDelivery, capsys: Any)
 
 def test_kept_sweeps_of_an_unknown_material_are_taught(box: TaughtDelivery, capsys: Any):
     """Listed, and chosen by one of them; without the skin they become a material."""
-    record(box.store, "", slides(FELT, 3), 1, "../black-box")
+    record(box.store, "", slides(FELT, 3), 1, "black-box")
     for number in (1, 2, 3):
         path = box.store / "black-box" / f"sweep-{number:06d}.json"
         verdict = {"status": "unknown", "bundle": box.running.bundle.id, "detail": "; as sweep 1"}
@@ -282,11 +287,15 @@ def test_a_trained_material_is_refused_before_a_sweep(box: TaughtDelivery, capsy
     assert main(["teach", *words]) == ConfigError.exit_code
     assert "was trained on 'foam'; record more of it for the desktop" in capsys.readouterr().err
     assert sorted((box.store / "sweeps").iterdir()) == recorded
-    session = teach_command.Session(arguments("teach", box.words), box.settings)
-    session._base = box.running
-    with pytest.raises(ConfigError, match="was trained on 'foam'"):
-        session._teach_again("foam")
-    assert session._teach_again("cork") == ["cork"]
+    settings = replace(box.settings, trigger=replace(box.settings.trigger, mode="serial"))
+    format, page = box.running.bundle.format, (Observer(),)
+    program = TeachingProgram(settings, Devices(SystemClock()), format, Lesson())
+    program.outputs = Outputs(page, "", lambda facts: [], lambda facts: [], lambda stack: None)
+    with ExitStack() as stack:
+        phase = Trying(program, stack)
+        with pytest.raises(ConfigError, match="was trained on 'foam'"):
+            phase.obey(command("TEACH", "foam"))
+        assert phase.obey(command("TEACH", "cork")) == ["cork"]
 
 
 def sessions(folder: Path, codes: int) -> TeachingSession:

@@ -19,8 +19,7 @@ from palpate.core.errors import ApplianceError, ConfigError
 from palpate.core.types import Status
 from palpate.learn import process, session
 from palpate.learn.process import TeachingProcess
-from palpate.learn.session import TeachingSession
-from palpate.learn.teacher import Teacher
+from palpate.learn.session import Teacher, TeachingSession
 from palpate.sim import skin
 from palpate.sweeps.recording import Labels, RecordingSession
 from tests.factories.feeds import HEALTH, OK, cut

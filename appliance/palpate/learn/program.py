@@ -1,0 +1,291 @@
+"""The program that teaches a box: it records and assesses sweeps until a bundle is made of them,
+and with a page then tries the bundle, until it is taught again or the person is done."""
+
+from __future__ import annotations
+
+import getpass
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from typing import Any
+
+from palpate.core.clock import SystemClock
+from palpate.core.config import Config
+from palpate.core.devices import Devices
+from palpate.core.disk_thread import DiskThread
+from palpate.core.errors import ApplianceError
+from palpate.core.interrupts import StopFlag
+from palpate.core.names import TypedNames
+from palpate.core.observer import Facts, Observer
+from palpate.core.types import SweepFormat
+from palpate.io.robot_link import Command, Port
+from palpate.io.verdict_lines import check_bits
+from palpate.learn import install, materials
+from palpate.learn.enrolment import slide_check
+from palpate.learn.hand_over import HandOver
+from palpate.learn.session import Teacher, TeachingSession, refuse_trained
+from palpate.runtime import assembly
+from palpate.runtime.loop import Box, CommandHandler
+from palpate.service.systemd import Notifier
+from palpate.signal.slide_check import SlidesAmong
+from palpate.sweeps.capture import CaptureWriter
+from palpate.sweeps.recording import Labels, RecordingSession
+
+NOTHING, GOOD = "nothing taught yet", 8
+"""The model of a box that is being taught, in status and feed; and its wanted number of sweeps."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lesson:
+    """The lesson that a person asks for.
+
+    labels: materials to record one after another; without them the page or the robot names them.
+    position, session: of the first sweeps. good: wanted number of sweeps of each material. by: who
+    teaches. options: of the settings, for the process that makes a bundle. waits: the address of
+    the page to which the service hands over, or the reason why there is none; the service runs even
+    if nothing can start a sweep. "" outside of the service.
+    """
+
+    labels: Sequence[str] = ()
+    position: str = "1"
+    session: str = ""
+    good: int = GOOD
+    by: str = ""
+    options: Sequence[str] = ()
+    waits: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Outputs:
+    """The outputs of the program. pages: at `address`. status, feed: the observers that publish
+    facts. capture: opens the capture of a recording."""
+
+    pages: Sequence[Observer]
+    address: str
+    status: Callable[[Facts], list[Observer]]
+    feed: Callable[[Facts], list[Observer]]
+    capture: Callable[[ExitStack], CaptureWriter | None]
+
+
+class TeachingProgram:
+    """Records until a bundle is made, or all sweeps of the lesson are there; with a page then tries
+    the bundle, and so on until DONE. again: the material that follows a trial, "" for none. base:
+    the delivered bundle into which materials are taught. Raises ConfigError."""
+
+    def __init__(
+        self, settings: Config, devices: Devices, format: SweepFormat, lesson: Lesson
+    ) -> None:
+        self.settings, self.devices, self.lesson = settings, devices, lesson
+        self.base = install.base(assembly.store(settings), format)
+        if self.base:  # sweeps as long as those of its materials
+            format = self.base.bundle.format
+            materials.check_settings(settings)
+        self.format, self.names, self.again = format, TypedNames(), ""
+        self._done, self._stopped = False, StopFlag()
+        self._phase: Recording | Trying | None = None
+        self.codes = 1 << len(bits) if (bits := settings.output.class_bits) else 0
+
+    @property
+    def ended(self) -> bool:
+        """Whether the person is done, or a signal came."""
+        return self._done or self._stopped()
+
+    @property
+    def trained(self) -> tuple[str, ...]:
+        """The labels that the delivered bundle was trained on."""
+        return materials.trained(self.base.bundle) if self.base else ()
+
+    def about(self) -> dict[str, Any]:
+        """The present phase, for the page."""
+        return (self._phase.about() if self._phase else {}) | {"good": self.lesson.good}
+
+    def obey(self, command: Command) -> list[object]:
+        """Carry out an order of the page, in the loop's thread."""
+        assert self._phase
+        return self._phase.obey(command)
+
+    def run(self, outputs: Outputs) -> None:
+        """Run until all sweeps are recorded; with a page until DONE."""
+        self.outputs = outputs
+        while self._ran(Recording) and outputs.pages and not self.ended and self._ran(Trying):
+            pass
+
+    def _ran(self, phase: type[Recording | Trying]) -> bool:
+        with ExitStack() as stack:
+            self._phase = phase(self, stack)
+            return self._phase.run()
+
+    def finish(self, _: str) -> list[object]:
+        """As the order DONE."""
+        self._done = True
+        return []
+
+    def port(self) -> Port | None:
+        """The line to the robot; none for a person at a terminal."""
+        sentences = self.settings.serial.port or not sys.stdout.isatty()
+        return assembly.port(self.settings, self.devices) if sentences else None
+
+    def by_robot(self, commands: Mapping[str, CommandHandler]) -> dict[str, CommandHandler]:
+        """The commands that the serial line carries, if the settings allow them to a robot."""
+        own = {name: act for name, act in commands.items() if name != "DISCARD"}
+        return own if self.settings.teach.serial else dict.fromkeys(own, _forbidden)
+
+
+class Phase:
+    """A part of the program with a box of its own. orders: of the page, before the box's own."""
+
+    box: Box
+    orders: Mapping[str, CommandHandler]
+
+    def obey(self, command: Command) -> list[object]:
+        """Carry out an order of the page."""
+        own = self.orders.get(command.name)
+        return own(command.text) if own else self.box.obey(command)
+
+
+class Recording(Phase):
+    """Records and assesses. `stack` closes it."""
+
+    def __init__(self, program: TeachingProgram, stack: ExitStack) -> None:
+        self._program, lesson, devices = program, program.lesson, program.devices
+        settings, again, outputs = program.settings, program.again, program.outputs
+        port, disk = program.port(), DiskThread()
+        say = port.say if port else lambda line: None
+        labels = Labels(again, lesson.position, lesson.session)
+        to = settings.kept("sweeps"), program.format, labels
+        self._recording = RecordingSession(
+            *to, devices.clock, say, lesson.good, disk, program.names
+        )
+        stack.callback(self._recording.close)
+        self._session = session = self._lesson(say)
+        stack.callback(session.close)
+        self._teacher = Teacher(session, () if again else lesson.labels, lesson.good)
+        base = program.base
+        self.box = assembly.recorder(
+            settings,
+            program.format,
+            devices,
+            port,
+            stack,
+            capture=outputs.capture(stack),
+            observers=[disk, *self._observers(), self._teacher, *outputs.pages],
+            commands={**session.recording_commands, **program.by_robot(session.commands)},
+            ordered=bool(outputs.pages or lesson.waits),
+            serving=False,
+            slides=slide_check(base.bundle) if base else SlidesAmong(program.format),
+        )
+        self.orders = {**session.recording_commands, **session.commands, "DONE": program.finish}
+        session.by = "the page" if outputs.pages else lesson.by or getpass.getuser()
+
+    def about(self) -> dict[str, Any]:
+        """The recording and the session."""
+        return self._recording.about() | {"teach": self._session.about()}
+
+    def run(self) -> bool:
+        """Run; returns whether a bundle was made."""
+        session, devices, box = self._session, self._program.devices, self.box
+        over = (
+            lambda: self._program.ended,
+            lambda: session.taught,
+            lambda: self._teacher.done,
+            lambda: devices.finished(box.answered),
+        )
+        box.run(lambda: any(end() for end in over))
+        return bool(session.taught)
+
+    def _lesson(self, say: Callable[[bytes], None]) -> TeachingSession:
+        """The session beside a recording. Raises ConfigError for a label that it refuses."""
+        program = self._program
+        if program.base:  # it has the materials of an earlier session by now
+            program.base = install.base(assembly.store(program.settings), program.format)
+        session = TeachingSession(
+            self._recording,
+            program.settings.teach,
+            lambda by: install.command(program.lesson.options, by),
+            say,
+            codes=program.codes,
+            base=program.base.bundle.manifest.labels if program.base else (),
+            trained=program.trained,
+        )
+        if program.lesson.labels:
+            session.admit(*program.lesson.labels)
+        return session
+
+    def _observers(self) -> list[Observer]:
+        outputs, waits = self._program.outputs, self._program.lesson.waits
+        facts: Facts = {
+            "model": lambda: NOTHING,
+            "recorded": lambda: self._recording.about()["missing"],
+            "teach": self._session.about,
+            "page": lambda: outputs.address,
+        }
+        runtime = self._program.settings.store.runtime_folder if waits.startswith("http") else None
+        return [
+            Notifier(SystemClock(), note=f"; {NOTHING}: {waits}" if waits else ""),
+            *([HandOver(runtime, SystemClock())] if runtime else []),
+            self._recording,
+            self._session,
+            *outputs.status(facts),
+            *outputs.feed(facts),
+        ]
+
+
+class Trying(Phase):
+    """Classifies with the new bundle, on trial as in the service. `stack` closes it."""
+
+    def __init__(self, program: TeachingProgram, stack: ExitStack) -> None:
+        program.again = ""
+        self._program, settings, outputs = program, program.settings, program.outputs
+        choice = assembly.store(settings).choose()
+        trial, disk = [stack.enter_context(choice.trial)] if choice.trial else [], DiskThread()
+        for one in trial:
+            one.disk = disk
+        self._bundle, m = choice.bundle, choice.bundle.manifest
+        facts: Facts = {"model": lambda: f"{m.name} {m.version}, {m.taught}"}
+        again = {"TEACH": self._teach_again}
+        self.orders = {**again, "DONE": program.finish}
+        reports = *trial, *outputs.status(facts), *outputs.pages
+        self.box = assembly.box(
+            settings,
+            choice.bundle,
+            program.devices,
+            program.port(),
+            stack,
+            observers=[disk, Notifier(SystemClock()), *reports],
+            commands=program.by_robot(again),
+            ordered=bool(outputs.pages),
+        )
+
+    def about(self) -> dict[str, Any]:
+        """The bundle that is tried."""
+        m = self._bundle.manifest
+        shown = {
+            "model": f"{m.name} {m.version}",
+            "labels": m.labels,
+            "displays": m.displays,
+            "taught": m.taught or f"taught into it: {', '.join(self._bundle.enrolled)}",
+        }
+        return {"trying": shown}
+
+    def run(self) -> bool:
+        """Run; returns whether more is to be taught."""
+        program, box = self._program, self.box
+        finished = program.devices.finished
+        box.run(lambda: program.ended or bool(program.again) or finished(box.answered))
+        return bool(program.again) and not program.ended
+
+    def _teach_again(self, label: str) -> list[object]:
+        label = label.strip()
+        Labels(material=label)
+        refuse_trained(self._program.trained, [label])
+        if self._program.codes:
+            check_bits(
+                self._program.codes, [*dict.fromkeys((*self._bundle.manifest.labels, label))]
+            )
+        self._program.again = label
+        return [label]
+
+
+def _forbidden(_: str) -> list[object]:
+    raise ApplianceError("the robot may not teach this box; set teach.serial = true to allow it")
