@@ -11,11 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from palpate.core.errors import FormatError
-from palpate.core.types import DATA_TYPES, EPOCH_BITS, MOST_AXES
+from palpate.core.types import DATA_TYPES, EPOCH_BITS
 from palpate.io import packets as wire
-from tests.factories.paths import ROOT
-
-PROTOCOL = ROOT / "firmware_config" / "PROTOCOL.md"
 
 
 def stream(count: int, frames: int = 3, first: int = 0, dtype: str = "uint8") -> list[bytes]:
@@ -66,26 +63,6 @@ def test_axes_that_cannot_be(byte: int, size: int):
     data = head + bytes(size) + struct.pack("<I", zlib.crc32(head + bytes(size)))
     got = wire.unpack(data)
     assert (got.packets, got.garbage + len(got.leftover)) == ([], len(data))
-
-
-def test_document_names_the_numbers():
-    """Magic, limits and offsets in PROTOCOL.md are the code's."""
-    text = PROTOCOL.read_text()
-    assert "magic 0x50 0xC1" in text
-    assert f"| {wire.HEADER.size} | n | payload" in text
-    assert f"at most {wire.MAX_PAYLOAD}" in text
-    assert f"up to {wire.RECENT:,} frames back" in text
-    assert all(f"| {r.value} | {r.name} |" in text for r in wire.Request)
-    assert (
-        f"| 1 | IDENTITY | {len(wire.pack_identity(wire.Identity(1, (1, 2, 3), 'b', 's')))} bytes"
-        in text
-    )
-    assert (
-        f"| 2 | FORMAT | {len(wire.pack_format(wire.SkinFormat(4, 4, 'uint8', 750, 750, 4)))} bytes"
-        in text
-    )
-    assert f"axes A of each taxel: 0 or 1 for one, at most {MOST_AXES}" in text
-    assert "data type: " + ", ".join(f"{i} {d}" for i, d in enumerate(DATA_TYPES)) in text
 
 
 @pytest.mark.parametrize("dtype", DATA_TYPES)
@@ -229,11 +206,7 @@ def test_identity_and_format_survive():
         (wire.unpack_identity, b"\x01", "36"),
         (wire.unpack_format, b"\x01", "16"),
         (wire.unpack_format, b"\x04\x04\x09" + bytes(13), "data type 9"),
-        (
-            wire.unpack_format,
-            b"\x04\x04\x00\x09" + bytes(12),
-            "9 axes of each taxel are more than the 8",
-        ),
+        (wire.unpack_format, b"\x04\x04\x00\x09" + bytes(12), "9 axes .* the 8"),
     ],
 )
 def test_broken_replies_are_named(call, value, hint):

@@ -136,22 +136,18 @@ def test_lines_with_other_text_around_their_numbers(keys: dict, line: bytes):
     found = decoded(p, line + end + b"boot: 1 2 3 4" + end + line + end)
     assert len(found) == 2, found.misfit
     np.testing.assert_array_equal(found.taxels[0, 0], np.float32([1, -2.5, 300, np.nan]))
-
-
-def test_a_sentence_with_another_sum_is_refused():
-    """A damaged NMEA sentence gives no frame."""
-    p = replace(TEXT, cols=4, around="$SKIN")
-    assert len(decoded(p, b"$SKIN,1,-2.6,300,nan*78\n")) == 0
+    if b"*" in line:
+        assert len(decoded(p, line.replace(b"5", b"6") + end)) == 0, "the sum of NMEA is wrong"
 
 
 @pytest.mark.parametrize(
     ("number", "line", "misfit"),
     [
-        ("uint16", b"1 -3 2 4", 'it sends -3, which uint16 cannot hold; set number = "float32"'),
-        ("uint16", b"1 2.5 2 4", "it sends 2.5, which uint16 cannot hold"),
-        ("int16", b"1 40000 2 4", "it sends 40000, which int16 cannot hold"),
-        ("float32", b"1 1e39 2 4", "it sends 1e39, which float32 cannot hold"),
-        ("uint16", b"a:1 b:2 c:3 d:4", "'a:b:c:d:' stands around its numbers, none is expected"),
+        ("uint16", b"1 -3 2 4", "-3, which uint16"),
+        ("uint16", b"1 2.5 2 4", "2.5, which uint16"),
+        ("int16", b"1 40000 2 4", "40000, which int16"),
+        ("float32", b"1 1e39 2 4", "1e39, which float32"),
+        ("uint16", b"a:1 b:2 c:3 d:4", "'a:b:c:d:'"),
     ],
 )
 def test_the_value_that_does_not_fit_is_named(number: str, line: bytes, misfit: str):
@@ -343,16 +339,6 @@ def test_orientation(orientation: tuple[str, ...], wanted: list[list[int]]):
     assert p.format.shape == got.shape[1:]
 
 
-def test_numbers_of_either_byte_order_and_a_count():
-    """Big-endian int16 with a uint16 count after the marker."""
-    p = replace(SMALL, number="int16", byte_order="big", sequence="uint16", rows=1, cols=2)
-    frame = b"\xaa\x55" + struct.pack(">Hhh", 65535, -2, 300)
-    found = decoded(p, frame * 3)
-    assert found.taxels.tolist() == [[[-2, 300]]] * 2
-    assert found.counts.tolist() == [65535] * 2
-    assert found.taxels.dtype == np.dtype("<i2")
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_split_or_whole_is_the_same(name: str):
     """Any split gives the frames, ends, garbage of the whole, with garbage in between."""
@@ -420,6 +406,7 @@ def test_nothing_but_marks_is_passed_over(name: str, monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize(
     ("number", "order", "wire", "values"),
     [
+        ("int16", "big", "ffff 8000 012c", [-1, -(1 << 15), 300]),
         ("uint24", "little", "010000 0000ff ffffff", [1, 0xFF0000, 0xFFFFFF]),
         ("uint24", "big", "000001 ff0000 ffffff", [1, 0xFF0000, 0xFFFFFF]),
         ("int24", "little", "ffffff 000080 ffff7f", [-1, -(1 << 23), (1 << 23) - 1]),
@@ -428,19 +415,15 @@ def test_nothing_but_marks_is_passed_over(name: str, monkeypatch: pytest.MonkeyP
         ("int32", "big", "ffffffff 80000000 00ffffff", [-1, -(1 << 31), (1 << 24) - 1]),
     ],
 )
-def test_numbers_of_24_and_32_bits(number: str, order: str, wire: str, values: list[int]):
-    """Both byte orders and signs. They become float32; of more than 24 bits the lowest are
-    rounded, so 2**32 - 1 reads 2**32."""
+def test_numbers_of_every_width(number: str, order: str, wire: str, values: list[int]):
+    """Both byte orders and signs. Above 16 bits they become float32, which rounds the lowest bits
+    of more than 24. A text has no width."""
+    if "4" in number:
+        with pytest.raises(ConfigError, match=number):
+            replace(TEXT, number=number)
     p = replace(SMALL, number=number, byte_order=order, rows=1, sequence="uint8")
     frames = b"".join(b"\xaa\x55" + bytes([i]) + bytes.fromhex(wire) for i in range(4))
     found = decoded(p, frames)
-    assert found.taxels.dtype == np.float32
-    assert p.format.dtype == "float32"
+    assert found.taxels.dtype == p.format.dtype == ("int16" if number == "int16" else "float32")
     assert found.taxels.tolist() == [[values]] * 3
     assert found.counts.tolist() == [0, 1, 2]
-
-
-def test_wide_numbers_belong_to_frames_of_fixed_length():
-    """A text has no width."""
-    with pytest.raises(ConfigError, match='number = "uint24" is for codec = "fixed"; write number'):
-        replace(TEXT, number="uint24")

@@ -62,7 +62,9 @@ def test_streams_without_loss(acm: bool):
     millisecond."""
     simulated = idle_devices(acm=acm)
     sensor = sensor_on(simulated)
+    assert simulated.backend.kernel_driver is acm, "cdc_acm has the device at first"
     frames = read_for(sensor, simulated, 5)
+    assert not simulated.backend.kernel_driver
     assert sensor.state == "streaming"
     assert sensor.trouble is None
     assert (np.diff(frames.seq) == 1).all()
@@ -74,14 +76,6 @@ def test_streams_without_loss(acm: bool):
     assert simulated.backend.dtr is acm, "a board on a serial port is told that somebody reads"
     sensor.close()
     assert not simulated.backend.board.running
-
-
-def test_acm_takes_the_board_from_the_kernel():
-    """cdc_acm has the device at first, and is detached."""
-    simulated = idle_devices(acm=True)
-    assert simulated.backend.kernel_driver
-    read_for(sensor_on(simulated), simulated, 0.1)
-    assert not simulated.backend.kernel_driver
 
 
 def test_no_libusb(monkeypatch: pytest.MonkeyPatch):
@@ -100,8 +94,6 @@ def test_no_libusb(monkeypatch: pytest.MonkeyPatch):
 @pytest.mark.parametrize(
     ("call", "code", "state", "hint"),
     [
-        ("claim", errno.EBUSY, "busy", "another program"),
-        ("open", errno.EACCES, "denied", "udev"),
         ("control", errno.EIO, "lost", "errno 5"),
         ("read", errno.EIO, "lost", "errno 5"),
         ("read", errno.EPIPE, "lost", "errno 32"),
@@ -156,35 +148,29 @@ def test_timeouts_with_partial_data():
 
 
 def test_zero_length_packets():
-    """Zero-length packets in between change nothing; nothing but them is silence."""
+    """Zero-length packets in between change nothing."""
     simulated = idle_devices()
     sensor = sensor_on(simulated)
     board, every = simulated.backend.board, iter(range(10**6))
     take = board.take
-    simulated.backend.mangle = lambda data: data
     board.take = lambda: b"" if next(every) % 3 == 0 else take()
-    due = board.due_ns
     frames = read_for(sensor, simulated, 2)
+    assert len(frames) > 1000
     assert (np.diff(frames.seq) == 1).all()
-    assert due() is not None
-    board.take = lambda: (take(), b"")[1]
-    states = {(sensor.read(), sensor.state)[1] for _ in range(2000)}
-    assert "silent" in states
 
 
 @pytest.mark.parametrize("acm", [False, True])
 def test_a_board_that_answers_and_sends_no_frame(acm: bool):
-    """Identity and format are right, and no frame comes: silent, never streaming, until the first
-    frame."""
+    """Identity and format are right, and only empty packets come: silent, never streaming, until
+    the first frame."""
     simulated = idle_devices(acm=acm)
     sensor = sensor_on(simulated)
     board = simulated.backend.board
     take, board.take = board.take, lambda: (take(), b"")[1]
-    end_ns = simulated.clock.now_ns() + 5_000_000_000
+    end_ns = simulated.clock.now_ns() + 5 * SECOND
     states = set()
     while simulated.clock.now_ns() < end_ns:
-        sensor.read()
-        states.add(sensor.state)
+        states.add((sensor.read(), sensor.state)[1])
     assert states == {"absent", "silent"}
     assert sensor.identity
     assert sensor.counters.enumerations > 3
@@ -221,48 +207,26 @@ def test_a_host_that_pauses_too_long():
     check_content(frames)
 
 
-@pytest.mark.parametrize(
-    ("change", "hint"),
-    [
-        ({"identity": {"protocol": 2}}, "protocol 2"),
-        ({"skin": {"rows": 3}}, "3x4"),
-        ({"skin": {"axes": 3}}, "4x4x3 uint8"),
-        ({"skin": {"dtype": "int16"}}, "int16"),
-        ({"skin": {"rate_hz": 765.0}}, "765 Hz"),
-    ],
-)
-def test_a_board_that_does_not_fit(change: dict, hint: str):
-    """Another protocol, grid, number of axes, data type or rate: state mismatch, naming both sides;
-    a matching board is used."""
-    simulated = idle_devices()
-    board = simulated.backend.board
-    before = {name: getattr(board, name) for name in change}
-    for name, fields in change.items():
-        setattr(board, name, replace(before[name], **fields))
-    sensor = sensor_on(simulated)
-    assert len(read_for(sensor, simulated, 1)) == 0
-    assert sensor.state == "mismatch"
-    assert hint in str(sensor.trouble)
-    for name, value in before.items():
-        setattr(board, name, value)
-    assert len(read_for(sensor, simulated, 1)) > 100
-
-
 @pytest.mark.parametrize("acm", [False, True])
-def test_a_skin_with_three_axes(acm: bool):
-    """All axes of every frame arrive at their indices. A box for one axis refuses this skin, and
-    the other way round."""
-    pillars = SweepFormat(3, 3, 1000.0, 2000, "float32", 3)
-    simulated = idle_devices(format=pillars, acm=acm)
-    sensor = sensor_on(simulated, pillars)
-    frames = read_for(sensor, simulated, 1)
+@pytest.mark.parametrize(
+    "format",
+    [SweepFormat(3, 3, 1000.0, 2000, "float32", 3), SweepFormat(16, 1, 35.61, 128, "int16")],
+    ids=["three axes", "a slow strip"],
+)
+def test_other_formats(format: SweepFormat, acm: bool):
+    """All values of every frame arrive at their indices. A box for another format refuses this
+    skin, naming both sides."""
+    simulated = idle_devices(600, format=format, acm=acm)
+    sensor = sensor_on(simulated, format)
+    frames = read_for(sensor, simulated, 1000 / format.rate_hz)
     assert (len(frames) > 900, sensor.counters.lost_frames) == (True, 0)
-    wanted = numbered(97, pillars)[(frames.seq & ((1 << EPOCH_BITS) - 1)) % 97]
+    wanted = numbered(97, format)[(frames.seq & ((1 << EPOCH_BITS) - 1)) % 97]
     np.testing.assert_array_equal(frames.taxels, wanted)
     sensor.close()
-    flat = sensor_on(simulated, replace(pillars, axes=1))
-    read_for(flat, simulated, 1)
-    assert "the skin sends 3x3x3 float32" in str(flat.trouble)
+    other = sensor_on(simulated, replace(format, axes=2))
+    read_for(other, simulated, 1)
+    assert other.state == "mismatch"
+    assert "x".join(map(str, format.shape)) in str(other.trouble)
 
 
 def test_a_board_that_answers_nonsense(monkeypatch: pytest.MonkeyPatch):
@@ -296,46 +260,23 @@ def test_no_fitting_interface():
     assert "skin.link" in str(sensor.trouble)
 
 
-def test_acm_board_that_never_answers():
-    """A CDC-ACM device that ignores requests: the box does not hang, has a state, and tries
-    again."""
-    simulated = idle_devices(acm=True)
-    simulated.backend.board.request = lambda request: b""
-    sensor = sensor_on(simulated)
-    read_for(sensor, simulated, 3)
-    assert sensor.state != "streaming"
-    assert sensor.trouble is not None
-
-
-def test_acm_board_that_answers_a_byte_at_a_time():
-    """A reply that never becomes complete is abandoned after half a second, even if bytes still
-    come."""
+@pytest.mark.parametrize("reply", [0, 1])
+def test_acm_board_whose_reply_never_ends(reply: int):
+    """A reply that does not come, or comes a byte at a time, is given up after half a second."""
     simulated = idle_devices(acm=True)
     sensor = sensor_on(simulated)
     backend = simulated.backend
     backend.bulk_write = lambda *args: 1
 
-    def a_byte(handle, ep, intf, buff, ms) -> int:
+    def some_bytes(handle, ep, intf, buff, ms) -> int:
         simulated.clock.sleep_until(simulated.clock.now_ns() + 400_000_000)
-        return 1
+        return reply
 
-    backend.bulk_read = a_byte
+    backend.bulk_read = some_bytes
     begun = simulated.clock.now_ns()
     sensor.read()
     assert sensor.state == "mismatch"
     assert simulated.clock.now_ns() - begun < 3 * SECOND
-
-
-def test_another_format_is_not_other_code():
-    """16x1 int16 at 35.61 Hz over the same wire."""
-    format = SweepFormat(16, 1, 35.61, 128, "int16")
-    simulated = idle_devices(600, format)
-    sensor = sensor_on(simulated, format)
-    frames = read_for(sensor, simulated, 20)
-    assert frames.taxels.dtype == np.int16
-    assert frames.taxels.shape[1:] == (16, 1)
-    assert (np.diff(frames.seq) == 1).all()
-    assert sensor.state == "streaming"
 
 
 @pytest.mark.parametrize("replugged", [True, False])
