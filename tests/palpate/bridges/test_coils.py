@@ -97,83 +97,42 @@ def test_a_refused_command_is_carried_out_when_it_is_sent_again(
     assert source.sent == ["START"] * 3
 
 
-@pytest.mark.parametrize("write", [one(START, True), several(START)])
-def test_a_command_that_met_a_busy_bridge_is_carried_out_when_it_is_sent_again(write: bytes):
-    """Exception 6 while another peer's command runs, with the coil off; afterwards the same write
-    sends the command."""
-    source = ScriptedSource()
-    bridge = ModbusBridge(source, SystemClock(), writes=True)
-    mine, slide = [False] * len(COILS), [0] * len(SLIDE)
-
-    async def both() -> None:
-        running, go_on = asyncio.Event(), asyncio.Event()
-        to_thread = asyncio.to_thread
-
-        async def slow(send: Callable[[str], str], command: str) -> str:
-            running.set()
-            await go_on.wait()
-            return await to_thread(send, command)
-
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(asyncio, "to_thread", slow)
-            tare = asyncio.create_task(
-                bridge.answer(ModbusRequest(1, 1, one(8, True)), [False] * len(COILS), slide)
-            )
-            await running.wait()
-            assert await bridge.answer(ModbusRequest(1, 1, write), mine, slide) == bytes(
-                [write[0] | 0x80, 6]
-            )
-            assert not any(mine)
-            go_on.set()
-            await tare
-        assert await bridge.answer(ModbusRequest(2, 1, write), mine, slide) == write[:5]
-
-    asyncio.run(both())
-    assert source.sent == ["TARE", "START"]
+BOTH = START | STOP
+WRITES: dict[str, tuple[list[tuple[str, int, int]], list[str]]] = {
+    "no STOP goes out without its START": (
+        [("START", BOTH, 0), ("", BOTH, BOTH)],
+        ["START", "START", "STOP"],
+    ),
+    "what was carried out is not repeated": (
+        [("STOP", BOTH, START), ("", BOTH, BOTH)],
+        ["START", "STOP", "STOP"],
+    ),
+    "a coil falls although another is refused": (
+        [("", START, START), ("STOP", STOP, 0), ("", START, START)],
+        ["START", "STOP", "START"],
+    ),
+    "the old sweep ends, then a new object, then its sweep": (
+        [("", 0b11111, 0b11111)],
+        ["ABORT", "NEW", "TARE", "START", "STOP"],
+    ),
+}
+"""Writes of all coils: the command that the box refuses, the coils wanted and those on afterwards;
+and all commands that were sent."""
 
 
-def test_no_stop_goes_out_without_its_start(source: ScriptedSource, ask: Callable[[bytes], bytes]):
-    """Both in one write: after a refused START no STOP is sent; sent again, both are, in order."""
-    source.refused = {"START"}
-    assert ask(several(START | STOP)) == b"\x8f\x04"
-    assert levels(ask) == 0
-    assert source.sent == ["START"]
-    source.refused = set()
-    assert ask(several(START | STOP))[0] == 15
-    assert source.sent == ["START", "START", "STOP"]
-    assert levels(ask) == START | STOP
-
-
-def test_a_command_that_was_carried_out_is_not_repeated(
-    source: ScriptedSource, ask: Callable[[bytes], bytes]
+@pytest.mark.parametrize(("writes", "sent"), WRITES.values(), ids=WRITES)
+def test_several_coils_in_one_write(
+    source: ScriptedSource,
+    ask: Callable[[bytes], bytes],
+    writes: list[tuple[str, int, int]],
+    sent: list[str],
 ):
-    """START was carried out, STOP was refused: sent again, the write sends STOP alone."""
-    source.refused = {"STOP"}
-    assert ask(several(START | STOP)) == b"\x8f\x04"
-    assert levels(ask) == START
-    source.refused = set()
-    assert ask(several(START | STOP))[0] == 15
-    assert source.sent == ["START", "STOP", "STOP"]
-
-
-def test_a_coil_falls_although_another_is_refused(
-    source: ScriptedSource, ask: Callable[[bytes], bytes]
-):
-    """START falls with the write whose STOP is refused, so the next START is a command again."""
-    ask(several(START))
-    source.refused = {"STOP"}
-    assert ask(several(STOP)) == b"\x8f\x04"
-    assert levels(ask) == 0
-    assert ask(several(START))[0] == 15
-    assert source.sent == ["START", "STOP", "START"]
-
-
-def test_the_commands_of_one_write_have_an_order(
-    source: ScriptedSource, ask: Callable[[bytes], bytes]
-):
-    """The old sweep ends first, then the new object is announced, then its sweep begins."""
-    assert ask(several(0b11111))[0] == 15
-    assert source.sent == ["ABORT", "NEW", "TARE", "START", "STOP"]
+    """Exception 4 if a command is refused; a coil is on only if its command was carried out."""
+    for refused, wanted, on in writes:
+        source.refused = {refused}
+        assert ask(several(wanted))[:2] == (b"\x8f\x04" if refused else b"\x0f\x00")
+        assert levels(ask) == on
+    assert source.sent == sent
 
 
 @pytest.mark.parametrize(

@@ -251,16 +251,6 @@ def test_ros(box: SpeakingBox, block: int, program: str, settings: dict[str, flo
     assert sweeps(box)[:5] == ["NEW", "START", "STOP", "START", "STOP"]
 
 
-def test_every_page_is_linked_and_every_link_leads_somewhere():
-    """README names each page; no link is dead."""
-    folder = ROOT / "docs" / "robots"
-    readme = (folder / "README.md").read_text()
-    for page in folder.glob("*.md"):
-        for target in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
-            assert (folder / target).is_file(), f"{page.name}: {target}"
-        assert page.name == "README.md" or f"({page.name})" in readme
-
-
 @pytest.mark.slow
 @pytest.mark.thorough  # starts processes and waits for them
 def test_the_manuals_client_without_hardware(tmp_path: Path):
