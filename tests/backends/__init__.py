@@ -28,21 +28,10 @@ NAMES = {
 }
 
 ALL = frozenset(
-    (
-        "skin",
-        "numbered",
-        "plug",
-        "unbind",
-        "garble",
-        "silence",
-        "hold",
-        "deny",
-        "lines",
-        "overrun",
-        "serial",
-        "stall",
-        "pull",
-    )
+    [
+        *("skin", "numbered", "plug", "unbind", "garble", "silence", "hold", "deny"),
+        *("lines", "overrun", "serial", "stall", "pull"),
+    ]
 )
 """All capabilities of backends. `Backend` explains each."""
 

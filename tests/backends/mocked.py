@@ -33,12 +33,8 @@ class Mocked(real.Real):
         self._chip = mocked_gpio.Chip(bench, [f"GPIO{i}" for i in range(28)])
         self._far = tty.PseudoTerminalEnd(stack)
         self.serial = replace(settings.serial, port=str(self._far.path))
-        self.put, self.pull, self.say, self.hear = (
-            self._far.put,
-            self._far.pull,
-            self._far.say,
-            self._far.hear,
-        )
+        self.put, self.pull = self._far.put, self._far.pull
+        self.say, self.hear = self._far.say, self._far.hear
         self.drive, self.unplug = self._chip.drive, self._socket.unplug
 
     def reset(self) -> None:

@@ -34,12 +34,8 @@ class Simulated:
         self.sensor, self.trigger, self.output = settings.skin, settings.trigger, settings.output
         self._far = tty.PseudoTerminalEnd(stack)
         self.serial = replace(settings.serial, port=str(self._far.path))
-        self.put, self.pull, self.say, self.hear = (
-            self._far.put,
-            self._far.pull,
-            self._far.say,
-            self._far.hear,
-        )
+        self.put, self.pull = self._far.put, self._far.pull
+        self.say, self.hear = self._far.say, self._far.hear
 
     def reset(self) -> None:
         self.backend.errors.clear()

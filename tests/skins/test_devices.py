@@ -31,18 +31,8 @@ def settings(name: str) -> config.Config:
 def test_what_is_recorded_is_what_was_felt(name: str, tmp_path: Path) -> None:
     """`record --sim skin:wood --skin NAME`: each window is the middle of its slide, to the frame
     and to the count."""
-    arguments = [
-        "--sim",
-        "skin:wood",
-        "--skin",
-        name,
-        "--virtual",
-        "--seed",
-        str(SEED),
-        "--sweeps",
-        str(SWEEPS),
-    ]
-    assert main(["record", *arguments, "--out", str(tmp_path)]) == 0
+    words = f"record --sim skin:wood --skin {name} --virtual --seed {SEED} --sweeps {SWEEPS} --out"
+    assert main([*words.split(), str(tmp_path)]) == 0
     profile = skins.profile(settings(name))
     acts = islice(script.tubes(SEED, seen=sweeps.view(name, profile.format), only="wood"), SWEEPS)
     for path, act in zip(sorted(tmp_path.glob("*.npy")), acts, strict=True):
@@ -89,28 +79,17 @@ def test_demo_without_a_bundle_for_the_skin(capsys: pytest.CaptureFixture[str]) 
     """One line with the missing bundle and how to make it."""
     assert main(["demo", "--skin", "papillarray", "--virtual", "--sweeps", "1"]) == 65
     (line,) = capsys.readouterr().err.splitlines()
-    assert (
-        "sends 3x3x3 float32 at 1000 Hz, window 2000, 4x4 uint8 at 750 Hz, window 1500 is wanted"
-        in line
-    )
-    assert "classifier.bundle=DIR" in line
+    for named in ("3x3x3 float32 at 1000 Hz", "4x4 uint8 at 750 Hz", "classifier.bundle=DIR"):
+        assert named in line
 
 
 def test_replayed_set_through_the_bytes_of_a_skin(tmp_path: Path) -> None:
     """`--sim replay:SET --skin NAME` plays a set of that skin over its line."""
     format = skins.profile(settings("flexitac")).format
-    samples = (
-        np.random.default_rng(1)
-        .integers(0, 200, (2, format.window, *format.shape))
-        .astype(np.uint8)
-    )
-    np.savez(
-        tmp_path / "s.npz",
-        samples=samples,
-        labels=[0, 1],
-        materials=["a", "b"],
-        rate_hz=format.rate_hz,
-    )
+    rng = np.random.default_rng(1)
+    samples = rng.integers(0, 200, (2, format.window, *format.shape)).astype(np.uint8)
+    told = {"labels": [0, 1], "materials": ["a", "b"], "rate_hz": format.rate_hz}
+    np.savez(tmp_path / "s.npz", samples=samples, **told)
     arguments = ["--sim", f"replay:{tmp_path / 's.npz'}", "--skin", "flexitac", "--virtual"]
     assert main(["record", *arguments, "--out", str(tmp_path / "kept")]) == 0
     kept = [types.load(path)[0].frames.taxels for path in sorted((tmp_path / "kept").glob("*.npy"))]

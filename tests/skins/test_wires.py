@@ -20,57 +20,6 @@ PREVIEW = bytes.fromhex(
 in the tests of the project langxin11/parallel_gripper_tactile."""
 
 
-def test_marked() -> None:
-    """FlexiTac: AA 55, then the rows."""
-    assert wires.wire("flexitac", 100).frame(
-        np.array([[1, 2], [3, 255]], np.uint8), 0
-    ) == bytes.fromhex("aa55010203ff")
-    big = wires.Marked(100, b"\x55\xaa\x01", ">u2", b"\r\n")
-    assert big.frame(np.array([[1, 0x1234]], np.uint16), 0) == bytes.fromhex("55aa01000112340d0a")
-
-
-def test_magnetic() -> None:
-    """AnySkin: t, x, y, z of each chip, CR LF, 82 bytes in all; ReSkin the same as text."""
-    taxels = np.arange(15, dtype=np.float32).reshape(1, 5, 3) - 7
-    sent = wires.wire("anyskin", 28).frame(taxels, 0)
-    assert len(sent) == 82
-    assert struct.unpack("<20f2s", sent) == (
-        25,
-        -7,
-        -6,
-        -5,
-        25,
-        -4,
-        -3,
-        -2,
-        25,
-        -1,
-        0,
-        1,
-        25,
-        2,
-        3,
-        4,
-        25,
-        5,
-        6,
-        7,
-        b"\r\n",
-    )
-    text = wires.wire("reskin", 28).frame(np.array([[[1.25, -2, 300.126]]], np.float32), 0)
-    assert text == b"25.00\t1.25\t-2.00\t300.13\r\n"
-
-
-def test_rows() -> None:
-    """3D-ViTac: a line for each row, and an empty line."""
-    sent = wires.wire("3d-vitac", 32).frame(np.arange(256, dtype=np.uint8).reshape(16, 16), 0)
-    lines = sent.split(b"\r\n")
-    assert lines[0] == b"0 1 2 3 4 5 6 7 8 9 10 11 12 13 14 15"
-    assert len(lines) == 18
-    assert lines[16:] == [b"", b""]
-    assert wires.Rows(10, ",").frame(np.array([[7]], np.uint8), 0) == b"7\r\n\r\n"
-
-
 def test_papillarray_as_a_controller_sends_it() -> None:
     """The layout of two sensors is that of a real controller to the byte; sum and end marker follow
     from the layout."""
@@ -78,27 +27,6 @@ def test_papillarray_as_a_controller_sends_it() -> None:
     assert sent.startswith(PREVIEW)
     body = sent[4:-6]
     assert sent[-6:] == (sum(body) % 65536).to_bytes(2, "little") + bytes.fromhex("aabbccdd")
-
-
-def test_papillarray_numbers() -> None:
-    """One sensor, by hand: block 3 lies where the table says, and pillar 9's force is the last but
-    its displacement."""
-    skin = wires.PapillArray(500, counter=7)
-    force = np.arange(27, dtype=np.float32).reshape(3, 3, 3)
-    sent = skin.frame(force, 123_456_789_012)
-    body = sent[4:-6]
-    table = dict(struct.unpack_from("<HH", body, 1 + 4 * i) for i in range(6))
-    assert struct.unpack_from("<IQ", body, table[1]) == (7, 123_456_789_012)
-    ((sensor,),) = [struct.unpack_from("<xxH", body, table[3])]
-    count, *pillars = struct.unpack_from("<10H", body, sensor)
-    assert count == 9
-    read = [struct.unpack_from("<H6f", body, at) for at in pillars]
-    assert {item[0] for item in read} == {2}
-    assert [item[1:4] for item in read] == [tuple(f) for f in force.reshape(9, 3).tolist()]
-    assert table[4] == pillars[-1] + 26
-    (whole,) = struct.unpack_from("<xxH", body, table[4])
-    assert struct.unpack_from("<H3f", body, whole) == (2, 9 * 12, 9 * 13, 9 * 14)
-    assert skin.frame(force, 0)[4 + table[1] :][:4] == b"\x08\0\0\0"
 
 
 def test_papillarray_commands() -> None:
@@ -140,27 +68,6 @@ def test_slcan() -> None:
     skin.invalid = frozenset({0})
     assert skin.frame(taxels, 0).startswith(b"t710800FA34")
     assert skin.receive(b"C\r") == b"\r"
-    assert not skin.streaming
-
-
-def test_robotiq() -> None:
-    """It sends after autosend with a period, stops at 0, and tells its version; fields in the
-    published order."""
-    skin = wires.Robotiq(60)
-    assert not skin.streaming
-    assert skin.receive(bytes.fromhex("009a00e300 9a0058")) == bytes.fromhex("9a00e305") + b"2.0.1"
-    skin.receive(bytes.fromhex("0110"))
-    assert (skin.streaming, skin.period_ns) == (True, 16e6)
-    taxels = np.arange(56).reshape(14, 4) + 0x2700
-    sent = skin.frame(taxels.astype(np.uint16), 5)
-    assert sent[:4] == bytes.fromhex("9a005898")
-    assert sent[4:9] == bytes.fromhex("1027002701")
-    assert sent[61:64] == bytes.fromhex("200000")
-    assert sent[64:71] == bytes.fromhex("30000000004000")
-    assert sent[71:80] == bytes.fromhex("700000000000000005")
-    assert sent[80:85] == bytes.fromhex("14271c271d")
-    assert skin.frame((taxels + 3).astype(np.uint16), 6)[61:64] == bytes.fromhex("200003")
-    skin.receive(bytes.fromhex("9a00580100"))
     assert not skin.streaming
 
 

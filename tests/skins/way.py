@@ -51,37 +51,16 @@ def go(name: str, folder: Path) -> dict[str, Any]:
     chosen = ("--skin", name, "--virtual")
     for seed in TRAINED:
         for material in skin.MATERIALS:
-            box(
-                "record",
-                *chosen,
-                "--sim",
-                f"skin:{material}",
-                "--seed",
-                seed,
-                "--sweeps",
-                RECORDED,
-                "--material",
-                material,
-                "--position",
-                f"p{seed}",
-                "--out",
-                sweeps,
-            )
+            played = ("--sim", f"skin:{material}", "--seed", seed, "--sweeps", RECORDED)
+            labels = ("--material", material, "--position", f"p{seed}")
+            box("record", *chosen, *played, *labels, "--out", sweeps)
     desktop("sets", "describe", sweeps)
     fitted = desktop("fit", "--set", sweeps, "--seed", 1, "--out", fit)
     desktop("export", fit, "--out", bundle, "--name", name, "--version", 1)
     right = total = lost = 0
     for seed in TESTED:
-        text = box(
-            "demo",
-            *chosen,
-            "--set",
-            f"classifier.bundle={bundle}",
-            "--seed",
-            seed,
-            "--sweeps",
-            PLAYED,
-        )
+        played = ("--set", f"classifier.bundle={bundle}", "--seed", seed, "--sweeps", PLAYED)
+        text = box("demo", *chosen, *played)
         good, of = map(int, re.findall(r"all sweeps\s+(\d+) / (\d+)", text)[-1])
         right, total = right + good, total + of
         lost += int(re.findall(r"frames lost\s+(\d+)", text)[-1])

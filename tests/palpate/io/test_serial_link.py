@@ -107,20 +107,6 @@ def test_unplugged_and_replugged(board: SerialBoard):
             assert (frames.taxels == skins.counts(frames.seq, FMT)).all()
 
 
-def test_another_format_is_a_mismatch(board: SerialBoard):
-    """A readout board with another grid is refused with both formats named; it is asked again, and
-    used once it fits."""
-    board.board = skins.board(Skin(rows=3), CLOCK)
-    board.plug()
-    with closing(sensor_on(board)) as sensor:
-        read_until(sensor, lambda n: sensor.state == "mismatch")
-        assert "3x4" in str(sensor.trouble)
-        board.unplug()
-        board.board = skins.board(Skin(), CLOCK)
-        board.plug()
-        read_until(sensor, lambda n: n > 10)
-
-
 def test_a_reply_in_the_middle_of_an_old_stream(line: tuple[int, str]):
     """Frames that an earlier program left running come before the reply and are left out."""
     far, path = line

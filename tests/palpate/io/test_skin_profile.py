@@ -106,14 +106,6 @@ def test_delivered(name: str):
     assert p.format.window == max(1, round(2 * p.rate_hz))
 
 
-def test_the_template_explains_each_key():
-    """matrix.toml contains or mentions every key."""
-    text = (FOLDER / "matrix.toml").read_text()
-    assert [
-        key for key in skin_profile._KEYS if not re.search(rf"^#?{key} = ", text, re.MULTILINE)
-    ] == []
-
-
 def test_modem_manager_leaves_each_skin_alone():
     """The rules that `make install` delivers name the USB ids of every delivered profile."""
     rules = (ROOT / "firmware_config" / "70-palpate.rules").read_text()

@@ -100,25 +100,20 @@ def played_set(folder: Path, bundle: Bundle, each: int = 4) -> str:
     return f"replay:{folder / 's.npz'}"
 
 
-def test_demo_of_a_set_shows_its_materials_in_turn(
-    tmp_path: Path, default_bundle: Bundle, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(("each", "more"), [(4, []), (1, ["--sweeps", "50"])])
+def test_demo_of_a_set(
+    each: int,
+    more: list[str],
+    tmp_path: Path,
+    default_bundle: Bundle,
+    capsys: pytest.CaptureFixture[str],
 ):
     """Three sweeps of a set of three materials show each once, also where the file has them one
-    after another."""
-    assert main(["demo", *VIRTUAL, "--sim", played_set(tmp_path, default_bundle)]) == 0
-    named = [line.split()[1] for line in capsys.readouterr().out.splitlines() if "-> " in line]
-    assert sorted(named) == ["a", "b", "c"]
-
-
-def test_demo_of_a_set_ends_with_the_set(
-    tmp_path: Path, default_bundle: Bundle, capsys: pytest.CaptureFixture[str]
-):
-    """More sweeps are asked for than there are: all are shown, then the table, and the exit code is
-    0."""
-    which = ["--sim", played_set(tmp_path, default_bundle, 1), "--sweeps", "50"]
-    assert main(["demo", "--virtual", *which]) == 0
+    after another, or ends before the sweeps that are asked for."""
+    which = ["--sim", played_set(tmp_path, default_bundle, each)]
+    assert main(["demo", *VIRTUAL, *which, *more]) == 0
     out = capsys.readouterr().out
-    assert out.count("-> ") == 3
+    assert sorted(line.split()[1] for line in out.splitlines() if "-> " in line) == ["a", "b", "c"]
     assert "not in the bundle: " in out
 
 
@@ -132,15 +127,8 @@ def test_materials_that_the_bundle_never_learnt_are_counted_apart(
     names[:2] = default_bundle.manifest.labels[:2]
     text = replace(default_bundle.manifest, labels=tuple(names)).json()
     folder = deliveries.put(tmp_path / "few", files | {bundle.MANIFEST: text})
-    assert (
-        main(
-            [
-                *("demo", "--virtual", "--sim", "skin", "--sweeps", "12"),
-                *("--set", f"classifier.bundle={folder}"),
-            ]
-        )
-        == 0
-    )
+    command = ["demo", "--virtual", "--sim", "skin", "--sweeps", "12"]
+    assert main([*command, "--set", f"classifier.bundle={folder}"]) == 0
     out = capsys.readouterr().out
     table = out[out.index("right / all") :].splitlines()
     assert sorted(line.split()[0] for line in table[1:3]) == sorted(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 
 from palpate.client.answers import Answer
@@ -13,21 +15,9 @@ from palpate.tools.score import AnswerScore
 
 def answer(number: int, label: str, status: Status = Status.OK, share: float = 1.0) -> Answer:
     """One that went through its sentence."""
-    v = Verdict(
-        number,
-        10**9,
-        status,
-        label,
-        0.9,
-        0.8,
-        np.array([0.9, 0.1]),
-        1,
-        0,
-        1_500_000,
-        "9f3c2a1b",
-        share=share,
-    )
-    read = Answer.read(result(v, "sim").decode().strip())
+    scores = np.array([0.9, 0.1])
+    told = (status, label, 0.9, 0.8, scores, 1, 0, 1_500_000, "9f3c2a1b")
+    read = Answer.read(result(Verdict(number, 10**9, *told, share=share), "sim").decode().strip())
     assert read
     return read
 
@@ -41,22 +31,16 @@ def test_only_ok_with_the_right_label_counts():
     """Another label, and the right one that is unsure, are wrong; percentages have their
     intervals."""
     score = AnswerScore(frozenset({"wood", "paper"}))
-    answers = [
-        answer(1, "wood"),
-        answer(2, "wood"),
-        answer(3, "wood", Status.UNSURE),
-        answer(4, "wood", share=0.5),
-    ]
     right = [
-        score.add(act(name), one)
-        for name, one in zip(("wood", "paper", "wood", "wood"), answers, strict=True)
+        score.add(act("wood"), answer(1, "wood")),
+        score.add(act("paper"), answer(2, "wood")),
+        score.add(act("wood"), answer(3, "wood", Status.UNSURE)),
+        score.add(act("wood"), answer(4, "wood", share=0.5)),
     ]
     assert right == [True, False, False, True]
-    assert score.table()[1:] == [
-        "  paper               0 / 1",
-        "  wood                2 / 3",
-        "  all sweeps          2 / 4     50.0 % [15.0, 85.0]",
-    ]
+    table = "".join(score.table()[1:])
+    assert re.findall(r"\d+ / \d+", table) == ["0 / 1", "2 / 3", "2 / 4"]
+    assert "[15.0, 85.0]" in table
     assert score.touch(750.0) == "2.00 s mean, 1 of 4 answered early"
     assert score.latency() == "1.50 ms median, 1.50 ms worst"
 
@@ -82,8 +66,7 @@ def test_a_material_that_the_bundle_does_not_know_is_unknown_at_best():
     assert right == [False, True, False, True]
     assert score.answers == 4
     assert score.objects == []
-    assert score.table()[1:] == [
-        "  wood                1 / 1",
-        "  all sweeps          1 / 1     100.0 % [20.7, 100.0]",
-        "  not in the bundle: 1 of 3 sweeps called unknown (cork, felt)",
-    ]
+    *counted, apart = score.table()[1:]
+    assert re.findall(r"\d+ / \d+", "".join(counted)) == ["1 / 1", "1 / 1"]
+    assert "1 of 3" in apart
+    assert "cork, felt" in apart

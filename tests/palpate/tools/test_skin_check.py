@@ -7,6 +7,8 @@ import struct
 import zlib
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import pytest
 
@@ -23,18 +25,8 @@ from tests.factories import pico
 from tests.factories.simulated_box import idle_devices
 
 PARTS = (
-    "identity",
-    "format",
-    "start",
-    "crc",
-    "packets",
-    "sequence",
-    "loss",
-    "rate",
-    "clock",
-    "requests",
-    "overflow",
-    "stop",
+    *("identity", "format", "start", "crc", "packets", "sequence"),
+    *("loss", "rate", "clock", "requests", "overflow", "stop"),
 )
 Fault = Callable[[SimDevices], object]
 
@@ -57,14 +49,12 @@ def of_packets(change: Callable[[packets.Packet], packets.Packet]) -> Fault:
         p = change(p)
         return packets.pack(p.seq, p.t_us, p.taxels, p.flags)
 
-    return lambda simulated: setattr(simulated.backend, "mangle", mangled)
+    return of_bytes(mangled)
 
 
 def of_crc(crc: Callable[[bytes], bytes]) -> Fault:
     """Each packet with another CRC."""
-    return lambda simulated: setattr(
-        simulated.backend, "mangle", lambda data: data[:-4] + crc(data[:-4])
-    )
+    return of_bytes(lambda data: data[:-4] + crc(data[:-4]))
 
 
 def of_bytes(change: Callable[[bytes], bytes]) -> Fault:
@@ -74,24 +64,22 @@ def of_bytes(change: Callable[[bytes], bytes]) -> Fault:
 
 def of_replies(number: int, change: Callable[[bytes], bytes]) -> Fault:
     """One reply changed."""
+    return lambda simulated: _intercepted(
+        simulated, lambda right, n: change(right(n)) if n == number else right(n)
+    )
 
-    def faulty(simulated: SimDevices) -> None:
-        board = simulated.backend.board
-        right = board.request
-        board.request = lambda n: change(right(n)) if n == number else right(n)  # type: ignore[method-assign]
 
-    return faulty
+def _intercepted(simulated: SimDevices, answer: Callable[[Any, int], bytes]) -> None:
+    """The board answers requests by `answer`, which gets its own method."""
+    board = simulated.backend.board
+    board.request = partial(answer, board.request)  # type: ignore[method-assign]
 
 
 def of_requests(change: Callable[[rig.ReadoutBoard, int], bool]) -> Fault:
     """Requests that `change` deals with itself are not seen by the board."""
-
-    def faulty(simulated: SimDevices) -> None:
-        board = simulated.backend.board
-        right = board.request
-        board.request = lambda n: b"" if change(board, n) else right(n)  # type: ignore[method-assign]
-
-    return faulty
+    return lambda simulated: _intercepted(
+        simulated, lambda right, n: b"" if change(simulated.backend.board, n) else right(n)
+    )
 
 
 def of_format(**changes: object) -> Fault:

@@ -45,13 +45,6 @@ def test_every_skin_is_found(name: str, rate: float):
     assert ("skin.rate_hz" in found.detail) == (rate != 1 and not p.rates_hz)
 
 
-def test_ids_come_first():
-    """The ids are named, and profiles with them are tried first."""
-    clock = VirtualClock()
-    port = WirePort(clock, lambda i: wire("flexitac", i), 1e7)
-    assert found_on(port, clock).detail.startswith("ids as flexitac; sends 16x32 uint8")
-
-
 def test_another_grid_of_a_known_skin():
     """The marks of a matrix at another distance: the number of its taxels, and what to set."""
     clock = VirtualClock()

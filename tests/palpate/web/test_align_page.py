@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import signal
-import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -25,22 +24,13 @@ from palpate.web.access import Access
 from palpate.web.server import PageServer
 from tests.factories.browser import WAIT_S, BrowsedPage, contrast, luminance, until
 
+pytestmark = pytest.mark.slow
+
 PLACE = ContactPositions(4.0, (6.0, 6.4), (6.0, 5.8), 0.6)
 LOADS = tuple(tuple(float(20 * r + c) for c in range(4)) for r in range(4))
 VIEW = View(
-    7,
-    "usb",
-    "tubes 3, 9f3c2a1b",
-    "streaming",
-    "off",
-    "2.2 mm too far towards row 1",
-    "move the skin",
-    (4, 4),
-    LOADS,
-    80.0,
-    (3.8, 6.0),
-    (6.0, 6.0),
-    PLACE,
+    *(7, "usb", "tubes 3, 9f3c2a1b", "streaming", "off", "2.2 mm too far towards row 1"),
+    *("move the skin", (4, 4), LOADS, 80.0, (3.8, 6.0), (6.0, 6.0), PLACE),
 )
 
 
@@ -106,7 +96,6 @@ def reached(seen: BrowsedPage, wanted: Callable[[dict[str, Any]], bool]) -> dict
     return shown
 
 
-@pytest.mark.slow
 def test_the_whole_way(browser: Any, box: tuple[subprocess.Popen[bytes], str]):
     """The real command: the page waits for contact, advises, follows the next touch; when it ends,
     "no connection"."""
@@ -114,9 +103,8 @@ def test_the_whole_way(browser: Any, box: tuple[subprocess.Popen[bytes], str]):
     context = browser.new_context(viewport={"width": 820, "height": 1180})
     seen = BrowsedPage(context, address)
     advice = re.compile(r"2\.\d mm too far towards row 1 and 2\.\d mm towards column 1")
-    off = reached(
-        seen, lambda shown: shown["state"] == "off" and bool(advice.fullmatch(shown["message"]))
-    )
+    wanted = lambda shown: shown["state"] == "off" and bool(advice.fullmatch(shown["message"]))  # noqa: E731
+    off = reached(seen, wanted)
     assert "move the skin" in off["hint"]
     assert (off["simulated"], off["skin"]) == (True, "skin streaming")
     assert (off["trained"], off["way"]) == (2, "visible")
@@ -138,7 +126,6 @@ def test_the_whole_way(browser: Any, box: tuple[subprocess.Popen[bytes], str]):
     context.close()
 
 
-@pytest.mark.slow
 def test_the_page_draws_what_the_box_says(browser: Any, page: PageServer):
     """Loads as shades and numbers, points at their coordinates, the message in large letters and
     for screen readers."""
@@ -166,32 +153,14 @@ def test_the_page_draws_what_the_box_says(browser: Any, page: PageServer):
     assert seen.text("#message") == "✓ in place"
     assert not seen.page.is_visible("#way")
     assert not seen.page.is_visible("#push")
-    page.show(
-        replace(
-            VIEW,
-            number=9,
-            state="no-skin",
-            skin="absent",
-            message="no skin: absent",
-            load=(),
-            centre=None,
-        )
-    )
+    absent = {"state": "no-skin", "skin": "absent", "message": "no skin: absent"}
+    page.show(replace(VIEW, number=9, load=(), centre=None, **absent))
     seen.state("no-skin")
     assert seen.text("#state") == "skin absent"
     assert set(seen.page.locator(".count").all_text_contents()) == {""}
-    page.show(
-        replace(
-            VIEW,
-            number=10,
-            shape=(2, 3),
-            load=((1.0, 2, 3),) * 2,
-            contact=None,
-            state="no-positions",
-            nearest=None,
-            centre=(0.5, 1.0),
-        )
-    )
+    other = {"shape": (2, 3), "load": ((1.0, 2, 3),) * 2, "centre": (0.5, 1.0)}
+    bare = {"contact": None, "nearest": None, "state": "no-positions"}
+    page.show(replace(VIEW, number=10, **other, **bare))
     seen.state("no-positions")
     assert seen.page.locator(".tile").count() == 6
     assert "0.5, column 1.0 taxels" in seen.text("#figures")
@@ -208,25 +177,23 @@ def circles(seen: BrowsedPage, which: str) -> list[dict[str, float]]:
     )
 
 
-FILES = {
-    "/",
-    "/tablet.js",
-    "/verdict.js",
-    "/statuses.js",
-    "/shift.js",
-    "/page.css",
-    "/watch.js",
-    "/events.js",
-    "/parts.js",
-    "/skin.js",
-    "/plots.js",
-    "/events",
-    "data:,",
+FILES = {"data:,", "/", "/page.css", "/events"} | {
+    f"/{name}.js"
+    for name in [
+        "tablet",
+        "verdict",
+        "statuses",
+        "shift",
+        "watch",
+        "events",
+        "parts",
+        "skin",
+        "plots",
+    ]
 }
 FILLS = "all => all.map(e => getComputedStyle(e).fill.match(/\\d+/g).map(Number))"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("centre", "message", "way"),
     [
@@ -247,10 +214,8 @@ def test_the_arrow_points_where_the_skin_has_to_go(
     page.show(replace(VIEW, message=message, centre=centre, nearest=nearest))
     seen = BrowsedPage(browser.new_context(), page.address)
     seen.state("off")
-    path = [
-        float(n)
-        for n in re.findall(r"-?[\d.]+", str(seen.page.locator("#way .line").get_attribute("d")))
-    ]
+    line = str(seen.page.locator("#way .line").get_attribute("d"))
+    path = [float(n) for n in re.findall(r"-?[\d.]+", line)]
     drawn = path[2] - path[0], path[3] - path[1]
     turned = seen.page.evaluate(
         "new DOMMatrix(getComputedStyle(document.querySelector('#push path')).transform)"
@@ -261,16 +226,12 @@ def test_the_arrow_points_where_the_skin_has_to_go(
     seen.page.close()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_every_count_can_be_read_on_its_taxel(browser: Any, page: PageServer, scheme: str):
     """A contrast of 4.5 between the number and its taxel, from no load to the full one (WCAG 2.1,
     1.4.3)."""
-    page.show(
-        replace(
-            VIEW, load=tuple(tuple(float(4 * r + c) for c in range(4)) for r in range(4)), full=15.0
-        )
-    )
+    rising = tuple(tuple(float(4 * r + c) for c in range(4)) for r in range(4))
+    page.show(replace(VIEW, load=rising, full=15.0))
     context = browser.new_context(color_scheme=scheme)
     seen = BrowsedPage(context, page.address)
     seen.state("off")
@@ -281,15 +242,13 @@ def test_every_count_can_be_read_on_its_taxel(browser: Any, page: PageServer, sc
     context.close()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("side", "at"),
-    [
-        ("first-row", "top"),
-        ("last-row", "bottom"),
-        ("first-column", "left"),
-        ("last-column", "right"),
-    ],
+    zip(
+        ["first-row", "last-row", "first-column", "last-column"],
+        ["top", "bottom", "left", "right"],
+        strict=True,
+    ),
 )
 def test_the_picture_shows_which_end_is_the_fingertip(
     browser: Any, page: PageServer, side: str, at: str
@@ -319,7 +278,6 @@ def beyond(board: dict[str, float], box: dict[str, float]) -> str:
     return max(out, key=lambda side: out[side])
 
 
-@pytest.mark.slow
 def test_a_box_that_says_nothing_new_is_no_news(browser: Any, page: PageServer):
     """The server still answers, but its loop hangs: after a while the page says so instead of
     showing an old picture."""
@@ -333,7 +291,6 @@ def test_a_box_that_says_nothing_new_is_no_news(browser: Any, page: PageServer):
     context.close()
 
 
-@pytest.mark.slow
 def test_a_server_that_is_gone_is_no_connection(browser: Any):
     """The page says at once that there is no connection, and the age of its picture. It shows a new
     server at the same port by itself."""
@@ -351,7 +308,6 @@ def test_a_server_that_is_gone_is_no_connection(browser: Any):
         seen.page.close()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("width", "height"), [(360, 640), (844, 390), (820, 1180), (1440, 900)])
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_it_fits_phone_tablet_and_desktop(
@@ -359,11 +315,8 @@ def test_it_fits_phone_tablet_and_desktop(
 ):
     """Everything on one screen without scrolling, in the light and the dark scheme; the text has
     enough contrast."""
-    page.show(
-        replace(
-            VIEW, message="12.5 mm too far towards column 4 and 10.5 mm towards row 4", source="sim"
-        )
-    )
+    longest = "12.5 mm too far towards column 4 and 10.5 mm towards row 4"
+    page.show(replace(VIEW, message=longest, source="sim"))
     context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme)
     seen = BrowsedPage(context, page.address)
     seen.state("off")
@@ -385,15 +338,3 @@ def style(seen: BrowsedPage, what: str, name: str) -> list[float]:
     """A colour of an element, as red, green and blue."""
     text = seen.page.locator(what).evaluate(f"e => getComputedStyle(e).{name}")
     return [float(part) for part in re.findall(r"\d+", text)[:3]]
-
-
-@pytest.mark.slow
-def test_without_a_browser_the_command_ends_at_sigterm(box: tuple[subprocess.Popen[bytes], str]):
-    """SIGTERM ends the command with 0 while connections are open, and the port is free."""
-    run, address = box
-    where = int(address.rsplit(":", 1)[1])
-    with socket.create_connection(("127.0.0.1", where), timeout=WAIT_S):
-        run.send_signal(signal.SIGTERM)
-        assert run.wait(timeout=WAIT_S) in (0, 130)
-    with pytest.raises(ConnectionRefusedError):
-        socket.create_connection(("127.0.0.1", where), timeout=WAIT_S)

@@ -17,6 +17,8 @@ from pathlib import Path
 
 import pytest
 
+from palpate.cli.main import main
+from palpate.core.clock import SystemClock
 from palpate.core.config import TriggerConfig, WatchConfig
 from palpate.core.errors import ApplianceError, ConfigError, FormatError, NoAnswer
 from palpate.core.types import Status, sidecar
@@ -25,16 +27,15 @@ from palpate.sim import skin
 from palpate.sweeps.recording import Labels, RecordingSession
 from palpate.web import record, server
 from palpate.web.access import Access
-from palpate.web.record import MOST_WAITING, CommandQueue, RecordPage, order, trigger_words
+from palpate.web.record import MOST_WAITING, CommandQueue, RecordPage, order
+from palpate.web.server import PageServer
 from tests.factories.browser import WAIT_S, until
 from tests.factories.install_scripts import page_secrets
 from tests.factories.page_client import (
     EventReader,
     PageAddress,
     ask,
-    connected,
     port,
-    received_by,
     status,
 )
 from tests.factories.recorded_page import KIND, RecordedPage, key_of, ordered
@@ -82,10 +83,7 @@ def waiting(recorded: RecordedPage) -> int:
 @pytest.mark.parametrize(
     ("body", "command"),
     [
-        (
-            b'{"command": "MATERIAL", "text": " plastic rough "}',
-            Command("MATERIAL", "plastic rough"),
-        ),
+        (b'{"command": "MATERIAL", "text": " a b "}', Command("MATERIAL", "a b")),
         (b'{"command": "POSITION", "text": "\\n7\\t"}', Command("POSITION", "7")),
         (b'{"command": "SESSION", "text": ""}', Command("SESSION")),
         (b'{"command": "NEXT"}', Command("NEXT")),
@@ -141,7 +139,6 @@ def test_a_bad_label_is_refused_as_the_command_refuses_it(tmp_path: Path, name: 
     with pytest.raises(ConfigError) as by_page:
         order(json.dumps({"command": name, "text": text}).encode(), ALLOWED)
     assert str(by_page.value) == str(by_command.value)
-    assert "1 to 24 letters" in str(by_page.value)
 
 
 def test_labels_from_the_page_are_those_of_the_stored_sweep(
@@ -194,11 +191,8 @@ def test_labels_from_the_page_are_those_of_the_stored_sweep(
         assert by_page("STOP") == []
         box.until(lambda: box.box.answered == 1)
         about = sidecar(tmp_path / "sweep-000001.npy")
-        assert (about["material"], about["position"], about["session"]) == (
-            "plastic rough",
-            "10",
-            "monday",
-        )
+        labels = [about[name] for name in ("material", "position", "session")]
+        assert labels == ["plastic rough", "10", "monday"]
         assert by_page("DISCARD", "1") == [1, 0, "sweep-000001"]
         assert not (tmp_path / "sweep-000001.npy").exists()
     assert not any(",ANS,START" in line or ",ANS,NEXT" in line for line in box.heard)
@@ -211,23 +205,14 @@ def test_the_page_hears_what_there_is(recorded: RecordedPage):
     assert reader.until("key") == recorded.page.server.key
     until(lambda: recorded.page.server.watched)
     recorded.turn()
-    said = reader.until("recording")
-    assert (said["material"], said["position"], said["counts"], said["last"]) == (
-        "metal",
-        "1",
-        [],
-        None,
-    )
-    assert said["trigger"] == "START and STOP, here or on the serial line"
+    told = {"material": "metal", "position": "1", "counts": [], "last": None}
+    assert reader.until("recording").items() >= told.items()
     assert recorded.sweep(detail="contact not checked") == 1
     assert reader.until("sweep")["detail"] == "contact not checked"
     recorded.turn()
     said = reader.until("recording")
-    assert (said["counts"], said["missing"], said["discard"]) == (
-        [["metal", "1", 1]],
-        "missing: metal at 1: 2",
-        1,
-    )
+    told = {"counts": [["metal", "1", 1]], "missing": "missing: metal at 1: 2", "discard": 1}
+    assert said.items() >= told.items()
     assert (said["last"]["outcome"], said["last"]["detail"]) == ("stored", "sweep-000001")
     before = recorded.page._view_ns
     until(lambda: (recorded.turn(), recorded.page._view_ns != before)[1])
@@ -263,20 +248,12 @@ def test_an_order_of_another_site_is_refused(
     recorded: RecordedPage, answer: int, changed: dict[str, str | None]
 ):
     """Requests that a page of another site can send are refused: wrong or missing key, another
-    origin, a content type without preflight."""
+    origin, a content type without preflight. Each run has a key of its own."""
     server_of, key = recorded.page.server, key_of(recorded.page.server)
+    assert key != PageServer("watch.html", Access(0), SystemClock().now_ns).key
     assert status(ordered(server_of, key, WOOD, **changed)) == answer
     assert waiting(recorded) == 0
     assert recorded.recording.about()["material"] == "metal"
-
-
-def test_a_key_of_another_run_is_refused(recorded: RecordedPage, tmp_path: Path):
-    """The key of another start of the program is refused."""
-    other = RecordedPage(tmp_path / "other", Labels())
-    with other.page:
-        assert status(ordered(recorded.page.server, other.page.server.key, WOOD)) == 403
-    other.recording.close()
-    assert waiting(recorded) == 0
 
 
 @pytest.mark.parametrize(
@@ -308,45 +285,28 @@ def test_other_ways_to_order_are_refused(
 def test_too_large_a_body_is_refused(recorded: RecordedPage, chunked: bool):
     """A body that is too large, announced or in chunks, is not read to its end; the next request is
     answered."""
-    page, body = (
-        recorded.page.server,
-        json.dumps({"command": "MATERIAL", "text": "x" * 2000}).encode(),
-    )
+    page = recorded.page.server
+    body = json.dumps({"command": "MATERIAL", "text": "x" * 2000}).encode()
+    more: dict[str, str | None] = {}
     if chunked:
         body = b"%x\r\n%s\r\n0\r\n\r\n" % (len(body), body)
-        answer = ordered(page, page.key, body, Content_Length=None, Transfer_Encoding="chunked")
-    else:
-        answer = ordered(page, page.key, body)
-    assert status(answer) in (0, 400)
+        more = {"Content_Length": None, "Transfer_Encoding": "chunked"}
+    assert status(ordered(page, page.key, body, **more)) in (0, 400)
     assert waiting(recorded) == 0
     assert status(ask(page)) == 200
 
 
-def test_half_a_body_ends_at_the_deadline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """The connection is closed, and no order comes from it."""
-    monkeypatch.setattr(server, "HEAD_S", 0.3)
-    one = RecordedPage(tmp_path, Labels())
-    with one.page, connected(one.page.server) as slow:
-        slow.sendall(b"POST /order HTTP/1.1\r\nHost: localhost\r\nContent-Length: 40\r\n\r\n{")
-        assert status(received_by(slow)) in (0, 400)
-        assert waiting(one) == 0
-    one.recording.close()
-
-
 def test_refusals_say_why(recorded: RecordedPage):
-    """In the words of the command, as a line of text; the labels stay."""
+    """As a line of text that names the value; the labels stay."""
     page = recorded.page.server
     answer = ordered(page, page.key, {"command": "MATERIAL", "text": "-1"})
-    assert (status(answer), b"text/plain" in answer) == (409, True)
-    assert answer.endswith(
-        b"material '-1' cannot be used: take 1 to 24 letters, digits, spaces, '.', '_' or '-'"
-    )
+    assert (status(answer), b"text/plain" in answer, b"'-1'" in answer) == (409, True, True)
     assert status(ordered(page, page.key, b"{}")) == 400
     asking = Asking(recorded, {"command": "DISCARD"})
     until(lambda: waiting(recorded) == 1)
     recorded.turn()
     assert asking.finished() == [409]
-    assert asking.answers[0].endswith(b"no sweep of this run is left to discard")
+    assert recorded.recording.about()["material"] == "metal"
 
 
 def test_many_requests_wait_in_bounds_and_the_loop_takes_one_a_turn(recorded: RecordedPage):
@@ -363,31 +323,30 @@ def test_many_requests_wait_in_bounds_and_the_loop_takes_one_a_turn(recorded: Re
     assert sorted(asking.finished()) == [200] * MOST_WAITING + [503] * 6
 
 
-def test_a_loop_that_takes_nothing_up(recorded: RecordedPage, monkeypatch: pytest.MonkeyPatch):
-    """After DONE_S the page gets an error, and the order is not carried out later."""
+@pytest.mark.parametrize(
+    ("under_way", "why"), [(False, b"was not carried out"), (True, b"may still be carried out")]
+)
+def test_a_loop_that_is_late(
+    recorded: RecordedPage, monkeypatch: pytest.MonkeyPatch, under_way: bool, why: bytes
+):
+    """After DONE_S the page is told whether the order is under way, as on a slow disk, or was never
+    taken up; then it is not carried out later."""
     monkeypatch.setattr(server, "DONE_S", 0.05)
+    answered, turns = threading.Event(), []
+    if under_way:
+        monkeypatch.setattr(recorded.page, "_obey", lambda command: [answered.wait(WAIT_S)])
     asking = Asking(recorded, WOOD)
+    if under_way:
+        until(lambda: waiting(recorded) == 1)
+        turns = [threading.Thread(target=recorded.turn)]
+        turns[0].start()
     assert asking.finished() == [503]
-    assert b"it was not carried out" in asking.answers[0]
+    assert why in asking.answers[0]
+    answered.set()
+    for turn in turns:
+        turn.join()
     recorded.turn()
     assert recorded.done == []
-
-
-def test_a_command_that_takes_long_is_not_called_undone(
-    recorded: RecordedPage, monkeypatch: pytest.MonkeyPatch
-):
-    """If an order is under way after DONE_S, as on a slow disk, the page does not get an error."""
-    monkeypatch.setattr(server, "DONE_S", 0.05)
-    answered = threading.Event()
-    monkeypatch.setattr(recorded.page, "_obey", lambda command: [answered.wait(WAIT_S)])
-    asking = Asking(recorded, WOOD)
-    until(lambda: waiting(recorded) == 1)
-    turn = threading.Thread(target=recorded.turn)
-    turn.start()
-    assert asking.finished() == [503]
-    answered.set()
-    turn.join()
-    assert b"it may still be carried out" in asking.answers[0]
 
 
 def test_the_end_of_the_recording_answers_who_waits(
@@ -438,21 +397,6 @@ def test_a_sweep_is_drawn_once(recorded: RecordedPage, monkeypatch: pytest.Monke
     assert status(ask(page, "/sweep/3")) == 404
 
 
-@pytest.mark.parametrize(
-    ("mode", "words"),
-    [
-        ("two-lines", "lines START and STOP"),
-        ("one-line", "line START"),
-        ("serial", "here or on the serial line"),
-        ("key", "space bar in the terminal"),
-        ("timed", "the clock: 3 s in every 5 s"),
-    ],
-)
-def test_the_trigger_is_named(mode: str, words: str):
-    """Each mode in words."""
-    assert words in trigger_words(TriggerConfig(mode=mode))
-
-
 def test_on_the_network_it_takes_token_and_key(tmp_path: Path):
     """As on the watch page, an order without the token is refused, and plain HTTP is not
     answered."""
@@ -481,22 +425,10 @@ def test_on_the_network_it_takes_token_and_key(tmp_path: Path):
 def test_the_command_records_what_its_page_orders(tmp_path: Path):
     """The real command without a serial line: its page sets the label, starts and stops; it ends
     with the page open."""
-    command = [
-        sys.executable,
-        "-m",
-        "palpate",
-        "record",
-        "--sim",
-        "skin",
-        "--trigger",
-        "serial",
-        "--web",
-        "0",
-    ]
-    options = ["--out", str(tmp_path), "--set", "store.runtime="]
-    with subprocess.Popen(
-        [*command, *options], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
-    ) as run:
+    words = "-m palpate record --sim skin --trigger serial --web 0 --set store.runtime= --out"
+    command = [sys.executable, *words.split(), str(tmp_path)]
+    pipes = {"stderr": subprocess.PIPE, "stdout": subprocess.DEVNULL}
+    with subprocess.Popen(command, text=True, **pipes) as run:
         there = PageAddress(re.search(r"page: (http://127\.0\.0\.1:\d+)", run.stderr.readline())[1])
         draining = threading.Thread(target=run.stderr.read, daemon=True)
         draining.start()
@@ -517,11 +449,7 @@ def test_the_command_records_what_its_page_orders(tmp_path: Path):
 def test_a_serial_trigger_needs_a_line_or_a_page(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ):
-    """Without either, the error names both ways."""
-    from palpate.__main__ import main
-
-    assert (
-        main(["record", "--sim", "skin", "--trigger", "serial", "--out", os.fspath(tmp_path)])
-        == ConfigError.exit_code
-    )
-    assert "or the page of palpate record --web" in capsys.readouterr().err
+    """Without either, the error names the way by the page."""
+    command = ["record", "--sim", "skin", "--trigger", "serial", "--out", os.fspath(tmp_path)]
+    assert main(command) == ConfigError.exit_code
+    assert "--web" in capsys.readouterr().err

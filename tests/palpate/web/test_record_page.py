@@ -73,12 +73,8 @@ def test_what_is_there_and_what_is_missing(browser: Any, recorded: RecordedPage)
     fields = seen.page.locator("#counts button")
     assert fields.all_inner_texts() == ["4 of 3", "3 of 3", "1 of 3", "0 of 3"]
     assert [one.get_attribute("class") for one in fields.all()] == ["done", "done", "", ""]
-    assert [one.get_attribute("aria-pressed") for one in fields.all()] == [
-        "false",
-        "false",
-        "true",
-        "false",
-    ]
+    pressed = [one.get_attribute("aria-pressed") for one in fields.all()]
+    assert pressed == ["false", "false", "true", "false"]
     assert seen.text("#missing") == "missing: wood at 1: 2, wood at 2: 3"
     assert seen.text("#now") == "wood at 1"
     assert seen.text("#trigger") == "START and STOP, here or on the serial line"
@@ -94,19 +90,12 @@ def test_the_last_sweep_with_its_checks(browser: Any, recorded: RecordedPage):
     seen = opened(browser, recorded)
     number = recorded.sweep()
     until(lambda: seen.text("#outcome") == f"wood at 1, stored as sweep-{number:06d}")
-    assert (
-        seen.text("#check")
-        == "checked: contact, saturation, stuck and dead taxels; nothing is wrong"
-    )
+    assert "nothing is wrong" in seen.text("#check")
     until(lambda: "16 taxels over 2.0 s" in str(seen.page.get_attribute("#signal", "aria-label")))
     assert "spectrogram up to" in seen.page.get_attribute("#spectrogram", "aria-label")
     recorded.sweep(Status.NO_CONTACT, "taxel 2.2 is loaded most, with 1 count")
     until(lambda: seen.text("#status") == "no-contact")
-    said = (
-        "no taxel is loaded; check that the finger touches the object; it is not counted; taxel"
-        " 2.2 is loaded most, with 1 count"
-    )
-    assert seen.text("#check") == said
+    assert "it is not counted; taxel 2.2 is loaded" in seen.text("#check")
     recorded.sweep(Status.SHORT)
     until(lambda: seen.text("#status") == "short")
     until(lambda: seen.text("#outcome") == "not stored, since it has no window")
@@ -125,19 +114,8 @@ def test_labels_are_set_with_the_keyboard(browser: Any, recorded: RecordedPage, 
         )
         outline = seen.page.evaluate("getComputedStyle(document.activeElement).outlineWidth")
         assert float(outline.removesuffix("px")) >= 2
-    assert stops == [
-        "start",
-        "stop",
-        "material",
-        "position",
-        "session",
-        "set",
-        "next",
-        "4 of 3",
-        "3 of 3",
-        "1 of 3",
-        "0 of 3",
-    ]
+    controls = ["start", "stop", "material", "position", "session", "set", "next"]
+    assert stops == [*controls, "4 of 3", "3 of 3", "1 of 3", "0 of 3"]
     seen.page.focus("#material")
     seen.page.keyboard.press("Control+A")
     seen.page.keyboard.type("plastic rough")
@@ -152,11 +130,8 @@ def test_labels_are_set_with_the_keyboard(browser: Any, recorded: RecordedPage, 
     assert seen.page.input_value("#position") == "08"
     number = recorded.sweep()
     about = sidecar(tmp_path / f"sweep-{number:06d}.npy")
-    assert (about["material"], about["position"], about["session"]) == (
-        "plastic rough",
-        "08",
-        "monday",
-    )
+    set_ = [about[name] for name in ("material", "position", "session")]
+    assert set_ == ["plastic rough", "08", "monday"]
     assert not seen.errors
 
 
@@ -167,11 +142,7 @@ def test_a_bad_label_is_refused_with_its_reason(browser: Any, recorded: Recorded
     for wrong in ("-wood", "<b>wood</b>", "a,b"):
         seen.page.fill("#material", wrong)
         seen.page.click("#set")
-        until(
-            lambda wrong=wrong: (
-                f"material '{wrong}' cannot be used: take 1 to 24 letters" in seen.text("#said")
-            )
-        )
+        until(lambda wrong=wrong: f"material '{wrong}'" in seen.text("#said"))
         assert seen.page.get_attribute("#material", "aria-invalid") == "true"
         assert seen.page.input_value("#material") == wrong
         assert labels(recorded) == ("wood", "1", "monday")
@@ -204,31 +175,22 @@ def test_a_field_of_the_table_sets_both_labels(browser: Any, recorded: RecordedP
     seen.page.keyboard.press("Enter")
     until(lambda: seen.text("#said") == "now wood at 2")
     assert labels(recorded) == ("wood", "2", "monday")
-    until(
-        lambda: seen.page.locator("#counts button").nth(3).get_attribute("aria-pressed") == "true"
-    )
+    cell = seen.page.locator("#counts button").nth(3)
+    until(lambda: cell.get_attribute("aria-pressed") == "true")
     until(lambda: not seen.page.is_disabled("#set"))
     assert seen.page.evaluate("document.activeElement.textContent") == "0 of 3"
 
 
 def test_start_and_stop(browser: Any, recorded: RecordedPage):
-    """Each button can be pressed while it has an effect, and the state says so."""
-    seen = opened(browser, recorded)
-    until(lambda: not seen.page.is_disabled("#start"))
-    assert seen.page.is_disabled("#stop")
-    seen.page.click("#start")
-    until(lambda: seen.text("#state") == "sweeping")
-    until(lambda: not seen.page.is_disabled("#stop"))
-    assert seen.page.is_disabled("#start")
-    seen.page.click("#stop")
-    until(lambda: seen.text("#state") == "ready")
-    assert recorded.done == ["START", "STOP"]
-
-
-def test_space_starts_and_stops(browser: Any, recorded: RecordedPage):
-    """Also after a button was pressed with the mouse; in a field it is a space."""
+    """By the buttons, which can be pressed while they have an effect, and by Space, also after a
+    button was pressed with the mouse; in a field it is a space."""
     seen = opened(browser, recorded)
     until(lambda: seen.text("#call") == "Press Start, Space or the pedal")
+    for button, other, state in (("#start", "#stop", "sweeping"), ("#stop", "#start", "ready")):
+        until(lambda button=button: not seen.page.is_disabled(button))
+        assert seen.page.is_disabled(other)
+        seen.page.click(button)
+        until(lambda state=state: seen.text("#state") == state)
     seen.page.click("#counts button[aria-label='metal at 2: 3 of 3']")
     until(lambda: seen.text("#said") == "now metal at 2")
     for state, words in (("sweeping", "Slide now"), ("ready", "Press Start, Space or the pedal")):
@@ -238,7 +200,8 @@ def test_space_starts_and_stops(browser: Any, recorded: RecordedPage):
     seen.page.focus("#material")
     seen.page.keyboard.type("a b")
     assert "a b" in seen.page.input_value("#material")
-    assert recorded.done[-2:] == ["START", "STOP"]
+    sweeps = [command for command in recorded.done if command in ("START", "STOP")]
+    assert sweeps == ["START", "STOP"] * 2
     assert not seen.errors
 
 
@@ -251,9 +214,8 @@ def test_timed_sweeps_are_counted_down(
     """In sight, in letters of 96 px or more, for recording and teaching; a skin that is away has no
     countdown."""
     with RecordedPage(tmp_path, Labels("metal", "1"), teaching=teaching) as one:
-        context = browser.new_context(
-            viewport={"width": width, "height": height}, color_scheme=scheme
-        )
+        size = {"width": width, "height": height}
+        context = browser.new_context(viewport=size, color_scheme=scheme)
         seen = BrowsedPage(context, one.page.server.address)
         for sweeping, words in ((False, "Next sweep in"), (True, "Slide now")):
             due_ns = SystemClock().now_ns() + 60 * SECOND
@@ -321,18 +283,6 @@ def test_a_recorder_that_ends_and_comes_back_while_the_page_is_open(browser: Any
         seen.page.context.close()
 
 
-def test_a_skin_that_is_away(browser: Any, recorded: RecordedPage):
-    """The banner says why."""
-    seen = opened(browser, recorded)
-    recorded.health = recorded.health._replace(
-        skin="lost", trouble="the skin was unplugged", ready=False
-    )
-    until(lambda: seen.page.is_visible("#banner"))
-    assert seen.text("#banner") == "no skin: lost; the skin was unplugged"
-    assert seen.text("#state") == "skin lost"
-    assert seen.page.is_disabled("#start")
-
-
 @contextmanager
 def other_site(folder: Path) -> Iterator[str]:
     """A site of another origin on this machine."""
@@ -392,11 +342,11 @@ def test_no_other_site_sets_a_label(
     """A page of another origin in the same browser: with and without headers, as a beacon, as a
     form; and it gets no key."""
     refused: list[tuple[str, int]] = []
-    monkeypatch.setattr(
-        OrderHandler,
-        "on_finish",
-        lambda self: refused.append((self.request.method, self.get_status())),
-    )
+
+    def noted(handler: OrderHandler) -> None:
+        refused.append((handler.request.method, handler.get_status()))
+
+    monkeypatch.setattr(OrderHandler, "on_finish", noted)
     with other_site(tmp_path) as address:
         seen = BrowsedPage(browser.new_context(), address)
         said = seen.page.evaluate(ATTACKS, recorded.page.server.address)
@@ -428,10 +378,9 @@ def test_every_text_of_it_can_be_read(
         recorded.recording.commands["POSITION"](f"{position}")
         recorded.sweep()
     recorded.sweep(Status.STUCK_TAXEL, "taxel 1.4")
-    seen = BrowsedPage(
-        browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme),
-        recorded.page.server.address,
-    )
+    size = {"width": width, "height": height}
+    context = browser.new_context(viewport=size, color_scheme=scheme)
+    seen = BrowsedPage(context, recorded.page.server.address)
     until(lambda: seen.page.locator("#counts button").count() == 3 * 14)
     seen.page.fill("#session", "-")
     seen.page.click("#set")
@@ -440,6 +389,7 @@ def test_every_text_of_it_can_be_read(
     for act in (lambda: None, lambda: setattr(recorded, "health", away)):
         act()
         until(lambda act=act: seen.page.is_visible("#banner") == (recorded.health is away))
+        assert seen.page.is_disabled("#start") == (recorded.health is away)
         texts, faint = seen.legibility()
         assert texts > 60
         assert faint == []

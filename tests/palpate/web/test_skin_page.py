@@ -14,25 +14,14 @@ from palpate.web.access import Access
 from palpate.web.server import PageServer
 from tests.factories.browser import BrowsedPage, contrast, until
 
+pytestmark = pytest.mark.slow
+
 LOAD = tuple(
     tuple(tuple(float(20 * a + 10 * r + c) for c in range(4)) for r in range(3)) for a in range(3)
 )
 VIEW = LiveView(
-    1,
-    "sim",
-    "mine 3x4x3 int16 at 100 Hz",
-    "streaming",
-    "",
-    (3, 4, 3),
-    LOAD,
-    63.0,
-    99.8,
-    LOAD,
-    ("1.2 axis 3",),
-    ("2.1 axis 1",),
-    (),
-    12345,
-    None,
+    *(1, "sim", "mine 3x4x3 int16 at 100 Hz", "streaming", "", (3, 4, 3), LOAD, 63.0, 99.8, LOAD),
+    *(("1.2 axis 3",), ("2.1 axis 1",), (), 12345, None),
 )
 
 
@@ -44,7 +33,6 @@ def page() -> Iterator[PageServer]:
         yield one
 
 
-@pytest.mark.slow
 def test_it_shows_loads_figures_and_faults(browser: Any, page: PageServer):
     """A map for each axis with its counts; faulty taxels outlined and named; loss that cannot be
     known is not called 0."""
@@ -59,21 +47,12 @@ def test_it_shows_loads_figures_and_faults(browser: Any, page: PageServer):
     faulty = seen.page.eval_on_selector_all(".taxel.faulty", "all => all.map(e => e.title)")
     assert [title.split(":")[0] for title in faulty] == ["taxel 2.1 axis 1", "taxel 1.2 axis 3"]
     asked = {request.removeprefix(page.address).split("?")[0] for request in seen.requests}
-    assert asked <= {
-        "/",
-        "/page.css",
-        "/skin_show.js",
-        "/events.js",
-        "/parts.js",
-        "/skin.js",
-        "/events",
-        "data:,",
-    }
+    scripts = {f"/{name}.js" for name in ("skin_show", "events", "parts", "skin")}
+    assert asked <= {"/", "/page.css", "/events", "data:,"} | scripts
     assert not seen.errors
     seen.page.close()
 
 
-@pytest.mark.slow
 def test_a_skin_that_is_gone_and_a_box_that_is_dead_are_told_apart(browser: Any, page: PageServer):
     """A missing skin has a reason, a dead box has no news; news bring the page back."""
     seen = BrowsedPage(browser.new_context(), page.address)
@@ -87,7 +66,6 @@ def test_a_skin_that_is_gone_and_a_box_that_is_dead_are_told_apart(browser: Any,
     seen.page.close()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [390, 1024, 1920])
 def test_nothing_is_cut_off(browser: Any, page: PageServer, width: int, scheme: Any):

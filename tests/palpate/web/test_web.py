@@ -104,6 +104,8 @@ def test_a_box_that_ends_and_comes_back_with_another_bundle(watcher: PageWatcher
     reader = EventReader(watcher.server)
     assert heard(watcher, offered, "box", reader) == {"there": True, "why": ""}
     heard(watcher, offered, "health", reader)
+    offered.turns(3, HEALTH._replace(skin="lost", trouble="unplugged", ready=False))
+    assert heard(watcher, None, "state", reader)["trouble"] == "unplugged"
     offered.feed.stopping()
     assert heard(watcher, None, "box", reader) == {"there": False, "why": "the box is stopping"}
     again = Offered(path)
@@ -167,29 +169,12 @@ def test_a_socket_that_is_no_feed_is_shown_as_a_box_that_is_away(
         pass
 
 
-def test_a_skin_that_is_lost_comes_with_its_reason(watcher: PageWatcher, path: Path):
-    """As the box says it."""
-    offered = Offered(path)
-    reader = EventReader(watcher.server)
-    heard(watcher, offered, "health", reader)
-    offered.turns(3, HEALTH._replace(skin="lost", trouble="the skin was unplugged", ready=False))
-    assert heard(watcher, None, "state", reader)["trouble"] == "the skin was unplugged"
-
-
 @pytest.mark.slow
 def test_the_command_serves_its_page_until_it_is_ended(tmp_path: Path):
     """The real command: its address on standard error, the page, a box that is away, exit 0 at
     SIGTERM."""
-    command = [
-        sys.executable,
-        "-m",
-        "palpate",
-        "watch",
-        "--web",
-        "0",
-        "--set",
-        f"store.runtime={tmp_path}/none",
-    ]
+    command = [sys.executable, *["-m", "palpate", "watch", "--web", "0", "--set"]]
+    command += [f"store.runtime={tmp_path}/none"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as run:
         address = re.search(r"page: (http://127\.0\.0\.1:\d+)", run.stderr.readline())[1]
         there = PageAddress(address)
