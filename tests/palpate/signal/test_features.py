@@ -34,26 +34,16 @@ def _tone(hz: float, rate_hz: float, frames: int, amplitude: float = 50.0) -> np
 
 
 def test_weights_are_equation_4() -> None:
-    """Each weight is the taxel's sum of counts over the sum of all counts, row by row."""
+    """Each weight is the taxel's sum of counts over the sum of all counts, row by row. A negative
+    taxel is left out; without activation, or with a negative one, all weights are 1 / M."""
     x = _sweep()
-    total = sum(int(v) for v in x.ravel())
-    want = [sum(int(v) for v in x[:, r, c]) / total for r in range(2) for c in range(3)]
-    np.testing.assert_allclose(features.taxel_weights(x), want, rtol=1e-12)
-
-
-@pytest.mark.parametrize(
-    "counts", [np.zeros((5, 2, 2), np.uint8), np.full((5, 2, 2), -7, np.int16)]
-)
-def test_weights_without_contact_are_uniform(counts: np.ndarray) -> None:
-    """Without activation, or with a negative one, all weights are 1 / M."""
-    np.testing.assert_array_equal(features.taxel_weights(counts), [0.25] * 4)
-
-
-def test_a_negative_taxel_weighs_nothing() -> None:
-    """Means of 30, 10 and -39 would give weights of 30 and -39 if they were summed; the negative
-    taxel is left out."""
-    x = np.array([[[30, 10, -39]]], np.int16)
-    np.testing.assert_allclose(features.taxel_weights(x), [0.75, 0.25, 0])
+    sums = x.sum(axis=0, dtype=float).ravel()
+    np.testing.assert_allclose(features.taxel_weights(x), sums / sums.sum(), rtol=1e-12)
+    pulled = np.array([[[30, 10, -39]]], np.int16)
+    np.testing.assert_allclose(features.taxel_weights(pulled), [0.75, 0.25, 0])
+    for level in (0, -7):
+        none = features.taxel_weights(np.full((5, 2, 2), level, np.int16))
+        np.testing.assert_array_equal(none, [0.25] * 4)
 
 
 def test_each_axis_is_a_series_weighted_by_the_load_of_its_taxel() -> None:
@@ -73,50 +63,29 @@ def test_each_axis_is_a_series_weighted_by_the_load_of_its_taxel() -> None:
     np.testing.assert_allclose(features.taxel_weights(three)[2::3], features.taxel_weights(x) / 3)
 
 
-def _l_by_the_formula(x: np.ndarray) -> list[float]:
-    """Eq. 1 to 3 written out: one complex sum a bin and taxel, after scipy's removal of the
-    trend."""
-    n = np.arange(len(x))
-    series = scipy.signal.detrend(x.reshape(len(x), -1).astype(float), axis=0, type="linear").T
-    means = x.reshape(len(x), -1).mean(axis=0)
-
-    def power(s: np.ndarray, q: int) -> float:
-        return abs(np.sum(np.exp(-1j * q * 2 * np.pi / FRAMES * n) * s) / math.sqrt(FRAMES)) ** 2
-
-    spectra = [{q: power(s, q) for q in range(4, 751)} for s in series]
-    roughness = math.log(sum(sum(p[q] for q in range(40, 751)) / (750 - 40) for p in spectra))
-    centroids = []
-    for first, last in ((40, 750), (4, 40)):
-        bins = range(first, last + 1)
-        each = [sum(p[q] * q * 0.5 for q in bins) / sum(p[q] for q in bins) for p in spectra]
-        centroids.append(float(np.dot(each, means) / means.sum()))
-    return [roughness, *centroids]
-
-
-def test_l_features_are_equations_1_to_3() -> None:
-    """All three numbers equal the sums of the paper, bins 40 to 750 and 4 to 40 of 0.5 Hz."""
-    x = _sweep()
-    np.testing.assert_allclose(features.l_features(x, RATE), _l_by_the_formula(x), rtol=1e-9)
-
-
-def test_l_features_agree_with_a_periodogram_of_another_skin() -> None:
-    """3x3 taxels at 100 Hz in int16: the same numbers from scipy's periodogram, the upper band
-    ending at 50 Hz."""
-    x = np.random.default_rng(2).integers(-200, 3000, (300, 3, 3)).astype(np.int16)
+@pytest.mark.parametrize(
+    ("x", "rate_hz", "first", "split"),
+    [
+        (_sweep(), RATE, 4, 40),
+        (np.random.default_rng(2).integers(-200, 3000, (300, 3, 3), np.int16), 100.0, 6, 60),
+    ],
+)
+def test_l_features_are_equations_1_to_3(
+    x: np.ndarray, rate_hz: float, first: int, split: int
+) -> None:
+    """The same numbers from scipy's periodogram: bins 40 to 750 and 4 to 40 of 0.5 Hz; for 3x3
+    taxels at 100 Hz the upper band ends at 50 Hz."""
+    frames, last = len(x), len(x) // 2
+    series = x.reshape(frames, -1).T.astype(float)
     hz, power = scipy.signal.periodogram(
-        x.reshape(300, 9).T.astype(float),
-        100.0,
-        detrend="linear",
-        return_onesided=False,
-        scaling="spectrum",
+        series, rate_hz, detrend="linear", return_onesided=False, scaling="spectrum"
     )
-    hz, power = np.abs(hz[:151]), power[:, :151] * 300
-    weights = features.taxel_weights(x)
-    want = [math.log(power[:, 60:].sum() / (150 - 60))]
-    for first, last in ((60, 150), (6, 60)):
-        band = slice(first, last + 1)
-        want.append(float(weights @ ((power[:, band] @ hz[band]) / power[:, band].sum(axis=1))))
-    np.testing.assert_allclose(features.l_features(x, 100.0), want, rtol=1e-9)
+    hz, power = np.abs(hz[: last + 1]), power[:, : last + 1] * frames
+    want = [math.log(power[:, split:].sum() / (last - split))]
+    for band in (slice(split, last + 1), slice(first, split + 1)):
+        centroids = (power[:, band] @ hz[band]) / power[:, band].sum(axis=1)
+        want.append(float(features.taxel_weights(x) @ centroids))
+    np.testing.assert_allclose(features.l_features(x, rate_hz), want, rtol=1e-9)
 
 
 def _h_by_the_formula(x: np.ndarray) -> np.ndarray:
@@ -177,18 +146,14 @@ def test_a_tone_lands_in_its_band_and_centroid(rate_hz: float, frames: int, hz: 
         assert set(h.argmax(axis=1)) == {int(hz // 20)}
 
 
-def test_a_slow_tone_moves_the_low_centroid() -> None:
-    """A ripple of 7 Hz sets c2 and leaves c1's band alone."""
+def test_slow_tones_and_drift_stay_in_their_bands() -> None:
+    """A ripple of 7 Hz sets c2, and a ramp of 60 counts changes none of the three features by more
+    than rounding."""
     assert features.l_features(_tone(7.0, RATE, FRAMES), RATE)[2] == pytest.approx(7.0, abs=0.05)
-
-
-def test_drift_does_not_leak_into_the_low_band() -> None:
-    """A ramp of 60 counts changes none of the three features by more than rounding."""
     tone = _tone(11.0, RATE, FRAMES) + 10 * _tone(90.0, RATE, FRAMES, 1.0)
     ramp = np.linspace(-30, 30, FRAMES, dtype=np.float32).reshape(-1, 1, 1)
-    np.testing.assert_allclose(
-        features.l_features(tone + ramp, RATE), features.l_features(tone, RATE), rtol=1e-5
-    )
+    want = features.l_features(tone, RATE)
+    np.testing.assert_allclose(features.l_features(tone + ramp, RATE), want, rtol=1e-5)
 
 
 def test_a_gain_adds_to_the_roughness_only() -> None:
@@ -201,14 +166,13 @@ def test_a_gain_adds_to_the_roughness_only() -> None:
     )
 
 
-def test_the_order_of_taxels_does_not_matter() -> None:
-    """Taxels in another order give the same features, as the paper's sums over taxels do."""
+@pytest.mark.parametrize("kind", ["L", "H"])
+def test_the_order_of_taxels_does_not_matter(kind: str) -> None:
+    """Taxels in another order give the same features, like the paper's sums over taxels."""
     x = _sweep()
-    other = x[:, ::-1, ::-1].transpose(0, 2, 1)
-    for kind in ("L", "H"):
-        np.testing.assert_allclose(
-            features.compute(kind, other, RATE), features.compute(kind, x, RATE), rtol=1e-5
-        )
+    want = features.compute(kind, x, RATE)
+    other = features.compute(kind, x[:, ::-1, ::-1].transpose(0, 2, 1), RATE)
+    np.testing.assert_allclose(other, want, rtol=1e-5)
 
 
 @pytest.mark.parametrize("level", [0, 255])
@@ -220,20 +184,15 @@ def test_a_silent_or_saturated_skin_has_finite_features(level: int) -> None:
     assert not features.h_features(x, RATE).any()
 
 
-def test_a_band_without_a_bin_keeps_the_one_above_its_lower_edge() -> None:
-    """Ten frames at 750 Hz have bins 75 Hz apart, none of them from 2 to 20 Hz; at 30 Hz none lies
-    above 15 Hz."""
+def test_few_frames_give_l_features() -> None:
+    """A band without a bin keeps the bin above its lower edge: ten frames at 750 Hz have bins 75 Hz
+    apart; at 30 Hz none lies above 15 Hz. Of one frame there are no H-features."""
     x = _sweep(10)
     assert features.l_features(x, RATE)[2] == pytest.approx(75)
     assert features.l_features(x, 30.0)[1] == pytest.approx(15)
-
-
-def test_one_frame_gives_l_features_but_no_h_features() -> None:
-    """L-features of a single frame are finite; H-features name the least number of frames."""
-    x = np.full((1, 4, 4), 9, np.uint8)
-    assert np.isfinite(features.l_features(x, RATE)).all()
-    with pytest.raises(FormatError, match=r"1 frames are too few .* use at least 75"):
-        features.h_features(x, RATE)
+    assert np.isfinite(features.l_features(x[:1], RATE)).all()
+    with pytest.raises(FormatError, match=r"1 frames .* at least 75"):
+        features.h_features(x[:1], RATE)
 
 
 _DIGITS = st.sampled_from(["uint8", "int16", "uint16", "float32"]).flatmap(
@@ -253,13 +212,12 @@ def test_results_are_finite_for_any_counts(taxels: np.ndarray, rate_hz: float) -
     weights = features.taxel_weights(taxels)
     assert weights.sum() == pytest.approx(1)
     assert weights.min() >= 0
-    low = features.compute("L", taxels, rate_hz)
+    low, high = (features.compute(kind, taxels, rate_hz) for kind in "LH")
     assert low.shape == (3,)
+    assert high.shape == (math.prod(features.h_shape(len(taxels), rate_hz)),)
+    assert low.dtype == high.dtype == np.float32
     assert np.isfinite(low).all()
     assert 0 <= low[1:].min() <= low[1:].max() <= rate_hz / 2 * (1 + 1e-6)
-    high = features.compute("H", taxels, rate_hz)
-    assert high.shape == (math.prod(features.h_shape(len(taxels), rate_hz)),)
-    assert np.isfinite(high).all()
     assert 0 <= high.min() <= high.max() <= 1 + 1e-6
 
 
@@ -282,23 +240,15 @@ def test_the_number_of_h_features_follows_from_frames_and_rate(
     assert len(features.h_features(np.ones((frames, 1, 1), np.uint8), rate_hz)) == math.prod(shape)
 
 
-def test_dimensions_and_type_are_those_of_the_paper() -> None:
-    """3 and 760 float32 values for the paper's 1500 x 4 x 4 counts at 750 Hz."""
-    x = _sweep(rows=4, cols=4)
-    low, high = features.compute("L", x, RATE), features.compute("H", x, RATE)
-    assert (low.shape, high.shape) == ((3,), (760,))
-    assert (low.dtype, high.dtype) == (np.float32, np.float32)
-
-
 @pytest.mark.parametrize(
     ("kind", "shape", "rate_hz", "message"),
     [
-        ("MFCC", (80, 4, 4), 750.0, "'MFCC' is unknown; use one of L, H"),
-        ("L", (80, 16), 750.0, r"shape \(80, 16\) is not a sweep"),
-        ("L", (0, 4, 4), 750.0, r"shape \(0, 4, 4\) is not a sweep"),
-        ("L", (80, 4, 4), 0.0, r"rate of 0.0 Hz"),
-        ("H", (80, 4, 4), math.nan, r"rate of nan Hz"),
-        ("H", (80, 4, 4), 12.0, "12 Hz is too slow for H-features; use at least 20 Hz"),
+        ("MFCC", (80, 4, 4), 750.0, "'MFCC' is unknown"),
+        ("L", (80, 16), 750.0, r"shape \(80, 16\)"),
+        ("L", (0, 4, 4), 750.0, r"shape \(0, 4, 4\)"),
+        ("L", (80, 4, 4), 0.0, r"0\.0 Hz"),
+        ("H", (80, 4, 4), math.nan, "nan Hz"),
+        ("H", (80, 4, 4), 12.0, r"12 Hz .* 20 Hz"),
     ],
 )
 def test_what_cannot_be_computed_is_named(
@@ -312,8 +262,8 @@ def test_what_cannot_be_computed_is_named(
 def test_counts_that_are_no_numbers_and_unknown_windows_are_refused() -> None:
     """NaN among float32 counts, and an unknown window function."""
     x = np.ones((80, 2, 2), np.float32)
-    with pytest.raises(FormatError, match="'hamming' is unknown; use rect or hann"):
+    with pytest.raises(FormatError, match="'hamming'"):
         features.h_features(x, RATE, "hamming")
     x[3, 1, 1] = math.nan
-    with pytest.raises(FormatError, match="not a number or infinite"):
+    with pytest.raises(FormatError, match="not a number"):
         features.taxel_weights(x)

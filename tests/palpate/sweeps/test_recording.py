@@ -8,7 +8,7 @@ import json
 import os
 import resource
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,19 +17,21 @@ import pynmea2
 import pytest
 
 from palpate.core.errors import ApplianceError, ConfigError, FormatError
+from palpate.core.sweep_set import SweepSet
 from palpate.core.types import Frames, Status, Sweep, Verdict, load, sidecar
 from palpate.service.feed import FeedServer
 from palpate.sim import devices, rig, script, skin
 from palpate.sweeps import recording, sweep_folder
 from palpate.sweeps.recording import Labels, RecordingSession
 from palpate.sweeps.sweep_folder import SweepFolder
-from palpate_train.data import sets
+from palpate_train.data import readers, sets
 from tests.factories import toy_bundle
 from tests.factories.feeds import FeedPeer
 from tests.factories.recorded_page import RecordedPage
 from tests.factories.simulated_box import Rigged
 
 WOOD, NONE = Labels("wood"), Labels()
+Recorded = Callable[..., Rigged]
 
 
 class Desk:
@@ -61,6 +63,11 @@ class Desk:
         self.recording.sweep(*judged(number, start_ns, status), {"bundle": "b"})
         return self.sentences[-1]
 
+    def outcome(self, number: int) -> list[str]:
+        """Record a sweep; returns what became of it, the count and the detail."""
+        fields = self.sweep(number)
+        return [*fields[1:3], *fields[6:]]
+
 
 def judged(
     number: int, start_ns: int = 0, status: Status = Status.RECORDED
@@ -77,13 +84,32 @@ def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
+def content(folder: Path) -> dict[str, bytes]:
+    """The files in a folder."""
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
 def pairs(*numbers: int) -> list[str]:
     """The names of these sweeps' files."""
     return sorted(f"sweep-{n:06d}.{kind}" for n in numbers for kind in ("json", "npy"))
 
 
+def refusing(monkeypatch: pytest.MonkeyPatch, code: int) -> None:
+    """A disk on which no sweep can be stored."""
+
+    def refused(*args: object) -> None:
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(sweep_folder, "save", refused)
+
+
+def simulated_tubes(seed: int, n: int) -> devices.SimDevices:
+    """Simulated devices that sweep over `n` tubes."""
+    return devices.build(skin.FORMAT, script.tubes(seed, n), rig.VirtualClock(), "sim")
+
+
 @pytest.fixture
-def recorded(rigged: Callable[..., Rigged], tmp_path: Path) -> Callable[..., Rigged]:
+def recorded(rigged: Callable[..., Rigged], tmp_path: Path) -> Recorded:
     """Builds boxes that record to `tmp_path`."""
 
     def make(simulated: devices.SimDevices, labels: Labels = NONE) -> Rigged:
@@ -99,26 +125,20 @@ def recorded(rigged: Callable[..., Rigged], tmp_path: Path) -> Callable[..., Rig
 
 def heard(box: Rigged) -> list[list[str]]:
     """The REC sentences that the robot has read: their fields after the kind."""
+    box.seconds(0.1)
     return [line.split("*")[0].split(",")[2:] for line in box.heard if ",REC," in line]
 
 
-def test_a_label_applies_to_sweeps_that_start_after_it(
-    recorded: Callable[..., Rigged], tmp_path: Path
-):
+def test_a_label_applies_to_sweeps_that_start_after_it(recorded: Recorded, tmp_path: Path):
     """On the serial line with real edges, a label that is sent during a sweep applies to the next
-    sweep."""
+    sweep. The three seconds before the first sweep are enough for the first command."""
     first, *others = script.tubes(1, 3)
-    before = np.zeros((3 * 750, 4, 4), np.uint8)  # time enough for the first command
-    first = rig.Act(
-        np.concatenate([before, first.frames]),
-        len(before) + first.start,
-        len(before) + first.stop,
-        "",
-    )
+    quiet = np.concatenate([np.zeros((3 * 750, 4, 4), np.uint8), first.frames])
+    first = rig.Act(quiet, 3 * 750 + first.start, 3 * 750 + first.stop, "")
     simulated = devices.build(skin.FORMAT, [first, *others], rig.VirtualClock(), "sim")
     box = recorded(simulated, Labels(session="first day"))
     box.seconds(0.1)
-    assert ",LABEL,error,sweeps are recorded without a bundle" in box.ask("$PPLP,LABEL,1")
+    assert ",LABEL,error," in box.ask("$PPLP,LABEL,1")
     assert ",MATERIAL,ok,wood,,first day*" in box.ask("$PPLP,MATERIAL,wood")
     box.until(lambda: box.box.health.sweeping)
     assert ",POSITION,ok,wood,1,first day*" in box.ask("$PPLP,POSITION,1")
@@ -130,55 +150,43 @@ def test_a_label_applies_to_sweeps_that_start_after_it(
     want = [("wood", "", "first day"), ("metal", "1", "first day"), ("metal", "2", "first day")]
     sweeps = [load(tmp_path / f"sweep-{n:06d}.npy")[0] for n in (1, 2, 3)]
     assert [(s.material, s.position, s.session) for s in sweeps] == want
-    box.seconds(0.1)
     assert [tuple(rec[3:6]) for rec in heard(box)] == want
-    for line in box.heard:
-        pynmea2.parse(line, check=True)
+    assert all(pynmea2.parse(line, check=True) for line in box.heard)
 
 
-def test_a_sidecar_holds_everything(recorded: Callable[..., Rigged], tmp_path: Path):
+def test_a_sidecar_holds_everything(recorded: Recorded, tmp_path: Path):
     """The sidecar has verdict, readout board, clock, trigger, unloaded skin and run in plain JSON,
-    and nothing of a bundle."""
-    simulated = devices.build(skin.FORMAT, script.tubes(2, 1), rig.VirtualClock(), "sim")
+    and nothing of a bundle. The start was a GPIO line, without speed and force."""
+    simulated = simulated_tubes(2, 1)
     box = recorded(simulated, Labels("wood", "3", "monday"))
     (verdict,) = box.until(lambda: simulated.finished(box.box.answered))
     about = json.loads((tmp_path / "sweep-000001.json").read_text())
     assert about["verdict"] == verdict.as_dict()
-    assert (about["verdict"]["status"], about["verdict"]["label"], about["verdict"]["bundle"]) == (
-        "recorded",
-        "",
-        "",
-    )
-    assert about["trigger"] == {"mode": "two-lines", "times": "edge, stamped by the kernel"}
+    said = [about["verdict"][name] for name in ("status", "label", "bundle")]
+    assert said == ["recorded", "", ""]
+    assert about["trigger"]["mode"] == "two-lines"
     assert about["device"]["serial"] == "SIM0001"
     assert about["clock"]["late_ms"] >= 0
     assert np.max(about["unloaded"]["level"]) < 1
     assert np.shape(about["unloaded"]["noise"]) == (4, 4)
     assert (about["run"], about["lost"]) == (0, 0)
-    assert not about.keys() & {"bundle", "tare", "rule"}
     assert (about["material"], about["position"], about["session"]) == ("wood", "3", "monday")
-    assert not about.keys() & {"speed_mm_s", "force_n"}  # the start was a GPIO line
+    assert not about.keys() & {"bundle", "tare", "rule", "speed_mm_s", "force_n"}
     again, format = load(tmp_path / "sweep-000001.npy")
     assert format == skin.FORMAT
     assert again.frames.taxels.tobytes() == box.kept[0].frames.taxels.tobytes()
 
 
-def test_a_recording_is_a_set_to_train_on(recorded: Callable[..., Rigged], tmp_path: Path):
+def test_a_recording_is_a_set_to_train_on(recorded: Recorded, tmp_path: Path):
     """`palpate-train --set DIR` reads the materials, positions, sessions and windows that the box
     recorded."""
-    files = pytest.importorskip(
-        "palpate_train.data.readers",
-        reason="the desktop's tools are not here; make test installs them",
-    )
-    from palpate.core.sweep_set import SweepSet
-
-    simulated = devices.build(skin.FORMAT, script.tubes(3, 2), rig.VirtualClock(), "sim")
+    simulated = simulated_tubes(3, 2)
     box = recorded(simulated, Labels("wood", "1", "a"))
     box.until(lambda: box.box.answered == 1)
     for command in ("MATERIAL,metal", "POSITION,2"):
         box.ask(f"$PPLP,{command}")
     box.until(lambda: simulated.finished(box.box.answered))
-    made = files.read(tmp_path, SweepSet)
+    made = readers.read(tmp_path, SweepSet)
     assert [made.materials[k] for k in made.labels] == ["wood", "metal"]
     assert made.groups["position"].tolist() == [1, 2]
     assert (made.samples[1] == box.kept[1].frames.taxels).all()
@@ -187,19 +195,12 @@ def test_a_recording_is_a_set_to_train_on(recorded: Callable[..., Rigged], tmp_p
 def test_speed_and_force_reach_sidecar_feed_and_set(rigged: Callable[..., Rigged], tmp_path: Path):
     """Two sweeps by command with `palpate record`: the values are in each sidecar, in the feed's
     verdict, and are groups of the set."""
-    files = pytest.importorskip(
-        "palpate_train.data.readers",
-        reason="the desktop's tools are not here; make test installs them",
-    )
-    from palpate.core.sweep_set import SweepSet
-
     acts = [rig.Act(np.zeros((20 * 750, 4, 4), np.uint8), 10**7, 10**7 + 1, "")]
     simulated = devices.build(skin.FORMAT, acts, rig.VirtualClock(), "sim")
     session = RecordingSession(tmp_path, skin.FORMAT, WOOD, simulated.clock, lambda line: None)
     feed = FeedServer(tmp_path / "feed.sock", skin.FORMAT, {}, simulated.clock)
-    box = rigged(
-        simulated, ("trigger.mode=serial",), observers=[session, feed], commands=session.commands
-    )
+    sets = ("trigger.mode=serial",)
+    box = rigged(simulated, sets, observers=[session, feed], commands=session.commands)
     box.seconds(0.5)
     peer = FeedPeer(tmp_path / "feed.sock")
     for start in ("START,30.5,1.5", "START,60,0.25"):
@@ -207,12 +208,11 @@ def test_speed_and_force_reach_sidecar_feed_and_set(rigged: Callable[..., Rigged
         box.seconds(2.5)
         box.ask("$PPLP,STOP")
         box.seconds(0.5)
-    want = [(30.5, 1.5), (60.0, 0.25)]
-    sidecars = [sidecar(tmp_path / f"sweep-{n:06d}.npy") for n in (1, 2)]
-    assert [(about["speed_mm_s"], about["force_n"]) for about in sidecars] == want
     verdicts = [line for line in peer.lines() if line["type"] == "verdict"]
-    assert [(line["speed_mm_s"], line["force_n"]) for line in verdicts] == want
-    groups = files.read(tmp_path, SweepSet).groups
+    for abouts in (verdicts, [sidecar(tmp_path / f"sweep-{n:06d}.npy") for n in (1, 2)]):
+        found = [(about["speed_mm_s"], about["force_n"]) for about in abouts]
+        assert found == [(30.5, 1.5), (60.0, 0.25)]
+    groups = readers.read(tmp_path, SweepSet).groups
     assert groups["speed"].tolist() == [30_500, 60_000]
     assert groups["force"].tolist() == [1_500, 250]
 
@@ -222,44 +222,29 @@ def test_rec_says_what_became_of_each_sweep(tmp_path: Path):
     desk = Desk(tmp_path, Labels("wood", "3", "a b"))
     assert desk.sweep(1) == ["1", "stored", "1", "wood", "3", "a b", "sweep-000001"]
     assert desk.sweep(2, status=Status.SHORT) == ["2", "skipped", "1", "wood", "3", "a b", "short"]
-    assert desk.sweep(3, status=Status.NO_CONTACT)[1:3] + desk.sentences[-1][6:] == [
-        "stored",
-        "2",
-        "sweep-000003 no-contact",
-    ]
+    faulty = desk.sweep(3, status=Status.NO_CONTACT)
+    assert faulty[1:3] + faulty[6:] == ["stored", "2", "sweep-000003 no-contact"]
     assert desk.sweep(4)[6] == "sweep-000004"
     desk.do("MATERIAL")
     assert desk.sweep(5)[3:] == ["", "3", "a b", "sweep-000005 no material"]
     assert names(tmp_path) == pairs(1, 3, 4, 5)
-    longest = "x" * 24
     for name in ("MATERIAL", "POSITION", "SESSION"):
-        desk.do(name, longest)
-    assert desk.sweep(999_999)[3:7] == [longest, longest, longest, "sweep-999999"]
+        desk.do(name, "x" * 24)
+    assert desk.sweep(999_999)[3:7] == ["x" * 24] * 3 + ["sweep-999999"]
 
 
 def test_the_label_at_the_start_edge_counts(tmp_path: Path):
     """Each sweep has the labels that applied at its start, even if it is answered after a later
-    sweep."""
+    sweep. A sweep that began before all kept changes has no label."""
     desk = Desk(tmp_path, Labels())
     for t_ns, material in ((100, "a"), (200, "b"), (300, "c")):
         desk.t_ns = t_ns
         desk.do("MATERIAL", material)
-    assert [desk.sweep(n, start)[3] for n, start in ((1, 299), (2, 100), (3, 99), (4, 300))] == [
-        "b",
-        "a",
-        "",
-        "c",
-    ]
-
-
-def test_more_changes_than_are_kept_lose_labels_and_mix_none(tmp_path: Path):
-    """A sweep that began before all kept changes is stored without labels, not with later
-    labels."""
-    desk = Desk(tmp_path)
-    for desk.t_ns in range(1, recording.MOST_CHANGES + 1):
+    starts = {299: "b", 100: "a", 99: "", 300: "c"}
+    assert {start: desk.sweep(n, start)[3] for n, start in enumerate(starts, 1)} == starts
+    for desk.t_ns in range(400, 400 + recording.MOST_CHANGES):
         desk.do("MATERIAL", "metal")
-    assert desk.sweep(1, 0)[3] == ""
-    assert desk.sweep(2, 1)[3] == "metal"
+    assert [desk.sweep(n, start)[3] for n, start in ((5, 300), (6, 400))] == ["", "metal"]
 
 
 @pytest.mark.parametrize(
@@ -268,13 +253,10 @@ def test_more_changes_than_are_kept_lose_labels_and_mix_none(tmp_path: Path):
         ("1", "2"),
         ("9", "10"),
         ("09", "10"),
-        ("", None),
-        ("left", None),
-        ("2.5", None),
-        ("9" * 24, None),
+        *((text, "") for text in ("", "left", "2.5", "9" * 24)),
     ],
 )
-def test_next_position(tmp_path: Path, text: str, after: str | None):
+def test_next_position(tmp_path: Path, text: str, after: str):
     """A whole number is increased by one; anything else is an error and stays."""
     desk = Desk(tmp_path, Labels("wood", text))
     if after:
@@ -328,7 +310,7 @@ def test_discard_of_the_sweep_that_was_seen(tmp_path: Path):
     for n in (1, 2):
         desk.sweep(n)
     for other in ("1", "3", "02"):
-        with pytest.raises(ApplianceError, match=f"the last stored sweep is 2, not {other}"):
+        with pytest.raises(ApplianceError, match=f"sweep is 2, not {other}"):
             desk.do("DISCARD", other)
     assert desk.do("DISCARD", "2") == [2, 1, "sweep-000002"]
     assert names(tmp_path) == [*pairs(1), "sweep-000002.discarded"]
@@ -338,26 +320,22 @@ def test_what_became_of_the_last_sweep_is_kept(tmp_path: Path):
     """For displays of the recording: the outcome as in REC, and the sweep that DISCARD would
     remove."""
     desk = Desk(tmp_path, Labels("wood", "3", "a"))
-    assert [desk.recording.about()[name] for name in ("last", "discard")] == [None, None]
+
+    def shown() -> tuple[object, object]:
+        about = desk.recording.about()
+        return about["last"], about["discard"]
+
+    assert shown() == (None, None)
     desk.sweep(1)
     desk.sweep(2, status=Status.SHORT)
-    last = {
-        "sweep": 2,
-        "outcome": "skipped",
-        "detail": "short",
-        "material": "wood",
-        "position": "3",
-        "session": "a",
-    }
-    assert [desk.recording.about()[name] for name in ("last", "discard")] == [last, 1]
+    last, discard = shown()
+    labels = {"material": "wood", "position": "3", "session": "a"}
+    assert last == {"sweep": 2, "outcome": "skipped", "detail": "short"} | labels
+    assert discard == 1
     desk.sweep(3)
     desk.do("DISCARD")
-    about = desk.recording.about()
-    assert (about["last"]["sweep"], about["last"]["outcome"], about["discard"]) == (
-        3,
-        "discarded",
-        1,
-    )
+    last, discard = shown()
+    assert (last["sweep"], last["outcome"], discard) == (3, "discarded", 1)
 
 
 def test_the_log_says_what_is_missing(tmp_path: Path, logged: list[str]):
@@ -378,59 +356,50 @@ def test_the_log_says_what_is_missing(tmp_path: Path, logged: list[str]):
     desk.do("MATERIAL")
     desk.sweep(5)
     desk.sweep(6, status=Status.SHORT)
-    assert logged == [
-        "<4>sweep 1: no answer, saturated: too many raw counts at full scale; press less; "
-        "it is not counted",
-        "sweep 2: recorded; wood at 1: 2 of 2; missing: another material, since a model tells at "
-        "least two apart",
-        "sweep 3: recorded; metal at 1: 1 of 2; missing: metal at 1: 1",
-        "sweep 4: recorded; metal at 2: 1 of 2; missing: metal at 1: 2, metal at 2: 1, wood at "
-        "2: 2",
-        "sweep 5: recorded; no material, so it cannot be trained on; "
-        "name it with MATERIAL or --material",
-        "<4>sweep 6: no answer, short: the stop edge came before a window's length had passed; "
-        "it is not counted",
+    want = [
+        ("<4>sweep 1: ", "saturated"),
+        ("sweep 2: ", "wood at 1: 2 of 2; missing: another material"),
+        ("sweep 3: ", "metal at 1: 1 of 2; missing: metal at 1: 1"),
+        ("sweep 4: ", "of 2; missing: metal at 1: 2, metal at 2: 1, wood at 2: 2"),
+        ("sweep 5: ", "no material"),
+        ("<4>sweep 6: ", "short"),
     ]
+    for line, (start, part) in zip(logged, want, strict=True):
+        assert line.startswith(start)
+        assert part in line
 
 
 def test_a_folder_of_another_format_is_refused(tmp_path: Path):
     """A model cannot be trained on sweeps of two formats. The folder does not change and can be
-    used by other programs."""
+    used by other programs; a damaged sweep there is neither counted nor refused."""
     first = Desk(tmp_path)
     first.sweep(1)
     first.recording.close()
     other = replace(toy_bundle.FORMAT, rows=3)
-    with pytest.raises(
-        ConfigError, match=r"sweep-000001\.npy has another format than 3x2 .* with --out"
-    ):
+    with pytest.raises(ConfigError, match=r"000001\.npy .*3x2 "):
         RecordingSession(tmp_path, other, NONE, first, first.hear)
-    (tmp_path / "sweep-000002.json").write_text("{}")  # damaged: not counted, not refused
+    (tmp_path / "sweep-000002.json").write_text("{}")
     assert Desk(tmp_path).sweep(1)[6] == "sweep-000003"
 
 
 def test_discard_that_fails_can_be_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """A disk that fails in the middle is an error; the sweep still counts as stored, and DISCARD
     can remove the rest."""
-    desk = Desk(tmp_path)
+    desk, rename = Desk(tmp_path), Path.replace
     desk.sweep(1)
-    with monkeypatch.context() as broken:
-        broken.setattr(Path, "replace", failing(Path.replace, ".json"))
-        with pytest.raises(ApplianceError, match="sweep 1 cannot be discarded: Input/output error"):
+
+    def broken(path: Path, target: Path) -> Path:
+        if path.suffix == ".json":
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return rename(path, target)
+
+    with monkeypatch.context() as disk:
+        disk.setattr(Path, "replace", broken)
+        with pytest.raises(ApplianceError, match="Input/output error"):
             desk.do("DISCARD")
     assert names(tmp_path) == ["sweep-000001.json"]
     assert desk.do("DISCARD") == [1, 0, "sweep-000001"]
     assert names(tmp_path) == ["sweep-000001.discarded"]
-
-
-def failing(replace: Callable[..., Path], suffix: str) -> Callable[..., Path]:
-    """A `Path.replace` that fails for names with this ending."""
-
-    def broken(path: Path, target: Path) -> Path:
-        if path.suffix == suffix:
-            raise OSError(errno.EIO, os.strerror(errno.EIO))
-        return replace(path, target)
-
-    return broken
 
 
 def test_a_later_run_writes_nothing_over(tmp_path: Path):
@@ -439,12 +408,12 @@ def test_a_later_run_writes_nothing_over(tmp_path: Path):
     first = Desk(tmp_path)
     first.sweep(1)
     first.recording.close()
-    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    before = content(tmp_path)
     (tmp_path / "sweep-000002.json").write_text("{}")
     for left in ("sweep-000003.json.part", "sweep-000003.npy.part", "mine.part"):
         (tmp_path / left).write_bytes(b"half")
     assert Desk(tmp_path).sweep(1)[6] == "sweep-000004"
-    after = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    after = content(tmp_path)
     assert before.items() <= after.items()
     assert sorted(after.keys() - before.keys()) == ["mine.part", "sweep-000002.json", *pairs(4)]
     about = sidecar(tmp_path / "sweep-000004.npy")
@@ -454,7 +423,7 @@ def test_a_later_run_writes_nothing_over(tmp_path: Path):
 def test_one_program_at_a_time_has_a_folder(tmp_path: Path):
     """A second program would use the same numbers, so it is refused, and the first continues."""
     first = Desk(tmp_path)
-    with pytest.raises(ConfigError, match="another program keeps sweeps there"):
+    with pytest.raises(ConfigError, match="another program"):
         Desk(tmp_path)
     assert first.sweep(1)[1] == "stored"
     first.recording.close()
@@ -480,24 +449,21 @@ def test_no_room_for_the_system_stops_recording(
     """In the reserved space nothing is written: REC says so, and one line is logged. Each sweep
     tries again, and one line is logged after a success."""
     free = [left]
-    monkeypatch.setattr(
-        os,
-        "statvfs",
-        lambda path: os.statvfs_result((4096, 4096, blocks, blocks, free[0], 9, 9, 9, 0, 255)),
-    )
+
+    def statvfs(path: object) -> os.statvfs_result:
+        return os.statvfs_result((4096, 4096, blocks, blocks, free[0], 9, 9, 9, 0, 255))
+
+    monkeypatch.setattr(os, "statvfs", statvfs)
     desk = Desk(tmp_path)
-    assert [desk.sweep(n)[1:3] + desk.sentences[-1][6:] for n in (1, 2)] == [
-        ["full", "0", detail]
-    ] * 2
+    assert [desk.outcome(n) for n in (1, 2)] == [["full", "0", detail]] * 2
     assert names(tmp_path) == []
     free[0] += 1
     assert desk.sweep(3)[1:3] == ["stored", "1"]
     desk.recording.close()
-    assert [line for line in logged if "record: " in line] == [
-        f"<4>record: sweep 1 is not stored: {detail}; make room in {tmp_path}; the answers go on",
-        "record: sweeps are stored again, from sweep 3 on",
-        f"record: sweeps of this run in {tmp_path}: 1; missing: wood: 9",
-    ]
+    trouble, again, end = (line for line in logged if "record: " in line)
+    assert trouble.startswith(f"<4>record: sweep 1 is not stored: {detail}; ")
+    assert "stored again" in again
+    assert end.endswith(f"{tmp_path}: 1; missing: wood: 9")
 
 
 @pytest.mark.parametrize(
@@ -508,11 +474,7 @@ def test_a_disk_that_refuses(
 ):
     """No space and no quota are `full`, anything else is `failed`, with the reason."""
     desk = Desk(tmp_path)
-
-    def refused(*args: object) -> None:
-        raise OSError(code, os.strerror(code))
-
-    monkeypatch.setattr(sweep_folder, "save", refused)
+    refusing(monkeypatch, code)
     assert desk.sweep(1) == ["1", outcome, "0", "wood", "", "", os.strerror(code)]
     assert len(logged) == 1
 
@@ -522,7 +484,7 @@ def test_what_cannot_be_written_leaves_nothing(tmp_path: Path, logged: list[str]
     of it stays, and existing files are complete."""
     desk = Desk(tmp_path)
     desk.sweep(1)
-    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    before = content(tmp_path)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     for size in range(0, max(map(len, before.values())), 50):
         resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
@@ -530,21 +492,18 @@ def test_what_cannot_be_written_leaves_nothing(tmp_path: Path, logged: list[str]
             assert desk.sweep(2)[1] == "failed"
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-        assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+        assert content(tmp_path) == before
     assert ["not stored" in line for line in logged] == [False, True]
     assert desk.sweep(2)[1:3] == ["stored", "2"]
 
 
 def test_a_folder_that_is_taken_away(tmp_path: Path, logged: list[str]):
     """Its sweeps fail with a report; once the folder is back, recording continues."""
-    desk = Desk(tmp_path / "a" / "b")
+    folder = tmp_path / "a" / "b"
+    desk = Desk(folder)
     shutil.rmtree(tmp_path / "a")
-    assert desk.sweep(1)[1:3] + desk.sentences[-1][6:] == [
-        "failed",
-        "0",
-        "No such file or directory",
-    ]
-    (tmp_path / "a" / "b").mkdir(parents=True)
+    assert desk.outcome(1) == ["failed", "0", "No such file or directory"]
+    folder.mkdir(parents=True)
     assert desk.sweep(2)[1] == "stored"
     assert "stored again" in logged[-2]
 
@@ -552,7 +511,7 @@ def test_a_folder_that_is_taken_away(tmp_path: Path, logged: list[str]):
 @pytest.mark.parametrize("folder", ["/proc/x", "/dev/null"])
 def test_a_folder_that_cannot_be_made(folder: str):
     """Reported before the robot sweeps."""
-    with pytest.raises(ConfigError, match=f"--out {folder}: .*name a folder that can be written"):
+    with pytest.raises(ConfigError, match=f"--out {folder}: "):
         Desk(Path(folder))
 
 
@@ -569,20 +528,12 @@ def test_folders_are_on_the_disk_before_their_sweeps(
         synced.clear()
 
 
-def test_a_disk_that_is_full_costs_no_answer(
-    recorded: Callable[..., Rigged], monkeypatch: pytest.MonkeyPatch
-):
+def test_a_disk_that_is_full_costs_no_answer(recorded: Recorded, monkeypatch: pytest.MonkeyPatch):
     """On the whole box: each sweep is answered, each REC says full, no frame is lost."""
-
-    def full(path: Path, sweep: Sweep, format: object, about: Mapping[str, object]) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(sweep_folder, "save", full)
-    simulated = devices.build(skin.FORMAT, script.tubes(4, 2), rig.VirtualClock(), "sim")
-    box = recorded(simulated, Labels("wood"))
-    verdicts = box.until(lambda: simulated.finished(box.box.answered))
-    box.seconds(0.1)
-    assert len(verdicts) == 2
+    refusing(monkeypatch, errno.ENOSPC)
+    simulated = simulated_tubes(4, 2)
+    box = recorded(simulated, WOOD)
+    assert len(box.until(lambda: simulated.finished(box.box.answered))) == 2
     assert [rec[1] for rec in heard(box)] == ["full", "full"]
     assert box.box.counters.lost_frames == 0
 
@@ -617,5 +568,5 @@ def test_display_names_outlast_the_run(tmp_path: Path):
     one = RecordedPage(tmp_path, Labels())
     assert one.recording.names.displays == {"Holz geoelt": "Holz, geölt"}
     one.recording.close()
-    with pytest.raises(FormatError, match=r"'a\\nb' of 'metal' cannot be shown; use 1"):
+    with pytest.raises(FormatError, match="of 'metal' cannot"):
         sets.load(str(tmp_path))
