@@ -5,9 +5,10 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,41 +27,30 @@ from tests.factories.settings import load
 A, B, NEAR_A = (0.0, 0.0), (6.0, 0.0), (2.8, -1.0)
 """Embeddings of a sure "a", a sure "b", and an "a" with a probability of .65."""
 S = 1_000_000_000
-PERIOD_S, SLIDE_S = 10, 3
+DELIVERED = ClassifierConfig()
 UNTIL_NEW_OBJECT = ClassifierConfig(max_sweeps=0, conflict="fuse", object_s=0)
 """The settings with which only NEW OBJECT ends an object."""
 
 
-def classifier(bundle: Bundle, settings: ClassifierConfig, **changes: float) -> Classifier:
+def classifier(bundle: Bundle, settings: ClassifierConfig = DELIVERED, **more: Any) -> Classifier:
     """A classifier with these settings."""
-    chosen = replace(settings, **changes)
-    return Classifier(
-        bundle,
-        VirtualClock(),
-        chosen.fuse,
-        chosen.min_probability,
-        chosen.max_sweeps,
-        chosen.conflict,
-        chosen.object_s,
-    )
+    chosen = asdict(replace(settings, **more))
+    names = ("min_probability", "max_sweeps", "conflict", "object_s")
+    rule = {name: chosen[name] for name in names}
+    return Classifier(bundle, VirtualClock(), chosen["fuse"], **rule)
 
 
-def timed(sweeps: Iterable[Sweep], pause_s: float = PERIOD_S - SLIDE_S) -> list[Sweep]:
-    """The sweeps with numbers and times, of an object that was signalled before the first."""
-    period = round((pause_s + SLIDE_S) * S)
+def timed(sweeps: Iterable[Sweep], pause_s: float = 7) -> list[Sweep]:
+    """The sweeps with numbers and times, of an object that was signalled before the first. A slide
+    takes 3 s."""
+    period, slide = round((pause_s + 3) * S), 3 * S
     return [
-        replace(
-            sweep,
-            id=n,
-            start_ns=n * period,
-            stop_ns=n * period + SLIDE_S * S,
-            object=sweep.object or 1,
-        )
-        for n, sweep in enumerate(sweeps, 1)
+        replace(one, id=n, start_ns=n * period, stop_ns=n * period + slide, object=one.object or 1)
+        for n, one in enumerate(sweeps, 1)
     ]
 
 
-def felt(*embeddings: tuple[float, float], pause_s: float = PERIOD_S - SLIDE_S) -> list[Sweep]:
+def felt(*embeddings: tuple[float, float], pause_s: float = 7) -> list[Sweep]:
     """Sweeps of one object with these embeddings."""
     return timed((toy_bundle.sweep(*z) for z in embeddings), pause_s)
 
@@ -68,6 +58,11 @@ def felt(*embeddings: tuple[float, float], pause_s: float = PERIOD_S - SLIDE_S) 
 def short(verdict: Verdict) -> tuple[str, str, int, str]:
     """The part of a verdict that these tests compare."""
     return str(verdict.status), verdict.label, verdict.fused, verdict.detail
+
+
+def labels(it: Classifier, *embeddings: tuple[float, float]) -> list[tuple[str, int]]:
+    """Label and number of fused sweeps of each answer."""
+    return [short(it(sweep))[1:3] for sweep in felt(*embeddings)]
 
 
 @pytest.fixture
@@ -102,50 +97,43 @@ def test_a_pause_is_from_the_end_to_the_start():
 
 
 def test_a_contradiction_begins_another_object(toy: Bundle):
-    """Its evidence is that sweep alone, the detail names both labels, and later sweeps are fused
-    with it."""
-    it = classifier(toy, ClassifierConfig())
-    given = [short(it(sweep)) for sweep in felt(A, A, B, B, A)]
-    assert given == [
+    """Its evidence is that sweep alone, the detail has both labels, and later sweeps are fused with
+    it. With `vote` the sweep is compared with the share of the votes."""
+    assert [short(one) for one in map(classifier(toy), felt(A, A, B, B, A))] == [
         ("ok", "a", 1, ""),
         ("ok", "a", 2, ""),
         ("ok", "b", 1, "another object: b after a"),
         ("ok", "b", 2, ""),
         ("ok", "a", 1, "another object: a after b"),
     ]
+    assert labels(classifier(toy, fuse="vote"), A, A, B) == [("a", 1), ("a", 2), ("b", 1)]
 
 
 def test_an_unsure_sweep_is_fused(toy: Bundle):
     """A sweep that is not sure of another label does not end the object, and neither does a sure
     sweep after unsure ones."""
-    it = classifier(toy, ClassifierConfig(), min_probability=0.9)
-    towards_b = (3.2, -1.0)
-    assert [short(it(sweep))[1:3] for sweep in felt(A, towards_b)] == [("a", 1), ("a", 2)]
+    it = classifier(toy, min_probability=0.9)
+    assert labels(it, A, (3.2, -1.0)) == [("a", 1), ("a", 2)]
     it.forget()
-    assert [short(it(sweep))[1:3] for sweep in felt(NEAR_A, B)] == [("a", 1), ("b", 2)]
+    assert labels(it, NEAR_A, B) == [("a", 1), ("b", 2)]
 
 
 def test_a_contradiction_can_be_refused(toy: Bundle):
     """The answer is `conflict` without a label, and the evidence stays as it was, until NEW
     OBJECT."""
-    it = classifier(toy, ClassifierConfig(), conflict="refuse")
-    sweeps = felt(A, B, A, B)
+    it, sweeps = classifier(toy, conflict="refuse"), felt(A, B, A, B)
     given = [it(sweep) for sweep in sweeps]
-    assert [short(v) for v in given] == [
-        ("ok", "a", 1, ""),
-        ("conflict", "", 0, "another object: b after a"),
-        ("ok", "a", 2, ""),
-        ("conflict", "", 0, "another object: b after a"),
-    ]
-    assert [len(v.scores) for v in given] == [3, 0, 3, 0]
-    assert [len(v.own) for v in given] == [3] * 4
-    assert [v.after for v in given] == [0, 1, 2, 3]
+    refused = ("conflict", "", 0, "another object: b after a")
+    fused = ("ok", "a", 1, ""), ("ok", "a", 2, "")
+    assert [short(v) for v in given] == [fused[0], refused, fused[1], refused]
+    found = [(len(v.scores), len(v.own), v.after) for v in given]
+    assert found == [(3, 3, 0), (0, 3, 1), (3, 3, 2), (0, 3, 3)]
     assert short(it(replace(sweeps[3], object=2))) == ("ok", "b", 1, "")
 
 
 def test_a_refused_sweep_is_not_a_pause(toy: Bundle):
     """The object goes on while sweeps of it are refused; it ends after a pause without sweeps."""
-    it = classifier(toy, ClassifierConfig(), conflict="refuse", object_s=10)
+    it = classifier(toy, conflict="refuse", object_s=10)
     sweeps = felt(A, B, B, B)
     assert [short(it(sweep))[0] for sweep in sweeps] == ["ok"] + ["conflict"] * 3
     later = sweeps[-1].stop_ns + 10 * S + 1
@@ -155,32 +143,25 @@ def test_a_refused_sweep_is_not_a_pause(toy: Bundle):
 @pytest.mark.parametrize(("pause_s", "fused"), [(60.0, [1, 2, 3]), (60.5, [1, 1, 1])])
 def test_a_pause_ends_an_object(toy: Bundle, pause_s: float, fused: list[int]):
     """By the times of the sweeps; the default is 60 s."""
-    it = classifier(toy, ClassifierConfig())
+    it = classifier(toy)
     assert [it(sweep).fused for sweep in felt(A, A, A, pause_s=pause_s)] == fused
 
 
 def test_after_max_sweeps_another_object_begins(toy: Bundle):
     """Whether the last answer was `ok` or `undecided`, and without the evidence of the object."""
-    it = classifier(toy, ClassifierConfig())
+    it = classifier(toy)
     assert [it(sweep).fused for sweep in felt(*[A] * 12)] == [1, 2, 3, 4, 5, 1, 2, 3, 4, 5, 1, 2]
-    it = classifier(toy, ClassifierConfig(), min_probability=0.999, max_sweeps=2)
+    it = classifier(toy, min_probability=0.999, max_sweeps=2)
     given = [short(it(sweep)) for sweep in felt(*[NEAR_A] * 3)]
     assert [g[::2] for g in given] == [("unsure", 1), ("undecided", 2), ("unsure", 1)]
 
 
-def test_a_vote_ends_by_the_votes(toy: Bundle):
-    """With `vote` the sweep is compared with the share of the votes."""
-    it = classifier(toy, replace(ClassifierConfig(), fuse="vote"))
-    assert [short(it(sweep))[1:3] for sweep in felt(A, A, B)] == [("a", 1), ("a", 2), ("b", 1)]
-
-
-@pytest.mark.parametrize("more", [{"object": 0}, {"object": 1, "fuse": "none"}])
-def test_sweeps_by_themselves_end_no_object(toy: Bundle, more: dict):
+@pytest.mark.parametrize(("object", "fuse"), [(0, "product"), (1, "none")])
+def test_sweeps_by_themselves_end_no_object(toy: Bundle, object: int, fuse: str):
     """Before NEW OBJECT and with `none` nothing is compared."""
-    settings = replace(ClassifierConfig(), fuse=more.get("fuse", "product"), conflict="refuse")
-    it = classifier(toy, settings)
-    sweeps = [replace(sweep, object=more["object"]) for sweep in felt(A, B)]
-    assert [short(it(sweep)) for sweep in sweeps] == [("ok", "a", 1, ""), ("ok", "b", 1, "")]
+    it = classifier(toy, fuse=fuse, conflict="refuse")
+    given = [short(it(replace(sweep, object=object))) for sweep in felt(A, B)]
+    assert given == [("ok", "a", 1, ""), ("ok", "b", 1, "")]
 
 
 @pytest.mark.parametrize(
@@ -189,7 +170,7 @@ def test_sweeps_by_themselves_end_no_object(toy: Bundle, more: dict):
 def test_early_answers_end_objects_too(toy: Bundle, conflict: str, label: str | None, fused: int):
     """A sure early answer of another label begins an object. If it is refused, or not ok, the sweep
     goes on and does not count."""
-    it = classifier(toy, ClassifierConfig(), conflict=conflict)
+    it = classifier(toy, conflict=conflict)
     first, second, third, fourth = felt(A, A, B, A)
     assert [it(sweep).fused for sweep in (first, second)] == [1, 2]
     early = it.conclude_if_ok(replace(third, share=0.5), np.array([0.001, 0.999, 0.0]))
@@ -200,9 +181,7 @@ def test_early_answers_end_objects_too(toy: Bundle, conflict: str, label: str | 
 def test_enrolled_labels_contradict(tmp_path: Path):
     """A label that was enrolled counts as any other."""
     arrays = toy_bundle.means(sweeps=np.array([0, 0, 5]))
-    it = classifier(
-        toy_bundle.load(tmp_path / "enrolled", arrays=arrays, labels=2), ClassifierConfig()
-    )
+    it = classifier(toy_bundle.load(tmp_path / "enrolled", arrays=arrays, labels=2))
     given = [short(it(sweep)) for sweep in felt(A, (0.0, 6.0))]
     assert given[1] == ("ok", "c", 1, "another object: c after a")
 
@@ -245,7 +224,7 @@ def test_new_object_forgotten(default_bundle: Bundle, order: str):
     """NEW OBJECT once, then 240 sweeps of six materials: at most 1 % of the answers are wrong
     though the sweep alone is right. If all are fused, over half are."""
     truth, sweeps = zip(*drawn(ORDERS[order](), 41), strict=True)
-    alone = named(classifier(default_bundle, ClassifierConfig()), sweeps)
+    alone = named(classifier(default_bundle), sweeps)
 
     def harmed(settings: ClassifierConfig) -> int:
         given = named(classifier(default_bundle, settings), timed(sweeps))
@@ -262,7 +241,7 @@ def test_new_object_before_each(default_bundle: Bundle):
     object, except to the few sweeps that are wrong by themselves."""
     truth, sweeps = zip(*drawn([i // 3 % 6 for i in range(180)], 43), strict=True)
     signalled = timed(replace(sweep, object=1 + i // 3) for i, sweep in enumerate(sweeps))
-    alone = named(classifier(default_bundle, ClassifierConfig()), sweeps)
+    alone = named(classifier(default_bundle), sweeps)
     ended, fused = (
         named(classifier(default_bundle, settings), signalled)
         for settings in (ClassifierConfig(), UNTIL_NEW_OBJECT)
@@ -280,14 +259,10 @@ def test_the_settings_reach_the_classifier(toy: Bundle):
     for given in ((), sets):
         settings = load([f"classifier.{text}" for text in given])
         rule = assembly.classifier(settings, toy, VirtualClock()).rule
-        chosen = settings.classifier
-        assert rule == {
-            "fuse": chosen.fuse,
-            "min_probability": chosen.min_probability or toy_bundle.LIMITS.unsure,
-            "max_sweeps": chosen.max_sweeps,
-            "conflict": chosen.conflict,
-            "object_s": chosen.object_s,
-        }
+        chosen = asdict(settings.classifier)
+        chosen["min_probability"] = chosen["min_probability"] or toy_bundle.LIMITS.unsure
+        assert rule.keys() >= {"fuse", "min_probability", "max_sweeps", "conflict", "object_s"}
+        assert rule == {name: chosen[name] for name in rule}
     assert (rule["conflict"], rule["object_s"], rule["max_sweeps"]) == ("refuse", 7.5, 3)
 
 
