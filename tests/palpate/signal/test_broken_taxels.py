@@ -46,35 +46,38 @@ def found(taxels: np.ndarray, rule: Bridging = RULE, limits: WindowLimits = LIMI
     return broken.text if broken else ""
 
 
-def test_a_sound_skin_has_no_broken_taxel():
-    """Of one axis and of three."""
-    assert found(slide()) == ""
-    assert found(slide(axes=3)) == ""
-
-
-@pytest.mark.parametrize("count", [0, 90, 255])
-def test_a_constant_taxel_is_silent(count: int):
-    """Dead, stuck within the range, or at full scale while its neighbours are below."""
-    taxels = slide()
-    taxels[:, 2, 3] = count
-    assert found(taxels) == "silent taxel 3.4"
-
-
 @pytest.mark.parametrize(
-    ("place", "named"),
+    ("place", "count", "named"),
     [
-        (np.s_[:, 2], "silent row 3"),
-        (np.s_[:, 0], "silent row 1"),
-        (np.s_[:, :, 4], "silent column 5"),
-        (np.s_[:, 2:4, 1:3], "silent taxel 3.2 3.3 4.2 4.3"),
-        (np.s_[:, 0, 0], "silent taxel 1.1"),
+        (np.s_[:, 2, 3], 0, "silent taxel 3.4"),
+        (np.s_[:, 2, 3], 90, "silent taxel 3.4"),
+        (np.s_[:, 2, 3], 255, "silent taxel 3.4"),  # while its neighbours are below
+        (np.s_[:, 2, 2:4], 255, ""),  # the load is too high
+        (np.s_[:, 2], 0, "silent row 3"),
+        (np.s_[:, 0], 0, "silent row 1"),
+        (np.s_[:, :, 4], 0, "silent column 5"),
+        (np.s_[:, 2:4, 1:3], 0, "silent taxel 3.2 3.3 4.2 4.3"),
+        (np.s_[:, 0, 0], 0, "silent taxel 1.1"),
+        (np.s_[17, 1, 1], np.nan, "silent taxel 2.2"),
+        (np.s_[17, 1, 1], np.inf, "silent taxel 2.2"),
+        (np.s_[17, 1, 1], -np.inf, "silent taxel 2.2"),
     ],
 )
-def test_broken_taxels_side_by_side(place: Any, named: str):
-    """A broken wire of a matrix silences a row or a column, also at the edge."""
-    taxels = slide()
-    taxels[place] = 0
+def test_a_constant_taxel_is_silent(place: Any, count: float, named: str):
+    """Dead, stuck, or without a number in one frame. A broken wire of a matrix silences a row or a
+    column, also at the edge. A sound skin has no broken taxel."""
+    taxels = slide() if np.isfinite(count) else slide().astype(np.float32)
+    assert found(taxels) == ""
+    taxels[place] = count
     assert found(taxels) == named
+
+
+def test_one_axis_makes_the_taxel_broken():
+    """A constant shear axis is enough."""
+    taxels = slide(axes=3)
+    assert found(taxels) == ""
+    taxels[:, 1, 1, 0] = 7
+    assert found(taxels) == "silent taxel 2.2"
 
 
 def test_a_noisy_taxel_is_one_that_is_noisier_than_its_neighbours():
@@ -113,13 +116,6 @@ def test_a_still_skin_has_no_silent_taxel():
     assert found(nearly) == ""
 
 
-def test_saturated_taxels_beside_each_other_are_not_silent():
-    """Both are at full scale, so the load is too high."""
-    taxels = slide()
-    taxels[:, 2, 2:4] = 255
-    assert found(taxels) == ""
-
-
 def test_a_skin_whose_sound_taxels_may_be_constant():
     """Then a constant taxel is silent if it is loaded, or if all direct neighbours are; one at the
     edge of the contact may be sound."""
@@ -135,21 +131,6 @@ def test_a_skin_whose_sound_taxels_may_be_constant():
         == found(taxels)
         == ("silent taxel 1.1 1.2 1.3 1.4 1.5 4.3 5.5")
     )
-
-
-def test_one_axis_makes_the_taxel_broken():
-    """A constant shear axis is enough."""
-    taxels = slide(axes=3)
-    taxels[:, 1, 1, 0] = 7
-    assert found(taxels) == "silent taxel 2.2"
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_a_taxel_that_gives_no_number_is_silent(value: float):
-    """One frame is enough, and its neighbours are judged without it."""
-    taxels = slide().astype(np.float32)
-    taxels[17, 1, 1] = value
-    assert found(taxels) == "silent taxel 2.2"
 
 
 def test_noise_is_measured_at_triples_of_frames():
@@ -223,25 +204,21 @@ def test_the_number_that_may_be_bridged(place: Any, allowed: bool):
     assert RULE.allows(mask) == allowed
     few = replace(RULE, taxels=2, row=False, column=False)
     assert not few.allows(mask)
-
-
-def test_the_only_row_of_a_skin_is_not_a_row_that_may_be_bridged():
-    """Nothing would be left to bridge it with."""
-    assert not RULE.allows(np.ones((1, COLS), bool))
-    assert not RULE.allows(np.ones((ROWS, 1), bool))
+    for only in (np.ones((1, COLS), bool), np.ones((ROWS, 1), bool)):
+        assert not RULE.allows(only)  # nothing would be left to bridge it with
 
 
 @pytest.mark.parametrize(
     ("rule", "text"),
     [
-        (RULE, "up to 3 broken taxels or one row or one column"),
-        (replace(RULE, column=False), "up to 3 broken taxels or one row"),
+        (RULE, "3 broken taxels or one row or one column"),
+        (replace(RULE, column=False), "3 broken taxels or one row"),
         (replace(RULE, taxels=0, row=False, column=False), "no broken taxel"),
     ],
 )
 def test_the_rule_in_words(rule: Bridging, text: str):
-    """As `check` and `export` print it."""
-    assert rule.text == text
+    """`check` and `export` print it."""
+    assert rule.text.endswith(text)
 
 
 @pytest.mark.parametrize(
@@ -255,7 +232,7 @@ def test_the_rule_in_words(rule: Bridging, text: str):
 )
 def test_a_rule_out_of_range_is_refused(change: dict[str, Any], why: str):
     """The message names the field and its value."""
-    with pytest.raises(BundleError, match=f"bridging.{why} must be"):
+    with pytest.raises(BundleError, match=why):
         replace(RULE, **change)
 
 
@@ -273,6 +250,6 @@ def test_broken_taxels_in_words_and_in_a_file():
     assert (again.kinds == kinds).all()
     assert BrokenTaxels.read(None, format) is None
     assert BrokenTaxels.of(kinds & False) is None
-    with pytest.raises(ValueError, match=r"\(2, 6, 5\) do not fit 4x5"):
+    with pytest.raises(ValueError, match=r"\(2, 6, 5\) .* 4x5"):
         BrokenTaxels.read(kinds.tolist(), replace(format, rows=4))
     assert places(np.ones((1, 1), bool)) == "taxel 1.1"
