@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +14,6 @@ from palpate.core.status import Status
 from palpate.core.types import Verdict
 from palpate.io.robot_link import result
 from tests.factories import speaking_box
-from tests.factories.paths import ROOT
 
 
 def verdict(status: Status, detail: str = "", share: float = 1.0) -> Verdict:
@@ -43,6 +41,8 @@ def test_an_answer_survives_its_sentence(status: Status):
     """All fields of RES, for each status."""
     read = Answer.read(result(verdict(status, "moved 2.1 mm"), "usb").decode())
     label = "wood" if status.classified else ""
+    assert read.early is False
+    assert Answer.read(result(verdict(status, share=0.4), "usb").decode()).early
     assert read == Answer(
         7, 1.0, status, label, 0.9, 0.8, 2, 1, 1.25, "9f3c2a1b", "usb", 1.0, "moved 2.1 mm"
     )
@@ -60,18 +60,6 @@ def test_the_answer_of_a_finger_survives_its_sentence():
     assert Answer.read(fin.decode()) is None
     with pytest.raises(FormatError, match="RES"):
         Answer.of_finger(["left"])
-
-
-@pytest.mark.parametrize(
-    "page", ["docs/how-to/use-two-fingertips.md", "docs/reference/sentences.md"]
-)
-def test_the_fingers_of_the_pages_can_be_read(page: str):
-    """Each FIN of the documents has its sum and all fields."""
-    lines = re.findall(r"\$PPLP,FIN,[^\n]*", (ROOT / page).read_text())
-    found = [sentences.read(line.encode()) for line in lines]
-    assert found
-    assert all(one.summed for one in found)
-    assert {Answer.of_finger(one.fields).finger for one in found} <= {"left", "right"}
 
 
 def test_a_finger_with_the_longest_name_keeps_all_its_fields():
@@ -112,7 +100,7 @@ def test_a_measured_speed_of_another_form_is_named():
     """A word for the speed."""
     line = result(replace(verdict(Status.OK), measured_mm_s=30.0, direction="rows+"), "usb")
     fields = sentences.read(line).fields
-    with pytest.raises(FormatError, match="older than the box"):
+    with pytest.raises(FormatError, match="older than"):
         Answer.of([*fields[:14], "fast", "rows+"])
 
 
@@ -129,12 +117,7 @@ def test_each_status_is_one_kind(status: Status):
 def test_the_detail_stands_with_the_advice():
     """The detail of the box is kept."""
     answer = Answer.read(result(verdict(Status.STUCK_TAXEL, "taxel 2.3"), "usb").decode())
-    assert answer.what_to_do == "a loaded taxel shows a constant count; check the skin (taxel 2.3)"
-
-
-def test_an_early_answer_says_so():
-    """Share below 1."""
-    assert Answer.read(result(verdict(Status.OK, share=0.4), "usb").decode()).early
+    assert answer.what_to_do.endswith("(taxel 2.3)")
 
 
 @pytest.mark.parametrize(
@@ -149,7 +132,7 @@ def test_an_early_answer_says_so():
 def test_a_sentence_of_another_form_is_named(fields: str):
     """Too few fields, a status that is not known, a word for a number: an error that repeats
     them."""
-    with pytest.raises(FormatError, match="older than the box"):
+    with pytest.raises(FormatError, match="older than"):
         Answer.of(fields.split(","))
 
 
@@ -162,18 +145,16 @@ def test_a_damaged_line_is_no_answer():
     ] == [None] * 3
 
 
-def test_the_state_is_read_with_all_counts():
+@pytest.mark.parametrize(
+    ("skin", "sweeping", "ready"),
+    [("streaming", 0, True), ("streaming", 1, False), ("lost", 0, False)],
+)
+def test_the_state_is_read_with_all_counts(skin: str, sweeping: int, ready: bool):
     """STA as the box sends it; ready if the skin streams and no sweep is open."""
-    read = BoxState.of(sentences.read(speaking_box.state(answered=3)).fields)
-    assert (read.skin, read.answered, read.frames, read.bundle) == (
-        "streaming",
-        3,
-        3000,
-        "9f3c2a1b",
-    )
-    assert read.ready
-    assert not BoxState.of(sentences.read(speaking_box.state(sweeping=1)).fields).ready
-    assert not BoxState.of(sentences.read(speaking_box.state("lost")).fields).ready
+    line = speaking_box.state(skin, answered=3, sweeping=sweeping)
+    read = BoxState.of(sentences.read(line).fields)
+    assert (read.skin, read.ready, read.answered) == (skin, ready, 3)
+    assert (read.frames, read.bundle) == (3000, "9f3c2a1b")
 
 
 @pytest.mark.parametrize(
@@ -181,7 +162,7 @@ def test_the_state_is_read_with_all_counts():
 )
 def test_too_few_fields_are_named(kind: type[BoxState | BoxIdentity], fields: list[str]):
     """A state or an identity that is cut short."""
-    with pytest.raises(FormatError, match="older than the box"):
+    with pytest.raises(FormatError, match="older than"):
         kind.of(fields)
 
 

@@ -163,21 +163,15 @@ def test_a_sentence_from_a_newer_box_is_told(speaking: SpeakingBox, box: Palpate
     reason."""
     speaking.say(result(1, "sideways"))
     box.state()
-    with pytest.raises(NoAnswer, match="'sideways' is not a valid Status"):
+    with pytest.raises(NoAnswer, match="'sideways'"):
         box.result(SHORT_S)
 
 
-def test_a_command_that_is_refused(speaking: SpeakingBox, box: Palpate):
+@pytest.mark.parametrize("kind", ["START", ""])
+def test_a_command_that_is_refused(speaking: SpeakingBox, box: Palpate, kind: str):
     """The box's reason is raised, also for a command that was damaged on its way."""
-    speaking.script = lambda s: [
-        sentence("ANS", s.kind, "error", "sweeps are triggered otherwise; set trigger.mode")
-    ]
-    with pytest.raises(CommandRefused, match="START: sweeps are triggered otherwise"):
-        box.start()
-    speaking.script = lambda s: [
-        sentence("ANS", "", "error", "not a command; send for example PPLP ID")
-    ]
-    with pytest.raises(CommandRefused, match="not a command"):
+    speaking.script = lambda s: [sentence("ANS", kind, "error", "set trigger.mode")]
+    with pytest.raises(CommandRefused, match="set trigger"):
         box.start()
 
 
@@ -206,17 +200,12 @@ def test_an_answer_of_another_form(
         ask(box)
 
 
-def test_a_silent_box(speaking: SpeakingBox, box: Palpate):
-    """Nothing is waited for without end, and the error says when something was last heard."""
+@pytest.mark.parametrize("ask", [Palpate.state, Palpate.result, Palpate.wait_ready])
+def test_a_silent_box(speaking: SpeakingBox, box: Palpate, ask: Callable[..., object]):
+    """Nothing is waited for without end."""
     speaking.script = lambda s: []
-    with pytest.raises(
-        NoAnswer, match=r"no answer to STATE within 0\.05 s; the last sentence came"
-    ):
-        box.state(SHORT_S)
-    with pytest.raises(NoAnswer, match=r"no answer to a sweep within 0\.05 s"):
-        box.result(SHORT_S)
-    with pytest.raises(NoAnswer, match=r"not ready within 0\.05 s: no answer to STATE"):
-        box.wait_ready(SHORT_S)
+    with pytest.raises(NoAnswer, match=r"within 0\.05 s"):
+        ask(box, SHORT_S)
 
 
 @pytest.mark.parametrize(
@@ -407,14 +396,8 @@ def test_the_client_needs_pyserial_alone():
         "'serial'}),"
         "sorted({n.split('.')[1] for n in names if n.startswith('palpate.')}))"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=120,
-    )
+    words = [sys.executable, "-c", code]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True, timeout=120)
     assert done.stdout.strip() == "['serial'] ['client', 'core']"
 
 

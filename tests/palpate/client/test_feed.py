@@ -65,22 +65,19 @@ def test_lines_come_whole_however_they_are_split():
 @pytest.mark.parametrize(
     ("data", "why"),
     [
-        (b"SSH-2.0-OpenSSH\r\n", "is not a line of a feed"),
-        (b"[1]\n", "is not a line of a feed"),
-        (b'{"kind": "hello"}\n', "is not a line of a feed"),
-        (b'{"type": 1}\n', "is not a line of a feed"),
-        (b"[" * 100_000 + b"\n", "is not a line of a feed"),
-        (b"x" * (MOST_LINE + 1), "a line of over 1048576 bytes"),
-        (
-            b'{"type": "hello", "schema": 2}\n',
-            "speaks schema 2 of the feed, this reader 1; update one of them",
-        ),
+        (b"SSH-2.0-OpenSSH\r\n", "not a line of a feed"),
+        (b"[1]\n", "not a line of a feed"),
+        (b'{"kind": "hello"}\n', "not a line of a feed"),
+        (b'{"type": 1}\n', "not a line of a feed"),
+        (b"[" * 100_000 + b"\n", "not a line of a feed"),
+        (b"x" * (MOST_LINE + 1), "over 1048576 bytes"),
+        (b'{"type": "hello", "schema": 2}\n', "speaks schema 2"),
         (b'{"type": "hello"}\n', "speaks schema None"),
     ],
 )
 def test_what_is_no_feed_is_named(feed: Feed, data: bytes, why: str):
     """`parse` raises; a Feed closes the connection and gives the reason."""
-    with pytest.raises(FormatError, match=why.split(";")[0]):
+    with pytest.raises(FormatError, match=why):
         parse(data)
     server = FakeFeed(feed.path)
     with server.meet(feed, b"") as connection:
@@ -114,12 +111,9 @@ def test_what_is_asked_for_is_asked_again_after_a_restart(feed: Feed):
 
 @pytest.mark.slow
 def test_without_a_box_it_says_what_to_do(feed: Feed, tmp_path: Path):
-    """No socket, or a socket without a server: a reason and not an error; a loop over lines ends
-    with it."""
+    """No socket, or a socket without a server: a reason and not an error."""
     assert feed.read(0) is None
-    assert (
-        "no palpate offers its feed there: the box is off or restarting; start it" in feed.trouble
-    )
+    assert "start it" in feed.trouble
     FakeFeed(feed.path).listener.close()
     time.sleep(0.6)
     assert feed.read(0.01) is None
@@ -133,7 +127,7 @@ def test_without_a_box_it_says_what_to_do(feed: Feed, tmp_path: Path):
 def test_a_loop_over_lines_ends_with_the_reason(feed: Feed, monkeypatch: pytest.MonkeyPatch):
     """`for line in feed` without a box is an error with exit code 69."""
     monkeypatch.setattr(Feed, "read", lambda self, timeout_s: None)
-    with pytest.raises(FeedError, match=f"{feed.path}: not connected yet") as e:
+    with pytest.raises(FeedError, match="not connected yet") as e:
         next(iter(feed))
     assert e.value.exit_code == 69
 
@@ -157,7 +151,7 @@ def test_the_reason_of_the_box_is_kept(tmp_path: Path):
         offered.turns(10)
         kinds = [line["type"] for line in iter(lambda: feed.read(0), None)]
         assert kinds == ["hello", "health", "closed"]
-        assert "give frames a second as a number from 0 to 20" in feed.trouble
+        assert "from 0 to 20" in feed.trouble
     offered.feed.stopping()
 
 
@@ -184,36 +178,20 @@ def test_its_default_is_the_setting_of_the_box():
 def test_a_reader_loads_no_numpy():
     """Nothing but Python's own modules and a little of the box."""
     code = (
-        "import sys, palpate.client.feed; print(sorted({'numpy', 'serial', 'usb', "
-        "'onnxruntime'} & set(sys.modules)))"
+        "import sys, palpate.client.feed;"
+        "print({'numpy', 'serial', 'usb', 'onnxruntime'} & set(sys.modules))"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=120,
-    )
-    assert done.stdout.strip() == "[]"
+    words = [sys.executable, "-c", code]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True, timeout=120)
+    assert done.stdout.strip() == "set()"
 
 
 @contextmanager
 def running(path: Path) -> Iterator[subprocess.Popen]:
     """`palpate run` on a simulated skin, with its feed at `path`; killed at the end."""
-    command = [
-        sys.executable,
-        "-m",
-        "palpate",
-        "run",
-        "--sim",
-        "skin",
-        "--set",
-        f"store.runtime={path.parent}",
-    ]
-    with subprocess.Popen(
-        command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd=ROOT
-    ) as process:
+    words = ["-m", "palpate", "run", "--sim", "skin", "--set", f"store.runtime={path.parent}"]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    with subprocess.Popen([sys.executable, *words], cwd=ROOT, **quiet) as process:
         try:
             yield process
         finally:
@@ -241,7 +219,7 @@ def test_palpate_run_is_killed_and_comes_back_under_a_reader(tmp_path: Path):
                 assert seen[begin : begin + 2] == ["hello", "health"]
                 if wait == "health":
                     process.send_signal(signal.SIGTERM)
-                    assert process.wait(10) == 0
+                    assert process.wait(60) == 0
             assert path.exists() == (wait == "sweep")
         rest = list(iter(lambda: feed.read(0), None))
         assert rest[-1] == {"type": "closed", "why": "the box is stopping"}

@@ -19,6 +19,7 @@ from palpate import __version__
 from palpate.core.errors import ApplianceError, FormatError
 from palpate.core.health import Health
 from palpate.core.sentences import MAX_LINE, sentence
+from palpate.core.status import REASONS
 from palpate.core.types import Status, Verdict
 from palpate.service import status
 from palpate.service.status_file import StatusFile
@@ -114,9 +115,7 @@ def test_a_bridged_taxel_has_a_line(status_file: ClockedStatus):
     status_file.turns(2)
     assert "degraded" not in status_file.text()
     status_file.turns(2, HEALTH._replace(degraded="silent taxel 2.3"))
-    assert "degraded silent taxel 2.3: bridged by its neighbours; check the skin" in (
-        status_file.text()
-    )
+    assert "degraded silent taxel 2.3: " in status_file.text()
 
 
 def test_a_storm_of_verdicts_writes_ten_times_a_second_at_most(status_file: ClockedStatus):
@@ -163,37 +162,30 @@ def test_every_user_may_read_it_whole(status_file: ClockedStatus):
 def test_in_words_it_says_how_it_is_and_what_to_do(tmp_path: Path):
     """Since when, skin, bundle, further facts, the last verdicts newest first; advice where
     something is wrong."""
-    status_file = ClockedStatus(
-        tmp_path, more=lambda: {"trial": "start 1 of 3, 7 of 20 sweeps", "shadow": "", "steps": [1]}
-    )
-    status_file.file.answered(replace(OK, sweep=6, detail="moved 2.1 mm too far towards row 4"))
-    status_file.file.answered(OK)
-    status_file.file.answered(SHORT)
+    more = {"trial": "start 1 of 3, 7 of 20 sweeps", "shadow": "", "steps": [1]}
+    status_file = ClockedStatus(tmp_path, more=lambda: more)
+    moved = "moved 2.1 mm too far towards row 4"
+    for verdict in (replace(OK, sweep=6, detail=moved), OK, SHORT):
+        status_file.file.answered(verdict)
     status_file.turns(135)
-    text = status_file.text().splitlines()
-    assert (
-        text[0] == f"running for 2 min 15 s (process {os.getpid()}, palpate {__version__}, source "
-        "usb)"
-    )
-    assert text[1:5] == [
+    head, *text = status_file.text().splitlines()
+    assert "2 min 15 s" in head
+    assert f"(process {os.getpid()}, palpate {__version__}, source usb)" in head
+    assert text[:4] == [
         "skin     streaming (5,000,000 frames, 3 lost)",
         "bundle   9f3c2a1b",
         "sweeps   7 answered",
         "trial    start 1 of 3, 7 of 20 sweeps",
     ]
-    assert [line.split()[1] for line in text[5:]] == ["8", "7", "6"]
-    assert "short        the stop edge came before a window" in text[5]
-    assert text[6].split()[-6:] == ["plastic", "rough", "98.7", "%", "1.2", "ms"]
-    assert text[7].endswith("1.2 ms; moved 2.1 mm too far towards row 4")
+    assert [line.split()[1] for line in text[4:]] == ["8", "7", "6"]
+    assert "short" in text[4]
+    assert text[5].split()[-6:] == ["plastic", "rough", "98.7", "%", "1.2", "ms"]
+    assert text[6].endswith(f"1.2 ms; {moved}")
     assert status.exit_code(status_file.read()) == 0
     status_file.turns(1.5, AWAY._replace(garbage_bytes=9, enumerations=2, dropped=4, bundle=""))
-    text = status_file.text()
-    assert "bundle   none" in text  # while sweeps are recorded
-    assert (
-        "absent: no skin on USB; check cable (5,000,000 frames, 3 lost, 9 bytes in no packet, "
-        "plugged in 2 t" in text
-    )
-    assert "serial   4 sentences dropped, since nobody read them" in text
+    told = status_file.text()
+    for words in ("bundle   none", f"absent: {AWAY.trouble}", "9 bytes", "in 2 t", "4 sentences"):
+        assert words in told
     assert status.exit_code(status_file.read()) == 69
 
 
@@ -212,18 +204,13 @@ def test_a_program_that_has_ended_is_not_running(status_file: ClockedStatus):
     assert status_file.read()["running"]
     written = json.loads(status_file.path.read_text())
     status_file.clock.sleep_until(status_file.clock.now_ns() + 11 * SECOND)
-    assert "has written nothing for 11 s, so it hangs" in status_file.text()
-    gone = subprocess.run(
-        [sys.executable, "-c", "import os; print(os.getpid())"],
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    for wrong in ({"pid": int(gone.stdout)}, {"time_ns": 10**18}):
-        status_file.path.write_text(
-            json.dumps(written | {"time_ns": status_file.clock.now_ns()} | wrong)
-        )
-        assert "has ended without closing down" in status_file.text()
+    assert "nothing for 11 s" in status_file.text()
+    gone = subprocess.Popen(["true"])
+    gone.wait(60)
+    for wrong in ({"pid": gone.pid}, {"time_ns": 10**18}):
+        now = {"time_ns": status_file.clock.now_ns()}
+        status_file.path.write_text(json.dumps(written | now | wrong))
+        assert "without closing down" in status_file.text()
         assert status.exit_code(status_file.read()) == 1
     status_file.file.stopping()
     assert not status_file.path.exists()
@@ -235,7 +222,7 @@ def test_a_program_that_has_ended_is_not_running(status_file: ClockedStatus):
 def test_a_file_of_another_form_is_named(status_file: ClockedStatus, text: str):
     """A status of another version is an error, not a guess."""
     status_file.path.write_text(text)
-    with pytest.raises(FormatError, match="not a status of this version"):
+    with pytest.raises(FormatError, match="status of this version"):
         status_file.read()
 
 
@@ -283,36 +270,28 @@ def test_a_running_box_reports_its_verdicts(rigged, tmp_path: Path, logged: list
     ]
 
 
+SURE = "plastic rough, 98.7 %"
+
+
 @pytest.mark.parametrize(
     ("verdict", "line"),
     [
-        (OK, "sweep 7: plastic rough, 98.7 % (1.2 ms)"),
-        (replace(OK, fused=3), "sweep 7: plastic rough, 98.7 % after 3 sweeps (1.2 ms)"),
-        (
-            replace(OK, share=0.4),
-            "sweep 7: plastic rough, 98.7 %, early at 40 % of the window (1.2 ms)",
-        ),
-        (
-            replace(OK, status=Status.UNSURE),
-            "sweep 7: unsure, perhaps plastic rough, 98.7 % (1.2 ms)",
-        ),
+        (OK, f"sweep 7: {SURE} (1.2 ms)"),
+        (replace(OK, fused=3), f"sweep 7: {SURE} after 3 sweeps (1.2 ms)"),
+        (replace(OK, share=0.4), f"sweep 7: {SURE}, early at 40 % of the window (1.2 ms)"),
+        (replace(OK, status=Status.UNSURE), f"sweep 7: unsure, perhaps {SURE} (1.2 ms)"),
         (
             replace(OK, displacement="moved 2 mm", detail="moved 2 mm"),
-            "<4>sweep 7: plastic rough, 98.7 % (1.2 ms); moved 2 mm",
+            f"<4>sweep 7: {SURE} (1.2 ms); moved 2 mm",
         ),
-        (
-            SHORT,
-            "<4>sweep 8: no answer, short: the stop edge came before a window's length had passed",
-        ),
+        (SHORT, f"<4>sweep 8: no answer, short: {REASONS[Status.SHORT]}"),
         (
             replace(SHORT, status=Status.STUCK_TAXEL, detail="taxel 2.3"),
-            "<4>sweep 8: no answer, stuck-taxel: a loaded taxel shows a constant count; check the "
-            "skin; "
-            "taxel 2.3",
+            f"<4>sweep 8: no answer, stuck-taxel: {REASONS[Status.STUCK_TAXEL]}; taxel 2.3",
         ),
         (
             replace(SHORT, status=Status.ABORTED),
-            "sweep 8: no answer, aborted: by command, or because the box was stopping",
+            f"sweep 8: no answer, aborted: {REASONS[Status.ABORTED]}",
         ),
     ],
 )
@@ -338,47 +317,25 @@ def burst(line: str, edges: int, apart_s: float) -> Callable[[Rigged], None]:
     return drive
 
 
+def mangled(change: Callable[[bytes], bytes]) -> Callable[[Rigged], None]:
+    """A fault of the bus that changes one transfer."""
+    return lambda box: setattr(box.simulated.backend, "mangle", once(change))
+
+
+def asleep(box: Rigged) -> None:
+    """The loop comes two seconds late."""
+    box.simulated.clock.sleep_until(box.simulated.clock.now_ns() + 2 * SECOND)
+
+
 @pytest.mark.parametrize(
     ("name", "field", "fault", "text"),
     [
-        (
-            "stale_frames",
-            12,
-            lambda box: setattr(box.simulated.backend, "mangle", once(lambda data: data * 2)),
-            "4 repeated or late",
-        ),
-        (
-            "overflows",
-            13,
-            lambda box: setattr(
-                box.simulated.backend, "mangle", once(lambda data: data + bytes(5000))
-            ),
-            "1 transfers too large",
-        ),
-        (
-            "fifo_overflows",
-            14,
-            lambda box: box.simulated.clock.sleep_until(box.simulated.clock.now_ns() + 2 * SECOND),
-            "1 times the readout board's FIFO was full",
-        ),
-        (
-            "glitches",
-            15,
-            burst(devices.START, 2, 1e-4),
-            "1 glitches; check the GPIO lines of the trigger",
-        ),
-        (
-            "lost_edges",
-            16,
-            burst(devices.STOP, 3000, 1e-6),
-            "edges lost; check the GPIO lines of the trigger",
-        ),
-        (
-            "storms",
-            17,
-            burst(devices.STOP, 60, 1e-4),
-            "1 storms of edges; check the GPIO lines of the trigger",
-        ),
+        ("stale_frames", 12, mangled(lambda data: data * 2), "4 repeated or late"),
+        ("overflows", 13, mangled(lambda data: data + bytes(5000)), "1 transfers too large"),
+        ("fifo_overflows", 14, asleep, "FIFO was full"),
+        ("glitches", 15, burst(devices.START, 2, 1e-4), "1 glitches; "),
+        ("lost_edges", 16, burst(devices.STOP, 3000, 1e-6), "edges lost; "),
+        ("storms", 17, burst(devices.STOP, 60, 1e-4), "1 storms of edges; "),
     ],
 )
 def test_what_is_counted_is_shown(
@@ -393,9 +350,8 @@ def test_what_is_counted_is_shown(
     not before it."""
     simulated = idle_devices(60)
     file = StatusFile(tmp_path / "status.json", simulated.clock)
-    box = rigged(
-        simulated, ("trigger.storm_edges=50",) if name == "storms" else (), observers=[file]
-    )
+    sets = ("trigger.storm_edges=50",) if name == "storms" else ()
+    box = rigged(simulated, sets, observers=[file])
     box.seconds(1.5)
 
     def shown() -> tuple[int, int, int, bool]:
@@ -416,19 +372,10 @@ def test_what_is_counted_is_shown(
 def test_numbers_of_a_state_are_left_out_rather_than_cut():
     """After years of faults the line is full: the counts in it are whole, and it is not longer than
     the limit."""
-    states = [
-        "31536000.125",
-        "streaming",
-        1,
-        10_000_000,
-        23_652_000_000,
-        99_999_999,
-        99_999_999,
-        99_999,
-        9_999_999,
-    ]
+    counts = [1, 10_000_000, 23_652_000_000, 99_999_999, 99_999_999, 99_999, 9_999_999]
+    states = ["31536000.125", "streaming", *counts, "9f3c2a1b", "usb"]
     for kind in (("STA",), ("ANS", "STATE", "ok")):
-        line = sentence(*kind, *states, "9f3c2a1b", "usb", *[987_654_321] * 6).decode()
+        line = sentence(*kind, *states, *[987_654_321] * 6).decode()
         assert len(line) <= MAX_LINE
         assert set(line.split("*")[0].split(",")[len(kind) + 12 :]) <= {"987654321"}
         assert ",9f3c2a1b,usb" in line

@@ -73,22 +73,12 @@ def test_only_what_is_new_is_sent(socket_end: ManagerSocket):
     """STATUS when it changes, READY once, even where the skin is lost later; STOPPING at the
     end."""
     sender, _ = notifier(socket_end)
-    for ready, status in [
-        (False, "skin absent"),
-        (False, "skin absent"),
-        (True, "fine"),
-        (True, "fine"),
-        (False, "no"),
-        (True, "no"),
-    ]:
-        sender.turn(state(ready, status))
+    for ready, text in ((False, "absent"), (True, "fine"), (False, "no"), (True, "no")):
+        sender.turn(state(ready, text))
+        sender.turn(state(ready, text))
     sender.stopping()
-    assert socket_end.heard() == [
-        ["STATUS=skin absent"],
-        ["STATUS=fine", "READY=1"],
-        ["STATUS=no"],
-        ["STOPPING=1"],
-    ]
+    sent = [["STATUS=absent"], ["STATUS=fine", "READY=1"], ["STATUS=no"], ["STOPPING=1"]]
+    assert socket_end.heard() == sent
 
 
 def test_the_watchdog_is_fed_by_turns_alone(socket_end: ManagerSocket):
@@ -178,7 +168,7 @@ def test_a_watchdog_that_is_no_number_is_told(
         clock.sleep_until(clock.now_ns() + 100 * SECOND)
     assert socket_end.heard() == [["STATUS=fine", "READY=1"]]
     assert len(logged) == 1
-    assert "is not a number of microseconds, so no watchdog is fed" in logged[0]
+    assert "no watchdog is fed" in logged[0]
 
 
 class TurnLog(Observer):
@@ -200,7 +190,7 @@ class TurnLog(Observer):
 
 
 def test_a_box_is_ready_with_the_first_frames_of_its_skin(rigged: Callable[..., Rigged]):
-    """Without a skin the status names the missing part; then it streams, and counts the answered
+    """Without a skin the status says what is missing; then it streams, and counts the answered
     sweeps."""
     turn_log, simulated = TurnLog(), idle_devices()
     simulated.backend.unplug()
@@ -208,8 +198,7 @@ def test_a_box_is_ready_with_the_first_frames_of_its_skin(rigged: Callable[..., 
     box.seconds(2)
     ((ready, status),) = turn_log.notes
     assert not ready
-    assert status.startswith("skin absent: no skin 1209:7ac7 on USB")
-    assert status.endswith("check cable, power and udev rule. Sweeps answered: 0")
+    assert status.startswith("skin absent: no skin 1209:7ac7")
     simulated.backend.plug()
     box.seconds(1)
     assert turn_log.notes[-1] == (True, "skin streaming. Sweeps answered: 0")
@@ -218,8 +207,8 @@ def test_a_box_is_ready_with_the_first_frames_of_its_skin(rigged: Callable[..., 
     assert turn_log.notes[-1] == (True, "skin streaming. Sweeps answered: 1")
     simulated.backend.unplug()
     box.seconds(0.1)
-    assert turn_log.notes[-1][0] is False
-    assert turn_log.notes[-1][1].startswith("skin lost: the skin was unplugged")
+    ready, status = turn_log.notes[-1]
+    assert (ready, status[:10]) == (False, "skin lost:")
 
 
 def test_a_skin_that_starts_but_sends_nothing_is_not_ready(rigged: Callable[..., Rigged]):
@@ -228,11 +217,7 @@ def test_a_skin_that_starts_but_sends_nothing_is_not_ready(rigged: Callable[...,
     turn_log, simulated = TurnLog(), idle_devices()
     simulated.backend.mangle = lambda data: b""
     rigged(simulated, observers=[turn_log]).seconds(3)
-    received = {status.split(" for ")[0] for _, status in turn_log.notes}
-    assert received == {
-        "skin absent. Sweeps answered: 0",
-        "skin silent: the skin is there but sent no frame",
-    }
+    assert {text.split()[1] for _, text in turn_log.notes} == {"absent.", "silent:"}
     assert not any(ready for ready, _ in turn_log.notes)
 
 
@@ -258,13 +243,8 @@ def test_a_turn_ends_after_everything_in_it(rigged: Callable[..., Rigged]):
 def test_stopping_is_sent_before_the_last_answer(rigged: Callable[..., Rigged]):
     """An open sweep is answered after systemd has been notified."""
     turn_log = TurnLog()
-    box = rigged(
-        idle_devices(),
-        observers=[
-            turn_log,
-            OnSweep(lambda sweep, verdict: turn_log.notes.append(str(sweep.status))),
-        ],
-    )
+    note = OnSweep(lambda sweep, verdict: turn_log.notes.append(str(sweep.status)))
+    box = rigged(idle_devices(), observers=[turn_log, note])
     box.pulse(devices.START, 0.2)
     end = box.simulated.clock.now_ns() + SECOND
     box.box.run(lambda: box.simulated.clock.now_ns() > end)
@@ -287,7 +267,7 @@ def test_the_command_notifies_systemd(tmp_path: Path):
             run.send_signal(signal.SIGTERM)
             while received[-1] != "STOPPING=1":
                 received += socket_end.socket.recv(4096).decode().split("\n")
-            assert run.wait(timeout=5) == 0
+            assert run.wait(timeout=60) == 0
         finally:
             run.kill()
     socket_end.socket.close()
