@@ -49,23 +49,21 @@ def test_later_layers_win_and_each_value_knows_its_source(folder: Path) -> None:
     """Defaults, skin.toml, board, site and --set each decide one value; of two --set the last
     wins."""
     (folder / "palpate.toml").write_text("[trigger]\nglitch_us = 300\nactive_low = true\n")
-    c = _load(
-        folder, "a", "trigger.glitch_us=9", "trigger.glitch_us=400", "serial.port=/dev/ttyUSB0"
-    )
+    sets = ("trigger.glitch_us=9", "trigger.glitch_us=400", "serial.port=/dev/ttyUSB0")
+    c = _load(folder, "a", *sets)
     assert (c.board, c.sources["board"]) == ("a", "--board")
-    got = {
-        "output.settle_us": (c.output.settle_us, 200, "code"),
-        "skin.silence_ms": (c.skin.silence_ms, 50, "skin.toml"),
-        "trigger.start": (c.trigger.start, "L1", "board-a.toml"),
-        "trigger.active_low": (c.trigger.active_low, True, "palpate.toml"),
-        "trigger.glitch_us": (c.trigger.glitch_us, 400, "--set"),
-        "serial.port": (c.serial.port, "/dev/ttyUSB0", "--set"),
-    }
-    for name, (value, want, source) in got.items():
-        assert (value, c.sources[name]) == (want, source), name
-    assert len(c.sources) == 1 + sum(
-        len(schema.keys(type(getattr(c, s)))) for s in config.Config.__slots__[1:-2]
-    )
+    for name, value, source in (
+        ("output.settle_us", 200, "code"),
+        ("skin.silence_ms", 50, "skin.toml"),
+        ("trigger.start", "L1", "board-a.toml"),
+        ("trigger.active_low", True, "palpate.toml"),
+        ("trigger.glitch_us", 400, "--set"),
+        ("serial.port", "/dev/ttyUSB0", "--set"),
+    ):
+        section, key = name.split(".")
+        assert (getattr(getattr(c, section), key), c.sources[name]) == (value, source), name
+    sections = config.Config.__slots__[1:-2]
+    assert len(c.sources) == 1 + sum(len(schema.keys(type(getattr(c, s)))) for s in sections)
 
 
 def test_the_site_file_can_name_the_board_and_the_command_line_wins(folder: Path) -> None:
@@ -96,125 +94,100 @@ def test_a_config_cannot_be_changed(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "name", "hint"),
     [
-        ("[trigger]\nglich_us = 3", "trigger.glich_us", "did you mean trigger.glitch_us?"),
-        ("[skin]\nsettle_us = 9", "skin.settle_us", "did you mean output.settle_us?"),
-        ("[triger]\nmode = 'one-line'", "triger", "did you mean trigger?"),
-        ("[gpio]\nx = 1", "gpio", "known are skin, trigger, output, sweep, serial, classifier"),
-        ("settle_us = 9", "settle_us", "did you mean output.settle_us?"),
-        ("skin = 5", "skin = 5", "write [skin], its keys below"),
-        ("[trigger]\nglitch_us = 0", "trigger.glitch_us = 0", "a whole number from 1 to 1000000"),
-        ("[trigger]\nglitch_us = true", "trigger.glitch_us = True", "a whole number from 1"),
-        ("[trigger]\nactive_low = 1", "trigger.active_low = 1", "true or false"),
-        ("[trigger]\nmode = 'both'", "trigger.mode = 'both'", 'one of "two-lines", "one-line"'),
-        (
-            "[classifier]\nfuse = ['vote']",
-            "classifier.fuse = ['vote']",
-            'one of "product", "vote"',
-        ),
-        ("[trigger]\nstart = 17", "trigger.start = 17", "a string in quotes"),
-        ('[trigger]\nstart = "a\\u0000"', "trigger.start = 'a\\x00'", "without control characters"),
-        (
-            "[output]\nclass_bits = 'GPIO16'",
-            "output.class_bits = 'GPIO16'",
-            'names such as ["GPIO16"]',
-        ),
-        (
-            "[output]\nclass_bits = ['A', '']",
-            "output.class_bits = ['A', '']",
-            'names such as ["GPIO16"]',
-        ),
-        (
-            "[sweep]\nmax_duration_s = nan",
-            "sweep.max_duration_s = nan",
-            "a number from 0.1 to 3600.0",
-        ),
-        ("[skin]\nusb = '1209'", "skin.usb = '1209'", 'USB ids such as "1209:7ac7"'),
-        ("[skin]\nusb = 0x1209", "skin.usb = 4617", 'USB ids such as "1209:7ac7"'),
-        ("[skin]\ntimeout_ms = 9", "skin.timeout_ms is unknown", "did you mean skin."),
+        ("[trigger]\nglich_us = 3", "trigger.glich_us", "trigger.glitch_us?"),
+        ("[skin]\nsettle_us = 9", "skin.settle_us", "output.settle_us?"),
+        ("[triger]\nmode = 'one-line'", "triger", "mean trigger?"),
+        ("[gpio]\nx = 1", "gpio", "known are skin, trigger"),
+        ("settle_us = 9", "settle_us", "output.settle_us?"),
+        ("skin = 5", "skin = 5", "[skin]"),
+        ("[trigger]\nglitch_us = 0", "glitch_us = 0", "from 1 to 1000000"),
+        ("[trigger]\nglitch_us = true", "glitch_us = True", "whole number"),
+        ("[trigger]\nactive_low = 1", "active_low = 1", "true or false"),
+        ("[trigger]\nmode = 'both'", "mode = 'both'", '"two-lines", "one-line"'),
+        ("[classifier]\nfuse = ['vote']", "fuse = ['vote']", '"product", "vote"'),
+        ("[trigger]\nstart = 17", "start = 17", "string in quotes"),
+        ('[trigger]\nstart = "a\\u0000"', r"start = 'a\x00'", "control characters"),
+        ("[output]\nclass_bits = 'GPIO16'", "class_bits = 'GPIO16'", '["GPIO16"]'),
+        ("[output]\nclass_bits = ['A', '']", "class_bits = ['A', '']", '["GPIO16"]'),
+        ("[sweep]\nmax_duration_s = nan", "max_duration_s = nan", "0.1 to 3600.0"),
+        ("[skin]\nusb = '1209'", "skin.usb = '1209'", '"1209:7ac7"'),
+        ("[skin]\nusb = 0x1209", "skin.usb = 4617", '"1209:7ac7"'),
+        ("[skin]\ntimeout_ms = 9", "skin.timeout_ms", "mean skin."),
         ("[skin\nport = 1", "not TOML", "line 1"),
         ("[skin]\n\nlink = vendor", "not TOML", "line 3"),
     ],
 )
 @pytest.mark.parametrize("file", ["skin.toml", "board-a.toml", "palpate.toml"])
-def test_a_wrong_file_names_itself_the_key_and_what_is_allowed(
+def test_a_wrong_file_is_told_with_the_key_and_what_is_allowed(
     folder: Path, file: str, text: str, name: str, hint: str
 ) -> None:
     """The same mistakes in each layer's file: the message has path, key with value, and advice."""
     (folder / file).write_text(text)
     with pytest.raises(ConfigError) as e:
         _load(folder, "a")
-    assert str(folder / file) in str(e.value)
-    assert name in str(e.value)
-    assert hint in str(e.value)
+    assert all(part in str(e.value) for part in (str(folder / file), name, hint))
 
 
 @pytest.mark.parametrize(
-    ("option", "name", "hint"),
+    ("option", "said"),
     [
-        ("trigger.glich_us=3", "--set: trigger.glich_us", "did you mean trigger.glitch_us?"),
-        ("serial.baud=fast", "--set: serial.baud = 'fast'", "a whole number from 1200 to 4000000"),
-        ("skin.grid=1234", "--set: skin.grid = 1234", "a string in quotes"),
-        ("glitch_us=3", "--set glitch_us=3", "use --set section.key=value"),
+        ("trigger.glich_us=3", "trigger.glitch_us"),
+        ("serial.baud=fast", "serial.baud = 'fast'"),
+        ("skin.grid=1234", "skin.grid = 1234"),
+        ("glitch_us=3", "section.key=value"),
     ],
 )
-def test_a_wrong_set_option_is_named(folder: Path, option: str, name: str, hint: str) -> None:
+def test_a_wrong_set_option_is_told(folder: Path, option: str, said: str) -> None:
     """--set goes through the same checks as a file."""
-    with pytest.raises(ConfigError, match=f"^{re.escape(name)}.*{re.escape(hint)}"):
+    with pytest.raises(ConfigError, match=f"^--set.*{said}"):
         _load(folder, None, option)
 
 
 @pytest.mark.parametrize(
-    ("option", "section", "key", "value"),
+    ("option", "value"),
     [
-        ("trigger.start=GPIO5", "trigger", "start", "GPIO5"),
-        ("trigger.start=", "trigger", "start", ""),
-        ('skin.grid="1234"', "skin", "grid", "1234"),
-        ("sweep.max_duration_s=3", "sweep", "max_duration_s", 3.0),
-        ('output.class_bits=["A", "B"]', "output", "class_bits", ("A", "B")),
-        ("serial.port=/dev/ttyS0 # not a comment", "serial", "port", "/dev/ttyS0 # not a comment"),
-        ('serial.port="a" x=1', "serial", "port", '"a" x=1'),
+        ("trigger.start=GPIO5", "GPIO5"),
+        ("trigger.start=", ""),
+        ('skin.grid="1234"', "1234"),
+        ("sweep.max_duration_s=3", 3.0),
+        ('output.class_bits=["A", "B"]', ("A", "B")),
+        ("serial.port=/dev/ttyS0 # not a comment", "/dev/ttyS0 # not a comment"),
+        ('serial.port="a" x=1', '"a" x=1'),
     ],
 )
-def test_set_takes_toml_or_a_bare_string(
-    folder: Path, option: str, section: str, key: str, value: object
-) -> None:
+def test_set_takes_toml_or_a_bare_string(folder: Path, option: str, value: object) -> None:
     """A text that is not one TOML value is used as a string."""
+    section, key = option.partition("=")[0].split(".")
     got = getattr(getattr(_load(folder, None, option), section), key)
     assert (got, type(got)) == (value, type(value))
 
 
 @pytest.mark.parametrize("board", ["c", "../a", "a.toml", 0, [], ["a"], True])
-def test_a_missing_board_lists_those_there_are(folder: Path, board: object) -> None:
+def test_a_missing_board_lists_the_boards_there(folder: Path, board: object) -> None:
     """By option and by site file; no name leads out of the folder, and an invalid name is an
     error."""
     (folder / "palpate.toml").write_text(f"board = {json.dumps(board)}\n")
-    with pytest.raises(ConfigError, match=r"palpate\.toml: board = .*boards there: a, b$"):
+    with pytest.raises(ConfigError, match=r"toml: board = .*a, b$"):
         _load(folder)
     if isinstance(board, str):
-        with pytest.raises(ConfigError, match=r"--board: board = .*boards there: a, b$"):
+        with pytest.raises(ConfigError, match=r"--board: .*a, b$"):
             _load(folder, board)
 
 
 def test_only_the_site_file_may_choose_the_board(folder: Path) -> None:
     """`board` in skin.toml would be read too late."""
     (folder / "skin.toml").write_text('board = "a"\n')
-    with pytest.raises(
-        ConfigError, match=r"skin\.toml: board is chosen in .*palpate\.toml, or with --board"
-    ):
+    with pytest.raises(ConfigError, match=r"skin\.toml: board.*--board"):
         _load(folder)
 
 
 def test_a_line_with_two_meanings_is_refused(folder: Path) -> None:
-    """Across layers and inside class_bits; both roles and both sources are named."""
+    """Across layers and inside class_bits; both roles and both sources are told."""
     with pytest.raises(ConfigError) as e:
         _load(folder, "a", "output.busy=L1")
-    assert (
-        "--set: output.busy = 'L1' is the GPIO line of trigger.start (board-a.toml) already"
-        in str(e.value)
-    )
-    with pytest.raises(
-        ConfigError, match=r"output\.class_bits = 'X' is the GPIO line of output\.class_bits"
-    ):
+    for said in ("--set", "output.busy = 'L1'", "trigger.start", "board-a.toml"):
+        assert said in str(e.value)
+    with pytest.raises(ConfigError, match=r"class_bits = 'X'"):
         _load(folder, None, "output.class_bits=['X', 'X']")
 
 
@@ -263,10 +236,7 @@ def test_describe_gives_each_value_with_its_source_and_loads_again(folder: Path)
 
 @pytest.mark.parametrize(
     ("usb", "ids"),
-    [
-        ("1209:7ac7", (0x1209, 0x7AC7, "")),
-        ("2E8A:0005:E661:4", (0x2E8A, 5, "E661:4")),
-    ],
+    [("1209:7ac7", (0x1209, 0x7AC7, "")), ("2E8A:0005:E661:4", (0x2E8A, 5, "E661:4"))],
 )
 def test_usb_ids_and_serial_number(folder: Path, usb: str, ids: tuple[int, int, str]) -> None:
     """One setting holds both."""
@@ -293,39 +263,14 @@ def test_skin_toml_shows_every_skin_setting_as_the_code_has_it() -> None:
     assert table == {"skin": {name: key.default for name, key in known.items()}}
 
 
+_ODD = "3V3 2 3 4 GND 17 27 22 3V3 10 9 11 GND ID_SD 5 6 13 19 26 GND"
+_EVEN = "5V 5V GND 14 15 18 GND 23 24 GND 25 8 7 ID_SC GND 12 GND 16 20 21"
 HEADER = {
-    3: "GPIO2",
-    5: "GPIO3",
-    7: "GPIO4",
-    8: "GPIO14",
-    10: "GPIO15",
-    11: "GPIO17",
-    12: "GPIO18",
-    13: "GPIO27",
-    15: "GPIO22",
-    16: "GPIO23",
-    18: "GPIO24",
-    19: "GPIO10",
-    21: "GPIO9",
-    22: "GPIO25",
-    23: "GPIO11",
-    24: "GPIO8",
-    26: "GPIO7",
-    27: "ID_SD",
-    28: "ID_SC",
-    29: "GPIO5",
-    31: "GPIO6",
-    32: "GPIO12",
-    33: "GPIO13",
-    35: "GPIO19",
-    36: "GPIO16",
-    37: "GPIO26",
-    38: "GPIO20",
-    40: "GPIO21",
-    **dict.fromkeys((1, 17), "3V3"),
-    **dict.fromkeys((2, 4), "5V"),
-    **dict.fromkeys((6, 9, 14, 20, 25, 30, 34, 39), "GND"),
+    first + 2 * i: f"GPIO{name}" if name.isdigit() else name
+    for first, column in ((1, _ODD), (2, _EVEN))
+    for i, name in enumerate(column.split())
 }
+"""The lines of the 40-pin header, by pin."""
 
 
 def _page(board: str) -> str:

@@ -14,24 +14,28 @@ from palpate.core.errors import ApplianceError
 from palpate.core.log import LineHandler, SparseLog, TroubleLog, in_journal, log, to_stderr
 
 
-def line(text: str, level: int = logging.INFO, *, journal: bool) -> str:
-    """A record as it is printed."""
-    return LineHandler(journal=journal).format(
-        logging.LogRecord("palpate", level, "", 0, text, None, None)
-    )
-
-
-def test_priorities_are_for_the_journal_alone():
+@pytest.mark.parametrize(
+    ("text", "level", "journal", "shown"),
+    [
+        ("skin: gone", logging.WARNING, True, "<4>skin: gone"),
+        ("skin: gone", logging.WARNING, False, "palpate: skin: gone"),
+        ("skin: streaming", logging.INFO, True, "<6>skin: streaming"),
+        ("lost", logging.ERROR, True, "<3>lost"),
+        ("detail", logging.DEBUG, True, "<7>detail"),
+        ("skin: <4>", logging.INFO, False, "palpate: skin: <4>"),
+        ("skin: X\r\n<0>board", logging.INFO, True, "<6>skin: X <0>board"),
+        ("100 % of %s", logging.INFO, False, "palpate: 100 % of %s"),
+        ("a\x1b[31mred\x07\x9b2J", logging.INFO, True, "<6>a?[31mred??2J"),
+        ("a\x1b[31mred\x07\x9b2J", logging.INFO, False, "palpate: a?[31mred??2J"),
+    ],
+)
+def test_a_line_for_the_journal_and_for_a_terminal(
+    text: str, level: int, journal: bool, shown: str
+):
     """A terminal shows the program's name and no priority; the journal knows the name and needs the
-    priority."""
-    assert line("skin: gone", logging.WARNING, journal=True) == "<4>skin: gone"
-    assert line("skin: gone", logging.WARNING, journal=False) == "palpate: skin: gone"
-    assert line("skin: streaming", journal=True) == "<6>skin: streaming"
-    assert line("lost", logging.ERROR, journal=True) == "<3>lost"
-    assert line("detail", logging.DEBUG, journal=True) == "<7>detail"
-    assert line("skin: <4>", journal=False) == "palpate: skin: <4>"
-    assert line("skin: X\r\n<0>board", journal=True) == "<6>skin: X <0>board"
-    assert line("100 % of %s", journal=False) == "palpate: 100 % of %s"
+    priority. What a device sends cannot control a terminal."""
+    record = logging.LogRecord("palpate", level, "", 0, text, None, None)
+    assert LineHandler(journal=journal).format(record) == shown
 
 
 def test_the_journal_is_known_by_its_stream(tmp_path: Path):
@@ -66,29 +70,25 @@ def test_a_full_disk_costs_the_line_alone(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_trouble_is_logged_when_it_begins_changes_and_ends(logged: list[str]):
-    """Each once, as a warning except the end; without a text for the end it has no line."""
+    """Each once, as a warning except the end; without a text for the end it has no line. A first
+    state that is not known is news."""
     trouble = TroubleLog("skin", "look at the cable", end="skin: streaming")
     for now in ("", "", "gone", "gone", "busy", "", "", "gone"):
         trouble.update(now)
     quiet = TroubleLog("disk")
     for now in ("full", "", "full"):
         quiet.update(now)
+    first = TroubleLog("serial", end="serial: open", known=False)
+    for now in ("", ""):
+        first.update(now)
     assert logged == [
         "<4>skin: gone; look at the cable",
         "<4>skin: busy; look at the cable",
         "skin: streaming",
         "<4>skin: gone; look at the cable",
-        "<4>disk: full",
-        "<4>disk: full",
+        *["<4>disk: full"] * 2,
+        "serial: open",
     ]
-
-
-def test_the_first_state_is_logged_where_it_is_not_known(logged: list[str]):
-    """A first state is news, also if it is not a trouble."""
-    trouble = TroubleLog("serial", end="serial: open", known=False)
-    trouble.update("")
-    trouble.update("")
-    assert logged == ["serial: open"]
 
 
 def test_an_attempt_is_repeated_in_silence(logged: list[str]):
@@ -108,15 +108,6 @@ def test_an_attempt_is_repeated_in_silence(logged: list[str]):
     begin = "<4>status: cannot be written: "
     end = "; classifying goes on"
     assert logged == [f"{begin}{why}{end}" for why in ["No space left on device"] * 2 + ["in use"]]
-
-
-def test_what_a_device_sends_cannot_control_a_terminal():
-    """Escape characters of a text of a device are replaced, in both forms of a line."""
-    record = logging.LogRecord("palpate", logging.INFO, "", 0, "a\x1b[31mred\x07\x9b2J", None, None)
-    for journal in (True, False):
-        line = LineHandler(journal=journal).format(record)
-        assert line.isprintable()
-        assert "a?[31mred??2J" in line
 
 
 def test_what_others_cause_is_logged_sparsely(logged: list[str]):
