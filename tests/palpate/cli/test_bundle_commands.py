@@ -131,7 +131,7 @@ def test_the_command_refuses_it_unless_it_is_told(
 def test_a_bundle_that_the_settings_name_stays(
     sets: list[str], named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """The message names the setting because of which the new bundle does not run there."""
+    """A setting of another bundle stays in force, and the message has its name."""
     box = Delivery(tmp_path)
     own, new = box.made(1), box.made(2)
     sets = [f"store.folder={box.how.folder}", f"store.keys={box.how.keys}", *sets]

@@ -303,8 +303,8 @@ def test_check_needs_no_bundle(tmp_path: Path, capsys: pytest.CaptureFixture[str
 
 
 def test_folders_and_files_that_are_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """A missing folder of settings, a file that is no set, and a result that could not be written,
-    which is refused before the work."""
+    """A missing folder of settings, a file that is no set, and a result that could not be written.
+    Nothing is begun."""
     none, json_file = str(tmp_path / "none"), ["check", "--bench", "--json"]
     for words, code, said in (
         (["check", "--settings", "--config-dir", none], 78, none),
@@ -326,7 +326,7 @@ def test_folders_and_files_that_are_not_there(tmp_path: Path, capsys: pytest.Cap
 def test_a_box_without_rights_names_the_service_s(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
-    """Whoever may not read the deployed bundle is told to use the service's rights."""
+    """A user without rights to the deployed bundle hears how to use the service's rights."""
     refused = mock.Mock(side_effect=PermissionError(13, "denied", "/var/lib/palpate/state.json"))
     monkeypatch.setattr("palpate.runtime.assembly.running", refused)
     assert main(CHECK) == 1

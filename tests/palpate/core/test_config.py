@@ -182,7 +182,7 @@ def test_only_the_site_file_may_choose_the_board(folder: Path) -> None:
 
 
 def test_a_line_with_two_meanings_is_refused(folder: Path) -> None:
-    """Across layers and inside class_bits; both roles and both sources are told."""
+    """Across layers and inside class_bits; the message has both roles and both sources."""
     with pytest.raises(ConfigError) as e:
         _load(folder, "a", "output.busy=L1")
     for said in ("--set", "output.busy = 'L1'", "trigger.start", "board-a.toml"):
@@ -351,7 +351,7 @@ def test_rules_and_unit_agree_with_the_settings() -> None:
 def test_a_unit_has_settings_and_folders_of_its_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """left.toml in place of palpate.toml, over default folders with the name; it must be there."""
+    """The unit reads left.toml, not palpate.toml, and its default folders end in -left."""
     monkeypatch.setattr(config, "SITE", tmp_path / "palpate.toml")
     (tmp_path / "palpate.toml").write_text("[skin]\nport = '/dev/a'")
     (tmp_path / "left.toml").write_text("[skin]\nport = '/dev/b'\n[store]\nruntime = '/r'")

@@ -63,7 +63,7 @@ def test_a_fault_comes_back_to_the_loop():
 
 
 def test_the_end_waits_for_a_bounded_time(monkeypatch: pytest.MonkeyPatch, logged: list[str]):
-    """A disk that hangs cannot keep the program from ending; the loss is told."""
+    """A disk that hangs cannot keep the program from ending; the log has the loss."""
     monkeypatch.setattr(disk_thread, "SETTLE_S", 0.05)
     disk, free = held()
     assert not disk.settle()

@@ -33,7 +33,7 @@ def test_a_line_for_the_journal_and_for_a_terminal(
     text: str, level: int, journal: bool, shown: str
 ):
     """A terminal shows the program's name and no priority; the journal knows the name and needs the
-    priority. What a device sends cannot control a terminal."""
+    priority. Text of a device cannot control a terminal."""
     record = logging.LogRecord("palpate", level, "", 0, text, None, None)
     assert LineHandler(journal=journal).format(record) == shown
 

@@ -43,7 +43,7 @@ def test_each_name_has_a_label_that_can_be_sent(name: str, label: str):
     ],
 )
 def test_only_short_printed_texts_are_shown(text: object, can: bool):
-    """No line breaks, nothing that turns the direction of a text; what is not so is made so."""
+    """No line breaks, nothing that turns the direction of a text; `shown` replaces them."""
     assert names.can_be_shown(text) is can
     if isinstance(text, str) and text.strip():
         assert names.can_be_shown(names.shown(text))

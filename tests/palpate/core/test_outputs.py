@@ -1,4 +1,4 @@
-"""The name of a new file says what it is: other names are refused before any work."""
+"""The ending of a new file must fit its kind; another is refused before any work."""
 
 from __future__ import annotations
 

@@ -190,7 +190,7 @@ class TurnLog(Observer):
 
 
 def test_a_box_is_ready_with_the_first_frames_of_its_skin(rigged: Callable[..., Rigged]):
-    """Without a skin the status says what is missing; then it streams, and counts the answered
+    """Without a skin the status has the missing part; then it streams, and counts the answered
     sweeps."""
     turn_log, simulated = TurnLog(), idle_devices()
     simulated.backend.unplug()
