@@ -155,8 +155,7 @@ def test_several_coils_in_one_write(
 def test_other_registers_are_not_written(
     source: ScriptedSource, ask: Callable[[bytes], bytes], pdu: str, code: int
 ):
-    """Functions 6 and 16 are refused beside the two registers, or with a wrong length, and change
-    nothing."""
+    """Other registers or wrong lengths in functions 6 and 16 are refused and change nothing."""
     data = bytes.fromhex(pdu)
     assert ask(data) == bytes([data[0] | 0x80, code])
     assert not source.sent

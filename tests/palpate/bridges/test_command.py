@@ -70,8 +70,7 @@ def test_a_serial_line_that_is_not_there_gets_a_warning(caplog: pytest.LogCaptur
 
 
 def test_the_settings_of_a_new_box():
-    """Modbus reads the feed, on this machine alone, and refuses commands; TCP lacks a serial line,
-    and the error names the setting."""
+    """Modbus reads the feed on this machine, without commands; TCP lacks a serial line."""
     args = settled("modbus")
     assert (args.feed, args.link, args.listen, args.allow_writes) == (
         "/run/palpate/feed.sock",
@@ -89,8 +88,7 @@ def test_the_settings_of_a_new_box():
 
 @pytest.mark.parametrize("kind", LINKS)
 def test_the_line_of_the_bridge(kind: str):
-    """serial.port names its link: the bridge makes it, listens at the address of the settings, and
-    passes commands on if that is allowed."""
+    """serial.port names its link: the bridge makes it, with the address of the settings."""
     sets = (f"serial.port={LINKS[kind]}", "bridge.address=192.168.0.10", "bridge.allow_writes=true")
     args = settled(kind, sets=sets)
     assert (args.link, args.allow_writes) == (Path(LINKS[kind]), True)

@@ -100,8 +100,7 @@ def test_the_image(camera: Any):
 
 
 def test_three_axes_have_colours(plugin: Any):
-    """Counts between `low` and `high`; without a frame the image is black, and an unknown
-    displacement is marked as such."""
+    """Counts between `low` and `high`; no frame is black, and no displacement is marked."""
     form = {"rows": 1, "cols": 2, "axes": 3, "dtype": "float32", "rate_hz": 100, "window": 9}
     touch = plugin.LastTouch(feed_lines.hello(format=form, alignment=None))
     touch.take(feed_lines.health(1))
@@ -198,8 +197,7 @@ print(json.dumps({
 
 @pytest.mark.slow
 def test_lerobot_itself_finds_and_reads_it(tmp_path: Path):
-    """By the prefix of its distribution, from words of a command line; its observations become
-    features of a data set."""
+    """By its distribution's prefix and a command line; observations become features."""
     lerobot.required()
     with lerobot.played(tmp_path / "feed") as feed, saying(feed, PRESSED):
         found = lerobot.run(IN_LEROBOT, tmp_path / "feed")

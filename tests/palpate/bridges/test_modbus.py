@@ -63,8 +63,7 @@ def sweeps(box: SpeakingBox) -> list[str]:
 
 
 def test_another_client_reads_the_map(box: SpeakingBox, raw: RawModbus, address: Address):
-    """pymodbus, an independent client, finds the answer in input and in holding registers, and the
-    inputs."""
+    """pymodbus finds the answer in input and in holding registers, and the inputs."""
     box.say(result(70_000, label="paper"), state(answered=7))
     eventually(
         lambda: word(raw, "answered") == 0 and raw.registers(ADDRESSES["answered"], 2) == [0, 7]
@@ -161,8 +160,7 @@ def test_another_client_sweeps(box: SpeakingBox, raw: RawModbus, address: Addres
 
 
 def test_bytes_by_hand(raw: RawModbus):
-    """Requests and replies as the specification prints them: transaction, unit, lengths, exception
-    codes."""
+    """Requests and replies as the specification prints them, with exception codes."""
     raw.send(bytes.fromhex("0400000001"), transaction=0x1234, unit=7)
     assert raw.receive().hex() == "123400000005" + "07" + "0402" + "0001"
     for pdu, code in (
@@ -203,8 +201,7 @@ def test_a_request_in_pieces_and_several_in_one(raw: RawModbus):
 
 
 def test_nothing_is_written_without_leave(box: SpeakingBox):
-    """Without --allow-writes each write is an illegal function, and the box hears nothing; reading
-    works."""
+    """Without --allow-writes a write is an illegal function; reading works."""
     with bridge("modbus", "--port", box.path) as address, RawModbus(address) as client:
         for pdu in ("050000ff00", "0f0000000501ff", "060028000a", "1000280001020001"):
             assert client.ask(bytes.fromhex(pdu)) == bytes([int(pdu[:2], 16) | 0x80, 1])
@@ -227,8 +224,7 @@ def test_one_command_at_a_time(box: SpeakingBox, raw: RawModbus, address: Addres
 
 
 def test_a_silent_box_is_stale_and_comes_back(box: SpeakingBox, raw: RawModbus):
-    """Unplugged: status 99, state 0, FAULT, and the heartbeat stands still; plugged in again it
-    goes on."""
+    """Unplugged: status 99, state 0, FAULT, a still heartbeat, until it is plugged in again."""
     box.say(result(1))
     eventually(lambda: word(raw, "status") == 1)
     box.unplug()
@@ -312,8 +308,7 @@ def is_closed(peer: socket.socket) -> bool:
 
 
 def test_a_thousand_connections(raw: RawModbus, address: Address):
-    """No more connections than the limit are kept, the others are closed at once, and the first is
-    still served."""
+    """Connections above the limit are closed at once, and the first is still served."""
     peers = []
     for _ in range(1000):
         peers.append(socket.create_connection(address, timeout=LONG_S))
@@ -405,8 +400,7 @@ def viewed(answer: Answer | None = None, **counts: int) -> BoxView:
 
 @pytest.mark.parametrize("status", list(Status))
 def test_each_status_has_its_code(status: Status):
-    """In the order of PROTOCOL.md, from 1; the label's code stands with `ok` alone, the likeliest
-    with any label."""
+    """In the order of PROTOCOL.md, from 1; the label's code stands with `ok` alone."""
     label = "paper" if status.classified else ""
     words = registers(viewed(Answer(1, 1.0, status, label, 0.9, 0.8, 1, 0, 1e9)), alive=True)
     assert words[ADDRESSES["status"]] == [*Status].index(status) + 1
@@ -423,8 +417,7 @@ def test_before_anything_was_heard():
 
 
 def test_the_python_of_the_page_runs(box: SpeakingBox, raw: RawModbus, address: Address):
-    """docs/robots/modbus.md: `unsure` is swept again, `ok` gives its code, other statuses their
-    errors."""
+    """docs/robots/modbus.md: `unsure` is swept again, `ok` gives its code, others errors."""
     names: dict[str, Any] = {}
     exec(page_blocks("modbus.md", "python")[0], names)
     numbers = itertools.count(1)

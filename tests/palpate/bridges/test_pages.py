@@ -153,8 +153,7 @@ def by_socket(address: tuple[str, int]) -> dict[str, Any]:
 
 
 def test_urscript_by_socket(box: SpeakingBox):
-    """urscript.md against a real bridge: a retry without NEW, objects that are sorted out, each
-    fault by its name."""
+    """urscript.md against a real bridge: a retry without NEW, each fault by its name."""
     with bridge("tcp", "--port", box.path, "--allow-writes") as address:
         classify = by_socket(address)["palpate_classify"]
         box.script = answering("unsure", "ok", "undecided", "unknown", "unsure", "unsure", *FAULTS)
@@ -167,8 +166,7 @@ def test_urscript_by_socket(box: SpeakingBox):
 
 
 def test_urscript_by_socket_at_faults(box: SpeakingBox):
-    """A bridge that refuses commands, a box that does not answer, no bridge: one line for a person,
-    and no hanging."""
+    """A bridge that refuses, a box that is silent, no bridge: one line and no hanging."""
     with bridge("tcp", "--port", box.path) as address:
         assert by_socket(address)["palpate_classify"]("from", "to", 2).startswith(
             "fault: the box does not answer, or refuses"
@@ -192,8 +190,7 @@ def test_urscript_by_socket_at_faults(box: SpeakingBox):
     ],
 )
 def test_urscript_by_lines(ready: bool, answers: list[Any], want: int):
-    """urscript.md with digital lines: READY is waited for, code 0 is swept again, FAULT and silence
-    end it."""
+    """urscript.md with lines: READY is waited for, code 0 is swept again, FAULT ends it."""
     inputs = {0: ready} | dict.fromkeys(range(1, 7), False)
     pulsed: list[int] = []
     left = iter(answers)
@@ -225,8 +222,7 @@ def test_urscript_by_lines(ready: bool, answers: list[Any], want: int):
     ids=["services", "action"],
 )
 def test_ros(box: SpeakingBox, block: int, program: str, settings: dict[str, float]):
-    """ros2.md: a node of a cell, in a process of its own, through the bridge, by services and by
-    the action."""
+    """ros2.md: a node in a process of its own, by services and by the action."""
     ros.required()
     ros.messages_required()
     box.script = answering("unsure", "ok", "unknown", "stuck-taxel", "unsure", "unsure", "unsure")
@@ -297,8 +293,7 @@ def test_the_manuals_client_without_hardware(tmp_path: Path):
 @pytest.mark.slow
 @pytest.mark.thorough  # starts processes and waits for them
 def test_a_box_that_is_killed_and_started_again(tmp_path: Path):
-    """The real program behind a bridge is killed in the middle of a sweep: the client's wait ends,
-    the restart is counted, and the same client sweeps on."""
+    """Killed within a sweep: the wait ends, the restart is counted, the client sweeps on."""
     command = [
         sys.executable,
         "-m",

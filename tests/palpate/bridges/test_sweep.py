@@ -148,8 +148,7 @@ def test_an_answer_counts_although_stop_fails(swept: Swept):
 
 
 def test_stop_from_elsewhere(swept: Swept):
-    """With slide_s = 0 the sweep waits for another's STOP and sends none, not even after an early
-    answer."""
+    """With slide_s = 0 another's STOP is waited for and none is sent."""
     swept.at_phase = lambda phase: swept.source.send("STOP")
     assert swept.run(slide_s=0.0).known
     assert swept.has_heard("START", "STOP")
@@ -213,8 +212,7 @@ def test_an_answer_to_an_earlier_sweep_is_none_to_this(swept: Swept):
 
 
 def test_unplugged_while_sliding(swept: Swept):
-    """The reason is the line's, at once and not after the time limit; plugged in again, the next
-    sweep works."""
+    """The reason is the line's, at once; plugged in again, the next sweep works."""
     swept.at_phase = lambda phase: swept.box.unplug()
     with pytest.raises(LinkLost, match="the box was lost during"):
         swept.run(slide_s=LONG_S, timeout_s=2 * LONG_S)

@@ -53,8 +53,7 @@ def test_the_client_works_through_it(box: SpeakingBox):
 
 
 def test_without_leave_questions_alone_are_passed_on(box: SpeakingBox):
-    """STATE, ID and LABEL are answered; what would change something is refused here, and the box
-    never hears it."""
+    """STATE, ID and LABEL are answered; the box never hears what would change something."""
     with (
         bridge("tcp", "--port", box.path) as address,
         Palpate(url(address), timeout_s=LONG_S) as client,
@@ -167,8 +166,7 @@ class DeafPort:
 
 
 def test_a_flood_of_commands_does_not_reach_the_box(monkeypatch: pytest.MonkeyPatch):
-    """Of many commands at once one is sent, and the next after its pause, whichever peer sent
-    it."""
+    """Of many commands at once one is sent, the next after its pause, whichever peer's."""
     monkeypatch.setattr(tcp, "PACE_S", 3600.0)
     monkeypatch.setattr(tcp, "ANSWER_S", 0.01)
     port = DeafPort()
@@ -232,8 +230,7 @@ def test_a_question_that_is_cancelled_as_its_answer_arrives_ends():
 
 
 def test_a_silent_peer_makes_room():
-    """A full server drops the peer that has been silent longest, but none that has sent something
-    lately."""
+    """A full server drops the peer that has been silent longest, none that has spoken lately."""
 
     async def run() -> None:
         server = TcpServer(lambda peer: asyncio.sleep(LONG_S), most=2)

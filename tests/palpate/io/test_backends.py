@@ -165,8 +165,7 @@ def test_streams_without_a_gap(need: Need):
 
 
 def test_absent_then_plugged(need: Need):
-    """No skin: state absent, a message with the ids, no frames. It is used when it is plugged
-    in."""
+    """No skin: absent, a message with the ids, no frames; it is used when it is plugged in."""
     u = need("plug")
     u.unplug()
     with SensorReader(u) as reader:
@@ -178,8 +177,7 @@ def test_absent_then_plugged(need: Need):
 
 
 def test_unplugged_in_mid_read(need: Need):
-    """The cable is pulled while frames come: lost, then absent; plugged in again, a new epoch with
-    correct frames."""
+    """Pulled while frames come: lost, then absent; plugged in again, a new epoch."""
     u = need("plug")
     with SensorReader(u) as reader:
         first = reader.frames(100)
@@ -201,8 +199,7 @@ def test_unplugged_in_mid_read(need: Need):
 
 
 def test_driver_taken_and_given_back(need: Need):
-    """The skin fails as if it had been unplugged, and is there again without a new plug: it streams
-    again each time, and nothing is left open."""
+    """Without its driver it is lost; with it, it streams again, and nothing is left open."""
     u = need("unbind")
     with SensorReader(u) as reader:
         reader.frames(100)
@@ -227,8 +224,7 @@ def timers() -> int:
 
 
 def test_serial_number_chooses(need: Need):
-    """Only the skin with the configured serial number is used; for another number the message lists
-    the skins found."""
+    """Only the skin with the serial number is used; the message counts the others."""
     u = need("plug")
     u.plug(Skin(serial="0042"))
     with SensorReader(u, usb=f"{u.sensor.usb[:9]}:0043") as reader:
@@ -252,8 +248,7 @@ def test_serial_number_chooses(need: Need):
     ],
 )
 def test_another_protocol_or_format(need: Need, change: dict[str, Any], hint: str):
-    """A skin with another protocol or format is refused with both sides named; a matching skin is
-    then used."""
+    """Another protocol or format is refused with both named; a matching skin is then used."""
     u = need("plug")
     u.plug(Skin(**change))
     with SensorReader(u) as reader:
@@ -269,8 +264,7 @@ def test_another_protocol_or_format(need: Need, change: dict[str, Any], hint: st
     [("hold", "busy", 16, "another program"), ("deny", "denied", 13, "udev rule")],
 )
 def test_a_skin_that_cannot_be_opened(need: Need, control: str, state: str, code: int, hint: str):
-    """Held by another program, or not allowed: a state of its own, advice, and frames once that is
-    over."""
+    """Held or not allowed: a state of its own, advice, and frames once that is over."""
     u = need("skin", control)
     refuse = getattr(u, control)
     refuse(True)
@@ -287,8 +281,7 @@ def test_a_skin_that_cannot_be_opened(need: Need, control: str, state: str, code
 
 
 def test_a_silent_skin_is_started_again(need: Need):
-    """A connected skin that sends nothing is silent after `silence_ms` and started again
-    automatically."""
+    """A skin that sends nothing is silent after `silence_ms` and is started again."""
     u = need("silence")
     with SensorReader(u, silence_ms=300) as reader:
         reader.frames(100)
@@ -328,8 +321,7 @@ class Watcher:
         self._u = u
 
     def look(self) -> None:
-        """One call. Each reported edge has held its level for `glitch_us` and has the time of the
-        edge itself."""
+        """One call: a reported edge has held its level, and has the edge's own time."""
         now_ns = now(self._u)
         for edge in self.trigger.edges(now_ns):
             if edge.kind is not EdgeKind.LOST:
@@ -374,8 +366,7 @@ def pulse(u: Backend, line: str) -> tuple[int, int]:
 
 
 def test_start_and_stop(need: Need):
-    """NEW OBJECT, START, STOP as they were driven, in order, each with a time while it was driven;
-    falls have no meaning."""
+    """The edges as they were driven, in order, each with its time; falls have no meaning."""
     u = need("lines")
     t = u.trigger
     roles = [
@@ -430,8 +421,7 @@ def test_high_at_the_start(need: Need):
 
 
 def test_more_edges_than_the_kernel_keeps(need: Need):
-    """Edges that the queue dropped are one LOST, and counted; when the line is quiet, edges are
-    reported again."""
+    """Dropped edges are one LOST, and counted; when the line is quiet, edges come again."""
     u = need("lines", "overrun")
     with Watcher(u) as watcher:
         u.storm(u.trigger.start, 3000)
@@ -444,8 +434,7 @@ def test_more_edges_than_the_kernel_keeps(need: Need):
 
 
 def test_lines_that_are_held(need: Need):
-    """A second program is refused with errno 16; the lines are free again once the first has
-    closed."""
+    """A second program is refused with errno 16; after the first the lines are free again."""
     u = need("lines")
     with Watcher(u), pytest.raises(LineError, match="errno 16"):
         GpioTrigger(u.trigger, u.gpio)
@@ -570,8 +559,7 @@ def test_sentences_arrive_whole(need: Need, sink_on: Callable[..., SerialSink]):
 
 
 def test_commands_come_in(need: Need, sink_on: Callable[..., SerialSink]):
-    """Commands as a program and as a person sends them, cut anywhere; a wrong command is answered
-    with its fault."""
+    """As a program and as a person sends them, cut anywhere; a wrong one gets its fault."""
     u = need("serial")
     sink = sink_on(u)
     peer = Peer(u, sink)
@@ -585,8 +573,7 @@ def test_commands_come_in(need: Need, sink_on: Callable[..., SerialSink]):
 
 
 def test_a_peer_that_does_not_read(need: Need, sink_on: Callable[..., SerialSink]):
-    """Sentences are dropped, the oldest first, and counted; no call waits, and sentences that are
-    sent are complete."""
+    """The oldest sentences are dropped and counted; no call waits, and none is cut."""
     u = need("serial", "stall")
     sink = sink_on(u, queue=8)
     total = 2000
@@ -612,8 +599,7 @@ def test_a_peer_that_does_not_read(need: Need, sink_on: Callable[..., SerialSink
 
 @pytest.mark.slow
 def test_a_port_that_goes_and_comes(need: Need, sink_on: Callable[..., SerialSink]):
-    """Unplugged while open: the next sentence fails and `trouble` gives the reason; plugged in
-    again, the sentence is sent completely."""
+    """Unplugged: `trouble` has the reason; plugged in again, the sentence is sent whole."""
     u = need("serial", "pull")
     sink = sink_on(u)
     peer = Peer(u, sink)
@@ -636,8 +622,7 @@ def test_a_port_that_goes_and_comes(need: Need, sink_on: Callable[..., SerialSin
 @pytest.mark.slow
 @pytest.mark.thorough  # the whole contract again, in real time
 def test_over_umockdev():
-    """The same contract over unmodified libusb, pyusb, libgpiod and gpiod, in a process of its
-    own."""
+    """The same contract over unmodified libusb, pyusb, libgpiod and gpiod, in a process."""
     if os.environ.get(backends.VARIABLE):
         pytest.skip("one backend is chosen")
     if lacking := mocks.lacking():

@@ -42,8 +42,7 @@ def test_a_negated_sum_makes_the_sum_of_all_bytes_zero() -> None:
 
 
 def test_parameters_describe_a_checksum_without_a_name() -> None:
-    """A polynomial, initial value and final exclusive or in hexadecimal; other values are
-    refused."""
+    """Polynomial, initial value and final exclusive or; other values are refused."""
     icode = Checksum("crc8", 0x1D, 0xFD)
     assert parsed("crc8 poly=1d init=fd xorout=00") == icode
     assert icode.of(b"123456789") == 0x7E  # CRC-8/I-CODE

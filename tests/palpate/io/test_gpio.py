@@ -280,8 +280,7 @@ def test_what_calls_report(
 
 @pytest.mark.parametrize("step_ns", [US, 10 * US])
 def test_storm(step_ns: int) -> None:
-    """10,000 edges in a burst are one LOST at the first one above the limit; the line works again
-    when it is quiet."""
+    """10,000 edges are one LOST at the first above the limit; a quiet line works again."""
     setup = TriggerSetup(**ONE)
     setup.drive("START", *(10 * MS + i * step_ns for i in range(10_000)))
     assert setup.run(200 * MS) == [(LOST, 10 * MS + 2000 * step_ns)]
@@ -308,8 +307,7 @@ def test_what_is_requested(active_low: bool, bias: str) -> None:
 
 
 def test_level_seen_too_late() -> None:
-    """The kernel may read the level too late: the same edge twice is one edge, and a return to the
-    level is not an edge."""
+    """The same edge twice is one edge, and a return to the level is not an edge."""
     setup = TriggerSetup()
     setup.queue((False, MS, 1), (False, MS + US, 2))
     assert setup.poll(3 * MS) == []
@@ -319,8 +317,7 @@ def test_level_seen_too_late() -> None:
 
 
 def test_interrupts_overtake() -> None:
-    """An edge that the kernel's thread delivers late, but within `glitch_us`, is reported in order
-    and is not a loss."""
+    """An edge that is delivered late, but within `glitch_us`, is in order and no loss."""
     setup = TriggerSetup()
     setup.drive("START", MS)
     setup.drive("STOP", MS + 5 * US)
@@ -336,8 +333,7 @@ def test_interrupts_overtake() -> None:
 
 
 def test_edges_that_the_kernel_joins() -> None:
-    """Two interrupts before their thread has run are one event with the level after both. This is
-    never a loss, whether it is a glitch or not."""
+    """Two interrupts in one event, with the level after both, are never a loss."""
     setup = TriggerSetup()
     rise, fall = gpiod.EdgeEvent.Type.RISING_EDGE.value, gpiod.EdgeEvent.Type.FALLING_EDGE.value
     reported = (
@@ -361,8 +357,7 @@ def test_event_numbers_wrap() -> None:
 
 
 def test_blind_until_quiet() -> None:
-    """After a loss nothing counts until all lines have been quiet for `glitch_us`; then the levels
-    are read again."""
+    """After a loss nothing counts until all lines were quiet; then levels are read again."""
     setup = TriggerSetup(mode="one-line", stop="", queue=4)
     setup.drive("START", *(t * 100 * US for t in (100, 110, 120, 130, 140, 144, 148)))
     assert (setup.poll(14_500 * US), setup.trigger.blind) == ([(LOST, 12 * MS)], True)
@@ -384,8 +379,7 @@ def test_reading_is_bounded() -> None:
 
 
 def test_chip_pulled_out() -> None:
-    """A chip that is unplugged while it is read is a LineError that names its line and the
-    errno."""
+    """A chip that is unplugged is a LineError that names its line and the errno."""
     setup = TriggerSetup()
     setup.gpio.refuse[CHIP0] = 19
     with pytest.raises(LineError, match=r"START.*errno 19"):
@@ -403,8 +397,7 @@ def toggles(gaps_us: list[int]) -> list[int]:
 
 
 def settled(times_ns: list[int]) -> list[tuple[int, bool]]:
-    """Reference implementation: (first edge, level) of each burst that changes the level of a line
-    that was low."""
+    """Reference: (first edge, level) of each burst that changes a line that was low."""
     bursts: list[list[int]] = []
     for t_ns in times_ns:
         if bursts and t_ns - bursts[-1][-1] < GLITCH:
@@ -422,8 +415,7 @@ def settled(times_ns: list[int]) -> list[tuple[int, bool]]:
 @pytest.mark.slow
 @given(st.tuples(gaps, gaps, gaps), st.integers(20, 5000))
 def test_any_edges(lines: tuple[list[int], list[int], list[int]], step_us: int) -> None:
-    """For any edges on three lines of two chips and any times of calls: the edges of the reference,
-    in order of time."""
+    """Any edges on three lines of two chips, read at any times, are the reference's, in order."""
     setup = TriggerSetup({CHIP0: ("NEW", "STOP"), CHIP1: ("START",)}, new_object="NEW")
     wanted = []
     for name, kind, gaps_us in zip(
@@ -440,8 +432,7 @@ def test_any_edges(lines: tuple[list[int], list[int], list[int]], step_us: int) 
 def test_any_losses(
     gaps_us: list[int], step_us: int, storm_edges: int, queue: int, high: bool
 ) -> None:
-    """START and STOP alternate unless LOST is between them, times never go back, no short pulse
-    makes an edge."""
+    """START and STOP alternate but for LOST, times never go back, no short pulse is an edge."""
     setup = TriggerSetup(
         high="START" if high else "", mode="one-line", stop="", storm_edges=storm_edges, queue=queue
     )
@@ -510,8 +501,7 @@ def test_lines_that_are_not_found(
 
 
 def test_find_through_link() -> None:
-    """A second path to the same chip (Raspberry Pi OS links gpiochip4 to gpiochip0) makes no name
-    ambiguous."""
+    """A second path to a chip (Raspberry Pi OS has one) makes no name ambiguous."""
     gpio = sim({CHIP0: ("START",)})
     chip = gpio.Chip
     with (
@@ -654,8 +644,7 @@ def test_code_that_does_not_fit(panel: tuple[SimGpio, VirtualClock, Lines], code
 
 
 def test_not_wired() -> None:
-    """Lines without a name are neither searched nor written; a box without outputs needs no
-    chip."""
+    """Lines without a name are not searched or written; without outputs no chip is needed."""
     gpio = SimGpio(VirtualClock(0), {CHIP0: ("READY",)})
     lines = Lines(
         output_config(busy="", result_valid="", fault="", class_bits=()), gpio, VirtualClock(0)
@@ -671,8 +660,7 @@ def test_not_wired() -> None:
 
 
 def test_close_drops_all(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Closing drives READY and all others low, as on a chip that keeps driven levels; closing twice
-    does no harm."""
+    """Closing drives all lines low, also on a chip that keeps levels; twice does no harm."""
     clock = VirtualClock(0)
     gpio = SimGpio(clock, {CHIP0: OUTPUTS})
     monkeypatch.setattr(SimRequest, "release", lambda request: gpio.requests.remove(request))
@@ -691,8 +679,7 @@ def test_close_drops_all(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_close_of_a_dead_chip(panel: tuple[SimGpio, VirtualClock, Lines]) -> None:
-    """A chip that is gone cannot be driven low: LineError, and the other lines are still
-    released."""
+    """A chip that is gone is a LineError, and the other lines are still released."""
     gpio, _, lines = panel
     lines.show(ready=True, busy=False, fault=False)
     gpio.refuse[CHIP0] = 19

@@ -112,8 +112,7 @@ def test_a_bad_speed_or_force_starts_nothing(text: str, message: str):
 
 
 def test_a_robot_sweeps_over_its_serial_line(rigged: Callable[..., Rigged]):
-    """The whole box with `trigger.mode = "serial"`: START, STOP and NEW as commands; same statuses,
-    no input line is used."""
+    """The whole box with START, STOP and NEW as commands; no input line is used."""
     simulated = idle_devices()
     box = rigged(simulated, sets=("trigger.mode=serial",))
     held = {name for request in simulated.gpio.requests for name in request.names.values()}
@@ -139,8 +138,7 @@ def test_a_robot_sweeps_over_its_serial_line(rigged: Callable[..., Rigged]):
 
 
 def test_a_bad_value_is_answered_and_starts_no_sweep(rigged: Callable[..., Rigged]):
-    """The whole box: each value that cannot be used is answered by an error, and no sweep
-    begins; then a good START begins one."""
+    """A value that cannot be used is answered by an error; a good START begins a sweep."""
     simulated = idle_devices()
     box = rigged(simulated, sets=("trigger.mode=serial",))
     box.seconds(0.5)
@@ -155,8 +153,7 @@ def test_a_bad_value_is_answered_and_starts_no_sweep(rigged: Callable[..., Rigge
 
 
 def test_the_space_bar_starts_and_stops(terminal: tuple[int, int]):
-    """Each press counts once, whatever else is typed, also if several come in one read; a message
-    confirms each."""
+    """Each press counts once, whatever else is typed, and a message confirms each."""
     far, near = terminal
     said: list[str] = []
     clock = rig.VirtualClock(7)
@@ -191,8 +188,7 @@ def test_after_an_answer_the_space_bar_starts(terminal: tuple[int, int]):
 
 
 def test_the_terminal_is_restored(terminal: tuple[int, int]):
-    """While it is open, keys come at once, are not shown, and none stops or kills the program but
-    Ctrl-C; then all is as before."""
+    """Keys come at once, unseen, and none but Ctrl-C ends the program; then all is as before."""
     _, near = terminal
     tty.setcbreak(near)  # some settings that are not the default
     before = termios.tcgetattr(near)
@@ -209,8 +205,7 @@ def test_the_terminal_is_restored(terminal: tuple[int, int]):
 
 
 def test_a_terminal_that_is_gone_ends_it(terminal: tuple[int, int]):
-    """Nobody could start a sweep any more: PortError, not a loop for ever; closing does not
-    fail."""
+    """A PortError, not a loop for ever; closing does not fail."""
     far, near = terminal
     with closing(KeyTrigger(near, rig.VirtualClock(), lambda line: None)) as trigger:
         os.close(far)
@@ -256,8 +251,7 @@ def test_it_says_when_the_next_edge_is_due():
 
 
 def test_no_sweep_is_started_while_it_is_held():
-    """The pause and its countdown begin again afterwards; a sweep that has begun is stopped in
-    time."""
+    """Pause and countdown begin again after it; a sweep that has begun is stopped in time."""
     trigger, said = timed()
     trigger.held = True
     assert trigger.edges(9 * SECOND) == []
@@ -271,8 +265,7 @@ def test_no_sweep_is_started_while_it_is_held():
 
 
 def test_nobody_slides_for_a_skin_that_is_away(rigged: Callable[..., Rigged]):
-    """The whole box: it is waited for the skin at the start and after an unplugging, and no sweep
-    is `not-ready`."""
+    """The skin is waited for at the start and after a plug; no sweep is `not-ready`."""
     simulated = idle_devices()
     simulated.backend.unplug()
     box = rigged(simulated, sets=("trigger.mode=timed", "trigger.every_s=4"))
@@ -307,8 +300,7 @@ def test_sweeps_by_the_clock_are_answered(rigged: Callable[..., Rigged]):
 def test_a_box_that_could_not_sweep_does_not_start(
     rigged: Callable[..., Rigged], sets: tuple[str, ...], hint: str, monkeypatch: pytest.MonkeyPatch
 ):
-    """Settings with which every sweep would fail, and a program without a standard input, are
-    refused before the first sweep."""
+    """Settings with which every sweep would fail, and no standard input, are refused."""
     monkeypatch.setattr("sys.stdin", None)
     with pytest.raises(ConfigError, match=hint):
         rigged(sets=sets)

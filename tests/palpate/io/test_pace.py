@@ -52,8 +52,7 @@ def late_ms(frames: Frames, simulated: SimDevices) -> np.ndarray:
 
 
 def alter(simulated: SimDevices, change: Alter, packets: int) -> None:
-    """The next packets get another number and another time, as `change` says of (a packet, the
-    first one)."""
+    """The next packets get another number and time, by `change` of (a packet, the first)."""
     first: list[wire.Packet] = []
 
     def mangle(data: bytes) -> bytes:
@@ -88,8 +87,7 @@ def alter(simulated: SimDevices, change: Alter, packets: int) -> None:
     ],
 )
 def test_a_clock_that_cannot_be_right(change: Alter, packets: int, packet_frames: int):
-    """If the device clock disagrees with the count: mismatch, no frame gets a wrong time, and the
-    skin streams again afterwards."""
+    """Clock and count disagree: mismatch, no wrong time, and streaming again afterwards."""
     simulated = idle_devices(packet_frames=packet_frames)
     sensor = sensor_on(simulated)
     read_for(sensor, simulated, 3)
@@ -106,8 +104,7 @@ def test_a_clock_that_cannot_be_right(change: Alter, packets: int, packet_frames
 
 @pytest.mark.parametrize("ahead", [1_000, 10_000, 1 << 30])
 def test_a_count_that_jumps(ahead: int):
-    """A count that jumps ahead while the clock does not is not a loss of frames: mismatch, and the
-    readout board is restarted."""
+    """A count ahead of the clock is no loss: mismatch, and the readout board is restarted."""
     simulated = idle_devices()
     sensor = sensor_on(simulated)
     read_for(sensor, simulated, 1)
@@ -122,8 +119,7 @@ def test_a_count_that_jumps(ahead: int):
 @pytest.mark.parametrize("ppm", [-500, 0, 500])
 @pytest.mark.parametrize("packet_frames", [1, 6, 255])
 def test_a_clock_that_is_only_bad(ppm: float, packet_frames: int):
-    """500 ppm, stamps that waver by half a frame, both counters at their wrap, two seconds lost:
-    nothing to refuse."""
+    """500 ppm, wavering stamps, counters at their wrap, two seconds lost: nothing to refuse."""
     rng = np.random.default_rng(7)
     simulated = idle_devices(
         packet_frames=packet_frames, ppm=ppm, first_seq=COUNTS - 2000, fifo_frames=300
@@ -145,8 +141,7 @@ def test_a_clock_that_is_only_bad(ppm: float, packet_frames: int):
 @pytest.mark.slow
 @pytest.mark.parametrize(("rate_hz", "packet_frames"), [(2000, 1), (2000, 8), (35.61, 1)])
 def test_stamps_in_milliseconds(rate_hz: float, packet_frames: int):
-    """Time stamps that are late by up to 4 ms and in whole milliseconds, so that time seems to
-    stand or go back, are accepted."""
+    """Stamps up to 4 ms late, in whole ms, so that time seems to go back, are accepted."""
     rng = np.random.default_rng(8)
     format = SweepFormat(4, 4, rate_hz, 1500, "uint8")
     simulated = idle_devices(60, format, packet_frames=packet_frames)
@@ -162,8 +157,7 @@ def test_stamps_in_milliseconds(rate_hz: float, packet_frames: int):
 
 
 def test_a_stalled_endpoint_is_cleared():
-    """errno 32 ends: the endpoint is cleared, and the readout board streams again without being
-    replugged."""
+    """errno 32 is cleared, and the board streams again without being replugged."""
     simulated = idle_devices()
     sensor = sensor_on(simulated)
     read_for(sensor, simulated, 1)
@@ -179,8 +173,7 @@ def test_a_stalled_endpoint_is_cleared():
     [(b"", "lost"), (b"\x05\x03a\0b", "absent"), (b"\x06\x03\x00\xd8\x00\xd8", "mismatch")],
 )
 def test_a_serial_number_that_is_no_text(string: bytes, state: str):
-    """A serial number that is not text, where it chooses the skin: a state with the reason, and the
-    program goes on."""
+    """Where it chooses the skin: a state with the reason, and the program goes on."""
     simulated = idle_devices()
     backend, control = simulated.backend, simulated.backend.ctrl_transfer
 
@@ -200,8 +193,7 @@ def test_a_serial_number_that_is_no_text(string: bytes, state: str):
 @pytest.mark.slow
 @pytest.mark.parametrize("ppm", [-80, 80])
 def test_windows_over_many_offsets(ppm: float):
-    """80 ppm, one packet in a hundred 50 to 200 ms late: 120 windows with edges anywhere, each
-    within a frame of the middle."""
+    """80 ppm and late packets: 120 windows, each within a frame of the middle."""
     rng = np.random.default_rng(11)
     late = (
         150_000 + int(rng.integers(50, 200)) * 1_000_000 * (rng.random() < 0.01)
@@ -237,8 +229,7 @@ def test_windows_over_many_offsets(ppm: float):
 
 
 def test_a_box_that_had_no_processor_does_not_call_the_skin_silent():
-    """Pauses of the box, between reads and within a read, are not silence; half a second without
-    bytes is."""
+    """Pauses of the box are not silence; half a second without bytes is."""
     simulated = idle_devices(fifo_frames=6000)
     sensor = sensor_on(simulated)
     read_for(sensor, simulated, 1)

@@ -45,8 +45,7 @@ def test_bytes_are_the_documents_table():
     ("byte", "shape"), [(0, (4, 2)), (1, (4, 2)), (2, (2, 2, 2)), (8, (1, 1, 8))]
 )
 def test_axes_of_a_taxel(byte: int, shape: tuple[int, ...]):
-    """The byte after the data type is the number of axes. 0 means one axis, and the box writes one
-    axis as 0."""
+    """The byte after the data type; 0 means one axis, and the box writes one as 0."""
     payload = bytes(range(8))
     head = struct.pack("<BBBBHBBBBBBII", 0x50, 0xC1, 1, 0, 8, 0, 1, *shape[:2], 0, byte, 5, 7)
     by_hand = head + payload + struct.pack("<I", zlib.crc32(head + payload))
@@ -108,8 +107,7 @@ def test_any_split_gives_the_same(cuts: list[int], data: st.DataObject):
     )
 )
 def test_only_intact_frames_and_all_bytes_accounted(pieces):
-    """Repeated, truncated, corrupted packets and garbage: no frame is invented, no intact one is
-    missed, bytes add up."""
+    """No frame is invented, no intact one missed, and bytes add up, whatever is damaged."""
     sent = stream(20)
     wanted, data = {}, b""
     for what, argument in pieces:
@@ -144,8 +142,7 @@ def test_garbage_never_raises_and_is_counted(data: bytes):
 
 @given(st.lists(st.integers(0, 30), max_size=40), st.integers(0, 2**32 - 1))
 def test_follow_accounts_for_every_frame(order: list[int], first: int):
-    """For any order of packets: numbers rise, and fresh plus lost frames cover the whole range of
-    numbers."""
+    """In any order: numbers rise, and fresh plus lost frames cover the whole range."""
     packets = [
         wire.Packet((first + 3 * k) % 2**32, 0, wire.Flag(0), np.zeros((3, 1, 1), np.uint8))
         for k in order
@@ -168,8 +165,7 @@ def test_follow_wraps():
 
 
 def test_follow_takes_a_count_far_back_as_restart():
-    """A readout board that begins again at 0 starts a new epoch: nothing is lost, and no frames
-    look adjacent."""
+    """A board that begins at 0 starts a new epoch: nothing is lost, nothing adjacent."""
     packets = wire.unpack(stream(1, first=900_000)[0] + stream(1, first=0)[0]).packets
     fresh, place, lost, stale = wire.follow(packets, wire.StreamPosition(0))
     assert [s for s, _ in fresh] == [900_000, 1 << EPOCH_BITS]
@@ -177,8 +173,7 @@ def test_follow_takes_a_count_far_back_as_restart():
 
 
 def test_unknown_version_is_garbage_but_its_reply_is_read():
-    """Frames of another protocol version are not parsed; a reply is read, so that the version can
-    be named."""
+    """Its frames are not parsed; its reply is, so that the version can be named."""
     packet = bytearray(stream(1)[0])
     packet[2] = 9
     assert wire.unpack(bytes(packet) + bytes(50)).packets == []

@@ -45,15 +45,13 @@ def verdict(label: str = "plastic rough", status: Status = Status.OK, detail: st
 
 
 def test_result_is_the_documents_example():
-    """The RES sentence in PROTOCOL.md is the one that the code writes, with the correct
-    checksum."""
+    """The RES sentence in PROTOCOL.md is the one that the code writes."""
     line = result(verdict(), "usb").decode().strip()
     assert f"`{line[:-2]}hh`" in PROTOCOL
 
 
 def test_a_measured_slide_shortens_the_detail():
-    """Fields 15 and 16 follow an empty field 14, and the detail keeps the rest of the 128
-    characters. Without a measured slide the sentence is that of earlier versions."""
+    """Fields 15 and 16 follow an empty field 14, and the detail keeps what room is left."""
     far = verdict(detail="moved 2.1 mm too far towards row 4; " * 3)
     line = result(replace(far, measured_mm_s=30.04, direction="rows+"), "usb")
     assert len(line) == MAX_LINE
@@ -104,8 +102,7 @@ def test_pynmea2_parses_every_sentence(detail: str, label: str, status: Status):
     ],
 )
 def test_commands_are_read(line: bytes, want: Command):
-    """With checksum or without, as a program or a person sends it; bytes of a break or noise before
-    the $ are ignored."""
+    """With checksum or without, by program or person; noise before the $ is ignored."""
     assert parse(line + b"\r\n") == ([want], b"")
 
 
@@ -127,8 +124,7 @@ def test_a_command_keeps_its_line(line: str):
     ],
 )
 def test_bad_commands_are_answered(line: bytes, hint: str):
-    """A wrong checksum, an unknown command, another protocol, noise: an error with the right
-    command."""
+    """A wrong checksum, unknown command, other protocol, noise: an error with the remedy."""
     (command,), rest = parse(line + b"\n")
     assert hint in command.error
     assert rest == b""
@@ -172,8 +168,7 @@ def sink_on(name: str, clock=None, **settings) -> SerialSink:
 
 
 def test_a_port_that_is_not_there_and_comes(tmp_path: Path):
-    """A missing port is named with what to do, sentences wait up to the queue's length, and it is
-    opened when it comes."""
+    """It is named with what to do, sentences wait in the queue, and it is opened later."""
     clock = rig.VirtualClock()
     sink = sink_on(str(tmp_path / "ttyUSB0"), clock)
     sink.send(verdict())
@@ -191,8 +186,7 @@ def test_a_port_that_is_not_there_and_comes(tmp_path: Path):
 
 
 def test_a_port_that_goes_away_while_open():
-    """The other end closes (an adapter is pulled): `trouble` gives the reason, nothing is raised,
-    the next port is opened."""
+    """An adapter is pulled: `trouble` gives the reason, and nothing is raised."""
     clock = rig.VirtualClock()
     with pseudo_terminal.pair() as (_, name):
         sink = sink_on(name, clock)

@@ -88,8 +88,7 @@ def test_streams_and_stops(board: SerialBoard):
 
 
 def test_unplugged_and_replugged(board: SerialBoard):
-    """Pulled while frames come: lost, then absent; back under the same name: a new epoch with the
-    right content."""
+    """Pulled while frames come: lost, then absent; back, a new epoch with right frames."""
     board.plug()
     with closing(sensor_on(board)) as sensor:
         first = read_until(sensor, lambda n: n > 100)
@@ -129,8 +128,7 @@ def test_a_reply_in_the_middle_of_an_old_stream(line: tuple[int, str]):
     [(b"", "sends nothing"), (b"hello", "sends 5 other bytes"), (bytes(20_000), "other bytes but")],
 )
 def test_no_reply(line: tuple[int, str], sent: bytes, hint: str):
-    """Another device at the port, or none: the attempt ends after half a second or too many
-    bytes."""
+    """Another device or none: the attempt ends after half a second or too many bytes."""
     far, path = line
     with closing(SerialLink(path, 115200, CLOCK)) as link:
         rest = sent
@@ -155,8 +153,7 @@ def test_what_came_before_the_port_was_opened_is_not_read(line: tuple[int, str])
 
 
 def test_read_and_write(line: tuple[int, str]):
-    """All byte values pass both ways unchanged; no byte within the timeout is b""; a longer text is
-    cut at `size`."""
+    """All byte values pass; none in time is b""; a longer text is cut at `size`."""
     far, path = line
     with closing(SerialLink(path, 2_000_000, CLOCK)) as link:
         assert link.read(10, 1) == b""
@@ -194,8 +191,7 @@ def test_a_port_that_takes_nothing(line: tuple[int, str], monkeypatch: pytest.Mo
 
 
 def test_a_port_that_another_program_holds(line: tuple[int, str]):
-    """Held by a lock: busy, and the message names the command that finds the holder; free again
-    after it."""
+    """Held by a lock: busy; free again after it."""
     with (
         serial.Serial(line[1], exclusive=True),
         pytest.raises(SensorBusy, match="port held by another"),
@@ -205,8 +201,7 @@ def test_a_port_that_another_program_holds(line: tuple[int, str]):
 
 
 def test_others_are_kept_out_and_dtr_stays(line: tuple[int, str], monkeypatch: pytest.MonkeyPatch):
-    """Another program gets errno 11 while the port is open, but not after it. Closing does not drop
-    DTR, which restarts many readout boards."""
+    """Others get errno 11 meanwhile; closing keeps DTR, which restarts many boards."""
     link = SerialLink(line[1], 115200, CLOCK)
     with open(line[1], "rb", buffering=0) as other:
         with pytest.raises(BlockingIOError):
@@ -245,8 +240,7 @@ def test_a_file_that_is_not_a_serial_port(path: str):
 
 
 def test_ids_find_the_port(tmp_path: Path):
-    """The first port with the ids, and the serial number where one is set; without one, all ports
-    are named."""
+    """The first port with the ids and the serial number; without one, all are named."""
     ports = [
         PortInfo("/dev/ttyS0"),
         PortInfo("/dev/ttyUSB0", 0x1A86, 0x7523, "", "USB Serial"),

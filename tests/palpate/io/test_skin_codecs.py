@@ -56,8 +56,7 @@ FULL = SkinProfile(
 
 
 def full(i: int, wrong: int = 0) -> bytes:
-    """Frame `i` of FULL: F0 0F, an ignored byte, the count, another, six numbers, another, the
-    checksum, CR LF."""
+    """Frame `i` of FULL: mark, ignored byte, count, ignored, six numbers, ignored, sum, CR LF."""
     body = b"\x07" + struct.pack(">H", i % 65536) + b"\x08"
     body += struct.pack("<6H", *((i * 31 + k) % 4000 for k in range(6))) + b"\x09"
     return b"\xf0\x0f" + body + struct.pack(">H", modbus(body) ^ wrong) + b"\r\n"
@@ -74,8 +73,7 @@ def modbus(data: bytes) -> int:
 
 
 def test_a_frame_with_count_checksum_and_ignored_bytes():
-    """Everything that a profile can say of a frame, in one: the numbers and the count are read,
-    and a frame with a wrong checksum is garbage before the next."""
+    """All that a profile can say; a frame with a wrong checksum is garbage."""
     frames = [full(i, wrong=i == 65533) for i in range(65530, 65540)]
     found = decoded(FULL, b"\r\n" + b"".join(frames) + frames[0])
     good = [i for i in range(65530, 65540) if i != 65533]
@@ -129,8 +127,7 @@ TEXT = SkinProfile(about="a", source="s", codec="text", lines="frames", number="
     ],
 )
 def test_lines_with_other_text_around_their_numbers(keys: dict, line: bytes):
-    """Brackets, labels, JSON, units, the time of day, sums of NMEA: the numbers are read, a line
-    with other text is not."""
+    """Brackets, labels, JSON, units, times, NMEA: numbers are read, other text is not."""
     p = replace(TEXT, cols=4, **keys)
     end = p.line_end.encode()
     found = decoded(p, line + end + b"boot: 1 2 3 4" + end + line + end)
@@ -167,8 +164,7 @@ def test_rows_between_other_lines():
 
 
 def test_anyskin_byte_by_byte():
-    """Five times (t, x, y, z), CR LF: 82 bytes. The temperature is left out, z is last. The first
-    frame has no mark before it and is not used."""
+    """Five times (t, x, y, z), CR LF: the temperature is left out, z is last."""
     values = [25.0, 1.0, 2.0, 3.0] * 4 + [25.0, 7.0, 8.0, 9.5]
     frame = struct.pack("<20f", *values) + b"\r\n"
     assert len(frame) == 82
@@ -180,8 +176,7 @@ def test_anyskin_byte_by_byte():
 
 
 def test_reskin_and_vitac_lines():
-    """Decimal text with tabs or blanks; rows on lines that a shorter line ends; a number outside
-    the range of its type makes the row invalid."""
+    """Decimal text; rows that a shorter line ends; a number out of range makes it invalid."""
     found = decoded(profile("reskin"), b"25.0\t1\t-2.5\t3e2\t" * 4 + b"25,1,2,3\r\n" + b"1 2 3\n")
     assert found.taxels[0, 0, 0].tolist() == [1, -2.5, 300]
     assert (len(found), found.garbage) == (1, 6)
@@ -203,8 +198,7 @@ def test_a_word_that_is_no_whole_number(word: bytes):
 
 
 def test_papillarray_byte_by_byte():
-    """One sensor of nine pillars: forces, count and microseconds of its clock. A packet with a
-    wrong sum, or with additional zero bytes, which the sum does not detect, is not a frame."""
+    """Forces, count and clock of nine pillars; a wrong sum or more zeros is no frame."""
     p = profile("papillarray")
     data = wire("papillarray", 5)
     found = decoded(p, data)
@@ -228,9 +222,7 @@ def test_papillarray_with_a_tail_inside():
 
 
 def test_papillarray_of_changing_form():
-    """Packets of the same length with other offsets of pillars are read by their own tables, and
-    invalid packets are left out. The result is the same whether packets come at once or one by one.
-    """
+    """Packets are read by their own tables, the same at once or one by one."""
     p = replace(profile("papillarray"), rows=6)
     grids = [np.arange(108, dtype=np.float32).reshape(6, 3, 6) + i for i in range(5)]
     data = [papillarray(grid, i, sensors=2 if i % 2 else 1) for i, grid in enumerate(grids)]
@@ -253,8 +245,7 @@ def test_papillarray_of_changing_form():
 
 
 def test_papillarray_of_two_sensors():
-    """Two sensors are 6x3, one below the other; with a profile of 3x3 the error says that this is
-    another skin."""
+    """They are 6x3, one below the other; with a profile of 3x3 another skin is named."""
     grid = np.arange(108, dtype=np.float32).reshape(6, 3, 6)
     data = papillarray(grid, 1, sensors=2)
     found = decoded(replace(profile("papillarray"), rows=6), data)
@@ -302,8 +293,7 @@ def test_other_nodes_on_the_bus_are_passed_over_and_counted():
 
 
 def test_robotiq_byte_by_byte():
-    """The grids of two fingers in one packet or in two, big-endian; other fields are ignored; the
-    last packet waits for the next."""
+    """Two fingers in one packet or two, big-endian; other fields are ignored."""
     p = profile("robotiq-tsf")
     fingers = [
         bytes([0x10 | k << 2]) + struct.pack(">28H", *range(1000 * k, 1000 * k + 28))
@@ -361,8 +351,7 @@ def test_split_or_whole_is_the_same(name: str):
 @pytest.mark.parametrize("name", NAMES)
 @given(data=st.binary(max_size=600), at=st.integers(0, 500))
 def test_no_bytes_raise(name: str, data: bytes, at: int):
-    """Any bytes, also in the middle of frames: no exception, every byte is in a frame, garbage, or
-    left over."""
+    """Any bytes, within frames too: each is in a frame, garbage, or left over."""
     p = profile(name)
     sent = wire(name, 0) + wire(name, 1)
     mixed = sent[:at] + data + sent[at:]

@@ -27,8 +27,7 @@ def consecutive(skin: WiredSkin, frames) -> bool:
 
 @each
 def test_streaming(name: str):
-    """Every frame once and in order, numbered without a gap, its time correct to a few
-    milliseconds, never ahead."""
+    """Every frame once and in order, without a gap, its time correct, never ahead."""
     skin = WiredSkin(name)
     skin.seconds(3)
     frames = skin.seconds(5)
@@ -47,8 +46,7 @@ def test_streaming(name: str):
 
 @each
 def test_jitter(name: str):
-    """Reads that are late by up to 20 ms at random, and a clock that is 2 % off: times correct to a
-    few milliseconds."""
+    """Reads up to 20 ms late and a clock 2 % off: times correct to a few milliseconds."""
     skin = WiredSkin(name, rate=1.0 if name == "papillarray" else 1.02)
     rng = np.random.default_rng(1)
     late = 0.0
@@ -120,8 +118,7 @@ def test_absent_is_found_by_its_ids(name: str):
 
 @each
 def test_garbage(name: str):
-    """One frame in twenty is damaged, cut or doubled on the cable: all others have the right
-    content and time, and the damage is counted."""
+    """One frame in twenty is damaged: all others are right, and the damage is counted."""
     skin = WiredSkin(name)
     rng = np.random.default_rng(3)
 
@@ -146,8 +143,7 @@ def test_garbage(name: str):
 
 @each
 def test_wrong_skin(name: str):
-    """Bytes of another skin: no frame, never streaming, a mismatch that stays, and a message with
-    the remedy."""
+    """Bytes of another skin: no frame, never streaming, a mismatch that names the profile."""
     other = "3d-vitac" if name != "3d-vitac" else "flexitac"
     skin = WiredSkin(name)
     skin.port.frames = lambda i: wire(other, i)
@@ -159,8 +155,7 @@ def test_wrong_skin(name: str):
 
 @each
 def test_wrong_format_of_the_bundle(name: str):
-    """A bundle for another grid is refused with both sides named, before a byte is sent to the
-    skin."""
+    """Another grid is refused with both named, before a byte is sent to the skin."""
     p = profile(name)
     skin = WiredSkin(name, replace(p.format, rows=p.format.rows + 1))
     skin.seconds(0.3)
@@ -172,8 +167,7 @@ def test_wrong_format_of_the_bundle(name: str):
 @each
 @pytest.mark.parametrize("rate", [0.5, 0.9, 1.1, 2.0])
 def test_wrong_rate(name: str, rate: float):
-    """A skin that is too slow or too fast: a mismatch that stays, with the measured figure and what
-    to set, until it has sent at the right rate for a while."""
+    """Too slow or too fast: a mismatch with the figure, until the rate is right for a while."""
     skin = WiredSkin(name, rate=rate)
     skin.seconds(12)
     assert skin.states == ["streaming", "mismatch"]
@@ -191,8 +185,7 @@ def test_wrong_rate(name: str, rate: float):
 
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "papillarray"])
 def test_a_rate_that_wanders(name: str):
-    """2 % more or less are followed; when the rate then falls by a tenth that is a mismatch with
-    the figure. Skins with a clock of their own: test_pace.py."""
+    """2 % are followed, a tenth is a mismatch. Skins with their own clock: test_pace.py."""
     skin = WiredSkin(name)
     skin.seconds(4)
     for rate in (1.02, 0.98, 1.0):
@@ -218,8 +211,7 @@ def _change_rate(skin: WiredSkin, rate: float) -> None:
 @each
 @pytest.mark.parametrize("pause_s", [0.2, 1.0, 3.0])
 def test_a_backlog_after_a_pause(name: str, pause_s: float):
-    """Nobody reads for a while and the driver keeps all: each frame comes with the time at which it
-    was taken."""
+    """The driver keeps all: each frame comes with the time at which it was taken."""
     skin = WiredSkin(name)
     skin.seconds(5)
     skin.clock.sleep_until(skin.clock.now_ns() + round(pause_s * 1e9))
@@ -234,8 +226,7 @@ def test_a_backlog_after_a_pause(name: str, pause_s: float):
 
 @each
 def test_a_driver_that_throws_away(name: str):
-    """Two seconds without a read, and the driver keeps 0.4 s: lost frames are counted, numbers
-    before and after the gap are never adjacent, and no frame has a wrong time."""
+    """The driver keeps 0.4 s of two: losses are counted, and no frame has a wrong time."""
     skin = WiredSkin(name)
     before = skin.seconds(5)
     skin.port.capacity = round(0.4 * skin.format.rate_hz) * len(wire(name, 0)) + 11
@@ -256,8 +247,7 @@ def test_a_driver_that_throws_away(name: str):
 
 @each
 def test_back_pressure(name: str):
-    """A host that is slower than the skin for three seconds gets later and later frames, whose
-    times stay true; then it catches up."""
+    """A host slower than the skin gets later frames with true times; then it catches up."""
     skin = WiredSkin(name)
     skin.seconds(5)
     parts = []
@@ -272,8 +262,7 @@ def test_back_pressure(name: str):
 
 @each
 def test_commands(name: str):
-    """Only the commands of the profile are written at the start and at the end; a tare only if it
-    is set."""
+    """Only the profile's commands are written at start and end; a tare only if it is set."""
     skin = WiredSkin(name)
     skin.seconds(1)
     skin.sensor.close()
@@ -283,8 +272,7 @@ def test_commands(name: str):
 
 
 def test_tare():
-    """With skin.tare the command goes out after those of the start. While it lasts no frame is
-    passed on, and the skin does not count as streaming."""
+    """The command follows those of the start; meanwhile no frame, and not streaming."""
     skin = WiredSkin("papillarray", tare=True)
     assert len(skin.seconds(1.9)) == 0
     assert skin.states == []
@@ -324,8 +312,7 @@ def test_a_mark_in_the_payload(name: str):
 
 @pytest.mark.parametrize("name", ["flexitac", "anyskin"])
 def test_once_in_step_a_mark_in_the_payload_does_no_harm(name: str):
-    """A synchronized stream stays so while its numbers contain marks; a byte lost meanwhile invents
-    no frame."""
+    """In step it stays so while numbers hold marks; a lost byte invents no frame."""
     skin = WiredSkin(name)
     skin.seconds(2)
     mark = skin.profile.trailer + skin.profile.marker
@@ -395,8 +382,7 @@ def test_a_text_that_stops_fitting_names_the_value():
 
 
 def test_a_sequence_number_shows_each_loss():
-    """A self-made matrix with a frame count: loss is known, and each missing frame is a gap in the
-    numbers."""
+    """A matrix with a frame count: each missing frame is a gap in the numbers."""
     skin = WiredSkin("matrix")
     p = replace(skin.profile, sequence="uint8")
     skin.port.frames = lambda i: (

@@ -35,8 +35,7 @@ def settings(*sets: str) -> Config:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_each_profile_has_its_sensor_and_form(name: str):
-    """Skins of other protocols are read from a serial port; the format is the profile's, without
-    asking the skin."""
+    """Other skins are read from a serial port, in the profile's format, without asking."""
     simulated = idle_devices()
     chosen = settings(f"skin.profile={name}")
     assert skins.announced(chosen, simulated) == profile(name).format
@@ -60,8 +59,7 @@ def test_a_rate_that_can_be_set_is_that_of_the_bundle():
 
 
 def test_a_form_that_a_person_describes():
-    """The examples of the error are understood, with a window of two seconds; a wrong description
-    is refused with them."""
+    """The error's examples are understood, with a window of two seconds."""
     assert skins.described("5x3:float32:100") == SweepFormat(5, 3, 100.0, 200, "float32")
     assert skins.described(" 4x4x3:int16:250 ") == SweepFormat(4, 4, 250.0, 500, "int16", 3)
     with pytest.raises(ConfigError, match=r"--format 5x3: not"):
@@ -102,8 +100,7 @@ def playing() -> Iterator[str]:
 
 
 def test_on_a_real_terminal(playing: str):
-    """The real pyserial on a real terminal: frames as they were sent; the port is free again after
-    that."""
+    """Real pyserial on a terminal: frames as they were sent, and a free port after it."""
     clock = SystemClock()
     chosen = settings("skin.profile=flexitac", f"skin.port={playing}")
     known = {taxels(profile("flexitac"), i).tobytes() for i in range(199)}

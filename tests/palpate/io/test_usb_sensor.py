@@ -58,8 +58,7 @@ def test_a_board_that_does_not_know_dtr_is_read(monkeypatch: pytest.MonkeyPatch)
 
 @pytest.mark.parametrize("acm", [False, True])
 def test_streams_without_loss(acm: bool):
-    """A healthy readout board, vendor class or CDC-ACM: every frame in order, its time correct to a
-    millisecond."""
+    """A healthy board, vendor class or CDC-ACM: every frame, its time correct to 1 ms."""
     simulated = idle_devices(acm=acm)
     sensor = sensor_on(simulated)
     assert simulated.backend.kernel_driver is acm, "cdc_acm has the device at first"
@@ -101,8 +100,7 @@ def test_no_libusb(monkeypatch: pytest.MonkeyPatch):
     ],
 )
 def test_failures_have_their_state_and_end(call: str, code: int, state: str, hint: str):
-    """An errno at open, claim, request or read: its own state and message; afterwards frames come
-    again."""
+    """An errno at request or read: its state and message; afterwards frames again."""
     simulated = idle_devices()
     sensor = sensor_on(simulated)
     simulated.backend.errors[call] = code
@@ -161,8 +159,7 @@ def test_zero_length_packets():
 
 @pytest.mark.parametrize("acm", [False, True])
 def test_a_board_that_answers_and_sends_no_frame(acm: bool):
-    """Identity and format are right, and only empty packets come: silent, never streaming, until
-    the first frame."""
+    """Only empty packets: silent, never streaming, until the first frame."""
     simulated = idle_devices(acm=acm)
     sensor = sensor_on(simulated)
     board = simulated.backend.board
@@ -180,8 +177,7 @@ def test_a_board_that_answers_and_sends_no_frame(acm: bool):
 
 
 def test_overflow_loses_one_transfer():
-    """A transfer larger than requested is lost, counted, and seen in the numbers; streaming goes
-    on."""
+    """A transfer larger than requested is lost and counted; streaming goes on."""
     simulated = idle_devices()
     sensor = sensor_on(simulated)
     read_for(sensor, simulated, 1)
@@ -195,8 +191,7 @@ def test_overflow_loses_one_transfer():
 
 
 def test_a_host_that_pauses_too_long():
-    """Two seconds without a read overflow the FIFO: the newest frames come, the gap is counted, and
-    the flag OVERFLOW is counted."""
+    """The FIFO overflows: the newest frames come, and gap and flag are counted."""
     simulated = idle_devices(fifo_frames=188)
     sensor = sensor_on(simulated)
     read_for(sensor, simulated, 1)
@@ -214,8 +209,7 @@ def test_a_host_that_pauses_too_long():
     ids=["three axes", "a slow strip"],
 )
 def test_other_formats(format: SweepFormat, acm: bool):
-    """All values of every frame arrive at their indices. A box for another format refuses this
-    skin, naming both sides."""
+    """All values arrive at their indices; a box for another format names both sides."""
     simulated = idle_devices(600, format=format, acm=acm)
     sensor = sensor_on(simulated, format)
     frames = read_for(sensor, simulated, 1000 / format.rate_hz)
@@ -281,8 +275,7 @@ def test_acm_board_whose_reply_never_ends(reply: int):
 
 @pytest.mark.parametrize("replugged", [True, False])
 def test_a_board_whose_clock_starts_anew(replugged: bool):
-    """After a replug, or a crash of the firmware that USB does not notice, times and numbers begin
-    a new epoch and are correct."""
+    """After a replug or a crash of the firmware a new epoch begins, with right times."""
     simulated = idle_devices(first_seq=1_000_000)
     sensor = sensor_on(simulated)
     now = simulated.clock.now_ns()
@@ -327,8 +320,7 @@ def test_a_board_whose_clock_starts_anew(replugged: bool):
 def test_no_error_of_a_usb_call_leaves_read(
     monkeypatch: pytest.MonkeyPatch, call: str, error: Exception
 ):
-    """Whatever libusb raises, at any call, is a state of the skin with its reason, and the skin
-    streams once the error is over."""
+    """Whatever libusb raises is a state with its reason, until the error is over."""
     simulated = idle_devices()
     sensor = sensor_on(simulated)
     assert len(read_for(sensor, simulated, 0.5))
@@ -383,8 +375,7 @@ def test_more_enumerations_than_a_number_holds():
 
 
 def test_garbage_that_costs_time_is_silence():
-    """Bytes without a frame whose examination takes all the time: `silent` after silence_ms, not
-    after many seconds."""
+    """`silent` after silence_ms, also if examining the bytes takes all the time."""
     simulated = idle_devices()
     sensor = sensor_on(simulated)
     read_for(sensor, simulated, 0.5)

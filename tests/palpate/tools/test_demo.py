@@ -23,8 +23,7 @@ VIRTUAL = ["--virtual", "--sweeps", "3", "--seed", "7"]
 
 
 def test_demo_prints_plain_lines_without_a_terminal(capsys: pytest.CaptureFixture[str]):
-    """Heads, each sweep with truth and answer, without a sentence; then the sum, and what to do
-    next."""
+    """Heads, each sweep with truth and answer, then the sum and what to do next."""
     assert main(["demo", *VIRTUAL]) == 0
     out = capsys.readouterr().out
     assert "$PPLP" not in out
@@ -86,8 +85,7 @@ def test_demo_raw_prints_sentences_alone(capsys: pytest.CaptureFixture[str]):
 
 
 def played_set(folder: Path, bundle: Bundle, each: int = 4) -> str:
-    """A set of three materials in the order of a file: all of the first, then all of the next. The
-    name of its script."""
+    """A set of three materials, one after the other: the name of its script."""
     samples = np.repeat(bundle.golden[:1], 3 * each, axis=0)
     np.savez(
         folder / "s.npz",
@@ -108,8 +106,7 @@ def test_demo_of_a_set(
     default_bundle: Bundle,
     capsys: pytest.CaptureFixture[str],
 ):
-    """Three sweeps of a set of three materials show each once, also where the file has them one
-    after another, or ends before the sweeps that are asked for."""
+    """Each of three materials is shown once, also where the set ends before the sweeps."""
     which = ["--sim", played_set(tmp_path, default_bundle, each)]
     assert main(["demo", *VIRTUAL, *which, *more]) == 0
     out = capsys.readouterr().out
@@ -120,8 +117,7 @@ def test_demo_of_a_set(
 def test_materials_that_the_bundle_never_learnt_are_counted_apart(
     tmp_path: Path, default_bundle: Bundle, capsys: pytest.CaptureFixture[str]
 ):
-    """A bundle has two of the simulated materials: other materials do not count as wrong, and
-    `unknown` is their right answer."""
+    """They do not count as wrong, and `unknown` is their right answer."""
     files = bundle.files(bundle.DEFAULT)
     names = [f"x{i}" for i in range(len(default_bundle.manifest.labels))]
     names[:2] = default_bundle.manifest.labels[:2]
@@ -146,8 +142,7 @@ def test_a_user_who_may_not_read_the_store_sees_the_packaged_bundle(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ):
-    """On an installed box only the user palpate may read deployed bundles: a message says so with
-    the remedy, and the demo plays."""
+    """A message says so with the remedy, and the demo plays."""
 
     def refused(path: object) -> str:
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))

@@ -28,8 +28,7 @@ def act(label: str, *, new_object: bool = False) -> Act:
 
 
 def test_only_ok_with_the_right_label_counts():
-    """Another label, and the right one that is unsure, are wrong; percentages have their
-    intervals."""
+    """Another label, or the right one unsure, is wrong; percentages have intervals."""
     score = AnswerScore(frozenset({"wood", "paper"}))
     right = [
         score.add(act("wood"), answer(1, "wood")),

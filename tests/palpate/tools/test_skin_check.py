@@ -304,8 +304,7 @@ def test_no_reply_while_frames_are_sent_is_found():
 
 
 def test_what_cannot_be_decided_is_unknown():
-    """Too short a time for the clock; packets that arrive with much jitter; a FIFO that does not
-    run over."""
+    """Too short a time, jitter, a FIFO that does not run over."""
     found = findings(idle_devices(), seconds=0.02)
     assert (found["rate"].verdict, found["clock"].verdict) == ("unknown", "unknown")
     assert "listen longer with --seconds" in found["clock"].detail
@@ -369,8 +368,7 @@ def test_another_device_at_the_port_is_told_apart():
 def of_a_port(
     capsys: pytest.CaptureFixture[str], port: str, *options: str
 ) -> dict[str, tuple[str, str]]:
-    """(verdict, detail) by part, as `palpate skin check` prints them for a board at a serial
-    port."""
+    """(verdict, detail) by part, as `palpate skin check` prints them for a port."""
     sets = ("--set", "skin.link=serial", "--set", f"skin.port={port}")
     ended = main(["skin", "check", *sets, *options])
     lines = [line.split(maxsplit=2) for line in capsys.readouterr().out.splitlines()]
@@ -380,8 +378,7 @@ def of_a_port(
 
 @pytest.mark.slow
 def test_the_pico_passes(capsys: pytest.CaptureFixture[str]):
-    """The reference firmware under MicroPython, at a serial port: nothing that a busy machine has
-    no part in fails."""
+    """The reference firmware under MicroPython: nothing fails but by the busy machine."""
     with pico.plugged_in(ROWS=16, COLS=16, RATE_HZ=200, DTYPE="uint16", FIFO_S=0.5) as port:
         found = of_a_port(capsys, port, "--seconds", "2")
     assert tuple(found) == PARTS
@@ -391,8 +388,7 @@ def test_the_pico_passes(capsys: pytest.CaptureFixture[str]):
 
 @pytest.mark.slow
 def test_a_pico_that_is_too_slow_is_found(capsys: pytest.CaptureFixture[str]):
-    """Every tenth interrupt comes 20 ms late: frames are missing though all was read, and count and
-    clock still agree."""
+    """Late interrupts: frames are missing, while count and clock agree."""
     with pico.plugged_in(RATE_HZ=200, late_ms=20, late_every=10) as port:
         found = of_a_port(capsys, port, "--seconds", "3")
     verdict, detail = found["loss"]

@@ -56,8 +56,7 @@ def test_another_grid_of_a_known_skin():
 
 
 def test_a_skin_that_has_to_be_asked():
-    """Silent until its start command: nothing is written without --write, with it the profile is
-    found, and it is stopped."""
+    """Nothing is written without --write; with it the profile is found, and it is stopped."""
     clock, p = VirtualClock(), profile("robotiq-tsf")
     start = p.commands(p.start, p.rate_hz)[0]
     port = WirePort(clock, lambda i: b"", p.format.period_ns)
@@ -88,8 +87,7 @@ def test_a_board_of_the_protocol_has_to_be_asked():
     "sent", [b"hello world\n", bytes(range(256)), b"\xaa\x55", b"\x0d\x0a" * 40]
 )
 def test_something_else_is_no_skin(sent: bytes):
-    """Bytes without frames: no profile, the number of bytes, and the command that describes a
-    skin."""
+    """Bytes without frames: no profile, and what describes a skin."""
     clock = VirtualClock()
     found = found_on(WirePort(clock, lambda i: sent, 1e7), clock)
     assert found.profile == ""

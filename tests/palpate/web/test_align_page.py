@@ -97,8 +97,7 @@ def reached(seen: BrowsedPage, wanted: Callable[[dict[str, Any]], bool]) -> dict
 
 
 def test_the_whole_way(browser: Any, box: tuple[subprocess.Popen[bytes], str]):
-    """The real command: the page waits for contact, advises, follows the next touch; when it ends,
-    "no connection"."""
+    """The real command: the page waits, advises, follows a touch; then "no connection"."""
     run, address = box
     context = browser.new_context(viewport={"width": 820, "height": 1180})
     seen = BrowsedPage(context, address)
@@ -127,8 +126,7 @@ def test_the_whole_way(browser: Any, box: tuple[subprocess.Popen[bytes], str]):
 
 
 def test_the_page_draws_what_the_box_says(browser: Any, page: PageServer):
-    """Loads as shades and numbers, points at their coordinates, the message in large letters and
-    for screen readers."""
+    """Loads, points at their coordinates, and the message, also for screen readers."""
     context = browser.new_context(viewport={"width": 1180, "height": 820})
     seen = BrowsedPage(context, page.address)
     seen.state("off")
@@ -228,8 +226,7 @@ def test_the_arrow_points_where_the_skin_has_to_go(
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_every_count_can_be_read_on_its_taxel(browser: Any, page: PageServer, scheme: str):
-    """A contrast of 4.5 between the number and its taxel, from no load to the full one (WCAG 2.1,
-    1.4.3)."""
+    """A contrast of 4.5 from no load to the full one (WCAG 2.1, 1.4.3)."""
     rising = tuple(tuple(float(4 * r + c) for c in range(4)) for r in range(4))
     page.show(replace(VIEW, load=rising, full=15.0))
     context = browser.new_context(color_scheme=scheme)
@@ -253,8 +250,7 @@ def test_every_count_can_be_read_on_its_taxel(browser: Any, page: PageServer, sc
 def test_the_picture_shows_which_end_is_the_fingertip(
     browser: Any, page: PageServer, side: str, at: str
 ):
-    """A cap at the side that `skin.fingertip` names; where it is not set, the page says how to
-    find it out."""
+    """A cap at that side; where it is not set, the page says how to find it out."""
     seen = BrowsedPage(browser.new_context(viewport={"width": 1024, "height": 768}), page.address)
     seen.state("off")
     assert seen.page.locator(".finger").count() == 0
@@ -279,8 +275,7 @@ def beyond(board: dict[str, float], box: dict[str, float]) -> str:
 
 
 def test_a_box_that_says_nothing_new_is_no_news(browser: Any, page: PageServer):
-    """The server still answers, but its loop hangs: after a while the page says so instead of
-    showing an old picture."""
+    """A loop that hangs behind a server: the page says so and shows no old picture."""
     context = browser.new_context()
     seen = BrowsedPage(context, page.address)
     seen.state("off")
@@ -292,8 +287,7 @@ def test_a_box_that_says_nothing_new_is_no_news(browser: Any, page: PageServer):
 
 
 def test_a_server_that_is_gone_is_no_connection(browser: Any):
-    """The page says at once that there is no connection, and the age of its picture. It shows a new
-    server at the same port by itself."""
+    """The page says so at once, and shows a new server at the port by itself."""
     access = Access(0)
     with PageServer("watch.html", access, SystemClock().now_ns) as page:
         page.show(VIEW)
@@ -313,8 +307,7 @@ def test_a_server_that_is_gone_is_no_connection(browser: Any):
 def test_it_fits_phone_tablet_and_desktop(
     browser: Any, page: PageServer, width: int, height: int, scheme: str
 ):
-    """Everything on one screen without scrolling, in the light and the dark scheme; the text has
-    enough contrast."""
+    """All on one screen without scrolling, light and dark, with enough contrast."""
     longest = "12.5 mm too far towards column 4 and 10.5 mm towards row 4"
     page.show(replace(VIEW, message=longest, source="sim"))
     context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme)

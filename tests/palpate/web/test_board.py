@@ -51,8 +51,7 @@ def frames(board: PageBoard, at_s: float, row: float, col: float, strength: floa
 
 
 def test_the_first_lines_say_what_box_it_is(board: PageBoard, events: Events):
-    """The page gets the box's presence, its labels, and its state with the content of the status
-    file."""
+    """The page gets the box's presence, its labels and its state."""
     assert events.of("box") == [{"there": True, "why": ""}]
     assert events.of("hello")[0]["labels"] == list(feed_lines.LABELS)
     told = feed_lines.health(1.0)
@@ -80,8 +79,7 @@ def test_people_read_display_names(events: Events):
 def test_a_verdict_comes_with_its_probabilities_or_its_reason(
     board: PageBoard, events: Events, status: str
 ):
-    """A verdict has rounded probabilities of all labels; without them it has the reason and the
-    remedy in words."""
+    """Rounded probabilities of all labels, else the reason and the remedy."""
     board.take(feed_lines.verdict(7, 2.0, "wood", status))
     (shown,) = events.of("verdict")
     assert shown["pid"] == 71
@@ -95,8 +93,7 @@ def test_a_verdict_comes_with_its_probabilities_or_its_reason(
 
 
 def test_frames_become_the_view_of_palpate_align(board: PageBoard, events: Events):
-    """Load above the lowest, the contact's centre, the way back; five times a second, however many
-    frames come."""
+    """Load, centre and way back, at most five times a second."""
     frames(board, 2.0, 0.7, 1.5, 0)
     assert events.of("view")[-1]["state"] == "no-contact"
     frames(board, 3.0, 0.7, 1.5)
@@ -130,8 +127,7 @@ def test_without_a_bundle_the_picture_has_no_positions(events: Events):
 
 
 def test_a_skin_that_goes_is_shown_at_once(board: PageBoard, events: Events):
-    """State and view change with the next line; the counts of another skin get their own lowest
-    value."""
+    """With the next line; the counts of another skin get their own lowest value."""
     frames(board, 2.0, 1.5, 1.5)
     board.take(feed_lines.state("absent", "check the cable"))
     wanted = feed_lines.state("absent", "check the cable")
@@ -144,8 +140,7 @@ def test_a_skin_that_goes_is_shown_at_once(board: PageBoard, events: Events):
 
 
 def test_loss_is_counted_by_the_minute(board: PageBoard, events: Events):
-    """Frames and lost frames of each minute, not over a restart, after which the box counts from
-    0."""
+    """Frames and lost frames of each minute, not over a restart."""
     for at_s in range(2, 125):
         board.take(feed_lines.health(float(at_s), lost_frames=3 if at_s > 70 else 0))
     assert [(one["frames"], one["lost"]) for one in events.of("minute")] == [
@@ -160,8 +155,7 @@ def test_loss_is_counted_by_the_minute(board: PageBoard, events: Events):
 
 
 def test_a_restart_is_noted_with_what_has_changed(board: PageBoard, events: Events):
-    """A restarted process causes a note in the history, with the new bundle; a cut connection does
-    not."""
+    """A note with the new bundle; a cut connection makes none."""
     board.away("the connection was cut")
     assert events.of("box")[-1] == {"there": False, "why": "the connection was cut"}
     board.take(feed_lines.hello())
@@ -176,8 +170,7 @@ def test_a_restart_is_noted_with_what_has_changed(board: PageBoard, events: Even
 
 
 def test_the_latest_sweeps_are_kept(board: PageBoard, events: Events):
-    """The latest SWEEPS sweeps are kept by a number of their own, because the box counts anew after
-    a restart."""
+    """By a number of their own, since the box counts anew after a restart."""
     for number in range(SWEEPS + 3):
         board.take(feed_lines.sweep(number))
     numbers = [one["number"] for one in events.of("signal")]

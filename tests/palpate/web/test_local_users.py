@@ -40,8 +40,7 @@ def status(page: PageServer, host: str = "127.0.0.1") -> tuple[int, str]:
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
 def test_the_owner_of_a_connection(host: str):
-    """The kernel names this user for both families, and nobody for a connection that is not
-    there."""
+    """This user for both families, and nobody for a connection that is not there."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with (
         socket.create_server((host, 0), family=family) as listener,

@@ -129,8 +129,7 @@ def test_what_is_no_order(body: bytes):
 @pytest.mark.parametrize("text", ["-1", "a,b", "blé", "x" * 25, "a\nb", "$"])
 @pytest.mark.parametrize("name", record.LABELS)
 def test_a_bad_label_is_refused_as_the_command_refuses_it(tmp_path: Path, name: str, text: str):
-    """The refusal has the command's words, and comes before the loop or a capture gets the
-    order."""
+    """In the command's words, before the loop or a capture gets the order."""
     recording = RecordingSession(
         tmp_path, skin.FORMAT, Labels(), idle_devices().clock, lambda line: None
     )
@@ -144,8 +143,7 @@ def test_a_bad_label_is_refused_as_the_command_refuses_it(tmp_path: Path, name: 
 def test_labels_from_the_page_are_those_of_the_stored_sweep(
     rigged: Callable[..., Rigged], tmp_path: Path
 ):
-    """On a whole box: set, started and stopped by the page alone, with labels that the robot had
-    set otherwise."""
+    """On a whole box, by the page alone, after the robot had set other labels."""
     simulated, box = idle_devices(), None
     recording = RecordingSession(
         tmp_path, skin.FORMAT, Labels(), simulated.clock, lambda line: None
@@ -269,8 +267,7 @@ def test_an_order_of_another_site_is_refused(
 def test_other_ways_to_order_are_refused(
     recorded: RecordedPage, method: str, host: str | None, answer: int
 ):
-    """Other methods, a preflight of another site among them, and a name that is not this
-    machine's."""
+    """Other methods, a preflight among them, and a name that is not this machine's."""
     page = recorded.page.server
     host = f"localhost:{port(page)}" if host is None else host
     more = (
@@ -283,8 +280,7 @@ def test_other_ways_to_order_are_refused(
 
 @pytest.mark.parametrize("chunked", [False, True])
 def test_too_large_a_body_is_refused(recorded: RecordedPage, chunked: bool):
-    """A body that is too large, announced or in chunks, is not read to its end; the next request is
-    answered."""
+    """Announced or in chunks, it is not read to its end; the next request is answered."""
     page = recorded.page.server
     body = json.dumps({"command": "MATERIAL", "text": "x" * 2000}).encode()
     more: dict[str, str | None] = {}
@@ -310,8 +306,7 @@ def test_refusals_say_why(recorded: RecordedPage):
 
 
 def test_many_requests_wait_in_bounds_and_the_loop_takes_one_a_turn(recorded: RecordedPage):
-    """While the loop stands still, orders beyond MOST_WAITING are refused at once. Then each turn
-    carries out exactly one."""
+    """Beyond MOST_WAITING they are refused at once; each turn takes one."""
     asking = Asking(recorded, *[WOOD] * (MOST_WAITING + 6))
     until(lambda: len(asking.answers) == 6)
     assert waiting(recorded) == MOST_WAITING
@@ -379,8 +374,7 @@ def test_commands_that_nobody_wants_any_more_take_no_turn():
 
 
 def test_a_sweep_is_drawn_once(recorded: RecordedPage, monkeypatch: pytest.MonkeyPatch):
-    """The picture is computed once. Only the last sweep has a picture, and a sweep without a window
-    has none."""
+    """Only the last sweep has a picture, and none without a window."""
     drawn: list[int] = []
     draw = record.picture
     monkeypatch.setattr(
@@ -398,8 +392,7 @@ def test_a_sweep_is_drawn_once(recorded: RecordedPage, monkeypatch: pytest.Monke
 
 
 def test_on_the_network_it_takes_token_and_key(tmp_path: Path):
-    """As on the watch page, an order without the token is refused, and plain HTTP is not
-    answered."""
+    """Without the token it is refused, and plain HTTP is not answered."""
     page_secrets(tmp_path / "secrets")
     settings = WatchConfig(address="0.0.0.0 localhost", folder=str(tmp_path / "secrets"))
     token = (tmp_path / "secrets" / "token").read_text().strip()
@@ -423,8 +416,7 @@ def test_on_the_network_it_takes_token_and_key(tmp_path: Path):
 
 @pytest.mark.slow
 def test_the_command_records_what_its_page_orders(tmp_path: Path):
-    """The real command without a serial line: its page sets the label, starts and stops; it ends
-    with the page open."""
+    """The real command without a serial line; it ends with the page open."""
     words = "-m palpate record --sim skin --trigger serial --web 0 --set store.runtime= --out"
     command = [sys.executable, *words.split(), str(tmp_path)]
     pipes = {"stderr": subprocess.PIPE, "stdout": subprocess.DEVNULL}

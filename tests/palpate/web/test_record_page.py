@@ -66,8 +66,7 @@ def labels(recorded: RecordedPage) -> tuple[str, str, str]:
 
 
 def test_what_is_there_and_what_is_missing(browser: Any, recorded: RecordedPage):
-    """A row for each material, a column for each position, with recorded and missing sweeps; the
-    trigger in words."""
+    """Materials by positions, with recorded and missing sweeps; the trigger in words."""
     seen = opened(browser, recorded)
     assert seen.page.locator("#counts th").all_inner_texts() == ["1", "2", "metal", "wood"]
     fields = seen.page.locator("#counts button")
@@ -85,8 +84,7 @@ def test_what_is_there_and_what_is_missing(browser: Any, recorded: RecordedPage)
 
 
 def test_the_last_sweep_with_its_checks(browser: Any, recorded: RecordedPage):
-    """The last sweep has status, checks, path and signal; also a faulty sweep, and a sweep without
-    a window."""
+    """Status, checks, path and signal, also of a faulty sweep and without a window."""
     seen = opened(browser, recorded)
     number = recorded.sweep()
     until(lambda: seen.text("#outcome") == f"wood at 1, stored as sweep-{number:06d}")
@@ -104,8 +102,7 @@ def test_the_last_sweep_with_its_checks(browser: Any, recorded: RecordedPage):
 
 
 def test_labels_are_set_with_the_keyboard(browser: Any, recorded: RecordedPage, tmp_path: Path):
-    """Tab reaches every control with a visible focus. Enter in a field sets the changed labels, and
-    the stored sweep has them."""
+    """Tab reaches every control, Enter sets the labels, and the stored sweep has them."""
     seen, stops = opened(browser, recorded), []
     for _ in range(11):
         seen.page.keyboard.press("Tab")
@@ -136,8 +133,7 @@ def test_labels_are_set_with_the_keyboard(browser: Any, recorded: RecordedPage, 
 
 
 def test_a_bad_label_is_refused_with_its_reason(browser: Any, recorded: RecordedPage):
-    """The refusal has the command's words and stands beside the field, which keeps the text; a good
-    label removes it."""
+    """It stands beside the field, which keeps the text; a good label removes it."""
     seen = opened(browser, recorded)
     for wrong in ("-wood", "<b>wood</b>", "a,b"):
         seen.page.fill("#material", wrong)
@@ -156,8 +152,7 @@ def test_a_bad_label_is_refused_with_its_reason(browser: Any, recorded: Recorded
 
 
 def test_what_is_being_typed_is_not_overwritten(browser: Any, recorded: RecordedPage):
-    """The robot sets a label meanwhile: the page shows it, and the field keeps the person's
-    text."""
+    """The robot sets a label: the page shows it, and the field keeps the person's text."""
     seen = opened(browser, recorded)
     seen.page.fill("#material", "pap")
     recorded.recording.commands["MATERIAL"]("cork")
@@ -168,8 +163,7 @@ def test_what_is_being_typed_is_not_overwritten(browser: Any, recorded: Recorded
 
 
 def test_a_field_of_the_table_sets_both_labels(browser: Any, recorded: RecordedPage):
-    """Pressing a cell of the table sets both labels. The cell keeps the focus, so that the next
-    cell can be reached."""
+    """The cell keeps the focus, so that the next cell can be reached."""
     seen = opened(browser, recorded)
     seen.page.focus("#counts button[aria-label='wood at 2: 0 of 3']")
     seen.page.keyboard.press("Enter")
@@ -211,8 +205,7 @@ def test_start_and_stop(browser: Any, recorded: RecordedPage):
 def test_timed_sweeps_are_counted_down(
     browser: Any, tmp_path: Path, width: int, height: int, scheme: str, teaching: bool
 ):
-    """In sight, in letters of 96 px or more, for recording and teaching; a skin that is away has no
-    countdown."""
+    """In sight, in letters of 96 px or more; a skin that is away has no countdown."""
     with RecordedPage(tmp_path, Labels("metal", "1"), teaching=teaching) as one:
         size = {"width": width, "height": height}
         context = browser.new_context(viewport=size, color_scheme=scheme)
@@ -339,8 +332,7 @@ ATTACKS = """async (page) => {
 def test_no_other_site_sets_a_label(
     browser: Any, recorded: RecordedPage, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """A page of another origin in the same browser: with and without headers, as a beacon, as a
-    form; and it gets no key."""
+    """A page of another origin, with headers, as a beacon, as a form; it gets no key."""
     refused: list[tuple[str, int]] = []
 
     def noted(handler: OrderHandler) -> None:
@@ -417,8 +409,7 @@ def test_everything_on_it_has_a_role_and_a_name(browser: Any, recorded: Recorded
 def test_a_material_has_a_name_in_any_language(
     browser: Any, recorded: RecordedPage, tmp_path: Path
 ):
-    """It is typed and shown as it is written; the command and the sweep have a label in ASCII, and
-    the sidecar has both."""
+    """Shown as written; command and sweep have a label in ASCII, the sidecar both."""
     seen = opened(browser, recorded)
     seen.page.fill("#material", "Holz, geölt")
     seen.page.press("#material", "Enter")

@@ -43,8 +43,7 @@ def page() -> Iterator[PageServer]:
 def guarded(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[tuple[PageServer, str, ssl.SSLContext]]:
-    """A page on the network as `make install` sets it up: the page, its token, and the context of a
-    browser that trusts it."""
+    """A page on the network as `make install` sets it up, its token, and its TLS context."""
     page_secrets(folder)
     settings = WatchConfig(address="0.0.0.0 localhost", folder=str(folder))
     token = (folder / "token").read_text().strip()
@@ -75,8 +74,7 @@ def test_events_are_numbered_and_the_newest_are_kept():
 
 
 def test_a_browser_gets_what_is_kept_and_then_what_comes(page: PageServer):
-    """The clock is the first event. A browser that comes back gets only the events it has
-    missed."""
+    """The clock is first; a browser that comes back gets only what it missed."""
     reader = EventReader(page)
     assert [reader.next() for _ in range(3)] == [
         ("now", now_ns()),
@@ -109,8 +107,7 @@ def test_a_number_that_json_lacks_is_an_error_of_who_publishes(page: PageServer)
     "path", ["/", "/page.css", "/watch.js", "/events", "/sweep/7", "/sweep/8", "/nothing"]
 )
 def test_every_answer_says_what_a_browser_may_do(page: PageServer, path: str):
-    """No caching, no frames, nothing loaded from elsewhere, and no version of the server; in
-    errors, too."""
+    """No caching, frames, sources elsewhere or server version; in errors, too."""
     with connected(page) as one:
         one.sendall(f"GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
         head = b""
@@ -166,8 +163,7 @@ def test_every_answer_says_what_a_browser_may_do(page: PageServer, path: str):
 def test_the_page_for_this_machine_and_no_more(
     page: PageServer, path: str, method: str, host: str, answer: int
 ):
-    """GET of the page, its files and its data is answered under this machine's names; other
-    requests get their HTTP status."""
+    """The page and its data under this machine's names; others get their HTTP status."""
     assert status(ask(page, path, method, host)) == answer
     assert status(ask(page)) == 200
 
@@ -197,8 +193,7 @@ def test_the_page_for_this_machine_and_no_more(
 def test_malformed_requests_are_refused(
     page: PageServer, sent: bytes, capfd: pytest.CaptureFixture[str]
 ):
-    """Each request ends with an error or a closed connection and prints nothing; the next request
-    is served."""
+    """Each ends with an error or a closed connection, silently; the next is served."""
     with connected(page) as one:
         with suppress(OSError):
             one.sendall(sent)
@@ -212,8 +207,7 @@ def test_malformed_requests_are_refused(
     "sent", [b"", b"GET / HTTP/1.1\r\nHost: localhost\r\n", b"x" * (MOST_HEAD - 1)]
 )
 def test_half_a_request_ends_at_the_deadline(monkeypatch: pytest.MonkeyPatch, sent: bytes):
-    """Half a request gets no answer and a closed connection, even if its other side continues to
-    send; others are served."""
+    """A closed connection, even if its other side goes on sending; others are served."""
     monkeypatch.setattr(server, "HEAD_S", 0.3)
     with (
         PageServer("watch.html", Access(0), now_ns) as page,
@@ -238,8 +232,7 @@ def test_half_a_request_ends_at_the_deadline(monkeypatch: pytest.MonkeyPatch, se
 
 @pytest.mark.parametrize("body", [False, True])
 def test_slow_requests_lock_nobody_out(page: PageServer, body: bool):
-    """Slow heads and slow bodies of four addresses hold all places: whoever asks is served, and who
-    reads the events stays connected."""
+    """Slow heads and bodies hold all places: whoever asks is served, readers stay."""
     reader = EventReader(page)
     assert reader.until("view") == {"number": 1}
     sent = b"POST /order HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9\r\n\r\n{" if body else b""
@@ -269,8 +262,7 @@ def test_of_served_connections_the_oldest_makes_room(
 
 
 def test_one_who_reads_nothing_holds_nobody_up(page: PageServer, monkeypatch: pytest.MonkeyPatch):
-    """A browser that never reads is disconnected when too many events wait for it; other browsers
-    get all events."""
+    """It is disconnected when too many events wait; others get all events."""
     lazy = EventReader(page)
     busy = EventReader(page)
     until(lambda: len(page.queues) == 2)
@@ -310,8 +302,7 @@ def test_a_port_that_is_taken_is_named(page: PageServer):
 
 
 def test_the_pages_hold_everything_they_show():
-    """No address but the namespace of SVG, no sources elsewhere, and nothing that could send or
-    keep data."""
+    """No address but SVG's namespace, and nothing that could send or keep data."""
     names = {"statuses.js"} | {f.name for f in FOLDER.iterdir()}
     for file in FOLDER.iterdir():
         text = file.read_text(encoding="utf-8")
@@ -362,8 +353,7 @@ def test_on_the_network_it_takes_a_token(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_plain_http_is_not_answered_on_the_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Plain HTTP, which would reveal the token, gets no answer; a handshake that never ends is cut
-    off."""
+    """It would reveal the token; a handshake that never ends is cut off."""
     monkeypatch.setattr(server, "HEAD_S", 0.3)
     with guarded(tmp_path, monkeypatch) as (page, token, trusts):
         assert status(ask(page, more=f"Authorization: Bearer {token}\r\n")) == 0
@@ -375,8 +365,7 @@ def test_plain_http_is_not_answered_on_the_network(tmp_path: Path, monkeypatch: 
 def test_wrong_tokens_are_slowed_and_logged_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, logged: list[str]
 ):
-    """Each wrong token waits for WRONG_S. The first is logged with the address, further wrong
-    tokens are not."""
+    """Each waits for WRONG_S; the first is logged with its address."""
     waited = []
 
     async def sleep(seconds: float) -> None:
@@ -425,8 +414,7 @@ def test_beyond_this_machine_token_and_certificate_must_be_there(
 
 
 def test_what_install_makes_is_for_the_unit_alone(tmp_path: Path):
-    """Token, key and certificate stay as they are on another install; nobody but root and the group
-    reads them."""
+    """All stay as they are on another install; only root and the group read them."""
     page_secrets(tmp_path)
     first = {f.name: f.read_bytes() for f in tmp_path.iterdir()}
     assert sorted(first) == ["certificate.pem", "key.pem", "token"]

@@ -34,8 +34,7 @@ def page() -> Iterator[PageServer]:
 
 
 def test_it_shows_loads_figures_and_faults(browser: Any, page: PageServer):
-    """A map for each axis with its counts; faulty taxels outlined and named; loss that cannot be
-    known is not called 0."""
+    """A map for each axis; faulty taxels outlined; unknown loss is not called 0."""
     seen = BrowsedPage(browser.new_context(), page.address)
     until(lambda: seen.text("#rate") == "99.8 Hz")
     assert seen.text("#lost") == "cannot be known"

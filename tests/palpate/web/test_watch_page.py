@@ -124,8 +124,7 @@ def test_the_shift_is_filtered_by_status(browser: Any, shown: Shown):
 
 
 def test_a_moved_skin_and_the_way_back(browser: Any, shown: Shown):
-    """The verdict leads to the view that shows the direction in which to move the skin, while the
-    service runs."""
+    """The verdict leads to the view with the direction in which to move the skin."""
     seen = opened(browser, shown)
     moved = "moved 2.2 mm too far towards row 1"
     shown.board.take(feed_lines.verdict(41, 390.0, "wood", moved=moved))
@@ -144,8 +143,7 @@ def test_a_moved_skin_and_the_way_back(browser: Any, shown: Shown):
 
 @pytest.mark.parametrize(("width", "height"), SIZES)
 def test_a_large_skin_is_drawn_without_numbers(browser: Any, shown: Shown, width: int, height: int):
-    """12 x 32 taxels: some rows and columns have numbers that do not overlap; the contact's ring is
-    large enough."""
+    """12 x 32 taxels: numbers of rows and columns do not overlap; the ring is large."""
     shape = {"rows": 12, "cols": 32, "rate_hz": 100.0, "window": 200, "dtype": "uint16"}
     known = {"contact": 5.0, "place": None, "unloaded": 0.0, "fingertip": "first-column"}
     shown.board.take(feed_lines.hello(format=shape, alignment=known))
@@ -185,8 +183,7 @@ def test_loss_latency_and_the_box(browser: Any, shown: Shown):
 
 
 def test_unsigned_bundles_are_told_at_the_top(browser: Any, shown: Shown):
-    """While a setting allows unsigned bundles, the top of the page says so at every size, without
-    scrolling; otherwise it does not."""
+    """While a setting allows them, at every size, without scrolling."""
     for text in ("", "bundles are allowed: classifier.allow_unsigned = true"):
         shown.board.take(feed_lines.health(380.0, unsigned=text))
         for width, height in SIZES:
@@ -234,8 +231,7 @@ def test_a_box_that_dies_and_comes_back_while_the_page_is_open(browser: Any, sho
 
 
 def test_a_page_program_that_dies_and_comes_back(browser: Any):
-    """The page says at once that the connection is gone, and tries again. The content of the new
-    program replaces the old content."""
+    """The page says so at once; the new program's content replaces the old."""
     first = Shown(Access(0))
     with first:
         first.shift()
@@ -255,8 +251,7 @@ def test_a_page_program_that_dies_and_comes_back(browser: Any):
 
 
 def test_it_is_used_with_the_keyboard(browser: Any, shown: Shown):
-    """Tab goes from the views over the filter to the sweeps with a visible focus; arrows choose a
-    sweep, space a status."""
+    """Tab has a visible focus; arrows choose a sweep, space a status."""
     seen = opened(browser, shown)
     stops = []
     for _ in range(11):
@@ -281,8 +276,7 @@ def test_it_is_used_with_the_keyboard(browser: Any, shown: Shown):
 
 
 def test_everything_has_a_role_and_a_name(browser: Any, shown: Shown):
-    """Sections, pictures, lists and buttons have names for screen readers, which speak urgent
-    changes."""
+    """Names for screen readers, which speak urgent changes."""
     seen = opened(browser, shown)
     unnamed = seen.page.evaluate(
         """() => [...document.querySelectorAll("section, canvas, meter, button, a, [role]")]

@@ -191,8 +191,7 @@ DEVICE = """() => {
 
 
 def test_a_tablet_stays_awake_and_sounds_on_a_refusal(browser: Any, shown: Shown):
-    """The screen is kept on, again after the page was hidden. If it is wanted, a refusal sounds
-    once, and an answer does not."""
+    """The screen is kept on; if wanted, a refusal sounds once, an answer not."""
     context = browser.new_context()
     context.add_init_script(f"({DEVICE})()")
     seen = BrowsedPage(context, shown.server.address)
@@ -235,8 +234,7 @@ def test_keys_lead_to_views_and_history(browser: Any, shown: Shown):
 
 
 def test_the_shift_is_counted_and_saved(browser: Any, shown: Shown):
-    """A sentence, and a table by material and status; the CSV file holds each sweep with its time
-    by the clock on the wall."""
+    """A sentence, a table, and a CSV file with each sweep and its time on the wall."""
     shown.board.take(verdict(41, 395.0, "=1+1", detail='a "word", and more'))
     seen = opened(browser, shown, rows=41)
     assert re.match(
@@ -266,8 +264,7 @@ def test_the_shift_is_counted_and_saved(browser: Any, shown: Shown):
 def test_long_names_and_many_materials_are_not_cut(
     browser: Any, shown: Shown, width: int, height: int
 ):
-    """Names of 24 characters, 26 materials: nothing is cut in the list, the probabilities, the
-    counts and the card."""
+    """24 characters, 26 materials: nothing is cut anywhere."""
     names = [f"Schaumstoff-beschichtet{chr(65 + i)}" for i in range(26)]
     shown.board.take(feed_lines.hello(labels=names))
     for i, name in enumerate(names):
@@ -290,8 +287,7 @@ def test_long_names_and_many_materials_are_not_cut(
 
 
 def test_a_taxel_of_a_large_skin_tells_its_value(browser: Any, shown: Shown):
-    """Of 16 x 32 taxels the one that is pointed at: row, column and value, in newtons with two
-    digits where the profile says newtons."""
+    """Row, column and value, in newtons where the profile says newtons."""
     shape = {"rows": 16, "cols": 32, "rate_hz": 100.0, "window": 200, "dtype": "float32"}
     known = {"contact": 0.05, "place": None, "unloaded": 0.0, "fingertip": ""}
     for unit, said in (("N", "row 3, column 7: 1.25 N"), ("", "row 3, column 7: 1 raw counts")):

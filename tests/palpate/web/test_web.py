@@ -62,8 +62,7 @@ def heard(
 
 
 def test_what_the_box_does_comes_to_the_page(watcher: PageWatcher, path: Path):
-    """The page gets verdicts with probabilities, views of the frames, and the sweep's picture under
-    its number."""
+    """Verdicts, views of the frames, and the sweep's picture under its number."""
     offered = Offered(path)
     reader = EventReader(watcher.server)
     assert heard(watcher, offered, "hello", reader)["labels"] == ["plastic rough", "wood"]
@@ -79,8 +78,7 @@ def test_what_the_box_does_comes_to_the_page(watcher: PageWatcher, path: Path):
 
 
 def test_frames_are_asked_for_while_somebody_watches(watcher: PageWatcher, path: Path):
-    """Frames come with the first browser and end with the last browser: without one, the page costs
-    the box nothing."""
+    """From the first browser to the last: without one the page costs nothing."""
     offered = Offered(path)
     until(lambda: (offered.turns(3), watcher.step(), watcher.feed.connected)[-1])
 
@@ -119,8 +117,7 @@ def test_a_box_that_ends_and_comes_back_with_another_bundle(watcher: PageWatcher
 def test_a_box_that_is_not_there_is_shown_as_away(
     watcher: PageWatcher, path: Path, logged: list[str]
 ):
-    """The page gets it repeatedly, so that browsers know that the program runs; the log has it
-    once."""
+    """The page gets it again and again; the log has it once."""
     reader = EventReader(watcher.server)
     for _ in range(2):
         said = heard(watcher, None, "box", reader)
@@ -171,8 +168,7 @@ def test_a_socket_that_is_no_feed_is_shown_as_a_box_that_is_away(
 
 @pytest.mark.slow
 def test_the_command_serves_its_page_until_it_is_ended(tmp_path: Path):
-    """The real command: its address on standard error, the page, a box that is away, exit 0 at
-    SIGTERM."""
+    """The real command: address, page, a box that is away, exit 0 at SIGTERM."""
     command = [sys.executable, *["-m", "palpate", "watch", "--web", "0", "--set"]]
     command += [f"store.runtime={tmp_path}/none"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as run:
