@@ -28,7 +28,7 @@ def _percent(share: float) -> str:
 
 def _way(found: dict[str, Json]) -> Iterator[str]:
     yield (
-        "| skin | as recorded | chosen by `fit` | named rightly, at other positions "
+        "| skin | as recorded | chosen by `fit` | classified correctly, at other positions "
         "| 95 % interval | frames lost | bundle |"
     )
     yield "|---|---|---|---|---|---|---|"

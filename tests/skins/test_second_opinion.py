@@ -13,7 +13,7 @@ import sys
 import numpy as np
 import pytest
 
-from tests.factories.played_skins import Numbered, played
+from tests.factories.skins.played import Numbered, played
 
 FRAMES = 20
 READERS = {

@@ -241,11 +241,12 @@ def test_every_count_can_be_read_on_its_taxel(browser: Any, page: PageServer, sc
 
 @pytest.mark.parametrize(
     ("side", "at"),
-    zip(
-        ["first-row", "last-row", "first-column", "last-column"],
-        ["top", "bottom", "left", "right"],
-        strict=True,
-    ),
+    [
+        ("first-row", "top"),
+        ("last-row", "bottom"),
+        ("first-column", "left"),
+        ("last-column", "right"),
+    ],
 )
 def test_the_picture_shows_which_end_is_the_fingertip(
     browser: Any, page: PageServer, side: str, at: str
