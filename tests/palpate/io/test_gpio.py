@@ -432,7 +432,7 @@ def test_any_edges(lines: tuple[list[int], list[int], list[int]], step_us: int) 
 def test_any_losses(
     gaps_us: list[int], step_us: int, storm_edges: int, queue: int, high: bool
 ) -> None:
-    """START and STOP alternate but for LOST, times never go back, no short pulse is an edge."""
+    """Without LOST between them START and STOP alternate, in time, and skip short pulses."""
     setup = TriggerSetup(
         high="START" if high else "", mode="one-line", stop="", storm_edges=storm_edges, queue=queue
     )

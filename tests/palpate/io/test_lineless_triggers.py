@@ -240,7 +240,7 @@ def test_the_clock_starts_and_stops():
 
 
 def test_it_says_when_the_next_edge_is_due():
-    """For the countdown of a page; not while it is held, but for a sweep that has begun."""
+    """For the countdown of a page; while it is held, only for a sweep that has begun."""
     trigger, _ = timed()
     due = []
     for t, held in ((0, False), (1, True), (2, False), (4, False), (5, True), (7, True), (8, True)):

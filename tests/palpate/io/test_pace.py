@@ -104,7 +104,7 @@ def test_a_clock_that_cannot_be_right(change: Alter, packets: int, packet_frames
 
 @pytest.mark.parametrize("ahead", [1_000, 10_000, 1 << 30])
 def test_a_count_that_jumps(ahead: int):
-    """A count ahead of the clock is no loss: mismatch, and the readout board is restarted."""
+    """A count ahead of the clock is a mismatch, not a loss, and the board is restarted."""
     simulated = idle_devices()
     sensor = sensor_on(simulated)
     read_for(sensor, simulated, 1)

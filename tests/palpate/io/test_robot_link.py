@@ -45,7 +45,7 @@ def verdict(label: str = "plastic rough", status: Status = Status.OK, detail: st
 
 
 def test_result_is_the_documents_example():
-    """The RES sentence in PROTOCOL.md is the one that the code writes."""
+    """The code writes the RES sentence of PROTOCOL.md."""
     line = result(verdict(), "usb").decode().strip()
     assert f"`{line[:-2]}hh`" in PROTOCOL
 

@@ -198,7 +198,7 @@ def test_a_word_that_is_no_whole_number(word: bytes):
 
 
 def test_papillarray_byte_by_byte():
-    """Forces, count and clock of nine pillars; a wrong sum or more zeros is no frame."""
+    """Forces, count and clock of nine pillars; a wrong sum or more zeros give none."""
     p = profile("papillarray")
     data = wire("papillarray", 5)
     found = decoded(p, data)

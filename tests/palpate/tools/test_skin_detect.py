@@ -87,7 +87,7 @@ def test_a_board_of_the_protocol_has_to_be_asked():
     "sent", [b"hello world\n", bytes(range(256)), b"\xaa\x55", b"\x0d\x0a" * 40]
 )
 def test_something_else_is_no_skin(sent: bytes):
-    """Bytes without frames: no profile, and what describes a skin."""
+    """Bytes without frames: no profile, and the file that describes a skin."""
     clock = VirtualClock()
     found = found_on(WirePort(clock, lambda i: sent, 1e7), clock)
     assert found.profile == ""

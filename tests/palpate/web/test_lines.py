@@ -126,7 +126,7 @@ def test_what_cannot_be_read_closes_the_connection(offered: Offered):
 
 
 def test_json_passes_the_lines_on(offered: Offered):
-    """The lines that any reader gets; why there is no box goes to standard error."""
+    """The lines that any reader gets; a missing box is explained on standard error."""
     peer = offered.peer()
     out, said, turns = io.StringIO(), [], [0]
 

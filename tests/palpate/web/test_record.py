@@ -324,7 +324,7 @@ def test_many_requests_wait_in_bounds_and_the_loop_takes_one_a_turn(recorded: Re
 def test_a_loop_that_is_late(
     recorded: RecordedPage, monkeypatch: pytest.MonkeyPatch, under_way: bool, why: bytes
 ):
-    """After DONE_S the page is told whether the order is under way, as on a slow disk, or was never
+    """After DONE_S the page learns whether the order is under way, as on a slow disk, or was never
     taken up; then it is not carried out later."""
     monkeypatch.setattr(server, "DONE_S", 0.05)
     answered, turns = threading.Event(), []

@@ -74,7 +74,7 @@ def test_events_are_numbered_and_the_newest_are_kept():
 
 
 def test_a_browser_gets_what_is_kept_and_then_what_comes(page: PageServer):
-    """The clock is first; a browser that comes back gets only what it missed."""
+    """The clock is first; a browser that comes back gets only the events it missed."""
     reader = EventReader(page)
     assert [reader.next() for _ in range(3)] == [
         ("now", now_ns()),
@@ -232,7 +232,7 @@ def test_half_a_request_ends_at_the_deadline(monkeypatch: pytest.MonkeyPatch, se
 
 @pytest.mark.parametrize("body", [False, True])
 def test_slow_requests_lock_nobody_out(page: PageServer, body: bool):
-    """Slow heads and bodies hold all places: whoever asks is served, readers stay."""
+    """Slow heads and bodies hold all places: a new request is served, readers stay."""
     reader = EventReader(page)
     assert reader.until("view") == {"number": 1}
     sent = b"POST /order HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9\r\n\r\n{" if body else b""
