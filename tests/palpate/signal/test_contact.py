@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from typing import Any
 
@@ -28,29 +27,20 @@ NAN, INF = float("nan"), float("inf")
 
 
 @pytest.mark.parametrize(
-    ("wrong", "message"),
+    ("name", "value"),
     [
-        ({"pitch_mm": 0.0}, "pitch_mm"),
-        ({"pitch_mm": NAN}, "pitch_mm"),
-        ({"pitch_mm": "4"}, "pitch_mm"),
-        ({"limit_mm": -1.0}, "limit_mm"),
-        ({"limit_mm": INF}, "limit_mm"),
-        ({"pitch_mm": 1e7}, "pitch_mm"),
-        ({"rows_mm": (6.0, -1e7)}, "rows_mm"),
-        ({"limit_mm": True}, "limit_mm"),
-        ({"rows_mm": ()}, "rows_mm"),
-        ({"rows_mm": (6.0, NAN)}, "rows_mm"),
-        ({"rows_mm": [6.0, 6.4]}, "rows_mm"),
-        ({"cols_mm": (6.0, None)}, "cols_mm"),
-        ({"cols_mm": (6.0,)}, "1 cols_mm"),
-        ({"rows_mm": (6.0,) * 1001, "cols_mm": (6.0,) * 1001}, "1000"),
+        *(("pitch_mm", value) for value in (0.0, NAN, "4", 1e7)),
+        *(("limit_mm", value) for value in (-1.0, INF, True)),
+        *(("rows_mm", value) for value in ((6.0, -1e7), (), (6.0, NAN), [6.0, 6.4])),
+        *(("cols_mm", value) for value in ((6.0, None), (6.0,))),
     ],
 )
-def test_a_place_that_makes_no_sense_is_refused(wrong: dict[str, Any], message: str):
-    """Values that are not numbers, not finite, too many or not in pairs: a BundleError that names
-    them."""
-    with pytest.raises(BundleError, match=re.escape(message)):
-        replace(MIDDLE, **wrong)
+def test_a_place_that_makes_no_sense_is_refused(name: str, value: Any):
+    """Values that are not numbers, not finite, too many or not in pairs."""
+    with pytest.raises(BundleError, match=name):
+        replace(MIDDLE, **{name: value})
+    with pytest.raises(BundleError, match="1000"):
+        replace(MIDDLE, rows_mm=(6.0,) * 1001, cols_mm=(6.0,) * 1001)
 
 
 def test_a_place_goes_through_the_manifest(default_bundle: Bundle):
@@ -94,10 +84,15 @@ def test_without_contact_there_is_no_centre():
     assert centre(counts(one), TARE, 5.0) == pytest.approx((1.5, 1.5))
 
 
-def test_a_threshold_below_zero_takes_no_pulled_taxel_along():
-    """A tared skin's threshold may be negative; a taxel with negative load has no weight."""
+def test_pulled_and_silent_taxels_have_no_weight():
+    """A tared skin's threshold may be negative; a taxel with negative load has no weight. A silent
+    taxel at the rim of the contact, or at its corner, is not filled in."""
     load = np.array([[-3.0, 0, 0, 0], [0, 50, 50, 0], [0, 50, 50, 0], [0, 0, 0, -3]])
     assert centre(counts(load), TARE, -10.0) == (1.5, 1.5)
+    load = np.zeros((4, 4))
+    load[1:3, 0:3] = 50
+    load[1, 2] = 0
+    assert (fill_dead_taxels(load) == load).all()
 
 
 @pytest.mark.parametrize("dead", [(1, 1), (2, 2), (1, 0), (0, 2)])
@@ -113,14 +108,6 @@ def test_a_dead_taxel_does_not_push_the_centre_away(dead: tuple[int, int]):
     assert np.hypot(*(silent - whole)) > 2 * np.hypot(*(there - whole))
 
 
-def test_the_rim_of_a_contact_is_not_filled_in():
-    """A silent taxel beside the contact, or at its corner, stays silent."""
-    load = np.zeros((4, 4))
-    load[1:3, 0:3] = 50
-    load[1, 2] = 0
-    assert (fill_dead_taxels(load) == load).all()
-
-
 @pytest.mark.parametrize(
     ("along", "axis", "towards"),
     [("dx_mm", 0, ("row 4", "row 1")), ("dy_mm", 1, ("column 4", "column 1"))],
@@ -128,14 +115,10 @@ def test_the_rim_of_a_contact_is_not_filled_in():
 def test_the_advice_follows_the_simulated_skin(along: str, axis: int, towards: tuple[str, str]):
     """The further forward the skin is, the further back is the centre, if the end of the pad is
     near; the advice names the right end."""
-    found = []
+    found, rng = [], np.random.default_rng(0)
     for mm in (-4.0, -3.0, 0.0, 3.0, 4.0):
-        window = skin.window(
-            "wood",
-            skin.Placement(**{along: mm}, seed=3),
-            np.random.default_rng(0),
-            skin.LEVEL_BLIND,
-        )[:200]
+        place = skin.Placement(**{along: mm}, seed=3)
+        window = skin.window("wood", place, rng, skin.LEVEL_BLIND)[:200]
         found.append(centre(window, TARE, 5.4)[axis])
         text = displacement(window.mean(axis=0), TARE, 5.4, MIDDLE).text
         assert text == "" if mm == 0 else text.endswith(f"mm too far towards {towards[mm > 0]}")
@@ -168,21 +151,7 @@ def test_the_nearest_position_counts():
 def test_a_sentence_keeps_what_matters_most_of_the_advice():
     """If a RES sentence is cut at 128 characters, the larger direction is still in it."""
     detail = f"moved {advice((-12.5, 11.5), (4, 4))}"
-    scores = np.array([0.98, 0.02])
-    v = Verdict(
-        12345,
-        10**14,
-        Status.OK,
-        "plastic rough",
-        0.98,
-        0.96,
-        scores,
-        1,
-        0,
-        400_000,
-        "9f3c2a1b",
-        detail,
-    )
-    line = result(v, "usb")
+    own = (12345, 10**14, Status.OK, "plastic rough", 0.98, 0.96, np.array([0.98, 0.02]), 1, 0)
+    line = result(Verdict(*own, 400_000, "9f3c2a1b", detail), "usb")
     assert len(line) <= MAX_LINE
     assert b"moved 12.5 mm too far towards row 1" in line

@@ -65,7 +65,7 @@ def test_filled_counts_stay_in_the_range_of_their_type():
     [
         ({"modes": ()}, "has 0 modes"),
         ({"modes": LOADS.modes * 5}, "has 10 modes"),
-        ({"modes": ((1.0, 2.0),)}, "as many values as the mean"),
+        ({"modes": ((1.0, 2.0),)}, "as many values"),
         ({"rest": 0.0}, "`rest` above 0"),
         ({"rest": float("nan")}, "`rest` above 0"),
         ({"mean": (float("inf"),) * 6}, "finite"),
@@ -88,5 +88,5 @@ def test_a_manifest_holds_them_or_none(tmp_path: Path):
     loads = LoadModes((1.0,) * n, ((2.0,) * n,), 0.5)
     told = replace(manifest, bridging=replace(rule, loads=loads))
     assert Manifest.parse(told.json()) == told
-    with pytest.raises(BundleError, match=f"6 loads in `bridging` for {n} values"):
+    with pytest.raises(BundleError, match=f"6 loads .* for {n}"):
         Manifest.parse(replace(manifest, bridging=replace(rule, loads=LOADS)).json())
