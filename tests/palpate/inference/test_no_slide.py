@@ -89,7 +89,7 @@ def test_no_early_answer_to_a_finger_that_rests(toy: Bundle):
 
 def test_more_limits_than_labels_are_refused(toy: Bundle):
     """Four limits for three labels."""
-    with pytest.raises(BundleError, match="4 limits in `sliding` for 3 labels"):
+    with pytest.raises(BundleError, match=r"4 limits .* 3 labels"):
         replace(toy.manifest, sliding=SlideLimits((LEAST,) * 4))
 
 
@@ -152,5 +152,5 @@ def test_a_whole_window_without_a_pattern_is_no_slide(packaged: Bundle):
 @pytest.mark.parametrize("pattern", [0.0, -1.0, math.inf, math.nan])
 def test_a_limit_of_patterns_out_of_range_is_refused(pattern: float):
     """It is a number above 0."""
-    with pytest.raises(BundleError, match=r"sliding.pattern .* finite number above 0"):
+    with pytest.raises(BundleError, match=r"sliding\.pattern"):
         SlideLimits((), pattern)
