@@ -284,7 +284,7 @@ def _classes(data: bytes, manifest: Manifest) -> Classes:
         )
     if manifest.early and sweeps.any():
         raise BundleError(
-            "manifest has `early`, whose heads do not know the enrolled labels; enrol again from "
+            "manifest has `early`, whose heads do not know the enrolled labels; teach again from "
             "the original"
         )
     return Classes(

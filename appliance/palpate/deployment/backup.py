@@ -111,8 +111,9 @@ def unpack(source: IO[bytes], root: Path = Path("/")) -> dict[str, Path]:
             if not old.is_dir():
                 raise ApplianceError(f"there is no {old}; install Palpate on this box first")
             if part == "settings":
-                shutil.copytree(old, folder, symlinks=True, copy_function=_copied)
-                _own_all(old, folder)
+                shutil.copytree(old, folder, symlinks=True)
+                for path in (old, *old.rglob("*")):
+                    _own_like(path, folder / path.relative_to(old))
             else:
                 folder.mkdir()
                 _own_like(old, folder)
@@ -208,18 +209,9 @@ def _own(path: Path, member: tarfile.TarInfo) -> None:
     os.chown(path, user, group, follow_symlinks=False)
 
 
-def _own_all(old: Path, new: Path) -> None:
-    for path in (old, *old.rglob("*")):
-        _own_like(path, new / path.relative_to(old))
-
-
 def _own_like(old: Path, new: Path) -> None:
     held = old.lstat()
     if not os.geteuid():
         os.chown(new, held.st_uid, held.st_gid, follow_symlinks=False)
     if not new.is_symlink():
         new.chmod(held.st_mode & 0o777)
-
-
-def _copied(source: str, target: str) -> str:
-    return str(shutil.copy2(source, target, follow_symlinks=False))

@@ -40,7 +40,7 @@ class EnrolmentKey:
                 ) from e
             raise ConfigError(
                 f"{self.folder / KEY} is not the key of {self.folder / SIGNER}; remove both and "
-                "run make install again: then enrol all labels again"
+                "run make install again: then teach all labels again"
             ) from e
 
     def sign(self, data: bytes, namespace: str = NAMESPACE) -> bytes:
@@ -67,7 +67,7 @@ class EnrolmentKey:
             if "does not sign" not in str(e):
                 raise  # ssh-keygen itself is missing or hangs
             raise ConfigError(
-                f"{path} is damaged; remove it and {SIGNER}, run make install again, and enrol "
+                f"{path} is damaged; remove it and {SIGNER}, run make install again, and teach "
                 "again"
             ) from e
 
@@ -94,5 +94,5 @@ class EnrolmentKey:
             raise ConfigError(
                 "whether this box enrolled the labels cannot be checked: "
                 f"{str(e).partition(';')[0]}; run make install, which makes {SIGNER} again from "
-                f"{KEY} if that exists; else enrol again"
+                f"{KEY} if that exists; else teach again"
             ) from e

@@ -75,7 +75,6 @@ class Agreement:
     total_ms: float = 0.0
     worst_ms: float = 0.0
     pairs: dict[str, dict[str, int]] = field(default_factory=dict)
-    schema: int = 1
 
     @property
     def text(self) -> str:
@@ -136,10 +135,7 @@ def read(folder: Path) -> Agreement | None:
     """The agreement in a shadow's folder, None if the file does not exist. Raises FormatError if it
     cannot be read."""
     try:
-        found = typed(Agreement, json.loads((folder / FILE).read_bytes()))
-        if found.schema != 1:
-            raise TypeError(f"schema {found.schema} is unknown to this version")
-        return found
+        return typed(Agreement, json.loads((folder / FILE).read_bytes()))
     except FileNotFoundError:
         return None
     except (OSError, ValueError, TypeError, RecursionError) as e:

@@ -41,11 +41,6 @@ class SignedBundle:
         delivered."""
         return bundle.TAUGHT_SIGNATURE in self.files and bundle.SIGNATURE not in self.files
 
-    @property
-    def base(self) -> str:
-        """The sha256 of the manifest, which is the name of the bundle without enrolled labels."""
-        return self.bundle.base
-
 
 class BundleFolder:
     """Complete, verified bundles in `folder`, each under its name.
@@ -106,7 +101,7 @@ class BundleFolder:
         elif files[bundle.MANIFEST] != (bundle.DEFAULT / bundle.MANIFEST).read_bytes():
             raise BundleError(
                 f"{folder}: the bundle that {bundle.ENROLMENT} adds labels to is not signed, and "
-                "is not the packaged bundle of this version; enrol again"
+                "is not the packaged bundle of this version; teach again"
             )
         else:
             signer = PACKAGER

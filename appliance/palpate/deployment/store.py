@@ -352,8 +352,8 @@ class Store:
         if signed.taught:
             return
         with suppress(BundleError, ConfigError):  # a damaged current bundle may be replaced
-            running = self.running()
-            if signed.base == running.base and (signed.bundle.added or running.bundle.added):
+            new, running = signed.bundle, self.running().bundle
+            if new.base == running.base and (new.added or running.added):
                 return
         state.admit(signed.sha, signed.bundle.manifest.counter)
 

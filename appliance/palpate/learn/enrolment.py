@@ -148,14 +148,9 @@ def _added(
 ) -> tuple[Bundle, bytes]:
     """`old` with the last label of `classes`, and the enrolment.npz that adds all enrolled labels
     to the signed bundle."""
-    before, mean, sweeps, spread = (
-        old.added,
-        classes.means[-1:],
-        classes.sweeps[-1:],
-        classes.spread[-1:],
-    )
+    mean, sweeps, spread = classes.means[-1:], classes.sweeps[-1:], classes.spread[-1:]
     added = AddedLabels(old.base, (label,), mean, sweeps, spread, golden[None], logits, LEAST)
-    if before:
+    if before := old.added:
         added = AddedLabels(
             old.base,
             (*before.labels, label),
@@ -187,16 +182,14 @@ def _median(scores: NDArray[np.float64]) -> int:
 def files(old: Mapping[str, bytes], new: Enrolment, signature: bytes | None) -> dict[str, bytes]:
     """The files of the enrolled bundle: the unchanged files of the original bundle, the enrolment,
     and the enrolment's signature if there is one."""
-    kept = {
-        name: data
-        for name, data in old.items()
-        if name not in (bundle.ENROLMENT, bundle.ENROLMENT_SIGNATURE)
-    }
-    return (
-        kept
-        | {bundle.ENROLMENT: new.file}
-        | ({bundle.ENROLMENT_SIGNATURE: signature} if signature else {})
-    )
+    added = {bundle.ENROLMENT: new.file}
+    return original(old) | added | ({bundle.ENROLMENT_SIGNATURE: signature} if signature else {})
+
+
+def original(files: Mapping[str, bytes]) -> dict[str, bytes]:
+    """The files of a bundle without its enrolment."""
+    added = bundle.ENROLMENT, bundle.ENROLMENT_SIGNATURE
+    return {name: data for name, data in files.items() if name not in added}
 
 
 def _disagreement(means: ClassDistances, label: str, z: NDArray[np.float64]) -> str:

@@ -136,11 +136,8 @@ def assessed(settings: Config, store: Store, clock: Clock) -> News:
 
 def described(found: News) -> str:
     """An assessment for a person."""
-    return "\n".join([found["text"], *_suspected(found), f"next: {found['advice']}"])
-
-
-def _suspected(found: News) -> list[str]:
-    return [one["text"] for one in (*found["no_slides"], *found["suspects"])]
+    suspected = [one["text"] for one in (*found["no_slides"], *found["suspects"])]
+    return "\n".join([found["text"], *suspected, f"next: {found['advice']}"])
 
 
 def version(store: Store) -> str:

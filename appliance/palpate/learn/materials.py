@@ -105,12 +105,7 @@ def _without(running: SignedBundle, labels: set[str]) -> Bundle:
     added = old.added
     if added is None or not labels & {*added.labels}:
         return old
-    signed = {
-        name: data
-        for name, data in running.files.items()
-        if name not in (bundle.ENROLMENT, bundle.ENROLMENT_SIGNATURE)
-    }
-    new = bundle.from_files(signed, old.manifest.name)
+    new = bundle.from_files(enrolment.original(running.files), old.manifest.name)
     kept = [k for k, label in enumerate(added.labels) if label not in labels]
     for k in kept:
         mean, n, spread = added.means[k], int(added.sweeps[k]), float(added.spread[k])

@@ -128,8 +128,8 @@ class TeachingProgram:
 
     def by_robot(self, commands: Mapping[str, CommandHandler]) -> dict[str, CommandHandler]:
         """The commands that the serial line carries, if the settings allow them to a robot."""
-        own = {name: act for name, act in commands.items() if name != "DISCARD"}
-        return own if self.settings.teach.serial else dict.fromkeys(own, _forbidden)
+        allowed = self.settings.teach.serial
+        return {name: act if allowed else _forbidden for name, act in commands.items()}
 
 
 class Phase:

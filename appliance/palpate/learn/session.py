@@ -83,7 +83,6 @@ class TeachingSession(Observer):
             "TEACH": self._teach,
             "USE": self._use,
             "FORGET": self._forget,
-            "DISCARD": self._discard,
         }
 
     def about(self) -> dict[str, Any]:
@@ -249,10 +248,6 @@ class TeachingSession(Observer):
         self._trouble = self._too_many()
         self._due_ns = self._clock.now_ns()
         return [label, number]
-
-    def _discard(self, which: str) -> list[object]:
-        """As DISCARD of a recording."""
-        return self._recording.commands["DISCARD"](which)
 
 
 class Teacher(Observer):

@@ -96,7 +96,7 @@ class RecordingSession(Observer):
         # (valid from, labels): a command during a sweep does not apply to that sweep
         self._labels = deque([(0, labels)], MOST_CHANGES)
         self._answered = False
-        self._stored: list[tuple[int, Labels, Status]] = []
+        self._stored: list[int] = []
         self._last: dict[str, Any] | None = None
         self._log = TroubleLog("record")
         self.commands: Mapping[str, Callable[[str], list[object]]] = {
@@ -158,7 +158,7 @@ class RecordingSession(Observer):
             "target": self._progress.target,
             "missing": self._progress.missing(),
             "last": self._last,
-            "discard": self._stored[-1][0] - self._folder.run if self._stored else None,
+            "discard": self._stored[-1] - self._folder.run if self._stored else None,
         }
 
     def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
@@ -260,7 +260,7 @@ class RecordingSession(Observer):
 
     def _count_stored(self, number: int, labels: Labels, status: Status) -> str:
         """Count a stored sweep; its file's name with remarks, for a person."""
-        self._stored.append((number, labels, status))
+        self._stored.append(number)
         gone = "forgotten" * self._folder.is_forgotten(number, labels.material)
         self._count(number, labels, str(status) if status.faulty else gone)
         fault = f" {status}" if status.faulty else ""
@@ -290,7 +290,7 @@ class RecordingSession(Observer):
             raise ApplianceError("a sweep is still being written; wait for its REC sentence")
         if not self._stored:
             raise ApplianceError("no sweep of this run is left to discard")
-        number = self._stored[-1][0]
+        number = self._stored[-1]
         if which and which != str(number - self._folder.run):
             raise ApplianceError(
                 f"the last stored sweep is {number - self._folder.run}, not {which}; "

@@ -34,8 +34,6 @@ _KEPT = re.compile(
     rf"sweep-([0-9]+)(\.npy|\.json|{re.escape(DISCARDED)})({re.escape(storage.PART)})?"
 )
 Forgotten = Mapping[str, Sequence[int]]
-
-
 REFUSED = tuple(status for status in Status if status.faulty)
 """The box's answers to windows that it does not classify."""
 
@@ -59,11 +57,6 @@ class RecordedSweep:
         held = forgotten_in(path.parent) if forgotten is None else forgotten
         gone = number_of(path) in held.get(sweep.material, ())
         return cls(path, sweep, format, sidecar(path), gone)
-
-    @property
-    def number(self) -> int:
-        """The number in its file's name; -1 for another name."""
-        return number_of(self.path)
 
     @property
     def exclusion(self) -> str:
@@ -160,7 +153,7 @@ def slides_alone(
         number[material] += 1
         if why:
             text = f"sweep {number[material]} of {material} is not learnt from: {why}"
-            no_slides.append(NoSlide(one.number, text))
+            no_slides.append(NoSlide(number_of(one.path), text))
         else:
             slides.append(one)
     return slides, tuple(no_slides)

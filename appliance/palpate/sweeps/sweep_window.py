@@ -66,27 +66,19 @@ class OpenSweep:
         )
 
 
-def ring_s(config: SweepConfig) -> float:
-    """Seconds of frames that must be held: the longest sweep and a margin."""
-    return config.max_duration_s + config.late_ms / 1000 + 1
-
-
 class SweepCutter:
     """Cuts windows. It holds the frames of the last `max_duration_s` and a margin, and the sweeps
-    that were not answered yet. ring: holds the frames; None: one is made."""
+    that were not answered yet."""
 
-    def __init__(
-        self, format: SweepFormat, config: SweepConfig, ring: FrameRing | None = None
-    ) -> None:
+    def __init__(self, format: SweepFormat, config: SweepConfig) -> None:
         self._format = format
         self._max_duration_ns = round(config.max_duration_s * 1e9)
         self._late_ns, self._lead_ns = config.late_ms * 1_000_000, config.lead_ms * 1_000_000
         self._least_ns = format.window * format.period_ns
-        self._ring = ring or FrameRing(format, ring_s(config))
+        self._ring = FrameRing(format, config.max_duration_s + config.late_ms / 1000 + 1)
         self._open: OpenSweep | None = None
-        self._closing: list[
-            tuple[OpenSweep, int]
-        ] = []  # (sweep, stop ns) whose window may still lack frames
+        # (sweep, stop ns) whose window may still lack frames
+        self._closing: list[tuple[OpenSweep, int]] = []
         self._done: list[Sweep] = []
         self._count = self._object = 0
 
@@ -221,24 +213,14 @@ class SweepCutter:
     def _answer(self, sweep: OpenSweep, stop_ns: int, status: Status, now_ns: int) -> None:
         """Finish a sweep with a status and without frames."""
         sweep.answered = True
-        self._done.append(self._empty(sweep, stop_ns, status, now_ns))
-
-    def _empty(self, sweep: OpenSweep, stop_ns: int, status: Status, now_ns: int) -> Sweep:
-        return sweep.sweep(stop_ns, status, Frames.empty(self._format), (), now_ns)
+        self._done.append(sweep.sweep(stop_ns, status, Frames.empty(self._format), (), now_ns))
 
     def _cut(self, sweep: OpenSweep, stop_ns: int, now_ns: int) -> Sweep | None:
         """The sweep with its window, or None while its frames may still arrive."""
-        return cut(self._ring, self._format, sweep, stop_ns, now_ns, self._late_ns)
-
-
-def cut(
-    ring: FrameRing, format: SweepFormat, sweep: OpenSweep, stop_ns: int, now_ns: int, late_ns: int
-) -> Sweep | None:
-    """The sweep with its window from the ring, or None while its frames may still arrive. late_ns:
-    longest wait for them after the stop edge."""
-    first = ring.seq_at((sweep.start_ns + stop_ns) / 2) - format.window // 2
-    if ring.newest < first + format.window - 1 and now_ns <= stop_ns + late_ns:
-        return None
-    frames, missing = ring.window(first, format.window)
-    status = Status.OK if len(frames) else Status.GAP
-    return sweep.sweep(stop_ns, status, frames, missing, now_ns)
+        n = self._format.window
+        first = self._ring.seq_at((sweep.start_ns + stop_ns) / 2) - n // 2
+        if self._ring.newest < first + n - 1 and now_ns <= stop_ns + self._late_ns:
+            return None
+        frames, missing = self._ring.window(first, n)
+        status = Status.OK if len(frames) else Status.GAP
+        return sweep.sweep(stop_ns, status, frames, missing, now_ns)

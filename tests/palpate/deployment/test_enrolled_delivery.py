@@ -52,8 +52,8 @@ def test_a_second_label_and_the_packaged_bundle(box: Delivery):
     running = box.store.running()
     assert running.bundle.enrolled == {"cork": 1, "felt": 1}
     assert running.signer == "palpate, enrolled here"
-    assert running.base == bundle.digest((bundle.DEFAULT / bundle.MANIFEST).read_bytes())
-    assert len({first, second, running.base}) == 3
+    assert running.bundle.base == bundle.digest((bundle.DEFAULT / bundle.MANIFEST).read_bytes())
+    assert len({first, second, running.bundle.base}) == 3
     assert box.store.rollback() == PACKAGED
 
 
@@ -120,7 +120,7 @@ def test_no_part_can_be_exchanged(box: Delivery, tmp_path: Path):
     check_refused(
         box,
         by_nobody,
-        "is not signed, and is not the packaged bundle of this version; enrol again",
+        "is not signed, and is not the packaged bundle of this version; teach again",
     )
     unknown = deliveries.files(9, deliveries.key(tmp_path, "unknown"))
     check_refused(
@@ -173,7 +173,7 @@ def test_a_program_with_another_packaged_bundle_does_not_take_the_label(
     monkeypatch.setattr(bundle, "DEFAULT", newer)
     with pytest.raises(
         BundleError,
-        match=r"not the packaged bundle of this version; enrol again.*rollback",
+        match=r"not the packaged bundle of this version; teach again.*rollback",
     ):
         box.store.choose()
     assert box.store.rollback() == PACKAGED

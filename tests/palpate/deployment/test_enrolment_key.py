@@ -116,7 +116,7 @@ def unsigned(key: EnrolmentKey) -> None:
         (open_to_all, r"may be read by others \(mode 444\)"),
         (cut, "key is damaged; remove it and signer, run make install again"),
         (empty, "key is damaged"),
-        (of_another, "is not the key of .*enrol all labels again"),
+        (of_another, "is not the key of .*teach all labels again"),
         (
             unsigned,
             "cannot be checked: .*signer cannot be read.*make install, which makes signer again "

@@ -61,7 +61,7 @@ class Taught:
 
     def order(self, name: str, text: str = "") -> list[object]:
         """Carry out a command."""
-        return self.session.commands[name](text)
+        return {**self.session.recording_commands, **self.session.commands}[name](text)
 
     def sweeps(self, material: str, count: int, status: Status = Status.RECORDED) -> None:
         """Record sweeps of a material."""

@@ -46,7 +46,8 @@ def recording(folder: Path, disk: SlowDisk | None = None) -> RecordingSession:
 def learnt(folder: Path) -> tuple[list[int], dict[str, int]]:
     """The numbers of the sweeps that are learnt from, and the reasons of the others."""
     left_out = Counter[str]()
-    return [one.number for one in sweep_folder.taught(folder, left_out)], dict(left_out)
+    found = sweep_folder.taught(folder, left_out)
+    return [sweep_folder.number_of(one.path) for one in found], dict(left_out)
 
 
 def test_each_state_of_a_sweep(tmp_path: Path):

@@ -84,6 +84,6 @@ def _check_useful(validation: dict[str, Any], counts: NDArray[Any], names: Seque
     if validation["accuracy"] <= chance:
         raise FormatError(
             f"{', '.join(names[:3])} cannot be told apart: {100 * validation['accuracy']:.0f} % of "
-            f"left-out sweeps are named rightly, by chance {100 * chance:.0f} %; slide differently "
-            "(faster, harder, longer), or teach them as one material"
+            f"left-out sweeps are classified correctly, by chance {100 * chance:.0f} %; slide "
+            "differently (faster, harder, longer), or teach them as one material"
         )
