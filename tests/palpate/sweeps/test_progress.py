@@ -5,13 +5,17 @@ from __future__ import annotations
 from palpate.sweeps.progress import RecordingProgress
 
 
+def counted(target: int, *pairs: tuple[str, str]) -> RecordingProgress:
+    """The progress after sweeps of these materials at these positions."""
+    progress = RecordingProgress(target)
+    for pair in pairs:
+        progress.add(*pair)
+    return progress
+
+
 def test_each_material_is_wanted_at_every_position():
     """All materials are wanted at each position of any material. A long list is cut."""
-    progress = RecordingProgress(2)
-    for material in "abcd":
-        progress.add(material, "1")
-    progress.add("a", "1")
-    progress.add("a", "2")
+    progress = counted(2, *((material, "1") for material in "abcda"), ("a", "2"))
     assert progress.line("a", "1") == (
         "a at 1: 2 of 2; missing: a at 2: 1, b at 1: 1, b at 2: 2, c at 1: 1, c at 2: 2, d at 1: "
         "1 and 1 more"
@@ -19,21 +23,14 @@ def test_each_material_is_wanted_at_every_position():
 
 
 def test_nothing_is_missing_at_the_target():
-    """Two materials with enough sweeps each; more than enough is fine."""
-    progress = RecordingProgress(1)
-    assert "another material" in progress.missing()
-    progress.add("a", "")
+    """Two materials with enough sweeps each; more than enough is fine. After its last sweep was
+    removed, a pair is no longer listed. A sweep without a material never counts."""
+    assert "another material" in counted(1).missing()
+    progress = counted(1, ("a", ""))
     assert "another material" in progress.missing()
     progress.add("b", "", 3)
     assert progress.line("b", "") == "b: 3 of 1; nothing is missing of 2 materials at 1 position"
-
-
-def test_what_was_removed_is_missing_again():
-    """After its last sweep was removed, a pair is no longer listed. A sweep without a material
-    never counts."""
-    progress = RecordingProgress(1)
-    for material in ("a", "b", "c", ""):
-        progress.add(material, "1")
+    progress = counted(1, ("a", "1"), ("b", "1"), ("c", "1"), ("", "1"))
     progress.add("a", "1", -1)
     assert progress.missing() == "nothing is missing of 2 materials at 1 position"
     assert "no material" in progress.line("", "1")

@@ -46,11 +46,8 @@ def test_sweeps_of_a_material_that_comes_again_are_a_group(tmp_path: Path, box: 
     answer of another bundle."""
     folder = tmp_path / "black-box"
     said = kept(folder, box, FELT[0], CORK[0], (0, 0), FELT[1], (60, -60), CORK[1], FELT[2])
-    assert [one.rpartition("; ")[2] for one in said if "; as" in one] == [
-        "as sweep 1",
-        "as sweep 2",
-        "as sweep 1",
-    ]
+    alike = [one.rpartition("; ")[2] for one in said if "; as" in one]
+    assert alike == ["as sweep 1", "as sweep 2", "as sweep 1"]
     assert numbers(folder, box) == [[1, 4, 7], [2, 6]]
     again = Classifier(box.bundle, VirtualClock())
     kept(folder, again, *FELT)
@@ -83,7 +80,7 @@ def test_a_damaged_sidecar_is_named_and_left_out(
 
 def test_which_group_is_never_guessed(tmp_path: Path, box: Classifier):
     """Without a number there has to be one only; the message lists what there is."""
-    with pytest.raises(ApplianceError, match=r"store.black_box = 500"):
+    with pytest.raises(ApplianceError, match=r"store\.black_box"):
         unknown_sweeps.chosen([], 0, tmp_path)
     kept(tmp_path, box, *FELT[:2])
     found = unknown_sweeps.groups(tmp_path, box.bundle.id)
