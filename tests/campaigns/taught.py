@@ -1,9 +1,9 @@
 """Accuracy of taught bundles beside `palpate-train fit`, as the box answers.
 
 `python -m tests.campaigns taught` prints a line for each set, number of sweeps of a material, and
-seed: the share of other recordings that the taught bundle names rightly and calls unknown, and the
-same of the model of `palpate-train fit` at its default, or `the same model` if all weights are
-equal. Taxels that may be bridged are not measured. Fabrics need PALPATE_DATA.
+seed: the share of other recordings that the taught bundle classifies correctly and calls unknown,
+and the same of the model of `palpate-train fit` at its default, or `the same model` if all
+weights are equal. Taxels that may be bridged are not measured. Fabrics need PALPATE_DATA.
 
 With `--added N` each material in turn comes later, with N sweeps: into a bundle of the others that
 stays, as the box teaches it, and into a fit of all materials.
@@ -90,8 +90,8 @@ def added(sweeps: Dataset, each: int, few: int, seed: int) -> str:
 def _later(
     given: Dataset, others: Dataset, label: int, few: int, seed: int
 ) -> tuple[float, float, float, float, float]:
-    """Shares that the box names rightly: of the new material, taught into a bundle and trained with
-    all; of the other materials before it came, after it, and trained with all."""
+    """Shares that the box classifies correctly: of the new material, taught into a bundle and
+    trained with all; of the other materials before it came, after it, and trained with all."""
     name = given.materials[label]
     own, rest = np.flatnonzero(given.labels == label)[:few], given.labels != label
     kept = ",".join(m for m in given.materials if m != name)

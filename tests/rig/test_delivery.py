@@ -136,7 +136,7 @@ def roles(cell: Cell) -> dict[str, dict[str, Any]]:
 
 
 def answered_by(cell: Cell, sha: str) -> None:
-    """READY, and a sweep is named rightly, by this bundle."""
+    """READY, and a sweep is classified correctly, by this bundle."""
     cell.until_ready(BACK_S)
     for _ in range(TRIES):
         touch, answer = cell.sweep()
@@ -164,7 +164,7 @@ def test_the_way_of_a_bundle(tmp_path: Path, note: Note):
         answered_by(cell, bundle.load(bundle.DEFAULT).id)
         note(
             "make install on a bare Debian for arm64, over ssh",
-            "service started, READY; a sweep named rightly",
+            "service started, READY; a sweep classified correctly",
             1,
         )
         said = box.deploy()
@@ -172,7 +172,11 @@ def test_the_way_of_a_bundle(tmp_path: Path, note: Note):
         first = box.sha[0]
         answered_by(cell, first)
         assert roles(cell)[first]["role"] == "on trial"
-        note("make deploy of a signed bundle", "on trial, READY; a sweep named rightly by it", 1)
+        note(
+            "make deploy of a signed bundle",
+            "on trial, READY; a sweep classified correctly by it",
+            1,
+        )
     sound(box)
     with box.on() as cell:
         answered_by(cell, first)

@@ -46,7 +46,7 @@ def sweeps(box: SpeakingBox) -> list[str]:
 
 
 def test_python(box: SpeakingBox):
-    """python.md: `unsure` is swept again without NEW, `undecided` and `unknown` are sorted out,
+    """python.md: `unsure` is swept again without NEW, `undecided` and `unknown` are set aside,
     each fault is an error."""
     names: dict[str, Any] = {}
     exec(page_blocks("python.md", "python")[0], names)
@@ -63,7 +63,7 @@ def test_python(box: SpeakingBox):
 
 
 def test_python_prints_what_to_do(box: SpeakingBox, capsys: pytest.CaptureFixture[str]):
-    """`main` of python.md: a label, something to sort out, a box that is gone."""
+    """`main` of python.md: a label, something to set aside, a box that is gone."""
     names: dict[str, Any] = {}
     exec(page_blocks("python.md", "python")[0], names)
     box.script = answering("ok", "unknown")

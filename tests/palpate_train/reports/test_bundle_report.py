@@ -130,7 +130,7 @@ def test_the_headline_says_what_was_missed(figures: dict, sweeps: Dataset):
     }
     text = PageReader(bundle_report.page(missed, sweeps)).text
     for line in (
-        "named rightly 75.0 %, 15 of 20",
+        "classified correctly 75.0 %, 15 of 20",
         "named wrongly 15.0 %, 3 of 20",
         "refused) 10.0 %, 2 of 20",
         "least often: wood 25.0 % [10.0, 50.0]",

@@ -74,7 +74,7 @@ EVERYTHING = np.ones(96, bool)
 
 
 def missing(numbers: slice) -> np.ndarray:
-    """All sweeps named rightly but these."""
+    """All sweeps classified correctly but these."""
     right = EVERYTHING.copy()
     right[numbers] = False
     return right

@@ -54,7 +54,7 @@ def test_few_sweeps_are_not_enough_however_right_they_are():
 
 
 def test_a_mislabelled_sweep_is_pointed_out():
-    """Sweep 4 of cork is surely pine, while all others are named rightly."""
+    """Sweep 4 of cork is surely pine, while all others are classified correctly."""
     labels = [0] * 6 + [1] * 6 + [2] * 6
     named = list(labels)
     named[3] = 2

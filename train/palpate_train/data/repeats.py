@@ -1,6 +1,7 @@
 """Finds sweeps that a set holds twice: identical sweeps, and windows that share frames.
 
-A model that is tested on such a sweep has seen it in training, and even noise is named rightly.
+A model that is tested on such a sweep has seen it in training, and even noise is classified
+correctly.
 """
 
 from __future__ import annotations

@@ -35,7 +35,7 @@ MOST_SHOWN = 6
 MATERIALS = [
     "material",
     "sweeps",
-    "named rightly",
+    "classified correctly",
     "right where named",
     "unsure",
     "unknown",
@@ -135,7 +135,7 @@ def _in_short(figures: Json) -> Iterator[list[str]]:
     named, n = figures["named"], figures["named"]["n"]
     for what in ("right", "wrong", "not_named"):
         text = {
-            "right": "named rightly",
+            "right": "classified correctly",
             "wrong": "named wrongly",
             "not_named": "not named (unsure, unknown or refused)",
         }[what]
@@ -144,7 +144,7 @@ def _in_short(figures: Json) -> Iterator[list[str]]:
         (row for row in figures["materials"] if row["recall"]), key=lambda row: row["recall"][0]
     )
     yield [
-        f"the material that is named rightly least often: {worst['name']}",
+        f"the material that is classified correctly least often: {worst['name']}",
         formatting.estimate(worst["recall"]),
     ]
     if share := figures["foreign_named"]:
@@ -260,7 +260,7 @@ def calibration(found: Json) -> str:
     for axis in (axes.xaxis, axes.yaxis):
         set_ticks(axis, [0, 0.25, 0.5, 0.75, 1], percent=True)
     axes.set_xlabel("predicted probability", color=GREY, size=SMALL)
-    axes.set_ylabel("named rightly", color=GREY, size=SMALL)
+    axes.set_ylabel("classified correctly", color=GREY, size=SMALL)
     return to_svg(figure, "share right against the predicted probability")
 
 
@@ -284,5 +284,5 @@ def curve(points: Sequence[Json]) -> str:
     set_ticks(axes.yaxis, [0, 0.25, 0.5, 0.75, 1], percent=True)
     set_ticks(axes.xaxis, each)
     axes.set_xlabel("training sweeps of each material", color=GREY, size=SMALL)
-    axes.set_ylabel("named rightly", color=GREY, size=SMALL)
-    return to_svg(figure, "share named rightly over the number of training sweeps")
+    axes.set_ylabel("classified correctly", color=GREY, size=SMALL)
+    return to_svg(figure, "share classified correctly over the number of training sweeps")

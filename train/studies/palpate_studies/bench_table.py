@@ -61,8 +61,8 @@ def _answer_rows(figures: Json) -> Iterator[tuple[str, str]]:
     right, n = accuracy["right"], accuracy["total"]
     low, high = (100 * value for value in accuracy["interval"])
     yield (
-        f"simulated sweeps named rightly (not the skin's accuracy), n = {n}, with 95 % interval; "
-        "`unknown` counts as wrong",
+        f"simulated sweeps classified correctly (not the skin's accuracy), n = {n}, with 95 % "
+        "interval; `unknown` counts as wrong",
         f"{right} of {n}: {100 * right / n:.1f} % [{low:.1f}, {high:.1f}]",
     )
     yield "frames lost in these sweeps", str(figures["frames_lost"])

@@ -38,8 +38,8 @@ def rows(log: Callable[[str], None]) -> Iterator[Json]:
     """Fits of one session in closed form, with and without loads as a candidate, for sweeps after
     the skin was put back and for positions that were left out.
 
-    label: share of sweeps that the network names rightly; right, wrong: of sweeps that the box
-    does, in per cent. `with` is None where the fit did not choose loads.
+    label: share of sweeps that the network classifies correctly; right, wrong: of sweeps that the
+    box does, in per cent. `with` is None where the fit did not choose loads.
     """
     for world, named in WORLDS.items():
         trained = sets.load(f"sim:T-REAL{named}:{SEED}")

@@ -174,7 +174,7 @@ def test_fewer_filters_where_held_out_parts_show_no_loss():
 
 
 def test_too_few_sweeps_show_nothing():
-    """A hundred sweeps, all named rightly by fewer filters, may be luck, so all filters stay."""
+    """A hundred sweeps, all classified correctly by fewer filters, may be luck: all stay."""
     given, parts = known(99)
     at = HeldOutScores([given] * 3, parts, 3)
     sure = at.score([HeadPart(GOOD, False)])
