@@ -20,7 +20,8 @@ from palpate.core import storage
 from palpate.core.clock import SystemClock
 from palpate.core.disk_thread import AtOnce, DiskThread, DiskWork
 from palpate.core.errors import FormatError
-from palpate.core.types import Frames, Status, Sweep, SweepFormat, Verdict, load
+from palpate.core.sweep_file import load
+from palpate.core.types import Frames, Status, Sweep, SweepFormat, Verdict
 from palpate.sim import skin
 from palpate.sweeps.recording import Labels, RecordingSession
 from tests.cuts.scene import CutScene, Found, SceneStep

@@ -24,7 +24,7 @@ from palpate.cli.main import main
 from palpate.core import storage
 from palpate.core.clock import Clock
 from palpate.core.errors import FormatError
-from palpate.core.types import load
+from palpate.core.sweep_file import load
 from palpate.learn import install
 from palpate.sweeps.sweep_folder import FORGOTTEN, forgotten_in
 from tests.cuts import delivery

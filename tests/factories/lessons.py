@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from palpate.core.sweep_file import save
 from palpate.core.sweep_set import SweepSet
-from palpate.core.types import Frames, Status, Sweep, save
+from palpate.core.types import Frames, Status, Sweep
 
 
 def write(folder: Path, sweeps: SweepSet, *, first: int = 1, position: bool = False) -> None:

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from palpate.core.types import Frames, Status, Sweep, SweepFormat, save
+from palpate.core.sweep_file import save
+from palpate.core.types import Frames, Status, Sweep, SweepFormat
 
 FORMAT = SweepFormat(2, 3, 50.0, 8, "int16")
 

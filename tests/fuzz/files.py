@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from palpate.bundle import bundle
-from palpate.core import config, sentences, types
+from palpate.core import config, sentences, sweep_file
 from palpate.core.errors import BundleError, ConfigError, FormatError
 from palpate.io import robot_link
 from palpate.sweeps import capture
@@ -152,7 +152,7 @@ def recording(data: bytes, folder: Path) -> None:
     (folder / "sweep.json").write_bytes(about)
     (folder / "sweep.npy").write_bytes(magic + table)
     try:
-        got, format = types.load(folder / "sweep.npy")
+        got, format = sweep_file.load(folder / "sweep.npy")
     except FormatError as e:
         message = one_line(e)
         assert "sweep.npy" in message
@@ -167,8 +167,8 @@ def recording(data: bytes, folder: Path) -> None:
         assert type(text) is str
         assert text.isprintable(), f"{text!r} cannot be shown"
     assert isinstance(got.share, (int, float))
-    types.save(folder / "again.npy", got, format)
-    again, form = types.load(folder / "again.npy")
+    sweep_file.save(folder / "again.npy", got, format)
+    again, form = sweep_file.load(folder / "again.npy")
     assert form == format
     assert again.frames.taxels.tobytes() == got.frames.taxels.tobytes()
     assert dataclasses.replace(again, frames=got.frames) == got

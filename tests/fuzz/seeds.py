@@ -15,16 +15,8 @@ import numpy as np
 
 from palpate.bundle import bundle
 from palpate.core import config, schema, sentences
-from palpate.core.types import (
-    DATA_TYPES,
-    Edge,
-    EdgeKind,
-    Frames,
-    Status,
-    Sweep,
-    SweepFormat,
-    save,
-)
+from palpate.core.sweep_file import save
+from palpate.core.types import DATA_TYPES, Edge, EdgeKind, Frames, Status, Sweep, SweepFormat
 from palpate.io import packets, robot_link
 from palpate.io.skin_profile import SkinProfile
 from palpate.sim import script, skin

@@ -20,7 +20,8 @@ from pathlib import Path
 from typing import Any
 
 from palpate.core.sentences import checksum
-from palpate.core.types import Status, Sweep, load
+from palpate.core.sweep_file import load
+from palpate.core.types import Status, Sweep
 from tests.factories.emulated_machines import ROOT
 from tests.rig.machine import Guest
 

@@ -16,7 +16,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from palpate.core.types import EPOCH_BITS, Sweep, load
+from palpate.core.sweep_file import load
+from palpate.core.types import EPOCH_BITS, Sweep
 from palpate.sim import rig, script, skin
 from tests.rig.cell import Cell
 from tests.rig.kept import KEPT, runs_with

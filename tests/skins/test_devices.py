@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from palpate.core import config, types
+from palpate.core import config, sweep_file, types
 from palpate.core.types import Status
 from palpate.io import skins
 from palpate.sim import rig, script
@@ -36,7 +36,7 @@ def test_what_is_recorded_is_what_was_felt(name: str, tmp_path: Path) -> None:
     profile = skins.profile(settings(name))
     acts = islice(script.tubes(SEED, seen=sweeps.view(name, profile.format), only="wood"), SWEEPS)
     for path, act in zip(sorted(tmp_path.glob("*.npy")), acts, strict=True):
-        sweep, format = types.load(path)
+        sweep, format = sweep_file.load(path)
         assert format == profile.format
         assert (sweep.status, sweep.lost) == (Status.OK, 0)
         begin = (act.start + act.stop - format.window) / 2
@@ -92,5 +92,7 @@ def test_replayed_set_through_the_bytes_of_a_skin(tmp_path: Path) -> None:
     np.savez(tmp_path / "s.npz", samples=samples, **told)
     arguments = ["--sim", f"replay:{tmp_path / 's.npz'}", "--skin", "flexitac", "--virtual"]
     assert main(["record", *arguments, "--out", str(tmp_path / "kept")]) == 0
-    kept = [types.load(path)[0].frames.taxels for path in sorted((tmp_path / "kept").glob("*.npy"))]
+    kept = [
+        sweep_file.load(path)[0].frames.taxels for path in sorted((tmp_path / "kept").glob("*.npy"))
+    ]
     assert [window.tobytes() for window in kept] == [window.tobytes() for window in samples]

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from palpate.bundle.manifest import MEANS, MOST_BYTES
 from palpate.core.errors import BundleError
-from palpate.core.types import UNREADABLE, SweepFormat
+from palpate.core.sweep_file import UNREADABLE
+from palpate.core.types import SweepFormat
 
 
 def read(data: bytes, file: str, *names: str) -> dict[str, NDArray[Any]]:

@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 
 from palpate.core import storage, wall_clock
 from palpate.core.errors import FormatError
-from palpate.core.types import Status, Sweep, SweepFormat, Verdict, load, save, sidecar
+from palpate.core.sweep_file import load, save, sidecar
+from palpate.core.types import Status, Sweep, SweepFormat, Verdict
 
 FORGOTTEN = "forgotten"
 """File in the folder: the numbers of forgotten sweeps by material."""

@@ -10,7 +10,8 @@ from typing import Any
 
 from palpate.core.errors import ApplianceError, FormatError
 from palpate.core.log import log
-from palpate.core.types import Status, sidecar
+from palpate.core.sweep_file import sidecar
+from palpate.core.types import Status
 
 ALIKE = re.compile(r"; as sweep (\d{1,9})$")
 """End of the detail of an answer, which names an earlier sweep of the same run."""

@@ -15,7 +15,7 @@ import pytest
 
 from palpate.bridges import modbus_pdu
 from palpate.bundle import arrays, bundle, enrolled, manifest
-from palpate.core import config, schema, sentences, types
+from palpate.core import config, schema, sentences, sweep_file, types
 from palpate.core.errors import ApplianceError
 from palpate.io import packets, robot_link, skin_codecs, skin_profile, usb_sensor
 from palpate.io.skin_codecs import fixed, papillarray, robotiq, text, xela
@@ -163,7 +163,7 @@ def read_recording(data: bytes, folder: Path) -> Any:
     """A recording from sidecar and table."""
     about, magic, table = data.partition(files.NPY)
     written(folder, "s.json", about)
-    return types.load(written(folder, "s.npy", magic + table))
+    return sweep_file.load(written(folder, "s.npy", magic + table))
 
 
 def frames_of(name: str, data: bytes, folder: Path) -> int:
@@ -420,8 +420,8 @@ BREAKS: list[tuple[str, str, Any, str, Any]] = [
         "Frames",
         lambda t_ns, seq, taxels: FRAMES(t_ns[1:], seq, taxels),
     ),
-    ("recording", "types are not looked at", types, "typed", unguarded),
-    ("recording", "the file is not named", types, "load", numb(types.load)),
+    ("recording", "types are not looked at", sweep_file, "typed", unguarded),
+    ("recording", "the file is not named", sweep_file, "load", numb(sweep_file.load)),
     ("capture", "records are not looked at", capture, "_written", lambda kind, t_ns, body: True),
     ("capture", "the last record is never played", capture.Playback, "finished", False),
     (
@@ -493,7 +493,7 @@ def test_each_promise_can_be_seen_broken(
         ("feed", feed_reader, "_request"),
         ("settings", config, "_checked"),
         ("manifest", manifest, "typed"),
-        ("recording", types, "typed"),
+        ("recording", sweep_file, "typed"),
         ("capture", capture, "typed"),
         ("enrolment", arrays, "summed"),
         ("modbus", modbus_pdu, "parse"),

@@ -36,7 +36,8 @@ from palpate.core.errors import (
     LineError,
     SensorError,
 )
-from palpate.core.types import Frames, Status, Sweep, save
+from palpate.core.sweep_file import save
+from palpate.core.types import Frames, Status, Sweep
 from palpate.inference.classifier import Classifier
 from palpate.io import packets
 from palpate.sim import skin

@@ -11,7 +11,8 @@ import pytest
 from palpate.bundle import bundle
 from palpate.core.errors import FormatError
 from palpate.core.schema import typed
-from palpate.core.types import Frames, Status, Sweep, SweepFormat, load, save
+from palpate.core.sweep_file import load, save
+from palpate.core.types import Frames, Status, Sweep, SweepFormat
 from tests.factories import toy_bundle
 from tests.factories.paths import ONE_AXIS
 

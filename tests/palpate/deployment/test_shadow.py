@@ -17,7 +17,7 @@ import pytest
 from palpate.bundle import bundle
 from palpate.bundle.bundle import Bundle
 from palpate.bundle.manifest import Early
-from palpate.core import statistics, storage, types
+from palpate.core import statistics, storage, sweep_file, types
 from palpate.core.errors import ApplianceError, BundleError
 from palpate.core.health import Health
 from palpate.core.types import Status, Sweep
@@ -114,8 +114,8 @@ def test_a_sweep_on_which_they_differ_is_kept_with_both_verdicts(side):
     pair = side(renamed)
     pair.judge(A)
     (path,) = pair.kept()
-    again, format = types.load(path)
-    told = types.sidecar(path)
+    again, format = sweep_file.load(path)
+    told = sweep_file.sidecar(path)
     assert (told["verdict"]["label"], told["candidate"]["label"]) == ("a", "b")
     assert format == toy_bundle.FORMAT
     for name, run in (("verdict", pair.current), ("candidate", pair.shadow._classifier)):
@@ -427,7 +427,7 @@ def test_the_robot_notices_nothing(rigged, default_bundle: Bundle, tmp_path: Pat
     assert found
     assert (found.compared, found.agreed, set(found.pairs)) == (3, 0, named)
     kept = sorted((tmp_path / "shadow").glob("*.npy"))
-    assert [types.load(path)[1] for path in kept] == [skin.FORMAT] * 3
+    assert [sweep_file.load(path)[1] for path in kept] == [skin.FORMAT] * 3
     about = json.loads(kept[0].with_suffix(".json").read_text())
     assert about["candidate"]["bundle"] == "aaaaaaaa"
     assert about["bundle"] == default_bundle.id == bundle.load(bundle.DEFAULT).id

@@ -19,7 +19,8 @@ from palpate.cli.main import main
 from palpate.client.answers import Answer
 from palpate.core.config import SweepConfig
 from palpate.core.errors import BundleError
-from palpate.core.types import Frames, Status, Sweep, SweepFormat, Verdict, load, save
+from palpate.core.sweep_file import load, save
+from palpate.core.types import Frames, Status, Sweep, SweepFormat, Verdict
 from palpate.inference.classifier import Classifier
 from palpate.inference.early_exit import EarlyExit, decides
 from palpate.io.robot_link import StdoutPort

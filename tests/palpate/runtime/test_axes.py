@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from palpate.core import config
-from palpate.core.types import load
+from palpate.core.sweep_file import load
 from palpate.runtime.replay import replay
 from palpate.sim import devices, rig
 from palpate.sweeps.black_box import BlackBox

@@ -18,7 +18,8 @@ from palpate.bundle.bundle import Bundle
 from palpate.bundle.manifest import Early
 from palpate.core import config
 from palpate.core.errors import FormatError
-from palpate.core.types import Frames, Status, Sweep, Verdict, save, sidecar
+from palpate.core.sweep_file import save, sidecar
+from palpate.core.types import Frames, Status, Sweep, Verdict
 from palpate.inference.classifier import Classifier
 from palpate.inference.early_exit import EarlyExit
 from palpate.runtime.replay import replay

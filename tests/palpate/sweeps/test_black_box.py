@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.core.types import Frames, Status, Sweep, Verdict, sidecar
+from palpate.core.sweep_file import sidecar
+from palpate.core.types import Frames, Status, Sweep, Verdict
 from palpate.sim import devices, rig, script, skin
 from palpate.sweeps import sweep_folder
 from palpate.sweeps.black_box import BlackBox

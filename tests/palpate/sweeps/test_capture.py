@@ -15,17 +15,8 @@ import pytest
 from palpate.bundle.bundle import Bundle
 from palpate.core.config import SweepConfig
 from palpate.core.errors import ConfigError, FormatError
-from palpate.core.types import (
-    EPOCH_BITS,
-    Edge,
-    EdgeKind,
-    Frames,
-    Status,
-    Sweep,
-    Verdict,
-    load,
-    save,
-)
+from palpate.core.sweep_file import load, save
+from palpate.core.types import EPOCH_BITS, Edge, EdgeKind, Frames, Status, Sweep, Verdict
 from palpate.io import packets
 from palpate.io.robot_link import StdoutPort
 from palpate.runtime import assembly

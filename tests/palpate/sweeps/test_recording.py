@@ -17,8 +17,9 @@ import pynmea2
 import pytest
 
 from palpate.core.errors import ApplianceError, ConfigError, FormatError
+from palpate.core.sweep_file import load, sidecar
 from palpate.core.sweep_set import SweepSet
-from palpate.core.types import Frames, Status, Sweep, Verdict, load, sidecar
+from palpate.core.types import Frames, Status, Sweep, Verdict
 from palpate.service.feed import FeedServer
 from palpate.sim import devices, rig, script, skin
 from palpate.sweeps import recording, sweep_folder

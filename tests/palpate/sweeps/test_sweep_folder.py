@@ -12,7 +12,8 @@ import pytest
 
 from palpate.core.clock import SystemClock
 from palpate.core.errors import FormatError
-from palpate.core.types import Status, save
+from palpate.core.sweep_file import save
+from palpate.core.types import Status
 from palpate.sweeps import sweep_folder
 from palpate.sweeps.recording import Labels, RecordingSession
 from palpate.sweeps.sweep_folder import FORGOTTEN, SweepFolder

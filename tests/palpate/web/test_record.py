@@ -21,7 +21,8 @@ from palpate.cli.main import main
 from palpate.core.clock import SystemClock
 from palpate.core.config import TriggerConfig, WatchConfig
 from palpate.core.errors import ApplianceError, ConfigError, FormatError, NoAnswer
-from palpate.core.types import Status, sidecar
+from palpate.core.sweep_file import sidecar
+from palpate.core.types import Status
 from palpate.io.robot_link import Command
 from palpate.sim import skin
 from palpate.sweeps.recording import Labels, RecordingSession

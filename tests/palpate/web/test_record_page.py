@@ -15,7 +15,8 @@ from typing import Any
 import pytest
 
 from palpate.core.clock import SystemClock
-from palpate.core.types import Status, sidecar
+from palpate.core.sweep_file import sidecar
+from palpate.core.types import Status
 from palpate.sweeps.recording import Labels
 from palpate.web.access import Access
 from palpate.web.server import OrderHandler

@@ -20,7 +20,8 @@ import numpy as np
 import pytest
 
 from palpate.core.errors import ApplianceError, FormatError
-from palpate.core.types import Status, load
+from palpate.core.sweep_file import load
+from palpate.core.types import Status
 from palpate_train.cli.main import PROGRAM
 from palpate_train.data import pull
 from palpate_train.data.pull import PullReport, RecordingHost

@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 from palpate.core.errors import FormatError
-from palpate.core.types import Frames, Status, Sweep, SweepFormat, load, save
+from palpate.core.sweep_file import load, save
+from palpate.core.types import Frames, Status, Sweep, SweepFormat
 from palpate.sweeps.sweep_folder import REFUSED, RecordedSweep
 from palpate_train.data import readers, sets
 from tests.factories.recordings import FORMAT, record

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from palpate.core.errors import FormatError
-from palpate.core.types import Frames, Status, Sweep, SweepFormat, load, save
+from palpate.core.sweep_file import load, save
+from palpate.core.types import Frames, Status, Sweep, SweepFormat
 from palpate_train.data import sets
 from palpate_train.reports import sweep_plot
 from tests.factories.recordings import record

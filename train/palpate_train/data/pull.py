@@ -24,7 +24,7 @@ from typing import IO
 from palpate.core import storage
 from palpate.core.config import StoreConfig
 from palpate.core.errors import ApplianceError, FormatError
-from palpate.core.types import load
+from palpate.core.sweep_file import load
 from palpate_train.data.progress import Progress
 
 FOLDER = f"{StoreConfig().folder}/sweeps"

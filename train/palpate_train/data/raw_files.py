@@ -14,7 +14,7 @@ from pathlib import Path
 import h5py
 
 from palpate.core.errors import FormatError
-from palpate.core.types import UNREADABLE
+from palpate.core.sweep_file import UNREADABLE
 from palpate_train.data.files import (
     bags,
     hdf5,
