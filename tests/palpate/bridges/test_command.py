@@ -62,7 +62,7 @@ def test_ctrl_c_while_the_box_owes_an_answer(kind: str):
 def test_a_serial_line_that_is_not_there_gets_a_warning(caplog: pytest.LogCaptureFixture):
     """A port that does not exist is named; sockets and existing ports are not."""
     command._warn(settled("modbus", "--port", "/dev/nonexist"))
-    assert "--port /dev/nonexist does not exist; trying again" in caplog.text
+    assert "/dev/nonexist" in caplog.text
     caplog.clear()
     command._warn(settled("modbus", "--port", "/dev/null"))
     command._warn(settled("tcp", "--port", "socket://127.0.0.1:9"))
@@ -72,17 +72,9 @@ def test_a_serial_line_that_is_not_there_gets_a_warning(caplog: pytest.LogCaptur
 def test_the_settings_of_a_new_box():
     """Modbus reads the feed on this machine, without commands; TCP lacks a serial line."""
     args = settled("modbus")
-    assert (args.feed, args.link, args.listen, args.allow_writes) == (
-        "/run/palpate/feed.sock",
-        None,
-        "127.0.0.1:1502",
-        False,
-    )
-    with pytest.raises(
-        ConfigError,
-        match=r'serial\.port = "" is not a serial line .* set serial\.port = '
-        r'"/run/palpate-tcp/line"',
-    ):
+    assert (args.feed, args.listen) == ("/run/palpate/feed.sock", "127.0.0.1:1502")
+    assert (args.link, args.allow_writes) == (None, False)
+    with pytest.raises(ConfigError, match="/run/palpate-tcp/line"):
         settled("tcp")
 
 
@@ -98,15 +90,10 @@ def test_the_line_of_the_bridge(kind: str):
 def test_options_hold():
     """A line, an address, or a feed by option: the settings do not change them."""
     sets = (f"serial.port={LINKS['tcp']}", "bridge.address=192.168.0.10")
-    args = settled(
-        "tcp", "--port", "/dev/ttyUSB0", "--listen", "[::1]:7", "--allow-writes", sets=sets
-    )
-    assert (args.port, args.link, args.listen, args.allow_writes) == (
-        "/dev/ttyUSB0",
-        None,
-        "[::1]:7",
-        True,
-    )
+    options = ("--port", "/dev/ttyUSB0", "--listen", "[::1]:7", "--allow-writes")
+    args = settled("tcp", *options, sets=sets)
+    assert (args.port, args.listen) == ("/dev/ttyUSB0", "[::1]:7")
+    assert (args.link, args.allow_writes) == (None, True)
     assert settled("modbus", "--feed", "/tmp/x", sets=sets).feed == "/tmp/x"
 
 
@@ -120,9 +107,7 @@ def test_options_hold():
 )
 def test_no_way_to_the_box(sets: tuple[str, ...]):
     """Commands without a line, or neither line nor feed: refused, with what to set."""
-    with pytest.raises(
-        ConfigError, match=r'feed is read-only; set serial\.port = "/run/palpate-modbus/line"'
-    ):
+    with pytest.raises(ConfigError, match="/run/palpate-modbus/line"):
         settled("modbus", sets=sets)
 
 

@@ -294,20 +294,8 @@ def test_the_manuals_client_without_hardware(tmp_path: Path):
 @pytest.mark.thorough  # starts processes and waits for them
 def test_a_box_that_is_killed_and_started_again(tmp_path: Path):
     """Killed within a sweep: the wait ends, the restart is counted, the client sweeps on."""
-    command = [
-        sys.executable,
-        "-m",
-        "palpate",
-        "run",
-        "--sim",
-        "skin",
-        "--trigger",
-        "serial",
-        "--set",
-        f"serial.port={tmp_path / 'line'}",
-        "--set",
-        "store.runtime=",
-    ]
+    command = [sys.executable, "-m", "palpate", "run", "--sim", "skin", "--trigger", "serial"]
+    command += ["--set", f"serial.port={tmp_path / 'line'}", "--set", "store.runtime="]
     with (
         bridge("tcp", "--link", tmp_path / "line", "--allow-writes") as address,
         Palpate(f"socket://{address[0]}:{address[1]}", timeout_s=LONG_S) as client,

@@ -142,13 +142,8 @@ def test_services(box: SpeakingBox, node: RosPeer):
     assert node.call("tare") == {"service": "tare", "success": True, "message": "16 taxels"}
     for name in ("new_object", "start", "stop", "abort"):
         assert node.call(name)["success"]
-    assert [s.kind for s in box.heard if s.kind != "LABEL"] == [
-        "TARE",
-        "NEW",
-        "START",
-        "STOP",
-        "ABORT",
-    ]
+    heard = [s.kind for s in box.heard if s.kind != "LABEL"]
+    assert heard == ["TARE", "NEW", "START", "STOP", "ABORT"]
     box.script = lambda s: [sentence("ANS", s.kind, "error", "set trigger.mode to serial")]
     assert node.call("start") == {
         "service": "start",

@@ -83,18 +83,10 @@ def test_a_sweep(box: SpeakingBox, node: RosPeer):
     if it is requested."""
     found = swept(node, slide_s=0.1, timeout_s=LONG_S, new_object=True, speed_mm_s=30.1)
     assert (found["state"], found["status"], found["label"]) == ("succeeded", "ok", "wood")
-    assert (found["sweep"], found["code"], found["fused"], found["lost"], found["share"]) == (
-        1,
-        1,
-        1,
-        0,
-        1,
-    )
-    assert [round(found[name], 3) for name in ("probability", "margin", "latency_ms")] == [
-        0.9,
-        0.8,
-        1.25,
-    ]
+    counts = [found[name] for name in ("sweep", "code", "fused", "lost", "share")]
+    assert counts == [1, 1, 1, 0, 1]
+    figures = [round(found[name], 3) for name in ("probability", "margin", "latency_ms")]
+    assert figures == [0.9, 0.8, 1.25]
     assert (found["bundle"], found["message"]) == ("9f3c2a1b", "use the label")
     assert commands(box) == ["NEW", "START", "STOP"]
     assert [s.fields for s in box.heard if s.kind == "START"] == [["30.1"]]
@@ -122,12 +114,8 @@ def test_what_was_not_ok(box: SpeakingBox, node: RosPeer):
     unsure = swept(node, slide_s=0.1)
     assert (unsure["state"], unsure["status"], unsure["label"]) == ("succeeded", "unsure", "wood")
     stuck = swept(node, slide_s=0.1)
-    assert (stuck["state"], stuck["status"], stuck["label"], stuck["code"]) == (
-        "aborted",
-        "stuck-taxel",
-        "",
-        0,
-    )
+    told = [stuck[name] for name in ("state", "status", "label", "code")]
+    assert told == ["aborted", "stuck-taxel", "", 0]
     assert stuck["message"] == "a loaded taxel shows a constant count; check the skin (taxel 2.3)"
 
 
@@ -275,18 +263,8 @@ def test_with_the_box_itself(tmp_path: Path):
     START."""
     quiet = ["--set", "store.runtime=", "--set", "store.folder=/nonexistent"]
     line = tmp_path / "line"
-    command = [
-        sys.executable,
-        "-m",
-        "palpate",
-        "run",
-        "--sim",
-        "skin",
-        "--trigger",
-        "serial",
-        "--set",
-        f"serial.port={line}",
-    ]
+    command = [sys.executable, "-m", "palpate", "run", "--sim", "skin", "--trigger", "serial"]
+    command += ["--set", f"serial.port={line}"]
     with (
         bridge("tcp", "--link", line, "--allow-writes") as address,
         subprocess.Popen(

@@ -388,13 +388,8 @@ def test_a_sequence_number_shows_each_loss():
     skin.port.frames = lambda i: (
         b"" if i % 50 == 49 else b"\xaa\x55" + bytes([i % 256]) + wire("matrix", i)[2:]
     )
-    skin.sensor = SerialSensor(
-        SkinConfig(profile="matrix", port=PATH),
-        p,
-        skin.format,
-        skin.clock,
-        open_port=skin.port.open,
-    )
+    config = SkinConfig(profile="matrix", port=PATH)
+    skin.sensor = SerialSensor(config, p, skin.format, skin.clock, open_port=skin.port.open)
     frames = skin.seconds(10)
     assert skin.sensor.loss_known
     assert skin.sensor.counters.lost_frames == pytest.approx(20, abs=1)
