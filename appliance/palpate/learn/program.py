@@ -83,7 +83,6 @@ class TeachingProgram:
             materials.check_settings(settings)
         self.format, self.names, self.again = format, TypedNames(), ""
         self._done, self._stopped = False, StopFlag()
-        self._phase: Recording | Trying | None = None
         self.codes = 1 << len(bits) if (bits := settings.output.class_bits) else 0
 
     @property
@@ -98,11 +97,10 @@ class TeachingProgram:
 
     def about(self) -> dict[str, Any]:
         """The present phase, for the page."""
-        return (self._phase.about() if self._phase else {}) | {"good": self.lesson.good}
+        return self._phase.about() | {"good": self.lesson.good}
 
     def obey(self, command: Command) -> list[object]:
         """Carry out an order of the page, in the loop's thread."""
-        assert self._phase
         return self._phase.obey(command)
 
     def run(self, outputs: Outputs) -> None:
@@ -113,7 +111,7 @@ class TeachingProgram:
 
     def _ran(self, phase: type[Recording | Trying]) -> bool:
         with ExitStack() as stack:
-            self._phase = phase(self, stack)
+            self._phase: Recording | Trying = phase(self, stack)
             return self._phase.run()
 
     def finish(self, _: str) -> list[object]:

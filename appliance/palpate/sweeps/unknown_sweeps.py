@@ -32,25 +32,20 @@ class UnknownGroup:
 def groups(folder: Path, bundle: str) -> list[UnknownGroup]:
     """The groups of at least two sweeps in a folder that the bundle with the id `bundle` did not
     know, the largest first. A file that cannot be used is logged and left out."""
-    joined: dict[int, int] = {}
-    dates: dict[int, str] = {}
-    paths: dict[int, Path] = {}
+    # the sweeps of each number's material; sweeps of one material share a list
+    seen: dict[int, list[tuple[int, Path, str]]] = {}
     for path in sorted(folder.glob("sweep-*.json")):
         try:
             number, before, date = _answer(path, bundle)
         except (FormatError, ValueError, TypeError, KeyError, AttributeError) as e:
             log.warning(f"{path} is left out: {e}")
             continue
-        if not number:
-            continue
-        dates[number], joined[number], paths[number] = date, number, path.with_suffix(".npy")
-        if before in joined:
-            joined[number] = _first(joined, before)
-    found: dict[int, list[int]] = {}
-    for number in sorted(joined):
-        found.setdefault(_first(joined, number), []).append(number)
-    large = sorted((one for one in found.values() if len(one) > 1), key=len, reverse=True)
-    return [UnknownGroup({n: paths[n] for n in one}, dates[one[-1]]) for one in large]
+        if number:
+            seen[number] = seen.get(before, [])
+            seen[number].append((number, path.with_suffix(".npy"), date))
+    shared = {id(one): one for one in seen.values() if len(one) > 1}
+    large = sorted(shared.values(), key=len, reverse=True)
+    return [UnknownGroup({n: path for n, path, _ in one}, one[-1][2]) for one in large]
 
 
 def chosen(found: list[UnknownGroup], number: int, folder: Path) -> UnknownGroup:
@@ -77,9 +72,3 @@ def _answer(path: Path, bundle: str) -> tuple[int, int, str]:
         return 0, 0, ""
     run, alike = int(about.get("run", 0)), ALIKE.search(verdict["detail"])
     return run + int(about["id"]), run + int(alike[1]) if alike else 0, str(about.get("date", "?"))
-
-
-def _first(joined: dict[int, int], number: int) -> int:
-    while joined[number] != number:
-        number = joined[number]
-    return number

@@ -40,7 +40,6 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--version", default="1", help="of the bundle")
     parser.add_argument("--by", default="", help="who teaches, for the manifest")
     parser.add_argument("--at", default="", help="when, for the manifest")
-    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--memory-mb", type=int, default=0, help="limit of private memory")
     parser.add_argument("--cpu-s", type=int, default=0, help="limit of processor time")
     args = parser.parse_args(argv)
@@ -70,14 +69,14 @@ def _run(args: argparse.Namespace) -> None:
     _limit_cpu(args.cpu_s)
     lesson = Lesson.read(args.folder)
     if args.out is None:
-        _say("assessed", **assess(lesson, args.seed).json())
+        _say("assessed", **assess(lesson).json())
         return
 
     def tell(step: str, done: float, left_s: float | None) -> None:
         _say("step", step=step, done=round(done, 2), left_s=left_s and round(left_s, 1))
 
     about = {"by": args.by, "at": args.at}
-    manifest = teach(lesson, args.out, args.version, about, args.seed, tell)
+    manifest = teach(lesson, args.out, args.version, about, tell)
     # not ru_maxrss, which begins with the memory of the parent process
     status = Path("/proc/self/status").read_text()
     peak = int(status.partition("VmHWM:")[2].split()[0]) // 1024

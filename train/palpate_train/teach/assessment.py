@@ -17,19 +17,18 @@ from palpate.inference.classifier import softmax
 from palpate.learn.assessment import Assessment
 from palpate_train.data.run import Run
 from palpate_train.data.splitters import InnerPart, recording_parts
-from palpate_train.models.methods import Log, no_log
 from palpate_train.models.recipe import recipe
 from palpate_train.teach.lesson import Lesson
 
 Array = NDArray[Any]
 
 
-def assess(lesson: Lesson, seed: int = 0, log: Log = no_log) -> Assessment:
+def assess(lesson: Lesson) -> Assessment:
     """Judge a model of the materials that have two sweeps or more. Raises FormatError if fewer than
     two materials have."""
     lesson = lesson.repeated()
     settings = recipe.Settings(steps=0, most=len(lesson.sweeps))
-    setup = recipe.Setup.of(lesson.sweeps, Run(seed, log), settings)
+    setup = recipe.Setup.of(lesson.sweeps, Run(0), settings)
     fixed = setup.fixed
     choice = recipe.judge(recipe.candidates(fixed, setup), fixed, setup)
     parts, scores, chosen = setup.parts, choice.scores, choice.chosen

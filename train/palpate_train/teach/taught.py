@@ -49,9 +49,7 @@ class StepTimes:
         self._done += SHARES[step]
 
 
-def teach(
-    lesson: Lesson, out: Path, version: str, about: dict[str, Any], seed: int, tell: Tell
-) -> Manifest:
+def teach(lesson: Lesson, out: Path, version: str, about: dict[str, Any], tell: Tell) -> Manifest:
     """Fit a model to the lesson and write its bundle to `out`, whole or not at all. about: who
     teaches and when, for the manifest.
 
@@ -66,7 +64,7 @@ def teach(
             "more of each material, or forget it"
         )
     sweeps.require_materials()
-    setup = recipe.Setup.of(sweeps, Run(seed), recipe.Settings(steps=0))
+    setup = recipe.Setup.of(sweeps, Run(0), recipe.Settings(steps=0))
     times.begin("features")
     _ = setup.fixed  # computed here, for the time of this step
     times.begin("heads")
