@@ -11,8 +11,9 @@ from palpate.bundle import bundle
 from palpate.bundle.bundle import Early, Manifest, Thresholds
 from palpate.bundle.pruning import prune
 from palpate.core.clock import SystemClock
-from palpate.inference import classifier, enrolment
+from palpate.inference import classifier
 from palpate.inference import early_exit as box_early
+from palpate.learn import enrolment
 from palpate_studies import certainty
 from palpate_train.calibration import early_exit
 from palpate_train.export.bundle_graph import bundle_graph
