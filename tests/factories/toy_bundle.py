@@ -143,6 +143,7 @@ def means(**changes: np.ndarray) -> dict[str, np.ndarray]:
         "bias": bias,
         "sweeps": np.zeros(3, np.int64),
         "spread": np.ones(3, np.float32),
+        "shapes": np.zeros((3, 0, 0), np.float16),
     } | changes
 
 
@@ -160,16 +161,16 @@ def displaced_arrays() -> dict[str, np.ndarray]:
 
     At the trained positions "a" scatters twice as far in the second direction as the others.
     Displaced sweeps scatter ten times as far in the first direction; their means are 0.1 further
-    there, after `moved_turn`.
+    there, after `displaced_turn`.
     """
     shapes = np.stack([np.eye(1)] * 3).astype(np.float16)
     turn = np.diag([0.1, 1]).astype(np.float32)
     at = (MEANS @ turn + [0.1, 0]).astype(np.float32)
     return {
         "shapes": shapes * np.float16([0.5, 1, 1])[:, None, None],
-        "moved_turn": turn,
-        "moved_means": at,
-        "moved_shapes": shapes,
+        "displaced_turn": turn,
+        "displaced_means": at,
+        "displaced_shapes": shapes,
     }
 
 
@@ -193,7 +194,7 @@ def files(
     logits = (z @ arrays["means"].T + arrays["bias"]) / KNOWN.temperature
     content = {
         bundle.MODEL: model(outputs, format=format, **graph),
-        bundle.GOLDEN: npz(samples=at, logits=logits),
+        bundle.GOLDEN: npz(changes=bundle.arrays.changes(at), logits=logits),
     }
     if known:
         content[bundle.MEANS] = npz(**arrays)

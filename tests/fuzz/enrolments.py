@@ -50,7 +50,7 @@ def _check_classes(old: Bundle, got: Bundle) -> None:
     n, trained = len(old.manifest.labels), old.classes.arrays()
     for name, values in got.classes.arrays().items():
         assert np.isfinite(values).all(), f"{name} is not finite"
-        if not name.startswith("moved_turn"):
+        if not name.startswith("displaced_turn"):
             assert len(values) == len(got.manifest.labels)
             assert values[:n].tobytes() == trained[name].tobytes(), (
                 f"{name} of a trained label changed"
@@ -105,7 +105,7 @@ def _right(labels: int) -> bytes:
 
 
 def seeds() -> list[bytes]:
-    """One to three labels; the file of an older program; each array with another invalid value;
+    """One to three labels; each array with another invalid value;
     the enrolment of another bundle, a label that exists, no label."""
     right = [_right(1), _right(2), _right(3)]
     with np.load(io.BytesIO(right[0])) as z:
@@ -118,7 +118,7 @@ def seeds() -> list[bytes]:
         ("sweeps", np.int64([0])),
         ("sweeps", np.int64([1 << 60])),
         ("changes", arrays["changes"][:1]),
-        ("joint", arrays["joint"][1:]),
+        ("logits", arrays["logits"][1:]),
         ("least", np.array(0.4)),
         ("least", np.array([0.7])),
         ("base", np.array("0" * 64)),
@@ -127,10 +127,8 @@ def seeds() -> list[bytes]:
         ("labels", np.array([], "<U4")),
         ("labels", np.array(["cork", "cork"])),
     ]
-    older = {name: v for name, v in arrays.items() if name not in ("joint", "least")}
     return [
         *right,
-        packing.packed(**older, logits=arrays["joint"]),
         *(packing.packed(**arrays | {name: value}) for name, value in wrong),
         right[0][:200],
         b"PK",

@@ -11,11 +11,11 @@ from pathlib import Path
 import pytest
 
 HERE = Path(__file__).parent
-BESIDE = (HERE / "studies", HERE / "models" / "peers")
+EXTRA_FILES = (HERE / "studies", HERE / "models" / "peers")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark the slow tests below these folders."""
     for item in items:
-        if item.path.parent in BESIDE and item.get_closest_marker("slow"):
+        if item.path.parent in EXTRA_FILES and item.get_closest_marker("slow"):
             item.add_marker(pytest.mark.thorough)

@@ -98,21 +98,21 @@ def check_classes(
         "sweeps": (n,),
         "spread": (n,),
         "shapes": (n, 0, 0),
-        "moved_turn": (rank, rank),
-        "moved_means": (n, rank),
-        "moved_shapes": (n, 0, 0),
+        "displaced_turn": (rank, rank),
+        "displaced_means": (n, rank),
+        "displaced_shapes": (n, 0, 0),
         "early_means": (steps, n, rank),
         "early_shapes": (steps, rank, rank),
         "changes": (disturbances, int((arrays["sweeps"] == 0).sum()), rank),
     }
-    halves = dict.fromkeys(("shapes", "moved_shapes", "early_shapes", "changes"), "float16")
+    halves = dict.fromkeys(("shapes", "displaced_shapes", "early_shapes", "changes"), "float16")
     kinds = {"sweeps": "int64"} | halves
     for name, wanted in rows.items():
         unused = not steps if name.startswith("early_") else name == "changes" and not disturbances
         if name not in arrays or unused:
             continue
         values, kind, shape = arrays[name], kinds.get(name, "float32"), arrays[name].shape
-        if name in ("shapes", "moved_shapes") and len(shape) == 3 and shape[1] <= rank:
+        if name in ("shapes", "displaced_shapes") and len(shape) == 3 and shape[1] <= rank:
             wanted = (n, shape[1], shape[1])
         if values.dtype != kind or shape != wanted or (not name.endswith("shapes") and 0 in shape):
             raise BundleError(

@@ -99,7 +99,7 @@ MOST_SMALL = 1 << 20
 SIGNATURE, ENROLMENT_SIGNATURE = MANIFEST + ".sig", ENROLMENT + ".sig"
 TAUGHT_SIGNATURE = "taught.sig"
 """Signature of the manifest by the box that has taught the bundle itself."""
-OPTIONAL = {
+EXTRA_FILES = {
     SIGNATURE: MOST_SMALL,
     TAUGHT_SIGNATURE: MOST_SMALL,
     ENROLMENT: MOST_BYTES,
@@ -141,7 +141,7 @@ def load(folder: Path) -> Bundle:
 
 def files(folder: Path) -> dict[str, bytes]:
     """The files of the bundle in `folder` by name: the manifest, the files that it names, and the
-    files of OPTIONAL that exist.
+    files of EXTRA_FILES that exist.
 
     Other files are ignored. Links are not followed, and no file is read beyond the size in the
     manifest. Raises BundleError if a file cannot be read or is larger, TemporaryError if
@@ -158,7 +158,7 @@ def files(folder: Path) -> dict[str, bytes]:
         try:
             found[name] = _read(folder / name, size)
         except OSError as e:
-            if name in OPTIONAL and e.errno == errno.ENOENT:
+            if name in EXTRA_FILES and e.errno == errno.ENOENT:
                 continue
             _raise_if_passing(folder, e)
             what = "was altered" if e.errno == errno.EFBIG else "cannot be read"
@@ -170,7 +170,7 @@ def files(folder: Path) -> dict[str, bytes]:
 
 def _named(manifest: bytes) -> dict[str, int]:
     """The other files to read, with the largest size of each."""
-    return OPTIONAL | {
+    return EXTRA_FILES | {
         name: entry["bytes"] for name, entry in Manifest.parse(manifest).files.items()
     }
 
@@ -238,22 +238,11 @@ def golden_file(samples: NDArray[Any], logits: NDArray[Any]) -> bytes:
 
 
 def _golden(data: bytes, manifest: Manifest) -> tuple[NDArray[Any], NDArray[np.float32]]:
-    """Golden sweeps [G, T, R, C] or [G, T, R, C, A] and their logits [G, K]. Older files hold
-    `samples`, the sweeps without packing."""
-    f = manifest.format
-    held = arrays.read(data, GOLDEN, "logits")
-    if not held.keys() & {"samples", "changes"}:
+    """Golden sweeps [G, T, R, C] or [G, T, R, C, A] and their logits [G, K]."""
+    held = arrays.read(data, GOLDEN, "logits", "changes")
+    samples, logits = arrays.summed(held["changes"], manifest.format, GOLDEN), held["logits"]
+    if not len(samples):
         raise BundleError(f"{GOLDEN} holds no sweeps; export the bundle again")
-    samples = held["samples"] if "samples" in held else arrays.summed(held["changes"], f, GOLDEN)
-    logits = held["logits"]
-    if (
-        samples.shape[1:] != (f.window, *f.shape)
-        or samples.dtype != f.numpy_type
-        or not len(samples)
-    ):
-        raise BundleError(
-            f"{GOLDEN} holds {samples.dtype} {samples.shape}, which does not fit the format {f}"
-        )
     if logits.shape != (len(samples), len(manifest.labels)):
         raise BundleError(
             f"{GOLDEN} holds logits {logits.shape} for {len(samples)} sweeps, "
@@ -266,15 +255,16 @@ def _classes(data: bytes, manifest: Manifest) -> Classes:
     """Content of means.npz: one row per label, trained labels first."""
     n = len(manifest.labels)
     displaced = (
-        [f"moved_{name}" for name in DisplacedClasses.__slots__] if manifest.displacement else []
+        [f"displaced_{name}" for name in DisplacedClasses.__slots__]
+        if manifest.displacement
+        else []
     )
     steps = len(manifest.early.limits) if manifest.early else 0
     early = [f"early_{name}" for name in EarlyClasses.__slots__] if steps else []
     allowed = len(manifest.disturbances.allowances) if manifest.disturbances else 0
     changes = ["changes"] * bool(allowed)
-    held = arrays.read(data, MEANS, "means", "bias", "sweeps", *displaced, *early, *changes)
-    held.setdefault("spread", np.ones(n, np.float32))
-    held.setdefault("shapes", np.zeros((n, 0, 0), np.float16))
+    own = "means", "bias", "sweeps", "spread", "shapes"
+    held = arrays.read(data, MEANS, *own, *displaced, *early, *changes)
     arrays.check_classes(held, n, steps, allowed)
     sweeps = held["sweeps"]
     if sweeps[0] or (sweeps[1:] < np.sign(sweeps[:-1])).any():

@@ -44,10 +44,10 @@ class Classes:
     bias: float32 [K], added to the product of mean and embedding.
     sweeps: int64 [K], number of sweeps that a label was enrolled from; 0 for a trained label.
     spread: float32 [K], variance of the label's sweeps per direction of the embedding; 1 for a
-        trained label, and for all labels if the file has no such array.
+        trained label.
     shapes: float16 [K, b, b], scatter of the label's sweeps in the last b directions of the
         embedding: a difference from the mean is multiplied by this matrix before it is squared. The
-        identity for an enrolled label; b = 0 if the file has no such array.
+        identity for an enrolled label.
     displaced: the same for sweeps whose contact is displaced, None if the manifest has no rule for
         these.
     early: of unfinished sweeps, None if the manifest has no limits for these.
@@ -66,9 +66,8 @@ class Classes:
     changes: NDArray[np.float16] = field(default_factory=lambda: np.zeros((0, 0, 0), np.float16))
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """The arrays of means.npz by name. In the file the arrays of `displaced` are named moved_*,
-        those of `early` early_*."""
-        parts = {"moved": self.displaced, "early": self.early}
+        """The arrays of means.npz by name: of `displaced` displaced_*, of `early` early_*."""
+        parts = {"displaced": self.displaced, "early": self.early}
         own = ("means", "bias", "sweeps", "spread", "shapes")
         arrays = {name: getattr(self, name) for name in own} | {
             f"{prefix}_{name}": getattr(part, name)
@@ -102,7 +101,7 @@ class AddedLabels:
     spread: NDArray[np.float32]
     golden: NDArray[Any]
     logits: NDArray[np.float32]
-    least: float | None
+    least: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)

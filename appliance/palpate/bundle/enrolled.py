@@ -20,11 +20,8 @@ from palpate.bundle.contents import AddedLabels, Bundle, Classes, DisplacedClass
 from palpate.core.errors import BundleError
 
 ENROLMENT = "enrolment.npz"
-COMMON = ("base", "labels", "means", "sweeps", "spread", "changes")
-"""Arrays in every file; `changes` are the packed golden sweeps (arrays.changes)."""
-ARRAYS, BY_MEANS = (*COMMON, "joint", "least"), (*COMMON, "logits")
-"""Arrays in a file, and in a file of a program that compared all labels by distances. The golden
-logits have another name there. So such a program refuses a file that it would misread."""
+ARRAYS = ("base", "labels", "means", "sweeps", "spread", "changes", "logits", "least")
+"""Arrays in the file; `changes` are the packed golden sweeps (arrays.changes)."""
 MOST_SWEEPS = 1_000_000
 """Largest number of sweeps for a label that the file may give."""
 AGAIN = "teach again (palpate teach)"
@@ -39,11 +36,8 @@ def file(added: AddedLabels) -> bytes:
         sweeps=added.sweeps,
         spread=added.spread,
         changes=arrays.changes(added.golden),
-        **(
-            {"logits": added.logits}
-            if added.least is None
-            else {"joint": added.logits, "least": np.array(added.least)}
-        ),
+        logits=added.logits,
+        least=np.array(added.least),
     )
 
 
@@ -67,7 +61,7 @@ def applied(bundle: Bundle, data: bytes, identity: str) -> Bundle:
     )
 
 
-def deciding(bundle: Bundle, least: float | None) -> Bundle:
+def deciding(bundle: Bundle, least: float) -> Bundle:
     """`bundle` with this rule for enrolled labels (Known.enrolled). Raises BundleError."""
     assert bundle.manifest.known
     known = replace(bundle.manifest.known, enrolled=least)
@@ -142,7 +136,7 @@ def _one_more(shapes: NDArray[np.float16]) -> NDArray[np.float16]:
 
 def _read(bundle: Bundle, data: bytes) -> AddedLabels:
     """The content of `data`, checked against `bundle`. Raises BundleError."""
-    held = arrays.read(data, ENROLMENT, *COMMON)
+    held = arrays.read(data, ENROLMENT, *ARRAYS)
     base, labels = held["base"], held["labels"]
     if (
         base.dtype.kind != "U"
@@ -162,8 +156,7 @@ def _read(bundle: Bundle, data: bytes) -> AddedLabels:
             f"{ENROLMENT} adds labels to bundle {bundle.id}, which has no class means; remove the "
             "file"
         )
-    by_means = "logits" in held
-    _check(held, bundle, len(labels), BY_MEANS if by_means else ARRAYS)
+    _check(held, bundle, len(labels))
     golden = arrays.summed(held["changes"], bundle.format, ENROLMENT)
     return AddedLabels(
         base.item(),
@@ -172,19 +165,15 @@ def _read(bundle: Bundle, data: bytes) -> AddedLabels:
         held["sweeps"],
         held["spread"],
         golden,
-        held["logits" if by_means else "joint"],
-        None if by_means else float(held["least"]),
+        held["logits"],
+        float(held["least"]),
     )
 
 
-def _check(
-    held: Mapping[str, NDArray[Any]], bundle: Bundle, n: int, names: tuple[str, ...]
-) -> None:
-    """Raises BundleError if one of the arrays `names` is missing, or has a wrong type, shape or
-    range for `n` labels of `bundle`."""
+def _check(held: Mapping[str, NDArray[Any]], bundle: Bundle, n: int) -> None:
+    """Raises BundleError if an array has a wrong type, shape or range for `n` labels of
+    `bundle`."""
     assert bundle.classes
-    if missing := [name for name in names if name not in held]:
-        raise BundleError(f"{ENROLMENT} has no {' and no '.join(missing)}; {AGAIN}")
     f = bundle.format
     logits = ("float32", (len(bundle.golden) + n, len(bundle.manifest.labels) + n))
     wanted = {
@@ -193,10 +182,9 @@ def _check(
         "spread": ("float32", (n,)),
         "changes": ("uint8", (f.numpy_type.itemsize, n, f.window, *f.shape)),
         "logits": logits,
-        "joint": logits,
         "least": ("float64", ()),
     }
-    for name in names[2:]:
+    for name in ARRAYS[2:]:
         values, (kind, shape) = held[name], wanted[name]
         if values.dtype != kind or values.shape != shape:
             raise BundleError(

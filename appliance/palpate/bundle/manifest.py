@@ -30,11 +30,9 @@ MANIFEST, MODEL, GOLDEN, MEANS = "manifest.json", "model.onnx", "golden.npz", "m
 INPUTS = ("raw", *features.KINDS)
 UNSURE = 0.5
 """Least probability for status ok if the bundle does not set it."""
-OPTIONAL = ("farthest_mm", None), ("enrolled", None)
-"""Values of rules that need not be there."""
 MOST_BYTES = 64 << 20
 """Largest file. The largest of our models, the paper's network in int8, has 16 MB. The memory that
-a model needs is checked by onnx_check."""
+a model needs shows in its trial."""
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 _VERSION = re.compile(r"[0-9]{1,6}(\.[0-9]{1,6}){2}")
 
@@ -84,8 +82,8 @@ class Known:
 
     limit: largest squared distance from a sweep's embedding to the nearest class mean; beyond it
     the material is unknown. temperature: divisor of the logits from class means. enrolled: least
-    probability of all enrolled labels together at which a sweep gets one of them; None if all
-    labels are compared by distances alone.
+    probability of all enrolled labels together at which a sweep gets one of them; None without
+    enrolled labels.
     """
 
     limit: float
@@ -123,7 +121,7 @@ class DisplacementRule:
 def _check_positive(rule: Known | DisplacementRule, where: str) -> None:
     for name in rule.__slots__:
         value = getattr(rule, name)
-        if not _positive(value) and (name, value) not in OPTIONAL:
+        if not _positive(value) and not (value is None and name in ("farthest_mm", "enrolled")):
             raise BundleError(f"{where}.{name} {value!r} must be a number above 0")
 
 

@@ -123,7 +123,7 @@ class ClassDistances:
         # the rest of the bias, since the squared distance already contains -|m|^2 / 2; logits that
         # are computed from distances do not suffer from the cancellation of large products
         self._extra = classes.bias + (self._means**2).sum(axis=1) / 2
-        self._enrolled, self._joint = classes.sweeps > 0, known.enrolled is not None
+        self._enrolled = classes.sweeps > 0
         self._softening = displacement.temperature if displacement else 1
         shapes = classes.shapes
         if displacement and classes.displaced:
@@ -167,14 +167,12 @@ class ClassDistances:
         network: [..., K0], logits of the K0 trained labels, which come first. embedding: [..., r].
         Without enrolled labels these are the network's own. With them, the distances give the
         probability of each enrolled label and that of all trained labels together; the network
-        divides the latter among them. In bundles without `Known.enrolled`, all are from distances.
+        divides the latter among them.
         """
         softened = np.asarray(network / self._softening, np.float32)
         if not self._enrolled.any():
             return softened
         by_means = np.asarray(self.logits(self.distances(embedding)) / self._softening, np.float32)
-        if not self._joint:
-            return by_means
         n, logs = network.shape[-1], log_softmax(by_means)
         trained = np.logaddexp.reduce(logs[..., :n], axis=-1, keepdims=True)
         logits = np.concatenate([trained + log_softmax(softened), logs[..., n:]], axis=-1)

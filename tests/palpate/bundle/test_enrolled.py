@@ -142,19 +142,15 @@ WRONG = {
         "changes uint8",
     ),
     "logits of fewer labels": (
-        {"joint": np.zeros((4, 4), np.float32)},
-        r"joint float32 \[4, 4\]; float32 \[4, 5\]",
+        {"logits": np.zeros((4, 4), np.float32)},
+        r"logits float32 \[4, 4\]; float32 \[4, 5\]",
     ),
     "logits that are nan": (
-        {"joint": np.full((4, 5), np.nan, np.float32)},
-        "joint that are not finite",
-    ),
-    "logits of an older program that are nan": (
         {"logits": np.full((4, 5), np.nan, np.float32)},
         "logits that are not finite",
     ),
-    "no logits": ({"joint": None}, "has no joint; teach again"),
-    "no rule": ({"joint": None, "least": None}, "has no joint and no least; teach again"),
+    "no logits": ({"logits": None}, "cannot be read.*logits"),
+    "no rule": ({"least": None}, "cannot be read.*least"),
     "no means": ({"means": None}, "cannot be read.*means"),
     "a rule of another type": ({"least": np.array([0.7])}, r"least float64 \[1\]; float64 \[\]"),
     "a rule that is nan": ({"least": np.array(np.nan)}, "least that are not finite"),

@@ -17,7 +17,6 @@ import pytest
 
 from palpate.bundle import bundle
 from palpate.bundle.bundle import Bundle, Early
-from palpate.bundle.manifest import SCHEMA
 from palpate.core.errors import BundleError
 from palpate.core.types import Frames, Status, Sweep, SweepFormat
 from palpate.inference.classifier import Classifier, fuse, softmax
@@ -165,7 +164,8 @@ def test_altered_and_missing_files_are_named(folder: Path, name: str):
 
 
 UNREAD = "manifest cannot be read"
-PLACE = {"pitch_mm": 4.0, "rows_mm": [1.0], "cols_mm": [1.0], "limit_mm": 1.0}
+CONTACT = {"pitch_mm": 1.0, "rows_mm": [0.5], "cols_mm": [0.5], "limit_mm": 0.1}
+NO_CONTACT = {"contact": None, "full_scale": 255.0}
 
 
 @pytest.mark.parametrize(
@@ -182,10 +182,7 @@ PLACE = {"pitch_mm": 4.0, "rows_mm": [1.0], "cols_mm": [1.0], "limit_mm": 1.0}
         ({"unloaded": [1.0, 2.0]}, "2 counts .* have 16"),
         ({"unloaded": 16}, UNREAD),
         ({"unloaded": ["1"] * 16}, UNREAD),
-        (
-            {"thresholds": {"contact": None, "full_scale": 255.0}, "contact": PLACE},
-            "without `thresh",
-        ),
+        ({"thresholds": NO_CONTACT, "contact": CONTACT}, "`contact` without"),
         ({"labels": ["a", "b"], "sliding": None}, "logits"),
     ],
 )
@@ -246,12 +243,18 @@ def test_golden_sweeps_are_packed_without_loss(dtype: str, axes: int):
     assert len(bundle.golden_file(smooth, logits)) < len(plain.getvalue())
 
 
-@pytest.mark.parametrize("shape", [(1, 2, 20, 2, 2), (2, 2, 19, 2, 2), (2, 2), (), None])
-def test_golden_sweeps_of_another_shape_are_refused(shape: tuple[int, ...] | None):
-    """Too few bytes or frames, no changes, or logits alone."""
+@pytest.mark.parametrize(
+    ("shape", "hint"),
+    [
+        *((n, "not fit the format") for n in ((1, 2, 20, 2, 2), (2, 2, 19, 2, 2), (2, 2), ())),
+        ((2, 0, 20, 2, 2), "holds no sweeps"),
+        (None, "cannot be read"),
+    ],
+)
+def test_golden_sweeps_of_another_shape_are_refused(shape: tuple[int, ...] | None, hint: str):
+    """Too few bytes or frames, no changes, no sweeps, or logits alone."""
     manifest = SimpleNamespace(format=SweepFormat(2, 2, 100.0, 20, "int16"), labels=("a", "b"))
     more = {} if shape is None else {"changes": np.zeros(shape, np.uint8)}
-    hint = "holds no sweeps" if shape is None else "do not fit the format"
     with pytest.raises(BundleError, match=hint):
         bundle._golden(toy_bundle.npz(logits=np.zeros((2, 2)), **more), manifest)
 
@@ -269,28 +272,24 @@ def test_optional_rules_may_be_missing(folder: Path):
 
 
 def test_a_bundle_that_is_written_is_read_unchanged(tmp_path: Path):
-    """With early heads and class means; a spread that is not given is 1."""
+    """With early heads and class means."""
     rule = Early((0.9, 0.8, 2.0), 2)
     new = toy_bundle.load(tmp_path / "toy", early=rule, outputs=WITH_EARLY)
     assert bundle.Manifest.parse(new.manifest.json()) == new.manifest
     m = new.manifest
-    assert (m.schema, m.early, m.known) == (SCHEMA, rule, toy_bundle.KNOWN)
+    assert (m.schema, m.early, m.known) == (1, rule, toy_bundle.KNOWN)
     assert new.classes
     assert new.classes.means.tolist() == toy_bundle.MEANS.tolist()
-    arrays = {k: v for k, v in toy_bundle.means().items() if k != "spread"}
-    plain = toy_bundle.load(tmp_path / "plain", arrays=arrays).classes
-    assert plain
-    assert plain.spread.tolist() == [1, 1, 1]
 
 
 EARLY = {"least": [0.9, 0.8, 2.0], "agree": 2}
 KNOWN = {"limit": 9.0, "temperature": 2.0}
-MOVED = {"limit": 4.0, "temperature": 3.0, "unsure": 0.75}
+DISPLACEMENT = {"limit": 4.0, "temperature": 3.0, "unsure": 0.75}
 
 
-def moved(**changes: Any) -> dict[str, Any]:
-    contact = {"pitch_mm": 1.0, "rows_mm": [0.5], "cols_mm": [0.5], "limit_mm": 0.1}
-    return {"displacement": MOVED | changes, "contact": contact}
+def displaced(**changes: Any) -> dict[str, Any]:
+    """The keys of a manifest with a rule for displaced contacts."""
+    return {"displacement": DISPLACEMENT | changes, "contact": CONTACT}
 
 
 @pytest.mark.parametrize(
@@ -314,12 +313,14 @@ def moved(**changes: Any) -> dict[str, Any]:
         ({"known": KNOWN | {"temperature": None}}, "known.temperature None "),
         ({"known": {"limit": 9.0}}, "temperature"),
         ({"known": None}, "both `known` and"),
-        ({"displacement": MOVED}, "`displacement` without `known`"),
-        (moved(limit=0), "displacement.limit 0 "),
-        (moved(temperature=-1), "displacement.temperature -1 "),
-        (moved(unsure="0.5"), "unsure"),
-        (moved() | {"displacement": {"limit": 4.0}}, "temperature"),
-        (moved(), "npz cannot be read"),
+        *(({"schema": n}, f"schema {n} ") for n in (0, 2, 1.0, True)),
+        ({"displacement": DISPLACEMENT}, "`displacement` without"),
+        ({"moved": DISPLACEMENT}, "moved"),
+        (displaced(limit=0), "displacement.limit 0 "),
+        (displaced(temperature=-1), "temperature -1 "),
+        (displaced(unsure="0.5"), "unsure"),
+        (displaced() | {"displacement": {"limit": 4.0}}, "temperature"),
+        (displaced(), "npz cannot be read"),
     ],
 )
 def test_broken_early_and_known_are_named(toy_folder: Path, changes: dict, hint: str):
@@ -347,8 +348,8 @@ def test_broken_early_and_known_are_named(toy_folder: Path, changes: dict, hint:
         ({"shapes": np.ones((3, 1, 2), np.float16)}, "shapes float16 .3, 1, 2."),
         ({"shapes": np.ones((3, 3, 3), np.float16)}, "shapes float16 .3, 3, 3."),
         ({"shapes": np.full((3, 1, 1), np.inf, np.float16)}, "shapes that are not"),
-        ({"moved_turn": np.eye(3, dtype=np.float32)}, "moved_turn float32 .3"),
-        ({"moved_means": toy_bundle.MEANS[:2]}, "moved_means float32 .2"),
+        ({"displaced_turn": np.eye(3, dtype=np.float32)}, "displaced_turn float32 .3"),
+        ({"displaced_means": toy_bundle.MEANS[:2]}, "displaced_means float32 .2"),
         ({"sweeps": np.zeros(3, np.int32)}, "sweeps int32"),
         *(({"sweeps": np.array(n)}, "come first") for n in ([0, 0, -1], [0, 5, 0], [5, 0, 0])),
         ({"sweeps": np.array([5, 5, 5])}, "come first"),
@@ -358,7 +359,7 @@ def test_broken_early_and_known_are_named(toy_folder: Path, changes: dict, hint:
 )
 def test_broken_means_are_named(toy_folder: Path, arrays: dict, hint: str):
     """Wrong number of labels, wrong types, NaN, wrong order, pickled objects."""
-    more = toy_bundle.displaced_arrays() if "displacement" in str([*arrays]) else {}
+    more = toy_bundle.displaced_arrays() if "displaced" in str([*arrays]) else {}
     given = toy_bundle.means(**(more | arrays))
     data = toy_bundle.npz(**{k: v for k, v in given.items() if v is not None})
     with pytest.raises(BundleError, match=hint):

@@ -490,7 +490,8 @@ def test_the_command_replays_what_it_decided(tmp_path: Path, capsys: pytest.Capt
     same answers."""
     model, folder = toy(), tmp_path / "toy"
     folder.mkdir()
-    np.savez(folder / bundle.GOLDEN, samples=model.golden, logits=model.golden_logits)
+    golden = bundle.golden_file(model.golden, model.golden_logits)
+    (folder / bundle.GOLDEN).write_bytes(golden)
     (folder / bundle.MODEL).write_bytes(model.model)
     names = bundle.MODEL, bundle.GOLDEN
     files = {n: bundle.file_entry((folder / n).read_bytes()) for n in names}

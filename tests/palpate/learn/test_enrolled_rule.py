@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from palpate.bundle import bundle, enrolled
 from palpate.bundle.bundle import Bundle
 from palpate.core.types import Frames, Status, Sweep
 from palpate.inference.classifier import Classifier, softmax
@@ -28,16 +27,6 @@ RULE = EnrolledLabels(np.array([False, False, True]), 0.6)
 def new(tmp_path: Path) -> Bundle:
     """The toy bundle with felt at (9, 0)."""
     return enrolment.enrol(toy_bundle.load(tmp_path / "toy"), "felt", FELT).bundle
-
-
-def by_old_rule(new: Bundle) -> Bundle:
-    """The bundle with an enrolment as programs wrote it that compared all labels by distances."""
-    assert new.added
-    assert new.manifest.known
-    old = enrolled.deciding(new, None)
-    logits = np.stack([Classifier(old, VirtualClock()).logits(one) for one in new.golden])
-    file = enrolled.file(replace(new.added, logits=logits, least=None))
-    return bundle.from_files({**toy_bundle.files(), bundle.ENROLMENT: file}, "toy")
 
 
 def distances(new: Bundle, least: float | None) -> ClassDistances:
@@ -59,15 +48,6 @@ def test_the_network_divides_what_the_distances_leave(new: Bundle):
     assert np.abs(p[:, :3] - own[:, :3]).max() > 0.5
 
 
-def test_a_network_that_agrees_with_the_means_changes_nothing(new: Bundle):
-    """Where the network is the nearest mean, as in the toy bundle, all probabilities are those of
-    the distances alone."""
-    it, old = Classifier(new, VirtualClock()), Classifier(by_old_rule(new), VirtualClock())
-    for z in ((0, 0), (3.1, 0.2), (7.4, 0), (9, 0), (4, 3)):
-        here, there = (softmax(one.logits(toy_bundle.window(*z))) for one in (it, old))
-        assert here == pytest.approx(there, abs=1e-5)
-
-
 def test_without_enrolled_labels_the_network_answers_alone(tmp_path: Path):
     """Its logits are not changed in any bit; for displaced contacts they are divided by the
     temperature of the rule."""
@@ -78,31 +58,6 @@ def test_without_enrolled_labels_the_network_answers_alone(tmp_path: Path):
     assert plain.joined(network, z).tobytes() == network.tobytes()
     moved = ClassDistances(classes, toy_bundle.KNOWN, LABELS[:3], toy_bundle.DISPLACEMENT)
     assert moved.joined(network, z).tobytes() == (network / 3.0).tobytes()
-
-
-def test_an_older_enrolment_answers_as_before(new: Bundle):
-    """By distances alone, among the trained labels too, without a least probability; its self-test
-    passes. With the next label it goes on by the new rule."""
-    old = by_old_rule(new)
-    assert old.manifest.known == toy_bundle.KNOWN
-    it, means = Classifier(old, VirtualClock()), distances(new, None)
-    assert it.self_test() < 1e-5
-    at = np.float32([7.5, 0])
-    want = means.logits(means.distances(at)).tolist()
-    assert means.joined(np.float32([9, 0, 0]), at).tolist() == want
-    between = toy_bundle.sweep(*near_b(new, 0.55))
-    assert it(between).label == "felt"
-    assert Classifier(new, VirtualClock())(between).label == "b"
-    more = enrolment.enrol(old, "cork", np.stack([toy_bundle.window(-8, 0)]))
-    assert more.bundle.manifest.known == replace(toy_bundle.KNOWN, enrolled=enrolment.LEAST)
-    assert Classifier(more.bundle, VirtualClock()).self_test() < 1e-5
-
-
-def test_an_older_program_refuses_the_file_by_name(new: Bundle):
-    """It wants an array that is not there, so it cannot misread the golden logits."""
-    assert new.added
-    assert "logits" in enrolled.BY_MEANS
-    assert "logits" not in bundle.arrays.read(enrolled.file(new.added), "x")
 
 
 def test_golden_sweeps_of_new_materials_need_not_agree(tmp_path: Path):

@@ -175,7 +175,7 @@ def test_an_enrolled_label_has_the_common_shape_and_moves_as_the_others(tmp_path
     assert classes.shapes.ravel().tolist() == [0.5, 1, 1, 1]
     assert classes.displaced.shapes.ravel().tolist() == [1, 1, 1, 1]
     assert classes.displaced.means[3] == pytest.approx([0.7 + 0.1, 8], abs=1e-5)
-    assert classes.displaced.means[:3].tolist() == arrays["moved_means"].tolist()
+    assert classes.displaced.means[:3].tolist() == arrays["displaced_means"].tolist()
 
 
 def test_early_answers_end_with_an_enrolment(tmp_path: Path):

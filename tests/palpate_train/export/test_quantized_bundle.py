@@ -185,7 +185,7 @@ def test_a_rule_for_moved_sweeps_needs_places(fitted: Fit, packed: Path, tmp_pat
     assert placed.classes.displaced
     assert plain.manifest.displacement is None
     with np.load(packed / bundle.MEANS) as arrays:
-        assert not [name for name in arrays if name.startswith("moved")]
+        assert not [name for name in arrays if name.startswith("displaced")]
 
 
 def test_figures_of_held_out_sweeps_are_not_of_heads_that_saw_them(fitted: Fit):

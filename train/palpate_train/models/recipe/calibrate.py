@@ -106,7 +106,7 @@ class Calibration:
         return Known(self.limit, self.class_mean_temperature)
 
     def displacement_rule(self) -> DisplacementRule | None:
-        """The entry `moved` of a manifest."""
+        """The entry `displacement` of a manifest."""
         return self.displacement.rule if self.displacement else None
 
     def classes(self) -> Classes:
