@@ -10,6 +10,4 @@ SOURCES = f"{ROOT / 'appliance'}:{ROOT}"
 NO_SITE = Path(__file__).with_name("no-site.toml")
 """A site file that does not exist, so that this machine's settings do not matter."""
 ONE_AXIS = Path(__file__).with_name("one_axis")
-"""Files of a version without axes: a recorded sweep, a capture of three sweeps with the toy bundle,
-and its verdicts.
-"""
+"""A recorded sweep of the toy bundle's format, as it is stored."""

@@ -36,9 +36,8 @@ def save(
     completely or not at all.
 
     The sidecar gets its name first, so that an .npy always has one. A field that is None is left
-    out, so that a sweep without it has the same bytes as in earlier versions. about: further
-    content of the sidecar, under names that Sweep does not use. Raises OSError if writing fails,
-    and then leaves nothing behind.
+    out. about: further content of the sidecar, under names that Sweep does not use. Raises OSError
+    if writing fails, and then leaves nothing behind.
     """
     table = np.zeros(len(sweep.frames), _record_dtype(format))
     table["t_ns"], table["seq"], table["taxels"] = (

@@ -91,8 +91,7 @@ class SweepFormat:
         return self.shape, self.dtype
 
     def json(self) -> dict[str, Any]:
-        """All fields by name, for JSON. One axis is left out, so that files and ids remain those of
-        earlier versions."""
+        """All fields by name, for JSON, without a single axis."""
         return {name: value for name, value in asdict(self).items() if (name, value) != ("axes", 1)}
 
     def __str__(self) -> str:

@@ -22,7 +22,7 @@ all others."""
 @dataclass(frozen=True, slots=True)
 class ObjectRule:
     """The settings by which an object ends (ClassifierConfig). With the defaults here only NEW
-    OBJECT ends it, as in versions before 0.2."""
+    OBJECT ends it."""
 
     max_sweeps: int = 0
     conflict: str = "fuse"

@@ -56,7 +56,7 @@ class RecordKind(IntEnum):
 
 _EDGES = {RecordKind.EDGES: struct.Struct("<QB"), RecordKind.SLIDES: struct.Struct("<QBdd")}
 """Layout of an edge: time and kind; in SLIDES also speed in mm/s and force in N, 0 if START had
-none. Edges without them are still written as EDGES, which earlier versions read."""
+none. Edges without them are written as EDGES."""
 
 
 class CaptureWriter(Observer):
@@ -70,7 +70,7 @@ class CaptureWriter(Observer):
     """
 
     def __init__(self, path: Path, format: SweepFormat, profile: SkinProfile = PALPATE) -> None:
-        # the profile of PROTOCOL.md is left out, as in captures of earlier versions
+        # the profile of PROTOCOL.md is left out
         head = json.dumps(
             format.json() | ({} if profile.codec == PALPATE.codec else {"skin": profile.json()})
         ).encode()
@@ -221,12 +221,11 @@ class Playback:
         return frames
 
     def _enter(self, state: str) -> None:
-        """Play a STATE record. When the skin is opened, OPENED is written; version 0.1 wrote
-        `streaming`."""
-        if state == OPENED or (state == "streaming" and not self._opened):
-            self._stream.restart()
+        """Play a STATE record."""
         self._opened = state == OPENED
-        if state != OPENED:
+        if self._opened:
+            self._stream.restart()
+        else:
             self.state = state
 
     def edges(self, now_ns: int) -> list[Edge]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import os
 import struct
 from collections.abc import Callable
@@ -25,28 +24,19 @@ from palpate.sim import devices, rig, script, skin
 from palpate.sweeps.capture import MOST_KEPT, CaptureWriter, Playback, RecordKind
 from palpate.sweeps.sweep_window import SweepCutter
 from tests.factories import toy_bundle
-from tests.factories.paths import ONE_AXIS
 from tests.factories.settings import load as load_settings
 from tests.factories.simulated_box import SECOND, OnSweep, Rigged
 from tests.factories.skin_wires import WiredSkin, profile
 
-UNTIL_NEW_OBJECT = (
-    "classifier.conflict=fuse",
-    "classifier.max_sweeps=0",
-    "classifier.object_s=0",
-)
-"""The settings with which only NEW OBJECT ends an object, as in versions before 0.2."""
 Make = Callable[..., Rigged]
 
 
-def played(
-    path: Path, model: Bundle, sets: tuple[str, ...] = ()
-) -> tuple[list[Verdict], list[Sweep]]:
+def played(path: Path, model: Bundle) -> tuple[list[Verdict], list[Sweep]]:
     """Verdicts and sweeps of a capture."""
     play = Playback(path)
     sweeps: list[Sweep] = []
     verdicts: list[Verdict] = []
-    classifier = assembly.classifier(load_settings(sets), model, play)
+    classifier = assembly.classifier(load_settings(), model, play)
     pipeline = Pipeline(play, play, SweepCutter(play.format, SweepConfig()), classifier)
     observers = [OnSweep(lambda sweep, verdict: sweeps.append(sweep))]
     box = Box(pipeline, play, port=StdoutPort("replay", play.commands), observers=observers)
@@ -130,19 +120,6 @@ def test_a_capture_gives_the_same_verdicts_bit_for_bit(
         assert (a.frames.t_ns == b.frames.t_ns).all()
 
 
-def test_a_capture_from_before_there_were_axes(tmp_path: Path):
-    """Its sweeps get their original verdicts with the settings of then."""
-    model = toy_bundle.load(tmp_path / "bundle")
-    verdicts, sweeps = played(ONE_AXIS / "capture", model, UNTIL_NEW_OBJECT)
-    then = json.loads((ONE_AXIS / "verdicts.json").read_text())
-    names = "sweep", "status", "label", "fused"
-    found = [[getattr(v, name) for name in names] for v in verdicts]
-    assert found == [[v[name] for name in names] for v in then]
-    np.testing.assert_allclose([v.scores for v in verdicts], [v["scores"] for v in then], rtol=1e-5)
-    kept = load(ONE_AXIS / "sweep.npy")[0]
-    np.testing.assert_array_equal(sweeps[1].frames.taxels, kept.frames.taxels)
-
-
 @pytest.mark.slow
 def test_commands_are_part_of_a_capture(rigged: Make, default_bundle: Bundle, path: Path):
     """NEW and ABORT affect later sweeps, so they are captured: replayed sweeps are fused and end as
@@ -220,7 +197,7 @@ def test_other_files_are_named(path: Path, content: bytes | None, hint: str):
 
 
 def test_speed_and_force_are_part_of_a_capture(path: Path):
-    """Edges come back with them, and edges without them are written as before."""
+    """Edges come back with them, and edges without them are written shorter."""
     plain, with_speed = Edge(EdgeKind.STOP, 5), Edge(EdgeKind.START, 6, 30.0)
     capture = CaptureWriter(path, skin.FORMAT)
     capture.edges(7, [plain])
@@ -232,8 +209,8 @@ def test_speed_and_force_are_part_of_a_capture(path: Path):
     assert play.edges(8) == [plain, with_speed, Edge(EdgeKind.START, 7, 0.1, 1.5)]
     play.read()
     assert [command.line for command in play.commands()] == ["START,30"]
-    as_before = struct.pack("<BQIQB", RecordKind.EDGES, 7, 9, 5, [*EdgeKind].index(plain.kind))
-    assert as_before in path.read_bytes()
+    short = struct.pack("<BQIQB", RecordKind.EDGES, 7, 9, 5, [*EdgeKind].index(plain.kind))
+    assert short in path.read_bytes()
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -1.0])
