@@ -135,7 +135,7 @@ def levels(simulated: devices.SimDevices, *names: str) -> list[tuple[str, bool]]
 @pytest.mark.parametrize(
     ("scores", "agree", "want"),
     [
-        ([0.95], 1, True),
+        ([0.9], 1, True),
         ([0.89], 1, False),
         ([0.95, 0.85], 1, True),
         ([0.95, 0.79], 1, False),

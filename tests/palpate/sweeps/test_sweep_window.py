@@ -79,7 +79,8 @@ SCRIPTS = {
     "no frames at all": "start 0; stop 2000; wait 1; due gap",
     "start without stop": """frames 0 3000; start 100; due; wait 6.2; due long; stop 6000; wait 1;
         due; frames 7000 3000; start 7100; stop 9400; due ok""",
-    "longer than the limit": "frames 0 4600; start 0; stop 4599; due long",
+    "longer than the limit": """frames 0 4600; start 0; stop 4500; due ok; start 0; stop 4501;
+        due long""",
     "stop without start": "stop 100; due no-start",
     "double start": "frames 0 3000; start 100; start 600; due no-stop; stop 2600; due ok",
     "not ready": "blind 100; due not-ready; stop 2500; wait 1; due",
