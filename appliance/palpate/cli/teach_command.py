@@ -22,7 +22,7 @@ from palpate.core.log import log
 from palpate.deployment.enrolment_key import TAUGHT, EnrolmentKey
 from palpate.learn import install, materials
 from palpate.learn.process import News
-from palpate.learn.program import NOTHING, Lesson, Outputs, TeachingProgram
+from palpate.learn.program import NOTHING, Outputs, TaughtLesson, TeachingProgram
 from palpate.learn.session import refuse_trained
 from palpate.runtime import assembly
 from palpate.sweeps import unknown_sweeps
@@ -48,7 +48,9 @@ def run(args: argparse.Namespace) -> int:
     if not args.labels and args.web is None:
         return _in_json(args, lambda: _assess(args, settings))
     EnrolmentKey(settings.store.enrolment_key).check(TAUGHT)
-    lesson = Lesson(args.labels, args.position, args.session, args.good, args.by, _options(args))
+    lesson = TaughtLesson(
+        args.labels, args.position, args.session, args.good, args.by, _options(args)
+    )
     if args.web is not None:
         _session(args, without_lines(args, settings), lesson, args.web)
         return 0
@@ -68,7 +70,7 @@ def until_taught(args: argparse.Namespace, settings: Config) -> int:
         f"{NOTHING}: READY stays low; teach the box on its page, {address} (systemctl start "
         "palpate-teach starts it at once), or by palpate teach; or deploy a bundle"
     )
-    lesson = Lesson(options=_options(args), waits=address)
+    lesson = TaughtLesson(options=_options(args), waits=address)
     _session(args, without_lines(args, settings), lesson)
     return 0
 
@@ -94,7 +96,7 @@ def without_lines(args: argparse.Namespace, settings: Config) -> Config:
 
 
 def _session(
-    args: argparse.Namespace, settings: Config, lesson: Lesson, web: int | None = None
+    args: argparse.Namespace, settings: Config, lesson: TaughtLesson, web: int | None = None
 ) -> None:
     """Record sweeps and teach them, also on a page at the port `web`."""
     with ExitStack() as stack:

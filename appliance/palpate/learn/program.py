@@ -37,7 +37,7 @@ NOTHING, GOOD = "nothing taught yet", 8
 
 
 @dataclass(frozen=True, slots=True)
-class Lesson:
+class TaughtLesson:
     """The lesson that a person asks for.
 
     labels: materials to record one after another; without them the page or the robot names them.
@@ -74,7 +74,7 @@ class TeachingProgram:
     the delivered bundle into which materials are taught. Raises ConfigError."""
 
     def __init__(
-        self, settings: Config, devices: Devices, format: SweepFormat, lesson: Lesson
+        self, settings: Config, devices: Devices, format: SweepFormat, lesson: TaughtLesson
     ) -> None:
         self.settings, self.devices, self.lesson = settings, devices, lesson
         self.base = install.base(assembly.store(settings), format)
@@ -106,12 +106,17 @@ class TeachingProgram:
     def run(self, outputs: Outputs) -> None:
         """Run until all sweeps are recorded; with a page until DONE."""
         self.outputs = outputs
-        while self._ran(Recording) and outputs.pages and not self.ended and self._ran(Trying):
+        while (
+            self._ran(RecordingPhase)
+            and outputs.pages
+            and not self.ended
+            and self._ran(TryingPhase)
+        ):
             pass
 
-    def _ran(self, phase: type[Recording | Trying]) -> bool:
+    def _ran(self, phase: type[RecordingPhase | TryingPhase]) -> bool:
         with ExitStack() as stack:
-            self._phase: Recording | Trying = phase(self, stack)
+            self._phase: RecordingPhase | TryingPhase = phase(self, stack)
             return self._phase.run()
 
     def finish(self, _: str) -> list[object]:
@@ -131,7 +136,7 @@ class TeachingProgram:
 
 
 class Phase:
-    """A part of the program with a box of its own. orders: of the page, before the box's own."""
+    """A part of the program with a box of its own. orders: of the page, taken before those of the box."""
 
     box: Box
     orders: Mapping[str, CommandHandler]
@@ -142,7 +147,7 @@ class Phase:
         return own(command.text) if own else self.box.obey(command)
 
 
-class Recording(Phase):
+class RecordingPhase(Phase):
     """Records and assesses. `stack` closes it."""
 
     def __init__(self, program: TeachingProgram, stack: ExitStack) -> None:
@@ -229,7 +234,7 @@ class Recording(Phase):
         ]
 
 
-class Trying(Phase):
+class TryingPhase(Phase):
     """Classifies with the new bundle, on trial as in the service. `stack` closes it."""
 
     def __init__(self, program: TeachingProgram, stack: ExitStack) -> None:

@@ -26,7 +26,7 @@ from palpate.deployment.signed import SignedBundle
 from palpate.inference.classifier import Classifier
 from palpate.io.robot_link import command
 from palpate.learn import enrolment, install, materials
-from palpate.learn.program import Lesson, Outputs, TeachingProgram, Trying
+from palpate.learn.program import Outputs, TaughtLesson, TeachingProgram, TryingPhase
 from palpate.learn.session import TeachingSession
 from palpate.runtime import assembly
 from palpate.sim import skin
@@ -289,10 +289,10 @@ def test_a_trained_material_is_refused_before_a_sweep(box: TaughtDelivery, capsy
     assert sorted((box.store / "sweeps").iterdir()) == recorded
     settings = replace(box.settings, trigger=replace(box.settings.trigger, mode="serial"))
     format, page = box.running.bundle.format, (Observer(),)
-    program = TeachingProgram(settings, Devices(SystemClock()), format, Lesson())
+    program = TeachingProgram(settings, Devices(SystemClock()), format, TaughtLesson())
     program.outputs = Outputs(page, "", lambda facts: [], lambda facts: [], lambda stack: None)
     with ExitStack() as stack:
-        phase = Trying(program, stack)
+        phase = TryingPhase(program, stack)
         with pytest.raises(ConfigError, match="was trained on 'foam'"):
             phase.obey(command("TEACH", "foam"))
         assert phase.obey(command("TEACH", "cork")) == ["cork"]

@@ -43,7 +43,7 @@ def turned(taxels: Array, direction: str) -> Array:
     return backwards.swapaxes(1, 2) if direction.startswith("cols") else backwards
 
 
-def measured(
+def expect_measured(
     meter: SlideMeter,
     taxels: Array,
     speed: float = 30.0,
@@ -62,13 +62,13 @@ def measured(
 def test_speed_and_direction_are_those_of_the_pattern(speed: float, direction: str):
     """Within 3 %, in each direction, between the limits of the meter."""
     meter = SlideMeter(FORMAT, PITCH_MM)
-    measured(meter, turned(passed(FORMAT, speed), direction), speed, direction)
+    expect_measured(meter, turned(passed(FORMAT, speed), direction), speed, direction)
     assert (meter.slowest_mm_s, meter.fastest_mm_s) == (8.0, 400.0)
 
 
 def test_the_pitch_scales_the_speed():
     """The same counts on a skin with half the pitch: half the speed."""
-    measured(SlideMeter(FORMAT, PITCH_MM / 2), passed(FORMAT, 30.0), 15.0)
+    expect_measured(SlideMeter(FORMAT, PITCH_MM / 2), passed(FORMAT, 30.0), 15.0)
 
 
 @pytest.mark.parametrize("shear", [False, True])
@@ -77,7 +77,7 @@ def test_the_simulators_texture_travels(shear: bool):
     normal axis is the last, gives the same."""
     world = replace(skin.WORLD, shear=shear)
     window = skin.window("plastic rough", skin.Placement(), np.random.default_rng(1), world)
-    measured(SlideMeter(world.format, skin.PITCH_MM), window, within=0.05)
+    expect_measured(SlideMeter(world.format, skin.PITCH_MM), window, within=0.05)
 
 
 BREAKS = {
@@ -97,13 +97,13 @@ def test_two_broken_taxels_change_little(broken: str):
     rng, taxels = np.random.default_rng(2), passed(FORMAT, 30.0)
     for r, c in ((1, 2), (3, 0)):
         taxels[:, r, c] = BREAKS[broken](taxels[:, r, c], rng)
-    measured(SlideMeter(FORMAT, PITCH_MM), taxels, within=0.05)
+    expect_measured(SlideMeter(FORMAT, PITCH_MM), taxels, within=0.05)
 
 
 def test_vibrations_of_all_taxels_are_left_out():
     """Ten times the pattern's variance, in phase on all taxels, in the band of the pattern."""
     hum = 63 * np.sin(2 * np.pi * 9.3 * np.arange(1500) / 750)[:, None, None]
-    measured(SlideMeter(FORMAT, PITCH_MM), passed(FORMAT, 30.0) + hum, within=0.05)
+    expect_measured(SlideMeter(FORMAT, PITCH_MM), passed(FORMAT, 30.0) + hum, within=0.05)
 
 
 @pytest.mark.parametrize(
@@ -183,7 +183,7 @@ def test_a_single_line_of_taxels_is_enough(rows: int, cols: int, direction: str)
     """A slide along the line."""
     taxels = turned(passed(replace(FORMAT, rows=8, cols=1), 30.0), direction)
     meter = SlideMeter(replace(FORMAT, rows=rows, cols=cols), PITCH_MM)
-    measured(meter, taxels, direction=direction)
+    expect_measured(meter, taxels, direction=direction)
 
 
 def test_a_large_skin_is_measured_where_it_is_touched():
@@ -195,6 +195,6 @@ def test_a_large_skin_is_measured_where_it_is_touched():
     taxels[:, 9:15, 20:26] += passed(replace(format, rows=6, cols=6), 30.0)
     taxels[:, 2, 3] = 4000 * rng.random(10_000)
     meter = SlideMeter(format, PITCH_MM)
-    measured(meter, taxels)
+    expect_measured(meter, taxels)
     tables = [table for table in vars(meter).values() if isinstance(table, np.ndarray)]
     assert sum(table.nbytes for table in tables) < 2 << 20
