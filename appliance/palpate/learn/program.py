@@ -136,7 +136,7 @@ class TeachingProgram:
 
 
 class Phase:
-    """A part of the program with a box of its own. orders: of the page, taken before those of the box."""
+    """A part of the program with its box. orders: of the page, taken before those of the box."""
 
     box: Box
     orders: Mapping[str, CommandHandler]
