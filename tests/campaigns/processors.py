@@ -1,8 +1,8 @@
-"""The numerical tests with the arithmetic of other processors, and all fast tests under load.
+"""The numerical tests with the arithmetic of other processors, and tests of waiting under load.
 
 `python -m tests.campaigns processors [OPTION ...]` runs pytest once for each kind of processor that
 OpenBLAS knows and this one can imitate, with one thread or with eight in turn (`--all`: with both),
-and once beside BUSY endless loops; options go to pytest. Takes ten minutes on two cores.
+and once beside BUSY endless loops; options go to pytest. Takes some minutes on two cores.
 """
 
 from __future__ import annotations
@@ -20,7 +20,13 @@ KINDS = {"Nehalem": "sse4_2", "Haswell": "avx2", "Zen": "avx2", "SkylakeX": "avx
 """Names of OPENBLAS_CORETYPE, each with the flag of /proc/cpuinfo that it needs."""
 THREADS = ("1", "8")
 BUSY = 8
-NUMERICAL = ("tests/palpate/signal", "tests/palpate/inference", "tests/palpate_train")
+NUMERICAL = ("tests/palpate/signal", "tests/palpate/inference", "tests/palpate_train/calibration")
+WAITING = (
+    "tests/palpate/io",
+    "tests/palpate/runtime",
+    "tests/palpate/service",
+    "tests/palpate/sweeps",
+)
 FAST = ("-m", "pytest", "-q", "-n", str((os.cpu_count() or 1) + 1), "--dist", "worksteal")
 FAST += ("-m", "not slow and not thorough")
 
@@ -46,7 +52,7 @@ def main(options: Sequence[str]) -> int:
     ]
     loops = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(BUSY)]
     try:
-        passed.append(tested(options))
+        passed.append(tested((*WAITING, *options)))
     finally:
         for loop in loops:
             loop.kill()

@@ -33,7 +33,6 @@ def test_every_form_is_a_bundle_of_its_own_and_made_once(tmp_path: Path):
         box = Classifier(bundle.load(one.folder), SystemClock())
         known = sweeps()
         assert [box.logits(counts).argmax() for counts in known.samples] == known.labels.tolist()
-        assert one.window_s == 0.4
         assert (
             measure.sizes(one.folder)[0]
             == (one.folder / "model.onnx").stat().st_size
