@@ -66,7 +66,3 @@ def test_bench_parts(
     assert main(["check", "--bench", "--part", "stream", "--acts", str(tmp_path / "acts.npz")]) == 0
     shares = json.loads(capsys.readouterr().out)
     assert 0 < shares["cpu_share_streaming"] < shares["cpu_share_with_simulated_board"]
-    assert main(["check", "--bench", "--part", "hand", "--acts", str(tmp_path / "acts.npz")]) == 0
-    shares = json.loads(capsys.readouterr().out)["cpu_share_by_skins"]
-    assert [*shares] == ["1", "2", "4"]
-    assert 0 < shares["1"] < shares["4"]

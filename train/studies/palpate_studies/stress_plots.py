@@ -47,7 +47,7 @@ AREA = 8.0
 NETWORK: Mapping[str, Any] = {"color": BLACK, "linewidth": 1.0, "linestyle": (0, (3, 1.5))}
 COLUMNS, HEIGHT = 3, 1.42
 """Small pictures in a row; height of each in inches, with title and labels."""
-LINE, LONGEST = 0.2, 22
+LINE, LONGEST = 0.2, 20
 """In a legend: length of a line in inches, and the letters of a text if three fit in a row."""
 
 
