@@ -124,7 +124,10 @@ def test_a_bare_host_is_installed_as_a_bare_user(host: hosts.Host, installed: st
     assert host.machine.get("cat", "/opt/palpate/stamp") == name
     assert name in host.machine.get("cat", f"/proc/{host.service['MainPID']}/maps")
     assert host.machine.get("cat", "/etc/palpate/palpate.toml") == 'board = "rpi5"'
-    assert host.machine.get("/usr/local/bin/palpate", "config").count("# board-rpi5.toml") > 3
+    assert (
+        host.machine.get("/usr/local/bin/palpate", "check", "--settings").count("# board-rpi5.toml")
+        > 3
+    )
     assert host.machine.get("stat", "-c", "%U %a", "/etc/palpate/allowed_signers") == "root 644"
     assert host.machine.run("systemd-analyze", "verify", "palpate.service").stderr == ""
     files = [f"/etc/palpate/watch/{one}" for one in ("token", "key.pem", "certificate.pem")]
