@@ -113,7 +113,9 @@ def where(box: FleetBox) -> tuple[str, str]:
     not use a delivered bundle."""
     lacks = "{ echo 'no Palpate is installed there; make install HOST=... first' >&2; exit 1; }"
     settings = tomllib.loads(
-        box.run("asking for its settings", f"test -x {PALPATE} || {lacks}; {PALPATE} check --settings")
+        box.run(
+            "asking for its settings", f"test -x {PALPATE} || {lacks}; {PALPATE} check --settings"
+        )
     )
     if own := settings["classifier"]["bundle"]:
         raise Failed(
