@@ -18,31 +18,11 @@ from palpate.core.errors import BundleError
 from palpate.core.health import Health
 from palpate.deployment.store import Store
 from palpate.service.status_file import StatusFile
-from tests.factories import deliveries, toy_bundle
+from tests.factories import deliveries, feeds, toy_bundle
 from tests.factories.deliveries import Delivery
 
 RUNNING = bundle.load(bundle.DEFAULT)
-HEALTH = Health(
-    time_ns=0,
-    skin="streaming",
-    trouble="",
-    streams=True,
-    sweeping=False,
-    answered=7,
-    frames=5_000,
-    lost_frames=0,
-    garbage_bytes=0,
-    enumerations=1,
-    dropped=0,
-    bundle=RUNNING.id,
-    source="usb",
-    stale_frames=0,
-    overflows=0,
-    fifo_overflows=0,
-    glitches=0,
-    lost_edges=0,
-    storms=0,
-)
+HEALTH = feeds.HEALTH._replace(frames=5_000, lost_frames=0, bundle=RUNNING.id, ready=False)
 
 
 @pytest.fixture

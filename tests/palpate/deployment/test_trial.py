@@ -19,7 +19,7 @@ from palpate.deployment.state import MOST_STARTS, Standing
 from palpate.deployment.store import Store
 from palpate.deployment.trial import Trial
 from palpate.sim import devices, rig, script, skin
-from tests.factories import deliveries
+from tests.factories import deliveries, feeds
 from tests.factories.deliveries import Delivery
 from tests.factories.simulated_box import Rigged, idle_devices
 
@@ -29,26 +29,17 @@ SECOND = 1_000_000_000
 
 def health(time_s: float, streams: bool = True, sweeping: bool = False) -> Health:
     """Health of the box at this time."""
-    return Health(
+    return feeds.HEALTH._replace(
         time_ns=round(time_s * SECOND),
         skin="streaming" if streams else "absent",
-        trouble="",
         streams=streams,
         sweeping=sweeping,
         answered=0,
         frames=0,
         lost_frames=0,
-        garbage_bytes=0,
-        enumerations=1,
-        dropped=0,
         bundle="",
         source="sim",
-        stale_frames=0,
-        overflows=0,
-        fifo_overflows=0,
-        glitches=0,
-        lost_edges=0,
-        storms=0,
+        ready=False,
     )
 
 

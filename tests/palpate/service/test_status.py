@@ -25,29 +25,10 @@ from palpate.service import status
 from palpate.service.status_file import StatusFile
 from palpate.service.systemd import VerdictLog
 from palpate.sim import devices, rig
+from tests.factories import feeds
 from tests.factories.simulated_box import SECOND, Rigged, idle_devices
 
-HEALTH = Health(
-    time_ns=0,
-    skin="streaming",
-    trouble="",
-    streams=True,
-    sweeping=False,
-    answered=7,
-    frames=5_000_000,
-    lost_frames=3,
-    garbage_bytes=0,
-    enumerations=1,
-    dropped=0,
-    bundle="9f3c2a1b",
-    source="usb",
-    stale_frames=0,
-    overflows=0,
-    fifo_overflows=0,
-    glitches=0,
-    lost_edges=0,
-    storms=0,
-)
+HEALTH = feeds.HEALTH._replace(ready=False)
 AWAY = HEALTH._replace(skin="absent", trouble="no skin on USB; check cable", streams=False)
 OK = Verdict(
     sweep=7,
