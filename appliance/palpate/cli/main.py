@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
-from collections.abc import Callable, Sequence
-from importlib import import_module
 
-from palpate.cli import parser
-from palpate.core.errors import ApplianceError
-from palpate.core.interrupts import INTERRUPTED, during_imports
+from palpate.core.errors import INTERRUPTED, ApplianceError
 from palpate.core.text import printable, replace_unprintable
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -21,15 +20,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     # One loop, one thread. Otherwise OpenBLAS starts a thread for each core when numpy is imported,
     # and a product in the loop waits for a thread that a busy processor does not run.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    words = sys.argv[1:] if argv is None else list(argv)
     try:
-        if not words or words == ["help"]:
-            words = ["--help"]
-        with during_imports("palpate"):
-            args = parser.arguments(words[0], words[1:])
-            run = _function(args.run)
-            _show_log()
-        code = run(args)
+        code = _run(sys.argv[1:] if argv is None else list(argv))
         _flush()
         return code
     except ApplianceError as e:
@@ -50,12 +42,30 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 1
 
 
-def _show_log() -> None:
-    """Print the log from now on, if the command has loaded it. `status` starts sooner without."""
-    if "palpate.core.log" in sys.modules:
-        from palpate.core.log import to_stderr
+def _run(words: list[str]) -> int:
+    """The command in these words. `status` does without the parser and all that others need."""
+    if words[:1] == ["status"]:
+        from palpate.cli import status_command
+        from palpate.core import runtime_folder
 
-        to_stderr()
+        if words[1:] in status_command.PLAIN and runtime_folder.is_default():
+            return status_command.show(as_json=len(words) > 1)
+    from importlib import import_module
+
+    from palpate.cli import parser
+    from palpate.core.interrupts import during_imports
+
+    if not words or words == ["help"]:
+        words = ["--help"]
+    with during_imports("palpate"):
+        args = parser.arguments(words[0], words[1:])
+        module, _, function = args.run.rpartition(".")
+        run = getattr(import_module(f"palpate.{module}"), function)
+        if "palpate.core.log" in sys.modules:  # a command without a log starts sooner
+            from palpate.core.log import to_stderr
+
+            to_stderr()
+    return int(run(args))
 
 
 def _fill_streams() -> None:
@@ -86,11 +96,3 @@ def _flush() -> None:
 def _give_up_output() -> None:
     """Write nothing more to standard output, not even at the end of the interpreter."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-
-
-def _function(path: str) -> Callable[[argparse.Namespace], int]:
-    module, _, function = path.rpartition(".")
-    found: Callable[[argparse.Namespace], int] = getattr(
-        import_module(f"palpate.{module}"), function
-    )
-    return found

@@ -2,27 +2,40 @@
 
 from __future__ import annotations
 
-import argparse
 import time
 
-from palpate.core import settings_files
+from palpate.core import runtime_folder
 from palpate.core.errors import ConfigError
-from palpate.core.runtime_folder import STATUS
 from palpate.service import status
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    import argparse
+
+PLAIN: tuple[list[str], ...] = ([], ["--json"])
+"""The options that need no parser."""
 
 
 def run(args: argparse.Namespace) -> int:
     """Print the state of the service; 69 if it waits for the skin, 1 if it does not run."""
-    layers = settings_files.read(args.board, args.set, folder=args.config_dir)
-    folder = settings_files.runtime(layers)
+    from palpate.core import settings_files
+
+    folder = settings_files.runtime(
+        settings_files.read(args.board, args.set, folder=args.config_dir)
+    )
     if folder is None:
         raise ConfigError(
             'store.runtime = "" turns the status file off; set it to a folder, and restart the'
             " service"
         )
+    return show(str(folder), as_json=args.json)
+
+
+def show(folder: str = runtime_folder.RUNTIME, *, as_json: bool) -> int:
+    """The same for a box with this runtime folder."""
     now_ns = time.monotonic_ns()
-    report = status.read(folder / STATUS, now_ns)
-    if args.json:
+    report = status.read(f"{folder}/{runtime_folder.STATUS}", now_ns)
+    if as_json:
         import json
 
         print(json.dumps(report, indent=1))

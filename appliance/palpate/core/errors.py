@@ -8,6 +8,8 @@ import errno
 
 # `os` has them on Unix only, but the client also runs elsewhere
 EX_DATAERR, EX_UNAVAILABLE, EX_SOFTWARE, EX_TEMPFAIL, EX_CONFIG = 65, 69, 70, 75, 78
+INTERRUPTED = 130
+"""Exit code of a program that Ctrl-C has ended, as in a shell."""
 
 PASSING = frozenset(
     getattr(errno, name)

@@ -13,8 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-INTERRUPTED = 130
-"""Exit code of a program that Ctrl-C has ended, as in a shell."""
+from palpate.core.errors import INTERRUPTED as INTERRUPTED
 
 
 @contextmanager

@@ -8,12 +8,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from palpate.core import runtime_folder
 from palpate.core.errors import ConfigError, TemporaryError, passes
-from palpate.core.runtime_folder import RUNTIME
 from palpate.core.text import shown
 
-SITE = Path("/etc/palpate/palpate.toml")
-"""The settings of this robot's installation; the file may be missing."""
+SITE = Path(runtime_folder.SITE)
 
 
 class Layers(NamedTuple):
@@ -56,7 +55,7 @@ def read(
 def runtime(layers: Layers) -> Path | None:
     """store.runtime, the folder of the status file and of the feed; None if it is "". Raises
     ConfigError."""
-    value: object = RUNTIME
+    value: object = runtime_folder.RUNTIME
     for where, table in layers.tables:
         section = table.get("store")
         if isinstance(section, dict) and "runtime" in section:
@@ -77,9 +76,8 @@ def boards(folder: Path | None = None) -> dict[str, Path]:
 
 
 def default_folder() -> Path:
-    """firmware_config/ of this checkout; in an installation the folder of SITE."""
-    beside = Path(__file__).resolve().parents[3] / "firmware_config"
-    return beside if beside.is_dir() else SITE.parent
+    """See `runtime_folder.settings_folder`."""
+    return Path(runtime_folder.settings_folder())
 
 
 def read_toml(path: Path, *, needed: bool = True) -> dict[str, Any]:

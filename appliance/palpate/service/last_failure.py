@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from palpate.core.errors import EX_CONFIG, ApplianceError
+from palpate.core.runtime_folder import LAST_FAILURE as FILE
 
 if TYPE_CHECKING:
     from palpate.core.clock import Clock
 
-FILE = "last-failure.json"
 AGAIN_NS = 60_000_000_000
 """A failure within this time after the last one lengthens the pause."""
 PAUSES_S = (0.0, 1.0, 2.0, 4.0, 6.0)

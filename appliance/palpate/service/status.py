@@ -3,16 +3,16 @@ shows it in words. It needs neither numpy nor the settings' schema."""
 
 from __future__ import annotations
 
-import json
 import os
-from collections.abc import Mapping
-from pathlib import Path
-from typing import Any
 
 from palpate.core.errors import ApplianceError, FormatError
-from palpate.core.health import Health
-from palpate.core.status import REASONS, Status
-from palpate.service import last_failure
+from palpate.core.runtime_folder import LAST_FAILURE
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+    from typing import Any
 
 SCHEMA = 1
 VERDICTS = 20
@@ -25,25 +25,19 @@ _START = "systemctl start palpate, then see journalctl -u palpate"
 WELL, NOT_RUNNING, SKIN_AWAY = os.EX_OK, 1, os.EX_UNAVAILABLE
 
 
-def read(path: Path, now_ns: int) -> dict[str, Any]:
+def read(path: Path | str, now_ns: int) -> dict[str, Any]:
     """The content of the file, with `running`, and `why` if the service does not run. now_ns: of
     the writer's clock.
 
     Raises FormatError for a file of another version, ApplianceError if it may not be read.
     """
     try:
-        with path.open("rb") as f:
-            report = json.loads(f.read(MOST_BYTES))
-        if not isinstance(report, dict) or report.get("schema") != SCHEMA:
-            raise TypeError(f"not an object of schema {SCHEMA}")
+        with open(path, "rb") as f:
+            report = _report(f.read(MOST_BYTES))
         pid, age_ns = int(report["pid"]), now_ns - int(report["time_ns"])
-        report["verdicts"] = [v | {"status": Status(v["status"])} for v in report["verdicts"]]
-        if missing := set(Health._fields) - report.keys():
-            raise KeyError(min(missing))
     except FileNotFoundError:
-        last = last_failure.read(path.parent)
         why = f"the service does not run, or has just started (no {path}); {_START}"
-        return {"running": False, "why": last.text if last else why}
+        return {"running": False, "why": _last_failure(path) or why}
     except OSError as e:
         raise ApplianceError(
             f"{path} cannot be read: {e.strerror}; see store.runtime, or ask as root"
@@ -53,14 +47,42 @@ def read(path: Path, now_ns: int) -> dict[str, Any]:
     why = ""
     # a file from before the last boot can be ahead of this boot's clock
     if not _alive(pid) or age_ns < 0:
-        last = last_failure.read(path.parent)
-        why = last.text if last else f"process {pid} has ended without closing down; {_START}"
+        why = _last_failure(path) or f"process {pid} has ended without closing down; {_START}"
     elif age_ns > STALE_NS:
         why = (
             f"process {pid} has written nothing for {_span(age_ns)}, so it hangs; the service's "
             "watchdog restarts it"
         )
     return report | {"running": not why, "why": why}
+
+
+def _report(data: bytes) -> dict[str, Any]:
+    """The content of the file. Raises one of several errors if it is not as StatusFile writes."""
+    import json
+
+    from palpate.core.health import Health
+    from palpate.core.status import Status
+
+    report: dict[str, Any] = json.loads(data)
+    if not isinstance(report, dict) or report.get("schema") != SCHEMA:
+        raise TypeError(f"not an object of schema {SCHEMA}")
+    report["verdicts"] = [v | {"status": Status(v["status"])} for v in report["verdicts"]]
+    if missing := set(Health._fields) - report.keys():
+        raise KeyError(min(missing))
+    return report
+
+
+def _last_failure(path: Path | str) -> str:
+    """Why the service has ended, "" if that is not known. path: of the status file."""
+    folder = os.path.dirname(path)
+    if not os.path.exists(os.path.join(folder, LAST_FAILURE)):
+        return ""
+    from pathlib import Path
+
+    from palpate.service import last_failure
+
+    last = last_failure.read(Path(folder))
+    return last.text if last else ""
 
 
 def _alive(pid: int) -> bool:
@@ -86,6 +108,8 @@ def lines(report: Mapping[str, Any], now_ns: int) -> list[str]:
     if not report["running"]:
         return [f"not running: {report['why']}"]
     head = f"process {report['pid']}, palpate {report['version']}, source {report['source']}"
+    from palpate.core.health import Health
+
     rows = [f"running for {_span(now_ns - report['since_ns'])} ({head})"]
     facts = {
         "skin": _skin(report),
@@ -140,6 +164,8 @@ def _trigger(report: Mapping[str, Any]) -> str:
 
 def verdict_line(v: Mapping[str, Any], now_ns: int) -> str:
     """One verdict as a row. v: as in the file, with its Status."""
+    from palpate.core.status import REASONS
+
     what = REASONS.get(v["status"], "")
     if v["status"].classified:
         what = f"{v['label']:<24}  {100 * v['probability']:5.1f} %  {v['latency_ns'] / 1e6:6.1f} ms"

@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 import termios
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -22,10 +23,9 @@ import pytest
 from palpate.bundle import bundle
 from palpate.bundle.bundle import Early
 from palpate.cli import devices as cli_devices
-from palpate.cli import main as main_module
 from palpate.cli import parser
 from palpate.cli.main import main
-from palpate.core import config, statistics, storage
+from palpate.core import config, runtime_folder, statistics, storage
 from palpate.core.clock import SystemClock
 from palpate.core.devices import Devices
 from palpate.core.errors import (
@@ -546,7 +546,7 @@ def test_a_set_of_another_format(tmp_path: Path, capsys: pytest.CaptureFixture[s
 def test_help_and_status_load_little(words: list[str]):
     """They answer at once, because nothing slow is imported for them; `status` prints a file."""
     slow = {"numpy", "onnxruntime", "usb", "serial", "gpiod"}
-    slow |= {"dataclasses", "logging"} if words == ["status"] else set()
+    slow |= {"dataclasses", "logging", "argparse", "tomllib"} if words == ["status"] else set()
     code = (
         "import contextlib, sys\n"
         "from palpate.__main__ import main\n"
@@ -556,11 +556,25 @@ def test_help_and_status_load_little(words: list[str]):
     assert python(code) == "set()"
 
 
+def test_status_finds_another_runtime_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """A settings file that names store.runtime is read, and a missing one is not needed."""
+    monkeypatch.setattr(runtime_folder, "CHECKOUT", str(tmp_path))
+    (tmp_path / "skin.toml").write_text("skin.rate_hz = 100.0\n")
+    assert main(["status"]) == 1
+    assert runtime_folder.RUNTIME in capsys.readouterr().out
+    (tmp_path / "skin.toml").write_text(f'store.runtime = "{tmp_path}"\n')
+    assert main(["status"]) == 1
+    assert str(tmp_path) in capsys.readouterr().out
+
+
 def test_each_command_has_a_function():
     """Each command and action names a function that exists."""
     for command in parser.COMMANDS.values():
         for one in command.actions.values() or [command]:
-            assert callable(main_module._function(one.run))
+            module, _, function = one.run.rpartition(".")
+            assert callable(getattr(import_module(f"palpate.{module}"), function))
 
 
 def test_unknown_arguments_are_usage_errors():
