@@ -64,27 +64,25 @@ def test_pages_of_the_studies_are_listed_and_their_links_lead_into_the_site(
     """By their titles; links to Markdown lead to the pages made of it, linked files come along."""
 
     def write(command: list[str], **_: object) -> None:
-        if "palpate_studies" not in command:
-            return
-        page = command[-1] / "soak" / "index.html"
+        page = command[-1] / "stress" / "index.html"
         page.parent.mkdir(parents=True)
         page.write_text(
-            '<a href="../../README.md"><a href="../../docs/skins.md#load"><img src="soak.svg">'
+            '<a href="../../README.md"><a href="../../docs/skins.md#load"><img src="stress.svg">'
         )
-        page.with_name("soak.svg").write_text("<svg/>")
+        page.with_name("stress.svg").write_text("<svg/>")
 
     monkeypatch.setattr(build.subprocess, "run", write)
     sources, site = tmp_path / "src", tmp_path / "site"
     build.results(sources)
     listed = (sources / build.RESULTS).read_text()
-    assert f'<a href="results/soak/index.html">{build.RESULT_PAGES["soak"]}</a>' in listed
-    build.take_over(Path("results/soak/index.html"), sources, site)
-    shown = (site / "results" / "soak" / "index.html").read_text()
+    assert f'<a href="results/stress/index.html">{build.RESULT_PAGES["stress"]}</a>' in listed
+    build.take_over(Path("results/stress/index.html"), sources, site)
+    shown = (site / "results" / "stress" / "index.html").read_text()
     assert re.findall(r'href="([^"]+)"', shown) == [
         "../../index.html",
         "../../docs/skins.html#load",
     ]
-    assert (site / "results" / "soak" / "soak.svg").is_file()
+    assert (site / "results" / "stress" / "stress.svg").is_file()
 
 
 def test_links_of_the_built_site_are_followed(build: ModuleType, tmp_path: Path):

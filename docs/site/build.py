@@ -27,14 +27,13 @@ from palpate_train.cli.main import PROGRAM
 HERE = Path(__file__).resolve().parent
 
 LINK = re.compile(r"(!?\[[^\]]*\]\()([^)#\s]+)((?:#[^)\s]*)?\))")
-RESULTS, SOAK = "results.md", "docs/data/soak.json"
+RESULTS = "results.md"
 RESULT_PAGES = {
     "development": "Speed against accuracy: our methods and their peers",
     "paper": "The paper's experiment, run again (simulated)",
     "stress-fabrics": "Robustness: accuracy on corrupted sweeps of recorded fabrics",
     "stress": "Robustness: accuracy on corrupted sweeps (simulated)",
     "certainty": "Calibration, unknown materials, several sweeps, enrolment (simulated)",
-    "soak": "Hours of sweeps without a pause",
 }
 """Pages of studies, by their folders, the most telling first."""
 REFERENCE = re.compile(r'(?:href|src)="([^"]+)"')
@@ -111,13 +110,8 @@ def gather(out: Path) -> list[str]:
 def results(out: Path) -> None:
     """Draw the pages of results into `out`/results, and list them on a page."""
     pages = (out / "results").absolute()
-    drawn: tuple[list[str | Path], ...] = (
-        ["palpate_studies", "pages", "--out", pages],
-        ["tests.rig.soak", "--draw", "--work", pages, "--out", SOAK, "--page", pages / "soak"],
-    )
-    for words in drawn:
-        command = [sys.executable, "-m", *words]
-        subprocess.run(command, check=True, cwd=ROOT, stdout=subprocess.DEVNULL)
+    command: list[str | Path] = [sys.executable, "-m", "palpate_studies", "pages", "--out", pages]
+    subprocess.run(command, check=True, cwd=ROOT, stdout=subprocess.DEVNULL)
     names = [page.parent.name for page in sorted(pages.glob("*/index.html"))]
     links = [
         f'- <a href="results/{name}/index.html">{RESULT_PAGES.get(name, name)}</a>'

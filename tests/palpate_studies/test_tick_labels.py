@@ -22,7 +22,6 @@ from palpate_studies import (
 from palpate_train.reports import bundle_report, plot_style, selection_plots, sweep_plot
 from tests.factories import choice_data, development_data, stress_data
 from tests.factories.study_pages import committed
-from tests.rig import soak_page
 
 
 def image() -> str:
@@ -42,7 +41,6 @@ PICTURES: dict[str, Callable[[], Any]] = {
     "stress": lambda: stress_report.render(stress_data.figures()),
     "choice": lambda: selection_plots.sizes(choice_data.choice()["rungs"], "pairs", 0.9, "sizes"),
     "less": lambda: selection_plots.reductions(choice_data.choice()["less"], "less"),
-    "soak": lambda: soak_page.charts(committed("soak")),
     "sweep": lambda: sweep_plot.draw(sweep_plot.load("sim:T-REAL:1001:1", 3)),
     "image": image,
     "development": lambda: development_report.render(development_data.figures()),

@@ -1,7 +1,7 @@
 """`python -m tests.rig.soak --hours 1`: boxes sweep without pause, and each sentence is judged.
 
-The results are a record of each box, a page with four charts, and exit code 1 if a target was
-missed. A process of its own records each box.
+The results are a record of each box with its sums, and exit code 1 if a target was missed. A
+process of its own records each box.
 """
 
 from __future__ import annotations
@@ -9,13 +9,13 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import re
 import signal
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,14 +25,15 @@ from palpate.core.provenance import commit
 from palpate.core.sentences import checksum
 from palpate.sim import skin
 from palpate_train.metrics import score
-from palpate_train.reports import html
 from tests.factories.paths import ROOT
-from tests.rig import soak_judge, soak_page
-from tests.rig.soak_boxes import BoxUnderTest, Gone, Script, ThisMachine
+from tests.rig import soak_judge
+from tests.rig.soak_boxes import Gone, Script, ThisMachine
 from tests.rig.soak_guest import VirtualBox
 from tests.rig.soak_judge import SoakRun
 
+BoxUnderTest = ThisMachine | VirtualBox
 BOXES = {kind.name: kind for kind in (ThisMachine, VirtualBox)}
+WORK = ROOT / "build" / "soak"
 WAIT_S, SAMPLE_S, MINUTE_S = 0.2, 10.0, 60.0
 SILENT_S = 60.0
 """A box that sends nothing for this long has ended; a working box sends its state each second."""
@@ -79,11 +80,7 @@ class Recorder:
     def sweeping(self) -> bool:
         """Whether a sweep has certainly begun and not ended."""
         now_s = self._clock()
-        (_, stops), (starts, _) = (
-            self._box.edges(now_s + MARGIN_S),
-            self._box.edges(now_s - MARGIN_S),
-        )
-        return starts > stops
+        return self._box.edges(now_s - MARGIN_S)[0] > self._box.edges(now_s + MARGIN_S)[1]
 
     def stop(self) -> None:
         """Make the box end; all sweeps that have begun must be answered. Raises Gone."""
@@ -128,18 +125,8 @@ class Recorder:
         ):
             self.fault(wrong, at_s)
         self._last = max(self._last, answer.sweep)
-        self.run.answers.append(
-            [
-                self._since(at_s),
-                answer.sweep,
-                fact.label,
-                answer.status,
-                answer.label,
-                fact.alone,
-                answer.latency_ms,
-                answer.lost,
-            ]
-        )
+        row = [self._since(at_s), answer.sweep, fact.label, answer.status, answer.label]
+        self.run.answers.append([*row, fact.alone, answer.latency_ms, answer.lost])
 
     def _note(self, at_s: float, state: list[str]) -> None:
         if state[1] == "streaming":
@@ -152,23 +139,17 @@ class Recorder:
 
 
 def record(
-    box: BoxUnderTest,
-    run: SoakRun,
-    length_s: float,
-    save: Callable[[], None],
-    *,
-    stopped: Callable[[], bool] = lambda: False,
-    log: Callable[[str], None] = print,
+    box: BoxUnderTest, run: SoakRun, length_s: float, save: Callable[[], None], stopped: list[int]
 ) -> None:
-    """Let a box sweep for this long; `save` is called each minute and at the end. Faults are in the
-    run."""
+    """Let a box sweep for this long, or until a signal is in `stopped`; `save` is called each
+    minute and at the end. Faults are in the run."""
     recorder = Recorder(box, run, Script(run.seed))
     try:
         recorder.start()
-        while run.length_s < length_s and not stopped():
-            recorder.listen(min(MINUTE_S, length_s - run.length_s), stopped)
+        while run.length_s < length_s and not stopped:
+            recorder.listen(min(MINUTE_S, length_s - run.length_s), lambda: bool(stopped))
             save()
-            log(f"{box.name}: {progress(run)}")
+            print(f"{box.name}: {progress(run)}", flush=True)
         recorder.listen(SILENT_S, recorder.sweeping)
         recorder.stop()
         run.ended = "time" if run.length_s >= length_s else "interrupted"
@@ -184,155 +165,72 @@ def progress(run: SoakRun) -> str:
     """The progress of a run as one line of text."""
     results = soak_judge.sums({"runs": [asdict(run)]})
     memory = f"{results['rss_kib'][-1] / 1024:.1f} MiB, " if results["rss_kib"] else ""
-    return (
-        f"{run.length_s / 60:.0f} min, {results['answers']} sweeps, {results['unanswered']} "
-        f"unanswered, {results['wrong']['n']} "
-        f"wrong, {memory}{results['lost']} frames lost, {results['unaccounted']} unaccounted "
-        f"for, {results['faults']} faults"
+    names = ("unanswered", "wrong", "lost", "unaccounted", "faults")
+    counts = (
+        f"{name} {results[name]['n'] if name == 'wrong' else results[name]}" for name in names
     )
+    return f"{run.length_s / 60:.0f} min, {memory}{results['answers']} sweeps: {', '.join(counts)}"
 
 
 def write(path: Path, content: Mapping[str, Any]) -> None:
-    """Write JSON whole or not at all, one row on each line."""
-    storage.put(path, (_text(content) + "\n").encode(), parents=True)
+    """Write JSON whole or not at all, each list of plain values on one line."""
+    text = json.dumps(content, indent=1)
+    text = re.sub(r"\[\n[^\[\]{}]*\]", lambda rows: json.dumps(json.loads(rows[0])), text)
+    storage.put(path, (text + "\n").encode(), parents=True)
 
 
-def _text(value: Any, indent: str = "") -> str:
-    flat = isinstance(value, list | tuple) and not any(
-        isinstance(v, dict | list | tuple) for v in value
-    )
-    if flat or not isinstance(value, dict | list | tuple):
-        return json.dumps(value)
-    deeper = indent + " "
-    named = isinstance(value, dict)
-    each = (
-        [f"{json.dumps(k)}: {_text(v, deeper)}" for k, v in value.items()]
-        if named
-        else [_text(v, deeper) for v in value]
-    )
-    begin, end = "{}" if named else "[]"
-    return f"{begin}\n{deeper}" + f",\n{deeper}".join(each) + f"\n{indent}{end}"
+def soak(name: str, seed: int, hours: float, work: Path) -> None:
+    """Record one box for `hours`, or until a signal comes."""
+    box, run, got = BOXES[name](), SoakRun(seed), list[int]()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda n, frame: got.append(n))
+    about = {"box": name, "commit": commit(), "bundle": score.shipped(), "seed": seed}
+    about |= {"format": str(skin.FORMAT), **box.about()}
+    about |= {"started": datetime.now(UTC).isoformat(timespec="seconds"), "hours": hours}
+    path = work / f"{name.replace(' ', '-')}.json"
+    record(box, run, hours * 3600, lambda: write(path, about | {"runs": [asdict(run)]}), got)
+    print(f"{name}: ended ({run.ended}); {progress(run)}", flush=True)
 
 
-def soak(
-    box: BoxUnderTest,
-    seed: int,
-    hours: float,
-    work: Path,
-    *,
-    stopped: Callable[[], bool] = lambda: False,
-    log: Callable[[str], None] = print,
-) -> Path:
-    """Record one box for `hours`; returns its record."""
-    path = _record(work, box.name)
-    about = {
-        "box": box.name,
-        "commit": commit(),
-        "bundle": score.shipped(),
-        "seed": seed,
-        "format": str(skin.FORMAT),
-        **box.about(),
-    }
-    run, started = SoakRun(seed, 0.0), datetime.now(UTC).isoformat(timespec="seconds")
-
-    def save() -> None:
-        write(path, about | {"started": started, "hours": hours, "runs": [asdict(run)]})
-
-    record(box, run, hours * 3600, save, stopped=stopped, log=log)
-    log(f"{box.name}: ended ({run.ended}); {progress(run)}")
-    return path
-
-
-def draw(work: Path, out: Path, page: Path) -> bool:
-    """Check the records against the targets, and write results and page; False if a target was
-    missed.
+def summed(work: Path, out: Path) -> bool:
+    """Check the records against the targets, and write the results; False if a target was missed.
 
     out: the file of results. A box without a record in `work` keeps its record in `out`.
     """
-    paths = [path for name in BOXES if (path := _record(work, name)).exists()]
-    records = _drawn(out) + [json.loads(path.read_text()) for path in paths]
+    records = list(json.loads(out.read_text())["boxes"].values()) if out.exists() else []
+    records += [json.loads(path.read_text()) for path in sorted(work.glob("*.json")) if path != out]
     boxes = {box["box"]: box | {"sums": soak_judge.sums(box)} for box in records}
-    results = {
-        "columns": {"answers": soak_judge.ANSWER, "samples": soak_judge.SAMPLE},
-        "left_out": {
-            name: kind.missing() or "it was not recorded"
-            for name, kind in BOXES.items()
-            if name not in boxes
-        },
-        "boxes": boxes,
+    columns = {"answers": soak_judge.ANSWER, "samples": soak_judge.SAMPLE}
+    left_out = {
+        name: kind.missing() or "it was not recorded"
+        for name, kind in BOXES.items()
+        if name not in boxes
     }
-    write(out, results)
-    rendered, _ = soak_page.render(results)
-    html.publish(page, rendered)
-    reached = True
-    for name, box in results["boxes"].items():
+    write(out, {"columns": columns, "left_out": left_out, "boxes": boxes})
+    reached = bool(records)
+    for name, box in boxes.items():
         for what, wanted, came, met in soak_judge.targets(box["sums"]):
-            mark = {True: "ok  ", False: "FAIL", None: "    "}[met]
-            print(
-                f"{mark} {name:<13} {what}: {came} "
-                f"(wanted {wanted}){'' if met is not None else ', too short to judge'}"
-            )
+            mark = {True: "ok", False: "FAIL", None: "too short to judge"}[met]
+            print(f"{name}: {what}: {came} (wanted {wanted}): {mark}")
             reached &= met is not False
-    return reached and bool(records)
-
-
-def _record(work: Path, name: str) -> Path:
-    return work / f"{name.replace(' ', '-')}.json"
-
-
-def _drawn(out: Path) -> list[dict[str, Any]]:
-    """The records in a file of results; empty if the file does not exist."""
-    return list(json.loads(out.read_text())["boxes"].values()) if out.exists() else []
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        "python -m tests.rig.soak", description="Has boxes sweep without pause, and judges them."
-    )
-    length = parser.add_mutually_exclusive_group()
-    length.add_argument("--hours", type=float, default=1.0, help="how long in all (default 1)")
-    length.add_argument("--minutes", type=float, help="the same in minutes, for a try")
-    parser.add_argument("--seed", type=int, default=1, help="of the robot's sweeps (default 1)")
-    parser.add_argument(
-        "--work", type=Path, default=ROOT / "build" / "soak", help="where records are kept"
-    )
-    parser.add_argument(
-        "--out", type=Path, default=ROOT / "build" / "soak" / "soak.json", help="file of results"
-    )
-    parser.add_argument(
-        "--page", type=Path, default=ROOT / "build" / "soak" / "page", help="where the page goes"
-    )
-    parser.add_argument("--box", choices=BOXES, help="record this one alone, and draw nothing")
-    parser.add_argument(
-        "--draw",
-        action="store_true",
-        help="only draw the records that are there, and those in --out",
-    )
-    return parser
-
-
-def _alone(box: str, seed: int, hours: float, work: Path) -> None:
-    """Record one box until its time is over or a signal comes."""
-    got: list[int] = []
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda n, frame: got.append(n))
-    log = partial(print, flush=True)
-    soak(BOXES[box](), seed, hours, work, stopped=lambda: bool(got), log=log)
+    return reached
 
 
 def main() -> int:
-    """Run the boxes, or one of them, and draw the page; the exit code."""
-    parser = _parser()
+    """Run the boxes, or one of them, and sum up; the exit code."""
+    parser = argparse.ArgumentParser("python -m tests.rig.soak", description=__doc__)
+    parser.add_argument("--hours", type=float, default=1.0, help="how long in all (default 1)")
+    parser.add_argument("--seed", type=int, default=1, help="of the robot's sweeps (default 1)")
+    parser.add_argument("--work", type=Path, default=WORK, help="where records are kept")
+    parser.add_argument("--out", type=Path, default=WORK / "soak.json", help="file of results")
+    parser.add_argument("--box", choices=BOXES, help="record this one alone, and sum up nothing")
     args = parser.parse_args()
-    hours = args.minutes / 60 if args.minutes else args.hours
     if args.box:
-        _alone(args.box, args.seed, hours, args.work)
+        soak(args.box, args.seed, args.hours, args.work)
         return 0
-    arguments = ["--seed", str(args.seed), "--hours", repr(hours)]
-    arguments += ["--work", str(args.work.resolve())]
-    recorded = args.draw or _together(arguments)
-    reached = draw(args.work, args.out, args.page)
-    return 0 if reached and recorded else 1
+    arguments = ["--seed", str(args.seed), "--hours", repr(args.hours)]
+    recorded = _together([*arguments, "--work", str(args.work.resolve())])
+    return 0 if summed(args.work, args.out) and recorded else 1
 
 
 def _together(arguments: list[str]) -> bool:

@@ -21,7 +21,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import onnxruntime as ort
@@ -77,11 +77,8 @@ class Script:
         """Start and stop edges up to this frame."""
         while self._next <= frame:
             self._add()
-        starts, stops = (
-            bisect_right(self._facts, frame, key=key)
-            for key in (lambda f: f.start, lambda f: f.stop)
-        )
-        return starts, stops
+        starts = bisect_right(self._facts, frame, key=lambda f: f.start)
+        return starts, bisect_right(self._facts, frame, key=lambda f: f.stop)
 
     def _add(self) -> None:
         act = next(self._acts)
@@ -98,53 +95,9 @@ class Script:
         return short_answer(verdict.status, verdict.label)
 
 
-class BoxUnderTest(Protocol):
-    """A box with a robot that sweeps without pause. All times are seconds of its clock."""
-
-    name: str
-
-    def clock(self) -> float:
-        """The clock of robot and skin: this machine's, or the guest's. Raises Gone."""
-        ...
-
-    def start(self, seed: int, sweeps: Script) -> None:
-        """Start the box and its robot."""
-        ...
-
-    def heard(self, wait_s: float) -> list[tuple[float, str]]:
-        """Lines since the last call, each with its time; waits at most `wait_s` for more. Raises
-        Gone."""
-        ...
-
-    def edges(self, at_s: float) -> tuple[int, int]:
-        """Numbers of start and stop edges up to that time."""
-        ...
-
-    def taken(self, at_s: float) -> float:
-        """Number of frames that the board had taken up to that time, from any origin."""
-        ...
-
-    def process(self) -> tuple[int, int, float, int, int]:
-        """RSS and PSS in KiB, processor seconds, open files, threads. Raises Gone."""
-        ...
-
-    def about(self) -> Mapping[str, Any]:
-        """What kind of box this is, for the record."""
-        ...
-
-    def stop(self) -> list[tuple[float, str]]:
-        """End the box and wait for its end; returns the last lines. Raises Gone if its exit code is
-        not 0."""
-        ...
-
-    def close(self) -> None:
-        """Clean up, whatever has happened."""
-        ...
-
-
 def process(smaps: str, stat: str, files: int) -> tuple[int, int, float, int, int]:
-    """The fields of `BoxUnderTest.process` from the texts of /proc/PID/smaps_rollup and
-    /proc/PID/stat."""
+    """RSS and PSS in KiB, processor seconds, open files and threads, from the texts of
+    /proc/PID/smaps_rollup and /proc/PID/stat."""
     kib = dict(SMAPS.findall(smaps))
     fields = stat.rpartition(")")[2].split()
     cpu_s = (int(fields[11]) + int(fields[12])) / TICKS
@@ -167,12 +120,9 @@ class Reckoned:
         """Take note of a sentence."""
         if answer := Answer.read(line):
             self._begin(at_s - self._sweeps[answer.sweep].stop / skin.FORMAT.rate_hz - HALF_FRAME_S)
-        if (
-            not self._board_s
-            and line.startswith("$PPLP,STA,")
-            and int(frames := line.split(",")[6])
-        ):
-            self._board_s = at_s - int(frames) / skin.FORMAT.rate_hz
+        if not self._board_s and line.startswith("$PPLP,STA,"):
+            frames = int(line.split(",")[6])
+            self._board_s = at_s - frames / skin.FORMAT.rate_hz if frames else 0.0
 
     def _begin(self, origin_s: float) -> None:
         """The script began at this time or earlier. Only small corrections are accepted: the first
@@ -181,15 +131,13 @@ class Reckoned:
             self._origin_s = origin_s
 
     def edges(self, at_s: float) -> tuple[int, int]:
-        """As BoxUnderTest.edges."""
-        return (
-            self._sweeps.edges((at_s - self._origin_s) * skin.FORMAT.rate_hz)
-            if self._origin_s
-            else (0, 0)
-        )
+        """Numbers of start and stop edges up to that time."""
+        if not self._origin_s:
+            return 0, 0
+        return self._sweeps.edges((at_s - self._origin_s) * skin.FORMAT.rate_hz)
 
     def taken(self, at_s: float) -> float:
-        """As BoxUnderTest.taken."""
+        """Number of frames that the board had taken up to that time, from any origin."""
         return (at_s - self._board_s) * skin.FORMAT.rate_hz if self._board_s else 0.0
 
 
@@ -212,7 +160,7 @@ class ThisMachine:
         return ""
 
     def start(self, seed: int, sweeps: Script) -> None:
-        """As BoxUnderTest."""
+        """Start the box and its robot."""
         self._robot = Reckoned(sweeps)
         self.launch("--sim", "skin", "--seed", str(seed))
 
@@ -232,7 +180,8 @@ class ThisMachine:
         self._box.wait()
 
     def heard(self, wait_s: float) -> list[tuple[float, str]]:
-        """As BoxUnderTest."""
+        """Lines since the last call, each with its time; waits at most `wait_s` for more. Raises
+        Gone."""
         if self._box.poll() is not None:
             raise Gone(f"the box ended with {self._box.returncode}: {self._log_text()}")
         return self._read(wait_s)
@@ -258,15 +207,15 @@ class ThisMachine:
         return self._log.read_text(errors="replace").strip()[-300:]
 
     def edges(self, at_s: float) -> tuple[int, int]:
-        """As BoxUnderTest."""
+        """Numbers of start and stop edges up to that time."""
         return self._robot.edges(at_s)
 
     def taken(self, at_s: float) -> float:
-        """As BoxUnderTest."""
+        """Number of frames that the board had taken up to that time, from any origin."""
         return self._robot.taken(at_s)
 
     def process(self) -> tuple[int, int, float, int, int]:
-        """As BoxUnderTest."""
+        """See `process`. Raises Gone."""
         place = Path("/proc", str(self._box.pid))
         try:
             smaps, stat = ((place / name).read_text() for name in ("smaps_rollup", "stat"))
@@ -277,7 +226,7 @@ class ThisMachine:
             ) from e
 
     def about(self) -> Mapping[str, Any]:
-        """As BoxUnderTest."""
+        """What kind of box this is, for the record."""
         versions = {
             "python": platform.python_version(),
             "numpy": np.__version__,
@@ -291,7 +240,8 @@ class ThisMachine:
         }
 
     def stop(self) -> list[tuple[float, str]]:
-        """As BoxUnderTest."""
+        """End the box and wait for its end; returns the last lines. Raises Gone if its exit code is
+        not 0."""
         self._box.terminate()
         lines = list(self._until_ended())
         if self._box.poll() != 0:
@@ -299,7 +249,7 @@ class ThisMachine:
         return lines
 
     def close(self) -> None:
-        """As BoxUnderTest."""
+        """Clean up, whatever has happened."""
         self._stack.close()
 
     def _until_ended(self) -> Iterator[tuple[float, str]]:

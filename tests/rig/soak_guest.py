@@ -73,7 +73,7 @@ class SoakRobot:
 
 
 class VirtualBox:
-    """A guest that continues from its snapshot, as a BoxUnderTest."""
+    """A guest that continues from its snapshot, in place of a ThisMachine."""
 
     name = "virtual box"
 
@@ -93,7 +93,7 @@ class VirtualBox:
         )
 
     def start(self, seed: int, sweeps: Script) -> None:
-        """As BoxUnderTest."""
+        """As ThisMachine."""
         made = image.built()
         if not made:
             raise Gone(self.missing())
@@ -115,14 +115,14 @@ class VirtualBox:
         self._hand.ready.set()
 
     def clock(self) -> float:
-        """As BoxUnderTest; 0 before it has been started."""
+        """As ThisMachine; 0 before it has been started."""
         try:
             return self._guest.clock.now_s() if self._guest else 0.0
         except OSError as e:
             raise Gone(f"the guest has ended: {e}") from e
 
     def heard(self, wait_s: float) -> list[tuple[float, str]]:
-        """As BoxUnderTest."""
+        """As ThisMachine."""
         try:
             self._guest.clock.sleep(wait_s)
         except OSError as e:
@@ -132,12 +132,12 @@ class VirtualBox:
         return [(t_ns / 1e9, line) for t_ns, line in lines]
 
     def edges(self, at_s: float) -> tuple[int, int]:
-        """As BoxUnderTest."""
+        """As ThisMachine."""
         starts, stops = (bisect_right(edges, at_s * 1e9) for edges in self._hand.edges_ns)
         return starts, stops
 
     def taken(self, at_s: float) -> float:
-        """As BoxUnderTest; counts frames that have left the board's FIFO, sent or dropped."""
+        """As ThisMachine; counts frames that have left the board's FIFO, sent or dropped."""
         sent = list(self._sent)
         at = bisect_right(sent, at_s, key=lambda s: s[0])
         return sent[at - 1][1] if at else 0
@@ -159,7 +159,7 @@ class VirtualBox:
         return self._answer(request)
 
     def process(self) -> tuple[int, int, float, int, int]:
-        """As BoxUnderTest."""
+        """As ThisMachine."""
         place = f"/proc/{self._pid}"
         try:
             text = self._guest.run(
@@ -171,7 +171,7 @@ class VirtualBox:
         return process(text, stat, int(files))
 
     def about(self) -> Mapping[str, Any]:
-        """As BoxUnderTest; only describes the emulated machine, since the guest does not run
+        """As ThisMachine; only describes the emulated machine, since the guest does not run
         yet."""
         return {
             "what": "an arm64 Debian in QEMU; the skin on its USB port, the robot on its lines "
@@ -186,7 +186,7 @@ class VirtualBox:
         }
 
     def stop(self) -> list[tuple[float, str]]:
-        """As BoxUnderTest."""
+        """As ThisMachine."""
         try:
             self._guest.run("systemctl stop palpate", timeout_s=60, check=True)
         except (GuestFailed, OSError) as e:
@@ -194,5 +194,5 @@ class VirtualBox:
         return self.heard(1.0)
 
     def close(self) -> None:
-        """As BoxUnderTest."""
+        """As ThisMachine."""
         self._stack.close()

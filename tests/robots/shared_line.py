@@ -26,7 +26,7 @@ class SharedLine(ThisMachine):
         super().launch(*options)
 
     def heard(self, wait_s: float) -> list[tuple[float, str]]:
-        """As BoxUnderTest; also passes on commands of the bridge."""
+        """As ThisMachine; also passes on commands of the bridge."""
         ready = select.select([self._far, self._bridge], [], [], wait_s)[0]
         if self._bridge in ready:
             with suppress(BlockingIOError):
