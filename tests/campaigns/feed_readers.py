@@ -226,15 +226,8 @@ def bridged(path: str, seen: Counter[str], stack: ExitStack) -> list[Act]:
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     command = [
-        sys.executable,
-        "-m",
-        "palpate",
-        "bridge",
-        "modbus",
-        "--feed",
-        path,
-        "--listen",
-        f"127.0.0.1:{port}",
+        *(sys.executable, "-m", "palpate", "bridge", "modbus", "--feed", path),
+        *("--listen", f"127.0.0.1:{port}"),
     ]
     bridge = stack.enter_context(subprocess.Popen(command, stderr=subprocess.DEVNULL, cwd=ROOT))
     stack.callback(bridge.kill)

@@ -12,18 +12,8 @@ from typing import Any
 import pytest
 
 COSTLY = {
-    "lite",
-    "ds-cnn",
-    "recurrent",
-    "multirocket-hydra",
-    "quant",
-    "palpate",
-    "palpate-64",
-    "palpate-stages",
-    "palpate-256",
-    "paper-cnn-centred",
-    "tactnet2",
-    "papillarray",
+    *("lite", "ds-cnn", "recurrent", "multirocket-hydra", "quant", "palpate", "palpate-64"),
+    *("palpate-stages", "palpate-256", "paper-cnn-centred", "tactnet2", "papillarray"),
 }
 
 

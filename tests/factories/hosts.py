@@ -1,7 +1,7 @@
 """Real hosts: containers with Debian, each with a network namespace, an sshd and a bare user.
 
-`make install` and `make deploy` are tested on them. `python -m tests.factories.hosts figures`
-measures the time of both. It needs root on this machine.
+`make install` and `make deploy` are tested on them, as root on this machine. `python -m
+tests.factories.hosts` makes their Debian.
 
 Their Debian is made once, in ~/.cache/palpate/hosts, in two kinds: `bare` has the packages of an
 install in apt's cache, as from a mirror; `ready` has them installed. Changes on a host are lost
@@ -10,27 +10,22 @@ when it stops. A drop-in for the unit selects the simulated skin.
 
 from __future__ import annotations
 
-import argparse
 import hashlib
-import json
 import os
 import platform
 import shutil
 import socket
-import statistics
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, closing, suppress
 from itertools import count
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
-from palpate.core.provenance import commit
-from tests.factories import deliveries, nspawn
-from tests.factories.emulated_machines import HOME, ROOT, Missing, run, wheel, whole
+from tests.factories import nspawn
+from tests.factories.emulated_machines import HOME, ROOT, Missing, run, whole
 
 CACHE = HOME.parent / "hosts"
 PACKAGES = ("systemd", "systemd-sysv", "openssh-server", "sudo", "dbus")
@@ -65,17 +60,7 @@ def set_up() -> Path:
 
 def _make(part: Path) -> None:
     bare, ready = part / "bare", part / "ready"
-    run(
-        "mmdebstrap",
-        "--variant=minbase",
-        f"--include={','.join(PACKAGES)}",
-        "--aptopt=Acquire::Languages none",
-        *(f"--dpkgopt=path-exclude=/usr/share/{what}/*" for what in ("man", "doc", "locale")),
-        "--skip=cleanup/apt",
-        "--format=directory",
-        nspawn.SUITE,
-        bare,
-    )
+    nspawn.debian(bare, PACKAGES, "--skip=cleanup/apt")
     _inside(bare, "useradd", "--create-home", "--shell", "/bin/sh", USER)
     (bare / "etc/sudoers.d/user").write_text(f"{USER} ALL=(ALL) NOPASSWD: ALL\n")
     install = ("apt-get", "install", "-y", "-qq", "--no-install-recommends")
@@ -146,12 +131,6 @@ class Host:
         """Shut it down."""
         self.machine.close()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
 
 def key_of(home: Path) -> Path:
     """The key of a new user, in a new home without known hosts."""
@@ -187,7 +166,7 @@ class Hosts:
         _fetch_wheels()
         with self._stack:
             self.hosts = [
-                self._stack.enter_context(Host(root, number, work / f"host-{number}", key))
+                self._stack.enter_context(closing(Host(root, number, work / f"host-{number}", key)))
                 for number in (1 + next(_NUMBERS) % 240 for _ in range(count))
             ]
             self._stack = self._stack.pop_all()
@@ -235,115 +214,8 @@ class Hosts:
         self._stack.close()
 
 
-def figures(repeats: int = 5, many: int = 8) -> dict[str, Any]:
-    """Times of an install and a delivery over loopback, to one host and then to `many` at once."""
-    with tempfile.TemporaryDirectory() as folder:
-        work = Path(folder)
-        for name in ("source", "dist"):
-            (work / name).mkdir()
-        wheel(work / "dist", work / "source")
-        key = deliveries.key(work / "keys")
-        (work / "signers").write_text(deliveries.line(key))
-        install = (
-            "--signers",
-            work / "signers",
-            "--board",
-            "rpi5",
-            "--wheel",
-            next((work / "dist").glob("*.whl")),
-        )
-        bundles = (deliveries.put(work / f"bundle-{n}", deliveries.files(n, key)) for n in count(1))
-        result: dict[str, Any] = {"commit": commit(), "machine": _machine()}
-        with Hosts(1, work / "one") as one:
-            at = ("--host", f"{USER}@127.0.0.1")
-            result["loopback"] = _measured(
-                one, at, install, [next(bundles) for _ in range(repeats)], one.hosts[0]
-            )
-        with Hosts(many, work / "many") as several:
-            at = ("--hosts", several.inventory())
-            result["many"] = _measured(
-                several, at, install, [next(bundles) for _ in range(repeats)]
-            )
-        result["load_after"] = os.getloadavg()[0]
-    return result
-
-
-def _measured(
-    place: Hosts,
-    at: Sequence[str | Path],
-    install: Sequence[str | Path],
-    bundles: Sequence[Path],
-    inside: Host | None = None,
-) -> dict[str, Any]:
-    """Seconds of an install and of each delivery, by the commands' own reports and by a second
-    clock.
-    """
-
-    def timed(command: str, *args: str | Path) -> dict[str, Any]:
-        begin_s = time.monotonic()
-        done = place.desktop(
-            command, *at, *args, "--json", place.work / "report.json", inside=inside
-        )
-        took_s = time.monotonic() - begin_s
-        if done.returncode:
-            raise RuntimeError(done.stdout + done.stderr)
-        result = json.loads((place.work / "report.json").read_text())
-        late_s = result["began_s"] - begin_s  # all processes of a machine share this clock
-        boxes = [
-            box | {"ready_s": round(box["ready_s"] + late_s, 2)} for box in result["boxes"].values()
-        ]
-        return {"command_s": round(took_s, 2), "boxes": boxes}
-
-    installed = timed("install", *install)
-    rounds = [timed("deploy", bundle) for bundle in bundles]
-    boxes = [box for one in rounds for box in one["boxes"]]
-    return {
-        "hosts": len(place.hosts),
-        "rounds": len(rounds),
-        "install": installed,
-        "command_s": _spread([one["command_s"] for one in rounds]),
-        **{name: _spread([box[name] for box in boxes]) for name in ("ready_s", "lost_s")},
-        "deploys": rounds,
-    }
-
-
-def _spread(values: Sequence[float]) -> dict[str, float]:
-    return {"median": round(statistics.median(values), 2), "min": min(values), "max": max(values)}
-
-
-def _machine() -> dict[str, Any]:
-    models = (
-        line
-        for line in Path("/proc/cpuinfo").read_text().splitlines()
-        if line.startswith("model name")
-    )
-    name = next(models, "unknown").partition(": ")[2]
-    return {
-        "processor": name,
-        "arch": platform.machine(),
-        "cores": os.cpu_count(),
-        "load_before": os.getloadavg()[0],
-        "python": platform.python_version(),
-    }
-
-
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser("python -m tests.factories.hosts")
-    commands = parser.add_subparsers(required=True, dest="command")
-    commands.add_parser("set-up", help="make the Debians")
-    measure = commands.add_parser("figures", help="how long an install and a deploy take")
-    measure.add_argument(
-        "--out",
-        type=Path,
-        default=ROOT / "build" / "deploy.json",
-        help="(default build/deploy.json)",
-    )
-    args = parser.parse_args()
     try:
-        if args.command == "set-up":
-            print(set_up())
-        else:
-            args.out.parent.mkdir(exist_ok=True)
-            args.out.write_text(json.dumps(figures(), indent=1) + "\n")
+        print(set_up())
     except Missing as e:
         sys.exit(str(e))

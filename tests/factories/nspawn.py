@@ -19,6 +19,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Self
@@ -29,14 +30,8 @@ CACHE = HOME.parent / "nspawn"
 SUITE, PYTHON = "bookworm", "3.11"
 """Debian 12, the boards' system, and its Python."""
 PACKAGES = (
-    "systemd",
-    "systemd-sysv",
-    "python3-venv",
-    "libstdc++6",
-    "libusb-1.0-0",
-    "openssh-client",
-    "openssl",
-    "udev",
+    *("systemd", "systemd-sysv", "python3-venv", "libstdc++6"),
+    *("libusb-1.0-0", "openssh-client", "openssl", "udev"),
 )
 TOOLS = {
     "mmdebstrap": "mmdebstrap",
@@ -44,15 +39,12 @@ TOOLS = {
     "nsenter": "util-linux",
     "setpriv": "util-linux",
 }
-PLACES = {
-    "palpate.service": "/etc/systemd/system/palpate.service",
-    "palpate@.service": "/etc/systemd/system/palpate@.service",
-    "palpate-watch.service": "/etc/systemd/system/palpate-watch.service",
-    "palpate-teach.path": "/etc/systemd/system/palpate-teach.path",
-    "palpate-teach.service": "/etc/systemd/system/palpate-teach.service",
-    "palpate-bridge@.service": "/etc/systemd/system/palpate-bridge@.service",
-    "palpate.sysusers": "/usr/lib/sysusers.d/palpate.conf",
-    "palpate.tmpfiles": "/usr/lib/tmpfiles.d/palpate.conf",
+UNITS = (
+    *("palpate.service", "palpate@.service", "palpate-watch.service", "palpate-teach.path"),
+    *("palpate-teach.service", "palpate-bridge@.service"),
+)
+PLACES = {unit: f"/etc/systemd/system/{unit}" for unit in UNITS} | {
+    f"palpate.{kind}": f"/usr/lib/{kind}.d/palpate.conf" for kind in ("sysusers", "tmpfiles")
 }
 """The destinations of the files of systemd/."""
 CABLE = """
@@ -78,6 +70,8 @@ WAIT_S = 60
 """Longest wait for an action of a second or two. Other programs may keep this machine busy."""
 PATH = "PATH=/usr/sbin:/usr/bin:/sbin:/bin"
 BOOT_S = 60
+NAMESPACES = ("-m", "-u", "-i", "-n", "-p", "-C", "-r", "-w")
+"""Options of nsenter for all namespaces of a container, its root and its folder."""
 
 
 def folder() -> Path:
@@ -101,32 +95,18 @@ def set_up() -> Path:
     return whole(folder(), _make)
 
 
+def debian(root: Path, packages: Sequence[str], *options: str) -> None:
+    """A minimal Debian with these packages in the folder `root`."""
+    without = (f"--dpkgopt=path-exclude=/usr/share/{what}/*" for what in ("man", "doc", "locale"))
+    including = (f"--include={','.join(packages)}", "--aptopt=Acquire::Languages none", *without)
+    run("mmdebstrap", "--variant=minbase", *including, *options, "--format=directory", SUITE, root)
+
+
 def _make(root: Path) -> None:
-    run(
-        "mmdebstrap",
-        "--variant=minbase",
-        f"--include={','.join(PACKAGES)}",
-        "--aptopt=Acquire::Languages none",
-        *(f"--dpkgopt=path-exclude=/usr/share/{what}/*" for what in ("man", "doc", "locale")),
-        "--format=directory",
-        SUITE,
-        root,
-    )
+    debian(root, PACKAGES)
     wheels = root / "wheels"
-    run(
-        *PIP,
-        "download",
-        "--no-deps",
-        "--only-binary",
-        ":all:",
-        "--python-version",
-        PYTHON,
-        "--require-hashes",
-        "-r",
-        LOCK,
-        "-d",
-        wheels,
-    )
+    binary = ("--no-deps", "--only-binary", ":all:", "--python-version", PYTHON)
+    run(*PIP, "download", *binary, "--require-hashes", "-r", LOCK, "-d", wheels)
     shutil.copy(LOCK, wheels)
     inside = ("chroot", root, "env", "-i", PATH)
     run(*inside, "python3", "-m", "venv", "/opt/palpate")
@@ -135,14 +115,8 @@ def _make(root: Path) -> None:
 
 
 def _pip(*args: str) -> tuple[str, ...]:
-    return (
-        "/opt/palpate/bin/pip",
-        "--disable-pip-version-check",
-        "-q",
-        "install",
-        "--no-index",
-        *args,
-    )
+    pip = ("/opt/palpate/bin/pip", "--disable-pip-version-check", "-q", "install")
+    return (*pip, "--no-index", *args)
 
 
 def _group() -> Path | None:
@@ -170,33 +144,18 @@ class Machine:
             socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as ear,
         ):
             ear.bind(f"{place}/notify")
+            inside = ("sh", "-c", 'echo $$ >"$0/cgroup.procs"; exec "$@"', self._group)
             command = (
-                *(
-                    ("sh", "-c", 'echo $$ >"$0/cgroup.procs"; exec "$@"', self._group)
-                    if self._group
-                    else ()
-                ),
-                "setpriv",
-                "--pdeathsig",
-                "TERM",  # so a killed test run leaves no container behind
-                "systemd-nspawn",
-                "--quiet",
-                f"--directory={root}",
-                f"--machine=palpate-{os.getpid()}",
-                "--register=no",
-                "--keep-unit",
-                "--console=pipe",
-                "--private-network",
+                *(inside if self._group else ()),
+                *("setpriv", "--pdeathsig", "TERM"),  # a killed test run leaves no container
+                *("systemd-nspawn", "--quiet", f"--directory={root}", "--boot", "--keep-unit"),
+                *(f"--machine=palpate-{os.getpid()}", "--register=no", "--console=pipe"),
+                *("--private-network", "--volatile=overlay", "--notify-ready=yes"),
                 "--system-call-filter=bpf",  # IPAddressDeny= of the units
-                "--volatile=overlay",
-                "--notify-ready=yes",
                 f"--bind-ro={parcel}:/parcel",
-                "--boot",
             )
-            env = os.environ | {
-                "NOTIFY_SOCKET": f"{place}/notify",
-                "SYSTEMD_NSPAWN_UNIFIED_HIERARCHY": "1",
-            }
+            env = os.environ | {"NOTIFY_SOCKET": f"{place}/notify"}
+            env |= {"SYSTEMD_NSPAWN_UNIFIED_HIERARCHY": "1"}
             with log.open("wb") as out:
                 self._process = subprocess.Popen(
                     command, env=env, stdin=subprocess.DEVNULL, stdout=out, stderr=subprocess.STDOUT
@@ -228,22 +187,7 @@ class Machine:
         self, *command: str, say: str = "", limit_s: float = 60
     ) -> subprocess.CompletedProcess[str]:
         """Run a command in it to the end, with `say` as its input."""
-        enter = (
-            "nsenter",
-            "-t",
-            self.first,
-            "-m",
-            "-u",
-            "-i",
-            "-n",
-            "-p",
-            "-C",
-            "-r",
-            "-w",
-            "env",
-            "-i",
-            PATH,
-        )
+        enter = ("nsenter", "-t", self.first, *NAMESPACES, "env", "-i", PATH)
         return subprocess.run(
             [*enter, *command],
             input=say,
@@ -252,6 +196,15 @@ class Machine:
             timeout=limit_s,
             check=False,
         )
+
+    def as_user(self, pid: int | str, user: str, *command: str) -> subprocess.CompletedProcess[str]:
+        """Run a command as a user, with its groups, in the file system that a process sees."""
+        who = ("setpriv", f"--reuid={user}", "--regid=palpate", "--clear-groups")
+        return self.run("nsenter", "-t", str(pid), "-m", *who, *command)
+
+    def shown(self, unit: str, name: str) -> str:
+        """A property of a unit."""
+        return self.get("systemctl", "show", unit, "--value", "-p", name)
 
     def get(self, *command: str, say: str = "") -> str:
         """The output of a command, which must succeed."""

@@ -26,18 +26,8 @@ from tests.fuzz import enrolments, far_sides, skins
 from tests.fuzz.files import NPY
 
 ENDLESS = packets.HEADER.pack(
-    packets.MAGIC,
-    packets.VERSION,
-    packets.PacketKind.REPLY,
-    packets.MAX_PAYLOAD,
-    0,
-    1,
-    0,
-    0,
-    0,
-    0,
-    0,
-    0,
+    *(packets.MAGIC, packets.VERSION, packets.PacketKind.REPLY, packets.MAX_PAYLOAD, 0, 1, 0, 0),
+    *(0, 0, 0, 0),
 )
 """The header of the largest possible packet; a reader waits for the end of this packet."""
 

@@ -29,35 +29,12 @@ SUITE = "bookworm"
 GUEST_PYTHON = "3.11"
 """Python version of SUITE."""
 PACKAGES = (
-    "systemd",
-    "systemd-sysv",
-    "udev",
-    "dbus",
-    "kmod",
-    "libpam-systemd",
-    "python3-venv",
-    "libusb-1.0-0",
-    "e2fsprogs",
-    "procps",
-    "usbutils",
-    "openssh-server",
-    "openssl",
-    "sudo",
+    *("systemd", "systemd-sysv", "udev", "dbus", "kmod", "libpam-systemd", "python3-venv"),
+    *("libusb-1.0-0", "e2fsprogs", "procps", "usbutils", "openssh-server", "openssl", "sudo"),
 )
 MODULES = (
-    "virtio_blk",
-    "virtio_pci",
-    "ext4",
-    "crc32c_generic",
-    "virtio_console",
-    "virtio_rng",
-    "autofs4",
-    "xhci-pci",
-    "cdc-acm",
-    "ftdi_sio",
-    "usbserial",
-    "tmpfs",
-    "virtio_net",
+    *("virtio_blk", "virtio_pci", "ext4", "crc32c_generic", "virtio_console", "virtio_rng"),
+    *("autofs4", "xhci-pci", "cdc-acm", "ftdi_sio", "usbserial", "tmpfs", "virtio_net"),
 )
 EARLY = ("virtio_pci", "virtio_blk", "ext4", "crc32c_generic")
 """Modules that the ramdisk loads; everything else comes from the disk."""
@@ -65,16 +42,8 @@ LINES = ("START", "STOP", "READY", "FAULT", "RESULT-VALID", "CLASS-0", "CLASS-1"
 """Names of the guest's eight PL061 lines, by offset."""
 DISK = "2G"
 MACHINE = (
-    "-machine",
-    "virt,gic-version=3",
-    "-cpu",
-    "cortex-a72",
-    "-smp",
-    "2",
-    "-m",
-    "512",
-    "-nic",
-    "none",
+    *("-machine", "virt,gic-version=3", "-cpu", "cortex-a72", "-smp", "2", "-m", "512"),
+    *("-nic", "none"),
 )
 """The guest's hardware, as far as its device tree describes it."""
 TOOLS = {

@@ -24,18 +24,8 @@ ANSWER = ("s", "number", "touched", "status", "label", "alone", "latency_ms", "l
 alone: the label of the same bundle for the exact frames of the script, computed by the recorder
 (see `said`)."""
 SAMPLE = (
-    "s",
-    "rss_kib",
-    "pss_kib",
-    "cpu_s",
-    "files",
-    "threads",
-    "received",
-    "lost",
-    "garbage",
-    "enumerations",
-    "dropped",
-    "behind",
+    *("s", "rss_kib", "pss_kib", "cpu_s", "files", "threads", "received", "lost", "garbage"),
+    *("enumerations", "dropped", "behind"),
 )
 """Columns of a sample: the process, then the counters of the last STA. behind: frames that the
 board had taken and the box had not yet counted as received or lost; the minimum since the previous

@@ -20,30 +20,13 @@ from palpate.sim import rig, skin
 from tests.rig.cell import Cell, Touch
 
 FIELDS = (
-    "time",
-    "state",
-    "sweeping",
-    "answered",
-    "received",
-    "lost",
-    "garbage",
-    "enumerations",
-    "dropped",
-    "bundle",
-    "source",
+    *("time", "state", "sweeping", "answered", "received", "lost", "garbage", "enumerations"),
+    *("dropped", "bundle", "source"),
 )
 """The first fields of a state sentence (PROTOCOL.md, part 2)."""
 LATE = {
-    "gap",
-    "short",
-    "long",
-    "no-start",
-    "no-stop",
-    "edges-lost",
-    "sensor-lost",
-    "not-ready",
-    "unsure",
-    "unknown",
+    *("gap", "short", "long", "no-start", "no-stop", "edges-lost", "sensor-lost", "not-ready"),
+    *("unsure", "unknown"),
 }
 """Answers to good sweeps while the guest is busy with something else: frames or edges reach the box
 late, and the window is shifted. None names a wrong material."""

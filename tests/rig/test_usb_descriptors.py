@@ -82,16 +82,10 @@ LIARS = {
 }
 QUICK = list(LIARS)[:3]
 HARMLESS = {
-    "255 endpoints claimed",
-    "255 interfaces claimed",
-    "a total length of 65535",
-    "packets of 65535 bytes",
-    "255 configurations",
-    "a device descriptor of length 8",
-    "strings of odd length",
-    "strings that claim 255 bytes",
-    "strings of no bytes",
-    "strings that are no UTF-16",
+    *("255 endpoints claimed", "255 interfaces claimed", "a total length of 65535"),
+    *("packets of 65535 bytes", "255 configurations", "a device descriptor of length 8"),
+    *("strings of odd length", "strings that claim 255 bytes"),
+    *("strings of no bytes", "strings that are no UTF-16"),
 }
 """Faults that the kernel or libusb corrects, or that nobody reads: such a device may stream."""
 OPINIONS = {"streaming", "mismatch", "lost", "silent", "busy"}

@@ -40,21 +40,8 @@ class Descriptors:
     """The descriptors that the device returns to the kernel; a test may put any bytes here."""
 
     device: bytes = struct.pack(
-        "<BBHBBBBHHHBBBB",
-        18,
-        1,
-        0x0200,
-        0,
-        0,
-        0,
-        MAX_PACKET,
-        VENDOR_ID,
-        PRODUCT_ID,
-        0x0100,
-        1,
-        2,
-        3,
-        1,
+        *("<BBHBBBBHHHBBBB", 18, 1, 0x0200, 0, 0, 0, MAX_PACKET, VENDOR_ID, PRODUCT_ID, 0x0100),
+        *(1, 2, 3, 1),
     )
     configuration: bytes = (
         struct.pack("<BBHBBBBB", 9, 2, 25, 1, 1, 0, 0x80, 50)

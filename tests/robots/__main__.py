@@ -95,18 +95,9 @@ class Times:
 def box(port: str, feed: Path) -> Iterator[None]:
     """A box that sweeps simulated tubes in real time."""
     command = [
-        sys.executable,
-        "-m",
-        "palpate",
-        "run",
-        "--sim",
-        "skin",
-        "--set",
-        f"serial.port={port}",
-        "--set",
-        f"store.runtime={feed.parent}",
-        "--set",
-        "store.folder=/nonexistent",
+        *(sys.executable, "-m", "palpate", "run", "--sim", "skin", "--set"),
+        *(f"serial.port={port}", "--set", f"store.runtime={feed.parent}"),
+        *("--set", "store.folder=/nonexistent"),
     ]
     with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL) as process:
         try:

@@ -167,14 +167,8 @@ def said(attackers: subprocess.Popen[bytes]) -> dict[str, int]:
 def page_of(feed: Path) -> Iterator[int]:
     """Start the page of the box with this feed; returns its port."""
     command = [
-        sys.executable,
-        "-m",
-        "palpate",
-        "watch",
-        "--web",
-        "0",
-        "--set",
-        f"store.runtime={feed.parent}",
+        *(sys.executable, "-m", "palpate", "watch", "--web", "0"),
+        *("--set", f"store.runtime={feed.parent}"),
     ]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=ROOT) as process:
         try:

@@ -91,14 +91,14 @@ def test_modbus_reads_the_feed_and_outlives_the_service(machine: Machine, bridge
     bridges.start()
     bridges.until("StatusText", STREAMS)
     machine.get("systemctl", "start", MODBUS)
-    pid = machine.get("systemctl", "show", MODBUS, "--value", "-p", "MainPID")
+    pid = machine.shown(MODBUS, "MainPID")
     assert ask(machine, ASK_MODBUS, "1").split()[2] == "1"
     assert machine.get("stat", "-c", "%U", f"/proc/{pid}") == "palpate-bridge"
     machine.get("systemctl", "stop", "palpate")
     assert ask(machine, ASK_MODBUS, "0").split()[2] == "0"
     machine.get("systemctl", "start", "palpate")
     assert ask(machine, ASK_MODBUS, "1").split()[2] == "1"
-    assert machine.get("systemctl", "show", MODBUS, "--value", "-p", "MainPID") == pid
+    assert machine.shown(MODBUS, "MainPID") == pid
 
 
 def test_the_line_over_tcp(machine: Machine, bridges: Service):
@@ -135,7 +135,7 @@ def test_settings_that_cannot_be_used(machine: Machine, bridges: Service):
     machine.put(SITE, '[serial]\nport = "/dev/ttyAMA0"\n')
     machine.get("systemctl", "start", TCP)
     until(machine, f"systemctl is-failed -q {TCP}")
-    assert machine.get("systemctl", "show", TCP, "--value", "-p", "ExecMainStatus") == "78"
+    assert machine.shown(TCP, "ExecMainStatus") == "78"
     assert f'set serial.port = "{LINE}"' in machine.get("journalctl", "-q", "-u", TCP, "-o", "cat")
 
 
@@ -144,19 +144,11 @@ def test_what_it_cannot_do(machine: Machine, bridges: Service):
     bridges.start()
     machine.get("systemctl", "start", MODBUS)
     ask(machine, ASK_MODBUS, "1")
-    pid = machine.get("systemctl", "show", MODBUS, "--value", "-p", "MainPID")
+    pid = machine.shown(MODBUS, "MainPID")
     assert re.search(r"(?m)^CapBnd:\t0+$", machine.get("cat", f"/proc/{pid}/status"))
     inside = machine.run(
-        "nsenter",
-        "-t",
-        pid,
-        "-m",
-        "setpriv",
-        "--reuid=palpate-bridge",
-        "--regid=palpate",
-        "--clear-groups",
-        "ls",
-        "/var/lib/palpate",
+        *("nsenter", "-t", pid, "-m", "setpriv", "--reuid=palpate-bridge", "--regid=palpate"),
+        *("--clear-groups", "ls", "/var/lib/palpate"),
     )
     assert inside.returncode != 0
     assert "Permission denied" in inside.stderr

@@ -48,7 +48,7 @@ else:
 
 
 def limit(machine: Machine, unit: str, name: str) -> int:
-    return int(machine.get("systemctl", "show", unit, "--value", "-p", name))
+    return int(machine.shown(unit, name))
 
 
 @pytest.fixture
@@ -75,7 +75,7 @@ def open_units(machine: Machine, service: Service) -> Iterator[Machine]:
 def test_a_crowd_leaves_room_within_the_limits(open_units: Machine, unit: str):
     """300 connections at once: files and threads stay below the limits of the unit, which are in
     force, and the program goes on."""
-    pid = open_units.get("systemctl", "show", unit, "--value", "-p", "MainPID")
+    pid = open_units.shown(unit, "MainPID")
     files, tasks = limit(open_units, unit, "LimitNOFILE"), limit(open_units, unit, "TasksMax")
     limits = open_units.get("cat", f"/proc/{pid}/limits")
     assert re.search(rf"(?m)^Max open files +{files} +{files} ", limits)
@@ -87,7 +87,7 @@ def test_a_crowd_leaves_room_within_the_limits(open_units: Machine, unit: str):
     assert crowd > 10
     assert opened < files
     assert threads < tasks
-    assert open_units.get("systemctl", "show", unit, "--value", "-p", "MainPID") == pid
+    assert open_units.shown(unit, "MainPID") == pid
 
 
 @pytest.mark.parametrize("unit", PORTS)
@@ -108,8 +108,7 @@ def test_the_unit_of_teaching_is_sound_and_limited(machine: Machine, before: lis
     assert limit(machine, "palpate-teach", "TasksMax") == 64
     assert limit(machine, "palpate-teach", "LimitNOFILE") == 512
     (denied, allowed) = (
-        machine.get("systemctl", "show", "palpate-teach", "--value", "-p", name)
-        for name in ("IPAddressDeny", "IPAddressAllow")
+        machine.shown("palpate-teach", name) for name in ("IPAddressDeny", "IPAddressAllow")
     )
     assert "0.0.0.0/0" in denied
     assert "192.168.0.0/16" in allowed

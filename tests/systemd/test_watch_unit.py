@@ -76,14 +76,14 @@ def test_the_page_is_served_with_the_token_of_the_install(page: Machine):
 def test_it_goes_on_without_the_service(page: Machine, service: Service):
     """The service stops during its work: the page shows it, and is live again after the next
     start."""
-    before = page.get("systemctl", "show", UNIT, "--value", "-p", "MainPID")
+    before = page.shown(UNIT, "MainPID")
     page.get("systemctl", "stop", "palpate")
     assert (
         json.loads(page.get("/opt/palpate/bin/python", "-c", ASK, "away"))["box"]["there"] is False
     )
     page.get("systemctl", "start", "palpate")
     assert json.loads(page.get("/opt/palpate/bin/python", "-c", ASK))["box"]["there"] is True
-    assert page.get("systemctl", "show", UNIT, "--value", "-p", "MainPID") == before
+    assert page.shown(UNIT, "MainPID") == before
 
 
 def test_the_token_is_for_root_and_the_page_alone(page: Machine):
@@ -94,23 +94,15 @@ def test_the_token_is_for_root_and_the_page_alone(page: Machine):
         path = f"/etc/palpate/watch/{name}"
         assert page.get("stat", "-c", "%U:%G %a", path) == "root:palpate-watch 640"
         assert page.run(*other, path).returncode != 0
-    pid = page.get("systemctl", "show", UNIT, "--value", "-p", "MainPID")
+    pid = page.shown(UNIT, "MainPID")
     uid, groups = (
         page.get("stat", "-c", "%u", f"/proc/{pid}"),
         page.get("sed", "-n", "s/^Groups:\t//p", f"/proc/{pid}/status"),
     )
     assert uid == page.get("id", "-u", UNIT)
     inside = page.run(
-        "nsenter",
-        "-t",
-        pid,
-        "-m",
-        "setpriv",
-        f"--reuid={uid}",
-        f"--regid={uid}",
-        f"--groups={groups.replace(' ', ',')}",
-        "ls",
-        "/var/lib/palpate",
+        *("nsenter", "-t", pid, "-m", "setpriv", f"--reuid={uid}", f"--regid={uid}"),
+        *(f"--groups={groups.replace(' ', ',')}", "ls", "/var/lib/palpate"),
     )
     assert inside.returncode != 0
     assert "Permission denied" in inside.stderr
@@ -126,7 +118,7 @@ def test_without_a_token_it_does_not_start_on_the_network(machine: Machine, serv
         "-c",
         f"for i in $(seq 60); do systemctl is-failed -q {UNIT} && exit; sleep 0.5; done; exit 1",
     )
-    assert machine.get("systemctl", "show", UNIT, "--value", "-p", "ExecMainStatus") == "78"
+    assert machine.shown(UNIT, "ExecMainStatus") == "78"
     journal = machine.get("journalctl", "-q", "-u", UNIT, "-o", "cat")
     assert "/etc/palpate/watch/token cannot be read" in journal
     assert "make install makes one" in journal
