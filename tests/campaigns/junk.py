@@ -66,6 +66,7 @@ class SweepDraw:
 
 Make = Callable[[SweepDraw, str], Counts]
 """Raw counts [T, R, C], not yet rounded, of a scene and a material."""
+Wave = Callable[[SweepDraw], Counts]
 
 
 def rests(scene: SweepDraw, material: str) -> Counts:
@@ -83,7 +84,7 @@ def strength(x: Counts) -> float:
     return float(np.sqrt(x.var(axis=0).mean()))
 
 
-def added(base: Make, wave: Callable[[SweepDraw], Counts], share: float) -> Make:
+def added(base: Make, wave: Wave, share: float) -> Make:
     """`base` and a wave of `share` deviations of a slide."""
 
     def make(scene: SweepDraw, material: str) -> Counts:
@@ -93,14 +94,9 @@ def added(base: Make, wave: Callable[[SweepDraw], Counts], share: float) -> Make
     return make
 
 
-def sine(hz: float) -> Callable[[SweepDraw], Counts]:
+def sine(hz: float) -> Wave:
     """A sine on all taxels, of deviation 1."""
-
-    def wave(scene: SweepDraw) -> Counts:
-        turns = hz * SECONDS + scene.rng.random()
-        return np.asarray(np.sqrt(2) * np.sin(2 * np.pi * turns))
-
-    return wave
+    return lambda scene: np.sqrt(2) * np.sin(2 * np.pi * (hz * SECONDS + scene.rng.random()))
 
 
 def chirp(scene: SweepDraw) -> Counts:
@@ -114,17 +110,12 @@ def square(scene: SweepDraw) -> Counts:
     return np.sign(np.sin(2 * np.pi * (10 * SECONDS + scene.rng.random())))
 
 
-def white(scene: SweepDraw) -> Counts:
-    """White noise of each taxel."""
-    return scene.rng.standard_normal((N, 4, 4))
+def white(taxels: int) -> Wave:
+    """White noise of each of 4 x 4 taxels, or of one that stands for all."""
+    return lambda scene: scene.rng.standard_normal((N, taxels, taxels))
 
 
-def common_white(scene: SweepDraw) -> Counts:
-    """White noise that all taxels share."""
-    return scene.rng.standard_normal((N, 1, 1))
-
-
-def coloured(power: float) -> Callable[[SweepDraw], Counts]:
+def coloured(power: float) -> Wave:
     """Noise that all taxels share, of deviation 1, whose power falls with the frequency."""
 
     def wave(scene: SweepDraw) -> Counts:
@@ -155,42 +146,30 @@ def rocks(scene: SweepDraw, material: str) -> Counts:
     return rests(scene, material) * (1 + lean * np.linspace(-1, 1, 4)[:, None])
 
 
-def presses(scene: SweepDraw, material: str) -> Counts:
-    """A finger that rests and presses more and more."""
-    return rests(scene, material) * np.linspace(0.4, 1.2, N)[:, None, None]
-
-
-def lifted(first: float, last: float) -> Make:
-    """A slide that is lifted between two shares of the window."""
+def lifted(off: NDArray[np.bool_]) -> Make:
+    """A slide that is lifted in these frames [T, 1, 1]."""
 
     def make(scene: SweepDraw, material: str) -> Counts:
         x, idle = scene.slide(material), skin.idle(N, scene.rng, scene.world)
-        off = (first * N <= TIMES) & (last * N > TIMES)
         return np.where(off, idle, x)
 
     return make
 
 
-def flutters(scene: SweepDraw, material: str) -> Counts:
-    """A slide that is lifted half of each fifth of a second."""
-    idle = skin.idle(N, scene.rng, scene.world)
-    return np.where(SECONDS % 0.2 < 0.1, scene.slide(material), idle)
-
-
-def part(rest: float, slid: float) -> Make:
-    """A finger that slides in a part of the window and rests in the others."""
-    return lambda scene, material: scene.touch(material, rest, slid)
+def both(first: NDArray[np.bool_]) -> Make:
+    """A slide in these frames [T, 1, 1], a slide over another material in the others."""
+    return lambda s, m: np.where(first, s.slide(m), s.slide(s.other(m)))
 
 
 def pauses(scene: SweepDraw, material: str) -> Counts:
     """A slide that rests between a quarter and three quarters of the window."""
     x, still = scene.slide(material), rests(scene, material)
-    return np.where((N // 4 <= TIMES) & (3 * N // 4 > TIMES), still, x)
+    return np.where(between(0.25, 0.75), still, x)
 
 
-def gained(gain: float) -> Make:
-    """A slide with another gain of all taxels."""
-    return lambda scene, material: gain * scene.slide(material)
+def between(first: float, last: float) -> NDArray[np.bool_]:
+    """The frames [T, 1, 1] between two shares of the window."""
+    return np.asarray((first * N <= TIMES) & (last * N > TIMES))
 
 
 def shaken(share: float) -> Make:
@@ -202,16 +181,6 @@ def shaken(share: float) -> Make:
         return middle + share * (x - middle)
 
     return make
-
-
-def at_speed(speed: float) -> Make:
-    """A slide at another speed."""
-    return lambda scene, material: scene.slide(material, speed=speed)
-
-
-def rows_off(rows: float) -> Make:
-    """A slide with the skin displaced by some rows."""
-    return lambda scene, material: scene.touch(material, 0.0, 1.0, rows * skin.PITCH_MM)
 
 
 def permuted(scene: SweepDraw, material: str) -> Counts:
@@ -227,31 +196,6 @@ def mosaic(scene: SweepDraw, material: str) -> Counts:
     return np.stack(parts, axis=1).reshape(N, 4, 4)
 
 
-def halves(scene: SweepDraw, material: str) -> Counts:
-    """Half of a slide over each of two materials."""
-    return np.where(TIMES * 2 < N, scene.slide(material), scene.slide(scene.other(material)))
-
-
-def mixed(scene: SweepDraw, material: str) -> Counts:
-    """The mean of two slides over different materials."""
-    return (scene.slide(material) + scene.slide(scene.other(material))) / 2
-
-
-def interleaved(scene: SweepDraw, material: str) -> Counts:
-    """Frames of two slides over different materials in turn."""
-    return np.where(TIMES % 2, scene.slide(material), scene.slide(scene.other(material)))
-
-
-def shuffled(scene: SweepDraw, material: str) -> Counts:
-    """The frames of a slide in random order."""
-    return scene.slide(material)[scene.rng.permutation(N)]
-
-
-def held(scene: SweepDraw, material: str) -> Counts:
-    """A slide that repeats each tenth frame ten times."""
-    return scene.slide(material)[::10].repeat(10, axis=0)
-
-
 def phases(scene: SweepDraw, material: str) -> Counts:
     """A slide whose taxels keep their spectra and get random phases."""
     bins = np.fft.rfft(scene.slide(material), axis=0)
@@ -265,16 +209,6 @@ def one_taxel(scene: SweepDraw, material: str) -> Counts:
     x, keep = skin.idle(N, scene.rng, scene.world).astype(float), scene.rng.integers(4, size=2)
     x[:, keep[0], keep[1]] = scene.slide(material)[:, keep[0], keep[1]]
     return x
-
-
-def random_bytes(scene: SweepDraw, material: str) -> Counts:
-    """Random bytes."""
-    return scene.rng.integers(0, 256, (N, 4, 4)).astype(float)
-
-
-def random_frames(scene: SweepDraw, material: str) -> Counts:
-    """Random bytes, the same on all taxels."""
-    return scene.rng.integers(0, 256, (N, 1, 1)) * np.ones((1, 4, 4))
 
 
 def walks(scene: SweepDraw, material: str) -> Counts:
@@ -325,79 +259,87 @@ def _varied(
     return skin.Material("untaught", **values)
 
 
-UNTAUGHT: dict[str, tuple[Make, bool]] = {
-    "material near foam": (untaught(near_foam), False),
-    "felt": (untaught(felt), False),
-    "random material": (untaught(random_material), False),
+UNTAUGHT: dict[str, Make] = {
+    "material near foam": untaught(near_foam),
+    "felt": untaught(felt),
+    "random material": untaught(random_material),
 }
 COUNTED = "whole", "whole wrong", "early", "early wrong"
-KINDS: dict[str, tuple[Make, bool]] = {
-    "finger rests": (rests, False),
-    "rests, skin two rows off": (lambda s, m: s.touch(m, 1.0, 0.0, 8.0), False),
-    "rests, 50 Hz hum": (added(rests, sine(50), 0.5), False),
-    "rests, 50 Hz hum, strong": (added(rests, sine(50), 2.0), False),
-    "rests, noise": (added(rests, white, 0.5), False),
-    "rests, common noise": (added(rests, common_white, 0.5), False),
-    "rests, common pink noise": (added(rests, coloured(1.0), 1.0), False),
-    "rests, clicks": (added(rests, clicks, 0.5), False),
-    "rests and taps": (taps, False),
-    "rests and rocks": (rocks, False),
-    "rests and presses more": (presses, False),
-    "load and white noise": (added(level, white, 1.0), False),
-    "load and loud white noise": (added(level, white, 3.0), False),
-    "load and common noise": (added(level, common_white, 1.0), False),
-    "load and pink noise": (added(level, coloured(1.0), 1.0), False),
-    "load and brown noise": (added(level, coloured(2.0), 1.0), False),
-    "load and a 20 Hz sine": (added(level, sine(20), 1.0), False),
-    "load and a 50 Hz sine": (added(level, sine(50), 1.0), False),
-    "load and a 100 Hz sine": (added(level, sine(100), 1.0), False),
-    "load and a chirp": (added(level, chirp, 1.0), False),
-    "load and a square wave": (added(level, square, 1.0), False),
-    "load and clicks": (added(level, clicks, 1.0), False),
-    "random bytes": (random_bytes, False),
-    "random bytes, all taxels alike": (random_frames, False),
-    "random walk": (walks, False),
-    "first half lifted": (lifted(0, 0.5), True),
-    "second half lifted": (lifted(0.5, 1), True),
-    "middle lifted": (lifted(0.25, 0.75), True),
-    "lifted ten times": (flutters, True),
-    "slides the first half": (part(0, 0.5), True),
-    "slides the second half": (part(0.5, 0.5), True),
-    "slides the first fifth": (part(0, 0.2), True),
-    "slides the last fifth": (part(0.8, 0.2), True),
-    "slides, rests, slides": (pauses, True),
-    "gain x 0.2": (gained(0.2), True),
-    "gain x 0.33": (gained(1 / 3), True),
-    "gain x 3": (gained(3.0), True),
-    "vibration x 0.1": (shaken(0.1), True),
-    "vibration x 0.33": (shaken(1 / 3), True),
-    "vibration x 3": (shaken(3.0), True),
-    "speed x 0.33": (at_speed(1 / 3), True),
-    "speed x 3": (at_speed(3.0), True),
-    "one row off": (rows_off(1), True),
-    "two rows off": (rows_off(2), True),
-    "two rows off, backwards": (rows_off(-2), True),
-    "taxels confused": (permuted, True),
-    "sixteen slides, a taxel of each": (mosaic, False),
-    "two halves": (halves, False),
-    "mean of two slides": (mixed, False),
-    "two slides in turn": (interleaved, False),
-    "frames shuffled": (shuffled, True),
-    "each tenth frame held": (held, True),
-    "random phases": (phases, True),
-    "one taxel loaded": (one_taxel, True),
-    **UNTAUGHT,
+NAMELESS: dict[str, Make] = {
+    "finger rests": rests,
+    "rests, skin two rows off": lambda s, m: s.touch(m, 1.0, 0.0, 8.0),
+    "rests, 50 Hz hum": added(rests, sine(50), 0.5),
+    "rests, 50 Hz hum, strong": added(rests, sine(50), 2.0),
+    "rests, noise": added(rests, white(4), 0.5),
+    "rests, common noise": added(rests, white(1), 0.5),
+    "rests, common pink noise": added(rests, coloured(1.0), 1.0),
+    "rests, clicks": added(rests, clicks, 0.5),
+    "rests and taps": taps,
+    "rests and rocks": rocks,
+    "rests and presses more": lambda s, m: rests(s, m) * np.linspace(0.4, 1.2, N)[:, None, None],
+    "load and white noise": added(level, white(4), 1.0),
+    "load and loud white noise": added(level, white(4), 3.0),
+    "load and common noise": added(level, white(1), 1.0),
+    "load and pink noise": added(level, coloured(1.0), 1.0),
+    "load and brown noise": added(level, coloured(2.0), 1.0),
+    "load and a 20 Hz sine": added(level, sine(20), 1.0),
+    "load and a 50 Hz sine": added(level, sine(50), 1.0),
+    "load and a 100 Hz sine": added(level, sine(100), 1.0),
+    "load and a chirp": added(level, chirp, 1.0),
+    "load and a square wave": added(level, square, 1.0),
+    "load and clicks": added(level, clicks, 1.0),
+    "random bytes": lambda s, m: s.rng.integers(0, 256, (N, 4, 4)),
+    "random bytes, all taxels alike": lambda s, m: s.rng.integers(0, 256, (N, 1, 1)),
+    "random walk": walks,
+    "sixteen slides, a taxel of each": mosaic,
+    "two halves": both(TIMES * 2 < N),
+    "mean of two slides": lambda s, m: (s.slide(m) + s.slide(s.other(m))) / 2,
+    "two slides in turn": both(TIMES % 2 == 1),
 }
-"""By name: how to draw a sweep, and whether its material is in it, so that its name is right."""
+ALTERED: dict[str, Make] = {
+    "first half lifted": lifted(between(0, 0.5)),
+    "second half lifted": lifted(between(0.5, 1)),
+    "middle lifted": lifted(between(0.25, 0.75)),
+    "lifted ten times": lambda s, m: np.where(
+        SECONDS % 0.2 < 0.1, skin.idle(N, s.rng, s.world), s.slide(m)
+    ),
+    "slides the first half": lambda s, m: s.touch(m, 0, 0.5),
+    "slides the second half": lambda s, m: s.touch(m, 0.5, 0.5),
+    "slides the first fifth": lambda s, m: s.touch(m, 0, 0.2),
+    "slides the last fifth": lambda s, m: s.touch(m, 0.8, 0.2),
+    "slides, rests, slides": pauses,
+    "gain x 0.2": lambda s, m: 0.2 * s.slide(m),
+    "gain x 0.33": lambda s, m: s.slide(m) / 3,
+    "gain x 3": lambda s, m: 3 * s.slide(m),
+    "vibration x 0.1": shaken(0.1),
+    "vibration x 0.33": shaken(1 / 3),
+    "vibration x 3": shaken(3.0),
+    "speed x 0.33": lambda s, m: s.slide(m, speed=1 / 3),
+    "speed x 3": lambda s, m: s.slide(m, speed=3.0),
+    "one row off": lambda s, m: s.touch(m, 0, 1, skin.PITCH_MM),
+    "two rows off": lambda s, m: s.touch(m, 0, 1, 2 * skin.PITCH_MM),
+    "two rows off, backwards": lambda s, m: s.touch(m, 0, 1, -2 * skin.PITCH_MM),
+    "taxels confused": permuted,
+    "frames shuffled": lambda s, m: s.slide(m)[s.rng.permutation(N)],
+    "each tenth frame held": lambda s, m: s.slide(m)[::10].repeat(10, axis=0),
+    "random phases": phases,
+    "one taxel loaded": one_taxel,
+}
+GROUPS = {
+    "no material, or no slide": NAMELESS,
+    "slides that were altered": ALTERED,
+    "materials that nobody taught": UNTAUGHT,
+}
+KINDS = NAMELESS | ALTERED | UNTAUGHT
+"""How to draw a sweep of each kind. Only in altered slides the label of the material is right."""
 
 
 def window(name: str, world: skin.World, number: int) -> tuple[NDArray[np.uint8], str]:
     """The raw counts [T, R, C] of a sweep of a kind, and the label that is right, "" for none."""
     scene = SweepDraw(world, np.random.default_rng([number, *name.encode()]))
-    make, named = KINDS[name]
     material = skin.MATERIALS[number % len(skin.MATERIALS)]
-    counts = np.clip(np.rint(make(scene, material) * np.ones((N, 4, 4))), 0, 255)
-    return counts.astype(np.uint8), material * named
+    counts = np.clip(np.rint(KINDS[name](scene, material) * np.ones((N, 4, 4))), 0, 255)
+    return counts.astype(np.uint8), material * (name in ALTERED)
 
 
 def answer(box: Classifier, early: EarlyExit | None, taxels: NDArray[np.uint8]) -> Verdict:
@@ -440,9 +382,7 @@ def counted(model: bundle.Bundle, world: skin.World, each: int) -> dict[str, dic
 
 def group(name: str) -> str:
     """The group of a kind, for the sums."""
-    if name in UNTAUGHT:
-        return "materials that nobody taught"
-    return "slides that were altered" if KINDS[name][1] else "no material, or no slide"
+    return next(text for text, kinds in GROUPS.items() if name in kinds)
 
 
 def table(content: dict[str, Any]) -> str:
