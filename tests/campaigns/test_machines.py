@@ -18,8 +18,8 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
+from palpate.answer.objects import softmax
 from palpate.bundle import bundle
-from palpate.inference.classifier import softmax
 from palpate_train.data import sets
 from palpate_train.export import quantized_bundle
 from palpate_train.onnx_tools.graph_builder import TENSOR

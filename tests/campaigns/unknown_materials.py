@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.answer.unknown import shaped_distances
 from palpate.core.clock import SystemClock
 from palpate.inference.classifier import Classifier
-from palpate.inference.novelty import shaped_distances
 from palpate_train.calibration.novelty import auroc
 from palpate_train.data import sets
 from palpate_train.data.sets import Dataset
@@ -91,7 +91,9 @@ def left_out(train: Dataset, test: Dataset, name: str, steps: int, seed: int) ->
     classes = box.bundle.classes
     assert known
     assert classes
-    z = np.stack([box.embedding(window) for window in test.samples]).astype(np.float64)
+    z = np.stack([box.outputs(window, "embedding")[0] for window in test.samples]).astype(
+        np.float64
+    )
     away = z[:, None] - classes.means.astype(np.float64)
     nearest = shaped_distances(away, classes.shapes.astype(np.float64)).min(axis=1) / known.limit
     unknown = np.array([test.materials[k] == name for k in test.labels])

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from palpate.signal.contact import ContactPositions
+from palpate.answer.contact import ContactPositions
 
 TARE = np.zeros((4, 4))
 MIDDLE = ContactPositions(4.0, (6.0, 6.4), (6.0, 5.8), 0.6)

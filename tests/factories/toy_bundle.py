@@ -15,11 +15,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from palpate.answer.contact import ContactPositions
+from palpate.answer.disturbance import Disturbances
+from palpate.answer.early import Early
+from palpate.answer.pipeline import Context, Stage
+from palpate.answer.unknown import DisplacementRule, Known
 from palpate.bundle import bundle
-from palpate.bundle.bundle import Bundle, DisplacementRule, Early, Known, Manifest, Thresholds
+from palpate.bundle.bundle import Bundle, Manifest, Thresholds
 from palpate.core.types import Frames, Status, Sweep, SweepFormat
-from palpate.signal.contact import ContactPositions
-from palpate.signal.disturbances import Disturbances
+from palpate.inference.classifier import Classifier
 
 FORMAT = SweepFormat(2, 2, 100.0, 20, "int16")
 THREE_AXES = replace(FORMAT, axes=3)
@@ -227,3 +231,19 @@ def put(folder: Path, content: dict[str, bytes]) -> Path:
 def load(folder: Path, **more) -> Bundle:
     """A toy bundle, written to `folder` and read from it."""
     return bundle.load(put(folder, files(**more)))
+
+
+class GivenAnswer:
+    """A stage in place of the network. probabilities: float64 [K]."""
+
+    def __init__(self, probabilities: np.ndarray) -> None:
+        self._probabilities = probabilities
+
+    def apply(self, context: Context) -> None:
+        with np.errstate(divide="ignore"):
+            context.logits = np.log(self._probabilities)
+
+
+def told(it: Classifier, probabilities: np.ndarray) -> list[Stage]:
+    """The stages of a classifier whose network gives these probabilities to each sweep."""
+    return it.stages(GivenAnswer(probabilities))

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import pytest
 
+from palpate.answer.contact import ContactPositions
 from palpate.bundle.bundle import Bundle
 from palpate.core.clock import SystemClock
 from palpate.core.errors import FormatError
 from palpate.inference.classifier import Classifier
-from palpate.signal.contact import ContactPositions
 from palpate_studies import alignment, contact_table
 from tests.factories.contacts import MIDDLE
 

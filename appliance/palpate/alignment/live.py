@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.alignment.view import Display, View, figure
+from palpate.answer.contact import IN_PLACE, ContactPositions, Point, advice, centre
+from palpate.answer.unloaded import UnloadedTracker
 from palpate.bundle.bundle import Bundle
 from palpate.core.config import Config
 from palpate.core.devices import Devices
 from palpate.core.schema import typed
 from palpate.core.types import Frames, SweepFormat, normal
 from palpate.io import skins
-from palpate.signal.contact import IN_PLACE, ContactPositions, Point, advice, centre
-from palpate.signal.unloaded import UnloadedTracker
 
 VIEW_NS = 200_000_000
 """Time between two Views."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any, Protocol
 
-from palpate.signal.contact import ContactPositions, Point
+from palpate.answer.contact import ContactPositions, Point
 
 
 @dataclass(frozen=True, slots=True)

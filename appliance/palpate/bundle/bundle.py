@@ -30,14 +30,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.answer import features
+from palpate.answer.unknown import Classes, DisplacedClasses, EarlyClasses
 from palpate.bundle import arrays, enrolled
-from palpate.bundle.contents import (
-    AddedLabels,
-    Bundle,
-    Classes,
-    DisplacedClasses,
-    EarlyClasses,
-)
+from palpate.bundle.contents import AddedLabels, Bundle
 from palpate.bundle.enrolled import ENROLMENT
 from palpate.bundle.manifest import (
     GOLDEN,
@@ -46,16 +42,12 @@ from palpate.bundle.manifest import (
     MEANS,
     MODEL,
     MOST_BYTES,
-    DisplacementRule,
-    Early,
-    Known,
     Manifest,
     Thresholds,
 )
 from palpate.bundle.onnx_check import check
 from palpate.core.errors import BundleError, TemporaryError, passes
 from palpate.core.names import LABEL
-from palpate.signal import features
 
 try:  # not from hashlib, which loads OpenSSL (4 MB) although Python has this function built in
     from _sha2 import sha256  # type: ignore[import-not-found,unused-ignore]
@@ -77,12 +69,6 @@ __all__ = [
     "TAUGHT_SIGNATURE",
     "AddedLabels",
     "Bundle",
-    "Classes",
-    "DisplacedClasses",
-    "DisplacementRule",
-    "Early",
-    "EarlyClasses",
-    "Known",
     "Manifest",
     "Thresholds",
     "digest",

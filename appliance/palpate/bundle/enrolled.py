@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.answer.unknown import Classes, DisplacedClasses
 from palpate.bundle import arrays
-from palpate.bundle.contents import AddedLabels, Bundle, Classes, DisplacedClasses
+from palpate.bundle.contents import AddedLabels, Bundle
 from palpate.core.errors import BundleError
 
 ENROLMENT = "enrolment.npz"

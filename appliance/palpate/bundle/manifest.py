@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -12,24 +11,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.answer import features
+from palpate.answer.contact import ContactPositions
+from palpate.answer.disturbance import Disturbances
+from palpate.answer.early import Early
+from palpate.answer.slide import SpeedRange
+from palpate.answer.taxels import Bridging
+from palpate.answer.unknown import UNSURE, DisplacementRule, Known
+from palpate.answer.vibration import SlideLimits
+from palpate.answer.window_check import WindowLimits
 from palpate.core.errors import BundleError, FormatError
 from palpate.core.names import LABEL, MOST_SHOWN, can_be_shown
 from palpate.core.schema import typed
 from palpate.core.types import SweepFormat
-from palpate.signal import features
-from palpate.signal.broken_taxels import Bridging
-from palpate.signal.contact import ContactPositions
-from palpate.signal.disturbances import Disturbances
-from palpate.signal.slide import SpeedRange
-from palpate.signal.vibration import SlideLimits
-from palpate.signal.window_check import WindowLimits
 
 SCHEMA = 1
 """Version of the schema."""
 MANIFEST, MODEL, GOLDEN, MEANS = "manifest.json", "model.onnx", "golden.npz", "means.npz"
 INPUTS = ("raw", *features.KINDS)
-UNSURE = 0.5
-"""Least probability for status ok if the bundle does not set it."""
 MOST_BYTES = 64 << 20
 """Largest file. The largest of our models, the paper's network in int8, has 16 MB. The memory that
 a model needs shows in its trial."""
@@ -45,88 +44,6 @@ class Thresholds(WindowLimits):
     """
 
     unsure: float = UNSURE
-
-
-@dataclass(frozen=True, slots=True)
-class Early:
-    """Rule for answers before the sweep has ended. Raises BundleError for a number out of range.
-
-    least: [D], least probability for an answer at each step; above 1 a step never answers. agree:
-    number of steps in a row, including the newest, that must give the same label, and be of a known
-    material. limits: [D], largest squared distance of a known material at each step; () if unknown
-    materials are not detected before the end of a sweep.
-    """
-
-    least: tuple[float, ...]
-    agree: int
-    limits: tuple[float, ...] = ()
-
-    def __post_init__(self) -> None:
-        if not self.least or not all(_positive(p) for p in self.least):
-            raise BundleError(
-                f"early.least {list(self.least)} must be numbers above 0, one for each step"
-            )
-        if type(self.agree) is not int or self.agree < 1:
-            raise BundleError(f"early.agree {self.agree!r} must be a whole number from 1 on")
-        if self.limits and not (
-            len(self.limits) == len(self.least) and all(map(_positive, self.limits))
-        ):
-            raise BundleError(
-                f"early.limits {list(self.limits)} must be numbers above 0, one for each step"
-            )
-
-
-@dataclass(frozen=True, slots=True)
-class Known:
-    """Rule for unknown materials. Raises BundleError for a number out of range.
-
-    limit: largest squared distance from a sweep's embedding to the nearest class mean; beyond it
-    the material is unknown. temperature: divisor of the logits from class means. enrolled: least
-    probability of all enrolled labels together at which a sweep gets one of them; None without
-    enrolled labels.
-    """
-
-    limit: float
-    temperature: float
-    enrolled: float | None = None
-
-    def __post_init__(self) -> None:
-        _check_positive(self, "known")
-        if self.enrolled is not None and not UNSURE <= self.enrolled < 1:
-            raise BundleError(
-                f"known.enrolled {self.enrolled!r} must be at least {UNSURE} and below 1"
-            )
-
-
-@dataclass(frozen=True, slots=True)
-class DisplacementRule:
-    """Rule for sweeps whose contact is displaced from `Manifest.contact`. Raises BundleError for a
-    number out of range.
-
-    limit: as in Known, for the distances of displaced sweeps. temperature: divisor of logits that
-    are calibrated for sweeps without displacement. unsure: least probability for status ok; above 1
-    a single displaced sweep is never ok. farthest_mm: displacement from which on a sweep gets
-    no label, because no training copy is displaced as far; None if unknown.
-    """
-
-    limit: float
-    temperature: float
-    unsure: float
-    farthest_mm: float | None = None
-
-    def __post_init__(self) -> None:
-        _check_positive(self, "displacement")
-
-
-def _check_positive(rule: Known | DisplacementRule, where: str) -> None:
-    for name in rule.__slots__:
-        value = getattr(rule, name)
-        if not _positive(value) and not (value is None and name in ("farthest_mm", "enrolled")):
-            raise BundleError(f"{where}.{name} {value!r} must be a number above 0")
-
-
-def _positive(value: object) -> bool:
-    return type(value) in (int, float) and 0 < value <= sys.float_info.max  # type: ignore[operator]
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from palpate.answer.taxels import BrokenTaxels
 from palpate.bundle.bundle import Bundle
 from palpate.core import storage
 from palpate.core.clock import Clock
@@ -28,7 +29,6 @@ from palpate.core.statistics import wilson
 from palpate.core.types import Status, Sweep, Verdict
 from palpate.inference.classifier import Classifier
 from palpate.inference.early_exit import EarlyExit
-from palpate.signal.broken_taxels import BrokenTaxels
 from palpate.sweeps.sweep_folder import SweepFolder
 
 FILE = "agreement.json"

@@ -13,12 +13,12 @@ import onnxruntime as ort
 from numpy.typing import NDArray
 from onnxruntime.capi import onnxruntime_pybind11_state
 
+from palpate.answer import features
 from palpate.bundle.bundle import Bundle
 from palpate.bundle.onnx_check import check
 from palpate.bundle.pruning import prune
 from palpate.core.errors import BundleError, ModelError
 from palpate.inference.code_pages import give_back
-from palpate.signal import features
 
 MOST_S = 3.0
 """Longest processor time for a sweep. The service's watchdog waits 10 s for the loop."""

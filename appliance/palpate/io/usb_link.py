@@ -32,7 +32,7 @@ CDC_CONTROL = 2
 DTR, RTS = 1, 2
 
 
-class Context(libusb1._LibUSB):  # type: ignore[misc]
+class UsbContext(libusb1._LibUSB):  # type: ignore[misc]
     """A libusb context that lives as long as the devices that it has found. libusb frees devices
     with their context, and pyusb does not prevent that.
 
@@ -42,10 +42,10 @@ class Context(libusb1._LibUSB):  # type: ignore[misc]
     for ever.
     """
 
-    newest: Context | None = None
+    newest: UsbContext | None = None
 
     @classmethod
-    def chosen(cls) -> Context | None:
+    def chosen(cls) -> UsbContext | None:
         """The newest context, made if there is none; None if libusb is not installed."""
         if cls.newest is None and (loaded := libusb1.get_backend()):
             cls.newest = cls(loaded.lib)
@@ -153,7 +153,7 @@ def open_readout(config: SkinConfig, backend: Any, clock: Clock) -> VendorLink:
     refused or of another kind."""
     ids = f"{config.vendor_id:04x}:{config.product_id:04x}"
     try:
-        bus = backend or Context.chosen()
+        bus = backend or UsbContext.chosen()
         found = list(
             usb.core.find(True, bus, idVendor=config.vendor_id, idProduct=config.product_id)
         )
@@ -162,7 +162,7 @@ def open_readout(config: SkinConfig, backend: Any, clock: Clock) -> VendorLink:
             "libusb-1.0 is not installed, so no skin can be found; apt install libusb-1.0-0"
         ) from e
     except usb.core.USBError as e:
-        Context.newest = None  # the next search uses a new context
+        UsbContext.newest = None  # the next search uses a new context
         raise _explain(e) from e
     device = next((d for d in found if not config.serial or _serial(d) == config.serial), None)
     if device is None:
@@ -189,7 +189,7 @@ def open_readout(config: SkinConfig, backend: Any, clock: Clock) -> VendorLink:
 
 def _let_go(device: usb.core.Device) -> None:
     """Release a device. The next search uses a new context."""
-    Context.newest = None
+    UsbContext.newest = None
     with contextlib.suppress(usb.core.USBError):  # it is gone
         usb.util.dispose_resources(device)
 

@@ -14,13 +14,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.answer.objects import softmax
+from palpate.answer.slide_check import SlideCheck
+from palpate.answer.unknown import ClassDistances, Classes
 from palpate.bundle import bundle, enrolled
-from palpate.bundle.bundle import AddedLabels, Bundle, Classes
+from palpate.bundle.bundle import AddedLabels, Bundle
 from palpate.core.clock import SystemClock
 from palpate.core.errors import BundleError, FormatError
-from palpate.inference.classifier import Classifier, softmax
-from palpate.inference.novelty import ClassDistances
-from palpate.signal.slide_check import SlideCheck
+from palpate.inference.classifier import Classifier
 
 Embedded = NDArray[np.float64]
 LEAST = 0.7
@@ -78,7 +79,7 @@ def enrol(old: Bundle, label: str, sweeps: NDArray[Any]) -> Enrolment:
             f"sweeps {sweeps.dtype} {sweeps.shape} cannot be enrolled; the bundle wants [n] of {f}"
         )
     run = Classifier(old, SystemClock())
-    sweeps = cleaned(run, sweeps)
+    sweeps = np.stack([run.cleaned(sweep) for sweep in sweeps])
     is_no_slide = slide_check(old)
     for number, sweep in enumerate(sweeps, 1):
         if why := is_no_slide(sweep):
@@ -106,17 +107,11 @@ def enrol(old: Bundle, label: str, sweeps: NDArray[Any]) -> Enrolment:
     return Enrolment(new, file, tuple(warnings), _disagreement(trained, label, z))
 
 
-def cleaned(run: Classifier, sweeps: NDArray[Any]) -> NDArray[Any]:
-    """Windows [n, T, R, C] or [n, T, R, C, A] as the network sees them in an answer: broken taxels
-    are bridged, and hum is removed."""
-    bridged = (run.taxels.repaired(sweep, run.tare)[0] for sweep in sweeps)
-    return np.stack([run.without_hum(window)[0] for window in bridged])
-
-
 def network_outputs(run: Classifier, sweeps: NDArray[Any]) -> tuple[Embedded, Embedded]:
     """The model's own logits [n, K0] and embeddings [n, r] of windows [n, T, R, C] or [n, T, R, C,
     A]."""
-    logits, z = zip(*map(run.network, sweeps), strict=True)
+    pairs = (run.outputs(sweep, "logits", "embedding") for sweep in sweeps)
+    logits, z = zip(*pairs, strict=True)
     return np.stack(logits).astype(np.float64), np.stack(z).astype(np.float64)
 
 

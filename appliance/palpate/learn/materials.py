@@ -15,15 +15,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.answer.objects import EnrolledLabels, softmax
+from palpate.answer.unknown import ClassDistances
 from palpate.bundle import bundle, enrolled
 from palpate.bundle.bundle import Bundle
 from palpate.core.clock import SystemClock
 from palpate.core.config import Config
 from palpate.core.errors import BundleError, ConfigError
 from palpate.deployment.signed import SignedBundle
-from palpate.inference.classifier import Classifier, softmax
-from palpate.inference.novelty import ClassDistances
-from palpate.inference.objects import EnrolledLabels
+from palpate.inference.classifier import Classifier
 from palpate.learn import enrolment
 from palpate.learn.assessment import Assessment
 from palpate.learn.enrolment import Enrolment
@@ -134,7 +134,7 @@ def left_out(old: Bundle, many: Mapping[str, Array], sweeps: NewSweeps) -> Asses
     """The same for a bundle without the materials of `many`, each with its windows."""
     run, names = Classifier(old, SystemClock()), (*old.manifest.labels, *many)
     outputs = {
-        name: enrolment.network_outputs(run, enrolment.cleaned(run, of))
+        name: enrolment.network_outputs(run, np.stack([run.cleaned(sweep) for sweep in of]))
         for name, of in many.items()
     }
     chances = np.concatenate([_left_out(old, outputs, name) for name in outputs])

@@ -10,6 +10,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any
 
+from palpate.answer.slide_check import SlidesAmong
 from palpate.core.clock import SystemClock
 from palpate.core.config import Config
 from palpate.core.devices import Devices
@@ -28,7 +29,6 @@ from palpate.learn.session import Teacher, TeachingSession, refuse_trained
 from palpate.runtime import assembly
 from palpate.runtime.loop import Box, CommandHandler
 from palpate.service.systemd import Notifier
-from palpate.signal.slide_check import SlidesAmong
 from palpate.sweeps.capture import CaptureWriter
 from palpate.sweeps.recording import Labels, RecordingSession
 

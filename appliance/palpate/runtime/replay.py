@@ -16,6 +16,7 @@ from typing import Any, get_args, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.answer.taxels import BrokenTaxels
 from palpate.bundle.bundle import Bundle
 from palpate.core.config import ClassifierConfig, Config
 from palpate.core.errors import FormatError
@@ -26,7 +27,6 @@ from palpate.inference.early_exit import EarlyExit
 from palpate.io.robot_link import StdoutPort, result
 from palpate.runtime import assembly
 from palpate.runtime.loop import Box, Pipeline
-from palpate.signal.broken_taxels import BrokenTaxels
 from palpate.sweeps.capture import Playback
 from palpate.sweeps.sweep_folder import RecordedSweep
 from palpate.sweeps.sweep_window import SweepCutter
@@ -172,9 +172,8 @@ class SweepReplay:
         if not whole:
             classifier.forget()
         sweep = kept.sweep if whole or fused == 1 else replace(kept.sweep, object=0)
-        verdict = classifier(sweep) if sweep.share == 1 else EarlyExit(classifier)(sweep)
+        verdict, own = _answered(classifier, sweep)
         if not whole:
-            own = verdict.own if verdict else EarlyExit(classifier).scores(sweep)[-1]
             same = own.tolist() == was.get("own")
             return ReplayResult(
                 verdict, ALONE if same else DIFFERENT, "earlier sweeps of its object are not there"
@@ -215,6 +214,17 @@ def _print(path: Path, found: ReplayResult, out: Callable[[str], object]) -> str
         out(result(found.verdict, "replay").decode("ascii"))
     out(f"{path.name}: {found.outcome}{found.detail and f' ({found.detail})'}\n")
     return found.outcome
+
+
+def _answered(classifier: Classifier, sweep: Sweep) -> tuple[Verdict | None, NDArray[np.float64]]:
+    """The verdict on a sweep, None if an unfinished one is not answered, and the probabilities of
+    this sweep alone."""
+    if sweep.share == 1:
+        verdict = classifier(sweep)
+        return verdict, verdict.own
+    found = EarlyExit(classifier).judged(sweep)
+    given = classifier.verdict(found) if found.status is Status.OK else None
+    return given, found.probabilities
 
 
 def _folder(folder: Path, classify: SweepReplay, out: Callable[[str], object]) -> int:

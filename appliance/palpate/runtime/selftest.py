@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
+from palpate.answer.slide import SlideMeter
 from palpate.bundle.bundle import Bundle, Manifest
 from palpate.core.config import Config
 from palpate.core.devices import Devices
@@ -21,7 +22,6 @@ from palpate.io.sensor import Sensor
 from palpate.io.trigger import GpioTrigger
 from palpate.io.usb_sensor import fits
 from palpate.runtime.assembly import UNSIGNED, gpio
-from palpate.signal.slide import SlideMeter
 
 UNPROVEN = "broken taxels are refused: export it again to measure how many can be bridged"
 """Text of a bundle without `bridging`."""

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.answer.slide_check import only_taxel
+from palpate.answer.unloaded import UnloadedTracker
+from palpate.answer.window_check import Finding, inspect_bare, inspect_readings
 from palpate.core.clock import Clock
 from palpate.core.errors import ApplianceError
 from palpate.core.observer import Observer
 from palpate.core.types import EPOCH_BITS, Frames, Status, Sweep, SweepFormat, Verdict, normal
-from palpate.signal.slide_check import only_taxel
-from palpate.signal.unloaded import UnloadedTracker
-from palpate.signal.window_check import Finding, inspect_bare, inspect_readings
 
 UNCHECKED = Finding(
     Status.RECORDED, "contact not checked: the skin was not both touched and let go so far"

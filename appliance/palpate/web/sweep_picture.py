@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.answer import features
 from palpate.core.errors import FormatError
 from palpate.core.types import DATA_TYPES, normal
-from palpate.signal import features
 
 MOST_TAXELS = 16
 """Most taxels in a picture; of a larger skin, the most loaded taxels are drawn."""

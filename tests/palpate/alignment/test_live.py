@@ -19,12 +19,12 @@ from palpate.alignment import live
 from palpate.alignment.lines import LinePrinter, line
 from palpate.alignment.live import Alignment, Expected
 from palpate.alignment.view import View, figure
+from palpate.answer.contact import ContactPositions
 from palpate.bundle import bundle
 from palpate.bundle.bundle import Bundle, Manifest
 from palpate.cli.main import main
 from palpate.core import config
 from palpate.core.interrupts import StopFlag
-from palpate.signal.contact import ContactPositions
 from palpate.sim import devices, rig, script, skin
 from tests.factories.paths import NO_SITE
 from tests.factories.simulated_box import SECOND, idle_devices

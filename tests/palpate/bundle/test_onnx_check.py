@@ -17,6 +17,7 @@ from tests.factories import toy_bundle
 pytest.importorskip("onnx", reason="onnx comes with the desktop's tools (make test)")
 import numpy as np
 
+from palpate.answer.early import Early
 from palpate.bundle import bundle
 from palpate.bundle.bundle import Manifest, Thresholds
 from palpate.bundle.onnx_check import check, reader
@@ -127,14 +128,14 @@ def test_the_manifest_decides_what_goes_in_and_comes_out():
         "takes uint8": {"format": replace(manifest.format, dtype="int16")},
         r"the manifest has uint8 \[1, 1400": {"format": replace(manifest.format, window=1400)},
         "5 labels": {"labels": manifest.labels[:5]},
-        r"early is \[1, 9, 6\]": {"early": bundle.Early((0.9,) * 3, 1)},
+        r"early is \[1, 9, 6\]": {"early": Early((0.9,) * 3, 1)},
         "the manifest has float32": {"input": "L", "early": None},
     }
     for words, change in other.items():
         with pytest.raises(BundleError, match=words):
             check.check(model, replace(manifest, **change))
     with pytest.raises(BundleError, match="early, logits"):
-        check.check(SOUND, replace(MANIFEST, early=bundle.Early((0.9,), 1)))
+        check.check(SOUND, replace(MANIFEST, early=Early((0.9,), 1)))
 
 
 def test_enrolled_labels_and_means_decide_as_well():

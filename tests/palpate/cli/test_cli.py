@@ -20,8 +20,8 @@ from unittest import mock
 import numpy as np
 import pytest
 
+from palpate.answer.early import Early
 from palpate.bundle import bundle
-from palpate.bundle.bundle import Early
 from palpate.cli import devices as cli_devices
 from palpate.cli import parser
 from palpate.cli.main import main

@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from palpate.answer.early import Early
+from palpate.answer.taxels import Bridging
 from palpate.bundle import bundle
 from palpate.bundle.bundle import Bundle
-from palpate.bundle.manifest import Early
 from palpate.core import statistics, storage, sweep_file, types
 from palpate.core.errors import ApplianceError, BundleError
 from palpate.core.health import Health
@@ -24,7 +25,6 @@ from palpate.core.types import Status, Sweep
 from palpate.deployment import shadow
 from palpate.deployment.shadow import Shadow
 from palpate.inference.classifier import Classifier
-from palpate.signal.broken_taxels import Bridging
 from palpate.sim import rig, skin
 from tests.factories import toy_bundle
 from tests.factories.simulated_box import SECOND

@@ -15,14 +15,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from palpate.answer import features
+from palpate.answer.early import Early
+from palpate.answer.objects import fuse, softmax
 from palpate.bundle import bundle
-from palpate.bundle.bundle import Bundle, Early
+from palpate.bundle.bundle import Bundle
 from palpate.core.errors import BundleError
 from palpate.core.types import Frames, Status, Sweep, SweepFormat
-from palpate.inference.classifier import Classifier, fuse, softmax
-from palpate.signal import features
+from palpate.inference.classifier import Classifier
 from palpate.sim.rig import VirtualClock
 from tests.factories import toy_bundle
+from tests.factories.toy_bundle import told
 
 WITH_EARLY = (*toy_bundle.OUTPUTS, "early")
 THIRD_ENROLLED = {"arrays": toy_bundle.means(sweeps=np.array([0, 0, 5])), "labels": 2}
@@ -503,11 +506,11 @@ def test_what_is_not_ok_need_not_count(toy: Bundle):
     assert it(borderline(object=1)).share == 1
     for object in (1, 2):
         half = replace(toy_bundle.sweep(0, 0, object=object), share=0.5)
-        assert it.conclude_if_ok(half, np.array([0.6, 0.4, 0.0])) is None
+        found = it.unfinished(half, told(it, np.array([0.6, 0.4, 0.0])))
+        assert found.status is Status.UNSURE
     assert it(borderline(object=1)).fused == 2
     half = replace(toy_bundle.sweep(0, 0, object=1), share=0.5)
-    v = it.conclude_if_ok(half, np.array([0.9, 0.1, 0.0]))
-    assert v
+    v = it.verdict(it.unfinished(half, told(it, np.array([0.9, 0.1, 0.0]))))
     assert (v.status, v.label, v.fused, v.share) == (Status.OK, "a", 3, 0.5)
     assert it(borderline(object=1)).fused == 4
 
@@ -515,7 +518,7 @@ def test_what_is_not_ok_need_not_count(toy: Bundle):
 def test_early_logits(tmp_path: Path):
     """One row a step."""
     it = toy_bundle.load(tmp_path / "toy", early=Early((0.9,) * 3, 1), outputs=WITH_EARLY)
-    rows = box(it).early(toy_bundle.window(1, 0))
+    (rows,) = box(it).outputs(toy_bundle.window(1, 0), "early")
     assert rows.tolist() == pytest.approx(np.outer([1, 2, 3], [0, -6, -9]), abs=1e-4)
 
 
@@ -559,5 +562,6 @@ def test_of_equal_probabilities_the_first_label_is_reported(default_bundle: Bund
     """Like argmax: equal votes of neighbours, or coarse logits, must give the same label as at
     export."""
     scores = np.array([0.0, 0.4, 0.0, 0.4, 0.1, 0.1])
-    verdict = box(default_bundle).conclude(sweep_of(default_bundle.golden[0]), scores)
+    it = box(default_bundle)
+    verdict = it.verdict(it.judged(sweep_of(default_bundle.golden[0]), told(it, scores)))
     assert (verdict.label, verdict.margin) == (default_bundle.manifest.labels[1], 0.0)

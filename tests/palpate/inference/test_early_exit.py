@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from palpate.answer.early import Early, decides
 from palpate.bundle import bundle
-from palpate.bundle.bundle import Bundle, Early, Manifest, Thresholds
+from palpate.bundle.bundle import Bundle, Manifest, Thresholds
 from palpate.cli.main import main
 from palpate.client.answers import Answer
 from palpate.core.config import SweepConfig
@@ -22,7 +23,7 @@ from palpate.core.errors import BundleError
 from palpate.core.sweep_file import load, save
 from palpate.core.types import Frames, Status, Sweep, SweepFormat, Verdict
 from palpate.inference.classifier import Classifier
-from palpate.inference.early_exit import EarlyExit, decides
+from palpate.inference.early_exit import EarlyExit
 from palpate.io.robot_link import StdoutPort
 from palpate.runtime import assembly
 from palpate.runtime.loop import Box, Pipeline
@@ -262,14 +263,15 @@ def test_one_run_of_the_graph_at_each_step(rigged: Make, monkeypatch: pytest.Mon
     two, never when idle. The window is completed by repeating the newest frame."""
     asked: list[int] = []
     rests: list[np.ndarray] = []
-    heads = Classifier.unfinished
+    heads = Classifier.outputs
 
     def watched(self: Classifier, taxels: np.ndarray, *outputs: str) -> list[np.ndarray]:
-        asked.append(box.box.answered)
-        rests.append(taxels[NEEDS[-1] :])
+        if "early" in outputs:
+            asked.append(box.box.answered)
+            rests.append(taxels[NEEDS[-1] :])
         return heads(self, taxels, *outputs)
 
-    monkeypatch.setattr(Classifier, "unfinished", watched)
+    monkeypatch.setattr(Classifier, "outputs", watched)
     box = rigged(simulated_slides(slid(10), slid(-10, 60)), SETS, toy())
     all_of(box)
     assert asked == [0] * 4 + [1] * 2

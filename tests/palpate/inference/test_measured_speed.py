@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from palpate.answer.slide import SpeedRange
 from palpate.bundle.bundle import Bundle, Manifest
 from palpate.core.errors import BundleError
-from palpate.core.types import Frames, Status, Sweep
+from palpate.core.types import Frames, Status, Sweep, Verdict
 from palpate.inference.classifier import Classifier
-from palpate.signal.slide import SpeedRange
 from palpate.sim import skin
 from palpate.sim.rig import VirtualClock
+from tests.factories.toy_bundle import told
 
 FAST = "slid at 60 mm/s, trained 28 to 33"
 NOTHING = np.full(6, np.nan)
@@ -44,6 +45,11 @@ def box(of: Bundle, **more: Any) -> Classifier:
     return Classifier(of, VirtualClock(), **more)
 
 
+def concluded(it: Classifier, sweep: Sweep, probabilities: np.ndarray) -> Verdict:
+    """The verdict of a box whose network gives these probabilities."""
+    return it.verdict(it.judged(sweep, told(it, probabilities)))
+
+
 def test_a_verdict_has_the_measured_slide(default_bundle: Bundle):
     """Speed and direction of the finger; the speed of START stands beside it unchanged."""
     for speed in (1.0, 2.0):
@@ -62,7 +68,7 @@ def test_a_verdict_without_a_measured_slide_has_no_such_fields(default_bundle: B
     found = [
         box(replace(default_bundle, manifest=bare))(slid()),
         box(default_bundle)(Sweep(1, 0, 0, Status.OK, Frames(n, n, resting[:1500]))),
-        box(default_bundle).conclude(replace(half, frames=cut), np.eye(6)[0]),
+        concluded(box(default_bundle), replace(half, frames=cut), np.eye(6)[0]),
         box(default_bundle)(replace(slid(), status=Status.GAP)),
     ]
     assert [v.as_dict().keys() & {"measured_mm_s", "direction"} for v in found] == [set()] * 4
@@ -74,9 +80,9 @@ def test_a_uncertain_answer_reports_a_speed_outside_of_training(default_bundle: 
     unsure = box(trained(default_bundle), min_probability=0.95)
     undecided = box(trained(default_bundle), min_probability=0.95, max_sweeps=1)
     found = [
-        unsure.conclude(slid(), probable),
-        undecided.conclude(slid(), probable),
-        unsure.conclude(slid(), NOTHING),
+        concluded(unsure, slid(), probable),
+        concluded(undecided, slid(), probable),
+        concluded(unsure, slid(), NOTHING),
     ]
     assert [(v.status, v.detail) for v in found] == [
         (Status.UNSURE, FAST),
@@ -86,7 +92,7 @@ def test_a_uncertain_answer_reports_a_speed_outside_of_training(default_bundle: 
     place = default_bundle.manifest.contact
     assert place
     far = replace(place, rows_mm=(0.0,), cols_mm=(0.0,))
-    v = box(trained(default_bundle, contact=far)).conclude(slid(), NOTHING)
+    v = concluded(box(trained(default_bundle, contact=far)), slid(), NOTHING)
     assert v.detail == f"{v.displacement}; {FAST}; the model gives no number"
     assert v.displacement.startswith("moved")
 
@@ -96,9 +102,9 @@ def test_other_answers_do_not_report_it(default_bundle: Bundle):
     versions."""
     sure, probable = np.eye(6)[0], np.array([0.9, 0.1, 0, 0, 0, 0])
     found = [
-        box(trained(default_bundle)).conclude(slid(), sure),
-        box(trained(default_bundle), min_probability=0.95).conclude(slid(1.0), probable),
-        box(untrained(default_bundle), min_probability=0.95).conclude(slid(), probable),
+        concluded(box(trained(default_bundle)), slid(), sure),
+        concluded(box(trained(default_bundle), min_probability=0.95), slid(1.0), probable),
+        concluded(box(untrained(default_bundle), min_probability=0.95), slid(), probable),
     ]
     assert [v.detail for v in found] == [""] * 3
     assert [v.status for v in found] == [Status.OK, Status.UNSURE, Status.UNSURE]

@@ -9,14 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from palpate.answer.disturbance import Allowance, Disturbances
+from palpate.answer.early import Early
+from palpate.answer.vibration import SlideLimits
 from palpate.bundle import bundle
-from palpate.bundle.bundle import Bundle, Early
+from palpate.bundle.bundle import Bundle
 from palpate.core.errors import BundleError
 from palpate.core.types import Frames, Status, Sweep
 from palpate.inference.classifier import Classifier
 from palpate.inference.early_exit import EarlyExit
-from palpate.signal.disturbances import Allowance, Disturbances
-from palpate.signal.vibration import SlideLimits
 from palpate.sim import skin
 from palpate.sim.rig import VirtualClock
 from tests.factories import toy_bundle

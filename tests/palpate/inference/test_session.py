@@ -6,7 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate.bundle.bundle import Bundle, Early
+from palpate.answer.early import Early
+from palpate.bundle.bundle import Bundle
 from palpate.bundle.onnx_check import reader
 from palpate.core.errors import BundleError
 from palpate.inference import session
@@ -62,7 +63,7 @@ def test_early_heads_have_their_own_session(tmp_path, opened: list[list[str]]):
     it = Classifier(toy_bundle.load(tmp_path / "toy", early=EARLY, outputs=OUTPUTS), VirtualClock())
     EarlyExit(it)
     assert opened == [["logits", "embedding"], ["early"]]
-    it.early(toy_bundle.window(1, 0))
+    it.outputs(toy_bundle.window(1, 0), "early")
     EarlyExit(it)
     assert len(opened) == 2
 
@@ -81,10 +82,10 @@ def test_answers_are_the_same_with_early_heads_and_without(default_bundle: Bundl
     )
     for window in (*default_bundle.golden, *noise):
         want = dict(zip(OUTPUTS, session.run(whole, OUTPUTS, {"sweep": window[None]}), strict=True))
-        assert early.early(window).tobytes() == want["early"].tobytes()
+        assert early.outputs(window, "early")[0].tobytes() == want["early"].tobytes()
         for it in (plain, early):
             assert it.logits(window).tobytes() == want["logits"].tobytes()
-            assert it.embedding(window).tobytes() == want["embedding"].tobytes()
+            assert it.outputs(window, "embedding")[0].tobytes() == want["embedding"].tobytes()
 
 
 def test_an_enrolled_bundle_runs_without_the_early_heads(

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from palpate.answer.objects import EnrolledLabels, softmax
+from palpate.answer.unknown import ClassDistances
 from palpate.bundle.bundle import Bundle
 from palpate.core.types import Frames, Status, Sweep
-from palpate.inference.classifier import Classifier, softmax
-from palpate.inference.novelty import ClassDistances
-from palpate.inference.objects import EnrolledLabels
+from palpate.inference.classifier import Classifier
 from palpate.learn import enrolment, materials
 from palpate.sim.rig import VirtualClock
 from tests.factories import toy_bundle
@@ -70,7 +70,7 @@ def test_golden_sweeps_of_new_materials_need_not_agree(tmp_path: Path):
     old = replace(old, classes=turned)
     made = enrolment.enrol(old, "felt", np.stack([toy_bundle.window(7, 7.4)]))
     it = Classifier(made.bundle, VirtualClock())
-    network, z = it.network(made.bundle.golden[-1])
+    network, z = it.outputs(made.bundle.golden[-1], "logits", "embedding")
     assert it._means
     assert network.argmax() != it._means.logits(it._means.distances(z))[:3].argmax()
     it.self_test()
@@ -151,7 +151,7 @@ def test_a_displaced_contact_is_named_by_the_same_rule(tmp_path: Path):
     means = ClassDistances(
         new.classes, new.manifest.known, new.manifest.labels, toy_bundle.DISPLACEMENT
     )
-    network, z = it.network(sweep.frames.taxels)
+    network, z = it.outputs(sweep.frames.taxels, "logits", "embedding")
     by_means = softmax(means.logits(means.distances(z)) / 3.0)
     assert 0.2 < by_means[3] < enrolment.LEAST
     assert verdict.own[3] == pytest.approx(by_means[3], rel=1e-4)

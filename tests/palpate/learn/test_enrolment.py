@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from palpate.answer.early import Early
+from palpate.answer.unknown import ClassDistances, Classes
 from palpate.bundle import bundle
-from palpate.bundle.bundle import Bundle, Early
+from palpate.bundle.bundle import Bundle
 from palpate.core.errors import BundleError, FormatError
 from palpate.core.types import Status
 from palpate.inference.classifier import Classifier
-from palpate.inference.novelty import ClassDistances
 from palpate.learn import enrolment
 from palpate.sim.rig import VirtualClock
 from tests.factories import toy_bundle
@@ -145,7 +146,7 @@ def test_the_limit_keeps_as_many_sweeps_of_an_enrolled_label_as_of_a_trained_one
     kept = []
     for _ in range(100):
         mean = rng.normal(size=(n, 2)).mean(axis=0)
-        classes = bundle.Classes(
+        classes = Classes(
             np.vstack([toy_bundle.MEANS + 100, mean]),
             np.zeros(4),
             np.array([0, 0, 0, n]),

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from palpate.answer.early import Early
+from palpate.answer.taxels import Bridging, BrokenTaxels
 from palpate.bundle.bundle import Bundle
-from palpate.bundle.manifest import Early
 from palpate.core import config
 from palpate.core.errors import FormatError
 from palpate.core.sweep_file import save, sidecar
@@ -23,7 +24,6 @@ from palpate.core.types import Frames, Status, Sweep, Verdict
 from palpate.inference.classifier import Classifier
 from palpate.inference.early_exit import EarlyExit
 from palpate.runtime.replay import replay
-from palpate.signal.broken_taxels import Bridging, BrokenTaxels
 from palpate.sim import devices, rig, script, skin
 from palpate.sweeps.black_box import BlackBox
 from tests.factories import toy_bundle

@@ -10,12 +10,12 @@ from typing import Any
 
 import pytest
 
+from palpate.answer.slide import SpeedRange
 from palpate.bundle import bundle
 from palpate.core import config
 from palpate.core.clock import Clock
 from palpate.io import skin_profile
 from palpate.runtime import selftest
-from palpate.signal.slide import SpeedRange
 from palpate.sim import devices, rig, script
 from tests.factories.skins import devices as played
 from tests.factories.skins import sweeps

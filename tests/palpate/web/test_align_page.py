@@ -16,10 +16,10 @@ from typing import Any
 import pytest
 
 from palpate.alignment.view import View
+from palpate.answer.contact import ContactPositions
 from palpate.bundle import bundle
 from palpate.bundle.bundle import Manifest
 from palpate.core.clock import SystemClock
-from palpate.signal.contact import ContactPositions
 from palpate.web.access import Access
 from palpate.web.server import PageServer
 from tests.factories.browser import WAIT_S, BrowsedPage, contrast, luminance, until

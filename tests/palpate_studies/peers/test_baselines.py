@@ -13,8 +13,8 @@ from scipy.stats import multivariate_normal
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
+from palpate.answer.objects import softmax
 from palpate.core.errors import FormatError
-from palpate.inference.classifier import softmax
 from palpate_studies.peers import baselines
 from palpate_studies.peers.baselines import ABSENT, FeatureModel, Gauss, knn, svm, to_onnx
 from palpate_train.data import sets

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from palpate.answer.objects import softmax
 from palpate.core.errors import FormatError
-from palpate.inference.classifier import softmax
 from palpate.inference.session import session
 from palpate_studies.peers import minirocket, sthmp
 from palpate_train.data.sets import Dataset

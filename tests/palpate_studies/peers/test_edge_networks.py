@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
+from palpate.answer.objects import softmax
 from palpate.bundle.onnx_check import reader
 from palpate.core.types import SweepFormat
-from palpate.inference.classifier import softmax
 from palpate_studies import cost
 from palpate_studies.peers import ds_cnn, edge_spectral
 from palpate_train.models import methods

@@ -8,8 +8,8 @@ from itertools import combinations
 import numpy as np
 import pytest
 
+from palpate.answer.objects import softmax
 from palpate.core.types import SweepFormat
-from palpate.inference.classifier import softmax
 from palpate_studies.peers import minirocket
 from palpate_train.data.sets import Dataset
 from palpate_train.models import linear_head

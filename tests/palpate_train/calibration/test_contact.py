@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from palpate.signal.contact import ContactPositions, centre
+from palpate.answer.contact import ContactPositions, centre
 from palpate.sim import skin
 from palpate_train.calibration.contact import ContactLimit, Contacts, find_centres, find_limit
 from palpate_train.data import sets

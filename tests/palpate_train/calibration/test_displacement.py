@@ -4,7 +4,7 @@ and certainty is limited."""
 import numpy as np
 import pytest
 
-from palpate.bundle.bundle import Classes
+from palpate.answer.unknown import Classes
 from palpate_train.calibration import displacement, novelty
 from palpate_train.calibration.displacement import AugmentedCopies, fit_displacement
 

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
+from palpate.answer.early import Early
+from palpate.answer.objects import softmax
 from palpate.bundle import bundle
-from palpate.bundle.bundle import Early, Manifest, Thresholds
+from palpate.bundle.bundle import Manifest, Thresholds
 from palpate.bundle.pruning import prune
 from palpate.core.clock import SystemClock
 from palpate.inference import classifier
@@ -109,7 +111,7 @@ def test_many_sweeps_are_decided_as_the_box_decides_each(agree: int):
     """early.decide equals the appliance's inference.early_exit on random probabilities, with some
     levels above 1."""
     rng = np.random.default_rng(agree)
-    p = classifier.softmax(2 * rng.standard_normal((200, 10, 3)))
+    p = softmax(2 * rng.standard_normal((200, 10, 3)))
     rule = Early(tuple(rng.choice([0.5, 0.7, 0.9, 1.5], 9).tolist()), agree)
     named, share = early_exit.decide(p, rule)
     for i in range(200):
@@ -211,8 +213,10 @@ def test_the_graph_gives_what_training_computed(made):
     box = classifier.Classifier(whole, SystemClock())
     box.self_test()
     for i in (0, 17, 40):
-        assert np.allclose(box.embedding(counts[i]), done.embedding(x[i, -1]), atol=1e-3)
-        have = classifier.softmax(np.vstack([box.early(counts[i]), box.logits(counts[i])]))
+        assert np.allclose(
+            box.outputs(counts[i], "embedding")[0], done.embedding(x[i, -1]), atol=1e-3
+        )
+        have = softmax(np.vstack([box.outputs(counts[i], "early")[0], box.logits(counts[i])]))
         assert np.allclose(have, done.probabilities(x[i : i + 1])[0], atol=1e-3)
 
 
@@ -229,8 +233,8 @@ def test_a_graph_without_tenths_has_no_early_heads(made):
     ):
         assert [o.name for o in model.graph.output] == ["logits", "embedding"]
         assert np.allclose(
-            classifier.softmax(run(model, counts[:2])),
-            classifier.softmax(done.logits(x[:2, -1])),
+            softmax(run(model, counts[:2])),
+            softmax(done.logits(x[:2, -1])),
             atol=1e-3,
         )
 
@@ -253,7 +257,7 @@ def test_enrolment_is_judged_as_the_box_enrols(made):
     box, z = classifier.Classifier(new, SystemClock()), done.embedding(x[:, -1])
     have = certainty.enrolled_probabilities(done, done.logits(x[:, -1]), z, z[drawn])
     want = classifier.enrolled_labels(new).decided(
-        classifier.softmax(np.stack([box.logits(one) for one in counts]))
+        softmax(np.stack([box.logits(one) for one in counts]))
     )
     assert np.allclose(have, want, atol=0.02)
     assert 0 < (have[:, -1] > 0).mean() < 1

@@ -9,7 +9,7 @@ import pytest
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from palpate.inference.novelty import shaped_distances
+from palpate.answer.unknown import shaped_distances
 from palpate_train.calibration.widened_shapes import DisturbedSweeps, Scatters, Space, choose
 
 MEANS = np.array([[0.0, 0, 0, 0], [12, 0, 0, 0], [0, 12, 0, 0]])

@@ -12,8 +12,8 @@ import numpy as np
 import onnx
 import pytest
 
+from palpate.answer.objects import softmax
 from palpate.core.errors import FormatError
-from palpate.inference.classifier import softmax
 from palpate_train.cli.main import main
 from palpate_train.data.sets import Dataset
 from palpate_train.evaluate import evaluate, fold

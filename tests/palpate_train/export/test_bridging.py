@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from palpate.answer.taxels import bridged
 from palpate.bundle import bundle
 from palpate.core.clock import SystemClock
 from palpate.core.errors import BundleError
 from palpate.core.types import Status
 from palpate.inference.classifier import Classifier
-from palpate.signal.broken_taxels import bridged
 from palpate_train.data import sets
 from palpate_train.data.sets import Dataset
 from palpate_train.evaluate.corruptions import dead

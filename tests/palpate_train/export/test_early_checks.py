@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from palpate.answer.unknown import EarlyDistances
 from palpate.bundle import bundle
-from palpate.inference.novelty import EarlyDistances
 from palpate_train.calibration import early_exit
 from palpate_train.data import sets
 from palpate_train.export import displacement_limit, early_checks

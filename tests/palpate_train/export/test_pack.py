@@ -9,11 +9,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from palpate.answer.objects import softmax
 from palpate.bundle import bundle
 from palpate.cli.main import main as palpate
 from palpate.core.clock import SystemClock
 from palpate.core.errors import BundleError, FormatError
-from palpate.inference.classifier import Classifier, softmax
+from palpate.inference.classifier import Classifier
 from palpate_train.cli.main import main
 from palpate_train.data.sets import Dataset
 from palpate_train.export import bundle_score, pack

@@ -15,13 +15,14 @@ import pytest
 import torch
 from onnx import numpy_helper
 
+from palpate.answer.objects import softmax
 from palpate.bundle import bundle
 from palpate.cli.main import main as palpate
 from palpate.core import sweep_set
 from palpate.core.clock import SystemClock
 from palpate.core.errors import BundleError, FormatError
 from palpate.core.types import SweepFormat
-from palpate.inference.classifier import Classifier, softmax
+from palpate.inference.classifier import Classifier
 from palpate.inference.session import session
 from palpate.sim import skin
 from palpate_studies import cost

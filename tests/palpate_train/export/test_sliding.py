@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from palpate.answer.slide import CHANCE
 from palpate.bundle import bundle
 from palpate.core.clock import SystemClock
 from palpate.core.types import Status
 from palpate.inference.classifier import Classifier
-from palpate.signal.slide import CHANCE
 from palpate_train.data import sets
 from palpate_train.export import sliding
 from tests.factories import toy_bundle

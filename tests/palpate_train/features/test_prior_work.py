@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from palpate.answer import features, time_series
 from palpate.core.errors import FormatError
-from palpate.signal import features, time_series
 from palpate_studies.peers.prior_work import explore
 from palpate_train.features import kinds
 from palpate_train.features.prior_work import correlation, spectrogram, static

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate.inference.classifier import softmax
+from palpate.answer.objects import softmax
 from palpate_train.metrics.score import Score, accuracy_figure, fuse, interval
 
 

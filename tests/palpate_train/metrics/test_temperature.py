@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from palpate.inference.classifier import softmax
+from palpate.answer.objects import softmax
 from palpate_train.metrics.temperature import platt_temperature, sufficient_temperature
 
 

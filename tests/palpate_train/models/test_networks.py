@@ -12,9 +12,9 @@ import pytest
 import torch
 from torch import nn
 
+from palpate.answer.objects import softmax
 from palpate.core.errors import FormatError
 from palpate.core.types import SweepFormat
-from palpate.inference.classifier import softmax
 from palpate.sim import skin
 from palpate_studies.peers import ds_cnn, edge_spectral, lite, paper_cnn, recurrent
 from palpate_train.data.sets import Dataset

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.answer.contact import MOST_POSITIONS, ContactPositions, centre
+from palpate.answer.unloaded import UnloadedSkin
 from palpate.core.types import normal
-from palpate.signal.contact import MOST_POSITIONS, ContactPositions, centre
-from palpate.signal.unloaded import UnloadedSkin
 from palpate.sim import skin
 from palpate_train.calibration import novelty
 from palpate_train.data.sets import Dataset

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.bundle.bundle import Classes, DisplacedClasses, DisplacementRule
-from palpate.inference.classifier import softmax
+from palpate.answer.objects import softmax
+from palpate.answer.unknown import Classes, DisplacedClasses, DisplacementRule
 from palpate_train.calibration.novelty import Embedding, embed, limit
 from palpate_train.metrics.temperature import sufficient_temperature
 

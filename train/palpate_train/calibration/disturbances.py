@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.answer import disturbance
+from palpate.answer.disturbance import TINY, Allowance
+from palpate.answer.hum import HumFilter
+from palpate.answer.slide import SlideMeter
+from palpate.answer.unknown import shaped_distances
 from palpate.core.types import SweepFormat
-from palpate.inference.novelty import shaped_distances
-from palpate.signal import disturbances
-from palpate.signal.disturbances import TINY, Allowance
-from palpate.signal.hum import HumFilter
-from palpate.signal.slide import SlideMeter
 from palpate_train.calibration.widened_shapes import DisturbedSweeps
 
 Array = NDArray[Any]
@@ -84,11 +84,11 @@ class DisturbanceMeter:
     def values(self, name: str, samples: Array) -> Array:
         """The values [n] of noise, load or speed; NaN where one is not known."""
         if name == "noise":
-            return np.array([disturbances.noise(window) for window in samples])
+            return np.array([disturbance.noise(window) for window in samples])
         if name == "load":
             means = (window.mean(axis=0, dtype=np.float64) for window in samples)
-            return np.array([disturbances.load(mean, self._tare) for mean in means])
-        return np.array([disturbances.speed(self._slide(window).taxels_s) for window in samples])
+            return np.array([disturbance.load(mean, self._tare) for mean in means])
+        return np.array([disturbance.speed(self._slide(window).taxels_s) for window in samples])
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from palpate.bundle.bundle import Early, EarlyClasses
-from palpate.inference.novelty import EarlyDistances
+from palpate.answer.early import Early
+from palpate.answer.unknown import EarlyClasses, EarlyDistances
 from palpate_train.calibration.heads import shrinkage
 from palpate_train.calibration.novelty import centred, cross_fitted, limit
 from palpate_train.metrics.temperature import sufficient_temperature

@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.bundle.bundle import Classes
+from palpate.answer.unknown import Classes, shaped_distances
 from palpate.core.errors import FormatError
-from palpate.inference.novelty import shaped_distances
 from palpate_train.calibration.heads import shrinkage
 from palpate_train.onnx_tools.quantize import sixteen_bits
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from palpate.signal.slide import Slide, SlideMeter, SpeedRange
+from palpate.answer.pipeline import Slide
+from palpate.answer.slide import SlideMeter, SpeedRange
 from palpate_train.data.sets import Dataset
 
 MOST_SWEEPS = 1000

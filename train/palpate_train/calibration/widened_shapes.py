@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.inference.novelty import shaped_distances
+from palpate.answer.unknown import shaped_distances
 from palpate_train.calibration.novelty import (
     Embedding,
     auroc,

@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
+from palpate.answer.unloaded import UnloadedSkin
 from palpate.core.errors import FormatError
 from palpate.core.sweep_set import Array, Set, build, load_file
 from palpate.core.types import LARGEST_READING, SweepFormat
-from palpate.signal.unloaded import UnloadedSkin
 from palpate.sweeps.sweep_folder import RecordedSweep
 from palpate_train.data import mapped
 from palpate_train.data.group_values import typed

@@ -34,7 +34,7 @@ from palpate_train.models import methods
 Array = NDArray[Any]
 Answer = Callable[[Array], Array]
 """Raw counts [T, R, C] -> logits [K]."""
-BOX = ("palpate.inference.classifier", "palpate.inference.novelty")
+BOX = ("palpate.inference.classifier", "palpate.answer.unknown")
 """Modules of the box that its answers depend on, beside the code of COUNTED."""
 TIMED_SWEEPS = 24
 """Number of test sweeps that are classified one by one, to measure their time and to compare their
@@ -50,7 +50,7 @@ NOT_COUNTED = (
 )
 """Modules that methods use and that do not change the result of a fold: it stays valid when their
 code changes. Sets are fingerprinted by their data."""
-COUNTED = ("palpate_train", "palpate_studies", "palpate.signal")
+COUNTED = ("palpate_train", "palpate_studies", "palpate.answer")
 """Packages whose code may change the result of a fold. `agreement` compares the box's other code
 with the desktop's."""
 LIBRARIES = (

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.answer.objects import softmax
 from palpate.core.errors import FormatError
-from palpate.inference.classifier import softmax
 from palpate_train.calibration.novelty import auroc, embed
 from palpate_train.data.sets import Dataset
 from palpate_train.evaluate.evaluate import Where

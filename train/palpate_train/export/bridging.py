@@ -17,15 +17,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.answer.load_modes import LoadModes
+from palpate.answer.taxel_statistics import TaxelStatistics
+from palpate.answer.taxels import Bridging, Comparison, places
+from palpate.answer.window_check import MANY_FULL
 from palpate.bundle.bundle import Bundle
 from palpate.bundle.manifest import Manifest
 from palpate.core.clock import SystemClock
 from palpate.core.types import Status, digitized
 from palpate.inference.classifier import Classifier
-from palpate.signal.broken_taxels import Bridging, Comparison, places
-from palpate.signal.load_modes import LoadModes
-from palpate.signal.taxel_statistics import TaxelStatistics
-from palpate.signal.window_check import MANY_FULL
 from palpate_train.data.sets import Dataset
 from palpate_train.evaluate.corruptions import CORRUPTIONS, TAXEL_FAULTS
 from palpate_train.evaluate.evaluation_sweeps import EvaluationSweeps

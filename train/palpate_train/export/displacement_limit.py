@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from palpate.answer.contact import displacement
 from palpate.bundle.manifest import Manifest
-from palpate.signal.contact import displacement
 from palpate_train.data.sets import Dataset
 from palpate_train.models.recipe.augment import Augmentation, augment
 

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.inference.novelty import shaped_distances
-from palpate.signal.disturbances import Disturbances, hum
+from palpate.answer.disturbance import Disturbances, hum
+from palpate.answer.unknown import shaped_distances
 from palpate_train.calibration import disturbances, novelty
 from palpate_train.calibration.widened_shapes import (
     DisturbedSweeps,

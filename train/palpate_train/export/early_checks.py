@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import onnx
 
-from palpate.bundle.bundle import EarlyClasses
+from palpate.answer.unknown import EarlyClasses
 from palpate.bundle.manifest import Manifest
 from palpate_train.calibration.early_exit import early_classes, early_limits
 from palpate_train.data.sets import Dataset

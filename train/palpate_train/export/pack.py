@@ -22,13 +22,15 @@ import onnx
 import onnxruntime
 from numpy.typing import NDArray
 
+from palpate.answer.disturbance import Disturbances
+from palpate.answer.early import Early
+from palpate.answer.objects import softmax
+from palpate.answer.unknown import Classes, DisplacementRule, Known, shaped_distances
 from palpate.bundle import arrays, bundle
 from palpate.core import provenance, storage
 from palpate.core.clock import SystemClock
 from palpate.core.errors import BundleError
-from palpate.inference.classifier import Classifier, softmax
-from palpate.inference.novelty import shaped_distances
-from palpate.signal.disturbances import Disturbances
+from palpate.inference.classifier import Classifier
 from palpate_train.calibration.contact import Contacts
 from palpate_train.calibration.slide_speeds import trained_speeds
 from palpate_train.data import extras, repeats
@@ -91,11 +93,11 @@ class Content:
     held_out_by: str
     about: dict[str, Any]
     figures: dict[str, Any] = field(default_factory=dict)
-    early: bundle.Early | None = None
-    known: bundle.Known | None = None
-    displacement: bundle.DisplacementRule | None = None
+    early: Early | None = None
+    known: Known | None = None
+    displacement: DisplacementRule | None = None
     disturbances: Disturbances | None = None
-    classes: bundle.Classes | None = None
+    classes: Classes | None = None
     contacts: Contacts | None = None
     unseen: Content | None = None
 
@@ -217,7 +219,7 @@ def _files(content: Content) -> dict[str, bytes]:
     return files | ({bundle.MEANS: means_file(content.classes)} if content.classes else {})
 
 
-def means_file(classes: bundle.Classes) -> bytes:
+def means_file(classes: Classes) -> bytes:
     """The file means.npz."""
     return arrays.packed(**classes.arrays())
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from palpate.answer.slide import CHANCE, SlideMeter
+from palpate.answer.vibration import PARTS, TINY, SlideLimits, vibration
 from palpate.bundle.manifest import Manifest
-from palpate.signal.slide import CHANCE, SlideMeter
-from palpate.signal.vibration import PARTS, TINY, SlideLimits, vibration
 from palpate_train.calibration.slide_speeds import OUTER, slides
 from palpate_train.data.sets import Dataset
 

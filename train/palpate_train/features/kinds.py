@@ -1,7 +1,7 @@
 """All feature sets by name. They map the raw counts of one sweep's window to float32 features.
 
 KINDS holds the features that the box computes and those of prior work, which only the desktop
-computes. A bundle may name only a feature set of palpate.signal.features.
+computes. A bundle may name only a feature set of palpate.answer.features.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.signal import features
+from palpate.answer import features
 from palpate_train.features import prior_work
 
 Array = NDArray[np.float64]

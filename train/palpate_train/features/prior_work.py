@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.answer import time_series
+from palpate.answer.features import axes
 from palpate.core.errors import FormatError
-from palpate.signal import time_series
-from palpate.signal.features import axes
 
 Array = NDArray[np.float64]
 

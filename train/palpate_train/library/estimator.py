@@ -12,10 +12,10 @@ from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.utils.multiclass import check_classification_targets
 from sklearn.utils.validation import check_is_fitted
 
+from palpate.answer.objects import softmax
 from palpate.bundle.manifest import Manifest
 from palpate.core import provenance
 from palpate.core.errors import FormatError
-from palpate.inference.classifier import softmax
 from palpate_train.data import labels
 from palpate_train.data.run import Run
 from palpate_train.data.sets import Dataset

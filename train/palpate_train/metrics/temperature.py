@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
-from palpate.inference.classifier import LEAST_PROBABILITY, softmax
+from palpate.answer.objects import LEAST_PROBABILITY, softmax
 
 Array = NDArray[Any]
 TEMPERATURES = np.geomspace(1, 100, 200)

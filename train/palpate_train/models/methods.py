@@ -20,8 +20,8 @@ import numpy as np
 import onnx
 from numpy.typing import NDArray
 
+from palpate.answer import features
 from palpate.core.errors import FormatError
-from palpate.signal import features
 from palpate_train.data.progress import spoken as spoken  # for trainings
 from palpate_train.data.run import Log as Log
 from palpate_train.data.run import no_log as no_log

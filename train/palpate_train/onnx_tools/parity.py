@@ -11,7 +11,7 @@ import numpy as np
 import onnx
 from numpy.typing import NDArray
 
-from palpate.inference.classifier import softmax
+from palpate.answer.objects import softmax
 from palpate.inference.session import session
 from palpate_train.metrics.score import widen
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.inference.classifier import softmax
+from palpate.answer.objects import softmax
 from palpate.learn.assessment import Assessment
 from palpate_train.data.run import Run
 from palpate_train.data.splitters import InnerPart, recording_parts

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
+from palpate.answer.slide_check import SlidesAmong
 from palpate.core.errors import FormatError
-from palpate.signal.slide_check import SlidesAmong
 from palpate.sweeps.sweep_folder import NoSlide, RecordedSweep, slides_alone, taught
 from palpate_train.data import labels
 from palpate_train.data.readers import NAMED_GROUPS, check_folder, counted, from_recorded

@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.answer.contact import centre
 from palpate.core.errors import FormatError
 from palpate.core.types import Frames, Status, Sweep
 from palpate.inference.classifier import Classifier
-from palpate.signal.contact import centre
 from palpate.sim import skin
 from palpate_train.evaluate.evaluation_sweeps import EvaluationSweeps
 from palpate_train.metrics.score import interval, provenance

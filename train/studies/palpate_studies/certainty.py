@@ -15,10 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.bundle.bundle import Early
-from palpate.inference.classifier import LEAST_PROBABILITY, softmax
-from palpate.inference.novelty import ClassDistances
-from palpate.inference.objects import EnrolledLabels
+from palpate.answer.early import Early
+from palpate.answer.objects import LEAST_PROBABILITY, EnrolledLabels, softmax
+from palpate.answer.unknown import ClassDistances
 from palpate.learn.enrolment import LEAST
 from palpate.learn.enrolment import extended as enrolled_classes
 from palpate_train.calibration.early_exit import LEVELS, decide

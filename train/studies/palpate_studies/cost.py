@@ -13,9 +13,9 @@ import numpy as np
 import onnx
 from onnx import TensorProto
 
+from palpate.answer import time_series
 from palpate.core.errors import FormatError
 from palpate.core.types import SweepFormat
-from palpate.signal import time_series
 from palpate_train.features import kinds
 
 NUMBERS = {TensorProto.FLOAT, TensorProto.INT8, TensorProto.UINT8, TensorProto.INT32}

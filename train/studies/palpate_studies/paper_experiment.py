@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.answer.objects import LEAST_PROBABILITY, fuse, softmax
 from palpate.core.errors import FormatError
-from palpate.inference.classifier import LEAST_PROBABILITY, fuse, softmax
 from palpate_studies import paper_values
 from palpate_studies.paper_values import CNN
 from palpate_studies.peers import prior_work

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from palpate.bundle.bundle import Early
+from palpate.answer.early import Early
 from palpate_train.calibration.displacement import AugmentedCopies
 from palpate_train.calibration.early_exit import EarlyRule
 from palpate_train.data.run import Run

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from palpate.inference.classifier import softmax
+from palpate.answer.objects import softmax
 from palpate_train.calibration.heads import HeadData, HeadPart, HeadPlan, fit_discriminant
 from palpate_train.data.splitters import InnerPart
 from palpate_train.models.recipe import choice

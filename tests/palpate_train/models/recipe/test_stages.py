@@ -85,7 +85,7 @@ def test_stages_follow_the_window():
     message."""
     assert [(s.kernel, s.stride) for s in STAGES.stages(1500)] == [(32, 4), (5, 2), (5, 2)]
     assert [(s.kernel, s.stride) for s in STAGES.stages(128)] == [(4, 1), (5, 2), (5, 2)]
-    assert STAGES.stages(1500)[-1] == architectures.Stage(5, 2, 89, 32 + 4 * 4 + 4 * 8, 16)
+    assert STAGES.stages(1500)[-1] == architectures.FilterStage(5, 2, 89, 32 + 4 * 4 + 4 * 8, 16)
     bare = Architecture((), planned=3)
     for window in range(16, 3000):
         last = STAGES.stages(window)[-1]

@@ -27,7 +27,7 @@ completely, but passes three quarters of 60 Hz."""
 
 
 @dataclass(frozen=True)
-class Stage:
+class FilterStage:
     """One convolution. steps: number of its responses. reach: number of frames that a response
     sees.
 
@@ -48,9 +48,9 @@ class Stage:
         return [max((end - self.reach) // self.hop + 1, 0) for end in ends]
 
 
-def each_frame(window: int) -> Stage:
+def each_frame(window: int) -> FilterStage:
     """The frames themselves, as if they were responses."""
-    return Stage(1, 1, window, 1, 1)
+    return FilterStage(1, 1, window, 1, 1)
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Architecture:
     relations: int = 0
     mains_hz: float = MAINS_HZ
 
-    def stages(self, window: int) -> tuple[Stage, ...]:
+    def stages(self, window: int) -> tuple[FilterStage, ...]:
         """The stages for a window of this many frames.
 
         Kernel and stride of the first stage are halved as long as the last stage has fewer steps
@@ -86,7 +86,7 @@ class Architecture:
         """
         return self._planned_stages(window)[: len(self.channels)]
 
-    def _planned_stages(self, window: int) -> tuple[Stage, ...]:
+    def _planned_stages(self, window: int) -> tuple[FilterStage, ...]:
         kernel, stride = self.kernel, self.stride
         while (plan := self._plan(window, kernel, stride))[
             -1
@@ -99,11 +99,11 @@ class Architecture:
             )
         return plan
 
-    def _plan(self, window: int, kernel: int, stride: int) -> tuple[Stage, ...]:
+    def _plan(self, window: int, kernel: int, stride: int) -> tuple[FilterStage, ...]:
         plan, steps, reach, hop = [], window, 1, 1
         for k, s in ((kernel, stride), *(LATER,) * (max(self.planned, len(self.channels)) - 1)):
             steps, reach, hop = (steps - k) // s + 1, reach + (k - 1) * hop, hop * s
-            plan.append(Stage(k, s, steps, reach, hop))
+            plan.append(FilterStage(k, s, steps, reach, hop))
         return tuple(plan)
 
     def zero_sum(self, window: int) -> bool:

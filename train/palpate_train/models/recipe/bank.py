@@ -20,7 +20,7 @@ from onnx import TensorProto
 
 from palpate.core.errors import FormatError
 from palpate.core.types import SweepFormat
-from palpate_train.models.recipe.architectures import FLOOR, Stage
+from palpate_train.models.recipe.architectures import FLOOR, FilterStage
 from palpate_train.onnx_tools import graph_builder
 from palpate_train.onnx_tools.graph_builder import FLOAT, MIDDLE, GraphBuilder
 from palpate_train.onnx_tools.quantize import PERCENTILE
@@ -155,12 +155,12 @@ def fitted(drawn: Bank, seen: Sequence[Array], rng: np.random.Generator) -> Bank
     )
 
 
-def stage(format: SweepFormat, dilation: int) -> Stage:
+def stage(format: SweepFormat, dilation: int) -> FilterStage:
     """The responses of a filter of this dilation."""
     macs = count(format) * format.channels * TAPS * format.window
     stride = max(1, format.window // MOST_STEPS, -(-macs // MOST_MACS))
     reach = (TAPS - 1) * dilation + 1
-    return Stage(TAPS, stride, (format.window - reach) // stride + 1, reach, stride)
+    return FilterStage(TAPS, stride, (format.window - reach) // stride + 1, reach, stride)
 
 
 def groups(bank: Bank) -> list[tuple[Array, int]]:
@@ -182,9 +182,9 @@ class Pooling:
 
 def responses(
     g: GraphBuilder, format: SweepFormat, bank: Bank, x: str, step: float, int8: bool
-) -> tuple[str, list[Stage]]:
-    """Taxels [n, R * C, T] in units of `step` -> responses [n, steps, filters], with the Stage of
-    each of `groups`.
+) -> tuple[str, list[FilterStage]]:
+    """Taxels [n, R * C, T] in units of `step` -> responses [n, steps, filters], with the
+    FilterStage of each of `groups`.
 
     Long filters give fewer responses than short ones. Zeros after the window make their number
     equal; these responses are ignored. In int8 a response is a byte, where MIDDLE is 0 and 255

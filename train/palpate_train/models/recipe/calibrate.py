@@ -16,9 +16,9 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.bundle.bundle import Classes, DisplacementRule, Early, Known
-from palpate.bundle.manifest import UNSURE
-from palpate.inference.classifier import LEAST_PROBABILITY, softmax
+from palpate.answer.early import Early
+from palpate.answer.objects import LEAST_PROBABILITY, softmax
+from palpate.answer.unknown import UNSURE, Classes, DisplacementRule, Known
 from palpate_train.calibration import early_exit, novelty
 from palpate_train.calibration.displacement import (
     AugmentedCopies,

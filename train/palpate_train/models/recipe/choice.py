@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.inference.classifier import softmax
+from palpate.answer.objects import softmax
 from palpate_train.calibration.heads import ABSENT, HeadData, HeadPart, HeadPlan
 from palpate_train.data.splitters import InnerPart
 from palpate_train.metrics.temperature import weighted_platt_temperature

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from onnx import TensorProto
 
 from palpate.core.types import SweepFormat
-from palpate_train.models.recipe.architectures import PREFIXES, Stage
+from palpate_train.models.recipe.architectures import PREFIXES, FilterStage
 from palpate_train.onnx_tools import graph_builder
 from palpate_train.onnx_tools.graph_builder import FLOAT, GraphBuilder
 
@@ -85,10 +85,10 @@ def _levels(values: Array, number: int) -> Array:
     return levels
 
 
-def _looked(window: int) -> Stage:
+def _looked(window: int) -> FilterStage:
     """The frames that are used, each with the next one."""
     hop = max(window // MOST_FRAMES, 1)
-    return Stage(2, hop, (window - 2) // hop + 1, 2, hop)
+    return FilterStage(2, hop, (window - 2) // hop + 1, 2, hop)
 
 
 def pooled(

@@ -29,8 +29,8 @@ from sklearn.pipeline import Pipeline, make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
 
+from palpate.answer.objects import LEAST_PROBABILITY
 from palpate.core.errors import FormatError
-from palpate.inference.classifier import LEAST_PROBABILITY
 from palpate.inference.session import session
 from palpate_train.data.sets import Dataset
 from palpate_train.metrics.temperature import platt_temperature

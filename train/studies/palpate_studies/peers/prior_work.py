@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.answer.objects import softmax
 from palpate.core.errors import FormatError
-from palpate.inference.classifier import softmax
 from palpate_studies.peers.baselines import ABSENT, Gauss, learn, svm
 from palpate_train.models.methods import Method
 

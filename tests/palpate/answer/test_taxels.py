@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.core.errors import BundleError
-from palpate.core.types import SweepFormat
-from palpate.signal.broken_taxels import (
+from palpate.answer.taxel_statistics import TRIPLES, TaxelStatistics
+from palpate.answer.taxels import (
     LEAST_FRAMES,
     Bridging,
     BrokenTaxels,
@@ -19,8 +18,9 @@ from palpate.signal.broken_taxels import (
     find,
     places,
 )
-from palpate.signal.taxel_statistics import TRIPLES, TaxelStatistics
-from palpate.signal.window_check import WindowLimits
+from palpate.answer.window_check import WindowLimits
+from palpate.core.errors import BundleError
+from palpate.core.types import SweepFormat
 
 ROWS, COLS, FRAMES = 6, 5, 600
 LIMITS = WindowLimits(contact=10, full_scale=255)

@@ -10,15 +10,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from palpate.answer.disturbance import Allowance, Disturbances
+from palpate.answer.early import Early
+from palpate.answer.objects import softmax
+from palpate.answer.unknown import KEPT, EarlyClasses, EarlyDistances
 from palpate.bundle import bundle
-from palpate.bundle.bundle import Bundle, Early
+from palpate.bundle.bundle import Bundle
 from palpate.core.errors import BundleError
 from palpate.core.types import Status, Sweep, SweepFormat, Verdict
-from palpate.inference.classifier import Classifier, softmax
+from palpate.inference.classifier import Classifier
 from palpate.inference.early_exit import EarlyExit
-from palpate.inference.novelty import KEPT, EarlyDistances
 from palpate.learn import enrolment
-from palpate.signal.disturbances import Allowance, Disturbances
 from palpate.sim.rig import VirtualClock
 from tests.factories import toy_bundle
 
@@ -250,7 +252,7 @@ def test_distances_have_the_shape_of_each_step():
     """In the second step the second direction counts half. An embedding that is not a number lies
     within no limit."""
     shapes = np.stack([np.eye(2), np.diag([1, 0.5])]).astype(np.float16)
-    classes = bundle.EarlyClasses(np.tile(toy_bundle.MEANS, (2, 1, 1)), shapes)
+    classes = EarlyClasses(np.tile(toy_bundle.MEANS, (2, 1, 1)), shapes)
     distances = EarlyDistances(classes, (4.0, 4.0))
     z = np.array([[0, -3], [0, -3]])
     assert distances.nearest(z).tolist() == [9, 2.25]

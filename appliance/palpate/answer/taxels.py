@@ -1,5 +1,4 @@
-"""Broken taxels: finds those that are silent or noisy, and bridges them by their neighbours. Pure
-functions of raw counts.
+"""Broken taxels: finds silent and noisy ones, and bridges them by their neighbours.
 
 A silent taxel does not change although its neighbours do, or gives no number: it is dead or stuck.
 A noisy taxel is far noisier than its neighbours. All limits were learned from the training sweeps
@@ -9,18 +8,19 @@ of the bundle (train/palpate_train/export/bridging).
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.answer.load_modes import LoadModes
+from palpate.answer.pipeline import Context, Refusal
+from palpate.answer.taxel_statistics import TRIPLES, TaxelStatistics
+from palpate.answer.window_check import Finding, WindowLimits, ceiling, enclosed, inspect
 from palpate.core.errors import BundleError
-from palpate.core.types import SweepFormat, digitized, normal
-from palpate.signal.load_modes import LoadModes
-from palpate.signal.taxel_statistics import TaxelStatistics
-from palpate.signal.window_check import WindowLimits, enclosed
+from palpate.core.types import EPOCH_BITS, Frames, Status, SweepFormat, digitized, normal
 
 REACH = 2
 """A taxel is compared with the taxels up to this many rows and columns away."""
@@ -30,6 +30,13 @@ finger slides."""
 LEAST_FRAMES = 75
 """Fewer frames do not show whether a taxel is noisy: their noise depends too much on chance."""
 MOST_TAXELS = 1000
+STRETCH = 3 * TRIPLES
+"""Frames of a stretch of the stream, if a window has as many: its noise is then measured as
+precisely as that of a window."""
+CERTAIN = 5
+"""A taxel is broken over the stream after this many more broken than sound stretches."""
+SOUND = 150
+"""A taxel is sound again after this many sound stretches in a row."""
 
 Mask = NDArray[np.bool_]
 
@@ -274,3 +281,121 @@ def _weights(
     between = np.diag(beside[targets].sum(axis=1)) - beside[np.ix_(targets, targets)]
     weights = np.linalg.solve(between, beside[np.ix_(targets, sources)].astype(np.float64))
     return targets, sources, weights
+
+
+class TaxelWatch:
+    """Watches the taxels over the stream, checks the window of a sweep and bridges broken taxels.
+
+    A taxel that was broken in several stretches of the stream is bridged in every sweep, until it
+    has been sound for a while. A taxel that is broken in a window is bridged there at once. Beyond
+    the number that `bridging` tolerates, silent taxels make the window faulty; without it none is
+    bridged. unloaded: as in `bridged`. broken: over the stream; None if there are none.
+    """
+
+    def __init__(
+        self,
+        format: SweepFormat,
+        limits: WindowLimits,
+        bridging: Bridging | None,
+        unloaded: NDArray[np.float64],
+    ) -> None:
+        self._format, self._limits, self._bridging = format, limits, bridging
+        self._unloaded = unloaded
+        self._size = min(format.window, STRETCH)
+        self._restart()
+
+    def _restart(self) -> None:
+        """Forget everything: this may be another skin."""
+        self._epoch = -1
+        self._waiting: list[NDArray[Any]] = []
+        self._frames = 0
+        # [2, R, C] each: silent, noisy
+        self._against = np.zeros((2, self._format.rows, self._format.cols), np.int64)
+        self._sound = np.zeros_like(self._against)
+        self.broken: BrokenTaxels | None = None
+
+    def put(self, frames: Frames, tare: NDArray[np.float64]) -> None:
+        """Add frames of the stream, at least one. tare: raw counts [R, C] or [R, C, A]."""
+        if self._bridging is None:
+            return
+        epoch = int(frames.seq[-1]) >> EPOCH_BITS
+        if epoch != self._epoch:
+            self._restart()
+            self._epoch = epoch
+        self._waiting.append(frames.taxels)
+        self._frames += len(frames)
+        if self._frames >= self._size:
+            self._judge(np.concatenate(self._waiting), tare)
+            self._waiting, self._frames = [], 0
+
+    def _judge(self, taxels: NDArray[Any], tare: NDArray[np.float64]) -> None:
+        """Count one stretch [n, R, C] or [n, R, C, A] for or against each taxel. While its
+        neighbours are still, a taxel counts neither as silent nor as sound."""
+        measured, rule = TaxelStatistics.of(taxels), self._bridging
+        assert rule
+        compared = Comparison.of(measured, self._format.shape[:2])
+        found = find(measured, compared, tare, self._clipping(measured), rule)
+        bad = found.kinds if found else np.zeros(self._sound.shape, bool)
+        lively = compared.lively(rule.quietest).any(axis=1).reshape(bad.shape[1:])
+        good = ~bad & np.stack([lively, np.ones_like(lively)])
+        self._against = np.clip(self._against + bad - good.astype(np.int64), 0, CERTAIN)
+        self._sound = np.where(bad, 0, self._sound + good)
+        was = self.broken.kinds if self.broken else np.zeros_like(bad)
+        now = (was & (self._sound < SOUND)) | (self._against == CERTAIN)
+        self.broken = BrokenTaxels.of(now)
+
+    def apply(self, context: Context) -> Refusal | None:
+        """Bridge broken taxels of the window, and refuse a faulty window."""
+        context.taxels, finding = self.repaired(context.taxels, context.tare)
+        context.degraded, context.mean, context.full = finding.degraded, finding.mean, finding.full
+        if finding.status is not Status.OK:
+            return Refusal(finding.status, finding.detail)
+        return None
+
+    def repaired(
+        self, taxels: NDArray[Any], tare: NDArray[np.float64]
+    ) -> tuple[NDArray[Any], Finding]:
+        """Raw counts [T, R, C] or [T, R, C, A] of a window with its broken taxels bridged, and the
+        result of its check. tare: raw counts [R, C] or [R, C, A]."""
+        measured, limits = TaxelStatistics.of(taxels), self._limits
+        broken = self._in_window(measured, tare, limits)
+        if self._beyond(broken):
+            limits = self._clipping(measured)
+            broken = self._in_window(measured, tare, limits)
+        if broken and self._beyond(broken):
+            broken = BrokenTaxels.of(broken.kinds & [[[True]], [[False]]])  # silent alone
+        if not (broken and self._bridging):
+            return taxels, inspect(taxels, tare, limits, measured=measured)
+        if self._beyond(broken):
+            return taxels, self._too_many(broken, measured, tare)
+        taxels = bridged(taxels, broken.mask, self._unloaded, self._bridging.loads)
+        return taxels, replace(inspect(taxels, tare, limits), degraded=broken.text)
+
+    def _beyond(self, broken: BrokenTaxels | None) -> bool:
+        """Whether more taxels are broken than the bundle tolerates."""
+        return bool(broken and self._bridging and not self._bridging.allows(broken.mask))
+
+    def _clipping(self, measured: TaxelStatistics) -> WindowLimits:
+        """The limits, with the count at which the amplifier clips as full scale: taxels that stay
+        there are saturated, not stuck."""
+        return replace(self._limits, full_scale=ceiling(measured, self._limits.full_scale))
+
+    def _in_window(
+        self, measured: TaxelStatistics, tare: NDArray[np.float64], limits: WindowLimits
+    ) -> BrokenTaxels | None:
+        """The broken taxels of a window and of the stream."""
+        if self._bridging is None:
+            return None
+        compared = Comparison.of(measured, self._format.shape[:2])
+        found = find(measured, compared, tare, limits, self._bridging)
+        return found | self.broken if found and self.broken else found or self.broken
+
+    def _too_many(
+        self, broken: BrokenTaxels, measured: TaxelStatistics, tare: NDArray[np.float64]
+    ) -> Finding:
+        """The finding for silent taxels beyond the number that the bundle tolerates."""
+        load = normal(measured.mean.reshape(tare.shape) - tare, 0)
+        contact = self._limits.contact
+        stuck = contact is None or (load[broken.silent] >= contact).any()
+        status = Status.STUCK_TAXEL if stuck else Status.DEAD_TAXEL
+        return Finding(status, places(broken.silent))

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.answer.taxel_statistics import TaxelStatistics
+from palpate.answer.unloaded import QUIET, UnloadedSkin
 from palpate.core.types import Status, normal
-from palpate.signal.taxel_statistics import TaxelStatistics
-from palpate.signal.unloaded import QUIET, UnloadedSkin
 
 FULL_SCALES = tuple(float(2**bits - 1) for bits in (8, 10, 12, 14, 15, 16, 24))
 """Highest counts of common converters; a skin does not announce its own."""

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.answer.pipeline import Context
 from palpate.core.errors import BundleError
 from palpate.core.types import normal
 
@@ -174,3 +175,22 @@ class Disturbances:
         """Factor of the limit of known materials: that of the disturbance that allows most."""
         slopes = np.array([a.slope for a in self.allowances])
         return 1 + float((slopes * sizes).max(initial=0.0))
+
+
+class MeasureDisturbances:
+    """Measures the disturbances of a sweep. unloaded: whether training knew the unloaded skin."""
+
+    def __init__(self, *, unloaded: bool) -> None:
+        self._unloaded = unloaded
+
+    def apply(self, context: Context) -> None:
+        """Measure them in a checked window without hum."""
+        assert context.mean is not None
+        tare = context.tare if self._unloaded else np.zeros_like(context.tare)
+        context.disturbed = {
+            "lost": context.sweep.lost / len(context.taxels),
+            "hum": hum(context.hum),
+            "noise": noise(context.taxels),
+            "speed": speed(context.slide.taxels_s),
+            "load": load(context.mean, tare),
+        }

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.answer.slide import CHANCE, NO_PATTERN, SlideMeter
+from palpate.answer.vibration import PARTS, SlideLimits, vibration
 from palpate.core.types import SweepFormat, normal
-from palpate.signal.slide import CHANCE, NO_PATTERN, SlideMeter
-from palpate.signal.vibration import PARTS, SlideLimits, vibration
 
 FEW = 4
 """A skin of at least so many taxels touches a finger with more than one."""

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from palpate.answer.hum import HumFilter
 from palpate.core.types import SweepFormat
-from palpate.signal.hum import HumFilter
 
 FORMAT = SweepFormat(4, 4, 750.0, 1500, "uint8")
 LIMIT = 4.0

@@ -8,14 +8,18 @@ measure does not change with the gain of the skin. Pure functions of raw counts.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.answer.disturbance import Disturbances
+from palpate.answer.objects import EnrolledLabels
+from palpate.answer.pipeline import Context, Refusal
 from palpate.core.errors import BundleError
-from palpate.core.types import normal
+from palpate.core.types import Status, normal
 
 Array = NDArray[np.float64]
 PARTS = 10
@@ -76,3 +80,40 @@ def vibration(taxels: NDArray[Any], tare: Array, parts: int = PARTS) -> Array:
         load = np.abs((means + first - normal(tare, 0).reshape(-1)).mean(axis=1))
         result: Array = 0.5 * np.log(np.maximum(variance, TINY)) - np.log(np.maximum(load, TINY))
     return result.astype(np.float64)
+
+
+class Vibrates:
+    """Refuses a sweep in which the finger rests in a part of the window so far, where a slide over
+    the label of the answer vibrates more.
+
+    labels: [K]. window: frames of a whole window. enrolled: rule for the label of the answer. A
+    load beyond that of training counts as that of training: vibrations grow less than it.
+    """
+
+    def __init__(
+        self,
+        limits: SlideLimits,
+        labels: Sequence[str],
+        window: int,
+        enrolled: EnrolledLabels,
+        disturbances: Disturbances | None,
+    ) -> None:
+        self._limits, self._labels, self._window = limits, labels, window
+        self._enrolled, self._disturbances = enrolled, disturbances
+
+    def apply(self, context: Context) -> Refusal | None:
+        """Refuse a sweep with a rest."""
+        parts = PARTS * len(context.taxels) // self._window
+        if not parts or len(context.taxels) < 2 * parts:
+            return None
+        allowed = self._disturbances
+        beyond = allowed.beyond("load", context.disturbed) if allowed else 0.0
+        label = int(self._enrolled.decided(context.probabilities).argmax())
+        found = self._limits.resting(vibration(context.taxels, context.tare, parts) + beyond, label)
+        if not found:
+            return None
+        where, name = " ".join(map(str, found)), self._labels[label]
+        return Refusal(
+            Status.NO_SLIDE,
+            f"hardly any vibration in part {where} of {PARTS}, less than {name} gives",
+        )

@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from palpate.answer.unloaded import UnloadedSkin, UnloadedTracker
 from palpate.core.types import SweepFormat
-from palpate.signal.unloaded import UnloadedSkin, UnloadedTracker
 
 FORMAT = SweepFormat(4, 4, 100.0, 200, "uint16")
 

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
+from palpate.answer.vibration import SlideLimits, vibration
 from palpate.core.errors import BundleError
-from palpate.signal.vibration import SlideLimits, vibration
 
 TARE = np.full((2, 2), 20.0)
 

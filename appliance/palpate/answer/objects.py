@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -9,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.core.types import Sweep
+from palpate.answer.pipeline import Context, Refusal
+from palpate.core.types import Status, Sweep
 
 STRONG = 10.0
 """Least Bayes factor for another object: strong evidence (Jeffreys 1961, appendix B). Decision 6
@@ -205,3 +207,39 @@ class ObjectSweeps:
             self._labels[int(self.enrolled.decided(p).argmax())] for p in (own, fused)
         )
         return f"another object: {label} after {before_it}"
+
+    def apply(self, context: Context) -> Refusal | None:
+        """Fuse a sweep, and refuse one that contradicts its object."""
+        fused = self.put(context.sweep, context.probabilities)
+        context.own, context.after = context.probabilities, fused.after
+        if fused.refused:
+            return Refusal(Status.CONFLICT, fused.conflict)
+        context.scores, context.fused, context.final = fused.scores, fused.fused, fused.final
+        context.detail = fused.conflict
+        return None
+
+
+class GivesNumbers:
+    """Refuses a sweep for which the network gives no number: float32 counts can overflow it."""
+
+    def apply(self, context: Context) -> Refusal | None:
+        """Turn the logits into probabilities."""
+        context.probabilities = softmax(context.logits)
+        if not math.isnan(context.probabilities[0]):  # all are NaN or none
+            return None
+        return Refusal(Status.UNKNOWN, "the model gives no number")
+
+
+class Certain:
+    """Gives an answer below a probability another status than ok: `unsure` asks for one more sweep,
+    `undecided` is final. least: for a contact in place and for a displaced one."""
+
+    def __init__(self, least: float, displaced: float) -> None:
+        self._least = least, displaced
+
+    def apply(self, context: Context) -> Refusal | None:
+        """Refuse an uncertain answer."""
+        if context.scores.max() < self._least[bool(context.displacement.text)]:
+            status = Status.UNDECIDED if context.final else Status.UNSURE
+            return Refusal(status, context.detail)
+        return None

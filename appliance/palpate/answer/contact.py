@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.answer.pipeline import Context, Displacement, Refusal
 from palpate.core.errors import BundleError
-from palpate.core.types import normal
+from palpate.core.types import Status, normal
 
 MOST_POSITIONS, MOST_MM = 1000, 1e6
 """Largest number of positions in a bundle, since each sweep is compared with all of them; largest
@@ -152,15 +153,6 @@ def advice(offset: Point, shape: Sequence[int]) -> str:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class Displacement:
-    """The displacement of a contact from the trained positions: its length, and a description, for
-    example "moved 2.1 mm too far towards row 4"; 0 and "" for a contact in place."""
-
-    mm: float = 0.0
-    text: str = ""
-
-
 def displacement(
     mean: NDArray[np.float64],
     tare: NDArray[np.float64],
@@ -173,3 +165,30 @@ def displacement(
     if found is None or positions.within(offset := positions.offset(found)):
         return Displacement()
     return Displacement(float(np.hypot(*offset)), f"moved {advice(offset, tare.shape[:2])}")
+
+
+class LocateContact:
+    """Finds the displacement of the contact. contact: as for `centre`."""
+
+    def __init__(self, positions: ContactPositions, contact: float) -> None:
+        self._positions, self._contact = positions, contact
+
+    def apply(self, context: Context) -> None:
+        """Measure the displacement of a checked window."""
+        assert context.mean is not None
+        context.displacement = displacement(
+            context.mean, context.tare, self._contact, self._positions
+        )
+
+
+class WithinReach:
+    """Refuses a contact that is displaced further than any training copy, `farthest_mm`."""
+
+    def __init__(self, farthest_mm: float) -> None:
+        self._farthest_mm = farthest_mm
+
+    def apply(self, context: Context) -> Refusal | None:
+        """Refuse a sweep that is too far off."""
+        if context.displacement.mm > self._farthest_mm:
+            return Refusal(Status.UNKNOWN, f"named up to {self._farthest_mm:.1f} mm")
+        return None

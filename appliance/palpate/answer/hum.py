@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.answer.pipeline import Context
 from palpate.core.types import SweepFormat, digitized, normal
 
 Array = NDArray[Any]
@@ -107,3 +108,14 @@ class HumFilter:
         tried = hz + np.linspace(-OFF_HZ, OFF_HZ, STEPS)
         power = np.abs(self._wave(tried) @ series.sum(axis=1))
         return float(tried[power.argmax()])
+
+
+class RemoveHum:
+    """Removes hum that stands out by `least` from windows of one format."""
+
+    def __init__(self, format: SweepFormat, least: float) -> None:
+        self._filter, self._least = HumFilter(format), least
+
+    def apply(self, context: Context) -> None:
+        """Remove the hum."""
+        context.taxels, context.hum = self._filter(context.taxels, self._least)

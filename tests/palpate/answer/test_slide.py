@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from palpate.answer.slide import DIRECTIONS, LEAST_HEIGHT, SlideMeter
 from palpate.core.types import SweepFormat
-from palpate.signal.slide import DIRECTIONS, LEAST_HEIGHT, SlideMeter
 from palpate.sim import skin
 
 FORMAT = SweepFormat(4, 4, 750.0, 1500, "float32")

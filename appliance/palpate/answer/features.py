@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.answer import time_series
+from palpate.answer.time_series import FLOOR
 from palpate.core.errors import FormatError
-from palpate.signal import time_series
-from palpate.signal.time_series import FLOOR
 
 Array = NDArray[np.float64]
 

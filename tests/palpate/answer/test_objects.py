@@ -13,16 +13,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from palpate.answer.objects import LEAST_PROBABILITY, FusedSweeps, ObjectRule, contradicts, softmax
 from palpate.bundle.bundle import Bundle
 from palpate.core.config import ClassifierConfig
 from palpate.core.types import Frames, Status, Sweep, Verdict
-from palpate.inference.classifier import LEAST_PROBABILITY, Classifier, Touched, softmax
-from palpate.inference.objects import FusedSweeps, ObjectRule, contradicts
+from palpate.inference.classifier import Classifier
 from palpate.runtime import assembly
 from palpate.sim import skin
 from palpate.sim.rig import VirtualClock
 from tests.factories import toy_bundle
 from tests.factories.settings import load
+from tests.factories.toy_bundle import told
 
 A, B, NEAR_A = (0.0, 0.0), (6.0, 0.0), (2.8, -1.0)
 """Embeddings of a sure "a", a sure "b", and an "a" with a probability of .65."""
@@ -173,8 +174,10 @@ def test_early_answers_end_objects_too(toy: Bundle, conflict: str, label: str | 
     it = classifier(toy, conflict=conflict)
     first, second, third, fourth = felt(A, A, B, A)
     assert [it(sweep).fused for sweep in (first, second)] == [1, 2]
-    early = it.conclude_if_ok(replace(third, share=0.5), np.array([0.001, 0.999, 0.0]))
-    assert (early and early.label) == label
+    half = replace(third, share=0.5)
+    early = it.unfinished(half, told(it, np.array([0.001, 0.999, 0.0])))
+    given = it.verdict(early).label if early.status is Status.OK else None
+    assert given == label
     assert it(fourth).fused == fused
 
 
@@ -274,7 +277,8 @@ def test_an_object_without_end_takes_no_more_memory_or_time(toy: Bundle, fusion:
     rng, given = np.random.default_rng(1), []
     sizes = []
     for n, own in enumerate(rng.dirichlet((2, 1, 1), 20_000), 1):
-        last = it.conclude(replace(toy_bundle.sweep(0, 0), id=n, object=1), own, Touched())
+        sweep = replace(toy_bundle.sweep(0, 0), id=n, object=1)
+        last = it.verdict(it.judged(sweep, told(it, own)))
         given.append(own)
         if n in (2, 20_000):
             sizes.append(len(pickle.dumps(it._objects.present.evidence)))

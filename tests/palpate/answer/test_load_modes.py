@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from palpate.answer.load_modes import LoadModes
+from palpate.answer.taxels import Bridging, bridged
 from palpate.bundle import bundle
 from palpate.bundle.manifest import Manifest
 from palpate.core.errors import BundleError
-from palpate.signal.broken_taxels import Bridging, bridged
-from palpate.signal.load_modes import LoadModes
 from tests.factories import toy_bundle
 
 SPREAD = np.array([4.0, 8.0, 2.0, 6.0, 1.0, 5.0])

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from palpate.answer.disturbance import Allowance, Disturbances, load, noise
 from palpate.core.errors import BundleError
-from palpate.signal.disturbances import Allowance, Disturbances, load, noise
 
 SLOWER = Allowance("speed", 2.0, 1.5, 4.0)
 LOST = Allowance("lost", 0.0, 0.2, 2.0)

@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.answer.pipeline import Context, Refusal, Slide
 from palpate.core.directions import DIRECTIONS
 from palpate.core.errors import BundleError
-from palpate.core.types import SweepFormat, normal
+from palpate.core.types import Status, SweepFormat, normal
 
 Array = NDArray[Any]
 
@@ -52,6 +53,7 @@ RATIO = 1.5
 """Least ratio of a peak to the next separate peak of its axis, and to the sum without a lag. The
 other axis is left out, because a pattern of straight ridges passes along both."""
 NO_PATTERN = "no pattern passes from taxel to taxel"
+STILL = f"{NO_PATTERN}, as with a finger that rests"
 NO_PITCH = "the distance between taxels is unknown; export with --pitch-mm"
 APART = 9
 """Peaks further apart than this many steps of the grid are separate."""
@@ -63,23 +65,6 @@ TINY = 1e-30
 """Replaces 0 as a divisor."""
 SILENT = 1e-6
 """A taxel with less than this share of the power of the strongest taxel is silent."""
-
-
-@dataclass(frozen=True, slots=True)
-class Slide:
-    """How the finger slid in a window.
-
-    speed_mm_s: to three digits; None if it could not be measured, with the reason in `why`.
-    direction: of the finger, one of DIRECTIONS; "" without a speed. height: of the highest sum, in
-    standard deviations of a sum with random phases; 0 if nothing was computed. taxels_s: the speed
-    in taxels a second, 0 without one.
-    """
-
-    speed_mm_s: float | None = None
-    direction: str = ""
-    height: float = 0.0
-    why: str = ""
-    taxels_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -279,3 +264,41 @@ def _busiest(taxels: Array, shape: tuple[int, int]) -> Array:
     sums = total[rows:, cols:] - total[:-rows, cols:] - total[rows:, :-cols] + total[:-rows, :-cols]
     r, c = np.unravel_index(sums.argmax(), sums.shape)
     return taxels[:, r : r + rows, c : c + cols]
+
+
+class MeasureSlide:
+    """Measures the slide in whole windows. pitch_mm: None if it is unknown or no speed is wanted;
+    then only the height of the pattern, and taxels a second, are measured."""
+
+    def __init__(self, format: SweepFormat, pitch_mm: float | None) -> None:
+        self._pitch_mm = pitch_mm
+        self._meter = SlideMeter(format, pitch_mm or 1.0)
+
+    @property
+    def able(self) -> bool:
+        """Whether slides on this skin can be measured at all."""
+        return not self._meter.why
+
+    def apply(self, context: Context) -> None:
+        """Measure the slide."""
+        if not context.whole:
+            return
+        slide = self._meter(context.taxels)
+        if not self._pitch_mm:
+            slide = Slide(height=slide.height, why=NO_PITCH, taxels_s=slide.taxels_s)
+        context.slide = slide
+
+
+class ShowsPattern:
+    """Refuses a whole window without the pattern that passed in all training sweeps. least: its
+    least height."""
+
+    def __init__(self, least: float) -> None:
+        self._least = least
+
+    def apply(self, context: Context) -> Refusal | None:
+        """Refuse a sweep without a pattern. Bridged taxels move with their neighbours, which hides
+        the pattern."""
+        if context.whole and not context.degraded and context.slide.height < self._least:
+            return Refusal(Status.NO_SLIDE, STILL)
+        return None

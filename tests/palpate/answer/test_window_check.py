@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from palpate.answer.taxel_statistics import TaxelStatistics
+from palpate.answer.unloaded import UnloadedSkin
+from palpate.answer.window_check import STAYS, ceiling, inspect, inspect_bare, inspect_readings
 from palpate.bundle.manifest import Thresholds
 from palpate.core.types import Status, shape
-from palpate.signal.taxel_statistics import TaxelStatistics
-from palpate.signal.unloaded import UnloadedSkin
-from palpate.signal.window_check import STAYS, ceiling, inspect, inspect_bare, inspect_readings
 
 LIMITS = Thresholds(contact=10, full_scale=255, saturated=0.01)
 BARE = np.zeros((4, 4))

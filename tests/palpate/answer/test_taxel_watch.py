@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from palpate.answer.early import Early
+from palpate.answer.taxels import CERTAIN, SOUND, Bridging, TaxelWatch
 from palpate.bundle import bundle
 from palpate.core.types import EPOCH_BITS, Frames, Status, Sweep
 from palpate.inference.classifier import Classifier
 from palpate.inference.early_exit import EarlyExit
-from palpate.inference.taxel_watch import CERTAIN, SOUND, TaxelWatch
-from palpate.signal.broken_taxels import Bridging
 from palpate.sim.rig import VirtualClock
 from tests.factories import toy_bundle
 
@@ -38,10 +38,7 @@ def run(tmp_path: Path) -> Classifier:
 @pytest.fixture
 def watch() -> TaxelWatch:
     """A watch over the stream alone."""
-    labels = ("a", "b")
-    return TaxelWatch(
-        bundle.Manifest("toy", "1", FORMAT, "raw", labels, toy_bundle.LIMITS, {}, bridging=RULE)
-    )
+    return TaxelWatch(FORMAT, toy_bundle.LIMITS, RULE, np.zeros(FORMAT.shape))
 
 
 def frames(taxels: np.ndarray, epoch: int = 0) -> Frames:
@@ -176,7 +173,7 @@ def test_the_place_of_the_contact_is_computed_from_bridged_taxels(tmp_path: Path
 
 def test_an_early_answer_bridges_too(tmp_path: Path):
     """The answer has the taxel; with too many broken taxels the rest of the sweep is needed."""
-    outputs, rule = ("logits", "embedding", "early"), bundle.Early((0.5,) * 3, 1)
+    outputs, rule = ("logits", "embedding", "early"), Early((0.5,) * 3, 1)
     early = EarlyExit(Classifier(made(tmp_path, early=rule, outputs=outputs), VirtualClock()))
     verdict = early(sweep(BAD[:75], 0.75))
     assert verdict

@@ -7,17 +7,20 @@ gives the label. An enrolled material is one more mean; nothing is trained for i
 
 from __future__ import annotations
 
+import sys
 from collections import deque
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.bundle.bundle import Classes, EarlyClasses
-from palpate.bundle.manifest import DisplacementRule, Known
-from palpate.signal.disturbances import Disturbances
+from palpate.answer.disturbance import Disturbances
+from palpate.answer.pipeline import Context, Refusal
+from palpate.core.errors import BundleError
+from palpate.core.types import Status
 
 Array = NDArray[np.float64]
 UNDISTURBED: Mapping[str, float] = MappingProxyType({})
@@ -27,6 +30,129 @@ ALIKE = 0.5
 """Largest distance of two sweeps of one unknown material, as a share of the limit of known ones. Of
 pairs of sweeps of one material 13 to 69 % are within it, of two materials at most 2 % (simulated
 skin, four pairs of materials left out). Two cottons of FabricSlide are not told apart."""
+
+
+UNSURE = 0.5
+"""Least probability for status ok if the bundle does not set it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """Rule for unknown materials. Raises BundleError for a number out of range.
+
+    limit: largest squared distance from a sweep's embedding to the nearest class mean; beyond it
+    the material is unknown. temperature: divisor of the logits from class means. enrolled: least
+    probability of all enrolled labels together at which a sweep gets one of them; None without
+    enrolled labels.
+    """
+
+    limit: float
+    temperature: float
+    enrolled: float | None = None
+
+    def __post_init__(self) -> None:
+        _checkpositive(self, "known")
+        if self.enrolled is not None and not UNSURE <= self.enrolled < 1:
+            raise BundleError(
+                f"known.enrolled {self.enrolled!r} must be at least {UNSURE} and below 1"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class DisplacementRule:
+    """Rule for sweeps whose contact is displaced from `Manifest.contact`. Raises BundleError for a
+    number out of range.
+
+    limit: as in Known, for the distances of displaced sweeps. temperature: divisor of logits that
+    are calibrated for sweeps without displacement. unsure: least probability for status ok; above 1
+    a single displaced sweep is never ok. farthest_mm: displacement from which on a sweep gets
+    no label, because no training copy is displaced as far; None if unknown.
+    """
+
+    limit: float
+    temperature: float
+    unsure: float
+    farthest_mm: float | None = None
+
+    def __post_init__(self) -> None:
+        _checkpositive(self, "displacement")
+
+
+def _checkpositive(rule: Known | DisplacementRule, where: str) -> None:
+    for name in rule.__slots__:
+        value = getattr(rule, name)
+        if not positive(value) and not (value is None and name in ("farthest_mm", "enrolled")):
+            raise BundleError(f"{where}.{name} {value!r} must be a number above 0")
+
+
+def positive(value: object) -> bool:
+    """Whether `value` is a finite number above 0."""
+    return type(value) in (int, float) and 0 < value <= sys.float_info.max  # type: ignore[operator]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DisplacedClasses:
+    """The classes for sweeps whose contact is displaced, in a turned embedding in which these
+    sweeps have covariance 1.
+
+    turn: float32 [r, r]; embedding @ turn is the turned embedding. means: float32 [K, r]. shapes:
+    float16 [K, b, b], see Classes.
+    """
+
+    turn: NDArray[np.float32]
+    means: NDArray[np.float32]
+    shapes: NDArray[np.float16]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EarlyClasses:
+    """The classes after each of D steps of an unfinished sweep. means: float32 [D, K, r]. shapes:
+    float16 [D, r, r] of all materials together, see Classes."""
+
+    means: NDArray[np.float32]
+    shapes: NDArray[np.float16]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Classes:
+    """Content of means.npz: the class means in the embedding, in the order of the labels.
+
+    means: float32 [K, r].
+    bias: float32 [K], added to the product of mean and embedding.
+    sweeps: int64 [K], number of sweeps that a label was enrolled from; 0 for a trained label.
+    spread: float32 [K], variance of the label's sweeps per direction of the embedding; 1 for a
+        trained label.
+    shapes: float16 [K, b, b], scatter of the label's sweeps in the last b directions of the
+        embedding: a difference from the mean is multiplied by this matrix before it is squared. The
+        identity for an enrolled label.
+    displaced: the same for sweeps whose contact is displaced, None if the manifest has no rule for
+        these.
+    early: of unfinished sweeps, None if the manifest has no limits for these.
+    changes: float16 [D, K0, r], change of a mean in the embedding by a disturbance of size 1, for
+        each of the manifest's allowances and each trained label; D = 0 if the file has no such
+        array.
+    """
+
+    means: NDArray[np.float32]
+    bias: NDArray[np.float32]
+    sweeps: NDArray[np.int64]
+    spread: NDArray[np.float32]
+    shapes: NDArray[np.float16]
+    displaced: DisplacedClasses | None = None
+    early: EarlyClasses | None = None
+    changes: NDArray[np.float16] = field(default_factory=lambda: np.zeros((0, 0, 0), np.float16))
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """The arrays of means.npz by name: of `displaced` displaced_*, of `early` early_*."""
+        parts = {"displaced": self.displaced, "early": self.early}
+        own = ("means", "bias", "sweeps", "spread", "shapes")
+        arrays = {name: getattr(self, name) for name in own} | {
+            f"{prefix}_{name}": getattr(part, name)
+            for prefix, part in parts.items()
+            if part
+            for name in part.__slots__
+        }
+        return arrays | ({"changes": self.changes} if len(self.changes) else {})
 
 
 def shaped_distances(away: NDArray[Any], shapes: NDArray[Any]) -> Array:
@@ -211,3 +337,35 @@ class ClassDistances:
         away = self._means[:, None] - self._means
         between = (away**2).sum(axis=-1)
         return float(between[~np.eye(len(between), dtype=bool)].min())
+
+
+class KnownMaterial:
+    """Refuses a sweep that is too far from every known material; joins the logits of the network
+    with those of the enrolled labels.
+
+    displaced: for sweeps whose contact is displaced, None without a rule for them. allowed: the
+    allowances for disturbances. Changes caused by either do not make a material unknown.
+    """
+
+    def __init__(
+        self,
+        means: ClassDistances,
+        displaced: ClassDistances | None,
+        allowed: Disturbances | None,
+    ) -> None:
+        self._means, self._displaced, self._allowed = means, displaced, allowed
+        self._unknown = UnknownSweeps(means)
+
+    def apply(self, context: Context) -> Refusal | None:
+        """Refuse an unknown material, and a disturbance that export has not tried."""
+        off = bool(context.displacement.text and self._displaced)
+        means = self._displaced if off and self._displaced else self._means
+        z = context.embedding
+        context.logits = means.joined(context.logits, z)
+        untried = self._allowed.untried(context.disturbed) if self._allowed else ""
+        novelty = untried or means.novelty(z, context.disturbed)
+        if not novelty:
+            return None
+        if not (off or untried) and (alike := self._unknown.put(context.sweep.id, z)):
+            novelty += f"; as sweep {alike}"
+        return Refusal(Status.UNKNOWN, novelty)

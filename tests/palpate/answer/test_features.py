@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from palpate.answer import features
 from palpate.core.errors import FormatError
-from palpate.signal import features
 
 RATE, FRAMES = 750.0, 1500
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from palpate.answer.slide import CHANCE, LEAST_HEIGHT, SlideMeter
+from palpate.answer.slide_check import MANY, SlideCheck, SlidesAmong
 from palpate.bundle import bundle
 from palpate.bundle.bundle import Bundle
 from palpate.core.errors import FormatError
 from palpate.core.types import Frames, Status, Sweep, SweepFormat
 from palpate.inference.classifier import Classifier
 from palpate.learn import enrolment
-from palpate.signal.slide import CHANCE, LEAST_HEIGHT, SlideMeter
-from palpate.signal.slide_check import MANY, SlideCheck, SlidesAmong
 from palpate.sim import skin
 from palpate.sim.rig import VirtualClock
 from tests.campaigns.junk import KINDS, window

@@ -8,18 +8,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.bundle.bundle import Bundle, Manifest
-from palpate.core.errors import BundleError
-from palpate.core.sentences import MAX_LINE
-from palpate.core.types import Status, Verdict
-from palpate.io.robot_link import result
-from palpate.signal.contact import (
+from palpate.answer.contact import (
     ContactPositions,
     advice,
     centre,
     displacement,
     fill_dead_taxels,
 )
+from palpate.bundle.bundle import Bundle, Manifest
+from palpate.core.errors import BundleError
+from palpate.core.sentences import MAX_LINE
+from palpate.core.types import Status, Verdict
+from palpate.io.robot_link import result
 from palpate.sim import skin
 from tests.factories.contacts import MIDDLE, TARE, counts, patch
 

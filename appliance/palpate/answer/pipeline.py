@@ -1,0 +1,112 @@
+"""The way from a sweep to what is known of it: stages in one order, a file a rule.
+
+A stage looks at the sweep and at what earlier stages have found, adds what it finds, and may refuse
+the sweep; then no later stage sees it. Stages do not know each other. `inference.classifier` makes
+the stages of a bundle and states their order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.core.types import Status, Sweep
+
+Array = NDArray[Any]
+
+
+def _none() -> Array:
+    return np.empty(0)
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """Why a sweep gets no label: its status, with the subject of the status in `detail`."""
+
+    status: Status
+    detail: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Displacement:
+    """The displacement of a contact from the trained positions: its length, and a description, for
+    example "moved 2.1 mm too far towards row 4"; 0 and "" for a contact in place."""
+
+    mm: float = 0.0
+    text: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Slide:
+    """How the finger slid in a window.
+
+    speed_mm_s: to three digits; None if it could not be measured, with the reason in `why`.
+    direction: of the finger, one of DIRECTIONS; "" without a speed. height: of the highest sum, in
+    standard deviations of a sum with random phases; 0 if nothing was computed. taxels_s: the speed
+    in taxels a second, 0 without one.
+    """
+
+    speed_mm_s: float | None = None
+    direction: str = ""
+    height: float = 0.0
+    why: str = ""
+    taxels_s: float = 0.0
+
+
+@dataclass(slots=True, eq=False)
+class Context:
+    """A sweep, and what the stages have found so far.
+
+    taxels: raw counts [T, R, C] or [T, R, C, A], as the network gets them: broken taxels bridged,
+    without hum. tare: raw counts [R, C] or [R, C, A] of the unloaded skin. whole: whether all
+    frames of the window are there. mean: counts of the checked window, in the shape of a frame.
+    full: share of its counts at full scale. degraded: the broken taxels that were bridged, "" for
+    none. hum: amplitude that was removed, in counts. disturbed: values of the disturbances by name.
+    logits, embedding: [K], [r], of the network. probabilities: float64 [K], of this sweep. own: the
+    same, of a sweep that belongs to an object. scores: float64 [K], of all `fused` sweeps of the
+    object. after: as in Verdict. final: no further sweep of the object is wanted. status, detail:
+    of the answer.
+    """
+
+    sweep: Sweep
+    taxels: Array
+    tare: Array
+    whole: bool
+    status: Status = Status.OK
+    detail: str = ""
+    mean: Array | None = None
+    full: float = 0.0
+    degraded: str = ""
+    hum: float = 0.0
+    displacement: Displacement = Displacement()
+    slide: Slide = Slide()
+    disturbed: Mapping[str, float] = field(default_factory=dict)
+    logits: Array = field(default_factory=_none)
+    embedding: Array = field(default_factory=_none)
+    probabilities: NDArray[np.float64] = field(default_factory=_none)
+    own: NDArray[np.float64] = field(default_factory=_none)
+    scores: NDArray[np.float64] = field(default_factory=_none)
+    fused: int = 0
+    after: int = 0
+    final: bool = False
+
+
+class Stage(Protocol):
+    """One rule of the answer."""
+
+    def apply(self, context: Context) -> Refusal | None:
+        """Add to `context` what this stage finds; the refusal if the sweep gets no label."""
+        ...
+
+
+def run(stages: Sequence[Stage], context: Context) -> Context:
+    """Let the stages look at a sweep in their order, up to the first that refuses it."""
+    for stage in stages:
+        if refusal := stage.apply(context):
+            context.status, context.detail = refusal.status, refusal.detail
+            break
+    return context
