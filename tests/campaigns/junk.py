@@ -301,7 +301,7 @@ ALTERED: dict[str, Make] = {
     "second half lifted": lifted(between(0.5, 1)),
     "middle lifted": lifted(between(0.25, 0.75)),
     "lifted ten times": lambda s, m: np.where(
-        SECONDS % 0.2 < 0.1, skin.idle(N, s.rng, s.world), s.slide(m)
+        SECONDS % 0.2 >= 0.1, skin.idle(N, s.rng, s.world), s.slide(m)
     ),
     "slides the first half": lambda s, m: s.touch(m, 0, 0.5),
     "slides the second half": lambda s, m: s.touch(m, 0.5, 0.5),
