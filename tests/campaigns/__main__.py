@@ -214,6 +214,10 @@ CAMPAIGNS = {
         _module("tests.campaigns.slow_disk"),
         variables={"OMP_NUM_THREADS": "1"},
     ),
+    "slow-page": Campaign(
+        "record by a page under thousands of slow requests, and count the sweeps (2 minutes)",
+        _module("tests.campaigns.slow_page"),
+    ),
     "junk": Campaign(
         "count the answers to sweeps that no one can name, early ones too (docs/decisions/0005)",
         _module("tests.campaigns.junk", "--out", "docs/data/junk.json"),

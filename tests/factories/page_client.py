@@ -73,7 +73,9 @@ class EventReader:
         self.socket.sendall(f"GET /events?last={last} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
         self.last, self._rest = "", b""
         while b"\r\n\r\n" not in self._rest:
-            self._rest += self.socket.recv(65536)
+            if not (more := self.socket.recv(65536)):
+                raise EOFError
+            self._rest += more
         head, _, self._chunks = self._rest.partition(b"\r\n\r\n")
         assert b"text/event-stream" in head
         self._text = b""
