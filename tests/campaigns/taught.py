@@ -49,7 +49,7 @@ def main() -> None:
     parser.add_argument("--added", type=int, help="sweeps of a material that comes later")
     args = parser.parse_args()
     for name in args.sets:
-        known = name.startswith(("sim:", "aeon:")) or Path(name).exists()
+        known = name.startswith("sim:") or Path(name).exists()
         path = name if known else str(Path(os.environ["PALPATE_DATA"]) / name)
         sweeps = sets.load(path)
         for each in args.each:

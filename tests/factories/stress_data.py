@@ -48,7 +48,6 @@ def figures() -> dict[str, Any]:
         "box": {
             "bundle": {"name": "six", "version": "3", "id": "8933e0d5"},
             "made": {"set": "sim:T-REAL:1-6", "recipe": {"reattached": True}},
-            "uninformative": {"silent": "no-contact"},
             "curves": {name: entry["curves"] for name, entry in box.items()},
             "pairs": {name: entry["pairs"] for name, entry in box.items()},
         },
@@ -83,10 +82,8 @@ def task(name: str, right: dict[str, tuple[int, ...]]) -> dict[str, Any]:
         "set": "sim:T-REAL:101:2",
         "refused": "",
         "total": 100,
-        "ran": "",
         "curves": curves,
         "pairs": pairs,
-        "trouble": {"silent": "finite"},
     }
 
 
@@ -102,5 +99,4 @@ def curve(
         "right": list(right),
         "low": [n / 100 - 0.05 for n in right],
         "high": [n / 100 + 0.01 for n in right],
-        "broken": [0] * len(right),
     }

@@ -111,7 +111,6 @@ def test_the_page_holds_the_figures():
         "QUANT: needs aeon",
         "540 sweeps of sim:T-REAL:1 (aa11)",
         "bundle six 3, 8933e0d5",
-        "silent 6 answer no-contact",
         "Commit c0ffee, abacus, 2 cores",
         "commit 0ld: H-svm.",
     ):

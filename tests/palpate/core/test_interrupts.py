@@ -70,7 +70,10 @@ def test_ctrl_c_during_the_imports_is_one_line(
 def test_ctrl_c_during_a_late_import_is_one_line(tmp_path: Path):
     """A library that a command imports during its work: exit code 130 without a traceback, although
     the command takes the library's error for a missing library."""
-    process = _loading("palpate_train", ["sets", "describe", "aeon:GunPoint"], "aeon", tmp_path)
+    (tmp_path / "tables").mkdir()
+    (tmp_path / "tables" / "cork.parquet").write_bytes(b"PAR1")
+    argv = ["import", "tables", "--pattern", "{material}.parquet", "--rate", "9", "--out", "s.npz"]
+    process = _loading("palpate_train", argv, "pyarrow", tmp_path)
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
     line = "palpate-train: interrupted; the same command begins anew\n"

@@ -19,13 +19,14 @@ from palpate_train.models import methods
 from palpate_train.models.methods import Model
 from tests.factories.sweep_sets import easy
 
-FEATURES = ("L-gauss", "L-knn", "L-svm", "static-svm", "spectrogram-svm", "fishel-bayes")
+FEATURES = ("L-gauss", "L-knn", "L-svm", "fishel-bayes")
+DESKTOP = ("static-svm", "spectrogram-svm")
 AEON = ("minirocket", "minirocket-augmented", "multirocket-hydra", "quant")
 ALONE = ("multirocket-hydra", "quant")
-"""Methods without a graph."""
+"""Methods that run in aeon alone."""
 SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("st-hmp", *AEON[:2])]
 LONG = [pytest.param(name, marks=[pytest.mark.slow, pytest.mark.thorough]) for name in ALONE]
-every = pytest.mark.parametrize("name", [*FEATURES, *SLOW, *LONG])
+every = pytest.mark.parametrize("name", [*FEATURES, *DESKTOP, *SLOW, *LONG])
 with_graph = pytest.mark.parametrize("name", [*FEATURES, *SLOW])
 
 

@@ -10,9 +10,8 @@ import pytest
 
 from palpate.answer.objects import softmax
 from palpate.core.types import SweepFormat
-from palpate_studies.peers import minirocket
+from palpate_studies.peers import linear_head, minirocket
 from palpate_train.data.sets import Dataset
-from palpate_train.models import linear_head
 from palpate_train.onnx_tools import graph_builder
 from tests.factories.sweep_sets import easy
 

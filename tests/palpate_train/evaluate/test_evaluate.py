@@ -209,7 +209,6 @@ def test_a_fold_depends_on_the_code_that_its_method_runs():
         "graph_builder",
         "features",
         "time_series",
-        "prior_work",
     } <= classical
     assert (
         not {"paper_cnn", "recurrent", "networks", "network", "evaluate", "score", "main"}
@@ -478,7 +477,6 @@ def test_a_model_without_a_graph_is_timed_in_its_library(monkeypatch: pytest.Mon
     assert asked == [12, 1, 1, 1, 1, 1]
     assert figures["agreement"] == 1
     assert figures["ms_p50"] > 0
-    assert not alone.runs_on_the_box
     with pytest.raises(FormatError, match="method 'alone' runs in"):
         MethodFit.of(alone, tones(), 1)
 

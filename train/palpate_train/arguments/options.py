@@ -19,10 +19,7 @@ from palpate_train.data.summary import warnings_of
 from palpate_train.evaluate import evaluate, set_warnings
 from palpate_train.models import methods
 
-SET = (
-    f"FILE (.npz, .h5), a folder of recordings, {sets.SIMULATED_FORM} or aeon:NAME; "
-    "several are joined"
-)
+SET = f"FILE (.npz, .h5), a folder of recordings or {sets.SIMULATED_FORM}; several are joined"
 SET_FILES = (".npz", *readers.HDF5)
 """Endings of a sweep set."""
 LOG_EVERY_S = 30
@@ -78,17 +75,6 @@ def add_effort(command: argparse.ArgumentParser) -> None:
         default=usual.share,
         metavar="SHARE",
         help="share of the networks' usual iterations (1)",
-    )
-    command.add_argument(
-        "--paper-steps",
-        type=numbers.whole("--paper-steps", 1),
-        metavar="N",
-        help="iterations of the paper's CNN (4000 on a GPU, fewer on a processor)",
-    )
-    command.add_argument(
-        "--bfloat16",
-        action="store_true",
-        help="compute the paper's CNN in bfloat16 where that helps",
     )
 
 
@@ -187,7 +173,7 @@ def seeds(args: argparse.Namespace) -> range:
 
 def effort(args: argparse.Namespace) -> methods.Effort:
     """The length of trainings."""
-    return methods.Effort(args.effort, args.paper_steps, args.bfloat16)
+    return methods.Effort(args.effort)
 
 
 def where(args: argparse.Namespace) -> evaluate.Where:

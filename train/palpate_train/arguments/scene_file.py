@@ -16,7 +16,6 @@ from palpate.core.text import closest
 
 PATHS = ("--set",)
 """Options whose values may be files relative to the scene's folder."""
-NAMED_SETS = ("sim:", "aeon:")
 
 
 def words(path: Path, command: argparse.ArgumentParser) -> list[str]:
@@ -68,7 +67,7 @@ def _located(path: Path, text: str) -> str:
         raise FormatError(
             f"{path.name}: set: {text!r} names a variable that is not set; set it to a folder"
         )
-    return full if full.startswith(NAMED_SETS) else str(path.parent / full)
+    return full if full.startswith("sim:") else str(path.parent / full)
 
 
 def _refused(path: Path, option: str, value: Any, use: str) -> FormatError:

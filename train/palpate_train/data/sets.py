@@ -1,5 +1,5 @@
-"""Sweep sets for training and testing, from a user's file or by the name of a simulated or
-published set.
+"""Sweep sets for training and testing, from a user's file or by the name of a simulated
+set.
 
 The groups of a set say which sweeps belong together. A set can be narrowed to some sweeps, and
 split so that no recording is on both sides. palpate.core.sweep_set defines the contents of a
@@ -21,7 +21,7 @@ from palpate.core import storage, sweep_set
 from palpate.core.errors import FormatError
 from palpate.core.sweep_set import Array
 from palpate.sim import skin
-from palpate_train.data import group_values, mapped, published, readers
+from palpate_train.data import group_values, mapped, readers
 from palpate_train.data.files.table import normal
 from palpate_train.data.group_values import text_of
 
@@ -201,8 +201,8 @@ class Dataset(sweep_set.SweepSet):
 
 
 def load(spec: str, seed: int = 0) -> Dataset:
-    """The set that `spec` names: an .npz, an HDF5 file, a folder of recordings,
-    sim:NAME[x3][/WORLD][:SEED[-LAST][:SWEEPS]] or aeon:NAME.
+    """The set that `spec` names: an .npz, an HDF5 file, a folder of recordings
+    or sim:NAME[x3][/WORLD][:SEED[-LAST][:SWEEPS]].
 
     x3: a skin with three axes. WORLD: of skin.WORLDS. SWEEPS: number of sweeps for each material
     and position. SEED-LAST: several simulated scenes joined, each with positions of its own. seed:
@@ -211,9 +211,6 @@ def load(spec: str, seed: int = 0) -> Dataset:
     """
     if spec.startswith("sim:"):
         return _simulated(spec, seed)
-    if spec.startswith(published.PREFIX):
-        samples, labels, materials, groups = published.load(spec.removeprefix(published.PREFIX))
-        return Dataset(samples, labels, materials, published.RATE_HZ, groups, spec)
     return readers.read(Path(spec), Dataset).require_materials()
 
 

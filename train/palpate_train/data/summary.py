@@ -17,7 +17,7 @@ from palpate.core.errors import FormatError
 from palpate.core.sweep_set import Array
 from palpate.sim import skin
 from palpate.sweeps.sweep_folder import RecordedSweep
-from palpate_train.data import labels, published, readers, sets
+from palpate_train.data import labels, readers, sets
 from palpate_train.data.group_values import text_of
 from palpate_train.data.sets import Dataset, shortened
 
@@ -212,10 +212,4 @@ def known() -> str:
         "  sim:NAME/level-blind   the same in a world where the level of a taxel says nothing "
         "about the tube"
     )
-    lines.append(
-        f"{published.PREFIX}NAME              published series that aeon ships, taken to have "
-        f"{published.RATE_HZ:g} Hz; "
-        "--protocol 'split:split=0->1'"
-    )
-    lines += [f"  {published.PREFIX}{name:<17} {what}" for name, what in published.SETS.items()]
     return "\n".join(lines)

@@ -292,8 +292,7 @@ def folds(
 ) -> Iterator[tuple[Any, Fold]]:
     """The Fold of every task: those in the cache first, then the others as they finish.
 
-    On this machine, an interrupted training of the paper's CNN continues from a file beside the
-    folds. data: digest of `sweeps`. kind: the input of the tasks' methods; if it cannot be
+    data: digest of `sweeps`. kind: the input of the tasks' methods; if it cannot be
     computed, all tasks are refused.
     """
     paths = {
@@ -302,13 +301,9 @@ def folds(
     kept = {name: fold for name, path in paths.items() if (fold := Fold.load(path))}
     yield from kept.items()
     left = {name: task for name, task in tasks.items() if name not in kept and not where.kept}
-    unfinished = {name: path.with_suffix(".pt") for name, path in paths.items()}
-    if where.cache and not where.scheduler:
-        left = {name: task.kept_in(unfinished[name]) for name, task in left.items()}
     for name, fold in _trained(list(left.items()), sweeps, kind, where):
         if where.cache:
             fold.save(paths[name])
-            unfinished[name].unlink(missing_ok=True)
         yield name, fold
 
 

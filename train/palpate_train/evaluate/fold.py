@@ -24,11 +24,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.answer import features
 from palpate.core.errors import BundleError, FormatError
 from palpate.core.storage import put
 from palpate.inference.session import session
 from palpate_train.data.sets import Dataset
-from palpate_train.features import kinds
 from palpate_train.models import methods
 
 Array = NDArray[Any]
@@ -97,10 +97,6 @@ class FoldTask:
     train: Array
     test: Array
     as_the_box: AsTheBox | None = None
-
-    def kept_in(self, path: Path) -> FoldTask:
-        """The same fold with `path` as the file that keeps its unfinished training."""
-        return replace(self, effort=replace(self.effort, unfinished=path))
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,15 +211,15 @@ def _timed_labels(answer: Answer, samples: Array) -> tuple[float, Array]:
 def _alone(method: methods.Method, model: methods.Model, rate_hz: float) -> Answer:
     """The function that classifies one sweep: features and the graph in a session like the box's,
     or the library of a method without a graph."""
+
+    def given(counts: Array) -> Array:
+        return features.graph_input(method.input, counts, rate_hz)[None]
+
     if method.library:
-        return lambda counts: model.logits(kinds.graph_input(method.input, counts, rate_hz)[None])[
-            0
-        ]
+        return lambda counts: model.logits(given(counts))[0]
     graph = session(model.graph().SerializeToString())
     name = graph.get_inputs()[0].name
-    return lambda counts: graph.run(
-        None, {name: kinds.graph_input(method.input, counts, rate_hz)[None]}
-    )[0][0]
+    return lambda counts: graph.run(None, {name: given(counts)})[0][0]
 
 
 def key(task: FoldTask, data: str) -> str:

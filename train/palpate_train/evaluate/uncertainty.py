@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.answer.objects import softmax
 from palpate.core.errors import FormatError
-from palpate_train.calibration.novelty import auroc, embed
+from palpate_train.calibration.novelty import auroc
 from palpate_train.data.sets import Dataset
 from palpate_train.evaluate.evaluate import Where
 from palpate_train.evaluate.uncertainty_cases import NONE_LEFT_OUT, Case, Log, Trainings, cases
@@ -28,8 +27,6 @@ Array = NDArray[Any]
 Json = dict[str, Any]
 BINS = 10
 """Bins of the reliability diagram and of the calibration error."""
-LIMITS = (0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0)
-"""Multiples of the novelty limit at which the shares of kept and of passed sweeps are reported."""
 DRAWS = 500
 """Draws of the bootstrap."""
 Trained = tuple[Case, Calibration]
@@ -81,49 +78,23 @@ def reliability(confidence: Array, right: Array) -> list[Json]:
 
 
 def unknown(without: Sequence[Trained], materials: Sequence[str]) -> Json:
-    """Detection of a material that was left out of training.
+    """Detection of a material that was left out of training, by material and as their mean.
 
-    Gives the AUROC of known test sweeps against those of the material, for several scores; the
-    share of known sweeps below the limit found in training, and of unknown sweeps that pass as
-    known; the same at multiples of the limit, and if a second sweep at the same placement must pass
-    as well.
+    Gives the AUROC of known test sweeps against those of the material, the share of known sweeps
+    below the limit found in training, and of unknown sweeps that pass as known.
     """
-    materials_of: dict[str, Json] = {}
-    every: dict[str, list[float]] = {}
-    passed: list[Array] = []
+    found: dict[str, Json] = {}
     for k in sorted({case.left_out for case, _ in without}):
         held = [one for one in without if one[0].left_out == k]
-        known, places = np.concatenate([case.known() for case, _ in held]), placements(held)
-        scores = {
-            name: np.concatenate([score(case, done) for case, done in held])
-            for name, score in SCORES.items()
-        }
-        ours, labels = scores["distance"], joined(held, "labels")
-        materials_of[materials[k]] = _detection(ours, known, places)
-        twice = [
-            [_passed(ours, known, places, labels, factor, n) for n in (1, 2)] for factor in LIMITS
-        ]
-        passed.append(np.array(twice))
-        for name, row in scores.items():
-            every.setdefault(name, []).append(auroc(row[known], row[~known]))
+        known = np.concatenate([case.known() for case, _ in held])
+        # in units of the limit, because the limits of folds differ
+        scores = [done.embedding.novelty(case.new[:, -1]) / done.limit for case, done in held]
+        found[materials[k]] = _detection(np.concatenate(scores), known, placements(held))
     mean = {
-        name: round(float(np.mean([row[name] for row in materials_of.values()])), 4)
+        name: round(float(np.mean([row[name] for row in found.values()])), 4)
         for name in ("auroc", "kept", "false_known", "false_known_at_95")
     }
-    means = {name: round(float(np.mean(values)), 4) for name, values in every.items()}
-    limits = [
-        {
-            "factor": factor,
-            "kept": one[0],
-            "false_known": one[1],
-            "kept_twice": two[0],
-            "false_known_twice": two[1],
-        }
-        for factor, (one, two) in zip(
-            LIMITS, np.mean(passed, axis=0).round(4).tolist(), strict=True
-        )
-    ]
-    return {"materials": materials_of, "mean": mean, "scores": means, "limits": limits}
+    return {"materials": found, "mean": mean}
 
 
 def _detection(scores: Array, known: Array, places: Array) -> Json:
@@ -142,42 +113,8 @@ def _detection(scores: Array, known: Array, places: Array) -> Json:
     }
 
 
-def _passed(
-    scores: Array, known: Array, places: Array, labels: Array, factor: float, n: int
-) -> tuple[float, float]:
-    """Shares of known and of unknown sweeps that pass `factor` times the limit together with the
-    next n - 1 sweeps of their material at their placement. The last sweeps of a placement have too
-    few successors and are left out."""
-    order = np.lexsort((labels, places))
-    here, fits = np.stack([places, labels])[:, order], (scores <= factor)[order]
-    size = len(order) - n + 1
-    whole = (here[:, :size] == here[:, n - 1 :]).all(axis=0)
-    all_fit = np.logical_and.reduce([fits[i : i + size] for i in range(n)])[whole]
-    is_known = known[order][:size][whole]
-    return float(all_fit[is_known].mean()), float(all_fit[~is_known].mean())
-
-
 def _auroc_of(scores: Array, known: Array, some: Array) -> float:
     return auroc(scores[some][known[some]], scores[some][~known[some]])
-
-
-def _of_trunk(case: Case, done: Calibration) -> Array:
-    """Squared distance in the trained features alone; 0 for all sweeps if there are none."""
-    if not (size := case.seen.shape[2] - case.fixed):
-        return np.zeros(len(case.new))
-    return embed(case.seen[:, -1, :size], case.seen_labels, size).novelty(case.new[:, -1, :size])
-
-
-SCORES: dict[str, Callable[[Case, Calibration], Array]] = {
-    "distance": lambda case, done: done.embedding.novelty(case.new[:, -1]) / done.limit,
-    "distance, trained features only": _of_trunk,
-    "distance, where trained materials differ": lambda case, done: embed(
-        case.seen[:, -1], case.seen_labels
-    ).novelty(case.new[:, -1]),
-    "highest probability": lambda case, done: -softmax(done.logits(case.new[:, -1])).max(1),
-}
-"""Each score is larger for a sweep that is less like the training sweeps. The limits of folds
-differ, so the first score is in units of the limit."""
 
 
 def joined(held: Sequence[Trained], name: str) -> Array:

@@ -61,7 +61,7 @@ def under_corruptions(
                 lost = round(severity * sweeps.format.window) * (corruption.name == "lost")
                 found.append(answers(box, replace(sweeps, samples=samples), lost))
             for answer, counted in trials.items():
-                counted.add(corruption, [(given[answer], 0) for given in found])
+                counted.add(corruption, [given[answer] for given in found])
         tasks += [counted.task(answer, seed) for answer, counted in trials.items()]
     return {name: entry["curves"] for name, entry in robustness.merge(tasks)["methods"].items()}
 

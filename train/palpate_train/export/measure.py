@@ -6,14 +6,12 @@ therefore imports at its top only packages that the box has.
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import subprocess
 import sys
 import tempfile
 import time
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,10 +34,8 @@ SWEEPS_BEFORE_MEMORY = 20
 """Number of sweeps that a process answers before its memory is read."""
 MEMORY_S = 600
 """Longest time in s of that process."""
-MODEL, TORCH, AEON = "model.onnx", "model.pt", "model.npz"
-"""The model's file in a bundle, as TorchScript, and as aeon's parameters."""
-DESKTOP = ("torch", "sklearn", "scipy", "aeon", "numba", "onnx", "palpate_train")
-"""Packages that the box never has."""
+MODEL = "model.onnx"
+"""The model's file in a bundle."""
 
 
 @dataclass(frozen=True)
@@ -47,10 +43,9 @@ class Measurement:
     """The cost of a packed model on this machine.
 
     ms_p50, ms_p99: processor time in ms of one sweep through the box's classifier, with its checks
-    and features, in one thread; for a model in its own library, of its logits. model_bytes: of the
-    model's file. bundle_bytes: of all files, golden sweeps included. rss_mib: resident memory
-    (VmRSS) in MiB of a separate process that has loaded the model and answered SWEEPS_BEFORE_MEMORY
-    sweeps. foreign: packages in that process that the box does not have.
+    and features, in one thread. model_bytes: of the model's file. bundle_bytes: of all files,
+    golden sweeps included. rss_mib: resident memory (VmRSS) in MiB of a separate process that has
+    loaded the model and answered SWEEPS_BEFORE_MEMORY sweeps.
     """
 
     ms_p50: float
@@ -58,7 +53,6 @@ class Measurement:
     model_bytes: int
     bundle_bytes: int
     rss_mib: float
-    foreign: tuple[str, ...] = ()
 
     @property
     def model_kb(self) -> float:
@@ -82,16 +76,15 @@ def measure_all(folders: Sequence[Path], sweeps: Array, rounds: int = ROUNDS) ->
     return [_measurement(folder, took[str(folder)], memory(folder, some)) for folder in folders]
 
 
-def _measurement(folder: Path, took_ms: Array, process: Mapping[str, Any]) -> Measurement:
-    model, whole = sizes(folder)
+def _measurement(folder: Path, took_ms: Array, rss_mib: float) -> Measurement:
     p50, p99 = (round(float(np.percentile(took_ms, q)), 4) for q in (50, 99))
-    return Measurement(p50, p99, model, whole, process["rss_mib"], tuple(process["foreign"]))
+    return Measurement(p50, p99, *sizes(folder), rss_mib)
 
 
 def sizes(folder: Path) -> tuple[int, int]:
     """Bytes of the model's file, and of all files in its folder."""
     files = {file.name: file.stat().st_size for file in folder.iterdir()}
-    return next(files[name] for name in (MODEL, TORCH, AEON) if name in files), sum(files.values())
+    return files[MODEL], sum(files.values())
 
 
 def timed(
@@ -120,9 +113,9 @@ def timed(
     return took
 
 
-def memory(folder: Path, sweeps: Array) -> dict[str, Any]:
-    """`rss_mib` of a fresh process that has loaded the model in `folder` and answered some of
-    `sweeps`, and the `foreign` packages there.
+def memory(folder: Path, sweeps: Array) -> float:
+    """Resident memory in MiB of a fresh process that has loaded the model in `folder` and answered
+    some of `sweeps`.
 
     Raises BundleError if the model does not run in a process of its own.
     """
@@ -131,9 +124,7 @@ def memory(folder: Path, sweeps: Array) -> dict[str, Any]:
         np.save(path, sweeps[:SWEEPS_BEFORE_MEMORY])
         # -P: the modules beside this file do not hide packages of their names
         command = [sys.executable, "-P", __file__, str(folder), str(path)]
-        env = os.environ | dict.fromkeys(
-            ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
-        )
+        env = os.environ | dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
         env |= {"PYTHONPATH": str(Path(palpate.__file__).parents[1])}
         try:
             done = subprocess.run(
@@ -148,27 +139,12 @@ def memory(folder: Path, sweeps: Array) -> dict[str, Any]:
             f"the model in {folder} does not run in a process of its own: "
             f"{done.stderr.strip()[-300:]}; pack it again"
         )
-    found: dict[str, Any] = json.loads(done.stdout)
-    return found
+    return float(done.stdout)
 
 
 def load(folder: Path) -> Call:
-    """A function that answers raw counts [T, R, C]: the box's classifier for a bundle, else the
-    model in its own library.
-
-    Raises BundleError for an incomplete bundle, and ImportError if the model's own library is
-    missing.
-    """
-    if (folder / TORCH).is_file():
-        return _torch(folder / TORCH)
-    if (folder / AEON).is_file():
-        return _aeon(folder / AEON)
-    return _classifier(folder)
-
-
-def _classifier(folder: Path) -> Call:
-    """The box's classifier, which gets one sound sweep after another, each of another object."""
-    # here: a model in its own library runs without the box's code
+    """The box's classifier of a bundle. It gets one sound sweep, raw counts [T, R, C], after
+    another, each of another object. Raises BundleError for an incomplete bundle."""
     from palpate.bundle import bundle
     from palpate.core.clock import SystemClock
     from palpate.core.types import Frames, Status, Sweep
@@ -185,56 +161,15 @@ def _classifier(folder: Path) -> Call:
     return answer
 
 
-def _torch(path: Path) -> Call:
-    import torch
-
-    with warnings.catch_warnings():
-        # of TorchScript, which is read without our code
-        warnings.simplefilter("ignore", DeprecationWarning)
-        network = torch.jit.load(path)
-
-    def answer(counts: Array) -> Any:
-        with torch.inference_mode():
-            return network(torch.from_numpy(counts[None])).numpy()[0]
-
-    return answer
-
-
-def _aeon(path: Path) -> Call:
-    from aeon.transformations.collection.convolution_based import MiniRocket
-
-    with np.load(path, allow_pickle=False) as z:
-        parameters, silence, weight, bias = (
-            tuple(z[f"p{i}"] for i in range(5)),
-            z["silence"],
-            z["weight"],
-            z["bias"],
-        )
-    features, before = MiniRocket(n_jobs=1), np.random.get_state()
-    features.fit(silence)  # it needs the shape of a sweep; its result is replaced
-    np.random.set_state(before)
-    features.parameters = parameters
-
-    def answer(counts: Array) -> Any:
-        series = np.ascontiguousarray(
-            counts.reshape(1, len(counts), -1).transpose(0, 2, 1), np.float32
-        )
-        return weight @ features.transform(series)[0] + bias
-
-    return answer
-
-
 def main(folder: str, sweeps: str) -> None:
-    """Answer some sweeps, and print the resident memory in MiB and the loaded packages of the
-    desktop as JSON."""
+    """Answer some sweeps, and print the resident memory in MiB."""
     answer = load(Path(folder))
     counts = np.load(sweeps)
     for i in range(SWEEPS_BEFORE_MEMORY):
         answer(counts[i % len(counts)])
     resident = re.search(r"VmRSS:\s+(\d+) kB", Path(f"/proc/{os.getpid()}/status").read_text())
     assert resident
-    foreign = sorted({name.split(".")[0] for name in sys.modules} & set(DESKTOP))
-    print(json.dumps({"rss_mib": round(int(resident[1]) / 1024, 1), "foreign": foreign}))
+    print(round(int(resident[1]) / 1024, 1))
 
 
 if __name__ == "__main__":

@@ -40,9 +40,10 @@ class MethodFit:
     def of(cls, method: Method, sweeps: Dataset, seed: int) -> tuple[Model, Self]:
         """`method`, trained on four fifths of the positions (else recordings) of `sweeps`; the
         others test it. Raises FormatError for a method that the box cannot run."""
-        if why := method.why_not_on_the_box:
+        if method.library:
             raise FormatError(
-                f"method {method.name!r} {why}; compare it with evaluate, and fit another"
+                f"method {method.name!r} runs in {method.library} alone and has no graph; compare "
+                "it with evaluate, and fit another"
             )
         train, held, by = hold_out(sweeps, seed)
         model = method.train(train, model_inputs(method.input, train), seed)

@@ -12,7 +12,6 @@ from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
 from importlib.util import find_spec
-from pathlib import Path
 from types import ModuleType
 from typing import Any, Protocol
 
@@ -26,7 +25,6 @@ from palpate_train.data.progress import spoken as spoken  # for trainings
 from palpate_train.data.run import Log as Log
 from palpate_train.data.run import no_log as no_log
 from palpate_train.data.sets import Dataset
-from palpate_train.features import kinds
 
 Array = NDArray[Any]
 Cost = list[tuple[int, float]]
@@ -73,16 +71,10 @@ AS_RECORDED = SkinUse()
 class Effort:
     """The length of trainings, and the use of the skin.
 
-    share: of each network's default iterations. paper_steps: of the paper's CNN; None for the
-    paper's 4,000 on a GPU and fewer on a processor. bfloat16: compute the paper's CNN in bfloat16
-    if the processor can. unfinished: a file that keeps the training of the paper's CNN from time to
-    time, so that it goes on after an interruption. use: of the skin, for our family.
+    share: of each network's default iterations. use: of the skin, for our family.
     """
 
     share: float = 1.0
-    paper_steps: int | None = None
-    bfloat16: bool = False
-    unfinished: Path | None = None
     use: SkinUse = AS_RECORDED
 
 
@@ -116,7 +108,7 @@ class Model(Protocol):
 class Method:
     """One way to name a material.
 
-    about: one line with its source. input: "raw" or a key of features.kinds.KINDS. train:
+    about: one line with its source. input: "raw" or a key of palpate.answer.features.KINDS. train:
     (training sweeps, their model_inputs, seed) -> Model; the same arguments give the same model.
     extra: the optional dependency that it needs, named as in train/pyproject.toml. effort: the part
     of an Effort that changes it. library: the library that runs its models if they have no graph;
@@ -131,31 +123,13 @@ class Method:
     effort: str = ""
     library: str = ""
 
-    @property
-    def why_not_on_the_box(self) -> str:
-        """The reason why the box cannot run it: no graph, or features that the box does not
-        compute; "" if it can."""
-        if self.library:
-            return f"runs in {self.library} alone and has no graph"
-        if self.input != "raw" and self.input not in features.KINDS:
-            return (
-                f"looks at the features {self.input!r} of prior work, which the box does not "
-                "compute"
-            )
-        return ""
-
-    @property
-    def runs_on_the_box(self) -> bool:
-        """Whether its models have a graph, and the box computes the graph's input."""
-        return not self.why_not_on_the_box
-
 
 def model_inputs(kind: str, sweeps: Dataset) -> Array:
     """The inputs of a method with the input `kind` for `sweeps`: raw counts [N, T, R, C], or
     features float32 [N, F]."""
     if kind == "raw":
         return sweeps.samples
-    return np.stack([kinds.compute(kind, counts, sweeps.rate_hz) for counts in sweeps.samples])
+    return np.stack([features.compute(kind, counts, sweeps.rate_hz) for counts in sweeps.samples])
 
 
 @cache

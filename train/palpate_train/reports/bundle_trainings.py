@@ -57,8 +57,7 @@ def run(
     figures["curve"] = curve(method, train, test, where, log, effort)
     if len(train.materials) > 2:
         try:
-            found = uncertainty.left_out(train, test, method, where, log, effort)
-            figures["left_out"] = {"materials": found["materials"], "mean": found["mean"]}
+            figures["left_out"] = uncertainty.left_out(train, test, method, where, log, effort)
         except FormatError as e:  # a method that knows no novelty
             figures["why_not"] = str(e)
     return figures

@@ -13,10 +13,9 @@ import numpy as np
 import onnx
 from onnx import TensorProto
 
-from palpate.answer import time_series
+from palpate.answer import features, time_series
 from palpate.core.errors import FormatError
 from palpate.core.types import SweepFormat
-from palpate_train.features import kinds
 
 NUMBERS = {TensorProto.FLOAT, TensorProto.INT8, TensorProto.UINT8, TensorProto.INT32}
 """Data types of trained constants. Shapes and indices are int64."""
@@ -113,5 +112,5 @@ def feature_macs(kind: str, format: SweepFormat) -> int:
     rng = np.random.default_rng(0)  # noise, because a transform of a silent sweep might be skipped
     counts = rng.integers(0, 100, (format.window, *format.shape)).astype(format.numpy_type)
     with mock.patch.object(time_series, "power", counted):
-        kinds.compute(kind, counts, format.rate_hz)
+        features.compute(kind, counts, format.rate_hz)
     return sum(transforms)

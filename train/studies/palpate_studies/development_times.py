@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.answer import features
 from palpate.bundle import bundle
 from palpate.core.errors import BundleError, FormatError
 from palpate.core.provenance import processor
@@ -24,12 +25,12 @@ from palpate.inference.session import session
 from palpate_studies import cost, precisions
 from palpate_studies.development_chart import SERIES, TACTILE
 from palpate_studies.development_experiment import CASES, OURS
+from palpate_studies.peers import minirocket
 from palpate_studies.precisions import Packed
 from palpate_studies.study import StudyCase
 from palpate_train.data.progress import Progress
 from palpate_train.data.sets import Dataset
 from palpate_train.export import measure
-from palpate_train.features import kinds
 from palpate_train.metrics import score
 from palpate_train.models import methods
 from palpate_train.models.methods import FULL_EFFORT, Effort, Method, Model, model_inputs
@@ -121,26 +122,31 @@ def _briefly(name: str, effort: Effort) -> Method:
     """The method, for a peer with SHARE of its iterations, unless the effort is smaller anyway."""
     return methods.find(
         [name],
-        effort if name in OURS else replace(effort, share=min(SHARE, effort.share), paper_steps=1),
+        effort if name in OURS else replace(effort, share=min(SHARE, effort.share)),
     )[0]
 
 
 def _callable(
     method: Method, sweeps: Dataset, some: Array, seed: int, cache: Path
 ) -> list[tuple[Json, measure.Call]]:
-    """The method in each precision of the box, and in its own library. A model that the box refuses
-    is timed all the same. some: raw counts [n, T, R, C] for its memory."""
+    """The method in each precision of the box, or in its own library; MiniRocket in both. A model
+    that the box refuses is timed all the same. some: raw counts [n, T, R, C] for its memory."""
+    few = sweeps.take(np.arange(0, len(sweeps), EVERY))
+    alone = {"method": method.name, "form": "", "precision": "float", "runs_on_box": False}
     if method.library:
-        few = sweeps.take(np.arange(0, len(sweeps), EVERY))
         model = method.train(few, model_inputs(method.input, few), seed)
-        entry = {"method": method.name, "form": "", "precision": "float", "runtime": method.library}
-        return [(entry | {"runs_on_box": False}, partial(_alone, model))]
+        return [(alone | {"runtime": method.library}, partial(_alone, model))]
     folder = precisions.kept_folder(method, sweeps, seed, cache)
     try:
         made = precisions.packed(method, sweeps, seed, folder)
     except BundleError as e:
         return list(_refused(method, sweeps, seed, str(e)))
-    return [(_entry(one, some), _call(method, one, sweeps.rate_hz)) for one in made]
+    found: list[tuple[Json, measure.Call]] = [
+        (_entry(one, some), _call(method, one, sweeps.rate_hz)) for one in made
+    ]
+    if method.name == "minirocket":
+        found.append((alone | {"runtime": "aeon"}, minirocket.in_aeon(few, seed)))
+    return found
 
 
 def _entry(one: Packed, some: Array) -> Json:
@@ -149,19 +155,17 @@ def _entry(one: Packed, some: Array) -> Json:
         "method": one.method,
         "form": one.form,
         "precision": one.precision,
-        "runtime": one.runtime,
-        "runs_on_box": one.runtime == "onnx",
+        "runtime": "onnx",
+        "runs_on_box": True,
         "weights": one.weights,
         "macs": one.macs,
         "file_kb": measure.sizes(one.folder)[0] / 1000,
-        "rss_mb": measure.memory(one.folder, some)["rss_mib"],
+        "rss_mb": measure.memory(one.folder, some),
     }
 
 
 def _call(method: Method, one: Packed, rate_hz: float) -> measure.Call:
     """A packed model without the checks of the box."""
-    if one.runtime != "onnx":
-        return measure.load(one.folder)
     return _graph(method, (one.folder / measure.MODEL).read_bytes(), rate_hz)
 
 
@@ -186,7 +190,7 @@ def _graph(method: Method, graph: bytes, rate_hz: float) -> measure.Call:
     run = session(graph)
     name = run.get_inputs()[0].name
     return lambda counts: run.run(
-        None, {name: kinds.graph_input(method.input, counts, rate_hz)[None]}
+        None, {name: features.graph_input(method.input, counts, rate_hz)[None]}
     )
 
 

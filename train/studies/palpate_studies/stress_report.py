@@ -5,7 +5,6 @@ It computes nothing but differences and orders. The first method is ours; five a
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
@@ -58,7 +57,6 @@ def render(result: Json, name: str = "stress") -> tuple[str, dict[str, str]]:
         missing=missing(curves, ours),
         methods=[[plain_name(name), about(name), name] for name in result["methods"]],
         refused=_refused(result["methods"]),
-        trouble=trouble(entries, result["box"]["uninformative"]),
     )
     return page, pictures
 
@@ -178,17 +176,3 @@ def missing(curves: Mapping[str, Json], ours: str) -> list[str]:
     """Corruptions without a picture: they cost no drawn method five points."""
     shown = stress_plots.shown(curves)
     return [curve["title"] for name, curve in curves[ours].items() if name not in shown]
-
-
-def trouble(entries: Mapping[str, Json], box: Mapping[str, str]) -> list[list[str]]:
-    """For each uninformative sweep the answers of methods and of the box."""
-    rows = []
-    for name in dict.fromkeys(name for entry in entries.values() for name in entry["trouble"]):
-        answers: Counter[str] = Counter(
-            entry["trouble"][name].split(":")[0] for entry in entries.values()
-        )
-        desktop = ", ".join(
-            f"{n} {'answer' if answer == 'finite' else answer}" for answer, n in answers.items()
-        )
-        rows.append([name, desktop, box.get(name, "–")])
-    return rows

@@ -14,6 +14,7 @@ from typing import Any
 
 from palpate.core.errors import FormatError
 from palpate.core.storage import put
+from palpate_studies import published
 from palpate_train.data import sets
 from palpate_train.data.sets import Dataset
 from palpate_train.evaluate.evaluate import Where
@@ -52,7 +53,9 @@ class StudyCase:
             return None
         paths = [name.format(**names) for name in self.sets]
         paths = [str(data / path) if self.real and data else path for path in paths]
-        return sets.join([sets.load(path).select(self.only) for path in paths])
+        loaders = [published if path.startswith(published.PREFIX) else sets for path in paths]
+        loaded = [loader.load(path) for loader, path in zip(loaders, paths, strict=True)]
+        return sets.join([one.select(self.only) for one in loaded])
 
 
 @dataclass(frozen=True, slots=True)

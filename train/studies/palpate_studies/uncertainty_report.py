@@ -106,17 +106,6 @@ def _unknown_tables(figures: Json) -> dict[str, list[list[str]]]:
     ]
     return {
         "unknown": [*rows, ["mean", *(formatting.percent(mean[k]) for k in shares), ""]],
-        "limits": [
-            [
-                f"{row['factor']:g}",
-                *(
-                    formatting.percent(row[k])
-                    for k in ("false_known", "kept", "false_known_twice", "kept_twice")
-                ),
-            ]
-            for row in of["limits"]
-        ],
-        "scores": [[name, formatting.percent(value)] for name, value in of["scores"].items()],
         "enrolment": [
             [
                 p["where"],

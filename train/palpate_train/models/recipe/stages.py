@@ -38,8 +38,8 @@ from palpate_train.onnx_tools.graph_builder import with_head
 from palpate_train.onnx_tools.quantize import PERCENTILE, calibration_sweeps
 
 Array = NDArray[Any]
-TRAINING = TrainingRecipe(noise=0.0, gain=0.0)
-"""The training of stages, but for its steps; an Augmentation replaces gain and noise."""
+TRAINING = TrainingRecipe()
+"""The training of stages, but for its steps."""
 
 
 class ZeroSum(nn.Conv1d):

@@ -16,7 +16,7 @@ from palpate.core.clock import SystemClock
 from palpate.core.errors import FormatError
 from palpate.core.provenance import commit
 from palpate.inference.classifier import Classifier
-from palpate_studies import alignment, certainty, contact_table, references
+from palpate_studies import alignment, certainty, contact_table, references, stress
 from palpate_studies.study import results_file, save
 from palpate_train.arguments import numbers, options
 from palpate_train.arguments.program import Add
@@ -24,8 +24,6 @@ from palpate_train.data import sets
 from palpate_train.data.progress import Progress
 from palpate_train.data.run import Run
 from palpate_train.data.sets import Dataset
-from palpate_train.evaluate import robustness
-from palpate_train.evaluate.corruption_pairs import pairs
 from palpate_train.evaluate.corruptions import applicable
 from palpate_train.evaluate.evaluation_sweeps import EvaluationSweeps
 from palpate_train.export import bundle_stress
@@ -173,7 +171,7 @@ def run_stress(args: argparse.Namespace) -> None:
     with tempfile.TemporaryDirectory() as own:
         folder = _made_of(train, Path(own), log) if args.split and not args.bundle else args.bundle
         box = _box_under_stress(folder, test, seeds, log)
-    result = robustness.run(
+    result = stress.run(
         names,
         train,
         test,
@@ -215,7 +213,7 @@ def _box_under_stress(
     try:
         curves, paired = (
             bundle_stress.under_corruptions(box, test, seeds, log, those)
-            for those in (applicable(test), pairs())
+            for those in (applicable(test), stress.pairs())
         )
     except FormatError:
         if folder:
@@ -226,7 +224,6 @@ def _box_under_stress(
     return {
         "bundle": {"name": manifest.name, "version": manifest.version, "id": number},
         "made": dict(manifest.made),
-        "uninformative": robustness.box_answers(box.bundle),
         "curves": curves,
         "pairs": paired,
     }

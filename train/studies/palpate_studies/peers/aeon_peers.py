@@ -19,8 +19,9 @@ import torch
 from numpy.typing import NDArray
 
 from palpate.core.errors import FormatError
+from palpate_studies.peers.linear_head import SHARPENING
 from palpate_train.data.sets import Dataset
-from palpate_train.models.linear_head import ABSENT, SHARPENING
+from palpate_train.models.linear_head import ABSENT
 from palpate_train.models.methods import Method
 from palpate_train.models.training import one_thread
 

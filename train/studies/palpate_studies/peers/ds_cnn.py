@@ -17,10 +17,16 @@ from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from palpate.core.types import SweepFormat
-from palpate_train.models.methods import FULL_EFFORT, Effort, Log, Method, no_log
-from palpate_train.models.networks import Network, layer_constants
+from palpate_studies.peers.networks import (
+    PeerNetwork,
+    PeerRecipe,
+    layer_constants,
+    network_method,
+    scale_steps,
+)
+from palpate_train.data.run import Log, no_log
+from palpate_train.models.methods import FULL_EFFORT, Effort, Method
 from palpate_train.models.recipe.augment import texture_scale
-from palpate_train.models.training import TrainingRecipe, network_method, scale_steps
 from palpate_train.onnx_tools.graph_builder import GraphBuilder, centred
 
 Array = NDArray[Any]
@@ -29,13 +35,13 @@ CHANNELS, BLOCKS, TAPS = 64, 4, 9
 STEPS, FIRST_TAPS = 50, 10
 """Approximate number of time steps after the first convolution, whose kernel has ten frames or two
 strides."""
-RECIPE = TrainingRecipe(ema=0.9, dropout=0.0)
+RECIPE = PeerRecipe(ema=0.9, dropout=0.0)
 """The recipe of our own networks with a shorter average, which batch norms need; no means are
 dropped."""
 INT8_NODES = ("Conv", "Relu")
 
 
-class DepthwiseSeparable(Network):
+class DepthwiseSeparable(PeerNetwork):
     """DS-CNN over time; the taxels are the channels of its first convolution. Zero padding keeps
     sizes in the blocks."""
 
@@ -85,7 +91,7 @@ class DepthwiseSeparable(Network):
         return g.model(self.format, "logits", self.head.out_features)
 
 
-def build(format: SweepFormat, classes: int, samples: Array) -> Network:
+def build(format: SweepFormat, classes: int, samples: Array) -> PeerNetwork:
     """The network with random weights; each taxel's mean is subtracted."""
     return DepthwiseSeparable(format, classes, texture_scale(samples))
 

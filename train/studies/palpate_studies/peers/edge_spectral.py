@@ -18,17 +18,17 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from palpate.core.types import SweepFormat
-from palpate_train.models.methods import FULL_EFFORT, Effort, Log, Method, no_log
-from palpate_train.models.networks import Network, layer_constants
-from palpate_train.models.recipe.augment import texture_scale
-from palpate_train.models.training import (
-    TrainingRecipe,
-    batches,
-    float_batches,
+from palpate_studies.peers.networks import (
+    PeerNetwork,
+    PeerRecipe,
+    layer_constants,
     network_method,
-    one_thread,
     scale_steps,
 )
+from palpate_train.data.run import Log, no_log
+from palpate_train.models.methods import FULL_EFFORT, Effort, Method
+from palpate_train.models.recipe.augment import texture_scale
+from palpate_train.models.training import batches, float_batches, one_thread
 from palpate_train.onnx_tools.graph_builder import GraphBuilder, centred
 
 Array = NDArray[Any]
@@ -39,7 +39,7 @@ HIDDEN = (20, 10)
 FLOOR = 1e-6
 """Added to a power before its logarithm and to a variance; the variance of all taxels together is
 1."""
-RECIPE = TrainingRecipe(dropout=0.0, noise=0.0, gain=0.0)
+RECIPE = PeerRecipe(dropout=0.0, noise=0.0, gain=0.0)
 """The recipe of our own networks without changes of the sweeps, because the tools' blocks augment
 nothing."""
 
@@ -49,7 +49,7 @@ def transform_length(window: int) -> int:
     return int(np.clip(2 ** int(np.log2(max(window // 2, 1))), SHORTEST, LONGEST))
 
 
-class SpectralNetwork(Network):
+class SpectralNetwork(PeerNetwork):
     """Two dense layers and a head on standardised spectra and statistics of each taxel.
 
     A window that is shorter than a transform is followed by zeros. waves [2 B, 1, L]: cosines, then
@@ -137,7 +137,7 @@ class SpectralNetwork(Network):
         return g.model(self.format, "logits", self.head.out_features)
 
 
-def build(format: SweepFormat, classes: int, samples: Array) -> Network:
+def build(format: SweepFormat, classes: int, samples: Array) -> PeerNetwork:
     """The network with random weights and the features of `samples` standardised; each taxel's mean
     is subtracted."""
     network = SpectralNetwork(format, classes, texture_scale(samples))

@@ -24,10 +24,10 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from palpate.core.types import SweepFormat
 from palpate_studies.peers.ds_cnn import INT8_NODES, RECIPE
-from palpate_train.models.methods import FULL_EFFORT, Effort, Log, Method, no_log
-from palpate_train.models.networks import Network, layer_constants
+from palpate_studies.peers.networks import PeerNetwork, layer_constants, network_method, scale_steps
+from palpate_train.data.run import Log, no_log
+from palpate_train.models.methods import FULL_EFFORT, Effort, Method
 from palpate_train.models.recipe.augment import texture_scale
-from palpate_train.models.training import network_method, scale_steps
 from palpate_train.onnx_tools.graph_builder import GraphBuilder, centred
 
 Array = NDArray[Any]
@@ -101,7 +101,7 @@ def separable(channels: int, taps: int, stride: int = 1, dilation: int = 1) -> n
     return nn.Sequential(depthwise, SameConv(channels, FILTERS, 1), nn.BatchNorm1d(FILTERS))
 
 
-class Lite(Network):
+class Lite(PeerNetwork):
     """LITE, in its multivariate variant if there are several taxels."""
 
     def __init__(self, format: SweepFormat, classes: int, scale: float) -> None:
@@ -189,7 +189,7 @@ def _normed(g: GraphBuilder, x: str, norm: nn.Module) -> str:
     return g("Add", g("Mul", x, g.constant(columns[0])), g.constant(columns[1]))
 
 
-def build(format: SweepFormat, classes: int, samples: Array) -> Network:
+def build(format: SweepFormat, classes: int, samples: Array) -> PeerNetwork:
     """The network with random weights; each taxel's mean is subtracted."""
     return Lite(format, classes, texture_scale(samples))
 

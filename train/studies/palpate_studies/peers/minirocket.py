@@ -7,6 +7,7 @@ the head is fitted.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import combinations
 from typing import Any
 
@@ -19,8 +20,8 @@ from sklearn.preprocessing import StandardScaler
 
 from palpate.core.errors import FormatError
 from palpate.core.types import SweepFormat
+from palpate_studies.peers.linear_head import LinearHeadModel, train_linear_head
 from palpate_train.data.sets import Dataset
-from palpate_train.models.linear_head import LinearHeadModel, train_linear_head
 from palpate_train.models.methods import Method
 from palpate_train.onnx_tools.graph_builder import GraphBuilder
 
@@ -67,18 +68,31 @@ def fitted(inputs: Array, seed: int) -> tuple[Array, ...]:
         raise FormatError(
             f"minirocket needs aeon ({e}); try pip install 'palpate-train[peers]'"
         ) from e
-    # in C order: for any other numba compiles again
-    series = np.ascontiguousarray(
-        inputs.reshape(*inputs.shape[:2], -1).transpose(0, 2, 1), np.float32
-    )
     before = np.random.get_state()
     try:
-        found: tuple[Array, ...] = (
-            MiniRocket(FEATURES, n_jobs=1, random_state=seed).fit(series).parameters
-        )
+        own = MiniRocket(FEATURES, n_jobs=1, random_state=seed).fit(_series(inputs))
     finally:
         np.random.set_state(before)
+    found: tuple[Array, ...] = own.parameters
     return found
+
+
+def in_aeon(sweeps: Dataset, seed: int) -> Callable[[Array], Array]:
+    """aeon's own transform and a head on it, fitted to `sweeps`, for timing: raw counts [T, R, C]
+    -> margins [K]."""
+    from aeon.transformations.collection.convolution_based import MiniRocket
+
+    own, before = MiniRocket(FEATURES, n_jobs=1, random_state=seed), np.random.get_state()
+    weight, bias = _ridge(own.fit_transform(_series(sweeps.samples)), sweeps.labels)
+    np.random.set_state(before)
+    return lambda counts: weight @ own.transform(_series(counts[None]))[0] + bias
+
+
+def _series(samples: Array) -> Array:
+    """Raw counts [n, T, R, C] as aeon takes them: float32 [n, R * C, T], in C order, since for any
+    other numba compiles again."""
+    flat = samples.reshape(*samples.shape[:2], -1).transpose(0, 2, 1)
+    return np.ascontiguousarray(flat, np.float32)
 
 
 def transform(format: SweepFormat, parameters: tuple[Array, ...]) -> onnx.ModelProto:

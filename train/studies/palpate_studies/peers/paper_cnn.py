@@ -21,23 +21,24 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from palpate.core.types import SweepFormat
 from palpate_studies.peers import fourier_convolution
-from palpate_train.models.methods import FULL_EFFORT, Effort, Log, Method, no_log
-from palpate_train.models.networks import Network, layer_constants
-from palpate_train.models.recipe.augment import texture_scale
-from palpate_train.models.training import (
-    MIN_STEPS,
+from palpate_studies.peers.networks import (
     Build,
-    TrainingRecipe,
+    PeerNetwork,
+    PeerRecipe,
+    layer_constants,
     network_method,
     scale_steps,
 )
+from palpate_train.data.run import Log, no_log
+from palpate_train.models.methods import FULL_EFFORT, Effort, Method
+from palpate_train.models.recipe.augment import texture_scale
 from palpate_train.onnx_tools.graph_builder import GraphBuilder, centred
 
 Array = NDArray[Any]
 PAPER_STEPS, PROCESSOR_STEPS = 4000, 200
 """Iterations of the paper's CNN: the paper's (table I) on a GPU; fewer on a processor, because a
 core needs about a second for each."""
-PAPER_RECIPE = TrainingRecipe(
+PAPER_RECIPE = PeerRecipe(
     batch=50,
     peak_rate=1e-4,
     weight_decay=0.0,
@@ -51,7 +52,7 @@ PAPER_RECIPE = TrainingRecipe(
 """The recipe as printed (section IV.D); the paper's p_d = .75 is the share that is kept."""
 INT8_NODES = ("Conv", "Relu", "MaxPool", "Gemm")
 """Kinds of nodes of the paper's CNN that are in int8 in the precision "int8"."""
-TACTNET2_RECIPE = TrainingRecipe(
+TACTNET2_RECIPE = PeerRecipe(
     steps=120,
     batch=32,
     peak_rate=2e-3,
@@ -99,7 +100,7 @@ predecessor. Channels, the dense layer and strides are our choice; the strides r
 pooling, at a twentieth of the work."""
 
 
-class ImageNetwork(Network):
+class ImageNetwork(PeerNetwork):
     """Convolutions over one image, time by taxels, then a dense layer, as in the paper's CNN.
 
     Zero padding keeps sizes; a pooling window that reaches past the end pools only the steps before
@@ -150,12 +151,7 @@ class ImageNetwork(Network):
     def _convolved(self, conv: nn.Conv2d, x: Tensor) -> Tensor:
         """The convolution of `x`, in training on a processor by the quicker way."""
         plain = conv.stride == (1, 1) and conv.in_channels >= FEW_CHANNELS
-        if (
-            plain
-            and self.training
-            and x.device.type == "cpu"
-            and not torch.is_autocast_enabled("cpu")
-        ):
+        if plain and self.training and x.device.type == "cpu":
             bias = conv.bias
             assert bias is not None
             return fourier_convolution.convolve(x, conv.weight) + bias[:, None, None]
@@ -196,7 +192,7 @@ class ImageNetwork(Network):
 
 def build_paper_cnn(
     format: SweepFormat, classes: int, samples: Array, layers: ImageLayers = PAPER
-) -> Network:
+) -> PeerNetwork:
     """The paper's CNN; raw counts are scaled by one mean and one deviation of all `samples`,
     because the paper prints no scale.
 
@@ -209,12 +205,12 @@ def build_paper_cnn(
 
 def build_centred(
     format: SweepFormat, classes: int, samples: Array, layers: ImageLayers = PAPER
-) -> Network:
+) -> PeerNetwork:
     """The paper's CNN behind a layer that subtracts each taxel's mean."""
     return ImageNetwork(format, classes, texture_scale(samples), None, layers)
 
 
-def build_tactnet2(format: SweepFormat, classes: int, samples: Array) -> Network:
+def build_tactnet2(format: SweepFormat, classes: int, samples: Array) -> PeerNetwork:
     """TactNet-II as far as it is published (TACTNET2); each taxel's mean is subtracted.
 
     Dropout is off at test time, on the box and here. This is the mean field of the published Monte
@@ -235,18 +231,13 @@ def random_paper_cnn(
 
 def methods(effort: Effort = FULL_EFFORT, log: Log = no_log) -> tuple[Method, ...]:
     """The methods, trained with this effort. log: called after every iteration."""
-    steps = effort.paper_steps
-    if steps is None:
-        steps = round(
-            (PAPER_STEPS if torch.cuda.is_available() else PROCESSOR_STEPS) * effort.share
-        )
-    recipe = replace(PAPER_RECIPE, steps=max(steps, MIN_STEPS))
+    steps = PAPER_STEPS if torch.cuda.is_available() else PROCESSOR_STEPS
+    recipe = scale_steps(replace(PAPER_RECIPE, steps=steps), effort)
 
     def paper(name: str, about: str, build: Build) -> Method:
         """As printed: trained on all sweeps, without a temperature."""
-        kept, half = effort.unfinished, effort.bfloat16
-        more: dict[str, Any] = {"calibrated": False, "bfloat16": half, "unfinished": kept}
-        return network_method(name, about, build, recipe, log, int8=INT8_NODES, **more)
+        more: dict[str, Any] = {"calibrated": False, "int8": INT8_NODES}
+        return network_method(name, about, build, recipe, log, **more)
 
     return (
         paper(

@@ -11,21 +11,27 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from palpate.core.types import SweepFormat
-from palpate_train.models.methods import FULL_EFFORT, Effort, Log, Method, no_log
-from palpate_train.models.networks import Network, layer_constants
+from palpate_studies.peers.networks import (
+    PeerNetwork,
+    PeerRecipe,
+    layer_constants,
+    network_method,
+    scale_steps,
+)
+from palpate_train.data.run import Log, no_log
+from palpate_train.models.methods import FULL_EFFORT, Effort, Method
 from palpate_train.models.recipe.augment import texture_scale
-from palpate_train.models.training import TrainingRecipe, network_method, scale_steps
 from palpate_train.onnx_tools.graph_builder import GraphBuilder, centred
 
 Array = NDArray[Any]
 STATE, PATCHES, MIN_PATCH = 64, 128, 8
 """Size of the state, number of patches that cover a window (approximately), frames of the shortest
 patch."""
-RECIPE = TrainingRecipe(steps=400)
+RECIPE = PeerRecipe(steps=400)
 """Half as many iterations as usual."""
 
 
-class Recurrent(Network):
+class Recurrent(PeerNetwork):
     """A gated recurrent unit over patches of time whose channels are the taxels; the head sees its
     mean state.
 
@@ -76,7 +82,7 @@ def _onnx_gate_order(gates: Tensor) -> Array:
     return np.concatenate([update, reset, new])
 
 
-def build_recurrent(format: SweepFormat, classes: int, samples: Array) -> Network:
+def build_recurrent(format: SweepFormat, classes: int, samples: Array) -> PeerNetwork:
     """The network with random weights; each taxel's mean is subtracted."""
     return Recurrent(format, classes, texture_scale(samples))
 

@@ -25,8 +25,8 @@ from sklearn.svm import LinearSVC
 
 from palpate.core.errors import FormatError
 from palpate.core.types import SweepFormat
+from palpate_studies.peers.linear_head import LinearHeadModel, train_linear_head
 from palpate_train.data.sets import Dataset
-from palpate_train.models.linear_head import LinearHeadModel, train_linear_head
 from palpate_train.models.methods import Method
 from palpate_train.onnx_tools.graph_builder import GraphBuilder, run
 

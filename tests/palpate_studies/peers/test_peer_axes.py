@@ -13,7 +13,7 @@ from palpate_train.onnx_tools import graph_builder
 from tests.factories.costly import quick_first
 from tests.factories.sheared import sheared
 
-BRIEF = Effort(share=0.01, paper_steps=2)
+BRIEF = Effort(share=0.01)
 
 
 @pytest.fixture(scope="module")

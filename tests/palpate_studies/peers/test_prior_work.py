@@ -15,11 +15,10 @@ from hypothesis.extra import numpy as hnp
 
 from palpate.answer import features, time_series
 from palpate.core.errors import FormatError
+from palpate_studies.peers.prior_features import correlation, spectrogram, static
 from palpate_studies.peers.prior_work import explore
-from palpate_train.features import kinds
-from palpate_train.features.prior_work import correlation, spectrogram, static
 
-KINDS = ("static", "spectrogram", "correlation")
+FEATURES = (static, spectrogram, correlation)
 RATE = 750.0
 
 
@@ -154,7 +153,7 @@ def test_the_number_of_features_hangs_on_the_grid_alone(rows: int, cols: int):
     """2 M + 7, 125 and 9, whatever the length of the sweep."""
     for frames in (20, 61):
         x = np.random.default_rng(0).integers(0, 99, (frames, rows, cols)).astype(np.int16)
-        assert [len(kinds.compute(k, x, 50.0)) for k in KINDS] == [2 * rows * cols + 7, 125, 9]
+        assert [len(of(x, 50.0)) for of in FEATURES] == [2 * rows * cols + 7, 125, 9]
 
 
 _DIGITS = st.sampled_from(["uint8", "int16", "uint16", "float32"]).flatmap(
@@ -167,27 +166,25 @@ _DIGITS = st.sampled_from(["uint8", "int16", "uint16", "float32"]).flatmap(
 
 
 @settings(max_examples=60)
-@given(_DIGITS, st.floats(1, 5000), st.sampled_from(KINDS))
-def test_results_are_finite_for_any_digits(taxels: np.ndarray, rate_hz: float, kind: str):
-    """Finite float32 numbers for any counts."""
-    assert np.isfinite(kinds.compute(kind, taxels, rate_hz)).all()
+@given(_DIGITS, st.floats(1, 5000), st.sampled_from(FEATURES))
+def test_results_are_finite_for_any_digits(taxels: np.ndarray, rate_hz: float, of):
+    """Finite numbers for any counts."""
+    assert np.isfinite(of(taxels, rate_hz)).all()
 
 
 @pytest.mark.parametrize(
-    ("kind", "shape", "rate_hz", "message"),
+    ("of", "shape", "rate_hz", "value"),
     [
-        ("static", (0, 2, 2), RATE, r"shape \(0, 2, 2\) is not"),
-        ("spectrogram", (19, 2, 2), RATE, "19 frames are too few"),
-        ("correlation", (2, 2, 2), RATE, "2 frames are too few"),
-        ("correlation", (20, 2, 2), 0.0, "rate of 0.0 Hz"),
+        (static, (0, 2, 2), RATE, r"\(0, 2, 2\)"),
+        (spectrogram, (19, 2, 2), RATE, "19 frames"),
+        (correlation, (2, 2, 2), RATE, "2 frames"),
+        (correlation, (20, 2, 2), 0.0, "0.0 Hz"),
     ],
 )
-def test_what_cannot_be_computed_is_named(
-    kind: str, shape: tuple[int, ...], rate_hz: float, message: str
-):
+def test_what_cannot_be_computed_is_refused(of, shape: tuple[int, ...], rate_hz: float, value: str):
     """Each refusal is a FormatError with the wrong value."""
-    with pytest.raises(FormatError, match=message):
-        kinds.compute(kind, np.ones(shape, np.uint8), rate_hz)
+    with pytest.raises(FormatError, match=value):
+        of(np.ones(shape, np.uint8), rate_hz)
 
 
 def test_exploring_stops_when_the_posterior_is_sure():
