@@ -1,4 +1,4 @@
-"""The published series that aeon ships: their format, their splits, and what happens without
+"""The published series that aeon ships: their format, splits, and refusals without
 them."""
 
 from __future__ import annotations

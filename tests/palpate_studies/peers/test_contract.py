@@ -39,7 +39,7 @@ def light(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def inputs(name: str, sweeps: Dataset) -> Any:
-    """What the method looks at."""
+    """The inputs of the method."""
     (method,) = methods.find([name])
     return methods.model_inputs(method.input, sweeps)
 
@@ -133,7 +133,7 @@ def test_a_window_that_is_too_short_is_refused(name: str, frames: int):
 
 @pytest.mark.parametrize("name", AEON)
 def test_without_aeon_the_extra_is_advised(name: str, monkeypatch: pytest.MonkeyPatch):
-    """aeon comes with the extra `peers`; what runs in aeon alone has no graph."""
+    """aeon comes with the extra `peers`; methods that run in aeon alone have no graph."""
     if name in ALONE:
         with pytest.raises(FormatError, match="aeon"):
             fitted(name, easy(4)).graph()
