@@ -23,7 +23,7 @@ from tests.factories.page_client import EventReader, PageAddress, port
 ATTACKERS, HELD, PAUSE_S = 12, 40, 0.22
 """Threads, open requests of each, and the pause between two requests of a thread."""
 SWEEP_S, REST_S, WAIT_S = 2.5, 2.0, 20
-HEAD = b"GET / HTTP/1.1\r\nHost: localhost\r\n"
+HEAD = b"GET / HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
 BODY = HEAD.replace(b"GET /", b"POST /order") + b"Content-Length: 900\r\n\r\n{"
 
 

@@ -238,40 +238,21 @@ def cut_at_renames(played: ScenePlay) -> list[CrashPoint]:
     ]
 
 
-@pytest.mark.thorough  # 20 s of kills and power cuts
-def test_a_delivery_that_is_cut_short_leaves_the_old_bundle_or_the_new(
-    shop: delivery.Shop, work: Path
+@pytest.mark.thorough  # up to a minute of kills and power cuts each
+@pytest.mark.parametrize("name", ["delivery", "enrolment", "teaching"])
+def test_a_command_that_is_cut_short_leaves_the_old_bundle_or_the_new(
+    shop: delivery.Shop, work: Path, name: str
 ):
-    """Killed before it renames the bundle's folder and the ledger, and a power cut before the link
-    is swapped: the box starts, answers, and takes the next bundle."""
-    played = ScenePlay(shop.alone("right"), work)
-    points = cut_at_renames(played)
-    assert [point.states for point in points] == [1, 1, 4]
+    """Killed before each rename of a file, and a power cut before the link is swapped: the box
+    starts, answers, and takes the next bundle; no sweep and no decision is lost."""
+    once = teaching.TeachingShop(shop.folder).once
+    scenes = {"delivery": shop.alone, "enrolment": shop.learns, "teaching": lambda way: once()}
+    points = cut_at_renames(ScenePlay(scenes[name]("right"), work))
     assert wrong(points) == []
-
-
-@pytest.mark.thorough  # 20 s of kills and power cuts
-def test_an_enrolment_that_is_cut_short_leaves_the_bundle_with_the_label_or_without(
-    shop: delivery.Shop, work: Path
-):
-    """As a delivery: at each moment the box's files of the label are signed, or it runs without the
-    label."""
-    played = ScenePlay(shop.learns("right"), work)
-    points = cut_at_renames(played)
-    assert [point.states for point in points] == [1, 1, 4]
-    assert wrong(points) == []
-
-
-@pytest.mark.thorough  # a minute of kills and power cuts
-def test_teaching_that_is_cut_short_leaves_the_old_bundle_or_the_new(
-    shop: delivery.Shop, work: Path
-):
-    """Before each rename of FORGET and USE: sweeps and decisions are there, the box starts with one
-    bundle or the other, and can be taught again."""
-    played = ScenePlay(teaching.TeachingShop(shop.folder).once(), work)
-    points = cut_at_renames(played)
-    assert len(points) >= 5
-    assert wrong(points) == []
+    if name == "teaching":
+        assert len(points) >= 5
+    else:
+        assert [point.states for point in points] == [1, 1, 4]
 
 
 @pytest.mark.thorough  # kills a box at every call that changes a file
@@ -292,16 +273,8 @@ def test_what_happens_to_a_box_in_between_is_as_the_scene_says(
 @pytest.mark.parametrize(
     ("way", "call", "what"),
     [
-        (
-            "the link is gone for a moment",
-            "symlink",
-            r"first start: exit code 0, answers by \['\w+'\] instead",
-        ),
-        (
-            "the ledger in place",
-            "write",
-            r"first start: exit code 78, .*bundles.json cannot be read",
-        ),
+        ("the link is gone for a moment", "symlink", r"start: exit code 0, answers by"),
+        ("the ledger in place", "write", r"start: exit code 78"),
     ],
     ids=["link", "ledger"],
 )
@@ -310,11 +283,7 @@ def test_deliveries_that_are_wrong_are_found(
 ):
     """A store that is neither old nor new for a moment: a kill at that moment finds it."""
     played = ScenePlay(shop.alone(way), work)
-    (moment,) = [
-        m
-        for m in played.moments()
-        if m.call
-        and m.call.name == call
-        and m.call.paths[0].endswith(("/current", "/bundles.json"))
-    ]
+    ends = ("/current", "/bundles.json")
+    moments = [m for m in played.moments() if m.call and m.call.name == call]
+    (moment,) = [m for m in moments if m.call.paths[0].endswith(ends)]
     assert re.search(what, str(played.kill(moment).wrong))

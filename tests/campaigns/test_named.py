@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import re
 import subprocess
-import sys
 
 import pytest
 
@@ -77,32 +76,3 @@ def test_a_campaign_runs_something_that_exists(name: str):
         assert campaign.command[0] == "-m"
         assert importlib.util.find_spec(campaign.command[1])
     assert all((ROOT / path).exists() for path in campaign.paths)
-
-
-def test_a_named_file_replaces_the_tests_of_a_campaign():
-    """`test-rig FILE::TEST` runs that test alone; other options leave the tests as they are."""
-    campaign = campaigns.CAMPAIGNS["test-rig"]
-    one = "tests/rig/test_usb.py::test_x"
-    assert campaign.arguments([one])[1:] == ["-m", "pytest", "-q", one]
-    assert campaign.arguments(["-x"])[1:] == ["-m", "pytest", "-q", "-x", "tests/rig"]
-
-
-def test_an_unknown_campaign_is_refused(capsys: pytest.CaptureFixture[str]):
-    """Exit code 2 and the names that exist; no argument prints the list."""
-    assert campaigns.main(["rigg"]) == 2
-    assert "no campaign rigg; there are pictures, rig, " in capsys.readouterr().err
-    assert campaigns.main([]) == 0
-    out = capsys.readouterr().out
-    assert all(f"  {name} " in out for name in campaigns.CAMPAIGNS)
-
-
-def test_a_campaign_gets_its_variables_and_returns_its_exit_code(
-    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-):
-    """A variable of the caller overrides that of the campaign."""
-    code = "import os, sys; print(os.environ['A_'], os.environ['B_']); sys.exit(7)"
-    monkeypatch.setenv("A_", "caller")
-    campaign = campaigns.Campaign("", ("-c", code), variables={"A_": "own", "B_": "own"})
-    assert campaign.run([]) == 7
-    assert capfd.readouterr().out.split() == ["caller", "own"]
-    assert campaign.arguments([])[0] == sys.executable
