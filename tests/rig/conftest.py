@@ -4,18 +4,20 @@ builds the box first."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from palpate.sim import script
 from tests.factories.emulated_machines import Missing
 from tests.rig import notes
 from tests.rig.cell import Cell
 from tests.rig.image import Image
 from tests.rig.image import image as make_image
 from tests.rig.machine import Guest
-from tests.rig.notes import HOW
+from tests.rig.notes import HOW, Count, Note
+from tests.rig.sound import known
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -37,26 +39,19 @@ def image() -> Image:
 
 
 @pytest.fixture(scope="session")
-def count() -> Callable[[int, int], int]:
+def count() -> Count:
     """Number of repetitions: count(quick, full)."""
     return lambda quick, full: full if HOW == "full" else quick
 
 
-@pytest.fixture
-def fresh(image: Image, tmp_path: Path) -> Iterator[Cell]:
-    """A guest for one test, from the snapshot; the skin is plugged in and the box is READY."""
-    with Guest(image, tmp_path, snapshot=True) as machine:
-        cell = Cell(machine)
-        cell.plug()
-        cell.until_ready()
-        yield cell
-
-
 @pytest.fixture(scope="module")
 def shared(image: Image, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cell]:
-    """A guest for a whole file of tests."""
+    """A guest for a whole file of tests. The answers to its sweeps are known, and its packets are
+    large: speed does not matter here."""
     with Guest(image, tmp_path_factory.mktemp("guest"), snapshot=True) as machine:
-        yield Cell(machine)
+        cell = Cell(machine)
+        cell.acts, cell.packet_frames = known(script.tubes(2)), 18
+        yield cell
 
 
 @pytest.fixture
@@ -68,7 +63,7 @@ def cell(shared: Cell) -> Cell:
 
 
 @pytest.fixture
-def note(request: pytest.FixtureRequest) -> Callable[[str, str, int], None]:
+def note(request: pytest.FixtureRequest) -> Note:
     """Records the outcome of a fault for the table of the report: note(fault, outcome, times)."""
 
     def write(fault: str, outcome: str, times: int) -> None:

@@ -23,6 +23,7 @@ from palpate.core.sentences import checksum
 from palpate.core.sweep_file import load
 from palpate.core.types import Status, Sweep
 from tests.factories.emulated_machines import ROOT
+from tests.rig.cell import Cell
 from tests.rig.machine import Guest
 
 KEPT = "/var/lib/palpate/kept"
@@ -55,22 +56,31 @@ def runs_with(machine: Guest, arguments: str, more: str = "") -> None:
     machine.run("systemctl daemon-reload", check=True, timeout_s=60)
 
 
+def checked(cell: Cell) -> str:
+    """The output of `palpate check`, which must succeed in the place of the service."""
+    as_palpate = f"runuser -u palpate -G dialout -G gpio -G plugdev -- {PALPATE}"
+    cell.machine.run("systemctl stop palpate", check=True)
+    try:
+        return cell.machine.run(f"{as_palpate} check", timeout_s=90, check=True).out
+    finally:
+        cell.machine.run("systemctl start --no-block palpate", check=True)
+        cell.until_ready()
+
+
 def found(disk: Path, folder: Path) -> tuple[int, list[Path]]:
     """Examine an unused disk on a copy: the exit code of e2fsck after the journal is replayed, and
     the kept sweeps."""
     raw, out = folder / "disk.raw", folder / "found"
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir()
-    subprocess.run(["qemu-img", "convert", "-O", "raw", disk, raw], check=True, timeout=120)
-    subprocess.run(
-        ["e2fsck", "-y", "-E", "journal_only", raw], check=False, capture_output=True, timeout=120
-    )
-    code = subprocess.run(
-        ["e2fsck", "-f", "-n", raw], check=False, capture_output=True, timeout=120
-    ).returncode
-    subprocess.run(
-        ["debugfs", "-R", f"rdump {KEPT} {out}", raw], check=False, capture_output=True, timeout=120
-    )
+
+    def run(*command: str | Path) -> int:
+        return subprocess.run(command, check=False, capture_output=True, timeout=120).returncode
+
+    assert run("qemu-img", "convert", "-O", "raw", disk, raw) == 0
+    run("e2fsck", "-y", "-E", "journal_only", raw)
+    code = run("e2fsck", "-f", "-n", raw)
+    run("debugfs", "-R", f"rdump {KEPT} {out}", raw)
     raw.unlink()
     return code, sorted((out / "kept").glob("*"))
 

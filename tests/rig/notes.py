@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,8 @@ from tests.factories.emulated_machines import ROOT
 
 FILE = ROOT / "build" / "rig" / "faults.jsonl"
 
+Count, Note = Callable[[int, int], int], Callable[[str, str, int], None]
+"""The fixtures `count` and `note`."""
 HOW = os.environ.get("PALPATE_RIG", "")
 """How the virtual box is tested: quick, full, or not at all."""
 

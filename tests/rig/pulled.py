@@ -4,7 +4,7 @@ attempt, and returns the status of the only answer."""
 from __future__ import annotations
 
 from tests.rig.cell import Cell
-from tests.rig.sound import begin, let_go, not_wrong, only_answer, until
+from tests.rig.sound import begin, let_go, not_wrong, only_answer
 
 SECOND = 1_000_000_000
 
@@ -27,7 +27,7 @@ def before(cell: Cell, i: int) -> str:
 def during(cell: Cell, i: int) -> str:
     """Pulled while the finger slides: answered at once."""
     touch, since = begin(cell)
-    until(cell, touch.start_ns + (i * 37 % 25) * SECOND // 10)
+    cell.clock.sleep_until(touch.start_ns + (i * 37 % 25) * SECOND // 10)
     cell.unplug()
     let_go(cell)  # no stop edge comes that could cause the answer
     return not_wrong(touch, only_answer(cell, since))
@@ -36,6 +36,6 @@ def during(cell: Cell, i: int) -> str:
 def after(cell: Cell, i: int) -> str:
     """Pulled within 30 ms of the stop edge: the answer has been sent, or is sensor-lost."""
     touch, since = begin(cell)
-    until(cell, touch.stop_ns + i % 4 * SECOND // 100)
+    cell.clock.sleep_until(touch.stop_ns + i % 4 * SECOND // 100)
     cell.unplug()
     return not_wrong(touch, only_answer(cell, since))

@@ -99,18 +99,13 @@ def begin(cell: Cell) -> tuple[Touch, int]:
         since = len(cell.serial.heard)
         touch = cell.touch()
         cell.begun(touch)
-        until(cell, touch.start_ns)
+        cell.clock.sleep_until(touch.start_ns)
         while cell.clock.now_ns() < touch.start_ns + OPEN_NS:
             if state(cell)["sweeping"] == "1":
                 return touch, since
         let_go(cell)
         cell.until_ready()
     raise AssertionError(f"{TRIES} start edges opened no sweep; the box says: {cell.journal()}")
-
-
-def until(cell: Cell, t_ns: int) -> None:
-    """Wait until that time of the guest's clock."""
-    cell.clock.sleep_until(t_ns)
 
 
 def let_go(cell: Cell) -> None:

@@ -13,7 +13,7 @@ import json
 import re
 import shutil
 import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ from tests.rig.cell import Cell
 from tests.rig.image import GUEST, Image, ground, layer
 from tests.rig.kept import PALPATE, found
 from tests.rig.machine import Guest
-from tests.rig.notes import HOW
+from tests.rig.notes import HOW, Note
 from tests.rig.sound import known, not_wrong
 
 pytestmark = pytest.mark.skipif(
@@ -36,8 +36,6 @@ pytestmark = pytest.mark.skipif(
     reason="installs a bare guest; PALPATE_RIG=full python -m tests.campaigns test-rig",
 )
 pytest.importorskip("pyinfra", reason="no pyinfra here; pip install -e .[deploy]")
-
-Note = Callable[[str, str, int], None]
 
 BOOT_S, BACK_S = 300, 180
 INSTALL_S = 1800

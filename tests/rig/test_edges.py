@@ -7,18 +7,15 @@ Seen from the robot: statuses, READY, FAULT and the other lines, and a right swe
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 import pytest
 
 from palpate.client.answers import Answer
-from palpate.sim import script
 from tests.rig.cell import Cell, Touch
-from tests.rig.sound import check_recovers, known, let_go, not_wrong, until
-
-Count = Callable[[int, int], int]
-Note = Callable[[str, str, int], None]
+from tests.rig.notes import Count, Note
+from tests.rig.sound import check_recovers, let_go, not_wrong
 
 OTHER_WIRING = """
 [trigger]
@@ -53,12 +50,6 @@ guest in no less."""
 LOST_EDGES = 15
 """Of a state sentence: the edges that the kernel dropped (PROTOCOL.md, part 2)."""
 WIDTHS_S = (0.0005, 0.001, 0.002, 0.005)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def robot(shared: Cell) -> None:
-    """Sweeps whose answer is known, and large packets: speed does not matter here."""
-    shared.acts, shared.packet_frames = known(script.tubes(3)), 18
 
 
 def pulse(cell: Cell, name: str, width_s: float = 0.1) -> None:
@@ -155,7 +146,7 @@ def test_second_start_and_glitches_in_a_sweep(cell: Cell, count: Count, note: No
         touch = cell.touch()
         first = cell.answer(since)
         assert first.status == "no-stop"
-        until(cell, touch.start_ns + PULSE_NS)
+        cell.clock.sleep_until(touch.start_ns + PULSE_NS)
         glitches = 0
         while cell.clock.now_ns() < touch.stop_ns - PULSE_NS:
             glitch(cell, "START")
@@ -283,7 +274,7 @@ def test_other_wiring(cell: Cell, count: Count, note: Note) -> None:
         touch, since = one_line_sweep(cell)
         results += [(touch, *answers(cell, since, 1))]
         assert cell.lines.wait("READY", True, 10)
-        until(cell, touch.stop_ns + SECOND // 3)
+        cell.clock.sleep_until(touch.stop_ns + SECOND // 3)
         seen = [(name, level) for _, name, level in cell.lines.log[begun:]]
         assert (
             seen.index((BUSY, True)) < seen.index((DECIDED, True))

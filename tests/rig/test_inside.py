@@ -5,13 +5,13 @@ from __future__ import annotations
 
 import re
 import threading
-from collections.abc import Callable
 from pathlib import Path
 
 from tests.backends import remote
 from tests.rig.image import Image
 from tests.rig.inside import GuestControls, pack
 from tests.rig.machine import Guest
+from tests.rig.notes import Count, Note
 
 PYTEST = (
     "/opt/palpate/bin/python -m pytest -q -rs -p no:cacheprovider tests/palpate/io/test_backends.py"
@@ -29,8 +29,8 @@ CODE = (
 def test_the_contract_holds_on_a_real_kernel(
     image: Image,
     tmp_path: Path,
-    count: Callable[[int, int], int],
-    note: Callable[[str, str, int], None],
+    count: Count,
+    note: Note,
 ):
     """test_backends.py with real libusb, libgpiod and termios on xHCI, PL061 and a 16550; a part of
     it where time is short."""

@@ -6,22 +6,17 @@ Sentences resume without help, and until then sweeps are answered on the lines.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from palpate.bundle import bundle
 from palpate.client.answers import Answer
 from palpate.core.sentences import MAX_LINE, checksum
-from palpate.sim import script
 from tests.rig.cell import Cell, Touch
 from tests.rig.far_end import ADAPTER, FarEnd
-from tests.rig.sound import known, not_wrong
-
-Count = Callable[[int, int], int]
-Note = Callable[[str, str, int], None]
+from tests.rig.notes import Count, Note
+from tests.rig.sound import not_wrong
 
 PORT = "/dev/palpate-robot"
 DROPPED, LOST_FRAMES = 8, 5
@@ -31,12 +26,6 @@ HOLD = (
     "import fcntl, sys, termios, time; f = open(sys.argv[1]); "
     "fcntl.ioctl(f, termios.TIOCEXCL); time.sleep(600)"
 )
-
-
-@pytest.fixture(scope="module", autouse=True)
-def robot(shared: Cell) -> None:
-    """Sweeps whose answer is known, and large packets: speed does not matter here."""
-    shared.acts, shared.packet_frames = known(script.tubes(4)), 18
 
 
 def shown(cell: Cell) -> Touch:

@@ -12,7 +12,6 @@ import random
 import shutil
 import subprocess
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,7 +24,7 @@ from tests.rig.cell import Cell, Touch
 from tests.rig.image import Image
 from tests.rig.kept import ANSWERED, KEPT, CampaignLog, found, lost, owed, runs_with, sweeps, whole
 from tests.rig.machine import Guest
-from tests.rig.notes import HOW
+from tests.rig.notes import HOW, Count, Note
 from tests.rig.sound import known
 
 START_S = 6
@@ -140,7 +139,7 @@ def killed(image: Image, folder: Path, ledger: CampaignLog, n: int, rng: random.
     assert not harmed
 
 
-def test_killed(image: Image, tmp_path: Path, count: Callable[..., int], note: Callable[..., None]):
+def test_killed(image: Image, tmp_path: Path, count: Count, note: Note):
     """SIGKILL at random moments, while starting, idle and sweeping: READY again each time, no kept
     sweep is lost."""
     ledger, rng = CampaignLog("kills", image.disk), random.Random()
@@ -220,9 +219,7 @@ def cut(
 @pytest.mark.skipif(
     HOW != "full", reason="boots for each cut; PALPATE_RIG=full python -m tests.campaigns test-rig"
 )
-def test_power_cut(
-    image: Image, disk: Path, tmp_path: Path, count: Callable[..., int], note: Callable[..., None]
-):
+def test_power_cut(image: Image, disk: Path, tmp_path: Path, count: Count, note: Note):
     """The power goes at random moments, while booting, idle and sweeping: it boots again, the file
     system is sound, no kept sweep is lost."""
     ledger, rng = CampaignLog("cuts", image.disk), random.Random()

@@ -25,14 +25,12 @@ from tests.factories.skins.wires import wire
 from tests.rig.cell import SEEN_S, Cell
 from tests.rig.far_end import ADAPTER
 from tests.rig.image import Image
-from tests.rig.kept import PALPATE, runs_with
+from tests.rig.kept import checked, runs_with
 from tests.rig.machine import START_S, Guest
+from tests.rig.notes import Count, Note
 from tests.rig.pulled import after, before, during
 from tests.rig.shell import GuestFailed
 from tests.rig.sound import check_recovers, known, not_wrong, state
-
-Count = Callable[[int, int], int]
-Note = Callable[[str, str, int], None]
 
 SETTINGS = f"""
 [skin]
@@ -153,18 +151,10 @@ def test_check_finds_it_through_the_kernels_driver(cell: Cell):
         "/ftdi_sio" in run("readlink -f /sys/bus/usb-serial/devices/ttyUSB*/driver", check=True).out
     )
     assert run(f"readlink -f {ADAPTER}", check=True).out.startswith("/dev/ttyUSB")
-    run("systemctl stop palpate", check=True)
-    try:
-        done = run(
-            f"runuser -u palpate -G dialout -G gpio -G plugdev -- {PALPATE} check", timeout_s=90
-        )
-        assert done.rc == 0, done.out
-        assert "FAIL" not in done.out
-        assert "matrix R1, 4x4 uint8 at 750 Hz" in done.out
-        assert "whether frames were lost cannot be seen" in done.out
-    finally:
-        run("systemctl start --no-block palpate", check=True)
-    cell.until_ready()
+    said = checked(cell)
+    assert "FAIL" not in said
+    assert "matrix R1, 4x4 uint8 at 750 Hz" in said
+    assert "whether frames were lost cannot be seen" in said
 
 
 def test_recorded_through_a_replug(cell: Cell, note: Note):

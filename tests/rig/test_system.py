@@ -11,7 +11,6 @@ import base64
 import json
 import time
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -22,7 +21,7 @@ from palpate.sweeps.capture import Playback
 from tests.rig.cell import Cell
 from tests.rig.image import GUEST_PYTHON
 from tests.rig.kept import DROP_IN, KEPT, runs_with
-from tests.rig.notes import HOW
+from tests.rig.notes import HOW, Count, Note
 from tests.rig.sound import TRIES, begin, check_recovers, known, not_wrong, state, until_state
 
 CAPTURE = "/run/capture"
@@ -125,7 +124,7 @@ def used_k(cell: Cell) -> int:
     return int(cell.machine.run(f"df --output=used -k {KEPT} | tail -1", check=True).out)
 
 
-def test_disk_full_at_each_write(box: Cell, note: Callable[..., None]):
+def test_disk_full_at_each_write(box: Cell, note: Note):
     """Space for n pages, or for no file: every sweep is answered, the first failure is logged, and
     only whole files stay."""
     empty = used_k(box)
@@ -150,7 +149,7 @@ def test_disk_full_at_each_write(box: Cell, note: Callable[..., None]):
     )
 
 
-def test_disk_full_of_a_capture(box: Cell, tmp_path: Path, note: Callable[..., None]):
+def test_disk_full_of_a_capture(box: Cell, tmp_path: Path, note: Note):
     """The capture's disk is full: this is logged once, the capture ends, sweeps go on, and the
     partial file can be played."""
     until_logged(
@@ -175,7 +174,7 @@ def test_disk_full_of_a_capture(box: Cell, tmp_path: Path, note: Callable[..., N
 
 
 @needs_time
-def test_disk_full_for_the_journal(box: Cell, note: Callable[..., None]):
+def test_disk_full_for_the_journal(box: Cell, note: Note):
     """No space for the journal nor anywhere else: sweeps and plugs go on; it is written again when
     there is space."""
     fill = (
@@ -203,7 +202,7 @@ def test_disk_full_for_the_journal(box: Cell, note: Callable[..., None]):
     )
 
 
-def test_clock_set(box: Cell, note: Callable[..., None]):
+def test_clock_set(box: Cell, note: Note):
     """An hour back and a year forward in the middle of sweeps: answers, times and files know
     nothing of it."""
     for change in ("-1 hour", "+1 year"):
@@ -254,7 +253,7 @@ def swept(cell: Cell) -> str:
     return by_hand(cell)
 
 
-def test_processor_loaded(box: Cell, count: Callable[..., int], note: Callable[..., None]):
+def test_processor_loaded(box: Cell, count: Count, note: Note):
     """Four programs that use all of the processor: each sweep is answered, losses are counted, no
     answer is wrong.
 
@@ -285,7 +284,7 @@ def test_processor_loaded(box: Cell, count: Callable[..., int], note: Callable[.
     )
 
 
-def test_permission_lost(box: Cell, note: Callable[..., None]):
+def test_permission_lost(box: Cell, note: Note):
     """The skin's node and the folder are taken away from the service: named, sweeps `not-ready` or
     not kept; given back, both are used again."""
     guest = box.machine
@@ -332,7 +331,7 @@ def test_permission_lost(box: Cell, note: Callable[..., None]):
 
 
 @needs_time
-def test_memory_limit(box: Cell, note: Callable[..., None]):
+def test_memory_limit(box: Cell, note: Note):
     """The unit's memory is cut to nothing: the program is killed, started again, and READY once it
     has its memory."""
     restarts = "systemctl show -P NRestarts palpate"
@@ -349,7 +348,7 @@ def test_memory_limit(box: Cell, note: Callable[..., None]):
 
 
 @needs_time
-def test_settings_and_bundle_broken(box: Cell, note: Callable[..., None]):
+def test_settings_and_bundle_broken(box: Cell, note: Note):
     """A misspelt key, a bundle cut short: each is named, READY stays low, no restart; mended and
     started, it comes up."""
     guest, again = box.machine, "systemctl restart --no-block palpate"
@@ -379,7 +378,7 @@ def test_settings_and_bundle_broken(box: Cell, note: Callable[..., None]):
     )
 
 
-def test_bundle_files_broken(box: Cell, note: Callable[..., None]):
+def test_bundle_files_broken(box: Cell, note: Note):
     """Each file of a bundle cut short, empty, missing, altered by one bit: each is refused as a
     BundleError that names it."""
     logged = box.machine.run(

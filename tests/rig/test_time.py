@@ -22,10 +22,8 @@ from palpate.sim import rig, script, skin
 from tests.rig.cell import Cell
 from tests.rig.kept import KEPT, runs_with
 from tests.rig.machine import Guest
-from tests.rig.notes import HOW
+from tests.rig.notes import HOW, Note
 from tests.rig.sound import LATE, known, not_wrong
-
-Note = Callable[[str, str, int], None]
 
 pytestmark = pytest.mark.skipif(
     HOW != "full", reason="one of the full run's: the service is started anew"

@@ -14,25 +14,19 @@ from pathlib import Path
 
 import pytest
 
-from palpate.sim import script
 from tests.rig.cell import Cell
-from tests.rig.notes import HOW
+from tests.rig.notes import HOW, Count, Note
 from tests.rig.pulled import SECOND, after, before, during
 from tests.rig.sound import (
     begin,
     check_recovers,
-    known,
     let_go,
     not_wrong,
     only_answer,
     state,
-    until,
     until_state,
 )
 from tests.rig.usbredir import UsbRedirPeer
-
-Count = Callable[[int, int], int]
-Note = Callable[[str, str, int], None]
 
 HUB = "0409:55aa"
 RESETS = {
@@ -43,12 +37,6 @@ RESETS = {
     "echo 1-1 > unbind; "
     "echo 1-1 > bind",
 }
-
-
-@pytest.fixture(scope="module", autouse=True)
-def robot(shared: Cell) -> None:
-    """Sweeps whose answer is known, and large packets: speed does not matter here."""
-    shared.acts, shared.packet_frames = known(script.tubes(2)), 18
 
 
 @pytest.mark.parametrize("when", [before, during, after])
@@ -124,7 +112,7 @@ def test_resets(cell: Cell, count: Count, note: Note, what: str):
         landed = cell.clock.now_ns() < touch.stop_ns
         status = not_wrong(touch, cell.answer(since))
         assert status == "sensor-lost" or not landed, status
-        until(cell, touch.stop_ns + SECOND // 2)
+        cell.clock.sleep_until(touch.stop_ns + SECOND // 2)
         assert len(cell.answers(since)) == 1
         outcomes[status] += 1
         check_recovers(cell)

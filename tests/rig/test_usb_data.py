@@ -15,22 +15,17 @@ import pytest
 
 from palpate.core.clock import Clock
 from palpate.io import packets
-from palpate.sim import script
 from tests.rig.cell import Cell
-from tests.rig.notes import HOW
+from tests.rig.notes import HOW, Count, Note
 from tests.rig.sound import (
     begin,
     check_recovers,
-    known,
     not_wrong,
     only_answer,
     state,
-    until,
     until_state,
 )
 
-Count = Callable[[int, int], int]
-Note = Callable[[str, str, int], None]
 Mangle = Callable[[bytes], bytes]
 
 SECOND = 1_000_000_000
@@ -148,12 +143,6 @@ class Cable:
         return self._harm(data)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def robot(shared: Cell) -> None:
-    """Sweeps whose answer is known, and large packets: speed does not matter here."""
-    shared.acts, shared.packet_frames = known(script.tubes(2)), 18
-
-
 @pytest.mark.parametrize("what", FAULTS if HOW == "full" else QUICK)
 def test_data_that_cannot_be_right(cell: Cell, count: Count, note: Note, what: str):
     """Damaged during a sweep: a single answer that says so, none that is wrong; damage beside the
@@ -167,7 +156,7 @@ def test_data_that_cannot_be_right(cell: Cell, count: Count, note: Note, what: s
             fault, cell.clock, touch.start_ns + round(fault.begin_s * SECOND)
         )
         status = not_wrong(touch, cell.answer(since))
-        until(cell, touch.stop_ns + SECOND // 2)
+        cell.clock.sleep_until(touch.stop_ns + SECOND // 2)
         assert len(cell.answers(since)) == 1
         assert cable.left < fault.transfers, "nothing was harmed"
         cell.cable.mangle = bytes
@@ -188,11 +177,11 @@ def test_a_skin_that_stops_sending(cell: Cell, count: Count, note: Note, what: s
     n = count(1, 3)
     for _ in range(n):
         touch, since = begin(cell)
-        until(cell, touch.start_ns + SECOND)
+        cell.clock.sleep_until(touch.start_ns + SECOND)
         setattr(cell.cable, what, True)
         assert not_wrong(touch, only_answer(cell, since)) == "sensor-lost"
         cell.cable.silent = False
-        until(cell, touch.stop_ns + SECOND // 2)
+        cell.clock.sleep_until(touch.stop_ns + SECOND // 2)
         assert len(cell.answers(since)) == 1
         check_recovers(cell)
         assert not cell.cable.halted

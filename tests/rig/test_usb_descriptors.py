@@ -7,18 +7,12 @@ working skin streams afterwards.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
 from dataclasses import dataclass
 
-import pytest
-
-from palpate.sim import script
 from tests.rig.cell import Cell
-from tests.rig.notes import HOW
-from tests.rig.sound import check_recovers, known, state, until_state
+from tests.rig.notes import HOW, Note
+from tests.rig.sound import check_recovers, state, until_state
 from tests.rig.usbredir import Descriptors
-
-Note = Callable[[str, str, int], None]
 
 SOUND = Descriptors()
 FACE, END = SOUND.configuration[9:18], SOUND.configuration[18:]
@@ -92,12 +86,6 @@ OPINIONS = {"streaming", "mismatch", "lost", "silent", "busy"}
 QUIET_S, LOOK_S = 1.0, 30
 """The kernel has done with a device when it has asked it nothing for so long; the longest wait for
 that."""
-
-
-@pytest.fixture(scope="module", autouse=True)
-def robot(shared: Cell) -> None:
-    """Sweeps whose answer is known, and large packets: speed does not matter here."""
-    shared.acts, shared.packet_frames = known(script.tubes(2)), 18
 
 
 def service(cell: Cell) -> str:

@@ -4,17 +4,20 @@ as a service on arm64."""
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable
 
 from palpate.bundle import bundle
 from tests.rig.cell import Cell
+from tests.rig.kept import checked
+from tests.rig.notes import Note
 
 LABELS = bundle.load(bundle.DEFAULT).manifest.labels
 
 
-def test_sweeps_become_sentences_and_codes(cell: Cell, note: Callable[[str, str, int], None]):
+def test_sweeps_become_sentences_and_codes(cell: Cell, note: Note):
     """Six tubes: each start edge has one answer, right or with the reason, in words and on the
     lines; no frame is lost."""
+    cell.packet_frames = 6
+    cell.restore()
     before, ms, right = cell.state(), [], 0
     for _ in range(6):
         touch, answer = cell.sweep()
@@ -71,18 +74,7 @@ def test_the_service_has_no_more_rights_than_it_needs(cell: Cell):
 def test_check_names_each_part(cell: Cell):
     """`palpate check` in the place of the service: bundle, golden sweeps, skin, lines and port are
     there."""
-    run = cell.machine.run
-    run("systemctl stop palpate", check=True)
-    try:
-        done = run(
-            "runuser -u palpate -G dialout -G gpio -G plugdev -- /opt/palpate/bin/palpate check",
-            timeout_s=90,
-        )
-        assert done.rc == 0, done.out
-        assert "FAIL" not in done.out
-    finally:
-        run("systemctl start --no-block palpate", check=True)
-    cell.until_ready()
+    assert "FAIL" not in checked(cell)
 
 
 def test_the_skin_has_its_name(cell: Cell):
