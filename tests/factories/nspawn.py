@@ -64,6 +64,7 @@ sys.exit(main())
 SIM = "ExecStart=\nExecStart=/opt/palpate/bin/palpate run --sim skin\n"
 CABLED = "ExecStart=\nExecStart=/opt/palpate/bin/python /opt/palpate/cable.py run --sim skin\n"
 PALPATE = "/opt/palpate/bin/palpate"
+NOBODY = ("setpriv", "--reuid=nobody", "--regid=nogroup", "--clear-groups")
 SITE = "/etc/palpate/palpate.toml"
 STREAMS = r"skin streaming\. Sweeps answered: \d+"
 WAIT_S = 60
@@ -202,6 +203,20 @@ class Machine:
         who = ("setpriv", f"--reuid={user}", "--regid=palpate", "--clear-groups")
         return self.run("nsenter", "-t", str(pid), "-m", *who, *command)
 
+    def check_unit(self, name: str) -> None:
+        """Check that systemd reports no problem of a unit, and an exposure of at most 1.5 of 10."""
+        done = self.run("systemd-analyze", "verify", name.replace("@.", "@tcp."))
+        assert (done.returncode, done.stderr) == (0, "")
+        how = ("security", "--offline=true", "--threshold=15", PLACES[name])
+        done = self.run("systemd-analyze", *how)
+        assert done.returncode == 0, done.stdout
+
+    def until(self, condition: str) -> None:
+        """Wait for a shell command to succeed."""
+        tries = f"for i in $(seq {2 * WAIT_S}); do {condition} && exit; sleep 0.5; done; exit 1"
+        done = self.run("sh", "-c", tries, limit_s=2 * WAIT_S)
+        assert done.returncode == 0, self.get("journalctl", "-q", "-n", "30", "-o", "cat")
+
     def shown(self, unit: str, name: str) -> str:
         """A property of a unit."""
         return self.get("systemctl", "show", unit, "--value", "-p", name)
@@ -293,10 +308,7 @@ class Service:
 
     def status(self) -> dict[str, Any]:
         """The output of `palpate status --json` for an unprivileged user."""
-        text = self.machine.run(
-            "setpriv", "--reuid=nobody", "--clear-groups", PALPATE, "status", "--json"
-        ).stdout
-        return dict(json.loads(text))
+        return dict(json.loads(self.machine.run(*NOBODY, PALPATE, "status", "--json").stdout))
 
 
 def pack(parcel: Path, source: Path) -> None:

@@ -1,11 +1,8 @@
 """Skins on a serial line in virtual time, by the name of a profile.
 
-For each skin: the expected content of its frames, their bytes after the makers' descriptions, and a
-port that delivers them with a driver's buffer and every fault.
-
-The bytes are on purpose not those of `tests.factories.skins.wires`. The second implementation makes
-other choices where a skin allows several (width of offsets, order of fields, separators), so a
-misreading in one of them shows.
+For each skin: the expected content of its frames, their bytes, and a port that delivers them with a
+driver's buffer and every fault. Where a skin allows several bytes (width of offsets, separators,
+commands), these are not the same as those of the emulated skins.
 """
 
 from __future__ import annotations
@@ -28,6 +25,7 @@ from palpate.io.serial_sensor import SerialSensor
 from palpate.io.skin_profile import SkinProfile
 from palpate.sim.rig import VirtualClock
 from tests.factories.paths import ROOT
+from tests.factories.skins import wires
 
 FOLDER = ROOT / "firmware_config" / "skins"
 NAMES = sorted(path.stem for path in FOLDER.glob("*.toml") if path.stem != "palpate")
@@ -47,7 +45,7 @@ def taxels(p: SkinProfile, i: int) -> NDArray[np.generic]:
     """Raw counts of frame `i`: [R, C] or [R, C, A], different in every frame and taxel."""
     format = p.format
     shift = (np.arange(format.channels).reshape(format.shape) * 7 + i * 13) % 199
-    return (shift / 8 if format.dtype == "float32" else shift).astype(format.numpy_type)
+    return (shift / 4 if format.dtype == "float32" else shift).astype(format.numpy_type)
 
 
 def numbers(p: SkinProfile, i: int) -> NDArray[np.generic]:
@@ -57,35 +55,22 @@ def numbers(p: SkinProfile, i: int) -> NDArray[np.generic]:
     return grid
 
 
+VARIANTS: dict[str, Callable[[bytes], bytes]] = {
+    "reskin": lambda data: data.replace(b"\t", b" "),
+    "3d-vitac": lambda data: data.replace(b"\r\n", b"\n"),
+    "xela-can": bytes.lower,
+    "robotiq-tsf": lambda data: data[:2] + bytes([wires.Robotiq.READ]) + data[3:],
+}
+"""Other choices of the bytes, where a skin allows several."""
+
+
 @lru_cache(20_000)
 def wire(name: str, i: int, period_ns: float = 1e6) -> bytes:
-    """Frame `i` of a packaged profile as bytes, after the maker's description. period_ns: of its
-    clock.
-    """
-    grid = numbers(profile(name), i)
-    return (
-        papillarray(grid, i, period_ns=period_ns)
-        if name == "papillarray"
-        else _WIRES[name](grid, i)
-    )
-
-
-def _bytes_after_a_marker(grid: NDArray[np.generic], i: int) -> bytes:
-    return b"\xaa\x55" + grid.astype(np.uint8).tobytes()
-
-
-def _floats_and_crlf(grid: NDArray[np.generic], i: int) -> bytes:
-    return struct.pack(f"<{grid.size}f", *grid.ravel().tolist()) + b"\r\n"
-
-
-def _one_line(grid: NDArray[np.generic], i: int) -> bytes:
-    return " ".join(f"{value:.3f}" for value in grid.ravel().tolist()).encode() + b"\r\n"
-
-
-def _lines(grid: NDArray[np.generic], i: int) -> bytes:
-    return (
-        b"".join(" ".join(map(str, row)).encode() + b"\n" for row in grid[..., 0].tolist()) + b"\n"
-    )
+    """Frame `i` of a packaged profile as bytes. period_ns: of its clock."""
+    if name == "papillarray":
+        return papillarray(numbers(profile(name), i), i, period_ns=period_ns)
+    data = wires.wire(name, 1e9 / period_ns).frame(taxels(profile(name), i), 0)
+    return VARIANTS.get(name, bytes)(data)
 
 
 def papillarray(
@@ -106,43 +91,8 @@ def papillarray(
         )
     table = 1 + 2 * 3
     content = bytes([1]) + struct.pack("<HBHB", 1, table, 3, table + len(clock)) + clock + body
-    return (
-        b"\x55\x66\x77\x88"
-        + content
-        + struct.pack("<H", sum(content) & 0xFFFF)
-        + b"\xaa\xbb\xcc\xdd"
-    )
-
-
-def _can_lines(grid: NDArray[np.generic], i: int) -> bytes:
-    rows = grid.reshape(-1, 3).tolist()
-    return b"".join(
-        f"t{0x710 + k:03X}8{bytes([0]).hex()}{struct.pack('>3H', *row).hex().upper()}00\r".encode()
-        for k, row in enumerate(rows)
-    )
-
-
-def _tsf_packet(grid: NDArray[np.generic], i: int) -> bytes:
-    fields = b""
-    for finger, part in enumerate(grid.reshape(-1, 28).tolist()):
-        fields += (
-            bytes([0x10 | finger << 2])
-            + struct.pack(">28H", *part)
-            + bytes([0x20 | finger << 2])
-            + b"\x00\x07"
-        )
-    return bytes([0x9A, 0, 0x61, len(fields)]) + fields
-
-
-_WIRES: dict[str, Callable[[NDArray[np.generic], int], bytes]] = {
-    "flexitac": _bytes_after_a_marker,
-    "matrix": _bytes_after_a_marker,
-    "anyskin": _floats_and_crlf,
-    "reskin": _one_line,
-    "3d-vitac": _lines,
-    "xela-can": _can_lines,
-    "robotiq-tsf": _tsf_packet,
-}
+    check = struct.pack("<H", sum(content) & 0xFFFF)
+    return wires.PapillArray.START + content + check + wires.PapillArray.END
 
 
 @dataclass

@@ -11,7 +11,17 @@ import pytest
 
 from tests.factories import nspawn
 from tests.factories.emulated_machines import ROOT
-from tests.factories.nspawn import CABLED, PALPATE, SIM, SITE, STREAMS, WAIT_S, Machine, Service
+from tests.factories.nspawn import (
+    CABLED,
+    NOBODY,
+    PALPATE,
+    SIM,
+    SITE,
+    STREAMS,
+    WAIT_S,
+    Machine,
+    Service,
+)
 
 pytestmark = [pytest.mark.slow, pytest.mark.thorough]  # systemd in a container
 
@@ -27,15 +37,10 @@ def test_the_tools_of_systemd_make_what_the_service_needs(machine: Machine, befo
     run changes nothing."""
     assert before == [False, False, False]
     for _ in range(2):
-        assert set(machine.get("id", "-nG", "palpate").split()) == {
-            "palpate",
-            "dialout",
-            "gpio",
-            "plugdev",
-        }
-        assert machine.get("getent", "passwd", "palpate").endswith(
-            ":/var/lib/palpate:/usr/sbin/nologin"
-        )
+        groups = machine.get("id", "-nG", "palpate").split()
+        assert sorted(groups) == ["dialout", "gpio", "palpate", "plugdev"]
+        entry = machine.get("getent", "passwd", "palpate")
+        assert entry.endswith(":/var/lib/palpate:/usr/sbin/nologin")
         assert len(machine.get("getent", "group", "gpio", "dialout", "plugdev").splitlines()) == 3
         own = [f"/var/lib/palpate{folder}" for folder in ("", "/incoming", "/bundles")]
         folders = machine.get("stat", "-c", "%n %U:%G %a", "/etc/palpate", *own).splitlines()
@@ -50,23 +55,13 @@ def test_the_tools_of_systemd_make_what_the_service_needs(machine: Machine, befo
 def test_the_unit_is_sound_and_hardened(machine: Machine, before: list[bool]):
     """systemd reports no problem and reads the times as meant; the exposure is at most 1.5 of
     10."""
-    done = machine.run("systemd-analyze", "verify", nspawn.PLACES["palpate.service"])
-    assert (done.returncode, done.stderr) == (0, "")
+    machine.check_unit("palpate.service")
     shown = dict(
         line.split("=", 1) for line in machine.get("systemctl", "show", "palpate").splitlines()
     )
     wanted = {"Type": "notify", "NotifyAccess": "main", "Restart": "always", "RestartUSec": "2s"}
     wanted |= {"TimeoutStartUSec": "1min", "TimeoutStopUSec": "10s", "StartLimitIntervalUSec": "0"}
     assert {name: shown[name] for name in wanted} == wanted
-    done = machine.run(
-        "systemd-analyze",
-        "security",
-        "--offline=true",
-        "--threshold=15",
-        nspawn.PLACES["palpate.service"],
-    )
-    print(done.stdout.splitlines()[-1])
-    assert done.returncode == 0, done.stdout
 
 
 def test_the_udev_rules_are_sound(machine: Machine, before: list[bool]):
@@ -98,11 +93,7 @@ def test_it_is_active_with_the_first_frames_of_its_skin(machine: Machine, servic
     stays active without it."""
     service.configure(CABLED + f"TimeoutStartSec={START_S}\nWatchdogSec={START_S}")
     machine.get("systemctl", "start", "--no-block", "palpate")
-    absent = (
-        r"skin absent: no skin 1209:7ac7 on USB .* check cable, power and udev rule\. Sweeps "
-        r"answered: \d"
-    )
-    service.until("StatusText", absent)
+    service.until("StatusText", r"skin absent: no skin 1209:7ac7 on USB .* answered: \d")
     time.sleep(2.1 * START_S)
     assert (service["ActiveState"], service["NRestarts"]) == ("activating", "0")
     machine.put("/run/skin", "")
@@ -173,15 +164,9 @@ def test_a_killed_process_is_started_again(machine: Machine, service: Service, s
     service.until("NRestarts", "1")
     service.until("ActiveState", "active")
     assert int(service["MainPID"]) not in (0, first)
-    assert (
-        sum("Main process exited, code=killed, status=" in line for line in service.journal()) == 1
-    )
-    lowered = [
-        line for line in service.log_lines() if line.startswith("palpate: outputs may not be low:")
-    ]
-    assert [line.split(": ")[2].split(";")[0] for line in lowered] == [
-        "this machine has no /dev/gpiochip*"
-    ]
+    assert sum("exited, code=killed, status=" in line for line in service.journal()) == 1
+    (lowered,) = [line for line in service.log_lines() if "outputs may not be low" in line]
+    assert "/dev/gpiochip*" in lowered
 
 
 def test_settings_that_cannot_be_used_end_it(machine: Machine, service: Service):
@@ -192,11 +177,8 @@ def test_settings_that_cannot_be_used_end_it(machine: Machine, service: Service)
     service.kill("SIGKILL")
     service.until("ActiveState", "failed")
     time.sleep(2.5)  # longer than RestartSec
-    assert (service["NRestarts"], service["ExecMainStatus"], service["SubState"]) == (
-        "1",
-        "78",
-        "failed",
-    )
+    ended = [service[name] for name in ("NRestarts", "ExecMainStatus", "SubState")]
+    assert ended == ["1", "78", "failed"]
     named = f"palpate: {SITE}: sweep.max_duration_s = 'for ever'"
     assert sum(line.startswith(named) for line in service.log_lines()) == 1
     machine.get("rm", SITE)
@@ -216,12 +198,7 @@ def test_hardware_that_is_not_there_is_looked_for_again(machine: Machine, servic
     print(f"three starts in {took_s:.1f} s")
     assert took_s > 4
     assert service["ExecMainStatus"] in ("0", "69")
-    named = [
-        line
-        for line in service.log_lines()
-        if line.startswith("palpate: this machine has no /dev/gpiochip*")
-    ]
-    assert len(named) in (3, 4)
+    assert sum("no /dev/gpiochip*" in line for line in service.log_lines()) in (3, 4)
 
 
 def test_a_stop_answers_the_open_sweep(machine: Machine, service: Service):
@@ -233,13 +210,9 @@ def test_a_stop_answers_the_open_sweep(machine: Machine, service: Service):
     machine.get("systemctl", "stop", "palpate")
     assert "palpate.service: Deactivated successfully." in service.journal()
     answers = service.answers()
-    assert [line.split(":")[0] for line in answers] == [
-        f"sweep {i + 1}" for i in range(len(answers))
-    ]
-    assert (
-        answers[-1]
-        == f"sweep {len(answers)}: no answer, aborted: by command, or because the box was stopping"
-    )
+    numbers = [line.split(":")[0] for line in answers]
+    assert numbers == [f"sweep {i + 1}" for i in range(len(answers))]
+    assert "aborted" in answers[-1]
 
 
 def test_the_journal_has_one_line_an_event(machine: Machine, service: Service):
@@ -265,7 +238,7 @@ def test_the_journal_has_one_line_an_event(machine: Machine, service: Service):
 def test_every_user_may_ask_how_it_is(machine: Machine, service: Service):
     """`palpate status` by a user without privileges: running, skin away (exit 69), stopped (exit
     1)."""
-    ask = ("setpriv", "--reuid=nobody", "--regid=nogroup", "--clear-groups", PALPATE, "status")
+    ask = (*NOBODY, PALPATE, "status")
     machine.put("/run/skin", "")
     pid = service.start(CABLED)
     service.until("StatusText", STREAMS)
@@ -309,22 +282,12 @@ def test_it_is_nobody_in_particular(machine: Machine, service: Service):
     assert {int(status[name], 16) for name in ("CapPrm", "CapEff", "CapBnd", "CapAmb")} == {0}
     assert (status["NoNewPrivs"], status["Seccomp"]) == ("1", "2")
     machine.put(SITE, "")
-    as_palpate = (
-        "nsenter",
-        "-t",
-        str(pid),
-        "-m",
-        "setpriv",
-        "--reuid=palpate",
-        "--regid=palpate",
-        "--clear-groups",
-    )
-    assert machine.run(*as_palpate, "cat", SITE).returncode == 0
+    assert machine.as_user(pid, "palpate", "cat", SITE).returncode == 0
     for path in (SITE, "/etc/palpate/new", "/opt/palpate/new", "/root/new"):
-        assert machine.run(*as_palpate, "touch", path).returncode != 0
+        assert machine.as_user(pid, "palpate", "touch", path).returncode != 0
         # not even root could
         assert "Read-only" in machine.run("nsenter", "-t", str(pid), "-m", "touch", path).stderr
-    machine.get(*as_palpate, "touch", "/var/lib/palpate/new")
+    assert machine.as_user(pid, "palpate", "touch", "/var/lib/palpate/new").returncode == 0
 
 
 def test_what_it_can_write_it_cannot_execute(machine: Machine, service: Service):

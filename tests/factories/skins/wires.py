@@ -1,134 +1,94 @@
 """The bytes that emulated skins send for frames of raw counts, and their answers to commands of the
 box.
 
-Each class is the skin's side of one serial line. Sources are the readers and firmware published by
-makers and users, named at each class. None of the skins was available.
+Sources are the readers and firmware published by makers and users, named at each skin. None of the
+skins was available.
 """
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Protocol
+from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 Taxels = NDArray[Any]
+TEMPERATURE = 25.0
 
 
-class Wire(Protocol):
-    """The skin's side of its serial line. period_ns: time between two frames. streaming: whether it
-    sends frames."""
+class Wire:
+    """The skin's side of its serial line. Plain skins stream from power-on, take no commands, and
+    number no frames.
 
-    period_ns: float
+    encode: the bytes of a frame [R, C] or [R, C, A]. period_ns: time between two frames. streaming:
+    whether frames are sent; for some skins commands decide.
+    """
+
+    def __init__(self, encode: Callable[[Taxels], bytes], rate_hz: float) -> None:
+        self.encode, self.period_ns = encode, 1e9 / rate_hz
 
     @property
     def streaming(self) -> bool:
-        """Whether frames are sent; for some skins commands decide."""
-        ...
+        """Always."""
+        return True
 
     def frame(self, taxels: Taxels, t_us: int) -> bytes:
-        """The bytes of one frame [R, C] or [R, C, A]. t_us: the skin's own time."""
-        ...
+        """The bytes of one frame. t_us: the skin's own time."""
+        return self.encode(taxels)
 
     def receive(self, data: bytes) -> bytes:
         """The skin's answer to bytes from the box."""
-        ...
+        return b""
 
     def skip(self, frames: int) -> None:
         """This many frames are taken and never sent; a skin that counts frames counts them."""
-        ...
 
 
-class _Uncounted:
-    """A skin whose frames have no number."""
+def marked(taxels: Taxels) -> bytes:
+    """FlexiTac and most self-made matrices: a marker, then all taxels row by row as bytes.
 
-    def skip(self, frames: int) -> None:
-        """Does nothing: the gap is invisible."""
-
-
-class _Deaf(_Uncounted):
-    """A skin that streams from power-on and takes no commands."""
-
-    streaming = True
-
-    def __init__(self, rate_hz: float) -> None:
-        self.period_ns = 1e9 / rate_hz
-
-    def receive(self, data: bytes) -> bytes:
-        """Does nothing: the skin does not listen."""
-        return b""
-
-
-class Marked(_Deaf):
-    """A marker, then all taxels row by row: FlexiTac and most self-made matrices.
-
-    Source: flexitac 0.3.1, firmware/template.ino (AA 55, R x C uint8).
+    Source: flexitac 0.3.1, firmware/template.ino.
     """
-
-    def __init__(
-        self, rate_hz: float, marker: bytes = b"\xaa\x55", dtype: str = "u1", trailer: bytes = b""
-    ) -> None:
-        super().__init__(rate_hz)
-        self._marker, self._dtype, self._trailer = marker, dtype, trailer
-
-    def frame(self, taxels: Taxels, t_us: int) -> bytes:
-        """Marker, numbers, trailer."""
-        return self._marker + taxels.astype(self._dtype).tobytes() + self._trailer
+    return b"\xaa\x55" + taxels.astype("u1").tobytes()
 
 
-class Magnetic(_Deaf):
-    """AnySkin: five chips, each its temperature and three axes as float32, then CR LF: 82 bytes.
+def _magnets(taxels: Taxels) -> NDArray[np.float64]:
+    """Temperature and three axes of each chip, [S, 4]."""
+    axes = taxels.reshape(-1, 3).astype(np.float64)
+    return np.column_stack([np.full(len(axes), TEMPERATURE), axes])
+
+
+def floats(taxels: Taxels) -> bytes:
+    """AnySkin: five chips as float32, then CR LF: 82 bytes.
 
     Source: anyskin 1.0.0, sensor.py, `burst_mode`.
     """
-
-    temperature = 25.0
-
-    def frame(self, taxels: Taxels, t_us: int) -> bytes:
-        """(t, x, y, z) of each chip, and the end of line."""
-        return self._with_temperature(taxels).astype("<f4").tobytes() + b"\r\n"
-
-    def _with_temperature(self, taxels: Taxels) -> NDArray[np.float64]:
-        axes = taxels.reshape(-1, 3).astype(np.float64)
-        return np.column_stack([np.full(len(axes), self.temperature), axes])
+    return _magnets(taxels).astype("<f4").tobytes() + b"\r\n"
 
 
-class MagneticText(Magnetic):
+def decimals(taxels: Taxels) -> bytes:
     """ReSkin: the same numbers as a line of decimal text with two digits after the point.
 
     Source: anyskin 1.0.0, sensor.py, without `burst_mode`; Arduino's Serial.print(float) gives two
     digits.
     """
-
-    def frame(self, taxels: Taxels, t_us: int) -> bytes:
-        """One line of text."""
-        return (
-            "\t".join(f"{value:.2f}" for value in self._with_temperature(taxels).ravel()).encode()
-            + b"\r\n"
-        )
+    return "\t".join(f"{value:.2f}" for value in _magnets(taxels).ravel()).encode() + b"\r\n"
 
 
-class Rows(_Deaf):
-    """A line of text for each row, and an empty line after the last: 3D-ViTac, and matrices of
-    sketches for Arduino.
+def rows(taxels: Taxels) -> bytes:
+    """3D-ViTac and matrices of sketches for Arduino: R lines of C numbers, and an empty line.
 
-    Source: the firmware notes of 3D-ViTac's 16 x 16 matrix (numbers separated by blanks, 16 rows
-    and a blank line).
+    Source: the firmware notes of 3D-ViTac's 16 x 16 matrix.
     """
-
-    def __init__(self, rate_hz: float, separator: str = " ") -> None:
-        super().__init__(rate_hz)
-        self._separator = separator
-
-    def frame(self, taxels: Taxels, t_us: int) -> bytes:
-        """R lines of C numbers, and an empty line."""
-        lines = [self._separator.join(map(str, row.tolist())) for row in taxels]
-        return ("\r\n".join(lines) + "\r\n\r\n").encode()
+    lines = [" ".join(map(str, row.tolist())) for row in taxels]
+    return ("\r\n".join(lines) + "\r\n\r\n").encode()
 
 
-class PapillArray:
+class PapillArray(Wire):
     """Contactile's PapillArray controller (PTS 2.0). Frames [3 S, 3, 3]: S sensors of 3 x 3 pillars
     with Fx, Fy, Fz in N.
 
@@ -142,7 +102,7 @@ class PapillArray:
     PILLARS = 9
 
     def __init__(self, rate_hz: float = 1000, counter: int = 0) -> None:
-        self.period_ns, self.streaming, self.counter = 1e9 / rate_hz, True, counter
+        self.period_ns, self.counter = 1e9 / rate_hz, counter
         self._rest = b""
         self._zero: NDArray[np.float64] | float = 0.0
         self._unloaded: list[NDArray[np.float64]] = []
@@ -193,23 +153,13 @@ class PapillArray:
         if kind == 7:
             return b"\0"
         sums = force.sum(axis=1)
-        if kind in (4, 6):
-            items = [
-                struct.pack("<H6f", 2, *f, *(0.01 * f))
-                if kind == 4
-                else struct.pack("<HB2f", 1, 0, 0.5, 1.0)
-                for f in sums
-            ]
-            return _listed(items, at)
-        inner = [
-            [
-                struct.pack("<H6f", 2, *f, *(0.1 * f))
-                if kind == 3
-                else struct.pack("<Hbf", 1, 0, 0.5)
-                for f in pillars
-            ]
-            for pillars in force
-        ]
+        if kind == 4:
+            return _listed([struct.pack("<H6f", 2, *f, *(0.01 * f)) for f in sums], at)
+        if kind == 6:
+            return _listed([struct.pack("<HB2f", 1, 0, 0.5, 1.0)] * len(sums), at)
+        inner = [[struct.pack("<Hbf", 1, 0, 0.5)] * self.PILLARS] * len(force)
+        if kind == 3:
+            inner = [[struct.pack("<H6f", 2, *f, *(0.1 * f)) for f in one] for one in force]
         sizes = [2 + 2 * len(items) + sum(map(len, items)) for items in inner]
         begins = at + 2 + 2 * len(inner) + np.cumsum([0, *sizes[:-1]])
         head = struct.pack(f"<H{len(inner)}H", len(inner), *begins)
@@ -224,7 +174,7 @@ def _listed(items: Sequence[bytes], at: int) -> bytes:
     return struct.pack(f"<H{len(items)}H", len(items), *begins) + b"".join(items)
 
 
-class Slcan(_Uncounted):
+class Slcan(Wire):
     """XELA's uSkin on CAN, behind a USB adapter that speaks slcan. Frames [R, C, 3] uint16: X, Y,
     Z.
 
@@ -288,7 +238,7 @@ class Slcan(_Uncounted):
         )
 
 
-class Robotiq(_Uncounted):
+class Robotiq(Wire):
     """Robotiq's TSF-85 fingertips. Frames [7 F, 4] uint16: F fingers of 7 x 4 taxels.
 
     Source: Robotiq's reader for Python (tactile_sensors, sensor_quickstart) as packages repeat it:
@@ -302,25 +252,25 @@ class Robotiq(_Uncounted):
     UPRIGHT = 0, 0, 16384  # 1 g
 
     def __init__(self, rate_hz: float) -> None:
-        self.period_ns = 1e9 / rate_hz
-        self.streaming = False
-        self._rest = b""
+        self.period_ns, self._sends, self._rest = 1e9 / rate_hz, False, b""
         self._last: NDArray[np.int64] | None = None
+
+    @property
+    def streaming(self) -> bool:
+        """Whether it was told to send."""
+        return self._sends
 
     def receive(self, data: bytes) -> bytes:
         """Commands: start sending with a period in ms, 0 to stop; ask for the version."""
         self._rest += data
         answer = b""
-        while (at := self._rest.find(b"\x9a")) >= 0 and len(self._rest) >= at + 4 + (
-            self._rest[at + 3 : at + 4] or b"\xff"
-        )[0]:
-            command, length = self._rest[at + 2], self._rest[at + 3]
-            content, self._rest = (
-                self._rest[at + 4 : at + 4 + length],
-                self._rest[at + 4 + length :],
-            )
+        while found := re.search(rb"(?s)\x9a.(.)(.)", self._rest):
+            (command,), (length,) = found.groups()
+            if len(self._rest) < (end := found.end() + length):
+                break
+            content, self._rest = self._rest[found.end() : end], self._rest[end:]
             if command in (self.AUTOSEND, self.AUTOSEND_ASYNC) and length == 1:
-                self.streaming = content[0] > 0
+                self._sends = content[0] > 0
                 self.period_ns = content[0] * 1e6 or self.period_ns
             elif command == self.VERSION:
                 answer += self._packet(self.VERSION, self.FIRMWARE)
@@ -337,9 +287,8 @@ class Robotiq(_Uncounted):
         for i, (static, dynamic) in enumerate(zip(fingers, change, strict=True)):
             finger = i << 2
             data += bytes([self.STATIC | finger]) + static.astype(">u2").tobytes()
-            data += struct.pack(
-                ">Bh", self.DYNAMIC | finger, int(np.clip(round(dynamic), -32768, 32767))
-            )
+            dynamic = int(np.clip(round(dynamic), -32768, 32767))
+            data += struct.pack(">Bh", self.DYNAMIC | finger, dynamic)
             data += struct.pack(">B3h", self.ACCELEROMETER | finger, *self.UPRIGHT)
             data += struct.pack(">BQ", self.TIMESTAMP | finger, t_us)
         return self._packet(self.AUTOSEND, data)
@@ -350,11 +299,11 @@ class Robotiq(_Uncounted):
 
 
 WIRES: Mapping[str, Callable[[float], Wire]] = {
-    "flexitac": Marked,
-    "matrix": Marked,
-    "anyskin": Magnetic,
-    "reskin": MagneticText,
-    "3d-vitac": Rows,
+    "flexitac": partial(Wire, marked),
+    "matrix": partial(Wire, marked),
+    "anyskin": partial(Wire, floats),
+    "reskin": partial(Wire, decimals),
+    "3d-vitac": partial(Wire, rows),
     "papillarray": PapillArray,
     "xela-can": Slcan,
     "robotiq-tsf": Robotiq,
