@@ -36,7 +36,28 @@ def test_drift_and_spikes(ppm: float, seed: int):
     alone is wrong by tens of ms."""
     t_s, error, plain = errors_ms(ppm, 60, seed)
     assert np.abs(error[t_s >= 5]).max() < 1
+    assert (error <= plain + 1e-3)[t_s >= 5].all()  # no frame was taken after it arrived
     assert plain[t_s >= 5].max() > 5
+
+
+def test_the_line_is_the_closest_below_all_points():
+    """As found by trying the lines through each two points."""
+    clock, rng = DeviceClock(settle_s=0.1, span_s=5, max_ppm=1e5), np.random.default_rng(5)
+    at = np.arange(20) * 250_000_000
+    offset = rng.integers(0, 1_000_000, 20) + at // 1000
+    for t, late in zip(at.tolist(), offset.tolist(), strict=True):
+        clock.update(t, t + late)
+    lines = [
+        (offset[i] + slope * (at - at[i]), slope)
+        for i in range(20)
+        for j in range(i)
+        if (slope := (offset[i] - offset[j]) / (at[i] - at[j])) is not None
+    ]
+    below = [(y.mean(), slope) for y, slope in lines if (y <= offset + 1e-3).all()]
+    quality = clock.quality()
+    assert quality is not None
+    assert quality["drift_ppm"] == pytest.approx(max(below)[1] * 1e6)
+    assert quality["seconds"] == 4.75
 
 
 def test_wraps_of_the_device_clock():

@@ -117,6 +117,7 @@ def test_a_command_keeps_its_line(line: str):
     ("line", "hint"),
     [
         (b"$PPLP,ID*00", "checksum 00 should be"),
+        (b"$PPLP,ID*FF", "checksum FF should be"),
         (b"$PPLP,JUMP", "known are ID"),
         (b"$GPGGA,1,2", "not a command"),
         (b"hello", "send for example"),

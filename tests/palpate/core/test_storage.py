@@ -1,0 +1,44 @@
+"""Atomic writes: folders, syncs and errors. Cuts of the power are in tests/cuts."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+
+import pytest
+
+from palpate.core import storage
+
+
+def test_folders_are_made_once(tmp_path: Path):
+    """`parents` makes the folders that are missing, and takes those that are there."""
+    for name in ("a", "b"):
+        storage.put(tmp_path / "one" / "two" / name, name.encode(), parents=True)
+    assert sorted(os.listdir(tmp_path / "one" / "two")) == ["a", "b"]
+
+
+@pytest.mark.parametrize("durable", [True, False])
+def test_only_a_durable_file_is_synced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, durable: bool
+):
+    """Each file and then its folder are synced, or nothing is."""
+    synced = list[str]()
+    monkeypatch.setattr(os, "fsync", lambda fd: synced.append(os.readlink(f"/proc/self/fd/{fd}")))
+    storage.put_all({tmp_path / "a": b"1", tmp_path / "b": b"2"}, durable=durable)
+    wanted = [f"{tmp_path}/a.part", f"{tmp_path}/b.part", str(tmp_path)]
+    assert synced == (wanted if durable else [])
+
+
+def test_what_could_not_be_written(tmp_path: Path):
+    """A folder and a file in no folder are refused; a new file is not."""
+    assert "folder" in storage.refused(tmp_path)
+    assert "no folder" in storage.refused(tmp_path / "none" / "file")
+    assert not storage.refused(tmp_path / "file")
+
+
+def test_a_failed_exchange_says_why(tmp_path: Path):
+    """The error of the system call arrives with its number and the name."""
+    with pytest.raises(FileNotFoundError) as e:
+        storage.exchange(tmp_path, tmp_path / "none")
+    assert (e.value.errno, e.value.filename) == (errno.ENOENT, str(tmp_path / "none"))
