@@ -68,6 +68,7 @@ def health(at_s: float, **other: Any) -> dict[str, Any]:
         "lost_edges": 0,
         "storms": 0,
         "loss_known": True,
+        "degraded": "",
         "pid": 71,
         "version": "0.2.0",
         "model": "tubes 3, 6 labels",

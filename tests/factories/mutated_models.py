@@ -219,7 +219,7 @@ def between(graph: Graph, rng: Random, other: Graph) -> None:
     if like:
         held.CopyFrom(rng.choice(like))
     del held.input[:], held.output[:]
-    extra = OPERATORS[domain, op].least - 1
+    extra = rng.randrange(3)
     held.input.extend([target.input[slot], *(rng.choice(names(graph)) for _ in range(extra))])
     held.op_type, held.domain, held.name = op, domain, "between"
     held.output.extend(["between", "beside"] if op in ("TopK", "SVMClassifier") else ["between"])

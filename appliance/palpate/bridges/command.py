@@ -1,5 +1,4 @@
-"""`palpate bridge tcp|modbus|ros|fuse`: completes the options from the settings and starts the
-bridge."""
+"""`palpate bridge KIND`: completes the options from the settings and starts the bridge."""
 
 from __future__ import annotations
 
@@ -7,7 +6,7 @@ import argparse
 import asyncio
 import sys
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from functools import partial
 from ipaddress import ip_address
 from pathlib import Path
@@ -15,7 +14,7 @@ from typing import Any
 
 from palpate.bridges.options import LINKS, MOST, PORTS, add_arguments
 from palpate.bridges.server import TcpServer, address, stop_event, until
-from palpate.bridges.source import FeedSource, LineSource, LinkPort, Source
+from palpate.bridges.source import FeedSource, LineSource, LinkPort
 from palpate.client.feed import Feed
 from palpate.client.line import Line, open_port
 from palpate.core import config, sentences
@@ -51,10 +50,26 @@ def settle(kind: str, args: argparse.Namespace, settings: Config) -> None:
         )
 
 
-def _source(args: argparse.Namespace) -> Source:
-    if args.feed:
-        return FeedSource(args.feed)
-    return LineSource(*_port(args), baud=args.baud)
+Served = tuple[TcpServer, str, Callable[[], Awaitable[None]], Callable[[], None]]
+"""A bridge as a server: itself, the name of the box, its work once a second, and what closes it."""
+
+
+def _modbus(args: argparse.Namespace) -> Served:
+    from palpate.bridges.modbus import ModbusBridge
+
+    source = FeedSource(args.feed) if args.feed else LineSource(*_port(args), baud=args.baud)
+    bridge = ModbusBridge(source, SystemClock(), writes=args.allow_writes)
+    work = partial(asyncio.to_thread, source.refresh)
+    return TcpServer(bridge.serve, args.most), source.name, work, source.close
+
+
+def _tcp(args: argparse.Namespace) -> Served:
+    from palpate.bridges.tcp import TcpBridge
+
+    name, opener = _port(args)
+    loop = asyncio.get_running_loop()
+    bridge = TcpBridge(name, opener, writes=args.allow_writes, most=args.most, loop=loop)
+    return bridge.server, name, partial(asyncio.sleep, 0), bridge.close
 
 
 def _warn(args: argparse.Namespace) -> None:
@@ -73,53 +88,21 @@ def _port(args: argparse.Namespace) -> tuple[str, Callable[[], Any]]:
     return args.port, partial(open_port, args.port, args.baud)
 
 
-def run_modbus(args: argparse.Namespace) -> int:
-    """`palpate bridge modbus`, until SIGTERM."""
-    from palpate.bridges.modbus import ModbusBridge
-
-    settle("modbus", args, config.load(None))
+def run_server(args: argparse.Namespace, made: Callable[[argparse.Namespace], Served]) -> int:
+    """`palpate bridge modbus|tcp`, until SIGTERM."""
+    settle(args.kind, args, config.load(None))
     host, port = address(args.listen)
 
     async def serve() -> int:
         stop = stop_event()
-        source = _source(args)
         _warn(args)
+        server, box, work, close = made(args)
         try:
-            server = TcpServer(
-                ModbusBridge(source, SystemClock(), writes=args.allow_writes).serve, args.most
-            )
             await server.open(host, port)
-            _say("modbus", server, source.name, args)
-            await until(stop, EVERY_S, partial(asyncio.to_thread, source.refresh))
+            _say(args, server, box)
+            await until(stop, EVERY_S, work)
         finally:
-            source.close()
-        return stop.code
-
-    codes: list[int] = []
-    retried(lambda: codes.append(asyncio.run(serve())), SystemClock())
-    return codes[-1]
-
-
-def run_tcp(args: argparse.Namespace) -> int:
-    """`palpate bridge tcp`, until SIGTERM."""
-    from palpate.bridges.tcp import TcpBridge
-
-    settle("tcp", args, config.load(None))
-    host, port = address(args.listen)
-
-    async def serve() -> int:
-        stop = stop_event()
-        _warn(args)
-        name, opener = _port(args)
-        bridge = TcpBridge(
-            name, opener, writes=args.allow_writes, most=args.most, loop=asyncio.get_running_loop()
-        )
-        try:
-            await bridge.server.open(host, port)
-            _say("tcp", bridge.server, name, args)
-            await until(stop, EVERY_S, partial(asyncio.sleep, 0))
-        finally:
-            bridge.close()
+            close()
         return stop.code
 
     codes: list[int] = []
@@ -159,16 +142,6 @@ def feeds(given: Sequence[str]) -> dict[str, Feed]:
     return found
 
 
-def _sent(line: Line | None, text: bytes) -> bool:
-    """Send a sentence on a line, or on standard output; whether it was sent."""
-    try:
-        line.write(text) if line else sys.stdout.buffer.write(text)
-        sys.stdout.flush()
-    except (LinkLost, BlockingIOError):
-        return False
-    return True
-
-
 def run_fuse(args: argparse.Namespace) -> int:
     """`palpate bridge fuse`, until SIGTERM."""
     from palpate.bridges.fuse import UNSURE, FingerFusion, listen
@@ -180,7 +153,15 @@ def run_fuse(args: argparse.Namespace) -> int:
     line = None
     if port:
         line = Line(partial(open_port, port, args.baud), heard.append, lambda: None, name=port)
-    send = partial(_sent, line)
+
+    def send(text: bytes) -> bool:
+        try:
+            line.write(text) if line else sys.stdout.buffer.write(text)
+            sys.stdout.flush()
+        except (LinkLost, BlockingIOError):
+            return False
+        return True
+
     hand = FingerFusion(each, settings.classifier.min_probability or UNSURE, clock, send)
 
     def work() -> None:
@@ -198,12 +179,18 @@ def run_fuse(args: argparse.Namespace) -> int:
     try:
         return asyncio.run(serve())
     finally:
-        for one in (*each.values(), line):
-            if one is not None:
-                one.close()
+        for feed in each.values():
+            feed.close()
+        if line:
+            line.close()
 
 
-RUNS = {"tcp": run_tcp, "modbus": run_modbus, "ros": run_ros, "fuse": run_fuse}
+RUNS: dict[str, Callable[[argparse.Namespace], int]] = {
+    "tcp": partial(run_server, made=_tcp),
+    "modbus": partial(run_server, made=_modbus),
+    "ros": run_ros,
+    "fuse": run_fuse,
+}
 
 
 def run(args: argparse.Namespace) -> int:
@@ -211,17 +198,14 @@ def run(args: argparse.Namespace) -> int:
     return RUNS[args.kind](args)
 
 
-def _say(kind: str, server: TcpServer, box: str, args: argparse.Namespace) -> None:
-    host, port = server.address
-    commands = (
-        "commands are passed on" if args.allow_writes else "commands are refused (--allow-writes)"
-    )
-    log.info(f"{kind}: listening on {host}:{port}, box at {box}; {commands}")
-    if args.allow_writes and not ip_address(host).is_loopback:
-        log.warning(
-            f"{kind}: whoever reaches {host}:{port} can command the box: keep it in the network "
-            "of the cell"
-        )
+def _say(args: argparse.Namespace, server: TcpServer, box: str) -> None:
+    at = f"{args.kind}: listening on {':'.join(map(str, server.address))}, box at {box}"
+    if not args.allow_writes:
+        log.info(f"{at}; commands are refused (--allow-writes)")
+        return
+    log.info(f"{at}; commands are passed on")
+    if not ip_address(server.address[0]).is_loopback:
+        log.warning(f"{args.kind}: whoever reaches it can command the box: keep it in the cell")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

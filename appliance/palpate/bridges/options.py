@@ -27,86 +27,43 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     """Add the kinds of bridges, with the options of each."""
     kinds = command.add_subparsers(dest="kind", metavar="KIND", required=True)
     for kind, text in TEXTS.items():
-        about = f"{text[0].upper()}{text[1:]}."
-        one = kinds.add_parser(kind, help=text, description=about)
+        one = kinds.add_parser(kind, help=text, description=f"{text[0].upper()}{text[1:]}.")
+        add = one.add_argument
         if kind == "ros":
-            one.add_argument(
-                "--ros-args",
-                nargs=argparse.REMAINDER,
-                default=[],
-                metavar="...",
-                help="parameters and names of ROS; the last option",
-            )
-        elif kind == "fuse":
-            _add_fingers(one)
+            text = "parameters and names of ROS; the last option"
+            add("--ros-args", nargs=argparse.REMAINDER, default=[], metavar="...", help=text)
+            continue
+        text = f"baud rate of the serial line (default {BAUD})"
+        add("--baud", type=int, default=BAUD, metavar="N", help=text)
+        if kind == "fuse":
+            text = "2 to 4 units, as in palpate@NAME, or the paths of their feeds (bridge.fingers)"
+            add("--fingers", nargs="+", metavar="NAME[=FEED]", help=text)
+            add("--port", metavar="PORT", help="the serial line to the robot (serial.port)")
         else:
             _add_ways(one, kind)
             _add_server(one, kind)
 
 
-def _add_fingers(one: argparse.ArgumentParser) -> None:
-    one.add_argument(
-        "--fingers",
-        nargs="+",
-        metavar="NAME[=FEED]",
-        help="2 to 4 units, as in palpate@NAME, or the paths of their feeds (bridge.fingers)",
-    )
-    one.add_argument("--port", metavar="PORT", help="the serial line to the robot (serial.port)")
-    _add_baud(one)
-
-
-def _add_baud(one: argparse.ArgumentParser) -> None:
-    one.add_argument(
-        "--baud",
-        type=int,
-        default=BAUD,
-        metavar="N",
-        help=f"baud rate of the serial line (default {BAUD})",
-    )
-
-
 def _add_ways(one: argparse.ArgumentParser, kind: str) -> None:
     """Add the ways to the box."""
     way = one.add_mutually_exclusive_group()
-    way.add_argument(
-        "--port", metavar="PORT", help="the box's serial line: a device, or socket://HOST:PORT"
-    )
-    way.add_argument(
-        "--link",
-        type=Path,
-        metavar="PATH",
-        help=f"on the box: make the link PATH; default if serial.port is {LINKS[kind]}",
-    )
+    text = "the box's serial line: a device, or socket://HOST:PORT"
+    way.add_argument("--port", metavar="PORT", help=text)
+    text = f"on the box: make the link PATH; default if serial.port is {LINKS[kind]}"
+    way.add_argument("--link", type=Path, metavar="PATH", help=text)
     one.set_defaults(feed=None)
     if kind == "modbus":
-        way.add_argument(
-            "--feed",
-            nargs="?",
-            const=FEED,
-            metavar="PATH",
-            help=f"on the box: read the feed at PATH (default {FEED})",
-        )
+        text = f"on the box: read the feed at PATH (default {FEED})"
+        way.add_argument("--feed", nargs="?", const=FEED, metavar="PATH", help=text)
 
 
 def _add_server(one: argparse.ArgumentParser, kind: str) -> None:
-    _add_baud(one)
-    one.add_argument(
-        "--listen",
-        metavar="HOST:PORT",
-        help=f"default: bridge.address of the settings, and port {PORTS[kind]}",
-    )
-    one.add_argument(
-        "--allow-writes",
-        action="store_true",
-        help="peers may start, stop, tare and abort, even if bridge.allow_writes is false",
-    )
-    one.add_argument(
-        "--most",
-        type=_number,
-        default=MOST,
-        metavar="N",
-        help=f"most connections at a time (default {MOST})",
-    )
+    text = f"default: bridge.address of the settings, and port {PORTS[kind]}"
+    one.add_argument("--listen", metavar="HOST:PORT", help=text)
+    text = "peers may start, stop, tare and abort, even if bridge.allow_writes is false"
+    one.add_argument("--allow-writes", action="store_true", help=text)
+    text = f"most connections at a time (default {MOST})"
+    one.add_argument("--most", type=_number, default=MOST, metavar="N", help=text)
 
 
 def _number(text: str) -> int:

@@ -36,6 +36,11 @@ COMMANDS: Mapping[str, Callable[..., str | None]] = {
     "ABORT": Palpate.abort,
 }
 """Commands that a bridge may pass on to the box."""
+OF_VERDICT = (
+    *("sweep", "label", "probability", "margin", "fused", "lost", "bundle", "share", "detail"),
+    *("measured_mm_s", "direction"),
+)
+"""Fields of an answer that a verdict line has under the same names."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,11 +203,7 @@ class FeedSource:
             if line is not None:
                 try:
                     self._take(line)
-                except (
-                    KeyError,
-                    TypeError,
-                    ValueError,
-                ):  # a line of a later version; the known facts are shown
+                except (KeyError, TypeError, ValueError):  # the known facts are shown
                     self._view = replace(self._view, damaged=self._view.damaged + 1)
         self._feed.close()
 
@@ -224,40 +225,16 @@ class FeedSource:
                     self._also(news)
 
     def _news(self, kind: str, line: Mapping[str, Any]) -> Heard | None:
-        if kind == "state":  # a change between two lines of health
-            state = self._view.state
-            return state and replace(state, skin=line["skin"], sweeping=bool(line["sweeping"]))
-        if kind == "health":
-            own = ("time_s", "sweeping", "degraded")  # the last is missing in earlier versions
-            values = {name: line[name] for name in BoxState.__slots__ if name not in own}
-            return BoxState(
-                time_s=line["time_ns"] / 1e9,
-                sweeping=bool(line["sweeping"]),
-                degraded=line.get("degraded", ""),
-                **values,
-            )
-        return self._answer(line)
-
-    def _answer(self, line: Mapping[str, Any]) -> Answer:
-        """The answer in a verdict line."""
         state = self._view.state
-        return Answer(
-            line["sweep"],
-            line["time_ns"] / 1e9,
-            Status(line["status"]),
-            line["label"],
-            line["probability"],
-            line["margin"],
-            line["fused"],
-            line["lost"],
-            line["latency_ns"] / 1e6,
-            line["bundle"],
-            state.source if state else "",
-            line["share"],
-            line["detail"],
-            measured_mm_s=line.get("measured_mm_s"),
-            direction=line.get("direction", ""),
-        )
+        if kind == "state":  # a change between two lines of health
+            return state and replace(state, skin=line["skin"], sweeping=bool(line["sweeping"]))
+        more = {"time_s": line["time_ns"] / 1e9}
+        if kind == "health":
+            more |= {"sweeping": bool(line["sweeping"])}
+            return BoxState(**more | {n: line[n] for n in BoxState.__slots__ if n not in more})
+        more |= {"latency_ms": line["latency_ns"] / 1e6, "status": Status(line["status"])}
+        more |= {"source": state.source if state else ""}
+        return Answer(**more | {name: line[name] for name in OF_VERDICT if name in line})
 
 
 def noted(view: BoxView, news: Heard, now_ns: int) -> BoxView:

@@ -3,12 +3,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from palpate.core import sentences
 from palpate.core.errors import FormatError
 from palpate.core.status import WORDS, Status
+
+_ANSWER: tuple[Callable[[str], Any], ...] = (
+    *(int, float, Status, str, float, float),
+    *(int, int, float, str, str, float),
+)
+_STATE: tuple[Callable[[str], Any], ...] = (
+    *(float, str, "1".__eq__),
+    *(int, int, int, int, int, int, str, str),
+)
+"""Types of the first fields of RES and of STA."""
+
+
+def _read(
+    names: Sequence[str], kinds: Sequence[Callable[[str], Any]], fields: Sequence[str]
+) -> dict[str, Any]:
+    """The first fields by name. Raises ValueError if they are too few or of another type."""
+    each = zip(kinds, fields[: len(kinds)], strict=True)
+    return dict(zip(names, (kind(text) for kind, text in each), strict=False))
+
+
+def _malformed(kind: str, fields: Sequence[str], why: object) -> FormatError:
+    return FormatError(f"{kind},{','.join(fields)}: {why}; is the client older than the box?")
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,42 +70,16 @@ class Answer:
     def of(cls, fields: Sequence[str]) -> Answer:
         """The answer in the fields of a RES sentence. Raises FormatError if they are invalid."""
         try:
-            (
-                sweep,
-                time_s,
-                status,
-                label,
-                probability,
-                margin,
-                fused,
-                lost,
-                latency,
-                bundle,
-                source,
-                share,
-            ) = fields[:12]
+            first = _read(cls.__slots__, _ANSWER, fields)
             return cls(
-                int(sweep),
-                float(time_s),
-                Status(status),
-                label,
-                float(probability),
-                float(margin),
-                int(fused),
-                int(lost),
-                float(latency),
-                bundle,
-                source,
-                float(share),
-                ",".join(fields[12:13]),
-                fields[13:14] != ["1"],
+                **first,
+                detail=",".join(fields[12:13]),
+                loss_known=fields[13:14] != ["1"],
                 measured_mm_s=float(fields[14]) if "".join(fields[14:15]) else None,
                 direction="".join(fields[15:16]),
             )
         except ValueError as e:
-            raise FormatError(
-                f"RES,{','.join(fields)}: {e}; is the client older than the box?"
-            ) from e
+            raise _malformed("RES", fields, e) from e
 
     @classmethod
     def of_finger(cls, fields: Sequence[str]) -> Answer:
@@ -150,27 +147,10 @@ class BoxState:
         """The state in the fields of STA or of the answer to STATE. Raises FormatError if they are
         invalid."""
         try:
-            time_s, skin, sweeping, *counts = fields[:9]
-            answered, frames, lost, garbage, enumerations, dropped = map(int, counts)
-            bundle, source = fields[9:11]
-            return cls(
-                float(time_s),
-                skin,
-                sweeping == "1",
-                answered,
-                frames,
-                lost,
-                garbage,
-                enumerations,
-                dropped,
-                bundle,
-                source,
-                ",".join(fields[18:19]),
-            )
+            first = _read(cls.__slots__, _STATE, fields)
+            return cls(**first, degraded=",".join(fields[18:19]))
         except ValueError as e:
-            raise FormatError(
-                f"STA,{','.join(fields)}: {e}; is the client older than the box?"
-            ) from e
+            raise _malformed("STA", fields, e) from e
 
     @property
     def ready(self) -> bool:
@@ -193,8 +173,5 @@ class BoxIdentity:
     def of(cls, fields: Sequence[str]) -> BoxIdentity:
         """The fields of the answer to ID. Raises FormatError if there are too few."""
         if len(fields) < 5:
-            raise FormatError(
-                f"ID,{','.join(fields)}: {len(fields)} fields instead of 5; is the client older "
-                "than the box?"
-            )
+            raise _malformed("ID", fields, f"{len(fields)} fields instead of 5")
         return cls(*fields[:5])
