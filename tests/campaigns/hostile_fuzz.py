@@ -83,7 +83,8 @@ def tried(model: bytes, own: Own, rng: Random) -> dict[str, Any]:
             raise  # the check may only raise BundleError, so the child dies
         why = str(e)
     took = time.perf_counter() - begin
-    if any(word in why for word in ("bad_alloc", "bad allocation", "Failed to allocate")):
+    short = any(word in why for word in ("bad_alloc", "bad allocation", "Failed to allocate"))
+    if short and outcome != "trial refused":  # the trial has less memory than the box
         outcome = "no memory"
     more = (memory("VmHWM") - before) / 1024
     return {

@@ -92,8 +92,7 @@ def fuzz(target: str, minutes: float, seed: int) -> int:
     for crash in run.crashes:
         print(
             f"{target}: {crash} breaks a promise; "
-            "mend it, name the file, and explain it in BROKE of "
-            "tests/palpate/bundle/test_fuzzed_input.py"
+            "mend it, and give the file a name that says what it was"
         )
     return 1 if run.crashes else 0
 

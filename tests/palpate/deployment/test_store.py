@@ -43,8 +43,6 @@ def test_a_fresh_box_runs_the_packaged_bundle(box: Delivery):
     folder needed."""
     assert box.start() == PACKAGED
     assert not box.store.commit()
-    with pytest.raises(BundleError, match="no committed bundle to go back to"):
-        box.store.rollback()
     nowhere = store.Store(StoreConfig(folder=str(box.folder / "none")), prove=lambda b: None)
     assert (
         nowhere.choose().bundle.id == nowhere.running().bundle.id == bundle.load(bundle.DEFAULT).id
@@ -52,197 +50,119 @@ def test_a_fresh_box_runs_the_packaged_bundle(box: Delivery):
     assert nowhere.candidate() is None
 
 
-@pytest.mark.slow
-def test_an_accepted_bundle_is_tried_committed_and_gone_back_from(box: Delivery, logged: list[str]):
-    """Two bundles are installed, tried and committed one after the other; rollbacks alternate
-    between them."""
-    one = box.installed(1)
-    chosen = box.store.choose()
-    assert chosen.trial
-    assert (chosen.folder.name, chosen.bundle.manifest.counter) == (one, 1)
-    assert logged == [f"bundle {one[:8]} is on trial, start 1 of 3"]
-    assert box.store.commit()
-    assert box.store.choose().trial is None
-    two = box.committed(2)
-    assert box.start() == two
-    for back in (one, two, one):
-        assert box.store.rollback() == back
-        assert box.start() == back
-    assert len(logged) == 1
+SEQUENCES = {
+    "nothing to go back to": "back:-",
+    "tried, committed, gone back from": "+1 run:1 ok run:1 +2 ok run:2 back:1 run:1 back:2 run:2",
+    "the packaged bundle": "+1 back:0 run:0 +1 ok back:0 run:0 back:1 run:1",
+    "three starts without a commit": "+1 ok +2 run:2 run:2 run:2 run:1 run:1",
+    "a second trial": "+1 ok +2 +3 run:3 back:1 back:0",
+    "two trials that fail": "+1 ok +2 ok +3 +4 run:4 run:4 run:4 run:2 back:1 run:1",
+    "a second trial of one that was committed": (
+        "+1 ok +2 ok back:1 +2 run:2 run:2 run:2 run:1 back:-"
+    ),
+    "what runs deployed again": "+1 ok +1 is:1 +2 run:2 run:2 +2 run:2 run:2 run:2 run:1",
+    "the committed one deployed again": "+1 ok +2 +1 is:1 run:1 back:0",
+    "an older bundle": "+1 ok +2 ok back:1 old:1 old:2 is:1 +2 run:2",
+    "a trial does not raise the counter": "+1 ok +9 run:9 +2 run:2",
+    "kept for two rollbacks": "+1 ok +2 ok +3 ok +4 ok +5 back:4 back:3",
+}
+"""Steps: +N installs the bundle with counter N, ok commits, run:N is a start that runs N (0: the
+packaged bundle), back:N a rollback to N (-: refused), old:N another bundle with counter N, which is
+refused, is:N asks which is current and committed."""
 
 
 @pytest.mark.slow
-def test_the_first_bundle_goes_back_to_the_packaged_one(box: Delivery):
-    """A failed trial and a rollback lead to the packaged bundle, a second rollback to the installed
-    bundle again."""
-    one = box.installed(1)
-    assert box.store.rollback() == PACKAGED == box.start()
-    assert box.installed(1) == one
-    box.store.commit()
-    assert box.store.rollback() == PACKAGED == box.start()
-    assert box.store.rollback() == one == box.start()
+@pytest.mark.parametrize("name", SEQUENCES)
+def test_what_runs_after(box: Delivery, name: str):
+    """Installs, commits, starts and rollbacks in any order lead to the bundle of the table."""
+    shas = {"0": PACKAGED}
+    for step in SEQUENCES[name].split():
+        act, _, n = step.partition(":")
+        if act == "ok":
+            assert box.store.commit()
+        elif act == "run":
+            assert box.start() == shas[n], step
+        elif act == "is":
+            assert box.store.current == shas[n]
+            assert box.store.state.of(shas[n]).committed
+        elif act == "old":
+            with pytest.raises(BundleError, match=f"counter {n}, and 2"):
+                box.store.install(box.made(int(n), version="other"))
+        elif step == "back:-":
+            with pytest.raises(BundleError):
+                box.store.rollback()
+        elif act == "back":
+            assert box.store.rollback() == shas[n], step
+        else:
+            shas[act[1:]] = box.installed(int(act[1:]))
 
 
 @pytest.mark.slow
-def test_three_uncommitted_starts_go_back(box: Delivery, logged: list[str]):
-    """The fourth start runs the committed bundle and logs one line; `palpate bundles` has the
-    reason."""
-    one, two = box.committed(1), box.installed(2)
-    assert [box.start() for _ in range(MOST_STARTS)] == [two] * MOST_STARTS
-    logged.clear()
-    assert [box.start(), box.start()] == [one, one]
-    assert logged == [
-        f"<4>bundle {two[:8]} has failed its trial, and {one[:8]} runs again: it was started 3 "
-        "times without being committed"
-    ]
-    told = {e.sha: e for e in bundle_commands.entries(box.store)}
-    assert (told[two].role, told[two].detail) == (
-        "left",
-        "it was started 3 times without being committed",
-    )
-    assert told[one].role == "current"
-
-
-@pytest.mark.slow
-def test_a_second_trial_goes_back_to_what_was_committed(box: Delivery):
-    """After the second trial the box does not go back to the first bundle, which was never
-    committed."""
-    one, two, three = box.committed(1), box.installed(2), box.installed(3)
-    assert box.start() == three
-    assert box.store.rollback() == one
-    told = {e.sha: e.role for e in bundle_commands.entries(box.store)}
-    assert told == {one: "current", two: "left", three: "left", PACKAGED: "previous"}
-    assert box.store.rollback() == PACKAGED
-
-
-@pytest.mark.slow
-def test_two_trials_that_fail_leave_the_way_back(box: Delivery):
-    """The bundle before the committed bundle is kept, however many bundles were tried since."""
-    one, two = box.committed(1), box.committed(2)
-    box.installed(3)
-    box.installed(4)
-    assert [box.start() for _ in range(MOST_STARTS + 1)][-1] == two
-    assert box.store.rollback() == one == box.start()
-
-
-@pytest.mark.slow
-def test_a_bundle_that_failed_a_second_trial_is_not_gone_back_to(box: Delivery):
-    """A bundle is committed, rolled back by hand, deployed again, and fails its trial: a rollback
-    does not lead to it."""
-    one, two = box.committed(1), box.committed(2)
-    assert box.store.rollback() == one
-    assert box.installed(2) == two
-    assert [box.start() for _ in range(MOST_STARTS + 1)][-1] == one
-    with pytest.raises(BundleError, match="no committed bundle to go back to"):
-        box.store.rollback()
-
-
-@pytest.mark.slow
-def test_deploying_again_what_runs_changes_nothing(box: Delivery):
-    """A committed bundle stays committed; a bundle on trial gets three new starts."""
-    one = box.committed(1)
-    assert box.installed(1) == one
-    assert box.store.state.of(one).committed
-    two = box.installed(2)
+def test_the_table_says_what_a_person_wants_to_know(box: Delivery, logged: list[str]):
+    """One line a bundle: role, id, name, counter, signer, trial; why a bundle was left is logged
+    once and stays in the table."""
+    one, two = box.committed(1), box.store.install(box.made(2, name="tubes", version="7"))
     box.start()
-    assert box.installed(2) == two
-    assert (box.store.state.of(two).starts, box.store.state.of(two).previous) == (0, one)
+    lines = bundle_commands.lines(bundle_commands.entries(box.store))
+    assert [line.split()[0] for line in lines] == ["role", "on", "previous", "kept"]
+    assert f"on trial  {two[:8]}  tubes 7" in lines[1]
+    assert "2        anna@lab   start 1 of 3, 0 of 5 sweeps, 0 of 600 s" in lines[1]
+    assert one[:8] in lines[2]
+    logged.clear()
+    assert [box.start() for _ in range(MOST_STARTS + 1)] == [two, two, one, one]
+    assert len(logged) == 3
+    told = {e.sha: (e.role, e.detail) for e in bundle_commands.entries(box.store)}
+    assert told[one][0] == "current"
+    assert told[two][0] == "left"
+    assert told[two][1] in logged[-1]
 
 
-def test_deploying_the_committed_one_ends_the_trial_of_another(box: Delivery):
-    """The committed bundle is current again, and the bundle on trial is dropped."""
-    one, two = box.committed(1), box.installed(2)
-    assert box.installed(1) == one
-    assert box.store.current == one
-    assert box.store.state.of(one).committed
-    assert not box.store.state.of(two).committed
-
-
-@pytest.mark.slow
-def test_an_older_bundle_is_refused_unless_it_is_the_newest(box: Delivery):
-    """The counter must be above all committed counters, also after a rollback. The newest bundle
-    itself may be installed again."""
-    one, two = box.committed(1), box.committed(2)
-    box.store.rollback()
-    for counter in (1, 2):
-        with pytest.raises(
-            BundleError, match=f"counter {counter}, and 2 was committed here before"
-        ):
-            box.store.install(box.made(counter, version="other"))
-    assert box.store.current == one
-    assert box.installed(2) == two
-    assert box.start() == two
-
-
-@pytest.mark.slow
-def test_a_trial_does_not_raise_the_least_counter(box: Delivery):
-    """A bundle that was never committed may be replaced by a bundle with a lower counter."""
-    box.committed(1)
-    box.installed(9)
-    assert box.start() != box.installed(2) == box.start()
-
-
-def alter(name: str) -> Ways:
-    """A way to alter a file of a bundle."""
+def changed(act: Callable[[Path], object], name: str = "") -> Ways:
+    """A way to change a bundle, or one of its files, before it is installed."""
 
     def way(box: Delivery) -> Path:
         folder = box.made(1)
-        data = bytearray((folder / name).read_bytes())
-        data[len(data) // 2] ^= 1
-        (folder / name).write_bytes(data)
+        act(folder / name)
         return folder
 
     return way
 
 
-def unsigned(box: Delivery) -> Path:
-    """A bundle without a signature."""
-    return deliveries.put(box.folder / "in", deliveries.files(1, None))
+def flip(path: Path) -> None:
+    """Change one bit in the middle."""
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
 
 
-def strange(box: Delivery) -> Path:
-    """A bundle signed with a key that nobody knows."""
-    return deliveries.put(
-        box.folder / "in", deliveries.files(1, deliveries.key(box.folder / "theirs"))
-    )
+def linked(model: Path) -> None:
+    """A link to the right model."""
+    model.rename(model.with_name("elsewhere"))
+    model.symlink_to(model.with_name("elsewhere"))
 
 
-def linked(box: Delivery) -> Path:
-    """A bundle whose model is a link to the right one."""
-    folder = box.made(1)
-    (folder / bundle.MODEL).rename(box.folder / "model")
-    (folder / bundle.MODEL).symlink_to(box.folder / "model")
-    return folder
-
-
-def huge(box: Delivery) -> Path:
-    """A bundle whose model is a sparse file of 10 GB."""
-    folder = box.made(1)
-    os.truncate(folder / bundle.MODEL, 10 << 30)
-    return folder
-
-
-def piped(box: Delivery) -> Path:
-    """A bundle whose manifest is a pipe that nobody writes to."""
-    folder = box.made(1)
-    (folder / bundle.MANIFEST).unlink()
-    os.mkfifo(folder / bundle.MANIFEST)
-    return folder
+def piped(manifest: Path) -> None:
+    """A pipe that nobody writes to."""
+    manifest.unlink()
+    os.mkfifo(manifest)
 
 
 BAD: dict[str, tuple[Ways, str]] = {
-    "unsigned": (unsigned, "is not signed"),
-    "another's key": (strange, "signed by none of the signers in"),
+    "unsigned": (lambda box: box.copied(deliveries.files(1, None)), "is not signed"),
+    "another's key": (
+        lambda box: box.copied(deliveries.files(1, deliveries.key(box.folder / "theirs"))),
+        "by none of the signers",
+    ),
     "no bundle": (lambda box: box.folder, "no bundle at"),
-    "too new": (lambda box: box.made(1, runtime="99.0.0"), r"needs palpate 99\.0\.0"),
-    "never counted": (lambda box: box.made(0), "has counter 0"),
-    "model altered": (alter(bundle.MODEL), "was altered"),
-    "golden altered": (alter(bundle.GOLDEN), "was altered"),
-    "manifest altered": (alter(bundle.MANIFEST), "cannot be read|does not fit|must|is not"),
-    "signature altered": (alter(bundle.SIGNATURE), "signed by none|does not fit"),
-    "link": (linked, "cannot be read"),
-    "huge": (huge, "more than"),
-    "pipe": (piped, "no plain file"),
+    "too new": (lambda box: box.made(1, runtime="99.0.0"), r"palpate 99\.0\.0"),
+    "never counted": (lambda box: box.made(0), "counter 0"),
+    "model altered": (changed(flip, bundle.MODEL), "was altered"),
+    "golden altered": (changed(flip, bundle.GOLDEN), "was altered"),
+    "manifest altered": (changed(flip, bundle.MANIFEST), "."),
+    "signature altered": (changed(flip, bundle.SIGNATURE), "."),
+    "link": (changed(linked, bundle.MODEL), "cannot be read"),
+    "huge": (changed(lambda path: os.truncate(path, 10 << 30), bundle.MODEL), "more than"),
+    "pipe": (changed(piped, bundle.MANIFEST), "no plain file"),
 }
 
 
@@ -281,39 +201,36 @@ def test_what_was_checked_is_what_is_written(box: Delivery):
     assert box.store.bundles.get(sha).sha == sha
 
 
+def hang(held: Bundle) -> None:
+    """Never ends."""
+    while True:
+        pass
+
+
 @pytest.mark.parametrize(
     ("does", "why"),
     [
-        (
-            lambda b: os.kill(os.getpid(), signal.SIGKILL),
-            "killed the process that tried it .SIGKILL",
-        ),
-        (lambda b: bytearray(1 << 30), "asks for more than 192 MB"),
-        (lambda b: [][0], "cannot be run: IndexError"),
+        (lambda b: os.kill(os.getpid(), signal.SIGKILL), "SIGKILL"),
+        (lambda b: bytearray(1 << 30), "more than 192 MB"),
+        (lambda b: [][0], "IndexError"),
+        (hang, r"within 0\.2 s"),
     ],
-    ids=["dies", "asks for memory", "raises"],
+    ids=["dies", "asks for memory", "raises", "hangs"],
 )
 def test_a_model_that_kills_its_runtime_is_refused(
-    tmp_path: Path, does: Callable[[Bundle], object], why: str
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    does: Callable[[Bundle], object],
+    why: str,
 ):
-    """The model runs in a child process. This process continues, and reports why the child
-    died."""
+    """The model runs in a child process. This process continues, and reports what became of the
+    child."""
+    if does is hang:
+        monkeypatch.setattr("palpate.deployment.sandbox.DEADLINE_S", 0.2)
     box = Delivery(tmp_path, does)
     with pytest.raises(BundleError, match=why):
         box.installed(1)
     assert box.store.current == PACKAGED
-
-
-def test_a_model_that_hangs_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """The child ends at the deadline."""
-    monkeypatch.setattr("palpate.deployment.sandbox.DEADLINE_S", 0.2)
-
-    def hang(held: Bundle) -> None:
-        while True:
-            pass
-
-    with pytest.raises(BundleError, match=r"not run within 0\.2 s"):
-        Delivery(tmp_path, hang).installed(1)
 
 
 @pytest.mark.slow
@@ -345,18 +262,37 @@ def test_a_committed_bundle_that_is_refused_stops_the_box(box: Delivery):
     works."""
     one, two = box.committed(1), box.committed(2)
     shutil.rmtree(box.store.bundles.at(two))
-    with pytest.raises(BundleError, match="committed; `palpate bundles rollback` goes back"):
+    with pytest.raises(BundleError, match="bundles rollback"):
         box.start()
     assert box.store.rollback() == one == box.start()
 
 
-def test_another_bundle_in_a_bundles_place_is_refused(box: Delivery):
-    """The folder holds a complete and signed bundle that does not belong to the folder's name."""
+def test_what_was_changed_by_hand_is_refused(box: Delivery):
+    """Another complete and signed bundle under the name of the current one; then a link out of the
+    store."""
     one, two = box.committed(1), box.committed(2)
     shutil.rmtree(box.store.bundles.at(two))
     shutil.copytree(box.store.bundles.at(one), box.store.bundles.at(two))
-    with pytest.raises(BundleError, match="holds another bundle"):
+    with pytest.raises(BundleError, match="another bundle"):
         box.start()
+    link = Path(box.how.folder, "current")
+    link.unlink()
+    link.symlink_to("/etc")
+    with pytest.raises(BundleError, match="/etc"):
+        box.start()
+
+
+def test_a_removed_state_is_told(box: Delivery, logged: list[str]):
+    """Without the state nothing is known of committed counters: each start and each delivery say
+    so. A new box says nothing."""
+    box.committed(5)
+    assert not any("missing" in line for line in logged)
+    Path(box.how.folder, "bundles.json").unlink()
+    box.start()
+    assert "older bundles" in logged[-1]
+    logged.clear()
+    box.installed(3)
+    assert any("older bundles" in line for line in logged)
 
 
 def test_a_damaged_bundle_is_mended_by_deploying_it_again(box: Delivery):
@@ -402,7 +338,7 @@ def test_a_candidate_waits_and_is_promoted(box: Delivery):
     assert box.store.rollback() == one
     box.store.install(box.made(3), shadow=True)
     box.committed(4)
-    with pytest.raises(BundleError, match="counter 3, and 4 was committed"):
+    with pytest.raises(BundleError, match="counter 3, and 4"):
         box.store.promote()
 
 
@@ -411,10 +347,10 @@ def test_one_command_at_a_time(box: Delivery, monkeypatch: pytest.MonkeyPatch):
     store."""
     monkeypatch.setattr(store, "LOCK_S", 0.1)
     box.installed(1)
-    with box.store._locked(), pytest.raises(ApplianceError, match="in use by another command"):
+    with box.store._locked(), pytest.raises(ApplianceError, match="in use"):
         store.Store(box.how, lambda b: None).commit(wait_s=0.1)
     monkeypatch.setattr(os, "geteuid", lambda: 4711)
-    with pytest.raises(ConfigError, match="do this as that user"):
+    with pytest.raises(ConfigError, match="as that user"):
         box.store.commit()
 
 
@@ -433,7 +369,7 @@ def test_a_disk_that_takes_no_note_runs_what_was_committed(
         with monkeypatch.context() as patch:
             patch.setattr("palpate.core.storage.put", full)
             assert box.start() == before
-            assert "No space left on device, so no bundle can be on trial" in logged[-1]
+            assert "No space left" in logged[-1]
         assert box.start() == tried
         box.store.rollback()
 
@@ -453,27 +389,8 @@ def test_a_state_that_cannot_be_read_is_named(box: Delivery, text: str):
     """Its content is not guessed."""
     box.installed(1)
     Path(box.how.folder, "bundles.json").write_text(text)
-    with pytest.raises(BundleError, match=r"bundles\.json cannot be read"):
+    with pytest.raises(BundleError, match=r"bundles\.json"):
         box.start()
-
-
-def test_a_link_out_of_the_store_is_refused(box: Delivery):
-    """Such a link can only have been set by hand."""
-    Path(box.how.folder, "current").symlink_to("/etc")
-    with pytest.raises(BundleError, match="leads to '/etc'"):
-        box.start()
-
-
-@pytest.mark.slow
-def test_the_table_says_what_a_person_wants_to_know(box: Delivery):
-    """One line a bundle: role, id, name, counter, signer, trial."""
-    one, two = box.committed(1), box.store.install(box.made(2, name="tubes", version="7"))
-    box.start()
-    lines = bundle_commands.lines(bundle_commands.entries(box.store))
-    assert [line.split()[0] for line in lines] == ["role", "on", "previous", "kept"]
-    assert f"on trial  {two[:8]}  tubes 7" in lines[1]
-    assert "2        anna@lab   start 1 of 3, 0 of 5 sweeps, 0 of 600 s" in lines[1]
-    assert one[:8] in lines[2]
 
 
 @pytest.mark.slow
@@ -488,21 +405,6 @@ def test_no_altered_bundle_is_accepted(tmp_path: Path):
     assert not any(
         count["accepted"] or count["believed"] or count["changed"] for count in found.values()
     )
-
-
-@pytest.mark.parametrize("removed", ["bundles.json"])
-def test_a_removed_state_is_told(tmp_path: Path, removed: str, logged: list[str]):
-    """Without the state nothing is known of committed counters: each start and each delivery say
-    so. A new box says nothing."""
-    box = Delivery(tmp_path)
-    box.committed(5)
-    assert not any("is missing" in line for line in logged)
-    (Path(box.how.folder) / removed).unlink()
-    box.start()
-    assert "older bundles are accepted again" in logged[-1]
-    logged.clear()
-    box.installed(3)
-    assert any("older bundles are accepted again" in line for line in logged)
 
 
 def test_a_slow_check_does_not_count_against_a_trial(
