@@ -180,20 +180,6 @@ def test_an_unknown_material_that_does_not_differ_is_not_seen():
     assert abs(uncertainty.unknown(done, NAMES)["mean"]["auroc"] - 0.5) < 0.06
 
 
-def test_enrolment_from_more_sweeps_comes_nearer(figures):
-    """More sweeps bring the accuracy nearer to that of a full training. Old classes lose little.
-
-    Both positions are reported.
-    """
-    points = {(p["where"], p["sweeps"]): p for p in figures["enrolment"]["points"]}
-    assert {w for w, _ in points} == {"same place", "other places"}
-    for where in ("same place", "other places"):
-        assert points[where, 1]["share"] < points[where, 10]["share"]
-        assert 0.9 < points[where, 5]["share"] <= 1.02
-        assert points[where, 5]["old_lost"] < 0.06
-        assert set(points[where, 5]["by_material"]) == set(NAMES)
-
-
 def test_early_needs_half_the_sweep_where_that_suffices(figures):
     """All is known at the fifth tenth. The share is below 0.6, the accuracy that of the whole
     sweep.

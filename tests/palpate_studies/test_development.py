@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -244,9 +243,7 @@ def test_cases_and_methods_exist_and_have_words_for_people():
         assert series == one.sets[0].startswith("aeon:")
 
 
-def experiment(
-    folder: Path, *names: str, skipped: Sequence[str] = (), **given: Any
-) -> tuple[StudyRun, dict[str, Any]]:
+def experiment(folder: Path, *names: str, **given: Any) -> tuple[StudyRun, dict[str, Any]]:
     """A run, and its results, of two cases on tones; the first has a learning curve."""
     tones().save(folder / "tones.npz")
     replace(tones(), samples=tones().samples[:, :7]).save(folder / "short.npz")
@@ -260,7 +257,7 @@ def experiment(
     where = Where(jobs=1, cache=folder / "cache")
     run = StudyRun(**({"where": where, "log": silent, "data": folder} | given))
     study = Study("tones", cases, names)
-    return run, development_experiment.results(study, run, names, skipped)
+    return run, development_experiment.results(study, run, names)
 
 
 @pytest.mark.slow
@@ -283,17 +280,11 @@ def test_all_is_run_kept_and_what_is_refused_is_left_out(tmp_path: Path):
     assert experiment(tmp_path, "L-knn", where=kept)[1]["results"] == []
 
 
-def test_what_is_missing_or_not_wanted_is_not_run_and_listed(tmp_path: Path):
-    """Cases without sweeps, skipped cases and points have a reason; unknown names are errors."""
+def test_what_is_missing_is_listed(tmp_path: Path):
+    """Cases without sweeps have a reason; unknown methods are errors."""
     run, found = experiment(tmp_path, "L-gauss", data=None)
     assert found["results"] == []
     assert "PALPATE_DATA" in run.left_out["tones"]
-    skipped = ["tones, 5 each", "tones, 10 each", "short"]
-    run, found = experiment(tmp_path, "L-gauss", skipped=skipped)
-    assert {(r["case"], r["each"]) for r in found["results"]} == {("tones", 0), ("tones", 20)}
-    assert list(run.left_out) == skipped
-    with pytest.raises(FormatError, match="'tone'"):
-        experiment(tmp_path, "L-gauss", skipped=["tone"])
     with pytest.raises(FormatError, match="'nobody'"):
         experiment(tmp_path, "L-gauss", "nobody")
 
@@ -308,32 +299,6 @@ def test_other_precisions_of_a_method_are_counted_with_it():
     made = development_experiment._entry(results)
     assert (made["mean"], made["seeds"], made["fit_s"], made["ms_p50"]) == (0.8, [1, 2], 1.0, 2.0)
     assert (made["forms"]["int8"]["mean"], made["forms"]["int8"]["seeds"]) == (0.65, [1, 2])
-
-
-def test_a_run_is_joined_by_what_it_lacks_of_another():
-    """Each entry comes once, from the run itself if it has it. Missing ones keep their reasons."""
-    run = figures(methods=["palpate"], results=[entry("one", "palpate", 0.9)], left_out={})
-    del run["times"]
-    others = [("one", "palpate", 0.1), ("one", "quant", 0.8), ("two", "minirocket", 0.7)]
-    why = {"palpate, one": "slow", "quant, two": "short", "one": "no", "one, 5 each": "no"}
-    earlier = figures(
-        methods=["quant", "minirocket", "palpate"],
-        results=[entry(*one) for one in others],
-        left_out=why,
-    )
-    made = development_experiment.join(run, [earlier])
-    assert made["methods"] == ["palpate", "minirocket", "quant"]
-    assert [(e["case"], e["method"], e["mean"]) for e in made["results"]] == [
-        ("one", "palpate", 0.9),
-        *others[1:],
-    ]
-    assert list(made["left_out"]) == ["quant, two", "one, 5 each"]
-    assert made["runs"] == [*run["runs"], earlier["runs"][0] | {"methods": ["quant"]}]
-    assert made["times"] == earlier["times"]
-    assert run["methods"] == ["palpate"]  # unchanged
-    earlier["cases"][1]["digest"] = "other"
-    with pytest.raises(FormatError, match="'two'"):
-        development_experiment.join(figures(), [earlier])
 
 
 def test_panels_are_timed_with_their_own_sweeps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -404,7 +369,7 @@ def test_a_model_that_the_box_refuses_is_timed_all_the_same(
 
 
 @pytest.mark.parametrize("text", [None, "{", "[]", "{}"])
-def test_other_results_are_not_joined_or_drawn(
+def test_other_results_are_not_drawn(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str | None
 ):
     """The error has the name of a missing or wrong file. Nothing is written."""
@@ -414,7 +379,6 @@ def test_other_results_are_not_joined_or_drawn(
     for command in (
         ["pages", "development", "--results", str(tmp_path), "--out", out],
         ["development", "--times", "--out", file],
-        ["paper", "--method", "L-gauss", "--out", file],
     ):
         assert main(command) == FormatError.exit_code
         assert "development.json" in capsys.readouterr().err

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.core.errors import FormatError
 from palpate.sim.skin import MATERIALS
 from palpate_studies import paper_experiment, paper_report, paper_values, study
 from palpate_studies.paper_experiment import Outcome, Step
@@ -165,31 +164,6 @@ def test_both_worlds_stand_side_by_side(results: dict[str, Any]):
         ours, other = (rows[part, m]["share"][0] for m in ("palpate-reattached", "H-svm"))
         assert gap.startswith(f"{100 * (ours - other):+.1f} [".replace("-", "−"))
         assert (cnn == "–") == part.endswith("level-blind")
-
-
-def test_some_methods_are_run_again_and_the_others_stay():
-    """The new result replaces the old."""
-    earlier, new = summary(), summary(cnn=False)
-    for row in new["table"]:
-        row["right"] = 1
-    for key in ("table", "results"):
-        new[key] = [one for one in new[key] if one["method"] == "palpate-reattached"]
-    both = paper_experiment.joined(new, earlier)
-    assert len(both["table"]) == len(earlier["table"])
-    assert {row["method"] for row in both["table"] if row["right"] == 1} == {"palpate-reattached"}
-    assert len(both["results"]) == len(earlier["results"])
-    assert both["several"].keys() == earlier["several"].keys()
-    left = paper_experiment.planned(earlier, [Step(("palpate-reattached",), ("lopo",), (1,))])
-    assert {row["method"] for row in left["table"]} == {"palpate-reattached"}
-    assert left["confusion"].keys() == {"palpate-reattached"}
-
-
-def test_only_methods_of_the_plan_are_run():
-    """Steps without any of them are left out. An unknown method is an error."""
-    steps = paper_experiment.narrowed(paper_experiment.FULL_STEPS, ["palpate", "H-svm"])
-    assert [step.methods for step in steps] == [("H-svm",), ("palpate",)]
-    with pytest.raises(FormatError, match="'quant'"):
-        paper_experiment.narrowed(paper_experiment.FULL_STEPS, ["quant"])
 
 
 def test_the_plan_holds_methods_and_parts_that_exist():

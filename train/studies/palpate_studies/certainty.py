@@ -1,26 +1,21 @@
 """The study of certainty: how far the probabilities of a method can be trusted.
 
-It covers calibration, the sequential test, unknown materials, enrolment and early decisions, each
-on test sweeps that nothing was fitted to.
+It covers calibration, the sequential test, unknown materials and early decisions, each on test
+sweeps that nothing was fitted to.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.answer.early import Early
-from palpate.answer.objects import LEAST_PROBABILITY, EnrolledLabels, softmax
-from palpate.answer.unknown import ClassDistances
-from palpate.learn.enrolment import LEAST
-from palpate.learn.enrolment import extended as enrolled_classes
-from palpate_train.calibration.early_exit import LEVELS, decide
+from palpate.answer.objects import LEAST_PROBABILITY, softmax
+from palpate_train.calibration.early_exit import decide
 from palpate_train.data.sets import Dataset, digest
 from palpate_train.evaluate import uncertainty
 from palpate_train.evaluate.evaluate import Where
@@ -29,17 +24,14 @@ from palpate_train.evaluate.uncertainty_cases import Case, Log, Trainings, cases
 from palpate_train.metrics.score import interval, provenance
 from palpate_train.models import methods
 from palpate_train.models.methods import Effort
-from palpate_train.models.recipe.calibrate import Calibration
 
 Array = NDArray[Any]
 Json = dict[str, Any]
 WANTED = (0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.999)
 MOST_SWEEPS = 5
 """Number of sweeps of an object after which the answer is final."""
-ENROLLED = (1, 2, 3, 5, 7, 10)
-"""Numbers of sweeps from which a material is enrolled."""
 ORDERS = 20
-"""Random orders of the sweeps of one object, or of one enrolment."""
+"""Random orders of the sweeps of one object."""
 
 
 def run(
@@ -94,7 +86,6 @@ def figures(trained: Sequence[Case], materials: Sequence[str], seed: int) -> Jso
     without = [one for one in fitted if one[0].left_out >= 0]
     if without:
         result["unknown"] = uncertainty.unknown(without, materials)
-        result["enrolment"] = enrolment(full, without, materials, seed)
     return result
 
 
@@ -220,126 +211,12 @@ def early(full: Sequence[Trained]) -> Json:
         "whole": _accuracy(whole, places),
         "rules": rules,
         "always": [_accuracy(p[:, d].argmax(1) == labels, places) for d in range(steps)],
-        "curves": {str(agree): _levels(p, labels, agree) for agree in (1, 2, 3)},
     }
-
-
-def _levels(p: Array, labels: Array, agree: int) -> list[Json]:
-    """Share of the sweep and accuracy for each of LEVELS by rules with `agree` steps."""
-    met = [decide(p, _same(level, agree, p.shape[1])) for level in LEVELS]
-    return [
-        {
-            "least": level,
-            "share": round(float(s.mean()), 4),
-            "accuracy": round(float(np.mean(k == labels)), 4),
-        }
-        for level, (k, s) in zip(LEVELS, met, strict=True)
-    ]
-
-
-def enrolment(
-    full: Sequence[Trained], without: Sequence[Trained], materials: Sequence[str], seed: int
-) -> Json:
-    """Enrolment of a material that was left out of training, from some sweeps of one placement.
-
-    Gives the balanced accuracy of all classes at the same placement and at others, as a share of
-    that of the model trained on all materials; and the accuracy lost by the old classes.
-    """
-    whole = {case.fold: (case, done) for case, done in full}
-    rows: dict[tuple[str, int], list[tuple[float, ...]]] = {}
-    for case, done in without:
-        rng = np.random.default_rng([seed, case.fold, case.left_out])
-        for n, where, row in _enrolled(case, done, *whole[case.fold], rng):
-            rows.setdefault((where, n), []).append((case.left_out, *row))
-    points: list[Json] = []
-    for (where, n), row_list in sorted(rows.items()):
-        values = np.array(row_list)
-        share, by_material = values[:, 1] / values[:, 2], values[:, 0].astype(int)
-        low, high = uncertainty.bootstrap(partial(_mean_of, share), by_material)
-        points.append(
-            {
-                "where": where,
-                "sweeps": n,
-                "share": round(float(share.mean()), 4),
-                "low": low,
-                "high": high,
-                "accuracy": round(float(values[:, 1].mean()), 4),
-                "trained": round(float(values[:, 2].mean()), 4),
-                "new": round(float(values[:, 3].mean()), 4),
-                "old_lost": round(float(values[:, 4].mean()), 4),
-                "draws": len(values),
-                "by_material": {
-                    materials[k]: round(float(share[by_material == k].mean()), 4)
-                    for k in np.unique(by_material)
-                },
-            }
-        )
-    return {"points": points}
-
-
-def _enrolled(
-    case: Case, done: Calibration, whole: Case, trained: Calibration, rng: np.random.Generator
-) -> Iterator[tuple[int, str, tuple[float, float, float, float]]]:
-    """For each random draw: (sweeps, where, (accuracy, accuracy of the model trained on all
-    materials, recall of the new material, loss of the old ones))."""
-    network, z = done.logits(case.new[:, -1]), done.embedding(case.new[:, -1])
-    k = case.left_out
-    as_trained = trained.logits(whole.new[:, -1]).argmax(1)
-    names = np.append(
-        np.delete(np.arange(case.labels.max() + 1), k), k
-    )  # the box puts the new label last
-    before = names[network.argmax(1)]
-    mine, places = np.flatnonzero(case.labels == k), np.unique(case.places)
-    for n in ENROLLED:
-        for _ in range(max(ORDERS // len(places), 2) if n <= len(mine) else 0):
-            for place in places:
-                there = mine[case.places[mine] == place]
-                if len(there) < n:
-                    continue
-                drawn = rng.permutation(there)[:n]
-                named = names[enrolled_probabilities(done, network, z, z[drawn]).argmax(1)]
-                for where, chosen in (
-                    ("same place", case.places == place),
-                    ("other places", case.places != place),
-                ):
-                    test = np.setdiff1d(np.flatnonzero(chosen), drawn)
-                    if (case.labels[test] == k).any() and (case.labels[test] != k).any():
-                        label, old = case.labels[test], test[case.labels[test] != k]
-                        yield (
-                            n,
-                            where,
-                            (
-                                _balanced(named[test], label),
-                                _balanced(as_trained[test], label),
-                                float(np.mean(named[test][label == k] == k)),
-                                float(
-                                    np.mean(before[old] == case.labels[old])
-                                    - np.mean(named[old] == case.labels[old])
-                                ),
-                            ),
-                        )
-
-
-def enrolled_probabilities(done: Calibration, network: Array, z: Array, sweeps: Array) -> Array:
-    """Probabilities [n, K + 1] of sweeps with these logits [n, K] and embeddings z [n, r], as the
-    box answers after the last label was enrolled from `sweeps` [m, r]."""
-    classes = enrolled_classes(done.embedding.classes(), sweeps)
-    labels = [*map(str, range(len(classes.means)))]
-    means = ClassDistances(classes, replace(done.known(), enrolled=LEAST), labels)
-    return EnrolledLabels(classes.sweeps > 0, LEAST).decided(softmax(means.joined(network, z)))
-
-
-def _balanced(named: Array, labels: Array) -> float:
-    return float(np.mean([np.mean(named[labels == k] == k) for k in np.unique(labels)]))
 
 
 def _parted(rows: Array, held: Sequence[Trained]) -> list[Array]:
     """`rows` of all cases, split by case."""
     return np.split(rows, np.cumsum([len(case.labels) for case, _ in held])[:-1])
-
-
-def _same(level: float, agree: int, steps: int) -> Early:
-    return Early((level,) * (steps - 1), agree)
 
 
 def _accuracy(right: Array, clusters: Array) -> Json:

@@ -28,7 +28,7 @@ PROGRAM = Program(
         "certainty": (
             "measure",
             "measure how far a model's probabilities can be trusted: calibration, more sweeps, "
-            "unknown materials, enrolment",
+            "unknown materials",
         ),
         "alignment": (
             "measure",

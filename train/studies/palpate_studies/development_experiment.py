@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from palpate.core.errors import FormatError
 from palpate_studies.fabrics_experiment import FABRICS, FOUR, SEVEN
 from palpate_studies.study import NO_DATA, Study, StudyCase, StudyRun
 from palpate_train.data.sets import Dataset, digest
@@ -76,15 +75,13 @@ def usual_methods(study: Study) -> tuple[str, ...]:
     return tuple(name for name in study.methods if name in known)
 
 
-def results(study: Study, run: StudyRun, names: Sequence[str], skipped: Sequence[str] = ()) -> Json:
+def results(study: Study, run: StudyRun, names: Sequence[str]) -> Json:
     """The results of the methods `names`: `cases` with their sets, and entries by case, method and
     number of training sweeps.
 
-    skipped: names of cases, or of points of their curves ("NAME, 5 each"), that are not run. Raises
-    FormatError for an unknown method, and for a skipped case that does not exist.
+    Raises FormatError for an unknown method.
     """
     methods.find(names)
-    _require_known(study, skipped)
     cases: list[Json] = []
     found: list[Json] = []
     for number, (name, case) in enumerate(study.cases.items(), 1):
@@ -94,14 +91,9 @@ def results(study: Study, run: StudyRun, names: Sequence[str], skipped: Sequence
             continue
         cases.append(_about(name, case, sweeps))
         for each, point in _points(name, case):
-            if point in skipped or name in skipped:
-                run.left_out[point] = f"skipped in the run of {', '.join(names)}"
-            else:
-                plan = Plan(
-                    names, (case.protocol,), run.seeds, case.means_removed, run.effort, each
-                )
-                progress = f"{number}/{len(study.cases)} {point}"
-                found += _evaluated(name, sweeps, plan, run, progress)
+            plan = Plan(names, (case.protocol,), run.seeds, case.means_removed, run.effort, each)
+            progress = f"{number}/{len(study.cases)} {point}"
+            found += _evaluated(name, sweeps, plan, run, progress)
     known = {"methods": list(names), "seeds": list(run.seeds), "effort": run.effort.share}
     return {
         "methods": list(names),
@@ -110,13 +102,6 @@ def results(study: Study, run: StudyRun, names: Sequence[str], skipped: Sequence
         "results": found,
         "left_out": run.left_out,
     }
-
-
-def _require_known(study: Study, names: Sequence[str]) -> None:
-    known = [point for name, case in study.cases.items() for _, point in _points(name, case)]
-    for name in names:
-        if name not in known:
-            raise FormatError(f"{name!r} is not a case; leave out some of {'; '.join(known)}")
 
 
 def _evaluated(
@@ -140,60 +125,7 @@ def _evaluated(
 def _points(name: str, case: StudyCase) -> list[tuple[int, str]]:
     """Training sweeps of each material (0 for all) and the name, of a case and of each point of
     its curve."""
-    return [(each, _name(name, each)) for each in (0, *case.curve)]
-
-
-def _name(case: str, each: int) -> str:
-    """Name of a case, or of a point of its curve."""
-    return f"{case}, {each} each" if each else case
-
-
-def _place(entry: Json) -> tuple[str, int]:
-    """The case and the point of its curve that an entry is of."""
-    return entry["case"], entry["each"]
-
-
-def join(run: Json, earlier: Sequence[Json]) -> Json:
-    """`run` with the methods, entries, reasons, runs and times of `earlier` runs that it does not
-    have itself. Of a method whose entries are all replaced no run is named.
-
-    Raises FormatError if an earlier run was of other sweeps.
-    """
-    made = dict(run)
-    for one in earlier:
-        _require_same_sweeps(made, one)
-        there = {(_place(entry), entry["method"]) for entry in made["results"]}
-        more = [entry for entry in one["results"] if (_place(entry), entry["method"]) not in there]
-        names = dict.fromkeys([*made["methods"], *one["methods"]])
-        left = {entry["method"] for entry in more}
-        runs = [run | {"methods": [m for m in run["methods"] if m in left]} for run in one["runs"]]
-        made |= {
-            "methods": sorted(names, key=lambda name: (*OURS, *PEERS, name).index(name)),
-            "results": [*made["results"], *more],
-            "runs": [*made["runs"], *(run for run in runs if run["methods"])],
-        }
-        for times in ("times", "panel_times"):
-            if one.get(times):
-                made.setdefault(times, one[times])
-        done = {
-            name
-            for entry in made["results"]
-            for name in (f"{entry['method']}, {entry['case']}", _name(*_place(entry)))
-        }
-        made["left_out"] = {
-            k: why for k, why in (one["left_out"] | made["left_out"]).items() if k not in done
-        }
-    return made
-
-
-def _require_same_sweeps(run: Json, earlier: Json) -> None:
-    known = {case["case"]: case["digest"] for case in earlier["cases"]}
-    for case in run["cases"]:
-        if known.get(case["case"], case["digest"]) != case["digest"]:
-            raise FormatError(
-                f"{case['case']!r} was of other sweeps in a run that is joined; "
-                "run its methods again"
-            )
+    return [(each, f"{name}, {each} each" if each else name) for each in (0, *case.curve)]
 
 
 def _about(name: str, case: StudyCase, sweeps: Dataset) -> Json:
@@ -218,7 +150,7 @@ def _entry(results: Sequence[Json]) -> Json:
     """Accuracy with its interval, and costs, over the results of all seeds, for each precision."""
     seeds = [result["seed"] for result in results]
     forms = {
-        name: joined(
+        name: _mean(
             [
                 result["forms"][name] | {"seed": seed}
                 for result, seed in zip(results, seeds, strict=True)
@@ -227,10 +159,10 @@ def _entry(results: Sequence[Json]) -> Json:
         for name in results[0].get("forms", {})
     }
     costs = {name: max(float(result[name]) for result in results) for name in ("fit_s", "ms_p50")}
-    return joined(results) | costs | {"forms": forms}
+    return _mean(results) | costs | {"forms": forms}
 
 
-def joined(results: Sequence[Json]) -> Json:
+def _mean(results: Sequence[Json]) -> Json:
     """Results of several seeds of one protocol as one: means of accuracies and of the ends of
     intervals."""
     shares = [(r["window"]["right"] / r["window"]["total"], *r["interval"]) for r in results]

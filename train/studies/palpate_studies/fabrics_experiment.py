@@ -1,5 +1,5 @@
 """The study `fabrics`: methods on real fabrics, one condition left out at a time, with and without
-each taxel's mean. Results of methods that are not run stay as they are."""
+each taxel's mean."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ of each."""
 SEED = 1
 
 
-def results(names: Sequence[str], how: StudyRun, earlier: Sequence[Json] = ()) -> list[Json]:
-    """The results of `names`, and of all other methods in `earlier` results.
+def results(names: Sequence[str], how: StudyRun) -> list[Json]:
+    """The results of `names`, in the order of the page.
 
     Methods that cannot use these sweeps are in how.left_out. Raises FormatError where the real
     sweeps are missing.
@@ -42,14 +42,7 @@ def results(names: Sequence[str], how: StudyRun, earlier: Sequence[Json] = ()) -
                     how.left_out[result.method] = result.refused
                 else:
                     found.append(result.json() | {"only": list(only)})
-    done = {_entry(result) for result in found}
-    found += [result for result in earlier if _entry(result) not in done]
     return sorted(found, key=_place)
-
-
-def _entry(result: Json) -> tuple[str, str, bool, tuple[str, ...]]:
-    """The method and the test of a result."""
-    return result["method"], result["protocol"], result["means_removed"], tuple(result["only"])
 
 
 def _place(result: Json) -> tuple[bool, int, int]:

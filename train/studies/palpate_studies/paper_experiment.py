@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.answer.objects import LEAST_PROBABILITY, fuse, softmax
-from palpate.core.errors import FormatError
 from palpate_studies import paper_values
 from palpate_studies.paper_values import CNN
 from palpate_studies.peers import prior_work
@@ -32,8 +31,6 @@ BASELINES = ("L-gauss", "L-knn", "L-svm", "H-knn", "H-svm")
 NEIGHBOURS = ("fishel-bayes", "static-svm", "spectrogram-svm", "correlation-svm")
 NETWORKS = ("tactnet2", "recurrent")
 OWN = ("palpate-reattached", "palpate")
-BY_METHOD = ("confusion", "several", "explored", "methods")
-"""Tables of the results by method; all but the last are of the case "lopo"."""
 SURE = (0.9, 0.95, 0.99)
 """Posteriors at which no more sweeps are added."""
 SEVERAL = 3
@@ -41,8 +38,6 @@ ATTACHMENTS = 36
 """Seeds of T-HARD for each seed of a case, 18 sweeps each."""
 PLACES = 10_000
 """More than a seed has attachments."""
-LISTS = ("table", "results")
-"""Tables of the results that are lists."""
 
 
 def load(case: StudyCase, seed: int) -> Dataset:
@@ -144,56 +139,9 @@ class Outcome:
 STUDY = Study("paper", FULL, tuple(dict.fromkeys(m for step in FULL_STEPS for m in step.methods)))
 
 
-def results(how: StudyRun, only: Sequence[str] = (), earlier: Json | None = None) -> Json:
-    """Train and test the whole plan; the results.
-
-    only: methods that are run; all others stay as in `earlier` results. Raises FormatError as
-    evaluate does, and for a name in `only` that the plan does not have.
-    """
-    outcomes = list(_outcomes(FULL, narrowed(FULL_STEPS, only) if only else FULL_STEPS, how))
-    found = summary(outcomes, FULL, how.effort) | score.provenance()
-    return joined(found, planned(earlier, FULL_STEPS)) if only and earlier else found
-
-
-def narrowed(steps: Sequence[Step], only: Sequence[str]) -> list[Step]:
-    """The steps with these methods alone. Raises FormatError for a method without a step."""
-    known = dict.fromkeys(m for step in steps for m in step.methods)
-    for name in only:
-        if name not in known:
-            raise FormatError(
-                f"method {name!r} is not in the paper's experiment; use some of {', '.join(known)}"
-            )
-    kept = [replace(step, methods=tuple(m for m in step.methods if m in only)) for step in steps]
-    return [step for step in kept if step.methods]
-
-
-def planned(found: Json, steps: Sequence[Step]) -> Json:
-    """`found` without methods that are not in the plan any more."""
-    known = {m for step in steps for m in step.methods}
-    lists = {key: [one for one in found[key] if one["method"] in known] for key in LISTS}
-    tables = {
-        key: {name: value for name, value in found[key].items() if name in known}
-        for key in BY_METHOD
-    }
-    return found | lists | tables
-
-
-def joined(found: Json, earlier: Json) -> Json:
-    """Two results as one. Entries of `found` replace those of `earlier`."""
-    lists = {
-        key: [
-            *(one for one in earlier[key] if _at(one) not in set(map(_at, found[key]))),
-            *found[key],
-        ]
-        for key in LISTS
-    }
-    tables = {k: earlier[k] | found[k] for k in BY_METHOD}
-    return earlier | found | tables | lists
-
-
-def _at(one: dict[str, Any]) -> tuple[Any, ...]:
-    """Key of an entry: part, method, seed."""
-    return one["part"], one["method"], one.get("seed")
+def results(how: StudyRun) -> Json:
+    """Train and test the whole plan; the results. Raises FormatError as evaluate does."""
+    return summary(list(_outcomes(FULL, FULL_STEPS, how)), FULL, how.effort) | score.provenance()
 
 
 def _outcomes(

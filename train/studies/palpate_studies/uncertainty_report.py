@@ -106,18 +106,6 @@ def _unknown_tables(figures: Json) -> dict[str, list[list[str]]]:
     ]
     return {
         "unknown": [*rows, ["mean", *(formatting.percent(mean[k]) for k in shares), ""]],
-        "enrolment": [
-            [
-                p["where"],
-                str(p["sweeps"]),
-                _share(p, "share"),
-                formatting.percent(p["accuracy"]),
-                formatting.percent(p["new"]),
-                formatting.points(p["old_lost"]),
-                str(p["draws"]),
-            ]
-            for p in figures["enrolment"]["points"]
-        ],
     }
 
 

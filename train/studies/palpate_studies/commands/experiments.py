@@ -25,15 +25,12 @@ from palpate_train.arguments.program import Add
 
 def register(add: Add) -> None:
     """Add all commands of this module."""
-    paper = add("paper", run_paper)
-    _add_method(paper)
     development = add("development", run_development)
     _add_development(development)
     fabrics = add("fabrics", run_fabrics)
-    _add_method(fabrics)
-    fabrics.set_defaults(method="all")
+    fabrics.add_argument("--method", default="all", metavar="NAME[,NAME...]", help="(all)")
     for name, command in (
-        ("paper", paper),
+        ("paper", add("paper", run_paper)),
         ("development", development),
         ("fabrics", fabrics),
         ("recipe", add("recipe", run_recipe)),
@@ -66,39 +63,12 @@ def _add_run(command: argparse.ArgumentParser, name: str) -> None:
     options.add_where(command)
 
 
-def _add_method(command: argparse.ArgumentParser) -> None:
-    command.add_argument(
-        "--method",
-        metavar="NAME[,NAME...]",
-        help="run these; all others stay as in the results in --out (all)",
-    )
-
-
-def _add_seeds(command: argparse.ArgumentParser) -> None:
+def _add_development(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--seeds", type=int, default=1, metavar="N", help="of training: 1 to N (1)"
     )
-
-
-def _add_development(command: argparse.ArgumentParser) -> None:
-    _add_seeds(command)
     command.add_argument(
         "--method", metavar="NAME[,NAME...]", help="(ours, as fit trains it, and the peers)"
-    )
-    command.add_argument(
-        "--leave-out",
-        action="append",
-        default=[],
-        metavar="CASE",
-        help="a case, or a point of its learning curve, that is not run, as the page names it",
-    )
-    command.add_argument(
-        "--join",
-        type=Path,
-        action="append",
-        default=[],
-        metavar="FILE",
-        help="results of an earlier run, whose methods join those of this one",
     )
     command.add_argument(
         "--times",
@@ -123,17 +93,13 @@ def _done(run: StudyRun, path: Path) -> None:
 def run_paper(args: argparse.Namespace) -> None:
     """Run the experiment and write its results."""
     run = _run(args)
-    only = options.names(args) if args.method else ()
-    earlier = read(args.out, *PAGES["paper"].keys) if only else None
-    _done(run, save(args.out, paper_experiment.results(run, only, earlier)))
+    _done(run, save(args.out, paper_experiment.results(run)))
 
 
 def run_fabrics(args: argparse.Namespace) -> None:
     """Evaluate and write the results."""
     names, run = options.names(args), _run(args)
-    earlier = read(args.out) if args.out.exists() else ()
-    found = fabrics_experiment.results(names, run, earlier)
-    _done(run, save(args.out, found))
+    _done(run, save(args.out, fabrics_experiment.results(names, run)))
 
 
 def run_recipe(args: argparse.Namespace) -> None:
@@ -150,8 +116,7 @@ def run_development(args: argparse.Namespace) -> None:
     if args.times:
         figures = read(args.out, *keys)
     else:
-        made = development_experiment.results(study, run, tuple(names), args.leave_out)
-        figures = development_experiment.join(made, [read(path, *keys) for path in args.join])
+        figures = development_experiment.results(study, run, tuple(names))
     if args.times or not args.kept:
         train = development_times.TIMED.load()
         assert train is not None  # it is simulated

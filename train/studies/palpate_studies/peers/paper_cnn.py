@@ -20,7 +20,6 @@ from torch.nn import functional
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from palpate.core.types import SweepFormat
-from palpate_studies.peers import fourier_convolution
 from palpate_studies.peers.networks import (
     Build,
     PeerNetwork,
@@ -85,8 +84,6 @@ class ImageLayers:
     dense: int
 
 
-FEW_CHANNELS = 8
-"""With fewer, the Fourier transform of a convolution costs more than it saves."""
 KERNEL = (15, 5)
 """Kernel of the paper's convolutions, frames by taxels (table I)."""
 PAPER = ImageLayers(channels=(32, 64), strides=((1, 1), (1, 1)), pool=10, norm=False, dense=1024)
@@ -144,19 +141,9 @@ class ImageNetwork(PeerNetwork):
         """[B, R * C, T] -> activations of the dense layer [B, layers.dense]."""
         x = prepared.transpose(1, 2)[:, None]
         for conv, norm in self._convolutions():
-            y = norm(self._convolved(conv, x))
+            y = norm(conv(x))
             x = functional.max_pool2d(y, (self.layers.pool, 1), ceil_mode=True).relu()
         return torch.relu(self.dense(x.flatten(1)))
-
-    def _convolved(self, conv: nn.Conv2d, x: Tensor) -> Tensor:
-        """The convolution of `x`, in training on a processor by the quicker way."""
-        plain = conv.stride == (1, 1) and conv.in_channels >= FEW_CHANNELS
-        if plain and self.training and x.device.type == "cpu":
-            bias = conv.bias
-            assert bias is not None
-            return fourier_convolution.convolve(x, conv.weight) + bias[:, None, None]
-        convolved: Tensor = conv(x)
-        return convolved
 
     def graph(self) -> onnx.ModelProto:
         """`sweep` -> `logits` float32 [1, K]; the batch norms are folded into the convolutions."""
