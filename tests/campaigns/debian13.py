@@ -1,8 +1,8 @@
 """The fast tests in a Debian 13 with its Python 3.13, as on a Raspberry Pi of today.
 
 `python -m tests.campaigns debian13 [OPTION ...]` runs them as root on a clone of the last commit;
-options go to pytest. The Debian with its virtual environment is made once, in ~/.cache/palpate: it
-takes some minutes and 6 GB.
+options go to pytest. The Debian with its virtual environment is made once for the locks, in
+~/.cache/palpate: it takes some minutes and 6 GB. `build` makes it and runs nothing.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ exec chroot "$0" env -i {env} sh -euc "$1"
 def inside(root: Path, command: str) -> int:
     """Run a shell command in the Debian, with the network of this machine; its exit code."""
     kept = {name: value for name, value in os.environ.items() if name.startswith("PIP_")}
+    kept.pop("PIP_FIND_LINKS", None)  # a folder of this machine
     env = kept | {"HOME": "/root", "LANG": "C.UTF-8", "PATH": "/usr/sbin:/usr/bin:/sbin:/bin"}
     words = " ".join(f"{name}={shlex.quote(value)}" for name, value in env.items())
     script = ENTER.format(shared=" ".join(SHARED), env=words)
@@ -42,9 +43,10 @@ def inside(root: Path, command: str) -> int:
 
 
 def folder() -> Path:
-    """The folder of the Debian; it depends on its packages and on the locks."""
+    """The folder of the Debian; it depends on its packages and on the locks. `make` brings the rest
+    of the virtual environment up to date before each run."""
     total = hashlib.sha256(repr((SUITE, PACKAGES, SHARED)).encode())
-    for name in (*LOCKS, "pyproject.toml", "train/pyproject.toml"):
+    for name in LOCKS:
         total.update((ROOT / name).read_bytes())
     return HOME.parent / "debian13" / total.hexdigest()[:16]
 
@@ -65,10 +67,12 @@ def _make(root: Path) -> None:
 
 
 def main(options: Sequence[str]) -> int:
-    """Run the fast tests there; the exit code of pytest."""
+    """Run the fast tests there, or only build it; the exit code of pytest."""
     if os.geteuid():
         raise Missing("a Debian needs root; use sudo")
     root = whole(folder(), _make)
+    if list(options) == ["build"]:
+        return 0
     _clone(root)
     more = shlex.quote(shlex.join(options))
     return inside(root, f"cd {SOURCE}; make VENV={VENV} PYTEST_OPTIONS={more} test-fast")

@@ -1,8 +1,8 @@
-"""The numerical tests with the arithmetic of other processors, and tests of waiting under load.
+"""The tests with the arithmetic of other processors, and on a busy machine.
 
-`python -m tests.campaigns processors [OPTION ...]` runs pytest once for each kind of processor that
-OpenBLAS knows and this one can imitate, with one thread or with eight in turn (`--all`: with both),
-and once beside BUSY endless loops; options go to pytest. Takes some minutes on two cores.
+`python -m tests.campaigns processors [OPTION ...]` runs the fast tests of NUMERICAL once for each
+kind of processor that OpenBLAS knows and this one can imitate, with one thread or with eight in
+turn (`--all`: with both), and then all fast tests beside BUSY endless loops; options go to pytest.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
 from itertools import cycle, product
 from pathlib import Path
@@ -20,43 +21,52 @@ KINDS = {"Nehalem": "sse4_2", "Haswell": "avx2", "Zen": "avx2", "SkylakeX": "avx
 """Names of OPENBLAS_CORETYPE, each with the flag of /proc/cpuinfo that it needs."""
 THREADS = ("1", "8")
 BUSY = 8
-NUMERICAL = ("tests/palpate/signal", "tests/palpate/inference", "tests/palpate_train/calibration")
-WAITING = (
-    "tests/palpate/io",
-    "tests/palpate/runtime",
-    "tests/palpate/service",
-    "tests/palpate/sweeps",
+NUMERICAL = (
+    *(f"tests/palpate/{name}" for name in ("signal", "inference", "learn")),
+    *(
+        f"tests/palpate_train/{name}"
+        for name in ("calibration", "evaluate", "export", "features", "metrics", "models")
+    ),
 )
+"""The packages that compute with matrices; the others read, write, wait and show."""
 FAST = ("-m", "pytest", "-q", "-n", str((os.cpu_count() or 1) + 1), "--dist", "worksteal")
 FAST += ("-m", "not slow and not thorough")
 
 
-def tested(paths: Sequence[str], **variables: str) -> bool:
-    """Run the fast tests of these paths with these variables; whether they passed."""
-    print(f"== {variables or f'beside {BUSY} busy loops'}", flush=True)
-    command = [sys.executable, *FAST, *paths]
-    return not subprocess.run(command, cwd=ROOT, env=os.environ | variables, check=False).returncode
+def tested(name: str, options: Sequence[str], **variables: str) -> str:
+    """Run fast tests with these variables; the line that says what came of it."""
+    print(f"== {name}", flush=True)
+    begin = time.monotonic()
+    command = [sys.executable, *FAST, *options]
+    code = subprocess.run(command, cwd=ROOT, env=os.environ | variables, check=False).returncode
+    return f"{'FAILED' if code else 'passed'} in {time.monotonic() - begin:.0f} s: {name}"
 
 
 def main(options: Sequence[str]) -> int:
     """Run all; 1 if a test failed."""
     flags = Path("/proc/cpuinfo").read_text().split()
     able = [kind for kind, flag in KINDS.items() if flag in flags]
-    if left := KINDS.keys() - able:
-        print(f"this processor cannot imitate {', '.join(sorted(left))}")
     pairs = product(able, THREADS) if "--all" in options else zip(able, cycle(THREADS))
     options = [option for option in options if option != "--all"]
-    passed = [
-        tested((*NUMERICAL, *options), OPENBLAS_CORETYPE=kind, OPENBLAS_NUM_THREADS=threads)
+    lines = [
+        tested(
+            f"{kind}, threads: {threads}",
+            (*NUMERICAL, *options),
+            OPENBLAS_CORETYPE=kind,
+            OPENBLAS_NUM_THREADS=threads,
+            OMP_NUM_THREADS=threads,
+        )
         for kind, threads in pairs
     ]
     loops = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(BUSY)]
     try:
-        passed.append(tested((*WAITING, *options)))
+        lines.append(tested(f"{BUSY} busy loops", options))
     finally:
         for loop in loops:
             loop.kill()
-    return 0 if all(passed) else 1
+    lines += [f"this processor cannot imitate {kind}" for kind in KINDS if kind not in able]
+    print(*lines, sep="\n")
+    return any(line.startswith("FAILED") for line in lines)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ import pytest
 from palpate.answer.objects import softmax
 from palpate.core.errors import FormatError
 from palpate.inference.session import session
-from palpate_studies.peers import minirocket, sthmp
+from palpate_studies.peers import aeon_peers, minirocket, sthmp
 from palpate_train.data.sets import Dataset
 from palpate_train.models import methods
 from palpate_train.models.methods import Model
@@ -24,8 +24,11 @@ DESKTOP = ("static-svm", "spectrogram-svm")
 AEON = ("minirocket", "minirocket-augmented", "multirocket-hydra", "quant")
 ALONE = ("multirocket-hydra", "quant")
 """Methods that run in aeon alone."""
-SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("st-hmp", *AEON[:2])]
-LONG = [pytest.param(name, marks=[pytest.mark.slow, pytest.mark.thorough]) for name in ALONE]
+COMPILED = [pytest.mark.slow, pytest.mark.timeout(1200)]
+"""Marks of what numba compiles for its first test: that takes minutes on a busy machine."""
+SLOW = [pytest.param("st-hmp", marks=pytest.mark.slow)]
+SLOW += [pytest.param(name, marks=COMPILED) for name in AEON[:2]]
+LONG = [pytest.param(name, marks=[*COMPILED, pytest.mark.thorough]) for name in ALONE]
 every = pytest.mark.parametrize("name", [*FEATURES, *DESKTOP, *SLOW, *LONG])
 with_graph = pytest.mark.parametrize("name", [*FEATURES, *SLOW])
 
@@ -136,7 +139,7 @@ def test_without_aeon_the_extra_is_advised(name: str, monkeypatch: pytest.Monkey
     """aeon comes with the extra `peers`; methods that run in aeon alone have no graph."""
     if name in ALONE:
         with pytest.raises(FormatError, match="aeon"):
-            fitted(name, easy(4)).graph()
+            aeon_peers.AeonModel(name, len, np.arange(2), 2).graph()
     for part in (
         "transformations.collection.convolution_based",
         "classification.convolution_based",
