@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import ast
 import functools
+import gc
 import os
 import re
 import subprocess
@@ -60,7 +61,11 @@ def run(*args: str | Path, cwd: Path, env: dict[str, str] | None = None) -> str:
 @functools.cache
 def nodes(path: Path) -> list[ast.AST]:
     """All nodes of a module; the module itself is the first."""
-    return list(ast.walk(ast.parse(path.read_text())))
+    gc.disable()  # it would look through the nodes of all modules before this one
+    try:
+        return list(ast.walk(ast.parse(path.read_text())))
+    finally:
+        gc.enable()
 
 
 def shown(path: Path) -> str:
@@ -120,6 +125,7 @@ def test_no_module_imports_itself_through_others():
     assert "palpate.core.errors -> palpate.deployment.store" in circles(back)
 
 
+@pytest.mark.slow
 def test_packages_import_downwards_only():
     """The contracts of pyproject.toml, as `make lint` checks them."""
     output = run(Path(sys.executable).with_name("lint-imports"), cwd=ROOT)
@@ -157,6 +163,7 @@ def foreign(path: Path) -> set[str]:
     return {name for name in imports(path) if name.split(".")[0] not in allowed}
 
 
+@pytest.mark.slow
 def test_the_box_imports_five_libraries():
     """The box imports the five libraries of the design, and itself by full names; a library of an
     extra only in the part that the extra is for."""
@@ -164,6 +171,7 @@ def test_the_box_imports_five_libraries():
     assert foreign(ROOT / "train" / "palpate_train" / "models" / "training.py") >= {"torch"}
 
 
+@pytest.mark.slow
 def test_no_test_imports_another():
     """Code that tests share stands in tests/factories."""
     found = [
@@ -224,11 +232,13 @@ def too_long(path: Path) -> list[str]:
     return found
 
 
+@pytest.mark.slow
 def test_modules_are_introduced():
     """A docstring opens each file."""
     assert [shown(p) for p in [*SOURCES, *GROUNDS] if not ast.get_docstring(nodes(p)[0])] == []
 
 
+@pytest.mark.slow
 def test_modules_and_functions_are_short():
     """Modules have at most 500 lines, functions under 40 lines of code."""
     paths = [path for path in [*SOURCES, *GROUNDS] if not path.name.startswith("test_")]
@@ -247,6 +257,7 @@ def test_no_wall_clock_no_pickle_no_bare_except():
     assert found == []
 
 
+@pytest.mark.slow
 def test_dataclasses_with_arrays_are_not_compared_by_value():
     """Each has eq=False: since Python 3.13, comparing two arrays for their truth raises."""
     array = re.compile(r"(?!.*Callable).*\b(NDArray|Array|ndarray)\b")
@@ -271,6 +282,7 @@ def written_tests() -> list[tuple[str, ast.FunctionDef]]:
     ]
 
 
+@pytest.mark.slow
 def test_every_test_says_what_it_holds():
     """Each test has a docstring."""
     assert [name for name, test in written_tests() if not ast.get_docstring(test)] == []
@@ -286,6 +298,7 @@ def asserts(test: ast.FunctionDef) -> bool:
     return any(map(judges.fullmatch, calls))
 
 
+@pytest.mark.slow
 def test_every_test_asserts():
     """Each test holds an assertion, or calls a helper whose name begins with check_, assert_ or
     expect_."""
@@ -304,6 +317,7 @@ def endless(node: ast.AST) -> bool:
     )
 
 
+@pytest.mark.slow
 def test_no_test_waits_for_a_program_without_a_limit():
     """Each program that a test or a factory runs to its end has a timeout."""
     assert endless(ast.parse("subprocess.run(['true'])").body[0].value)
@@ -314,6 +328,7 @@ def test_no_test_waits_for_a_program_without_a_limit():
     assert found == []
 
 
+@pytest.mark.slow
 def test_each_class_name_stands_once():
     """A class name says which class is meant: none stands in two modules, tests included."""
     found: dict[str, list[str]] = {}

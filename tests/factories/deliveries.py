@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import atexit
 import shutil
 import subprocess
+import tempfile
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -85,15 +88,32 @@ def put(folder: Path, files: dict[str, bytes]) -> Path:
     return folder
 
 
+@cache
+def _keys() -> Path:
+    """A sender's key and a box's key for enrolments, for all boxes of this process."""
+    folder = Path(tempfile.mkdtemp())
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    key(folder / "keys")
+    enrolment_key(folder / "enrolment")
+    return folder
+
+
+@cache
+def _delivered(counter: int, **changes: object) -> dict[str, bytes]:
+    """The same as `files`, signed with the sender's key."""
+    return files(counter, _keys() / "keys" / "key", **changes)
+
+
 class Delivery:
-    """A box's store, and the sender of its bundles."""
+    """A box's store, and the sender of its bundles. All boxes of a process have the same keys."""
 
     def __init__(
         self, folder: Path, prove: Callable[[Bundle], object] = lambda bundle: None
     ) -> None:
         self.folder = folder
-        self.key = key(folder / "keys")
-        self.enrolment_key = enrolment_key(folder / "enrolment")
+        shutil.copytree(_keys(), folder, dirs_exist_ok=True)
+        self.key = folder / "keys" / "key"
+        self.enrolment_key = EnrolmentKey(folder / "enrolment")
         self.how = StoreConfig(str(folder / "store"), str(folder), trial_sweeps=5)
         Path(self.how.folder).mkdir()
         self.how.signers.write_text(line(self.key))
@@ -102,7 +122,7 @@ class Delivery:
 
     def made(self, counter: int, **changes: object) -> Path:
         """A folder with a signed bundle, as `deploy` copies it."""
-        return self.copied(files(counter, self.key, **changes))
+        return self.copied(_delivered(counter, **changes))
 
     def copied(self, held: dict[str, bytes]) -> Path:
         """A folder with these files."""

@@ -6,6 +6,8 @@ import os
 import shutil
 import subprocess
 import sys
+import tempfile
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -16,20 +18,60 @@ from tests.factories.paths import ROOT
 SCRIPTS = ROOT / "systemd"
 
 
+SERVER = """
+import os, sys
+fork, wait = os.fork, os.waitpid  # gevent may replace them
+try:
+    import deploy, install
+except ImportError:
+    pass  # no pyinfra here
+for line in sys.stdin:
+    child = fork()
+    if not child:
+        for fd, name in ((1, "said"), (2, "errors")):
+            os.dup2(os.open(os.path.join(line.strip(), name), os.O_CREAT | os.O_WRONLY), fd)
+        code = 1
+        try:
+            exec(open(os.path.join(line.strip(), "code")).read(), {"__name__": "__main__"})
+            code = 0
+        except BaseException:
+            import traceback
+            traceback.print_exc()
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+    print(wait(child, 0)[1], flush=True)
+"""
+"""Forks a process for each line, a folder with code. The imports take half a second."""
+
+
+@cache
+def _server() -> subprocess.Popen[str]:
+    """The process that has imported the scripts; it ends with this one, at the end of its input."""
+    return subprocess.Popen(
+        [sys.executable, "-c", SERVER],
+        env=os.environ | {"PYTHONPATH": str(SCRIPTS)},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+
+
 def run_here(code: str) -> str:
     """Output of Python code that imports the scripts, in a process of its own.
 
     Importing gevent here would change this process too much.
     """
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        env=os.environ | {"PYTHONPATH": str(SCRIPTS)},
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout.strip()
+    server = _server()
+    assert server.stdin
+    assert server.stdout
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder, "code").write_text(code)
+        server.stdin.write(f"{folder}\n")
+        server.stdin.flush()
+        failed = server.stdout.readline().strip()
+        assert failed == "0", Path(folder, "errors").read_text()
+        return Path(folder, "said").read_text().strip()
 
 
 def enrolment_key(folder: Path) -> EnrolmentKey:

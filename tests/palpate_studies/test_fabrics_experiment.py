@@ -78,13 +78,20 @@ def test_methods_are_run_under_all_protocols(data: Path):
 def test_what_is_missing_is_named(
     data: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    """Missing sweeps, and a method that cannot use these."""
+    """Missing sweeps."""
     monkeypatch.delenv("PALPATE_DATA", raising=False)
     assert (
         main(["fabrics", "--method", "static-svm", "--out", str(data / "fabrics.json")])
         == FormatError.exit_code
     )
     assert "name their folder with --data or PALPATE_DATA" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_method_that_cannot_use_these_sweeps_is_named(
+    data: Path, capsys: pytest.CaptureFixture[str]
+):
+    """The others are evaluated."""
     assert run(data, method="H-svm,static-svm") == 0
     assert "left out: H-svm: 40 frames" in capsys.readouterr().out
     assert {r["method"] for r in results(data)} == {"static-svm"}

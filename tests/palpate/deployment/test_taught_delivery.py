@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -65,6 +66,8 @@ def test_one_taught_bundle_follows_another(box: Delivery):
 def test_only_this_box_accepts_it(box: Delivery, tmp_path: Path):
     """Another box has another key; there it has to be signed on a desktop."""
     other = Delivery(tmp_path / "other")
+    shutil.rmtree(other.enrolment_key.folder)
+    install_scripts.enrolment_key(other.enrolment_key.folder)
     with pytest.raises(BundleError, match=r"not taught on this box, .*teach it here"):
         other.store.learn(taught(box))
 

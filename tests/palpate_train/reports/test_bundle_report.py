@@ -36,10 +36,17 @@ def sweeps() -> Dataset:
 
 @pytest.fixture(scope="module")
 def figures(sweeps: Dataset) -> dict:
-    """The figures of the packaged bundle."""
-    return bundle_experiment.run(bundle.DEFAULT, sweeps, NOTHING) | {
-        "command": "palpate-train report"
-    }
+    """The figures of the packaged bundle; corruptions are those of six sweeps."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(EvaluationSweeps.of.__func__, "__defaults__", (6, 0))
+        found = bundle_experiment.run(bundle.DEFAULT, sweeps, NOTHING)
+    return found | {"command": "palpate-train report"}
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pages without pictures of example sweeps."""
+    monkeypatch.setattr(bundle_report, "_examples", lambda sweeps: [])
 
 
 def test_the_figures_are_those_of_score(figures: dict, sweeps: Dataset, default_bundle: Bundle):
@@ -99,6 +106,7 @@ def test_the_page_holds_the_figures(figures: dict, sweeps: Dataset):
         assert f"{row['title']}: {row['about']}" in reader.text
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_set_with_a_foreign_material_and_many_labels(figures: dict, sweeps: Dataset):
     """A material that the bundle lacks has its own table; with more than twelve labels there is no
     matrix."""
@@ -115,6 +123,7 @@ def test_a_set_with_a_foreign_material_and_many_labels(figures: dict, sweeps: Da
     assert "simulated" not in plain.split("How it was made")[0]
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_headline_says_what_was_missed(figures: dict, sweeps: Dataset):
     """Right, wrong and unnamed sweeps add up to all sweeps. The headline has the worst material,
     the first corruption to break the bundle, errors and cost."""
@@ -160,6 +169,7 @@ def test_what_the_bundle_calls_a_foreign_material_is_counted(
     assert named["unknown"][0] == pytest.approx(2 / 11)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_bundle_without_novelty_says_so(figures: dict, sweeps: Dataset):
     """Such a bundle never answers `unknown`, and the page states no figure for it."""
     text = PageReader(bundle_report.page(figures | {"tells_unknown": False}, sweeps)).text
@@ -215,6 +225,7 @@ def test_a_row_of_few_sweeps_says_how_many(figures: dict):
     assert f"{'x' * 23}…" in drawn
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_page_shows_the_curve_and_materials_left_out(figures: dict, sweeps: Dataset):
     """Each point in words, the picture with titles, the material in its table."""
     row = {"auroc": 0.9, "low": 0.8, "high": 1.0, "kept": 0.95, "false_known": 0.25}

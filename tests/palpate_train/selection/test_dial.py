@@ -223,7 +223,7 @@ def test_a_size_that_the_windows_do_not_allow_is_named():
 
 @pytest.fixture
 def costs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fixed costs in the order of the sizes, without a bundle."""
+    """Fixed costs in the order of the sizes, without fits and bundles."""
 
     def fixed(
         fits: dict[str, Fit], sweeps: Dataset, log: object
@@ -233,6 +233,7 @@ def costs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dial, "bundle_costs", fixed)
     judged = judged_skin()
     monkeypatch.setattr(dial, "judge", lambda *args: judged)
+    monkeypatch.setattr(dial.Judgement, "fit", lambda self, name: cast(Fit, name))
 
 
 def chosen(**budget: float) -> dial.Selection:

@@ -10,12 +10,10 @@ from pathlib import Path
 
 import pytest
 
-HERE = Path(__file__).parent
-EXTRA_FILES = (HERE / "studies", HERE / "models" / "peers")
-
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the slow tests below these folders."""
+    """Mark the slow tests of this folder."""
     for item in items:
-        if item.path.parent in EXTRA_FILES and item.get_closest_marker("slow"):
+        here = item.path.is_relative_to(Path(__file__).parent)
+        if here and item.get_closest_marker("slow"):
             item.add_marker(pytest.mark.thorough)
