@@ -47,7 +47,7 @@ for line in sys.stdin:
 
 @cache
 def _server() -> subprocess.Popen[str]:
-    """The process that has imported the scripts; it ends with this one, at the end of its input."""
+    """The process that has imported the scripts. It ends when its input ends."""
     return subprocess.Popen(
         [sys.executable, "-c", SERVER],
         env=os.environ | {"PYTHONPATH": str(SCRIPTS)},
