@@ -42,7 +42,7 @@ for line in sys.stdin:
         os._exit(code)
     print(wait(child, 0)[1], flush=True)
 """
-"""Forks a process for each line, a folder with code. The imports take half a second."""
+"""Forks a process for each line, which is a folder with code."""
 
 
 @cache

@@ -78,7 +78,7 @@ def test_methods_are_run_under_all_protocols(data: Path):
 def test_what_is_missing_is_named(
     data: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    """Missing sweeps."""
+    """The folder of real sweeps is missing."""
     monkeypatch.delenv("PALPATE_DATA", raising=False)
     assert (
         main(["fabrics", "--method", "static-svm", "--out", str(data / "fabrics.json")])

@@ -36,7 +36,7 @@ def sweeps() -> Dataset:
 
 @pytest.fixture(scope="module")
 def figures(sweeps: Dataset) -> dict:
-    """The figures of the packaged bundle; corruptions are those of six sweeps."""
+    """The figures of the packaged bundle. Six sweeps are corrupted."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(EvaluationSweeps.of.__func__, "__defaults__", (6, 0))
         found = bundle_experiment.run(bundle.DEFAULT, sweeps, NOTHING)
