@@ -13,20 +13,19 @@ import logging
 import re
 import sys
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from palpate.bundle import bundle
 from palpate.core import config
 from palpate.core.errors import ApplianceError, LineError, ModelError, SensorError
-from palpate.core.health import Health
 from palpate.core.log import log
 from palpate.core.observer import Observer
-from palpate.core.types import Edge, EdgeKind, Frames, Status, Sweep, Verdict
+from palpate.core.types import Edge, EdgeKind, Status, Verdict
 from palpate.io.robot_link import Command
 from palpate.runtime import assembly
 from palpate.runtime.loop import FAILURES, Box
@@ -94,32 +93,15 @@ class ThrowingPart:
         return self._part(*args)
 
 
-class ThrowingObserver(Observer):
+def throwing_observer(calls: ThrowingCalls) -> Observer:
     """An observer whose calls are counted."""
 
-    def __init__(self, calls: ThrowingCalls) -> None:
-        self._calls = calls
+    def counted(name: str) -> Callable[..., None]:
+        return lambda self, *args: calls.enter(f"observer.{name}")
 
-    def frames(self, frames: Frames) -> None:
-        self._calls.enter("observer.frames")
-
-    def edges(self, t_ns: int, edges: Any) -> None:
-        self._calls.enter("observer.edges")
-
-    def command(self, t_ns: int, line: str) -> None:
-        self._calls.enter("observer.command")
-
-    def answered(self, verdict: Verdict) -> None:
-        self._calls.enter("observer.answered")
-
-    def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
-        self._calls.enter("observer.sweep")
-
-    def turn(self, health: Health) -> None:
-        self._calls.enter("observer.turn")
-
-    def stopping(self) -> None:
-        self._calls.enter("observer.stopping")
+    names = [name for name in vars(Observer) if not name.startswith("_")]
+    made = type("ThrowingObserver", (Observer,), {name: counted(name) for name in names})
+    return cast(Observer, made())
 
 
 class EdgeLog:
@@ -237,7 +219,12 @@ def play(scene: str, model: bundle.Bundle, calls: ThrowingCalls) -> PlayedScene:
     ended: BaseException | None = None
     with ExitStack() as stack:
         box = assembly.box(
-            settings, model, simulated, port, stack, observers=[ThrowingObserver(calls)]
+            settings,
+            model,
+            simulated,
+            port,
+            stack,
+            observers=[throwing_observer(calls)],
         )
         edges = _stand_before(box, calls)
         try:

@@ -18,7 +18,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 
 from palpate.client.feed import parse
 from palpate.core.errors import FormatError
@@ -64,86 +64,75 @@ def send(one: socket.socket, data: bytes) -> bool:
     return True
 
 
-def reader(path: str, seen: Counter[str]) -> Act:
-    """A reader that asks for everything and reads it; the lines are counted by type."""
-    one: socket.socket | None = None
-    rest = b""
+def peer(address: Address, goes_on: Callable[[socket.socket], bool], opening: bytes = b"") -> Act:
+    """A program with one connection, on which it first sends `opening`. It connects again once
+    `goes_on`, called in each round, has returned False or raised OSError."""
+    held: list[socket.socket] = []
 
     def act() -> None:
-        nonlocal one, rest
-        if one is None:
-            one, rest = connected(path), b""
-            if one:
-                send(one, ALL)
+        if not held:
+            if one := connected(address):
+                send(one, opening)
+                held.append(one)
             return
+        try:
+            ended = not goes_on(held[0])
+        except BlockingIOError:
+            ended = False
+        except OSError:
+            ended = True
+        if ended:
+            held.pop().close()
+
+    return act
+
+
+def reader(path: str, seen: Counter[str]) -> Act:
+    """A reader that asks for everything and reads it; the lines are counted by type."""
+    rest = b""
+
+    def goes_on(one: socket.socket) -> bool:
+        nonlocal rest
         try:
             while data := one.recv(1 << 16):
                 lines, rest = parse(data, rest)
                 seen.update(line["type"] for line in lines)
                 seen["lines lost"] += sum(line["lines"] for line in lines if line["type"] == "lost")
-            one = None
         except BlockingIOError:
-            pass
+            return True
         except (OSError, FormatError):
             seen["broken"] += 1
-            one = None
+        rest = b""
+        return False
 
-    return act
+    return peer(path, goes_on, ALL)
 
 
-def silent(path: str, seen: Counter[str]) -> Act:
+def silent(path: str) -> Act:
     """A reader that asks for everything and never reads."""
-    held: list[socket.socket] = []
-
-    def act() -> None:
-        if not held and (one := connected(path)):
-            send(one, ALL)
-            held.append(one)
-
-    return act
+    return peer(path, lambda one: True, ALL)
 
 
-def sluggish(path: str, seen: Counter[str]) -> Act:
+def sluggish(path: str) -> Act:
     """A reader that asks for everything and reads a few bytes now and then."""
-    held: list[socket.socket] = []
-
-    def act() -> None:
-        if not held:
-            silent_one = connected(path)
-            held.extend([silent_one] if silent_one else [])
-            if held:
-                send(held[0], ALL)
-        elif random.random() < 0.002:
-            with suppress(OSError):
-                if not held[0].recv(10):
-                    held.clear()
-
-    return act
+    return peer(path, lambda one: random.random() >= 0.002 or bool(one.recv(10)), ALL)
 
 
 def talker(
     path: Address, seen: Counter[str], said: Callable[[], bytes], *, reads: bool = False
 ) -> Act:
-    """A peer that sends without end, and connects again when it is closed. reads: it reads the
-    replies."""
-    held: list[socket.socket] = []
+    """A peer that sends without end. reads: it reads the replies."""
+    known: set[int] = set()
 
-    def goes_on() -> bool:
-        if reads and select.select(held, [], [], 0)[0]:
-            with suppress(OSError):
-                return bool(held[0].recv(1 << 16)) and send(held[0], said())
+    def goes_on(one: socket.socket) -> bool:
+        seen["attempts"] += id(one) not in known
+        known.clear()
+        known.add(id(one))
+        if reads and select.select([one], [], [], 0)[0] and not one.recv(1 << 16):
             return False
-        return send(held[0], said())
+        return send(one, said())
 
-    def act() -> None:
-        if not held:
-            one = connected(path)
-            held.extend([one] if one else [])
-            seen["attempts"] += len(held)
-        elif not goes_on():
-            held.pop().close()
-
-    return act
+    return peer(path, goes_on)
 
 
 def storm(path: Address, seen: Counter[str], half: bytes = b'{"fra', burst: int = 20) -> Act:
@@ -169,55 +158,44 @@ def storm(path: Address, seen: Counter[str], half: bytes = b'{"fra', burst: int 
     return act
 
 
+def noise() -> bytes:
+    """Up to 3 kB of nothing."""
+    return random.randbytes(random.randrange(1, 3000))
+
+
 def acts(kind: str, path: str, seen: Counter[str]) -> list[Act]:
     """The programs of a kind. Of 8 and 64 readers, one never reads; attacked: eight good readers
     and all bad programs."""
     if kind != "attacked":
         n = int(kind)
-        return [reader(path, seen) for _ in range(n - (n > 1))] + [silent(path, seen)] * (n > 1)
-    bad: Counter[str] = Counter()
-    floods = [
-        talker(path, bad, lambda: b'{"frames": 20}\n{"sweeps": false}\n' * 200) for _ in range(10)
+        return [reader(path, seen) for _ in range(n - (n > 1))] + [silent(path)] * (n > 1)
+    orders = b'{"frames": 20}\n{"sweeps": false}\n' * 200
+    return [
+        *(reader(path, seen) for _ in range(8)),
+        *(sluggish(path) for _ in range(10)),
+        *(silent(path) for _ in range(10)),
+        *(talker(path, seen, lambda: orders) for _ in range(10)),
+        *(talker(path, seen, noise) for _ in range(10)),
+        *(talker(path, seen, lambda: b"x" * 300) for _ in range(5)),
+        storm(path, seen),
     ]
-    garbage = [
-        talker(path, bad, lambda: random.randbytes(random.randrange(1, 3000))) for _ in range(10)
-    ]
-    endless = [talker(path, bad, lambda: b"x" * 300) for _ in range(5)]
-    good = [reader(path, seen) for _ in range(8)]
-    slow = [sluggish(path, bad) for _ in range(10)] + [silent(path, bad) for _ in range(10)]
-
-    def note() -> None:
-        seen["attempts"] = bad["attempts"]
-
-    return [*good, *slow, *floods, *garbage, *endless, storm(path, bad), note]
 
 
 def asker(address: Address, seen: Counter[str], request: bytes) -> Act:
     """A peer that asks again when it has its answer, as a controller does; its answers are
     counted."""
-    held: list[socket.socket] = []
-    asked = False
+    asked: list[socket.socket] = []
 
-    def act() -> None:
-        nonlocal asked
-        if not held:
-            one, asked = connected(address), False
-            held.extend([one] if one else [])
-            return
-        try:
-            if not asked:
-                asked = held[0].send(request) > 0
-            elif data := held[0].recv(1 << 12):
-                seen["answers of the bridge"] += bool(data)
-                asked = False
-            else:
-                held.pop().close()
-        except BlockingIOError:
-            pass
-        except OSError:
-            held.pop().close()
+    def goes_on(one: socket.socket) -> bool:
+        if one not in asked:
+            asked[:] = [one] if one.send(request) else []
+            return True
+        answered = bool(one.recv(1 << 12))
+        seen["answers of the bridge"] += answered
+        asked.clear()
+        return answered
 
-    return act
+    return peer(address, goes_on)
 
 
 def bridged(path: str, seen: Counter[str], stack: ExitStack) -> list[Act]:
@@ -225,23 +203,16 @@ def bridged(path: str, seen: Counter[str], stack: ExitStack) -> list[Act]:
     endless frames and a storm."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
-    command = [
-        *(sys.executable, "-m", "palpate", "bridge", "modbus", "--feed", path),
-        *("--listen", f"127.0.0.1:{port}"),
-    ]
+    command = [sys.executable, "-m", "palpate", "bridge", "modbus", "--feed", path]
+    command += ["--listen", f"127.0.0.1:{port}"]
     bridge = stack.enter_context(subprocess.Popen(command, stderr=subprocess.DEVNULL, cwd=ROOT))
     stack.callback(bridge.kill)
     there = ("127.0.0.1", port)
     read = b"\0\1\0\0\0\6\1\3\0\0\0\x0a"  # ten holding registers from the first
-    floods = [talker(there, seen, lambda: read * 50) for _ in range(5)]
-    garbage = [
-        talker(there, seen, lambda: random.randbytes(random.randrange(1, 3000))) for _ in range(5)
-    ]
-    good = asker(there, seen, read)
     return [
-        good,
-        *floods,
-        *garbage,
+        asker(there, seen, read),
+        *(talker(there, seen, lambda: read * 50) for _ in range(5)),
+        *(talker(there, seen, noise) for _ in range(5)),
         *(talker(there, seen, lambda: b"\0\1\0\0\0\xff") for _ in range(3)),
         storm(there, seen),
     ]

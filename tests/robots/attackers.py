@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import os
-import random
 import select
 import sys
 import time
@@ -23,7 +22,8 @@ from tests.campaigns.feed_readers import (
     Act,
     Address,
     asker,
-    connected,
+    noise,
+    peer,
     send,
     storm,
     talker,
@@ -53,42 +53,16 @@ GOOD = {"modbus": READ, "tcp": sentence("ID"), "page": ASK + b"\r\n"}
 BURST = 2
 
 
-def deaf(there: Address, ask: bytes) -> Act:
-    """A peer that asks and never reads; it connects again when it is closed."""
-    held = [connected(there)]
-
-    def act() -> None:
-        if held[0] is None or not send(held[0], ask):
-            if held[0]:
-                held[0].close()
-            held[0] = connected(there)
-
-    return act
-
-
 def acts(kind: str, there: Address, seen: Counter[str]) -> list[Act]:
-    """A good peer, and all hostile peers of a kind."""
-    bad: Counter[str] = Counter()
-    floods = [
-        talker(there, bad, partial(bytes, said), reads=reads)
-        for said in FLOODS[kind]
-        for reads in (True, True, False)
-    ]
-    noise = [
-        talker(there, bad, lambda: random.randbytes(random.randrange(1, 3000))) for _ in range(3)
-    ]
-
-    def note() -> None:
-        seen["attempts"] = bad["attempts"]
-
-    good = asker(there, seen, GOOD[kind])
+    """A good peer, and all hostile peers of a kind, one of which asks and never reads."""
+    good = GOOD[kind]
+    floods = ((said, reads) for said in FLOODS[kind] for reads in (True, True, False))
     return [
-        good,
-        *floods,
-        *noise,
-        deaf(there, GOOD[kind]),
-        storm(there, bad, HALVES[kind], BURST),
-        note,
+        asker(there, seen, good),
+        *(talker(there, seen, partial(bytes, said), reads=reads) for said, reads in floods),
+        *(talker(there, seen, noise) for _ in range(3)),
+        peer(there, lambda one: send(one, good)),
+        storm(there, seen, HALVES[kind], BURST),
     ]
 
 
