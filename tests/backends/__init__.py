@@ -90,69 +90,23 @@ class Backend(Protocol):
     output: OutputConfig
     serial: SerialConfig
 
-    def reset(self) -> None:
-        """Plug in a default `Skin()`, set inputs low, empty the serial line, clear all faults."""
-        ...
-
+    def reset(self) -> None: ...  # a default `Skin()`, inputs low, the serial line empty, no faults
     def wait(self, seconds: float) -> None: ...
-
-    def after(self, seconds: float, control: Callable[[], None]) -> None:
-        """Call `control` after this many seconds, while the box goes on."""
-        ...
-
-    def plug(self, what: Skin) -> None:
-        """Plug a skin in, after unplugging the previous skin."""
-        ...
-
-    def unplug(self) -> None:
-        """Pull the skin's cable."""
-        ...
-
-    def unbind(self, on: bool) -> None:
-        """Remove the skin's kernel driver, or restore it, without an event for the box."""
-        ...
-
-    def garble(self, on: bool) -> None:
-        """Replace every fifth transfer by zeros."""
-        ...
-
-    def silence(self) -> None:
-        """Let the skin stop sending until it is started again."""
-        ...
-
-    def hold(self, on: bool) -> None:
-        """Let another program claim the skin, or release it."""
-        ...
-
-    def deny(self, on: bool) -> None:
-        """Withdraw this process's permission to open the skin, or restore it."""
-        ...
-
+    def after(self, seconds: float, control: Callable[[], None]) -> None: ...  # the box goes on
+    def plug(self, what: Skin) -> None: ...  # after unplugging the previous skin
+    def unplug(self) -> None: ...
+    def unbind(self, on: bool) -> None: ...  # or restore the driver, without an event for the box
+    def garble(self, on: bool) -> None: ...  # every fifth transfer is replaced by zeros
+    def silence(self) -> None: ...  # until it is started again
+    def hold(self, on: bool) -> None: ...
+    def deny(self, on: bool) -> None: ...
     def drive(self, line: str, level: bool) -> None: ...
-
-    def storm(self, line: str, edges: int) -> None:
-        """Toggle an input `edges` times, as fast as possible. An even number restores its level."""
-        ...
-
-    def level(self, line: str) -> bool:
-        """Level of an output of the box, as seen from outside."""
-        ...
-
-    def say(self, data: bytes) -> None:
-        """Send from the far end of the serial line."""
-        ...
-
-    def hear(self) -> bytes:
-        """Bytes that arrived at the far end since the last call."""
-        ...
-
-    def pull(self) -> None:
-        """Remove the serial port, as if its USB adapter was pulled out."""
-        ...
-
-    def put(self) -> None:
-        """Bring the serial port back under the same name."""
-        ...
+    def storm(self, line: str, edges: int) -> None: ...  # as fast as possible; an even number
+    def level(self, line: str) -> bool: ...  # of an output of the box, as seen from outside
+    def say(self, data: bytes) -> None: ...  # from the far end of the serial line
+    def hear(self) -> bytes: ...  # the bytes at the far end since the last call
+    def pull(self) -> None: ...  # as if the USB adapter of the serial port was pulled out
+    def put(self) -> None: ...  # the port is back under the same name
 
 
 def chosen() -> str:

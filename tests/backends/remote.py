@@ -14,6 +14,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
+from functools import partial
 from typing import IO, Any
 
 import usb.core
@@ -100,6 +101,8 @@ class Remote(real.Real):
         self.sensor, self.trigger, self.output = settings.skin, settings.trigger, settings.output
         self.serial = settings.serial
         self._ask = asker.ask
+        for name in ("garble", "silence", "drive", "storm", "level", "say", "hear", "pull", "put"):
+            setattr(self, name, partial(asker.ask, name))
         self.can = frozenset(self._ask("able")) | {"hold"}
 
     def reset(self) -> None:
@@ -124,33 +127,6 @@ class Remote(real.Real):
         while (usb.core.find(**ids) is not None) != wanted:
             assert self.clock.now_ns() < end_ns, "the kernel does not notice the skin's cable"
             self.wait(0.01)
-
-    def garble(self, on: bool) -> None:
-        self._ask("garble", on)
-
-    def silence(self) -> None:
-        self._ask("silence")
-
-    def drive(self, line: str, level: bool) -> None:
-        self._ask("drive", line, level)
-
-    def storm(self, line: str, edges: int) -> None:
-        self._ask("storm", line, edges)
-
-    def level(self, line: str) -> bool:
-        return bool(self._ask("level", line))
-
-    def say(self, data: bytes) -> None:
-        self._ask("say", data)
-
-    def hear(self) -> bytes:
-        return bytes(self._ask("hear"))
-
-    def pull(self) -> None:
-        self._ask("pull")
-
-    def put(self) -> None:
-        self._ask("put")
 
 
 @contextmanager

@@ -66,7 +66,7 @@ def own_models(names: tuple[str, ...] = ()) -> list[Own]:
     from tests.factories.sweep_sets import tones
 
     sweeps, found = tones(), [own_default()]
-    for name, method in methods.every(methods.Effort(0.02, 2)).items():
+    for name, method in methods.every(methods.Effort(0.02)).items():
         if method.input in bundle.INPUTS and name in (names or methods.every()):
             given = methods.model_inputs(method.input, sweeps)
             try:

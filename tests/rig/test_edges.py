@@ -259,10 +259,12 @@ def test_other_wiring(cell: Cell, count: Count, note: Note) -> None:
     A storm, here of bursts, raises FAULT until it is over, and a line that stays high is `long`.
     The last test of this guest: the wiring stays.
     """
+    since = len(cell.serial.heard)
     cell.lines.set("START", True)
+    assert cell.lines.wait("READY", False, 20)
     cell.machine.put("/etc/palpate/palpate.toml", OTHER_WIRING.encode())
     cell.machine.run("systemctl restart --no-block palpate", check=True)
-    assert cell.lines.wait("READY", False, 20)
+    assert statuses(cell, since, 1) == ["aborted"]
     since = len(cell.serial.heard)
     cell.until_ready()
     cell.lines.set("START", False)

@@ -39,22 +39,16 @@ def wheels(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     folder, source = (tmp_path_factory.mktemp(name) for name in ("wheels", "source"))
     emulated_machines.wheel(folder, source)
     shutil.copytree(ROOT / "train", source / "train", ignore=shutil.ignore_patterns("build"))
-    emulated_machines.run(
-        *emulated_machines.PIP, "wheel", "--no-deps", "-w", folder, source / "train"
-    )
+    pip = emulated_machines.PIP
+    emulated_machines.run(*pip, "wheel", "--no-deps", "-w", folder, source / "train")
     return sorted(folder.glob("*.whl"))
 
 
 def packed(folder: Path, wheels: list[Path], *architectures: str) -> list[Path]:
     """The packages for these architectures."""
     command = [sys.executable, SCRIPTS / "debian.py", folder, "--wheels", *wheels]
-    done = subprocess.run(
-        [*command, "--architectures", *architectures],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=120,
-    )
+    command += ["--architectures", *architectures]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     return [Path(line) for line in done.stdout.split()]
 
@@ -91,9 +85,8 @@ def test_both_architectures_hold_the_same(wheels: list[Path], tmp_path: Path, sa
     """A package for arm64 has the libraries of arm64 for both Pythons, and otherwise the files and
     scripts of that for amd64."""
     found = {}
-    for package, machine in zip(
-        packed(tmp_path, wheels, "amd64", "arm64"), ("x86_64", "aarch64"), strict=True
-    ):
+    packages = packed(tmp_path, wheels, "amd64", "arm64")
+    for package, machine in zip(packages, ("x86_64", "aarch64"), strict=True):
         folder = tmp_path / machine
         subprocess.run(["dpkg-deb", "-R", package, folder], check=True, timeout=120)
         control = (folder / "DEBIAN/control").read_text()
@@ -111,9 +104,8 @@ def test_both_architectures_hold_the_same(wheels: list[Path], tmp_path: Path, sa
             names |= {re.sub(r"-(cp3|py3).*", "", name) for name in members}
         found[machine] = names
     assert found["x86_64"] == found["aarch64"]
-    assert {"share/palpate/palpate-teach.service", "share/palpate/skins/flexitac.toml"} <= found[
-        "aarch64"
-    ]
+    shared = {"share/palpate/palpate-teach.service", "share/palpate/skins/flexitac.toml"}
+    assert shared <= found["aarch64"]
 
 
 def _by_python(archives: list[Path]) -> list[Path]:

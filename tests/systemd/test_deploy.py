@@ -55,18 +55,9 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hosts.Hosts]:
 def installed(site: hosts.Hosts, wheel: Path) -> str:
     """Installs the first host over loopback, as a user without a profile; the output of that."""
     (site.work / "signers").write_text(deliveries.line(deliveries.key(site.work / "keys")))
-    done = site.desktop(
-        "install",
-        "--host",
-        f"{hosts.USER}@127.0.0.1",
-        "--wheel",
-        wheel,
-        "--board",
-        "rpi5",
-        "--signers",
-        site.work / "signers",
-        inside=site.hosts[0],
-    )
+    words = ("--host", f"{hosts.USER}@127.0.0.1", "--wheel", wheel, "--board", "rpi5")
+    signers = ("--signers", site.work / "signers")
+    done = site.desktop("install", *words, *signers, inside=site.hosts[0])
     assert done.returncode == 0, done.stdout + done.stderr
     # reported, not changed silently
     assert "No host key for 127.0.0.1 found in known_hosts, accepting" in done.stderr
@@ -116,32 +107,22 @@ def start_again(host: hosts.Host) -> None:
 def test_a_bare_host_is_installed_as_a_bare_user(host: hosts.Host, installed: str):
     """From a Debian without Python to an active, enabled service; the board's name is in its
     settings."""
-    assert re.fullmatch(
-        r"robot@127\.0\.0\.1: \S+ is READY [0-9.]+ s after the command\n", installed
-    )
+    assert re.fullmatch(r"robot@127\.0\.0\.1: \S+ is READY [0-9.]+ s .*\n", installed)
     assert (host.service["ActiveState"], host.service["UnitFileState"]) == ("active", "enabled")
     name = release(host)
     assert host.machine.get("cat", "/opt/palpate/stamp") == name
     assert name in host.machine.get("cat", f"/proc/{host.service['MainPID']}/maps")
     assert host.machine.get("cat", "/etc/palpate/palpate.toml") == 'board = "rpi5"'
-    assert (
-        host.machine.get("/usr/local/bin/palpate", "check", "--settings").count("# board-rpi5.toml")
-        > 3
-    )
+    settings = host.machine.get("/usr/local/bin/palpate", "check", "--settings")
+    assert settings.count("# board-rpi5.toml") > 3
     assert host.machine.get("stat", "-c", "%U %a", "/etc/palpate/allowed_signers") == "root 644"
     assert host.machine.run("systemd-analyze", "verify", "palpate.service").stderr == ""
     files = [f"/etc/palpate/watch/{one}" for one in ("token", "key.pem", "certificate.pem")]
-    assert set(host.machine.get("stat", "-c", "%U:%G %a", *files).splitlines()) == {
-        "root:palpate-watch 640"
-    }
-    off = {
-        "palpate-watch": "linked",
-        "palpate-bridge@tcp": "disabled",
-        "palpate-bridge@modbus": "disabled",
-    }
-    assert {
-        unit: host.machine.run("systemctl", "is-enabled", unit).stdout.strip() for unit in off
-    } == off
+    owners = host.machine.get("stat", "-c", "%U:%G %a", *files).splitlines()
+    assert set(owners) == {"root:palpate-watch 640"}
+    off = ("palpate-watch", "palpate-bridge@tcp", "palpate-bridge@modbus")
+    enabled = host.machine.run("systemctl", "is-enabled", *off).stdout.split()
+    assert enabled == ["linked", "disabled", "disabled"]
     assert host.machine.get("find", f"/home/{hosts.USER}", "-name", ".palpate*") == ""
 
 
@@ -153,10 +134,8 @@ def test_a_second_install_changes_nothing(
     done = site.desktop(
         "install", *at, "--wheel", wheel, "--board", "rpi5", "--signers", site.work / "signers"
     )
-    assert (done.returncode, done.stdout.partition(": ")[2].strip()) == (
-        0,
-        f"{name.removeprefix('palpate-')} runs already",
-    )
+    assert done.returncode == 0
+    assert done.stdout.endswith(f"{name.removeprefix('palpate-')} runs already\n")
     assert (host.service["MainPID"], release(host)) == (pid, name)
     assert host.machine.get("cat", "/etc/palpate/palpate.toml") == 'board = "rpi5"'
 
@@ -177,22 +156,12 @@ def test_the_board_that_is_named_last_holds(
 
 def test_a_board_without_a_file_is_refused_before_any_box_is_asked():
     """The error lists the existing boards."""
-    command = [
-        sys.executable,
-        SCRIPTS / "install.py",
-        "--host",
-        "robot@127.0.0.1:1",
-        "--wheel",
-        __file__,
-    ]
-    done = subprocess.run(
-        [*command, "--board", "rpi9"], capture_output=True, text=True, timeout=120
-    )
+    words = ("--host", "robot@127.0.0.1:1", "--wheel", __file__, "--board", "rpi9")
+    command = [sys.executable, SCRIPTS / "install.py", *words]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stdout) == (1, "")
-    assert (
-        "BOARD=rpi9 has no file firmware_config/board-rpi9.toml; boards there: rpi4, rpi5"
-        in done.stderr
-    )
+    assert "board-rpi9.toml" in done.stderr
+    assert "rpi4, rpi5" in done.stderr
 
 
 def test_signers_are_never_overwritten(
@@ -203,10 +172,7 @@ def test_signers_are_never_overwritten(
     before = host.machine.get("cat", "/etc/palpate/allowed_signers")
     done = site.desktop("install", *at, "--wheel", wheel, "--signers", tmp_path / "others")
     assert done.returncode == 1
-    assert (
-        "FAILED: users, folders and settings: /etc/palpate/allowed_signers differs from this file "
-        "there" in done.stdout
-    )
+    assert "/etc/palpate/allowed_signers differs" in done.stdout
     assert host.machine.get("cat", "/etc/palpate/allowed_signers") == before
 
 
@@ -214,14 +180,11 @@ def test_a_box_without_packages_and_mirror_is_refused(site: hosts.Hosts, wheel: 
     """Nothing is changed there before the packages can be installed."""
     machine = site.hosts[1].machine
     machine.get("find", "/var/cache/apt/archives", "-name", "*.deb", "-delete")
-    done = site.desktop(
-        "install", "--host", f"{hosts.USER}@{site.hosts[1].address}", "--wheel", wheel, limit_s=120
-    )
+    at = ("--host", f"{hosts.USER}@{site.hosts[1].address}")
+    done = site.desktop("install", *at, "--wheel", wheel, limit_s=120)
     assert done.returncode == 1
-    assert (
-        "FAILED: python3-venv libusb-1.0-0 openssl cannot be installed: apt-get: E: " in done.stdout
-    )
-    assert "give the box a way to Debian's mirrors" in done.stdout
+    assert "FAILED: python3-venv libusb-1.0-0 openssl " in done.stdout
+    assert "Debian's mirrors" in done.stdout
     assert machine.get("ls", "/opt") == ""
 
 
@@ -230,20 +193,14 @@ def test_what_a_person_put_there_stays(
 ):
     """A settings file of theirs is kept and named; a file in the way of the program ends the
     install before anything else."""
-    settings, program, pid = (
-        "/etc/palpate/skin.toml",
-        "/usr/local/bin/palpate",
-        host.service["MainPID"],
-    )
+    settings, program = "/etc/palpate/skin.toml", "/usr/local/bin/palpate"
+    pid = host.service["MainPID"]
     for path in (settings, program):
         host.machine.get("rm", path)
         host.machine.put(path, "# mine\n")
     done = site.desktop("install", *at, "--wheel", wheel)
     assert done.returncode == 1
-    assert (
-        f"FAILED: users, folders and settings: {program} is a file there, not a link; move it away"
-        in done.stdout
-    )
+    assert f"{program} is a file there" in done.stdout
     host.machine.get("rm", program)
     done = site.desktop("install", *at, "--wheel", wheel)
     assert done.returncode == 0
@@ -261,9 +218,8 @@ def upgraded(
     folder, outputs = tmp_path_factory.mktemp("releases"), [(release(site.hosts[0]), installed)]
     at = ("--host", f"{hosts.USER}@{site.hosts[0].address}")
     for i in range(2):
-        done = site.desktop(
-            "install", *at, "--wheel", changed(wheel, folder, "palpate/more.py", f"# {i}\n")
-        )
+        other = changed(wheel, folder, "palpate/more.py", f"# {i}\n")
+        done = site.desktop("install", *at, "--wheel", other)
         outputs.append((release(site.hosts[0]), done.stdout + done.stderr))
     return outputs
 
@@ -273,9 +229,7 @@ def test_an_upgrade_swaps_everything_at_once(host: hosts.Host, upgraded: list[tu
     releases = [name for name, _ in upgraded]
     assert len({*releases}) == 3
     for _, output in upgraded[1:]:
-        assert re.search(
-            r"is READY [0-9.]+ s after the command, [0-9.]+ s without classifying\n", output
-        ), output
+        assert re.search(r"is READY [0-9.]+ s .*, [0-9.]+ s without", output), output
     there = host.machine.get("sh", "-c", "ls -d /opt/palpate-*").split()
     assert there == sorted(f"/opt/{name}" for name in releases[1:])
     assert host.machine.get("readlink", "/opt/palpate.previous") == releases[1]
@@ -300,12 +254,8 @@ def test_a_release_that_fails_its_self_test_is_never_swapped_in(
 ):
     """The process that classifies is not touched."""
     before, pid = release(host), host.service["MainPID"]
-    broken = changed(
-        wheel,
-        tmp_path,
-        "palpate/inference/classifier.py",
-        "\nraise OSError('not on this box')\n",
-    )
+    fails = "\nraise OSError('not on this box')\n"
+    broken = changed(wheel, tmp_path, "palpate/inference/classifier.py", fails)
     done = site.desktop("install", *at, "--wheel", broken)
     assert done.returncode == 1
     assert "FAILED: self-test: OSError: not on this box" in done.stdout
@@ -326,10 +276,8 @@ def test_an_install_that_is_cut_is_finished_by_the_next(
 ):
     """The desktop dies during the copy, or while the box builds: the old release starts, and a
     second command finishes."""
-    new, before = (
-        changed(wheel, tmp_path, "palpate/more.py", f"# {said} {after_s}\n"),
-        release(host),
-    )
+    new = changed(wheel, tmp_path, "palpate/more.py", f"# {said} {after_s}\n")
+    before = release(host)
     site.cut("install", *at, "--wheel", new, words=said, after_s=after_s)
     assert release(host) == before
     start_again(host)
@@ -342,9 +290,7 @@ def test_an_install_that_is_cut_is_finished_by_the_next(
 def test_a_swap_that_is_cut_leaves_old_or_new(host: hosts.Host, upgraded: list[tuple[str, str]]):
     """The box dies before the N-th command of the swap, for each N: it starts with one release or
     the other, complete."""
-    new, old = (
-        host.machine.get("readlink", link) for link in ("/opt/palpate", "/opt/palpate.previous")
-    )
+    new, old = release(host), host.machine.get("readlink", "/opt/palpate.previous")
     script = run_here(f"import install; print(install.swap('/opt/{old}', '{new}'))")
     found = []
     for n in range(1, 20):
@@ -386,15 +332,8 @@ def sha(folder: Path) -> str:
 
 def listed(host: hosts.Host) -> dict[str, str]:
     """The roles of the box's bundles by sha256."""
-    output = host.machine.get(
-        "setpriv",
-        "--reuid=palpate",
-        "--regid=palpate",
-        "--clear-groups",
-        PALPATE,
-        "bundles",
-        "--json",
-    )
+    who = ("setpriv", "--reuid=palpate", "--regid=palpate", "--clear-groups")
+    output = host.machine.get(*who, PALPATE, "bundles", "--json")
     return {entry["sha"]: entry["role"] for entry in json.loads(output)}
 
 
@@ -413,30 +352,16 @@ def test_a_bundle_is_delivered_and_runs_on_trial(
     """READY with the new bundle, on trial, no files left behind; a second delivery changes
     nothing."""
     bundle = sender.made()
-    done = site.desktop(
-        "deploy",
-        *at,
-        bundle,
-        "--signers",
-        site.work / "signers",
-        "--json",
-        tmp_path / "report.json",
-    )
+    more = ("--signers", site.work / "signers", "--json", tmp_path / "report.json")
+    done = site.desktop("deploy", *at, bundle, *more)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert re.search(
-        r"is READY [0-9.]+ s after the command; [0-9.]+ s without classifying; on trial: ",
-        done.stdout,
-    )
+    assert re.search(r"is READY [0-9.]+ s .* s without .*; on trial: ", done.stdout)
     (figures,) = json.loads((tmp_path / "report.json").read_text())["boxes"].values()
     assert figures["lost_s"] <= figures["ready_s"]
     assert listed(host)[sha(bundle)] == "on trial"
     assert serves(host) == sha(bundle)[:8]
-    assert (
-        host.machine.get("ls", "-A", "/var/lib/palpate/incoming", f"/home/{hosts.USER}").count(
-            ".palpate"
-        )
-        == 0
-    )
+    left = host.machine.get("ls", "-A", "/var/lib/palpate/incoming", f"/home/{hosts.USER}")
+    assert ".palpate" not in left
     pid = host.service["MainPID"]
     done = site.desktop("deploy", *at, bundle)
     assert (done.returncode, done.stdout.strip().endswith("runs already")) == (0, True)
@@ -460,14 +385,8 @@ def test_a_bundle_with_an_unknown_key_is_refused(
 
 @pytest.mark.parametrize(
     ("said", "after_s"),
-    [
-        ("settings", 0.0),
-        ("copying", 0.0),
-        ("checking", 0.0),
-        ("checking", 0.3),
-        ("restarting", 0.0),
-        ("restarting", 0.5),
-    ],
+    [(step, 0.0) for step in ("settings", "copying", "checking", "restarting")]
+    + [("checking", 0.3), ("restarting", 0.5)],
 )
 def test_a_delivery_that_is_cut_leaves_old_or_new(
     site: hosts.Hosts,
@@ -543,13 +462,8 @@ def test_boxes_that_fail_do_not_stop_the_others(
     assert "is READY" in lines["good"]
     assert lines["refuses"].startswith("FAILED: cannot be reached: Could not connect")
     assert lines["dumb"].startswith("FAILED: cannot be reached: SSH error")
-    assert (
-        "the server there does not speak ssh or is too busy: ssh USER@HOST must get in"
-        in lines["dumb"]
-    )
-    assert lines["bare"].startswith(
-        "FAILED: asking for its settings: no Palpate is installed there"
-    )
+    assert "does not speak ssh" in lines["dumb"]
+    assert "no Palpate is installed there" in lines["bare"]
     assert lines["hangs"].startswith("FAILED: ")
     assert "no answer within" in lines["hangs"] or "not done within 40 s" in lines["hangs"]
     assert done.stdout.splitlines()[-1] == "1 of 5 boxes done"
@@ -597,16 +511,10 @@ def test_a_user_who_needs_a_password_for_sudo_is_refused(
 @pytest.mark.parametrize(
     ("stderr", "why"),
     [
-        (
-            "tar: x: write error: No space left on device\ntar: Exiting with failure",
-            "No space left.*; free some room",
-        ),
-        ("sudo: a password is required", "a password is required; let the user in without"),
+        ("tar: x: No space left on device\ntar: Exiting", "No space left.*; free some room"),
+        ("sudo: a password is required", "is required; let the user in"),
         ("robot is not in the sudoers file.", "sudoers file.; let the user in"),
-        (
-            "bash: line 1: sudo: command not found",
-            "not found; log in as root, or install sudo there",
-        ),
+        ("bash: line 1: sudo: command not found", "not found; log in as root"),
         ("E: one\nE: two", "^copying: E: two$"),
         ("", "no reason given"),
     ],
@@ -657,10 +565,9 @@ for why in ("apt-get: E: Unable to locate package", "apt-get: sh: 1: sudo: not f
     except install.Failed as e: print(e)
 """
     plain, sudo = run_here(code).splitlines()
-    assert plain.endswith(
-        "Unable to locate package; give the box a way to Debian's mirrors, or install it there"
-    )
-    assert sudo.endswith("sudo: not found; log in as root, or install sudo there")
+    assert "Unable to locate package; give the box a way" in plain
+    assert "sudo: not found; log in as root" in sudo
+    assert "mirrors" not in sudo
 
 
 def test_a_copy_that_fails_names_the_disk():
@@ -674,32 +581,21 @@ try:
 except fleet.Failed as e:
     print(e)
 """
-    assert (
-        run_here(code)
-        == "copying bundle.tar: Failure; check whether its disk is full (df -h) and try again"
-    )
+    assert re.match("copying bundle.tar: Failure; .* disk is full", run_here(code))
 
 
 def test_the_self_test_of_a_release_speaks_of_the_setting(tmp_path: Path):
     """Its error is a line without the names of classes, as the box itself says it."""
     (tmp_path / "skin.toml").write_text("[skin]\nbuad = 9600\n")
     script = run_here("import install; print(install.SELF_TEST)")
-    done = subprocess.run(
-        [sys.executable, "-c", script, tmp_path],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
+    command = [sys.executable, "-c", script, tmp_path]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
     assert done.returncode == 1
     assert "buad" in done.stderr
     assert "Error" not in done.stderr
     assert len(done.stderr.splitlines()) == 1
     shutil.copy(ROOT / "firmware_config" / "skin.toml", tmp_path)
-    assert (
-        subprocess.run([sys.executable, "-c", script, tmp_path], cwd=ROOT, timeout=120).returncode
-        == 0
-    )
+    assert subprocess.run(command, cwd=ROOT, timeout=120).returncode == 0
 
 
 @pytest.mark.slow
@@ -719,12 +615,10 @@ for outputs in ({"looking at its system": "Alpine Linux v3.19\\n"},
     try: install.install(Box(**outputs), None, "", "")
     except install.Failed as e: print(e)
 """
-    assert run_here(code).splitlines() == [
-        "its system is Alpine Linux v3.19, not Debian; Palpate needs Debian 12 for arm64 or amd64",
-        "its system is Raspbian 11, armhf; Palpate needs Debian 12 for arm64 or amd64",
-        "/opt is a separate file system there; it must be part of the root file system",
-        "its Python is 3.9.2; Palpate needs 3.11 or later, which Debian 12 has",
-    ]
+    for line, named in zip(
+        run_here(code).splitlines(), ("Alpine Linux v3.19", "armhf", "/opt", "3.9.2"), strict=True
+    ):
+        assert named in line
 
 
 @pytest.mark.slow
@@ -736,13 +630,7 @@ for text in ("pi@box", "Box.lab:2222", "pi@[fe80::1]:22", "pi@", "a@b@c"):
     found = fleet.NAME.fullmatch(text)
     print(found and "|".join(value or "" for value in found.groups()))
 """
-    assert run_here(code).splitlines() == [
-        "pi|box|",
-        "|Box.lab|2222",
-        "pi|[fe80::1]|22",
-        "None",
-        "None",
-    ]
+    assert run_here(code).split() == ["pi|box|", "|Box.lab|2222", "pi|[fe80::1]|22", *["None"] * 2]
 
 
 @pytest.mark.slow
@@ -750,11 +638,8 @@ def test_the_lock_is_read_for_the_box_not_for_the_desktop():
     """Markers are evaluated for the box's Python: numpy differs between 3.11 and 3.13; hashes stay
     with their packages."""
     for python, numpy in (("3.11.2", "2.3.5"), ("3.13.5", "2.3.5")):
-        code = (
-            f"import release; print(release.locked(release.LOCK.read_text(), {python!r}, "
-            "'aarch64'))"
-        )
-        lock = run_here(code)
+        locked = f"release.locked(release.LOCK.read_text(), {python!r}, 'aarch64')"
+        lock = run_here(f"import release; print({locked})")
         (line,) = re.findall(r"^numpy==(\S+) \\$", lock, re.MULTILINE)
         assert line.startswith(numpy)
         assert ";" not in lock
