@@ -54,7 +54,7 @@ BURST = 2
 
 
 def acts(kind: str, there: Address, seen: Counter[str]) -> list[Act]:
-    """A good peer, and all hostile peers of a kind, one of which asks and never reads."""
+    """A good peer, and all hostile peers of a kind; the last but one asks and never reads."""
     good = GOOD[kind]
     floods = ((said, reads) for said in FLOODS[kind] for reads in (True, True, False))
     return [
