@@ -132,6 +132,7 @@ def test_loads_are_compared_in_both_worlds(monkeypatch: pytest.MonkeyPatch):
         assert row["without"] == {"label": 100, "right": 0, "wrong": 100}
 
 
+@pytest.mark.slow
 def test_loads_that_no_fit_chose_have_no_figures(monkeypatch: pytest.MonkeyPatch):
     """Each fit is made once then, and the table says "not chosen"."""
     fits = LoadsFits(monkeypatch, chosen=False)

@@ -43,6 +43,12 @@ def figures(sweeps: Dataset) -> dict:
     return found | {"command": "palpate-train report"}
 
 
+@pytest.fixture(autouse=True)
+def few(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pages with the picture of one sweep."""
+    monkeypatch.setattr(bundle_report, "MOST_SHOWN", 1)
+
+
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pages without pictures of example sweeps."""

@@ -80,6 +80,7 @@ def test_materials_are_matched_by_name():
         bundle_trainings.aligned(tones(), train)
 
 
+@pytest.mark.slow
 def test_a_fit_gives_back_all_its_sweeps():
     """The training sweeps come first, then the held-out ones, with their groups."""
     whole = easy(20)

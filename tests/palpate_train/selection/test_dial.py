@@ -167,6 +167,7 @@ def test_all_sizes_are_judged_on_the_same_sweeps():
     assert (made.architecture.pools, made.architecture.relations > 0) == (0, True)
 
 
+@pytest.mark.slow
 def test_equal_models_are_fitted_once():
     """A single taxel has no relations: `pairs` chooses what `bands` chose, `all` more."""
     sweeps = skin()
@@ -175,6 +176,7 @@ def test_equal_models_are_fitted_once():
     assert judged.first_equals() == {"bands": "bands", "pairs": "bands", "all": "all"}
 
 
+@pytest.mark.slow
 def test_a_size_alone_is_the_same_model():
     """The fit of a judged size has the weights of `recipe.fit` with that size."""
     alone = recipe.fit(skin(), Run(1), replace(CLOSED, size=dial.FAMILY["pairs"]))
@@ -291,6 +293,7 @@ def reduced(sweeps: Dataset, kind: str, wanted: float = 0.0) -> tuple[dict[str, 
     return curve, change
 
 
+@pytest.mark.slow
 def test_two_taxels_are_all_that_is_needed():
     """Of six taxels the third and the fifth have all the information: one alone is not enough.
     Nothing is applied, because the sensor would have to be set."""
@@ -336,6 +339,7 @@ def test_less_does_not_fall_below_what_is_wanted():
     assert fits(1.0).fine(less, less)
 
 
+@pytest.mark.slow
 def test_materials_that_look_alike_are_proposed_as_one():
     """Only the first taxel has information, so that a and c, b and d are alike. The pairs are
     proposed and not applied."""

@@ -137,7 +137,7 @@ def test_damage_is_told(tmp_path: Path):
     for version in ("4", "5"):
         scipy.io.savemat(tmp_path / "a.mat", {"skin": SKIN, "t": np.arange(40.0)}, format=version)
         whole = (tmp_path / "a.mat").read_bytes()
-        for _ in range(20):
+        for _ in range(10):
             data = bytearray(whole[: len(whole) - rng.integers(200)])
             data[rng.integers(300)] = rng.integers(256)
             (tmp_path / "a.mat").write_bytes(data)

@@ -63,7 +63,7 @@ def test_a_disturbed_sweep_of_a_known_material_stays_known():
 def test_disturbed_sweeps_are_of_those_that_were_trained_on():
     """One in ten training sweeps has a changed copy of the same material and group; none of the
     copies judges."""
-    fit = recipe.fit(easy(), Run(1), recipe.Settings(steps=0))
+    fit = recipe.fit(easy(16), Run(1), recipe.Settings(steps=0))
     given = calibration_inputs(fit)
     prefixes, labels, groups, held, faulty = (
         given.prefixes,

@@ -79,6 +79,7 @@ def fitted_by_command(folder: Path, *options: str) -> Fit:
     return Fit.load(out)
 
 
+@pytest.mark.slow
 def test_a_skin_that_is_put_back_is_shown_to_every_head(tmp_path: Path, fitted: Fit):
     """With --reattached all discriminants see copies, which the held-out parts of the easy set
     would not demand."""
@@ -303,6 +304,7 @@ def test_the_method_is_what_the_command_fits(fitted: Fit):
     np.testing.assert_allclose(model.logits(s.samples), logits, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_the_method_names_materials_that_it_never_saw_last():
     """A material without a training sweep gets a logit below all others; labels keep their
     numbers."""
@@ -365,6 +367,7 @@ def varied() -> Dataset:
     return replace(sweeps, samples=samples, groups=groups | {"batch": np.arange(n) // 6 % 5})
 
 
+@pytest.mark.slow
 def test_the_hardest_condition_judges():
     """The sweeps of a new force are the hardest, so some force is held out; a group of two values
     comes last. Each condition has figures of its own."""
@@ -381,6 +384,7 @@ def test_the_hardest_condition_judges():
     assert figures["held-out batch"]["n"] == len(varied())
 
 
+@pytest.mark.slow
 def test_sweeps_without_recordings_are_numbered_before_they_are_divided():
     """Each sweep is then a recording of its own on both sides, and counts by itself."""
     made = recipe.fit(replace(easy(), groups={}), Run(1), CLOSED)
@@ -389,11 +393,16 @@ def test_sweeps_without_recordings_are_numbered_before_they_are_divided():
     assert "held-out recording, by recording" not in made.held_out_figures()
 
 
+@pytest.mark.slow
 def test_only_named_conditions_judge():
-    """The varying conditions may be named; a group that cannot be left out is refused by name."""
+    """The varying conditions may be named."""
     made = recipe.fit(varied(), Run(1), replace(CLOSED, varies=("batch",)))
     assert made.about["conditions"] == ["batch"]
     assert next(iter(made.held_out_figures())) == "held-out batch"
+
+
+def test_a_condition_that_cannot_be_left_out_is_refused():
+    """The error names it."""
     for name in ("recording ", "speed"):
         with pytest.raises(FormatError, match=name):
             recipe.fit(varied(), Run(1), replace(CLOSED, varies=(name,)))

@@ -29,7 +29,9 @@ def tubes() -> Dataset:
     return sets.load("sim:T-REAL/level-blind:1:2")
 
 
-@pytest.mark.parametrize("name", SIZES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name == "64" else pytest.mark.slow) for name in SIZES]
+)
 def test_a_fit_contains_at_most_its_size(name: str):
     """Its trunk has no view that the size excludes, and it names sweeps at held-out positions."""
     size = SIZES[name]
@@ -91,6 +93,7 @@ def test_each_size_is_a_method():
     assert set(made.values()) == {steps, ""}
 
 
+@pytest.mark.slow
 def test_a_fit_of_the_spectrum_alone_survives_its_file(tmp_path: Path):
     """Its weights are those of its heads. Nothing in its graph is int8, both precisions agree, and
     it learns an easy set."""

@@ -406,6 +406,7 @@ def test_a_fit_survives_its_file(tmp_path: Path, fitted: Fit):
         Fit.load(tmp_path / "set.npz")
 
 
+@pytest.mark.slow
 def test_a_fit_of_another_form_is_refused(tmp_path: Path, fitted: Fit):
     """Weights that do not fit the architecture in the file are refused, and so is a file of an
     older version."""
