@@ -198,3 +198,29 @@ def test_the_change_log_knows_this_version():
     heads = re.findall(r"(?m)^## (\d+\.\d+\.\d+)", (ROOT / "CHANGELOG.md").read_text())
     assert heads[0] == __version__
     assert heads == sorted(heads, key=lambda v: [*map(int, v.split("."))], reverse=True)
+
+
+def test_every_page_is_reached_from_the_readme():
+    """A person finds each page by links, without a search."""
+    reached, left = set[Path](), [ROOT / "README.md"]
+    while left:
+        page = left.pop().resolve()
+        if page not in reached:
+            reached.add(page)
+            links = re.findall(r"\]\(([^)#\s:]+\.md)", page.read_text())
+            left += [page.parent / link for link in links]
+    pages = {*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("firmware_config/**/*.md")}
+    assert pages - reached == set()
+
+
+def test_every_way_into_the_box_has_tests():
+    """Each row of docs/security.md is whole, and the files of tests that it names exist."""
+    text = (DOCS / "security.md").read_text("utf-8")
+    found = [line.strip("|").split("|") for line in text.splitlines() if line.startswith("| ")][1:]
+    assert len(found) > 10
+    for row in found:
+        assert len(row) == 5, row[0]
+        assert all(cell.strip() for cell in row), row[0]
+        files = re.findall(r"`(tests/[\w/]+\.py)`", row[4])
+        assert files, row[0]
+        assert all((ROOT / file).is_file() for file in files), row[4]

@@ -109,9 +109,6 @@ CAMPAIGNS = {
         _module("tests.rig", "show"),
         prepare=rig_tools,
     ),
-    "rig-shell": Campaign(
-        "open a shell in the virtual box", _module("tests.rig", "shell"), prepare=rig_tools
-    ),
     "rig-tools": Campaign(
         "install the emulator of the virtual box",
         _module("tests.rig", "lacking"),

@@ -1,9 +1,7 @@
-"""`python -m tests.rig build|show|shell`: builds the virtual box, shows it at work, or opens a
-shell in it.
+"""`python -m tests.rig build|show`: builds the virtual box, or shows it at work.
 
-`ground` builds the part that is the same for every commit, `lacking` lists the Debian packages that
-are missing on this machine, and `table` prints how the box responded to each fault that the tests
-have injected.
+`ground` builds the part that is the same for every commit, and `lacking` lists the Debian packages
+that are missing on this machine.
 """
 
 from __future__ import annotations
@@ -15,7 +13,6 @@ import time
 from pathlib import Path
 
 from tests.factories.emulated_machines import Missing
-from tests.rig import notes
 from tests.rig.cell import Cell
 from tests.rig.image import ground, image, lacking
 from tests.rig.machine import Guest
@@ -40,32 +37,12 @@ def show(cell: Cell, sweeps: int) -> None:
         )
 
 
-def shell(cell: Cell) -> None:
-    """Run commands from the keyboard in the guest, as root, while the skin streams; `sweep` makes
-    the robot sweep."""
-    cell.plug()
-    print(
-        "a shell in the virtual box; `sweep` sweeps, `unplug` and `plug` do that, an empty line "
-        "ends"
-    )
-    while line := input("box# ").strip():
-        if line == "sweep":
-            print(cell.sweep())
-        elif line in ("plug", "unplug"):
-            getattr(cell, line)()
-        else:
-            print(cell.machine.run(line).out, end="")
-
-
 def main() -> int:
     """Run the command of the arguments; its exit code."""
     parser = argparse.ArgumentParser(prog="python -m tests.rig", description=__doc__)
-    parser.add_argument("what", choices=["build", "show", "shell", "ground", "lacking", "table"])
+    parser.add_argument("what", choices=["build", "show", "ground", "lacking"])
     parser.add_argument("--sweeps", type=int, default=6)
     args = parser.parse_args()
-    if args.what == "table":
-        print("\n".join(notes.table()))
-        return 0
     if args.what == "lacking":
         print(*lacking())
         return 0
@@ -93,7 +70,7 @@ def main() -> int:
                 flush=True,
             )
             cell = Cell(machine)
-            shell(cell) if args.what == "shell" else show(cell, args.sweeps)
+            show(cell, args.sweeps)
     return 0
 
 

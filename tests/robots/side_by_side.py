@@ -21,6 +21,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
@@ -29,10 +30,10 @@ from typing import Any
 
 import numpy as np
 
+from palpate.client.answers import Answer
 from palpate.core import storage
 from palpate.core.provenance import commit
 from palpate.sim import skin
-from tests.campaigns.feed_load import LATE_MS, REAL_TIME, Kind, LatencyListener
 from tests.factories.bridges import bridge
 from tests.factories.paths import ROOT
 from tests.rig.soak_boxes import Script, ThisMachine
@@ -45,10 +46,63 @@ START_S, COME_S, LOOK_S = 20.0, 10.0, 10.0
 RESULTS = ROOT / "docs" / "data" / "robots-side-by-side.json"
 SWEEP_S = 3.0
 """Shortest time between two sweeps of the robot."""
+WAIT_S = 0.1
+LATE_MS = 1.0
+"""Largest additional median of the times inside the box and to the robot's end."""
+LOST, DROPPED = 7, 10
+"""Fields of an STA sentence, counted from the talker."""
+REAL_TIME = ("chrt", "-f", "10")
 SHARE = 0.03
 """Largest additional share of a core: one percent for the feed's readers, two for fifty requests a
 second over TCP, which the box answers."""
 MIB = 2.0
+
+
+@dataclass
+class Measured:
+    """Answers of a box: the time of each in seconds, and the frame of its stop edge; milliseconds
+    inside the box, and from the verdict to the robot's end; frames lost and sentences dropped."""
+
+    answers: list[tuple[float, int]] = field(default_factory=list)
+    latency_ms: list[float] = field(default_factory=list)
+    way_ms: list[float] = field(default_factory=list)
+    lost: int = 0
+    dropped: int = 0
+    faults: Counter[str] = field(default_factory=Counter)
+
+
+class LatencyListener:
+    """The robot's end of the line: the delay of each answer, and the frames that the box counts as
+    lost."""
+
+    def __init__(self, box: ThisMachine, sweeps: Script) -> None:
+        self._box, self._sweeps = box, sweeps
+        self._next, self._counts = 1, (0, 0)
+
+    def listen(self, seconds: float, into: Measured) -> None:
+        """Record the sentences of this many seconds for `into`."""
+        end_s = time.monotonic() + seconds
+        before = self._counts
+        while (left_s := end_s - time.monotonic()) > 0:
+            for at_s, line in self._box.heard(min(left_s, WAIT_S)):
+                self._note(at_s, line, into)
+        into.lost += self._counts[0] - before[0]
+        into.dropped += self._counts[1] - before[1]
+
+    def _note(self, at_s: float, line: str, into: Measured) -> None:
+        fields = line.split("*")[0].split(",")
+        if fields[:2] == ["$PPLP", "STA"]:
+            self._counts = int(fields[LOST]), int(fields[DROPPED])
+            into.faults["skin away"] += fields[3] != "streaming"
+        if answer := Answer.read(line):
+            fact = self._sweeps[answer.sweep]
+            into.faults["sweeps without an answer"] += answer.sweep - self._next
+            said = answer.label if answer.status == "ok" else answer.status
+            into.faults["not as the network by itself"] += said != fact.alone
+            self._next = answer.sweep + 1
+            into.answers.append((at_s, fact.stop))
+            into.latency_ms.append(answer.latency_ms)
+            into.way_ms.append(1e3 * (at_s - float(fields[3])))
 
 
 @dataclass
@@ -58,7 +112,7 @@ class BoxSide:
 
     box: ThisMachine
     listener: LatencyListener
-    kind: Kind = field(default_factory=Kind)
+    found: Measured = field(default_factory=Measured)
     looks: list[tuple[float, float, int]] = field(default_factory=list)
     before_kib: int = 0
 
@@ -71,14 +125,14 @@ class BoxSide:
         """latency_ms: inside the box. way_ms: from the verdict to the robot's end of the line.
         edge_ms: from the stop edge to the robot's end, minus the median, because the start of the
         script is not known outside the box; both boxes have the same sweeps."""
-        kind = self.kind
-        at_s, stop = np.array(kind.answers).T
+        found = self.found
+        at_s, stop = np.array(found.answers).T
         edge_s = at_s - stop / skin.FORMAT.rate_hz
         seconds, cpu_s, kib = (np.array(values) for values in zip(*self.looks, strict=True))
         shares = np.diff(cpu_s) / np.diff(seconds)
         return {
             "seconds": round(float(seconds[-1] - seconds[0])),
-            "answers": len(kind.answers),
+            "answers": len(found.answers),
             "share": round(float((cpu_s[-1] - cpu_s[0]) / (seconds[-1] - seconds[0])), 5),
             "shares": [round(float(share), 4) for share in shares],
             "before_mib": round(self.before_kib / 1024, 1),
@@ -87,13 +141,13 @@ class BoxSide:
                 f"{name}_ms": spread(values)
                 for name, values in (
                     ("edge", 1e3 * (edge_s - np.median(edge_s))),
-                    ("latency", kind.latency_ms),
-                    ("way", kind.way_ms),
+                    ("latency", found.latency_ms),
+                    ("way", found.way_ms),
                 )
             },
-            "frames_lost": kind.lost,
-            "sentences_dropped": kind.dropped,
-            "faults": {name: n for name, n in kind.faults.items() if n},
+            "frames_lost": found.lost,
+            "sentences_dropped": found.dropped,
+            "faults": {name: n for name, n in found.faults.items() if n},
         }
 
 
@@ -130,7 +184,7 @@ def listen(both: dict[str, BoxSide], seconds: float, *, measured: bool) -> None:
     def one(side: BoxSide) -> None:
         hurry(BOX)
         try:
-            side.listener.listen(seconds, side.kind if measured else Kind())
+            side.listener.listen(seconds, side.found if measured else Measured())
         except BaseException as e:  # raised by the thread that joins
             failed.append(e)
 
@@ -149,10 +203,10 @@ def listen(both: dict[str, BoxSide], seconds: float, *, measured: bool) -> None:
         side.look()
 
 
-def attack(stack: ExitStack, kind: str, port: int) -> subprocess.Popen[bytes]:
+def attack(stack: ExitStack, kind: str, where: object) -> subprocess.Popen[bytes]:
     """Start hostile peers; they end with their input, and then report their counts."""
     command, pipe = (
-        [sys.executable, "-m", "tests.robots.attackers", kind, str(port)],
+        [sys.executable, "-m", "tests.robots.attackers", kind, str(where)],
         subprocess.PIPE,
     )
     return stack.enter_context(subprocess.Popen(command, stdin=pipe, stdout=pipe, cwd=ROOT))
@@ -178,19 +232,6 @@ def page_of(feed: Path) -> Iterator[int]:
             process.terminate()
 
 
-@contextmanager
-def readers(feed: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """Start good and bad readers of the feed."""
-    command = [sys.executable, "-m", "tests.campaigns.feed_readers", str(feed), "attacked"]
-    with subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=ROOT
-    ) as process:
-        try:
-            yield process
-        finally:
-            process.kill()
-
-
 def measure(minutes: float, seed: int, before: Sequence[str]) -> dict[str, Any]:
     """Figures of both boxes, counts of the peers, and the names of box and machine."""
     with ExitStack() as stack:
@@ -202,13 +243,13 @@ def measure(minutes: float, seed: int, before: Sequence[str]) -> dict[str, Any]:
         attached = stack.enter_context(ExitStack())
         line = both["attacked"].box
         assert isinstance(line, SharedLine)
-        ports = {
+        there = {
+            "feed": feed,
             "tcp": attached.enter_context(bridge("tcp", "--port", line.line))[1],
             "modbus": attached.enter_context(bridge("modbus", "--feed", feed))[1],
             "page": attached.enter_context(page_of(feed)),
         }
-        peers = {kind: attack(attached, kind, port) for kind, port in ports.items()}
-        peers["feed"] = attached.enter_context(readers(feed))
+        peers = {kind: attack(attached, kind, where) for kind, where in there.items()}
         print(f"attached: {', '.join(peers)}", flush=True)
         listen(both, COME_S, measured=False)
         listen(both, 60 * minutes, measured=True)
