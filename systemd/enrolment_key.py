@@ -29,8 +29,4 @@ if [ -s key ] && [ ! -s signer ]; then
     "$(printf %s "$public" | cut -d ' ' -f 1,2)" > signer.new
   chmod 644 signer.new && sync -f signer.new && mv signer.new signer
 fi
-if grep -q '^box namespaces="palpate-enrolment" ' signer; then # of a version that taught nothing
-  sed '/^box /s/"palpate-enrolment"/"palpate-enrolment,palpate-taught"/' signer > signer.new
-  chmod 644 signer.new && sync -f signer.new && mv signer.new signer
-fi
 )"""

@@ -19,6 +19,7 @@ KEY, SIGNER = "key", "signer"
 OTHERS = 0o077
 """Permission bits that a private key must not have."""
 PROBE = b"palpate: does this key sign?"
+WHAT = {NAMESPACE: "the labels were not enrolled", TAUGHT: "the bundle was not taught"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,43 +34,34 @@ class EnrolmentKey:
         try:
             self.verify(PROBE, self.sign(PROBE, namespace), namespace)
         except BundleError as e:
-            if namespace == TAUGHT:
-                raise ConfigError(
-                    f"{self.folder / SIGNER} does not admit taught bundles; run make install, "
-                    "which adds that"
-                ) from e
             raise ConfigError(
-                f"{self.folder / KEY} is not the key of {self.folder / SIGNER}; remove both and "
-                "run make install again: then teach all labels again"
+                f"{self.folder / SIGNER} does not admit what {KEY} signs as {namespace}; run make "
+                "install, which adds that; if it stays so, remove both, run it again and teach "
+                "all labels again"
             ) from e
 
     def sign(self, data: bytes, namespace: str = NAMESPACE) -> bytes:
         """The signature of an enrolment. Raises ConfigError if the key is missing, damaged or not
         private."""
         path = self.folder / KEY
-        again = (
-            "teach as the user palpate (sudo -u palpate palpate teach); if the key does not "
-            f"exist, run make install, which makes a key unless {SIGNER} exists"
-        )
         try:
             mode = path.stat().st_mode
             path.open("rb").close()
         except OSError as e:
-            raise ConfigError(f"{path}: {e.strerror}, so nothing can be enrolled; {again}") from e
-        if mode & OTHERS:
             raise ConfigError(
-                f"{path} may be read by others (mode {mode & 0o777:o}); remove it and {SIGNER}, "
-                "and run make install again"
-            )
+                f"{path}: {e.strerror}, so nothing can be enrolled; teach as the user palpate "
+                "(sudo -u palpate palpate teach); if the key does not exist, run make install, "
+                f"which makes a key unless {SIGNER} exists"
+            ) from e
+        again = f"remove it and {SIGNER}, run make install again, and teach again"
+        if mode & OTHERS:
+            raise ConfigError(f"{path} may be read by others (mode {mode & 0o777:o}); {again}")
         try:
             return signature.sign(data, path, namespace, interactive=False)
         except ConfigError as e:
             if "does not sign" not in str(e):
                 raise  # ssh-keygen itself is missing or hangs
-            raise ConfigError(
-                f"{path} is damaged; remove it and {SIGNER}, run make install again, and teach "
-                "again"
-            ) from e
+            raise ConfigError(f"{path} is damaged; {again}") from e
 
     def verify(self, data: bytes, signed: bytes, namespace: str = NAMESPACE) -> None:
         """Raises BundleError if this box did not sign `data` in the namespace, ConfigError if that
@@ -78,15 +70,9 @@ class EnrolmentKey:
         try:
             signature.verify(data, signed, signer, namespace)
         except BundleError as e:
-            if namespace == TAUGHT:
-                raise BundleError(
-                    "the bundle was not taught on this box, or altered since "
-                    f"({e.args[0].partition(';')[0]}); teach it here (palpate teach), or sign it "
-                    "on a desktop (palpate-train sign)"
-                ) from e
             raise BundleError(
-                "the labels were not enrolled on this box, or altered since "
-                f"({e.args[0].partition(';')[0]}); teach them here (palpate teach)"
+                f"{WHAT[namespace]} on this box, or altered since ({str(e).partition(';')[0]}); "
+                "teach again here (palpate teach)"
             ) from e
         except TemporaryError:
             raise  # ssh-keygen may run at the next attempt

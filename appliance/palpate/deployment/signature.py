@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import base64
 import binascii
-import codecs
 import os
 import re
 from collections.abc import Iterator
@@ -39,7 +38,6 @@ LINE = re.compile(
 )
 """A line of the signers' file: one name, one key. ssh-keygen also allows patterns, certificates and
 dates. Dates need a correct clock, which a box may not have."""
-DATED = re.compile(r"valid-after|valid-before|cert-authority", re.IGNORECASE)
 
 
 def verify(message: bytes, signature: bytes, signers: Path, namespace: str = NAMESPACE) -> str:
@@ -98,12 +96,12 @@ def own_key() -> Path:
 
 def _trusted(signers: Path) -> bytes:
     """The content of the file of signers, with each line checked, because ssh-keygen skips invalid
-    lines silently. Raises ConfigError."""
+    lines silently. A byte order mark and any ends of line are allowed. Raises ConfigError."""
     try:
         with signers.open("rb") as f:
             data = f.read(MOST_SIGNERS + 1)
-        text = _plain(data)
-        lines = text.split("\n")
+        each = re.split(r"\r\n|\r|\n", data.decode("utf-8-sig"))
+        lines = [line.strip(" \t") for line in each]
     except (OSError, ValueError) as e:
         raise (TemporaryError if passes(e) else ConfigError)(
             f"{signers} cannot be read: {e}; put a line `NAME KEY` there for each who signs"
@@ -112,34 +110,18 @@ def _trusted(signers: Path) -> bytes:
         raise ConfigError(
             f"{signers} has more than {MOST_SIGNERS} bytes; keep one line for each who signs"
         )
-    entries = [
-        (n, line) for n, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")
-    ]
+    entries = [(n, line) for n, line in enumerate(lines, 1) if line and not line.startswith("#")]
     if not entries:
         raise ConfigError(
             f"{signers} has no signer, so no bundle can be trusted; put a line `NAME KEY` there"
         )
     for n, line in entries:
         if not _is_signer(line):
-            dated = DATED.search(line)
-            why = (
-                f"{dated[0]} is not used here, a box may not know the time"
-                if dated
-                else "it is not understood"
-            )
             raise ConfigError(
-                f"{signers}, line {n}: {why}; write NAME ssh-ed25519 AAAA..., the rest as in a "
-                ".pub file"
+                f"{signers}, line {n} is not understood; write NAME ssh-ed25519 AAAA..., the rest "
+                "as in a .pub file, without dates: a box may not know the time"
             )
-    return text.encode()
-
-
-def _plain(data: bytes) -> str:
-    """The text of a file as editors of any system write it: UTF-8 or UTF-16 with a byte order mark,
-    and any ends of line. Raises UnicodeDecodeError."""
-    marked = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
-    text = data.decode("utf-16" if marked else "utf-8-sig")
-    return "\n".join(line.strip(" \t") for line in re.split(r"\r\n|\r|\n", text)) + "\n"
+    return "\n".join([*lines, ""]).encode()
 
 
 def _is_signer(line: str) -> bool:

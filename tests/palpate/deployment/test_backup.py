@@ -151,7 +151,7 @@ def member(name: str, kind: bytes = tarfile.REGTYPE, link: str = "") -> tarfile.
 def test_a_member_that_no_box_has_saved_is_refused(tmp_path: Path, hostile: tarfile.TarInfo):
     """Paths that lead elsewhere, links, devices."""
     new = box(tmp_path / "new", {})
-    with pytest.raises(FormatError, match="which no box has saved"):
+    with pytest.raises(FormatError, match="no box has saved"):
         backup.unpack(archive(hostile), new)
 
 
@@ -161,20 +161,20 @@ def test_a_missing_current_bundle_and_another_schema_are_refused(
     """The reason names them."""
     new = box(tmp_path / "new", {})
     link = member("data/current", tarfile.SYMTYPE, f"bundles/{SHA}")
-    with pytest.raises(FormatError, match="lacks its current bundle"):
+    with pytest.raises(FormatError, match="current bundle"):
         backup.unpack(archive(link), new)
     monkeypatch.setattr(backup, "SCHEMA", 2)
     later = saved(old_box(tmp_path / "old"))
     monkeypatch.setattr(backup, "SCHEMA", 1)
-    with pytest.raises(FormatError, match="schema 2; update Palpate"):
+    with pytest.raises(FormatError, match="schema 2"):
         backup.unpack(io.BytesIO(later), new)
 
 
 def test_a_computer_without_palpate_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """Both ways; the message names the missing part."""
-    with pytest.raises(ApplianceError, match="Palpate is not installed here"):
+    with pytest.raises(ApplianceError, match="not installed"):
         backup.save(io.BytesIO(), tmp_path)
-    with pytest.raises(ApplianceError, match="install Palpate on this box first"):
+    with pytest.raises(ApplianceError, match="install Palpate"):
         backup.unpack(io.BytesIO(saved(old_box(tmp_path / "old"))), tmp_path / "bare")
     assert command.main(["restore", str(tmp_path / "nowhere")], tmp_path) == 1
     assert "nowhere: No such file or directory" in capsys.readouterr().err

@@ -57,12 +57,6 @@ def test_a_second_label_and_the_packaged_bundle(box: Delivery):
     assert box.store.rollback() == PACKAGED
 
 
-def test_three_bad_starts_lead_back_to_the_bundle_without_the_label(box: Delivery):
-    """As with every bundle on trial."""
-    one, with_cork = box.committed(1), box.store.learn(grown(box))
-    assert [box.start() for _ in range(4)] == [with_cork] * 3 + [one]
-
-
 def test_the_next_delivery_counts_from_the_bundle_that_was_signed(box: Delivery):
     """After a newer bundle was committed, labels that were enrolled into the older bundle are
     refused. Delivering the running bundle again may remove its label."""
@@ -73,7 +67,7 @@ def test_the_next_delivery_counts_from_the_bundle_that_was_signed(box: Delivery)
     assert box.store.install(box.made(1)) != with_cork
     assert box.store.learn(old) == with_cork
     box.committed(2)
-    with pytest.raises(BundleError, match="counter 1, and 2 was committed"):
+    with pytest.raises(BundleError, match="counter 1, and 2"):
         box.store.learn(old)
     box.store.rollback()
     assert box.store.learn(grown(box, "felt"))
@@ -94,54 +88,30 @@ def check_refused(
 def test_no_part_can_be_exchanged(box: Delivery, tmp_path: Path):
     """Refused: an enrolment without a signature, signed by another box, or by a signer of bundles;
     labels of another bundle, other labels of this bundle; a base that is unsigned, altered, or by
-    an unknown signer."""
+    an unknown signer. So the box's private key can add labels and nothing else."""
     box.committed(1)
-    good, unsigned = grown(box), deliveries.enrolled(dict(box.store.running().files), None)
-    other_box = install_scripts.enrolment_key(tmp_path / "other")
-    check_refused(box, unsigned, "enrolment.npz is not signed; teach again on this box")
+    good, key = grown(box), box.enrolment_key
+    labels = {name: good[name] for name in (bundle.ENROLMENT, bundle.ENROLMENT_SIGNATURE)}
+    unsigned = deliveries.enrolled(dict(box.store.running().files), None)
+    check_refused(box, unsigned, "npz is not signed")
     for signed in (
-        other_box.sign(good[bundle.ENROLMENT]),
+        install_scripts.enrolment_key(tmp_path / "other").sign(good[bundle.ENROLMENT]),
         deliveries.signature.sign(good[bundle.ENROLMENT], box.key),
     ):
-        check_refused(box, good | {bundle.ENROLMENT_SIGNATURE: signed}, "not enrolled on this box")
-    labels = (bundle.ENROLMENT, bundle.ENROLMENT_SIGNATURE)
+        check_refused(box, good | {bundle.ENROLMENT_SIGNATURE: signed}, "not enrolled")
+    felt = grown(box, "felt")[bundle.ENROLMENT]
+    check_refused(box, good | {bundle.ENROLMENT: felt}, "not enrolled")
     other = deliveries.files(1, box.key, version="other")
-    check_refused(
-        box, other | {name: good[name] for name in labels}, "enrolment.npz belongs to bundle"
-    )
-    felt = grown(box, "felt")
-    check_refused(
-        box,
-        good | {bundle.ENROLMENT: felt[bundle.ENROLMENT]},
-        "not enrolled on this box, or altered",
-    )
-    nobody = deliveries.files(9, None)
-    by_nobody = deliveries.enrolled(nobody, box.enrolment_key)
-    check_refused(
-        box,
-        by_nobody,
-        "is not signed, and is not the packaged bundle of this version; teach again",
-    )
-    unknown = deliveries.files(9, deliveries.key(tmp_path, "unknown"))
-    check_refused(
-        box, deliveries.enrolled(unknown, box.enrolment_key), "signed by none of the signers"
-    )
-    check_refused(box, good | {bundle.MEANS: good[bundle.MEANS] + b"\0"}, "means.npz was altered")
+    check_refused(box, other | labels, "belongs to bundle")
+    nobody = deliveries.enrolled(deliveries.files(9, None), key)
+    check_refused(box, nobody, "not the packaged bundle")
+    for signer in (deliveries.key(tmp_path, "unknown"), key.folder / KEY):
+        unknown = deliveries.enrolled(deliveries.files(9, signer), key)
+        check_refused(box, unknown, "none of the signers")
+    for name in (bundle.MEANS, bundle.MODEL):
+        altered = good | {name: good[name][:-1] + bytes([good[name][-1] ^ 1])}
+        check_refused(box, altered, f"{name} was altered")
     assert box.store.learn(good)
-
-
-def test_the_key_can_add_labels_and_nothing_else(box: Delivery):
-    """A person with the box's private key cannot change the model, a threshold or a class mean by
-    an enrolment."""
-    box.committed(1)
-    good = grown(box)
-    evil = deliveries.signed(deliveries.files(1, None, name="evil"), box.enrolment_key.folder / KEY)
-    check_refused(
-        box, deliveries.enrolled(evil, box.enrolment_key), "signed by none of the signers"
-    )
-    model = bytearray(good[bundle.MODEL])
-    model[len(model) // 2] ^= 1
-    check_refused(box, good | {bundle.MODEL: bytes(model)}, "model.onnx was altered")
 
 
 def test_a_lost_key_or_signer_does_not_end_what_runs_unless_it_must(box: Delivery):
@@ -153,9 +123,7 @@ def test_a_lost_key_or_signer_does_not_end_what_runs_unless_it_must(box: Deliver
     (box.enrolment_key.folder / KEY).rename(box.folder / "kept")
     assert box.store.running().bundle.enrolled
     (box.enrolment_key.folder / SIGNER).unlink()
-    with pytest.raises(
-        ConfigError, match=r"cannot be checked.*make install, which makes signer again"
-    ):
+    with pytest.raises(ConfigError, match="make install"):
         box.store.choose()
     (box.folder / "kept").rename(box.enrolment_key.folder / KEY)
     install_scripts.enrolment_key(box.enrolment_key.folder)
@@ -171,24 +139,7 @@ def test_a_program_with_another_packaged_bundle_does_not_take_the_label(
     assert box.store.commit()
     newer = deliveries.put(box.folder / "newer", deliveries.files(0, None, version="99"))
     monkeypatch.setattr(bundle, "DEFAULT", newer)
-    with pytest.raises(
-        BundleError,
-        match=r"not the packaged bundle of this version; teach again.*rollback",
-    ):
+    with pytest.raises(BundleError, match=r"teach again.*rollback"):
         box.store.choose()
     assert box.store.rollback() == PACKAGED
     assert box.store.running().bundle.manifest.version == "99"
-
-
-def test_a_damaged_enrolment_is_told_and_gone_back_from(box: Delivery):
-    """One byte of the enrolment has changed on the card."""
-    one, sha = box.committed(1), box.store.learn(grown(box))
-    assert box.store.commit()
-    path = box.store.bundles.at(sha) / bundle.ENROLMENT
-    data = bytearray(path.read_bytes())
-    data[100] ^= 1
-    path.write_bytes(bytes(data))
-    with pytest.raises(BundleError, match=r"not enrolled on this box, or altered since.*rollback"):
-        box.store.choose()
-    assert box.store.rollback() == one
-    assert box.start() == one

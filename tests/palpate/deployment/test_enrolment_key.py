@@ -4,15 +4,13 @@ the key is missing or damaged."""
 from __future__ import annotations
 
 import os
-import shutil
-import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from palpate.core.errors import BundleError, ConfigError, TemporaryError
-from palpate.deployment import enrolment_key, signature
+from palpate.deployment import signature
 from palpate.deployment.enrolment_key import KEY, NAMESPACE, SIGNER, TAUGHT, EnrolmentKey
 from tests.factories import deliveries, install_scripts
 
@@ -54,9 +52,7 @@ def test_two_boxes_do_not_believe_each_other(key: EnrolmentKey, tmp_path: Path):
         (DATA, good[:80]),
         (DATA, b""),
     ):
-        with pytest.raises(
-            BundleError, match=r"not enrolled on this box, or altered since .*palpate teach"
-        ):
+        with pytest.raises(BundleError, match="not enrolled"):
             key.verify(data, signed)
     key.verify(DATA, good)
 
@@ -71,102 +67,53 @@ def test_the_key_signs_no_bundle(key: EnrolmentKey, tmp_path: Path):
             signature.verify(DATA, signed, signers)
 
 
-def lost(key: EnrolmentKey) -> None:
-    """Remove the private key."""
-    (key.folder / KEY).unlink()
-
-
-def open_to_all(key: EnrolmentKey) -> None:
-    """Let others read the private key."""
-    (key.folder / KEY).chmod(0o444)
-
-
-def cut(key: EnrolmentKey) -> None:
-    """Cut the private key to half its length."""
+def held(key: EnrolmentKey, data: Callable[[bytes], bytes], mode: int = 0o400) -> None:
+    """Change the private key."""
     path = key.folder / KEY
-    half = path.read_bytes()[: path.stat().st_size // 2]
     path.chmod(0o600)
-    path.write_bytes(half)
-    path.chmod(0o400)
+    path.write_bytes(data(path.read_bytes()))
+    path.chmod(mode)
 
 
-def empty(key: EnrolmentKey) -> None:
-    """Make the private key an empty file."""
-    (key.folder / KEY).chmod(0o600)
-    (key.folder / KEY).write_bytes(b"")
-    (key.folder / KEY).chmod(0o400)
-
-
-def of_another(key: EnrolmentKey) -> None:
-    """Replace the private key by the key of another box."""
+def another(key: EnrolmentKey) -> bytes:
+    """The private key of another box."""
     other = install_scripts.enrolment_key(key.folder.parent / "another")
-    shutil.copy2(other.folder / KEY, key.folder / "new")
-    (key.folder / "new").replace(key.folder / KEY)
+    return (other.folder / KEY).read_bytes()
 
 
-def unsigned(key: EnrolmentKey) -> None:
-    """Remove the signer."""
-    (key.folder / SIGNER).unlink()
+SPOILS: dict[str, tuple[Callable[[EnrolmentKey], None], str]] = {
+    "lost": (lambda key: (key.folder / KEY).unlink(), "No such file"),
+    "open to all": (lambda key: held(key, bytes, 0o444), "mode 444"),
+    "cut": (lambda key: held(key, lambda data: data[: len(data) // 2]), "is damaged"),
+    "empty": (lambda key: held(key, lambda data: b""), "is damaged"),
+    "of another": (lambda key: held(key, lambda data: another(key)), "does not admit"),
+    "no signer": (lambda key: (key.folder / SIGNER).unlink(), "signer cannot be read"),
+}
 
 
-@pytest.mark.parametrize(
-    ("spoil", "why"),
-    [
-        (lost, "key: No such file or directory, so nothing can be enrolled"),
-        (open_to_all, r"may be read by others \(mode 444\)"),
-        (cut, "key is damaged; remove it and signer, run make install again"),
-        (empty, "key is damaged"),
-        (of_another, "is not the key of .*teach all labels again"),
-        (
-            unsigned,
-            "cannot be checked: .*signer cannot be read.*make install, which makes signer again "
-            "from key",
-        ),
-    ],
-)
-def test_a_key_that_cannot_be_used_is_told_with_what_to_do(
-    key: EnrolmentKey, spoil: Callable[[EnrolmentKey], None], why: str
-):
+@pytest.mark.parametrize("spoil", SPOILS)
+def test_a_key_that_cannot_be_used_is_told_with_what_to_do(key: EnrolmentKey, spoil: str):
     """A key that is missing, readable by others, damaged, or of another box, or has no signer, is
     reported in one line before the robot sweeps."""
-    spoil(key)
+    spoiled, why = SPOILS[spoil]
+    spoiled(key)
     with pytest.raises(ConfigError, match=why) as e:
         key.check()
+    assert "make install" in str(e.value)
     assert "\n" not in str(e.value)
 
 
-def test_what_was_enrolled_is_believed_without_the_private_key(key: EnrolmentKey):
-    """After the loss of the private key the enrolled labels stay valid. The next install does not
-    make another key, which would make them invalid."""
-    signed = key.sign(DATA)
-    lost(key)
+def test_a_lost_signer_is_made_again_and_a_lost_key_is_not(key: EnrolmentKey):
+    """`make install` makes the signer again, and earlier signatures are valid again. A new key
+    would make them invalid: without the private key the enrolled labels stay valid."""
+    signed, before = key.sign(DATA), (key.folder / SIGNER).read_bytes()
+    SPOILS["no signer"][0](key)
+    install_scripts.enrolment_key(key.folder)
+    assert (key.folder / SIGNER).read_bytes() == before
+    SPOILS["lost"][0](key)
     install_scripts.enrolment_key(key.folder)
     assert os.listdir(key.folder) == [SIGNER]
     key.verify(DATA, signed)
-
-
-def test_a_lost_signer_is_made_again_from_the_key(key: EnrolmentKey):
-    """`make install` makes the signer again, and earlier signatures are valid again."""
-    signed, before = key.sign(DATA), (key.folder / SIGNER).read_bytes()
-    unsigned(key)
-    install_scripts.enrolment_key(key.folder)
-    assert (key.folder / SIGNER).read_bytes() == before
-    key.verify(DATA, signed)
-    unsigned(key)
-    cut(key)
-    with pytest.raises(subprocess.CalledProcessError) as e:
-        install_scripts.enrolment_key(key.folder)
-    assert b"key is damaged; remove it" in e.value.stderr
-
-
-def test_a_box_without_ssh_keygen_says_so(key: EnrolmentKey, monkeypatch: pytest.MonkeyPatch):
-    """The error mentions neither a damaged key nor a wrong signature."""
-    monkeypatch.setenv("PATH", "/nowhere")
-    with pytest.raises(ConfigError, match="ssh-keygen is missing"):
-        key.sign(DATA)
-    with pytest.raises(ConfigError, match="ssh-keygen is missing"):
-        key.verify(DATA, b"")
-    assert NAMESPACE == enrolment_key.NAMESPACE != signature.NAMESPACE
 
 
 @pytest.mark.parametrize("namespace", [NAMESPACE, TAUGHT])

