@@ -6,7 +6,6 @@ from __future__ import annotations
 import itertools
 import json
 import random
-import re
 import socket
 import struct
 from collections.abc import Iterator
@@ -20,7 +19,6 @@ from pymodbus.client import ModbusTcpClient
 
 from palpate.bridges import modbus, modbus_pdu
 from palpate.bridges.modbus import ADDRESSES, COILS, INPUTS, STALE, STATUS_CODES, inputs, registers
-from palpate.bridges.options import MOST
 from palpate.bridges.source import BoxView, noted
 from palpate.cli.main import main
 from palpate.client.answers import Answer, BoxState
@@ -29,7 +27,6 @@ from palpate.core.sentences import Sentence, read, sentence
 from palpate.core.status import Status
 from tests.factories import feed_lines, speaking_box
 from tests.factories.bridges import LONG_S, RawModbus, bridge, eventually, page_blocks
-from tests.factories.paths import ROOT
 from tests.factories.speaking_box import LABELS, SpeakingBox, finger, obeying, result, state
 
 Address = tuple[str, int]
@@ -296,30 +293,6 @@ def test_hostile_bytes_reach_nobody_else(raw: RawModbus, address: Address):
     assert raw.registers(0, 1) == [1]
 
 
-def is_closed(peer: socket.socket) -> bool:
-    """Whether the bridge has ended this connection."""
-    peer.settimeout(0)
-    try:
-        return peer.recv(1) == b""
-    except BlockingIOError:
-        return False
-    except ConnectionError:
-        return True
-
-
-def test_a_thousand_connections(raw: RawModbus, address: Address):
-    """Connections above the limit are closed at once, and the first is still served."""
-    peers = []
-    for _ in range(1000):
-        peers.append(socket.create_connection(address, timeout=LONG_S))
-        if len(peers) % 10 == 0:
-            assert raw.registers(0, 1) == [1]
-    eventually(lambda: sum(map(is_closed, peers)) >= 1000 - MOST)
-    for peer in peers:
-        peer.close()
-    assert raw.registers(0, 1) == [1]
-
-
 def test_the_feed_in_place_of_the_line(tmp_path: Path):
     """On the box, beside a robot that has the serial line: the same map. Commands are refused;
     lines of a later version are counted and do no harm."""
@@ -437,25 +410,6 @@ def test_the_python_of_the_page_runs(box: SpeakingBox, raw: RawModbus, address: 
         box.unplug()
         with pytest.raises(RuntimeError, match=r"coil 2|not heard"):
             names["classify"](plc, lambda: None, timeout_s=LONG_S)
-
-
-def test_the_document_has_the_map():
-    """docs/robots/modbus.md, after which a PLC is programmed, lists each register, input and coil
-    at its address. Of the fingers it lists the first."""
-    text = (ROOT / "docs" / "robots" / "modbus.md").read_text()
-    words, rest = text.split("## Discrete inputs")
-    rows = re.findall(r"^\| (\d+)(?:, \d+| to \d+)? \| `([a-z0-9 ]+)` \|", words, re.M)
-    wanted = list(ADDRESSES.items())
-    wanted += [(name.partition("_")[0], modbus.SLIDE_AT + i) for i, name in enumerate(modbus.SLIDE)]
-    wanted += [(register.name, MEASURED_AT + i) for i, register in enumerate(modbus.MEASURED)]
-    at = FINGERS_AT
-    for register in modbus.FINGERS[:5]:
-        wanted.append((register.name, at))
-        at += register.words
-    assert sorted((int(at), name) for at, name in rows) == sorted((at, name) for name, at in wanted)
-    bits, coils = rest.split("Coils", 1)
-    assert re.findall(r"^\| \d+ \| `([a-z]+)` \|", bits, re.M) == [*INPUTS]
-    assert tuple(re.findall(r"^\| \d+ \| ([A-Z]+) \|", coils, re.M)) == COILS
 
 
 @pytest.mark.parametrize(

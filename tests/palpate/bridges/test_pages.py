@@ -62,20 +62,6 @@ def test_python(box: SpeakingBox):
                 names["classify"](client, lambda: None)
 
 
-def test_python_prints_what_to_do(box: SpeakingBox, capsys: pytest.CaptureFixture[str]):
-    """`main` of python.md: a label, something to set aside, a box that is gone."""
-    names: dict[str, Any] = {}
-    exec(page_blocks("python.md", "python")[0], names)
-    box.script = answering("ok", "unknown")
-    for _ in range(2):
-        names["main"](str(box.path), lambda: None)
-    box.unplug()
-    names["main"](str(box.path), lambda: None)
-    out = capsys.readouterr().out.splitlines()
-    assert out[:2] == ["wood", "set it aside"]
-    assert out[2].startswith("no answer: ")
-
-
 class SocketOfUr:
     """`socket_*` of URScript, as the Script Directory describes them."""
 
@@ -163,19 +149,6 @@ def test_urscript_by_socket(box: SpeakingBox):
         assert [classify("from", "to", 2) for _ in FAULTS] == [
             f"fault: {status}" for status in FAULTS
         ]
-
-
-def test_urscript_by_socket_at_faults(box: SpeakingBox):
-    """A bridge that refuses, a box that is silent, no bridge: one line and no hanging."""
-    with bridge("tcp", "--port", box.path) as address:
-        assert by_socket(address)["palpate_classify"]("from", "to", 2).startswith(
-            "fault: the box does not answer, or refuses"
-        )
-    with bridge("tcp", "--port", box.path, "--allow-writes") as address:
-        classify = by_socket(address)["palpate_classify"]
-        box.script = lambda heard: obeying(heard)[:1]
-        assert classify("from", "to", 2) == "fault: no answer in time"
-    assert classify("from", "to", 2) == "fault: no connection to the box"
 
 
 @pytest.mark.parametrize(

@@ -150,36 +150,6 @@ def test_unplugged_meanwhile(box: SpeakingBox, node: RosPeer):
     assert swept(node, slide_s=0.1)["state"] == "succeeded"
 
 
-def test_a_dead_box(box: SpeakingBox, node: RosPeer):
-    """A box that has fallen silent: the goal ends long before the time limit."""
-    box.script = silent
-    begun(node)
-    assert (
-        later(node, 0)["message"]
-        == "the box has said nothing for 3.5 s during the sweep; is it on?"
-    )
-    assert node.on("result")[0]["state"] == "aborted"
-
-
-def test_no_answer_in_time(box: SpeakingBox, node: RosPeer):
-    """Aborted, and the box's sweep with it."""
-    box.script = silent
-    found = swept(node, slide_s=0.1, timeout_s=0.5)
-    assert found["state"] == "aborted"
-    assert found["message"] == "no answer within timeout_s = 0.5 of START; the sweep was aborted"
-    eventually(lambda: commands(box) == ["START", "STOP", "ABORT"])
-
-
-def test_a_goal_that_cannot_be(box: SpeakingBox, node: RosPeer):
-    """Aborted with the value and what to use; nothing reaches the box."""
-    found = swept(node, slide_s=3.0, timeout_s=2.0)
-    assert found["state"] == "aborted"
-    assert found["message"].startswith(
-        "timeout_s = 2 is not a valid limit from START to the answer; use more than slide_s = 3"
-    )
-    assert commands(box) == []
-
-
 def test_cleaned_up_meanwhile(box: SpeakingBox, node: RosPeer):
     """The box's sweep is aborted before its line is closed, and the goal has its result; without a
     line, goals are aborted; configured again, they work."""
@@ -245,17 +215,6 @@ def test_without_the_messages(box: SpeakingBox, tmp_path: Path):
     )
 
 
-def test_with_the_messages_nothing_is_said_of_them(box: SpeakingBox, tmp_path: Path):
-    """The line is there only where the action is not."""
-    with (
-        (tmp_path / "log").open("wb") as log,
-        ros.peer() as peer,
-        ros.bridge("-p", f"port:={box.path}", log=log.fileno()),
-    ):
-        ready(box, peer)
-    assert b"~/sweep is not offered" not in (tmp_path / "log").read_bytes()
-
-
 @pytest.mark.slow
 def test_with_the_box_itself(tmp_path: Path):
     """The box's program on a simulated skin, a bridge on its serial line, another node: the box
@@ -287,28 +246,3 @@ def test_with_the_box_itself(tmp_path: Path):
             assert (ended["state"], ended["status"]) == ("aborted", "no-stop")
         finally:
             run.terminate()
-
-
-def test_the_definition_is_what_was_built():
-    """The installed package has the action of the sources, so the tests are of it."""
-    prefix = ros.PYTHON.parent.parent
-    built = (prefix / "share" / "palpate_msgs" / "action" / "Sweep.action").read_text()
-    assert (
-        built
-        == (
-            ros.ROOT / "appliance" / "plugins" / "palpate_msgs" / "action" / "Sweep.action"
-        ).read_text()
-    )
-    told = subprocess.run(
-        [ros.PYTHON, "-c", "from palpate_msgs.action import Sweep; print(Sweep.Goal())"],
-        env=ros.environment(),
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=120,
-    ).stdout
-    assert (
-        told.strip()
-        == "palpate_msgs.action.Sweep_Goal(new_object=False, slide_s=3.0, timeout_s=10.0, "
-        "speed_mm_s=0.0, force_n=0.0)"
-    )

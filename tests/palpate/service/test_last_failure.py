@@ -3,7 +3,6 @@ end in order."""
 
 from __future__ import annotations
 
-import json
 from contextlib import suppress
 from pathlib import Path
 
@@ -102,9 +101,3 @@ def test_the_start_after_a_failure_waits(
     words = ["--set", f"store.runtime={tmp_path}"]
     assert lower_outputs.main(words, lines, clock, {"EXIT_STATUS": exit_status}) == 0
     assert (clock.now_ns() > begun) == waits
-
-
-def test_the_note_is_readable_json(tmp_path: Path):
-    """Long reasons are cut, so that the file stays small."""
-    failed(tmp_path, VirtualClock(), LineError("x" * 100_000))
-    assert len(json.loads((tmp_path / last_failure.FILE).read_text())["why"]) == 1000

@@ -7,7 +7,6 @@ import json
 import os
 import stat
 import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +17,6 @@ import pytest
 from palpate import __version__
 from palpate.core.errors import ApplianceError, FormatError
 from palpate.core.health import Health
-from palpate.core.sentences import MAX_LINE, sentence
 from palpate.core.status import REASONS
 from palpate.core.types import Status, Verdict
 from palpate.service import status
@@ -110,19 +108,6 @@ def test_a_storm_of_verdicts_writes_ten_times_a_second_at_most(status_file: Cloc
         status_file.clock.sleep_until(status_file.clock.now_ns() + SECOND // 100)
     assert 9 <= written <= 11
     assert len(status_file.read()["verdicts"]) == 20
-
-
-def test_writing_it_interns_no_string(status_file: ClockedStatus, monkeypatch: pytest.MonkeyPatch):
-    """pathlib interns the parts of a path: one a second would fill Python's table of interned
-    strings (docs/faults.md)."""
-    status_file.turns(2)
-    interned = []
-    monkeypatch.setattr(sys, "intern", lambda text: interned.append(text) or text)
-    if not Path("a").name or not interned:
-        pytest.skip("pathlib of this Python interns nothing")
-    interned.clear()
-    assert status_file.turns(3) >= 3
-    assert not interned
 
 
 def test_every_user_may_read_it_whole(status_file: ClockedStatus):
@@ -348,15 +333,3 @@ def test_what_is_counted_is_shown(
     sent, answered, written, in_words = shown()
     assert sent == answered == written == getattr(box.box.health, name) > 0
     assert in_words
-
-
-def test_numbers_of_a_state_are_left_out_rather_than_cut():
-    """After years of faults the line is full: the counts in it are whole, and it is not longer than
-    the limit."""
-    counts = [1, 10_000_000, 23_652_000_000, 99_999_999, 99_999_999, 99_999, 9_999_999]
-    states = ["31536000.125", "streaming", *counts, "9f3c2a1b", "usb"]
-    for kind in (("STA",), ("ANS", "STATE", "ok")):
-        line = sentence(*kind, *states, *[987_654_321] * 6).decode()
-        assert len(line) <= MAX_LINE
-        assert set(line.split("*")[0].split(",")[len(kind) + 12 :]) <= {"987654321"}
-        assert ",9f3c2a1b,usb" in line

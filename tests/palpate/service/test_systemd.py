@@ -20,7 +20,6 @@ from palpate.core.health import Health
 from palpate.core.observer import Observer
 from palpate.service.systemd import Notifier
 from palpate.sim import devices, rig, script, skin
-from tests.factories.paths import ROOT
 from tests.factories.simulated_box import SECOND, OnSweep, Rigged, idle_devices
 
 WATCHDOG = {"WATCHDOG_USEC": "10000000"}
@@ -274,17 +273,3 @@ def test_the_command_notifies_systemd(tmp_path: Path):
     assert received[0].startswith("STATUS=skin ")
     assert received.count("READY=1") == 1
     assert "STATUS=skin streaming. Sweeps answered: 0" in received
-
-
-def test_the_unit_of_a_finger_is_that_of_the_box():
-    """The template differs by the name in its paths and options only."""
-    one, each = (
-        (ROOT / "systemd" / name).read_text() for name in ("palpate.service", "palpate@.service")
-    )
-
-    def lines(text: str) -> list[str]:
-        return [line for line in text.splitlines() if line and not line.startswith(("#", "Descr"))]
-
-    assert "--unit %i" in each
-    named = each.replace(" --unit %i", "").replace("-%i", "")
-    assert lines(named) == lines(one.replace(" palpate-teach.path", ""))

@@ -287,24 +287,10 @@ def test_a_box_that_says_nothing_new_is_no_news(browser: Any, page: PageServer):
     context.close()
 
 
-def test_a_server_that_is_gone_is_no_connection(browser: Any):
-    """The page says so at once, and shows a new server at the port by itself."""
-    access = Access(0)
-    with PageServer("watch.html", access, SystemClock().now_ns) as page:
-        page.show(VIEW)
-        seen = BrowsedPage(browser.new_context(), page.address)
-        seen.state("off")
-        access = Access(int(page.address.rsplit(":", 1)[1]))
-    seen.state("no-connection")
-    assert "tunnel" in seen.text("#hint")
-    with PageServer("watch.html", access, SystemClock().now_ns) as page:
-        page.show(replace(VIEW, state="in-place", message="in place"))
-        seen.state("in-place")
-        seen.page.close()
-
-
-@pytest.mark.parametrize(("width", "height"), [(360, 640), (844, 390), (820, 1180), (1440, 900)])
-@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize(
+    ("width", "height", "scheme"),
+    [(360, 640, "light"), (844, 390, "dark"), (820, 1180, "dark"), (1440, 900, "light")],
+)
 def test_it_fits_phone_tablet_and_desktop(
     browser: Any, page: PageServer, width: int, height: int, scheme: str
 ):

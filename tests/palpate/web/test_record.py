@@ -7,7 +7,6 @@ import json
 import os
 import re
 import signal
-import ssl
 import subprocess
 import sys
 import threading
@@ -19,8 +18,8 @@ import pytest
 
 from palpate.cli.main import main
 from palpate.core.clock import SystemClock
-from palpate.core.config import TriggerConfig, WatchConfig
-from palpate.core.errors import ApplianceError, ConfigError, FormatError, NoAnswer
+from palpate.core.config import TriggerConfig
+from palpate.core.errors import ApplianceError, ConfigError, FormatError
 from palpate.core.sweep_file import sidecar
 from palpate.core.types import Status
 from palpate.io.robot_link import Command
@@ -28,10 +27,9 @@ from palpate.sim import skin
 from palpate.sweeps.recording import Labels, RecordingSession
 from palpate.web import record, server
 from palpate.web.access import Access
-from palpate.web.record import MOST_WAITING, CommandQueue, RecordPage, order
+from palpate.web.record import MOST_WAITING, RecordPage, order
 from palpate.web.server import PageServer
 from tests.factories.browser import WAIT_S, until
-from tests.factories.install_scripts import page_secrets
 from tests.factories.page_client import (
     EventReader,
     PageAddress,
@@ -219,14 +217,6 @@ def test_the_page_hears_what_there_is(recorded: RecordedPage):
     reader.socket.close()
 
 
-def test_nothing_is_computed_for_nobody(recorded: RecordedPage, monkeypatch: pytest.MonkeyPatch):
-    """Without a browser no picture of the skin is made."""
-    recorded.turn()
-    monkeypatch.setattr(recorded.page, "_tracker", None)
-    recorded.turn()
-    assert not recorded.page.server.watched
-
-
 REFUSED = [
     (403, {"X_Palpate_Key": None}),
     (403, {"X_Palpate_Key": "wrong"}),
@@ -360,20 +350,6 @@ def test_the_end_of_the_recording_answers_who_waits(
     assert capfd.readouterr().err == ""
 
 
-def test_commands_that_nobody_wants_any_more_take_no_turn():
-    """An abandoned order is skipped; the next order is carried out in the same turn."""
-    queue, done = CommandQueue(), []
-    first, second = queue.put(Command("NEXT")), queue.put(Command("DISCARD"))
-    assert first.cancel()
-    assert queue.carry_out(lambda command: [done.append(command.name)])
-    assert (done, second.result(0)) == (["DISCARD"], [None])
-    assert not queue.carry_out(lambda command: [])
-    for _ in range(MOST_WAITING):
-        queue.put(Command("NEXT"))
-    with pytest.raises(NoAnswer, match="try again"):
-        queue.put(Command("NEXT"))
-
-
 def test_a_sweep_is_drawn_once(recorded: RecordedPage, monkeypatch: pytest.MonkeyPatch):
     """Only the last sweep has a picture, and none without a window."""
     drawn: list[int] = []
@@ -390,29 +366,6 @@ def test_a_sweep_is_drawn_once(recorded: RecordedPage, monkeypatch: pytest.Monke
     assert drawn == [2]
     recorded.sweep(Status.SHORT)
     assert status(ask(page, "/sweep/3")) == 404
-
-
-def test_on_the_network_it_takes_token_and_key(tmp_path: Path):
-    """Without the token it is refused, and plain HTTP is not answered."""
-    page_secrets(tmp_path / "secrets")
-    settings = WatchConfig(address="0.0.0.0 localhost", folder=str(tmp_path / "secrets"))
-    token = (tmp_path / "secrets" / "token").read_text().strip()
-    one = RecordedPage(tmp_path / "sweeps", Labels(), access=Access.configured(settings, 0))
-    trusts = ssl.create_default_context(cafile=tmp_path / "secrets" / "certificate.pem")
-    with one:
-        page, body = one.page.server, json.dumps(WOOD).encode()
-        head = (
-            f"Origin: https://localhost:{port(page)}\r\nX-Palpate-Key: {page.key}\r\nContent-Type:"
-            f" {KIND}\r\n"
-            f"Content-Length: {len(body)}\r\n"
-        )
-        host = f"localhost:{port(page)}"
-        assert status(ask(page, "/order", "POST", host, head, trusts, body)) == 401
-        assert status(ask(page, "/order", "POST", host, head, None, body)) == 0
-        assert one.done == []
-        known = f"{head}Authorization: Bearer {token}\r\n"
-        assert status(ask(page, "/order", "POST", host, known, trusts, body)) == 200
-        assert one.done == ["MATERIAL,wood"]
 
 
 @pytest.mark.slow
