@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.answer.pipeline import Context
+from palpate.answer.pipeline import Context, Refusal
 from palpate.core.errors import BundleError
-from palpate.core.types import normal
+from palpate.core.types import Status, normal
 
 Array = NDArray[Any]
 NAMES = ("noise", "load", "speed", "lost", "hum")
@@ -194,3 +194,15 @@ class MeasureDisturbances:
             "speed": speed(context.slide.taxels_s),
             "load": load(context.mean, tare),
         }
+
+
+class WasTried:
+    """Refuses a sweep with a disturbance beyond what export has tried."""
+
+    def __init__(self, allowed: Disturbances) -> None:
+        self._allowed = allowed
+
+    def apply(self, context: Context) -> Refusal | None:
+        """Refuse an untried disturbance."""
+        untried = self._allowed.untried(context.disturbed)
+        return Refusal(Status.UNKNOWN, untried) if untried else None

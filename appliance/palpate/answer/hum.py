@@ -1,13 +1,16 @@
 """The hum of the mains in a window: found, and subtracted before the network sees the counts.
 
-Hum is a sine of 50 or 60 Hz that all taxels have in phase. A network may not respond to 50 Hz and
-yet see other counts, because hum dithers small vibrations that are rounded. A texture can be
-periodic as well. The hum of a window is therefore removed only if it stands out more than in any
-training sweep. Pure functions of raw counts; windows of one format.
+Hum is a comb: 50 or 60 Hz and its multiples, as rectifiers and motors make them, which all taxels
+have in phase. A network may not respond to 50 Hz and yet see other counts, because hum dithers
+small vibrations that are rounded. A texture can be periodic as well. Hum is therefore removed only
+if one of its lines stands out more than in any training sweep. An unfinished window shows hum as
+soon as it is long enough for a line. Functions of raw counts; windows of one format.
 """
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,75 +22,124 @@ from palpate.core.types import SweepFormat, digitized, normal
 Array = NDArray[Any]
 MAINS_HZ = (50.0, 60.0)
 ASIDE = (3, 4, 5)
-"""Distances of the frequencies beside the hum to which it is compared, in periods per window. A
-Hann window keeps the hum within two."""
+"""Distances of the frequencies beside a line to which it is compared, in periods per window. A Hann
+window keeps a line within two."""
 QUIET = 4
-"""Hum is searched in one of so many taxels: those that vibrate least beside its frequency, because
-all taxels have the same hum."""
+"""A line is searched in one of so many taxels: those that vibrate least beside its frequency,
+because all taxels have the same hum."""
 IN_PHASE = 0.9
 """Least length of the sum of the taxels' amplitudes, as a share of the sum of their lengths."""
+SEARCHED = 2
+"""Multiples in which hum is searched: each comb of the mains has one of them, as its strongest
+line or as one of several."""
+FAINT = 2.0
+"""Least ratio of the other lines of a comb that was found."""
 OFF_HZ, STEPS = 0.3, 13
 """Largest error of the mains' frequency, and number of frequencies that are tried within it."""
 TINY = 1e-30
 """Replaces a divisor of 0."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class HumLines:
+    """The lines that a window of some length can show.
+
+    hz, mains, order: [L], frequency, that of the mains, and the multiple. parts: float32 [2 * L *
+    (1 + 2 * len(ASIDE)), T], real and imaginary waves at each line and at frequencies around it.
+    """
+
+    hz: Array
+    mains: Array
+    order: Array
+    parts: Array
+
+    @classmethod
+    def of(cls, frames: int, rate_hz: float, multiples: float = math.inf) -> HumLines:
+        """Of windows with this number of frames, up to some multiple of the mains."""
+        seconds = frames / rate_hz
+        reach = max(ASIDE) / seconds
+        least, most = max(2 * reach, TINY), rate_hz / 2 - reach
+        lines = [
+            (mains * k, mains, k)
+            for mains in MAINS_HZ
+            for k in range(1, 1 + int(min(multiples, max(0.0, most) // mains)))
+            if least < mains * k < most
+        ]
+        hz, mains, order = np.array(lines).reshape(-1, 3).T
+        aside = np.array([0, *ASIDE, *(-step for step in ASIDE)]) / seconds
+        # a product of real numbers takes a quarter of the time
+        waves = _waves((hz[:, None] + aside).ravel(), np.hanning(frames), rate_hz)
+        parts = np.concatenate([waves.real, waves.imag])
+        return cls(hz, mains, order, np.ascontiguousarray(parts, np.float32))
+
+
+def _waves(hz: Array, hann: Array, rate_hz: float) -> NDArray[np.complex64]:
+    """Multiplies counts [T, V] to give complex amplitudes [F, V] at `hz` [F]."""
+    turns = np.exp(-2j * np.pi / rate_hz * hz[:, None] * np.arange(len(hann))) * hann
+    turns -= turns.mean(axis=1, keepdims=True)  # the constant part of the counts
+    return turns.astype(np.complex64)
+
+
 class HumFilter:
-    """Finds and removes hum in windows of one format. hz: the frequencies of mains that it finds;
-    a window may be too short or a rate too low for them."""
+    """Finds and removes hum in windows of one format, unfinished ones included. hz: the frequencies
+    of mains that a whole window shows; it may be too short or its rate too low for them."""
 
     def __init__(self, format: SweepFormat) -> None:
-        self._times = np.arange(format.window) / format.rate_hz
-        self._type = format.numpy_type
-        seconds = format.window / format.rate_hz
-        reach = max(ASIDE) / seconds
-        self.hz = tuple(hz for hz in MAINS_HZ if 2 * reach < hz and hz + reach < format.rate_hz / 2)
-        self._window = np.hanning(format.window)
-        self._window /= self._window.sum() / 2  # so that a sine gives its amplitude
-        aside = np.array([0, *ASIDE, *(-step for step in ASIDE)]) / seconds
-        waves = np.array([self._wave(hz + aside) for hz in self.hz])  # [mains, F, T]
-        # a product of real numbers takes a quarter of the time
-        parts = np.stack([waves.real, waves.imag]).reshape(-1, format.window)
-        self._parts = np.ascontiguousarray(parts, np.float32)
-
-    def _wave(self, hz: Array) -> NDArray[np.complex64]:
-        """Multiplies counts [T, V] to give complex amplitudes [F, V] at `hz` [F]."""
-        turns = np.exp(-2j * np.pi * hz[:, None] * self._times) * self._window
-        turns -= turns.mean(axis=1, keepdims=True)  # the constant part of the counts
-        wave: NDArray[np.complex64] = turns.astype(np.complex64)
-        return wave
+        self._rate_hz, self._type = format.rate_hz, format.numpy_type
+        self._lines: dict[tuple[int, bool], HumLines] = {}  # by frames, and whether of a whole comb
+        self.hz = tuple(sorted(set(self._of(format.window).mains.tolist())))
 
     def ratio(self, taxels: Array) -> float:
-        """How much the hum of one window stands out: its amplitude by those beside it. 0 without
-        hum in phase. taxels: raw counts [T, R, C] or [T, R, C, A]; only the normal axis is
-        used."""
-        return max((ratio for ratio, _ in self._found(taxels)), default=0.0)
+        """How much the hum of one window stands out: the amplitude of a line by those beside it. 0
+        without a line in phase. taxels: raw counts [T, R, C] or [T, R, C, A]; only the normal axis
+        is used."""
+        return float(self._ratios(self._of(len(taxels)), taxels).max(initial=0.0))
 
     def __call__(self, taxels: Array, least: float) -> tuple[Array, float]:
         """One window without hum, and the amplitude of this hum in counts; the window as it is and
-        0 if no hum stands out by `least`."""
-        found = self._found(taxels, least)
-        if not found:
+        0 if no line stands out by `least`."""
+        searched = self._of(len(taxels))
+        found = self._ratios(searched, taxels, least)
+        if not found.max(initial=0.0) >= least:
             return taxels, 0.0
         series = taxels.reshape(len(taxels), -1).astype(np.float64)
         series -= series.mean(axis=0)
-        hz = self._refined(series, max(found)[1])
-        turns = 2 * np.pi * hz * self._times
-        waves = np.linalg.qr(np.stack([np.sin(turns), np.cos(turns)], axis=1))[0]
-        hum = waves @ (waves.T @ series)
-        clean = digitized(taxels - hum.reshape(taxels.shape), self._type)
-        of_normal = normal(hum.reshape(taxels.shape), 1)
-        return clean, float(np.sqrt(2 * (of_normal**2).mean()))
+        every = self._comb(searched, int(found.argmax()), taxels, series.sum(axis=1))
+        turns = 2 * np.pi / self._rate_hz * np.outer(np.arange(len(taxels)), every)
+        waves = np.linalg.qr(np.concatenate([np.sin(turns), np.cos(turns)], axis=1))[0]
+        hum = (waves @ (waves.T @ series)).reshape(taxels.shape)
+        clean = digitized(taxels - hum, self._type)
+        return clean, float(np.sqrt(2 * (normal(hum, 1) ** 2).mean()))
 
-    def _found(self, taxels: Array, least: float = 0.0) -> list[tuple[float, float]]:
-        """Ratio, at least `least`, and frequency of the hum at each frequency of mains."""
-        if not self.hz or len(taxels) != len(self._times):
-            return []
+    def _of(self, frames: int, *, comb: bool = False) -> HumLines:
+        """The lines of windows of this length: those that are searched, or all."""
+        if (frames, comb) not in self._lines:
+            most = math.inf if comb else SEARCHED
+            self._lines[frames, comb] = HumLines.of(frames, self._rate_hz, most)
+        return self._lines[frames, comb]
+
+    def _comb(
+        self, searched: HumLines, strongest: int, taxels: Array, common: Array
+    ) -> list[float]:
+        """The frequencies of the lines that the window has of a comb. strongest: number of the line
+        that was found. common: float64 [T], sum of all taxels."""
+        mains, order = searched.mains[strongest], searched.order[strongest]
+        hz = self._refined(common, searched.hz[strongest], OFF_HZ * order)
+        lines = self._of(len(taxels), comb=True)
+        present = (lines.mains == mains) & (self._ratios(lines, taxels) >= FAINT)
+        others = [k for k in lines.order[present] if k != order]
+        off_hz = OFF_HZ / STEPS
+        return [hz, *(self._refined(common, hz / order * k, off_hz * k) for k in others)]
+
+    def _ratios(self, lines: HumLines, taxels: Array, least: float = 0.0) -> Array:
+        """Ratio of each line [L], 0 for a line that is not in phase or surely below `least`."""
+        found = np.zeros(len(lines.hz))
+        if not len(found):
+            return found
         counts = normal(taxels, 1).reshape(len(taxels), -1).astype(np.float32)
         counts -= counts[0]
-        found = []
         with np.errstate(all="ignore"):  # float32 counts may be infinite
-            parts = (self._parts @ counts).reshape(2, len(self.hz), 1 + 2 * len(ASIDE), -1)
+            parts = (lines.parts @ counts).reshape(2, len(found), 1 + 2 * len(ASIDE), -1)
             power = (parts * parts).sum(axis=0)
             beside = power[:, 1:].mean(axis=1)
             # the ratio of two sums is at most the largest ratio of their parts
@@ -97,17 +149,25 @@ class HumFilter:
                 quiet = np.argsort(near)[: max(1, len(near) // QUIET)]
                 at = parts[0, i, 0, quiet] + 1j * parts[1, i, 0, quiet]
                 size = np.abs(at).sum()
-                in_phase = bool(np.abs(at.sum()) >= IN_PHASE * size > 0)
-                ratio = float(size / max(near[quiet].sum(), TINY)) if in_phase else 0.0
-                if np.isfinite(ratio) and ratio >= least:
-                    found.append((ratio, self.hz[i]))
+                ratio = size / max(near[quiet].sum(), TINY)
+                if np.abs(at.sum()) >= IN_PHASE * size > 0 and np.isfinite(ratio):
+                    found[i] = ratio
         return found
 
-    def _refined(self, series: Array, hz: float) -> float:
-        """The frequency near `hz` at which all taxels together have most power."""
-        tried = hz + np.linspace(-OFF_HZ, OFF_HZ, STEPS)
-        power = np.abs(self._wave(tried) @ series.sum(axis=1))
-        return float(tried[power.argmax()])
+    def _refined(self, common: Array, hz: float, off_hz: float) -> float:
+        """The frequency within `off_hz` of `hz` at which all taxels together, float64 [T], have
+        most power: the highest of some frequencies, and the vertex of a parabola around it."""
+        tried = hz + np.linspace(-off_hz, off_hz, STEPS)
+        power = np.log(
+            np.abs(_waves(tried, np.hanning(len(common)), self._rate_hz) @ common) + TINY
+        )
+        top = int(power.argmax())
+        if top in (0, STEPS - 1):
+            return float(tried[top])
+        before, at, after = power[top - 1 : top + 2]
+        bend = before - 2 * at + after
+        shift = (before - after) / (2 * bend) if bend < 0 else 0.0
+        return float(tried[top] + shift * (tried[1] - tried[0]))
 
 
 class RemoveHum:

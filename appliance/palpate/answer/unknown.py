@@ -343,29 +343,23 @@ class KnownMaterial:
     """Refuses a sweep that is too far from every known material; joins the logits of the network
     with those of the enrolled labels.
 
-    displaced: for sweeps whose contact is displaced, None without a rule for them. allowed: the
-    allowances for disturbances. Changes caused by either do not make a material unknown.
+    displaced: for sweeps whose contact is displaced, None without a rule for them. Neither a
+    displacement nor a disturbance makes a material unknown.
     """
 
-    def __init__(
-        self,
-        means: ClassDistances,
-        displaced: ClassDistances | None,
-        allowed: Disturbances | None,
-    ) -> None:
-        self._means, self._displaced, self._allowed = means, displaced, allowed
+    def __init__(self, means: ClassDistances, displaced: ClassDistances | None) -> None:
+        self._means, self._displaced = means, displaced
         self._unknown = UnknownSweeps(means)
 
     def apply(self, context: Context) -> Refusal | None:
-        """Refuse an unknown material, and a disturbance that export has not tried."""
+        """Refuse an unknown material."""
         off = bool(context.displacement.text and self._displaced)
         means = self._displaced if off and self._displaced else self._means
         z = context.embedding
         context.logits = means.joined(context.logits, z)
-        untried = self._allowed.untried(context.disturbed) if self._allowed else ""
-        novelty = untried or means.novelty(z, context.disturbed)
+        novelty = means.novelty(z, context.disturbed)
         if not novelty:
             return None
-        if not (off or untried) and (alike := self._unknown.put(context.sweep.id, z)):
+        if not off and (alike := self._unknown.put(context.sweep.id, z)):
             novelty += f"; as sweep {alike}"
         return Refusal(Status.UNKNOWN, novelty)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from palpate.answer import features
 from palpate.answer.contact import LocateContact, WithinReach
-from palpate.answer.disturbance import MeasureDisturbances
+from palpate.answer.disturbance import MeasureDisturbances, WasTried
 from palpate.answer.hum import RemoveHum
 from palpate.answer.objects import (
     Certain,
@@ -118,7 +118,7 @@ class Classifier(Observer):
         network: list[Stage] = [NetworkStage(self, *self._outputs)]
         if self._means:
             displaced = class_distances(bundle, displaced=True)
-            network.append(KnownMaterial(self._means, displaced, m.disturbances))
+            network.append(KnownMaterial(self._means, displaced))
         self._stages = self.stages(*network)
 
     def stages(self, *network: Stage) -> list[Stage]:
@@ -126,7 +126,7 @@ class Classifier(Observer):
         return [*self._cleaning, *self._measuring, *network, *self._judging]
 
     def _measures(self, slides: bool) -> list[Stage]:
-        """The stages that only measure."""
+        """The stages before the network."""
         m, stages = self.bundle.manifest, list[Stage]()
         if m.contact and m.thresholds.contact is not None:
             stages.append(LocateContact(m.contact, m.thresholds.contact))
@@ -136,6 +136,8 @@ class Classifier(Observer):
             stages.append(self._slide)
         if m.disturbances:
             stages.append(MeasureDisturbances(unloaded=bool(m.unloaded)))
+            if self._means:
+                stages.append(WasTried(m.disturbances))
         return stages
 
     def _judges(self) -> list[Stage]:

@@ -32,13 +32,14 @@ def slid(speed: float = 2.0, material: str = "plastic rough", **more: Any) -> Sw
 
 
 def trained(of: Bundle, **changes: Any) -> Bundle:
-    """A bundle that was trained at 28 to 33 mm/s."""
-    return replace(of, manifest=replace(of.manifest, speeds=SpeedRange(28.0, 33.0), **changes))
+    """A bundle that was trained at 28 to 33 mm/s, and judges no disturbance."""
+    changes |= {"speeds": SpeedRange(28.0, 33.0), "disturbances": None}
+    return replace(of, manifest=replace(of.manifest, **changes))
 
 
 def untrained(of: Bundle) -> Bundle:
     """A bundle that does not state its speeds."""
-    return replace(of, manifest=replace(of.manifest, speeds=None))
+    return replace(of, manifest=replace(of.manifest, speeds=None, disturbances=None))
 
 
 def box(of: Bundle, **more: Any) -> Classifier:
@@ -98,8 +99,7 @@ def test_a_uncertain_answer_reports_a_speed_outside_of_training(default_bundle: 
 
 
 def test_other_answers_do_not_report_it(default_bundle: Bundle):
-    """An answer that is ok, a speed of training, a bundle without the range: as in earlier
-    versions."""
+    """An answer that is ok, a speed of training, a bundle without the range."""
     sure, probable = np.eye(6)[0], np.array([0.9, 0.1, 0, 0, 0, 0])
     found = [
         concluded(box(trained(default_bundle)), slid(), sure),

@@ -14,7 +14,7 @@ from palpate.bundle.bundle import Manifest, Thresholds
 from palpate.bundle.pruning import prune
 from palpate.core.clock import SystemClock
 from palpate.inference import classifier
-from palpate.inference import early_exit as box_early
+from palpate.answer import early as box_early
 from palpate.learn import enrolment
 from palpate_studies import certainty
 from palpate_train.calibration import early_exit
