@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
+from palpate.answer import early as box_early
 from palpate.answer.early import Early
 from palpate.answer.objects import softmax
 from palpate.bundle import bundle
@@ -14,7 +15,6 @@ from palpate.bundle.bundle import Manifest, Thresholds
 from palpate.bundle.pruning import prune
 from palpate.core.clock import SystemClock
 from palpate.inference import classifier
-from palpate.answer import early as box_early
 from palpate.learn import enrolment
 from palpate_studies import certainty
 from palpate_train.calibration import early_exit
