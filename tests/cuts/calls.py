@@ -26,7 +26,8 @@ BEGINS = ("clone", "clone3")
 """Calls that begin a thread or a process."""
 MOST_BYTES = 1 << 24
 """Largest number of bytes of a write that strace prints."""
-DEADLINE_S = 120
+DEADLINE_S = 900
+"""Longest time of a command, also on a machine with much other work."""
 LINE = re.compile(r"(\d+) +(\w+)\((.*)\) += (-?\d+|\?)(?:[ <].*)?")
 END = re.compile(r"\d+ +(?:\+\+\+ .* \+\+\+|\?\?\?\(\) += \?)")
 """The end of a thread. ???: on a busy machine it was killed before strace could read its call."""

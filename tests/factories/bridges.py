@@ -26,27 +26,20 @@ def page_blocks(page: str, language: str) -> list[str]:
     )
 
 
-def eventually(there: Callable[[], bool], limit_s: float = LONG_S) -> None:
-    """Wait until another process has made `there` true; fails after `limit_s`."""
-    for _ in range(round(limit_s / 0.02)):
+def eventually(there: Callable[[], bool]) -> None:
+    """Wait until another process has made `there` true; fails after LONG_S."""
+    for _ in range(round(LONG_S / 0.02)):
         if there():
             return
         threading.Event().wait(0.02)
-    pytest.fail(f"the condition did not hold within {limit_s} s")
+    pytest.fail(f"the condition did not hold within {LONG_S} s")
 
 
 @contextmanager
 def bridge(kind: str, *options: str | Path) -> Iterator[tuple[str, int]]:
     """Run a bridge; yields its address."""
-    command = [
-        sys.executable,
-        "-m",
-        "palpate.bridges",
-        kind,
-        "--listen",
-        "127.0.0.1:0",
-        *map(str, options),
-    ]
+    command = [sys.executable, "-m", "palpate.bridges", kind, "--listen", "127.0.0.1:0"]
+    command += map(str, options)
     with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) as process:
         try:
             said = []
@@ -94,9 +87,9 @@ class RawModbus:
         self.send(pdu)
         return self.receive()[7:]
 
-    def registers(self, address: int, count: int, function: int = 4) -> list[int]:
-        data = self.ask(struct.pack(">BHH", function, address, count))
-        assert data[:2] == bytes([function, 2 * count]), data.hex()
+    def registers(self, address: int, count: int) -> list[int]:
+        data = self.ask(struct.pack(">BHH", 4, address, count))
+        assert data[:2] == bytes([4, 2 * count]), data.hex()
         return list(struct.unpack(f">{count}H", data[2:]))
 
     def _exactly(self, n: int) -> bytes:

@@ -70,9 +70,9 @@ def cut(format: SweepFormat = skin.FORMAT) -> Sweep:
 class FeedPeer:
     """A reader of the feed, as a separate program would be."""
 
-    def __init__(self, path: Path, *, wait_s: float = 5.0) -> None:
+    def __init__(self, path: Path) -> None:
         self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        self.socket.settimeout(wait_s)
+        self.socket.settimeout(30)
         self.socket.connect(str(path))
         self.ended, self._rest = False, b""
 

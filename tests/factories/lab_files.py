@@ -12,19 +12,17 @@ LEAD_FRAMES = 300
 """Frames before and after the window of a sweep."""
 
 
-def csv_folder(
-    folder: Path, each: int = 2, positions: int = 4, seed: int = 5, materials: int = 3
-) -> Path:
-    """Write simulated sweeps of a 4x4 skin at 750 Hz, `each` of every tube at every position.
+def csv_folder(folder: Path, each: int = 2, positions: int = 4) -> Path:
+    """Write simulated sweeps of a 4x4 skin at 750 Hz, `each` of three tubes at every position.
 
     The files MATERIAL_POSITION_TRIAL.csv have a header, milliseconds and 16 raw counts. Spaces in
     materials become "-". A README lies beside them.
     """
     folder.mkdir(parents=True)
-    samples, labels, position = skin.sweep_set("T-REAL", seed, each)
+    samples, labels, position = skin.sweep_set("T-REAL", 5, each)
     trial: dict[tuple[int, int], int] = {}
     for counts, label, at in zip(samples, labels.tolist(), position.tolist(), strict=True):
-        if label < materials and at < positions:
+        if label < 3 and at < positions:
             trial[label, at] = trial.get((label, at), 0) + 1
             around = np.concatenate(
                 [counts[:LEAD_FRAMES][::-1], counts, counts[-LEAD_FRAMES:][::-1]]

@@ -7,11 +7,11 @@ import numpy as np
 from palpate_train.data.sets import Dataset
 
 
-def close(n: int = 80, dtype: str = "uint8", seed: int = 0) -> Dataset:
+def close(n: int = 80) -> Dataset:
     """Sweeps [n, 64, 2, 2] of three materials that hum at nearly equal rates in much noise, one
     sweep a recording.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     labels = np.repeat(np.arange(3), n)
     pitch = np.array([0.11, 0.15, 0.2])[labels] * rng.uniform(0.9, 1.1, 3 * n)
     phase = 2 * np.pi * (pitch[:, None] * np.arange(64) + rng.random((3 * n, 1)))
@@ -20,4 +20,6 @@ def close(n: int = 80, dtype: str = "uint8", seed: int = 0) -> Dataset:
         offset + 12 * np.sin(phase)[:, :, None, None] + 8 * rng.standard_normal((3 * n, 64, 2, 2))
     )
     groups = {"recording": np.arange(3 * n)}
-    return Dataset(samples.astype(dtype), labels, ("low", "middle", "high"), 100.0, groups, "close")
+    return Dataset(
+        samples.astype("uint8"), labels, ("low", "middle", "high"), 100.0, groups, "close"
+    )

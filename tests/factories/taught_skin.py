@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from palpate.core.clock import SystemClock
 from tests.factories import install_scripts
 from tests.factories.paths import ROOT
-from tests.factories.skins.player import Player
+from tests.factories.skins.player import Player, running
 from tests.factories.skins.wires import wire
 
 PITCHES = {"oak": 0.04, "cork": 0.1, "felt": 0.19, "slate": 0.33}
@@ -64,17 +64,8 @@ class TaughtBox:
     def start(self, *more: str) -> None:
         """Start `palpate teach` with its page."""
         words = ["teach", *self.options(), "--skin", "matrix", "--port", str(self.player.path)]
-        words += [
-            "--set",
-            "skin.grid=4x4",
-            "--trigger",
-            "serial",
-            "--window",
-            str(WINDOW_S),
-            "--web",
-            "0",
-            *more,
-        ]
+        words += ["--set", "skin.grid=4x4", "--trigger", "serial", "--window", str(WINDOW_S)]
+        words += ["--web", "0", *more]
         self.process = subprocess.Popen(
             [sys.executable, "-m", "palpate", *words],
             cwd=ROOT,
@@ -108,20 +99,16 @@ class TaughtBox:
 @contextmanager
 def taught_box() -> Iterator[TaughtBox]:
     """A box without a bundle for its skin, which is plugged in."""
-    skin, stop = SlidSkin(), threading.Event()
+    skin = SlidSkin()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "store").mkdir()
         install_scripts.enrolment_key(folder / "enrolment")
         player = Player(wire("matrix", RATE_HZ), skin, SystemClock(), folder / "ttySkin")
-        thread = threading.Thread(target=player.run, args=(stop.is_set,), daemon=True)
-        thread.start()
-        box = TaughtBox(folder, player, skin)
-        try:
-            yield box
-        finally:
-            if box.process and box.process.poll() is None:
-                box.stop(kill=True)
-            stop.set()
-            thread.join()
-            player.close()
+        with running(player):
+            box = TaughtBox(folder, player, skin)
+            try:
+                yield box
+            finally:
+                if box.process and box.process.poll() is None:
+                    box.stop(kill=True)

@@ -42,13 +42,13 @@ def read(
     return shown
 
 
-def ended(run: subprocess.Popen[Any], shown: bytes, limit_s: float = LIMIT_S) -> int:
+def ended(run: subprocess.Popen[Any], shown: bytes) -> int:
     """The exit code of a program that should end now."""
     try:
-        return run.wait(timeout=limit_s)
+        return run.wait(timeout=LIMIT_S)
     except subprocess.TimeoutExpired as e:
         run.kill()
         run.wait()
         raise AssertionError(
-            f"the program did not end within {limit_s} s; it has shown {shown[-3000:]!r}"
+            f"the program did not end within {LIMIT_S} s; it has shown {shown[-3000:]!r}"
         ) from e

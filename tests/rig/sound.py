@@ -81,9 +81,9 @@ def state(cell: Cell) -> dict[str, str]:
     return dict(zip(FIELDS, received[: len(FIELDS)], strict=True))
 
 
-def until_state(cell: Cell, wanted: str, timeout_s: float = 30) -> None:
+def until_state(cell: Cell, wanted: str) -> None:
     """Wait until the skin is in a state. Raises AssertionError if it does not get there."""
-    end, seen = cell.clock.now_s() + timeout_s, Counter[str]()
+    end, seen = cell.clock.now_s() + 30, Counter[str]()
     while (now := state(cell)["state"]) != wanted:
         seen[now] += 1
         assert cell.clock.now_s() < end, (
@@ -115,11 +115,11 @@ def let_go(cell: Cell) -> None:
         cell.lines.set(name, False)
 
 
-def only_answer(cell: Cell, since: int, seconds: float = 0.3) -> Answer:
+def only_answer(cell: Cell, since: int) -> Answer:
     """The only answer since line number `since`. Raises AssertionError if a second answer comes
-    within `seconds`."""
+    a moment later."""
     first = cell.answer(since)
-    end = cell.clock.now_s() + seconds
+    end = cell.clock.now_s() + 0.3
     while cell.clock.now_s() < end:
         assert len(cell.answers(since)) == 1, cell.answers(since)
         cell.wait(0.02)

@@ -103,9 +103,9 @@ def journal_count(cell: Cell, text: str) -> int:
     )
 
 
-def until_logged(cell: Cell, text: str, since: int = 0, timeout_s: float = START_S) -> None:
+def until_logged(cell: Cell, text: str, since: int = 0) -> None:
     """Wait until more than `since` lines hold it."""
-    end = cell.clock.now_s() + timeout_s
+    end = cell.clock.now_s() + START_S
     while journal_count(cell, text) <= since:
         assert cell.clock.now_s() < end, f"the box has not logged {text!r}, but: {cell.journal()}"
         cell.wait(1)

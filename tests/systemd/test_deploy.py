@@ -470,8 +470,8 @@ def test_boxes_that_fail_do_not_stop_the_others(
 
 
 @contextmanager
-def stalling(host: hosts.Host, most: int = 6000) -> Iterator[int]:
-    """A port that forwards to the host's sshd and stops after `most` bytes from it, which is after
+def stalling(host: hosts.Host) -> Iterator[int]:
+    """A port that forwards to the host's sshd and stops after 6000 bytes from it, which is after
     the login."""
 
     def carry(source: socket.socket, sink: socket.socket, left: float) -> None:
@@ -489,7 +489,7 @@ def stalling(host: hosts.Host, most: int = 6000) -> Iterator[int]:
             with suppress(OSError):
                 near = door.accept()[0]
                 Thread(target=carry, args=(near, far, float("inf")), daemon=True).start()
-                carry(far, near, most)
+                carry(far, near, 6000)
 
         Thread(target=serve, daemon=True).start()
         yield door.getsockname()[1]

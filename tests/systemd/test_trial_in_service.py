@@ -11,19 +11,16 @@ import hashlib
 import io
 import itertools
 import json
-import subprocess
 import tarfile
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from palpate.bundle import bundle
-from palpate_train.export.sign import sign
-from tests.factories.nspawn import CABLED, PALPATE, SITE, STREAMS, Machine, Service
+from tests.factories import deliveries
+from tests.factories.nspawn import CABLED, PALPATE, SITE, STREAMS, WAIT_S, Machine, Service
 
 pytestmark = [pytest.mark.slow, pytest.mark.thorough]  # systemd in a container
 
@@ -61,14 +58,8 @@ class DeliveredStore:
 
     def __init__(self, machine: Machine, folder: Path) -> None:
         self.machine, self._folder, self._counters = machine, folder, itertools.count(1)
-        self._key = folder / "key"
-        subprocess.run(
-            ["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", "me", "-f", self._key],
-            check=True,
-            timeout=120,
-        )
-        kind, key, _ = self._key.with_suffix(".pub").read_text().split()
-        machine.put("/etc/palpate/allowed_signers", f"me {kind} {key}\n")
+        self._key = deliveries.key(folder / "keys")
+        machine.put("/etc/palpate/allowed_signers", deliveries.line(self._key))
         machine.put("/opt/palpate/cursed.py", CURSED)
         self.a = self.deploy()
         self.do("commit")
@@ -81,13 +72,8 @@ class DeliveredStore:
         """Copy a new bundle, A with changes to its manifest, to the box and install it; its
         sha256."""
         counter = next(self._counters)
-        made = self._folder / f"b{counter}"
-        made.mkdir()
-        for name, data in bundle.files(bundle.DEFAULT).items():
-            (made / name).write_bytes(data)
-        manifest = replace(bundle.load(bundle.DEFAULT).manifest, **changes)
-        (made / "manifest.json").write_bytes(manifest.json())
-        sign(made, self._key, counter)
+        held = deliveries.files(counter, self._key, **changes)
+        made = deliveries.put(self._folder / f"b{counter}", held)
         packed = io.BytesIO()
         with tarfile.open(fileobj=packed, mode="w") as tar:
             tar.add(made, arcname=made.name)
@@ -95,6 +81,12 @@ class DeliveredStore:
         self.machine.get("sh", "-c", unpack, say=base64.b64encode(packed.getvalue()).decode())
         self.do("install", *options, f"/var/lib/palpate/incoming/{made.name}")
         return hashlib.sha256((made / "manifest.json").read_bytes()).hexdigest()
+
+    def alter(self, sha: str) -> None:
+        """Change a byte of the model of an installed bundle."""
+        model = f"/var/lib/palpate/bundles/{sha}/model.onnx"
+        write = f"printf X | dd of={model} bs=1 seek=5000 conv=notrunc"
+        self.machine.get("sh", "-c", f"chmod u+w {model}; {write}")
 
     @property
     def current(self) -> str:
@@ -134,10 +126,7 @@ def serves(service: Service, sha: str) -> None:
     """Wait until the skin streams and this bundle answers."""
     service.until("ActiveState", "active")
     service.until("StatusText", STREAMS)
-    end = time.monotonic() + 10
-    while service.status().get("bundle") != sha[:8]:
-        assert time.monotonic() < end, service.journal()
-        time.sleep(0.2)
+    wait_for(lambda: service.status().get("bundle") == sha[:8], service)
 
 
 def test_a_bundle_that_does_its_work_is_committed(
@@ -149,10 +138,8 @@ def test_a_bundle_that_does_its_work_is_committed(
     machine.put(SITE, "[store]\ntrial_sweeps = 1\n")
     service.start(RUN)
     serves(service, new)
-    end = time.monotonic() + 30
-    while store.starts(new) or not store.ledger["standings"][new]["committed"]:
-        assert time.monotonic() < end, service.journal()
-        time.sleep(0.2)
+    wait_for(lambda: store.ledger["standings"][new]["committed"], service)
+    assert store.starts(new) == 0
     lines = [line for line in service.log_lines() if line.startswith("bundle ")]
     assert lines == [
         f"bundle {new[:8]} is on trial, start 1 of 3",
@@ -190,10 +177,7 @@ def test_a_bundle_that_fails_its_checks_at_the_start_is_left_in_that_start(
 ):
     """Altered on the card after it was installed: A serves in the same start, without a restart."""
     new = store.deploy()
-    model = f"/var/lib/palpate/bundles/{new}/model.onnx"
-    machine.get(
-        "sh", "-c", f"chmod u+w {model}; printf X | dd of={model} bs=1 seek=5000 conv=notrunc"
-    )
+    store.alter(new)
     service.start(RUN)
     serves(service, store.a)
     assert (service["NRestarts"], store.current) == ("0", store.a)
@@ -224,10 +208,7 @@ def test_a_committed_bundle_that_is_altered_ends_it_and_rollback_mends(
     start, A serves."""
     new = store.deploy()
     store.do("commit")
-    model = f"/var/lib/palpate/bundles/{new}/model.onnx"
-    machine.get(
-        "sh", "-c", f"chmod u+w {model}; printf X | dd of={model} bs=1 seek=5000 conv=notrunc"
-    )
+    store.alter(new)
     service.configure(RUN)
     machine.run("systemctl", "start", "palpate")
     service.until("ActiveState", "failed")
@@ -266,10 +247,8 @@ def test_what_is_not_the_bundle_s_doing_leaves_it_on_trial(
         service.configure(CABLED + "RestartSec=100ms")
         machine.get("systemctl", "start", "--no-block", "palpate")
         for i in range(4):
-            wait_for(
-                lambda: store.starts(new) == 0 and service["StatusText"].startswith("skin absent"),
-                service,
-            )
+            service.until("StatusText", "skin absent.*")
+            wait_for(lambda: store.starts(new) == 0, service)
             service.kill("SIGKILL")
             service.until("NRestarts", str(i + 1))
         wait_for(lambda: store.starts(new) == 0, service)
@@ -277,9 +256,9 @@ def test_what_is_not_the_bundle_s_doing_leaves_it_on_trial(
     assert not [line for line in service.log_lines() if LEFT in line]
 
 
-def wait_for(done: Callable[[], bool], service: Service, limit_s: float = 30) -> None:
+def wait_for(done: Callable[[], bool], service: Service) -> None:
     """Wait for a condition that usually takes a second or two."""
-    end = time.monotonic() + limit_s
+    end = time.monotonic() + WAIT_S
     while not done():
         assert time.monotonic() < end, service.journal()
         time.sleep(0.1)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tempfile
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core.clock import SystemClock
-from tests.factories.skins.player import Player
+from tests.factories.skins.player import Player, running
 from tests.factories.skins.wires import wire
 
 SHAPES: dict[str, tuple[tuple[int, ...], str, float]] = {
@@ -48,16 +47,9 @@ class Numbered:
 @contextmanager
 def played(name: str, **how: Any) -> Iterator[Player]:
     """A skin that plays in a thread until the block ends."""
-    source, stop = Numbered(name), threading.Event()
+    source = Numbered(name)
     with tempfile.TemporaryDirectory() as folder:
-        player = Player(
-            wire(name, source.rate_hz), source, SystemClock(), Path(folder) / "ttySkin", **how
-        )
-        thread = threading.Thread(target=player.run, args=(stop.is_set,), daemon=True)
-        thread.start()
-        try:
+        link = Path(folder) / "ttySkin"
+        player = Player(wire(name, source.rate_hz), source, SystemClock(), link, **how)
+        with running(player):
             yield player
-        finally:
-            stop.set()
-            thread.join()
-            player.close()

@@ -12,9 +12,10 @@ import os
 import select
 import sys
 import termios
+import threading
 import time
 import tty
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -191,6 +192,20 @@ class Player:
             while self._waiting:
                 written = os.write(self._far, self._waiting)
                 self._waiting, self.sent = self._waiting[written:], self.sent + written
+
+
+@contextlib.contextmanager
+def running(player: Player) -> Iterator[Player]:
+    """The player plays in a thread until the block ends."""
+    stop = threading.Event()
+    thread = threading.Thread(target=player.run, args=(stop.is_set,), daemon=True)
+    thread.start()
+    try:
+        yield player
+    finally:
+        stop.set()
+        thread.join()
+        player.close()
 
 
 DELIVERY_S = 0.1

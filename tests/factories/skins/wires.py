@@ -188,10 +188,10 @@ class Slcan(Wire):
     BUS_SPEED = b"S8"  # 1 Mbit/s, at which the sensors speak
     FIRST_ID = 0x710
 
-    def __init__(self, rate_hz: float, board: int = 1) -> None:
+    def __init__(self, rate_hz: float) -> None:
         self.period_ns = 1e9 / rate_hz
         self.invalid: frozenset[int] = frozenset()
-        self._start = b"t%03X20700" % (0x200 + board)
+        self._start = b"t20120700"
         self._speed, self._open, self._started = b"", False, False
         self._rest = b""
 
