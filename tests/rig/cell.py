@@ -38,16 +38,12 @@ ANSWER_S = 30
 
 @dataclass(slots=True)
 class Touch:
-    """One sweep of the robot. first: number of its first frame; start_ns, stop_ns: times of its
-    edges.
-
-    played: set once the board has reached it.
-    """
+    """One sweep of the robot. start_ns, stop_ns: times of its edges. played: set once the board has
+    reached it."""
 
     act: rig.Act
     start: bool = True
     stop: bool = True
-    first: int = -1
     start_ns: int = 0
     stop_ns: int = 0
     played: threading.Event = field(default_factory=threading.Event)
@@ -67,15 +63,9 @@ class CellRobot:
             return rig.Act(skin.idle(IDLE, self._rng), 0, 0, "")
         touch = self.touches.get_nowait()
         act = touch.act
-        touch.first, touch.start_ns, touch.stop_ns = (
-            first,
-            frame_ns(first + act.start),
-            frame_ns(first + act.stop),
-        )
-        for line, t_ns, wanted in (
-            ("START", touch.start_ns, touch.start),
-            ("STOP", touch.stop_ns, touch.stop),
-        ):
+        touch.start_ns, touch.stop_ns = frame_ns(first + act.start), frame_ns(first + act.stop)
+        edges = ("START", touch.start_ns, touch.start), ("STOP", touch.stop_ns, touch.stop)
+        for line, t_ns, wanted in edges:
             if wanted:
                 self._lines.drive(line, True, t_ns)
                 self._lines.drive(line, False, t_ns + rig.PULSE_NS)
@@ -92,13 +82,8 @@ class Cell:
     """
 
     def __init__(self, machine: Guest, seed: int = 1) -> None:
-        self.machine, self.lines, self.serial, self.cable = (
-            machine,
-            machine.lines,
-            machine.serial,
-            machine.skin,
-        )
-        self.clock = machine.clock
+        self.machine, self.lines, self.serial = machine, machine.lines, machine.serial
+        self.cable, self.clock = machine.skin, machine.clock
         self.hand = CellRobot(machine.lines, self.clock, seed)
         self.acts = script.tubes(seed)
         self.packet_frames = 6
@@ -123,12 +108,16 @@ class Cell:
         """Pull the skin's cable."""
         self.cable.unplug()
 
+    def until(self, done: Callable[[], object], timeout_s: float, what: str) -> None:
+        """Wait until `done()`. Raises AssertionError with `what` and the log of the box if it is
+        not in time."""
+        if not self.clock.until(done, timeout_s):
+            raise AssertionError(f"{what} within {timeout_s} s; the box says: {self.journal()}")
+
     def until_ready(self, timeout_s: float = 60) -> None:
         """Wait until the box reports READY. Raises AssertionError if it does not."""
-        if not (
-            self.lines.wait("READY", True, timeout_s) and self.lines.wait("FAULT", False, timeout_s)
-        ):
-            raise AssertionError(f"not READY within {timeout_s} s; the box says: {self.journal()}")
+        levels = self.lines.levels
+        self.until(lambda: levels["READY"] and not levels["FAULT"], timeout_s, "not READY")
 
     def touch(self, *, start: bool = True, stop: bool = True) -> Touch:
         """Begin a sweep, without waiting for its end. start, stop: whether the robot sends that
@@ -147,10 +136,7 @@ class Cell:
 
     def begun(self, touch: Touch) -> None:
         """Wait until the board has reached a touch. Raises AssertionError if it does not."""
-        if not self.clock.until(touch.played.is_set, BEGUN_S):
-            raise AssertionError(
-                f"the box is {BEGUN_S} s behind the skin; the box says: {self.journal()}"
-            )
+        self.until(touch.played.is_set, BEGUN_S, "the box has not caught up with the skin")
 
     def answer(self, since: int, timeout_s: float = ANSWER_S) -> Answer:
         """The first RES sentence from line number `since` on."""

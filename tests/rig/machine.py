@@ -177,6 +177,10 @@ class Guest:
         not answer, or if it fails and `check` is set."""
         return self._shell.run(line, timeout_s=timeout_s, check=check, stdin=stdin)
 
+    def out(self, line: str, timeout_s: float = 30) -> str:
+        """The output of a shell command, which must succeed."""
+        return self.run(line, timeout_s=timeout_s, check=True).out.strip()
+
     def put(self, path: str, data: bytes) -> None:
         """Write a file of the guest."""
         self.run(f"cat > {path}", stdin=data, check=True)

@@ -101,7 +101,7 @@ class VirtualBox:
         try:
             self._guest = self._stack.enter_context(Guest(made, Path(folder), snapshot=True))
             self._guest.ready(READY_S)
-            self._pid = self._guest.run("systemctl show -P MainPID palpate", check=True).out.strip()
+            self._pid = self._guest.out("systemctl show -P MainPID palpate")
         except (GuestFailed, OSError) as e:
             raise Gone(str(e)) from e
         self._guest.skin.mangle = self._note

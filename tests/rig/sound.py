@@ -6,7 +6,6 @@ A failed check raises AssertionError with the log of the box.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable, Iterator
 
 import numpy as np
@@ -83,13 +82,7 @@ def state(cell: Cell) -> dict[str, str]:
 
 def until_state(cell: Cell, wanted: str) -> None:
     """Wait until the skin is in a state. Raises AssertionError if it does not get there."""
-    end, seen = cell.clock.now_s() + 30, Counter[str]()
-    while (now := state(cell)["state"]) != wanted:
-        seen[now] += 1
-        assert cell.clock.now_s() < end, (
-            f"never {wanted}, but {dict(seen)}; the box says: {cell.journal()}"
-        )
-        cell.wait(0.02)
+    cell.until(lambda: state(cell)["state"] == wanted, 30, f"never {wanted}")
 
 
 def begin(cell: Cell) -> tuple[Touch, int]:

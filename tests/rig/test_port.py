@@ -33,18 +33,14 @@ def shown(cell: Cell) -> Touch:
     touched material, or of none."""
     cell.until_ready()
     before, touch = len(cell.lines.log), cell.touch()
-    end = cell.clock.now_s() + 60
-    while ("RESULT-VALID", True) not in [
-        (name, level) for _, name, level in cell.lines.log[before:]
-    ]:
-        assert cell.clock.now_s() < end, (
-            f"the sweep was not answered; the box says: {cell.journal()}"
-        )
-        cell.wait(0.02)
-    assert cell.lines.code() in (
-        0,
-        1 + bundle.load(bundle.DEFAULT).manifest.labels.index(touch.act.label),
+    valid = ("RESULT-VALID", True)
+    cell.until(
+        lambda: valid in [(name, level) for _, name, level in cell.lines.log[before:]],
+        60,
+        "the sweep was not answered",
     )
+    labels = bundle.load(bundle.DEFAULT).manifest.labels
+    assert cell.lines.code() in (0, 1 + labels.index(touch.act.label))
     return touch
 
 
@@ -170,10 +166,8 @@ def test_another_program_and_an_adapter(
     assert cell.lines.wait("READY", False, 20)
     assert tries(cell, PORT) == ""
     cell.until_ready()
-    end = cell.clock.now_s() + 20
-    while "end the program that has it" not in cell.journal() and cell.clock.now_s() < end:
-        cell.wait(0.2)
-    assert "end the program that has it" in cell.journal()
+    told = "end the program that has it"
+    cell.until(lambda: told in cell.journal(), 20, "the held port is not reported")
     assert far.heard == []
     cell.machine.run("kill $(cat /run/holder)", check=True)
     far.wait_for("$PPLP,STA,", 10)

@@ -65,10 +65,8 @@ def keeping(shared: Cell) -> Cell:
     guest = shared.machine
     shared.acts, shared.packet_frames = known(script.tubes(2)), 48
     for place in (KEPT, CAPTURE):
-        guest.run(
-            f"mkdir -p {place} && mount -t tmpfs -o size=96k,uid=palpate,mode=755 none {place}",
-            check=True,
-        )
+        mount = f"mount -t tmpfs -o size=96k,uid=palpate,mode=755 none {place}"
+        guest.run(f"mkdir -p {place} && {mount}", check=True)
     runs_with(guest, f"record --out {KEPT} --capture {CAPTURE}/all", f"ReadWritePaths={CAPTURE}")
     guest.run("systemctl restart --no-block palpate", check=True)
     shared.plug()
@@ -98,30 +96,29 @@ def sound(cell: Cell) -> Answer:
 
 def journal_count(cell: Cell, text: str) -> int:
     """How many lines of the journal hold a text."""
-    return int(
-        cell.machine.run(f"journalctl -u palpate -o cat | grep -cF '{text}'", timeout_s=60).out
-    )
+    count = f"journalctl -u palpate -o cat | grep -cF '{text}'"
+    return int(cell.machine.run(count, timeout_s=60).out)
 
 
 def until_logged(cell: Cell, text: str, since: int = 0) -> None:
     """Wait until more than `since` lines hold it."""
-    end = cell.clock.now_s() + START_S
-    while journal_count(cell, text) <= since:
-        assert cell.clock.now_s() < end, f"the box has not logged {text!r}, but: {cell.journal()}"
+
+    def there() -> bool:
         cell.wait(1)
+        return journal_count(cell, text) > since
+
+    cell.until(there, START_S, f"{text!r} not logged")
 
 
 def files(cell: Cell) -> dict[str, str]:
     """Name and digest of each file of kept sweeps."""
-    lines = cell.machine.run(
-        f"cd {KEPT} && find . -type f -exec md5sum {{}} +", check=True
-    ).out.splitlines()
+    lines = cell.machine.out(f"cd {KEPT} && find . -type f -exec md5sum {{}} +").splitlines()
     return {line.split()[1]: line.split()[0] for line in lines}
 
 
 def used_k(cell: Cell) -> int:
     """KiB of kept sweeps."""
-    return int(cell.machine.run(f"df --output=used -k {KEPT} | tail -1", check=True).out)
+    return int(cell.machine.out(f"df --output=used -k {KEPT} | tail -1"))
 
 
 def test_disk_full_at_each_write(box: Cell, note: Note):

@@ -90,7 +90,7 @@ that."""
 
 def service(cell: Cell) -> str:
     """Process and restarts of the service."""
-    return cell.machine.run("systemctl show -p MainPID -p NRestarts palpate", check=True).out
+    return cell.machine.out("systemctl show -p MainPID -p NRestarts palpate")
 
 
 def looked_at(cell: Cell) -> set[str]:

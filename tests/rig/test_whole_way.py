@@ -55,13 +55,13 @@ def test_the_service_has_no_more_rights_than_it_needs(cell: Cell):
     """User palpate with no capability, device nodes by group, /etc out of reach; nothing of the
     unit failed to apply."""
     run = cell.machine.run
-    pid = run("systemctl show -P MainPID palpate", check=True).out.strip()
+    pid = cell.machine.out("systemctl show -P MainPID palpate")
     about = dict(
         line.split(":\t", 1)
         for line in run(f"cat /proc/{pid}/status").out.splitlines()
         if ":\t" in line
     )
-    palpate = run("id -u palpate", check=True).out.strip()
+    palpate = cell.machine.out("id -u palpate")
     assert set(about["Uid"].split()) == {palpate}
     assert {about[kind] for kind in ("CapEff", "CapPrm", "CapBnd", "CapAmb")} == {"0" * 16}
     assert about["NoNewPrivs"] == "1"
@@ -79,6 +79,4 @@ def test_check_names_each_part(cell: Cell):
 
 def test_the_skin_has_its_name(cell: Cell):
     """udev calls the skin's node by its name."""
-    assert cell.machine.run("readlink -f /dev/palpate-skin", check=True).out.startswith(
-        "/dev/bus/usb/"
-    )
+    assert cell.machine.out("readlink -f /dev/palpate-skin").startswith("/dev/bus/usb/")
