@@ -93,6 +93,15 @@ def test_wheels_have_names_of_their_own(wheels: dict[str, Path]):
 
 
 @pytest.mark.slow
+def test_the_desktop_holds_its_templates(wheels: dict[str, Path]):
+    """Pages of reports are made of files that are not modules."""
+    folder = ROOT / "train" / "palpate_train" / "reports" / "templates"
+    wanted = {f"palpate_train/reports/templates/{path.name}" for path in folder.iterdir()}
+    assert wanted
+    assert wanted <= set(zipfile.ZipFile(wheels["palpate_train"]).namelist())
+
+
+@pytest.mark.slow
 def test_box_and_desktop_beside_files_of_the_user(wheels: dict[str, Path], tmp_path: Path):
     """A tiny set is fitted without PyTorch's stages, and answered."""
     told = run([wheels["palpate"], wheels["palpate_train"]], USES_BOTH, tmp_path)

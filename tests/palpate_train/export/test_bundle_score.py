@@ -63,7 +63,7 @@ def test_what_is_named_is_counted(classifier: Classifier):
     assert found.answered["a"] == Counter(a=2, b=1)
     assert found.answered["c"] == Counter({"c": 1, "(unknown)": 1})
     assert found.statuses == Counter(ok=4, unsure=1, unknown=1)
-    assert found.json()["named_rightly"] == {
+    assert found.json()["classified_correctly"] == {
         "right": 3,
         "total": 6,
         "interval": interval(found.right, s.groups["position"]),
@@ -127,7 +127,7 @@ def test_the_command_prints_and_writes_what_it_found(
         in capsys.readouterr().out
     )
     told = json.loads((tmp_path / "out.json").read_text())
-    assert told["named_rightly"]["right"] == 3
+    assert told["classified_correctly"]["right"] == 3
     assert told["answers"] == {"a": {"a": 1}, "b": {"b": 1}, "c": {"c": 1}}
     content = toy_bundle.files()
     manifest = content["manifest.json"].replace(b'"seed": 1', b'"set": "s.npz"')

@@ -59,7 +59,7 @@ def test_the_figures_are_those_of_score(figures: dict, sweeps: Dataset, default_
     """The counts by material add up to the answers of the box's classifier, and precision includes
     the sweeps of other materials."""
     found = bundle_score.score(Classifier(default_bundle, SystemClock()), sweeps)
-    assert figures["named_rightly"]["right"] == found.right.sum()
+    assert figures["classified_correctly"]["right"] == found.right.sum()
     assert sum(row["sweeps"] for row in figures["materials"]) == len(sweeps)
     assert (
         round(sum(row["recall"][0] * row["sweeps"] for row in figures["materials"]))
@@ -103,7 +103,7 @@ def test_the_page_holds_the_figures(figures: dict, sweeps: Dataset):
     reader = PageReader(bundle_report.page(figures, sweeps))
     assert (reader.open, reader.wrong) == ([], [])
     assert all(link.startswith(("#", "data:")) for link in reader.links)
-    assert f"Of {figures['named_rightly']['total']} sweeps of 6 materials" in reader.text
+    assert f"Of {figures['classified_correctly']['total']} sweeps of 6 materials" in reader.text
     assert "All sweeps are simulated" in reader.text
     assert not re.search(r"\{\{|\}\}|\{%", reader.text)
     for row in figures["materials"]:

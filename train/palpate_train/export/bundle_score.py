@@ -104,7 +104,7 @@ class BundleScore:
             "set": self.sweeps.source,
             "digest": digest(self.sweeps),
             "sweeps": len(self.sweeps),
-            "named_rightly": Score.of(self.right).json()
+            "classified_correctly": Score.of(self.right).json()
             | {"interval": interval(self.right, self.clusters)},
             "interval_by": self.by,
             "statuses": self.statuses,

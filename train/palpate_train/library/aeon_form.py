@@ -1,8 +1,9 @@
 """Our recipe as a classifier of aeon, for its pipelines, ensembles and benchmarks. Needs aeon, the
-extra `minirocket`."""
+extra `peers`."""
 
 from __future__ import annotations
 
+from inspect import signature
 from typing import Any
 
 from aeon.classification.base import BaseClassifier
@@ -26,24 +27,13 @@ class AeonPalpateClassifier(BaseClassifier):  # type: ignore[misc]  # aeon has n
         "algorithm_type": "feature",
     }
 
-    def __init__(
-        self,
-        rate_hz: float = 100.0,
-        grid: tuple[int, ...] | None = None,
-        reattached: bool = False,
-        mains_hz: float = 50.0,
-        steps: int = 600,
-        size: str | None = None,
-        random_state: int = 0,
-    ) -> None:
-        self.rate_hz = rate_hz
-        self.grid = grid
-        self.reattached = reattached
-        self.mains_hz = mains_hz
-        self.steps = steps
-        self.size = size
-        self.random_state = random_state
+    def __init__(self, **parameters: Any) -> None:
+        for name, value in PalpateClassifier(**parameters).get_params().items():
+            setattr(self, name, value)
         super().__init__()
+
+    # scikit-learn reads the parameters from it
+    __init__.__signature__ = signature(PalpateClassifier.__init__)  # type: ignore[attr-defined]
 
     def _fit(self, X: Array, y: Array) -> AeonPalpateClassifier:
         self.palpate_ = PalpateClassifier(**self.get_params()).fit(X, y)

@@ -1,7 +1,7 @@
 """The base class of all networks.
 
 A network has a linear head on features of a sweep; `prepare` scales raw counts for the
-convolutions. Its ONNX graph takes the raw counts of the sensor.
+convolutions.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import Self
 
-import onnx
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -60,7 +59,3 @@ class Network(nn.Module, ABC):
         loss = functional.cross_entropy(self.training_logits(x), labels, label_smoothing=smoothing)
         loss.backward()
         return loss.item()
-
-    @abstractmethod
-    def graph(self) -> onnx.ModelProto:
-        """`sweep` -> `logits` float32 [1, K], as in inference."""

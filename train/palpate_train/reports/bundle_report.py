@@ -71,8 +71,8 @@ def page(figures: Json, sweeps: Dataset) -> str:
         pictures=pictures,
         short=list(_in_short(figures)),
         right=[
-            figures["named_rightly"]["right"] / figures["named_rightly"]["total"],
-            *figures["named_rightly"]["interval"],
+            figures["classified_correctly"]["right"] / figures["classified_correctly"]["total"],
+            *figures["classified_correctly"]["interval"],
         ],
         statuses=sorted(figures["statuses"].items(), key=lambda item: -item[1]),
         material_head=MATERIALS,

@@ -20,13 +20,14 @@ from palpate_train.data import sets
 from palpate_train.data.run import Run
 from palpate_train.data.sets import Dataset
 from palpate_train.data.splitters import inner_parts
-from palpate_train.models import checkpoint, training
+from palpate_train.models import checkpoint
 from palpate_train.models.methods import SkinUse
 from palpate_train.models.recipe import choice, palpate, recipe
 from palpate_train.models.recipe import fitted as fitted_module
 from palpate_train.models.recipe.architectures import STAGES
 from palpate_train.models.recipe.fitted import Fit
 from palpate_train.models.recipe.recipe import Settings
+from palpate_train.models.recipe.stages import StagesNetwork
 from palpate_train.onnx_tools.graph_builder import run, with_head
 from tests.factories.sweep_sets import easy
 
@@ -40,7 +41,7 @@ def fitted() -> Fit:
     return recipe.fit(easy(), Run(1), CLOSED)
 
 
-def test_an_easy_set_is_named_rightly(fitted: Fit):
+def test_an_easy_set_is_classified_correctly(fitted: Fit):
     """The heads did not see the part; the description names the choice."""
     assert fitted.about["validation"]["accuracy"] > 0.9
     assert "filters" in fitted.about["chosen"] or "spectrum" in fitted.about["chosen"]
@@ -229,7 +230,7 @@ def test_an_interrupted_fit_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(fit_command, "CACHE", tmp_path / "cache")
     monkeypatch.setattr(fitted_module, "fit_calibration", uncalibrated)
     easy().save(tmp_path / "easy.npz")
-    plain, steps = training.backward, []
+    plain, steps = StagesNetwork.backward, []
 
     def backward(*args):
         if len(steps) == stop:
@@ -243,7 +244,7 @@ def test_an_interrupted_fit_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         assert main(["fit", *args]) == (0 if stop < 0 else INTERRUPTED)
         return Fit.load(out) if stop < 0 else None
 
-    monkeypatch.setattr(training, "backward", backward)
+    monkeypatch.setattr(StagesNetwork, "backward", backward)
     stop = 7
     fitted("first")
     assert len(list((tmp_path / "cache").iterdir())) == 1

@@ -12,7 +12,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import onnx
 import torch
 from numpy.typing import NDArray
 from torch import Generator, Tensor, nn
@@ -25,7 +24,7 @@ from palpate_train.models.networks import Network
 from palpate_train.models.recipe.architectures import FLOOR, NOISE_LIMIT, STAGES, Architecture
 from palpate_train.models.recipe.augment import Augmentation, augment
 from palpate_train.models.recipe.fitted import Fit
-from palpate_train.models.recipe.graph import Ranges, level_frames, trunk_graph
+from palpate_train.models.recipe.graph import Ranges, level_frames
 from palpate_train.models.training import (
     Augment,
     TrainingRecipe,
@@ -34,7 +33,6 @@ from palpate_train.models.training import (
     learn,
     one_thread,
 )
-from palpate_train.onnx_tools.graph_builder import with_head
 from palpate_train.onnx_tools.quantize import PERCENTILE, calibration_sweeps
 
 Array = NDArray[Any]
@@ -164,12 +162,6 @@ class StagesNetwork(Network):
         return weights | {
             "convs.0.weight": self.first_taps(self.convs[0].get_parameter("weight")).numpy()
         }
-
-    def graph(self) -> onnx.ModelProto:
-        """`sweep` -> `logits` float32 [1, K]; of a fused network."""
-        weights = self.weights()
-        trunk = trunk_graph(self.format, self.scale, weights, self.architecture)
-        return with_head(trunk, weights["head.weight"], weights["head.bias"])
 
     @torch.no_grad()
     def ranges(self, samples: Array) -> Ranges:
