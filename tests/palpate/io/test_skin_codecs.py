@@ -34,6 +34,25 @@ def test_a_matrix_byte_by_byte():
     assert (found.garbage, found.rest.data, found.rest.synced) == (0, frame, True)
 
 
+def test_noise_leaves_what_may_begin_a_mark():
+    """All bytes but the last are garbage at once: it may be the first of a mark."""
+    found = decoded(SMALL, bytes(100))
+    assert (len(found), found.garbage, found.rest.data) == (0, 99, b"\0")
+
+
+@pytest.mark.parametrize("cut", [0, 3])
+def test_a_mark_among_the_numbers_of_some_frames(cut: int):
+    """The numbers of the first three frames hold a mark: frames begin at the mark that stays, also
+    where the stream begins at the other."""
+    numbers = ["01aa55040506"] * 3 + ["010203040506"] * 6
+    data = b"".join(bytes.fromhex("aa55" + six) for six in numbers)[cut:]
+    found = decoded(SMALL, data)
+    assert found.garbage == (8 - cut) % 8
+    wanted = [[[1, 170, 85], [4, 5, 6]]] * 3 + [[[1, 2, 3], [4, 5, 6]]] * 6
+    assert found.taxels.tolist() == wanted[len(wanted) - 1 - len(found) : -1]
+    assert len(found) == 8 - (cut > 0)
+
+
 FULL = SkinProfile(
     about="a",
     source="s",
@@ -208,6 +227,8 @@ def test_papillarray_byte_by_byte():
     at = data.index(b"\x02\x00", 40)
     assert len(decoded(p, data[:at] + bytes(26) + data[at:])) == 0
     assert len(decoded(p, data[:-6] + bytes(7) + data[-6:])) == 0
+    # a count whose low bytes would be the type of a block, were they read as a part of the table
+    assert len(decoded(p, papillarray(np.ones((3, 3, 6)), 65_536 + 3 - 1000))) == 1
 
 
 def test_papillarray_with_a_tail_inside():
@@ -309,6 +330,8 @@ def test_robotiq_byte_by_byte():
     for frame in found.taxels:
         assert frame.reshape(-1).tolist() == [*range(28), *range(1000, 1028)]
     assert decoded(p, two[: len(two) // 2] + one + head).taxels.shape == (1, 14, 4)
+    short = b"".join(head + bytes([len(f) - 1]) + f[:-1] for f in fingers)
+    assert len(decoded(p, short + one + head)) == 1
 
 
 @pytest.mark.parametrize(
