@@ -34,3 +34,5 @@ def test_nothing_is_missing_at_the_target():
     progress.add("a", "1", -1)
     assert progress.missing() == "nothing is missing of 2 materials at 1 position"
     assert "no material" in progress.line("", "1")
+    progress = counted(1, *((material, position) for material in "ab" for position in "12"))
+    assert progress.missing().endswith("2 positions")

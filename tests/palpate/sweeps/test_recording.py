@@ -317,9 +317,14 @@ def test_discard_of_the_sweep_that_was_seen(tmp_path: Path):
     assert names(tmp_path) == [*pairs(1), "sweep-000002.discarded"]
 
 
-def test_what_became_of_the_last_sweep_is_kept(tmp_path: Path):
+@pytest.mark.parametrize("earlier", [0, 2])
+def test_what_became_of_the_last_sweep_is_kept(tmp_path: Path, earlier: int):
     """For displays of the recording: the outcome as in REC, and the sweep that DISCARD would
-    remove."""
+    remove. Sweeps of an earlier run do not count."""
+    before = Desk(tmp_path)
+    for n in range(earlier):
+        before.sweep(n + 1)
+    before.recording.close()
     desk = Desk(tmp_path, Labels("wood", "3", "a"))
 
     def shown() -> tuple[object, object]:

@@ -16,7 +16,7 @@ from palpate.core.sweep_file import save
 from palpate.core.types import Status
 from palpate.sweeps import sweep_folder
 from palpate.sweeps.recording import Labels, RecordingSession
-from palpate.sweeps.sweep_folder import FORGOTTEN, SweepFolder
+from palpate.sweeps.sweep_folder import FORGOTTEN, RecordedSweep, SweepFolder
 from tests.cuts.recording import SHORT, taken
 
 
@@ -123,3 +123,20 @@ def test_sweeps_of_a_folder_in_use_are_not_forgotten_from_outside(tmp_path: Path
     with pytest.raises(OSError, match="another program"):
         SweepFolder(tmp_path, None)
     one.close()
+
+
+def test_sweeps_of_another_folder_are_adopted(tmp_path: Path):
+    """They get the next numbers and the material; the others stay."""
+    session = recording(tmp_path / "old")
+    put(session, 1, 2)
+    session.close()
+    old = [RecordedSweep.load(path) for path in sorted((tmp_path / "old").glob("*.npy"))]
+    folder = SweepFolder(tmp_path / "new", SHORT)
+    assert [folder.adopt(one, "felt") for one in (*old, old[0])] == [1, 2, 3]
+    folder.close()
+    again = [RecordedSweep.load(path) for path in sorted((tmp_path / "new").glob("*.npy"))]
+    assert [(one.sweep.id, one.sweep.material, one.about["run"]) for one in again] == [
+        (1, "felt", 0),
+        (2, "felt", 0),
+        (1, "felt", 2),
+    ]
