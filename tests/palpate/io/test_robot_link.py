@@ -44,6 +44,12 @@ def verdict(label: str = "plastic rough", status: Status = Status.OK, detail: st
     return Verdict(7, 5_021_384_000_000, *told)
 
 
+def test_a_late_answer_says_how_late():
+    """The latency is in milliseconds, to a hundredth."""
+    line = result(replace(verdict(), latency_ns=123_456_789_000), "usb")
+    assert b",123456.79," in line
+
+
 def test_result_is_the_documents_example():
     """The code writes the RES sentence of PROTOCOL.md."""
     line = result(verdict(), "usb").decode().strip()

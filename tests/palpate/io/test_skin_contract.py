@@ -155,13 +155,14 @@ def test_wrong_skin(name: str):
 
 @each
 def test_wrong_format_of_the_bundle(name: str):
-    """Another grid is refused with both named, before a byte is sent to the skin."""
-    p = profile(name)
-    skin = WiredSkin(name, replace(p.format, rows=p.format.rows + 1))
-    skin.seconds(0.3)
-    assert skin.sensor.state == "mismatch"
-    assert "wanted is" in str(skin.sensor.trouble)
-    assert skin.port.sent == []
+    """Another grid or rate is refused with both named, before a byte is sent to the skin."""
+    has = profile(name).format
+    for wanted in (replace(has, rows=has.rows + 1), replace(has, rate_hz=1.7 * has.rate_hz)):
+        skin = WiredSkin(name, wanted)
+        skin.seconds(0.3)
+        assert skin.sensor.state == "mismatch"
+        assert "wanted is" in str(skin.sensor.trouble)
+        assert skin.port.sent == []
 
 
 @each

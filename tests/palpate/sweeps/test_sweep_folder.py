@@ -65,7 +65,8 @@ def test_each_state_of_a_sweep(tmp_path: Path):
         status = Status.NO_CONTACT if number == 6 else Status.UNKNOWN
         about = {"verdict": {"status": str(status)}}
         save(tmp_path / f"sweep-{number:06d}.npy", one, SHORT, about)
-    (tmp_path / "sweep-000007.npy").write_bytes(b"half")
+    for name in ("sweep-000007.npy", "notes.npy"):
+        (tmp_path / name).write_bytes(b"half")
     folder = SweepFolder(tmp_path, None)
     folder.forget("felt", [5])
     folder.close()

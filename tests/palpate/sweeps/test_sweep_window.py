@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from palpate.core.config import SweepConfig
 from palpate.core.types import EPOCH_BITS, Edge, EdgeKind, Frames, Status, Sweep, SweepFormat
 from palpate.sim import skin
-from palpate.sweeps.frame_ring import MAX_GAP
+from palpate.sweeps.frame_ring import MAX_GAP, FrameRing
 from palpate.sweeps.sweep_window import SweepCutter
 from tests.factories.simulated_box import SECOND, numbered
 
@@ -221,6 +221,14 @@ def test_the_ring_overwrites_only_old_frames():
     (sweep,) = bench.done()
     assert (sweep.frames.seq == np.arange(27_250, 28_750)).all()
     assert (sweep.frames.taxels == numbered(30_000)[27_250:28_750]).all()
+
+
+def test_a_window_as_old_as_the_ring_has_its_neighbours():
+    """A missing first frame of the oldest window is interpolated from the frame before it."""
+    ring = FrameRing(FMT, seconds=1)
+    ring.put(frames(0, round(FMT.rate_hz) + FMT.window + 2 * MAX_GAP, drop=(MAX_GAP,)))
+    window, missing = ring.window(MAX_GAP, FMT.window)
+    assert (len(window), missing) == (FMT.window, (0,))
 
 
 def test_latest_is_complete_or_none():

@@ -128,9 +128,9 @@ def _numbers(profile: SkinProfile, line: bytes, most: int) -> tuple[NDArray[Any]
         numbers = np.array([float(_NULL.get(word, word)) for word in words])
         large = np.flatnonzero(np.abs(numbers) > _MOST_FLOAT)
         if len(large):
-            return None, _unfit(words[large[0]], "float32", "the skin's firmware")
+            return None, _unfit(words[large[0]], "float32", "check the skin's firmware")
         return numbers.astype(np.float32), ""
-    limits, wider = np.iinfo(profile.number), 'number = "float32" in its profile'
+    limits, wider = np.iinfo(profile.number), 'set number = "float32" in its profile'
     for word in words:
         if not _WHOLE.fullmatch(word) or not limits.min <= int(word) <= limits.max:
             return None, _unfit(word, profile.number, wider)
@@ -146,9 +146,8 @@ def _positions(columns: tuple[int, ...]) -> frozenset[int]:
 
 
 def _unfit(word: bytes, kind: str, remedy: str) -> str:
-    return f"it sends {word[:_SHOWN].decode('ascii', 'replace')}, which {kind} cannot hold; " + (
-        f"set {remedy}" if "=" in remedy else f"check {remedy}"
-    )
+    sent = word[:_SHOWN].decode("ascii", "replace")
+    return f"it sends {sent}, which {kind} cannot hold; {remedy}"
 
 
 def _strange(line: bytes, around: str, profile: SkinProfile) -> str:
