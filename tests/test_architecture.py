@@ -272,6 +272,25 @@ def test_dataclasses_with_arrays_are_not_compared_by_value():
     assert found == []
 
 
+CHANGING = {
+    *("Agreement", "AnswerScore", "Context", "EdgeCounters", "Finger", "OpenSweep", "Reception"),
+    *("SensorCounters", "_Line"),
+}
+"""Dataclasses of the box that count or collect; every other one is a value."""
+
+
+def test_values_of_the_box_do_not_change():
+    """Each dataclass is frozen and takes no other attribute; LeRobot and a cached part want two."""
+    written = re.compile(r"(?m)^ *@dataclass\((.*)\)\n *class (\w+)")
+    found = {
+        name: (name not in CHANGING, True) == ("frozen=True" in how, "slots=True" in how)
+        for path in sorted((ROOT / "appliance").rglob("*.py"))
+        for how, name in written.findall(path.read_text())
+    }
+    wrong = {name for name, right in found.items() if not right}
+    assert wrong == {"PalpateCameraConfig", "SweepSet"}
+
+
 def written_tests() -> list[tuple[str, ast.FunctionDef]]:
     """Each test function, after the name of its file."""
     return [

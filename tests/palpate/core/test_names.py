@@ -6,6 +6,7 @@ import pytest
 
 from palpate.core import names
 from palpate.core.names import TypedNames
+from palpate.core.text import closest
 
 
 @pytest.mark.parametrize(
@@ -47,6 +48,14 @@ def test_only_short_printed_texts_are_shown(text: object, can: bool):
     assert names.can_be_shown(text) is can
     if isinstance(text, str) and text.strip():
         assert names.can_be_shown(names.shown(text))
+
+
+def test_the_closest_names_are_proposed():
+    """The best one, or as many as are asked for, whatever their case; none that is too far."""
+    known = ["max_sweeps", "max_sweep", "black_box"]
+    assert closest("max_sweepz", known) == ["max_sweeps"]
+    assert closest("MAX_SWEEPZ", known, 3) == ["max_sweeps", "max_sweep"]
+    assert closest("zzz", known, 3) == []
 
 
 def test_a_typed_name_keeps_its_label():

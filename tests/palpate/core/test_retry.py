@@ -69,6 +69,27 @@ def test_which_errors_pass():
     assert not any(map(errors.passes, [*staying, ValueError("x")]))
 
 
+def test_how_a_command_ends():
+    """docs/reference/exit-codes.md has these numbers."""
+    codes = {
+        1: [errors.ApplianceError],
+        65: [errors.FormatError],
+        69: [
+            errors.SensorError,
+            errors.LineError,
+            errors.PortError,
+            AddressError,
+            errors.FeedError,
+        ],
+        70: [errors.ModelError],
+        75: [errors.TemporaryError],
+        78: [ConfigError, errors.BundleError],
+    }
+    assert {code: {kind.exit_code for kind in kinds} for code, kinds in codes.items()} == {
+        code: {code} for code in codes
+    }
+
+
 def test_a_page_whose_port_is_in_use_or_whose_address_is_missing():
     """Both are restarted; a port that does not exist is not."""
     with socket.create_server(("127.0.0.1", 0)) as taken:
