@@ -6,6 +6,7 @@ import io
 import json
 import os
 import tarfile
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -26,10 +27,29 @@ SAVED = {
 }
 
 
+GIVE = backup._own
+
+
 @pytest.fixture(autouse=True)
 def own_names(monkeypatch: pytest.MonkeyPatch) -> None:
     """Users of boxes do not exist here."""
     monkeypatch.setattr(backup, "_own", lambda path, member: None)
+
+
+@pytest.mark.parametrize(("user", "given"), [(0, [(0, 0)]), (1000, [])])
+def test_only_root_gives_files_to_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, user: int, given: list[tuple[int, int]]
+):
+    """To the user and the group of the same names; a name that is missing here is an error."""
+    member, found = tarfile.TarInfo(), list[tuple[int, int]]()
+    member.uname = member.gname = "root"
+    monkeypatch.setattr(os, "geteuid", lambda: user)
+    monkeypatch.setattr(os, "chown", lambda path, *ids, **how: found.append(ids))
+    GIVE(tmp_path, member)
+    assert found == given
+    member.uname = "nobody-of-this-box"
+    with nullcontext() if user else pytest.raises(ApplianceError, match="nobody-of"):
+        GIVE(tmp_path, member)
 
 
 def box(root: Path, files: dict[str, str]) -> Path:

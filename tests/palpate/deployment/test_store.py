@@ -23,7 +23,7 @@ from palpate.core.errors import (
     TemporaryError,
 )
 from palpate.deployment import store
-from palpate.deployment.state import MOST_STARTS, PACKAGED
+from palpate.deployment.state import MOST_STARTS, PACKAGED, Standing, StoreState
 from tests.campaigns import flips
 from tests.factories import deliveries
 from tests.factories.deliveries import Delivery
@@ -48,6 +48,26 @@ def test_a_fresh_box_runs_the_packaged_bundle(box: Delivery):
         nowhere.choose().bundle.id == nowhere.running().bundle.id == bundle.load(bundle.DEFAULT).id
     )
     assert nowhere.candidate() is None
+    with pytest.raises(BundleError, match="no candidate"):
+        box.store.promote()
+
+
+def test_the_progress_of_a_trial_is_noted(box: Delivery):
+    """Starts, sweeps and tenths of a second; a start that ended in order counts for no boot."""
+    for counted in (True, False):
+        box.store.note("a", 2, counted, 3, 12.34)
+        kept = box.store.state.of("a")
+        assert (kept.starts, kept.sweeps, kept.streamed_s) == (2, 3, 12.3)
+        assert bool(kept.boot) is counted
+
+
+@pytest.mark.parametrize("sha", ["a", "z"])
+def test_what_comes_after_a_committed_bundle_is_on_trial(sha: str):
+    """It goes back to the committed one, which stays as it is."""
+    state = StoreState(candidate=sha)
+    after = state.activated(sha, 3, "m")
+    assert after == StoreState(standings={sha: Standing("m", 3, committed=False)})
+    assert after.activated("m", 1, sha) == after
 
 
 SEQUENCES = {

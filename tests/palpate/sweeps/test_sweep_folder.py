@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import io
+import json
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from zlib import crc32
 
+import numpy as np
 import pytest
 
 from palpate.core.clock import SystemClock
 from palpate.core.errors import FormatError
-from palpate.core.sweep_file import save
+from palpate.core.sweep_file import load, save
 from palpate.core.types import Status
 from palpate.sweeps import sweep_folder
 from palpate.sweeps.recording import Labels, RecordingSession
@@ -141,3 +145,15 @@ def test_sweeps_of_another_folder_are_adopted(tmp_path: Path):
         (2, "felt", 0),
         (1, "felt", 2),
     ]
+
+
+def test_a_table_of_another_form_is_no_sweep(tmp_path: Path):
+    """Records in two dimensions, with the sum of their file."""
+    path, out = tmp_path / "sweep-000001.npy", io.BytesIO()
+    save(path, taken(1, SHORT)[0], SHORT, {})
+    np.save(out, np.load(path)[None])
+    path.write_bytes(out.getvalue())
+    about = json.loads(path.with_suffix(".json").read_text())
+    path.with_suffix(".json").write_text(json.dumps(about | {"crc32": crc32(out.getvalue())}))
+    with pytest.raises(FormatError, match="do not fit"):
+        load(path)
