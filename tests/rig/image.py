@@ -185,12 +185,8 @@ def _make_ground(part: Path) -> None:
     package = next(
         word for word in about if word.startswith("linux-image-6") or word[12:13].isdigit()
     )
-    subprocess.run(
-        [*apt, "apt-get", "-qq", "download", package, "busybox-static"],
-        cwd=part,
-        check=True,
-        timeout=600,
-    )
+    command = [*apt, "apt-get", "-qq", "download", package, "busybox-static"]
+    subprocess.run(command, cwd=part, check=True, timeout=600)
     for deb in part.glob("*.deb"):
         run("dpkg-deb", "-x", deb, part / ("kernel" if "linux-image" in deb.name else "busybox"))
     _download_wheels(part)
@@ -219,13 +215,8 @@ def _make_root(part: Path, version: str) -> None:
     """Debian with the box's virtual environment, the agent and the modules of its kernel."""
     shutil.copy(part / emulated_machines.LOCK.name, part / "wheels")
     (part / "wheels").chmod(0o755)
-    here = (
-        []
-        if not subprocess.run(
-            ["arch-test", "arm64"], capture_output=True, check=False, timeout=600
-        ).returncode
-        else [sys.executable, HERE / "arm.py"]
-    )
+    try_arm = subprocess.run(["arch-test", "arm64"], capture_output=True, timeout=600)
+    here = [sys.executable, HERE / "arm.py"] if try_arm.returncode else []
     run(
         *here,
         "mmdebstrap",
@@ -274,16 +265,10 @@ def _modules(kernel: Path, root: Path, version: str, names: Iterable[str]) -> li
         run("depmod", "-b", kernel, version)
     found: dict[Path, None] = {}
     for name in names:
-        listing = subprocess.run(
-            ["modprobe", "-d", kernel, "-S", version, "--show-depends", name],
-            capture_output=True,
-            text=True,
-            check=False,
-            timeout=600,
-        ).stdout
-        found |= dict.fromkeys(
-            Path(line.split()[1]) for line in listing.splitlines() if line.startswith("insmod")
-        )
+        command = ["modprobe", "-d", kernel, "-S", version, "--show-depends", name]
+        listing = subprocess.run(command, capture_output=True, text=True, timeout=600).stdout
+        loads = (line.split()[1] for line in listing.splitlines() if line.startswith("insmod"))
+        found |= dict.fromkeys(map(Path, loads))
     for file in found:
         place = target / file.relative_to(source)
         place.parent.mkdir(parents=True, exist_ok=True)

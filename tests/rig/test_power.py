@@ -73,16 +73,9 @@ class EndlessRobot:
         for heard_ns, line in self.cell.serial.heard:
             touched = [t for t in self.touches if t.played.is_set() and t.stop_ns < heard_ns]
             if whole(line)[1:2] == ["RES"] and whole(line)[4] in ANSWERED and touched:
-                last = touched[-1]
-                at = [kill for kill in kills if last.start_ns < kill < last.stop_ns]
-                wrong += (
-                    [
-                        f"{line} heard {heard_ns}, sweep {last.start_ns} to {last.stop_ns}, "
-                        f"killed {at}"
-                    ]
-                    if at
-                    else []
-                )
+                begin, end = touched[-1].start_ns, touched[-1].stop_ns
+                if at := [kill for kill in kills if begin < kill < end]:
+                    wrong.append(f"{line} heard {heard_ns}, sweep {begin} to {end}, killed {at}")
         return wrong
 
 
@@ -139,6 +132,14 @@ def killed(image: Image, folder: Path, ledger: CampaignLog, n: int, rng: random.
     assert not harmed
 
 
+def outcome(ledger: CampaignLog) -> str:
+    """The sums in words. Raises AssertionError if a sweep was lost or a file is not sound."""
+    lost, owed = ledger.sum("lost"), ledger.sum("owed")
+    assert lost == ledger.sum("parts") == ledger.sum("fsck") == 0 < owed
+    doing = Counter(line["doing"] for line in ledger.lines if line["doing"] != "end")
+    return f"{dict(doing)}; of {owed} sweeps that had to be kept {lost} were lost"
+
+
 def test_killed(image: Image, tmp_path: Path, count: Count, note: Note):
     """SIGKILL at random moments, while starting, idle and sweeping: READY again each time, no kept
     sweep is lost."""
@@ -146,18 +147,8 @@ def test_killed(image: Image, tmp_path: Path, count: Count, note: Note):
     wanted = count(ledger.sum("back") + 1, 200)
     while (left := wanted - ledger.sum("back")) > 0:
         killed(image, tmp_path, ledger, min(left, BATCH), rng)
-    kinds = [line["doing"] for line in ledger.lines if line["doing"] != "end"]
-    where = ", ".join(f"{kinds.count(kind)} {kind}" for kind in ("starting", "idle", "sweeping"))
-    assert ledger.sum("lost") == ledger.sum("parts") == ledger.sum("fsck") == 0 < ledger.sum("owed")
     assert not any(line.get("harmed") for line in ledger.lines)
-    note(
-        "SIGKILL at a random moment",
-        f"READY again each time ({where}); {ledger.sum('owed')} of {ledger.sum('answered')} "
-        "answered sweeps had to be "
-        f"kept, {ledger.sum('lost')} of these lost; {ledger.sum('unfinished')} in progress not "
-        "kept",
-        ledger.sum("back"),
-    )
+    note("SIGKILL at a random moment", f"READY again; {outcome(ledger)}", ledger.sum("back"))
 
 
 @pytest.fixture
@@ -204,14 +195,8 @@ def cut(
     kept = sweeps(files)
     counts = lost(cell.serial.heard, kept) | {"parts": parts, "fsck": code}
     counts["lost"] += max(0, had - len(kept))
-    ledger.add(
-        doing=doing,
-        back=int(not booting),
-        cut=1,
-        ready_s=ready_s,
-        statuses=statuses(cell),
-        **counts,
-    )
+    counts |= {"back": int(not booting), "cut": 1}
+    ledger.add(doing=doing, ready_s=ready_s, statuses=statuses(cell), **counts)
     assert {counts[name] for name in ("lost", "parts", "fsck")} == {0}
     return len(kept)
 
@@ -226,36 +211,23 @@ def test_power_cut(image: Image, disk: Path, tmp_path: Path, count: Count, note:
     wanted, kept = count(ledger.sum("cut") + 1, 50), 0
     while (n := ledger.sum("cut")) < wanted:
         # twice while it boots, then a life that has to get to READY; such a one is the last, too
-        kept = cut(
-            image, disk, tmp_path, ledger, rng, booting=n % 3 < 2 and n < wanted - 1, had=kept
-        )
-    kinds = [line["doing"] for line in ledger.lines]
-    where = ", ".join(f"{kinds.count(kind)} {kind}" for kind in ("starting", "idle", "sweeping"))
-    assert ledger.sum("lost") == ledger.sum("fsck") == ledger.sum("parts") == 0 < ledger.sum("owed")
-    note(
-        "power cut at a random moment",
-        f"it boots again each time ({where}), file system clean; {ledger.sum('owed')} "
-        f"of {ledger.sum('answered')} answered "
-        f"sweeps had to be kept, {ledger.sum('lost')} of these lost; {ledger.sum('unfinished')} "
-        "in progress not kept",
-        ledger.sum("cut"),
-    )
+        booting = n % 3 < 2 and n < wanted - 1
+        kept = cut(image, disk, tmp_path, ledger, rng, booting=booting, had=kept)
+    told = f"it boots again, file system clean; {outcome(ledger)}"
+    note("power cut at a random moment", told, ledger.sum("cut"))
 
 
 def test_what_is_owed():
     """An answer whose sweep was reported as stored is owed; others, and damaged lines, are not."""
+    of_box = ("9f", "usb", "1.00", "")
     heard = [
-        sentence(
-            "RES", 1, "5.021", "ok", "felt", "0.9", "0.8", 1, 0, "21.00", "9f", "usb", "1.00", ""
-        ),
+        sentence("RES", 1, "5.021", "ok", "felt", "0.9", "0.8", 1, 0, "21.00", *of_box),
         sentence("REC", 1, "stored", 1, "felt", "", "", "sweep-000001"),
         sentence("STA", "6.0", "streaming", 0, 1, 1, 0, 0, 1, 0, "9f", "usb"),
-        sentence(
-            "RES", 2, "9.021", "recorded", "", "0.0", "0.0", 1, 0, "21.00", "9f", "usb", "1.00", ""
-        ),
+        sentence("RES", 2, "9.021", "recorded", "", "0.0", "0.0", 1, 0, "21.00", *of_box),
         b"$PPLP,REC,2,sto",
         sentence("STA", "12.0", "streaming", 0, 0, 1, 0, 0, 1, 0, "9f", "usb"),
-        sentence("RES", 1, "15.0", "gap", "", "0.0", "0.0", 0, 9, "1.00", "9f", "usb", "1.00", ""),
+        sentence("RES", 1, "15.0", "gap", "", "0.0", "0.0", 0, 9, "1.00", *of_box),
         sentence("STA", "16.0", "streaming", 0, 1, 1, 0, 0, 1, 0, "9f", "usb"),
     ]
     lines = [(0, line.decode().strip()) for line in heard]

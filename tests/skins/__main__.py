@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Callable
 from dataclasses import asdict
 from shutil import rmtree
 from typing import Any
@@ -25,29 +24,21 @@ from tests.skins.subjects import NAMES, subject
 WORK = ROOT / "build" / "skins"
 RESULTS = ROOT / "docs" / "data" / "skins.json"
 FAULTS = 10_000
+PARTS = ("way", "noise", "load")
 
 
-def _way(name: str, args: argparse.Namespace) -> dict[str, Any]:
+def measured(part: str, name: str, seconds: float) -> dict[str, Any]:
+    """The results of a part for a skin."""
+    if part == "noise":
+        return {
+            fault.__name__: asdict(noise.count(subject(name), fault, FAULTS))
+            for fault in noise.FAULTS
+        }
+    if part == "load":
+        return load.measure(name, WORK / name / "bundle", seconds)
     rmtree(WORK / name, ignore_errors=True)
     (WORK / name).mkdir(parents=True)
     return {"shipped": score.shipped(), **way.go(name, WORK / name)}
-
-
-def _noise(name: str, args: argparse.Namespace) -> dict[str, Any]:
-    return {
-        fault.__name__: asdict(noise.count(subject(name), fault, FAULTS)) for fault in noise.FAULTS
-    }
-
-
-def _load(name: str, args: argparse.Namespace) -> dict[str, Any]:
-    return load.measure(name, WORK / name / "bundle", args.seconds)
-
-
-PARTS: dict[str, Callable[[str, argparse.Namespace], dict[str, Any]]] = {
-    "way": _way,
-    "noise": _noise,
-    "load": _load,
-}
 
 
 def main() -> int:
@@ -63,9 +54,9 @@ def main() -> int:
     args = parser.parse_args()
     if wrong := set(args.skins) - set(NAMES):
         parser.error(f"no skin {', '.join(sorted(wrong))}; there are {', '.join(NAMES)}")
-    for part in [args.part] if args.part in PARTS else [] if args.part else PARTS:
+    for part in [part for part in PARTS if args.part in (None, part)]:
         for name in args.skins or NAMES:
-            found = PARTS[part](name, args)
+            found = measured(part, name, args.seconds)
             print(part, name, json.dumps(found), flush=True)
             _keep(part, name, found)
     page.write(ROOT / "docs" / "skins.md", json.loads(RESULTS.read_text("utf-8")))

@@ -14,6 +14,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
@@ -138,9 +139,11 @@ def measure(name: str, folder: Path, seconds: float) -> dict[str, Any]:
         link = Path(stack.enter_context(TemporaryDirectory())) / "ttySkin"
         player = stack.enter_context(playing(name, current.format.rate_hz, link))
         real_time = hurry(BOX)
-        settings = config.load(None, sets(name, current.format, link), site=Path("/dev/null"))
-        _, sweep_s, _, every_s = times(current.format)
-        trigger = replace(settings.trigger, sweep_s=float(sweep_s), every_s=float(every_s))
+        chosen = [f"skin.profile={name}", f"skin.port={link}", "trigger.mode=timed"]
+        chosen += [f"skin.rate_hz={current.format.rate_hz}"]
+        settings = config.load(None, chosen, site=Path("/dev/null"))
+        sweep_s = current.format.window / current.format.rate_hz + LEAD_S
+        trigger = replace(settings.trigger, sweep_s=sweep_s, every_s=sweep_s + PAUSE_S)
         settings = replace(settings, trigger=trigger)
         far_end, port = stack.enter_context(pseudo_terminal.pair())
         sink = SerialSink(replace(settings.serial, port=port), clock, "emulator")
@@ -166,30 +169,9 @@ def measure(name: str, folder: Path, seconds: float) -> dict[str, Any]:
         "garbage": box.counters.garbage_bytes,
         **emulator,
         "answers": len(check.answer_ms),
-        "statuses": {
-            status: check.statuses.count(status) for status in sorted(set(check.statuses))
-        },
-        "answer_ms": {
-            f"p{q}": round(float(np.percentile(check.answer_ms, q)), 2) for q in (50, 99)
-        },
+        "statuses": dict(sorted(Counter(check.statuses).items())),
+        "answer_ms": {f"p{q}": round(np.percentile(check.answer_ms, q), 2) for q in (50, 99)},
     }
-
-
-def sets(name: str, format: SweepFormat, link: Path) -> list[str]:
-    """Settings of a box with this skin and without GPIO lines."""
-    chosen = {
-        "skin.profile": name,
-        "skin.port": link,
-        "skin.rate_hz": format.rate_hz,
-        "trigger.mode": "timed",
-    }
-    return [f"{key}={value}" for key, value in chosen.items()]
-
-
-def times(format: SweepFormat) -> list[str]:
-    """Options of `palpate run` for timed sweeps that hold a window of this format."""
-    sweep_s = format.window / format.rate_hz + LEAD_S
-    return ["--sweep", str(sweep_s), "--every", str(sweep_s + PAUSE_S)]
 
 
 def _turns(box: Box, far_end: int, seconds: float) -> None:
@@ -227,9 +209,8 @@ def play(name: str, rate_hz: float, link: Path) -> None:
     clock.latest_ns = 0
     player.run(stop.is_set)
     player.close()
-    print(
-        json.dumps({"thrown": player.thrown, "emulator_late_ms": round(clock.latest_ns / 1e6, 1)})
-    )
+    late_ms = round(clock.latest_ns / 1e6, 1)
+    print(json.dumps({"thrown": player.thrown, "emulator_late_ms": late_ms}))
 
 
 if __name__ == "__main__":
