@@ -67,7 +67,7 @@ PALPATE = "/opt/palpate/bin/palpate"
 NOBODY = ("setpriv", "--reuid=nobody", "--regid=nogroup", "--clear-groups")
 SITE = "/etc/palpate/palpate.toml"
 STREAMS = r"skin streaming\. Sweeps answered: \d+"
-WAIT_S = 60
+WAIT_S = 180
 """Longest wait for an action of a second or two. Other programs may keep this machine busy."""
 PATH = "PATH=/usr/sbin:/usr/bin:/sbin:/bin"
 BOOT_S = 60
@@ -185,7 +185,7 @@ class Machine:
         )
 
     def run(
-        self, *command: str, say: str = "", limit_s: float = 60
+        self, *command: str, say: str = "", limit_s: float = 300
     ) -> subprocess.CompletedProcess[str]:
         """Run a command in it to the end, with `say` as its input."""
         enter = ("nsenter", "-t", self.first, *NAMESPACES, "env", "-i", PATH)
