@@ -85,9 +85,8 @@ def command(name: str, *args: str | Path) -> tuple[list[str], dict[str, str]]:
     if platform.machine() != "x86_64":
         raise Missing("other processors are compared with an x86")
     run = [qemu(kind), "-cpu", processor]
-    kept = {
-        name: value for name, value in os.environ.items() if not name.startswith("OPENBLAS_")
-    }  # the features of this processor
+    # without the features of this processor
+    kept = {name: v for name, v in os.environ.items() if not name.startswith("OPENBLAS_")}
     env = kept | {"PYTHONPATH": SOURCES, "OPENBLAS_NUM_THREADS": "1"}
     if kind == platform.machine():
         return [*run, sys.executable, __file__, *map(str, args)], env
@@ -160,16 +159,8 @@ def _unpack(part: Path) -> None:
         wanted["qemu"] = [f"qemu-user-static:{mine}"]
     with_apt = apt(part, "arm64", *([mine] if "qemu" in wanted else []))
     for where, names in wanted.items():
-        run(
-            *with_apt,
-            "apt-get",
-            "-qq",
-            "install",
-            "-y",
-            "--download-only",
-            "--no-install-recommends",
-            *names,
-        )
+        how = ("-qq", "-y", "--download-only", "--no-install-recommends")
+        run(*with_apt, "apt-get", "install", *how, *names)
         for package in (part / "archives").glob("*.deb"):
             run("dpkg-deb", "-x", package, part / where)
             package.unlink()

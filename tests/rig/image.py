@@ -133,13 +133,8 @@ def _need(tools: Iterable[str]) -> None:
 
 
 def _ground_name() -> str:
-    parts = [
-        emulated_machines.LOCK,
-        HERE / "arm.py",
-        GUEST / "agent.py",
-        GUEST / "agent.service",
-        GUEST / "init",
-    ]
+    inside = (GUEST / name for name in ("agent.py", "agent.service", "init"))
+    parts = [emulated_machines.LOCK, HERE / "arm.py", *inside]
     key = repr((SUITE, PACKAGES, MODULES, EARLY, LINES, DISK, MACHINE))
     return f"ground-{_hash(parts, key)}"
 
@@ -151,13 +146,8 @@ def _box_name() -> str:
         for p in sorted((ROOT / folder).rglob("*"))
         if p.is_file() and "__pycache__" not in p.parts
     ]
-    parts += [
-        ROOT / "pyproject.toml",
-        GUEST / "install.sh",
-        GUEST / "palpate.toml",
-        HERE / "machine.py",
-        HERE / "guest_clock.py",
-    ]
+    parts += [ROOT / "pyproject.toml", GUEST / "install.sh", GUEST / "palpate.toml"]
+    parts += [HERE / "machine.py", HERE / "guest_clock.py"]
     return f"box-{_hash(parts, _ground_name())}"
 
 
@@ -217,20 +207,10 @@ def _make_root(part: Path, version: str) -> None:
     (part / "wheels").chmod(0o755)
     try_arm = subprocess.run(["arch-test", "arm64"], capture_output=True, timeout=600)
     here = [sys.executable, HERE / "arm.py"] if try_arm.returncode else []
-    run(
-        *here,
-        "mmdebstrap",
-        "--architectures=arm64",
-        "--variant=minbase",
-        f"--include={','.join(PACKAGES)}",
-        "--dpkgopt=path-exclude=/usr/share/man/*",
-        "--dpkgopt=path-exclude=/usr/share/doc/*",
-        "--dpkgopt=path-exclude=/usr/share/locale/*",
-        *(f"--customize-hook={hook}" for hook in _hooks(part)),
-        "--format=directory",
-        SUITE,
-        part / "root",
-    )
+    how = [f"--include={','.join(PACKAGES)}", "--architectures=arm64", "--variant=minbase"]
+    how += [f"--dpkgopt=path-exclude=/usr/share/{what}/*" for what in ("man", "doc", "locale")]
+    how += [f"--customize-hook={hook}" for hook in _hooks(part)]
+    run(*here, "mmdebstrap", *how, "--format=directory", SUITE, part / "root")
     _modules(part / "kernel", part / "root", version, MODULES)
 
 
@@ -291,24 +271,15 @@ def _make_ramdisk(part: Path, version: str) -> None:
     shutil.copy(part / "busybox/bin/busybox", ramdisk / "bin")
     shutil.copy(GUEST / "init", ramdisk / "init")
     (ramdisk / "init").chmod(0o755)
-    run(
-        "sh",
-        "-c",
-        f"cd {ramdisk} && find . | cpio -o -H newc --quiet | gzip -1 > {part / 'ramdisk'}",
-    )
+    pack = f"find . | cpio -o -H newc --quiet | gzip -1 > {part / 'ramdisk'}"
+    run("sh", "-c", f"cd {ramdisk} && {pack}")
 
 
 def _make_tree(path: Path) -> None:
     """The machine's device tree, with names for its lines, and without its power button on one of
     them."""
-    run(
-        "qemu-system-aarch64",
-        MACHINE[0],
-        f"{MACHINE[1]},dumpdtb={path}",
-        *MACHINE[2:],
-        "-display",
-        "none",
-    )
+    option, machine, *rest = MACHINE
+    run("qemu-system-aarch64", option, f"{machine},dumpdtb={path}", *rest, "-display", "none")
     run("fdtput", "-r", path, "/gpio-keys")
     run("fdtput", "-t", "s", path, "/pl061@9030000", "gpio-line-names", *LINES)
 
@@ -316,9 +287,9 @@ def _make_tree(path: Path) -> None:
 def _make_box(part: Path, on: Path) -> None:
     from tests.rig.machine import Guest
 
+    for name in ("code", "source"):
+        (part / name).mkdir()
     code, source = part / "code", part / "source"
-    code.mkdir()
-    source.mkdir()
     emulated_machines.wheel(code, source)
     for folder in ("systemd", "firmware_config"):
         shutil.copytree(ROOT / folder, code / folder)

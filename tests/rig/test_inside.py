@@ -39,17 +39,10 @@ def test_the_contract_holds_on_a_real_kernel(
     pack(code, CODE)
     some = count(1, 0) * " -k 'without_a_gap or start_and_stop or test_outputs or arrive_whole'"
     with Guest(image, tmp_path, snapshot=True, code=code) as machine:
-        asking = threading.Thread(
-            target=remote.serve,
-            args=(machine.bench().makefile("rwb"), GuestControls(machine)),
-            daemon=True,
-        )
-        asking.start()
-        machine.run(
-            "systemctl stop palpate; mkdir -p /code && mount -o ro /dev/vdb /code",
-            timeout_s=90,
-            check=True,
-        )
+        ends = (machine.bench().makefile("rwb"), GuestControls(machine))
+        threading.Thread(target=remote.serve, args=ends, daemon=True).start()
+        mount = "mkdir -p /code && mount -o ro /dev/vdb /code"
+        machine.run(f"systemctl stop palpate; {mount}", timeout_s=90, check=True)
         env = "PYTHONDONTWRITEBYTECODE=1 PALPATE_BACKEND=remote PYTHONPATH=/code/site"
         done = machine.run(
             f"cd /code && timeout -s INT 500 env {env} {PYTEST}{some}", timeout_s=520
