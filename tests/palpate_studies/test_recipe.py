@@ -115,6 +115,7 @@ class LoadsFits:
         return {"label": np.ones(len(test), bool), "right": right, "wrong": ~right}
 
 
+@pytest.mark.slow
 def test_loads_are_compared_in_both_worlds(monkeypatch: pytest.MonkeyPatch):
     """Each world has a skin that was put back and positions left out; a fit without loads stands
     beside each fit that chose them, and the answers of all positions are counted together."""

@@ -83,6 +83,7 @@ def test_demo_without_a_bundle_for_the_skin(capsys: pytest.CaptureFixture[str]) 
         assert named in line
 
 
+@pytest.mark.slow
 def test_replayed_set_through_the_bytes_of_a_skin(tmp_path: Path) -> None:
     """`--sim replay:SET --skin NAME` plays a set of that skin over its line."""
     format = skins.profile(settings("flexitac")).format

@@ -154,6 +154,7 @@ def test_the_board_that_is_named_last_holds(
     host.machine.put(file, 'board = "rpi5"\n')
 
 
+@pytest.mark.slow
 def test_a_board_without_a_file_is_refused_before_any_box_is_asked():
     """The error lists the existing boards."""
     words = ("--host", "robot@127.0.0.1:1", "--wheel", __file__, "--board", "rpi9")
@@ -584,6 +585,7 @@ except fleet.Failed as e:
     assert re.match("copying bundle.tar: Failure; .* disk is full", run_here(code))
 
 
+@pytest.mark.slow
 def test_the_self_test_of_a_release_speaks_of_the_setting(tmp_path: Path):
     """Its error is a line without the names of classes, as the box itself says it."""
     (tmp_path / "skin.toml").write_text("[skin]\nbuad = 9600\n")

@@ -271,21 +271,21 @@ def test_the_settings_reach_the_classifier(toy: Bundle):
 
 @pytest.mark.parametrize("fusion", ["product", "vote"])
 def test_an_object_without_end_takes_no_more_memory_or_time(toy: Bundle, fusion: str):
-    """After 20,000 sweeps of one object the fused sweeps are as small as after two, and the fused
+    """After 2,000 sweeps of one object the fused sweeps are as small as after two, and the fused
     probabilities are those of all sweeps."""
     it = classifier(toy, UNTIL_NEW_OBJECT, fuse=fusion)
     rng, given = np.random.default_rng(1), []
     sizes = []
-    for n, own in enumerate(rng.dirichlet((2, 1, 1), 20_000), 1):
+    for n, own in enumerate(rng.dirichlet((2, 1, 1), 2_000), 1):
         sweep = replace(toy_bundle.sweep(0, 0), id=n, object=1)
         last = it.verdict(it.judged(sweep, told(it, own)))
         given.append(own)
-        if n in (2, 20_000):
+        if n in (2, 2_000):
             sizes.append(len(pickle.dumps(it._objects.present.evidence)))
     assert sizes[1] <= sizes[0] + 32
-    assert last.fused == 20_000
+    assert last.fused == 2_000
     if fusion == "product":
         together = softmax(np.log(np.maximum(given, LEAST_PROBABILITY)).sum(axis=0))
     else:
-        together = np.bincount([int(p.argmax()) for p in given], minlength=3) / 20_000
+        together = np.bincount([int(p.argmax()) for p in given], minlength=3) / 2_000
     assert last.scores == pytest.approx(together, abs=1e-8)

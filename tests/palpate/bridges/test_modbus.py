@@ -95,26 +95,25 @@ def test_another_client_reads_the_map(box: SpeakingBox, raw: RawModbus, address:
 MEASURED_AT = 42
 
 
-@pytest.mark.parametrize(
-    ("optional", "words"),
-    [
-        ((), [0, 0]),
-        ((1,), [0, 0]),
-        (("", "30.5", "rows+"), [305, 1]),
-        ((1, "8.0", "rows-"), [80, 2]),
-        (("", "400.0", "cols+"), [4000, 3]),
-        (("", "9999.9", "cols-"), [65535, 4]),
-        (("", "30.5", "sideways"), [305, 0]),
-    ],
+MEASURED = (
+    ((), [0, 0]),
+    ((1,), [0, 0]),
+    (("", "30.5", "rows+"), [305, 1]),
+    ((1, "8.0", "rows-"), [80, 2]),
+    (("", "400.0", "cols+"), [4000, 3]),
+    (("", "9999.9", "cols-"), [65535, 4]),
+    (("", "30.5", "sideways"), [305, 0]),
 )
-def test_the_measured_slide_is_read(
-    box: SpeakingBox, raw: RawModbus, optional: tuple[object, ...], words: list[int]
-):
+"""The optional fields of an answer, and the two registers."""
+
+
+def test_the_measured_slide_is_read(box: SpeakingBox, raw: RawModbus):
     """Two registers: tenths of mm/s, and a code for each direction; 0 where RES has no
     speed, or a direction of a later version. They are refused to writers."""
-    box.say(result(1, optional=optional))
-    eventually(lambda: word(raw, "answers") == 1)
-    assert raw.registers(MEASURED_AT, 2) == words
+    for number, (optional, words) in enumerate(MEASURED, 1):
+        box.say(result(number, optional=optional))
+        eventually(lambda number=number: word(raw, "answers") == number)
+        assert raw.registers(MEASURED_AT, 2) == words, optional
     assert modbus.SLIDE_AT + len(modbus.SLIDE) == MEASURED_AT
 
 

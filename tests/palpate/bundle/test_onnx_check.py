@@ -75,6 +75,7 @@ def test_a_hostile_model_is_refused(name: str):
 
 
 @pytest.mark.parametrize("name", [name for name, (_, words) in HOSTILE.items() if not words])
+@pytest.mark.slow
 def test_what_is_too_large_or_too_slow_fails_its_trial(name: str, monkeypatch: pytest.MonkeyPatch):
     """Models that the check lets pass: the kernel and the clock end their trial."""
     monkeypatch.setattr("palpate.deployment.sandbox.PROCESSOR_S", 2)

@@ -67,6 +67,7 @@ def test_ctrl_c_during_the_imports_is_one_line(
     assert (process.returncode, err) == (130, f"{program}: interrupted before anything was done\n")
 
 
+@pytest.mark.slow
 def test_ctrl_c_during_a_late_import_is_one_line(tmp_path: Path):
     """A library that a command imports during its work: exit code 130 without a traceback, although
     the command takes the library's error for a missing library."""

@@ -95,6 +95,7 @@ def test_power_cuts_do_not_count_against_the_bundle(box: Trying):
     assert box.start() == box.one
 
 
+@pytest.mark.slow
 def test_a_bundle_under_which_the_computer_is_reset_again_and_again_gives_way(box: Trying):
     """The bundle is replaced after ten power cuts. Else a bundle that resets the computer would
     stay for ever. An id of the boot that cannot be read is that of a crash."""

@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from palpate.core.errors import ConfigError
@@ -373,6 +373,7 @@ def test_split_or_whole_is_the_same(name: str):
 
 
 @pytest.mark.parametrize("name", NAMES)
+@settings(max_examples=40)
 @given(data=st.binary(max_size=600), at=st.integers(0, 500))
 def test_no_bytes_raise(name: str, data: bytes, at: int):
     """Any bytes, within frames too: each is in a frame, garbage, or left over."""

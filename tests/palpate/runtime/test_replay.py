@@ -146,6 +146,7 @@ def test_one_sweep_is_judged_after_those_of_its_object(
         assert played(at(folder, n), default_bundle) == (0, [heard[n - 1]], told)
 
 
+@pytest.mark.slow
 def test_sweeps_whose_object_is_cut_off_are_compared_by_themselves(
     in_service: tuple[Path, list[str]], default_bundle: Bundle
 ):
@@ -186,7 +187,10 @@ def test_an_early_answer_that_only_earlier_sweeps_made_sure(tmp_path: Path):
     assert (code, sentences, outcomes[-1]) == (0, [], "1 sweeps: 1 the same by itself")
 
 
-@pytest.mark.parametrize("conflict", ["new", "refuse", "fuse"])
+@pytest.mark.parametrize(
+    "conflict",
+    ["new", *(pytest.param(one, marks=pytest.mark.slow) for one in ("refuse", "fuse"))],
+)
 def test_objects_end_in_a_replay_as_they_did(tmp_path: Path, toy: Bundle, conflict: str):
     """NEW OBJECT once, then sweeps that contradict, a pause, and more than max_sweeps: the same
     verdicts. With any sweep missing, the sweeps that depended on it are compared by themselves."""

@@ -260,6 +260,7 @@ def test_of_served_connections_the_oldest_makes_room(
     until(lambda: len(page.queues) == 3)
 
 
+@pytest.mark.slow
 def test_one_who_reads_nothing_holds_nobody_up(page: PageServer, monkeypatch: pytest.MonkeyPatch):
     """It is disconnected when too many events wait; others get all events."""
     lazy = EventReader(page)

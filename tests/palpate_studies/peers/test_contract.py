@@ -106,6 +106,7 @@ def test_silence_and_saturation_get_finite_logits(name: str):
 
 
 @every
+@pytest.mark.slow
 def test_a_seed_gives_one_model_and_random_states_stay(name: str):
     """aeon leaves numpy's global stream unchanged, networks PyTorch's; another seed gives another
     network."""

@@ -26,6 +26,8 @@ from palpate_train.onnx_tools import graph_builder
 from tests.factories.costly import quick_first
 from tests.factories.sweep_sets import easy
 
+pytestmark = pytest.mark.slow
+
 NETS = (
     "paper-cnn",
     "paper-cnn-centred",

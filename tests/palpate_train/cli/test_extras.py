@@ -58,6 +58,7 @@ def messages(folder: Path) -> str:
     return "\n".join(node.value for node in nodes if isinstance(node.value, str))
 
 
+@pytest.mark.slow
 def test_each_extra_that_a_message_names_exists():
     """In both packages; so do those of the helper's table."""
     known = {

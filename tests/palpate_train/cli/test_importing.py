@@ -226,6 +226,7 @@ def test_what_was_passed_over_is_said(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "windows of 40 frames; read up to line 41" in (tmp_path / "report.txt").read_text()
 
 
+@pytest.mark.slow
 def test_a_terminal_without_unicode_shows_replaced_characters(tmp_path: Path):
     """A file whose name is not even UTF-8, on a terminal that knows only ASCII: no traceback."""
     folder = nine(tmp_path / "r")

@@ -129,6 +129,7 @@ def test_loads_that_differ_in_every_sweep_bridge_better_than_neighbours(
     assert bundle.Manifest.parse(kept.json()).bridging == found
 
 
+@pytest.mark.slow
 def test_a_bundle_answers_clipped_sweeps_as_far_as_it_names_them(tmp_path: Path):
     """The toy knows "b" from the load of a taxel, which is soon lost; for "a" alone half of the
     taxels may be clipped, and the manifest says so."""
@@ -156,6 +157,7 @@ def test_skins_and_sets_that_show_no_modes(shape: tuple[int, ...]):
     assert bridging.load_modes(Dataset(samples, labels, ("a", "b"), 100.0, {}, "x")) is None
 
 
+@pytest.mark.slow
 def test_the_packaged_bundle_bridges_what_its_manifest_says():
     """A dead taxel at each place, of sweeps that it has not seen: none is refused, and the box
     names them as with a sound skin."""

@@ -65,6 +65,7 @@ def test_a_mislabelled_sweep_is_pointed_out():
     assert found.advice().startswith("look at it first: sweep 4 of cork looks like pine")
 
 
+@pytest.mark.slow
 def test_a_mislabelled_sweep_is_found_in_signals():
     """The same from raw counts: one label of easy materials is exchanged."""
     sweeps = easy(8)

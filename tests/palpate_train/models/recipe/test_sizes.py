@@ -70,6 +70,7 @@ def test_filters_of_a_size_are_spread_evenly_over_each_kind():
     )
 
 
+@pytest.mark.slow
 def test_a_size_without_filters_needs_windows_with_a_spectrum():
     """The error says what to do; a size with filters can be fitted."""
     short = replace(tubes(), samples=tubes().samples[:, 700:730])

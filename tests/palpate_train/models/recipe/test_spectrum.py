@@ -224,6 +224,7 @@ def test_the_box_computes_no_wave_and_the_file_holds_none(tmp_path: Path):
     assert [150, 2 * 149] in [list(c.dims) for c in optimized.initializer]
 
 
+@pytest.mark.slow
 def test_a_window_too_short_has_no_spectrum():
     """With fewer than four frames in a tenth there are no bands, and a fit has no spectrum."""
     short = replace(easy(12), samples=easy(12).samples[:, :39])
