@@ -33,7 +33,7 @@ RESULT_PAGES = {
     "paper": "The paper's experiment, run again (simulated)",
     "stress-fabrics": "Robustness: accuracy on corrupted sweeps of recorded fabrics",
     "stress": "Robustness: accuracy on corrupted sweeps (simulated)",
-    "certainty": "Calibration, unknown materials, several sweeps (simulated)",
+    "certainty": "Calibration, unknown materials, early answers (simulated)",
 }
 """Pages of studies, by their folders, the most telling first."""
 REFERENCE = re.compile(r'(?:href|src)="([^"]+)"')

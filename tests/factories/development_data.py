@@ -1,5 +1,4 @@
-"""Results for the page of development: a tactile, a simulated and a published test, four methods, a
-learning curve."""
+"""Results for the page of development: a tactile, a simulated and a published test."""
 
 from __future__ import annotations
 
@@ -8,7 +7,7 @@ from typing import Any
 SERIES = "GunPoint, published split"
 
 
-def entry(case: str, method: str, mean: float, each: int = 0, **more: Any) -> dict[str, Any]:
+def entry(case: str, method: str, mean: float, **more: Any) -> dict[str, Any]:
     """An accuracy with an interval of five points each way. `palpate` is in int8; its float
     accuracy is a point higher.
     """
@@ -23,7 +22,6 @@ def entry(case: str, method: str, mean: float, each: int = 0, **more: Any) -> di
     return {
         "case": case,
         "method": method,
-        "each": each,
         "fit_s": 1.5,
         "ms_p50": 0.25,
         "forms": forms,
@@ -43,7 +41,6 @@ def case(name: str, **more: Any) -> dict[str, Any]:
         "format": "2x2 int16 at 100 Hz, window 200",
         "rate_hz": 100.0,
         "digest": f"digest of {name}",
-        "curve": [5],
         "windows": [100],
         "simulated": name == "two",
     } | more
@@ -75,7 +72,7 @@ def times(*entries: dict[str, Any]) -> dict[str, Any]:
 
 
 def figures(**changes: Any) -> dict[str, Any]:
-    """Three tests and four methods, with a learning curve of the first test.
+    """Three tests and four methods.
 
     The third method cannot run the second test.
     """
@@ -87,8 +84,6 @@ def figures(**changes: Any) -> dict[str, Any]:
         entry("two", "quant", 0.755),
         entry(SERIES, "palpate", 0.92),
         entry(SERIES, "quant", 0.93),
-        entry("one", "palpate", 0.5, each=5),
-        entry("one", "quant", 0.61, each=5),
     ]
     names = ["palpate", "quick <b>", "quant"]
     runs = [

@@ -76,7 +76,7 @@ def case(left_out: int = NONE_LEFT_OUT, apart: float = 6.0, fold: int = 0, place
 def figures():
     """All figures of one fold, with each material left out once."""
     held = [case(k) for k in (NONE_LEFT_OUT, 0, 1, 2, 3)]
-    return json.loads(json.dumps(certainty.figures(held, NAMES, 1)))
+    return json.loads(json.dumps(certainty.figures(held, NAMES)))
 
 
 def test_error_is_the_gap_between_probability_and_accuracy():
@@ -126,39 +126,6 @@ def test_temperature_scaling_corrects_an_overconfident_head():
     assert figures["accuracy"]["low"] < right < figures["accuracy"]["high"]
 
 
-def test_more_sweeps_for_more_certainty(figures):
-    """The mean number of sweeps and the accuracy rise with the requested probability. Without a
-    requested probability an object takes one sweep.
-    """
-    for held in figures["sequence"].values():
-        sweeps = [p["sweeps"] for p in held["points"]]
-        assert sweeps[0] == 1
-        assert sweeps == sorted(sweeps)
-        assert sweeps[-1] > 1
-        assert held["points"][-1]["accuracy"] >= held["points"][0]["accuracy"]
-        assert held["points"][-1]["right_of_decided"] > 0.995
-
-
-def test_the_sequential_test_stops_at_the_wanted_probability():
-    """By hand: of two objects one is decided at the second sweep, the other is ended by the
-    limit.
-    """
-    fused = np.array(
-        [[[0.6, 0.4], [0.9, 0.1], [0.99, 0.01]], [[0.5, 0.5], [0.4, 0.6], [0.45, 0.55]]]
-    )
-    point = certainty._stopped(fused, np.array([0, 0]), np.array([0, 1]), 0.9)
-    assert (point["sweeps"], point["decided"], point["accuracy"], point["right_of_decided"]) == (
-        2.5,
-        0.5,
-        0.5,
-        1.0,
-    )
-    assert (
-        certainty._stopped(fused, np.array([0, 0]), np.array([0, 1]), 0.999)["right_of_decided"]
-        is None
-    )
-
-
 def test_unknown_materials_six_deviations_away_are_detected(figures):
     """A left-out material is six deviations away, known materials are chi-squared: AUROC above
     0.95.
@@ -196,7 +163,7 @@ ABOUT = dict.fromkeys(uncertainty_report.ORIGIN, "x")
 
 
 def test_of_two_materials_none_is_left_out():
-    """The page has calibration, sweeps and early answers, and nothing of left-out materials."""
+    """The page has calibration and early answers, and nothing of left-out materials."""
     one = case()
     two, test, also = one.seen_labels < 2, one.labels < 2, one.copied_labels < 2
     fewer = replace(
@@ -214,8 +181,8 @@ def test_of_two_materials_none_is_left_out():
         places=one.places[test],
         faulty=one.faulty[two],
     )
-    figures = certainty.figures([fewer], NAMES[:2], 1)
-    assert set(figures) == {"calibration", "sequence", "early"}
+    figures = certainty.figures([fewer], NAMES[:2])
+    assert set(figures) == {"calibration", "early"}
     html, pictures = uncertainty_report.render(figures | ABOUT)
     assert set(pictures) == {"reliability"}
     assert "never trained<" not in html

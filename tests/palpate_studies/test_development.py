@@ -66,7 +66,6 @@ FACTS = [
     "Palpate, all views real tactile sets 90.0 % 91.0 % 1.0 1",
     "quick <b>, two: a window of 8 frames",
     "MiniRocket’s = 1 1/100 – 2.2",
-    "Palpate, all views 50.0 % 45.0 – 55.0 % 2 seeds – – 90.0 %",
     "one.npz, force<=180 leave:force digest of one",
     "seeds 1, 2; commit 0123abcd; x86_64, 2 cores",
     "QUANT float onnx 22 ms 44 ms",
@@ -76,7 +75,7 @@ FACTS = [
 
 
 def test_the_page_shows_every_figure():
-    """Findings, intervals beside the best peer, means, precisions, curves, costs and omissions."""
+    """Findings, intervals beside the best peer, means, precisions, costs and omissions."""
     text = shown(figures())
     assert [fact for fact in FACTS if fact not in text] == []
 
@@ -244,14 +243,12 @@ def test_cases_and_methods_exist_and_have_words_for_people():
 
 
 def experiment(folder: Path, *names: str, **given: Any) -> tuple[StudyRun, dict[str, Any]]:
-    """A run, and its results, of two cases on tones; the first has a learning curve."""
+    """A run, and its results, of two cases on tones."""
     tones().save(folder / "tones.npz")
     replace(tones(), samples=tones().samples[:, :7]).save(folder / "short.npz")
     real: dict[str, Any] = {"real": True, "means_removed": True}
     cases = {
-        "tones": StudyCase(
-            ("tones.npz",), "leave:session", curve=development_experiment.EACH, **real
-        ),
+        "tones": StudyCase(("tones.npz",), "leave:session", **real),
         "short": StudyCase(("short.npz",), "split:session=0,1->2", ("material=a,c",), **real),
     }
     where = Where(jobs=1, cache=folder / "cache")
@@ -263,13 +260,11 @@ def experiment(folder: Path, *names: str, **given: Any) -> tuple[StudyRun, dict[
 @pytest.mark.slow
 @pytest.mark.thorough  # a whole study
 def test_all_is_run_kept_and_what_is_refused_is_left_out(tmp_path: Path):
-    """The first case runs with fewer sweeps, too. A second run needs only the cache."""
+    """A second run needs only the cache."""
     names = ("L-gauss", "spectrogram-svm")
     run, found = experiment(tmp_path, *names, seeds=(1, 2))
-    there = {(r["case"], r["method"], r["each"]) for r in found["results"]}
-    assert there == {("short", "L-gauss", 0)} | {
-        ("tones", m, n) for m in names for n in (0, 5, 10, 20)
-    }
+    there = {(r["case"], r["method"]) for r in found["results"]}
+    assert there == {("short", "L-gauss"), *(("tones", m) for m in names)}
     assert list(run.left_out) == ["spectrogram-svm, short"]
     assert [one["materials"] for one in found["cases"]] == [3, 2]
     assert all(

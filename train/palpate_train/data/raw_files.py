@@ -34,7 +34,7 @@ Reader = Callable[[Path, ReadPlan], Table]
 BINARY: Mapping[tuple[str, ...], Reader] = {
     (".npy",): numpy_files.read_npy,
     (".npz",): numpy_files.read_npz,
-    (".mat", ".fig"): matlab.read,
+    (".mat",): matlab.read,
     HDF5: hdf5.read,
     sheets.SUFFIXES: sheets.read,
     parquet.SUFFIXES: parquet.read,
@@ -64,6 +64,10 @@ REMEDIES = {
         "a picture or a video; export the counts as CSV or .npy"
     ),
     (".pdf", ".doc", ".docx"): "a document; export the numbers as CSV",
+    (".fig",): (
+        "a figure of MATLAB; there: l = findobj(gca, 'Type', 'line'); "
+        "skin = vertcat(l.YData)'; save('skin.mat', 'skin', '-v7')"
+    ),
     (".fsx", ".sens", ".fpx"): "Tekscan's own format; export it as ASCII (.asf)",
     (".edf", ".bdf", ".gdf"): "a biosignal recording; export it as CSV",
     (".slx", ".m", ".mlx", ".mlapp"): "a program of MATLAB; save its data with -v7",

@@ -1,7 +1,7 @@
 """The study of certainty: how far the probabilities of a method can be trusted.
 
-It covers calibration, the sequential test, unknown materials and early decisions, each on test
-sweeps that nothing was fitted to.
+It covers calibration, unknown materials and early decisions, each on test sweeps that nothing was
+fitted to.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.answer.objects import LEAST_PROBABILITY, softmax
+from palpate.answer.objects import softmax
 from palpate_train.calibration.early_exit import decide
 from palpate_train.data.sets import Dataset, digest
 from palpate_train.evaluate import uncertainty
@@ -27,11 +27,6 @@ from palpate_train.models.methods import Effort
 
 Array = NDArray[Any]
 Json = dict[str, Any]
-WANTED = (0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.999)
-MOST_SWEEPS = 5
-"""Number of sweeps of an object after which the answer is final."""
-ORDERS = 20
-"""Random orders of the sweeps of one object."""
 
 
 def run(
@@ -54,7 +49,7 @@ def run(
     whole_set = plan.sweeps
     trained = cases(plan.tasks(method, effort, seed), whole_set, where, log)
     log("figures")
-    result = figures(trained, whole_set.materials, seed)
+    result = figures(trained, whole_set.materials)
     about = {
         "set": sweeps.source,
         "test": test.source if test else "",
@@ -74,13 +69,12 @@ def run(
     return about | provenance() | result
 
 
-def figures(trained: Sequence[Case], materials: Sequence[str], seed: int) -> Json:
+def figures(trained: Sequence[Case], materials: Sequence[str]) -> Json:
     """All figures. With two materials there are none that need a material left out."""
     fitted = [(case, case.calibration()) for case in trained]
     full = [one for one in fitted if one[0].left_out < 0]
     result = {
         "calibration": calibration(full),
-        "sequence": sequence(full, seed),
         "early": early(full),
     }
     without = [one for one in fitted if one[0].left_out >= 0]
@@ -119,63 +113,6 @@ def calibration(full: Sequence[Trained]) -> Json:
 
 def _error_of(confidence: Array, right: Array, some: Array) -> float:
     return uncertainty.error(confidence[some], right[some])
-
-
-def sequence(full: Sequence[Trained], seed: int) -> Json:
-    """Mean number of sweeps and accuracy for each of the WANTED probabilities.
-
-    Sweeps of one object are fused until the probability is reached, at most MOST_SWEEPS. "same
-    place": all sweeps are of one attachment, and their errors are correlated. "several places":
-    they are drawn from all test sweeps.
-    """
-    log_p = np.log(
-        np.maximum(
-            softmax(np.concatenate([d.logits(c.new[:, -1]) for c, d in full])), LEAST_PROBABILITY
-        )
-    )
-    labels, places = uncertainty.joined(full, "labels"), uncertainty.placements(full)
-    rng, result = np.random.default_rng(seed), {}
-    for name, objects in (
-        ("same place", labels + places * (labels.max() + 1)),
-        ("several places", labels),
-    ):
-        members = [np.flatnonzero(objects == o) for o in np.unique(objects)]
-        repeat = max(ORDERS, 400 // len(members))
-        picks = [
-            rng.permutation(m)[:MOST_SWEEPS]
-            for m in members
-            for _ in range(repeat)
-            if len(m) >= MOST_SWEEPS
-        ]
-        if not picks:
-            continue
-        order = np.array(picks)
-        fused = softmax(log_p[order].cumsum(axis=1))  # [objects, MOST_SWEEPS, K]
-        truth = labels[order[:, 0]]
-        clusters = places[order[:, 0]] if name == "same place" else truth
-        result[name] = {
-            "objects": len(order),
-            "points": [_stopped(fused, truth, clusters, p) for p in (0.0, *WANTED)],
-        }
-    return result
-
-
-def _stopped(fused: Array, truth: Array, clusters: Array, wanted: float) -> Json:
-    """The result of a sequential test that stops at the probability `wanted` or after the last
-    sweep."""
-    enough = fused.max(2) >= wanted
-    decided = enough.any(axis=1)
-    enough[:, -1] = True
-    stop = enough.argmax(axis=1)
-    named = fused[np.arange(len(fused)), stop].argmax(1)
-    right = named == truth
-    return {
-        "wanted": wanted,
-        "sweeps": round(float(stop.mean() + 1), 3),
-        "decided": round(float(decided.mean()), 4),
-        "right_of_decided": round(float(right[decided].mean()), 4) if decided.any() else None,
-        **_accuracy(right, clusters),
-    }
 
 
 def early(full: Sequence[Trained]) -> Json:

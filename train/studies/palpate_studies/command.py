@@ -27,7 +27,7 @@ PROGRAM = Program(
         ),
         "certainty": (
             "measure",
-            "measure how far a model's probabilities can be trusted: calibration, more sweeps, "
+            "measure how far a model's probabilities can be trusted: calibration, "
             "unknown materials",
         ),
         "alignment": (

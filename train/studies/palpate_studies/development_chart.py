@@ -21,7 +21,7 @@ from palpate_train.reports.formatting import percent, points
 
 Json = Mapping[str, Any]
 Accuracies = Mapping[str, Json]
-"""Entries of one case with all training sweeps and the whole window, by method."""
+"""Entries of one case by method."""
 UNIT = "minirocket"
 """The method whose time is 1."""
 LEAST_SHARE = 0.5
@@ -144,10 +144,10 @@ class ChartPanel:
 
 
 def by_case(results: Iterable[Json]) -> dict[str, dict[str, Json]]:
-    """Entries with all training sweeps and the whole window: {case: {method: entry}}."""
+    """Entries with all training sweeps: {case: {method: entry}}."""
     table: dict[str, dict[str, Json]] = {}
     for entry in results:
-        if not entry["each"] and not entry.get("frames"):
+        if not entry.get("each"):
             table.setdefault(entry["case"], {})[entry["method"]] = entry
     return table
 

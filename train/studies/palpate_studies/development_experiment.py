@@ -38,32 +38,30 @@ PEERS = (
     "H-svm",
     "paper-cnn-centred",
 )
-EACH = (5, 10, 20)
-"""Training sweeps of each material at the points of a learning curve, if a set has more of them."""
 
 
-def _fabrics(protocol: str, only: tuple[str, ...], curve: tuple[int, ...] = ()) -> StudyCase:
-    return StudyCase((FABRICS,), protocol, only, True, True, curve)
+def _fabrics(protocol: str, only: tuple[str, ...]) -> StudyCase:
+    return StudyCase((FABRICS,), protocol, only, True, True)
 
 
-def _published(name: str, curve: tuple[int, ...] = ()) -> StudyCase:
-    return StudyCase((f"aeon:{name}",), "split:split=0->1", means_removed=True, curve=curve)
+def _published(name: str) -> StudyCase:
+    return StudyCase((f"aeon:{name}",), "split:split=0->1", means_removed=True)
 
 
 TUBES = "simulated tubes, a position out"
 CASES = {
-    "7 fabrics, a force out": _fabrics("leave:force", SEVEN, curve=EACH),
+    "7 fabrics, a force out": _fabrics("leave:force", SEVEN),
     "7 fabrics, a speed out": _fabrics("leave:speed", SEVEN),
     "7 fabrics, a repetition out": _fabrics("leave:rep", SEVEN),
     "4 fabrics, a force out": _fabrics("leave:force", FOUR),
     "4 fabrics, a speed out": _fabrics("leave:speed", FOUR),
     "4 fabrics, a direction out": _fabrics("leave:direction", FOUR),
-    "ACSF1, published split": _published("ACSF1", (5,)),
-    "OSULeaf, published split": _published("OSULeaf", (5, 10)),
-    "BasicMotions, published split": _published("BasicMotions", (5,)),
-    "ArrowHead, published split": _published("ArrowHead", (5, 10)),
-    "GunPoint, published split": _published("GunPoint", EACH),
-    TUBES: StudyCase(("sim:T-REAL/level-blind:1",), "leave:position", curve=EACH),
+    "ACSF1, published split": _published("ACSF1"),
+    "OSULeaf, published split": _published("OSULeaf"),
+    "BasicMotions, published split": _published("BasicMotions"),
+    "ArrowHead, published split": _published("ArrowHead"),
+    "GunPoint, published split": _published("GunPoint"),
+    TUBES: StudyCase(("sim:T-REAL/level-blind:1",), "leave:position"),
 }
 """In the order of the page."""
 STUDY = Study("development", CASES, (*OURS, *PEERS))
@@ -76,8 +74,8 @@ def usual_methods(study: Study) -> tuple[str, ...]:
 
 
 def results(study: Study, run: StudyRun, names: Sequence[str]) -> Json:
-    """The results of the methods `names`: `cases` with their sets, and entries by case, method and
-    number of training sweeps.
+    """The results of the methods `names`: `cases` with their sets, and entries by case and
+    method.
 
     Raises FormatError for an unknown method.
     """
@@ -90,10 +88,9 @@ def results(study: Study, run: StudyRun, names: Sequence[str]) -> Json:
             run.left_out[name] = NO_DATA
             continue
         cases.append(_about(name, case, sweeps))
-        for each, point in _points(name, case):
-            plan = Plan(names, (case.protocol,), run.seeds, case.means_removed, run.effort, each)
-            progress = f"{number}/{len(study.cases)} {point}"
-            found += _evaluated(name, sweeps, plan, run, progress)
+        plan = Plan(names, (case.protocol,), run.seeds, case.means_removed, run.effort)
+        progress = f"{number}/{len(study.cases)} {name}"
+        found += _evaluated(name, sweeps, plan, run, progress)
     known = {"methods": list(names), "seeds": list(run.seeds), "effort": run.effort.share}
     return {
         "methods": list(names),
@@ -119,13 +116,7 @@ def _evaluated(
         else:
             by_method.setdefault(result.method, []).append(result.json() | {"seed": result.seed})
     for method, several in by_method.items():
-        yield {"case": name, "each": plan.each, "method": method} | _entry(several)
-
-
-def _points(name: str, case: StudyCase) -> list[tuple[int, str]]:
-    """Training sweeps of each material (0 for all) and the name, of a case and of each point of
-    its curve."""
-    return [(each, f"{name}, {each} each" if each else name) for each in (0, *case.curve)]
+        yield {"case": name, "method": method} | _entry(several)
 
 
 def _about(name: str, case: StudyCase, sweeps: Dataset) -> Json:
@@ -141,7 +132,6 @@ def _about(name: str, case: StudyCase, sweeps: Dataset) -> Json:
         "materials": len(sweeps.materials),
         "format": str(sweeps.format),
         "digest": digest(sweeps),
-        "curve": list(case.curve),
         "rate_hz": sweeps.rate_hz,
     }
 

@@ -23,7 +23,7 @@ from palpate_studies.development_chart import (
     plain_case,
     relative_times,
 )
-from palpate_studies.development_experiment import EACH, OURS, PEERS
+from palpate_studies.development_experiment import OURS, PEERS
 from palpate_studies.method_names import about, plain_name
 from palpate_train.reports import html, provenance
 from palpate_train.reports.formatting import amount, percent, points
@@ -58,8 +58,6 @@ def render(figures: Json) -> tuple[str, dict[str, str]]:
         shown=comparison.shown,
         means=_mean_rows(shown, names),
         precisions=list(precisions(table, shown, names)),
-        curves=_curve_rows(learning_curves(figures["results"], ours), names),
-        each=EACH,
         **_costs(figures, table, names),
         **_words(cases, names, _missing(table, cases, names, figures["left_out"])),
     )
@@ -203,32 +201,6 @@ def _missing(
         for name in every
     }
     return {name: those for name, those in lacks.items() if those}
-
-
-def learning_curves(results: Iterable[Json], ours: str) -> dict[str, dict[str, dict[int, Json]]]:
-    """{case: {method: {training sweeps of each material, 0 for all: entry}}} of the cases in which
-    ours has all sweeps and another point."""
-    curves: dict[str, dict[str, dict[int, Json]]] = {}
-    for entry in results:
-        if not entry.get("frames"):
-            line = curves.setdefault(entry["case"], {}).setdefault(entry["method"], {})
-            line[entry["each"]] = entry
-    return {
-        case: lines
-        for case, lines in curves.items()
-        if 0 in (own := lines.get(ours, {})) and set(own) & set(EACH)
-    }
-
-
-def _curve_rows(curves: Mapping[str, Any], names: Sequence[str]) -> list[Json]:
-    """Lines of the table of learning curves. cells: an entry or None for each of EACH, and for
-    all."""
-    return [
-        {"case": case, "method": name, "cells": [lines[name].get(each) for each in (*EACH, 0)]}
-        for case, lines in curves.items()
-        for name in names
-        if name in lines
-    ]
 
 
 def _fit_s(table: Mapping[str, Accuracies], name: str) -> str:

@@ -30,8 +30,7 @@ class StudyCase:
     """Sweeps and the protocol under which methods are tested on them.
 
     sets: they are joined. only: selects sweeps of each set. real: the sets are files in the folder
-    of real sweeps. means_removed: each taxel's mean over the window is subtracted. curve: numbers
-    of training sweeps of each material along a learning curve, before all of them.
+    of real sweeps. means_removed: each taxel's mean over the window is subtracted.
     """
 
     sets: tuple[str, ...]
@@ -39,7 +38,6 @@ class StudyCase:
     only: tuple[str, ...] = ()
     real: bool = False
     means_removed: bool = False
-    curve: tuple[int, ...] = ()
 
     @property
     def simulated(self) -> bool:

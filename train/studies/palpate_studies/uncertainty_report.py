@@ -72,18 +72,6 @@ def _worst(figures: Json) -> str:
 def _tables(figures: Json) -> dict[str, list[list[str]]]:
     """The rows of each table."""
     tables = {
-        "sequences": [
-            [
-                name,
-                formatting.exact_percent(p["wanted"]),
-                f"{p['sweeps']:.2f}",
-                _share(p, "accuracy"),
-                formatting.percent(p["decided"]),
-            ]
-            for name, sequence in figures["sequence"].items()
-            for p in sequence["points"]
-            if p["wanted"]
-        ],
         "always": [
             [f"{tenth} of 10", _share(p, "accuracy")]
             for tenth, p in enumerate(figures["early"]["always"], 1)

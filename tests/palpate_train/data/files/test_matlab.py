@@ -108,28 +108,6 @@ def test_objects_of_version_7_are_passed_over(tmp_path: Path):
     np.testing.assert_array_equal(raw_files.read(tmp_path / "a.mat").values, SKIN)
 
 
-def figure(path: Path, xs: list[np.ndarray]) -> Path:
-    """A figure with a line for each taxel, as savefig stores it."""
-    lines = np.zeros((len(xs), 1), [("type", object), ("properties", object), ("children", object)])
-    for k, x in enumerate(xs):
-        lines[k, 0] = ("graph2d.lineseries", {"XData": x, "YData": SKIN[:, k], "Color": "b"}, [])
-    axes = {"type": "axes", "properties": {"Tag": ""}, "children": lines}
-    tree = {"type": "figure", "properties": {"Name": "skin"}, "children": axes}
-    scipy.io.savemat(path.with_suffix(".mat"), {"hgS_070000": tree})
-    return path.with_suffix(".mat").rename(path)
-
-
-def test_a_figures_lines_are_columns(tmp_path: Path):
-    """The x values are the times; lines of different x values, and none, are refused."""
-    path = figure(tmp_path / "a.fig", [np.arange(40) / 100] * 4)
-    found = raw_files.read(path, ReadPlan(time="x"))
-    np.testing.assert_array_equal(found.values, SKIN)
-    np.testing.assert_allclose(found.vectors["x"], np.arange(40) / 100)
-    for xs, why in (([np.arange(40) + k for k in range(4)], "x values"), ([], "without lines")):
-        with pytest.raises(FormatError, match=why):
-            raw_files.read(figure(tmp_path / "b.fig", xs))
-
-
 def test_damage_is_told(tmp_path: Path):
     """Cut anywhere or with altered bytes, of both versions: the file gives an array, or a
     FormatError."""

@@ -1,4 +1,4 @@
-"""Reads MAT files of all versions and MATLAB's figures.
+"""Reads MAT files of all versions.
 
 Version 7.3 is HDF5; SciPy reads the others. It trusts the sizes in a damaged file: version 1.17.1
 ended its process with a segmentation fault in three of three runs of 3,000 damaged files. So a
@@ -30,21 +30,12 @@ from palpate_train.data.files.table import Array, ReadPlan, Table, chosen
 DEADLINE_S = 120.0
 MOST_BYTES = 16 << 30
 """Address space of the child. An array of version 7 has 2 GB at most."""
-FIGURE = "hgS_070000"
-"""The structure in which a .fig keeps its axes and lines."""
-REMEDY = (
-    "in MATLAB: l = findobj(gca, 'Type', 'line'); "
-    "skin = vertcat(l.YData)'; save('skin.mat', 'skin', '-v7')"
-)
 
 
 def read(path: Path, wanted: ReadPlan) -> Table:
-    """The wanted array of a MAT file, or the lines of a figure as columns, with their common x
-    values as the vector `x`. Raises FormatError."""
+    """The wanted array of a MAT file. Raises FormatError."""
     if h5py.is_hdf5(path):
         with h5py.File(path, "r") as file:
-            if FIGURE in file:
-                raise FormatError(f"is a figure of version 7.3; {REMEDY}")
             dotted = {name.replace("/", "."): e for name, e in hdf5.entries(file, True).items()}
             return chosen(dotted, wanted)
     with tempfile.TemporaryDirectory() as folder:
@@ -99,8 +90,6 @@ def _arrays(path: Path) -> dict[str, Array]:
     import scipy.io
 
     stored, typed = (scipy.io.loadmat(path, mat_dtype=typed) for typed in (False, True))
-    if FIGURE in typed:
-        return _figure(typed[FIGURE])
     real = dict(_walk_all(stored))  # with its types SciPy drops the imaginary parts
     return {name: values for name, values in _walk_all(typed) if name in real}
 
@@ -126,27 +115,3 @@ def _walk(name: str, value: Any) -> Iterator[tuple[str, Array]]:
             yield from _walk(f"{name}{{{k}}}", item)
     elif value.dtype.kind in "biuf":
         yield name, value.astype(value.dtype.newbyteorder("="), copy=False)
-
-
-def _figure(tree: Array) -> dict[str, Array]:
-    """The lines of a figure [n, lines], in the order in which they were drawn, and their x [n]."""
-    lines = list(_lines(tree))
-    if not lines:
-        raise FormatError(f"is a figure without lines; {REMEDY}")
-    x = lines[0][0]
-    if any(not np.array_equal(x, other) for other, _ in lines):
-        raise FormatError(f"is a figure whose lines differ in their x values; {REMEDY}")
-    return {"lines": np.stack([y for _, y in lines], axis=1), "x": x}
-
-
-def _lines(tree: Any) -> Iterator[tuple[Array, Array]]:
-    """x and y of all lines in a tree of graphics objects."""
-    for one in tree.ravel() if tree.dtype.names else ():
-        about = one["properties"].ravel()
-        values = {name: about[0][name] for name in about.dtype.names or ()}
-        y = values.get("YData", np.empty(0)).ravel()
-        if str(one["type"].item()).endswith(("line", "lineseries")) and y.size > 1:
-            x = values.get("XData", np.empty(0)).ravel()
-            yield x if x.size == y.size else np.arange(1.0, y.size + 1), y
-        if "legend" not in values.get("Tag", ()):
-            yield from _lines(one["children"])
