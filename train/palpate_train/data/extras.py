@@ -21,7 +21,6 @@ EXTRAS = {
     "python_calamine": "files",
     "nptdms": "files",
     "rosbags": "files",
-    "distributed": "dask",
 }
 """The extra of each library, as in train/pyproject.toml."""
 

@@ -247,7 +247,6 @@ class Where:
     none. kept: train nothing and use only kept folds."""
 
     jobs: int = -1
-    scheduler: str = ""
     cache: Path | None = CACHE
     kept: bool = False
 
@@ -317,7 +316,7 @@ def _trained(
     except FormatError as e:
         yield from ((name, Fold.refusal(task, str(e))) for name, task in tasks)
         return
-    for (name, _), fold in parallel.results(_run, tasks, shared, where.jobs, where.scheduler):
+    for (name, _), fold in parallel.results(_run, tasks, shared, where.jobs):
         yield name, fold
 
 

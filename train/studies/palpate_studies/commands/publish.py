@@ -62,9 +62,7 @@ def run_reports(args: argparse.Namespace) -> None:
     if args.list:
         print(reports.table(reports.named(args.names)))
         return
-    where = ["--jobs", str(args.jobs), "--cache", str(args.cache)] + (
-        ["--scheduler", args.scheduler] if args.scheduler else []
-    )
+    where = ["--jobs", str(args.jobs), "--cache", str(args.cache)]
     reports.make(args.names, where, options.Log().keep)
     run_tables(args)
 
