@@ -15,8 +15,6 @@ from palpate.bundle.bundle import Manifest, Thresholds
 from palpate.bundle.pruning import prune
 from palpate.core.clock import SystemClock
 from palpate.inference import classifier
-from palpate.learn import enrolment
-from palpate_studies import certainty
 from palpate_train.calibration import early_exit
 from palpate_train.export.bundle_graph import bundle_graph
 from palpate_train.export.pack import means_file
@@ -247,20 +245,6 @@ def test_without_early_answers_the_box_runs_the_graph_that_has_none(made):
         == bundle_graph(done, trunk(FORMAT)).SerializeToString()
     )
     assert len(prune(whole.model, {"early"})) < len(whole.model)
-
-
-def test_enrolment_is_judged_as_the_box_enrols(made):
-    """enrolled_probabilities equals the answers of the box with the same sweeps enrolled."""
-    done, x, counts, labels, whole = made
-    drawn = np.flatnonzero(labels == 1)[:3]
-    new = enrolment.enrol(whole, "new", counts[drawn]).bundle
-    box, z = classifier.Classifier(new, SystemClock()), done.embedding(x[:, -1])
-    have = certainty.enrolled_probabilities(done, done.logits(x[:, -1]), z, z[drawn])
-    want = classifier.enrolled_labels(new).decided(
-        softmax(np.stack([box.logits(one) for one in counts]))
-    )
-    assert np.allclose(have, want, atol=0.02)
-    assert 0 < (have[:, -1] > 0).mean() < 1
 
 
 @pytest.mark.parametrize(("materials", "each"), [(2, 5), (3, 20), (6, 4)])
