@@ -162,20 +162,26 @@ def test_packets_are_those_of_the_protocol(dtype, level):
     assert made.sent() == packets.pack(7 << 16 | 65534, 1000, taxels, level * packets.Flag.TRIGGER)
 
 
-@pytest.mark.parametrize(("rows", "cols"), [*itertools.product(range(1, 17), range(1, 17))])
-def test_every_taxel_is_read_once_at_its_place(rows, cols):
+@pytest.mark.parametrize("rows", range(1, 17))
+def test_every_taxel_is_read_once_at_its_place(rows):
     """The select lines stand at its row and column when it is read; at the end they are low again,
     as at the beginning."""
+    for cols in range(1, 17):
+        check_order(rows, cols)
+
+
+def check_order(rows, cols):
+    """The order in which the taxels of a skin are read."""
     at, seen, order = 0, [], readout.reading_order(rows, cols)
     for line, level, taxel in zip(*order, strict=True):
         at = at & ~(1 << line) | level << line
         if taxel != readout.NO_TAXEL:
-            assert divmod(taxel, cols) == (at & 15, at >> 4)
+            assert divmod(taxel, cols) == (at & 15, at >> 4), (rows, cols)
             seen.append(taxel)
-    assert sorted(seen) == list(range(rows * cols))
-    assert at == 0
+    assert sorted(seen) == list(range(rows * cols)), (rows, cols)
+    assert at == 0, (rows, cols)
     if {rows, cols} <= {2, 4, 8, 16}:
-        assert len(order[0]) <= rows * cols + 2, "one switch a taxel"
+        assert len(order[0]) <= rows * cols + 2, (rows, cols)
 
 
 def test_numbers_and_times_follow_one_another():
