@@ -297,7 +297,7 @@ def test_everything_on_it_has_a_role_and_a_name(browser: Any, recorded: Recorded
     assert set(unnamed) <= {"banner", "said"}
     assert seen.page.get_attribute("#said", "role") == "status"
     assert seen.page.get_attribute("#now", "aria-live") == "polite"
-    assert json.dumps(seen.requests).count(".js") == 5
+    assert json.dumps(seen.requests).count(".js") == 6
 
 
 def test_a_material_has_a_name_in_any_language(

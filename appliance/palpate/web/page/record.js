@@ -1,47 +1,20 @@
 /* The page of a recording: what is there and what is missing, the last sweep, the skin; and the labels, which are set here. */
 
-import {listen} from "/events.js";
-import {ago, byId, call, enable, frame, listenToPedal, made, mark, order, put} from "/parts.js";
+import {byId, enable, made, mark, put} from "/parts.js";
 import {signal, spectrogram} from "/plots.js";
+import {drawHeader, lastPicture, live, ordered, run, seen, since} from "/recording.js";
 import {SkinPicture} from "/skin.js";
 
 const FIELDS = ["material", "position", "session"], SKIN = new SkinPicture(document.querySelector(".skin"));
-let key, recording, last, view; // events of these names, as appliance/palpate/web/record.py sends them
-let picture = null, drawn = {}, table = "", reached = null, answers = true, wallMs = 0, ordering = false, dirty = true;
-
-function begin() {
-  key = "";
-  recording = last = view = null;
-}
-begin();
+let view, drawn = {}, table = "";
 
 /* A material by the name that people read. */
-function shown(material) { return recording?.displays?.[material] ?? material; }
+function shown(material) { return seen.recording?.displays?.[material] ?? material; }
 
 function named(material, position) { return material ? shown(material) + (position && ` at ${position}`) : "no material"; }
 
-function live() { return reached === true && recording !== null; }
-
-/* Why what is shown is not of this moment; "" where it is. */
-function trouble() {
-  if (reached === null) return "";
-  const heard = recording ? `; last heard of it ${ago(Date.now() - wallMs - recording.time_ns / 1e6)} ago` : "";
-  if (!reached) return `${answers ? "palpate record answers, but has no news" : "no connection to palpate record"}${heard}; trying again`;
-  if (recording && recording.skin !== "streaming") return `no skin: ${recording.skin}${recording.trouble && `; ${recording.trouble}`}`;
-  return "";
-}
-
-function drawHeader() {
-  const why = trouble();
-  document.body.classList.toggle("stale", Boolean(why));
-  const state = !reached ? "no connection" : !recording ? "waiting" : recording.skin !== "streaming" ? `skin ${recording.skin}`
-    : recording.sweeping ? "sweeping" : recording.ready ? "ready" : "not ready";
-  frame({state, fine: live() && recording.skin === "streaming", source: recording?.source, why});
-  byId("format").hidden = !recording;
-  if (recording) put("format", recording.format);
-}
-
 function drawLabels() {
+  const {recording} = seen;
   for (const id of ["set", "next"]) enable(byId(id), live());
   if (!recording) return;
   put("now", named(recording.material, recording.position));
@@ -56,15 +29,10 @@ function drawLabels() {
   enable(byId("stop"), live() && recording.sweeping);
 }
 
-function drawCall() {
-  const [words, seconds] = live() ? call(recording, (Date.now() - wallMs) * 1e6) : ["", ""];
-  put("call", words);
-  put("countdown", seconds);
-}
-
 function sorted(values) { return [...new Set(values)].sort((a, b) => a.localeCompare(b, "en", {numeric: true})); }
 
 function drawCounts() {
+  const {recording} = seen;
   if (!recording) return;
   const {counts, material, position, target} = recording, held = new Map(counts.map(([m, p, n]) => [JSON.stringify([m, p]), n]));
   const materials = sorted([...counts.map((one) => one[0]), ...(material ? [material] : [])]);
@@ -99,7 +67,7 @@ function drawCounts() {
 }
 
 function outcome(sweep) {
-  const became = recording?.last;
+  const became = seen.recording?.last;
   if (became?.sweep !== sweep.sweep) return "";
   const of = named(became.material, became.position);
   return {stored: `${of}, stored as ${became.detail.split(" ")[0]}`, skipped: "not stored, since it has no window", discarded: `${of}, discarded`,
@@ -107,7 +75,7 @@ function outcome(sweep) {
 }
 
 function drawSweep() {
-  const which = recording?.discard ?? null;
+  const {recording, last} = seen, which = recording?.discard ?? null;
   enable(byId("discard"), live() && which !== null);
   put("discard", which === null ? "Discard" : `Discard sweep ${which}`);
   byId("status").hidden = !last;
@@ -116,28 +84,14 @@ function drawSweep() {
     return;
   }
   mark(byId("status"), last.status);
-  put("sweep-title", `Sweep ${last.sweep}, ${ago(Date.now() - wallMs - last.time_ns / 1e6)} ago`);
+  put("sweep-title", `Sweep ${last.sweep}, ${since(last.time_ns)}`);
   put("outcome", outcome(last));
   const wrong = last.status === "recorded" ? "" : `${last.reason}; it is not counted`;
   const lost = last.lost ? `${last.lost} lost frames filled in` : "";
   put("check", [wrong, last.detail, lost].filter(Boolean).join("; ") || "checked: contact, saturation, stuck and dead taxels; nothing is wrong");
-  const drawing = picture?.sweep === last.sweep ? picture : null;
-  const why = !last.signal ? "it has no window" : drawing?.asked ? "asking palpate record" : "its signal is not kept";
-  const drawn = drawing?.taxels ? drawing : null;
-  signal(byId("signal"), drawn, why, recording?.unit || undefined);
-  spectrogram(byId("spectrogram"), drawn, why);
-  if (last.signal && !drawing && reached) fetchPicture(last.sweep);
-}
-
-async function fetchPicture(sweep) {
-  picture = {sweep, asked: true};
-  let got = {sweep};
-  try {
-    const answer = await fetch(`/sweep/${sweep}`, {cache: "no-store"});
-    if (answer.ok) got = await answer.json();
-  } catch { /* said where the signal would be; asked again when the connection is back */ }
-  if (last?.sweep === sweep) picture = got;
-  dirty = true;
+  const {picture, why} = lastPicture();
+  signal(byId("signal"), picture, why, recording?.unit || undefined);
+  spectrogram(byId("spectrogram"), picture, why);
 }
 
 function drawSkin() {
@@ -148,7 +102,6 @@ function drawSkin() {
 }
 
 function draw() {
-  dirty = false;
   drawHeader();
   drawLabels();
   drawCounts();
@@ -156,22 +109,20 @@ function draw() {
 }
 
 /* Sends orders one after another, until one is refused: [command, text, what is said, its field]. */
-async function send(orders) {
-  if (ordering) return;
-  ordering = dirty = true;
-  for (const name of FIELDS) byId(name).removeAttribute("aria-invalid");
-  let said = "";
-  for (const [command, text, done, field] of orders) {
-    const why = await order("palpate record", key, command, text);
-    said = why || done;
-    byId("said").className = why ? "wrong" : "";
-    if (why && field) byId(field).setAttribute("aria-invalid", "true");
-    if (why) break;
-    if (field) drawn[field] = byId(field).value = text.trim();
-  }
-  put("said", said);
-  ordering = false;
-  dirty = true;
+function send(orders) {
+  return ordered(async (order) => {
+    for (const name of FIELDS) byId(name).removeAttribute("aria-invalid");
+    let said = "";
+    for (const [command, text, done, field] of orders) {
+      const why = await order(command, text);
+      said = why || done;
+      byId("said").className = why ? "wrong" : "";
+      if (why && field) byId(field).setAttribute("aria-invalid", "true");
+      if (why) break;
+      if (field) drawn[field] = byId(field).value = text.trim();
+    }
+    put("said", said);
+  });
 }
 
 function setLabels() {
@@ -184,7 +135,7 @@ const PRESSED = {
   next: () => send([["NEXT", "", "next position"]]),
   start: () => send([["START", "", "started"]]),
   stop: () => send([["STOP", "", "stopped"]]),
-  discard: () => send([["DISCARD", `${recording.discard}`, `sweep ${recording.discard} discarded`]]),
+  discard: () => send([["DISCARD", `${seen.recording.discard}`, `sweep ${seen.recording.discard} discarded`]]),
 };
 
 byId("record").addEventListener("click", (event) => {
@@ -197,40 +148,14 @@ byId("record").addEventListener("click", (event) => {
 });
 byId("fields").addEventListener("keydown", (event) => { if (event.key === "Enter" && live()) setLabels(); });
 
-listenToPedal(() => {
-  const button = byId(recording?.sweeping ? "stop" : "start");
-  if (recording?.commands.includes("START") && button.getAttribute("aria-disabled") === "false") PRESSED[button.id]();
-});
-
-listen({
-  now(ns) { wallMs = Date.now() - ns / 1e6; },
-  begin,
-  key(one) { key = one; },
-  recording(one) {
-    recording = one;
-    dirty = true;
-  },
-  sweep(one) {
-    last = one;
-    dirty = true;
-  },
-  view(one) {
-    view = one;
-    drawSkin();
-  },
-}, (there, program) => {
-  [reached, answers] = [there, program];
-  if (there && !picture?.taxels) picture = null;
-  dirty = true;
-});
-
-function tick() {
-  if (dirty) draw();
-  drawCall();
-  requestAnimationFrame(tick);
+function press() {
+  const button = byId(seen.recording?.sweeping ? "stop" : "start");
+  if (seen.recording?.commands.includes("START") && button.getAttribute("aria-disabled") === "false") PRESSED[button.id]();
 }
-for (const [what, name] of [[window, "resize"], [matchMedia("(prefers-color-scheme: dark)"), "change"]]) {
-  what.addEventListener(name, () => { dirty = true; });
+
+function hear(one) {
+  view = one;
+  drawSkin();
 }
-setInterval(() => { dirty = true; }, 1000);
-tick();
+
+run({name: "palpate record", draw, wanted: live, pedal: press, heard: {view: hear}});

@@ -1,47 +1,21 @@
 /* The page of `palpate teach`: what to do next, the materials, what was learnt, and the bundle that is made of it. */
 
-import {listen} from "/events.js";
-import {ago, byId, call, enable, frame, listenToPedal, made, mark, order, put} from "/parts.js";
+import {byId, enable, made, mark, put} from "/parts.js";
 import {signal} from "/plots.js";
+import {drawHeader, lastPicture, live, ordered, run, seen, since} from "/recording.js";
 
 const STEPS = {start: "starting", features: "looking at the sweeps", heads: "learning", bundle: "checking"};
-let key, recording, last; // events of these names, as appliance/palpate/web/record.py sends them
-let picture = null, listed = "", reached = null, ordering = false, dirty = true, wallMs = 0;
+let listed = "";
 
-function begin() {
-  key = "";
-  recording = last = null;
-}
-begin();
-
-function live() { return reached === true && recording !== null; }
-
-function teach() { return recording?.teach ?? null; }
+function teach() { return seen.recording?.teach ?? null; }
 
 /* A material by the name that people read. */
-function shown(name) { return (recording?.trying ?? recording)?.displays?.[name] ?? name; }
+function shown(name) { return (seen.recording?.trying ?? seen.recording)?.displays?.[name] ?? name; }
 
-function byPage() { return recording?.commands.includes("START"); }
-
-function drawHeader() {
-  const skin = recording && recording.skin !== "streaming" ? `no skin: ${recording.skin}${recording.trouble && `; ${recording.trouble}`}` : "";
-  const heard = recording ? `; last heard of it ${ago(Date.now() - wallMs - recording.time_ns / 1e6)} ago` : "";
-  const why = reached === false ? `no connection to palpate teach${heard}; trying again` : skin;
-  const state = !reached ? "no connection" : !recording ? "waiting" : skin ? `skin ${recording.skin}` : recording.sweeping ? "sweeping" : "ready";
-  frame({state, fine: live() && !skin, source: recording?.source, why});
-  document.body.classList.toggle("stale", Boolean(why));
-  byId("format").hidden = !recording;
-  if (recording) put("format", recording.format);
-}
-
-function drawCall() {
-  const wanted = live() && (recording.trying || recording.material);
-  const [words, seconds] = wanted ? call(recording, (Date.now() - wallMs) * 1e6) : ["", ""];
-  put("call", words);
-  put("countdown", seconds);
-}
+function byPage() { return seen.recording?.commands.includes("START"); }
 
 function drawTask() {
+  const {recording, last} = seen;
   enable(byId("add-button"), live());
   if (!recording) return;
   const trying = recording.trying, now = teach(), name = recording.material;
@@ -65,6 +39,7 @@ function drawTask() {
 }
 
 function drawMaterials() {
+  const {recording} = seen;
   const held = teach()?.materials ?? Object.fromEntries((recording?.trying?.labels ?? []).map((name) => [name, null]));
   const content = JSON.stringify([held, recording?.displays, recording?.material, Boolean(recording?.trying), live()]);
   if (content === listed) return;
@@ -87,7 +62,7 @@ function drawMaterials() {
 }
 
 function drawLearnt() {
-  const now = teach(), trying = recording?.trying, learnt = now?.learnt;
+  const {recording} = seen, now = teach(), trying = recording?.trying, learnt = now?.learnt;
   if (trying) {
     put("accuracy", `${trying.model} is on trial`);
     put("learnt", trying.taught);
@@ -122,6 +97,7 @@ function drawLearnt() {
 }
 
 function drawSweep() {
+  const {recording, last} = seen;
   byId("status").hidden = !last;
   if (!last) {
     put("sweep-title", "Last sweep");
@@ -129,25 +105,14 @@ function drawSweep() {
     return signal(byId("signal"), null, "no sweep yet");
   }
   mark(byId("status"), last.status);
-  put("sweep-title", `Sweep ${last.sweep}, ${ago(Date.now() - wallMs - last.time_ns / 1e6)} ago`);
+  put("sweep-title", `Sweep ${last.sweep}, ${since(last.time_ns)}`);
   const wrong = last.faulty ? `${last.reason}; it does not count` : "";
   put("outcome", [wrong, last.detail].filter(Boolean).join("; ") || "nothing is wrong with it");
-  const drawing = picture?.sweep === last.sweep ? picture : null;
-  signal(byId("signal"), drawing?.taxels ? drawing : null, last.signal ? "asking palpate teach" : "it has no window", recording?.unit || undefined);
-  if (last.signal && !drawing && reached) fetchPicture(last.sweep);
-}
-
-async function fetchPicture(sweep) {
-  picture = {sweep};
-  try {
-    const answer = await fetch(`/sweep/${sweep}`, {cache: "no-store"});
-    if (answer.ok && last?.sweep === sweep) picture = await answer.json();
-  } catch { /* asked again when the connection is back */ }
-  dirty = true;
+  const {picture, why: none} = lastPicture();
+  signal(byId("signal"), picture, none, recording?.unit || undefined);
 }
 
 function draw() {
-  dirty = false;
   drawHeader();
   drawTask();
   drawMaterials();
@@ -156,24 +121,22 @@ function draw() {
 }
 
 /* Sends an order. Why it was refused, "" where it was not. */
-async function send(...words) {
-  if (ordering) return "the order before is not answered yet";
-  ordering = true;
-  const why = await order("palpate teach", key, ...words);
-  put("said", why);
-  ordering = false;
-  dirty = true;
-  return why;
+function send(...words) {
+  return ordered(async (order) => {
+    const why = await order(...words);
+    put("said", why);
+    return why;
+  });
 }
 
 function skip() {
-  const names = Object.keys(teach().materials), at = names.indexOf(recording.material);
+  const names = Object.keys(teach().materials), at = names.indexOf(seen.recording.material);
   send("TEACH", names[(at + 1) % names.length]);
 }
 
 const PRESSED = {
-  "sweep-button": () => send(recording.sweeping ? "STOP" : "START"),
-  discard: () => send("DISCARD", `${recording.discard}`),
+  "sweep-button": () => send(seen.recording.sweeping ? "STOP" : "START"),
+  discard: () => send("DISCARD", `${seen.recording.discard}`),
   skip,
   place: () => send("NEXT"),
   use: () => send("USE"),
@@ -199,34 +162,15 @@ async function add() {
 }
 byId("add-button").addEventListener("click", add);
 byId("name").addEventListener("keydown", (event) => { if (event.key === "Enter") add(); });
-listenToPedal(() => {
+function press() {
   if (byPage() && byId("sweep-button").getAttribute("aria-disabled") === "false") PRESSED["sweep-button"]();
-});
-
-listen({
-  now(ns) { wallMs = Date.now() - ns / 1e6; },
-  begin,
-  key(one) { key = one; },
-  recording(one) {
-    if (Boolean(recording?.trying) !== Boolean(one.trying)) last = null;
-    recording = one;
-    dirty = true;
-  },
-  sweep(one) {
-    last = one;
-    dirty = true;
-  },
-}, (there) => {
-  reached = there;
-  if (there && !picture?.taxels) picture = null;
-  dirty = true;
-});
-
-function tick() {
-  if (dirty) draw();
-  drawCall();
-  requestAnimationFrame(tick);
 }
-window.addEventListener("resize", () => { dirty = true; });
-setInterval(() => { dirty = true; }, 1000);
-tick();
+
+function hear(one) {
+  if (Boolean(seen.recording?.trying) !== Boolean(one.trying)) seen.last = null;
+  Object.assign(seen, {recording: one, dirty: true});
+}
+
+function wanted() { return live() && (seen.recording.trying || seen.recording.material); }
+
+run({name: "palpate teach", draw, wanted, pedal: press, heard: {recording: hear}});

@@ -1,0 +1,101 @@
+/* What the pages of palpate record and palpate teach share: their events, the head, the call, the last sweep and orders. */
+
+import {listen} from "/events.js";
+import {ago, byId, call, frame, listenToPedal, order, put} from "/parts.js";
+
+/* key, recording, last: events of these names, as appliance/palpate/web/record.py sends them. picture: of the last sweep.
+   dirty: something is to be drawn. */
+export const seen = {key: "", recording: null, last: null, picture: null, reached: null, answers: true, wallMs: 0, dirty: true};
+let program = "", ordering = false;
+
+function begin() { Object.assign(seen, {key: "", recording: null, last: null}); }
+
+export function live() { return seen.reached === true && seen.recording !== null; }
+
+/* How long ago something was, by the box's clock. */
+export function since(ns) { return `${ago(Date.now() - seen.wallMs - ns / 1e6)} ago`; }
+
+/* Why what is shown is not of this moment; "" where it is. */
+function trouble() {
+  const {reached, answers, recording} = seen;
+  if (reached === null) return "";
+  const heard = recording ? `; last heard of it ${since(recording.time_ns)}` : "";
+  if (!reached) return `${answers ? `${program} answers, but has no news` : `no connection to ${program}`}${heard}; trying again`;
+  if (recording && recording.skin !== "streaming") return `no skin: ${recording.skin}${recording.trouble && `; ${recording.trouble}`}`;
+  return "";
+}
+
+export function drawHeader() {
+  const why = trouble(), {reached, recording} = seen;
+  document.body.classList.toggle("stale", Boolean(why));
+  const state = !reached ? "no connection" : !recording ? "waiting" : recording.skin !== "streaming" ? `skin ${recording.skin}`
+    : recording.sweeping ? "sweeping" : recording.ready ? "ready" : "not ready";
+  frame({state, fine: live() && recording.skin === "streaming", source: recording?.source, why});
+  byId("format").hidden = !recording;
+  if (recording) put("format", recording.format);
+}
+
+function drawCall(wanted) {
+  const [words, seconds] = wanted() ? call(seen.recording, (Date.now() - seen.wallMs) * 1e6) : ["", ""];
+  put("call", words);
+  put("countdown", seconds);
+}
+
+/* The picture of the last sweep, null without; it is asked for once. why: why there is none. */
+export function lastPicture() {
+  const {last, picture, reached} = seen, drawing = picture?.sweep === last.sweep ? picture : null;
+  const why = !last.signal ? "it has no window" : drawing?.asked ? `asking ${program}` : "its signal is not kept";
+  if (last.signal && !drawing && reached) fetchPicture(last.sweep);
+  return {picture: drawing?.taxels ? drawing : null, why};
+}
+
+async function fetchPicture(sweep) {
+  seen.picture = {sweep, asked: true};
+  let got = {sweep};
+  try {
+    const answer = await fetch(`/sweep/${sweep}`, {cache: "no-store"});
+    if (answer.ok) got = await answer.json();
+  } catch { /* said where the signal would be; asked again when the connection is back */ }
+  if (seen.last?.sweep === sweep) seen.picture = got;
+  seen.dirty = true;
+}
+
+/* Does `act` with a function that sends one order and gives why it was refused, "" where it was not; one `act` at a time. */
+export async function ordered(act) {
+  if (ordering) return "the order before is not answered yet";
+  ordering = seen.dirty = true;
+  const result = await act((command, text) => order(program, seen.key, command, text));
+  ordering = false;
+  seen.dirty = true;
+  return result;
+}
+
+/* name: of the program. draw: draws all. wanted: whether the call is shown. pedal: a press of it. heard: further events. */
+export function run({name, draw, wanted, pedal, heard = {}}) {
+  program = name;
+  listen({
+    begin,
+    now(ns) { seen.wallMs = Date.now() - ns / 1e6; },
+    key(one) { seen.key = one; },
+    recording(one) { Object.assign(seen, {recording: one, dirty: true}); },
+    sweep(one) { Object.assign(seen, {last: one, dirty: true}); },
+    ...heard,
+  }, (reached, answers) => {
+    Object.assign(seen, {reached, answers, dirty: true});
+    if (reached && !seen.picture?.taxels) seen.picture = null;
+  });
+  listenToPedal(pedal);
+  const tick = () => {
+    if (seen.dirty) {
+      seen.dirty = false;
+      draw();
+    }
+    drawCall(wanted);
+    requestAnimationFrame(tick);
+  };
+  for (const [what, event] of [[window, "resize"], [matchMedia("(prefers-color-scheme: dark)"), "change"]]) {
+    what.addEventListener(event, () => { seen.dirty = true; });
+  }
+  setInterval(() => { seen.dirty = true; }, 1000);
+  tick();
+}
