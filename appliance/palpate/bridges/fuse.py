@@ -167,15 +167,13 @@ class FingerFusion:
         labels = {name: self.fingers[name].labels for name in found}
         answer = fused(found, labels, self._least, self._clock.now_ns())
         for name, own in {**found, "": answer}.items():
-            head = ("FIN", name) if name else ("RES",)
             seen = all(
                 f.health.get("loss_known", True)
                 for finger, f in self.fingers.items()
                 if name in ("", finger)
             )
-            slide = own.get("measured_mm_s"), own.get("direction", "")
-            fields = (*head, self._answered, *_fields(own, self._source()))
-            self._say(sentences.answer(*fields, detail=own["detail"], slide=slide, loss_known=seen))
+            kind, head = "FIN" if name else "RES", [*([name] if name else []), self._answered]
+            self._say(sentences.answer(kind, head, own, self._source(), loss_known=seen))
 
 
 def fused(
@@ -264,20 +262,3 @@ def _detail(found: Mapping[str, FeedLine], touching: Mapping[str, FeedLine]) -> 
     bridged = [f"{name} {v['degraded']}" for name, v in touching.items() if v.get("degraded")]
     texts = ", ".join(moved), ", ".join(without), bridged and f"degraded: {', '.join(bridged)}"
     return "; ".join(text for text in texts if text)
-
-
-def _fields(v: FeedLine, source: str) -> tuple[object, ...]:
-    """Fields 2 to 12 of RES."""
-    return (
-        f"{v['time_ns'] / 1e9:.3f}",
-        v["status"],
-        v["label"],
-        f"{v['probability']:.3f}",
-        f"{v['margin']:.3f}",
-        v["fused"],
-        v["lost"],
-        f"{v['latency_ns'] / 1e6:.2f}",
-        v["bundle"],
-        source,
-        f"{v['share']:.2f}",
-    )

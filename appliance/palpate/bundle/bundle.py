@@ -55,29 +55,17 @@ except ImportError:  # Python 3.11
     from _sha256 import sha256  # type: ignore[import-not-found,unused-ignore]
 
 __all__ = [
-    "DEFAULT",
     "ENROLMENT",
-    "ENROLMENT_SIGNATURE",
     "GOLDEN",
-    "GOLDEN_TOLERANCE",
     "INPUTS",
     "LABEL",
     "MANIFEST",
     "MEANS",
     "MODEL",
-    "SIGNATURE",
-    "TAUGHT_SIGNATURE",
     "AddedLabels",
     "Bundle",
     "Manifest",
     "Thresholds",
-    "digest",
-    "file_entry",
-    "files",
-    "from_files",
-    "identity",
-    "load",
-    "name",
 ]
 DEFAULT = Path(__file__).parents[1] / "default_bundle"
 MOST_SMALL = 1 << 20

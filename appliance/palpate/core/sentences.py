@@ -4,9 +4,11 @@ both of its ends."""
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from operator import xor
+from typing import Any
 
 TALKER = "PPLP"
 OWN = ("RES", "FIN", "STA", "ANS", "REC", "TCH")
@@ -64,26 +66,34 @@ def sentence(kind: str, *fields: object) -> bytes:
 
 
 def answer(
-    *fields: object, detail: str, slide: tuple[float | None, str | None], loss_known: bool
+    kind: str, head: Sequence[object], v: Mapping[str, Any], source: str, *, loss_known: bool
 ) -> bytes:
-    """RES or FIN with its first fields, from the kind on. slide: measured speed and direction, None
-    without. loss_known: whether lost frames of the skin can be seen.
+    """RES or FIN for a verdict, as in the feed. head: its fields up to the number of the sweep.
+    source: of the frames (usb, sim, replay). loss_known: whether lost frames of the skin can be
+    seen.
 
     Optional fields follow the detail: that losses cannot be seen, and the measured slide. The
     detail is shortened to make room for them. If an empty detail does not suffice, the slide is
     left out.
     """
-    kind, *first = fields
+    first = (
+        *head,
+        f"{v['time_ns'] / 1e9:.3f}",
+        *(v["status"], v["label"], f"{v['probability']:.3f}", f"{v['margin']:.3f}"),
+        *(v["fused"], v["lost"], f"{v['latency_ns'] / 1e6:.2f}"),
+        *(v["bundle"], source, f"{v['share']:.2f}"),
+    )
+    detail, measured = v["detail"], v.get("measured_mm_s")
     unseen: list[object] = [] if loss_known else [1]
-    if slide[0] is not None:
-        measured = [*(unseen or [""]), f"{slide[0]:.1f}", slide[1]]
+    if measured is not None:
+        slide = [*(unseen or [""]), f"{measured:.1f}", v.get("direction")]
         # a sentence of full length may have been cut
-        if (room := MAX_LINE - len(sentence(str(kind), *first, "", *measured))) > 0:
-            return sentence(str(kind), *first, detail[:room], *measured)
+        if (room := MAX_LINE - len(sentence(kind, *first, "", *slide))) > 0:
+            return sentence(kind, *first, detail[:room], *slide)
     if loss_known:
-        return sentence(str(kind), *first, detail)
-    room = MAX_LINE - len(sentence(str(kind), *first, "", 1))
-    return sentence(str(kind), *first, detail[: max(0, room)], 1)
+        return sentence(kind, *first, detail)
+    room = MAX_LINE - len(sentence(kind, *first, "", 1))
+    return sentence(kind, *first, detail[: max(0, room)], 1)
 
 
 def parse(data: bytes, rest: bytes = b"") -> tuple[list[Sentence], bytes]:

@@ -99,24 +99,8 @@ class Command:
 def result(v: Verdict, source: str, *, loss_known: bool = True) -> bytes:
     """The RES sentence of a verdict. source: of the frames (usb, sim, replay). loss_known: whether
     lost frames of the skin can be seen."""
-    return sentences.answer(
-        "RES",
-        v.sweep,
-        f"{v.time_ns / 1e9:.3f}",
-        v.status,
-        v.label,
-        f"{v.probability:.3f}",
-        f"{v.margin:.3f}",
-        v.fused,
-        v.lost,
-        f"{v.latency_ns / 1e6:.2f}",
-        v.bundle,
-        source,
-        f"{v.share:.2f}",
-        detail=v.detail,
-        slide=(v.measured_mm_s, v.direction),
-        loss_known=loss_known,
-    )
+    values = v.as_dict(arrays=False)
+    return sentences.answer("RES", (v.sweep,), values, source, loss_known=loss_known)
 
 
 def parse(data: bytes, rest: bytes = b"") -> tuple[list[Command], bytes]:
