@@ -122,20 +122,28 @@ def test_a_skin_that_is_never_near_zero(model: Bundle):
     assert states(views_of(pressed(130, 145, 52, 130), model)(4)) == ["wait", "lift"]
 
 
-def test_a_bundle_without_a_threshold_shows_the_centre(model: Bundle):
-    """The threshold comes from the present unloaded skin, as without a bundle. No position is
-    compared."""
-    m = model.manifest
-    limits = replace(m.thresholds, contact=None)
-    without = replace(
-        model, manifest=replace(m, contact=None, displacement=None, thresholds=limits)
-    )
-    last = [v for v in views_of(resting(), without)(14.5) if v.centre][-1]
+def known(model: Bundle, **changes: object) -> Expected:
+    """The skin as a bundle with another manifest describes it."""
+    return Expected.by(replace(model, manifest=replace(model.manifest, **changes)))
+
+
+@pytest.mark.parametrize("lacks", ["a threshold", "positions", "a bundle"])
+def test_without_trained_positions_the_centre_alone_is_shown(model: Bundle, lacks: str):
+    """The threshold comes from the present unloaded skin if the bundle has none. The centre is in
+    taxels, and the hint says what to do."""
+    bare = {"contact": None, "displacement": None}
+    limits = replace(model.manifest.thresholds, contact=None)
+    expected, hint = {
+        "a threshold": (known(model, **bare, thresholds=limits), "cannot detect contact"),
+        "positions": (known(model, **bare), "export it again"),
+        "a bundle": (Expected(model.format), "no bundle fits"),
+    }[lacks]
+    seen = views_of(resting(), expected)(14.5)
+    assert {*states(seen)} == {"wait", "no-contact", "no-positions"}
+    last = [v for v in seen if v.centre][-1]
     assert last.centre == pytest.approx((1.5, 1.5), abs=0.15)
-    assert last.hint == (
-        "this bundle cannot detect contact, so it has no trained position; "
-        "train a bundle on sweeps of palpate record"
-    )
+    assert (last.nearest, last.contact, last.unit) == (None, None, "taxels")
+    assert hint in last.hint
 
 
 def test_an_unplugged_skin_is_shown_and_waited_for(model: Bundle):
@@ -152,33 +160,6 @@ def test_an_unplugged_skin_is_shown_and_waited_for(model: Bundle):
     assert gone.load == ()
     simulated.backend.plug()
     assert states(views(4)) == ["no-skin", "wait", "lift", "no-contact", "off"]
-
-
-def test_a_bundle_without_positions_shows_the_centre(default_bundle: Bundle):
-    """The View says that the bundle has no positions, and what to do. The centre is in taxels."""
-    without = replace(
-        default_bundle, manifest=replace(default_bundle.manifest, contact=None, displacement=None)
-    )
-    views = views_of(resting(), without)
-    last = [v for v in views(14.5) if v.centre][-1]
-    assert last.state == "no-positions"
-    assert "export it again" in last.hint
-    assert last.centre == pytest.approx((1.5, 1.5), abs=0.15)
-    assert last.nearest is None
-
-
-def test_without_a_bundle_the_contact_alone_is_shown(model: Bundle):
-    """For a skin without a bundle the View has load and centre, in taxels. The threshold comes from
-    the unloaded skin."""
-    seen = views_of(resting(), Expected(model.format))(14.5)
-    assert [state for state in states(seen) if state != "wait"][:2] == [
-        "no-contact",
-        "no-positions",
-    ]
-    last = [v for v in seen if v.centre][-1]
-    assert last.centre == pytest.approx((1.5, 1.5), abs=0.15)
-    assert (last.bundle, last.contact, last.unit) == ("none for this skin", None, "taxels")
-    assert "no bundle fits this skin" in last.hint
 
 
 @pytest.mark.parametrize(
@@ -260,33 +241,21 @@ VIEW = View(
 )
 
 
-def test_one_line_a_second_is_printed():
-    """Views come more often than lines."""
-    out, clock = io.StringIO(), rig.VirtualClock()
-    begin_ns = clock.now_ns()
-    printer = LinePrinter(out, clock, line)
-    for tenth in range(25):
-        clock.sleep_until(begin_ns + tenth * SECOND // 10)
-        printer.show(VIEW)
-    assert out.getvalue().splitlines() == [line(VIEW)] * 3
-
-
-def test_a_slow_terminal_ends_nothing(model: Bundle, monkeypatch: pytest.MonkeyPatch):
-    """There is a View every VIEW_NS, not a View for each frame. `stopped` ends the command, and the
-    skin is released."""
-    simulated, out = resting(), io.StringIO()
-    end_ns = simulated.clock.now_ns() + 5 * SECOND
-    monkeypatch.setattr("palpate.alignment.lines.LINE_NS", 0)
-    settings = simulated.wire(config.load(None, [], site=NO_SITE))
-    live.run(
-        settings,
-        Expected.by(model),
-        simulated,
-        [LinePrinter(out, simulated.clock, line)],
-        lambda: simulated.clock.now_ns() >= end_ns,
-    )
-    assert 24 <= len(out.getvalue().splitlines()) <= 26
-    assert not simulated.backend.board.running
+def test_a_view_is_shown_five_times_a_second_and_printed_once(
+    model: Bundle, monkeypatch: pytest.MonkeyPatch
+):
+    """There is a View every VIEW_NS, not a View for each frame; lines come once a second. `stopped`
+    ends the command, and the skin is released."""
+    for line_ns, lines in ((0, range(24, 27)), (SECOND, range(5, 7))):
+        simulated, out = resting(), io.StringIO()
+        end_ns = simulated.clock.now_ns() + 5 * SECOND
+        monkeypatch.setattr("palpate.alignment.lines.LINE_NS", line_ns)
+        settings = simulated.wire(config.load(None, [], site=NO_SITE))
+        printer = LinePrinter(out, simulated.clock, line)
+        stopped = lambda: simulated.clock.now_ns() >= end_ns  # noqa: B023, E731
+        live.run(settings, Expected.by(model), simulated, [printer], stopped)
+        assert len(out.getvalue().splitlines()) in lines
+        assert not simulated.backend.board.running
 
 
 def test_a_denied_skin_is_named(model: Bundle):

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 import pytest
@@ -97,143 +98,123 @@ def saying(**lines: bytes) -> Callable[[Sentence], list[bytes]]:
     return script
 
 
-def test_start_slide_stop_answer(swept: Swept):
-    """The commands in order, and NEW only if it is requested."""
-    answer = swept.run()
-    assert (answer.status, answer.label, answer.sweep) == (Status.OK, "wood", 1)
-    assert swept.has_heard("START", "STOP")
-    assert swept.phases == ["sliding", "judging"]
-    swept.run(new_object=True)
-    assert swept.has_heard("START", "STOP", "NEW", "START", "STOP")
+EARLY, LONG = result(1, share="0.40"), {"slide_s": LONG_S, "timeout_s": 2 * LONG_S}
+REFUSES = sentence("ANS", "START", "error", "set trigger.mode to serial")
+NOTHING = sentence("ANS", "ABORT", "error", "no sweep is open")
+
+
+class Case(NamedTuple):
+    """lines: what the box says after its answer to a command. at: what happens in each phase.
+    wanted: status, or the error and its reason. heard: the commands of the box."""
+
+    lines: dict[str, bytes] | None
+    wanted: Status | tuple[type[ApplianceError], str]
+    heard: str
+    phases: str
+    terms: Mapping[str, float | bool] = MappingProxyType({})
+    at: Callable[[Swept], object] = lambda swept: None
+
+
+CASES = {
+    "slide": Case(None, Status.OK, "START STOP", "sliding judging"),
+    "a new object": Case(
+        None, Status.OK, "NEW START STOP", "sliding judging", {"new_object": True}
+    ),
+    "an early answer": Case({"START": EARLY}, Status.OK, "START STOP", "sliding early", LONG),
+    "a fault": Case(
+        {"START": result(1, "sensor-lost", "")}, Status.SENSOR_LOST, "START STOP", "sliding", LONG
+    ),
+    "another's START: the STOP is the other's": Case(
+        {"START": result(1, "no-stop", "")}, Status.NO_STOP, "START", "sliding", LONG
+    ),
+    "the line is lost after the answer": Case(
+        *({"START": EARLY}, Status.OK, "START", "sliding early", LONG),
+        lambda swept: swept.phases[-1] == "early" and swept.box.unplug(),
+    ),
+    "another's STOP": Case(
+        *(None, Status.OK, "START STOP", "sliding", {"slide_s": 0.0}),
+        lambda swept: swept.source.send("STOP"),
+    ),
+    "canceled while sliding": Case(
+        *({"ABORT": result(1, "aborted", "")}, Status.ABORTED, "START ABORT", "sliding", LONG),
+        lambda swept: swept.canceled.set(),
+    ),
+    "canceled and not answered": Case(
+        *(None, (NoAnswer, r"within 0\.1 s"), "START ABORT", "sliding", LONG),
+        lambda swept: swept.canceled.set(),
+    ),
+    "no answer in time": Case(
+        {}, (NoAnswer, r"0\.3"), "START STOP ABORT", "sliding judging", {"timeout_s": 0.3}
+    ),
+    "unplugged": Case(
+        *(None, (LinkLost, "was lost"), "START", "sliding", LONG),
+        lambda swept: swept.box.unplug(),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_what_becomes_of_a_sweep(swept: Swept, monkeypatch: pytest.MonkeyPatch, name: str):
+    """The answer or the error, the commands that the box has heard, and the phases. After an error
+    the box is not left with an open sweep if it can be reached."""
+    case = CASES[name]
+    monkeypatch.setattr(sweep, "ABORTED_S", 0.1 if name == "canceled and not answered" else LONG_S)
+    if case.lines is not None:
+        swept.box.script = saying(**case.lines)
+    swept.at_phase = lambda phase: case.at(swept)
+    if isinstance(case.wanted, Status):
+        assert swept.run(**case.terms).status is case.wanted
+    else:
+        with pytest.raises(case.wanted[0], match=case.wanted[1]):
+            swept.run(**case.terms)
+    assert swept.has_heard(*case.heard.split())
+    assert swept.phases == case.phases.split()
+    if name == "unplugged":
+        swept.at_phase = lambda phase: None
+        swept.box.plug_in()
+        eventually(lambda: not swept.source.view().trouble)
+        assert swept.run().known
 
 
 def test_start_has_the_speed_and_force_of_the_goal(swept: Swept):
     """0 is not sent."""
-    swept.run(speed_mm_s=30.5)
-    swept.run(force_n=1.5)
-    swept.run()
+    for terms in ({"speed_mm_s": 30.5}, {"force_n": 1.5}, {}):
+        swept.run(**terms)
     started = [s.fields for s in swept.box.heard if s.kind == "START"]
     assert started == [["30.5"], ["", "1.5"], []]
 
 
-def test_an_early_answer_ends_the_slide(swept: Swept):
-    """It is said, STOP follows at once, and it is the answer."""
-    swept.box.script = saying(START=result(1, share="0.40"))
-    assert swept.run(slide_s=LONG_S, timeout_s=2 * LONG_S).early
-    assert swept.phases == ["sliding", "early"]
-    assert swept.has_heard("START", "STOP")
-
-
-def test_a_fault_ends_the_slide(swept: Swept):
-    """A sweep that fails while the finger slides is answered at once; STOP closes it."""
-    swept.box.script = saying(START=result(1, "sensor-lost", ""))
-    assert swept.run(slide_s=LONG_S, timeout_s=2 * LONG_S).status is Status.SENSOR_LOST
-    assert swept.phases == ["sliding"]
-    assert swept.has_heard("START", "STOP")
-
-
-def test_a_sweep_of_another_is_not_stopped(swept: Swept):
-    """Another's START ends the sweep, which is answered `no-stop`: the STOP is the other's."""
-    swept.box.script = saying(START=result(1, "no-stop", ""))
-    assert swept.run(slide_s=LONG_S, timeout_s=2 * LONG_S).status is Status.NO_STOP
-    assert swept.source.send("TARE")
-    assert swept.has_heard("START", "TARE")
-
-
-def test_an_answer_counts_although_stop_fails(swept: Swept):
-    """The line is lost after an early answer: the answer is valid."""
-    swept.box.script = saying(START=result(1, share="0.40"))
-    swept.at_phase = lambda phase: phase == "early" and swept.box.unplug()
-    assert swept.run(slide_s=LONG_S, timeout_s=2 * LONG_S).early
-
-
-def test_stop_from_elsewhere(swept: Swept):
-    """With slide_s = 0 another's STOP is waited for and none is sent."""
-    swept.at_phase = lambda phase: swept.source.send("STOP")
-    assert swept.run(slide_s=0.0).known
-    assert swept.has_heard("START", "STOP")
-    swept.at_phase = lambda phase: None
-    swept.box.script = saying(START=result(2, share="0.40"))
-    assert swept.run(slide_s=0.0).early
-    assert swept.has_heard("START", "STOP", "START")
-
-
-def test_canceled_while_sliding(swept: Swept):
-    """The box aborts its sweep, and that is the answer."""
-    swept.box.script = saying(ABORT=result(1, "aborted", ""))
-    swept.at_phase = lambda phase: swept.canceled.set()
-    assert swept.run(slide_s=LONG_S, timeout_s=2 * LONG_S).status is Status.ABORTED
-    assert swept.has_heard("START", "ABORT")
-
-
 def test_canceled_when_the_answer_came(swept: Swept):
-    """The box has nothing to abort any more: the answer that it gave is the answer."""
+    """The box has nothing to abort any more: the answer that it gave is the answer. A sweep that is
+    canceled before START is not begun."""
 
     def script(heard: Sentence) -> list[bytes]:
-        if heard.kind == "ABORT":
-            return [result(1), sentence("ANS", "ABORT", "error", "no sweep is open")]
-        return obeying(heard)
+        return [result(1), NOTHING] if heard.kind == "ABORT" else obeying(heard)
 
     swept.box.script = script
     swept.at_phase = lambda phase: swept.canceled.set()
-    assert swept.run(slide_s=LONG_S, timeout_s=2 * LONG_S).known
-
-
-def test_canceled_before_start(swept: Swept):
-    """No sweep is begun."""
-    swept.canceled.set()
-    with pytest.raises(CommandRefused, match="canceled before START"):
+    assert swept.run(**LONG).known
+    with pytest.raises(CommandRefused, match="canceled before"):
         swept.run()
-    assert swept.has_heard()
-
-
-def test_canceled_and_not_answered(swept: Swept, monkeypatch: pytest.MonkeyPatch):
-    """A box that does not answer an aborted sweep is not waited for without end."""
-    monkeypatch.setattr(sweep, "ABORTED_S", 0.1)
-    swept.at_phase = lambda phase: swept.canceled.set()
-    with pytest.raises(NoAnswer, match=r"within 0\.1 s"):
-        swept.run()
-
-
-def test_no_answer_in_time(swept: Swept):
-    """The reason names the time limit, and the box is not left with an open sweep."""
-    swept.box.script = saying()
-    with pytest.raises(NoAnswer, match=r"timeout_s = 0\.3"):
-        swept.run(timeout_s=0.3)
-    assert swept.has_heard("START", "STOP", "ABORT")
+    assert swept.has_heard("START", "ABORT")
 
 
 def test_an_answer_to_an_earlier_sweep_is_none_to_this(swept: Swept):
     """What came before START is forgotten."""
     swept.box.script = saying()
     swept.sweep.notice(Answer(6, 1.0, Status.OK, "paper", 0.9, 0.8, 1, 0, 1.0))
-    with pytest.raises(NoAnswer, match="no answer within"):
+    with pytest.raises(NoAnswer):
         swept.run(timeout_s=0.3)
 
 
-def test_unplugged_while_sliding(swept: Swept):
-    """The reason is the line's, at once; plugged in again, the next sweep works."""
-    swept.at_phase = lambda phase: swept.box.unplug()
-    with pytest.raises(LinkLost, match="the box was lost during"):
-        swept.run(slide_s=LONG_S, timeout_s=2 * LONG_S)
-    swept.at_phase = lambda phase: None
-    swept.box.plug_in()
-    eventually(lambda: not swept.source.view().trouble)
-    assert swept.run().known
-
-
 def test_a_box_that_falls_silent(swept: Swept):
-    """Without a sentence for 3.5 s the sweep ends, long before its time limit."""
+    """Without a sentence for 3.5 s the sweep ends, long before its time limit. Each sentence begins
+    the 3.5 s anew: then only the time limit ends the wait."""
     swept.use(Hurried())
     swept.box.script = saying()
-    with pytest.raises(NoAnswer, match=r"nothing for 3\.5 s"):
+    with pytest.raises(NoAnswer, match=r"3\.5 s"):
         swept.run(slide_s=0.0, timeout_s=1000.0)
     assert swept.has_heard("START", "ABORT")
-
-
-def test_a_box_that_speaks_is_waited_for(swept: Swept):
-    """Each sentence begins the 3.5 s anew: only the time limit ends the wait."""
-    swept.box.script = saying()
     spoken = CommandedSweep(
         swept.source,
         canceled=lambda: bool(spoken.notice(state())),
@@ -244,28 +225,19 @@ def test_a_box_that_speaks_is_waited_for(swept: Swept):
         spoken.run(Wanted(slide_s=0.0, timeout_s=20.0))
 
 
-def test_a_box_that_refuses(swept: Swept):
+def test_a_box_that_refuses_or_is_not_ready(swept: Swept, monkeypatch: pytest.MonkeyPatch):
     """Its reason is the reason; nothing of another's is aborted."""
-    swept.box.script = lambda s: (
-        [sentence("ANS", "START", "error", "set trigger.mode to serial")]
-        if s.kind == "START"
-        else obeying(s)
-    )
+    swept.box.script = lambda s: [REFUSES] if s.kind == "START" else obeying(s)
     with pytest.raises(CommandRefused, match=r"trigger\.mode"):
         swept.run()
     assert swept.has_heard("START")
-
-
-def test_a_box_that_is_not_ready(swept: Swept, monkeypatch: pytest.MonkeyPatch):
-    """No sweep is begun; the reason names the missing condition."""
     monkeypatch.setattr(sweep, "READY_S", 0.3)
-    absent = sentence(
-        "ANS", "STATE", "ok", "9.000", "absent", 0, 0, 3000, 0, 0, 1, 0, "9f3c2a1b", "sim"
-    )
+    fields = ("9.000", "absent", 0, 0, 3000, 0, 0, 1, 0, "9f3c2a1b", "sim")
+    absent = sentence("ANS", "STATE", "ok", *fields)
     swept.box.script = lambda s: [absent] if s.kind == "STATE" else obeying(s)
-    with pytest.raises(NoAnswer, match="the skin is absent"):
+    with pytest.raises(NoAnswer, match="absent"):
         swept.run()
-    assert swept.has_heard()
+    assert swept.has_heard("START")
 
 
 def test_an_error_of_the_caller_leaves_no_sweep_open(swept: Swept):
@@ -283,7 +255,7 @@ def test_an_error_of_the_caller_leaves_no_sweep_open(swept: Swept):
 def test_the_feed_begins_nothing(tmp_path: Path):
     """It is read-only, and the error names it."""
     source = FeedSource(str(tmp_path / "feed.sock"))
-    with pytest.raises(CommandRefused, match="the feed is read-only"):
+    with pytest.raises(CommandRefused, match="read-only"):
         CommandedSweep(source, canceled=lambda: False, say=lambda phase, answer: None).run(Wanted())
     source.close()
 
@@ -291,15 +263,12 @@ def test_the_feed_begins_nothing(tmp_path: Path):
 @pytest.mark.parametrize(
     ("terms", "text"),
     [
-        ({"slide_s": -1.0}, "slide_s = -1 is not a valid time from START to STOP; use 0 to 3600"),
-        ({"slide_s": float("nan")}, "slide_s = nan is not a valid time"),
-        ({"slide_s": float("inf")}, "slide_s = inf is not a valid time"),
-        (
-            {"slide_s": 3.0, "timeout_s": 3.0},
-            "timeout_s = 3 is not a valid limit from START to the answer; use more than",
-        ),
-        ({"timeout_s": float("nan")}, "timeout_s = nan is not a valid limit"),
-        ({"timeout_s": 3601.0}, "timeout_s = 3601 is not a valid limit"),
+        ({"slide_s": -1.0}, "slide_s = -1"),
+        ({"slide_s": float("nan")}, "slide_s = nan"),
+        ({"slide_s": float("inf")}, "slide_s = inf"),
+        ({"slide_s": 3.0, "timeout_s": 3.0}, "timeout_s = 3"),
+        ({"timeout_s": float("nan")}, "timeout_s = nan"),
+        ({"timeout_s": 3601.0}, "timeout_s = 3601"),
     ],
 )
 def test_times_that_cannot_be(swept: Swept, terms: dict[str, float], text: str):
@@ -307,4 +276,3 @@ def test_times_that_cannot_be(swept: Swept, terms: dict[str, float], text: str):
     with pytest.raises(ConfigError, match=text):
         swept.run(**terms)
     assert swept.box.heard == []
-    assert issubclass(ConfigError, ApplianceError)

@@ -19,7 +19,7 @@ from palpate.client.answers import Answer, BoxState
 from palpate.client.box import KEPT, Palpate
 from palpate.core.clock import SystemClock
 from palpate.core.errors import ApplianceError, CommandRefused, FormatError, LinkLost, NoAnswer
-from palpate.core.sentences import Sentence, sentence
+from palpate.core.sentences import sentence
 from palpate.core.status import Status
 from tests.factories.paths import ROOT
 from tests.factories.speaking_box import LABELS, SpeakingBox, finger, obeying, result, state
@@ -75,24 +75,13 @@ def test_start_has_speed_and_force(
     assert speaking.heard[-1].fields == fields
 
 
-def test_a_command_is_asked_in_one_text_or_in_several(box: Palpate):
-    """As it stands in a sentence, or each field by itself: the box answers with the first word."""
-    assert box.ask("LABEL,1") == box.ask("LABEL", "1")
-    assert box.ask("LABEL,1")[:2] == ["1", LABELS[0]]
-
-
 def test_what_the_box_is(box: Palpate):
     """State, identity, labels and tare."""
     assert box.state().frames == 3000
     assert (box.identify().name, box.identify().skin) == ("mine", "skin-4x4 A0017 1.2.0")
     assert box.labels() == LABELS
+    assert box.ask("LABEL,1") == box.ask("LABEL", "1")
     assert box.tare() == "16 taxels"
-
-
-def test_an_answer_waits_until_it_is_asked_for(speaking: SpeakingBox, box: Palpate):
-    """Two answers that come before anyone asks are given in their order."""
-    speaking.say(result(1), result(2, "unsure"))
-    assert [box.result(LONG_S).status, box.result(LONG_S).status] == [Status.OK, Status.UNSURE]
 
 
 def test_the_answer_of_a_hand_has_those_of_its_fingers(speaking: SpeakingBox, box: Palpate):
@@ -123,11 +112,20 @@ def test_an_old_answer_is_not_taken_for_a_new_one(speaking: SpeakingBox, box: Pa
             box.result(SHORT_S)
 
 
-def test_a_gap_in_the_numbers_is_told(speaking: SpeakingBox, box: Palpate):
-    """Sweeps 2 and 3 were answered but not heard; 3 comes late after all."""
-    speaking.say(result(1), result(4), result(3), result(5))
-    assert [box.result(LONG_S).missed for _ in range(4)] == [0, 2, 0, 0]
-    assert (box.missed, box.restarts) == (1, 0)
+def test_answers_are_given_in_order_with_their_gaps(speaking: SpeakingBox):
+    """Sweeps 2 and 3 were answered but not heard; 3 comes late after all. REC and kinds of later
+    versions are skipped. A listener hears answers and states once each."""
+    heard: list[Answer | BoxState] = []
+    with Palpate(str(speaking.path), timeout_s=LONG_S, listener=heard.append) as box:
+        box.wait_ready(LONG_S)
+        speaking.say(state(), sentence("REC", 7, "stored", 5), sentence("NEW", 1))
+        speaking.say(result(1), result(4, "unsure"), result(3), result(5), state(answered=5))
+        found = [box.result(LONG_S) for _ in range(4)]
+        box.state()
+        assert [one.missed for one in found] == [0, 2, 0, 0]
+        assert [one.status for one in found[:2]] == [Status.OK, Status.UNSURE]
+        assert (box.missed, box.restarts, box.damaged) == (1, 0, 0)
+    assert [type(one) for one in heard] == [BoxState, *[Answer] * 4, BoxState]
 
 
 def test_a_restart_of_the_program_is_no_gap(speaking: SpeakingBox, box: Palpate):
@@ -142,8 +140,8 @@ def test_a_restart_of_the_program_is_no_gap(speaking: SpeakingBox, box: Palpate)
 
 
 def test_damage_is_counted_and_never_believed(speaking: SpeakingBox, box: Palpate):
-    """A flipped character, a missing checksum, noise, an endless line: no answer, a count, and the
-    gap at the next."""
+    """A flipped character, a missing checksum, noise, an endless line, a status of a newer box: no
+    answer, a count, and the gap at the next. An ANS without a checksum answers nothing."""
     speaking.say(
         result(1),
         result(2).replace(b"wood", b"wo0d"),
@@ -156,27 +154,23 @@ def test_damage_is_counted_and_never_believed(speaking: SpeakingBox, box: Palpat
     assert [box.result(LONG_S).sweep, box.result(LONG_S).missed] == [1, 2]
     assert box.damaged == 4
     assert "without an end" in box.damage
-
-
-def test_a_sentence_from_a_newer_box_is_told(speaking: SpeakingBox, box: Palpate):
-    """A status that this client does not know is not an answer; a waiting call raises with the
-    reason."""
-    speaking.say(result(1, "sideways"))
+    speaking.say(result(5, "sideways"))
     box.state()
     with pytest.raises(NoAnswer, match="'sideways'"):
         box.result(SHORT_S)
+    speaking.script = lambda s: [sentence("ANS", s.kind, "ok").partition(b"*")[0] + b"\r\n"]
+    with pytest.raises(NoAnswer):
+        box.ask("NEW", timeout_s=SHORT_S)
+    eventually(lambda: box.damaged == 6)
 
 
 @pytest.mark.parametrize("kind", ["START", ""])
 def test_a_command_that_is_refused(speaking: SpeakingBox, box: Palpate, kind: str):
-    """The box's reason is raised, also for a command that was damaged on its way."""
+    """The box's reason is raised, also for a command that was damaged on its way. The late answer
+    to an abandoned command is not taken for that to the next command."""
     speaking.script = lambda s: [sentence("ANS", kind, "error", "set trigger.mode")]
     with pytest.raises(CommandRefused, match="set trigger"):
         box.start()
-
-
-def test_an_answer_to_another_command_is_left_alone(speaking: SpeakingBox, box: Palpate):
-    """The late answer to an abandoned command is not taken for that to the next command."""
     speaking.script = lambda s: [sentence("ANS", "TARE", "error", "late"), *obeying(s)]
     assert box.state().skin == "streaming"
 
@@ -285,7 +279,8 @@ def test_a_port_is_not_closed_while_a_command_is_written():
 
 
 def test_a_port_that_is_not_there(tmp_path: Path):
-    """It is waited for: commands fail at once and name it, `wait_ready` fails at its deadline."""
+    """It is waited for: commands fail at once and name it, `wait_ready` fails at its deadline, also
+    where pyserial refuses."""
     with Palpate(str(tmp_path / "ttyUSB0")) as box:
         with pytest.raises(NoAnswer, match=r"not ready within 0\.05 s: .*ttyUSB0"):
             box.wait_ready(SHORT_S)
@@ -293,10 +288,6 @@ def test_a_port_that_is_not_there(tmp_path: Path):
             box.tare()
         with pytest.raises(LinkLost, match="ttyUSB0"):
             box.result(LONG_S)
-
-
-def test_a_port_that_refuses():
-    """pyserial's own errors become `trouble`."""
 
     def refuse() -> None:
         raise serial.SerialException(13, "permission denied")
@@ -314,18 +305,6 @@ def test_the_oldest_of_too_many_answers_is_dropped(speaking: SpeakingBox, box: P
     box.state()
     assert box.result(LONG_S).sweep == 3
     assert box.missed == 2
-
-
-def test_a_listener_hears_answers_and_states(speaking: SpeakingBox):
-    """Each once, in order."""
-    heard: list[Answer | BoxState] = []
-    with Palpate(str(speaking.path), timeout_s=LONG_S, listener=heard.append) as box:
-        box.wait_ready(LONG_S)
-        speaking.say(state(), result(1), state(answered=1))
-        box.result(LONG_S)
-        box.state()
-    assert [type(one) for one in heard] == [BoxState, Answer, BoxState]
-    assert heard[1].label == "wood"
 
 
 def test_commands_of_several_threads_do_not_mix(speaking: SpeakingBox, box: Palpate):
@@ -399,23 +378,3 @@ def test_the_client_needs_pyserial_alone():
     words = [sys.executable, "-c", code]
     done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True, timeout=120)
     assert done.stdout.strip() == "['serial'] ['client', 'core']"
-
-
-def test_what_is_no_sentence_of_ours_is_counted(box: Palpate, speaking: SpeakingBox):
-    """REC of `palpate record` and kinds of later versions are skipped; they are valid sentences, so
-    they do not count as damage."""
-    speaking.say(sentence("REC", 7, "stored", 5), sentence("NEW", 1), result(1))
-    assert box.result(LONG_S).sweep == 1
-    assert box.damaged == 0
-
-
-def test_an_unsummed_reply_is_not_believed(speaking: SpeakingBox, box: Palpate):
-    """An ANS without a checksum could be anything."""
-
-    def unsealed(heard: Sentence) -> list[bytes]:
-        return [sentence("ANS", heard.kind, "ok").partition(b"*")[0] + b"\r\n"]
-
-    speaking.script = unsealed
-    with pytest.raises(NoAnswer):
-        box.ask("NEW", timeout_s=SHORT_S)
-    eventually(lambda: box.damage == "ANS came without a checksum")
