@@ -165,7 +165,6 @@ class ContactTracker:
         if self._expected.threshold is not None and least >= self._expected.threshold:
             above = " above the unloaded skin" if np.any(self._expected.unloaded) else ""
             unit = self._expected.unit
-            unit = self._expected.unit
             hint = (
                 f"a taxel has not read less than {figure(least, least, unit)} "
                 f"{unit or 'raw counts'}{above} yet: something lies on the skin"

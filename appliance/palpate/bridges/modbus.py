@@ -155,16 +155,10 @@ FINGERS = (
     ),
 )
 """The last entries of the map: the answers of the fingers."""
-COUNTERS = {
-    "heartbeat",
-    "answers",
-    "sweep",
-    "answered",
-    "frames",
-    "lost frames",
-    "missed answers",
-    "damaged sentences",
-}
+COUNTERS = (
+    *("heartbeat", "answers", "sweep", "answered"),
+    *("frames", "lost frames", "missed answers", "damaged sentences"),
+)
 """Entries that wrap; all others stay at the largest number that fits."""
 
 

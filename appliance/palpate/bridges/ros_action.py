@@ -81,16 +81,11 @@ class SweepAction:
         """The answer, if one came, and the message for it."""
 
         def say(phase: str, answer: Answer | None) -> None:
-            said = (
-                {
-                    "status": str(answer.status),
-                    "label": answer.label,
-                    "probability": answer.probability,
-                }
-                if answer
-                else {}
-            )
-            goal.publish_feedback(Sweep.Feedback(phase=phase, **said))
+            said = Sweep.Feedback(phase=phase)
+            if answer:
+                said.status, said.label = str(answer.status), answer.label
+                said.probability = answer.probability
+            goal.publish_feedback(said)
 
         try:
             box = self._box()
@@ -101,15 +96,8 @@ class SweepAction:
         except ApplianceError as e:
             return None, Sweep.Result(message=str(e))
         names = (
-            "sweep",
-            "label",
-            "probability",
-            "margin",
-            "fused",
-            "lost",
-            "latency_ms",
-            "share",
-            "bundle",
+            *("sweep", "label", "probability", "margin", "fused", "lost"),
+            *("latency_ms", "share", "bundle"),
         )
         return answer, Sweep.Result(
             status=str(answer.status),

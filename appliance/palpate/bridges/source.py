@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from palpate.client.answers import Answer, BoxState
 from palpate.client.box import BAUD, Heard, Palpate
@@ -73,36 +73,9 @@ class BoxView:
         return self.labels.index(label) + 1 if label in self.labels else 0
 
 
-class Source(Protocol):
-    """A bridge's connection to the box. name: for messages."""
-
-    name: str
-
-    def view(self) -> BoxView: ...
-
-    def refresh(self) -> None:
-        """Ask for facts that do not come by themselves; may take seconds. To be called about once a
-        second."""
-        ...
-
-    def send(self, command: str, **slide: float) -> str:
-        """Carry out one of COMMANDS; the box's reply. slide: speed_mm_s and force_n, for START
-        only. Raises ApplianceError."""
-        ...
-
-    def wait_ready(self, timeout_s: float) -> None:
-        """Wait until a sweep can begin, so that every earlier sweep is answered. Raises NoAnswer or
-        CommandRefused."""
-        ...
-
-    def close(self) -> None:
-        """Release the box."""
-        ...
-
-
 class LineSource:
-    """The box over its serial line. heard: is called with each answer and state, in the reading
-    thread."""
+    """The box over its serial line. name: for messages. heard: is called with each answer and
+    state, in the reading thread."""
 
     def __init__(
         self,
@@ -127,7 +100,8 @@ class LineSource:
         )
 
     def refresh(self) -> None:
-        """Ask for the labels of a new bundle."""
+        """Ask for the labels of a new bundle; may take seconds. To be called about once a
+        second."""
         self._box.forget()  # nobody asks for results here
         view = self._view
         if view.state and view.state.bundle and view.state.bundle != view.bundle:
@@ -138,10 +112,13 @@ class LineSource:
             self._view = replace(self._view, labels=labels, bundle=view.state.bundle)
 
     def send(self, command: str, **slide: float) -> str:
-        """Carry out one of COMMANDS; the box's reply."""
+        """Carry out one of COMMANDS; the box's reply. slide: speed_mm_s and force_n, for START
+        only. Raises ApplianceError."""
         return COMMANDS[command](self._box, **slide) or "done"
 
     def wait_ready(self, timeout_s: float) -> None:
+        """Wait until a sweep can begin, so that every earlier sweep is answered. Raises NoAnswer or
+        CommandRefused."""
         self._box.wait_ready(timeout_s)
 
     def close(self) -> None:
@@ -235,6 +212,10 @@ class FeedSource:
         more |= {"latency_ms": line["latency_ns"] / 1e6, "status": Status(line["status"])}
         more |= {"source": state.source if state else ""}
         return Answer(**more | {name: line[name] for name in OF_VERDICT if name in line})
+
+
+Source = LineSource | FeedSource
+"""A bridge's connection to the box."""
 
 
 def noted(view: BoxView, news: Heard, now_ns: int) -> BoxView:

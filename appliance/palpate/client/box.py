@@ -16,7 +16,6 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from types import TracebackType
 from typing import Any, Self
 
 from palpate.client.answers import Answer, BoxIdentity, BoxState
@@ -84,9 +83,7 @@ class Palpate:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, e: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exc: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -124,11 +121,8 @@ class Palpate:
                     if state.sweeping
                     else f"the skin is {state.skin}"
                 )
-            except (
-                LinkLost,
-                NoAnswer,
-                CommandRefused,
-            ) as e:  # a bridge refuses while its own line is gone
+            # a bridge refuses while its own line is gone
+            except (LinkLost, NoAnswer, CommandRefused) as e:
                 why = str(e)
             with self._news:
                 self._news.wait(min(POLL_S, max(0.0, self._left_s(end_ns))))

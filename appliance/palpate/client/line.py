@@ -96,10 +96,8 @@ class Line:
                 self._changed()
                 why = self._read(self._port)
                 self.trouble = f"{self._name} was lost: {why}; it is opened again when it is back"
-                with (
-                    self._writing,
-                    contextlib.suppress(OSError),
-                ):  # without the lock, pyserial fails if it is closed while it writes
+                # without the lock, pyserial fails if it is closed while it writes
+                with self._writing, contextlib.suppress(OSError):
                     port, self._port = self._port, None
                     port.close()
                 self.losses += 1
@@ -122,9 +120,6 @@ class Line:
                         self._heard(sentence)
                 elif is_socket and self._clock.now_ns() - last_ns > SILENT_NS:
                     return "nothing came for 10 s"
-        except (
-            OSError,
-            TypeError,
-        ) as e:  # TypeError: pyserial 3.5 reads from a closed descriptor
+        except (OSError, TypeError) as e:  # pyserial 3.5 reads from a closed descriptor
             return str(e)
         return "closed"

@@ -299,16 +299,9 @@ class FeedServer(Observer):
 
 def _hello(format: SweepFormat, facts: Mapping[str, Any], most_hz: float) -> bytes:
     """The first line of each connection."""
-    content = {
-        "schema": FEED_SCHEMA,
-        "version": __version__,
-        "pid": os.getpid(),
-        **facts,
-        "format": format.json(),
-        "window_s": format.window / format.rate_hz,
-        "frames_hz": most_hz,
-    }
-    return encode("hello", content)
+    program = {"schema": FEED_SCHEMA, "version": __version__, "pid": os.getpid()}
+    sweeps = {"format": format.json(), "window_s": format.window / format.rate_hz}
+    return encode("hello", {**program, **facts, **sweeps, "frames_hz": most_hz})
 
 
 def _due(share: float, before: int, tick: int) -> bool:

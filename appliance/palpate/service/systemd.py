@@ -74,9 +74,7 @@ class Notifier(Observer):
             with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
                 manager.setblocking(False)
                 manager.sendto("\n".join(messages).encode(errors="replace"), self._address)
-        except (
-            OSError
-        ):  # gone, or full: a fault of the service manager must not become a fault of the robot
+        except OSError:  # gone, or full: not a fault of the robot
             return False
         return True
 

@@ -29,19 +29,8 @@ KEPT = {"hello": 8, "verdict": SHIFT, "minute": 1440, "signal": SWEEPS, "note": 
 """Number of events that are kept for new browsers, by name; of all other names the newest event is
 kept."""
 FIELDS = (
-    "sweep",
-    "time_ns",
-    "status",
-    "label",
-    "probability",
-    "margin",
-    "fused",
-    "lost",
-    "latency_ns",
-    "bundle",
-    "detail",
-    "share",
-    "moved",
+    *("sweep", "time_ns", "status", "label", "probability", "margin", "fused", "lost"),
+    *("latency_ns", "bundle", "detail", "share", "moved"),
 )
 """Fields of a verdict."""
 
@@ -76,11 +65,11 @@ class PageBoard:
     def take(self, line: Mapping[str, Any]) -> None:
         """Take a line of the feed. Lines of an unknown type are ignored: a later version may send
         them. Raises FormatError for a line that does not fit its type."""
-        act = _LINES.get(str(line.get("type")))
+        act = getattr(self, f"_take_{line.get('type')}", None)
         if not act:
             return
         try:
-            act(self, line)
+            act(line)
         except (KeyError, TypeError, ValueError, AttributeError) as e:
             raise FormatError(
                 f"the feed's line {line.get('type')!r} does not fit PROTOCOL.md: {e!r}; update"
@@ -184,14 +173,3 @@ def _restarted(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
         else "the same bundle"
     )
     return f"the box was restarted, with {changed}"
-
-
-_LINES: dict[str, Callable[[PageBoard, Mapping[str, Any]], None]] = {
-    "hello": PageBoard._take_hello,
-    "closed": PageBoard._take_closed,
-    "health": PageBoard._take_health,
-    "state": PageBoard._take_state,
-    "verdict": PageBoard._take_verdict,
-    "frame": PageBoard._take_frame,
-    "sweep": PageBoard._take_sweep,
-}

@@ -42,6 +42,8 @@ TRIGGERS = {
 }
 """The trigger of sweeps in words."""
 
+STATE = ("skin", "trouble", "sweeping", "ready", "due_ns", "frames")
+"""Facts of the box that the page shows; a change of any but the last is shown at once."""
 Obey = Callable[[Command], list[object]]
 """Carries out a command and returns the fields of its answer. Raises ApplianceError."""
 
@@ -212,7 +214,7 @@ class RecordPage(Observer):
         if health.enumerations != self._enumerations:
             self._enumerations = health.enumerations
             self._tracker.reset()
-        state = health.skin, health.trouble, health.sweeping, health.ready, health.due_ns
+        state = tuple(getattr(health, name) for name in STATE[:-1])
         if state != self._state or now_ns - self._state_ns >= PERIOD_NS:
             self._state, self._state_ns = state, now_ns
             self.server.publish(
@@ -221,12 +223,7 @@ class RecordPage(Observer):
                     **self._known,
                     **self._about(),
                     "time_ns": now_ns,
-                    "skin": health.skin,
-                    "trouble": health.trouble,
-                    "sweeping": health.sweeping,
-                    "ready": health.ready,
-                    "due_ns": health.due_ns,
-                    "frames": health.frames,
+                    **{name: getattr(health, name) for name in STATE},
                     "lost_frames": health.lost_frames if health.loss_known else None,
                 },
             )
