@@ -252,8 +252,9 @@ CUT = """() => [...document.querySelectorAll("main :not(svg *, #counts)")]
 """Elements whose content is cut; the table may scroll within itself."""
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize(("width", "height"), SIZES)
+@pytest.mark.parametrize(
+    ("width", "height", "scheme"), [(*SIZES[0], "dark"), (*SIZES[1], "light"), (*SIZES[2], "dark")]
+)
 def test_every_text_of_it_can_be_read(
     browser: Any, recorded: RecordedPage, width: int, height: int, scheme: str
 ):

@@ -32,24 +32,6 @@ def shown() -> Iterator[Shown]:
         yield one
 
 
-def test_the_verdict_comes_first_and_large(browser: Any, shown: Shown):
-    """Letters that are read from two metres: 20' of arc are 12 mm there, 57 px of a tablet's 0.2
-    mm; less at no size."""
-    for width, height in SIZES:
-        seen = opened(browser, shown, width, height)
-        assert seen.text("#label") == feed_lines.LABELS[40 % 6]
-        assert seen.text("#sure") == "96.2 %"
-        assert seen.text("#which").startswith("sweep 40, ")
-        label = seen.page.locator("#label")
-        assert float(label.evaluate("e => parseFloat(getComputedStyle(e).fontSize)")) >= (
-            57 if width > 400 else 40
-        )
-        box = label.bounding_box()
-        assert box["y"] + box["height"] <= height  # without scrolling
-        assert not seen.errors
-        seen.page.context.close()
-
-
 def test_people_read_display_names_and_programs_labels(browser: Any, shown: Shown, tmp_path: Path):
     """Card, list, counts and probabilities have the name in any language; the CSV has the label."""
     shown.board.take(feed_lines.hello(displays={"wood": "Holz, <b>geölt</b>"}))
@@ -291,8 +273,9 @@ def test_everything_has_a_role_and_a_name(browser: Any, shown: Shown):
     assert seen.page.locator("nav a[aria-current=page]").inner_text() == "Watch"
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize(("width", "height"), SIZES)
+@pytest.mark.parametrize(
+    ("width", "height", "scheme"), [(*SIZES[0], "dark"), (*SIZES[1], "light"), (*SIZES[2], "dark")]
+)
 @pytest.mark.parametrize("at", ["/", "/#align"])
 def test_every_text_can_be_read(
     browser: Any, shown: Shown, width: int, height: int, scheme: str, at: str
