@@ -79,37 +79,23 @@ class Agreement:
     @property
     def text(self) -> str:
         """The counts in one line, for a person."""
-        text = (
-            f"candidate {self.candidate} agrees with {self.current} on {self.agreed} of "
-            f"{self.compared} sweeps"
-        )
+        text = f"candidate {self.candidate} agrees with {self.current}"
+        text += f" on {self.agreed} of {self.compared} sweeps"
         if self.compared:
             low, high = wilson(self.agreed, self.compared)
-            text += (
-                f" [{100 * low:.1f} to {100 * high:.1f} %], computing "
-                f"{self.total_ms / self.compared:.2g} ms for each and {self.worst_ms:.2g} ms at "
-                "most"
-            )
+            text += f" [{100 * low:.1f} to {100 * high:.1f} %], computing"
+            text += f" {self.total_ms / self.compared:.2g} ms for each"
+            text += f" and {self.worst_ms:.2g} ms at most"
         text += f"; {self.later} early answers are not compared" if self.later else ""
         return text + (f"; it failed on {self.failed}" if self.failed else "")
 
     def lines(self, folder: Path) -> list[str]:
         """The text, each pair of different answers with the most frequent first, and the folder of
         the kept sweeps."""
-        pairs = [
-            (n, one, other)
-            for one, row in self.pairs.items()
-            for other, n in row.items()
-            if one != other
-        ]
-        differ = [
-            f"  {one} -> {other}: {n}" for n, one, other in sorted(pairs, key=lambda pair: -pair[0])
-        ]
-        return [
-            self.text,
-            *differ,
-            *([f"  {self.kept} of these are kept in {folder}"] if self.kept else []),
-        ]
+        pairs = [(n, one, other) for one, row in self.pairs.items() for other, n in row.items()]
+        pairs = sorted((pair for pair in pairs if pair[1] != pair[2]), key=lambda pair: -pair[0])
+        kept = [f"  {self.kept} of these are kept in {folder}"] if self.kept else []
+        return [self.text, *(f"  {one} -> {other}: {n}" for n, one, other in pairs), *kept]
 
     def json(self) -> bytes:
         """The content of agreement.json."""

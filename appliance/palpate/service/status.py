@@ -22,6 +22,14 @@ STALE_NS = 10_000_000_000
 watchdog time."""
 MOST_BYTES = 1 << 20
 _START = "systemctl start palpate, then see journalctl -u palpate"
+TROUBLES = {
+    "garbage_bytes": "bytes in no packet",
+    "stale_frames": "repeated or late",
+    "overflows": "transfers too large",
+    "fifo_overflows": "times the readout board's FIFO was full",
+    "foreign_frames": "frames of other nodes on its bus",
+}
+"""Counts of the skin that are shown unless they are 0, in words."""
 WELL, NOT_RUNNING, SKIN_AWAY = os.EX_OK, 1, os.EX_UNAVAILABLE
 
 
@@ -140,16 +148,9 @@ def _skin(report: Mapping[str, Any]) -> str:
     if not report.get("loss_known", True):
         lost = f"at least {lost}: this skin does not count its frames"
     counted = f"{report['frames']:,} frames, {lost}"
-    if report["garbage_bytes"]:
-        counted += f", {report['garbage_bytes']:,} bytes in no packet"
-    if report["stale_frames"]:
-        counted += f", {report['stale_frames']:,} repeated or late"
-    if report["overflows"]:
-        counted += f", {report['overflows']:,} transfers too large"
-    if report["fifo_overflows"]:
-        counted += f", {report['fifo_overflows']:,} times the readout board's FIFO was full"
-    if report["foreign_frames"]:
-        counted += f", {report['foreign_frames']:,} frames of other nodes on its bus"
+    for name, what in TROUBLES.items():
+        if report[name]:
+            counted += f", {report[name]:,} {what}"
     if report["enumerations"] > 1:
         counted += f", plugged in {report['enumerations']} times"
     return f"{report['skin']}{': ' if report['trouble'] else ''}{report['trouble']} ({counted})"

@@ -86,11 +86,8 @@ class Access:
         """Whether the Host of a request names this machine. own: the local address of the
         connection."""
         name = host.rsplit(":", 1)[0] if not host.endswith("]") else host
-        return bool(name) and name.lower() in (
-            *NAMES,
-            *self.names,
-            f"[{own}]" if ":" in own else own,
-        )
+        own = f"[{own}]" if ":" in own else own
+        return bool(name) and name.lower() in (*NAMES, *self.names, own)
 
     def admits(self, given: str) -> bool:
         """Whether `given` is the token, or no token is needed. All wrong tokens take the same
@@ -110,12 +107,9 @@ def _token(path: Path) -> str:
     try:
         token = path.read_text("ascii").strip()
     except PermissionError as e:
-        join = (
-            f"add this user to its group with usermod -aG GROUP USER (ls -ld {path.parent} "
-            "shows it)"
-        )
         raise ConfigError(
-            f"{path} may not be read by this user; {join}, or set watch.address to {HERE}"
+            f"{path} may not be read by this user; add the user to the group of {path.parent} "
+            f"(usermod -aG GROUP USER), or set watch.address to {HERE}"
         ) from e
     except (OSError, ValueError) as e:
         raise (TemporaryError if passes(e) else ConfigError)(
