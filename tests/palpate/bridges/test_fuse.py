@@ -41,10 +41,6 @@ class Fused:
             self.take(name, feed_lines.hello())
             self.take(name, feed_lines.health(0))
 
-    def _heard(self, line: bytes) -> bool:
-        self.lines.append(line)
-        return True
-
     def take(self, *lines: Any) -> None:
         """A finger's name and its lines, then a turn."""
         for line in lines[1:]:
