@@ -121,12 +121,8 @@ def test_a_sweep_on_which_they_differ_is_kept_with_both_verdicts(side):
     for name, run in (("verdict", pair.current), ("candidate", pair.shadow._classifier)):
         assert run(again).scores.tolist() == told[name]["scores"]
     written = pair.written()
-    assert (written.compared, written.agreed, written.kept, written.pairs) == (
-        1,
-        0,
-        1,
-        {"a": {"b": 1}},
-    )
+    assert (written.compared, written.agreed, written.kept) == (1, 0, 1)
+    assert written.pairs == {"a": {"b": 1}}
     assert written.lines(pair.folder)[1:] == [
         "  a -> b: 1",
         f"  1 of these are kept in {pair.folder}",
@@ -209,11 +205,8 @@ def test_an_early_answer_is_compared_where_the_candidate_gives_one(tmp_path: Pat
         share=0.5,
         frames=types.Frames(*(v[:10] for v in (A.frames.t_ns, A.frames.seq, A.frames.taxels))),
     )
-    for candidate, counts in (
-        (replace(eager, id="e"), (1, 1, 0)),
-        (slow, (0, 0, 1)),
-        (plain, (0, 0, 1)),
-    ):
+    known = (replace(eager, id="e"), (1, 1, 0)), (slow, (0, 0, 1)), (plain, (0, 0, 1))
+    for candidate, counts in known:
         pair = Side(eager, candidate, tmp_path / f"shadow-{candidate.id}")
         verdict = shadow.EarlyExit(pair.current)(half)
         assert verdict
@@ -229,14 +222,8 @@ class FailingClassifier:
     def __init__(
         self, run: Classifier, fails: Callable[[Sweep], bool], act: Callable[[], None]
     ) -> None:
-        self.format, self.taxels = run.format, run.taxels
-        self.bundle, self.self_test, self._run, self._fails, self._act = (
-            run.bundle,
-            run.self_test,
-            run,
-            fails,
-            act,
-        )
+        self.format, self.taxels, self.bundle = run.format, run.taxels, run.bundle
+        self.self_test, self._run, self._fails, self._act = run.self_test, run, fails, act
 
     def __call__(self, one: Sweep):
         """Fail, or judge."""
@@ -341,10 +328,7 @@ def test_a_candidate_that_cannot_be_one_is_named(side, tmp_path: Path, default_b
     file are errors that say what to try."""
     with pytest.raises(BundleError, match="wants 4x4 uint8"):
         side(lambda b: default_bundle)
-    with pytest.raises(
-        BundleError,
-        match=r"bbbbbbbb .* \d+ bytes together",
-    ):
+    with pytest.raises(BundleError, match="bytes together"):
         side(lambda b: replace(b, id="bbbbbbbb", model=bytes(shadow.MOST_MODELS)))
     with pytest.raises(BundleError, match="golden sweeps"):
         side(lambda b: replace(b, golden_logits=b.golden_logits[:, ::-1].copy()))

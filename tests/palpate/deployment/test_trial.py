@@ -29,18 +29,8 @@ SECOND = 1_000_000_000
 
 def health(time_s: float, streams: bool = True, sweeping: bool = False) -> Health:
     """Health of the box at this time."""
-    return feeds.HEALTH._replace(
-        time_ns=round(time_s * SECOND),
-        skin="streaming" if streams else "absent",
-        streams=streams,
-        sweeping=sweeping,
-        answered=0,
-        frames=0,
-        lost_frames=0,
-        bundle="",
-        source="sim",
-        ready=False,
-    )
+    at_ns = round(time_s * SECOND)
+    return feeds.HEALTH._replace(time_ns=at_ns, streams=streams, sweeping=sweeping)
 
 
 def verdict(label: str = "Canvas") -> Verdict:
