@@ -96,66 +96,33 @@ def check_refused(files: dict[str, bytes], why: str) -> None:
 
 
 WRONG = {
-    "another bundle": (
-        {"base": np.array("0" * 64)},
-        "belongs to bundle '00000000', and the files beside it are those of",
-    ),
-    "no bundle": ({"base": np.zeros(64, np.uint8)}, "names no bundle and its labels"),
-    "no labels": ({"labels": np.array([], "U1")}, "names no bundle and its labels"),
-    "labels as bytes": ({"labels": np.array([b"felt", b"cork"])}, "names no bundle and its labels"),
-    "a label that is taken": (
-        {"labels": np.array(["felt", "a"])},
-        "must be at least two different names",
-    ),
-    "a label twice": (
-        {"labels": np.array(["felt", "felt"])},
-        "must be at least two different names",
-    ),
+    "another bundle": ({"base": np.array("0" * 64)}, "bundle '00000000'"),
+    "no bundle": ({"base": np.zeros(64, np.uint8)}, "names no bundle"),
+    "no labels": ({"labels": np.array([], "U1")}, "names no bundle"),
+    "labels as bytes": ({"labels": np.array([b"felt", b"cork"])}, "names no bundle"),
+    "a label that is taken": ({"labels": np.array(["felt", "a"])}, "two different names"),
+    "a label twice": ({"labels": np.array(["felt", "felt"])}, "two different names"),
     "a label that cannot be sent": ({"labels": np.array(["felt", "$,*"])}, "cannot be sent"),
-    "more labels than means": (
-        {"labels": np.array(["felt", "cork", "silk"])},
-        r"means float32 \[2, 2\]; .*\[3, 2\]",
-    ),
-    "means of another rank": ({"means": np.zeros((2, 3), np.float32)}, r"means float32 \[2, 3\]"),
+    "more labels than means": ({"labels": np.array(["felt", "cork", "silk"])}, r"\[3, 2\]"),
+    "means of another rank": ({"means": np.zeros((2, 3), np.float32)}, r"float32 \[2, 3\]"),
     "means as doubles": ({"means": np.zeros((2, 2))}, "means float64"),
-    "a mean that is nan": (
-        {"means": np.float32([[7, 8], [np.nan, 0]])},
-        "means that are not finite",
-    ),
-    "a mean without end": (
-        {"means": np.float32([[7, 8], [3e38, 3e38]])},
-        "bias that are not finite",
-    ),
-    "no sweep": ({"sweeps": np.array([2, 0])}, "number of sweeps or a spread below 1, or too many"),
-    "sweeps below none": (
-        {"sweeps": np.array([2, -5])},
-        "number of sweeps or a spread below 1, or too many",
-    ),
-    "sweeps without end": (
-        {"sweeps": np.array([2, 1 << 62])},
-        "number of sweeps or a spread below 1, or too many",
-    ),
-    "a small spread": ({"spread": np.float32([1, 0.5])}, "number of sweeps or a spread below 1"),
-    "a spread without end": ({"spread": np.float32([1, np.inf])}, "spread that are not finite"),
-    "golden sweeps of another shape": (
-        {"changes": np.zeros((1, 2, 20, 2, 2), np.uint8)},
-        "changes uint8",
-    ),
-    "logits of fewer labels": (
-        {"logits": np.zeros((4, 4), np.float32)},
-        r"logits float32 \[4, 4\]; float32 \[4, 5\]",
-    ),
-    "logits that are nan": (
-        {"logits": np.full((4, 5), np.nan, np.float32)},
-        "logits that are not finite",
-    ),
-    "no logits": ({"logits": None}, "cannot be read.*logits"),
-    "no rule": ({"least": None}, "cannot be read.*least"),
-    "no means": ({"means": None}, "cannot be read.*means"),
-    "a rule of another type": ({"least": np.array([0.7])}, r"least float64 \[1\]; float64 \[\]"),
-    "a rule that is nan": ({"least": np.array(np.nan)}, "least that are not finite"),
-    "a rule that prefers new labels": ({"least": np.array(0.4)}, "known.enrolled 0.4 must be"),
-    "a rule that lets none pass": ({"least": np.array(1.0)}, "known.enrolled 1.0 must be"),
+    "a mean that is nan": ({"means": np.float32([[7, 8], [np.nan, 0]])}, "means that"),
+    "a mean without end": ({"means": np.float32([[7, 8], [3e38, 3e38]])}, "bias that"),
+    "no sweep": ({"sweeps": np.array([2, 0])}, "number of sweeps"),
+    "sweeps below none": ({"sweeps": np.array([2, -5])}, "number of sweeps"),
+    "sweeps without end": ({"sweeps": np.array([2, 1 << 62])}, "too many"),
+    "a small spread": ({"spread": np.float32([1, 0.5])}, "spread below 1"),
+    "a spread without end": ({"spread": np.float32([1, np.inf])}, "spread that"),
+    "other golden sweeps": ({"changes": np.zeros((1, 2, 20, 2, 2), np.uint8)}, "changes uint8"),
+    "logits of fewer labels": ({"logits": np.zeros((4, 4), np.float32)}, r"float32 \[4, 5\]"),
+    "logits that are nan": ({"logits": np.full((4, 5), np.nan, np.float32)}, "logits that"),
+    "no logits": ({"logits": None}, "logits"),
+    "no rule": ({"least": None}, "least"),
+    "no means": ({"means": None}, "means"),
+    "a rule of another type": ({"least": np.array([0.7])}, r"float64 \[1\]; float64 \[\]"),
+    "a rule that is nan": ({"least": np.array(np.nan)}, "least that"),
+    "a rule that prefers new labels": ({"least": np.array(0.4)}, "known.enrolled 0.4"),
+    "a rule that lets none pass": ({"least": np.array(1.0)}, "known.enrolled 1.0"),
     "objects": ({"spread": np.array([1, "x"], object)}, "cannot be read"),
 }
 
@@ -177,7 +144,7 @@ def test_a_member_that_is_no_array_is_refused(made: dict[str, bytes], name: str)
             damaged.writestr(
                 member, b"nothing" if member == whole.namelist()[0] else whole.read(member)
             )
-    with pytest.raises(BundleError, match=rf"{name} cannot be read: '\w+' is not an array"):
+    with pytest.raises(BundleError, match="is not an array"):
         arrays.read(file.getvalue(), name)
 
 
@@ -185,18 +152,13 @@ def test_a_file_that_is_no_npz_is_refused(made: dict[str, bytes]):
     """A cut or empty file, other bytes, or a zip file that unpacks without end."""
     whole = made[bundle.ENROLMENT]
     for data in (b"", b"PK", whole[:200], b"\0" * 1000):
-        check_refused(made | {bundle.ENROLMENT: data}, "enrolment.npz cannot be read")
+        check_refused(made | {bundle.ENROLMENT: data}, "cannot be read")
     name, extra = (int.from_bytes(whole[at : at + 2], "little") for at in (26, 28))
     packed, central = 30 + name + extra, whole.index(b"PK\1\2")
-    for at, value in (
-        (packed, 0xFF),
-        (central + 8, 1),
-        (central + 10, 99),
-    ):  # no deflate, encrypted, method 99
-        check_refused(
-            made | {bundle.ENROLMENT: whole[:at] + bytes([value]) + whole[at + 1 :]},
-            "enrolment.npz cannot be read",
-        )
+    # no deflate, encrypted, method 99
+    for at, value in ((packed, 0xFF), (central + 8, 1), (central + 10, 99)):
+        damaged = whole[:at] + bytes([value]) + whole[at + 1 :]
+        check_refused(made | {bundle.ENROLMENT: damaged}, "cannot be read")
     bomb = io.BytesIO()
     np.savez_compressed(bomb, **content(made) | {"zeros": np.zeros(70 << 20, np.uint8)})
     check_refused(made | {bundle.ENROLMENT: bomb.getvalue()}, "unpacks to .* bytes")
