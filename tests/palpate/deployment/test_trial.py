@@ -3,6 +3,7 @@ trouble with the disk."""
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
@@ -25,6 +26,7 @@ from tests.factories.simulated_box import Rigged
 
 pytestmark = deliveries.NEEDED
 SECOND = 1_000_000_000
+Ready = tuple[str, str, str]
 
 
 def health(time_s: float, streams: bool = True, sweeping: bool = False) -> Health:
@@ -43,9 +45,11 @@ class Trying(Delivery):
     """A box with bundle 1 committed and bundle 2 on trial. Its trial ends after 5 sweeps or 600
     s."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, ready: Ready) -> None:
+        """ready: the store of such a box, with the sha256 of both bundles."""
         super().__init__(folder)
-        self.one, self.two = self.committed(1), self.installed(2)
+        made, self.one, self.two = ready
+        shutil.copytree(made, self.how.folder, symlinks=True, dirs_exist_ok=True)
 
     def tried(self) -> Trial:
         """The trial of one more start."""
@@ -59,10 +63,18 @@ class Trying(Delivery):
         return self.store.state.of(self.two)
 
 
+@pytest.fixture(scope="module")
+def ready(tmp_path_factory: pytest.TempPathFactory) -> Ready:
+    """The store of a box with bundle 1 committed and bundle 2 on trial."""
+    made = Delivery(tmp_path_factory.mktemp("ready"))
+    one, two = made.committed(1), made.installed(2)
+    return made.how.folder, one, two
+
+
 @pytest.fixture
-def box(tmp_path: Path) -> Trying:
+def box(tmp_path: Path, ready: Ready) -> Trying:
     """A box with a bundle on trial."""
-    return Trying(tmp_path)
+    return Trying(tmp_path, ready)
 
 
 def booted(box: Trying, name: str) -> None:
