@@ -49,29 +49,21 @@ class ListedBundle:
 def entries(store: Store) -> list[ListedBundle]:
     """The bundles of the store, in the order of their roles."""
     current, state = store.current, store.state
-    names = (
-        sorted(p.name for p in store.bundles.folder.iterdir())
-        if store.bundles.folder.is_dir()
-        else []
-    )
-    listed = [
-        _entry(store, sha, current, state) for sha in (*filter(SHA.fullmatch, names), PACKAGED)
-    ]
+    folder = store.bundles.folder
+    names = sorted(p.name for p in folder.iterdir()) if folder.is_dir() else []
+    shas = (*filter(SHA.fullmatch, names), PACKAGED)
+    listed = [_entry(store, sha, current, state) for sha in shas]
     order = ("current", "on trial", "previous", "candidate", "left", "kept", "damaged")
     return sorted(listed, key=lambda e: order.index(e.role))
 
 
 def lines(listed: Iterable[ListedBundle]) -> list[str]:
-    """The list as a table."""
-    rows = [
-        (e.role, e.id, f"{e.name} {e.version}", str(e.counter), e.signer, e.detail) for e in listed
-    ]
-    rows = [("role", "id", "bundle", "counter", "signed by", ""), *rows]
+    rows = [("role", "id", "bundle", "counter", "signed by", "")]
+    for e in listed:
+        name = f"{e.name} {e.version}"
+        rows.append((e.role, e.id, name, str(e.counter), e.signer, e.detail))
     wide = [max(len(row[i]) for row in rows) for i in range(5)]
-    return [
-        "  ".join([*(t.ljust(w) for t, w in zip(row, wide, strict=False)), row[-1]]).rstrip()
-        for row in rows
-    ]
+    return ["  ".join([*map(str.ljust, row[:5], wide), row[5]]).rstrip() for row in rows]
 
 
 def _entry(store: Store, sha: str, current: str, state: StoreState) -> ListedBundle:
@@ -83,16 +75,8 @@ def _entry(store: Store, sha: str, current: str, state: StoreState) -> ListedBun
             signed = store.bundles.get(sha)
             loaded, signer = signed.bundle, signed.signer
     except BundleError as e:
-        return ListedBundle(
-            sha,
-            sha[:8],
-            "?",
-            "?",
-            0,
-            "?",
-            "damaged",
-            " ".join(filter(None, (role, detail, str(e)))),
-        )
+        why = " ".join(filter(None, (role, detail, str(e))))
+        return ListedBundle(sha, sha[:8], "?", "?", 0, "?", "damaged", why)
     m = loaded.manifest
     return ListedBundle(sha, loaded.id, m.name, m.version, m.counter, signer, role, detail)
 
@@ -102,12 +86,10 @@ def _role(sha: str, current: str, state: StoreState, settings: StoreConfig) -> t
     if sha == current and standing.committed:
         return "current", ""
     if sha == current:
-        return "on trial", (
-            f"start {standing.starts} of {MOST_STARTS}, {standing.sweeps} of"
-            f" {settings.trial_sweeps} sweeps, {standing.streamed_s:.0f} of {settings.trial_s:.0f}"
-            " s,"
-            " as of its last start or end"
-        )
+        trial = f"start {standing.starts} of {MOST_STARTS}"
+        trial += f", {standing.sweeps} of {settings.trial_sweeps} sweeps"
+        trial += f", {standing.streamed_s:.0f} of {settings.trial_s:.0f} s"
+        return "on trial", f"{trial}, as of its last start or end"
     if sha == state.of(current).previous:
         return "previous", ""
     if sha == state.candidate != PACKAGED:
@@ -116,7 +98,6 @@ def _role(sha: str, current: str, state: StoreState, settings: StoreConfig) -> t
 
 
 def run_list(args: argparse.Namespace) -> int:
-    """Print the bundles of the store."""
     from palpate.deployment import shadow
 
     settings = load_settings(args)
@@ -135,10 +116,10 @@ def run_install(args: argparse.Namespace) -> int:
     store = assembly.store(settings)
     skin = None if args.other_skin else streaming(settings, store)
     sha = store.install(args.folder, args.shadow, lambda new: suits(new, skin))
-    committed = (
-        "it is committed already" if store.state.of(sha).committed else f"it runs on trial {NEXT}"
-    )
-    how = "it is the candidate" if args.shadow else committed
+    how = "it is the candidate"
+    if not args.shadow:
+        committed = store.state.of(sha).committed
+        how = "it is committed already" if committed else f"it runs on trial {NEXT}"
     print(f"bundle {sha[:8]} is installed; {how}{_elsewhere(settings)}")
     return 0
 
@@ -150,8 +131,7 @@ def _elsewhere(settings: Config) -> str:
 
 
 def streaming(settings: Config, store: Store) -> SweepFormat | None:
-    """The format of the skin that streams into the service, which is the format of the running
-    bundle. None if it is not known."""
+    """The format of the skin that streams into the service, None if it is not known."""
     try:
         if not settings.store.status:
             return None
@@ -159,22 +139,17 @@ def streaming(settings: Config, store: Store) -> SweepFormat | None:
         running = store.running().bundle
     except ApplianceError:  # `palpate status` and `palpate bundles` say what is wrong with them
         return None
-    return (
-        running.format
-        if report["running"] and report["streams"] and report["bundle"] == running.id
-        else None
-    )
+    runs = report["running"] and report["streams"] and report["bundle"] == running.id
+    return running.format if runs else None
 
 
 def suits(new: Bundle, skin: SweepFormat | None) -> None:
-    """Raise BundleError if `new` is for another skin than the streaming skin. None: the skin is not
-    known."""
+    """Raise BundleError if `new` is for another skin than the streaming one (None: not known)."""
     if skin and not fits(skin, new.format):
         raise BundleError(
-            f"bundle {new.id} is for a skin of {new.format}, and the skin that streams has {skin}:"
-            " it"
-            " would answer no sweep; if another skin comes with it, use --other-skin (make deploy"
-            " OTHER_SKIN=1)"
+            f"bundle {new.id} is for a skin of {new.format}, and the skin that streams has {skin};"
+            " it would answer no sweep; if another skin comes with it, use --other-skin (make"
+            " deploy OTHER_SKIN=1)"
         )
 
 
@@ -182,27 +157,22 @@ def run_verify(args: argparse.Namespace) -> int:
     """Examine a bundle as `install` does, without its counter."""
     signed = assembly.store(load_settings(args)).examine(args.folder)
     m = signed.bundle.manifest
-    print(
-        f"bundle {signed.bundle.id}: {m.name} {m.version}, counter {m.counter}, signed by"
-        f" {signed.signer}; all is well"
-    )
+    kind = f"{m.name} {m.version}, counter {m.counter}, signed by {signed.signer}"
+    print(f"bundle {signed.bundle.id}: {kind}; all is well")
     return 0
 
 
 def run_commit(args: argparse.Namespace) -> int:
-    """End the trial."""
     print("committed" if assembly.store(load_settings(args)).commit() else "nothing is on trial")
     return 0
 
 
 def run_rollback(args: argparse.Namespace) -> int:
-    """Go back to the previous bundle."""
     sha = assembly.store(load_settings(args)).rollback()
     print(f"{f'bundle {sha[:8]}' if sha else 'the packaged bundle'} runs {NEXT}")
     return 0
 
 
 def run_promote(args: argparse.Namespace) -> int:
-    """Run the candidate on trial."""
     print(f"bundle {assembly.store(load_settings(args)).promote()[:8]} runs on trial {NEXT}")
     return 0

@@ -21,19 +21,15 @@ if TYPE_CHECKING:
 
 def load_settings(args: argparse.Namespace) -> Config:
     """The settings with the changes that a command's options make. Raises ConfigError."""
-    given = {
-        key: value
-        for key, option in (("profile", "skin"), ("port", "skin_port"))
-        if (value := getattr(args, option, None))
-    }
-    sets = [*args.set, *(f"skin.{key}={value}" for key, value in given.items())]
+    sets = list(args.set)
+    for key, option in (("profile", "skin"), ("port", "skin_port")):
+        if value := getattr(args, option, None):
+            sets.append(f"skin.{key}={value}")
     every, sweep = getattr(args, "every", None), getattr(args, "sweep", None)
     mode = getattr(args, "trigger", None)
     if every is not None or sweep is not None:
         if mode not in (None, "timed"):
-            raise ConfigError(
-                f"--every and --sweep are for --trigger timed, not for {mode}; leave them out"
-            )
+            raise ConfigError(f"--every and --sweep are for --trigger timed, not for {mode}")
         mode = "timed"
     sets += [f"trigger.mode={mode}"] if mode else []
     settings = config.load(args.board, sets, folder=args.config_dir, unit=args.unit)
@@ -50,10 +46,8 @@ def load_bundle(settings: Config, *, answers: bool = True) -> Bundle:
     try:
         return assembly.running(settings, answers=answers).bundle
     except PermissionError as e:
-        raise BundleDenied(
-            f"{e.filename}: this user may not read the deployed bundle; use the service's rights: "
-            "sudo -u palpate palpate ..., with the same command"
-        ) from e
+        how = "use the service's rights: sudo -u palpate palpate ..., with the same command"
+        raise BundleDenied(f"{e.filename}: this user may not read the bundle; {how}") from e
 
 
 def check_output(path: Path) -> None:

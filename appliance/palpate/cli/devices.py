@@ -26,17 +26,15 @@ def open_devices(args: argparse.Namespace, format: Callable[[], SweepFormat] | N
     """The real devices, or simulated devices with `--sim`. format: gives the format of a simulated
     skin; None for the format of its script."""
     if args.sim:
-        return simulated(
-            args.sim, format() if format else None, args, load_settings(args), remember=False
-        )
+        settings = load_settings(args)
+        return simulated(args.sim, format() if format else None, args, settings, remember=False)
     if args.virtual:
         raise ConfigError("--virtual needs --sim: real devices run in real time")
     return Devices(SystemClock())
 
 
 def open_any(args: argparse.Namespace, settings: Config) -> Devices:
-    """The devices. A simulated skin has the format of the bundle, if there is a bundle and the skin
-    can send this format."""
+    """The devices. A simulated skin has the bundle's format, if there is one that it can send."""
     try:
         return open_devices(args, lambda: load_bundle(settings, answers=False).format)
     except (BundleError, FormatError):
@@ -53,21 +51,14 @@ def simulated(
     spread: bool = False,
     touring: bool = False,
 ) -> RobotDevices:
-    """A simulated robot with the skin of the settings: a readout board on USB. touring:
-    the robot plays the tour of `palpate demo`."""
+    """A simulated robot with a readout board on USB. touring: it plays the tour of the demo."""
     from palpate.sim import devices, rig, script, tour
 
     clock: Clock = rig.VirtualClock() if args.virtual else SystemClock()
     follows = settings.trigger.mode == "serial"
     profile = skins.profile(settings)
     if profile.codec == "palpate":
-        acts, source, format = script.named(
-            name,
-            format,
-            args.seed,
-            spread=spread,
-            follows=follows,
-        )
+        acts, source, format = script.named(name, format, args.seed, spread=spread, follows=follows)
         acts = islice(tour.tour(format, args.seed) if touring else acts, args.sweeps)
         return devices.build(format, acts, clock, source, remember=remember, follows=follows)
     return emulated(name, format, args, settings, clock, remember=remember, spread=spread)

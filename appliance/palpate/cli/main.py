@@ -82,8 +82,7 @@ def _fill_streams() -> None:
 
 
 def _flush() -> None:
-    """Write the rest of standard output; what a full disk or a slow reader does not take is
-    lost."""
+    """Write the rest of standard output; on a full disk it is lost."""
     try:
         sys.stdout.flush()
     except BrokenPipeError:

@@ -6,7 +6,7 @@ It imports neither numpy nor devices, so that help answers at once.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from palpate import __version__
@@ -21,134 +21,133 @@ Parser = argparse.ArgumentParser
 
 
 class CommandEntry(NamedTuple):
-    """A command. run: its function below `palpate`, imported when it is called. options: adds its
-    options. actions: its actions, if it has any."""
+    """A command. run: its function below `palpate`, imported when it is called. options: see
+    `options.add`. actions: its actions, if it has any."""
 
     text: str
     run: str
-    options: Callable[[Parser], None]
+    options: str = ""
     actions: Mapping[str, CommandEntry] = {}
 
 
+_SKIN = "sim skin virtual seed port"
+_TIMES = "trigger every sweep capture"
+_BUNDLES = {
+    "list": CommandEntry(
+        "show which bundle runs, and which bundle `rollback` returns to",
+        "cli.bundle_commands.run_list",
+        "json",
+    ),
+    "install": CommandEntry(
+        "check the signed bundle in DIR, and run it on trial from the next start on",
+        "cli.bundle_commands.run_install",
+        "folder candidate other-skin",
+    ),
+    "verify": CommandEntry(
+        "check the signed bundle in DIR, and change nothing",
+        "cli.bundle_commands.run_verify",
+        "folder",
+    ),
+    "commit": CommandEntry(
+        "end the trial of the bundle that runs: it stays", "cli.bundle_commands.run_commit"
+    ),
+    "rollback": CommandEntry(
+        "go back to the previous bundle, from the next start on",
+        "cli.bundle_commands.run_rollback",
+    ),
+    "promote": CommandEntry(
+        "run the candidate on trial from the next start on", "cli.bundle_commands.run_promote"
+    ),
+}
+_SKINS = {
+    "list": CommandEntry(
+        "show all profiles, with missing features, and whether a device was measured",
+        "cli.skin_commands.run_list",
+    ),
+    "detect": CommandEntry(
+        "find connected skins and the profiles that fit; sends nothing, and opens only the ports"
+        " on USB, or --port",
+        "cli.skin_commands.run_detect",
+        "port write",
+    ),
+    "check": CommandEntry(
+        "compare the skin with PROTOCOL.md part by part, or its bytes with its profile",
+        "cli.skin_commands.run_check",
+        f"{_SKIN} seconds",
+    ),
+    "show": CommandEntry(
+        "show the skin live: rate, noise, dead and stuck taxels; --web with a heat map",
+        "cli.skin_commands.run_show",
+        f"{_SKIN} local-page",
+    ),
+    "align": CommandEntry(
+        "show where the contact lies on the skin, and where it should",
+        "cli.skin_commands.run_align",
+        f"{_SKIN} local-page",
+    ),
+}
 GROUPS: Mapping[str, Mapping[str, CommandEntry]] = {
     "run": {
-        "run": CommandEntry("classify sweeps until SIGTERM", "cli.run_command.run", options.run),
+        "run": CommandEntry(
+            "classify sweeps until SIGTERM",
+            "cli.run_command.run",
+            f"{_SKIN} sweeps {_TIMES} shadow",
+        ),
         "demo": CommandEntry(
             "watch simulated sweeps being classified",
             "cli.simulated_commands.run_demo",
-            options.demo,
+            f"{_SKIN} sweeps raw",
         ),
     },
     "look": {
         "check": CommandEntry(
             "test bundle, golden sweeps and devices, show the settings, or measure this machine",
-            "cli.check_command.run",
-            options.check,
+            "cli.look_commands.run_check",
+            f"{_SKIN} settings|bench figures references part acts",
         ),
         "status": CommandEntry(
             "show the state of the service, and its last verdicts",
             "cli.status_command.run",
-            options.status,
+            "json",
         ),
         "watch": CommandEntry(
             "show the running box live: a line a verdict, or a page",
-            "cli.watch_command.run",
-            options.watch,
+            "cli.look_commands.run_watch",
+            "feed|watch-page",
         ),
         "replay": CommandEntry(
             "classify a capture, a kept sweep or a folder of them again",
-            "cli.replay_command.run",
-            options.replay,
+            "cli.look_commands.run_replay",
+            "file",
         ),
     },
     "record and learn": {
         "record": CommandEntry(
             "keep each sweep with its label, for training; needs no bundle",
             "cli.record_command.run",
-            options.record,
+            f"{_SKIN} sweeps {_TIMES} out material position session format window target"
+            " record-page",
         ),
         "teach": CommandEntry(
             "learn materials from sweeps beside the robot, without a desktop",
             "cli.teach_command.run",
-            options.teach,
+            f"{_SKIN} {_TIMES} label good place attachment format window use unknown forget by"
+            " steps teach-page",
         ),
     },
     "bundles": {
         "bundles": CommandEntry(
             "list, install, verify, commit, rollback or promote bundles of this box",
             "cli.bundle_commands.run_list",
-            options.as_json,
-            {
-                "list": CommandEntry(
-                    "show which bundle runs, and which bundle `rollback` returns to",
-                    "cli.bundle_commands.run_list",
-                    options.as_json,
-                ),
-                "install": CommandEntry(
-                    "check the signed bundle in DIR, and run it on trial from the next start on",
-                    "cli.bundle_commands.run_install",
-                    options.install,
-                ),
-                "verify": CommandEntry(
-                    "check the signed bundle in DIR, and change nothing",
-                    "cli.bundle_commands.run_verify",
-                    options.bundle_folder,
-                ),
-                "commit": CommandEntry(
-                    "end the trial of the bundle that runs: it stays",
-                    "cli.bundle_commands.run_commit",
-                    options.nothing,
-                ),
-                "rollback": CommandEntry(
-                    "go back to the previous bundle, from the next start on",
-                    "cli.bundle_commands.run_rollback",
-                    options.nothing,
-                ),
-                "promote": CommandEntry(
-                    "run the candidate on trial from the next start on",
-                    "cli.bundle_commands.run_promote",
-                    options.nothing,
-                ),
-            },
+            "json",
+            _BUNDLES,
         ),
     },
     "devices": {
-        "skin": CommandEntry(
-            "list, detect, check, show or align skins",
-            "",
-            options.nothing,
-            {
-                "list": CommandEntry(
-                    "show all profiles, with missing features, and whether a device was measured",
-                    "cli.skin_commands.run_list",
-                    options.nothing,
-                ),
-                "detect": CommandEntry(
-                    "find connected skins and the profiles that fit; sends nothing",
-                    "cli.skin_commands.run_detect",
-                    options.detect,
-                ),
-                "check": CommandEntry(
-                    "compare the skin with PROTOCOL.md part by part, or its bytes with its profile",
-                    "cli.skin_commands.run_check",
-                    options.skin_check,
-                ),
-                "show": CommandEntry(
-                    "show the skin live: rate, noise, dead and stuck taxels; --web with a heat map",
-                    "cli.skin_commands.run_show",
-                    options.show,
-                ),
-                "align": CommandEntry(
-                    "show where the contact lies on the skin, and where it should",
-                    "cli.align_command.run",
-                    options.align,
-                ),
-            },
-        ),
+        "skin": CommandEntry("list, detect, check, show or align skins", "", "", _SKINS),
         "bridge": CommandEntry(
             "pass answers on to other machines of the cell: TCP, Modbus TCP, ROS 2",
             "bridges.command.run",
-            options.bridge,
         ),
     },
 }
@@ -171,7 +170,7 @@ def parser(*names: str) -> Parser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     top.add_argument("--version", action="version", version=f"palpate {__version__}")
-    top.set_defaults(**options.NO_SETTINGS)
+    top.set_defaults(**options.NO_SETTINGS, json=None, sweeps=None)
     subparsers = top.add_subparsers(
         dest="command", metavar="COMMAND", help=argparse.SUPPRESS, prog="palpate"
     )
@@ -189,9 +188,13 @@ def _add(subparsers: Any, name: str, command: CommandEntry) -> None:
         epilog=EXIT_CODES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    if name != "bridge":
+    if name == "bridge":
+        from palpate.bridges.options import add_arguments
+
+        add_arguments(one)
+    else:
         options.add_settings(one)
-    command.options(one)
+    options.add(one, command.options)
     one.set_defaults(run=command.run)
     if command.actions:
         actions = one.add_subparsers(dest="action", metavar="ACTION", required=not command.run)

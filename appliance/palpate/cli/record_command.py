@@ -48,15 +48,9 @@ def run(args: argparse.Namespace) -> int:
             folder, format, labels, devices.clock, _sentences(port), args.target, disk
         )
         stack.callback(recording.close)
-        pages = page(
-            args.web,
-            settings,
-            format,
-            devices,
-            recording.about,
-            lambda command: box.obey(command),
-            recording.names.label,
-        )
+        obey: Callable[[Command], list[object]] = lambda command: box.obey(command)  # noqa: E731
+        talk = recording.about, obey, recording.names.label
+        pages = page(args.web, settings, format, devices, *talk)
         _announce(format, folder)
         box = assembly.recorder(
             settings,
@@ -76,8 +70,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def open_skin(args: argparse.Namespace, settings: Config) -> tuple[Devices, SweepFormat]:
-    """The devices, and the format of the recorded sweeps. Raises ConfigError if no sweep can be as
-    long as the window."""
+    """The devices, and the format of the sweeps. Raises ConfigError for too long a window."""
     given, window = getattr(args, "format", None), getattr(args, "window", None)
     asked = skins.described(given) if given else None
     devices = open_devices(args, (lambda: asked) if asked else None)
@@ -114,8 +107,7 @@ def _observers(
 
 
 class SweepPrinter(Observer):
-    """Prints the counts of a recording after each sweep, for a person at a terminal. about: see
-    RecordingSession.about."""
+    """Prints the counts of a recording (`about`) after each sweep, for a person."""
 
     def __init__(self, out: TextIO, about: Callable[[], Mapping[str, Any]]) -> None:
         self._out, self._about = out, about
@@ -166,19 +158,16 @@ def _announced(settings: Config, devices: Devices) -> SweepFormat:
     try:
         return skins.announced(devices.wire(settings), devices)
     except SensorError as e:
-        raise type(e)(
-            f"{e}; or name its format with --format 4x4:uint8:750; then the command waits for it"
-        ) from e
+        how = "or name its format with --format 4x4:uint8:750; then the command waits for it"
+        raise type(e)(f"{e}; {how}") from e
 
 
 def _check_length(format: SweepFormat, settings: Config) -> None:
     """Raises ConfigError if no sweep could be as long as the window."""
-    if format.window * format.period_ns > settings.sweep.max_duration_s * 1e9:
-        raise ConfigError(
-            f"a window of {format.window / format.rate_hz:g} s is longer than any sweep may last"
-            f" ({settings.sweep.max_duration_s:g} s); use a shorter --window, or raise"
-            " sweep.max_duration_s"
-        )
+    window_s, most_s = format.window / format.rate_hz, settings.sweep.max_duration_s
+    if window_s > most_s:
+        longer = f"a window of {window_s:g} s is longer than any sweep may last ({most_s:g} s)"
+        raise ConfigError(f"{longer}; use a shorter --window, or raise sweep.max_duration_s")
 
 
 def _sentences(port: Port | None) -> Callable[[bytes], None]:

@@ -34,8 +34,9 @@ def done(
     args: argparse.Namespace, box: Box, devices: Devices, stopped: Callable[[], bool]
 ) -> Callable[[], bool]:
     """True after a signal, after `--sweeps` answers, and at the end of a script."""
+    wanted = args.sweeps
     return lambda: (
-        (args.sweeps is not None and box.answered >= args.sweeps)
+        (wanted is not None and box.answered >= wanted)
         or stopped()
         or devices.finished(box.answered)
     )
@@ -66,12 +67,5 @@ def feed(
 
     known = {"source": source, "skin": settings.skin.profile, **model}
     known["unit"] = skins.profile(settings).unit
-    return [
-        FeedServer(
-            path,
-            format,
-            known,
-            SystemClock(),
-            lambda: {name: fact() for name, fact in facts.items()},
-        )
-    ]
+    more = lambda: {name: fact() for name, fact in facts.items()}  # noqa: E731
+    return [FeedServer(path, format, known, SystemClock(), more)]

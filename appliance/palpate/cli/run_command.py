@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -65,16 +66,10 @@ def _classify(args: argparse.Namespace, settings: Config, choice: Choice | None)
             "unsigned": lambda: unsigned,
         }
         reports = _reports(settings, current, devices.source, facts, stack, disk)
-        observers = disk, Notifier(SystemClock()), trial, shadow, *reports
-        box = assembly.box(
-            settings,
-            current,
-            devices,
-            port,
-            stack,
-            capture=capture(args, settings, current.format, stack),
-            observers=[o for o in observers if o],
-        )
+        observers = [o for o in (disk, Notifier(SystemClock()), trial, shadow, *reports) if o]
+        recorded = capture(args, settings, current.format, stack)
+        parts = settings, current, devices, port, stack
+        box = assembly.box(*parts, capture=recorded, observers=observers)
         box.run(done(args, box, devices, stopped))
     return stopped.exit_code
 
@@ -99,8 +94,7 @@ def _reports(
     stack: ExitStack,
     disk: DiskThread,
 ) -> list[Observer]:
-    """The observers that the settings ask for: log, black box, status file, feed with `facts`.
-    source: origin of the frames."""
+    """The observers that the settings ask for, with `facts`. source: origin of the frames."""
     # without a serial port, a terminal shows the sentences
     shown = in_journal() or bool(settings.serial.port and sys.stderr.isatty())
     observers: list[Observer] = [VerdictLog()] if shown else []
@@ -118,15 +112,11 @@ def _reports(
     expected = Expected.by(current, settings.skin.fingertip, skins.profile(settings).unit)
     known = {"bundle": current.id, "labels": m.labels, "alignment": expected.json()}
     known |= {"displays": m.displays} if m.displays else {}
-    return [
-        *observers,
-        *status(settings, facts),
-        *feed(settings, current.format, source, known, facts),
-    ]
+    reports = status(settings, facts), feed(settings, current.format, source, known, facts)
+    return [*observers, *reports[0], *reports[1]]
 
 
 def _named(m: Manifest) -> str:
-    """The bundle in words."""
     return f"{m.name} {m.version}, {len(m.labels)} labels{f', {m.taught}' if m.taught else ''}"
 
 
@@ -149,17 +139,9 @@ def _shadow(
             return None
         from palpate.deployment.shadow import Shadow
 
-        return Shadow(
-            candidate,
-            current,
-            Path(settings.store.folder) / "shadow",
-            devices.clock,
-            lambda bundle: assembly.classifier(settings, bundle, devices.clock),
-            disk,
-        )
-    except (
-        ApplianceError,
-        OSError,
-    ) as e:  # the box serves the robot, the candidate is for a person
+        folder = Path(settings.store.folder) / "shadow"
+        made = partial(assembly.classifier, settings, clock=devices.clock)
+        return Shadow(candidate, current, folder, devices.clock, made, disk)
+    except (ApplianceError, OSError) as e:  # the box serves the robot, this is for a person
         log.warning(f"no shadow: {e}")
         return None

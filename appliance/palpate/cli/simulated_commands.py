@@ -49,8 +49,7 @@ def _played_bundle(settings: Config) -> Bundle:
 
 
 def run_demo(args: argparse.Namespace) -> int:
-    """Show sweeps through a pseudo-terminal, from both ends: a tour of good and faulty sweeps, or
-    the sweeps of --sim."""
+    """Show a tour of good and faulty sweeps, or the sweeps of --sim, from both ends of a line."""
     from palpate.tools import demo, pseudo_terminal
 
     settings = load_settings(args)

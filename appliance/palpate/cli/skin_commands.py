@@ -8,19 +8,22 @@ from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from typing import TYPE_CHECKING
 
-from palpate.cli.common import load_settings, local_page
-from palpate.cli.devices import open_devices
+from palpate.cli.common import load_bundle, load_settings, local_page
+from palpate.cli.devices import open_any, open_devices
 from palpate.core.clock import SystemClock
 from palpate.core.config import Config
 from palpate.core.devices import Devices
-from palpate.core.errors import ConfigError
+from palpate.core.errors import BundleError, ConfigError, SensorError
 from palpate.core.interrupts import StopFlag
 from palpate.core.log import log
 from palpate.io import serial_port, skin_profile, skins
 from palpate.io.serial_port import PortInfo
 from palpate.io.skin_profile import DEFAULT, SkinProfile
+from palpate.io.usb_sensor import fits
 
 if TYPE_CHECKING:
+    from palpate.alignment.live import Expected
+    from palpate.alignment.view import Display
     from palpate.tools.skin_monitor import SkinDisplay
 
 CHECK_S = 10.0
@@ -146,7 +149,7 @@ def _profiles(settings: Config) -> Iterator[tuple[str, SkinProfile | ConfigError
 def run_show(args: argparse.Namespace) -> int:
     """Show the skin live, a line a second and on a page, until Ctrl-C."""
     from palpate.alignment.lines import LinePrinter
-    from palpate.tools import skin_monitor, skin_show
+    from palpate.tools import skin_monitor
 
     devices = open_devices(args, None)
     settings = devices.wire(load_settings(args))
@@ -159,7 +162,45 @@ def run_show(args: argparse.Namespace) -> int:
         lines = LinePrinter(sys.stdout, devices.clock, skin_monitor.line)
         sensor = stack.enter_context(closing(skins.sensor(settings, format, devices)))
         shown_on: list[SkinDisplay] = [lines, *pages]
-        unit = skins.profile(settings).unit
-        name, source = settings.skin.profile, devices.source
-        skin_show.run(sensor, format, name, source, devices.clock, shown_on, stopped, unit)
+        names = settings.skin.profile, devices.source, skins.profile(settings).unit
+        skin_monitor.run(sensor, format, names, devices.clock, shown_on, stopped)
     return stopped.exit_code
+
+
+def run_align(args: argparse.Namespace) -> int:
+    """Show where the contact lies, until Ctrl-C."""
+    from palpate.alignment import live
+    from palpate.alignment.lines import LinePrinter, line
+
+    if args.sim == "skin":  # a sweep lifts the finger for a tenth of a second; here it rests
+        args.sim = "rest"
+    settings = load_settings(args)
+    devices = open_any(args, settings)
+    expected = _expected(devices.wire(settings), devices)
+    stopped = StopFlag()  # before anybody can read the page's address
+    with ExitStack() as stack:
+        pages = local_page("watch.html", args.web, stack)
+        displays: list[Display] = [LinePrinter(sys.stdout, devices.clock, line), *pages]
+        live.run(devices.wire(settings), expected, devices, displays, stopped)
+    return stopped.exit_code
+
+
+def _expected(settings: Config, devices: Devices) -> Expected:
+    """The expected contact, of a bundle that fits the skin, or of any before a skin is found."""
+    from palpate.alignment.live import Expected
+
+    current, fingertip = None, settings.skin.fingertip
+    unit = skins.profile(settings).unit
+    try:
+        current = load_bundle(settings, answers=False)
+    except BundleError as e:
+        log.warning(f"no bundle: {e}")
+    try:
+        format = devices.format or skins.announced(settings, devices)
+    except SensorError:
+        if not current:
+            raise
+        return Expected.by(current, fingertip, unit)  # the command waits for the skin
+    if current and fits(format, current.format):
+        return Expected.by(current, fingertip, unit)
+    return Expected(format, fingertip=fingertip, unit=unit)

@@ -178,7 +178,6 @@ def _adopt(args: argparse.Namespace, settings: Config) -> bool:
 
 
 def _assess(args: argparse.Namespace, settings: Config) -> None:
-    """Print the assessment of the recorded sweeps."""
     found = install.assessed(settings, assembly.store(settings), SystemClock())
     print(json.dumps(found) if args.json else install.described(found), flush=True)
 
@@ -199,7 +198,6 @@ def _in_json(args: argparse.Namespace, act: Callable[[], object]) -> int:
 
 
 def _use(args: argparse.Namespace, settings: Config) -> int:
-    """Make a bundle of all sweeps, sign and install it."""
 
     def tell(news: News) -> None:
         if args.json and news["type"] == "step":

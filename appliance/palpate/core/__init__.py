@@ -1,2 +1,1 @@
-"""Shared by all packages: types, errors, clock, settings, files. Imports nothing else of the
-appliance."""
+"""Shared by all packages: types, errors, clock, settings, files. Imports nothing of the others."""

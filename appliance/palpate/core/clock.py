@@ -35,11 +35,9 @@ class SystemClock:
     """The real clock."""
 
     def now_ns(self) -> int:
-        """`CLOCK_MONOTONIC` in nanoseconds."""
         return time.monotonic_ns()
 
     def sleep_until(self, t_ns: int) -> None:
-        """Sleep until `t_ns`."""
         left = t_ns - time.monotonic_ns()
         if left > 0:
             time.sleep(left / 1e9)
@@ -65,12 +63,7 @@ class DeviceClock:
     """
 
     def __init__(
-        self,
-        *,
-        settle_s: float = 2.0,
-        span_s: float = 20.0,
-        step_s: float = 0.25,
-        max_ppm: float = 200.0,
+        self, *, settle_s: float = 2, span_s: float = 20, step_s: float = 0.25, max_ppm: float = 200
     ) -> None:
         self._settle_ns = settle_s * 1e9
         self._step_ns = int(step_s * 1e9)
@@ -83,8 +76,7 @@ class DeviceClock:
         self._fitted_ns = 0  # device time at which the line was fitted
 
     def unwrap(self, device_us: int) -> int:
-        """The unwrapped time in us of a 32-bit stamp, which wraps every 71.6 minutes: the time
-        nearest to the last."""
+        """The unwrapped time in us of a 32-bit stamp: the time nearest to the last."""
         if self._device_us is None:
             self._device_us = device_us
         else:
@@ -92,8 +84,7 @@ class DeviceClock:
         return self._device_us
 
     def update(self, device_ns: int, arrival_ns: int) -> None:
-        """Record that the frame taken at `device_ns` (unwrapped) arrived at host time
-        `arrival_ns`."""
+        """Record that the frame of `device_ns` (unwrapped) arrived at host time `arrival_ns`."""
         offset = arrival_ns - device_ns
         if not self._points:
             self._first_ns = device_ns

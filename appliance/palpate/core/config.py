@@ -64,12 +64,10 @@ class SkinConfig:
 
     @property
     def vendor_id(self) -> int:
-        """First half of the USB ids."""
         return int(self.usb[:4], 16)
 
     @property
     def product_id(self) -> int:
-        """Second half of the USB ids."""
         return int(self.usb[5:9], 16)
 
     @property
@@ -216,7 +214,6 @@ class StoreConfig:
 
     @property
     def feed(self) -> Path | None:
-        """The socket of the feed."""
         return Path(self.runtime) / FEED if self.runtime else None
 
 
@@ -317,10 +314,8 @@ def load(
     """
     if unit:
         if not UNIT.fullmatch(unit):
-            raise ConfigError(
-                f"--unit {shown(unit)} is not a unit's name; use up to 8 small letters, digits and "
-                "hyphens, as in palpate@left"
-            )
+            allowed = "use up to 8 small letters, digits and hyphens, as in palpate@left"
+            raise ConfigError(f"--unit {shown(unit)} is not a unit's name; {allowed}")
         site = SITE.with_name(f"{unit}.toml")
     layers = settings_files.read(board, sets, folder=folder, site=site)
     values = {name: key.default for name, key in _KEYS.items()}
@@ -336,17 +331,12 @@ def load(
         section: group(**{key: values[f"{section}.{key}"] for key in keys(group)})
         for section, group in _SECTIONS.items()
     }
-    return Config(
-        board=layers.board,
-        sources=MappingProxyType(sources),
-        folder=layers.folder,
-        **groups,
-    )
+    frozen = MappingProxyType(sources)
+    return Config(board=layers.board, sources=frozen, folder=layers.folder, **groups)
 
 
 def describe(config: Config) -> str:
-    """One line per value, `section.key = value # source`. The text is TOML that can be loaded as a
-    site file."""
+    """One line per value, `section.key = value # source`: TOML that can be loaded."""
     values = {"board": json.dumps(config.board)}
     for name in _KEYS:
         section, _, last = name.partition(".")
@@ -362,15 +352,11 @@ def _checked(table: Mapping[str, Any], where: str) -> Iterator[tuple[str, Any]]:
     for section, content in table.items():
         if section not in _SECTIONS:
             if section == "board":
-                raise ConfigError(
-                    f"{where}: board is chosen in {SITE}, or with --board; move it there"
-                )
+                raise ConfigError(f"{where}: board is chosen in {SITE}, or with --board")
             raise _unknown(section, [*_SECTIONS, "board"], where)
         if not isinstance(content, dict):
-            raise ConfigError(
-                f"{where}: {section} = {shown(content)} is not a section; write [{section}], its "
-                "keys below"
-            )
+            given = f"{where}: {section} = {shown(content)}"
+            raise ConfigError(f"{given} is not a section; write [{section}], its keys below")
         named = {f"{section}.{last}": value for last, value in content.items()}
         yield from read_table(
             _KEYS,
@@ -381,8 +367,7 @@ def _checked(table: Mapping[str, Any], where: str) -> Iterator[tuple[str, Any]]:
 
 
 def _unknown(name: str, known: list[str], where: str) -> ConfigError:
-    """The error for an unknown name; a key of that name in another section is suggested before a
-    similar spelling."""
+    """The error for an unknown name, with the same key of another section or a close name."""
     last = name.rpartition(".")[2]
     near = [k for k in _KEYS if k.endswith(f".{last}")] or closest(name, known)
     hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
@@ -396,8 +381,6 @@ def _check_lines(values: Mapping[str, Any], sources: Mapping[str, str]) -> None:
         for line in filter(None, [values[name]] if isinstance(values[name], str) else values[name]):
             if line in taken:
                 first = f"{taken[line]} ({sources[taken[line]]})"
-                raise ConfigError(
-                    f"{sources[name]}: {name} = {line!r} is the GPIO line of {first} already; give "
-                    'each its own line, or ""'
-                )
+                twice = f"{sources[name]}: {name} = {line!r} is the GPIO line of {first} already"
+                raise ConfigError(f'{twice}; give each its own line, or ""')
             taken[line] = name

@@ -1,5 +1,4 @@
-"""Clock, GPIO module and USB backend of the drivers. These are the real devices; `sim.devices` has
-simulated devices."""
+"""Clock, GPIO module and USB backend of the drivers; `sim.devices` has simulated ones."""
 
 from __future__ import annotations
 
@@ -30,8 +29,7 @@ class Devices:
     format: SweepFormat | None = None
 
     def wire(self, settings: Config) -> Config:
-        """The settings with the GPIO lines and ids of these devices. The real devices change
-        nothing."""
+        """The settings with the GPIO lines and ids of these devices; real ones change nothing."""
         return settings
 
     def commanded(self, t_ns: int, *, start: bool) -> None:

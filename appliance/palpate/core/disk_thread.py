@@ -69,11 +69,8 @@ class DiskThread(Observer):
         self._results: deque[Callable[[], object]] = deque()
         self._changed = threading.Condition()
         self._thread: threading.Thread | None = None
-        self._log = TroubleLog(
-            "disk: it is too slow, and sweeps are not kept",
-            "the answers go on; use another card",
-            end="disk: sweeps are kept again",
-        )
+        begin, advice = "disk: it is too slow, and sweeps are not kept", "use another card"
+        self._log = TroubleLog(begin, advice, end="disk: sweeps are kept again")
 
     @property
     def text(self) -> str:
@@ -101,11 +98,9 @@ class DiskThread(Observer):
         return True
 
     def turn(self, health: Health) -> None:
-        """Give finished work back."""
         self._give_back()
 
     def stopping(self) -> None:
-        """Finish the work."""
         self.settle()
 
     def settle(self) -> bool:
@@ -113,10 +108,8 @@ class DiskThread(Observer):
             self._changed.wait_for(lambda: len(self._results) == self._open, SETTLE_S)
         self._give_back()
         if self._open:
-            log.warning(
-                f"disk: {self._open} pieces of work were not done in {SETTLE_S:g} s, so the last"
-                " sweeps may be missing; use another card"
-            )
+            late = f"disk: {self._open} pieces of work were not done in {SETTLE_S:g} s"
+            log.warning(f"{late}, so the last sweeps may be missing; use another card")
         return not self._open
 
     def _give_back(self) -> None:

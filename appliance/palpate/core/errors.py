@@ -22,8 +22,7 @@ PASSING = frozenset(
 
 
 class ApplianceError(Exception):
-    """Base of all expected errors. The command line prints it as a single line and exits with
-    `exit_code`."""
+    """Base of all expected errors: one line for a person, and the command's `exit_code`."""
 
     exit_code = 1
 
@@ -58,8 +57,7 @@ class TemporaryError(ConfigError):
 
 
 class SensorError(ApplianceError):
-    """The skin cannot be read. `state`: the sensor state of the STA sentence (PROTOCOL.md, sensor
-    states)."""
+    """The skin cannot be read. `state`: of the sensor in the STA sentence (PROTOCOL.md)."""
 
     exit_code = EX_UNAVAILABLE
     state = "error"

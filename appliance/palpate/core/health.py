@@ -1,5 +1,4 @@
-"""The state of the box at the end of a turn of its loop, for observers, the STA sentence and the
-status."""
+"""The state of the box at the end of a turn of its loop."""
 
 from __future__ import annotations
 

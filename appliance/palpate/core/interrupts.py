@@ -18,8 +18,7 @@ from palpate.core.errors import INTERRUPTED as INTERRUPTED
 
 @contextmanager
 def during_imports(program: str) -> Iterator[None]:
-    """Within this block, Ctrl-C ends the process. An ignored SIGINT, as after `nohup`, stays
-    ignored."""
+    """Within this block, Ctrl-C ends the process; an ignored SIGINT stays ignored."""
 
     def end(number: int, frame: FrameType | None) -> None:
         os.write(2, f"{program}: interrupted before anything was done\n".encode())

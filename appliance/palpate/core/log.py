@@ -22,8 +22,7 @@ log.setLevel(logging.INFO)
 EVERY_NS = 10_000_000_000
 """Least time between two lines of a SparseLog."""
 PRIORITIES = ((logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6))
-"""Levels of `logging` with their priorities of sd-daemon(3), each for this level and above; lower
-levels have 7, debug."""
+"""Levels of `logging` with their priorities of sd-daemon(3); lower levels have 7, debug."""
 
 
 def in_journal(environ: Mapping[str, str] = os.environ, stream: int = 2) -> bool:
@@ -36,16 +35,14 @@ def in_journal(environ: Mapping[str, str] = os.environ, stream: int = 2) -> bool
 
 
 class LineHandler(logging.Handler):
-    """Prints each record as one line: with its priority for the journal, after the program's name
-    for a terminal."""
+    """Prints each record as a line, with its priority for the journal, else the program's name."""
 
     def __init__(self, *, journal: bool) -> None:
         super().__init__()
         self._journal = journal
 
     def format(self, record: logging.LogRecord) -> str:
-        """The line of a record. The text of a device may contain line breaks, which must not begin
-        a line with another priority."""
+        """The line of a record; line breaks in a device's text must not begin another line."""
         line = printable(" ".join(record.getMessage().splitlines()))
         priority = next((n for level, n in PRIORITIES if record.levelno >= level), 7)
         return f"<{priority}>{line}" if self._journal else f"palpate: {line}"
@@ -64,7 +61,6 @@ class SparseLog:
         self._now_ns, self._next_ns, self._left_out = now_ns, 0, 0
 
     def warning(self, text: str) -> None:
-        """Log a warning, or count it."""
         now_ns = self._now_ns()
         if now_ns < self._next_ns:
             self._left_out += 1
@@ -104,8 +100,7 @@ class TroubleLog:
     def attempt(
         self, act: Callable[[], object], errors: tuple[type[Exception], ...] = (OSError,)
     ) -> bool:
-        """Do `act`, which may be tried again later; whether it succeeded. One of `errors` becomes
-        the trouble."""
+        """Do `act`; whether it succeeded. One of `errors` becomes the trouble."""
         try:
             act()
         except errors as e:

@@ -1,5 +1,4 @@
-"""Names of materials: the label that is sent on the wire, in ASCII, and the display name for
-people, in any language."""
+"""Names of materials: the label on the wire, in ASCII, and the display name, in any language."""
 
 from __future__ import annotations
 
@@ -9,8 +8,7 @@ from collections.abc import Container
 MOST_LETTERS, MOST_SHOWN = 24, 60
 """Most characters of a label, and of a display name."""
 LABEL = re.compile(rf"[A-Za-z0-9][A-Za-z0-9 _.-]{{0,{MOST_LETTERS - 1}}}")
-"""Pattern of a label. Labels are sent in sentences, so they are short and have no comma, star or
-dollar sign."""
+"""Pattern of a label: short, without comma, star or dollar sign, as sentences need it."""
 SPELT_OUT = str.maketrans(
     {"ä": "ae", "ö": "oe", "ü": "ue", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue", "ß": "ss"}
     | {"æ": "ae", "Æ": "Ae", "œ": "oe", "ø": "o", "Ø": "O", "ł": "l", "Ł": "L", "đ": "d", "ı": "i"}
@@ -37,11 +35,9 @@ def sendable(name: str, taken: Container[str] = (), otherwise: str = "material")
 
 def can_be_shown(text: object) -> bool:
     """Whether a text can be a display name: 1 to MOST_SHOWN characters that are printed."""
-    return (
-        isinstance(text, str)
-        and 0 < len(text.strip()) <= len(text) <= MOST_SHOWN
-        and (text.isprintable())
-    )
+    if not isinstance(text, str) or not text.isprintable():
+        return False
+    return 0 < len(text.strip()) <= len(text) <= MOST_SHOWN
 
 
 def shown(text: str) -> str:
@@ -74,9 +70,9 @@ class TypedNames:
             return typed
         if typed.isascii() or not can_be_shown(typed):
             return typed
-        for label, text in self.displays.items():
-            if text == typed:
-                return label
+        held = (label for label, text in self.displays.items() if text == typed)
+        if known := next(held, ""):
+            return known
         label = sendable(typed, {*self.displays, *self.plain})
         self.displays[label] = typed
         return label

@@ -33,12 +33,10 @@ class Observer:
         """The robot was sent this verdict on the serial line."""
 
     def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
-        """A sweep was answered, and all other answers of the turn are out. circumstances: see
-        Box.circumstances."""
+        """A sweep was answered, with all others of the turn. See Box.circumstances."""
 
     def turn(self, health: Health) -> None:
-        """A turn has ended: frames were read or the skin is away, edges were polled, answers are
-        out."""
+        """A turn has ended: frames were read, edges were polled, answers are out."""
 
     def stopping(self) -> None:
         """The loop has ended; an open sweep will still be answered."""

@@ -18,23 +18,19 @@ def folder(text: str) -> Path:
     """The path of a folder. Raises ArgumentTypeError for the name of a file."""
     path = Path(text)
     if path.suffix.lower() in OF_FILES and not path.is_dir():
-        raise ArgumentTypeError(
-            f"{text} would be a folder, not a {path.suffix} file; leave the ending out"
-        )
+        why = f"{text} would be a folder, not a {path.suffix} file"
+        raise ArgumentTypeError(f"{why}; leave the ending out")
     return path
 
 
 def file(*endings: str) -> Callable[[str], Path]:
-    """A reader of the path of a file with one of these endings, or none. It raises
-    ArgumentTypeError for another ending."""
+    """A reader of the path of a file with one of these endings, or none."""
 
     def read(text: str) -> Path:
-        path = Path(text)
+        path, known = Path(text), " or ".join(endings)
         if path.suffix.lower() not in ("", *endings):
-            raise ArgumentTypeError(
-                f"{text} would not be a {path.suffix} file; name one that ends in "
-                f"{' or '.join(endings)}"
-            )
+            why = f"{text} would not be a {path.suffix} file"
+            raise ArgumentTypeError(f"{why}; name one that ends in {known}")
         return path
 
     return read

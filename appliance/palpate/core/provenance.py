@@ -7,8 +7,7 @@ from pathlib import Path
 
 
 def commit() -> str:
-    """The commit of this code, followed by + if files have changed since; "unknown" outside a
-    checkout."""
+    """The commit of this code, with + if files have changed; "unknown" outside a checkout."""
     here = str(Path(__file__).parent)
     command = ["git", "-C", here, "describe", "--always", "--abbrev=12", "--dirty=+", "--exclude=*"]
     try:
@@ -23,6 +22,5 @@ def processor() -> str:
     if board.is_file():
         return board.read_text().strip("\0\n ")
     lines = names.read_text().splitlines() if names.is_file() else []
-    return next(
-        (line.partition(":")[2].strip() for line in lines if line.startswith("model name")), ""
-    )
+    models = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(models, "")

@@ -47,8 +47,7 @@ def custom(default: Any, allowed: str, read: Callable[[Any], Any]) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class Key:
-    """A field of a dataclass as a key of a TOML table. hint: the field's type. limits: its
-    metadata."""
+    """A field of a dataclass as a key of TOML. hint: its type. limits: its metadata."""
 
     hint: Any
     default: Any
@@ -60,13 +59,12 @@ class Key:
             return self.limits["read"](value)
         if get_origin(self.hint) is Literal:
             return value if value in get_args(self.hint) else None
-        if get_origin(self.hint) is tuple:
-            names = isinstance(value, list) and all(_fits(v, str) and v for v in value)
-            return tuple(value) if names else None
-        if self.hint in (str, bool):
-            return value if _fits(value, self.hint) else None
-        known = type(value) in (int, self.hint)
-        within = known and self.limits["least"] <= value <= self.limits["most"]
+        value = _nested(self.hint, value)
+        if not _fits(value, self.hint) or (type(value) is tuple and "" in value):
+            return None
+        if "least" not in self.limits:
+            return value
+        within = self.limits["least"] <= value <= self.limits["most"]
         return self.hint(value) if within else None
 
     @property
@@ -141,8 +139,7 @@ def typed(kind: type[_Kind], table: Any) -> _Kind:
 
 
 def _nested(hint: Any, value: Any) -> Any:
-    """A JSON value for a field of type `hint`: lists become tuples and objects dataclasses as the
-    type requires."""
+    """A JSON value for a field of type `hint`: lists as tuples, objects as dataclasses."""
     if get_origin(hint) is tuple and isinstance(value, list):
         return tuple(_nested(get_args(hint)[0], v) for v in value)
     if get_origin(hint) is dict and isinstance(value, dict):

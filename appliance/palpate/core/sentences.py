@@ -1,5 +1,4 @@
-"""Writes and parses sentences of the serial line, a dialect of NMEA 0183 (PROTOCOL.md, part 2), for
-both of its ends."""
+"""Writes and parses sentences of the serial line, a dialect of NMEA 0183 (PROTOCOL.md, part 2)."""
 
 from __future__ import annotations
 
@@ -12,8 +11,7 @@ from typing import Any
 
 TALKER = "PPLP"
 OWN = ("RES", "FIN", "STA", "ANS", "REC", "TCH")
-"""Kinds of sentences that the box sends. A line that sends them back, an echo, must not be
-answered: the answer would come back as well, without end."""
+"""Kinds of sentences that the box sends; one that comes back is an echo and is not answered."""
 MOST_FINGERS = 4
 """Largest number of fingers of a hand."""
 MAX_LINE = 128
@@ -42,13 +40,11 @@ class Sentence:
 
     @property
     def fields(self) -> list[str]:
-        """The fields of the text."""
         return [] if self.text is None else self.text.split(",")
 
 
 def checksum(body: str) -> str:
-    """Checksum of NMEA 0183: exclusive or of the characters between $ and *, as two hexadecimal
-    digits."""
+    """Checksum of NMEA 0183: the exclusive or of the characters, as two hexadecimal digits."""
     return f"{reduce(xor, body.encode('ascii'), 0):02X}"
 
 
@@ -126,9 +122,7 @@ def read(line: bytes) -> Sentence:
     if not match:  # the example has no characters that a sentence cannot contain
         return Sentence("", error=f"not a command; send for example {TALKER} ID")
     kind, body = match["kind"].decode(), match["body"].decode()
-    text, given = (
-        None if group is None else group.decode() for group in match.group("text", "sum")
-    )
+    text, given = (g if g is None else g.decode() for g in match.group("text", "sum"))
     if given and given.upper() != checksum(body):
         return Sentence(kind, error=f"checksum {given} should be {checksum(body)}")
     return Sentence(kind, text, bool(given))

@@ -31,18 +31,14 @@ class Layers(NamedTuple):
 def read(
     board: str | None, sets: Sequence[str] = (), *, folder: Path | None = None, site: Path = SITE
 ) -> Layers:
-    """All layers: `skin.toml`, `board-NAME.toml`, `site`, `sets`; parameters as for `config.load`.
-    Raises ConfigError."""
+    """All layers; parameters as for `config.load`. Raises ConfigError."""
     if folder and not folder.is_dir():
-        raise ConfigError(
-            f"--config-dir {folder}: no such folder; name that of skin.toml and the board files"
-        )
+        raise ConfigError(f"--config-dir {folder}: no such folder; name that of skin.toml")
     folder = folder or default_folder()
     of_site = read_toml(site, needed=site != SITE)
     in_site = of_site.pop("board", "")
-    board, named_in = (
-        (board, "--board") if board else (in_site, "code" if in_site == "" else str(site))
-    )
+    named_in = "--board" if board else str(site) if in_site != "" else "code"
+    board = board or in_site
     files = [(folder / "skin.toml", read_toml(folder / "skin.toml", needed=False))]
     if board != "":
         path = _board_file(folder, board, named_in)
@@ -53,17 +49,15 @@ def read(
 
 
 def runtime(layers: Layers) -> Path | None:
-    """store.runtime, the folder of the status file and of the feed; None if it is "". Raises
-    ConfigError."""
+    """store.runtime, None if it is "". Raises ConfigError."""
     value: object = runtime_folder.RUNTIME
     for where, table in layers.tables:
         section = table.get("store")
         if isinstance(section, dict) and "runtime" in section:
             value = section["runtime"]
             if not isinstance(value, str):
-                raise ConfigError(
-                    f'{where}: store.runtime = {shown(value)} is not allowed; use a folder, or ""'
-                )
+                given = f"{where}: store.runtime = {shown(value)}"
+                raise ConfigError(f'{given} is not allowed; use a folder, or ""')
     return Path(str(value)) if value else None
 
 
@@ -76,7 +70,6 @@ def boards(folder: Path | None = None) -> dict[str, Path]:
 
 
 def default_folder() -> Path:
-    """See `runtime_folder.settings_folder`."""
     return Path(runtime_folder.settings_folder())
 
 
@@ -90,23 +83,19 @@ def read_toml(path: Path, *, needed: bool = True) -> dict[str, Any]:
             return {}
         raise ConfigError(f"{path}: no such file; check the path") from e
     except OSError as e:
-        raise (TemporaryError if passes(e) else ConfigError)(
-            f"{path}: cannot be read: {str(e.strerror).lower()}; check who may read it"
-        ) from e
+        why = f"{path}: cannot be read: {str(e.strerror).lower()}; check who may read it"
+        raise (TemporaryError if passes(e) else ConfigError)(why) from e
     except (ValueError, RecursionError) as e:  # no TOML or no UTF-8; deeply nested brackets
-        raise ConfigError(
-            f"{path}: not TOML: {str(e).lower()}; write key = value, strings in quotes"
-        ) from e
+        why = f"{path}: not TOML: {str(e).lower()}"
+        raise ConfigError(f"{why}; write key = value, strings in quotes") from e
 
 
 def _board_file(folder: Path, board: Any, where: str) -> Path:
     known = boards(folder)
     if not (isinstance(board, str) and board in known):
-        there = ", ".join(known) or "none"
-        raise ConfigError(
-            f"{where}: board = {shown(board)} has no board-NAME.toml in {folder}; boards there: "
-            f"{there}"
-        )
+        there = f"boards there: {', '.join(known) or 'none'}"
+        missing = f"{where}: board = {shown(board)} has no board-NAME.toml in {folder}"
+        raise ConfigError(f"{missing}; {there}")
     return known[board]
 
 

@@ -14,13 +14,10 @@ DRAWS = 2000
 
 
 def wilson(k: float, n: float) -> tuple[float, float]:
-    """The 95 % score interval (lower, upper) of a proportion, observed as `k` of `n` > 0 (E. B.
-    Wilson, 1927)."""
+    """The 95 % score interval of a proportion `k` of `n` > 0 (E. B. Wilson, 1927)."""
     z = 1.959964
-    middle, half = (
-        (k + z * z / 2) / (n + z * z),
-        z * sqrt(k * (n - k) / n + z * z / 4) / (n + z * z),
-    )
+    middle = (k + z * z / 2) / (n + z * z)
+    half = z * sqrt(k * (n - k) / n + z * z / 4) / (n + z * z)
     return max(0.0, middle - half), min(1.0, middle + half)
 
 
@@ -51,6 +48,5 @@ def widen(
     sums, size = np.bincount(member, values), np.bincount(member)
     drawn = np.random.default_rng(0).integers(len(size), size=(DRAWS, len(size)))
     means = sums[drawn].sum(1) / size[drawn].sum(1)
-    return min(bounds[0], float(np.quantile(means, 0.025))), max(
-        bounds[1], float(np.quantile(means, 0.975))
-    )
+    low, high = (float(np.quantile(means, q)) for q in (0.025, 0.975))
+    return min(bounds[0], low), max(bounds[1], high)

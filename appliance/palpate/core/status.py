@@ -9,8 +9,7 @@ from typing import NamedTuple
 
 
 class Status(StrEnum):
-    """The outcome of a sweep, in sentences, on GPIO lines and in files, in the order of their
-    codes. PROTOCOL.md explains each."""
+    """The outcome of a sweep, in the order of the codes. PROTOCOL.md explains each."""
 
     OK = "ok"
     UNSURE = "unsure"
@@ -36,13 +35,11 @@ class Status(StrEnum):
 
     @property
     def classified(self) -> bool:
-        """True if a label was computed."""
         return self in (Status.OK, Status.UNSURE, Status.UNDECIDED)
 
     @property
     def faulty(self) -> bool:
-        """True if there is a window, but its counts show that the skin did not measure a slide as
-        it should. Nothing is learnt from such a sweep."""
+        """True if the counts show that the skin did not measure a slide: nothing is learnt."""
         return self in (
             Status.NO_CONTACT,
             Status.SATURATED,

@@ -94,8 +94,7 @@ def refused(path: Path) -> str:
 
 
 def write(path: Path | str, data: bytes, *, durable: bool = True, mode: int | None = None) -> None:
-    """Write one file under its own name, synced if `durable`; for a folder that gets its name only
-    when complete."""
+    """Write one file under its own name, synced if `durable`."""
     with open(path, "wb") as f:
         if mode is not None:
             os.fchmod(f.fileno(), mode)

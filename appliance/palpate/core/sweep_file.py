@@ -21,8 +21,7 @@ from palpate.core.types import Frames, Status, Sweep, SweepFormat
 SCHEMA = 1
 """Version of a recorded sweep's sidecar."""
 UNREADABLE = (ValueError, TypeError, EOFError, SyntaxError, TokenError, MemoryError)
-"""Errors of numpy for a broken .npy, beside OSError; MemoryError if its header gives an impossible
-size."""
+"""Errors of numpy for a broken .npy, beside OSError."""
 
 
 def _record_dtype(format: SweepFormat) -> np.dtype[Any]:
@@ -39,12 +38,8 @@ def save(
     out. about: further content of the sidecar, under names that Sweep does not use. Raises OSError
     if writing fails, and then leaves nothing behind.
     """
-    table = np.zeros(len(sweep.frames), _record_dtype(format))
-    table["t_ns"], table["seq"], table["taxels"] = (
-        sweep.frames.t_ns,
-        sweep.frames.seq,
-        sweep.frames.taxels,
-    )
+    table, frames = np.zeros(len(sweep.frames), _record_dtype(format)), sweep.frames
+    table["t_ns"], table["seq"], table["taxels"] = frames.t_ns, frames.seq, frames.taxels
     own = {
         name: value
         for name in Sweep.__slots__
@@ -53,35 +48,29 @@ def save(
     # np.save writes to a file without Python's I/O, and a full disk then gives no errno
     packed = io.BytesIO()
     np.save(packed, table, allow_pickle=False)
-    content = {
-        **about,
-        **own,
-        "format": format.json(),
-        "crc32": crc32(packed.getvalue()),
-        "schema": SCHEMA,
-    }
-    storage.put_all(
-        {path.with_suffix(".json"): json.dumps(content, indent=1).encode(), path: packed.getvalue()}
-    )
+    more = {"format": format.json(), "crc32": crc32(packed.getvalue()), "schema": SCHEMA}
+    content = json.dumps({**about, **own, **more}, indent=1).encode()
+    storage.put_all({path.with_suffix(".json"): content, path: packed.getvalue()})
 
 
 def sidecar(path: Path) -> dict[str, Any]:
-    """The content of the sidecar of the .npy at `path`. Raises FormatError if it is missing or
-    broken."""
+    """The content of the sidecar of the .npy at `path`. Raises FormatError."""
     try:
         content = json.loads(path.with_suffix(".json").read_text("utf-8"))
         if not isinstance(content, dict):
             raise TypeError(f"{type(content).__name__} instead of an object")
         return content
     except (ValueError, OSError, TypeError, RecursionError) as e:
-        raise FormatError(
-            f"{path}: not a recorded sweep ({e}); a recording is an .npy with its .json beside it"
-        ) from e
+        raise _broken(path, e) from e
+
+
+def _broken(path: Path, why: object) -> FormatError:
+    form = "a recording is an .npy with its .json beside it"
+    return FormatError(f"{path}: not a recorded sweep ({why}); {form}")
 
 
 def load(path: Path) -> tuple[Sweep, SweepFormat]:
-    """Read a sweep that `save` wrote. Raises FormatError if a file is missing, broken or of another
-    format."""
+    """Read a sweep that `save` wrote. Raises FormatError."""
     content = sidecar(path)
     try:
         data = path.read_bytes()
@@ -101,6 +90,4 @@ def load(path: Path) -> tuple[Sweep, SweepFormat]:
         own = {name: content[name] for name in Sweep.__slots__ if name in content}
         return typed(Sweep, own | {"status": status, "frames": frames}), format
     except (*UNREADABLE, OSError, KeyError, AttributeError, RecursionError, FormatError) as e:
-        raise FormatError(
-            f"{path}: not a recorded sweep ({e}); a recording is an .npy with its .json beside it"
-        ) from e
+        raise _broken(path, e) from e

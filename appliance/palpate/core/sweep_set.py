@@ -75,15 +75,11 @@ class SweepSet:
     def _check_samples(self) -> None:
         x = self.samples
         if x.ndim not in (4, 5) or 0 in x.shape or x.shape[4:] == (1,):
-            raise self._error(
-                f"samples have the shape {list(x.shape)}; give [sweeps, frames, rows, columns], "
-                "none empty, "
-                "and axes after them only where there are several"
-            )
+            form = "[sweeps, frames, rows, columns] and perhaps several axes, none empty"
+            raise self._error(f"samples have the shape {list(x.shape)}; give {form}")
         if x.dtype.name not in DATA_TYPES:
-            raise self._error(
-                f"samples are {x.dtype}; use one of {', '.join(DATA_TYPES)}{_conversion(x)}"
-            )
+            types = f"{', '.join(DATA_TYPES)}{_conversion(x)}"
+            raise self._error(f"samples are {x.dtype}; use one of {types}")
         if x.dtype.kind != "f":
             return
         least, most = x.min(), x.max()  # without an array of the size of a mapped set
@@ -92,11 +88,9 @@ class SweepSet:
             raise self._error(f"samples{list(at)} is {x[at]}; drop sweep {at[0]} or fill it in")
         if max(most, -least) > LARGEST_READING:
             sweep, frame, *taxel = (int(i) for i in np.argwhere(np.abs(x) > LARGEST_READING)[0])
-            raise self._error(
-                f"sweep {sweep}, frame {frame}, taxel {', '.join(map(str, taxel))} reads "
-                f"{x[(sweep, frame, *taxel)]:g} (counted from 0), and no skin reads more than "
-                f"{LARGEST_READING:g}; drop sweep {sweep} or fill the reading in"
-            )
+            place = f"sweep {sweep}, frame {frame}, taxel {', '.join(map(str, taxel))}"
+            reads = f"{place} reads {x[(sweep, frame, *taxel)]:g} (counted from 0)"
+            raise self._error(f"{reads}, more than any skin; drop sweep {sweep} or fill it in")
 
     def _check_numbers(self) -> None:
         """Check the arrays with an entry for each sweep."""
@@ -108,11 +102,8 @@ class SweepSet:
             self._check_values(f"group_{name}", values, kinds, what)
         level, wanted = self.unloaded, (len(x), 2, *x.shape[2:])
         if level is not None and (level.shape != wanted or level.dtype.kind != "f"):
-            raise self._error(
-                f"unloaded holds {level.dtype} {list(level.shape)}; give floats {list(wanted)}: "
-                "mean and standard deviation "
-                "of the unloaded skin for each sweep, or leave it out"
-            )
+            given = f"unloaded holds {level.dtype} {list(level.shape)}; give floats {list(wanted)}"
+            raise self._error(f"{given}, mean and deviation of the unloaded skin, or leave it out")
 
     def _check_values(self, name: str, values: Array, kinds: str, wanted: str) -> None:
         """Check an array with a value for each sweep."""
@@ -123,23 +114,17 @@ class SweepSet:
         bad = ~np.isfinite(values) if values.dtype.kind == "f" else values == ""
         if np.any(bad):
             i = int(np.flatnonzero(bad)[0])
-            raise self._error(
-                f"{name} of sweep {i} is {values[i].item()!r}; give a value, or leave the group out"
-            )
+            given = f"{name} of sweep {i} is {values[i].item()!r}"
+            raise self._error(f"{given}; give a value, or leave the group out")
 
     def _check_materials(self) -> None:
         n = len(self.materials)
         outside = np.flatnonzero((self.labels < 0) | (self.labels >= n))
         if len(outside):
-            i = outside[0]
-            raise self._error(
-                f"label {self.labels[i]} of sweep {i} is out of range; there are {n} materials, "
-                "from 0 on"
-            )
+            given = f"label {self.labels[outside[0]]} of sweep {outside[0]} is out of range"
+            raise self._error(f"{given}; there are {n} materials, from 0 on")
         if len(set(self.materials)) < n:
-            raise self._error(
-                f"materials {list(self.materials)} name one twice; give each its own name"
-            )
+            raise self._error(f"materials {list(self.materials)} name one twice; rename one")
 
     def _error(self, why: str) -> FormatError:
         return FormatError(f"{self.source}: {why}")
@@ -154,8 +139,7 @@ class SweepSet:
         return SweepFormat(rows, cols, self.rate_hz, window, self.samples.dtype.name, *axes)
 
     def group(self, name: str) -> Array:
-        """Values [N] of the group `name`; without a group `recording` each sweep is its own. Raises
-        FormatError."""
+        """Values [N] of the group `name`; without `recording` each sweep is its own."""
         if name in self.groups:
             return self.groups[name]
         if name == "recording":
@@ -179,8 +163,7 @@ def read(path: Path, what: str, known: Collection[str] = ()) -> dict[str, Array]
 
 
 def _typed(z: Any, name: str) -> Array:
-    """One array of an open .npz. Raises ValueError with the remedy if it contains Python
-    objects."""
+    """One array of an open .npz. Raises ValueError with the remedy for Python objects."""
     try:
         return np.asarray(z[name])
     except ValueError as e:
@@ -257,8 +240,7 @@ def _displays(materials: tuple[str, ...], given: Array | None, source: str) -> d
 
 
 def _group(name: str, values: Array) -> Array:
-    """The values of a group as a set keeps them: recordings as whole numbers, and short floats as
-    the decimal numbers that they were written as."""
+    """The values of a group: recordings as whole numbers, short floats as the decimals written."""
     if name == "recording" and values.dtype.kind in "fU" and values.ndim == 1:
         return np.unique(values, return_inverse=True)[1]
     if values.dtype.kind == "f" and values.itemsize < 8:
@@ -267,8 +249,7 @@ def _group(name: str, values: Array) -> Array:
 
 
 def _numbered(arrays: dict[str, Array], source: str) -> dict[str, Array]:
-    """The arrays, with labels that are names converted to indices into `materials`, which may then
-    be missing. Raises FormatError."""
+    """The arrays, with labels that are names as indices into `materials`. Raises FormatError."""
     if "labels" not in arrays or (given := arrays["labels"]).dtype.kind != "U":
         return arrays
     materials = arrays.get("materials", np.unique(given))
@@ -285,8 +266,7 @@ def _numbered(arrays: dict[str, Array], source: str) -> dict[str, Array]:
 
 
 def _conversion(x: Array) -> str:
-    """Advice for samples of another type: the first data type that holds the same values, float32
-    for fractions."""
+    """Advice for samples of another type: the first data type that holds the same values."""
     if x.dtype.kind not in "biuf":
         return ""
     fits = (d for d in DATA_TYPES if x.dtype.kind != "f" and (x.astype(d) == x).all())

@@ -1,5 +1,4 @@
-"""Texts for people: characters of a device or a file that are safe to print, and close names for a
-misspelt one."""
+"""Texts for people: characters that are safe to print, and close names for a misspelt one."""
 
 from __future__ import annotations
 
@@ -16,8 +15,7 @@ def replace_unprintable() -> None:
 
 
 def printable(text: str) -> str:
-    """`text` with "?" for each character that is not printable: a device may send characters that
-    control a terminal."""
+    """`text` with "?" for characters that cannot be printed."""
     return "".join(c if c.isprintable() else "?" for c in text)
 
 

@@ -17,8 +17,7 @@ from palpate.core.errors import FormatError
 from palpate.core.status import Status as Status
 
 DATA_TYPES = ("uint8", "int16", "uint16", "float32")
-"""Data types of a taxel's raw count; the position in this tuple is its code in packets
-(PROTOCOL.md)."""
+"""Data types of a raw count; the position is its code in packets (PROTOCOL.md)."""
 LARGEST_READING = 1e12
 """Largest magnitude of a raw count. Larger ones come from a fault, and their squares overflow."""
 MOST_AXES = 8
@@ -113,8 +112,7 @@ def normal(counts: NDArray[Any], before: int) -> NDArray[Any]:
 
 
 def digitized(x: NDArray[Any], kind: np.dtype[Any]) -> NDArray[Any]:
-    """Counts as the converter gives them: whole numbers within the range of their type. float32
-    stays unchanged."""
+    """Counts as the converter gives them: whole, within their type. float32 stays unchanged."""
     if kind.kind == "f":
         return x.astype(kind)
     limits = np.iinfo(kind)
@@ -165,8 +163,7 @@ def entries(record: Any) -> dict[str, Any]:
 
 
 class EdgeKind(StrEnum):
-    """Meaning of an edge. LOST: edges were dropped or came in a storm, so that the robot's signals
-    are unknown."""
+    """Meaning of an edge. LOST: edges were dropped or came in a storm."""
 
     START = "start"
     STOP = "stop"

@@ -1,2 +1,1 @@
-"""Drivers: the skin on USB, GPIO lines and the serial port; bytes and levels to frames, edges and
-sentences, and back."""
+"""Drivers: the skin on USB, GPIO lines and the serial port."""

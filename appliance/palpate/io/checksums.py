@@ -31,11 +31,9 @@ class Checksum:
 
     @property
     def size(self) -> int:
-        """Bytes of the checksum."""
         return KINDS[self.kind]
 
     def of(self, data: bytes) -> int:
-        """The checksum of `data`."""
         value, most = self.init, (1 << 8 * self.size) - 1
         if self.kind.startswith("sum"):
             value = (value + sum(data)) & most
@@ -107,8 +105,7 @@ NAMED = {
     "crc32-mpeg2": _crc("crc32", "04c11db7 ffffffff 00000000 plain"),
     "crc32c": _crc("crc32", "1edc6f41 ffffffff ffffffff reflected"),
 }
-"""Checksums by name; all others by parameters. A negated sum makes the sum of all bytes with it
-0."""
+"""Checksums by name. A negated sum makes the sum of all bytes with it 0."""
 
 
 def parsed(text: str) -> Checksum | None:

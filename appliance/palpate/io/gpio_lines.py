@@ -25,8 +25,7 @@ if TYPE_CHECKING:
 MAX_CHIPS = 256
 """Largest number of GPIO devices in the kernel (GPIO_DEV_MAX)."""
 QUEUE = 1024
-"""Length of the kernel's event queue of one request, the largest that it grants. A full queue drops
-its oldest event."""
+"""Length of the kernel's event queue of a request, the largest; a full one drops the oldest."""
 _PLACE = re.compile(r"(?:/dev/)?(gpiochip[0-9]{1,3})[: ]([0-9]{1,4})")
 _ADVICE = {
     errno.EACCES: "add the user to group gpio, and in a unit set DeviceAllow=char-gpiochip",
@@ -41,11 +40,10 @@ _ADVICE = {
 def check_binding(gpio: Any) -> None:
     """Raises LineError unless `gpio` is the libgpiod v2 binding or a double of it."""
     if not (hasattr(gpio, "request_lines") and hasattr(gpio, "LineSettings")):
+        version = getattr(gpio, "__version__", "of unknown version")
         raise LineError(
-            f"module gpiod {getattr(gpio, '__version__', 'of unknown version')} is not the "
-            "libgpiod v2 binding; "
-            "pip install 'gpiod>=2' (Debian's python3-libgpiod 1.6 shadows it: remove it or use a "
-            "virtual environment)"
+            f"module gpiod {version} is not the libgpiod v2 binding; pip install 'gpiod>=2' in a"
+            " virtual environment (Debian's python3-libgpiod 1.6 shadows it)"
         )
 
 
@@ -57,43 +55,37 @@ def find_lines(gpio: Any, names: Sequence[str]) -> dict[str, tuple[str, int]]:
     without any chip.
     """
     if len(set(names)) < len(names):
-        raise LineError(
-            f"a gpio line is given two roles in {', '.join(names)}; give each role its own line"
-        )
+        raise LineError(f"one of {', '.join(names)} has two roles; give each role its own line")
     found = {name: _at_offset(gpio, *place) for name in names if (place := _place(name))}
     named = [name for name in names if name not in found]
     places, denied = _catalogue(gpio) if named else ({}, [])
     for name in named:
-        match places.get(name, []):
-            case [place]:
-                found[name] = place
-            case []:
-                if denied:
-                    what, advice = (
-                        f"may not open {', '.join(denied)} (errno 13)",
-                        _ADVICE[errno.EACCES],
-                    )
-                    raise LineError(f"{what}, where gpio line {name!r} might be; {advice}")
-                near = closest(name, places, 3) or sorted(places)[:3]
-                hint = (
-                    f"nearest: {', '.join(near)}; gpioinfo lists them all"
-                    if near
-                    else "no line has a name here; give chip and offset, such as gpiochip0:17 "
-                    "(gpioinfo lists them)"
-                )
-                raise LineError(f"no gpio line is named {name!r}; {hint}")
-            case several:
-                where = " and ".join(f"{path} line {offset}" for path, offset in several)
-                raise LineError(
-                    f"gpio line {name!r} is ambiguous: {where}; choose another line, "
-                    "or give chip and offset, such as gpiochip0:17"
-                )
+        found[name] = _only(name, places, denied)
     twice = [name for name in names if list(found.values()).count(found[name]) > 1]
     if twice:
-        raise LineError(
-            f"{' and '.join(twice)} are the same gpio line; give each role its own line"
-        )
+        both = " and ".join(twice)
+        raise LineError(f"{both} are the same gpio line; give each role its own line")
     return {name: found[name] for name in names}
+
+
+def _only(
+    name: str, places: dict[str, list[tuple[str, int]]], denied: list[str]
+) -> tuple[str, int]:
+    """The place of a name. Raises LineError if it has none or several."""
+    match places.get(name, []):
+        case [place]:
+            return place
+        case []:
+            if denied:
+                what = f"may not open {', '.join(denied)} (errno 13)"
+                advice = _ADVICE[errno.EACCES]
+                raise LineError(f"{what}, where gpio line {name!r} might be; {advice}")
+            near = closest(name, places, 3) or sorted(places)[:3]
+            hint = f"nearest: {', '.join(near)}" if near else "give one such as gpiochip0:17"
+            raise LineError(f"no gpio line is named {name!r}; {hint}; gpioinfo lists them all")
+        case several:
+            where = " and ".join(f"{path} line {offset}" for path, offset in several)
+            raise LineError(f"gpio line {name!r} is ambiguous: {where}; use gpiochip0:17 or alike")
 
 
 def _place(name: str) -> tuple[str, int] | None:
@@ -114,8 +106,7 @@ def _at_offset(gpio: Any, path: str, offset: int) -> tuple[str, int]:
 
 
 def _catalogue(gpio: Any) -> tuple[dict[str, list[tuple[str, int]]], list[str]]:
-    """All named GPIO lines with their (chip path, offset), and the paths of chips that may not be
-    opened."""
+    """All named GPIO lines with their places, and the paths of chips that are denied."""
     places: dict[str, list[tuple[str, int]]] = {}
     denied = []
     chips = set()
@@ -133,14 +124,11 @@ def _catalogue(gpio: Any) -> tuple[dict[str, list[tuple[str, int]]], list[str]]:
         except PermissionError:
             denied.append(path)
         except OSError as e:
-            raise LineError(
-                f"cannot list the gpio lines of {path}: {e}; see the kernel log (dmesg)"
-            ) from e
+            raise LineError(f"cannot list the gpio lines of {path}: {e}; see dmesg") from e
     if not chips and not denied:
         raise LineError(
-            "this machine has no /dev/gpiochip*; load the driver of its gpio chip or plug in one "
-            "on USB; "
-            "without lines leave `board` out and set trigger.mode to serial, key or timed"
+            "this machine has no /dev/gpiochip*; load the driver of its gpio chip, or leave `board`"
+            " out and set trigger.mode to serial, key or timed"
         )
     return places, denied
 
@@ -165,8 +153,7 @@ def naming(doing: str, names: Iterable[str]) -> Iterator[None]:
 def request_lines(
     gpio: Any, names: Sequence[str], settings: Any, stack: ExitStack, *, separate: bool = False
 ) -> list[tuple[LineRequest, dict[int, str]]]:
-    """One request for each chip, or with `separate` for each GPIO line, with its {offset: name}.
-    `stack` releases them."""
+    """A request for each chip, or `separate` for each line, with its {offset: name}."""
     groups: dict[tuple[str, str], dict[int, str]] = {}
     for name, (path, offset) in find_lines(gpio, names).items():
         groups.setdefault((path, name if separate else ""), {})[offset] = name
@@ -210,8 +197,7 @@ class Lines:
         return 1 << len(self._bits)
 
     def show(self, *, ready: bool, busy: bool, fault: bool, decided: bool = False) -> None:
-        """Set READY, BUSY, FAULT and DECIDED; only changes are written. RESULT VALID falls when
-        BUSY rises."""
+        """Set READY, BUSY, FAULT and DECIDED. RESULT VALID falls when BUSY rises."""
         if (ready, busy, fault, decided) == self._status:
             return
         if busy and not self._status[1]:
@@ -230,17 +216,14 @@ class Lines:
         if code is None:
             return
         if not 0 <= code < self.capacity:
-            raise LineError(
-                f"code {code} does not fit {len(self._bits)} class bits; wire more lines in "
-                "output.class_bits"
-            )
+            bits = f"{len(self._bits)} class bits"
+            raise LineError(f"code {code} does not fit {bits}; wire more in output.class_bits")
         self._write({name: bool(code >> i & 1) for i, name in enumerate(self._bits)})
         self._clock.sleep_until(self._clock.now_ns() + self._settle_ns)
         self._write({self._valid: True})
 
     def close(self) -> None:
-        """Set all GPIO lines low, then release them. The level of a released line depends on its
-        chip."""
+        """Set all GPIO lines low, then release them."""
         try:
             self._write(dict.fromkeys(self._levels, False))
         finally:
@@ -248,19 +231,13 @@ class Lines:
             self._open.close()
 
     def _write(self, wanted: dict[str, bool]) -> None:
-        new = {
-            name: level for name, level in wanted.items() if self._levels.get(name, level) != level
-        }
+        new = {name: on for name, on in wanted.items() if self._levels.get(name, on) != on}
+        level = {True: self._value.ACTIVE, False: self._value.INACTIVE}
         for request, names in self._requests:
             changed = {offset: name for offset, name in names.items() if name in new}
             if changed:
                 with naming("write", changed.values()):
-                    request.set_values(
-                        {
-                            o: self._value.ACTIVE if new[n] else self._value.INACTIVE
-                            for o, n in changed.items()
-                        }
-                    )
+                    request.set_values({o: level[new[n]] for o, n in changed.items()})
                 self._levels.update({name: new[name] for name in changed.values()})
 
     def __enter__(self) -> Self:

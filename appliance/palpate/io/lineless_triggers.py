@@ -97,9 +97,7 @@ def slide_values(text: str) -> dict[str, float]:
     """
     values = text.replace(" ", ",").split(",")  # a person may type spaces for commas
     if len(values) > len(SLIDE_VALUES):
-        raise ApplianceError(
-            f"{len(values)} values are too many; send at most a speed in mm/s and a force in N"
-        )
+        raise ApplianceError(f"{len(values)} values are too many; send a speed and a force")
     found = {}
     for value, name in zip(values, SLIDE_VALUES, strict=False):
         if not value:
@@ -107,10 +105,8 @@ def slide_values(text: str) -> dict[str, float]:
         word, unit, most, example = SLIDE_VALUES[name]
         number = float(value) if _NUMBER.fullmatch(value) else 0.0
         if not 0 < number <= most:
-            raise ApplianceError(
-                f"{word} '{value[:MOST_SHOWN]}' is not valid; send {unit} above 0 and up to "
-                f"{most:g} such as {example} or leave it empty"
-            )
+            allowed = f"send {unit} above 0 and up to {most:g} such as {example} or leave it empty"
+            raise ApplianceError(f"{word} '{value[:MOST_SHOWN]}' is not valid; {allowed}")
         found[name] = number
     return found
 
@@ -137,8 +133,7 @@ class KeyTrigger(LinelessTrigger):
             termios.tcsetattr(terminal, termios.TCSANOW, changed)
         except (termios.error, OSError, ValueError) as e:
             raise ConfigError(
-                'trigger.mode = "key" reads the space bar, but standard input is not a terminal; '
-                'run it in one, or use "serial" or "timed"'
+                'trigger.mode = "key" needs a terminal as standard input; use "serial" or "timed"'
             ) from e
         say("the space bar starts a sweep and stops it; Ctrl-C ends")
 
@@ -158,7 +153,6 @@ class KeyTrigger(LinelessTrigger):
             self._sweeping = False
 
     def close(self) -> None:
-        """Restore the terminal, unless it is gone."""
         try:
             termios.tcsetattr(self._terminal, termios.TCSANOW, self._before)
         except termios.error:
@@ -178,9 +172,7 @@ class KeyTrigger(LinelessTrigger):
         except OSError:
             keys = b""
         if not keys:
-            raise PortError(
-                "the terminal whose space bar is the trigger was closed; start again in another one"
-            )
+            raise PortError("the terminal whose space bar is the trigger was closed; start again")
         return keys
 
 
@@ -194,14 +186,10 @@ class TimedTrigger(LinelessTrigger):
     def __init__(self, config: TriggerConfig, clock: Clock, say: Say) -> None:
         super().__init__("timed", "clock of the box")
         if config.every_s <= config.sweep_s:
-            raise ConfigError(
-                f"a sweep of {config.sweep_s:g} s every {config.every_s:g} s leaves no pause; "
-                "let --every be longer than --sweep"
-            )
-        self._every_ns, self._sweep_ns = (
-            round(config.every_s * SECOND),
-            round(config.sweep_s * SECOND),
-        )
+            times = f"a sweep of {config.sweep_s:g} s every {config.every_s:g} s"
+            raise ConfigError(f"{times} leaves no pause; let --every be longer than --sweep")
+        self._every_ns = round(config.every_s * SECOND)
+        self._sweep_ns = round(config.sweep_s * SECOND)
         self._say = say
         self._next_ns = clock.now_ns() + self._every_ns - self._sweep_ns
         self._sweeping, self._announced = False, COUNTDOWN + 1
@@ -221,9 +209,8 @@ class TimedTrigger(LinelessTrigger):
             self._edges.append(Edge(kind, self._next_ns))
             self._next_ns += self._every_ns - self._sweep_ns if self._sweeping else self._sweep_ns
             self._sweeping, self._announced = not self._sweeping, COUNTDOWN + 1
-            self._say(
-                f"{kind}: slide for {self._sweep_ns / 1e9:g} s" if self._sweeping else str(kind)
-            )
+            how = f": slide for {self._sweep_ns / 1e9:g} s" if self._sweeping else ""
+            self._say(f"{kind}{how}")
         left = -(-(self._next_ns - now_ns) // SECOND)
         if not (self._sweeping or self.held) and left < self._announced:
             self._announced = left
@@ -257,9 +244,5 @@ def standard_input() -> int:
     """The file descriptor of standard input, -1 if there is none."""
     try:
         return sys.stdin.fileno()
-    except (
-        AttributeError,
-        OSError,
-        ValueError,
-    ):  # closed, or replaced by an object without a descriptor
+    except (AttributeError, OSError, ValueError):  # closed, or replaced by another object
         return -1

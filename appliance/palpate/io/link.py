@@ -48,6 +48,6 @@ def reply_to(request: packets.Request, read: Callable[[int, int], bytes], clock:
                 return reply.payload
     sent = f"sends {len(data)} other bytes but" if data else "sends nothing and"
     raise SensorMismatch(
-        f"the skin {sent} does not answer request {request.name}; check its firmware, or name its "
-        "profile with skin.profile"
+        f"the skin {sent} does not answer request {request.name}; check its firmware, or set"
+        " skin.profile"
     )

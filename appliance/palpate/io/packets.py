@@ -49,8 +49,7 @@ class Flag(IntFlag):
 
 
 class Request(IntEnum):
-    """Requests: bRequest of a vendor device, or a byte on the bulk OUT endpoint of a CDC-ACM
-    device."""
+    """Requests: bRequest of a vendor device, or a byte to a CDC-ACM device."""
 
     IDENTITY = 1
     FORMAT = 2
@@ -79,8 +78,7 @@ class Reply:
 
 @dataclass(frozen=True, slots=True)
 class Unpacked:
-    """The content of received bytes: packets and replies in order, the number of bytes outside of
-    them, and the unfinished rest."""
+    """The content of bytes: packets and replies, bytes outside of them, the unfinished rest."""
 
     packets: list[Packet]
     replies: list[Reply]
@@ -90,8 +88,7 @@ class Unpacked:
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """The reply to IDENTITY: protocol version, firmware version, name and serial number of the
-    readout board."""
+    """The reply to IDENTITY: versions of protocol and firmware, name, serial number."""
 
     protocol: int
     firmware: tuple[int, int, int]
@@ -101,8 +98,7 @@ class Identity:
 
 @dataclass(frozen=True, slots=True)
 class SkinFormat:
-    """The reply to FORMAT: grid, data type, frames per second, frames in the FIFO and in a packet,
-    axes."""
+    """The reply to FORMAT: grid, data type, rate, frames in the FIFO and in a packet, axes."""
 
     rows: int
     cols: int
@@ -114,14 +110,12 @@ class SkinFormat:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Shape of one frame: [R, C] or [R, C, A]."""
         return shape(self.rows, self.cols, self.axes)
 
 
 @dataclass(frozen=True, slots=True)
 class StreamPosition:
-    """Position in the stream: number of the enumeration, and the unwrapped number of the next frame
-    (None before the first)."""
+    """Position in the stream: enumeration, and number of the next frame (None at first)."""
 
     epoch: int
     next: int | None = None
@@ -141,25 +135,12 @@ def pack(seq: int, t_us: int, taxels: NDArray[Any], flags: int = 0) -> bytes:
     code = _DTYPES.index(taxels.dtype.newbyteorder("<"))
     payload = taxels.astype(_DTYPES[code], copy=False).tobytes()
     if not 0 < n <= MAX_FRAMES or len(payload) > MAX_PAYLOAD:
-        raise FormatError(
-            f"{n} frames of {shown(taxels.shape[1:])} {taxels.dtype} do not fit a packet of "
-            f"{MAX_PAYLOAD} bytes; send fewer"
-        )
-    head = HEADER.pack(
-        MAGIC,
-        VERSION,
-        PacketKind.FRAMES,
-        len(payload),
-        flags,
-        n,
-        rows,
-        cols,
-        code,
-        _axes_byte(*axes),
-        seq % (1 << 32),
-        t_us % (1 << 32),
-    )
-    return _seal(head, payload)
+        frames = f"{n} frames of {shown(taxels.shape[1:])} {taxels.dtype}"
+        raise FormatError(f"{frames} do not fit a packet of {MAX_PAYLOAD} bytes; send fewer")
+    grid = n, rows, cols, code, _axes_byte(*axes)
+    stamp = seq % (1 << 32), t_us % (1 << 32)
+    kind = PacketKind.FRAMES
+    return _seal(HEADER.pack(MAGIC, VERSION, kind, len(payload), flags, *grid, *stamp), payload)
 
 
 def pack_reply(request: Request, payload: bytes, version: int = VERSION) -> bytes:
@@ -196,20 +177,15 @@ def unpack(data: bytes) -> Unpacked:
 
 
 def _one(data: bytes, at: int) -> tuple[Packet | Reply | None, int]:
-    """The packet at `at` and its size; (None, 0) if more bytes are needed, (None, 1) if no packet
-    begins there."""
+    """The packet at `at` and its size; (None, 0): too few bytes, (None, 1): no packet here."""
     if len(data) - at < HEADER.size:
         return None, 0
     _, version, kind, length, flags, count, rows, cols, code, axes, seq, t_us = HEADER.unpack_from(
         data, at
     )
     axes = axes or 1
-    frames = (
-        kind == PacketKind.FRAMES
-        and version == VERSION
-        and code < len(_DTYPES)
-        and axes <= MOST_AXES
-    )
+    known = kind == PacketKind.FRAMES and version == VERSION
+    frames = known and code < len(_DTYPES) and axes <= MOST_AXES
     if frames:
         frames = 0 < length == count * rows * cols * axes * _DTYPES[code].itemsize
     if length > MAX_PAYLOAD or not (frames or kind == PacketKind.REPLY):
@@ -239,12 +215,9 @@ def follow(
     fresh: list[tuple[int, Packet]] = []
     lost = stale = 0
     for p in packets:
-        n = len(p.taxels)
-        ahead = (
-            0
-            if position.next is None
-            else (p.seq - position.next + (1 << 31)) % (1 << 32) - (1 << 31)
-        )
+        n, ahead = len(p.taxels), 0
+        if position.next is not None:
+            ahead = (p.seq - position.next + (1 << 31)) % (1 << 32) - (1 << 31)
         if -RECENT <= ahead < 0:
             stale += n
             continue
@@ -261,63 +234,44 @@ def follow(
 
 
 def pack_identity(who: Identity) -> bytes:
-    """Payload of the IDENTITY reply."""
     return _IDENTITY.pack(
         who.protocol, *who.firmware, who.board.encode()[:16], who.serial.encode()[:16]
     )
 
 
 def unpack_identity(payload: bytes) -> Identity:
-    """Read an IDENTITY reply. Raises FormatError if it is too short; a newer readout board may send
-    a longer reply."""
+    """Read an IDENTITY reply, which may be longer. Raises FormatError."""
     if len(payload) < _IDENTITY.size:
-        raise FormatError(
-            f"identity of {len(payload)} bytes; protocol {VERSION} has {_IDENTITY.size}: check "
-            "the firmware"
-        )
+        wanted = f"protocol {VERSION} has {_IDENTITY.size}"
+        raise FormatError(f"identity of {len(payload)} bytes; {wanted}: check the firmware")
     protocol, major, minor, patch, board, serial = _IDENTITY.unpack_from(payload)
     return Identity(protocol, (major, minor, patch), _text(board), _text(serial))
 
 
 def pack_format(skin: SkinFormat) -> bytes:
-    """Payload of the FORMAT reply."""
     code, rate_mhz = DATA_TYPES.index(skin.dtype), round(skin.rate_hz * 1000)
-    return _FORMAT.pack(
-        skin.rows,
-        skin.cols,
-        code,
-        _axes_byte(skin.axes),
-        rate_mhz,
-        skin.fifo_frames,
-        skin.packet_frames,
-    )
+    grid, rate_mhz = (skin.rows, skin.cols), round(skin.rate_hz * 1000)
+    code, axes = DATA_TYPES.index(skin.dtype), _axes_byte(skin.axes)
+    return _FORMAT.pack(*grid, code, axes, rate_mhz, skin.fifo_frames, skin.packet_frames)
 
 
 def unpack_format(payload: bytes) -> SkinFormat:
-    """Read a FORMAT reply. Raises FormatError if it is too short, or its data type or number of
-    axes is unknown."""
+    """Read a FORMAT reply. Raises FormatError."""
     if len(payload) < _FORMAT.size:
-        raise FormatError(
-            f"format of {len(payload)} bytes; protocol {VERSION} has {_FORMAT.size}: check the "
-            "firmware"
-        )
+        wanted = f"protocol {VERSION} has {_FORMAT.size}"
+        raise FormatError(f"format of {len(payload)} bytes; {wanted}: check the firmware")
     rows, cols, code, axes, rate_mhz, fifo_frames, packet_frames = _FORMAT.unpack_from(payload)
     if code >= len(DATA_TYPES):
-        raise FormatError(
-            f"data type {code} is not on the list 0..{len(DATA_TYPES) - 1}; update the appliance"
-        )
+        raise FormatError(f"data type {code} is not among 0..{len(DATA_TYPES) - 1}; update the box")
     if axes > MOST_AXES:
-        raise FormatError(
-            f"{axes} axes of each taxel are more than the {MOST_AXES} that there can be; check "
-            "the firmware"
-        )
+        raise FormatError(f"{axes} axes of a taxel, at most {MOST_AXES}; check the firmware")
     return SkinFormat(
         rows, cols, DATA_TYPES[code], rate_mhz / 1000, fifo_frames, packet_frames, axes or 1
     )
 
 
 def _axes_byte(axes: int = 1) -> int:
-    """One axis is sent as 0, as the byte was always 0 before skins with several axes."""
+    """One axis is sent as 0."""
     return 0 if axes == 1 else axes
 
 

@@ -27,23 +27,8 @@ from palpate.core.types import Verdict
 from palpate.io import serial_port
 
 COMMANDS = (
-    "ID",
-    "STATE",
-    "TEST",
-    "LABEL",
-    "TARE",
-    "NEW",
-    "ABORT",
-    "START",
-    "STOP",
-    "MATERIAL",
-    "POSITION",
-    "SESSION",
-    "NEXT",
-    "DISCARD",
-    "TEACH",
-    "USE",
-    "FORGET",
+    *("ID", "STATE", "TEST", "LABEL", "TARE", "NEW", "ABORT", "START", "STOP"),
+    *("MATERIAL", "POSITION", "SESSION", "NEXT", "DISCARD", "TEACH", "USE", "FORGET"),
 )
 TEXT_COMMANDS = ("LABEL", "MATERIAL", "POSITION", "SESSION", "TEACH", "FORGET")
 """The commands that need a text after a comma. START may have one: speed and force of the slide."""
@@ -82,8 +67,7 @@ class Port(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A command of the robot controller: one of COMMANDS, and a text if it has one; or `error`, the
-    reason why it was not understood."""
+    """A command of the robot: one of COMMANDS with its text, or `error` for another line."""
 
     name: str
     text: str = ""
@@ -97,8 +81,7 @@ class Command:
 
 
 def result(v: Verdict, source: str, *, loss_known: bool = True) -> bytes:
-    """The RES sentence of a verdict. source: of the frames (usb, sim, replay). loss_known: whether
-    lost frames of the skin can be seen."""
+    """The RES sentence of a verdict. source: of the frames. loss_known: losses can be seen."""
     values = v.as_dict(arrays=False)
     return sentences.answer("RES", (v.sweep,), values, source, loss_known=loss_known)
 
@@ -121,9 +104,8 @@ def command(name: str, text: str | None = None) -> Command:
     if name not in COMMANDS or UNSAFE.search(text or ""):
         return Command(name, error=f"unknown command; known are {' '.join(COMMANDS)}")
     if (name in TEXT_COMMANDS) != (text is not None):
-        return Command(
-            name, error=f"send it as {TALKER} {name}" + " TEXT" * (name in TEXT_COMMANDS)
-        )
+        form = f"{TALKER} {name}" + " TEXT" * (name in TEXT_COMMANDS)
+        return Command(name, error=f"send it as {form}")
     return Command(name, text or "")
 
 
@@ -134,17 +116,11 @@ class StdoutPort:
     """
 
     def __init__(self, source: str, commands: Callable[[], list[Command]] = list) -> None:
-        self.name, self.dropped, self.trouble, self._source, self._commands = (
-            "standard output",
-            0,
-            "",
-            source,
-            commands,
-        )
+        self.name, self.dropped, self.trouble = "standard output", 0, ""
+        self._source, self._commands = source, commands
         self._gone = False  # the reader of a pipe
 
     def send(self, verdict: Verdict, *, loss_known: bool = True) -> None:
-        """Print a verdict's sentence."""
         self.say(result(verdict, self._source, loss_known=loss_known))
 
     def say(self, line: bytes) -> None:
@@ -178,8 +154,7 @@ class StdoutPort:
 
 
 def _can_be_written(stream: TextIO) -> bool:
-    """Whether a sentence can be written without waiting. A pipe that is ready takes PIPE_BUF bytes,
-    which is more."""
+    """Whether a sentence can be written without waiting: a ready pipe takes more."""
     try:
         poll = select.poll()
         poll.register(stream.fileno(), select.POLLOUT)
@@ -216,8 +191,7 @@ class SerialSink:
         self.say(result(verdict, self._source, loss_known=loss_known))
 
     def say(self, line: bytes) -> None:
-        """Queue a sentence. If the queue is full, the oldest sentence is dropped and counted,
-        except one that was sent in part."""
+        """Queue a sentence. Of a full queue the oldest that was not begun is dropped."""
         if len(self._queue) >= self._config.queue:
             del self._queue[1 if self._begun else 0]
             self.dropped += 1
@@ -240,7 +214,6 @@ class SerialSink:
         return [command for command in found if self._is_answered(command)]
 
     def close(self) -> None:
-        """Close the port; unsent sentences are lost."""
         if self._port:
             port, self._port = self._port, None
             serial_port.close(port)
@@ -282,21 +255,17 @@ class SerialSink:
         try:
             port = serial_port.open_alone(self._config.port, self._config.baud, self._opener)
         except (OSError, ValueError, termios.error) as e:  # SerialException is an OSError
-            held = serial_port.is_held(e)
-            advice = (
-                "end the program that has it (fuser shows it)"
-                if held
-                else "check serial.port and group dialout"
-            )
+            advice = "check serial.port and group dialout"
+            if serial_port.is_held(e):
+                advice = "end the program that has it (fuser shows it)"
             self.trouble = f"serial port {self._config.port} cannot be opened: {e}; {advice}"
             return False
         self._port, self.trouble, self._rest = port, "", b""
         return True
 
     def _lose(self, e: OSError) -> None:
-        self.trouble = (
-            f"serial port {self._config.port} failed: {e}; it is opened again when it is back"
-        )
+        why = f"serial port {self._config.port} failed: {e}"
+        self.trouble = f"{why}; it is opened again when it is back"
         self.close()
         self._begun = 0
         self._retry_ns = self._clock.now_ns() + RETRY_NS

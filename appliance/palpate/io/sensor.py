@@ -56,8 +56,7 @@ class Sensor(Protocol):
 
     @property
     def loss_known(self) -> bool:
-        """Whether every lost frame is seen. If not, `lost_frames` counts only the losses that can
-        be inferred from times."""
+        """Whether every lost frame is seen, not only those that times show."""
         ...
 
     @property
@@ -86,8 +85,7 @@ class TransferObserver(Protocol):
 
 
 class FrameStream(Protocol):
-    """Converts the bytes of a skin to Frames with unwrapped numbers and host times. It does no
-    I/O."""
+    """Converts the bytes of a skin to Frames with numbers and host times, without I/O."""
 
     @property
     def loss_known(self) -> bool:
@@ -105,8 +103,7 @@ class FrameStream(Protocol):
         ...
 
     def restart(self) -> None:
-        """Begin an enumeration, also the first: frame numbers get the next epoch, and the clock
-        starts again."""
+        """Begin an enumeration: frame numbers get the next epoch, the clock starts again."""
         ...
 
     def feed(self, data: bytes, arrival_ns: int) -> Frames:

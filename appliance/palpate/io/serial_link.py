@@ -35,8 +35,7 @@ full buffer."""
 
 
 class SerialLink:
-    """An opened serial port: requests are single bytes, replies come as packets. wait: see
-    `Devices`."""
+    """An opened serial port: requests are bytes, replies packets. wait: see `Devices`."""
 
     def __init__(
         self,
@@ -60,8 +59,7 @@ class SerialLink:
         return reply_to(request, self.read, self._clock) if length else b""
 
     def write(self, data: bytes) -> None:
-        """Send all of `data`. Raises SensorLost if the port is gone or accepts nothing for
-        REPLY_MS."""
+        """Send all of `data`. Raises SensorLost if the port takes nothing for REPLY_MS."""
         while data:
             try:
                 if not select.select([], [self._port.fileno()], [], REPLY_MS / 1000)[1]:
@@ -73,8 +71,7 @@ class SerialLink:
                 raise _lost(self.path, e) from e
 
     def read(self, size: int, timeout_ms: int) -> bytes:
-        """At most `size` bytes; b"" if none came within `timeout_ms`. Raises SensorLost if the port
-        is gone."""
+        """At most `size` bytes, b"" if none came in time. Raises SensorLost."""
         try:
             if not self._wait(self._port.fileno(), timeout_ms / 1000):
                 return b""
@@ -92,7 +89,6 @@ class SerialLink:
         return data
 
     def close(self) -> None:
-        """Release the port."""
         serial_port.close(self._port)
 
 
@@ -129,8 +125,7 @@ def find(ids: Iterable[tuple[int, int]], serial_number: str, ports: Iterable[Por
     number = f" and serial number {serial_number}" if serial_number else ""
     there = ", ".join(map(str, ports)) or "none"
     raise SensorAbsent(
-        f"no serial port {wanted}{number}; there are: {there}; plug the skin in, or name its port "
-        "with --port (skin.port)"
+        f"no serial port {wanted}{number}; there are: {there}; plug it in, or use --port"
     )
 
 
@@ -150,32 +145,22 @@ def _refused(path: str, e: Exception) -> SensorError:
     """The SensorError for a port that could not be opened."""
     code = getattr(e, "errno", None)
     if serial_port.is_held(e):
-        return SensorBusy(
-            f"port held by another program: {path} (errno {code}); end it, `fuser {path}` shows "
-            "which"
-        )
+        held = f"port held by another program: {path} (errno {code})"
+        return SensorBusy(f"{held}; end it, `fuser {path}` shows which")
     if code == errno.EACCES:
-        return SensorDenied(
-            f"{path} may not be opened by this user (errno 13); add the user to group dialout, "
-            "or use the service's rights (sudo -u palpate)"
-        )
+        denied = f"{path} may not be opened by this user (errno 13)"
+        return SensorDenied(f"{denied}; join group dialout, or use sudo -u palpate")
     if code in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
-        return SensorAbsent(
-            f"no port {path} (errno {code}); plug the skin in, or correct --port (skin.port)"
-        )
-    if code == errno.EISDIR or f"({errno.ENOTTY}," in str(
-        e
-    ):  # pyserial has no errno for the latter
+        absent = f"no port {path} (errno {code})"
+        return SensorAbsent(f"{absent}; plug the skin in, or correct --port (skin.port)")
+    # pyserial has no errno for the latter
+    if code == errno.EISDIR or f"({errno.ENOTTY}," in str(e):
         return SensorLost(f"{path} is not a serial port; correct --port (skin.port)")
-    return SensorLost(
-        f"{path} cannot be opened: {e}; check skin.port and the baud rate of its profile"
-    )
+    return SensorLost(f"{path} cannot be opened: {e}; check skin.port and its profile's baud")
 
 
 def _lost(path: str, e: OSError) -> SensorLost:
     if e.errno in (errno.ENODEV, errno.EIO, errno.ENXIO):
-        return SensorLost(
-            f"the skin on {path} was unplugged (errno {e.errno}); plug it in again, it is taken "
-            "up by itself"
-        )
+        gone = f"the skin on {path} was unplugged (errno {e.errno})"
+        return SensorLost(f"{gone}; plug it in again, it is taken up by itself")
     return SensorLost(f"{path} failed: {e}; trying again, check its cable if this stays")

@@ -1,5 +1,4 @@
-"""Serial ports, for the line to the robot and for skins: lists them and opens one for this program
-alone."""
+"""Serial ports, of the robot and of skins: lists them and opens one for this program alone."""
 
 from __future__ import annotations
 
@@ -32,27 +31,21 @@ class PortInfo:
     name: str = ""
 
     def __str__(self) -> str:
-        return (
-            f"{self.path} ({self.vendor_id:04x}:{self.product_id:04x} {self.name})"
-            if self.vendor_id
-            else self.path
-        )
+        ids = f" ({self.vendor_id:04x}:{self.product_id:04x} {self.name})"
+        return self.path + ids * bool(self.vendor_id)
 
 
 def ports() -> list[PortInfo]:
     """The serial ports of this machine, from /sys; none is opened."""
     from serial.tools.list_ports import comports
 
-    return [
-        PortInfo(
-            p.device,
-            p.vid or 0,
-            p.pid or 0,
-            printable(p.serial_number or ""),
-            printable(p.product or p.description or ""),
-        )
-        for p in sorted(comports(), key=lambda p: str(p.device))
-    ]
+    found = sorted(comports(), key=lambda p: str(p.device))
+    return [PortInfo(p.device, p.vid or 0, p.pid or 0, *_named(p)) for p in found]
+
+
+def _named(port: Any) -> tuple[str, str]:
+    """Serial number and name of a port of pyserial."""
+    return printable(port.serial_number or ""), printable(port.product or port.description or "")
 
 
 def open_alone(path: str, baud: int, opener: Callable[..., Any] = serial.Serial) -> Any:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Protocol
 
 from palpate.core.clock import Clock
@@ -28,13 +29,9 @@ from palpate.io.usb_sensor import LinkSensor
 class BytePort(Protocol):
     """An opened port, as SerialLink is."""
 
-    def write(self, data: bytes) -> None:
-        """Send all of `data`. Raises SensorError."""
-        ...
+    def write(self, data: bytes) -> None: ...
 
-    def read(self, size: int, timeout_ms: int) -> bytes:
-        """At most `size` bytes; b"" if none came within `timeout_ms`. Raises SensorError."""
-        ...
+    def read(self, size: int, timeout_ms: int) -> bytes: ...
 
     def close(self) -> None: ...
 
@@ -79,13 +76,8 @@ class SerialSensor(LinkSensor):
         open_port: Callable[[str, int], BytePort] | None = None,
         ports: Callable[[], list[PortInfo]] = serial_port.ports,
     ) -> None:
-        super().__init__(
-            config,
-            format,
-            clock,
-            lambda counters: skin_stream.stream(profile, format, counters),
-            tap,
-        )
+        made = partial(skin_stream.stream, profile, format)
+        super().__init__(config, format, clock, made, tap)
         self._profile, self._ports = profile, ports
         self._open_port = open_port or (lambda path, baud: SerialLink(path, baud, clock))
         self._tared_ns = 0  # until then the skin tares itself, and its frames are not used
@@ -101,12 +93,12 @@ class SerialSensor(LinkSensor):
         info = next((port for port in there if port.path in (path, node)), PortInfo(path))
         port = self._open_port(path, self._profile.baud)
         try:
-            for command in self._profile.commands(self._profile.start, self._format.rate_hz):
+            rate = self._format.rate_hz
+            for command in self._profile.commands(self._profile.start, rate):
                 port.write(command)
             if self._config.tare:
-                for command in self._profile.commands(self._profile.tare, self._format.rate_hz):
+                for command in self._profile.commands(self._profile.tare, rate):
                     port.write(command)
-                self._tared_ns = self._clock.now_ns() + round(self._profile.tare_s * 1e9)
         except Exception:
             port.close()
             raise
@@ -116,30 +108,24 @@ class SerialSensor(LinkSensor):
     def _check_format(self) -> None:
         """Raises SensorMismatch if the skin cannot send the bundle's format."""
         sent, wanted = self._profile.format, self._format
-        able = (
-            wanted.rate_hz in self._profile.rates_hz
-            or abs(sent.rate_hz / wanted.rate_hz - 1) <= RATE_WANDER
-        )
-        if sent.skin != wanted.skin or not able:
+        near = abs(sent.rate_hz / wanted.rate_hz - 1) <= RATE_WANDER
+        if sent.skin != wanted.skin or not (near or wanted.rate_hz in self._profile.rates_hz):
             rates = " or ".join(f"{rate:g}" for rate in self._profile.rates_hz or (sent.rate_hz,))
             raise SensorMismatch(
                 f"the profile {self._config.profile} sends {shown(sent.shape)} {sent.dtype} at "
-                f"{rates} Hz, wanted is "
-                f"{wanted}; correct skin.profile, skin.grid or skin.rate_hz, or deploy a "
-                "bundle for this skin"
+                f"{rates} Hz, wanted is {wanted}; correct skin.profile, skin.grid or skin.rate_hz, "
+                "or deploy a bundle for this skin"
             )
 
     def _no_frame(self, *, bytes_came: bool) -> SensorError:
         if not bytes_came:
             return super()._no_frame(bytes_came=False)
-        remedy = (
-            self._stream.misfit
-            or "correct skin.profile, skin.grid or the profile's baud; `palpate skin detect` "
-            "listens for what fits; a board that boots when it is opened needs a longer "
-            "skin.silence_ms"
+        remedy = self._stream.misfit or (
+            "correct skin.profile, skin.grid or the profile's baud (`palpate skin detect` listens);"
+            " a board that boots when it is opened needs a longer skin.silence_ms"
         )
         return SensorMismatch(
-            f"the skin sent bytes for {self._config.silence_ms} ms, "
-            f"but no frame of profile {self._config.profile} "
-            f"({shown(self._profile.format.shape)} {self._profile.number}); {remedy}"
+            f"the skin sent bytes for {self._config.silence_ms} ms, but no frame of profile"
+            f" {self._config.profile} ({shown(self._profile.format.shape)} {self._profile.number});"
+            f" {remedy}"
         )

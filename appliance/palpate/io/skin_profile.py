@@ -185,8 +185,7 @@ class SkinProfile:
 
     @property
     def lacks(self) -> tuple[str, ...]:
-        """The MARKS that its frames do not have. Without a sequence number, lost frames cannot be
-        seen."""
+        """The MARKS that its frames lack. Without a sequence losses cannot be seen."""
         has: tuple[str, ...] = MARKS if self.codec in ("palpate", "papillarray") else ()
         if self.codec == "fixed":
             has = ("sequence",) * bool(self.sequence) + ("checksum",) * bool(self.checksum)
@@ -199,17 +198,14 @@ class SkinProfile:
 
     @property
     def data_type(self) -> str:
-        """The type of its raw counts."""
         return wire_numbers.data_type(self.number)
 
     @property
     def format(self) -> SweepFormat:
-        """The format of its sweeps, with rows along the direction of sliding and a window of
-        WINDOW_S."""
-        rows, cols = (
-            (self.cols, self.rows) if "transpose" in self.orientation else (self.rows, self.cols)
-        )
-        return with_window(rows, cols, self.rate_hz, self.data_type, len(self.take))
+        """The format of its sweeps, rows along the sliding, a window of WINDOW_S."""
+        turned = "transpose" in self.orientation
+        grid = (self.cols, self.rows) if turned else (self.rows, self.cols)
+        return with_window(*grid, self.rate_hz, self.data_type, len(self.take))
 
     def commands(self, texts: Sequence[str], rate_hz: float) -> list[bytes]:
         """Commands as bytes. {rate} becomes frames per second in decimal, {period_ms} milliseconds:
@@ -235,16 +231,8 @@ class SkinProfile:
 _KEYS = keys(SkinProfile)
 _OF_CODEC = {
     "fixed": (
-        "marker",
-        "trailer",
-        "skip_before",
-        "skip_after",
-        "sequence",
-        "sequence_at",
-        "sequence_order",
-        "checksum",
-        "checksum_from",
-        "checksum_order",
+        *("marker", "trailer", "skip_before", "skip_after", "sequence", "sequence_at"),
+        *("sequence_order", "checksum", "checksum_from", "checksum_order"),
     ),
     "text": ("skip_columns", "around", "decimal", "line_end"),
 }
@@ -259,40 +247,26 @@ def _contradiction(p: SkinProfile) -> str:
         return 'codec = "fixed" needs a marker or a trailer; give one, or take "text"'
     for codec, names in _OF_CODEC.items():
         if codec != p.codec and (wrong := [n for n in names if getattr(p, n) != _KEYS[n].default]):
-            return (
-                f'{" and ".join(wrong)} belong{"s" * (len(wrong) == 1)} to codec = "{codec}", not '
-                f'to "{p.codec}"; remove {"it" if len(wrong) == 1 else "them"}'
-            )
+            return f'only codec = "{codec}" has {" and ".join(wrong)}; remove it from "{p.codec}"'
     if why := _outside(p):
         return why
     if p.codec != "fixed" and p.number in wire_numbers.WIDE:
         return f'number = "{p.number}" is for codec = "fixed"; write number = "float32"'
-    if (
-        not p.take
-        or len(p.take) > MOST_AXES
-        or len({*p.take}) < len(p.take)
-        or max(p.take) >= p.values
-    ):
-        return (
-            f"take = {list(p.take)} is not 1 to {MOST_AXES} different ones of 0 to {p.values - 1} "
-            "(see values)"
-        )
+    take = {*p.take}
+    if not 0 < len(p.take) == len(take) <= MOST_AXES or max(take) >= p.values:
+        allowed = f"1 to {MOST_AXES} different ones of 0 to {p.values - 1} (see values)"
+        return f"take = {list(p.take)} is not {allowed}"
     if p.codec in _VALUES and (p.values, p.number) != _VALUES[p.codec]:
         values, kind = _VALUES[p.codec]
-        return (
-            f'codec = "{p.codec}" sends {values} values of {kind} a taxel; write values = '
-            f'{values}, number = "{kind}"'
-        )
+        return f'codec = "{p.codec}" needs values = {values} and number = "{kind}"'
     if p.codec == "palpate" and (p.usb_ids or p.start or p.stop or p.tare):
         return (
-            'usb_ids, start, stop and tare are not for codec = "palpate"; skin.link and '
-            "skin.usb say where it is"
+            'usb_ids, start, stop and tare are not for codec = "palpate"; see skin.link, skin.usb'
         )
     if p.codec == "robotiq-tsf" and p.rows * p.cols not in (28, 56):
-        return (
-            f"{p.rows} x {p.cols} taxels are neither one finger (7 x 4) nor two (14 x 4); correct "
-            "rows and cols"
-        )
+        sizes = "neither one finger (7 x 4) nor two (14 x 4)"
+        return f"{p.rows} x {p.cols} taxels are {sizes}; correct rows and cols"
+    return ""
     return ""
 
 
@@ -300,14 +274,10 @@ def _outside(p: SkinProfile) -> str:
     """Why a part of a frame of fixed length lies where it cannot lie, "" if none does."""
     end = p.skip_before + p.body
     if p.sequence_at and not p.sequence:
-        return (
-            'sequence_at says where the frame count is; give its type, such as sequence = "uint8"'
-        )
+        return 'sequence_at needs the type of the count; give one, such as sequence = "uint8"'
     if not (p.sequence_at <= p.skip_before or end <= p.sequence_at <= end + p.skip_after):
-        return (
-            f"sequence_at = {p.sequence_at} is among the numbers; use 0 to skip_before "
-            f"({p.skip_before}), or {end} to {end + p.skip_after} behind them"
-        )
+        allowed = f"0 to skip_before ({p.skip_before}), or {end} to {end + p.skip_after}"
+        return f"sequence_at = {p.sequence_at} is among the numbers; use {allowed}"
     if p.checksum_from and not p.checksum:
         return 'checksum_from needs a checksum; give one, such as checksum = "crc8"'
     if p.checksum_from >= len(p.marker) + end + p.skip_after:
@@ -331,21 +301,16 @@ def load(name: str, folders: Sequence[Path]) -> SkinProfile:
     if name not in there:
         near = closest(name, there)
         hint = f"did you mean {near[0]}?" if near else f"there are: {', '.join(there) or 'none'}"
-        raise ConfigError(
-            f"skin.profile = {shown(name)} has no profile in {' or '.join(map(str, folders))}; "
-            f"{hint}"
-        )
+        where = " or ".join(map(str, folders))
+        raise ConfigError(f"skin.profile = {shown(name)} has no profile in {where}; {hint}")
     path = there[name]
     return _made(read_toml(path), str(path))
 
 
 def from_json(table: Any, where: str) -> SkinProfile:
-    """The profile that `json` wrote, checked like a file. where: its place, for messages. Raises
-    ConfigError."""
+    """The profile that `json` wrote, checked like a file. Raises ConfigError."""
     if not isinstance(table, dict):
-        raise ConfigError(
-            f"{where}: {shown(table)} is not a skin profile; take one that was not changed"
-        )
+        raise ConfigError(f"{where}: {shown(table)} is not a skin profile")
     return _made(table, where)
 
 
@@ -353,16 +318,15 @@ def _made(table: dict[str, Any], where: str) -> SkinProfile:
     def unknown(name: str) -> ConfigError:
         near = closest(name, _KEYS)
         hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(_KEYS)}"
-        return ConfigError(
-            f"{where}: {name if name.isprintable() else shown(name)} is unknown; {hint}"
-        )
+        return refused(f"{name if name.isprintable() else shown(name)} is unknown; {hint}")
 
-    values = read_table(
-        _KEYS, table, unknown=unknown, refused=lambda why: ConfigError(f"{where}: {why}")
-    )
+    def refused(why: str) -> ConfigError:
+        return ConfigError(f"{where}: {why}")
+
+    values = read_table(_KEYS, table, unknown=unknown, refused=refused)
     missing = next((name for name in _NEEDED if not values.get(name)), None)
     if missing:
-        raise ConfigError(f"{where}: {missing} is missing; matrix.toml explains each key")
+        raise refused(f"{missing} is missing; matrix.toml explains each key")
     try:
         return SkinProfile(**values)
     except ConfigError as e:
@@ -380,29 +344,22 @@ def names(folders: Sequence[Path]) -> dict[str, Path]:
 
 
 def adapted(profile: SkinProfile, config: SkinConfig) -> SkinProfile:
-    """The profile with the changes of skin.grid, skin.rate_hz and baud. Raises
-    ConfigError."""
+    """The profile with skin.grid, skin.rate_hz and baud. Raises ConfigError."""
     if profile.codec == "palpate" and (config.grid or config.rate_hz):
         key = "grid" if config.grid else "rate_hz"
-        raise ConfigError(
-            f"sensor.{key} is for skins that do not announce it; this skin speaks "
-            "PROTOCOL.md, so remove it"
-        )
+        raise ConfigError(f"skin.{key} is announced by a skin of PROTOCOL.md; remove it")
     grid = _GRID.fullmatch(config.grid)
     if config.grid and not (grid and max(map(int, grid.groups())) <= 255):
-        raise ConfigError(
-            f"skin.grid = {config.grid!r} is not allowed; use rows x columns, such as 12x32"
-        )
+        allowed = "use rows x columns, such as 12x32"
+        raise ConfigError(f"skin.grid = {config.grid!r} is not allowed; {allowed}")
     changes: dict[str, Any] = {}
     if grid:
         changes |= {"rows": int(grid[1]), "cols": int(grid[2])}
     if config.rate_hz:
         if profile.rates_hz and config.rate_hz not in profile.rates_hz:
             allowed = ", ".join(f"{rate:g}" for rate in profile.rates_hz)
-            raise ConfigError(
-                f"skin.rate_hz = {config.rate_hz:g} cannot be set on this skin; use one of "
-                f"{allowed}"
-            )
+            why = f"skin.rate_hz = {config.rate_hz:g} cannot be set on this skin"
+            raise ConfigError(f"{why}; use one of {allowed}")
         changes["rate_hz"] = config.rate_hz
     if config.baud:
         changes["baud"] = config.baud
@@ -420,7 +377,6 @@ def warning(format: SweepFormat) -> str:
         return ""
     finest = ceil(20 * SLIDE_MM_S / format.rate_hz) / 10
     return (
-        f"{format.window} frames in a window, at {format.rate_hz:g} Hz: at {SLIDE_MM_S} mm/s "
-        f"textures finer than {finest:g} mm "
-        "cannot be told apart; slide slower, or tell materials apart by stiffness and shape"
+        f"{format.window} frames in a window, at {format.rate_hz:g} Hz: at {SLIDE_MM_S} mm/s"
+        f" textures finer than {finest:g} mm cannot be told apart; slide slower"
     )

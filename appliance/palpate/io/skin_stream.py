@@ -59,8 +59,7 @@ def stream(profile: SkinProfile, format: SweepFormat, counters: SensorCounters) 
 
 
 def _packets(codec: Codec, profile: SkinProfile, data: bytes) -> packets.Unpacked:
-    """Group frames that have a count and a clock into packets of consecutive frames. Raises
-    SensorMismatch for another grid."""
+    """Frames with count and clock as packets. Raises SensorMismatch for another grid."""
     found = codec(Rest(), data)
     if found.wrong:
         raise SensorMismatch(_of_another(found.wrong))
@@ -74,9 +73,7 @@ def _packets(codec: Codec, profile: SkinProfile, data: bytes) -> packets.Unpacke
 
 
 def _of_another(why: str) -> str:
-    return (
-        f"the skin is another one: {why}; correct skin.grid, or name its profile with skin.profile"
-    )
+    return f"the skin is another one: {why}; correct skin.grid or skin.profile"
 
 
 class CountedStream:
@@ -105,12 +102,10 @@ class CountedStream:
 
     @property
     def loss_known(self) -> bool:
-        """Whether every lost frame is seen."""
         return bool(self._wrap)
 
     @property
     def clock(self) -> dict[str, float] | None:
-        """Accuracy of the times: DeviceClock.quality."""
         return self._fit.quality()
 
     def feed(self, data: bytes, arrival_ns: int) -> Frames:
@@ -162,9 +157,9 @@ class CountedStream:
             return np.empty(0, np.int64)
         self._skipped = found.garbage - int(found.skipped.sum())
         # the rest of a frame that was being sent when the port was opened is not garbage
-        uncounted = (
-            min(before, round(found.size)) - (before - int(found.skipped[0])) if first else 0
-        )
+        uncounted = 0
+        if first:
+            uncounted = min(before, round(found.size)) - (before - int(found.skipped[0]))
         self._counters.garbage_bytes += found.garbage - uncounted
         if len(found.counts):
             missing = self._gaps(found.counts)
@@ -194,8 +189,7 @@ class CountedStream:
     def _timed(
         self, numbers: NDArray[np.int64], taxels: NDArray[Any], arrived_ns: int, *, piled: bool
     ) -> Frames:
-        """Frames with times, together with the frames that were held back before them. Empty if
-        these frames are held back."""
+        """Frames with times, after those held back; empty if these are held back."""
         last = int(numbers[-1])
         late_ns = self._late(last, arrived_ns)
         suspect = late_ns > max(SUSPECT_NS, SUSPECT_FRAMES * self._format.period_ns)
@@ -213,8 +207,7 @@ class CountedStream:
         return Frames.joined([*held, frames]) if held else frames
 
     def _late(self, number: int, arrived_ns: int) -> int:
-        """Lateness of frame `number` in nanoseconds. The fit learns from it unless it is far too
-        large."""
+        """Lateness of a frame in ns. The fit learns from it unless it is far too large."""
         device_ns = round(number * self._format.period_ns)
         if self._fitted:
             late_ns = arrived_ns - self._fit.to_host_ns(device_ns)
@@ -225,8 +218,7 @@ class CountedStream:
         return arrived_ns - self._fit.to_host_ns(device_ns)
 
     def _times(self, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Host times of frames [n]. A better fit may move them back, but they never run
-        backwards."""
+        """Host times of frames [n], which never run backwards."""
         first, last = int(numbers[0]), int(numbers[-1])
         first_ns, last_ns = (
             self._fit.to_host_ns(number * self._format.period_ns) for number in (first, last)
@@ -248,10 +240,10 @@ class CountedStream:
 
 def another_rate(measured_hz: float, wanted_hz: float) -> str:
     """The sentence about a skin that sends frames at another rate than expected."""
+    share = f"{100 * (measured_hz / wanted_hz - 1):+.0f} %, at most {100 * RATE_WANDER:g}"
     return (
-        f"the skin sends {measured_hz:.1f} frames a second, {wanted_hz:g} are expected "
-        f"({100 * (measured_hz / wanted_hz - 1):+.0f} %, at most {100 * RATE_WANDER:g}); set "
-        f"skin.rate_hz for new recordings, or let it send {wanted_hz:g}"
+        f"the skin sends {measured_hz:.1f} frames a second, {wanted_hz:g} are expected ({share}); "
+        f"set skin.rate_hz for new recordings, or let it send {wanted_hz:g}"
     )
 
 
@@ -272,9 +264,8 @@ class ArrivalWatch:
         self._last_ns = 0  # the arrival before
         self._least_ns = 0
         self._piled = False
-        self._steps: deque[tuple[int, int, int]] = deque(
-            maxlen=_STEPS
-        )  # (frames, time in ns, least lateness in ns)
+        # (frames, time in ns, least lateness in ns)
+        self._steps: deque[tuple[int, int, int]] = deque(maxlen=_STEPS)
         self.pace = 0.0
 
     def missing(self, number: int, arrival_ns: int, late_ns: int, *, piled: bool) -> int:
@@ -282,9 +273,8 @@ class ArrivalWatch:
         `number`. piled: more bytes were waiting when it was read."""
         self.pace = 0.0
         # if the host reads rarely, a frame may have come at any time since the last read
-        late_ns -= (
-            max(0, round(arrival_ns - self._last_ns - 1.5 * self._period_ns)) if self._begun else 0
-        )
+        if self._begun:
+            late_ns -= max(0, round(arrival_ns - self._last_ns - 1.5 * self._period_ns))
         self._last_ns = arrival_ns
         if self._begun is None:
             self._begun, self._least_ns = (number, arrival_ns), late_ns
@@ -310,10 +300,8 @@ class ArrivalWatch:
         if len(paces) < 2 or not abs(paces[-1] - 1) < _STEADY or not abs(paces[-2] - 1) < _STEADY:
             return 0
         before_ns, now_ns = self._steps[-2][2], self._steps[-1][2]
-        stays = (
-            min(before_ns, now_ns) > max(_SLACK_NS, 0.75 * self._period_ns)
-            and abs(now_ns - before_ns) < _SAME_NS
-        )
+        still = abs(now_ns - before_ns) < _SAME_NS
+        stays = still and min(before_ns, now_ns) > max(_SLACK_NS, 0.75 * self._period_ns)
         # after several steps at the right pace, frames that are still late will stay late
         stuck = bool(self.pace) and abs(self.pace - 1) <= RATE_WANDER and now_ns > self._suspect_ns
         return max(1, round(now_ns / self._period_ns)) if stays or stuck else 0

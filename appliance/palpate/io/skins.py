@@ -1,5 +1,4 @@
-"""The skin of a box by its settings: its profile, its sensor, and the format of its sweeps without
-a bundle."""
+"""The skin of a box: its profile, its sensor, and the format of its sweeps."""
 
 from __future__ import annotations
 
@@ -39,8 +38,7 @@ def profile(settings: Config) -> SkinProfile:
 def sensor(
     settings: Config, format: SweepFormat, devices: Devices, tap: TransferObserver | None = None
 ) -> LinkSensor:
-    """The sensor for the whole skin of the settings, which has to send sweeps of `format`. Raises
-    ConfigError."""
+    """The sensor of the settings, for sweeps of `format`. Raises ConfigError."""
     chosen = profile(settings)
     if chosen.codec == "palpate":
         return UsbSensor(_config(settings, chosen), format, devices.clock, devices.backend, tap)
@@ -55,14 +53,12 @@ def sensor(
 
 
 def open_readout(settings: Config, devices: Devices) -> SkinLink:
-    """The opened readout board of a skin that speaks PROTOCOL.md. Raises ConfigError for another
-    skin, SensorError if there is none."""
+    """The opened board of a skin of PROTOCOL.md. Raises ConfigError, SensorError."""
     chosen = profile(settings)
     if chosen.codec != "palpate":
         raise ConfigError(
-            f'skin.profile = "{settings.skin.profile}" sends a protocol of its maker (codec '
-            f'"{chosen.codec}"), not PROTOCOL.md; `palpate check` tests this skin; for a board of'
-            ' PROTOCOL.md use skin.profile = "palpate"'
+            f'skin.profile = "{settings.skin.profile}" (codec "{chosen.codec}") does not speak'
+            " PROTOCOL.md; `palpate check` tests this skin"
         )
     return open_link(_config(settings, chosen), devices.backend, devices.clock)
 
@@ -76,35 +72,29 @@ def announced(settings: Config, devices: Devices, wanted: SweepFormat | None = N
     """
     chosen = profile(settings)
     if chosen.codec != "palpate":
-        settable = wanted and wanted.rate_hz in chosen.rates_hz
-        return (
-            replace(chosen, rate_hz=wanted.rate_hz).format if wanted and settable else chosen.format
-        )
+        if wanted and wanted.rate_hz in chosen.rates_hz:
+            chosen = replace(chosen, rate_hz=wanted.rate_hz)
+        return chosen.format
     try:
         board = open_readout(settings, devices)
     except SensorAbsent as e:
-        raise SensorAbsent(
-            f"{e}, or name another skin with --skin; `palpate skin detect` says which"
-        ) from e
+        hint = "or name another skin with --skin; `palpate skin detect` says which"
+        raise SensorAbsent(f"{e}, {hint}") from e
     with closing(board):
         skin = ask(board)[1]
     try:
         return skin_profile.with_window(skin.rows, skin.cols, skin.rate_hz, skin.dtype, skin.axes)
     except FormatError as e:
-        raise SensorMismatch(
-            f"the skin announces an invalid format: {e}; check its firmware"
-        ) from e
+        raise SensorMismatch(f"the skin's format is invalid: {e}; check its firmware") from e
 
 
 def described(text: str) -> SweepFormat:
-    """The format described as ROWSxCOLUMNS[xAXES]:TYPE:RATE, for example "5x3:float32:100". Raises
-    ConfigError."""
+    """The format ROWSxCOLUMNS[xAXES]:TYPE:RATE, as "5x3:float32:100". Raises ConfigError."""
     found = _DESCRIPTION.fullmatch(text.strip())
     if not found:
         raise ConfigError(
-            f"--format {text}: not understood; give rows x columns (x axes), data type and frames "
-            "per second, "
-            "for example 5x3:float32:100 or 4x4x3:int16:250"
+            f"--format {text}: not understood; give rows x columns (x axes), type and rate, for"
+            " example 5x3:float32:100 or 4x4x3:int16:250"
         )
     rows, cols, axes, dtype, rate = found.groups()
     try:

@@ -44,8 +44,7 @@ class Trigger(Protocol):
 
     @property
     def about(self) -> dict[str, str]:
-        """For the sidecar of a recorded sweep. mode: `trigger.mode`. times: the origin of an edge's
-        time."""
+        """For sidecars. mode: `trigger.mode`. times: the origin of an edge's time."""
         ...
 
     @property
@@ -103,19 +102,16 @@ class GpioTrigger:
         self.edge_counters = EdgeCounters()
         self.about = {"mode": config.mode, "times": "edge, stamped by the kernel"}
         self._pending: list[Edge] = []
-        self._blind_ns: (
-            int | None
-        )  # newest edge since the levels became unknown; None: they are known
+        # newest edge since the levels became unknown; None: they are known
+        self._blind_ns: int | None
         roles = _roles(config)
         with ExitStack() as stack:
             # separate requests: with several lines in a request, the interrupt handler counts an
             # edge and its thread delivers it. Of two edges before the thread has run, one count is
             # never delivered, so each bounce would look like a loss
+            meaning, settings = dict(roles), _input_settings(config, gpio)
             names = [name for name, _ in roles]
-            requests = request_lines(
-                gpio, names, _input_settings(config, gpio), stack, separate=True
-            )
-            meaning = dict(roles)
+            requests = request_lines(gpio, names, settings, stack, separate=True)
             self._lines = [
                 _Line(r, o, name, meaning[name])
                 for r, found in requests
@@ -131,27 +127,22 @@ class GpioTrigger:
         return self._blind_ns is not None
 
     def edges(self, now_ns: int) -> list[Edge]:
-        """Edges that are settled at `now_ns` (the time before the call), in order of time; never
-        waits."""
+        """Edges that are settled at `now_ns`, in order of time; never waits."""
         for line in self._lines:
             try:  # not `naming`: its generator costs more than reading an empty queue
                 self._read(line, now_ns)
             except OSError as e:
                 raise line_error("read", [line.name], e) from e
-        if (
-            self._blind_ns is None
-            and not self._pending
-            and not any(line.count for line in self._lines)
-        ):
+        waiting = self._pending or any(line.count for line in self._lines)
+        if self._blind_ns is None and not waiting:
             return []
         horizon_ns = min(line.known_ns for line in self._lines)
         for line in self._lines:
             if line.count and horizon_ns - line.last_ns >= self._glitch_ns:
                 self._settle(line)
         # the levels are read now, so all events that led to them must have been read before
-        if self._blind_ns is not None and horizon_ns >= max(
-            now_ns, self._blind_ns + self._glitch_ns
-        ):
+        quiet_ns = 0 if self._blind_ns is None else self._blind_ns + self._glitch_ns
+        if self._blind_ns is not None and horizon_ns >= max(now_ns, quiet_ns):
             self._read_levels()
         until_ns = min([horizon_ns, *(line.first_ns for line in self._lines if line.count)])
         self._pending.sort(key=lambda edge: edge.t_ns)
@@ -196,11 +187,8 @@ class GpioTrigger:
             line.first_ns = t_ns
         # a rise may follow a rise: the kernel reads the level only after the interrupt, so the
         # level of the newest event is right
-        line.count, line.last_ns, line.after = (
-            line.count + 1,
-            t_ns,
-            event.event_type is self._rising,
-        )
+        line.count, line.last_ns = line.count + 1, t_ns
+        line.after = event.event_type is self._rising
         if line.count > self._storm_edges:
             self.edge_counters.storms += 1
             self._lose(t_ns)
@@ -216,13 +204,10 @@ class GpioTrigger:
             self._pending.append(Edge(kind, line.first_ns))
 
     def _lose(self, t_ns: int) -> None:
-        """Report LOST at `t_ns` and discard later edges on all lines: a STOP may be missing as well
-        as a START."""
+        """Report LOST at `t_ns` and discard later edges on all lines."""
         if self._blind_ns is None:
-            self._pending = [edge for edge in self._pending if edge.t_ns <= t_ns] + [
-                Edge(EdgeKind.LOST, t_ns)
-            ]
-            self._blind_ns = t_ns
+            certain = [edge for edge in self._pending if edge.t_ns <= t_ns]
+            self._pending, self._blind_ns = [*certain, Edge(EdgeKind.LOST, t_ns)], t_ns
         for line in self._lines:
             line.count = 0
 

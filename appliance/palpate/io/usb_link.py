@@ -30,6 +30,7 @@ from palpate.io.link import REPLY_MS, reply_to
 
 CDC_CONTROL = 2
 DTR, RTS = 1, 2
+_UDEV = "install the udev rule, join group plugdev"
 
 
 class UsbContext(libusb1._LibUSB):  # type: ignore[misc]
@@ -52,7 +53,6 @@ class UsbContext(libusb1._LibUSB):  # type: ignore[misc]
         return cls.newest
 
     def enumerate_devices(self) -> Iterator[Any]:
-        """All devices on the bus."""
         found = super().enumerate_devices()
         self._outlive(found)
         for device in found:
@@ -76,15 +76,12 @@ class VendorLink:
         return [self._number]
 
     def request(self, request: packets.Request, length: int) -> bytes:
-        """Send a request; returns a reply of at most `length` bytes, b"" for length 0. Raises
-        SensorError."""
-        kind = (
-            usb.util.CTRL_TYPE_VENDOR | usb.util.CTRL_RECIPIENT_INTERFACE | (0x80 if length else 0)
-        )
+        """Send a request; returns at most `length` bytes. Raises SensorError."""
+        kind = usb.util.CTRL_TYPE_VENDOR | usb.util.CTRL_RECIPIENT_INTERFACE
+        kind |= 0x80 if length else 0
+        what = request, 0, self._number, length or None, REPLY_MS
         with _explained():
-            reply = self._device.ctrl_transfer(
-                kind, request, 0, self._number, length or None, REPLY_MS
-            )
+            reply = self._device.ctrl_transfer(kind, *what)
         return bytes(reply) if length else b""
 
     def read(self, size: int, timeout_ms: int) -> bytes:
@@ -111,8 +108,7 @@ class VendorLink:
 
 
 class AcmLink(VendorLink):
-    """An opened readout board of the class CDC-ACM: requests are single bytes on bulk OUT, replies
-    come as packets on bulk IN."""
+    """An opened board of the class CDC-ACM: requests are bytes, replies come as packets."""
 
     def __init__(self, device: usb.core.Device, interface: Any, clock: Clock) -> None:
         self._out = _endpoint(interface, usb.util.ENDPOINT_OUT)
@@ -136,10 +132,9 @@ class AcmLink(VendorLink):
         """
         configuration = self._device.get_active_configuration()
         control = [i.bInterfaceNumber for i in configuration if i.bInterfaceClass == CDC_CONTROL]
+        to = control[0] if control else self._number
         with contextlib.suppress(usb.core.USBError):
-            self._device.ctrl_transfer(
-                0x21, 0x22, DTR | RTS, control[0] if control else self._number, None, REPLY_MS
-            )
+            self._device.ctrl_transfer(0x21, 0x22, DTR | RTS, to, None, REPLY_MS)
 
     def request(self, request: packets.Request, length: int) -> bytes:
         """Send a request byte; returns the reply, b"" for length 0. Raises SensorError."""
@@ -149,35 +144,30 @@ class AcmLink(VendorLink):
 
 
 def open_readout(config: SkinConfig, backend: Any, clock: Clock) -> VendorLink:
-    """Find and claim the configured readout board. Raises SensorError if it is absent, held,
-    refused or of another kind."""
+    """Find and claim the configured readout board. Raises SensorError."""
     ids = f"{config.vendor_id:04x}:{config.product_id:04x}"
+    vendor, product = config.vendor_id, config.product_id
     try:
         bus = backend or UsbContext.chosen()
-        found = list(
-            usb.core.find(True, bus, idVendor=config.vendor_id, idProduct=config.product_id)
-        )
+        found = list(usb.core.find(True, bus, idVendor=vendor, idProduct=product))
     except usb.core.NoBackendError as e:
-        raise SensorAbsent(
-            "libusb-1.0 is not installed, so no skin can be found; apt install libusb-1.0-0"
-        ) from e
+        raise SensorAbsent("libusb-1.0 is missing; apt install libusb-1.0-0") from e
     except usb.core.USBError as e:
         UsbContext.newest = None  # the next search uses a new context
         raise _explain(e) from e
     device = next((d for d in found if not config.serial or _serial(d) == config.serial), None)
     if device is None:
         serial = f" with serial number {config.serial}" if config.serial else ""
+        others = f"{len(found)} with other numbers"
         raise SensorAbsent(
-            f"no skin {ids}{serial} on USB ({len(found)} with other numbers); check cable, power "
-            "and udev rule"
+            f"no skin {ids}{serial} on USB ({others}); check cable, power and udev rule"
         )
     link, wanted = (AcmLink, 10) if config.link == "acm" else (VendorLink, 255)
     try:
         interface = usb.util.find_descriptor(_configuration(device), bInterfaceClass=wanted)
         if interface is None:
-            raise SensorMismatch(
-                f"skin {ids} has no {config.link} interface (class {wanted}); see skin.link"
-            )
+            missing = f"skin {ids} has no {config.link} interface (class {wanted})"
+            raise SensorMismatch(f"{missing}; see skin.link")
         return link(device, interface, clock)
     except usb.core.USBError as e:
         _let_go(device)
@@ -188,7 +178,6 @@ def open_readout(config: SkinConfig, backend: Any, clock: Clock) -> VendorLink:
 
 
 def _let_go(device: usb.core.Device) -> None:
-    """Release a device. The next search uses a new context."""
     UsbContext.newest = None
     with contextlib.suppress(usb.core.USBError):  # it is gone
         usb.util.dispose_resources(device)
@@ -204,15 +193,11 @@ def _serial(device: usb.core.Device) -> str:
             f"the skin's serial number is not text ({e}); check its firmware"
         ) from e
     except ValueError as e:  # pyusb raises it if the string descriptors may not be read
-        raise SensorDenied(
-            f"the skin's serial number cannot be read ({e}); install the udev rule, join group "
-            "plugdev"
-        ) from e
+        raise SensorDenied(f"the skin's serial number cannot be read ({e}); {_UDEV}") from e
 
 
 def _configuration(device: usb.core.Device) -> Any:
-    """The active configuration. It is set only if there is none, since setting it again resets the
-    device."""
+    """The active configuration, set only if there is none: setting it resets the device."""
     try:
         return device.get_active_configuration()
     except usb.core.USBError:
@@ -221,18 +206,16 @@ def _configuration(device: usb.core.Device) -> Any:
 
 
 def _endpoint(interface: Any, direction: int) -> int:
-    endpoint = usb.util.find_descriptor(
-        interface,
-        custom_match=lambda e: (
-            usb.util.endpoint_direction(e.bEndpointAddress) == direction
-            and usb.util.endpoint_type(e.bmAttributes) == usb.util.ENDPOINT_TYPE_BULK
-        ),
-    )
+    kinds = direction, usb.util.ENDPOINT_TYPE_BULK
+
+    def wanted(e: Any) -> bool:
+        address, kind = usb.util.endpoint_direction(e.bEndpointAddress), e.bmAttributes
+        return (address, usb.util.endpoint_type(kind)) == kinds
+
+    endpoint = usb.util.find_descriptor(interface, custom_match=wanted)
     if endpoint is None:
-        raise SensorMismatch(
-            f"the skin's interface has no bulk endpoint {'IN' if direction else 'OUT'}; check its "
-            "firmware"
-        )
+        which = "IN" if direction else "OUT"
+        raise SensorMismatch(f"the skin has no bulk endpoint {which}; check its firmware")
     return int(endpoint.bEndpointAddress)
 
 
@@ -253,25 +236,13 @@ def _explained() -> Iterator[None]:
 def _explain(e: usb.core.USBError) -> SensorError:
     """The SensorError that explains an errno of libusb."""
     if e.errno == errno.EOVERFLOW:
-        return SensorOverflow(
-            "a USB transfer was larger than a read (errno 75) and is lost; let the firmware send "
-            "less"
-            " in one transfer"
-        )
+        return SensorOverflow("a USB transfer was larger than a read (errno 75); send less at once")
     if e.errno == errno.EACCES:
-        return SensorDenied(
-            "the skin may not be opened by this user (errno 13); install the udev rule, join "
-            "group plugdev"
-        )
+        return SensorDenied(f"the skin may not be opened by this user (errno 13); {_UDEV}")
     if e.errno == errno.EBUSY:
-        return SensorBusy(
-            "another program holds the skin (errno 16); stop it, or unplug and replug the skin"
-        )
+        return SensorBusy("another program holds the skin (errno 16); stop it, or replug the skin")
     if e.errno == errno.ENODEV:
-        return SensorLost(
-            "the skin was unplugged (errno 19); plug it in again, it is taken up by itself"
-        )
-    return SensorLost(
-        f"the skin failed ({e.strerror or e}, errno {e.errno}); trying again, check its cable if "
-        "this stays"
-    )
+        again = "plug it in again, it is taken up by itself"
+        return SensorLost(f"the skin was unplugged (errno 19); {again}")
+    why = f"the skin failed ({e.strerror or e}, errno {e.errno})"
+    return SensorLost(f"{why}; trying again, check its cable if this stays")

@@ -31,8 +31,7 @@ from palpate.io.link import SkinLink
 from palpate.io.sensor import OPENED, FrameStream, SensorCounters, TransferObserver
 
 RATE_TOLERANCE = 0.01
-"""Largest relative difference between the rate of the readout board and that of the bundle: 1 %,
-for the tolerances of crystals and timers."""
+"""Largest relative difference of the board's rate from the bundle's, for crystals and timers."""
 STAMPS_NS = 5_000_000
 """Largest jitter of the time stamps. The readout board may count milliseconds, or be delayed by an
 interrupt; windows do not move by that."""
@@ -44,6 +43,7 @@ would come and go with a wrong skin."""
 
 MOST_SILENCE_MS = 8000
 """Longest wait for the first frame of an opened skin, unless `skin.silence_ms` is longer."""
+LONGER = f"waiting longer each time, up to {MOST_SILENCE_MS / 1000:g} s (skin.silence_ms for more)"
 MOST_RESTARTS, RESTARTS_NS = 8, 1_000_000_000
 """A readout board that begins its count anew so often within this time is faulty."""
 
@@ -66,9 +66,8 @@ class Stream:
     ) -> None:
         self._format, self._counters, self._unpack = format, counters, unpack
         self._shape, self._dtype = format.shape, format.numpy_type
-        self._within_ns = np.rint(_COUNT * format.period_ns).astype(
-            np.int64
-        )  # time of frame i of a packet after its first
+        # time of frame i of a packet after its first
+        self._within_ns = np.rint(_COUNT * format.period_ns).astype(np.int64)
         self._position = packets.StreamPosition(-1)
         self._device = DeviceClock()
         self._leftover = b""
@@ -78,8 +77,7 @@ class Stream:
         self._mark: tuple[int, int] | None = None
 
     def restart(self) -> None:
-        """Begin an enumeration, also the first: frame numbers get the next epoch, and the device
-        clock starts again."""
+        """Begin an enumeration: frame numbers get the next epoch, the clock starts again."""
         self._counters.enumerations += 1
         self._position = packets.StreamPosition((self._position.epoch + 1) % EPOCHS)
         self._begun_ns.clear()
@@ -88,7 +86,6 @@ class Stream:
 
     @property
     def clock(self) -> dict[str, float] | None:
-        """Accuracy of the times: DeviceClock.quality."""
         return self._device.quality()
 
     def feed(self, data: bytes, arrival_ns: int) -> Frames:
@@ -115,9 +112,8 @@ class Stream:
             self._check_restarts(restarts, arrival_ns)
         now = [item for item in fresh if item[0] >> EPOCH_BITS == position.epoch]
         # frames from before a restart within the same transfer have no host time and count as lost
-        self._counters.lost_frames += (
-            lost + sum(len(p.taxels) for _, p in fresh) - sum(len(p.taxels) for _, p in now)
-        )
+        kept, all_frames = (sum(len(p.taxels) for _, p in of) for of in (now, fresh))
+        self._counters.lost_frames += lost + all_frames - kept
         self._counters.stale_frames += stale
         return self._stamp(now, arrival_ns)
 
@@ -126,33 +122,24 @@ class Stream:
         self._begun_ns.extend([now_ns] * min(restarts, MOST_RESTARTS))
         full = len(self._begun_ns) == MOST_RESTARTS
         if full and now_ns - self._begun_ns[0] < RESTARTS_NS:
-            raise SensorMismatch(
-                f"the skin began its count of frames anew {MOST_RESTARTS} times within a second;"
-                " check its firmware"
-            )
+            often = f"the skin began its count of frames anew {MOST_RESTARTS} times within a second"
+            raise SensorMismatch(f"{often}; check its firmware")
 
     def _stamp(self, fresh: list[tuple[int, packets.Packet]], arrival_ns: int) -> Frames:
-        """Give numbers and host times to packets [(number of the first frame, packet)] of one
-        epoch."""
+        """Give numbers and host times to packets [(first number, packet)] of one epoch."""
         if not fresh:
             return Frames.empty(self._format)
         starts = [self._device.unwrap(p.t_us) * 1000 for _, p in fresh]
         for start, (first, _) in zip(starts, fresh, strict=True):
             self._check_pace(first, start)
-        self._device.update(
-            starts[-1] + int(self._within_ns[len(fresh[-1][1].taxels) - 1]), arrival_ns
-        )
+        last = int(self._within_ns[len(fresh[-1][1].taxels) - 1])
+        self._device.update(starts[-1] + last, arrival_ns)
         runs = []
         for start, (first, p) in zip(starts, fresh, strict=True):
             n = len(p.taxels)
             self._counters.frames += n
-            runs.append(
-                Frames(
-                    self._device.to_host_ns(start) + self._within_ns[:n],
-                    first + _COUNT[:n],
-                    p.taxels,
-                )
-            )
+            t_ns = self._device.to_host_ns(start) + self._within_ns[:n]
+            runs.append(Frames(t_ns, first + _COUNT[:n], p.taxels))
         return runs[0] if len(runs) == 1 else Frames.joined(runs)
 
     def _check_pace(self, first: int, start_ns: int) -> None:
@@ -167,11 +154,11 @@ class Stream:
         passed_ns = start_ns - self._mark[1]
         slack_ns = max(STAMPS_NS, self._format.period_ns) + RATE_TOLERANCE * counted_ns
         if abs(passed_ns - counted_ns) > slack_ns:
+            wanted_hz = self._format.rate_hz
+            hz = wanted_hz * counted_ns / max(passed_ns, 1)
             raise SensorMismatch(
                 f"the skin's clock went on {passed_ns / 1e6:.1f} ms during frames of "
-                f"{counted_ns / 1e6:.1f} ms: "
-                f"{self._format.rate_hz * counted_ns / max(passed_ns, 1):.4g} frames a second, "
-                f"{self._format.rate_hz:g} are expected; "
+                f"{counted_ns / 1e6:.1f} ms: {hz:.4g} frames a second, not {wanted_hz:g}; "
                 "starting it again, check its firmware or skin.rate_hz if this stays"
             )
         if counted_ns >= 1_000_000_000:
@@ -215,12 +202,10 @@ class LinkSensor(ABC):
 
     @property
     def clock(self) -> dict[str, float] | None:
-        """Accuracy of the times: DeviceClock.quality."""
         return self._stream.clock
 
     @property
     def loss_known(self) -> bool:
-        """Whether every lost frame is seen."""
         return self._stream.loss_known
 
     def read(self) -> Frames:
@@ -275,22 +260,14 @@ class LinkSensor(ABC):
     def _no_frame(self, *, bytes_came: bool) -> SensorError:
         """The trouble of a skin that sent no frame for `silence_ms`. bytes_came: it sent other
         bytes. The message contains no measured figure, so that the log shows it once."""
-        longer = "" if self._framed else f", {self._longer}"
+        longer = "" if self._framed else f"; {LONGER}"
         return SensorSilent(
             f"the skin is there but sent no frame for {self._config.silence_ms} ms; "
             f"starting it again{longer}"
         )
 
-    @property
-    def _longer(self) -> str:
-        return (
-            f"and waiting longer each time, up to {MOST_SILENCE_MS / 1000:g} s; for a board that "
-            "boots longer raise skin.silence_ms"
-        )
-
     def _connect(self) -> bool:
-        """Find, open, check and start the skin. If that fails, state and trouble are set, and the
-        result is False."""
+        """Find, open, check and start the skin; False, with state and trouble, if it fails."""
         now = self._clock.now_ns()
         if now < self._retry_ns:
             if self.waits:
@@ -357,8 +334,7 @@ def _named(e: Exception) -> str:
 
 
 def fits(skin: packets.SkinFormat | SweepFormat, wanted: SweepFormat) -> bool:
-    """Whether the frames of a skin suit a bundle or a recording. The length of the window does not
-    matter: the box cuts it."""
+    """Whether the frames of a skin suit a bundle or a recording; windows are cut here."""
     same_rate = abs(skin.rate_hz / wanted.rate_hz - 1) <= RATE_TOLERANCE
     return (skin.shape, skin.dtype) == wanted.skin and same_rate
 
@@ -382,11 +358,10 @@ class UsbSensor(LinkSensor):
         try:
             who, skin = ask(link)
             if not fits(skin, self._format):
+                sends = f"{shown(skin.shape)} {skin.dtype} at {skin.rate_hz:g} Hz"
                 raise SensorMismatch(
-                    f"the skin sends {shown(skin.shape)} {skin.dtype} at {skin.rate_hz:g} Hz, "
-                    "wanted is "
-                    f"{self._format}; plug in the skin that it was trained for, or deploy a "
-                    "bundle for this one"
+                    f"the skin sends {sends}, wanted is {self._format}; plug in the skin that it "
+                    "was trained for, or deploy a bundle for this one"
                 )
             link.request(packets.Request.START, 0)
         except Exception:
@@ -396,15 +371,14 @@ class UsbSensor(LinkSensor):
 
 
 def ask(board: SkinLink) -> tuple[packets.Identity, packets.SkinFormat]:
-    """Identity and format of a readout board. Raises SensorMismatch if a reply is not as
-    PROTOCOL.md defines, or of another version."""
+    """Identity and format of a board. Raises SensorMismatch for other replies or versions."""
     try:
         who = packets.unpack_identity(board.request(packets.Request.IDENTITY, 64))
         if who.protocol != packets.VERSION:
+            firmware = f"the skin's firmware {'.'.join(map(str, who.firmware))}"
             raise SensorMismatch(
-                f"the skin's firmware {'.'.join(map(str, who.firmware))} speaks protocol "
-                f"{who.protocol}, "
-                f"this box speaks {packets.VERSION}; update the older of them"
+                f"{firmware} speaks protocol {who.protocol}, this box speaks {packets.VERSION};"
+                " update the older of them"
             )
         return who, packets.unpack_format(board.request(packets.Request.FORMAT, 64))
     except FormatError as e:
@@ -412,8 +386,7 @@ def ask(board: SkinLink) -> tuple[packets.Identity, packets.SkinFormat]:
 
 
 def open_link(config: SkinConfig, backend: Any, clock: Clock) -> SkinLink:
-    """Find and open the configured readout board. Raises SensorError if it is absent, held, refused
-    or of another kind."""
+    """Find and open the configured readout board. Raises SensorError."""
     # imported when it is used, since most boxes use one kind of link
     if config.link == "serial":
         from palpate.io import serial_link

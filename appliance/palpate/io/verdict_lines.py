@@ -15,8 +15,7 @@ from palpate.io.gpio_lines import Lines
 
 
 class LineSink(Observer):
-    """Outputs the verdict as a code: 1 + the label's index in the manifest if the status is ok,
-    otherwise 0."""
+    """Outputs the verdict as a code: 1 + the label's index in the manifest, or 0."""
 
     def __init__(self, lines: Lines, labels: Sequence[str]) -> None:
         check_bits(lines.capacity, labels)
@@ -31,8 +30,5 @@ class LineSink(Observer):
 def check_bits(codes: int, labels: Sequence[str]) -> None:
     """Raises ConfigError if `codes` are too few for the labels and the code 0."""
     if codes <= len(labels):
-        raise ConfigError(
-            f"{len(labels)} labels and the code 0 do not fit output.class_bits, which have "
-            f"{codes} codes; "
-            "wire more GPIO lines, or none"
-        )
+        needed = f"{len(labels)} labels and the code 0 do not fit output.class_bits"
+        raise ConfigError(f"{needed}, which have {codes} codes; wire more GPIO lines, or none")

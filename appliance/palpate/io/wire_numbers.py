@@ -21,7 +21,6 @@ def data_type(kind: str) -> str:
 
 
 def size(kind: str) -> int:
-    """Bytes of a number."""
     return 3 if kind.endswith("24") else np.dtype(kind).itemsize
 
 

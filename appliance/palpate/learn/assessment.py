@@ -30,8 +30,7 @@ MORE = 3
 
 @dataclass(frozen=True, slots=True)
 class Suspect:
-    """A sweep that may have a wrong label. sweep: the name of its file; number: among the sweeps of
-    its material."""
+    """A sweep that may have a wrong label: its file, and its number within its material."""
 
     sweep: str
     number: int
@@ -71,7 +70,6 @@ class Assessment:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """The 95 % interval of the accuracy."""
         return interval(self.right, self.clusters)
 
     def confused(self) -> tuple[int, int] | None:
@@ -94,8 +92,7 @@ class Assessment:
         return pair if wilson(right, max(round(total), 1))[0] <= 0.5 else None
 
     def suspects(self) -> list[Suspect]:
-        """Sweeps that are surely of another material, where the other sweeps of both are mostly
-        classified correctly."""
+        """Sweeps that are surely of another material, where both are mostly correct."""
         found, right = [], self.right
         likely = self.chances.argmax(axis=1)
         sure = (likely != self.labels) & (self.chances.max(axis=1) >= SURE)
@@ -123,23 +120,18 @@ class Assessment:
                 "harder, longer), or teach them as one material"
             )
         if low >= ENOUGH:
-            return (
-                f"enough: at least {100 * low:.0f} % of such sweeps are classified correctly "
-                "(with 97.5 % certainty)"
-            )
+            least = f"at least {100 * low:.0f} % of such sweeps are classified correctly"
+            return f"enough: {least} (with 97.5 % certainty)"
         wrong, held = self._counts(), self._sweeps()
         np.fill_diagonal(wrong, 0)
         errors = np.where(held > 0, wrong.sum(axis=0) + wrong.sum(axis=1), 0)
         if errors.any():
             return f"{MORE} more of {self.materials[int(errors.argmax())]}, from another place"
         fewest = self.materials[int(np.where(held > 0, held, np.inf).argmin())]
-        return (
-            f"nothing was confused, but {len(self.named)} sweeps are few: {MORE} more of each, of "
-            f"{fewest} first"
-        )
+        few = f"nothing was confused, but {len(self.named)} sweeps are few"
+        return f"{few}: {MORE} more of each, of {fewest} first"
 
     def json(self) -> dict[str, Any]:
-        """The assessment for pages and programs."""
         pair, counts, (low, high) = self.confused(), self._counts(), self.interval
         between = float(counts[pair] + counts[pair[::-1]]) if pair else 0.0
         held = zip(self.materials, self._sweeps().tolist(), strict=True)
@@ -158,7 +150,6 @@ class Assessment:
         }
 
     def text(self) -> str:
-        """The accuracy in a sentence."""
         parts = " and ".join(f"{name}s" for name in self.left_out).replace("recording", "sweep")
         low, high = self.interval
         said = (

@@ -46,18 +46,15 @@ def admit(old: Bundle, label: str) -> None:
     """Raises BundleError if `label` cannot be enrolled into `old`."""
     labels = old.manifest.labels
     if label in labels:
-        raise BundleError(
-            f"label {label!r} is taken: the bundle has {', '.join(labels)}; choose another name"
-        )
+        known = f"the bundle has {', '.join(labels)}"
+        raise BundleError(f"label {label!r} is taken: {known}; choose another name")
     if not bundle.LABEL.fullmatch(label):
-        raise BundleError(
-            f"label {label!r} cannot be sent; use 1 to 24 letters, digits, spaces, '.', '_' or '-'"
-        )
+        allowed = "1 to 24 letters, digits, spaces, '.', '_' or '-'"
+        raise BundleError(f"label {label!r} cannot be sent; use {allowed}")
     if old.classes is None:
         raise BundleError(
-            f"bundle {old.manifest.name} {old.manifest.version} has no embedding and no class "
-            "means, so nothing can be enrolled; pack it again with a method that gives them "
-            "(palpate-train)"
+            f"bundle {old.manifest.name} {old.manifest.version} has no embedding, so nothing can be"
+            " enrolled; export it with a method that gives one (palpate-train)"
         )
 
 
@@ -75,21 +72,19 @@ def enrol(old: Bundle, label: str, sweeps: NDArray[Any]) -> Enrolment:
     assert old.classes
     assert m.known
     if sweeps.shape[1:] != (f.window, *f.shape) or not len(sweeps) or sweeps.dtype != f.numpy_type:
-        raise FormatError(
-            f"sweeps {sweeps.dtype} {sweeps.shape} cannot be enrolled; the bundle wants [n] of {f}"
-        )
+        given = f"sweeps {sweeps.dtype} {sweeps.shape} cannot be enrolled"
+        raise FormatError(f"{given}; the bundle wants [n] of {f}")
     run = Classifier(old, SystemClock())
     sweeps = np.stack([run.cleaned(sweep) for sweep in sweeps])
     is_no_slide = slide_check(old)
     for number, sweep in enumerate(sweeps, 1):
         if why := is_no_slide(sweep):
-            raise FormatError(
-                f"sweep {number} of {len(sweeps)} is not a slide over {label!r}: {why}; take others"
-            )
+            which = f"sweep {number} of {len(sweeps)} is not a slide over {label!r}"
+            raise FormatError(f"{which}: {why}; take others")
     network, z = network_outputs(run, sweeps)
     if not np.isfinite(z).all():
         raise FormatError(
-            "the model gives no number for some of the sweeps; look at the skin and take others"
+            "the model gives no number for some sweeps; look at the skin, take others"
         )
     classes = extended(old.classes, z)
     means = ClassDistances(classes, replace(m.known, enrolled=LEAST), (*m.labels, label))
@@ -100,16 +95,13 @@ def enrol(old: Bundle, label: str, sweeps: NDArray[Any]) -> Enrolment:
     if close := _closeness(trained, label, z):
         warnings.append(close)
     if m.early:
-        warnings.append(
-            f"early answers end with this bundle: their heads do not know {label!r}; set "
-            "classifier.early = false"
-        )
+        why = f"early answers end with this bundle: their heads do not know {label!r}"
+        warnings.append(f"{why}; set classifier.early = false")
     return Enrolment(new, file, tuple(warnings), _disagreement(trained, label, z))
 
 
 def network_outputs(run: Classifier, sweeps: NDArray[Any]) -> tuple[Embedded, Embedded]:
-    """The model's own logits [n, K0] and embeddings [n, r] of windows [n, T, R, C] or [n, T, R, C,
-    A]."""
+    """The model's own logits [n, K0] and embeddings [n, r] of windows [n, T, R, C(, A)]."""
     pairs = (run.outputs(sweep, "logits", "embedding") for sweep in sweeps)
     logits, z = zip(*pairs, strict=True)
     return np.stack(logits).astype(np.float64), np.stack(z).astype(np.float64)
@@ -141,23 +133,19 @@ def extended(classes: Classes, z: NDArray[np.float64]) -> Classes:
 def _added(
     old: Bundle, label: str, classes: Classes, golden: NDArray[Any], logits: NDArray[np.float32]
 ) -> tuple[Bundle, bytes]:
-    """`old` with the last label of `classes`, and the enrolment.npz that adds all enrolled labels
-    to the signed bundle."""
-    mean, sweeps, spread = classes.means[-1:], classes.sweeps[-1:], classes.spread[-1:]
-    added = AddedLabels(old.base, (label,), mean, sweeps, spread, golden[None], logits, LEAST)
+    """`old` with the last label of `classes`, and the enrolment.npz of all enrolled labels."""
+    means, sweeps, spread = classes.means[-1:], classes.sweeps[-1:], classes.spread[-1:]
+    golden_sweeps = golden[None]
+    labels: tuple[str, ...] = (label,)
     if before := old.added:
-        added = AddedLabels(
-            old.base,
-            (*before.labels, label),
-            np.vstack([before.means, mean]),
-            np.append(before.sweeps, sweeps),
-            np.append(before.spread, spread),
-            np.concatenate([before.golden, golden[None]]),
-            logits,
-            LEAST,
-        )
+        labels = (*before.labels, label)
+        means, spread = np.vstack([before.means, means]), np.append(before.spread, spread)
+        sweeps = np.append(before.sweeps, sweeps)
+        golden_sweeps = np.concatenate([before.golden, golden_sweeps])
+    added = AddedLabels(old.base, labels, means, sweeps, spread, golden_sweeps, logits, LEAST)
     file = enrolled.file(added)
-    new = enrolled.with_label(old, label, mean[0], int(sweeps[0]), float(spread[0]), golden)
+    n, wide = int(sweeps[-1]), float(spread[-1])
+    new = enrolled.with_label(old, label, means[-1], n, wide, golden)
     new = enrolled.deciding(new, LEAST)
     return replace(new, golden_logits=logits, id=bundle.identity(file), added=added), file
 
@@ -175,8 +163,7 @@ def _median(scores: NDArray[np.float64]) -> int:
 
 
 def files(old: Mapping[str, bytes], new: Enrolment, signature: bytes | None) -> dict[str, bytes]:
-    """The files of the enrolled bundle: the unchanged files of the original bundle, the enrolment,
-    and the enrolment's signature if there is one."""
+    """The files of the enrolled bundle: the original ones, the enrolment, its signature."""
     added = {bundle.ENROLMENT: new.file}
     return original(old) | added | ({bundle.ENROLMENT_SIGNATURE: signature} if signature else {})
 
@@ -200,24 +187,20 @@ def _disagreement(means: ClassDistances, label: str, z: NDArray[np.float64]) -> 
     spread = away.sum() / max(1, n - 1)
     if spread <= means.limit:
         return ""
+    usual = f"those of a trained material {r}, limit {means.limit:.1f}"
     return (
-        f"the sweeps of {label!r} disagree: they lie {spread:.1f} from their mean (squared; those "
-        f"of a trained material {r}, limit {means.limit:.1f}), number {away.argmax() + 1} most of "
-        "all; take others"
+        f"the sweeps of {label!r} disagree: they lie {spread:.1f} from their mean (squared; {usual}"
+        f"), number {away.argmax() + 1} most of all; take others"
     )
 
 
 def _closeness(means: ClassDistances, label: str, z: NDArray[np.float64]) -> str:
-    """A warning if the sweeps with the embeddings `z` [n, r] will often get a label of `means`, ""
-    if not."""
+    """A warning if the sweeps with embeddings `z` [n, r] will often get a label of `means`."""
     n, r = z.shape
-    to_old = (
-        means.distances(z.mean(axis=0)) - r / n
-    )  # minus the expected squared error of a mean of n sweeps
+    # minus the expected squared error of a mean of n sweeps
+    to_old = means.distances(z.mean(axis=0)) - r / n
     k = int(to_old.argmin())
     if to_old[k] >= min(means.limit, means.closest_pair()):
         return ""
-    return (
-        f"{label!r} lies close to {means.labels[k]!r}: squared distance {max(to_old[k], 0):.1f}, "
-        f"limit {means.limit:.1f}; its sweeps will often be called that"
-    )
+    close = f"squared distance {max(to_old[k], 0):.1f}, limit {means.limit:.1f}"
+    return f"{label!r} lies close to {means.labels[k]!r} ({close}) and will often be called that"

@@ -38,20 +38,17 @@ class TeachingFailed(ApplianceError):
 def check_allowed(settings: Config) -> None:
     """Raises ConfigError if this box may not or cannot be taught."""
     if not settings.teach.allow:
-        raise ConfigError(
-            "teach.allow = false forbids teaching on this box; set it to true, or deploy a bundle"
-        )
+        raise ConfigError("teach.allow = false forbids teaching on this box; set it to true")
     if settings.classifier.bundle:
-        raise ConfigError(
-            "classifier.bundle names the bundle that runs, so a taught one would not; remove this "
-            "setting"
-        )
+        raise ConfigError("classifier.bundle chooses the bundle that runs; remove this setting")
     check_installed()
 
 
-def install(
-    settings: Config, store: Store, by: str, clock: Clock, tell: Callable[[News], object]
-) -> str:
+Tell = Callable[[News], object]
+"""Gets each news of the process that learns."""
+
+
+def install(settings: Config, store: Store, by: str, clock: Clock, tell: Tell) -> str:
     """Teach all recorded sweeps. The bundle runs on trial from the next start on; returns its name
     in the store.
 
@@ -81,8 +78,7 @@ def install(
 
 
 def base(store: Store, format: SweepFormat | None) -> SignedBundle | None:
-    """The delivered bundle in service, if it is one for a skin of this format (None: any): new
-    materials are taught into it."""
+    """The delivered bundle in service that materials are taught into, if it fits the format."""
     try:
         running = store.running()
     except (ApplianceError, OSError):  # a damaged bundle is replaced
@@ -92,11 +88,7 @@ def base(store: Store, format: SweepFormat | None) -> SignedBundle | None:
 
 
 def _into(
-    settings: Config,
-    store: Store,
-    running: SignedBundle,
-    key: EnrolmentKey,
-    tell: Callable[[News], object],
+    settings: Config, store: Store, running: SignedBundle, key: EnrolmentKey, tell: Tell
 ) -> str:
     """Teach the new materials among the recorded sweeps into a delivered bundle, as `install`."""
     materials.check_settings(settings)
@@ -119,8 +111,7 @@ def _into(
 
 
 def assessed(settings: Config, store: Store, clock: Clock) -> News:
-    """The assessment of the recorded sweeps, as news of type `assessed`. Raises TeachingFailed if
-    they are too few."""
+    """The assessment of the sweeps, as news. Raises TeachingFailed if they are too few."""
     sweeps = settings.kept("sweeps")
     if running := base(store, sweep_folder.last_format(sweeps)):
         try:
@@ -151,13 +142,12 @@ def version(store: Store) -> str:
 
 
 def command(options: Sequence[str], by: str = "") -> list[str]:
-    """The command of a process that does all of `install`, or without `by` of `assessed`. options:
-    of the settings."""
+    """The command of a process that does `install`, without `by` `assessed`."""
     asked = ["--use", "--by", by] if by else []
     return [sys.executable, "-P", "-m", "palpate", "teach", *options, *asked, "--json"]
 
 
-def _wait(words: list[str], limit_s: float, clock: Clock, tell: Callable[[News], object]) -> None:
+def _wait(words: list[str], limit_s: float, clock: Clock, tell: Tell) -> None:
     process = TeachingProcess(words, limit_s, clock)
     try:
         while not process.ended:

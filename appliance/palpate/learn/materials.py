@@ -51,8 +51,7 @@ def check_settings(settings: Config) -> None:
 
 
 def delivered(running: SignedBundle) -> bool:
-    """Whether new materials are taught into this bundle: a person has signed it, and it has an
-    embedding."""
+    """Whether materials are taught into this bundle: a person signed it, it has an embedding."""
     return bundle.SIGNATURE in running.files and running.bundle.classes is not None
 
 
@@ -91,10 +90,8 @@ def taught(
         new, warnings = made.bundle, [*warnings, *made.warnings]
         disagreements += [made.disagreement] if made.disagreement else []
     if made is None:
-        raise BundleError(
-            f"bundle {new.manifest.name} {new.manifest.version} gets no new material; record one "
-            "that it does not have yet"
-        )
+        name = f"{new.manifest.name} {new.manifest.version}"
+        raise BundleError(f"bundle {name} gets no new material; record one that it does not have")
     warnings = [*dict.fromkeys(warnings)]
     return replace(made, warnings=tuple(warnings), disagreement="; ".join(disagreements))
 
@@ -110,20 +107,15 @@ def _without(running: SignedBundle, labels: set[str]) -> Bundle:
     for k in kept:
         mean, n, spread = added.means[k], int(added.sweeps[k]), float(added.spread[k])
         new = enrolled.with_label(new, added.labels[k], mean, n, spread, added.golden[k])
-    still = replace(
-        added,
-        labels=tuple(added.labels[k] for k in kept),
-        means=added.means[kept],
-        sweeps=added.sweeps[kept],
-        spread=added.spread[kept],
-        golden=added.golden[kept],
-    )
+    new_lists = {
+        name: getattr(added, name)[kept] for name in ("means", "sweeps", "spread", "golden")
+    }
+    still = replace(added, labels=tuple(added.labels[k] for k in kept), **new_lists)
     return replace(new, added=still if kept else None)
 
 
 def assessed(running: SignedBundle, sweeps: NewSweeps) -> Assessment:
-    """The answers to sweeps of new materials, each left out in turn, among all labels. Raises
-    BundleError if no material has two sweeps."""
+    """Answers to sweeps of new materials, each left out in turn. Raises BundleError."""
     many = {name: of for name, of in sweeps.windows.items() if len(of) > 1}
     if not many:
         raise BundleError("no new material has two sweeps; record another of it")
@@ -131,7 +123,6 @@ def assessed(running: SignedBundle, sweeps: NewSweeps) -> Assessment:
 
 
 def left_out(old: Bundle, many: Mapping[str, Array], sweeps: NewSweeps) -> Assessment:
-    """The same for a bundle without the materials of `many`, each with its windows."""
     run, names = Classifier(old, SystemClock()), (*old.manifest.labels, *many)
     outputs = {
         name: enrolment.network_outputs(run, np.stack([run.cleaned(sweep) for sweep in of]))
@@ -140,14 +131,10 @@ def left_out(old: Bundle, many: Mapping[str, Array], sweeps: NewSweeps) -> Asses
     chances = np.concatenate([_left_out(old, outputs, name) for name in outputs])
     late = {*old.enrolled, *many}
     rule = EnrolledLabels(np.array([name in late for name in names]), enrolment.LEAST)
-    return Assessment(
-        names,
-        np.concatenate([np.full(len(of), names.index(name)) for name, of in many.items()]),
-        tuple(file for name in many for file in sweeps.files[name]),
-        np.eye(len(names))[rule.decided(chances).argmax(axis=1)],
-        chances,
-        no_slides=sweeps.no_slides,
-    )
+    labels = np.concatenate([np.full(len(of), names.index(name)) for name, of in many.items()])
+    files = tuple(file for name in many for file in sweeps.files[name])
+    named = np.eye(len(names))[rule.decided(chances).argmax(axis=1)]
+    return Assessment(names, labels, files, named, chances, no_slides=sweeps.no_slides)
 
 
 def _left_out(old: Bundle, outputs: Mapping[str, tuple[Array, Array]], of: str) -> Array:

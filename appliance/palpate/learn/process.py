@@ -29,8 +29,7 @@ NICE = 19
 ENDED_S = 5.0
 """Longest wait for a killed process."""
 QUIET_S = 300.0
-"""Longest time without a line of news. The longest step takes far less with all sweeps that a
-person records."""
+"""Longest time without a line of news; the longest step takes far less."""
 MOST_LINE = 1 << 20
 """Most bytes of an unfinished line."""
 
@@ -43,10 +42,8 @@ News = dict[str, Any]
 def check_installed() -> None:
     """Raises ConfigError if this box cannot learn."""
     if missing := [name for name in NEEDED if not find_spec(name)]:
-        raise ConfigError(
-            f"teaching needs {missing[0]}, which is not installed; make install installs it "
-            "unless TEACH=0 was given"
-        )
+        advice = "make install installs it unless TEACH=0 was given"
+        raise ConfigError(f"teaching needs {missing[0]}, which is not installed; {advice}")
 
 
 def learning(folder: Path, settings: TeachConfig, *more: str) -> list[str]:
@@ -91,8 +88,7 @@ class TeachingProcess:
         os.set_blocking(self._output, False)
 
     def news(self) -> list[News]:
-        """The lines that have come since the last call. The last of all has the type `assessed`,
-        `taught` or `error`; `ended` is true then."""
+        """The lines that have come. The last is `assessed`, `taught` or `error`."""
         if self.ended:
             return []
         found = self._read()
@@ -120,7 +116,6 @@ class TeachingProcess:
         return ""
 
     def close(self) -> None:
-        """Kill it, with the processes that it started."""
         if self.ended:
             return
         self.ended = True

@@ -87,7 +87,6 @@ class TeachingProgram:
 
     @property
     def ended(self) -> bool:
-        """Whether the person is done, or a signal came."""
         return self._done or self._stopped()
 
     @property
@@ -96,7 +95,6 @@ class TeachingProgram:
         return materials.trained(self.base.bundle) if self.base else ()
 
     def about(self) -> dict[str, Any]:
-        """The present phase, for the page."""
         return self._phase.about() | {"good": self.lesson.good}
 
     def obey(self, command: Command) -> list[object]:
@@ -106,13 +104,9 @@ class TeachingProgram:
     def run(self, outputs: Outputs) -> None:
         """Run until all sweeps are recorded; with a page until DONE."""
         self.outputs = outputs
-        while (
-            self._ran(RecordingPhase)
-            and outputs.pages
-            and not self.ended
-            and self._ran(TryingPhase)
-        ):
-            pass
+        while self._ran(RecordingPhase) and outputs.pages and not self.ended:
+            if not self._ran(TryingPhase):
+                return
 
     def _ran(self, phase: type[RecordingPhase | TryingPhase]) -> bool:
         with ExitStack() as stack:
@@ -120,7 +114,6 @@ class TeachingProgram:
             return self._phase.run()
 
     def finish(self, _: str) -> list[object]:
-        """As the order DONE."""
         self._done = True
         return []
 
@@ -142,7 +135,6 @@ class Phase:
     orders: Mapping[str, CommandHandler]
 
     def obey(self, command: Command) -> list[object]:
-        """Carry out an order of the page."""
         own = self.orders.get(command.name)
         return own(command.text) if own else self.box.obey(command)
 
@@ -182,19 +174,19 @@ class RecordingPhase(Phase):
         session.by = "the page" if outputs.pages else lesson.by or getpass.getuser()
 
     def about(self) -> dict[str, Any]:
-        """The recording and the session."""
         return self._recording.about() | {"teach": self._session.about()}
 
     def run(self) -> bool:
         """Run; returns whether a bundle was made."""
-        session, devices, box = self._session, self._program.devices, self.box
-        over = (
-            lambda: self._program.ended,
-            lambda: session.taught,
-            lambda: self._teacher.done,
-            lambda: devices.finished(box.answered),
+        program, session = self._program, self._session
+        self.box.run(
+            lambda: (
+                program.ended
+                or bool(session.taught)
+                or self._teacher.done
+                or program.devices.finished(self.box.answered)
+            )
         )
-        box.run(lambda: any(end() for end in over))
         return bool(session.taught)
 
     def _lesson(self, say: Callable[[bytes], None]) -> TeachingSession:
@@ -250,26 +242,17 @@ class TryingPhase(Phase):
         self.orders = {**again, "DONE": program.finish}
         reports = *trial, *outputs.status(facts), *outputs.pages
         self.box = assembly.box(
-            settings,
-            choice.bundle,
-            program.devices,
-            program.port(),
-            stack,
+            *(settings, choice.bundle, program.devices, program.port(), stack),
             observers=[disk, Notifier(SystemClock()), *reports],
             commands=program.by_robot(again),
             ordered=bool(outputs.pages),
         )
 
     def about(self) -> dict[str, Any]:
-        """The bundle that is tried."""
         m = self._bundle.manifest
-        shown = {
-            "model": f"{m.name} {m.version}",
-            "labels": m.labels,
-            "displays": m.displays,
-            "taught": m.taught or f"taught into it: {', '.join(self._bundle.enrolled)}",
-        }
-        return {"trying": shown}
+        taught = m.taught or f"taught into it: {', '.join(self._bundle.enrolled)}"
+        shown = {"model": f"{m.name} {m.version}", "labels": m.labels, "displays": m.displays}
+        return {"trying": shown | {"taught": taught}}
 
     def run(self) -> bool:
         """Run; returns whether more is to be taught."""
@@ -283,9 +266,8 @@ class TryingPhase(Phase):
         Labels(material=label)
         refuse_trained(self._program.trained, [label])
         if self._program.codes:
-            check_bits(
-                self._program.codes, [*dict.fromkeys((*self._bundle.manifest.labels, label))]
-            )
+            labels = dict.fromkeys((*self._bundle.manifest.labels, label))
+            check_bits(self._program.codes, [*labels])
         self._program.again = label
         return [label]
 

@@ -33,13 +33,10 @@ of a process that only assesses the sweeps."""
 
 
 def refuse_trained(trained: Iterable[str], labels: Iterable[str]) -> None:
-    """Raises ConfigError for a label that the delivered bundle was trained on: its sweeps teach
-    nothing here."""
+    """Raises ConfigError for a label that the delivered bundle was trained on."""
     if known := next((name for name in labels if name in trained), ""):
-        raise ConfigError(
-            f"the bundle in service was trained on {known!r}; record more of it for the desktop "
-            "(palpate record), or take another name"
-        )
+        advice = "record it for the desktop (palpate record), or take another name"
+        raise ConfigError(f"the bundle in service was trained on {known!r}; {advice}")
 
 
 class TeachingSession(Observer):
@@ -95,15 +92,14 @@ class TeachingSession(Observer):
         USE with the share done and the seconds left, None if it does not run. taught: the result of
         USE. trouble: why the last step failed, "" if it did not.
         """
+        idle = {"step": "start", "done": 0.0, "left_s": None}
         return {
             "base": [*self._base],
             "fewest": self._fewest,
             "materials": self.materials(),
             "learnt": self._learnt,
             "assessing": (bool(self._process) and not self._using) or self._due_ns is not None,
-            "using": (self._step or {"step": "start", "done": 0.0, "left_s": None})
-            if self._using
-            else None,
+            "using": (self._step or idle) if self._using else None,
             "taught": self.taught,
             "trouble": self._trouble,
         }
@@ -143,8 +139,7 @@ class TeachingSession(Observer):
         return ""
 
     def turn(self, health: Health) -> None:
-        """Take the news of the process, and begin an assessment that is due: a moment after a sweep
-        was stored or discarded."""
+        """Take the news of the process, and begin an assessment that is due."""
         if self._recording.stored != self._stored:
             self._stored = self._recording.stored
             self._due_ns = self._clock.now_ns() + PAUSE_NS
@@ -212,7 +207,6 @@ class TeachingSession(Observer):
         return [label, self.materials().get(label, 0)]
 
     def _material(self, label: str) -> list[object]:
-        """As MATERIAL of a recording."""
         self.admit(*filter(None, [label.strip()]))
         return self._recording.commands["MATERIAL"](label)
 
@@ -232,8 +226,7 @@ class TeachingSession(Observer):
         return [len(held), sum(held.values())]
 
     def _forget(self, label: str) -> list[object]:
-        """Teach the sweeps of a material no longer; returns it and their number. They stay in the
-        folder."""
+        """Teach a material no longer; returns it and the number of its sweeps."""
         label = label.strip()
         number = self.materials().get(label)
         if number is None:

@@ -1,5 +1,4 @@
-"""Assembles a Box from settings, devices, and a bundle if there is one. The simulator is not
-imported here."""
+"""Assembles a Box from settings, devices, and a bundle if there is one."""
 
 from __future__ import annotations
 
@@ -54,8 +53,7 @@ NO_COMMANDS: Mapping[str, CommandHandler] = MappingProxyType({})
 
 
 class NotServing:
-    """The GPIO lines of a box without a bundle: READY stays low, since no sweep gets an answer that
-    a robot could use."""
+    """The GPIO lines of a box without a bundle: READY stays low."""
 
     def __init__(self, lines: Panel) -> None:
         self._lines = lines
@@ -218,8 +216,7 @@ def _trigger(
 
 
 def _label(labels: tuple[str, ...], code: str) -> list[object]:
-    """The label with this code on the class bits, and the number of labels. Raises FormatError if
-    no label has this code."""
+    """The label with this code and the number of labels. Raises FormatError."""
     if not labels:
         raise FormatError("sweeps are recorded without a bundle, so there are no labels")
     if not (code.isdecimal() and 1 <= int(code) <= len(labels)):
@@ -245,7 +242,6 @@ def gpio(devices: Devices) -> Any:
 
 
 def classifier(settings: Config, bundle: Bundle, clock: Clock) -> Classifier:
-    """The classifier with these settings."""
     chosen = settings.classifier
     return Classifier(
         bundle,
@@ -259,13 +255,11 @@ def classifier(settings: Config, bundle: Bundle, clock: Clock) -> Classifier:
 
 
 def early_exit(settings: Config, run: Classifier) -> EarlyExit | None:
-    """The early exit, None unless the settings ask for it."""
     return EarlyExit(run) if settings.classifier.early else None
 
 
 def prove(settings: Config, bundle: Bundle) -> None:
-    """Raises BundleError or ConfigError if this machine, with these settings, does not run a bundle
-    correctly."""
+    """Raises BundleError or ConfigError if this machine does not run a bundle correctly."""
     run = classifier(settings, bundle, SystemClock())
     run.self_test()
     early_exit(settings, run)
@@ -274,7 +268,6 @@ def prove(settings: Config, bundle: Bundle) -> None:
 
 
 def store(settings: Config) -> Store:
-    """The store of bundles that the settings name."""
     return Store(
         settings.store, lambda bundle: prove(settings, bundle), taught=settings.teach.allow
     )
@@ -291,8 +284,7 @@ def running(settings: Config, *, answers: bool = True) -> SignedBundle:
 
 
 def named(settings: Config, folder: Path, *, answers: bool) -> SignedBundle:
-    """The bundle in `folder`, from a setting or an option, tried in a limited process; otherwise
-    as `running`."""
+    """The bundle in `folder`, tried in a limited process; otherwise as `running`."""
     if settings.classifier.allow_unsigned or not answers:
         files = bundles.files(folder)
         found = SignedBundle(bundles.from_files(files, str(folder)), "", files)
@@ -308,8 +300,7 @@ def named(settings: Config, folder: Path, *, answers: bool) -> SignedBundle:
 
 
 def port(settings: Config, devices: Devices) -> Port | None:
-    """The serial line, or standard output if no line is configured. Sentences are not written to
-    the journal, which people read."""
+    """The serial line, or standard output; none in the journal, which people read."""
     if settings.serial.port:
         return SerialSink(settings.serial, devices.clock, devices.source)
     return None if in_journal() else StdoutPort(devices.source)

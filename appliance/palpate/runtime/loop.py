@@ -32,10 +32,11 @@ TARE_S = 0.5
 FAILURES, SOUND = 3, 20
 """The program ends after this many `failed` sweeps, each less than SOUND sweeps after the last. It
 is started again, and the end counts against a bundle on trial."""
+EVENTS = ("frames", "edges", "command", "answered", "sweep", "turn", "stopping")
+"""The methods of an Observer."""
 
 CommandHandler = Callable[[str], list[object]]
-"""Carries out a command: its text -> the fields of its answer. An ApplianceError becomes the
-answer."""
+"""Carries out a command: its text -> the fields of its answer, or an ApplianceError."""
 
 
 class Panel(Protocol):
@@ -47,13 +48,10 @@ class Panel(Protocol):
 
 
 class Answerer(Protocol):
-    """Gives each sweep its verdict: the classifier, or SweepCheck in recordings without a
-    bundle."""
+    """Gives each sweep its verdict: the classifier, or SweepCheck without a bundle."""
 
     @property
-    def format(self) -> SweepFormat:
-        """The format of the sweeps."""
-        ...
+    def format(self) -> SweepFormat: ...
 
     @property
     def model(self) -> str:
@@ -65,9 +63,7 @@ class Answerer(Protocol):
         """Taxels that are broken over the stream and bridged, "" for none."""
         ...
 
-    def __call__(self, sweep: Sweep) -> Verdict:
-        """The verdict on one sweep."""
-        ...
+    def __call__(self, sweep: Sweep) -> Verdict: ...
 
     def about(self) -> dict[str, Any]:
         """Entries for the sidecar of a recorded sweep, for JSON."""
@@ -124,26 +120,20 @@ class Box:
         self._asked: deque[Command] = deque()  # commands that were not carried out yet
         self._edges: list[Edge] = []  # edges that the cutter has not taken yet
         self._failures, self._sound, self._failure = 0, 0, ""
-        self._sensor, self._trigger, self._cutter = (
-            pipeline.sensor,
-            pipeline.trigger,
-            pipeline.cutter,
-        )
+        self._sensor, self._trigger = pipeline.sensor, pipeline.trigger
+        self._cutter = pipeline.cutter
         self._answerer, self._early = pipeline.answerer, pipeline.early
         self._clock, self._port, self._panel, self._commands = clock, port, panel, commands
         self._source, self._state_ns = source, round(state_s * 1e9)
         # only overridden methods of observers are called, so nothing is computed in vain
-        self._on_frames = [o.frames for o in observers if type(o).frames is not Observer.frames]
-        self._on_edges = [o.edges for o in observers if type(o).edges is not Observer.edges]
-        self._on_command = [o.command for o in observers if type(o).command is not Observer.command]
-        self._on_answered = [
-            o.answered for o in observers if type(o).answered is not Observer.answered
-        ]
-        self._on_sweep = [o.sweep for o in observers if type(o).sweep is not Observer.sweep]
-        self._on_turn = [o.turn for o in observers if type(o).turn is not Observer.turn]
-        self._on_stopping = [
-            o.stopping for o in observers if type(o).stopping is not Observer.stopping
-        ]
+        self._on: dict[str, list[Callable[..., None]]] = {
+            event: [
+                getattr(o, event)
+                for o in observers
+                if getattr(type(o), event) is not getattr(Observer, event)
+            ]
+            for event in EVENTS
+        }
         self._decided = False
         self._next_state_ns = self._turn_ns = clock.now_ns()
         self._skin_log = TroubleLog("skin", end="skin: streaming", known=False)
@@ -155,12 +145,10 @@ class Box:
 
     @property
     def counters(self) -> SensorCounters:
-        """Counters of the sensor since the start."""
         return self._sensor.counters
 
     @property
     def format(self) -> SweepFormat:
-        """The format of its sweeps."""
         return self._answerer.format
 
     def newest_frame(self) -> NDArray[Any] | None:
@@ -169,12 +157,11 @@ class Box:
         return None if frames is None else frames[0]
 
     def run(self, stopped: Callable[[], bool]) -> None:
-        """Take turns until `stopped()`. At the end, also after an exception, answer an open sweep
-        with `aborted`."""
+        """Take turns until `stopped()`; at the end answer an open sweep with `aborted`."""
         try:
             while not stopped():
                 self.step()
-            self._notify(self._on_stopping)
+            self._notify("stopping")
         finally:
             self._end()
 
@@ -187,7 +174,7 @@ class Box:
         now = self._turn_ns = self._clock.now_ns()
         self._cutter.put(frames, now)
         if len(frames):
-            self._notify(self._on_frames, frames)
+            self._notify("frames", frames)
         # before the edges of this turn: a capture gives frames and edges in turns of their own
         verdicts = self._decide(now)
         self._take_edges(now, ready=self._able)
@@ -196,8 +183,8 @@ class Box:
         self._show()
         verdicts += self._answer(self._cutter.finished(now))
         self._report(now)
-        if self._on_turn:
-            self._notify(self._on_turn, self.health)
+        if self._on["turn"]:
+            self._notify("turn", self.health)
         if self._failures >= FAILURES:
             raise ModelError(f"{self._failures} sweeps could not be classified: {self._failure}")
         return verdicts
@@ -208,11 +195,10 @@ class Box:
         self._cutter.trigger(self._edges, ready, now_ns)
         edges, self._edges = self._edges, []
         if edges:
-            self._notify(self._on_edges, now_ns, edges)
+            self._notify("edges", now_ns, edges)
 
     def _end(self) -> None:
-        """Answer each sweep that is still open, whatever has failed. A step that fails is tried
-        twice."""
+        """Answer each open sweep, whatever has failed; a failed step is tried twice."""
         now = self._turn_ns
         for what, act in (
             ("the last commands", self._obey_asked),
@@ -239,12 +225,11 @@ class Box:
         status = Status.ABORTED if sweep.status is Status.OK else sweep.status
         return Verdict.without_label(sweep, status, "", now_ns, self._answerer.model)
 
-    def _notify(self, calls: Iterable[Callable[..., None]], *event: Any) -> None:
-        """Call the observers. A fault in one must not stop the classifying, so only expected errors
-        of the outputs are raised."""
-        for call in calls:
+    def _notify(self, event: str, *content: Any) -> None:
+        """Call the observers. Only expected errors of the outputs stop the loop."""
+        for call in self._on[event]:
             try:
-                call(*event)
+                call(*content)
             except ApplianceError:
                 raise
             except Exception as e:
@@ -311,13 +296,12 @@ class Box:
         return verdict
 
     def _pass_on(self, sweeps: Iterable[Sweep], verdicts: Sequence[Verdict]) -> None:
-        """Give answered sweeps to the observers that keep them. This comes after all answers,
-        because disks are slow."""
-        if not (verdicts and self._on_sweep):
+        """Give answered sweeps to their observers, after all answers: disks are slow."""
+        if not (verdicts and self._on["sweep"]):
             return
         circumstances = self.circumstances()
         for sweep, verdict in zip(sweeps, verdicts, strict=True):
-            self._notify(self._on_sweep, sweep, verdict, circumstances)
+            self._notify("sweep", sweep, verdict, circumstances)
 
     def _send(self, verdict: Verdict) -> None:
         if self._port:
@@ -325,7 +309,7 @@ class Box:
         if self._unanswered:
             self._unanswered.popleft()
         self.answered += 1
-        self._notify(self._on_answered, verdict)
+        self._notify("answered", verdict)
 
     def _report(self, now_ns: int) -> None:
         """Log changes, answer commands, and send the state every `state_s`."""
@@ -343,8 +327,7 @@ class Box:
 
     @property
     def health(self) -> Health:
-        """The state now."""
-        sensor, counters, edges = self._sensor, self._sensor.counters, self._trigger.edge_counters
+        sensor = self._sensor
         return Health(
             time_ns=self._clock.now_ns(),
             skin=sensor.state,
@@ -352,24 +335,15 @@ class Box:
             streams=sensor.state == "streaming",
             sweeping=self._cutter.sweeping,
             answered=self.answered,
-            frames=counters.frames,
-            lost_frames=counters.lost_frames,
-            garbage_bytes=counters.garbage_bytes,
-            enumerations=counters.enumerations,
             dropped=self._port.dropped if self._port else 0,
             bundle=self._answerer.model,
             source=self._source,
-            stale_frames=counters.stale_frames,
-            overflows=counters.overflows,
-            fifo_overflows=counters.fifo_overflows,
-            glitches=edges.glitches,
-            lost_edges=edges.lost_edges,
-            storms=edges.storms,
             loss_known=sensor.loss_known,
             ready=self._able and not self._cutter.sweeping,
             degraded=self._answerer.degraded,
-            foreign_frames=counters.foreign_frames,
             due_ns=self._trigger.due_ns,
+            **entries(sensor.counters),
+            **entries(self._trigger.edge_counters),
         )
 
     def circumstances(self) -> dict[str, Any]:
@@ -392,26 +366,8 @@ class Box:
     def _state(self) -> list[object]:
         """Fields of the STA sentence (PROTOCOL.md, part 2)."""
         h = self.health
-        return [
-            f"{h.time_ns / 1e9:.3f}",
-            h.skin,
-            int(h.sweeping),
-            h.answered,
-            h.frames,
-            h.lost_frames,
-            h.garbage_bytes,
-            h.enumerations,
-            h.dropped,
-            h.bundle,
-            h.source,
-            h.stale_frames,
-            h.overflows,
-            h.fifo_overflows,
-            h.glitches,
-            h.lost_edges,
-            h.storms,
-            *_last_fields(h),
-        ]
+        counts = h[h._fields.index("answered") : h._fields.index("storms") + 1]
+        return [f"{h.time_ns / 1e9:.3f}", h.skin, int(h.sweeping), *counts, *_last_fields(h)]
 
     def _obey_asked(self) -> None:
         while self._port and self._asked:
@@ -432,7 +388,7 @@ class Box:
         To be called between two turns or in an observer's `turn`. Raises ApplianceError with the
         reason for a refusal.
         """
-        self._notify(self._on_command, self._turn_ns, command.line)
+        self._notify("command", self._turn_ns, command.line)
         if command.name in self._commands:
             return self._commands[command.name](command.text)
         if command.name in ("START", "STOP"):
@@ -469,8 +425,7 @@ class Box:
 
 
 def _succeeds(what: str, act: Callable[[], object]) -> bool:
-    """Whether `act` raises no exception. An exception is logged, because the next step must be done
-    as well."""
+    """Whether `act` raises no exception; one is logged, and the next step is done as well."""
     try:
         act()
     except Exception as e:
@@ -480,8 +435,7 @@ def _succeeds(what: str, act: Callable[[], object]) -> bool:
 
 
 def _last_fields(h: Health) -> list[object]:
-    """The fields of STA that are often missing: whether lost frames cannot be seen, and broken
-    taxels."""
+    """The fields of STA that are often missing: unseen losses, and broken taxels."""
     if h.degraded:
         return ["" if h.loss_known else 1, h.degraded]
     return [] if h.loss_known else [1]

@@ -134,7 +134,6 @@ class ReplayClock:
         self.t_ns = 0
 
     def now_ns(self) -> int:
-        """The time that was set."""
         return self.t_ns
 
     def sleep_until(self, t_ns: int) -> None:
@@ -153,8 +152,7 @@ class SweepReplay:
         self._last: object = None
 
     def __call__(self, kept: KeptSweep) -> ReplayResult:
-        """The verdict on `kept`, compared with the verdict in its sidecar. Raises FormatError for a
-        sweep of another bundle or format."""
+        """The verdict on `kept`, compared with its sidecar's. Raises FormatError."""
         if kept.bundle not in ("", self._bundle.id):
             raise OtherBundle(
                 f"sweep {kept.sweep.id} was classified by bundle {kept.bundle}, this is "
@@ -228,8 +226,7 @@ def _answered(classifier: Classifier, sweep: Sweep) -> tuple[Verdict | None, NDA
 
 
 def _folder(folder: Path, classify: SweepReplay, out: Callable[[str], object]) -> int:
-    """Replay all kept sweeps in `folder` and below. A sweep of another bundle is listed, but does
-    not count as a difference."""
+    """Replay all kept sweeps in `folder` and below; another bundle is no difference."""
     outcomes: Counter[str] = Counter()
     paths = sorted(folder.rglob("*.npy"), key=_order)
     if not paths:
@@ -252,8 +249,7 @@ def _order(path: Path) -> tuple[Path, int, str]:
 
 
 def _with_earlier(path: Path) -> list[KeptSweep]:
-    """The earlier sweeps of the object in the same folder, then the sweep at `path`. Raises
-    FormatError."""
+    """The earlier sweeps of the object, then the sweep at `path`. Raises FormatError."""
     found = [KeptSweep.read(path)]
     if found[0].sweep.object:
         for earlier in sorted(

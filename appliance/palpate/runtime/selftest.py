@@ -1,5 +1,4 @@
-"""The self-test of `palpate check`: bundle, golden sweeps, skin, GPIO lines and port, each by
-itself."""
+"""The self-test of `palpate check`: bundle, golden sweeps, skin, GPIO lines, port."""
 
 from __future__ import annotations
 

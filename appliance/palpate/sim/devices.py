@@ -19,8 +19,7 @@ BITS = tuple(f"CLASS-{i}" for i in range(8))
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RobotDevices(Devices):
-    """Simulated GPIO lines with the robot that acts on them. robot.played: the acts so far, for
-    scoring."""
+    """Simulated GPIO lines with the robot that acts on them, which keeps what it played."""
 
     gpio: gpio.SimGpio
     robot: rig.Robot
@@ -31,23 +30,15 @@ class RobotDevices(Devices):
         trigger = replace(settings.trigger, **wires, active_low=False)  # type: ignore[arg-type]
         if trigger.by_lines:
             trigger = replace(trigger, mode="two-lines")
-        output = replace(
-            settings.output,
-            ready=READY,
-            busy=BUSY,
-            result_valid=RESULT_VALID,
-            fault=FAULT,
-            decided=DECIDED,
-            class_bits=BITS,
-        )
+        bits = {"class_bits": BITS, "result_valid": RESULT_VALID}
+        state = {"ready": READY, "busy": BUSY, "fault": FAULT, "decided": DECIDED}
+        output = replace(settings.output, **bits, **state)  # type: ignore[arg-type]
         return replace(settings, trigger=trigger, output=output)
 
     def commanded(self, t_ns: int, *, start: bool) -> None:
-        """The robot follows START and STOP."""
         self.robot.obey(t_ns, start=start)
 
     def finished(self, answered: int) -> bool:
-        """True when the script has ended and each of its sweeps was answered."""
         return self.robot.finished and answered >= self.robot.acts
 
 
@@ -58,7 +49,6 @@ class SimDevices(RobotDevices):
     backend: usb.RigBackend
 
     def wire(self, settings: Config) -> Config:
-        """The settings with the simulated GPIO lines and skin."""
         ids = {"usb": f"{usb.VENDOR_ID:04x}:{usb.PRODUCT_ID:04x}", "profile": "palpate", "grid": ""}
         link = "acm" if self.backend.acm else "vendor"
         skin_config = replace(settings.skin, **ids, rate_hz=0.0, link=link)  # type: ignore[arg-type]
@@ -73,21 +63,12 @@ def robot_on_lines(
     remember: bool = True,
     follows: bool = False,
 ) -> tuple[rig.Robot, gpio.SimGpio]:
-    """A robot that plays `acts`, and the GPIO lines that it drives. stops, remember, follows: see
-    `build`."""
+    """A robot that plays `acts`, and the GPIO lines that it drives. See `build`."""
     outputs = READY, BUSY, RESULT_VALID, FAULT, DECIDED, *BITS
-    lines = gpio.SimGpio(
-        clock, {"/dev/gpiochip0": [START, STOP, NEW_OBJECT, *outputs]}, remember=remember
-    )
-    robot = rig.Robot(
-        iter(acts),
-        lines,
-        start=START,
-        stop=STOP,
-        new_object=NEW_OBJECT,
-        remember=remember,
-        follows=follows,
-    )
+    chips = {"/dev/gpiochip0": [START, STOP, NEW_OBJECT, *outputs]}
+    lines = gpio.SimGpio(clock, chips, remember=remember)
+    names = {"start": START, "stop": STOP, "new_object": NEW_OBJECT}
+    robot = rig.Robot(iter(acts), lines, **names, remember=remember, follows=follows)
     if stops:
         lines.watchers[DECIDED] = robot.react
     return robot, lines
@@ -119,11 +100,5 @@ def build(
         backend.at(in_ns, backend.plug)
 
     robot.cable = cable
-    return SimDevices(
-        clock=clock,
-        gpio=lines,
-        backend=backend,
-        source=source,
-        robot=robot,
-        format=format,
-    )
+    more = {"backend": backend, "source": source, "robot": robot, "format": format}
+    return SimDevices(clock=clock, gpio=lines, **more)  # type: ignore[arg-type]

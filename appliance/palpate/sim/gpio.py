@@ -51,8 +51,7 @@ class SimGpio:
         self._plan, self._order = list[tuple[int, int, str, bool]](), count()
 
     def drive(self, name: str, level: bool, t_ns: int) -> None:
-        """Schedule `level` of the input line `name` for `t_ns`, which is also the time stamp of the
-        edge."""
+        """Schedule `level` of the input `name` for `t_ns`, also the edge's time stamp."""
         if not any(name in names for names in self._chips.values()):
             raise ValueError(f"no simulated gpio line is named {name!r}; add it to chips")
         heapq.heappush(self._plan, (t_ns, next(self._order), name, bool(level)))
@@ -63,7 +62,6 @@ class SimGpio:
         heapq.heapify(self._plan)
 
     def is_gpiochip_device(self, path: str) -> bool:
-        """As in gpiod."""
         return path in self._chips
 
     def Chip(self, path: str) -> nullcontext[SimpleNamespace]:
@@ -77,17 +75,14 @@ class SimGpio:
     def request_lines(
         self, path: str, config: RequestConfig, consumer: str = "", event_buffer_size: int = 0
     ) -> SimRequest:
-        """As in gpiod; lines are given by their offsets."""
         self.now_ns()
         self.check(path)
         settings = {
             offset: line_settings for offsets, line_settings in config.items() for offset in offsets
         }
         names = {offset: self._chips[path][offset] for offset in settings}
-        if any(
-            request.path == path and request.names.keys() & names.keys()
-            for request in self.requests
-        ):
+        held = (r for r in self.requests if r.path == path)
+        if any(request.names.keys() & names.keys() for request in held):
             raise OSError(16, os.strerror(16))
         levels = {
             o: self._driven.get(name, settings[o].bias is Bias.PULL_UP) for o, name in names.items()
@@ -112,8 +107,7 @@ class SimGpio:
 
 
 class SimRequest:
-    """As gpiod's LineRequest. queue: the kernel's event queue, which drops its oldest event when
-    full."""
+    """As gpiod's LineRequest. queue: the kernel's; when full it drops its oldest event."""
 
     def __init__(
         self,
@@ -136,10 +130,8 @@ class SimRequest:
         for offset in (o for o, n in self.names.items() if n == name and self._levels[o] != level):
             self._levels[offset] = level
             rise = level != self.settings[offset].active_low
-            if self.settings[offset].edge_detection in (
-                Edge.BOTH,
-                Edge.RISING if rise else Edge.FALLING,
-            ):
+            wanted = Edge.RISING if rise else Edge.FALLING
+            if self.settings[offset].edge_detection in (Edge.BOTH, wanted):
                 event_type = EventType.RISING_EDGE if rise else EventType.FALLING_EDGE
                 numbers = next(self._seqno), next(self._line_seqno[offset])
                 self.queue.append(gpiod.EdgeEvent(event_type.value, t_ns, offset, *numbers))
@@ -156,7 +148,6 @@ class SimRequest:
         return [self.queue.popleft() for _ in range(min(max_events, len(self.queue)))]
 
     def get_values(self, lines: Iterable[int]) -> list[Value]:
-        """As in gpiod."""
         self._now_ns()
         return [
             Value.ACTIVE if self._levels[o] != self.settings[o].active_low else Value.INACTIVE
@@ -164,7 +155,6 @@ class SimRequest:
         ]
 
     def set_values(self, values: Mapping[int, Value]) -> None:
-        """As in gpiod."""
         now_ns = self._now_ns()
         for offset, value in values.items():
             self._levels[offset] = (value is Value.ACTIVE) != self.settings[offset].active_low

@@ -32,34 +32,28 @@ REACTION_NS = 20_000_000
 
 
 class VirtualClock:
-    """Time that passes only in `sleep_until`, so that minutes are simulated in a fraction of a
-    second, reproducibly."""
+    """Time that passes only in `sleep_until`: minutes are simulated at once, reproducibly."""
 
     def __init__(self, start_ns: int = 1_000_000_000) -> None:
         self._now_ns = start_ns
 
     def now_ns(self) -> int:
-        """The simulated time in nanoseconds."""
         return self._now_ns
 
     def sleep_until(self, t_ns: int) -> None:
-        """Jump to `t_ns`."""
         self._now_ns = max(self._now_ns, t_ns)
 
 
 class SkippingClock:
-    """Real time without waiting: computing takes real time, sleeping takes none. For measuring the
-    computing time of the box."""
+    """Real time without waiting, to measure the computing time of the box."""
 
     def __init__(self) -> None:
         self._skipped_ns = 0
 
     def now_ns(self) -> int:
-        """Monotonic nanoseconds plus everything that was skipped."""
         return time.monotonic_ns() + self._skipped_ns
 
     def sleep_until(self, t_ns: int) -> None:
-        """Skip to `t_ns`."""
         self._skipped_ns += max(0, t_ns - self.now_ns())
 
 
@@ -85,20 +79,15 @@ class Act:
     lifted: int = 1
 
     def part(self, of: slice) -> Act:
-        """The same act with a part of its frames."""
         return replace(self, frames=self.frames[of])
 
 
 class EdgeLines(Protocol):
     """Receives the robot's edges: SimGpio, or a list of a test."""
 
-    def drive(self, name: str, level: bool, t_ns: int) -> None:
-        """Set the input line `name` to `level` at `t_ns`."""
-        ...
+    def drive(self, name: str, level: bool, t_ns: int) -> None: ...
 
-    def forget(self, name: str, t_ns: int) -> None:
-        """Cancel the levels scheduled for `name` at `t_ns` and later."""
-        ...
+    def forget(self, name: str, t_ns: int) -> None: ...
 
 
 class Robot:
@@ -183,8 +172,7 @@ class Robot:
             )
 
     def obey(self, t_ns: int, *, start: bool) -> None:
-        """START or STOP has come as a command at `t_ns`. START makes a finger that waits slide from
-        the next frame on; STOP lifts it."""
+        """START or STOP has come at `t_ns`: a waiting finger slides, or is lifted."""
         if start and not self._sliding:
             self._sliding, self._lifting = True, False
             self._playing = None
@@ -197,8 +185,7 @@ class Robot:
                 self.skipped = (first + at, first + last) if at < last else None
 
     def _followed(self, first: int, frame_ns: Callable[[int], int]) -> Act | None:
-        """The next frames of a finger that follows commands: a few lifted ones, a whole slide, or
-        the end of an act."""
+        """The next frames of a finger that follows commands: lifted, a slide, or the end."""
         if self._act is None:
             self._act = next(self._script, None)
             if self._act is None:
@@ -274,14 +261,9 @@ class ReadoutBoard:
         first_seq: int = 0,
     ) -> None:
         self.identity = packets.Identity(packets.VERSION, (1, 0, 0), "palpate-sim", serial)
+        f = format
         self.skin = packets.SkinFormat(
-            format.rows,
-            format.cols,
-            format.dtype,
-            format.rate_hz,
-            fifo_frames,
-            packet_frames,
-            format.axes,
+            f.rows, f.cols, f.dtype, f.rate_hz, fifo_frames, packet_frames, f.axes
         )
         self.present = True
         self.running = False
@@ -317,14 +299,12 @@ class ReadoutBoard:
         return None
 
     def due_ns(self) -> int | None:
-        """Time at which the next packet will be on the bus; None while the readout board does not
-        send."""
+        """Time of the next packet on the bus; None while the board does not send."""
         if not self.running:
             return None
         if self._arrival_ns is None:
-            self._arrival_ns = (
-                self.frame_ns(self._next + self.skin.packet_frames - 1) + self._latency()
-            )
+            last = self._next + self.skin.packet_frames - 1
+            self._arrival_ns = self.frame_ns(last) + self._latency()
         return self._arrival_ns
 
     def take(self) -> bytes:
@@ -336,9 +316,5 @@ class ReadoutBoard:
         self._next, self._arrival_ns = first + n, None
         device_us = round((self.frame_ns(first) - self._origin_ns) * self._rate / 1000)
         flags = packets.Flag.OVERFLOW if late else 0
-        return packets.pack(
-            self._first_seq + first,
-            device_us,
-            self._film.frames(first, n, self.frame_ns),
-            flags,
-        )
+        frames = self._film.frames(first, n, self.frame_ns)
+        return packets.pack(self._first_seq + first, device_us, frames, flags)

@@ -30,8 +30,7 @@ so that edges come anywhere within packets."""
 PAUSE_FRAMES = 12
 """Least number of frames without contact, so that a slow skin is seen unloaded, too."""
 SLIDE_S, REST_S = 3.0, 0.1
-"""Duration of the slide (paper, sec. II.B), and of the finger at rest on the tube before and after
-it."""
+"""Duration of the slide (paper, sec. II.B), and of the rest before and after it."""
 FOLLOWED_S = 8.0
 """Duration of a slide that ends with the command STOP; it is repeated if STOP comes later."""
 LEAD_S = 0.5
@@ -41,8 +40,7 @@ LIFTED_SET_S = 0.4
 """Time for which the finger is lifted before a sweep of a set. A set does not record the unloaded
 skin, so all counts are 0."""
 RESTS_MM = (4.0, 3.0), (-2.5, 2.0), (1.5, -1.0), (0.0, 0.0)
-"""Positions of the skin while somebody aligns it, each better than the one before: (along the
-finger, across). In mm."""
+"""Positions of the skin while somebody aligns it: (along the finger, across) in mm."""
 RESTS_FOR_S, LIFTED_S = 3.0, 1.0
 """Time for which the finger then rests on the tube, and for which it is lifted before."""
 MARGIN = 8
@@ -89,17 +87,10 @@ def named(
             hint = _NAME_BUNDLE if seen else _NAME_SKIN
             raise FormatError(f"the simulated skin sends {sent}, {format} is wanted; {hint}")
         _, world, by = fits[0]
-        acts = (
-            rests(seed, world, by)
-            if name == "rest"
-            else tubes(
-                seed,
-                world=world,
-                seen=by,
-                only=only,
-                slide_s=FOLLOWED_S if follows else SLIDE_S,
-            )
-        )
+        if name == "rest":
+            return rests(seed, world, by), "sim", format
+        slide_s = FOLLOWED_S if follows else SLIDE_S
+        acts = tubes(seed, world=world, seen=by, only=only, slide_s=slide_s)
         return acts, "sim", format
     if name.startswith(SETS):
         sweeps = load(Path(name.removeprefix(SETS)), format)
@@ -111,17 +102,12 @@ def named(
 
 
 class SeenTubes(Protocol):
-    """Tubes as seen by a skin on the finger: the module `skin`, or the view of another skin
-    (`skins.sweeps`)."""
+    """Tubes as seen by a skin on the finger: the module `skin`, or another's view."""
 
     @property
-    def FORMAT(self) -> SweepFormat:
-        """Format of its sweeps."""
-        ...
+    def FORMAT(self) -> SweepFormat: ...
 
-    def idle(self, n: int, rng: Generator, world: skin.World) -> NDArray[Any]:
-        """n frames without contact."""
-        ...
+    def idle(self, n: int, rng: Generator, world: skin.World) -> NDArray[Any]: ...
 
     def sweep(
         self,
@@ -133,9 +119,7 @@ class SeenTubes(Protocol):
         rest_s: float,
         slide_s: float,
         after_s: float,
-    ) -> NDArray[Any]:
-        """A sweep over a tube."""
-        ...
+    ) -> NDArray[Any]: ...
 
 
 def tubes(
@@ -154,15 +138,8 @@ def tubes(
     this tube alone. Raises ConfigError for an unknown tube.
     """
     materials = (world.tube(only).name,) if only else skin.MATERIALS
-    return _tubes(
-        np.random.default_rng(seed),
-        sweeps,
-        places or skin.placements("T-LAB", seed),
-        world,
-        seen,
-        materials,
-        slide_s,
-    )
+    rng, places = np.random.default_rng(seed), places or skin.placements("T-LAB", seed)
+    return _tubes(rng, sweeps, places, world, seen, materials, slide_s)
 
 
 def _tubes(
@@ -201,8 +178,7 @@ def slide(
 
 
 def rests(seed: int, world: skin.World = PLAYED, seen: SeenTubes = skin) -> Iterator[Act]:
-    """A finger that is lifted and put on the wooden tube again, without end. The skin is shifted
-    between the touches."""
+    """A finger that is lifted and put on the wooden tube again, with a shifted skin."""
     rng = np.random.default_rng(seed)
     off = round(LIFTED_S * seen.FORMAT.rate_hz)
     for dx_mm, dy_mm in itertools.cycle(RESTS_MM):
@@ -224,8 +200,7 @@ def load(path: Path, format: SweepFormat | None) -> SweepSet:
 
 
 def in_turn(labels: NDArray[Any], seed: int) -> list[int]:
-    """An order of sweeps in which the materials come in turn, in each round in another order.
-    labels: int [N]."""
+    """An order of sweeps in which the materials come in turn. labels: int [N]."""
     rng = np.random.default_rng(seed)
     waiting = {
         label: rng.permutation(np.flatnonzero(labels == label)).tolist()
@@ -250,15 +225,8 @@ def play(sweeps: SweepSet, order: Iterable[int]) -> Iterator[Act]:
     for i in order:
         window, now = sweeps.samples[i], None if recording is None else recording[i]
         ahead, after = window[:1].repeat(MARGIN + lead, 0), window[-1:].repeat(MARGIN + lead, 0)
-        frames = np.concatenate(
-            [np.zeros((lifted, *window.shape[1:]), window.dtype), ahead, window, after]
-        )
-        yield Act(
-            frames,
-            start,
-            stop,
-            sweeps.materials[sweeps.labels[i]],
-            now is not None and now != before,
-            lifted=lifted,
-        )
+        dark = np.zeros((lifted, *window.shape[1:]), window.dtype)
+        frames = np.concatenate([dark, ahead, window, after])
+        label, new = sweeps.materials[sweeps.labels[i]], now is not None and now != before
+        yield Act(frames, start, stop, label, new, lifted=lifted)
         before = now

@@ -29,25 +29,20 @@ SetName = Literal["T-LAB", "T-REAL", "T-HARD"]
 
 FORMAT = SweepFormat(4, 4, 750.0, 1500, "uint8")
 SHEAR_FORMAT = replace(FORMAT, dtype="int16", axes=3)
-"""Format of a skin with three axes: shear along the sliding, shear across it, pressure; counts of
-12 bits with a sign."""
+"""Format of a skin with three axes: shear along and across the sliding, pressure."""
 SHEAR_FULL = 2047
 PITCH_MM, TAXEL_MM, TUBE_RADIUS_MM = 4.0, 2.5, 25.0
 STEP_MM = 30.0 / FORMAT.rate_hz  # path from one frame to the next, at 3 cm/s
 # precision of the controller: largest error of the force, as a share of the desired one
 FORCE_LIMIT = 0.2
-SETS = {
-    "T-LAB": (1, 40),
-    "T-REAL": (9, 10),
-    "T-HARD": (1, 10),
-}  # positions, sweeps of each tube per position
+SETS = {"T-LAB": (1, 40), "T-REAL": (9, 10), "T-HARD": (1, 10)}
+"""Positions of each set, and sweeps of each tube per position."""
 EFFECTS = ("position", "attachment", "drift", "spot", "texture", "vibration", "noise")
 
 
 @dataclass(frozen=True, slots=True)
 class Material:
-    """A tube. pitch_mm and vibration_hz are centres of peaks in the spectrum, `_octaves` their
-    standard deviations."""
+    """A tube. pitch_mm, vibration_hz: centres of spectral peaks, `_octaves` their spread."""
 
     name: str
     softness_mm_per_kpa: float
@@ -91,10 +86,7 @@ class World:
     off: frozenset[str] = frozenset()
     rows: int = FORMAT.rows
     cols: int = FORMAT.cols
-    pitch_mm: tuple[float, float] = (
-        PITCH_MM,
-        PITCH_MM,
-    )  # from taxel to taxel, along sliding and across
+    pitch_mm: tuple[float, float] = (PITCH_MM, PITCH_MM)  # between taxels, along sliding and across
     tubes: tuple[Material, ...] = TUBES
     speed: float = 1.0  # of sliding, relative to 3 cm/s; friction vibrations keep their frequency
     force_n: float = 1.0
@@ -131,12 +123,10 @@ class World:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Shape of one frame."""
         return shape(self.rows, self.cols, 3 if self.shear else 1)
 
     @property
     def format(self) -> SweepFormat:
-        """Format of the skin's sweeps."""
         return replace(SHEAR_FORMAT if self.shear else FORMAT, rows=self.rows, cols=self.cols)
 
 
@@ -163,8 +153,7 @@ WORLDS = {"": WORLD, "level-blind": LEVEL_BLIND}
 
 @dataclass(frozen=True, slots=True)
 class Placement:
-    """Position of the skin's centre on the pad, along sliding and across, and its rotation. seed:
-    of its attachment."""
+    """Position of the skin's centre on the pad, its rotation, and the attachment's seed."""
 
     dx_mm: float = 0.0
     dy_mm: float = 0.0
@@ -195,8 +184,7 @@ def band(
 
 
 def position(placement: Placement, world: World) -> tuple[Array, Array]:
-    """Effect: positions of the taxels' centres on the pad, x and y [R, C] in mm; without it the
-    skin is centred."""
+    """Effect: positions of the taxels' centres on the pad, x and y [R, C] in mm."""
     sits = Placement() if "position" in world.off else placement
     along, across = (
         (np.arange(n) - (n - 1) / 2) * pitch
@@ -227,8 +215,7 @@ def attachment(placement: Placement, world: World) -> tuple[Array, Array, Array]
 
 
 def drift(n: int, rng: Generator, world: World) -> Array:
-    """Effect: contact force [n] in N; half of the controller's error is constant in a sweep, half
-    varies at 0.5 Hz."""
+    """Effect: contact force [n] in N; half of the error is constant, half varies at 0.5 Hz."""
     if "drift" in world.off:
         return np.full(n, world.force_n)
     wander = band(max(n, FORMAT.window), 1, 0.5, 1.0, FORMAT.rate_hz, rng)[0, :n]
@@ -237,19 +224,14 @@ def drift(n: int, rng: Generator, world: World) -> Array:
 
 
 def spot(tube: Material, rng: Generator, world: World) -> Material:
-    """Effect: the tube was turned, and its texture and vibrations differ a little from one spot to
-    another."""
+    """Effect: the tube was turned; texture and vibrations differ from spot to spot."""
     if "spot" in world.off:
         return tube
     height, squeak = np.exp(world.spot_spread * rng.standard_normal(2))
     pitch, rate = np.exp2(world.spot_octaves * rng.standard_normal(2))
-    return replace(
-        tube,
-        texture_mm=tube.texture_mm * height,
-        pitch_mm=tube.pitch_mm * pitch,
-        vibration=tube.vibration * squeak,
-        vibration_hz=tube.vibration_hz * rate,
-    )
+    height, pitch = tube.texture_mm * height, tube.pitch_mm * pitch
+    squeak, rate = tube.vibration * squeak, tube.vibration_hz * rate
+    return replace(tube, texture_mm=height, pitch_mm=pitch, vibration=squeak, vibration_hz=rate)
 
 
 def texture(tube: Material, x: Array, slid: Whole, rng: Generator, world: World) -> Array:
@@ -265,33 +247,27 @@ def texture(tube: Material, x: Array, slid: Whole, rng: Generator, world: World)
     lead = np.rint((x - x.min()) / STEP_MM).astype(np.int64)
     n = 500 * int(np.ceil((slid[-1] + lead.max() + 1) / 500))  # a length for which the FFT is fast
     blur = np.sinc(np.fft.rfftfreq(n, STEP_MM) * TAXEL_MM)
-    track = tube.texture_mm * band(
-        n, world.cols, 1 / tube.pitch_mm, tube.pitch_octaves, 1 / STEP_MM, rng, blur
-    )
-    height: Array = (
-        np.exp(world.relief_per_mm * x.mean())
-        * track[np.arange(world.cols), slid[:, None, None] + lead]
-    )
+    of = 1 / tube.pitch_mm, tube.pitch_octaves, 1 / STEP_MM
+    track = tube.texture_mm * band(n, world.cols, *of, rng, blur)
+    relief = track[np.arange(world.cols), slid[:, None, None] + lead]
+    height: Array = np.exp(world.relief_per_mm * x.mean()) * relief
     return height
 
 
 def vibration(
     tube: Material, x: Array, colour: Array, moving: Flags, rng: Generator, world: World
 ) -> Array:
-    """Effect: friction vibrations of all taxels in phase, [n, 1, 1] as a share of the pressure,
-    while `moving` [n]."""
+    """Effect: friction vibrations, [n, 1, 1] as a share of the pressure, while `moving` [n]."""
     if "vibration" in world.off:
         return np.zeros((1, 1, 1))
     n = len(moving)
     hz = np.fft.rfftfreq(n, 1 / FORMAT.rate_hz)
     octave = np.log2(np.maximum(hz, 1) * 2 / FORMAT.rate_hz) + len(colour) - 1
-    damping = np.hypot(
-        1, hz / (world.damping_hz * np.exp2(world.damping_octaves_per_mm * x.mean()))
-    )
+    limit_hz = world.damping_hz * np.exp2(world.damping_octaves_per_mm * x.mean())
+    damping = np.hypot(1, hz / limit_hz)
     passed = np.exp(np.interp(octave, np.arange(len(colour)), colour)) / damping
-    shake = tube.vibration * band(
-        n, 1, tube.vibration_hz, tube.vibration_octaves, FORMAT.rate_hz, rng, passed
-    )
+    of = tube.vibration_hz, tube.vibration_octaves, FORMAT.rate_hz
+    shake = tube.vibration * band(n, 1, *of, rng, passed)
     return (shake * moving).reshape(n, 1, 1)
 
 
@@ -304,29 +280,25 @@ def shear(pressure: Array, height: Array, y: Array, moving: Flags, world: World)
     While the finger slides (`moving` [n]), friction adds its share of the pressure, vibrations
     included, against the motion; at rest there is none.
     """
-    slope = np.diff(height, axis=0, prepend=height[:1]) / (
-        STEP_MM * world.speed
-    )  # 0 where the finger rests
+    # 0 where the finger rests
+    slope = np.diff(height, axis=0, prepend=height[:1]) / (STEP_MM * world.speed)
     along = -pressure * (slope + world.friction * moving.reshape(-1, 1, 1))
     return np.stack([along, pressure * (y / TUBE_RADIUS_MM), pressure], axis=-1)
 
 
 def noise(n: int, rng: Generator, world: World) -> Array:
     """Effect: white noise of the readout, [n, R, C] or [n, R, C, 3] in counts."""
-    return rng.standard_normal((n, *world.shape)) * (
-        0.0 if "noise" in world.off else world.noise_counts
-    )
+    counts = 0.0 if "noise" in world.off else world.noise_counts
+    return rng.standard_normal((n, *world.shape)) * counts
 
 
 def gap(x: Array, y: Array | float, world: World) -> Array:
-    """Distance in mm between the unloaded pad and a tube that it just touches: the tube's curvature
-    across, the pad's end along."""
+    """Distance in mm between the unloaded pad and a tube that it just touches."""
     return np.square(y) / (2 * TUBE_RADIUS_MM) + np.abs(x / world.pad_half_mm) ** world.pad_edge
 
 
 def indentation(force_n: Array, kpa_per_mm: float, world: World) -> Array:
-    """Indentation [n] in mm of the pad under `force_n` [n] in N, carried by the springs of the
-    whole contact area."""
+    """Indentation [n] in mm of the pad under `force_n` [n] in N."""
     x = np.linspace(-1.5, 1.5, 61) * world.pad_half_mm
     depth = np.linspace(0, 8, 161)
     pressed = np.maximum(depth[:, None] - gap(x, 0.0, world), 0)
@@ -356,9 +328,8 @@ def loaded(
     tube = spot(tube, of_spot, world)
     kpa_per_mm = 1 / (1 / world.pad_kpa_per_mm + tube.softness_mm_per_kpa)
     depth = indentation(drift(len(slid), of_drift, world), kpa_per_mm, world)[:, None, None]
-    height = bedding + texture(
-        tube, x, np.rint(world.speed * slid).astype(np.int64), of_texture, world
-    )
+    path = np.rint(world.speed * slid).astype(np.int64)
+    height = bedding + texture(tube, x, path, of_texture, world)
     pressure_kpa = kpa_per_mm * np.maximum(depth - gap(x, y, world) + height, 0)
     pressure_kpa *= 1 + vibration(tube, x, colour, moving, of_vibration, world)
     signal: Array = world.counts_per_kpa * gain * pressure_kpa
@@ -368,8 +339,7 @@ def loaded(
 def _touch(
     tube: Material, placement: Placement, rng: Generator, world: World, slid: Whole, moving: Flags
 ) -> Counts:
-    """Raw counts [n, R, C] or [n, R, C, 3] of a finger in contact. slid: path on the tube in frames
-    [n]. moving: [n]."""
+    """Raw counts [n, R, C(, 3)] of a finger in contact. slid: path in frames [n]. moving: [n]."""
     signal = loaded(tube, placement, rng, world, slid, moving)
     return digitize(signal + noise(len(slid), rng.spawn(1)[0], world), world)
 
@@ -403,14 +373,8 @@ def sweep(
 def window(material: str, placement: Placement, rng: Generator, world: World = WORLD) -> Counts:
     """The middle two seconds of a slide, raw counts [1500, 4, 4] or [1500, 4, 4, 3]. Raises
     ConfigError for an unknown material."""
-    return _touch(
-        world.tube(material),
-        placement,
-        rng,
-        world,
-        np.arange(FORMAT.window),
-        np.ones(FORMAT.window, bool),
-    )
+    n = FORMAT.window
+    return _touch(world.tube(material), placement, rng, world, np.arange(n), np.ones(n, bool))
 
 
 def idle(n: int, rng: Generator, world: World = WORLD) -> Counts:
@@ -419,8 +383,7 @@ def idle(n: int, rng: Generator, world: World = WORLD) -> Counts:
 
 
 def _set_rng(name: SetName, seed: int) -> Generator:
-    """Random generator of a set; sets with the same seed are independent. Raises ConfigError for an
-    unknown set."""
+    """Random generator of a set, of its own for each name. Raises ConfigError."""
     if name not in SETS:
         raise ConfigError(f"sweep set {name!r} is unknown; use one of {', '.join(SETS)}")
     return np.random.default_rng([seed, *name.encode()])
@@ -435,13 +398,11 @@ def placements(name: SetName, seed: int) -> list[Placement]:
     rng = _set_rng(name, seed)
     places = []
     for _ in range(SETS[name][0]):
-        aside = np.sqrt(rng.random()) * np.exp(
-            2j * np.pi * rng.random()
-        )  # uniform on a disc of 1 mm radius
+        # uniform on a disc of 1 mm radius
+        aside = np.sqrt(rng.random()) * np.exp(2j * np.pi * rng.random())
         dx_mm = PITCH_MM if name == "T-HARD" else float(aside.real)
-        places.append(
-            Placement(dx_mm, float(aside.imag), 2 * rng.standard_normal(), int(rng.integers(2**32)))
-        )
+        turn_deg, of_attachment = 2 * rng.standard_normal(), int(rng.integers(2**32))
+        places.append(Placement(dx_mm, float(aside.imag), turn_deg, of_attachment))
     return places
 
 

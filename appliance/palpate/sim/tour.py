@@ -39,8 +39,7 @@ def _special(rng: Generator, world: skin.World) -> Iterator[Act]:
     place = skin.placements("T-LAB", PLACES)[0]
 
     def over(tube: str) -> Act:
-        with_cork = replace(world, tubes=(*world.tubes, CORK))
-        return script.slide(tube, place, rng, with_cork)
+        return script.slide(tube, place, rng, replace(world, tubes=(*world.tubes, CORK)))
 
     yield over("wood")
     yield over("plastic rough")
@@ -52,14 +51,9 @@ def _special(rng: Generator, world: skin.World) -> Iterator[Act]:
     first, second = over("metal"), over("wood")
     middle = min(first.stop + first.start, second.stop + second.start) // 2
     both = np.concatenate([first.frames[:middle], second.frames[middle:]])
-    yield Act(
-        both,
-        first.start,
-        second.stop,
-        "metal, then wood",
-        about="half of each",
-        wanted=Status.UNSURE,
-    )
+    half, unsure = "half of each", Status.UNSURE
+    of_both = first.start, second.stop, "metal, then wood"
+    yield Act(both, *of_both, about=half, wanted=unsure)
     act = over("paper")
     gone, back = (round(act.start + share * (act.stop - act.start)) for share in UNPLUGGED)
     yield replace(

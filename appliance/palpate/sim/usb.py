@@ -11,6 +11,7 @@ import heapq
 from array import array
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
+from typing import Any
 
 import usb.backend
 import usb.core
@@ -62,19 +63,15 @@ class RigBackend(usb.backend.IBackend):  # type: ignore[misc]
         while self._agenda and self._agenda[0][0] <= self._clock.now_ns():
             heapq.heappop(self._agenda)[2]()
         if what in self.errors:
-            code = self.errors[what]
-            raise usb.core.USBError("simulated failure", -1, code)
+            raise usb.core.USBError("simulated failure", -1, self.errors[what])
         if not self.board.present:
-            raise usb.core.USBError(
-                "No such device (it may have been disconnected)", -4, errno.ENODEV
-            )
+            raise usb.core.USBError("No such device", -4, errno.ENODEV)
 
     def _wait(self, t_ns: int) -> None:
         """Sleep until `t_ns` or until the next scheduled action."""
         self._clock.sleep_until(min(t_ns, self._agenda[0][0]) if self._agenda else t_ns)
 
     def enumerate_devices(self) -> Iterator[str]:
-        """pyusb: the devices on the bus."""
         try:
             self._touch()
         except usb.core.USBError:
@@ -82,40 +79,18 @@ class RigBackend(usb.backend.IBackend):  # type: ignore[misc]
         return iter(("board",))
 
     def get_device_descriptor(self, dev: str) -> SimpleNamespace:
-        """pyusb: the device descriptor."""
         return SimpleNamespace(
-            bLength=18,
-            bDescriptorType=1,
-            bcdUSB=0x200,
-            bDeviceClass=0xEF if self.acm else 0,
-            bDeviceSubClass=0,
-            bDeviceProtocol=0,
-            bMaxPacketSize0=64,
-            idVendor=VENDOR_ID,
-            idProduct=PRODUCT_ID,
-            bcdDevice=0x100,
-            iManufacturer=1,
-            iProduct=2,
-            iSerialNumber=3,
-            bNumConfigurations=1,
-            bus=1,
-            address=1,
-            port_number=1,
-            port_numbers=(1,),
-            speed=SPEED_FULL,
+            **dict(bLength=18, bDescriptorType=1, bcdUSB=0x200, bcdDevice=0x100),
+            **dict(bDeviceClass=0xEF if self.acm else 0, bDeviceSubClass=0, bDeviceProtocol=0),
+            **dict(idVendor=VENDOR_ID, idProduct=PRODUCT_ID, bMaxPacketSize0=64),
+            **dict(iManufacturer=1, iProduct=2, iSerialNumber=3, bNumConfigurations=1),
+            **dict(bus=1, address=1, port_number=1, port_numbers=(1,), speed=SPEED_FULL),
         )
 
     def get_configuration_descriptor(self, dev: str, config: int) -> SimpleNamespace:
-        """pyusb: the one configuration."""
         return SimpleNamespace(
-            bLength=9,
-            bDescriptorType=2,
-            wTotalLength=32,
-            bNumInterfaces=1 + self.acm,
-            bConfigurationValue=1,
-            iConfiguration=0,
-            bmAttributes=0x80,
-            bMaxPower=50,
+            **dict(bLength=9, bDescriptorType=2, wTotalLength=32, bNumInterfaces=1 + self.acm),
+            **dict(bConfigurationValue=1, iConfiguration=0, bmAttributes=0x80, bMaxPower=50),
             extra_descriptors=[],
         )
 
@@ -127,15 +102,9 @@ class RigBackend(usb.backend.IBackend):  # type: ignore[misc]
         if intf >= len(classes) or alt:
             raise IndexError
         return SimpleNamespace(
-            bLength=9,
-            bDescriptorType=4,
-            bInterfaceNumber=intf,
-            bAlternateSetting=0,
-            bNumEndpoints={2: 0, 10: 2, 255: 1}[classes[intf]],
-            bInterfaceClass=classes[intf],
-            bInterfaceSubClass=0,
-            bInterfaceProtocol=0,
-            iInterface=0,
+            **dict(bLength=9, bDescriptorType=4, bInterfaceNumber=intf, bAlternateSetting=0),
+            **dict(bInterfaceClass=classes[intf], bInterfaceSubClass=0, bInterfaceProtocol=0),
+            **dict(bNumEndpoints={2: 0, 10: 2, 255: 1}[classes[intf]], iInterface=0),
             extra_descriptors=[],
         )
 
@@ -145,19 +114,12 @@ class RigBackend(usb.backend.IBackend):  # type: ignore[misc]
         """pyusb: bulk IN 0x81, and bulk OUT 0x02 of CDC-ACM."""
         addresses = (0x81, 0x02) if self.acm and intf else () if self.acm else (0x81,)
         return SimpleNamespace(
-            bLength=7,
-            bDescriptorType=5,
-            bEndpointAddress=addresses[ep],
-            bmAttributes=2,
-            wMaxPacketSize=MAX_PACKET,
-            bInterval=0,
-            bRefresh=0,
-            bSynchAddress=0,
+            **dict(bLength=7, bDescriptorType=5, bEndpointAddress=addresses[ep], bmAttributes=2),
+            **dict(wMaxPacketSize=MAX_PACKET, bInterval=0, bRefresh=0, bSynchAddress=0),
             extra_descriptors=[],
         )
 
     def open_device(self, dev: str) -> str:
-        """pyusb: open the device."""
         self._touch("open")
         self._pending = b""
         return "handle"
@@ -166,7 +128,6 @@ class RigBackend(usb.backend.IBackend):  # type: ignore[misc]
         """pyusb: nothing to release."""
 
     def get_configuration(self, handle: str) -> int:
-        """pyusb: the configuration that the kernel has set."""
         self._touch("open")
         return 1
 
@@ -177,7 +138,6 @@ class RigBackend(usb.backend.IBackend):  # type: ignore[misc]
             raise usb.core.USBError("Resource busy", -6, errno.EBUSY)
 
     def release_interface(self, handle: str, intf: int) -> None:
-        """pyusb: give an interface back."""
         self._touch()
 
     def is_kernel_driver_active(self, handle: str, intf: int) -> bool:
@@ -185,23 +145,14 @@ class RigBackend(usb.backend.IBackend):  # type: ignore[misc]
         return self.kernel_driver
 
     def detach_kernel_driver(self, handle: str, intf: int) -> None:
-        """pyusb: detach the kernel's driver."""
         self.kernel_driver = False
 
     def clear_halt(self, handle: str, ep: int) -> None:
-        """pyusb: clear a stalled endpoint."""
         self._touch("clear")
         self.halted = False
 
     def ctrl_transfer(
-        self,
-        handle: str,
-        kind: int,
-        request: int,
-        value: int,
-        index: int,
-        data: array[int],
-        ms: int,
+        self, handle: str, kind: int, request: int, value: int, index: int, data: Any, ms: int
     ) -> int:
         """pyusb: standard string descriptors and the requests of PROTOCOL.md."""
         self._touch("control")
@@ -209,9 +160,8 @@ class RigBackend(usb.backend.IBackend):  # type: ignore[misc]
             self.dtr = bool(value & 1)
             return 0
         if kind == 0x80 and request == 6 and value >> 8 == 3:
-            text = ("", "Palpate", self.board.identity.board, self.board.identity.serial)[
-                value & 0xFF
-            ]
+            board = self.board.identity
+            text = ("", "Palpate", board.board, board.serial)[value & 0xFF]
             body = b"\x09\x04" if value & 0xFF == 0 else text.encode("utf-16-le")
             reply: bytes | None = bytes([len(body) + 2, 3]) + body
         else:

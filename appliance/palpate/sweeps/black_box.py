@@ -7,6 +7,7 @@ without a skin would push out the sweeps that have a window.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,26 +32,17 @@ class BlackBox(Observer):
         self._path, self._format, self._most = folder, format, most
         self._disk = disk or AtOnce()
         self._folder: SweepFolder | None = None
-        self._log = TroubleLog(
-            "black box: no sweep is kept",
-            f"see to {folder}",
-            end="black box: sweeps are kept again",
-        )
-        self._with_folder(
-            lambda folder: None
-        )  # now, at the start, since it waits for the disk several times
+        end, advice = "black box: sweeps are kept again", f"see to {folder}"
+        self._log = TroubleLog("black box: no sweep is kept", advice, end=end)
+        self._with_folder(lambda folder: None)  # now, since it waits for the disk several times
 
     def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
         """Write the sweep if it has a window, and remove the oldest sweep beyond `most`."""
         if len(sweep.frames):
-            self._disk(
-                lambda: self._with_folder(
-                    lambda folder: self._put(folder, sweep, verdict, circumstances)
-                )
-            )
+            put = partial(self._put, sweep=sweep, verdict=verdict, circumstances=circumstances)
+            self._disk(lambda: self._with_folder(put))
 
     def close(self) -> None:
-        """Finish writing, and release the folder."""
         self._disk.settle()
         if self._folder:
             self._folder.close()

@@ -71,13 +71,10 @@ class CaptureWriter(Observer):
 
     def __init__(self, path: Path, format: SweepFormat, profile: SkinProfile = PALPATE) -> None:
         # the profile of PROTOCOL.md is left out
-        head = json.dumps(
-            format.json() | ({} if profile.codec == PALPATE.codec else {"skin": profile.json()})
-        ).encode()
-        self._ended = False
-        self._log = TroubleLog(
-            f"capture: {path} cannot be written", "it ends here, classifying goes on"
-        )
+        skin = {} if profile.codec == PALPATE.codec else {"skin": profile.json()}
+        head = json.dumps(format.json() | skin).encode()
+        trouble, advice = f"capture: {path} cannot be written", "it ends here, the answers go on"
+        self._ended, self._log = False, TroubleLog(trouble, advice)
         try:
             _set_aside(path)
             self._file: IO[bytes] = path.open("wb")
@@ -92,7 +89,6 @@ class CaptureWriter(Observer):
         self._write(RecordKind.TRANSFER, t_ns, data)
 
     def state(self, t_ns: int, state: str) -> None:
-        """Write the sensor's new state."""
         self._write(RecordKind.STATE, t_ns, state.encode())
 
     def edges(self, t_ns: int, edges: Sequence[Edge]) -> None:
@@ -107,7 +103,6 @@ class CaptureWriter(Observer):
         self._write(RecordKind.COMMAND, t_ns, line.encode())
 
     def close(self) -> None:
-        """Close the file."""
         self._put(self._file.close)
 
     def _write(self, kind: RecordKind, t_ns: int, data: bytes) -> None:
@@ -119,17 +114,13 @@ class CaptureWriter(Observer):
 
 
 def _set_aside(path: Path) -> None:
-    """Rename the capture of an earlier start, because a box restarts by itself. Raises OSError, and
-    ConfigError if there are too many captures."""
+    """Rename the capture of an earlier start. Raises OSError, ConfigError for too many."""
     if not path.is_file() or not path.stat().st_size:  # /dev/full, a pipe
         return
     kept = (path.with_name(f"{path.name}.{i}") for i in range(1, MOST_KEPT + 1))
     free = next((name for name in kept if not name.exists()), None)
     if not free:
-        raise ConfigError(
-            f"--capture {path}: {MOST_KEPT} captures of earlier starts are beside it; move them "
-            "away"
-        )
+        raise ConfigError(f"--capture {path}: {MOST_KEPT} older captures are there; move some away")
     path.rename(free)
     log.info(f"capture: {path} of an earlier start was renamed to {free.name}")
 
@@ -146,14 +137,10 @@ class Playback:
         try:
             data = path.read_bytes()
         except OSError as e:
-            raise FormatError(
-                f"{path}: cannot be read: {e.strerror}; name a file of `palpate run --capture`"
-            ) from e
+            raise FormatError(f"{path}: cannot be read: {e.strerror}; name a capture") from e
         if not data.startswith(MAGIC):
-            raise FormatError(
-                f"{path}: not a capture (it begins with {data[:8]!r}); `palpate run --capture` "
-                "writes captures"
-            )
+            why = f"{path}: not a capture (it begins with {data[:8]!r})"
+            raise FormatError(f"{why}; `palpate run --capture` writes captures")
         begin = len(MAGIC) + 4 + int.from_bytes(data[len(MAGIC) : len(MAGIC) + 4], "little")
         try:
             head = json.loads(data[len(MAGIC) + 4 : begin])
@@ -161,9 +148,7 @@ class Playback:
             self.format = typed(SweepFormat, head)
             profile = PALPATE if skin is None else skin_profile.from_json(skin, "skin")
         except (ValueError, TypeError, RecursionError, ConfigError) as e:
-            raise FormatError(
-                f"{path}: the capture's head cannot be read: {e}; capture again"
-            ) from e
+            raise FormatError(f"{path}: its head cannot be read: {e}; capture again") from e
         self.state = "absent"
         self._opened = False  # the last STATE record was OPENED
         self.trouble: SensorError | None = None
@@ -177,21 +162,17 @@ class Playback:
 
     @property
     def finished(self) -> bool:
-        """True after all records were played."""
         return not self._records
 
     @property
     def clock(self) -> dict[str, float] | None:
-        """Sensor: accuracy of the readout board's time (DeviceClock.quality)."""
         return self._stream.clock
 
     @property
     def loss_known(self) -> bool:
-        """Sensor: whether each lost frame was seen."""
         return self._stream.loss_known
 
     def now_ns(self) -> int:
-        """Clock: the time of the last record that was played."""
         return self._now_ns
 
     def sleep_until(self, t_ns: int) -> None:
@@ -221,7 +202,6 @@ class Playback:
         return frames
 
     def _enter(self, state: str) -> None:
-        """Play a STATE record."""
         self._opened = state == OPENED
         if self._opened:
             self._stream.restart()
@@ -241,28 +221,21 @@ class Playback:
 
     def commands(self) -> list[Command]:
         """Port: the commands that were executed at this time."""
-        found = []
-        while (
-            self._records
-            and self._records[0][0] == RecordKind.COMMAND
-            and self._records[0][1] <= self._now_ns
-        ):
+        found, due = [], RecordKind.COMMAND
+        while self._records and self._records[0][0] == due and self._records[0][1] <= self._now_ns:
             found.append(_command(self._records.popleft()[2]))
         return found
 
 
 def _records(path: Path, data: bytes, at: int) -> Iterator[tuple[RecordKind, int, bytes]]:
-    """The records (kind, host ns, content) from byte `at` on. Raises FormatError for an unknown
-    record."""
+    """The records (kind, host ns, content) from byte `at` on. Raises FormatError."""
     while at + _RECORD.size <= len(data):
         kind, t_ns, size = _RECORD.unpack_from(data, at)
         body = data[at + _RECORD.size : at + _RECORD.size + size]
         whole = len(body) == size
         if kind >= len(RecordKind) or (whole and not _written(kind, t_ns, body)):
-            raise FormatError(
-                f"{path}: record of kind {kind} with {size} bytes at byte {at} is unknown; capture "
-                "again"
-            )
+            record = f"record of kind {kind} with {size} bytes at byte {at}"
+            raise FormatError(f"{path}: {record} is unknown; capture again")
         if whole:
             yield RecordKind(kind), t_ns, body
         at += _RECORD.size + size
@@ -281,6 +254,5 @@ def _written(kind: int, t_ns: int, body: bytes) -> bool:
 
 
 def _command(line: bytes) -> Command:
-    """The command of a record."""
     name, comma, text = line.decode("ascii", "replace").partition(",")
     return command(name, text if comma else None)

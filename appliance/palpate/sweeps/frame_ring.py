@@ -10,13 +10,11 @@ from numpy.typing import NDArray
 from palpate.core.types import EPOCH_BITS, Frames, SweepFormat
 
 MAX_GAP = 2
-"""Largest number of consecutive missing frames that are interpolated; for more the status is
-`gap`."""
+"""Most consecutive missing frames that are interpolated; for more the status is `gap`."""
 
 
 class FrameRing:
-    """The frames of the last `seconds` and a window more. newest: number of the newest frame, -1
-    before the first."""
+    """The frames of the last `seconds` and a window more. newest: number, -1 at first."""
 
     def __init__(self, format: SweepFormat, seconds: float) -> None:
         self.newest = -1
@@ -43,21 +41,16 @@ class FrameRing:
         slots: slice | NDArray[np.int64] = slice(at, at + n)
         if at + n > self._size or frames.seq[-1] - frames.seq[0] != n - 1:
             slots = frames.seq % self._size
-        self._seq[slots], self._t_ns[slots], self._taxels[slots] = (
-            frames.seq,
-            frames.t_ns,
-            frames.taxels,
-        )
+        self._seq[slots], self._t_ns[slots] = frames.seq, frames.t_ns
+        self._taxels[slots] = frames.taxels
         self.newest = int(frames.seq[-1])
 
     def latest(self, n: int) -> NDArray[Any] | None:
-        """The newest `n` frames as raw counts [n, R, C] or [n, R, C, A]; None if frames are
-        missing."""
+        """The newest `n` frames, raw counts [n, R, C(, A)]; None if some are missing."""
         window = np.arange(self.newest - n + 1, self.newest + 1)
         slots = window % self._size
-        return (
-            self._taxels[slots] if self.newest >= 0 and (self._seq[slots] == window).all() else None
-        )
+        whole = self.newest >= 0 and (self._seq[slots] == window).all()
+        return self._taxels[slots] if whole else None
 
     def window(self, first: int, n: int) -> tuple[Frames, tuple[int, ...]]:
         """Frames `first` to `first + n` with missing frames interpolated, and the indices of the

@@ -21,8 +21,7 @@ class RecordingProgress:
         self._count: Counter[tuple[str, str]] = Counter()
 
     def add(self, material: str, position: str, sweeps: int = 1) -> None:
-        """Count stored sweeps; -1 for a removed sweep. Sweeps without a material are not counted,
-        since a model cannot be trained on them."""
+        """Count stored sweeps, -1 for a removed one; none without a material."""
         if material:
             self._count[material, position] += sweeps
 
@@ -32,8 +31,7 @@ class RecordingProgress:
         return [(*pair, number) for pair, number in sorted((+self._count).items())]
 
     def line(self, material: str, position: str) -> str:
-        """The count of this pair, and all missing sweeps: "wood at 2: 3 of 10; missing: wood at 2:
-        7"."""
+        """The count of this pair, and all missing sweeps."""
         if not material:
             return "no material, so it cannot be trained on; name it with MATERIAL or --material"
         count = self._count[material, position]
@@ -42,9 +40,7 @@ class RecordingProgress:
     def missing(self) -> str:
         """The missing sweeps of the known materials and positions, in words."""
         held = +self._count
-        materials, positions = (
-            (sorted(set(names)) for names in zip(*held, strict=True)) if held else ((), ())
-        )
+        materials, positions = (sorted({pair[i] for pair in held}) for i in (0, 1))
         lacking = [
             f"{_name(*pair)}: {self.target - held[pair]}"
             for pair in product(materials, positions)
@@ -55,10 +51,8 @@ class RecordingProgress:
             return f"missing: {', '.join(lacking[:MOST_SHOWN])}" + f" and {more} more" * (more > 0)
         if len(materials) < 2:
             return "missing: another material, since a model tells at least two apart"
-        return (
-            f"nothing is missing of {len(materials)} materials at {len(positions)} "
-            f"position{'s'[: len(positions) > 1]}"
-        )
+        places = f"{len(positions)} position{'s'[: len(positions) > 1]}"
+        return f"nothing is missing of {len(materials)} materials at {places}"
 
 
 def _name(material: str, position: str) -> str:

@@ -35,14 +35,12 @@ number. A completely full card can stop more than a recording."""
 TARGET = 10
 """Default of the wanted number of sweeps of each material at each position."""
 MOST_CHANGES = 1024
-"""Largest number of label changes that are kept until the sweeps before them are answered; far more
-than a person makes."""
+"""Most label changes that wait for the answers to sweeps before them."""
 
 
 @dataclass(frozen=True, slots=True)
 class Labels:
-    """Material, position on the object, and session; "" if unknown. Raises ConfigError for a text
-    that cannot be sent."""
+    """Material, position and session, "" if unknown. Raises ConfigError if not sendable."""
 
     material: str = ""
     position: str = ""
@@ -50,12 +48,9 @@ class Labels:
 
     def __post_init__(self) -> None:
         for name in self.__slots__:
-            text = getattr(self, name)
-            if text and not LABEL.fullmatch(text):
-                raise ConfigError(
-                    f"{name} {text!r} cannot be used: take 1 to 24 letters, digits, spaces, '.', "
-                    "'_' or '-'"
-                )
+            if (text := getattr(self, name)) and not LABEL.fullmatch(text):
+                allowed = "take 1 to 24 letters, digits, spaces, '.', '_' or '-'"
+                raise ConfigError(f"{name} {text!r} cannot be used: {allowed}")
 
 
 class RecordingSession(Observer):
@@ -109,12 +104,10 @@ class RecordingSession(Observer):
 
     @property
     def stored(self) -> int:
-        """Number of stored sweeps of this run."""
         return len(self._stored)
 
     @property
     def folder(self) -> Path:
-        """The folder of the sweeps."""
         return self._folder.folder
 
     @property
@@ -128,8 +121,7 @@ class RecordingSession(Observer):
         return dict(Counter(kept))
 
     def leave_out(self, number: int) -> None:
-        """Count a stored sweep no longer: it is discarded or forgotten, or was found not to be a
-        slide."""
+        """Count a stored sweep no longer: it is discarded, forgotten or no slide."""
         if labels := self._counted.pop(number, None):
             self._progress.add(labels.material, labels.position, -1)
 
@@ -164,13 +156,9 @@ class RecordingSession(Observer):
     def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
         """Write the sweep if it has a window, and report the outcome in a REC sentence."""
         self._answered = True
-        labels = next(
-            (labels for since_ns, labels in reversed(self._labels) if since_ns <= sweep.start_ns),
-            Labels(),
-        )
-        sweep = replace(
-            sweep, material=labels.material, position=labels.position, session=labels.session
-        )
+        since = (labels for t_ns, labels in reversed(self._labels) if t_ns <= sweep.start_ns)
+        labels = next(since, Labels())
+        sweep = replace(sweep, **entries(labels))
         self._writing[self._folder.run + sweep.id] = labels.material
         report = partial(self._report_outcome, sweep, verdict, labels)
         if not self._disk(partial(self._write, sweep, verdict, circumstances), report):
@@ -194,20 +182,15 @@ class RecordingSession(Observer):
         self._say(sentence("REC", sweep.id, *said))
 
     def close(self) -> None:
-        """Finish writing, and release the folder. Log the number of stored sweeps if there was a
-        sweep to store."""
+        """Finish writing, release the folder, and log the number of stored sweeps."""
         self._disk.settle()
         self._folder.close()
-        if not self._answered:
-            return
-        log.info(
-            f"record: sweeps of this run in {self._folder.folder}: {self.stored}; "
-            f"{self._progress.missing()}"
-        )
+        if self._answered:
+            where = f"record: sweeps of this run in {self._folder.folder}: {self.stored}"
+            log.info(f"{where}; {self._progress.missing()}")
 
     def _count_earlier(self, format: SweepFormat) -> None:
-        """Count the sweeps of earlier runs in the folder. Raises ConfigError for a sweep of another
-        format."""
+        """Count the sweeps of earlier runs. Raises ConfigError for another format."""
         for number, about in self._folder.sidecars():
             path = self._folder.path(number)
             try:
@@ -218,8 +201,7 @@ class RecordingSession(Observer):
             if stored != format.json():
                 self._folder.close()
                 raise ConfigError(
-                    f"{path} has another format than {format}, and a model is trained on one "
-                    "format; name another folder with --out"
+                    f"{path} has another format than {format}; name another folder with --out"
                 )
             gone = self._folder.is_forgotten(number, labels.material)
             self._count(number, labels, exclusion(about, forgotten=gone))
@@ -242,8 +224,7 @@ class RecordingSession(Observer):
     def _write(
         self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]
     ) -> tuple[str, str] | int:
-        """Write a sweep; its number in the folder, or the outcome ("skipped", "full" or "failed")
-        and details for a person."""
+        """Write a sweep; its number, or the outcome and details for a person."""
         if not len(sweep.frames):
             return "skipped", f"{verdict.status}"
         try:
@@ -275,9 +256,7 @@ class RecordingSession(Observer):
     def _next(self, _: str) -> list[object]:
         position = self._labels[-1][1].position
         if not position.isdecimal():
-            raise ApplianceError(
-                f"position {position!r} has no next position; begin with PPLP POSITION 1"
-            )
+            raise ApplianceError(f"position {position!r} has no next; begin with PPLP POSITION 1")
         return self._change("position", str(int(position) + 1).zfill(len(position)))
 
     def _discard(self, which: str) -> list[object]:
@@ -291,22 +270,18 @@ class RecordingSession(Observer):
         if not self._stored:
             raise ApplianceError("no sweep of this run is left to discard")
         number = self._stored[-1]
-        if which and which != str(number - self._folder.run):
-            raise ApplianceError(
-                f"the last stored sweep is {number - self._folder.run}, not {which}; "
-                "look at it first"
-            )
+        shown = number - self._folder.run
+        if which and which != str(shown):
+            raise ApplianceError(f"the last stored sweep is {shown}, not {which}; look at it first")
         try:
             self._folder.remove(number, reserve=True)
         except OSError as e:
-            raise ApplianceError(
-                f"sweep {number - self._folder.run} cannot be discarded: {e.strerror}"
-            ) from e
+            raise ApplianceError(f"sweep {shown} cannot be discarded: {e.strerror}") from e
         self._stored.pop()
         self.leave_out(number)
-        if self._last and self._last["sweep"] == number - self._folder.run:
+        if self._last and self._last["sweep"] == shown:
             self._last["outcome"] = "discarded"
-        return [number - self._folder.run, self.stored, self._folder.path(number).stem]
+        return [shown, self.stored, self._folder.path(number).stem]
 
 
 def _labels(about: Mapping[str, Any]) -> Labels:

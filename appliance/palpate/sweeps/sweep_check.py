@@ -20,9 +20,10 @@ from palpate.core.errors import ApplianceError
 from palpate.core.observer import Observer
 from palpate.core.types import EPOCH_BITS, Frames, Status, Sweep, SweepFormat, Verdict, normal
 
-UNCHECKED = Finding(
-    Status.RECORDED, "contact not checked: the skin was not both touched and let go so far"
-)
+MEASURED = "level", "noise"
+"""The entry `unloaded` of a sidecar: level and noise of the unloaded skin."""
+WHY = "contact not checked: the skin was not both touched and let go so far"
+UNCHECKED = Finding(Status.RECORDED, WHY)
 
 
 class SweepCheck(Observer):
@@ -35,10 +36,7 @@ class SweepCheck(Observer):
     model = degraded = ""
 
     def __init__(
-        self,
-        format: SweepFormat,
-        clock: Clock,
-        slides: Callable[[NDArray[Any]], str] | None = None,
+        self, format: SweepFormat, clock: Clock, slides: Callable[[NDArray[Any]], str] | None = None
     ) -> None:
         self.format, self._clock, self._slides = format, clock, slides
         self._unloaded = UnloadedTracker(format)
@@ -80,12 +78,9 @@ class SweepCheck(Observer):
         return Finding(Status.RECORDED) if finding.status is Status.OK else finding
 
     def about(self) -> dict[str, Any]:
-        """Entries for sidecars: level and noise of the unloaded skin in raw counts, None while it
-        is not certain."""
+        """Entries for sidecars: MEASURED in raw counts, None while it is not certain."""
         found = self._unloaded.skin if self._unloaded.certain else None
-        return {
-            "unloaded": found and {"level": found.level.tolist(), "noise": found.noise.tolist()}
-        }
+        return {"unloaded": found and {name: getattr(found, name).tolist() for name in MEASURED}}
 
     def describe(self) -> list[object]:
         """The fields of the answer to ID: no bundle, and the format."""

@@ -52,8 +52,7 @@ class RecordedSweep:
 
     @classmethod
     def load(cls, path: Path, forgotten: Forgotten | None = None) -> RecordedSweep:
-        """Read an .npy with its sidecar. forgotten: of its folder, read there by default. Raises
-        FormatError if a file is broken."""
+        """Read an .npy with its sidecar. Raises FormatError if a file is broken."""
         sweep, format = load(path)
         held = forgotten_in(path.parent) if forgotten is None else forgotten
         gone = number_of(path) in held.get(sweep.material, ())
@@ -61,7 +60,6 @@ class RecordedSweep:
 
     @property
     def exclusion(self) -> str:
-        """See `exclusion`."""
         own = {"status": self.sweep.status, "share": self.sweep.share}
         return exclusion({**self.about, **own}, forgotten=self.forgotten)
 
@@ -79,8 +77,8 @@ class RecordedSweep:
             level = np.empty(0)
         if level.shape != (2, *shape):
             raise FormatError(
-                f"{self.path}: `unloaded` in its sidecar lacks a level and noise of shape "
-                f"{list(shape)}; restore the original sidecar, or remove the entry"
+                f"{self.path}: `unloaded` in its sidecar needs level and noise of shape"
+                f" {list(shape)}; restore the sidecar, or remove the entry"
             )
         return level if np.isfinite(level).all() else np.full(level.shape, np.nan)
 
@@ -197,22 +195,16 @@ class SweepFolder:
             raise
 
     def put(self, sweep: Sweep, verdict: Verdict, about: Mapping[str, Any]) -> int:
-        """Write a sweep with its verdict and `about`, completely or not at all; returns its number.
-        Raises OSError."""
+        """Write a sweep, completely or not at all; returns its number. Raises OSError."""
         number = self.run + sweep.id
         assert self._format
-        save(
-            self.path(number),
-            sweep,
-            self._format,
-            {**about, "date": wall_clock.date(), "run": self.run, "verdict": verdict.as_dict()},
-        )
+        more = {"date": wall_clock.date(), "run": self.run, "verdict": verdict.as_dict()}
+        save(self.path(number), sweep, self._format, {**about, **more})
         self.numbers.append(number)
         return number
 
     def adopt(self, one: RecordedSweep, material: str) -> int:
-        """Copy a sweep of another folder as one of a material; returns its number. Raises
-        OSError."""
+        """Copy a sweep of another folder as one of a material. Raises OSError."""
         number = max([self.run, *self.numbers]) + 1
         about = {**one.about, "run": number - one.sweep.id}
         save(self.path(number), replace(one.sweep, material=material), one.format, about)
@@ -236,8 +228,7 @@ class SweepFolder:
         self.numbers.remove(number)
 
     def forget(self, material: str, numbers: Iterable[int]) -> None:
-        """Sweeps of a material are learnt from no longer; they stay in the folder. They may still
-        be waiting to be put. Raises OSError."""
+        """Learn from these sweeps no longer; they may still wait. Raises OSError."""
         new = self.forgotten | {material: sorted({*self.forgotten.get(material, ()), *numbers})}
         storage.put(self.folder / FORGOTTEN, (json.dumps(new, indent=1) + "\n").encode())
         self.forgotten = new
@@ -253,28 +244,24 @@ class SweepFolder:
         return number in self.forgotten.get(material, ())
 
     def path(self, number: int) -> Path:
-        """Path of the sweep of this number."""
         return self.folder / f"sweep-{number:06d}.npy"
 
     def close(self) -> None:
-        """Release the folder."""
         os.close(self._lock)
 
     def _take(self) -> None:
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as e:
-            raise BlockingIOError(
-                e.errno, "another program keeps sweeps there", str(self.folder)
-            ) from e
+            why = "another program keeps sweeps there"
+            raise BlockingIOError(e.errno, why, str(self.folder)) from e
         names = [name for path in self.folder.iterdir() if (name := _KEPT.fullmatch(path.name))]
         # an unfinished sweep was never reported as stored, but its number is not used again; nor
         # are forgotten numbers, in a folder that a person has emptied
         gone = (n for numbers in self.forgotten.values() for n in numbers)
         self.run = max([0, *(int(name[1]) for name in names), *gone])
-        self.numbers = sorted(
-            {int(name[1]) for name in names if name[2] != DISCARDED and not name[3]}
-        )
+        kept = (name for name in names if name[2] != DISCARDED and not name[3])
+        self.numbers = sorted({int(name[1]) for name in kept})
         for name in names:
             if name[3] or (name[2] == DISCARDED and int(name[1]) < self.run):
                 (self.folder / name[0]).unlink()

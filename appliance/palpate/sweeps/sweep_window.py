@@ -8,7 +8,7 @@ For early answers the open sweep is returned while it goes on. The window is the
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from numpy.typing import NDArray
@@ -36,7 +36,6 @@ class OpenSweep:
 
     @property
     def start_ns(self) -> int:
-        """Time of the start edge, host monotonic."""
         return self.start.t_ns
 
     def sweep(
@@ -50,25 +49,14 @@ class OpenSweep:
     ) -> Sweep:
         """The Sweep that the answer is about, complete at `now_ns`. missing: indices of the frames
         of the window that never arrived."""
-        return Sweep(
-            self.id,
-            self.start_ns,
-            stop_ns,
-            status,
-            frames,
-            len(missing),
-            now_ns,
-            self.object,
-            share=share,
-            speed_mm_s=self.start.speed_mm_s,
-            force_n=self.start.force_n,
-            filled=missing if missing and len(frames) else None,
-        )
+        start, filled = self.start, missing if missing and len(frames) else None
+        what = self.id, start.t_ns, stop_ns, status, frames, len(missing), now_ns, self.object
+        slide = Sweep(*what, share=share, filled=filled)
+        return replace(slide, speed_mm_s=start.speed_mm_s, force_n=start.force_n)
 
 
 class SweepCutter:
-    """Cuts windows. It holds the frames of the last `max_duration_s` and a margin, and the sweeps
-    that were not answered yet."""
+    """Cuts windows from the last `max_duration_s`, for sweeps that are not answered yet."""
 
     def __init__(self, format: SweepFormat, config: SweepConfig) -> None:
         self._format = format
@@ -96,8 +84,7 @@ class SweepCutter:
         self._ring.put(frames)
 
     def trigger(self, edges: Iterable[Edge], ready: bool, now_ns: int) -> None:
-        """Process the trigger edges of one turn in order. ready: whether the box could take a sweep
-        when they came."""
+        """Process the edges of a turn. ready: a sweep could be taken when they came."""
         before = self._count
         for edge in edges:
             if edge.kind is EdgeKind.START:
@@ -115,8 +102,7 @@ class SweepCutter:
         self._object += 1
 
     def interrupt(self, status: Status, now_ns: int) -> bool:
-        """Answer all unanswered sweeps with `status`. Returns whether there were any. A later stop
-        edge gives no answer."""
+        """Answer all open sweeps with `status`; whether there were any."""
         had = self.sweeping
         if self._open and not self._open.answered:
             self._answer(self._open, now_ns, status, now_ns)
@@ -127,17 +113,13 @@ class SweepCutter:
 
     def finished(self, now_ns: int) -> list[Sweep]:
         """The sweeps that can be answered at `now_ns`, in order of their numbers."""
-        if (
-            self._open
-            and not self._open.answered
-            and now_ns - self._open.start_ns > self._max_duration_ns
-        ):
-            self._answer(self._open, now_ns, Status.LONG, now_ns)
-        waiting = []
+        sweep = self._open
+        if sweep and not sweep.answered and now_ns - sweep.start_ns > self._max_duration_ns:
+            self._answer(sweep, now_ns, Status.LONG, now_ns)
+        waiting: list[tuple[OpenSweep, int]] = []
         for item in self._closing:
-            sweep = self._cut(*item, now_ns)
-            if sweep:
-                self._done.append(sweep)
+            if cut := self._cut(*item, now_ns):
+                self._done.append(cut)
             else:
                 waiting.append(item)
         self._closing = waiting
@@ -166,14 +148,8 @@ class SweepCutter:
             sweep.step += 1
             frames, missing = self._ring.window(sweep.first, n)
             if len(frames):
-                yield sweep.sweep(
-                    int(frames.t_ns[-1]),
-                    Status.OK,
-                    frames,
-                    missing,
-                    now_ns,
-                    share=sweep.step / (steps + 1),
-                )
+                stop_ns, share = int(frames.t_ns[-1]), sweep.step / (steps + 1)
+                yield sweep.sweep(stop_ns, Status.OK, frames, missing, now_ns, share=share)
 
     def settle(self) -> None:
         """Mark the open sweep as answered early; its stop edge then gives no answer."""
@@ -181,8 +157,7 @@ class SweepCutter:
             self._open.answered = True
 
     def latest(self, n: int) -> NDArray[Any] | None:
-        """The newest `n` frames as raw counts [n, R, C] or [n, R, C, A], for a tare; None if frames
-        are missing."""
+        """The newest `n` frames, raw counts [n, R, C(, A)], for a tare; None if not whole."""
         return self._ring.latest(n)
 
     def _begin(self, edge: Edge) -> OpenSweep:

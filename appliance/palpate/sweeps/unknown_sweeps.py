@@ -19,8 +19,7 @@ ALIKE = re.compile(r"; as sweep (\d{1,9})$")
 
 @dataclass(frozen=True, slots=True)
 class UnknownGroup:
-    """Sweeps of one unknown material. paths: of their files by number, in order. date: of the last
-    sweep."""
+    """Sweeps of one unknown material, by number, and the date of the last."""
 
     paths: dict[int, Path]
     date: str
@@ -49,12 +48,11 @@ def groups(folder: Path, bundle: str) -> list[UnknownGroup]:
 
 
 def chosen(found: list[UnknownGroup], number: int, folder: Path) -> UnknownGroup:
-    """The group with the sweep `number`; for 0 the only group. Raises ApplianceError with the
-    groups that there are."""
+    """The group with the sweep `number`; for 0 the only one. Raises ApplianceError."""
     if not found:
         raise ApplianceError(
-            f"no unknown material was seen twice in {folder}: store.black_box = 500 keeps the last "
-            "500 sweeps; make sweeps of the material, or teach it without --unknown"
+            f"no unknown material was seen twice in {folder}; set store.black_box = 500, make"
+            " sweeps of the material, or teach it without --unknown"
         )
     fitting = [one for one in found if number in one.paths or not number]
     if len(fitting) != 1:

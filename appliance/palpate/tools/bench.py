@@ -47,25 +47,18 @@ def run(
     that are timed beside the bundle; they are made if they are missing. seed: of the simulated
     sweeps. Raises BundleError if the references cannot be made."""
     load_before = os.getloadavg()
-    figures: dict[str, Any] = {
-        "commit": commit(),
-        "seed": seed,
-        "machine": _machine(),
-        "bundle": bundle.id,
-    }
+    figures: dict[str, Any] = {}
 
     def add(more: dict[str, Any]) -> None:
         figures.update(more)
         for key, value in more.items():
             report(f"{key:<24} {json.dumps(value)}")
 
-    add({k: figures[k] for k in ("commit", "seed", "machine", "bundle")})
+    add({"commit": commit(), "seed": seed, "machine": _machine(), "bundle": bundle.id})
     add(_whole_way(bundle.format, build, seed))
     add({"inference_ms": _inference(bundle, references, seed)})
     if "fp32" not in figures["inference_ms"]:
-        report(
-            "fp32 and paper_int8 were not measured: they come with the desktop's tools (make bench)"
-        )
+        report("fp32 and paper_int8 were not measured: they need the desktop's tools (make bench)")
     for name in bench_process.NAMES:
         add(_child(name, seed))
     add(_cold_start())
@@ -75,7 +68,6 @@ def run(
 
 
 def _rounded(load: tuple[float, float, float]) -> list[float]:
-    """Mean number of runnable processes in the last 1, 5 and 15 minutes."""
     return [round(value, 2) for value in load]
 
 
@@ -87,14 +79,12 @@ def _size_kb(bundle: Bundle) -> dict[str, float]:
 
 
 def _percentiles(values: list[float]) -> dict[str, float]:
-    return {f"p{q}": round(float(np.percentile(values, q)), 4) for q in (50, 99)} | {
-        "n": len(values)
-    }
+    found = {f"p{q}": round(float(np.percentile(values, q)), 4) for q in (50, 99)}
+    return found | {"n": len(values)}
 
 
 class _Watch(Observer):
-    """Measures the latency of answers. An observer gets a verdict after its sentence was
-    written."""
+    """Measures the latency of answers: verdicts come here after their sentences."""
 
     def __init__(self, clock: Clock) -> None:
         self.verdicts: list[Verdict] = []
@@ -132,21 +122,19 @@ def _whole_way(format: SweepFormat, build: Build, seed: int) -> dict[str, Any]:
         lost = box.counters.lost_frames
     pairs = zip(watch.verdicts, simulated.robot.played, strict=True)
     right = sum(v.label == act.label and v.status is Status.OK for v, act in pairs)
-    return {
-        "accuracy": {
-            "right": right,
-            "total": SWEEPS,
-            "interval": [round(v, 4) for v in wilson(right, SWEEPS)],
-        },
-        "frames_lost": lost,
-        "edge_to_sentence_ms": _percentiles(watch.answered_ms),
-        "edge_seen_ms": _percentiles(watch.seen_ms),
+    accuracy = {
+        "right": right,
+        "total": SWEEPS,
+        "interval": [round(v, 4) for v in wilson(right, SWEEPS)],
     }
+    times = watch.answered_ms, watch.seen_ms
+    answered, seen = map(_percentiles, times)
+    figures = {"edge_to_sentence_ms": answered, "edge_seen_ms": seen}
+    return {"accuracy": accuracy, "frames_lost": lost, **figures}
 
 
 def _inference(bundle: Bundle, references: Path, seed: int) -> dict[str, Any]:
-    """Times of the bundle, of the same network in float, and of the paper's network in int8, in
-    turns."""
+    """Times of the bundle, of its network in float, and of the paper's in int8, in turns."""
     rng = np.random.default_rng(seed)
     window = rng.integers(0, 256, bundle.golden[0].shape).astype(bundle.format.numpy_type)
     calls: dict[str, Callable[[], object]] = {}
@@ -168,8 +156,7 @@ def _inference(bundle: Bundle, references: Path, seed: int) -> dict[str, Any]:
 
 
 def _make_references(folder: Path) -> None:
-    """Let the desktop's tools write the reference models, if they are installed beside this
-    program."""
+    """Let the desktop's tools write the reference models, if they are installed."""
     if folder.is_dir() or not Path(sys.executable).with_name("palpate-train").exists():
         return
     command = [sys.executable, "-P", "-m", "palpate_studies", "references", "--out", str(folder)]
@@ -191,8 +178,7 @@ def _child(name: str, seed: int) -> dict[str, Any]:
 
 
 def _cold_start() -> dict[str, Any]:
-    """Seconds from the start of the process to READY with a streaming skin, as the first state
-    sentence reports it."""
+    """Seconds from the start of the process to READY with a streaming skin."""
     took = []
     command = [sys.executable, "-P", "-m", "palpate", "run", "--sim", "skin"]
     for _ in range(STARTS):
@@ -203,17 +189,12 @@ def _cold_start() -> dict[str, Any]:
                 pass
             took.append(time.monotonic() - start)
             box.terminate()
-    return {
-        "cold_start_s": round(statistics.median(took), 3),
-        "cold_start_worst_s": round(max(took), 3),
-    }
+    worst = {"cold_start_worst_s": round(max(took), 3)}
+    return {"cold_start_s": round(statistics.median(took), 3), **worst}
 
 
 def _machine() -> dict[str, Any]:
-    versions = {
-        "python": platform.python_version(),
-        "numpy": np.__version__,
-        "onnxruntime": ort.__version__,
-    }
-    machine = {"arch": platform.machine(), "cores": os.cpu_count(), "system": platform.system()}
-    return machine | versions | {"processor": processor()}
+    system = {"arch": platform.machine(), "cores": os.cpu_count(), "system": platform.system()}
+    python = {"python": platform.python_version()}
+    versions = {"numpy": np.__version__, "onnxruntime": ort.__version__}
+    return system | python | versions | {"processor": processor()}

@@ -30,14 +30,11 @@ NAMES = ("memory", "stream")
 
 
 class Build(Protocol):
-    """Builds a box on simulated devices, which `stack` closes; returns the box and the robot's end
-    of its serial line."""
+    """Builds a box on simulated devices; returns it and the robot's end of its line."""
 
     def __call__(
         self, simulated: devices.SimDevices, stack: ExitStack, /, observers: Iterable[Observer] = ()
-    ) -> tuple[Box, int]:
-        """Build it."""
-        ...
+    ) -> tuple[Box, int]: ...
 
 
 def write_acts(path: Path, acts: Iterable[rig.Act]) -> None:
@@ -48,8 +45,7 @@ def write_acts(path: Path, acts: Iterable[rig.Act]) -> None:
 
 def measure(name: str, format: SweepFormat, build: Build, path: Path) -> dict[str, Any]:
     """The part `name` of NAMES, measured in this process, which repeats the acts in `path`."""
-    parts = {"memory": _memory, "stream": _stream}
-    return parts[name](format, build, path)
+    return {"memory": _memory, "stream": _stream}[name](format, build, path)
 
 
 def _board(format: SweepFormat, path: Path, clock: Clock | None = None) -> devices.SimDevices:
@@ -60,13 +56,8 @@ def _board(format: SweepFormat, path: Path, clock: Clock | None = None) -> devic
         played = ((z[key], *map(int, key.split()[1:])) for key in z)
         acts = [rig.Act(frames, start, stop, "") for frames, start, stop in played]
     # the simulator's memory of acts is not part of the box
-    return devices.build(
-        format,
-        cycle(acts),
-        clock or rig.VirtualClock(),
-        "sim",
-        remember=False,
-    )
+    clock = clock or rig.VirtualClock()
+    return devices.build(format, cycle(acts), clock, "sim", remember=False)
 
 
 def drain(far_end: int) -> None:
@@ -93,12 +84,8 @@ def _memory(format: SweepFormat, build: Build, path: Path) -> dict[str, Any]:
                 rss_mb[box.answered] = _rss_mb()
             drain(far_end)
     first, after, later = rss_mb.values()
-    figures = {
-        "after_1000": after,
-        "without_board": after - board,
-        "growth_last_900": after - first,
-        "growth_next_900": later - after,
-    }
+    figures = {"after_1000": after, "without_board": after - board}
+    figures |= {"growth_last_900": after - first, "growth_next_900": later - after}
     return {"rss_mb": {name: round(value, 2) for name, value in figures.items()}}
 
 
@@ -108,14 +95,8 @@ def _rss_mb() -> float:
 
 
 def _stream(format: SweepFormat, build: Build, path: Path) -> dict[str, Any]:
-    """Share of one core while the skin streams in real time, with and without the simulated readout
-    board."""
-    box, whole = _shares(_board(format, path, SystemClock()), build)
-    return {"cpu_share_streaming": box, "cpu_share_with_simulated_board": whole}
-
-
-def _shares(simulated: devices.SimDevices, build: Build) -> tuple[float, float]:
-    """Share of one core while the skin streams, without and with the simulated readout board."""
+    """Share of one core while the skin streams, without and with the simulated board."""
+    simulated = _board(format, path, SystemClock())
     board_ns = 0
 
     def timed(read: Callable[..., int]) -> Callable[..., int]:
@@ -139,4 +120,6 @@ def _shares(simulated: devices.SimDevices, build: Build) -> tuple[float, float]:
             box.step()
             drain(far_end)
         wall_ns, cpu_ns = wall_ns + time.monotonic_ns(), cpu_ns + time.process_time_ns()
-    return round((cpu_ns - board_ns) / wall_ns, 4), round(cpu_ns / wall_ns, 4)
+    shares = (cpu_ns - board_ns) / wall_ns, cpu_ns / wall_ns
+    box_alone, whole = (round(share, 4) for share in shares)
+    return {"cpu_share_streaming": box_alone, "cpu_share_with_simulated_board": whole}

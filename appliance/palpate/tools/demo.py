@@ -1,24 +1,106 @@
-"""`palpate demo`: a line for each sweep with its answer, coloured on a terminal, at the end their
-sum."""
+"""`palpate demo`: a line for each sweep with its answer, at the end their sum."""
 
 from __future__ import annotations
 
 import os
 import select
+import statistics
+from collections import Counter
 from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, field
 from typing import IO
 
 from palpate.client.answers import Answer
+from palpate.core.statistics import wilson
 from palpate.core.status import REASONS, Status
 from palpate.runtime.loop import Box
 from palpate.sim.rig import Act
-from palpate.tools.score import AnswerScore
 
 ARRIVAL_S = 1.0
 """Longest time of a sentence from one end of the serial line to the other."""
 HEAD = f"{'':5}{'felt':<20}{'answer':<16}{'sure':>8}"
 """Heads of the columns."""
 GREEN, YELLOW, RED, GREY, PLAIN = "\033[32m", "\033[33m", "\033[31m", "\033[90m", "\033[0m"
+
+
+@dataclass(slots=True)
+class AnswerScore:
+    """Counts of the answers so far.
+
+    labels: labels of the bundle. right, total: by material; the right answer for other materials is
+    `unknown`. objects: whether the last answer for each object was right, if NEW OBJECT was
+    signalled. early: answers that did not need the whole window. slide_frames: frames from START to
+    STOP, of all sweeps.
+    """
+
+    labels: frozenset[str]
+    right: Counter[str] = field(default_factory=Counter)
+    total: Counter[str] = field(default_factory=Counter)
+    objects: list[bool] = field(default_factory=list)
+    latency_ms: list[float] = field(default_factory=list)
+    early: int = 0
+    slide_frames: int = 0
+
+    def add(self, act: Act, answer: Answer) -> bool:
+        """Count an answer. Returns whether it is right: the status that `act` wants, otherwise its
+        material, or `unknown` for a material that the bundle does not have."""
+        known = act.label in self.labels
+        wanted = act.wanted or (Status.OK if known else Status.UNKNOWN)
+        right = answer.status == wanted and (wanted != Status.OK or answer.label == act.label)
+        self.total[act.label] += 1
+        self.right[act.label] += right
+        self.latency_ms.append(answer.latency_ms)
+        self.early += answer.share < 1
+        self.slide_frames += act.stop - act.start
+        if not known:
+            return right
+        if act.new_object:
+            self.objects.append(right)
+        elif self.objects:
+            self.objects[-1] = right
+        return right
+
+    @property
+    def answers(self) -> int:
+        return self.total.total()
+
+    @property
+    def summary(self) -> str:
+        """How many answers were right."""
+        return f"{self.right.total()} of {self.answers} answers are right"
+
+    def table(self) -> list[str]:
+        """Right answers and totals in lines: by material, of all sweeps, of all objects, of the
+        bundle's materials; then the share of other materials that were called unknown."""
+        names = sorted(self.total.keys() & self.labels)
+        rows = [(name, self.right[name], self.total[name]) for name in names]
+        sums = []
+        if rows:
+            sums = [("all sweeps", sum(right for _, right, _ in rows), sum(n for *_, n in rows))]
+        if self.objects:
+            sums.append(("all objects", sum(self.objects), len(self.objects)))
+        lines = [f"  {name:<16}{right:>5} / {n}" for name, right, n in rows]
+        for name, right, n in sums:
+            low, high = wilson(right, n)
+            percent = f"{100 * right / n:.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
+            lines.append(f"  {name:<16}{right:>5} / {n:<5} {percent}")
+        if others := sorted(self.total.keys() - self.labels):
+            right, n = (sum(counts[name] for name in others) for counts in (self.right, self.total))
+            called = f"{right} of {n} sweeps called unknown ({', '.join(others)})"
+            lines.append(f"  not in the bundle: {called}")
+        return ["  material        right / all", *lines]
+
+    def touch(self, rate_hz: float) -> str:
+        """Mean touch time, from start edge to stop edge, and the number of early answers."""
+        n = self.answers
+        return f"{self.slide_frames / n / rate_hz:.2f} s mean, {self.early} of {n} answered early"
+
+    def latency(self) -> str:
+        """Median and worst latency. In virtual time there is none."""
+        if not any(self.latency_ms):
+            return "not measured: --virtual lets no time pass"
+        median, worst = statistics.median(self.latency_ms), max(self.latency_ms)
+        return f"{median:.2f} ms median, {worst:.2f} ms worst"
 
 
 class Demo:
@@ -70,16 +152,16 @@ class Demo:
         return [*self.score.table(), "", *lines]
 
     def _read(self, sent: int, wanted: int) -> None:
-        """Read the sentences at the robot's end, up to `wanted` answers. Sent answers are waited
-        for."""
-        while select.select([self._far_end], [], [], ARRIVAL_S if self.score.answers < sent else 0)[
-            0
-        ]:
+        """Read the sentences at the robot's end, up to `wanted` answers."""
+        while select.select([self._far_end], [], [], self._patience_s(sent))[0]:
             *lines, self._rest = (self._rest + os.read(self._far_end, 65536)).split(b"\r\n")
             for line in lines:
                 self._show(line.decode("ascii"))
                 if self.score.answers == wanted:
                     return
+
+    def _patience_s(self, sent: int) -> float:
+        return ARRIVAL_S if self.score.answers < sent else 0
 
     def _show(self, line: str) -> None:
         if self._raw:

@@ -77,7 +77,6 @@ def first_misfit(
 
 
 def _spans(profile: SkinProfile, found: Decoded) -> list[tuple[int, int]]:
-    """First byte and end of each frame."""
     if profile.codec == "fixed":
         return [(int(end - found.size), int(end)) for end in found.ends]
     befores = np.append(0, found.ends[:-1]) + found.skipped

@@ -60,7 +60,7 @@ class HeardBytes:
 
 
 def table(profiles: Mapping[str, SkinProfile]) -> list[str]:
-    """All profiles in lines: name, format, missing features, and what the skin is. A last line
+    """All profiles in lines: name, format, missing features, and kind of skin. A last line
     names the profiles that nobody has compared with a device."""
     rows = [("profile", "format", "lacks", "skin")]
     for name, one in profiles.items():
@@ -68,10 +68,7 @@ def table(profiles: Mapping[str, SkinProfile]) -> list[str]:
         measured = f" (measured: {one.measured})" if one.measured else ""
         rows.append((name, format, ", ".join(one.lacks) or "nothing", one.about + measured))
     wide = [max(len(row[i]) for row in rows) for i in range(3)]
-    lines = [
-        "  ".join(f"{cell:<{n}}" for cell, n in zip(row[:3], wide, strict=True)) + f"  {row[3]}"
-        for row in rows
-    ]
+    lines = ["  ".join([*map(str.ljust, row[:3], wide), row[3]]) for row in rows]
     if not any(one.measured for one in profiles.values()):
         return [*lines, "none was measured on a device"]
     never = [name for name, one in profiles.items() if not one.measured]
@@ -92,8 +89,7 @@ def detect(
     write: bool = False,
     seconds: float = LISTEN_S,
 ) -> Iterator[PortFinding]:
-    """The skins on the ports. profiles: with the changes of the settings. write: also ask, and send
-    start commands."""
+    """The skins on the ports. write: also ask, and send start commands."""
     for port in ports:
         try:
             yield from _on_port(port, profiles, open_port, clock, write, seconds)
@@ -127,23 +123,19 @@ def _on_port(
     ):
         these = {name: p for name, p in others.items() if p.baud == baud}
         for starter in [None, *(n for n in these if write and these[n].start)]:
-            heard[baud] = listen(
-                port.path, baud, these[starter] if starter else None, open_port, clock, seconds
-            )
-            fitting = [n for n in these if fits(these[n], heard[baud])]
-            if fitting:
-                yield PortFinding(
-                    port, fitting[0], known + _settings(port, fitting, these, heard[baud])
-                )
+            by = these[starter] if starter else None
+            heard[baud] = listen(port.path, baud, by, open_port, clock, seconds)
+            if fitting := [n for n in these if fits(these[n], heard[baud])]:
+                found = _settings(port, fitting, these, heard[baud])
+                yield PortFinding(port, fitting[0], known + found)
                 return
     for name, p in others.items():
         if taxels := other_grid(p, heard[p.baud]):
             yield PortFinding(port, name, known + _another_grid(port, name, taxels))
             return
     if write and (who := _asked(port.path, open_port, clock)):
-        yield PortFinding(
-            port, DEFAULT, f'{known}{who}; set skin.link = "serial", skin.port = "{port.path}"'
-        )
+        told = f'{known}{who}; set skin.link = "serial", skin.port = "{port.path}"'
+        yield PortFinding(port, DEFAULT, told)
         return
     proposal = next(filter(None, map(_proposed, heard.items())), "")
     most = max(len(one.data) for one in heard.values())
@@ -158,8 +150,7 @@ def listen(
     clock: Clock,
     seconds: float,
 ) -> HeardBytes:
-    """The bytes of a port at this speed. starter: the profile whose start and stop commands are
-    written. Raises SensorError."""
+    """The bytes of a port. starter: its start and stop are written. Raises SensorError."""
     port = open_port(path, baud)
     reads: list[tuple[bytes, int]] = []
     try:
@@ -198,8 +189,7 @@ def fits(profile: SkinProfile, heard: HeardBytes) -> bool:
 
 
 def measured_hz(profile: SkinProfile, heard: HeardBytes) -> float:
-    """Frames per second, by the arrivals of the first and the last frame; 0 for fewer than two
-    frames."""
+    """Frames per second by their arrivals; 0 for fewer than two."""
     codec, rest, seen = skin_codecs.codec(profile), Rest(), []
     for data, t_ns in heard.reads:
         found = codec(rest, data)
@@ -214,7 +204,6 @@ def measured_hz(profile: SkinProfile, heard: HeardBytes) -> float:
 def _settings(
     port: PortInfo, fitting: list[str], profiles: Mapping[str, SkinProfile], heard: HeardBytes
 ) -> str:
-    """The measurements, and the settings."""
     profile = profiles[fitting[0]]
     hz = measured_hz(profile, heard)
     sets = [f'skin.profile = "{fitting[0]}"', f'skin.port = "{port.path}"']
@@ -270,8 +259,7 @@ def _nothing(heard: int, profiles: Mapping[str, SkinProfile], write: bool, propo
 
 
 def other_grid(profile: SkinProfile, heard: HeardBytes) -> int:
-    """Taxels of a frame, by the distance between the marks of a profile; 0 if it is not
-    constant."""
+    """Taxels of a frame, by the distance between marks; 0 if it is not constant."""
     mark, data = profile.trailer + profile.marker, heard.data
     places = [at for at in range(len(data)) if mark and data.startswith(mark, at)]
     steps = Counter(later - at for at, later in pairwise(places))
@@ -279,17 +267,13 @@ def other_grid(profile: SkinProfile, heard: HeardBytes) -> int:
         return 0
     step, times = steps.most_common(1)[0]
     each = wire_numbers.size(profile.number) * profile.values
-    whole = (
-        times >= FEWEST
-        and times * step >= FITS * (len(data) - 2 * step)
-        and (step - len(mark)) % each == 0
-    )
+    found, most = times * step, len(data) - 2 * step
+    whole = times >= FEWEST and found >= FITS * most and (step - len(mark)) % each == 0
     return (step - len(mark)) // each if whole else 0
 
 
 def on_usb(config: SkinConfig) -> list[str]:
-    """A line for each board of PROTOCOL.md on USB with the configured ids. The boards are not
-    opened."""
+    """A line for each board of PROTOCOL.md on USB; none is opened."""
     import usb.core
 
     try:

@@ -5,14 +5,17 @@ No bundle is needed: the format is the skin's own, and the faults are visible in
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.alignment.live import VIEW_NS
+from palpate.core.clock import Clock
 from palpate.core.types import Frames, SweepFormat
+from palpate.io.sensor import Sensor
 
 SPAN_S = 2.0
 """Length of the signal for rate and noise."""
@@ -60,16 +63,13 @@ class LiveView:
     unit: str = ""
 
     def json(self) -> dict[str, Any]:
-        """The View as JSON for the page."""
         return asdict(self)
 
 
 class SkinDisplay(Protocol):
     """Shows one LiveView after another."""
 
-    def show(self, view: LiveView) -> None:
-        """Show a view; it replaces the previous view."""
-        ...
+    def show(self, view: LiveView) -> None: ...
 
 
 def line(view: LiveView) -> str:
@@ -77,10 +77,9 @@ def line(view: LiveView) -> str:
     rate = "" if view.rate_hz is None else f"{view.rate_hz:.1f} Hz, "
     lost = "loss cannot be known" if view.lost is None else f"{view.lost:,} lost"
     noise = sorted(value for axis in view.noise for row in axis for value in row)
-    unit = view.unit or "raw counts"
-    middle = (
-        f", noise {noise[len(noise) // 2]:.2g}, at most {noise[-1]:.2g} {unit}" if noise else ""
-    )
+    unit, middle = view.unit or "raw counts", ""
+    if noise:
+        middle = f", noise {noise[len(noise) // 2]:.2g}, at most {noise[-1]:.2g} {unit}"
     kinds = (("stuck", view.stuck), ("dead", view.dead), ("saturated", view.saturated))
     faults = "".join(f"; {name}: {_named(taxels)}" for name, taxels in kinds if taxels)
     text = view.trouble or f"{rate}{view.frames:,} frames, {lost}{middle}{faults}"
@@ -90,6 +89,38 @@ def line(view: LiveView) -> str:
 def _named(taxels: Sequence[str]) -> str:
     more = f" and {len(taxels) - MOST_NAMED} more" if len(taxels) > MOST_NAMED else ""
     return ", ".join(taxels[:MOST_NAMED]) + more
+
+
+def run(
+    sensor: Sensor,
+    format: SweepFormat,
+    names: tuple[str, str, str],
+    clock: Clock,
+    displays: Iterable[SkinDisplay],
+    stopped: Callable[[], bool],
+) -> None:
+    """Show the frames of `sensor` on `displays`, five times a second, until `stopped()`. names: of
+    the skin's profile, of the source in sentences, of the unit."""
+    shown_on, monitor, number = tuple(displays), SkinMonitor(format), 0
+    enumerations, next_ns = sensor.counters.enumerations, clock.now_ns()
+    name, source, unit = names
+    shape = format.rows, format.cols, format.axes
+    while not stopped():
+        frames = sensor.read()
+        if sensor.counters.enumerations != enumerations:
+            enumerations = sensor.counters.enumerations
+            monitor.reset()
+        monitor.put(frames)
+        if (now := clock.now_ns()) >= next_ns:
+            next_ns, number = now + VIEW_NS, number + 1
+            what = number, source, f"{name} {format}", sensor.state, str(sensor.trouble or "")
+            counted = sensor.counters.frames
+            lost = sensor.counters.lost_frames if sensor.loss_known else None
+            view = LiveView(
+                *what, shape, frames=counted, lost=lost, unit=unit, **monitor.measured()
+            )
+            for display in shown_on:
+                display.show(view)
 
 
 class SkinMonitor:
@@ -102,14 +133,11 @@ class SkinMonitor:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything: this may be another skin."""
         self._t_ns, self._taxels = np.empty(0, np.int64), np.empty((0, *self._grid))
         self._lowest, self._highest = np.full(self._grid, np.inf), np.full(self._grid, -np.inf)
-        self._changed_ns = np.zeros(self._grid, np.int64)
-        self._full = 1.0
+        self._changed_ns, self._full = np.zeros(self._grid, np.int64), 1.0
 
     def put(self, frames: Frames) -> None:
-        """Take the newest frames."""
         if not len(frames):
             return
         new = frames.taxels.reshape(len(frames), *self._grid).astype(np.float64)
@@ -120,14 +148,11 @@ class SkinMonitor:
         self._changed_ns[changed] = frames.t_ns[-1]
         self._t_ns = np.concatenate([self._t_ns, frames.t_ns])[-self._span :]
         self._taxels = np.concatenate([self._taxels, new])[-self._span :]
-        self._lowest, self._highest = (
-            np.fmin(self._lowest, new.min(axis=0)),
-            np.fmax(self._highest, new.max(axis=0)),
-        )
+        self._lowest = np.fmin(self._lowest, new.min(axis=0))
+        self._highest = np.fmax(self._highest, new.max(axis=0))
 
     def measured(self) -> dict[str, Any]:
-        """The fields of a LiveView that are computed from the signal; none before the second
-        frame."""
+        """The fields of a LiveView from the signal; none before the second frame."""
         if len(self._t_ns) < 2:
             return {}
         level = self._taxels[-self._shown :].mean(axis=0)
@@ -156,21 +181,17 @@ class SkinMonitor:
         return np.asarray(still & ~still.all())
 
     def _dead(self, noise: NDArray[np.float64]) -> NDArray[np.bool_]:
-        moved = self._highest - self._lowest
-        touched = np.median(moved, axis=(0, 1)) > MOVED * np.maximum(
-            1e-12, np.median(noise, axis=(0, 1))
-        )
-        return np.asarray(touched & (moved < DEAD * np.median(moved, axis=(0, 1))))
+        moved, middle = self._highest - self._lowest, (0, 1)
+        least = MOVED * np.maximum(1e-12, np.median(noise, axis=middle))
+        usual = np.median(moved, axis=middle)
+        return np.asarray((usual > least) & (moved < DEAD * usual))
 
     def _saturated(self) -> NDArray[np.bool_]:
-        """Taxels at the end of their type's range in the newest frame; none for floating-point
-        counts."""
-        newest = self._taxels[-1]
-        if self._limits is None:
+        """Taxels at the end of their type's range in the newest frame."""
+        newest, limits = self._taxels[-1], self._limits
+        if limits is None:
             return np.zeros(self._grid, bool)
-        return np.asarray(
-            (newest >= self._limits.max) | ((newest <= self._limits.min) & (self._limits.min < 0))
-        )
+        return np.asarray((newest >= limits.max) | ((newest <= limits.min) & (limits.min < 0)))
 
     def _names(self, which: NDArray[np.bool_]) -> tuple[str, ...]:
         """Names of taxels, counted from 1: "2.3", or "2.3 axis 1" with several axes."""

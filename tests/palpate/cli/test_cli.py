@@ -484,7 +484,7 @@ FORM = ["record", "--format"]
         ([*RECORD, "--skin", "anyskin"], ConfigError, "anyskin"),
         (["record", "--sim", "skin", "--format", "2x2:uint8:10"], FormatError, "2x2 uint8"),
         (["run", "--trigger", "serial"], ConfigError, "serial.port"),
-        (["run", "--trigger", "key"], ConfigError, "not a terminal"),
+        (["run", "--trigger", "key"], ConfigError, "needs a terminal"),
         (["run", "--trigger", "key", "--every", "3"], ConfigError, "--trigger timed"),
         (["run", "--every", "3"], ConfigError, "every 3 s"),
         (["run", "--sim", "skin", "--virtual", "--capture", "/proc/x"], ConfigError, "/proc/x"),

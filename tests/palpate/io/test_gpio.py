@@ -484,7 +484,7 @@ def test_lines_are_found(
         (NAMELESS, ["gpiochip0:3"], "no line 3; use 0 to 2"),
         (NAMELESS, ["A", "gpiochip0:2"], "A and gpiochip0:2"),
         (NAMELESS, [""], "''"),
-        ({CHIP0: ("", "")}, ["START"], "no line has a name"),
+        ({CHIP0: ("", "")}, ["START"], "gpiochip0:17"),
         ({CHIP0: ("", "ID_SDA", "GPIO17")}, ["GPIO71"], r"GPIO71.*GPIO17"),
         ({CHIP0: ("PA0", "PA1", "PA2", "PA3")}, ["START"], "nearest: PA0"),
         ({CHIP0: ("A",), CHIP1: ("", "A")}, ["A"], r"0 line 0 and .*1 line 1"),

@@ -108,7 +108,7 @@ def test_a_bad_speed_or_force_starts_nothing(text: str, message: str):
     assert trigger.edges(20) == []
     line = sentence("ANS", "START", "error", refused.value)
     assert len(line) <= MAX_LINE
-    assert b"or leave it empty*" in line or b"force in N*" in line
+    assert b"or leave it empty*" in line or b"and a force*" in line
 
 
 def test_a_robot_sweeps_over_its_serial_line(rigged: Callable[..., Rigged]):
@@ -294,7 +294,7 @@ def test_sweeps_by_the_clock_are_answered(rigged: Callable[..., Rigged]):
         (("trigger.mode=timed", "trigger.sweep_s=1"), "window of 2 s"),
         (("trigger.mode=timed", "trigger.sweep_s=6"), "leaves no pause"),
         (("trigger.mode=timed", "trigger.sweep_s=3", "trigger.every_s=3"), "leaves no pause"),
-        (("trigger.mode=key",), "is not a terminal"),
+        (("trigger.mode=key",), "needs a terminal"),
     ],
 )
 def test_a_box_that_could_not_sweep_does_not_start(
@@ -304,7 +304,7 @@ def test_a_box_that_could_not_sweep_does_not_start(
     monkeypatch.setattr("sys.stdin", None)
     with pytest.raises(ConfigError, match=hint):
         rigged(sets=sets)
-    with open("/dev/null") as null, pytest.raises(ConfigError, match="is not a terminal"):
+    with open("/dev/null") as null, pytest.raises(ConfigError, match="needs a terminal"):
         KeyTrigger(null.fileno(), rig.VirtualClock(), lambda line: None)
 
 

@@ -217,7 +217,7 @@ def test_others_are_kept_out_and_dtr_stays(line: tuple[int, str], monkeypatch: p
         (errno.EBUSY, SensorBusy, "fuser"),
         (errno.EACCES, SensorDenied, "group dialout"),
         (errno.ENOENT, SensorAbsent, "skin.port"),
-        (errno.EIO, SensorLost, "baud rate"),
+        (errno.EIO, SensorLost, "baud"),
     ],
 )
 def test_a_port_that_cannot_be_opened(code: int, kind: type[SensorError], hint: str):

@@ -194,8 +194,8 @@ def test_early_answers_end_with_an_enrolment(tmp_path: Path):
 @pytest.mark.parametrize(
     ("at", "hints"),
     [
-        ([(1, 0)] * 3, ["close to 'a': squared distance 0.3, limit 9.0"]),
-        ([(6, 2.9)] * 100, ["close to 'b': squared distance 8.4"]),
+        ([(1, 0)] * 3, ["close to 'a' (squared distance 0.3, limit 9.0"]),
+        ([(6, 2.9)] * 100, ["close to 'b' (squared distance 8.4"]),
         ([(6, 3.1)] * 100, []),
         ([(20, 20), (20, 24.2)], []),  # 4.2^2 / 2 = 8.8
         ([(20, 20), (20, 24.3)], ["disagree: they lie 9.2 from their mean"]),

@@ -169,7 +169,7 @@ def test_nothing_new_leaves_the_bundle_in_service(box: TaughtDelivery, capsys: A
     before = box.running.sha
     code, news = box.teach(capsys, "--use")
     assert code == 1
-    assert "gets no new material; record one that it does not have yet" in news["text"]
+    assert "gets no new material; record one that it does not have" in news["text"]
     assert news["text"].endswith("the bundle in service stays")
     code, news = box.teach(capsys)
     assert code == 1
@@ -285,7 +285,7 @@ def test_a_trained_material_is_refused_before_a_sweep(box: TaughtDelivery, capsy
     words = [*box.words, "--label", "foam", "--sim", "skin", "--virtual"]
     recorded = sorted((box.store / "sweeps").iterdir())
     assert main(["teach", *words]) == ConfigError.exit_code
-    assert "was trained on 'foam'; record more of it for the desktop" in capsys.readouterr().err
+    assert "was trained on 'foam'; record it for the desktop" in capsys.readouterr().err
     assert sorted((box.store / "sweeps").iterdir()) == recorded
     settings = replace(box.settings, trigger=replace(box.settings.trigger, mode="serial"))
     format, page = box.running.bundle.format, (Observer(),)

@@ -174,7 +174,7 @@ def test_a_restart_keeps_the_capture_before(tmp_path: Path, path: Path, logged: 
     assert logged[-1].endswith("capture.2")
     for i in range(3, MOST_KEPT + 1):
         (tmp_path / f"capture.{i}").touch()
-    with pytest.raises(ConfigError, match="99 captures"):
+    with pytest.raises(ConfigError, match="99 older"):
         CaptureWriter(path, skin.FORMAT)
     assert path.stat().st_size == sizes[-1]
 

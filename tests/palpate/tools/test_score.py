@@ -10,7 +10,7 @@ from palpate.client.answers import Answer
 from palpate.core.types import Status, Verdict
 from palpate.io.robot_link import result
 from palpate.sim.rig import Act
-from palpate.tools.score import AnswerScore
+from palpate.tools.demo import AnswerScore
 
 
 def answer(number: int, label: str, status: Status = Status.OK, share: float = 1.0) -> Answer:

@@ -50,7 +50,6 @@ class FixedLayout:
 
     @property
     def body(self) -> slice:
-        """The bytes of the numbers."""
         return slice(self.numbers, self.numbers + self.profile.body)
 
 
@@ -79,8 +78,7 @@ def layout(p: SkinProfile) -> FixedLayout:
 
 
 def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
-    """Read frames: the bytes between two marks that are exactly one period apart, once the
-    beginning of frames is known."""
+    """Read frames: the bytes between two marks that are exactly one period apart."""
     plan = layout(profile)
     data, synced = rest.data + new, rest.synced
     at = garbage = before = 0
@@ -117,8 +115,7 @@ def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
 
 
 def _checked(layout: FixedLayout, table: NDArray[np.uint8], found: Decoded) -> Decoded:
-    """The frames whose checksum is right; the others are garbage. table: all frames as bytes [n,
-    period]."""
+    """The frames whose checksum is right. table: all frames as bytes [n, period]."""
     assert layout.checksum
     right = np.array(
         [
@@ -161,8 +158,7 @@ def _columns(
 
 
 def _run(layout: FixedLayout, data: bytes, at: int) -> tuple[int, bool]:
-    """How many frames follow the mark at `at`, and whether the next frame is broken (False: it is
-    not complete yet)."""
+    """How many frames follow the mark at `at`, and whether the next is broken."""
     mark, period = layout.mark, layout.period
     n = 0
     while (end := at + (n + 1) * period) + len(mark) <= len(data):

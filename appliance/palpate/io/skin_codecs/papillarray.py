@@ -1,5 +1,4 @@
-"""Packets of Contactile's PapillArray (PTS 2.0), with frame count, clock and a sum of their
-bytes."""
+"""Packets of Contactile's PapillArray (PTS 2.0), with frame count, clock and sum."""
 
 from __future__ import annotations
 
@@ -46,8 +45,7 @@ class PtsLayout:
 
 
 def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
-    """Packets between head and tail with a sum of their bytes. A tail may also occur inside, where
-    the sum does not fit."""
+    """Packets between head and tail with a sum of their bytes; a tail may occur inside."""
     data = rest.data + new
     spans, kept = _packets(data)
     size = 4 * profile.rows * profile.cols * profile.values
@@ -96,8 +94,7 @@ def _packets(data: bytes) -> tuple[list[Span], int]:
 
 
 def _end(data: bytes, begin: int) -> int:
-    """The end of the packet whose content begins at `begin`; 0 if more bytes are needed, -1 if this
-    is not a packet."""
+    """The end of the packet whose content begins at `begin`; 0: too few bytes, -1: none."""
     tail = begin
     while (tail := data.find(_TAIL, tail)) >= 0 and tail - begin <= MOST_PACKET:
         if (

@@ -99,8 +99,7 @@ def split(line: bytes, decimal: str = ".") -> tuple[list[bytes], str]:
 
 
 def closes(line: bytes) -> bool:
-    """Whether a list of lists that began on an earlier line ends with this line, as arrays are
-    printed."""
+    """Whether a list of lists ends with this line, as arrays are printed."""
     return line.rstrip().endswith(b"]]") and not line.lstrip().startswith(b"[[")
 
 
@@ -110,7 +109,7 @@ def _stands_between(line: bytes) -> bool:
 
 
 def _numbers(profile: SkinProfile, line: bytes, most: int) -> tuple[NDArray[Any] | None, str]:
-    """The numbers of a line, and what is wrong with it; None if it contains anything else, or a
+    """The numbers of a line, and its fault; None if it contains anything else, or a
     number outside the range of its type. A line with more than `most` is cut after most + 1."""
     skip = profile.skip_columns
     words = line.translate(_BETWEEN[profile.decimal]).split()
