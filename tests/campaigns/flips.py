@@ -19,7 +19,8 @@ import random
 import shutil
 import tempfile
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -51,16 +52,11 @@ def flipped(files: Files, name: str, bit: int) -> Files:
 
 def flips(files: Files, name: str, count: int | None, seed: int) -> Iterator[Case]:
     """The files with each bit of one file flipped (None), or with each of `count` random bits."""
-    bits = range(8 * len(files[name]))
-    chosen = (
-        bits
-        if count is None
-        else sorted(random.Random(f"{seed} {name}").sample(bits, min(count, len(bits))))
-    )
-    return (
-        (FLIPPED.replace(bundle.MANIFEST, name), f"bit {bit}", flipped(files, name, bit))
-        for bit in chosen
-    )
+    bits: Sequence[int] = range(8 * len(files[name]))
+    if count is not None:
+        bits = sorted(random.Random(f"{seed} {name}").sample(bits, min(count, len(bits))))
+    kind = FLIPPED.replace(bundle.MANIFEST, name)
+    return ((kind, f"bit {bit}", flipped(files, name, bit)) for bit in bits)
 
 
 def swaps(one: Files, other: Files) -> Iterator[Case]:
@@ -70,11 +66,13 @@ def swaps(one: Files, other: Files) -> Iterator[Case]:
     for i, name in enumerate(names):
         yield "a file swapped", name, one | {name: other[name]}
         for second in names[i + 1 :]:
-            yield (
-                "two files swapped",
-                f"{name}, {second}",
-                one | {n: other[n] for n in (name, second)},
-            )
+            swapped = one | {n: other[n] for n in (name, second)}
+            yield "two files swapped", f"{name}, {second}", swapped
+
+
+def without(files: Files, name: str) -> Files:
+    """The files but this one."""
+    return {n: data for n, data in files.items() if n != name}
 
 
 def another(key: Path) -> Files:
@@ -99,42 +97,27 @@ def enrolled(box: Delivery, bits: int | None, seed: int) -> Iterator[Case]:
         for made in (deliveries.files(3, box.key), another(box.key))
     )
     parts = (bundle.ENROLMENT, bundle.ENROLMENT_SIGNATURE)
-    yield (
-        "not signed",
-        "",
-        {name: data for name, data in one.items() if name != bundle.ENROLMENT_SIGNATURE},
-    )
-    yield (
-        "a base not signed",
-        "",
-        {name: data for name, data in one.items() if name != bundle.SIGNATURE},
-    )
-    foreign = install_scripts.enrolment_key(box.folder / "foreign")
+    yield "not signed", "", without(one, bundle.ENROLMENT_SIGNATURE)
+    yield "a base not signed", "", without(one, bundle.SIGNATURE)
+    foreign, own = install_scripts.enrolment_key(box.folder / "foreign"), one[bundle.ENROLMENT]
+    box_key = box.enrolment_key.folder / KEY
     for who, signed in (
-        ("another box", foreign.sign(one[bundle.ENROLMENT])),
-        ("a signer", signature.sign(one[bundle.ENROLMENT], box.key)),
-        (
-            "the box, for bundles",
-            signature.sign(one[bundle.ENROLMENT], box.enrolment_key.folder / KEY),
-        ),
+        ("another box", foreign.sign(own)),
+        ("a signer", signature.sign(own, box.key)),
+        ("the box, for bundles", signature.sign(own, box_key)),
     ):
         yield "wrongly signed", who, one | {bundle.ENROLMENT_SIGNATURE: signed}
     for version in (1, 0):
-        yield (
-            "older",
-            str(version),
-            deliveries.enrolled(deliveries.files(version, box.key), box.enrolment_key),
-        )
-    by_box = deliveries.signed(
-        deliveries.files(3, None, name="by the box"), box.enrolment_key.folder / KEY
-    )
+        base = deliveries.files(version, box.key)
+        yield "older", str(version), deliveries.enrolled(base, box.enrolment_key)
+    by_box = deliveries.signed(deliveries.files(3, None, name="by the box"), box_key)
     yield "a base signed by the box", "", deliveries.enrolled(by_box, box.enrolment_key)
     yield "labels of another bundle", "", one | {name: other[name] for name in parts}
     for name in sorted(one.keys() - set(parts)):
         yield "a file swapped", name, one | {name: other[name]}
-    for cut in (0, 1, len(one[bundle.ENROLMENT]) // 2, len(one[bundle.ENROLMENT]) - 1):
-        yield "a file cut", str(cut), one | {bundle.ENROLMENT: one[bundle.ENROLMENT][:cut]}
-    yield "a file longer", "", one | {bundle.ENROLMENT: one[bundle.ENROLMENT] + b"\0"}
+    for cut in (0, 1, len(own) // 2, len(own) - 1):
+        yield "a file cut", str(cut), one | {bundle.ENROLMENT: own[:cut]}
+    yield "a file longer", "", one | {bundle.ENROLMENT: own + b"\0"}
     for name in sorted(one.keys() - {bundle.SIGNATURE, bundle.ENROLMENT_SIGNATURE}):
         yield from flips(one, name, FLIPS if bits is None else 10, seed)
 
@@ -142,17 +125,14 @@ def enrolled(box: Delivery, bits: int | None, seed: int) -> Iterator[Case]:
 def others(files: Files, box: Delivery) -> Iterator[Case]:
     """Unsigned, wrongly signed, cut, older."""
     text = files[bundle.MANIFEST]
-    yield "not signed", "", {name: data for name, data in files.items() if name != bundle.SIGNATURE}
+    yield "not signed", "", without(files, bundle.SIGNATURE)
     unknown = deliveries.key(box.folder / "unknown")
     yield "signed by an unknown key", "", files | {bundle.SIGNATURE: signature.sign(text, unknown)}
     for space in ("file", "git", "palpate", "palpate-bundle2", " "):
-        yield (
-            "signed for another use",
-            space,
-            files | {bundle.SIGNATURE: signature.sign(text, box.key, space)},
-        )
+        signed = signature.sign(text, box.key, space)
+        yield "signed for another use", space, files | {bundle.SIGNATURE: signed}
     for name, data in sorted(files.items()):
-        yield "a file missing", name, {n: d for n, d in files.items() if n != name}
+        yield "a file missing", name, without(files, name)
         for kept in (0, 1, len(data) // 2, len(data) - 1)[: 4 - (name == bundle.SIGNATURE)]:
             yield "a file cut", f"{name} at {kept}", files | {name: data[:kept]}
         if name != bundle.SIGNATURE:
@@ -173,10 +153,8 @@ def cases(box: Delivery, manifest_bits: int | None, seed: int) -> Iterator[Case]
     yield from flips(good, bundle.MANIFEST, manifest_bits, seed)
     for name in sorted(good.keys() - {bundle.MANIFEST, bundle.SIGNATURE}):
         yield from flips(good, name, FLIPS if manifest_bits is None else 10, seed)
-    yield from (
-        (f"{ENROLLED}{kind}", which, files)
-        for kind, which, files in enrolled(box, manifest_bits, seed)
-    )
+    for kind, which, files in enrolled(box, manifest_bits, seed):
+        yield f"{ENROLLED}{kind}", which, files
 
 
 def tried(box: Delivery, case: Case) -> str:
@@ -193,12 +171,10 @@ def tried(box: Delivery, case: Case) -> str:
 
 def believed(box: Delivery, files: Files) -> bool:
     """Whether the signature alone fits the manifest."""
-    try:
-        return bool(
-            signature.verify(files[bundle.MANIFEST], files[bundle.SIGNATURE], box.how.signers)
-        )
-    except BundleError:
-        return False
+    with suppress(BundleError):
+        verify, signed = signature.verify, files[bundle.SIGNATURE]
+        return bool(verify(files[bundle.MANIFEST], signed, box.how.signers))
+    return False
 
 
 def campaign(
@@ -227,13 +203,10 @@ def campaign(
         count["changed"] += box.store.current != current
         if every and n % every == 0:
             print(f"{n}: {case[0]}, {case[1]}", flush=True)
-    for n, good in enumerate(
-        (deliveries.files(3, box.key), another(box.key))
-    ):  # otherwise the campaign would prove nothing
-        box.store.install(
-            deliveries.put(folder / f"good{n}", deliveries.enrolled(good, box.enrolment_key))
-        )
-        box.store.install(deliveries.put(folder / f"plain{n}", good))
+    for good in (deliveries.files(3, box.key), another(box.key)):
+        # otherwise the campaign would prove nothing
+        box.store.install(box.copied(deliveries.enrolled(good, box.enrolment_key)))
+        box.store.install(box.copied(good))
     return {kind: dict(count) for kind, count in counts.items()}
 
 
@@ -255,15 +228,9 @@ def main() -> int:
         name: sum(count[name] for count in found.values())
         for name in ("tried", "accepted", "believed", "changed")
     }
-    result = {
-        "total": total,
-        "kinds": found,
-        "seed": args.seed,
-        "commit": commit(),
-        "machine": platform.machine(),
-    }
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    put(args.out, (json.dumps(result, indent=1) + "\n").encode())
+    result = {"total": total, "kinds": found, "seed": args.seed, "commit": commit()}
+    result["machine"] = platform.machine()
+    put(args.out, (json.dumps(result, indent=1) + "\n").encode(), parents=True)
     print("\n".join(f"{kind}: {count}" for kind, count in [*found.items(), ("total", total)]))
     return int(total["accepted"] + total["believed"] + total["changed"] > 0)
 

@@ -87,13 +87,8 @@ def tried(model: bytes, own: Own, rng: Random) -> dict[str, Any]:
     if short and outcome != "trial refused":  # the trial has less memory than the box
         outcome = "no memory"
     more = (memory("VmHWM") - before) / 1024
-    return {
-        "outcome": outcome,
-        "why": why[:200],
-        "check_ms": 1e3 * checked_s,
-        "mb": more,
-        "s": took,
-    }
+    about = {"outcome": outcome, "why": why[:200]}
+    return about | {"check_ms": 1e3 * checked_s, "mb": more, "s": took}
 
 
 def trial(model: bytes) -> None:
@@ -116,9 +111,8 @@ def checked(model: bytes, own: Own) -> Bundle | None:
     """The box's first check of it; the bundle of an enrolment. Raises BundleError if it is
     refused."""
     if own is ENROLLING:
-        return bundle.from_files(
-            mutated_enrolments.packaged() | {bundle.ENROLMENT: model}, "a campaign"
-        )
+        files = mutated_enrolments.packaged() | {bundle.ENROLMENT: model}
+        return bundle.from_files(files, "a campaign")
     check.check(model, own.manifest)
     return None
 
@@ -141,18 +135,10 @@ def classify(classifier: Classifier, rng: Random) -> None:
     """Classify these sweeps, and the golden sweeps, which have contact and so reach the class
     means."""
     f = classifier.format
-    noise = (
-        np.random.default_rng(rng.getrandbits(32))
-        .integers(0, 255, (f.window, *f.shape))
-        .astype(f.numpy_type)
-    )
-    number = np.arange(f.window)
-    for window in (
-        np.zeros_like(noise),
-        np.full_like(noise, 255),
-        noise,
-        *classifier.bundle.golden,
-    ):
+    noise = np.random.default_rng(rng.getrandbits(32)).integers(0, 255, (f.window, *f.shape))
+    noise, number = noise.astype(f.numpy_type), np.arange(f.window)
+    ends = np.zeros_like(noise), np.full_like(noise, 255)
+    for window in (*ends, noise, *classifier.bundle.golden):
         verdict = classifier(Sweep(1, 0, 0, Status.OK, Frames(number, number, window)))
         if verdict.label and not 0 <= verdict.probability <= 1:
             raise FloatingPointError(f"{verdict.label!r} with probability {verdict.probability}")
@@ -205,14 +191,8 @@ class Fuzz:
                     code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
                     pid = 0
                     outcome = f"died ({code})" if there else "hung"
-                    yield {
-                        "number": at,
-                        "outcome": outcome,
-                        "why": "",
-                        "check_ms": 0,
-                        "mb": 0,
-                        "s": DEADLINE_S,
-                    }
+                    found = {"number": at, "outcome": outcome, "why": ""}
+                    yield found | {"check_ms": 0, "mb": 0, "s": DEADLINE_S}
                     return
                 *lines, rest = (rest + more).split(b"\n")
                 for line in lines:
@@ -242,15 +222,8 @@ class Fuzz:
 
 def fresh(seed: int) -> dict[str, Any]:
     """The record of a campaign that has not begun."""
-    return provenance() | {
-        "seed": seed,
-        "done": 0,
-        "outcomes": {},
-        "finds": [],
-        "slowest_check_ms": 0.0,
-        "slowest_s": 0.0,
-        "most_mb": 0.0,
-    }
+    most = {"slowest_check_ms": 0.0, "slowest_s": 0.0, "most_mb": 0.0}
+    return provenance() | {"seed": seed, "done": 0, "outcomes": {}, "finds": []} | most
 
 
 def note(record: dict[str, Any], result: dict[str, Any]) -> None:
@@ -279,11 +252,8 @@ def main() -> int:
         note(record, result)
         if record["done"] % BATCH == 0 or record["done"] == args.count:
             storage.put(args.out, (json.dumps(record, indent=1) + "\n").encode())
-            print(
-                f"{record['done']} of {args.count}: {record['outcomes']}, "
-                f"finds {len(record['finds'])}",
-                flush=True,
-            )
+            finds = len(record["finds"])
+            print(f"{record['done']}: {record['outcomes']}, finds {finds}", flush=True)
     return 1 if record["finds"] else 0
 
 
