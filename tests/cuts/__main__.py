@@ -102,15 +102,11 @@ def figures(points: Iterable[CrashPoint]) -> Iterator[str]:
     for name in sorted(steps, key="all".__eq__):
         reported = []
         for how in HOWS:
-            if not (of_it := [point for point in steps[name] if point.how == how]):
-                continue
-            states, wrong = (
-                sum(point.states for point in of_it),
-                sum(bool(point.wrong) for point in of_it),
-            )
-            reported.append(
-                f"{how.replace('_', ' ')} at {len(of_it)} moments, {states} folders, wrong {wrong}"
-            )
+            if of_it := [point for point in steps[name] if point.how == how]:
+                states = sum(point.states for point in of_it)
+                wrong = f"wrong {sum(bool(point.wrong) for point in of_it)}"
+                moments = f"{how.replace('_', ' ')} at {len(of_it)} moments"
+                reported.append(f"{moments}, {states} folders, {wrong}")
         yield f"{name}: {'; '.join(reported)}"
 
 

@@ -80,11 +80,8 @@ def lacking() -> str:
     if not shutil.which("strace"):
         return "strace (apt-get install strace)"
     tried = subprocess.run(["strace", "-o", os.devnull, "true"], capture_output=True, check=False)
-    return (
-        ""
-        if tried.returncode == 0
-        else "permission to trace a process (CAP_SYS_PTRACE, or ptrace_scope 0 or 1)"
-    )
+    may = "permission to trace a process (CAP_SYS_PTRACE, or ptrace_scope 0 or 1)"
+    return may if tried.returncode else ""
 
 
 def run(
@@ -99,23 +96,9 @@ def run(
     env: additions to the environment. Raises NotFollowed, and subprocess.TimeoutExpired.
     """
     how = [f"--inject={at.name}:signal=SIGKILL:when={at.nth}"] if at else ["--seccomp-bpf"]
+    strace = ("strace", "-f", "-y", "-xx", "-s", str(MOST_BYTES), "-e", "signal=none")
     done = subprocess.run(
-        [
-            "strace",
-            "-f",
-            "-y",
-            "-xx",
-            "-s",
-            str(MOST_BYTES),
-            "-e",
-            "signal=none",
-            "-e",
-            f"trace=/^({WATCHED})",
-            *how,
-            "-o",
-            log,
-            *command,
-        ],
+        [*strace, "-e", f"trace=/^({WATCHED})", *how, "-o", log, *command],
         cwd=log.parent,
         env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1", "PYTHONHASHSEED": "0"} | (env or {}),
         stdin=subprocess.DEVNULL,
@@ -124,10 +107,8 @@ def run(
         check=False,
     )
     calls = tuple(_calls(log.read_text("ascii").splitlines(), str(log.parent)))
-    if at and not any(
-        c.result is None and (c.thread, c.name, c.nth) == (at.thread, at.name, at.nth)
-        for c in calls
-    ):
+    killed = [(c.thread, c.name, c.nth) for c in calls if c.result is None]
+    if at and (at.thread, at.name, at.nth) not in killed:
         raise NotFollowed(
             f"was not killed at its {at.name} number {at.nth}: it ended with {done.returncode}"
         )
@@ -137,13 +118,9 @@ def run(
 def output(call: SystemCall) -> str:
     """The bytes that this call writes to standard output or standard error; children do not
     count."""
-    heard = (
-        call.process == 0
-        and call.name in ("write", "writev")
-        and call.descriptor in (1, 2)
-        and call.result
-    )
-    return call.data[: call.result].decode("utf-8", "replace") if heard else ""
+    if call.process or call.name not in ("write", "writev") or call.descriptor not in (1, 2):
+        return ""
+    return call.data[: call.result or 0].decode("utf-8", "replace")
 
 
 def _calls(lines: list[str], folder: str) -> Iterator[SystemCall]:
@@ -167,16 +144,9 @@ def _calls(lines: list[str], folder: str) -> Iterator[SystemCall]:
         if name in BEGINS:
             continue
         paths, data = _arguments(name, words, folder)
-        yield SystemCall(
-            ranks.setdefault(process, len(ranks)),
-            rank,
-            name,
-            counts[thread, name],
-            paths,
-            data,
-            words,
-            None if result == "?" else int(result),
-        )
+        first, nth = ranks.setdefault(process, len(ranks)), counts[thread, name]
+        ended = None if result == "?" else int(result)
+        yield SystemCall(first, rank, name, nth, paths, data, words, ended)
 
 
 def _parsed(line: str) -> tuple[str, str, str, str]:
@@ -218,11 +188,8 @@ def _arguments(name: str, words: str, folder: str) -> tuple[tuple[str, ...], byt
         elif of_data or (name.startswith("symlink") and not data):
             data += _bytes(match[1])
         else:
-            paths.append(
-                os.path.normpath(
-                    os.path.join(base, _bytes(match[1]).decode("utf-8", "surrogateescape"))
-                )
-            )
+            name = _bytes(match[1]).decode("utf-8", "surrogateescape")
+            paths.append(os.path.normpath(os.path.join(base, name)))
             base = folder
     return tuple(paths), data
 

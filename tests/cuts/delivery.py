@@ -76,9 +76,8 @@ class Shop:
         enrolment_key(folder / ENROLMENT)
         for counter, name in enumerate(NAMES[1:], 1):
             shutil.copytree(bundle.DEFAULT, folder / name)
-            manifest = replace(
-                bundle.load(folder / name).manifest, name=name, counter=counter, schema=SCHEMA
-            ).json()
+            held = bundle.load(folder / name).manifest
+            manifest = replace(held, name=name, counter=counter, schema=SCHEMA).json()
             (folder / name / bundle.MANIFEST).write_bytes(manifest)
             (folder / name / bundle.SIGNATURE).write_bytes(signature.sign(manifest, key))
         return cls(folder)
@@ -233,20 +232,15 @@ class Shop:
 
     def _comes_back(self, folder: Path, ids: set[str]) -> list[str]:
         """Faults of the box when it starts twice."""
-        return [
-            wrong
-            for time in ("first", "second")
-            for wrong in self._answers(folder, f"{time} start", ids)
-        ]
+        first = self._answers(folder, "first start", ids)
+        return first + self._answers(folder, "second start", ids)
 
     def _answers(self, folder: Path, when: str, ids: set[str]) -> list[str]:
         code, output = _apart(self.words(folder, *START))
         names = ANSWER.findall(output)
         if code or len(names) != 1 or not set(names) <= ids:
-            return [
-                f"{when}: exit code {code}, answers by {names} instead "
-                f"of {sorted(ids)}: {_end(output)}"
-            ]
+            instead = f"answers by {names} instead of {sorted(ids)}: {_end(output)}"
+            return [f"{when}: exit code {code}, {instead}"]
         return []
 
     def _takes_another(self, folder: Path, last: str) -> list[str]:
@@ -256,15 +250,11 @@ class Shop:
         code, output = _apart(self.words(folder, "bundles", "install", again))
         if code:
             return [f"the next delivery ends with {code}: {_end(output)}"]
+        held = [path.name for path in (folder / STORE / "bundles").iterdir()]
         left = [path.name for path in (folder / STORE).iterdir() if path.suffix == storage.PART]
-        left += [
-            path.name
-            for path in (folder / STORE / "bundles").iterdir()
-            if not SHA.fullmatch(path.name)
-        ]
-        return [f"{name} is left" for name in left] + self._answers(
-            folder, "after the next delivery", {last}
-        )
+        left += [name for name in held if not SHA.fullmatch(name)]
+        wrong = self._answers(folder, "after the next delivery", {last})
+        return [f"{name} is left" for name in left] + wrong
 
 
 def _bare(folder: Path) -> None:

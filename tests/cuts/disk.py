@@ -26,6 +26,8 @@ from pathlib import Path, PurePosixPath
 from tests.cuts.calls import NotFollowed, SystemCall
 from tests.cuts.tree import NOTHING, Tree, digest
 
+HOWS = ("all", "synced", "none", "half", "zeros")
+"""What may be left of the content of a file that is not synced."""
 MOST_STATES = 4096
 """Largest number of states of the names at one moment; a program with more should have synced
 earlier."""
@@ -74,13 +76,8 @@ class Disk:
         self._root = Folder()
         self._open: list[Change] = []
         for name, held in sorted(there.items()):
-            inode = (
-                Folder()
-                if held is None
-                else Link(held)
-                if isinstance(held, str)
-                else File(held, held)
-            )
+            plain = Folder() if held is None else Link(str(held))
+            inode = File(held, held) if isinstance(held, bytes) else plain
             above, last, _ = self._find(str(self._path / name))
             above.names[last] = above.synced[last] = inode
 
@@ -171,13 +168,9 @@ class Disk:
 
         def write() -> None:
             alone = call.name == "pwrite64"
-            at = (
-                int(call.words.rsplit(", ", 1)[1])
-                if alone
-                else len(file.data)
-                if file.at is None
-                else file.at
-            )
+            at = len(file.data) if file.at is None else file.at
+            if alone:
+                at = int(call.words.rsplit(", ", 1)[1])
             file.data = file.data[:at].ljust(at, b"\0") + call.data[:n] + file.data[at + n :]
             if not alone and file.at is not None:
                 file.at = at + n
@@ -186,11 +179,9 @@ class Disk:
 
     def _resized(self, call: SystemCall) -> Callable[[], None] | None:
         file, size = self._at(call.paths[0]), int(call.words.rsplit(", ", 1)[1])
-        return (
-            (lambda: setattr(file, "data", file.data[:size].ljust(size, b"\0")))
-            if isinstance(file, File)
-            else None
-        )
+        if not isinstance(file, File):
+            return None
+        return lambda: setattr(file, "data", file.data[:size].ljust(size, b"\0"))
 
     def _inside(self, path: str) -> bool:
         return PurePosixPath(path).is_relative_to(self._path)
@@ -208,9 +199,8 @@ class Disk:
             there = folder.names.get(name)
             if isinstance(there, Link) and (follow or i < len(way)):
                 rest = (*way, last)[i + 1 :]
-                return self._find(
-                    os.path.normpath(done.joinpath(there.target, *rest)), follow, depth + 1
-                )
+                target = os.path.normpath(done.joinpath(there.target, *rest))
+                return self._find(target, follow, depth + 1)
             if i < len(way):
                 if not isinstance(there, Folder):
                     raise NotFollowed(f"{path} goes through {name}, which is no folder")
@@ -249,9 +239,8 @@ class Disk:
 
     def seen(self) -> Tree:
         """The folder as programs see it."""
-        return {
-            path: _held(inode, "all") for path, inode in _walk(self._root, _overlay(self._open))
-        }
+        there = _walk(self._root, _overlay(self._open))
+        return {path: _held(inode, "all") for path, inode in there}
 
     def left(self) -> Iterator[Tree]:
         """Each folder that may be found if the power fails now, once."""
@@ -265,16 +254,11 @@ class Disk:
                 and inode.data != inode.synced
                 and not self._apart.fullmatch(path)
             ]
-            ways = [
-                dict.fromkeys(map(id, unsure), how)
-                for how in ("all", "synced", "none", "half", "zeros")
-            ]
+            ways = [dict.fromkeys(map(id, unsure), how) for how in HOWS]
             for one in unsure if len(unsure) > 1 else ():
                 ways += [ways[0] | {id(one): "synced"}, ways[1] | {id(one): "all"}]
             for way in ways if unsure else [{}]:
-                found: Tree = {
-                    path: _held(inode, way.get(id(inode), "all")) for path, inode in there
-                }
+                found = {path: _held(inode, way.get(id(inode), "all")) for path, inode in there}
                 if (name := digest(found, self._apart)) not in reported:
                     reported.add(name)
                     yield found
@@ -285,9 +269,8 @@ class Disk:
         sets: list[tuple[int, ...]] = [()]
         for i, change in enumerate(self._open):
             folders = {id(folder) for folder, _, _ in change}
-            before = [
-                j for j in range(i) if any(id(folder) in folders for folder, _, _ in self._open[j])
-            ]
+            shares = [any(id(folder) in folders for folder, _, _ in c) for c in self._open[:i]]
+            before = [j for j, shared in enumerate(shares) if shared]
             sets += [(*there, i) for there in sets if set(before) <= set(there)]
             if len(sets) > MOST_STATES:
                 raise NotFollowed(
@@ -322,9 +305,8 @@ def _walk(
     folder: Folder, over: dict[int, dict[str, Inode | None]], at: str = ""
 ) -> Iterator[tuple[str, Inode]]:
     """Paths and inodes below a folder: its synced names, overridden by `over`."""
-    for name, inode in sorted(
-        {**folder.synced, **over.get(id(folder), {})}.items(), key=lambda entry: entry[0]
-    ):
+    names = folder.synced | over.get(id(folder), {})
+    for name, inode in sorted(names.items(), key=lambda entry: entry[0]):
         if inode is not None:
             yield f"{at}{name}", inode
             if isinstance(inode, Folder):
@@ -338,11 +320,5 @@ def _held(inode: Inode, how: str) -> bytes | str | None:
         case Link():
             return inode.target
     data = inode.data
-    ways = {
-        "all": data,
-        "synced": inode.synced,
-        "none": b"",
-        "half": data[: len(data) // 2],
-        "zeros": bytes(len(data)),
-    }
-    return ways[how]
+    held = (data, inode.synced, b"", data[: len(data) // 2], bytes(len(data)))
+    return held[HOWS.index(how)]

@@ -191,19 +191,13 @@ class ScenePlay:
         steps = step.cut(moment.call, self.runs[moment.step]), replace(step, code=None)
         twice = replace(self.scene, prepare=lambda folder: tree.write(before, folder), steps=steps)
         wrong, states = [], 0
+        output = "".join(BETWEEN + run.output for run in self.runs[: moment.step])
         with stage() as work:
-            play = ScenePlay(
-                twice,
-                Path(work),
-                output="".join(BETWEEN + run.output for run in self.runs[: moment.step]),
-                judged=self.judged,
-            )
+            play = ScenePlay(twice, Path(work), output=output, judged=self.judged)
             for point in (play.power(later) for later in play.moments() if later.step):
                 states += point.states
-                wrong += [
-                    f"{text} (before its {point.call}, when it was started again)"
-                    for text in point.wrong
-                ]
+                again = f"(before its {point.call}, when it was started again)"
+                wrong += [f"{text} {again}" for text in point.wrong]
         return self._point("kill_then_power", moment, states, wrong)
 
     def _run(self, step: SceneStep) -> TracedRun:
@@ -213,12 +207,8 @@ class ScenePlay:
         run = calls.run(step.arguments(self.folder), self.work / "log", step.killed, ENVIRONMENT)
         disk.follow(run.calls)
         if (seen := disk.seen()) != (there := tree.read(self.folder)):
-            differ = sorted(
-                name for name in seen | there if seen.get(name, "") != there.get(name, "")
-            )
-            raise NotFollowed(
-                f"{step.name}: {', '.join(differ)} not as its calls must have left it"
-            )
+            names = sorted(n for n in seen | there if seen.get(n, "") != there.get(n, ""))
+            raise NotFollowed(f"{step.name}: {', '.join(names)} not as its calls must have left it")
         return run
 
     def _restore(self, held: tree.Tree) -> None:
