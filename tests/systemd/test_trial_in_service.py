@@ -49,6 +49,8 @@ RUN = (
 )
 REAL = "ExecStart=\nExecStart=/opt/palpate/bin/palpate run\nRestartSec=100ms\n"
 AS_PALPATE = ("setpriv", "--reuid=palpate", "--regid=palpate", "--init-groups", PALPATE)
+HANG = "WatchdogSec=5\nTimeoutStartSec=20\nTimeoutStopSec=2\n"
+"""On a busy machine a program may hang before it is READY: the start times out then."""
 LEFT = "has failed its trial, and "
 
 
@@ -150,7 +152,7 @@ def test_a_bundle_that_does_its_work_is_committed(
     store.do("rollback")
 
 
-@pytest.mark.parametrize(("does", "more"), [("die", ""), ("hang", "WatchdogSec=5\n")])
+@pytest.mark.parametrize(("does", "more"), [("die", ""), ("hang", HANG)])
 def test_a_bundle_with_which_the_program_dies_or_hangs_is_left(
     machine: Machine, service: Service, store: DeliveredStore, does: str, more: str
 ):
