@@ -71,7 +71,7 @@ def swaps(one: Files, other: Files) -> Iterator[Case]:
 
 
 def without(files: Files, name: str) -> Files:
-    """The files but this one."""
+    """All other files."""
     return {n: data for n, data in files.items() if n != name}
 
 

@@ -92,7 +92,7 @@ def tried(model: bytes, own: Own, rng: Random) -> dict[str, Any]:
 
 
 def trial(model: bytes) -> None:
-    """What the box tries in its sandbox: a sweep, here one at rest. Raises BundleError if it takes
+    """The trial in the sandbox of the box: a sweep, here one at rest. Raises BundleError if it takes
     too long."""
     opened = session(model)
     begin_s = time.process_time()
