@@ -92,8 +92,8 @@ def tried(model: bytes, own: Own, rng: Random) -> dict[str, Any]:
 
 
 def trial(model: bytes) -> None:
-    """The trial in the sandbox of the box: a sweep, here one at rest. Raises BundleError if it takes
-    too long."""
+    """The trial of the box in its sandbox: a sweep, here one at rest. Raises BundleError if it is
+    slow."""
     opened = session(model)
     begin_s = time.process_time()
     (takes,) = opened.get_inputs()
