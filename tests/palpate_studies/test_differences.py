@@ -44,18 +44,6 @@ def test_groups_of_a_mean_err_independently():
     assert mixed == pytest.approx((0.8, 0.8 - 0.2 / 3, 0.8 + 0.2 / 3))
 
 
-def test_an_entry_of_results_is_an_estimate():
-    """An estimate survives the round trip through an entry."""
-    entry = {"mean": 0.8, "low": 0.7, "high": 0.9}
-    assert differences.entry(differences.of(entry | {"n": 3})) == entry
-
-
-def test_of_nothing_there_is_no_mean():
-    """The mean of nothing is an error instead of a number."""
-    with pytest.raises(ZeroDivisionError):
-        differences.mean({})
-
-
 @pytest.mark.parametrize(
     ("gap", "words"),
     [

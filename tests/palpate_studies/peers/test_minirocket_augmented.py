@@ -10,20 +10,8 @@ import pytest
 
 from palpate_studies.peers import minirocket, minirocket_augmented
 from palpate_train.data.sets import Dataset
-from palpate_train.models.recipe.architectures import STAGES
-from palpate_train.models.recipe.augment import COPIES, SLOW, copies, default_augmentation
+from palpate_train.models.recipe.augment import copies
 from tests.factories.sweep_sets import easy
-
-
-def test_copies_are_augmented_as_in_our_own_training():
-    """They are as many, and augmented as for the format. A window that our networks cannot take
-    counts as that of a slow sensor."""
-    assert minirocket_augmented.COPIES == COPIES
-    for window in (64, 1500):
-        assert minirocket_augmented.augmentation(window) == default_augmentation(
-            STAGES.zero_sum(window)
-        )
-    assert minirocket_augmented.augmentation(12) == SLOW
 
 
 @pytest.mark.parametrize("dtype", ["int16", "float32"])

@@ -4,14 +4,12 @@ Sets are written as version 3.0, and LeRobot reads them where it is installed.""
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from palpate.core.errors import FormatError
 from palpate_train.cli.main import main
 from palpate_train.data import lerobot_writer, sets
 from tests.factories import lerobot as environment
@@ -213,13 +211,3 @@ def test_names_and_a_broken_rate_are_written(tmp_path: Path):
         [1.0],
         [18],
     )
-
-
-def test_pyarrow_is_named_where_it_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """What to install, before anything is written."""
-    monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
-    samples = np.zeros((2, 9, 2, 2), np.uint8)
-    made = sets.Dataset(samples, np.array([0, 1]), ("felt", "wood"), 10.0)
-    with pytest.raises(FormatError, match="set is a set of Parquet"):
-        lerobot_writer.write(made, tmp_path / "set")
-    assert list(tmp_path.iterdir()) == []

@@ -64,15 +64,6 @@ def test_hdf5_holds_what_an_npz_holds(tmp_path: Path):
     assert sets.digest(b) == sets.digest(a)
 
 
-@pytest.mark.parametrize("name", ["a.npz", "a.h5", "a.hdf5"])
-def test_every_form_is_read_back(tmp_path: Path, name: str):
-    """load reads a saved file back; the suffix selects the format."""
-    whole = sets.load(hdf5(tmp_path / "whole.h5"))
-    whole.save(tmp_path / name)
-    assert sets.digest(sets.load(str(tmp_path / name))) == sets.digest(whole)
-    assert h5py.is_hdf5(tmp_path / name) == (name != "a.npz")
-
-
 class FullDisk(io.BytesIO):
     """A file of which 2 kB can be written."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -414,14 +413,6 @@ def test_digest_names_the_data_and_nothing_else(tmp_path: Path):
     assert sets.digest(
         replace(s, source="elsewhere", labels=s.labels.astype(np.uint8))
     ) == sets.digest(s)
-
-
-def test_a_set_goes_to_another_process():
-    """Pickled and back, as on a cluster; files are never loaded like this."""
-    s = easy(4)
-    again = pickle.loads(pickle.dumps(s))
-    assert sets.digest(again) == sets.digest(s)
-    assert again.source == s.source
 
 
 def test_labels_may_be_names(tmp_path: Path):

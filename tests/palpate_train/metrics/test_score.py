@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from palpate.answer.objects import softmax
-from palpate_train.metrics.score import Score, accuracy_figure, fuse, interval
+from palpate_train.metrics.score import Score, fuse, interval
 
 
 def test_a_score_counts():
@@ -58,8 +58,3 @@ def test_no_window_can_veto_all_others():
     scores, _ = fuse(np.array([[1e4, 0.0]] + [[0.0, 9.0]] * 5, np.float32), np.zeros(6, int))
     assert np.isfinite(scores).all()
     assert scores.argmax() == 1
-
-
-def test_a_figure_has_wilsons_interval():
-    """55 of 60, the paper's T-HARD: .917 in [.819, .964]."""
-    assert accuracy_figure(55, 60) == {"accuracy": 0.9167, "n": 60, "low": 0.8193, "high": 0.9639}

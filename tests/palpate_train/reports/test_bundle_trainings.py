@@ -102,34 +102,10 @@ def test_the_report_of_a_fit_is_that_of_its_bundle(
     since a fit holds its sweeps."""
     tones(12).save(tmp_path / "t.npz")
     fit, page = tmp_path / "mine.npz", tmp_path / "r.html"
-    assert (
-        main(
-            [
-                "fit",
-                "--set",
-                str(tmp_path / "t.npz"),
-                "--seed",
-                "1",
-                "--steps",
-                "0",
-                "--out",
-                str(fit),
-            ]
-        )
-        == 0
-    )
+    assert main(f"fit --set {tmp_path / 't.npz'} --seed 1 --steps 0 --out {fit}".split()) == 0
     assert f"palpate-train report {fit} --set " in capsys.readouterr().out.splitlines()[-1]
     tones(4, noise=1.5).save(tmp_path / "test.npz")
-    named = [
-        "report",
-        str(fit),
-        "--set",
-        str(tmp_path / "test.npz"),
-        "--out",
-        str(page),
-        "--jobs",
-        "1",
-    ]
+    named = f"report {fit} --set {tmp_path / 'test.npz'} --out {page} --jobs 1".split()
     assert main([*named, "--cache", str(tmp_path / "cache")]) == 0
     text = PageReader(page.read_text()).text
     assert "mine 1: what it answers" in text

@@ -156,18 +156,6 @@ def test_offsets_do_not_flatten_the_lines(monkeypatch: pytest.MonkeyPatch):
     assert all(up - low < 60 for low, up in limits)
 
 
-def test_every_peak_is_in_the_line():
-    """The thinned line keeps the first and the last step, the single peak and the order of time."""
-    counts = np.zeros(5000)
-    counts[[3210, 4321]] = 99, -99
-    time_s, seen = sweep_plot._thinned(np.arange(5000) / 750, counts)
-    assert len(seen) <= 2 * sweep_plot.FINEST
-    assert (seen.max(), seen.min()) == (99, -99)
-    assert time_s[seen.argmax()] == 3210 / 750
-    assert (np.diff(time_s) > 0).all()
-    assert len(sweep_plot._thinned(np.arange(9), counts[:9])[1]) == 9
-
-
 def test_a_tone_stands_at_its_frequency(monkeypatch: pytest.MonkeyPatch):
     """A sine of 100 Hz has its peak there, with its height as a density: amplitude over the root of
     twice the noise width of a bin."""

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 
 from palpate_train.models.recipe.augment import BATCH, Augmentation, augment, copies, texture_scale
-from tests.factories.paths import ROOT
 from tests.factories.sweep_sets import easy
 
 STILL = Augmentation(**{f.name: 0.0 for f in fields(Augmentation)})
@@ -79,20 +76,3 @@ def test_a_seed_gives_the_same_copies_and_each_differs():
     assert not np.array_equal(once[0], once[1])
     assert not np.array_equal(once[0], other[0])
     np.testing.assert_array_equal(sweeps.samples, before)
-
-
-def test_copies_need_no_pytorch():
-    """A fresh process that makes copies has not loaded it."""
-    code = (
-        "import sys, palpate_train.models.recipe.augment; "
-        "print('torch' in sys.modules, 'scipy' in sys.modules)"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=120,
-    )
-    assert done.stdout.split() == ["False", "True"]

@@ -60,23 +60,8 @@ def fitted_by_command(folder: Path, *options: str) -> Fit:
     """The fit of the easy set by `palpate-train fit`, without stages."""
     easy().save(folder / "easy.npz")
     out = folder / "fit.npz"
-    assert (
-        main(
-            [
-                "fit",
-                "--set",
-                str(folder / "easy.npz"),
-                "--seed",
-                "1",
-                "--steps",
-                "0",
-                "--out",
-                str(out),
-                *options,
-            ]
-        )
-        == 0
-    )
+    words = f"fit --set {folder / 'easy.npz'} --seed 1 --steps 0 --out {out}".split()
+    assert main([*words, *options]) == 0
     return Fit.load(out)
 
 
@@ -131,6 +116,9 @@ def test_a_fit_is_read_as_it_was_written(fitted: Fit, tmp_path: Path):
     fitted.save(tmp_path / "fit.npz")
     again = Fit.load(tmp_path / "fit.npz")
     assert again.plan == fitted.plan
+    for mine, of_file in ((fitted.train, again.train), (fitted.held, again.held)):
+        np.testing.assert_array_equal(mine.samples, of_file.samples)
+        np.testing.assert_array_equal(mine.group("recording"), of_file.group("recording"))
     x = easy().samples[:4]
     np.testing.assert_array_equal(run(again.trunk(), x), run(fitted.trunk(), x))
     gone = {

@@ -160,23 +160,6 @@ def test_the_hum_of_the_mains_changes_nothing(
         assert (apart < 5e-3).all() if silent else (apart > 0.5).all()
 
 
-def test_a_fit_that_names_no_mains_is_as_before_it_could():
-    """Its graph is that of 50 Hz in every bit; another frequency changes the waves and nothing
-    else."""
-    usual, fifty, sixty = (
-        graph.trunk_graph(skin.FORMAT, 0.1, {}, shape, prefixes=True)
-        for shape in (BARE, replace(BARE, mains_hz=50.0), replace(BARE, mains_hz=60.0))
-    )
-    assert usual.SerializeToString() == fifty.SerializeToString()
-    assert [node.op_type for node in usual.graph.node] == [
-        node.op_type for node in sixty.graph.node
-    ]
-    pairs = zip(usual.graph.initializer, sixty.graph.initializer, strict=True)
-    assert [list(one.dims) for one, other in pairs if one != other] == [
-        [skin.FORMAT.window // 10, 3]
-    ]
-
-
 def test_later_frames_and_offsets_do_not_matter():
     """Row d depends on the first d + 1 tenths alone, to the bit. Frames left over at the end are
     not used, and a constant load changes nothing."""

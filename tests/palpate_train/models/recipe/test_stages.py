@@ -386,27 +386,6 @@ def test_positions_are_held_out_where_there_are_several():
 
 
 @pytest.mark.slow
-def test_a_fit_survives_its_file(tmp_path: Path, fitted: Fit):
-    """Weights, sweeps and description are read again; another file is refused by name."""
-    fitted.save(tmp_path / "fit.npz")
-    again = Fit.load(tmp_path / "fit.npz")
-    assert (again.scale, again.about, again.train.materials) == (
-        fitted.scale,
-        fitted.about,
-        fitted.train.materials,
-    )
-    for mine, theirs in ((again.train, fitted.train), (again.held, fitted.held)):
-        np.testing.assert_array_equal(mine.samples, theirs.samples)
-        np.testing.assert_array_equal(mine.group("recording"), theirs.group("recording"))
-    for name, value in fitted.weights.items():
-        np.testing.assert_array_equal(again.weights[name], value)
-    assert (again.architecture, again.ranges) == (fitted.architecture, fitted.ranges)
-    easy(4).save(tmp_path / "set.npz")
-    with pytest.raises(FormatError, match=r"^set.npz: not a fit"):
-        Fit.load(tmp_path / "set.npz")
-
-
-@pytest.mark.slow
 def test_a_fit_of_another_form_is_refused(tmp_path: Path, fitted: Fit):
     """Weights that do not fit the architecture in the file are refused, and so is a file of an
     older version."""
