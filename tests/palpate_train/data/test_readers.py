@@ -65,7 +65,7 @@ def test_hdf5_holds_what_an_npz_holds(tmp_path: Path):
 
 
 class FullDisk(io.BytesIO):
-    """A file of which 2 kB can be written."""
+    """A file that takes 2 kB."""
 
     def write(self, data) -> int:
         """As on a full disk."""

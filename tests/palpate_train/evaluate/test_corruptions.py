@@ -1,4 +1,4 @@
-"""Corruptions change only what they say, grow with their severity, and are drawn repeatably."""
+"""Corruptions change one property, grow with their severity, and give the same for a seed."""
 
 from __future__ import annotations
 
@@ -293,7 +293,7 @@ def test_counts_are_digitized_again():
 
 def test_the_grid_is_read_elsewhere():
     """With a shift by one row, each row has the values of its neighbour, and the last row mirrors;
-    the gains are new ones."""
+    the gains differ."""
     trial = EvaluationSweeps(small("float32", (3, 50, 4, 2)))
     was = trial.sweeps.samples
     ratio = BY_NAME["shift-grid"].apply(trial, 1, 0) / was[:, :, [1, 2, 3, 2]]
