@@ -204,6 +204,7 @@ def test_a_kill_and_then_a_loss_of_power_lose_no_more(work: Path):
     assert wrong([played.kill_then_power(made)]) == []
 
 
+@pytest.mark.thorough  # the campaign itself cuts at all calls
 @pytest.mark.parametrize(
     "way", [way for way in recording.WAYS if way not in ("right", recording.THREAD)]
 )
@@ -270,6 +271,7 @@ def test_what_happens_to_a_box_in_between_is_as_the_scene_says(
     assert len(points) == len(played.scene.steps)
 
 
+@pytest.mark.thorough  # two deliveries, each cut at all calls
 @pytest.mark.parametrize(
     ("way", "call", "what"),
     [

@@ -1,5 +1,5 @@
-"""Methods whose training takes seconds, though a test lets them take few steps; and a skin that
-sends 1,000 frames a second.
+"""Methods whose training takes seconds, though a test lets them take few steps; a skin that sends
+1,000 frames a second, and two with the format of another.
 
 `make test` tries the others; `make test-all` tries these as well.
 """
@@ -13,7 +13,8 @@ import pytest
 
 COSTLY = {
     *("lite", "ds-cnn", "recurrent", "multirocket-hydra", "quant", "palpate", "palpate-64"),
-    *("palpate-stages", "palpate-256", "paper-cnn-centred", "tactnet2", "papillarray"),
+    *("palpate-stages", "palpate-256", "paper-cnn-centred", "tactnet2"),
+    *("papillarray", "reskin", "flexitac"),
 }
 
 
