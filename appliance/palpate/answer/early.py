@@ -37,15 +37,20 @@ class Early:
     def __post_init__(self) -> None:
         if not self.least or not all(positive(p) for p in self.least):
             raise BundleError(
-                f"early.least {list(self.least)} must be numbers above 0, one for each step"
+                f"early.least {list(self.least)} must be numbers above 0, one for each step; "
+                "export the bundle again"
             )
         if type(self.agree) is not int or self.agree < 1:
-            raise BundleError(f"early.agree {self.agree!r} must be a whole number from 1 on")
+            raise BundleError(
+                f"early.agree {self.agree!r} must be a whole number from 1 on; "
+                "export the bundle again"
+            )
         if self.limits and not (
             len(self.limits) == len(self.least) and all(map(positive, self.limits))
         ):
             raise BundleError(
-                f"early.limits {list(self.limits)} must be numbers above 0, one for each step"
+                f"early.limits {list(self.limits)} must be numbers above 0, one for each step; "
+                "export the bundle again"
             )
 
 

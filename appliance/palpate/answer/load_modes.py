@@ -39,11 +39,17 @@ class LoadModes:
                 f"bridging.loads has {len(self.modes)} modes; 1 to {MOST_MODES} are possible"
             )
         if {len(mode) for mode in self.modes} != {len(self.mean)}:
-            raise BundleError("bridging.loads: each mode must have as many values as the mean")
+            raise BundleError(
+                "bridging.loads: each mode must have as many values as the mean; "
+                "export the bundle again"
+            )
         numbers = [self.rest, *self.mean, *(value for mode in self.modes for value in mode)]
         most = sys.float_info.max**0.25  # products of four stay finite
         if not (self.rest > 0 and all(abs(number) <= most for number in numbers)):
-            raise BundleError("bridging.loads must have finite numbers, and `rest` above 0")
+            raise BundleError(
+                "bridging.loads must have finite numbers, and `rest` above 0; "
+                "export the bundle again"
+            )
 
     def expected(self, frames: NDArray[Any], broken: NDArray[np.bool_]) -> NDArray[np.float32]:
         """The most probable broken values [T, B], given the sound ones of frames [T, V].

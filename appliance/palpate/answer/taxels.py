@@ -64,12 +64,15 @@ class Bridging:
     def __post_init__(self) -> None:
         if type(self.taxels) is not int or not 0 <= self.taxels <= MOST_TAXELS:
             raise BundleError(
-                f"bridging.taxels {self.taxels!r} must be a whole number from 0 to {MOST_TAXELS}"
+                f"bridging.taxels {self.taxels!r} must be a whole number from 0 to {MOST_TAXELS}; "
+                "export the bundle again"
             )
         for name in ("noise", "quietest"):
             value = getattr(self, name)
             if type(value) not in (int, float) or not 0 < value <= sys.float_info.max:
-                raise BundleError(f"bridging.{name} {value!r} must be a number above 0")
+                raise BundleError(
+                    f"bridging.{name} {value!r} must be a number above 0; export the bundle again"
+                )
 
     def allows(self, broken: Mask) -> bool:
         """Whether the taxels of the mask `broken` [R, C] may be bridged together."""

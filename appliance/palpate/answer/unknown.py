@@ -54,7 +54,8 @@ class Known:
         _checkpositive(self, "known")
         if self.enrolled is not None and not UNSURE <= self.enrolled < 1:
             raise BundleError(
-                f"known.enrolled {self.enrolled!r} must be at least {UNSURE} and below 1"
+                f"known.enrolled {self.enrolled!r} must be at least {UNSURE} and below 1; "
+                "export the bundle again"
             )
 
 
@@ -82,7 +83,9 @@ def _checkpositive(rule: Known | DisplacementRule, where: str) -> None:
     for name in rule.__slots__:
         value = getattr(rule, name)
         if not positive(value) and not (value is None and name in ("farthest_mm", "enrolled")):
-            raise BundleError(f"{where}.{name} {value!r} must be a number above 0")
+            raise BundleError(
+                f"{where}.{name} {value!r} must be a number above 0; export the bundle again"
+            )
 
 
 def positive(value: object) -> bool:

@@ -74,7 +74,9 @@ def requests(data: bytes, rest: bytes = b"") -> tuple[list[ModbusRequest], bytes
     while len(data) >= HEADER.size:
         transaction, protocol, length, unit = HEADER.unpack_from(data)
         if protocol or not 2 <= length <= MOST_PDU + 1:
-            raise FormatError(f"{data[: HEADER.size].hex()} is not a header of Modbus TCP")
+            raise FormatError(
+                f"{data[: HEADER.size].hex()} is not a header of Modbus TCP; speak it to this port"
+            )
         end = HEADER.size + length - 1
         if len(data) < end:
             break

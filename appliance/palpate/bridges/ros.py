@@ -240,7 +240,7 @@ class PalpateNode(LifecycleNode):  # type: ignore[misc]
     def _box(self) -> Source:
         """The box, for a command. Raises ApplianceError if commands are refused."""
         if self._source is None:
-            raise ApplianceError("the node is not configured")
+            raise ApplianceError("the node is not configured; send it the transition `configure`")
         if not self.setting("allow_writes"):
             raise CommandRefused(
                 "commands are refused; start the bridge with -p allow_writes:=true"

@@ -69,7 +69,7 @@ class CommandedSweep:
         # so every earlier sweep is answered, and the next answer belongs to this sweep
         self._source.wait_ready(READY_S)
         if self._canceled():
-            raise CommandRefused("the sweep was canceled before START")
+            raise CommandRefused("the sweep was canceled before START; send another goal")
         if terms.new_object:
             self._source.send("NEW")
         self._forget()
@@ -130,7 +130,7 @@ class CommandedSweep:
         """Raises LinkLost or NoAnswer once the box is gone."""
         trouble = self._source.view().trouble
         if trouble:
-            raise LinkLost(f"the box was lost during the sweep: {trouble}")
+            raise LinkLost(f"the box was lost during the sweep: {trouble}; sweep again")
         if self._clock.now_ns() - max(begin_ns, self._heard_ns) > STALE_S * 1e9:
             raise NoAnswer(
                 f"the box has said nothing for {STALE_S:g} s during the sweep; is it on?"
@@ -141,7 +141,9 @@ class CommandedSweep:
             self._source.send("ABORT")
         answer = self._next(ABORTED_S)
         if answer is None:
-            raise NoAnswer(f"the box did not answer the aborted sweep within {ABORTED_S:g} s")
+            raise NoAnswer(
+                f"the box did not answer the aborted sweep within {ABORTED_S:g} s; look at its log"
+            )
         return answer
 
     def _next(self, limit_s: float) -> Answer | None:

@@ -80,7 +80,8 @@ def summed(planes: NDArray[Any], f: SweepFormat, file: str) -> NDArray[Any]:
         *f.shape,
     ):
         raise BundleError(
-            f"{file} holds changes {planes.dtype} {planes.shape}, which do not fit the format {f}"
+            f"{file} holds changes {planes.dtype} {planes.shape}, which do not fit the format {f}; "
+            "export the bundle again"
         )
     steps = np.ascontiguousarray(np.moveaxis(planes, 0, -1)).view(f"<u{size}")[..., 0]
     return np.cumsum(steps, axis=1, dtype=steps.dtype).view(f.numpy_type)

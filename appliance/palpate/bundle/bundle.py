@@ -220,7 +220,7 @@ def _golden(data: bytes, manifest: Manifest) -> tuple[NDArray[Any], NDArray[np.f
     if logits.shape != (len(samples), len(manifest.labels)):
         raise BundleError(
             f"{GOLDEN} holds logits {logits.shape} for {len(samples)} sweeps, "
-            f"{len(manifest.labels)} labels"
+            f"{len(manifest.labels)} labels; export the bundle again"
         )
     return samples, logits.astype(np.float32)
 

@@ -227,7 +227,10 @@ def _check_labels(labels: tuple[str, ...]) -> None:
     """Raises BundleError for fewer than two labels, equal labels, and labels that cannot be
     sent."""
     if len(labels) < 2 or len(set(labels)) < len(labels):
-        raise BundleError(f"manifest labels {list(labels)} must be at least two different names")
+        raise BundleError(
+            f"manifest labels {list(labels)} must be at least two different names; "
+            "export the bundle again"
+        )
     for label in labels:
         if not isinstance(label, str) or not LABEL.fullmatch(label):
             raise BundleError(

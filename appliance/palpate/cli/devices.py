@@ -29,7 +29,7 @@ def open_devices(args: argparse.Namespace, format: Callable[[], SweepFormat] | N
         settings = load_settings(args)
         return simulated(args.sim, format() if format else None, args, settings, remember=False)
     if args.virtual:
-        raise ConfigError("--virtual needs --sim: real devices run in real time")
+        raise ConfigError("--virtual needs --sim; real devices run in real time")
     return Devices(SystemClock())
 
 

@@ -127,7 +127,7 @@ class Palpate:
             with self._news:
                 self._news.wait(min(POLL_S, max(0.0, self._left_s(end_ns))))
             if self._left_s(end_ns) <= 0:
-                raise NoAnswer(f"not ready within {timeout_s:g} s: {why}")
+                raise NoAnswer(f"not ready within {timeout_s:g} s: {why}; look at the box")
 
     def start(self, *, speed_mm_s: float | None = None, force_n: float | None = None) -> None:
         """Begin a sweep by command (trigger.mode = "serial"), and drop answers that `result` has
@@ -197,7 +197,8 @@ class Palpate:
                 return self._answers.popleft()
             if self._line.trouble or self._line.losses != losses:
                 raise LinkLost(
-                    self._line.trouble or "the line was lost meanwhile, and is open again"
+                    self._line.trouble
+                    or "the line was lost meanwhile, and is open again; ask once more"
                 )
         raise NoAnswer(f"no answer to a sweep within {timeout_s:g} s; {self._why_silent()}")
 
@@ -212,7 +213,10 @@ class Palpate:
         wait_s = self._timeout_s if timeout_s is None else timeout_s
         end_ns = self._end_ns(wait_s)
         if not self._asking.acquire(timeout=max(0.0, wait_s)):
-            raise NoAnswer(f"{name} was not sent within {wait_s:g} s: another command is under way")
+            raise NoAnswer(
+                f"{name} was not sent within {wait_s:g} s: another command is under way; "
+                "wait longer"
+            )
         try:
             with self._news:
                 self._replies.clear()
@@ -226,7 +230,8 @@ class Palpate:
                     )
                     if self._line.losses != losses:
                         raise LinkLost(
-                            f"{name}: {self._line.trouble or 'the line was lost meanwhile'}"
+                            f"{name}: {self._line.trouble or 'the line was lost meanwhile'}; "
+                            "ask once more"
                         )
                     if not self._replies:
                         raise NoAnswer(
@@ -265,7 +270,9 @@ class Palpate:
         with self._news:
             try:
                 if heard.error or not heard.summed:
-                    raise FormatError(heard.error or f"{heard.kind} came without a checksum")
+                    raise FormatError(
+                        heard.error or f"{heard.kind} came without a checksum; look at the cable"
+                    )
                 self._heard_ns = self._clock.now_ns()
                 if heard.kind == "ANS":
                     self._replies.append(heard.fields)

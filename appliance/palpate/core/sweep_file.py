@@ -75,7 +75,9 @@ def load(path: Path) -> tuple[Sweep, SweepFormat]:
     try:
         data = path.read_bytes()
         if content["crc32"] != crc32(data):
-            raise FormatError("its bytes are not those that were recorded: the file was altered")
+            raise FormatError(
+                "its bytes are not those that were recorded: the file was altered; copy it again"
+            )
         table = np.load(io.BytesIO(data), allow_pickle=False)
         format = typed(SweepFormat, content.pop("format"))
         schema = content.pop("schema")
@@ -84,7 +86,8 @@ def load(path: Path) -> tuple[Sweep, SweepFormat]:
             raise FormatError(f"schema {schema!r} is unknown to this version; update one of them")
         if table.dtype != _record_dtype(format) or table.ndim != 1:
             raise FormatError(
-                f"records of {table.dtype} do not fit the format {format} of its sidecar"
+                f"records of {table.dtype} do not fit the format {format} of its sidecar; "
+                "copy both again"
             )
         frames = Frames(table["t_ns"].copy(), table["seq"].copy(), table["taxels"].copy())
         own = {name: content[name] for name in Sweep.__slots__ if name in content}

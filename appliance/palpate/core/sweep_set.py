@@ -155,11 +155,11 @@ def read(path: Path, what: str, known: Collection[str] = ()) -> dict[str, Array]
             return {k: _typed(z, k) for k in z.files if k not in known}
     except OSError as e:
         why = f": {str(e.strerror).lower()}" if e.strerror else ""
-        raise FormatError(f"{path.name}: not {what}{why}") from e
+        raise FormatError(f"{path.name}: not {what}{why}; copy or write it again") from e
     except (ValueError, EOFError, TypeError, zipfile.BadZipFile, zlib.error) as e:
         # numpy takes any other file for a pickle, and explains how to load one
         why = "" if "pickle" in str(e) else f": {e}"
-        raise FormatError(f"{path.name}: not {what}{why}") from e
+        raise FormatError(f"{path.name}: not {what}{why}; copy or write it again") from e
 
 
 def _typed(z: Any, name: str) -> Array:

@@ -176,7 +176,10 @@ def _take(
     plain = part in new and name and ".." not in PurePosixPath(name).parts
     linked = member.name == FIRST[0] and CURRENT.fullmatch(member.linkname)
     if not plain or not (member.isreg() or member.isdir() or (member.issym() and linked)):
-        raise FormatError(f"the backup has {member.name!r}, which no box has saved")
+        raise FormatError(
+            f"the backup has {member.name!r}, which no box has saved; "
+            "use a file of `palpate backup`"
+        )
     path = new[part] / name
     if member.issym():
         path.symlink_to(member.linkname)

@@ -146,7 +146,9 @@ def _as_file(data: bytes) -> Iterator[str]:
         try:
             os.write(at, data)
         except OSError as e:  # a limit on the size of files (RLIMIT_FSIZE)
-            raise TemporaryError(f"a file in memory cannot be written: {e.strerror}") from e
+            raise TemporaryError(
+                f"a file in memory cannot be written: {e.strerror}; end other programs"
+            ) from e
         yield f"/proc/self/fd/{at}"
     finally:
         os.close(at)

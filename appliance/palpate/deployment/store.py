@@ -298,7 +298,7 @@ class Store:
         try:
             self._prove(loaded)
         except ConfigError as e:
-            raise BundleError(f"it does not fit the settings: {e}") from e
+            raise BundleError(f"it does not fit the settings: {e}; change one of them") from e
         standing = self.state.of(sha)
         log.info(f"bundle {sha[:8]} is on trial, start {standing.starts} of {MOST_STARTS}")
         return Choice(loaded, self.bundles.at(sha), Trial(self, sha, standing))

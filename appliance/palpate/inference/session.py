@@ -42,7 +42,9 @@ def session(model: bytes) -> ort.InferenceSession:
         why = str(e).strip()[:200]
         if _lacks_memory(e):
             raise ModelError(f"no memory for the model: {why}; end other programs") from e
-        raise BundleError(f"onnxruntime {ort.__version__} refuses the model: {why}") from e
+        raise BundleError(
+            f"onnxruntime {ort.__version__} refuses the model: {why}; export it again"
+        ) from e
 
 
 class ModelRunner:

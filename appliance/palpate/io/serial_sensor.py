@@ -46,7 +46,8 @@ class ProfileLink:
     def request(self, request: packets.Request, length: int) -> bytes:
         """Raises SensorMismatch: these skins do not answer requests."""
         raise SensorMismatch(
-            f"this skin does not speak PROTOCOL.md, so it cannot be asked for {request.name}"
+            f"this skin does not speak PROTOCOL.md, so it cannot be asked for {request.name}; "
+            "leave this out of its profile"
         )
 
     def close(self) -> None:

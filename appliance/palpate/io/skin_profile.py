@@ -254,8 +254,8 @@ def _contradiction(p: SkinProfile) -> str:
         return f'number = "{p.number}" is for codec = "fixed"; write number = "float32"'
     take = {*p.take}
     if not 0 < len(p.take) == len(take) <= MOST_AXES or max(take) >= p.values:
-        allowed = f"1 to {MOST_AXES} different ones of 0 to {p.values - 1} (see values)"
-        return f"take = {list(p.take)} is not {allowed}"
+        allowed = f"1 to {MOST_AXES} different ones of 0 to {p.values - 1}"
+        return f"take = {list(p.take)} is not {allowed}; number the wanted values"
     if p.codec in _VALUES and (p.values, p.number) != _VALUES[p.codec]:
         values, kind = _VALUES[p.codec]
         return f'codec = "{p.codec}" needs values = {values} and number = "{kind}"'

@@ -382,7 +382,9 @@ def ask(board: SkinLink) -> tuple[packets.Identity, packets.SkinFormat]:
             )
         return who, packets.unpack_format(board.request(packets.Request.FORMAT, 64))
     except FormatError as e:
-        raise SensorMismatch(f"the skin does not answer as PROTOCOL.md says: {e}") from e
+        raise SensorMismatch(
+            f"the skin does not answer as PROTOCOL.md says: {e}; update its firmware"
+        ) from e
 
 
 def open_link(config: SkinConfig, backend: Any, clock: Clock) -> SkinLink:

@@ -80,7 +80,9 @@ class TeachingProcess:
                 process_group=0 if group else None,
             )
         except OSError as e:
-            raise ConfigError(f"{command[0]} cannot be started: {e.strerror}") from e
+            raise ConfigError(
+                f"{command[0]} cannot be started: {e.strerror}; install palpate[teach]"
+            ) from e
         with suppress(OSError):  # the loop comes first
             os.setpriority(os.PRIO_PROCESS, self._process.pid, NICE)
         assert self._process.stdout

@@ -230,7 +230,9 @@ class TeachingSession(Observer):
         label = label.strip()
         number = self.materials().get(label)
         if number is None:
-            raise ApplianceError(f"there is no material {label!r} to forget")
+            raise ApplianceError(
+                f"there is no material {label!r} to forget; name one that was recorded"
+            )
         if self._using:
             raise ApplianceError("a bundle is being made; forget it afterwards")
         try:

@@ -218,7 +218,9 @@ def _trigger(
 def _label(labels: tuple[str, ...], code: str) -> list[object]:
     """The label with this code and the number of labels. Raises FormatError."""
     if not labels:
-        raise FormatError("sweeps are recorded without a bundle, so there are no labels")
+        raise FormatError(
+            "sweeps are recorded without a bundle, so there are no labels; deliver or teach one"
+        )
     if not (code.isdecimal() and 1 <= int(code) <= len(labels)):
         raise FormatError(f"label {code} is not there; use 1 to {len(labels)}")
     return [int(code), labels[int(code) - 1], len(labels)]

@@ -186,7 +186,10 @@ class Box:
         if self._on["turn"]:
             self._notify("turn", self.health)
         if self._failures >= FAILURES:
-            raise ModelError(f"{self._failures} sweeps could not be classified: {self._failure}")
+            raise ModelError(
+                f"{self._failures} sweeps could not be classified: {self._failure}; "
+                "look at the log, and go back by `palpate rollback`"
+            )
         return verdicts
 
     def _take_edges(self, now_ns: int, *, ready: bool) -> None:
@@ -420,7 +423,7 @@ class Box:
 
     def _abort(self) -> list[object]:
         if not self._cutter.interrupt(Status.ABORTED, self._clock.now_ns()):
-            raise ApplianceError("no sweep is open, so there is nothing to abort")
+            raise ApplianceError("no sweep is open, so there is nothing to abort; send START first")
         return []
 
 

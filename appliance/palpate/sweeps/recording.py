@@ -268,7 +268,7 @@ class RecordingSession(Observer):
         if self._writing:
             raise ApplianceError("a sweep is still being written; wait for its REC sentence")
         if not self._stored:
-            raise ApplianceError("no sweep of this run is left to discard")
+            raise ApplianceError("no sweep of this run is left to discard; record one first")
         number = self._stored[-1]
         shown = number - self._folder.run
         if which and which != str(shown):
@@ -276,7 +276,9 @@ class RecordingSession(Observer):
         try:
             self._folder.remove(number, reserve=True)
         except OSError as e:
-            raise ApplianceError(f"sweep {shown} cannot be discarded: {e.strerror}") from e
+            raise ApplianceError(
+                f"sweep {shown} cannot be discarded: {e.strerror}; look at the disk"
+            ) from e
         self._stored.pop()
         self.leave_out(number)
         if self._last and self._last["sweep"] == shown:

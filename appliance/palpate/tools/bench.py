@@ -162,7 +162,9 @@ def _make_references(folder: Path) -> None:
     command = [sys.executable, "-P", "-m", "palpate_studies", "references", "--out", str(folder)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
-        raise BundleError(f"palpate_studies references failed: {done.stderr.strip()[-300:]}")
+        raise BundleError(
+            f"palpate_studies references failed; run it by hand: {done.stderr.strip()[-300:]}"
+        )
 
 
 def _child(name: str, seed: int) -> dict[str, Any]:

@@ -60,7 +60,7 @@ def order(body: bytes, allowed: Sequence[str], named: Callable[[str], str] = str
             'an order is not JSON; send {"command": "MATERIAL", "text": "wood"}'
         ) from e
     if not isinstance(asked, dict) or not asked.keys() <= {"command", "text"}:
-        raise FormatError('an order holds "command" and "text" and nothing else')
+        raise FormatError('an order holds "command" and "text" and nothing else; send these two')
     name, text = str(asked.get("command")), asked.get("text", "")
     if name not in allowed or not isinstance(text, str):
         raise FormatError(

@@ -26,7 +26,7 @@ def words(path: Path, command: argparse.ArgumentParser) -> list[str]:
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as e:
-        raise FormatError(f"{path.name}: not TOML: {e}") from e
+        raise FormatError(f"{path.name}: not TOML: {e}; mend this line") from e
     actions = command._option_string_actions  # argparse has no public way to list them
     known = sorted({name for name in actions if name.startswith("--")} - {"--help", "--scene"})
     found: list[str] = []

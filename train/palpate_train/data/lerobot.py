@@ -82,7 +82,7 @@ def _info(folder: Path) -> Mapping[str, Any]:
     try:
         info = json.loads((folder / INFO).read_bytes())
     except ValueError as e:
-        raise FormatError(f"{folder / INFO}: cannot be read: {e}") from e
+        raise FormatError(f"{folder / INFO}: cannot be read: {e}; fetch the set again") from e
     if not isinstance(info, dict) or not isinstance(info.get("features"), dict):
         raise FormatError(f"{folder / INFO}: lists no features; it is not of LeRobot 2.0 to 3.0")
     return info
@@ -128,7 +128,7 @@ def _table(rows: Any, name: str, tasks: Mapping[int, str], fields: Any) -> Table
     """The table of an episode."""
     found = parquet.numbers(rows.column(name), name)
     if found is None:
-        raise FormatError(f"{name} does not hold numbers")
+        raise FormatError(f"{name} does not hold numbers; name a feature that does")
     flat = found.reshape(len(found), -1)
     names = [f"{name}.{k}" for k in range(flat.shape[1])]
     columns, texts = list(flat.T), {}

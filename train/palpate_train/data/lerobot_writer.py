@@ -47,7 +47,7 @@ def write(sweeps: Dataset, out: Path) -> None:
     if out.exists():
         raise FormatError(f"{out} is there already; name a new folder")
     if not out.parent.is_dir():
-        raise FormatError(f"{out}: there is no folder {out.parent}")
+        raise FormatError(f"{out}: there is no folder {out.parent}; make it first")
     try:
         library("pyarrow.parquet", "a set of Parquet files", "write")
     except FormatError as e:

@@ -62,7 +62,8 @@ def read(path: Path, kind: type[Set]) -> Set:
         path.open("rb").close()
     except OSError as e:
         raise FormatError(
-            f"{path.name}: not a sweep set: the file cannot be read: {e.strerror}"
+            f"{path.name}: not a sweep set: the file cannot be read: {e.strerror}; "
+            "make it readable for you"
         ) from e
     import h5py  # here, and below: the box, which reads folders alone, does not have it
 
@@ -88,7 +89,8 @@ def read_hdf5(path: Path, kind: type[Set]) -> Set:
                 arrays.setdefault("rate_hz", np.asarray(file.attrs["rate_hz"]))
     except (OSError, KeyError, RuntimeError, ValueError, TypeError) as e:
         raise FormatError(
-            f"{path.name}: not a sweep set (HDF5 with samples, materials …) that can be read: {e}"
+            f"{path.name}: not a sweep set (HDF5 with samples, materials …) that can be read: {e}; "
+            "copy or write it again"
         ) from e
     except FormatError as e:
         raise FormatError(f"{path.name}: {e}") from e
@@ -150,7 +152,8 @@ def _tactmat(arrays: dict[str, Array], source: str) -> dict[str, Array]:
     if len(materials) != len(x):
         raise FormatError(
             f"{source}: samples {list(x.shape)} hold {len(x)} materials, "
-            f"but there are {len(materials)} names"
+            f"but there are {len(materials)} names; "
+            "give as many"
         )
     if x.dtype.kind in "iuf":
         with np.errstate(invalid="ignore"):
@@ -226,7 +229,8 @@ def check_folder(folder: Path) -> None:
         next(folder.iterdir(), None)
     except OSError as e:
         raise FormatError(
-            f"{folder}: not a sweep set: the folder cannot be read: {e.strerror}"
+            f"{folder}: not a sweep set: the folder cannot be read: {e.strerror}; "
+            "make it readable for you"
         ) from e
 
 

@@ -309,7 +309,7 @@ def _simulated(spec: str, seed: int) -> Dataset:
         groups = {"position": position, "world": np.full(len(labels), world)}
         scenes.append(Dataset(samples, labels, skin.MATERIALS, skin.FORMAT.rate_hz, groups, spec))
     if not scenes:
-        raise FormatError(f"set {spec!r} is empty: its last seed comes before its first")
+        raise FormatError(f"set {spec!r} is empty: its last seed comes before its first; swap them")
     return replace(_joined(scenes), source=spec)
 
 

@@ -186,7 +186,8 @@ def _checked(what: str, train: Array, test: Array, sweeps: Dataset) -> Fold:
         )
     if len(np.unique(sweeps.labels[train])) < 2:
         raise FormatError(
-            f"{what}: {train.sum()} sweeps of fewer than two materials are left to train on"
+            f"{what}: {train.sum()} sweeps of fewer than two materials are left to train on; "
+            "leave out less, or add sweeps"
         )
     return np.flatnonzero(train), np.flatnonzero(test)
 

@@ -58,7 +58,10 @@ class BundleClassifier:
         if samples.dtype != wanted.dtype:
             kept = samples.astype(wanted.dtype)
             if not np.array_equal(kept, samples):
-                raise FormatError(f"X holds {samples.dtype}, and the bundle takes {wanted.dtype}")
+                raise FormatError(
+                    f"X holds {samples.dtype}, and the bundle takes {wanted.dtype}; "
+                    "give it the counts of its skin"
+                )
             samples = kept
         labels = np.zeros(len(samples), np.int64)
         made = Dataset(samples, labels, tuple(self.classes_), wanted.rate_hz, {}, "X")

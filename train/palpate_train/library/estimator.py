@@ -152,7 +152,8 @@ class PalpateClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  
         for what, values in (("y", numbers), *given.items()):
             if values.shape != (len(samples),):
                 raise FormatError(
-                    f"{what} holds {list(values.shape)} values for {len(samples)} sweeps"
+                    f"{what} holds {list(values.shape)} values for {len(samples)} sweeps; "
+                    "give one a sweep"
                 )
         materials = tuple(map(str, names))
         return Dataset(samples, numbers, materials, float(self.rate_hz), given, "X")

@@ -39,7 +39,8 @@ def raw_counts(x: Any, grid: tuple[int, ...] | None = None) -> Array:
         if int(np.prod(shape)) != values.shape[1]:
             raise FormatError(
                 f"X has {values.shape[1]} channels, but the grid {'x'.join(map(str, shape))} has "
-                f"{int(np.prod(shape))} places"
+                f"{int(np.prod(shape))} places; "
+                "set grid"
             )
         values = values.transpose(0, 2, 1).reshape(len(values), values.shape[2], *shape)
     if values.dtype.name in DATA_TYPES:

@@ -72,7 +72,8 @@ def _macs(node: onnx.NodeProto, known: dict[str, list[int]]) -> int:
     def shape(name: str) -> list[int]:
         if not all(found := known.get(name, [0])):
             raise FormatError(
-                f"node {node.name!r} ({node.op_type}): the shape of {name!r} is not known"
+                f"node {node.name!r} ({node.op_type}): the shape of {name!r} is not known; "
+                "infer the shapes first"
             )
         return found
 

@@ -42,7 +42,9 @@ class OnFeatures:
 
     def graph(self) -> onnx.ModelProto:
         """Raises FormatError."""
-        raise FormatError("the box does not compute these features of prior work")
+        raise FormatError(
+            "the box does not compute these features of prior work; export another method"
+        )
 
 
 def _computed(features: Features, samples: Array, rate_hz: float) -> Array:
