@@ -29,7 +29,9 @@ def load_settings(args: argparse.Namespace) -> Config:
     mode = getattr(args, "trigger", None)
     if every is not None or sweep is not None:
         if mode not in (None, "timed"):
-            raise ConfigError(f"--every and --sweep are for --trigger timed, not for {mode}")
+            raise ConfigError(
+                f"--every and --sweep are for --trigger timed, not for {mode}; leave them out"
+            )
         mode = "timed"
     sets += [f"trigger.mode={mode}"] if mode else []
     settings = config.load(args.board, sets, folder=args.config_dir, unit=args.unit)

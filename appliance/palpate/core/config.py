@@ -352,7 +352,9 @@ def _checked(table: Mapping[str, Any], where: str) -> Iterator[tuple[str, Any]]:
     for section, content in table.items():
         if section not in _SECTIONS:
             if section == "board":
-                raise ConfigError(f"{where}: board is chosen in {SITE}, or with --board")
+                raise ConfigError(
+                    f"{where}: board is chosen elsewhere; set it in {SITE}, or give --board"
+                )
             raise _unknown(section, [*_SECTIONS, "board"], where)
         if not isinstance(content, dict):
             given = f"{where}: {section} = {shown(content)}"

@@ -267,7 +267,6 @@ def _contradiction(p: SkinProfile) -> str:
         sizes = "neither one finger (7 x 4) nor two (14 x 4)"
         return f"{p.rows} x {p.cols} taxels are {sizes}; correct rows and cols"
     return ""
-    return ""
 
 
 def _outside(p: SkinProfile) -> str:
@@ -310,7 +309,7 @@ def load(name: str, folders: Sequence[Path]) -> SkinProfile:
 def from_json(table: Any, where: str) -> SkinProfile:
     """The profile that `json` wrote, checked like a file. Raises ConfigError."""
     if not isinstance(table, dict):
-        raise ConfigError(f"{where}: {shown(table)} is not a skin profile")
+        raise ConfigError(f"{where}: {shown(table)} is not a skin profile; record with one")
     return _made(table, where)
 
 
