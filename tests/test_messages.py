@@ -1,4 +1,4 @@
-"""Each error says what is wrong, and what to do: one rule over every place that raises one."""
+"""One rule over every place that raises an error: its message says what to do."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def raised() -> Iterator[tuple[str, str]]:
 
 
 def literal(node: ast.AST) -> str:
-    """The words of a raised error of ours, without what is filled in; "" for another node."""
+    """The words of a raised error, without the values in them; "" for another node."""
     if not (isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call) and node.exc.args):
         return ""
     if not (isinstance(node.exc.func, ast.Name) and node.exc.func.id in OURS):

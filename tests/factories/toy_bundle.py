@@ -234,7 +234,7 @@ def load(folder: Path, **more) -> Bundle:
 
 
 class GivenAnswer:
-    """A stage in place of the network. probabilities: float64 [K]."""
+    """Gives `probabilities` float64 [K] where a network would compute them."""
 
     def __init__(self, probabilities: np.ndarray) -> None:
         self._probabilities = probabilities

@@ -52,9 +52,9 @@ def test_only_short_printed_texts_are_shown(text: object, can: bool):
 
 def test_the_closest_names_are_proposed():
     """The best one, or as many as are asked for, whatever their case; none that is too far."""
-    known = ["max_sweeps", "max_sweep", "black_box"]
+    known = ["max_sweeps", "max_sheets", "black_box"]
     assert closest("max_sweepz", known) == ["max_sweeps"]
-    assert closest("MAX_SWEEPZ", known, 3) == ["max_sweeps", "max_sweep"]
+    assert closest("MAX_SWEEPZ", known, 3) == ["max_sweeps", "max_sheets"]
     assert closest("zzz", known, 3) == []
 
 
