@@ -569,6 +569,7 @@ def test_the_simulated_robot_stops_once(stop: str):
 
 
 @pytest.mark.parametrize("hz", [(50,), (50, 150), (100, 200)], ids=["sine", "odd", "rectifier"])
+@pytest.mark.slow
 def test_hum_costs_hardly_an_early_answer(default_bundle: Bundle, hz: tuple[float, ...]):
     """Unfinished sweeps pass the stages of whole ones: with hum of 8 counts as many of 12 slides
     are answered early as without, and none wrongly. More hum than was tried is answered by

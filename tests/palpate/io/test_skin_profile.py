@@ -212,6 +212,7 @@ def test_settings_find_own_profiles(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         st.none() | st.booleans() | st.integers() | st.floats() | st.text(), st.lists, max_leaves=5
     )
 )
+@pytest.mark.slow
 def test_any_value_of_any_key_is_taken_or_refused(value: object):
     """Any value in a file gives a profile or a ConfigError."""
     for key in skin_profile._KEYS:
