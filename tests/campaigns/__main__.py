@@ -20,6 +20,7 @@ from tests.factories.paths import ROOT
 from tests.rig import image
 
 ATHERIS = "atheris==3.0.0"
+MUTATORS = ("cosmic-ray==8.7.0", "coverage==7.17.5", "pytest-cov==7.1.0")
 BUILD = ROOT / "build"
 
 
@@ -47,6 +48,14 @@ def fuzzer() -> None:
     """Install Atheris, the fuzzer, into this virtual environment."""
     if importlib.util.find_spec("atheris") is None:
         subprocess.run([sys.executable, "-m", "pip", "install", "-q", ATHERIS], check=True)
+
+
+def mutators() -> None:
+    """Install cosmic-ray and coverage into a folder of their own."""
+    folder = BUILD / "mutants" / "tools"
+    if not folder.exists():
+        pip = (sys.executable, "-m", "pip", "--disable-pip-version-check", "install", "-q")
+        subprocess.run([*pip, "--target", str(folder), *MUTATORS], check=True)
 
 
 def board_tests() -> None:
@@ -181,6 +190,13 @@ CAMPAIGNS = {
         "fuzz all parsers of outside bytes; the options name targets and --minutes of each",
         _module("tests.fuzz", "--minutes", "10"),
         prepare=fuzzer,
+    ),
+    "mutants": Campaign(
+        "change single operators and constants, and count changes without a red test (hours)",
+        _module("tests.campaigns.mutants", "--count", "500", "--seed", "7"),
+        prepare=mutators,
+        variables={"OMP_NUM_THREADS": "1"},
+        nice=True,
     ),
     "hostile": Campaign(
         "load models that mean harm through the check of the box: build/hostile.json",
