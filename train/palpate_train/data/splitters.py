@@ -194,7 +194,8 @@ def _checked(what: str, train: Array, test: Array, sweeps: Dataset) -> Fold:
 
 OF_THE_SET = ("recording", "set", "split", "trial", "world")
 """Groups that say where a sweep comes from. They are not conditions that a user would vary."""
-RANDOM_PARTS = 5
+RANDOM_PARTS, MOST_PARTS = 5, 3
+"""Parts of recordings, and most parts of another group."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,8 +207,8 @@ class InnerPart:
     out: Array
 
 
-def inner_parts(sweeps: Dataset, most: int = 3, varies: Sequence[str] = ()) -> list[InnerPart]:
-    """The parts of each group that can be left out, at most `most` for a group. If no group can,
+def inner_parts(sweeps: Dataset, varies: Sequence[str] = ()) -> list[InnerPart]:
+    """The parts of each group that can be left out, at most MOST_PARTS of each. If no group can,
     the parts are recordings, with materials spread evenly. varies: only these groups.
 
     The first part of every group comes first, then the second parts, and so on. A group can be left
@@ -215,7 +216,7 @@ def inner_parts(sweeps: Dataset, most: int = 3, varies: Sequence[str] = ()) -> l
     tested. Raises FormatError if nothing can be left out, or a group of `varies` cannot.
     """
     names = varies or sorted(set(sweeps.groups) - set(OF_THE_SET))
-    of_all = [_parts_of(sweeps, name, most) for name in names]
+    of_all = [_parts_of(sweeps, name) for name in names]
     for name, parts in zip(varies, of_all, strict=False):
         if not parts:
             raise FormatError(
@@ -243,7 +244,7 @@ def recording_parts(sweeps: Dataset) -> list[InnerPart]:
     return [InnerPart("recording", np.isin(np.arange(len(sweeps)), test)) for _, test in drawn]
 
 
-def _parts_of(sweeps: Dataset, name: str, most: int) -> list[InnerPart]:
+def _parts_of(sweeps: Dataset, name: str) -> list[InnerPart]:
     values, member = np.unique(sweeps.group(name), return_inverse=True)
     recording = sweeps.group("recording")
     shuffled = np.random.default_rng(0).permutation(len(values))
@@ -251,6 +252,8 @@ def _parts_of(sweeps: Dataset, name: str, most: int) -> list[InnerPart]:
         np.unique(recording)
     ):
         return []
-    parts = [np.isin(member, some) for some in np.array_split(shuffled, min(most, len(shuffled)))]
+    parts = [
+        np.isin(member, some) for some in np.array_split(shuffled, min(MOST_PARTS, len(shuffled)))
+    ]
     labels = sweeps.labels
     return [InnerPart(name, out) for out in parts if set(labels[out]) <= set(labels[~out])]

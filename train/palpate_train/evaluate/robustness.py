@@ -69,12 +69,12 @@ def merge(tasks: Iterable[Json]) -> Json:
     return {"sets": sorted({t["set"] for t in tasks}), "methods": entries}
 
 
-def falls(curve: Json, points: float = POINTS) -> float | None:
-    """The severity at which accuracy is `points` below that of clean sweeps, interpolated between
+def falls(curve: Json) -> float | None:
+    """The severity at which accuracy is POINTS below that of clean sweeps, interpolated between
     two severities; None if it never is."""
     severity: list[float] = curve["severities"]
     accuracy: list[float] = curve["accuracy"]
-    limit = accuracy[0] - points + 1e-9  # .9 - .05 is less than .85
+    limit = accuracy[0] - POINTS + 1e-9  # .9 - .05 is less than .85
     for i in range(1, len(accuracy)):
         if accuracy[i] <= limit:
             part = (accuracy[i - 1] - limit) / (accuracy[i - 1] - accuracy[i])

@@ -25,6 +25,7 @@ from palpate_train.models.recipe.calibrate import Calibration
 
 Array = NDArray[Any]
 Json = dict[str, Any]
+SEED = 1
 BINS = 10
 """Bins of the reliability diagram and of the calibration error."""
 DRAWS = 500
@@ -40,15 +41,14 @@ def left_out(
     where: Where,
     log: Log,
     effort: Effort = methods.FULL_EFFORT,
-    seed: int = 1,
 ) -> Json:
     """Train without each material in turn; `unknown` of the sweeps of `test`.
 
     Raises FormatError if the sets do not fit together, or if the method has no features to judge
     novelty by.
     """
-    plan = Trainings.of(train, test, "", seed)
-    wanted = [t for t in plan.tasks(method, effort, seed) if t.left_out != NONE_LEFT_OUT]
+    plan = Trainings.of(train, test, "", SEED)
+    wanted = [t for t in plan.tasks(method, effort, SEED) if t.left_out != NONE_LEFT_OUT]
     done = cases(wanted, plan.sweeps, where, log)
     return unknown([(case, case.calibration()) for case in done], plan.sweeps.materials)
 

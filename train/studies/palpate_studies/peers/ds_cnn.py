@@ -24,7 +24,6 @@ from palpate_studies.peers.networks import (
     network_method,
     scale_steps,
 )
-from palpate_train.data.run import Log, no_log
 from palpate_train.models.methods import FULL_EFFORT, Effort, Method
 from palpate_train.models.recipe.augment import texture_scale
 from palpate_train.onnx_tools.graph_builder import GraphBuilder, centred
@@ -96,12 +95,10 @@ def build(format: SweepFormat, classes: int, samples: Array) -> PeerNetwork:
     return DepthwiseSeparable(format, classes, texture_scale(samples))
 
 
-def methods(effort: Effort = FULL_EFFORT, log: Log = no_log) -> tuple[Method, ...]:
-    """The method, trained with this effort. log: called after every iteration."""
+def methods(effort: Effort = FULL_EFFORT) -> tuple[Method, ...]:
+    """The method, trained with this effort."""
     about = "DS-CNN, as deployed on microcontrollers, over time (Zhang et al. 2017); also in int8"
-    return (
-        network_method("ds-cnn", about, build, scale_steps(RECIPE, effort), log, int8=INT8_NODES),
-    )
+    return (network_method("ds-cnn", about, build, scale_steps(RECIPE, effort), int8=INT8_NODES),)
 
 
 METHODS = methods()

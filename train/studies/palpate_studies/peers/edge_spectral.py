@@ -25,7 +25,6 @@ from palpate_studies.peers.networks import (
     network_method,
     scale_steps,
 )
-from palpate_train.data.run import Log, no_log
 from palpate_train.models.methods import FULL_EFFORT, Effort, Method
 from palpate_train.models.recipe.augment import texture_scale
 from palpate_train.models.training import batches, float_batches, one_thread
@@ -145,13 +144,13 @@ def build(format: SweepFormat, classes: int, samples: Array) -> PeerNetwork:
     return network
 
 
-def methods(effort: Effort = FULL_EFFORT, log: Log = no_log) -> tuple[Method, ...]:
-    """The method, trained with this effort. log: called after every iteration."""
+def methods(effort: Effort = FULL_EFFORT) -> tuple[Method, ...]:
+    """The method, trained with this effort."""
     about = (
         "log spectra and statistics of each taxel + dense layers of 20 and 10, as the edge tools "
         "do (Hymel et al. 2022)"
     )
-    return (network_method("edge-spectral", about, build, scale_steps(RECIPE, effort), log),)
+    return (network_method("edge-spectral", about, build, scale_steps(RECIPE, effort)),)
 
 
 METHODS = methods()

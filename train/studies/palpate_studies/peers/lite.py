@@ -25,7 +25,6 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 from palpate.core.types import SweepFormat
 from palpate_studies.peers.ds_cnn import INT8_NODES, RECIPE
 from palpate_studies.peers.networks import PeerNetwork, layer_constants, network_method, scale_steps
-from palpate_train.data.run import Log, no_log
 from palpate_train.models.methods import FULL_EFFORT, Effort, Method
 from palpate_train.models.recipe.augment import texture_scale
 from palpate_train.onnx_tools.graph_builder import GraphBuilder, centred
@@ -194,15 +193,13 @@ def build(format: SweepFormat, classes: int, samples: Array) -> PeerNetwork:
     return Lite(format, classes, texture_scale(samples))
 
 
-def methods(effort: Effort = FULL_EFFORT, log: Log = no_log) -> tuple[Method, ...]:
-    """The method, trained with this effort. log: called after every iteration."""
+def methods(effort: Effort = FULL_EFFORT) -> tuple[Method, ...]:
+    """The method, trained with this effort."""
     about = (
         "LITE, 10,000 weights, some filters hand-crafted (Ismail-Fawaz et al. 2023, 2024); also in "
         "int8"
     )
-    return (
-        network_method("lite", about, build, scale_steps(RECIPE, effort), log, int8=INT8_NODES),
-    )
+    return (network_method("lite", about, build, scale_steps(RECIPE, effort), int8=INT8_NODES),)
 
 
 METHODS = methods()

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from torch import Generator, Tensor, nn
 
 from palpate.core.types import SweepFormat
-from palpate_train.data.run import Log
 from palpate_train.data.sets import Dataset
 from palpate_train.metrics.temperature import platt_temperature
 from palpate_train.models.linear_head import ABSENT, hold_out_or_all
@@ -159,7 +158,6 @@ def train_network(
     build: Build,
     recipe: PeerRecipe,
     calibrated: bool,
-    log: Log,
     int8: Sequence[str],
 ) -> NetworkModel:
     """A network of `build`, trained on the materials that occur in `inputs`, the raw counts [N, T,
@@ -175,9 +173,7 @@ def train_network(
     with deterministic_device(seed) as device:
         network = build(train.format, len(train.materials), train.samples)
         network.adversarial = recipe.adversarial
-        network, cost = learn(
-            network, train, recipe, seed, log, device=device, augment=recipe.perturbed
-        )
+        network, cost = learn(network, train, recipe, seed, device=device, augment=recipe.perturbed)
         ran = f"{recipe.steps} iterations of {recipe.batch} in float32 on {device}"
     trained = NetworkModel(network, ran, cost)
     temperature = (
@@ -193,15 +189,12 @@ def network_method(
     about: str,
     build: Build,
     recipe: PeerRecipe,
-    log: Log,
     *,
     calibrated: bool = True,
     int8: Sequence[str] = (),
 ) -> Method:
     """The Method of this name that trains the networks of `build`; see train_network."""
-    train = partial(
-        train_network, build=build, recipe=recipe, calibrated=calibrated, log=log, int8=int8
-    )
+    train = partial(train_network, build=build, recipe=recipe, calibrated=calibrated, int8=int8)
     return Method(name, about, "raw", train, effort=f"{recipe.steps} iterations")
 
 

@@ -28,7 +28,6 @@ from palpate_studies.peers.networks import (
     network_method,
     scale_steps,
 )
-from palpate_train.data.run import Log, no_log
 from palpate_train.models.methods import FULL_EFFORT, Effort, Method
 from palpate_train.models.recipe.augment import texture_scale
 from palpate_train.onnx_tools.graph_builder import GraphBuilder, centred
@@ -216,15 +215,15 @@ def random_paper_cnn(
         return ImageNetwork(format, classes, 1 / 255, 0.0, PAPER).graph()
 
 
-def methods(effort: Effort = FULL_EFFORT, log: Log = no_log) -> tuple[Method, ...]:
-    """The methods, trained with this effort. log: called after every iteration."""
+def methods(effort: Effort = FULL_EFFORT) -> tuple[Method, ...]:
+    """The methods, trained with this effort."""
     steps = PAPER_STEPS if torch.cuda.is_available() else PROCESSOR_STEPS
     recipe = scale_steps(replace(PAPER_RECIPE, steps=steps), effort)
 
     def paper(name: str, about: str, build: Build) -> Method:
         """As printed: trained on all sweeps, without a temperature."""
         more: dict[str, Any] = {"calibrated": False, "int8": INT8_NODES}
-        return network_method(name, about, build, recipe, log, **more)
+        return network_method(name, about, build, recipe, **more)
 
     return (
         paper(
@@ -242,7 +241,6 @@ def methods(effort: Effort = FULL_EFFORT, log: Log = no_log) -> tuple[Method, ..
             "TactNet-II as far as it is published (Tulbure and Baeuml 2018)",
             build_tactnet2,
             scale_steps(TACTNET2_RECIPE, effort),
-            log,
         ),
     )
 

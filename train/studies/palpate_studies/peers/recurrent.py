@@ -18,7 +18,6 @@ from palpate_studies.peers.networks import (
     network_method,
     scale_steps,
 )
-from palpate_train.data.run import Log, no_log
 from palpate_train.models.methods import FULL_EFFORT, Effort, Method
 from palpate_train.models.recipe.augment import texture_scale
 from palpate_train.onnx_tools.graph_builder import GraphBuilder, centred
@@ -87,10 +86,10 @@ def build_recurrent(format: SweepFormat, classes: int, samples: Array) -> PeerNe
     return Recurrent(format, classes, texture_scale(samples))
 
 
-def methods(effort: Effort = FULL_EFFORT, log: Log = no_log) -> tuple[Method, ...]:
-    """The method, trained with this effort. log: called after every iteration."""
+def methods(effort: Effort = FULL_EFFORT) -> tuple[Method, ...]:
+    """The method, trained with this effort."""
     about = "gated recurrent unit over patches, the paper's future work"
-    return (network_method("recurrent", about, build_recurrent, scale_steps(RECIPE, effort), log),)
+    return (network_method("recurrent", about, build_recurrent, scale_steps(RECIPE, effort)),)
 
 
 METHODS = methods()
