@@ -1,19 +1,23 @@
-"""Bridges as separate processes, as they run beside a box, and their clients."""
+"""Bridges in threads, and their clients."""
 
 from __future__ import annotations
 
+import argparse
+import asyncio
 import re
 import socket
 import struct
-import subprocess
-import sys
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import CancelledError, Future
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
+from palpate.bridges import command
+from palpate.bridges.options import add_arguments
+from palpate.bridges.server import StopEvent
 from tests.factories.paths import ROOT
 
 LONG_S = 30.0
@@ -37,29 +41,41 @@ def eventually(there: Callable[[], bool]) -> None:
 
 @contextmanager
 def bridge(kind: str, *options: str | Path) -> Iterator[tuple[str, int]]:
-    """Run a bridge; yields its address."""
-    command = [sys.executable, "-m", "palpate.bridges", kind, "--listen", "127.0.0.1:0"]
-    command += map(str, options)
-    with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) as process:
+    """Run a bridge in a thread, which takes a tenth of the time of a process; yields its
+    address."""
+    parser = argparse.ArgumentParser("bridge")
+    add_arguments(parser)
+    args = parser.parse_args([kind, "--listen", "127.0.0.1:0", *map(str, options)])
+    there: Future[tuple[str, int]] = Future()
+    ended, ends = Future[int](), []
+
+    def stop_event() -> StopEvent:
+        stop, loop = StopEvent(), asyncio.get_running_loop()
+        ends.append(lambda: loop.call_soon_threadsafe(stop.end, 0))
+        return stop
+
+    def work() -> None:
         try:
-            said = []
-            for line in process.stderr:
-                said.append(line)
-                found = re.search(r"listening on ([\d.]+):(\d+)", line)
-                if found:
-                    break
-            else:
-                pytest.fail("".join(said))
-            threading.Thread(target=process.stderr.read, daemon=True).start()
-            yield found[1], int(found[2])
-            assert process.poll() is None, "the bridge has ended before the test did"
-        finally:
-            process.terminate()
-            try:
-                process.wait(LONG_S)
-            except subprocess.TimeoutExpired:  # otherwise closing its pipe waits forever
-                process.kill()
-                raise
+            ended.set_result(command.run(args))
+        except BaseException as e:
+            ended.set_exception(e)
+            there.cancel()
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(command, "stop_event", stop_event)
+        patched.setattr(command, "_say", lambda args, server, box: there.set_result(server.address))
+        threading.Thread(target=work, daemon=True).start()
+        try:
+            address = there.result(LONG_S)
+        except CancelledError:
+            ended.result()
+            raise
+    try:
+        yield address
+        assert not ended.done(), "the bridge has ended before the test did"
+    finally:
+        ends[-1]()
+        assert ended.result(LONG_S) == 0
 
 
 class RawModbus:

@@ -1,4 +1,4 @@
-"""The Modbus bridge as a process, seen by pymodbus's client and by bytes put together by hand; and
+"""The Modbus bridge, seen by pymodbus's client and by bytes put together by hand; and
 its map alone."""
 
 from __future__ import annotations

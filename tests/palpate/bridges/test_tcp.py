@@ -1,4 +1,4 @@
-"""The serial line over TCP as a process: the sentences and commands of peers; the pseudo-terminal
+"""The serial line over TCP: the sentences and commands of peers; the pseudo-terminal
 that a box opens; limits."""
 
 from __future__ import annotations
