@@ -103,7 +103,7 @@ REFUSES = sentence("ANS", "START", "error", "set trigger.mode to serial")
 NOTHING = sentence("ANS", "ABORT", "error", "no sweep is open")
 
 
-class Case(NamedTuple):
+class SweepCase(NamedTuple):
     """lines: what the box says after its answer to a command. at: what happens in each phase.
     wanted: status, or the error and its reason. heard: the commands of the box."""
 
@@ -116,37 +116,37 @@ class Case(NamedTuple):
 
 
 CASES = {
-    "slide": Case(None, Status.OK, "START STOP", "sliding judging"),
-    "a new object": Case(
+    "slide": SweepCase(None, Status.OK, "START STOP", "sliding judging"),
+    "a new object": SweepCase(
         None, Status.OK, "NEW START STOP", "sliding judging", {"new_object": True}
     ),
-    "an early answer": Case({"START": EARLY}, Status.OK, "START STOP", "sliding early", LONG),
-    "a fault": Case(
+    "an early answer": SweepCase({"START": EARLY}, Status.OK, "START STOP", "sliding early", LONG),
+    "a fault": SweepCase(
         {"START": result(1, "sensor-lost", "")}, Status.SENSOR_LOST, "START STOP", "sliding", LONG
     ),
-    "another's START: the STOP is the other's": Case(
+    "another's START: the STOP is the other's": SweepCase(
         {"START": result(1, "no-stop", "")}, Status.NO_STOP, "START", "sliding", LONG
     ),
-    "the line is lost after the answer": Case(
+    "the line is lost after the answer": SweepCase(
         *({"START": EARLY}, Status.OK, "START", "sliding early", LONG),
         lambda swept: swept.phases[-1] == "early" and swept.box.unplug(),
     ),
-    "another's STOP": Case(
+    "another's STOP": SweepCase(
         *(None, Status.OK, "START STOP", "sliding", {"slide_s": 0.0}),
         lambda swept: swept.source.send("STOP"),
     ),
-    "canceled while sliding": Case(
+    "canceled while sliding": SweepCase(
         *({"ABORT": result(1, "aborted", "")}, Status.ABORTED, "START ABORT", "sliding", LONG),
         lambda swept: swept.canceled.set(),
     ),
-    "canceled and not answered": Case(
+    "canceled and not answered": SweepCase(
         *(None, (NoAnswer, r"within 0\.1 s"), "START ABORT", "sliding", LONG),
         lambda swept: swept.canceled.set(),
     ),
-    "no answer in time": Case(
+    "no answer in time": SweepCase(
         {}, (NoAnswer, r"0\.3"), "START STOP ABORT", "sliding judging", {"timeout_s": 0.3}
     ),
-    "unplugged": Case(
+    "unplugged": SweepCase(
         *(None, (LinkLost, "was lost"), "START", "sliding", LONG),
         lambda swept: swept.box.unplug(),
     ),

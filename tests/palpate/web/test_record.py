@@ -217,7 +217,7 @@ def test_the_page_hears_what_there_is(recorded: RecordedPage):
     reader.socket.close()
 
 
-REFUSED = [
+REFUSED: list[tuple[int, dict[str, str | None]]] = [
     (403, {"X_Palpate_Key": None}),
     (403, {"X_Palpate_Key": "wrong"}),
     (403, {"X_Palpate_Key": "ö"}),
@@ -232,41 +232,23 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("answer", "changed"), REFUSED)
-def test_an_order_of_another_site_is_refused(
-    recorded: RecordedPage, answer: int, changed: dict[str, str | None]
-):
+def test_an_order_of_another_site_is_refused(recorded: RecordedPage):
     """Requests that a page of another site can send are refused: wrong or missing key, another
-    origin, a content type without preflight. Each run has a key of its own."""
-    server_of, key = recorded.page.server, key_of(recorded.page.server)
+    origin, a content type without preflight, other methods, a preflight among them, and a name that
+    is not this machine's. Each run has a key of its own."""
+    page, key = recorded.page.server, key_of(recorded.page.server)
     assert key != PageServer("watch.html", Access(0), SystemClock().now_ns).key
-    assert status(ordered(server_of, key, WOOD, **changed)) == answer
+    for answer, changed in REFUSED:
+        assert status(ordered(page, key, WOOD, **changed)) == answer, changed
+    here = f"localhost:{port(page)}"
+    others = (("GET", here), ("PUT", here), ("OPTIONS", here), ("POST", "evil"), ("POST", ""))
+    for method, host in others:
+        more = f"Origin: http://{host}\r\nX-Palpate-Key: {key}\r\nContent-Type: {KIND}\r\n"
+        more += "Content-Length: 2\r\n"
+        answer = 421 if method == "POST" else 405
+        assert status(ask(page, "/order", method, host, more, body=b"{}")) == answer, method
     assert waiting(recorded) == 0
     assert recorded.recording.about()["material"] == "metal"
-
-
-@pytest.mark.parametrize(
-    ("method", "host", "answer"),
-    [
-        ("GET", None, 405),
-        ("PUT", None, 405),
-        ("OPTIONS", None, 405),
-        ("POST", "evil.example", 421),
-        ("POST", "", 421),
-    ],
-)
-def test_other_ways_to_order_are_refused(
-    recorded: RecordedPage, method: str, host: str | None, answer: int
-):
-    """Other methods, a preflight among them, and a name that is not this machine's."""
-    page = recorded.page.server
-    host = f"localhost:{port(page)}" if host is None else host
-    more = (
-        f"Origin: http://{host}\r\nX-Palpate-Key: {page.key}\r\nContent-Type:"
-        f" {KIND}\r\nContent-Length: 2\r\n"
-    )
-    assert status(ask(page, "/order", method, host, more, body=b"{}")) == answer
-    assert waiting(recorded) == 0
 
 
 @pytest.mark.parametrize("chunked", [False, True])
@@ -283,8 +265,9 @@ def test_too_large_a_body_is_refused(recorded: RecordedPage, chunked: bool):
     assert status(ask(page)) == 200
 
 
-def test_refusals_say_why(recorded: RecordedPage):
-    """As a line of text that names the value; the labels stay."""
+def test_refusals_say_why(recorded: RecordedPage, tmp_path: Path):
+    """As a line of text that names the value; the labels stay. Orders that wait when the recording
+    ends are refused, and none is carried out."""
     page = recorded.page.server
     answer = ordered(page, page.key, {"command": "MATERIAL", "text": "-1"})
     assert (status(answer), b"text/plain" in answer, b"'-1'" in answer) == (409, True, True)
@@ -294,6 +277,14 @@ def test_refusals_say_why(recorded: RecordedPage):
     recorded.turn()
     assert asking.finished() == [409]
     assert recorded.recording.about()["material"] == "metal"
+    ending = RecordedPage(tmp_path / "another", Labels())
+    with ending.page:
+        asking = Asking(ending, WOOD, WOOD)
+        until(lambda: waiting(ending) == 2)
+    assert asking.finished() == [503, 503]
+    assert all(b"ended" in answer for answer in asking.answers)
+    assert ending.done == []
+    ending.recording.close()
 
 
 def test_many_requests_wait_in_bounds_and_the_loop_takes_one_a_turn(
@@ -338,21 +329,6 @@ def test_a_loop_that_is_late(
         turn.join()
     recorded.turn()
     assert recorded.done == []
-
-
-def test_the_end_of_the_recording_answers_who_waits(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-):
-    """Waiting orders are refused with the reason, and none is carried out."""
-    one = RecordedPage(tmp_path, Labels())
-    with one.page:
-        asking = Asking(one, WOOD, WOOD)
-        until(lambda: waiting(one) == 2)
-    assert asking.finished() == [503, 503]
-    assert all(b"the recording has ended" in answer for answer in asking.answers)
-    assert one.done == []
-    one.recording.close()
-    assert capfd.readouterr().err == ""
 
 
 def test_a_sweep_is_drawn_once(recorded: RecordedPage, monkeypatch: pytest.MonkeyPatch):
