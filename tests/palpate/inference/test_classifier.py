@@ -88,16 +88,19 @@ def test_fusion_is_the_papers_and_bayes():
 def test_golden_sweeps_are_compared(default_bundle: Bundle):
     """This machine runs the default bundle as it was exported; other logits are refused."""
     assert box(default_bundle).self_test() < bundle.GOLDEN_TOLERANCE
-    other = replace(default_bundle, golden_logits=-default_bundle.golden_logits)
-    with pytest.raises(BundleError, match="another label"):
-        box(other).self_test()
+    for label in (0, -1):
+        logits = default_bundle.golden_logits.copy()
+        logits[:, label] = logits.max() + 9
+        with pytest.raises(BundleError, match=r"golden sweeps \[\d"):
+            box(replace(default_bundle, golden_logits=logits)).self_test()
 
 
 def test_verdict_carries_what_is_known(default_bundle: Bundle):
     """Label, probability, margin, fused and bundle id; probabilities add up to one. Below the
     threshold the label is still reported, but not as ok."""
-    sweep = sweep_of(default_bundle.golden[0], lost=1)
+    sweep = replace(sweep_of(default_bundle.golden[0], lost=1), complete_ns=1000)
     v = box(default_bundle)(sweep)
+    assert v.latency_ns == v.time_ns - 1000
     assert v.status in (Status.OK, Status.UNSURE)
     assert v.label == default_bundle.manifest.labels[v.scores.argmax()]
     assert v.scores.sum() == pytest.approx(1)
