@@ -132,7 +132,7 @@ def killed(image: Image, folder: Path, ledger: CampaignLog, n: int, rng: random.
     assert not harmed
 
 
-def outcome(ledger: CampaignLog) -> str:
+def check_outcome(ledger: CampaignLog) -> str:
     """The sums in words. Raises AssertionError if a sweep was lost or a file is not sound."""
     lost, owed = ledger.sum("lost"), ledger.sum("owed")
     assert lost == ledger.sum("parts") == ledger.sum("fsck") == 0 < owed
@@ -148,7 +148,7 @@ def test_killed(image: Image, tmp_path: Path, count: Count, note: Note):
     while (left := wanted - ledger.sum("back")) > 0:
         killed(image, tmp_path, ledger, min(left, BATCH), rng)
     assert not any(line.get("harmed") for line in ledger.lines)
-    note("SIGKILL at a random moment", f"READY again; {outcome(ledger)}", ledger.sum("back"))
+    note("SIGKILL at a random moment", f"READY again; {check_outcome(ledger)}", ledger.sum("back"))
 
 
 @pytest.fixture
@@ -213,7 +213,7 @@ def test_power_cut(image: Image, disk: Path, tmp_path: Path, count: Count, note:
         # twice while it boots, then a life that has to get to READY; such a one is the last, too
         booting = n % 3 < 2 and n < wanted - 1
         kept = cut(image, disk, tmp_path, ledger, rng, booting=booting, had=kept)
-    told = f"it boots again, file system clean; {outcome(ledger)}"
+    told = f"it boots again, file system clean; {check_outcome(ledger)}"
     note("power cut at a random moment", told, ledger.sum("cut"))
 
 

@@ -182,7 +182,7 @@ def test_a_box_without_packages_and_mirror_is_refused(site: hosts.Hosts, wheel: 
     machine = site.hosts[1].machine
     machine.get("find", "/var/cache/apt/archives", "-name", "*.deb", "-delete")
     at = ("--host", f"{hosts.USER}@{site.hosts[1].address}")
-    done = site.desktop("install", *at, "--wheel", wheel, limit_s=120)
+    done = site.desktop("install", *at, "--wheel", wheel)
     assert done.returncode == 1
     assert "FAILED: python3-venv libusb-1.0-0 openssl " in done.stdout
     assert "Debian's mirrors" in done.stdout
@@ -417,7 +417,7 @@ def test_without_a_skin_the_bundle_is_installed_and_ready_waits(
     host.service.configure(CABLED)
     bundle = sender.made()
     try:
-        done = site.desktop("deploy", *at, bundle, limit_s=60)
+        done = site.desktop("deploy", *at, bundle)
         assert done.returncode == 0, done.stdout + done.stderr
         assert "on trial" in done.stdout
         assert "READY waits: skin absent: no skin 1209:7ac7 on USB" in done.stdout
@@ -456,7 +456,7 @@ def test_boxes_that_fail_do_not_stop_the_others(
         ]
         (tmp_path / "fleet.py").write_text(f"boxes = ({boxes!r}, {shared!r})\n")
         done = site.desktop(
-            "deploy", "--hosts", tmp_path / "fleet.py", sender.made(), "--limit", "40", limit_s=100
+            "deploy", "--hosts", tmp_path / "fleet.py", sender.made(), "--limit", "40"
         )
     assert done.returncode == 1
     lines = dict(line.split(": ", 1) for line in done.stdout.splitlines() if ": " in line)
@@ -502,7 +502,7 @@ def test_a_user_who_needs_a_password_for_sudo_is_refused(
     """At once and with a reason, instead of a prompt that nobody answers."""
     host.machine.put("/etc/sudoers.d/user", f"{hosts.USER} ALL=(ALL) ALL\n")
     try:
-        done = site.desktop("deploy", *at, sender.made(), limit_s=30)
+        done = site.desktop("deploy", *at, sender.made())
         assert done.returncode == 1
         assert "sudo: a password is required; let the user in without" in done.stdout
     finally:
