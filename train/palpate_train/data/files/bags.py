@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -97,12 +98,11 @@ def _table(bag: Any, connections: list[Any]) -> Table:
         received.append(at)
     if not rows or not names:
         raise FormatError(f"topic {connections[0].topic} holds no numbers")
-    values = np.stack(rows)
-    table = from_columns(names, list(values.T), {})
     times = {RECEIVED: 1e-9 * (np.array(received) - received[0])}
     if len(stamps) == len(rows) and any(stamps):
         times[TIME] = np.array(stamps) - stamps[0]
-    return Table(table.values, table.columns, times, tuple(times))
+    table = from_columns(names, list(np.stack(rows).T), {})
+    return replace(table, vectors=times, beside=tuple(times))
 
 
 def _numbers(name: str, value: Any) -> Iterator[tuple[str, Any]]:

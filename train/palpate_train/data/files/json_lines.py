@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -131,5 +132,4 @@ def _table(frames: Sequence[tuple[int, dict[str, Any]]], what: str, notes: Seque
             if number is None:
                 faults.setdefault(k, f"{what} {i}, {name} is {value!r}, which is not a number")
         columns.append(np.array([np.nan if v is None else v for v in numbers], np.float64))
-    table = from_columns(names, columns, texts, notes)
-    return Table(table.values, table.columns, texts=texts, faults=faults, notes=table.notes)
+    return replace(from_columns(names, columns, texts, notes), faults=faults)

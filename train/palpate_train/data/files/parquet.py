@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -61,8 +62,8 @@ def table(content: Any) -> Table:
                 faults[len(names)] = f"row {row} of {name} is empty"
             columns.append(flat[:, k])
             names.append(name if found.ndim == 1 else f"{name}.{k}")
-    made = from_columns(names, columns, texts, [f"column {n} is passed over" for n in left])
-    return Table(made.values, made.columns, texts=texts, faults=faults, notes=made.notes)
+    notes = [f"column {n} is passed over" for n in left]
+    return replace(from_columns(names, columns, texts, notes), faults=faults)
 
 
 def numbers(values: Any, name: str) -> Array | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -58,4 +59,4 @@ def _table(group: Any) -> Table:
     if len(steps) != 1:
         return made
     time = steps.pop() * np.arange(len(made.values))
-    return Table(made.values, made.columns, {"time": time}, ("time",), made.texts)
+    return replace(made, vectors={"time": time}, beside=("time",))
