@@ -114,6 +114,14 @@ def sheared() -> np.ndarray:
     return np.concatenate([shear, moving()[..., None]], axis=-1).astype(np.int16)
 
 
+def test_shear_is_at_full_scale_on_both_sides():
+    """Also on a skin with one axis of shear."""
+    taxels = sheared()[..., 1:]
+    taxels[:200, 0, 1, 0] = -2000
+    found = inspect(taxels, SHEARED[..., 1:], THREE)
+    assert (found.status, found.detail) == (Status.SATURATED, "taxel 1.2 axis 1")
+
+
 @pytest.mark.parametrize(
     ("place", "value", "status", "detail"),
     [
