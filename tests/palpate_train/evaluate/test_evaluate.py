@@ -44,6 +44,7 @@ def every(sweeps: Dataset, where: Where, *names: str, **plan) -> list[evaluate.R
 HERE = Where(jobs=1, cache=None)
 
 
+@pytest.mark.slow
 def test_it_finds_nothing_where_there_is_nothing():
     """Labels drawn at random are guessed at about one in three, so nothing leaks from the test
     sweeps."""
@@ -263,6 +264,7 @@ def test_a_set_without_recordings_has_no_count_of_them(tmp_path: Path):
     assert "recording" not in result
 
 
+@pytest.mark.slow
 def test_a_method_whose_features_cannot_be_computed_does_not_stop_the_others(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):

@@ -70,6 +70,7 @@ def test_a_bundle_that_needs_one_taxel_tolerates_none(tmp_path: Path):
     assert found.figures["one row"]["at"] == "row 1"
 
 
+@pytest.mark.slow
 def test_a_bundle_that_needs_no_single_taxel_tolerates_a_quarter(tmp_path: Path):
     """All sweeps are of "a", which every taxel shows."""
     loaded, sweeps = bundle.load(toy(tmp_path)), windows("a")
@@ -99,6 +100,7 @@ class Weighed:
         self.bundle = told
 
 
+@pytest.mark.slow
 def test_loads_that_differ_in_every_sweep_bridge_better_than_neighbours(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ):

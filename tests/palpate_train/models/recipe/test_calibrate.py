@@ -60,6 +60,7 @@ def test_a_disturbed_sweep_of_a_known_material_stays_known():
     assert (sturdy.held["recording"].numbers < known.sum()).all()
 
 
+@pytest.mark.slow
 def test_disturbed_sweeps_are_of_those_that_were_trained_on():
     """One in ten training sweeps has a changed copy of the same material and group; none of the
     copies judges."""
