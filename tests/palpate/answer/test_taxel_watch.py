@@ -200,6 +200,7 @@ def test_a_taxel_is_broken_over_the_stream_after_several_stretches(watch: TaxelW
         ([CLIPPED], ""),  # however long the finger presses
         ([np.where(np.arange(16).reshape(4, 4) == 3, 3, CLIPPED)], "silent taxel 1.4"),
         ([BAD[:30], BAD[30:60], BAD[60:90], BAD[90:]], "silent taxel 2.2"),
+        ([BAD[:30], BAD[30:60]], "silent taxel 2.2"),
     ],
 )
 def test_which_streams_make_a_taxel_broken(

@@ -88,6 +88,8 @@ def test_fusion_is_the_papers_and_bayes():
 def test_golden_sweeps_are_compared(default_bundle: Bundle):
     """This machine runs the default bundle as it was exported; other logits are refused."""
     assert box(default_bundle).self_test() < bundle.GOLDEN_TOLERANCE
+    with pytest.raises(BundleError, match=r"golden sweeps \[\]"):
+        box(replace(default_bundle, golden_logits=0.1 * default_bundle.golden_logits)).self_test()
     for label in (0, -1):
         logits = default_bundle.golden_logits.copy()
         logits[:, label] = logits.max() + 9

@@ -48,6 +48,7 @@ def written(tmp_path: Path, text: str) -> Path:
         (GOOD + "values = 9\ntake = [0, 1, 2, 3, 4, 5, 6, 7, 8]", "1 to 8"),
         (GOOD + 'orientation = ["upside-down"]', "some of transpose, flip-rows, flip-columns"),
         (GOOD + "rate_hz = 0", "a number from 0.1"),
+        (GOOD + "baud = 600", "from 1200 to 4000000"),
         (GOOD + "rate_hz = nan", "a number from 0.1"),
         (GOOD + "rates_hz = [0]", "rates such as"),
         (GOOD + 'start = ["hex:9"]', "commands such as"),
@@ -151,8 +152,10 @@ def test_what_each_lacks():
     ],
 )
 def test_settings_change_a_profile(name: str, settings: dict, wanted: SweepFormat):
-    """Grid and rate come from the settings where they are set."""
-    assert adapted(profile(name), SkinConfig(**settings)).format == wanted
+    """Grid, rate and baud come from the settings where they are set."""
+    new = adapted(profile(name), SkinConfig(**settings))
+    assert (new.format, new.baud) == (wanted, profile(name).baud)
+    assert adapted(profile(name), SkinConfig(**settings, baud=9600)).baud == 9600
 
 
 @pytest.mark.parametrize(
