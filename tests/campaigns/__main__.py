@@ -149,6 +149,10 @@ CAMPAIGNS = {
         prepare=containers,
         variables={"PALPATE_SYSTEMD": "1"},
     ),
+    "busy": Campaign(
+        "run a command, else the fast tests, beside eight busy loops",
+        _module("tests.campaigns.busy"),
+    ),
     "debian13": Campaign(
         "run the fast tests in a Debian 13 with Python 3.13 (as root; 6 GB)",
         _module("tests.campaigns.debian13"),
@@ -161,7 +165,7 @@ CAMPAIGNS = {
         variables={"PALPATE_MACHINES": "1"},
     ),
     "processors": Campaign(
-        "run the tests with the arithmetic of other processors, and on a busy machine",
+        "run the numerical tests with the arithmetic of other processors",
         _module("tests.campaigns.processors"),
     ),
     "lock": Campaign(

@@ -1,8 +1,8 @@
-"""The tests with the arithmetic of other processors, and on a busy machine.
+"""The numerical tests with the arithmetic of other processors.
 
 `python -m tests.campaigns processors [OPTION ...]` runs the fast tests of NUMERICAL once for each
 kind of processor that OpenBLAS knows and this one can imitate, with one thread or with eight in
-turn (`--all`: with both), and then all fast tests beside BUSY endless loops; options go to pytest.
+turn (`--all`: with both); options go to pytest.
 """
 
 from __future__ import annotations
@@ -20,12 +20,11 @@ from tests.factories.paths import ROOT
 KINDS = {"Nehalem": "sse4_2", "Haswell": "avx2", "Zen": "avx2", "SkylakeX": "avx512f"}
 """Names of OPENBLAS_CORETYPE, each with the flag of /proc/cpuinfo that it needs."""
 THREADS = ("1", "8")
-BUSY = 8
 NUMERICAL = (
-    *(f"tests/palpate/{name}" for name in ("signal", "inference", "learn")),
+    *(f"tests/palpate/{name}" for name in ("answer", "inference", "learn")),
     *(
         f"tests/palpate_train/{name}"
-        for name in ("calibration", "evaluate", "export", "features", "metrics", "models")
+        for name in ("calibration", "evaluate", "export", "metrics", "models")
     ),
 )
 """The packages that compute with matrices; the others read, write, wait and show."""
@@ -33,12 +32,14 @@ FAST = ("-m", "pytest", "-q", "-n", str((os.cpu_count() or 1) + 1), "--dist", "w
 FAST += ("-m", "not slow and not thorough")
 
 
-def tested(name: str, options: Sequence[str], **variables: str) -> str:
-    """Run fast tests with these variables; the line that says what came of it."""
-    print(f"== {name}", flush=True)
+def tested(kind: str, threads: str, options: Sequence[str]) -> str:
+    """Run the tests with the arithmetic of a processor; the line that says what came of it."""
     begin = time.monotonic()
-    command = [sys.executable, *FAST, *options]
-    code = subprocess.run(command, cwd=ROOT, env=os.environ | variables, check=False).returncode
+    name = f"{kind}, threads: {threads}"
+    print(f"== {name}", flush=True)
+    env = os.environ | {"OPENBLAS_CORETYPE": kind, "OPENBLAS_NUM_THREADS": threads}
+    command = [sys.executable, *FAST, *NUMERICAL, *options]
+    code = subprocess.run(command, cwd=ROOT, env=env, check=False).returncode
     return f"{'FAILED' if code else 'passed'} in {time.monotonic() - begin:.0f} s: {name}"
 
 
@@ -48,25 +49,10 @@ def main(options: Sequence[str]) -> int:
     able = [kind for kind, flag in KINDS.items() if flag in flags]
     pairs = product(able, THREADS) if "--all" in options else zip(able, cycle(THREADS))
     options = [option for option in options if option != "--all"]
-    lines = [
-        tested(
-            f"{kind}, threads: {threads}",
-            (*NUMERICAL, *options),
-            OPENBLAS_CORETYPE=kind,
-            OPENBLAS_NUM_THREADS=threads,
-            OMP_NUM_THREADS=threads,
-        )
-        for kind, threads in pairs
-    ]
-    loops = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(BUSY)]
-    try:
-        lines.append(tested(f"{BUSY} busy loops", options))
-    finally:
-        for loop in loops:
-            loop.kill()
+    lines = [tested(kind, threads, options) for kind, threads in pairs]
     lines += [f"this processor cannot imitate {kind}" for kind in KINDS if kind not in able]
     print(*lines, sep="\n")
-    return any(line.startswith("FAILED") for line in lines)
+    return int(any(line.startswith("FAILED") for line in lines))
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ import pytest
 
 from palpate_studies.command import PROGRAM
 from tests.campaigns import __main__ as campaigns
+from tests.campaigns import processors
 from tests.factories.paths import ROOT
 
 READ = (".md", ".py", ".toml", ".yml", ".yaml", ".html", ".j2", ".service")
@@ -76,3 +77,8 @@ def test_a_campaign_runs_something_that_exists(name: str):
         assert campaign.command[0] == "-m"
         assert importlib.util.find_spec(campaign.command[1])
     assert all((ROOT / path).exists() for path in campaign.paths)
+
+
+def test_the_numerical_packages_have_tests():
+    """pytest would say only that it ran none."""
+    assert [path for path in processors.NUMERICAL if not (ROOT / path).is_dir()] == []

@@ -3,7 +3,9 @@ finds."""
 
 from __future__ import annotations
 
+from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -84,7 +86,12 @@ def test_a_file_that_cannot_be_read_counts_as_none(
     check_same(fit(PLAIN, path), fit(PLAIN, None))
 
 
-def test_it_is_written_from_time_to_time(tmp_path: Path):
-    """A training of a second writes no file."""
+@pytest.mark.parametrize(("step_s", "written"), [(1, False), (2, True)])
+def test_it_is_written_from_time_to_time(
+    step_s: int, written: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Nine steps within ten seconds write no file."""
+    seconds = count(0, step_s)
+    monkeypatch.setattr(checkpoint, "time", SimpleNamespace(monotonic=lambda: next(seconds)))
     fit(PLAIN, tmp_path / "half.pt")
-    assert not list(tmp_path.iterdir())
+    assert bool(list(tmp_path.iterdir())) == written
