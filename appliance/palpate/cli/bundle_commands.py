@@ -30,11 +30,9 @@ NEXT = "from the next start on: systemctl restart palpate"
 
 @dataclass(frozen=True, slots=True)
 class ListedBundle:
-    """One bundle of the store. sha and signature are empty for the packaged bundle.
-
-    role: current, on trial, previous (`rollback` returns to it), candidate, left, kept, or damaged.
-    detail: progress of the trial, reason for leaving the bundle, or its damage.
-    """
+    """One bundle of the store. sha and signature are empty for the packaged bundle. role: current,
+    on trial, previous (`rollback` returns to it), candidate, left, kept, or damaged. detail:
+    progress of the trial, reason for leaving the bundle, or its damage."""
 
     sha: str
     id: str

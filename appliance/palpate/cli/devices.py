@@ -1,7 +1,5 @@
-"""The devices of a command, real or simulated.
-
-Simulated devices are chosen by name, and only in this module. Each of their sentences says so.
-"""
+"""The devices of a command, real or simulated. Simulated devices are chosen by name, and only in
+this module. Each of their sentences says so."""
 
 from __future__ import annotations
 

@@ -31,10 +31,8 @@ def main(
     clock: Clock | None = None,
     environ: Mapping[str, str] = os.environ,
 ) -> int:
-    """Drive all configured outputs low and release them. Exit codes as of `palpate`.
-
-    If the program has failed several times in a row, wait before systemd starts it again.
-    """
+    """Drive all configured outputs low and release them. Exit codes as of `palpate`. If the program
+    has failed several times in a row, wait before systemd starts it again."""
     about = "Sets all output lines low. Options as for palpate run."
     parser = argparse.ArgumentParser("python -m palpate.cli.lower_outputs", description=about)
     add_settings(parser)

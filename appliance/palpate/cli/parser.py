@@ -1,7 +1,5 @@
-"""The command line of `palpate`: its commands in groups, and the options of each.
-
-It imports neither numpy nor devices, so that help answers at once.
-"""
+"""The command line of `palpate`: its commands in groups, and the options of each. It imports
+neither numpy nor devices, so that help answers at once."""
 
 from __future__ import annotations
 
@@ -152,6 +150,7 @@ GROUPS: Mapping[str, Mapping[str, CommandEntry]] = {
     },
 }
 """All commands of `palpate`, by heading."""
+LOOK: Any = {"epilog": EXIT_CODES, "formatter_class": argparse.RawDescriptionHelpFormatter}
 COMMANDS: Mapping[str, CommandEntry] = {n: c for group in GROUPS.values() for n, c in group.items()}
 
 
@@ -162,13 +161,7 @@ def parser(*names: str) -> Parser:
     for heading, commands in GROUPS.items():
         lines += ["", f"{heading}:", *(f"  {n:<{width}}  {c.text}" for n, c in commands.items())]
     lines += ["", "palpate COMMAND --help shows the options of a command."]
-    top = Parser(
-        "palpate",
-        usage="palpate COMMAND [OPTIONS]",
-        description="\n".join(lines),
-        epilog=EXIT_CODES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    top = Parser("palpate", "palpate COMMAND [OPTIONS]", "\n".join(lines), **LOOK)
     top.add_argument("--version", action="version", version=f"palpate {__version__}")
     top.set_defaults(**options.NO_SETTINGS, json=None, sweeps=None)
     subparsers = top.add_subparsers(
@@ -181,13 +174,8 @@ def parser(*names: str) -> Parser:
 
 def _add(subparsers: Any, name: str, command: CommandEntry) -> None:
     """Add a command with its options and its actions."""
-    one = subparsers.add_parser(
-        name,
-        help=command.text,
-        description=f"{command.text[0].upper()}{command.text[1:]}.",
-        epilog=EXIT_CODES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    about = f"{command.text[0].upper()}{command.text[1:]}."
+    one = subparsers.add_parser(name, help=command.text, description=about, **LOOK)
     if name == "bridge":
         from palpate.bridges.options import add_arguments
 

@@ -52,14 +52,11 @@ def run(args: argparse.Namespace) -> int:
         talk = recording.about, obey, recording.names.label
         pages = page(args.web, settings, format, devices, *talk)
         _announce(format, folder)
+        reports = _observers(settings, format, devices.source, recording)
         box = assembly.recorder(
-            settings,
-            format,
-            devices,
-            port,
-            stack,
+            *(settings, format, devices, port, stack),
             capture=capture(args, settings, format, stack),
-            observers=[disk, *_observers(settings, format, devices.source, recording), *pages],
+            observers=[disk, *reports, *pages],
             commands=recording.commands,
             ordered=bool(pages),
         )

@@ -35,10 +35,9 @@ def done(
 ) -> Callable[[], bool]:
     """True after a signal, after `--sweeps` answers, and at the end of a script."""
     wanted = args.sweeps
+    done = devices.finished
     return lambda: (
-        (wanted is not None and box.answered >= wanted)
-        or stopped()
-        or devices.finished(box.answered)
+        (wanted is not None and box.answered >= wanted) or stopped() or done(box.answered)
     )
 
 

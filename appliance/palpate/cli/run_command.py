@@ -78,12 +78,8 @@ def untaught(args: argparse.Namespace, settings: Config, packaged: Bundle) -> bo
     """Whether the skin lacks a bundle: none was delivered or taught, and the packaged bundle is for
     another skin. A skin of PROTOCOL.md announces its format later, so it does not count."""
     profile = skins.profile(settings)
-    return (
-        not args.sim
-        and settings.teach.allow
-        and profile.codec != "palpate"
-        and not fits(profile.format, packaged.format)
-    )
+    teaches = settings.teach.allow and not args.sim and profile.codec != "palpate"
+    return teaches and not fits(profile.format, packaged.format)
 
 
 def _reports(

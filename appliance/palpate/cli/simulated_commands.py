@@ -62,13 +62,8 @@ def run_demo(args: argparse.Namespace) -> int:
     with ExitStack() as stack:
         far_end, name = stack.enter_context(pseudo_terminal.pair())
         port = SerialSink(replace(settings.serial, port=name), devices.clock, devices.source)
-        show = demo.Demo(
-            devices.robot.played,
-            far_end,
-            sys.stdout,
-            bundle.manifest.labels,
-            raw=args.raw,
-        )
+        labels = bundle.manifest.labels
+        show = demo.Demo(devices.robot.played, far_end, sys.stdout, labels, raw=args.raw)
         box = assembly.box(_on_lines(settings), bundle, devices, port, stack)
         show.run(box, args.sweeps, lambda: stopped() or devices.finished(box.answered))
     if not args.raw and not stopped():

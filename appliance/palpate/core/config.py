@@ -106,11 +106,9 @@ class TriggerConfig:
 
 @dataclass(frozen=True, slots=True)
 class OutputConfig:
-    """The box's GPIO lines to the robot; "" means not wired.
-
-    ready, busy, result_valid, fault, decided: PROTOCOL.md, part 3. class_bits: the class code,
-    lowest bit first. settle_us: time from setting these lines to the rise of `result_valid`.
-    """
+    """The box's GPIO lines to the robot; "" means not wired. ready, busy, result_valid, fault,
+    decided: PROTOCOL.md, part 3. class_bits: the class code, lowest bit first. settle_us: time from
+    setting these lines to the rise of `result_valid`."""
 
     ready: str = gpio_line()
     busy: str = gpio_line()
@@ -123,10 +121,8 @@ class OutputConfig:
 
 @dataclass(frozen=True, slots=True)
 class SweepConfig:
-    """Limits of a sweep.
-
-    max_duration_s: a sweep without a stop edge for this long is answered `long`.
-    """
+    """Limits of a sweep. max_duration_s: a sweep without a stop edge for this long is answered
+    `long`."""
 
     max_duration_s: float = number(12.0, 0.1, 3600.0)
     late_ms: int = fixed(500)  # longest wait for frames after the stop edge
@@ -136,10 +132,8 @@ class SweepConfig:
 
 @dataclass(frozen=True, slots=True)
 class SerialConfig:
-    """The serial line to the robot.
-
-    port: a device path, "" for none. baud: bits per second, 8N1.
-    """
+    """The serial line to the robot. port: a device path, "" for none. baud: bits per second,
+    8N1."""
 
     port: str = ""
     baud: int = number(115200, 1200, 4_000_000)
@@ -219,11 +213,9 @@ class StoreConfig:
 
 @dataclass(frozen=True, slots=True)
 class WatchConfig:
-    """The page of `palpate watch --web`.
-
-    address: where it listens, then further host names by which browsers may ask for it, separated
-    by spaces. Addresses beyond this machine need token and certificate.
-    """
+    """The page of `palpate watch --web`. address: where it listens, then further host names by
+    which browsers may ask for it, separated by spaces. Addresses beyond this machine need token and
+    certificate."""
 
     address: str = "127.0.0.1"
     folder: str = fixed("/etc/palpate/watch")  # token, certificate.pem and key.pem
@@ -231,12 +223,9 @@ class WatchConfig:
 
 @dataclass(frozen=True, slots=True)
 class TeachConfig:
-    """Teaching at the robot (`palpate teach`).
-
-    allow: whether this box may learn materials by itself, and run a bundle that it has taught.
-    serial: whether the robot may teach it,
-    by the commands TEACH, USE and FORGET of the serial line.
-    """
+    """Teaching at the robot (`palpate teach`). allow: whether this box may learn materials by
+    itself, and run a bundle that it has taught. serial: whether the robot may teach it, by the
+    commands TEACH, USE and FORGET of the serial line."""
 
     allow: bool = True
     serial: bool = False
@@ -287,11 +276,7 @@ _SECTIONS: Mapping[str, Any] = MappingProxyType(
     {n: h for n, h in get_type_hints(Config).items() if is_dataclass(h)}
 )
 _KEYS: Mapping[str, Key] = MappingProxyType(
-    {
-        f"{section}.{last}": key
-        for section, group in _SECTIONS.items()
-        for last, key in keys(group).items()
-    }
+    {f"{s}.{last}": key for s, group in _SECTIONS.items() for last, key in keys(group).items()}
 )
 
 

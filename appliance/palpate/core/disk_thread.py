@@ -57,10 +57,8 @@ class AtOnce:
 
 class DiskThread(Observer):
     """Does the work in a thread. As an observer of the loop it gives results back in each turn, so
-    it comes before the observers that use it.
-
-    most: pieces of work that may wait. refused: number of pieces that were refused, and so lost.
-    """
+    it comes before the observers that use it. most: pieces of work that may wait. refused: number
+    of pieces that were refused, and so lost."""
 
     def __init__(self, most: int = MOST_WAITING) -> None:
         self.refused = 0

@@ -77,11 +77,9 @@ def to_stderr() -> None:
 
 
 class TroubleLog:
-    """Logs a trouble when it begins, changes and ends, but not each time it is seen.
-
-    The log gets `begin: TROUBLE; advice` as a warning, and `end` unless it is "". known: False to
-    log the first state even without trouble.
-    """
+    """Logs a trouble when it begins, changes and ends, but not each time it is seen. The log gets
+    `begin: TROUBLE; advice` as a warning, and `end` unless it is "". known: False to log the first
+    state even without trouble."""
 
     def __init__(self, begin: str, advice: str = "", *, end: str = "", known: bool = True) -> None:
         self._begin, self._advice, self._end = begin, advice and f"; {advice}", end

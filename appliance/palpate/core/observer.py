@@ -14,11 +14,9 @@ Facts = Mapping[str, Callable[[], object]]
 
 
 class Observer:
-    """Base of all observers; each overrides the methods that it needs.
-
-    No method may raise or wait: a full disk may cost the record, but must not stop the classifying.
-    Slow work belongs into `sweep` or `turn`, when all answers of the turn are out.
-    """
+    """Base of all observers; each overrides the methods that it needs. No method may raise or wait:
+    a full disk may cost the record, but must not stop the classifying. Slow work belongs into
+    `sweep` or `turn`, when all answers of the turn are out."""
 
     def frames(self, frames: Frames) -> None:
         """Frames have come, at least one."""

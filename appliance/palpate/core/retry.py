@@ -18,10 +18,8 @@ def retried(
     make: Callable[[], Made], clock: Clock, stopped: Callable[[], bool] = lambda: False
 ) -> Made:
     """`make()`; a service tries again with a growing pause as long as an address cannot be used.
-
     After a power cut the address may come later than the service. Raises AddressError in a
-    terminal, where a person reads it, and once `stopped()`.
-    """
+    terminal, where a person reads it, and once `stopped()`."""
     pause_s = FIRST_S
     while True:
         try:

@@ -1,7 +1,5 @@
 """The folder of a running box, and the names in it, for the box and for programs beside it.
-
-`palpate status` finds its file by this module alone: scripts call it often.
-"""
+`palpate status` finds its file by this module alone: scripts call it often."""
 
 import os
 

@@ -98,11 +98,9 @@ def read_table(
     unknown: Callable[[str], Exception],
     refused: Callable[[str], Exception],
 ) -> dict[str, Any]:
-    """The values of a TOML table as their fields' types, by name.
-
-    unknown: makes the error for a name that is not in `known`. refused: makes the error for the
-    text "NAME = VALUE is not allowed; use ...".
-    """
+    """The values of a TOML table as their fields' types, by name. unknown: makes the error for a
+    name that is not in `known`. refused: makes the error for the text "NAME = VALUE is not allowed;
+    use ..."."""
     values = {}
     for name, value in table.items():
         if name not in known:

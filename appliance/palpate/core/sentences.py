@@ -26,12 +26,9 @@ _PATTERN = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class Sentence:
-    """A line that was received.
-
-    kind: RES, STA, … or the name of a command. text: the text after it, None if there is none.
-    summed: it had a checksum, which was right. error: the reason why it is not a sentence, "" if it
-    is.
-    """
+    """A line that was received. kind: RES, STA, … or the name of a command. text: the text after
+    it, None if there is none. summed: it had a checksum, which was right. error: the reason why it
+    is not a sentence, "" if it is."""
 
     kind: str
     text: str | None = None
@@ -93,12 +90,9 @@ def answer(
 
 
 def parse(data: bytes, rest: bytes = b"") -> tuple[list[Sentence], bytes]:
-    """The sentences in `data`, which continues `rest`, and the new unfinished rest.
-
-    Each line gives one Sentence, however it is split. A line of over MAX_LINE characters is
-    reported once. The rest then contains one character more, so that the end of the line is not
-    taken for a sentence.
-    """
+    """The sentences in `data`, which continues `rest`, and the new unfinished rest. Each line gives
+    one Sentence, however it is split. A line of over MAX_LINE characters is reported once. The rest
+    then contains one character more, so that the end of the line is not taken for a sentence."""
     reported = len(rest) > MAX_LINE
     *lines, rest = re.split(rb"[\r\n]+", rest + data)
     found = [read(line) for line in lines[reported:] if line]
@@ -108,12 +102,9 @@ def parse(data: bytes, rest: bytes = b"") -> tuple[list[Sentence], bytes]:
 
 
 def read(line: bytes) -> Sentence:
-    """One line, with or without its end.
-
-    A checksum may be missing, and spaces may stand for commas, so that a person can type commands;
-    a wrong checksum is always refused. A sentence begins at its $, since noise or a break may have
-    left bytes before it.
-    """
+    """One line, with or without its end. A checksum may be missing, and spaces may stand for
+    commas, so that a person can type commands; a wrong checksum is always refused. A sentence
+    begins at its $, since noise or a break may have left bytes before it."""
     if len(line) > MAX_LINE:
         return Sentence("", error=f"line of over {MAX_LINE} characters without an end")
     # the kind has only letters, since it is sent back in the answer to a command, and noise could

@@ -37,11 +37,8 @@ def widen(
     bounds: tuple[float, float], values: Array, clusters: Array | None
 ) -> tuple[float, float]:
     """The interval `bounds` of the mean of `values` [n], extended to the interval of the bootstrap
-    over `clusters` [n].
-
-    The bootstrap's interval is from 2.5 to 97.5 % of DRAWS draws. Without clusters, `bounds` are
-    returned unchanged.
-    """
+    over `clusters` [n]. The bootstrap's interval is from 2.5 to 97.5 % of DRAWS draws. Without
+    clusters, `bounds` are returned unchanged."""
     if clusters is None:
         return bounds
     member = np.unique(clusters, return_inverse=True)[1]

@@ -40,13 +40,8 @@ class Status(StrEnum):
     @property
     def faulty(self) -> bool:
         """True if the counts show that the skin did not measure a slide: nothing is learnt."""
-        return self in (
-            Status.NO_CONTACT,
-            Status.SATURATED,
-            Status.STUCK_TAXEL,
-            Status.DEAD_TAXEL,
-            Status.NO_SLIDE,
-        )
+        fault = (Status.SATURATED, Status.STUCK_TAXEL, Status.DEAD_TAXEL)
+        return self in (Status.NO_CONTACT, *fault, Status.NO_SLIDE)
 
 
 USE, AGAIN, ASIDE = "use the label", "sweep again", "set the object aside"
@@ -54,12 +49,9 @@ HALT, NOTHING = "stop and call a person", "nothing"
 
 
 class Words(NamedTuple):
-    """What is said about a status.
-
-    code: for Modbus. colour: of the page's card: good, warn, bad or plain. word, advice: for an
-    operator, on the page. robot: what the robot's program does. reason: why there is no label, and
-    the remedy, for logs; "" with a label.
-    """
+    """What is said about a status. code: for Modbus. colour: of the page's card: good, warn, bad or
+    plain. word, advice: for an operator, on the page. robot: what the robot's program does. reason:
+    why there is no label, and the remedy, for logs; "" with a label."""
 
     code: int
     colour: str

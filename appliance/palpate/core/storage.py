@@ -23,10 +23,7 @@ def put(
     path: Path, data: bytes, *, parents: bool = False, durable: bool = True, mode: int | None = None
 ) -> None:
     """Write one file completely or not at all. parents: make its folders. durable, mode: as for
-    `put_all`.
-
-    Raises OSError, and then leaves nothing behind.
-    """
+    `put_all`. Raises OSError, and then leaves nothing behind."""
     if parents:
         path.parent.mkdir(parents=True, exist_ok=True)
     put_all({path: data}, durable=durable, mode=mode)

@@ -1,8 +1,5 @@
 """Sweep sets, which the simulator plays and `train` learns from: a user's .npz as a checked
-SweepSet.
-
-All shapes and types are checked here, so that no other module has to.
-"""
+SweepSet. All shapes and types are checked here, so that no other module has to."""
 
 from __future__ import annotations
 

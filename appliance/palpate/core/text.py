@@ -30,10 +30,7 @@ def shown(value: object) -> str:
 
 def closest(name: str, known: Iterable[str], most: int = 1, cutoff: float = 0.5) -> list[str]:
     """Up to `most` of the `known` names that a misspelt `name` may stand for, the most similar
-    first; case is ignored.
-
-    cutoff: least similarity, 0 to 1 (difflib's ratio).
-    """
+    first; case is ignored. cutoff: least similarity, 0 to 1 (difflib's ratio)."""
     from difflib import get_close_matches
 
     by_folded = {k.casefold(): k for k in known}

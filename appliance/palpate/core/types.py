@@ -1,7 +1,5 @@
-"""The types that all packages share: SweepFormat, Frames, Sweep, Verdict, Status.
-
-Times are nanoseconds of the host's `CLOCK_MONOTONIC`.
-"""
+"""The types that all packages share: SweepFormat, Frames, Sweep, Verdict, Status. Times are
+nanoseconds of the host's `CLOCK_MONOTONIC`."""
 
 from __future__ import annotations
 
@@ -104,10 +102,7 @@ def shape(rows: int, cols: int, axes: int) -> tuple[int, ...]:
 
 def normal(counts: NDArray[Any], before: int) -> NDArray[Any]:
     """The axis along the skin's normal, which is the last: [..., R, C] of [..., R, C] or [..., R,
-    C, A].
-
-    before: dimensions before the rows, 0 for one frame, 1 for a window.
-    """
+    C, A]. before: dimensions before the rows, 0 for one frame, 1 for a window."""
     return counts[..., -1] if counts.ndim == before + 3 else counts
 
 
@@ -146,19 +141,14 @@ class Frames:
     @classmethod
     def joined(cls, runs: Sequence[Frames]) -> Frames:
         """Several runs of frames of one skin as one."""
-        return cls(
-            np.concatenate([run.t_ns for run in runs]),
-            np.concatenate([run.seq for run in runs]),
-            np.concatenate([run.taxels for run in runs]),
-        )
+        joined = zip(*((run.t_ns, run.seq, run.taxels) for run in runs), strict=True)
+        return cls(*(np.concatenate(part) for part in joined))
 
 
 def entries(record: Any) -> dict[str, Any]:
-    """The fields of a dataclass with slots, by name, for code that runs with each sweep.
-
-    At each call dataclasses.asdict makes a tuple of a generator. Python keeps up to 2,000 tuples of
-    each length for later use, so memory would grow for hours (docs/faults.md).
-    """
+    """The fields of a dataclass with slots, by name, for code that runs with each sweep. At each
+    call dataclasses.asdict makes a tuple of a generator. Python keeps up to 2,000 tuples of each
+    length for later use, so memory would grow for hours (docs/faults.md)."""
     return {name: getattr(record, name) for name in record.__slots__}
 
 

@@ -1,8 +1,5 @@
-"""The wall clock, for dates that people read.
-
-A box without a network may have a wrong one. Nothing is decided by it: times that are compared come
-from `clock`.
-"""
+"""The wall clock, for dates that people read. A box without a network may have a wrong one. Nothing
+is decided by it: times that are compared come from `clock`."""
 
 from datetime import UTC, datetime
 

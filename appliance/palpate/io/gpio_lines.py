@@ -49,11 +49,8 @@ def check_binding(gpio: Any) -> None:
 
 def find_lines(gpio: Any, names: Sequence[str]) -> dict[str, tuple[str, int]]:
     """Map each name to (path of its chip, offset), searching all chips of this machine. A line
-    without a name is given as chip and offset, such as "gpiochip0:17".
-
-    Raises LineError if a line is given twice, missing or ambiguous, if a chip may not be opened, or
-    without any chip.
-    """
+    without a name is given as chip and offset, such as "gpiochip0:17". Raises LineError if a line
+    is given twice, missing or ambiguous, if a chip may not be opened, or without any chip."""
     if len(set(names)) < len(names):
         raise LineError(f"one of {', '.join(names)} has two roles; give each role its own line")
     found = {name: _at_offset(gpio, *place) for name in names if (place := _place(name))}
@@ -170,10 +167,7 @@ def request_lines(
 
 class Lines:
     """The output GPIO lines of the box, all low at first. An empty name means that the line is not
-    wired.
-
-    Raises LineError if lines cannot be found, requested or written.
-    """
+    wired. Raises LineError if lines cannot be found, requested or written."""
 
     def __init__(self, config: OutputConfig, gpio: Any, clock: Clock) -> None:
         check_binding(gpio)
@@ -207,11 +201,8 @@ class Lines:
 
     def result(self, code: int | None) -> None:
         """Output a class code: RESULT VALID falls, the class bits change, and RESULT VALID rises
-        `settle_us` later.
-
-        With None, RESULT VALID only falls. With a code outside 0..capacity-1 it falls as well, and
-        LineError is raised.
-        """
+        `settle_us` later. With None, RESULT VALID only falls. With a code outside 0..capacity-1 it
+        falls as well, and LineError is raised."""
         self._write({self._valid: False})
         if code is None:
             return

@@ -45,10 +45,7 @@ Say = Callable[[str], object]
 
 class LinelessTrigger:
     """The common part of these triggers: edges are kept for the next turn of the loop, and none is
-    lost.
-
-    about: for the sidecar of a recorded sweep, as in GpioTrigger.
-    """
+    lost. about: for the sidecar of a recorded sweep, as in GpioTrigger."""
 
     blind = False
     due_ns: int = 0
@@ -91,10 +88,8 @@ class CommandTrigger(LinelessTrigger):
 
 def slide_values(text: str) -> dict[str, float]:
     """Speed in mm/s and force in N from the text of START ("30,1.5", ",1.5", ""), by the names of
-    Edge's fields. An empty value is left out.
-
-    Raises ApplianceError for a value that is not allowed, or for too many values.
-    """
+    Edge's fields. An empty value is left out. Raises ApplianceError for a value that is not
+    allowed, or for too many values."""
     values = text.replace(" ", ",").split(",")  # a person may type spaces for commas
     if len(values) > len(SLIDE_VALUES):
         raise ApplianceError(f"{len(values)} values are too many; send a speed and a force")
@@ -178,10 +173,7 @@ class KeyTrigger(LinelessTrigger):
 
 class TimedTrigger(LinelessTrigger):
     """Starts a sweep of `sweep_s` every `every_s` and announces it. Raises ConfigError if `every_s`
-    is not longer.
-
-    held: no sweep is started; afterwards the pause before a sweep begins again.
-    """
+    is not longer. held: no sweep is started; afterwards the pause before a sweep begins again."""
 
     def __init__(self, config: TriggerConfig, clock: Clock, say: Say) -> None:
         super().__init__("timed", "clock of the box")

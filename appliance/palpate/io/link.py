@@ -35,10 +35,8 @@ class SkinLink(Protocol):
 
 def reply_to(request: packets.Request, read: Callable[[int, int], bytes], clock: Clock) -> bytes:
     """The reply to a request that was sent as a byte. read: as `SkinLink.read`. Frames before the
-    reply are dropped: they belong to a stream that an earlier program did not stop.
-
-    Raises SensorMismatch if no reply comes within REPLY_MS.
-    """
+    reply are dropped: they belong to a stream that an earlier program did not stop. Raises
+    SensorMismatch if no reply comes within REPLY_MS."""
     data, until_ns = b"", clock.now_ns() + REPLY_MS * 1_000_000
     # without this limit, a device that sends a few bytes now and then would keep the loop running
     while len(data) <= _MOST_BYTES and clock.now_ns() < until_ns:

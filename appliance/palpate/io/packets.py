@@ -127,10 +127,7 @@ def _seal(head: bytes, payload: bytes) -> bytes:
 
 def pack(seq: int, t_us: int, taxels: NDArray[Any], flags: int = 0) -> bytes:
     """A frame packet. taxels: raw counts [n, R, C] or [n, R, C, A] of one of DATA_TYPES. seq and
-    t_us are sent modulo 2**32.
-
-    Raises FormatError if the frames do not fit one packet.
-    """
+    t_us are sent modulo 2**32. Raises FormatError if the frames do not fit one packet."""
     n, rows, cols, *axes = taxels.shape
     code = _DTYPES.index(taxels.dtype.newbyteorder("<"))
     payload = taxels.astype(_DTYPES[code], copy=False).tobytes()

@@ -40,11 +40,9 @@ RETRY_NS = 1_000_000_000
 
 
 class Port(Protocol):
-    """A serial line to the robot controller, for sentences and commands.
-
-    name: of the port, for messages. dropped: number of sentences that were not sent. trouble: the
-    reason why the line does not work, "" if it does.
-    """
+    """A serial line to the robot controller, for sentences and commands. name: of the port, for
+    messages. dropped: number of sentences that were not sent. trouble: the reason why the line does
+    not work, "" if it does."""
 
     name: str
     dropped: int
@@ -110,10 +108,8 @@ def command(name: str, text: str | None = None) -> Command:
 
 
 class StdoutPort:
-    """Sentences on standard output, used if no serial port is configured.
-
-    commands: another source of commands, since standard output has none.
-    """
+    """Sentences on standard output, used if no serial port is configured. commands: another source
+    of commands, since standard output has none."""
 
     def __init__(self, source: str, commands: Callable[[], list[Command]] = list) -> None:
         self.name, self.dropped, self.trouble = "standard output", 0, ""
@@ -125,10 +121,8 @@ class StdoutPort:
 
     def say(self, line: bytes) -> None:
         """Print a sentence. It is dropped and counted if nobody reads the output, or the disk
-        behind it is full.
-
-        Raises BrokenPipeError once if the reader has gone, as for any program in a pipeline.
-        """
+        behind it is full. Raises BrokenPipeError once if the reader has gone, as for any program in
+        a pipeline."""
         if self._gone:
             self.dropped += 1
             return
@@ -164,10 +158,8 @@ def _can_be_written(stream: TextIO) -> bool:
 
 
 class SerialSink:
-    """Sentences to and commands from a serial port, which may be unplugged and come back.
-
-    opener: opens a `serial.Serial`. dropped: number of sentences that the peer did not read.
-    """
+    """Sentences to and commands from a serial port, which may be unplugged and come back. opener:
+    opens a `serial.Serial`. dropped: number of sentences that the peer did not read."""
 
     def __init__(
         self,

@@ -112,10 +112,7 @@ def open_readout(
 
 def find(ids: Iterable[tuple[int, int]], serial_number: str, ports: Iterable[PortInfo]) -> str:
     """The path of the first port with one of the USB `ids` (vendor, product) and this serial
-    number; "" fits any.
-
-    Raises SensorAbsent with a list of the existing ports.
-    """
+    number; "" fits any. Raises SensorAbsent with a list of the existing ports."""
     ids, ports = list(ids), list(ports)
     for port in ports:
         if (port.vendor_id, port.product_id) in ids and serial_number in ("", port.serial):

@@ -50,11 +50,8 @@ def _named(port: Any) -> tuple[str, str]:
 
 def open_alone(path: str, baud: int, opener: Callable[..., Any] = serial.Serial) -> Any:
     """The open port at `path`, non-blocking, with an empty buffer, and closed to other programs.
-    opener: opens a `serial.Serial`.
-
-    Raises OSError, or ValueError for an unsupported baud rate; `is_held` tells whether another
-    program has it.
-    """
+    opener: opens a `serial.Serial`. Raises OSError, or ValueError for an unsupported baud rate;
+    `is_held` tells whether another program has it."""
     port = opener(path, baud, timeout=0, write_timeout=0, exclusive=True)
     try:
         _keep_others_out(port.fileno())
@@ -81,10 +78,7 @@ def is_held(e: Exception) -> bool:
 
 def _keep_others_out(port: int) -> None:
     """Make the kernel refuse any further open of `port`, except by root. Another reader would take
-    bytes away, and a lock only binds programs that check it.
-
-    Pseudo-terminals are left out: if we were killed while the other end is open, it would stay
-    locked, also for us.
-    """
+    bytes away, and a lock only binds programs that check it. Pseudo-terminals are left out: if we
+    were killed while the other end is open, it would stay locked, also for us."""
     if os.major(os.fstat(port).st_rdev) not in PSEUDO_TERMINALS:
         fcntl.ioctl(port, termios.TIOCEXCL)

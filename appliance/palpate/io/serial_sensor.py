@@ -59,10 +59,8 @@ class ProfileLink:
 
 
 class SerialSensor(LinkSensor):
-    """A skin on a serial port, read as its profile describes.
-
-    open_port: opens a port, given path and baud rate. ports: lists the serial ports of the machine.
-    """
+    """A skin on a serial port, read as its profile describes. open_port: opens a port, given path
+    and baud rate. ports: lists the serial ports of the machine."""
 
     announced = False
 

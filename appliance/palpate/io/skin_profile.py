@@ -1,7 +1,5 @@
-"""Skin profiles: TOML files that describe the bytes of a skin, read into a checked SkinProfile.
-
-The fields of SkinProfile are the schema; firmware_config/skins/matrix.toml explains each for users.
-"""
+"""Skin profiles: TOML files that describe the bytes of a skin, read into a checked SkinProfile. The
+fields of SkinProfile are the schema; firmware_config/skins/matrix.toml explains each for users."""
 
 from __future__ import annotations
 
@@ -290,10 +288,8 @@ PALPATE = SkinProfile()
 
 def load(name: str, folders: Sequence[Path]) -> SkinProfile:
     """The profile NAME.toml in the first folder that has it. DEFAULT needs no file. A name that
-    ends in .toml is a path.
-
-    Raises ConfigError with the file, the key, the value and the allowed values.
-    """
+    ends in .toml is a path. Raises ConfigError with the file, the key, the value and the allowed
+    values."""
     there = {name: Path(name)} if name.endswith(".toml") else names(folders)
     if name == DEFAULT and name not in there:
         return PALPATE

@@ -109,10 +109,8 @@ class CountedStream:
         return self._fit.quality()
 
     def feed(self, data: bytes, arrival_ns: int) -> Frames:
-        """The frames that are completed by a read that ended at `arrival_ns`.
-
-        Raises SensorMismatch if they have another grid or come at another rate.
-        """
+        """The frames that are completed by a read that ended at `arrival_ns`. Raises SensorMismatch
+        if they have another grid or come at another rate."""
         begin = self._bytes - len(self._rest.data)
         self._bytes += len(data)
         self._arrivals.append((self._bytes, arrival_ns))

@@ -21,11 +21,9 @@ if TYPE_CHECKING:
 
 @dataclass(slots=True)
 class EdgeCounters:
-    """Counts since the program started.
-
-    glitches: bursts that did not change the level. lost_edges: dropped by the kernel because its
-    queue was full. storms: bursts of more than `storm_edges` edges.
-    """
+    """Counts since the program started. glitches: bursts that did not change the level. lost_edges:
+    dropped by the kernel because its queue was full. storms: bursts of more than `storm_edges`
+    edges."""
 
     glitches: int = 0
     lost_edges: int = 0

@@ -85,11 +85,9 @@ class VendorLink:
         return bytes(reply) if length else b""
 
     def read(self, size: int, timeout_ms: int) -> bytes:
-        """One bulk transfer of at most `size` bytes; b"" if none came within `timeout_ms`.
-
-        Raises SensorOverflow for a larger transfer, else SensorError. A stalled endpoint is cleared
-        for the next read.
-        """
+        """One bulk transfer of at most `size` bytes; b"" if none came within `timeout_ms`. Raises
+        SensorOverflow for a larger transfer, else SensorError. A stalled endpoint is cleared for
+        the next read."""
         try:
             return bytes(self._device.read(self._in, size, timeout_ms))
         except usb.core.USBTimeoutError:
@@ -117,19 +115,13 @@ class AcmLink(VendorLink):
 
     def _claimed(self) -> list[int]:
         # the kernel's cdc_acm holds both the control and the data interface
-        return [
-            i.bInterfaceNumber
-            for i in self._device.get_active_configuration()
-            if i.bInterfaceClass in (2, 10)
-        ]
+        found = self._device.get_active_configuration()
+        return [i.bInterfaceNumber for i in found if i.bInterfaceClass in (2, 10)]
 
     def _raise_dtr(self) -> None:
         """Signal that the host reads, as the kernel's driver does (SET_CONTROL_LINE_STATE, USB PSTN
-        1.2, 6.3.12).
-
-        Without this signal TinyUSB, and so MicroPython, overwrites unsent data. A readout board may
-        refuse the request.
-        """
+        1.2, 6.3.12). Without this signal TinyUSB, and so MicroPython, overwrites unsent data. A
+        readout board may refuse the request."""
         configuration = self._device.get_active_configuration()
         control = [i.bInterfaceNumber for i in configuration if i.bInterfaceClass == CDC_CONTROL]
         to = control[0] if control else self._number

@@ -89,11 +89,8 @@ class Stream:
         return self._device.quality()
 
     def feed(self, data: bytes, arrival_ns: int) -> Frames:
-        """The frames of a transfer that ended at `arrival_ns`.
-
-        Raises SensorMismatch if they have another format, or if the device clock disagrees with the
-        frame count.
-        """
+        """The frames of a transfer that ended at `arrival_ns`. Raises SensorMismatch if they have
+        another format, or if the device clock disagrees with the frame count."""
         unpacked = self._unpack(self._leftover + data)
         self._leftover = unpacked.leftover
         self._counters.garbage_bytes += unpacked.garbage
@@ -144,11 +141,8 @@ class Stream:
 
     def _check_pace(self, first: int, start_ns: int) -> None:
         """Compare the device clock with the frame count. If they disagree, host times and windows
-        are wrong.
-
-        The reference is a frame up to one second ago, so a jump of either is detected at once, and
-        a wrong rate within that second. Raises SensorMismatch.
-        """
+        are wrong. The reference is a frame up to one second ago, so a jump of either is detected at
+        once, and a wrong rate within that second. Raises SensorMismatch."""
         self._mark = self._mark or (first, start_ns)
         counted_ns = round((first - self._mark[0]) * self._format.period_ns)
         passed_ns = start_ns - self._mark[1]

@@ -1,8 +1,5 @@
-"""Outputs the verdict as a class code on GPIO lines: class bits and RESULT VALID.
-
-Separate from gpio_lines.py, which must not import numpy, since `cli.lower_outputs` needs to start
-fast.
-"""
+"""Outputs the verdict as a class code on GPIO lines: class bits and RESULT VALID. Separate from
+gpio_lines.py, which must not import numpy, since `cli.lower_outputs` needs to start fast."""
 
 from __future__ import annotations
 

@@ -1,7 +1,5 @@
 """Types of the numbers that a skin sends, and the data type of the box that takes each of them.
-
-Numbers of 24 and 32 bits become float32, which holds 24 bits exactly.
-"""
+Numbers of 24 and 32 bits become float32, which holds 24 bits exactly."""
 
 from __future__ import annotations
 

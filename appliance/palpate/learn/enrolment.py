@@ -30,11 +30,8 @@ LEAST = 0.7
 
 @dataclass(frozen=True, slots=True)
 class Enrolment:
-    """A bundle with one more label, and its enrolment.npz.
-
-    warnings: for the person who enrols. disagreement: why the sweeps may not be of one material, ""
-    if they agree.
-    """
+    """A bundle with one more label, and its enrolment.npz. warnings: for the person who enrols.
+    disagreement: why the sweeps may not be of one material, "" if they agree."""
 
     bundle: Bundle
     file: bytes

@@ -63,11 +63,9 @@ def trained(running: Bundle) -> tuple[str, ...]:
 def recorded(running: Bundle, folder: Path) -> NewSweeps:
     """The sweeps in `folder` of new materials and of the format of the bundle."""
     check, known = enrolment.slide_check(running), trained(running)
-    new = [
-        one
-        for one in sweep_folder.taught(folder, Counter())
-        if one.format == running.format and one.sweep.material not in known
-    ]
+    taught = sweep_folder.taught(folder, Counter())
+    ours = [one for one in taught if one.format == running.format]
+    new = [one for one in ours if one.sweep.material not in known]
     slides, no_slides = slides_alone(new, [check(one.sweep.frames.taxels) for one in new])
     windows: dict[str, list[Array]] = {}
     files: dict[str, list[str]] = {}
@@ -139,9 +137,7 @@ def left_out(old: Bundle, many: Mapping[str, Array], sweeps: NewSweeps) -> Asses
 
 def _left_out(old: Bundle, outputs: Mapping[str, tuple[Array, Array]], of: str) -> Array:
     """Probabilities [n, K] of all labels for the sweeps of a material, each left out in turn.
-
-    outputs: as of `enrolment.network_outputs`, of each material.
-    """
+    outputs: as of `enrolment.network_outputs`, of each material."""
     assert old.classes
     assert old.manifest.known
     known, labels = replace(old.manifest.known, enrolled=enrolment.LEAST), old.manifest.labels

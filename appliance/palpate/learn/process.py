@@ -1,7 +1,5 @@
-"""A process of its own that learns beside the loop. It prints a line of JSON for each step.
-
-Nothing here waits: the loop looks for news between two turns.
-"""
+"""A process of its own that learns beside the loop. It prints a line of JSON for each step. Nothing
+here waits: the loop looks for news between two turns."""
 
 from __future__ import annotations
 

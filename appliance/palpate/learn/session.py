@@ -247,10 +247,8 @@ class TeachingSession(Observer):
 
 class Teacher(Observer):
     """Leads through the materials of a session without a page: asks for `sweeps` good sweeps of
-    each label, one after another. It must come after the session among the observers.
-
-    done: true once all sweeps are stored; false for ever without labels.
-    """
+    each label, one after another. It must come after the session among the observers. done: true
+    once all sweeps are stored; false for ever without labels."""
 
     def __init__(self, session: TeachingSession, labels: Sequence[str], sweeps: int) -> None:
         self._session, self._left, self._sweeps = session, [*labels], sweeps

@@ -75,10 +75,8 @@ def box(
     commands: Mapping[str, CommandHandler] = NO_COMMANDS,
     ordered: bool = False,
 ) -> Box:
-    """The box that classifies; `stack` closes it again.
-
-    capture: records all inputs. commands, ordered: as for `recorder`.
-    """
+    """The box that classifies; `stack` closes it again. capture: records all inputs. commands,
+    ordered: as for `recorder`."""
     run = classifier(settings, bundle, devices.clock)
     run.self_test()
     return _assembled(
@@ -110,10 +108,9 @@ def recorder(
     serving: bool = True,
     slides: Callable[[NDArray[Any]], str] | None = None,
 ) -> Box:
-    """The box that records sweeps of a format and needs no bundle; the class bits stay 0.
-
-    ordered: commands also come from another source than the port. serving: whether READY may rise.
-    slides: as for SweepCheck. Other parameters as for `box`."""
+    """The box that records sweeps of a format and needs no bundle; the class bits stay 0. ordered:
+    commands also come from another source than the port. serving: whether READY may rise. slides:
+    as for SweepCheck. Other parameters as for `box`."""
     check = SweepCheck(format, devices.clock, slides)
     watching = [check, *observers]
     return _assembled(
@@ -246,13 +243,8 @@ def gpio(devices: Devices) -> Any:
 def classifier(settings: Config, bundle: Bundle, clock: Clock) -> Classifier:
     chosen = settings.classifier
     return Classifier(
-        bundle,
-        clock,
-        chosen.fuse,
-        chosen.min_probability,
-        chosen.max_sweeps,
-        chosen.conflict,
-        chosen.object_s,
+        *(bundle, clock, chosen.fuse, chosen.min_probability, chosen.max_sweeps),
+        *(chosen.conflict, chosen.object_s),
     )
 
 
@@ -277,10 +269,8 @@ def store(settings: Config) -> Store:
 
 def running(settings: Config, *, answers: bool = True) -> SignedBundle:
     """The bundle that the settings name, else the deployed bundle, else the packaged bundle.
-
     answers: whether a robot gets its answers. Then it must be signed, unless
-    classifier.allow_unsigned is set. Raises BundleError or ConfigError.
-    """
+    classifier.allow_unsigned is set. Raises BundleError or ConfigError."""
     name = settings.classifier.bundle
     return named(settings, Path(name), answers=answers) if name else store(settings).running()
 

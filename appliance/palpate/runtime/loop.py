@@ -167,9 +167,7 @@ class Box:
 
     def step(self) -> list[Verdict]:
         """One turn, which takes at most the sensor's timeout. Returns the verdicts that were sent.
-
-        Raises ModelError after FAILURES sweeps that could not be classified; they are answered.
-        """
+        Raises ModelError after FAILURES sweeps that could not be classified; they are answered."""
         frames = self._sensor.read()
         now = self._turn_ns = self._clock.now_ns()
         self._cutter.put(frames, now)
@@ -386,11 +384,9 @@ class Box:
             return sentence("ANS", command.name, "error", str(e) or type(e).__name__)
 
     def obey(self, command: Command) -> list[object]:
-        """Carry out a command of any origin; returns the fields of its answer.
-
-        To be called between two turns or in an observer's `turn`. Raises ApplianceError with the
-        reason for a refusal.
-        """
+        """Carry out a command of any origin; returns the fields of its answer. To be called between
+        two turns or in an observer's `turn`. Raises ApplianceError with the reason for a
+        refusal."""
         self._notify("command", self._turn_ns, command.line)
         if command.name in self._commands:
             return self._commands[command.name](command.text)

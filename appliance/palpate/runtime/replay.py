@@ -44,11 +44,8 @@ class OtherBundle(FormatError):
 
 def replay(path: Path, settings: Config, bundle: Bundle, out: Callable[[str], object]) -> int:
     """Replay the file or folder at `path`: write its sentences, and for each kept sweep whether the
-    verdict is the same.
-
-    out: called with each line. Returns 1 if a verdict differs, else 0. Raises FormatError for an
-    unreadable file, another format or another bundle.
-    """
+    verdict is the same. out: called with each line. Returns 1 if a verdict differs, else 0. Raises
+    FormatError for an unreadable file, another format or another bundle."""
     if path.is_dir():
         return _folder(path, SweepReplay(settings, bundle), out)
     if path.suffix != ".npy":
@@ -100,11 +97,8 @@ class KeptSweep:
         recorded = RecordedSweep.load(path, {})
         sweep, format, about = recorded.sweep, recorded.format, recorded.about
         try:
-            tare = (
-                np.broadcast_to(np.asarray(about["tare"], np.float64), format.shape)
-                if "tare" in about
-                else None
-            )
+            tare = np.asarray(about["tare"], np.float64) if "tare" in about else None
+            tare = None if tare is None else np.broadcast_to(tare, format.shape)
             rule = typed(ReplayRule, about["rule"]) if "rule" in about else None
             touched = path.parent, int(about.get("run", 0)), sweep.object
             verdict = dict(about.get("verdict", {}))

@@ -53,10 +53,8 @@ def check(
     devices: Devices,
     spent_ns: Callable[[], int] = time.thread_time_ns,
 ) -> Iterator[CheckResult]:
-    """Check all components in turn, also after a failure; the skin also without a bundle.
-
-    spent_ns: processor time that this thread has taken so far.
-    """
+    """Check all components in turn, also after a failure; the skin also without a bundle. spent_ns:
+    processor time that this thread has taken so far."""
     loaded: list[Bundle] = []
     yield from _of_bundle(settings, load, devices, loaded)
     if loaded:
@@ -129,10 +127,8 @@ def _speed(manifest: Manifest) -> str:
 def _skin(
     settings: Config, wanted: SweepFormat | None, devices: Devices, spent_ns: Callable[[], int]
 ) -> str:
-    """The skin's name, format and processor time, in words. wanted: format of the bundle.
-
-    Raises SensorError, also if the bundle is for another skin or this board is too slow for it.
-    """
+    """The skin's name, format and processor time, in words. wanted: format of the bundle. Raises
+    SensorError, also if the bundle is for another skin or this board is too slow for it."""
     format = skins.announced(settings, devices, wanted)
     sends = _listened(settings, format, devices, spent_ns)
     if wanted and not fits(format, wanted):
@@ -163,16 +159,12 @@ def _listened(
         who = sensor.identity
         name = f"{who.board} {who.serial}" if who else ""
         sent = f"{shown(format.shape)} {format.dtype} at {format.rate_hz:g} Hz"
-        lost = (
-            f"{counters.lost_frames} lost"
-            if sensor.loss_known
-            else "whether frames were lost cannot be seen"
-        )
+        lost = f"{counters.lost_frames} lost"
+        lost = lost if sensor.loss_known else "whether frames were lost cannot be seen"
+        foreign = f"{counters.foreign_frames} foreign, " if counters.foreign_frames else ""
         sends = (
             f"{name.strip()}, {sent}, {counters.frames - first} frames in {passed_s:.1f} s, "
-            + f"{lost}, "
-            + (f"{counters.foreign_frames} foreign, " if counters.foreign_frames else "")
-            + f"{100 * share:.1f} % of a core"
+            f"{lost}, {foreign}{100 * share:.1f} % of a core"
         )
         if share > MOST_READING:
             raise SensorError(
@@ -241,11 +233,8 @@ def _another_rate(points: list[tuple[int, int]], wanted_hz: float) -> str:
 def _triggered(settings: Config, devices: Devices) -> Iterator[CheckResult]:
     if settings.trigger.mode == "serial" and not settings.serial.port:
         hint = "set serial.port, or trigger.mode to two-lines, key or timed"
-        yield CheckResult(
-            "trigger",
-            False,
-            f"serial: START and STOP come over serial.port, which is not set; {hint}",
-        )
+        wrong = f"serial: START and STOP come over serial.port, which is not set; {hint}"
+        yield CheckResult("trigger", False, wrong)
     elif not settings.trigger.by_lines:
         yield CheckResult("trigger", True, f"{settings.trigger.mode}, no lines")
     elif settings.trigger.start:

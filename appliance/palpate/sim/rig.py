@@ -125,10 +125,7 @@ class Robot:
 
     def next_act(self, first: int, frame_ns: Callable[[int], int]) -> Act | None:
         """Begin the next act with frame `first`, schedule its edges and return it; None when the
-        script has ended.
-
-        frame_ns: gives the host time at which a frame is taken.
-        """
+        script has ended. frame_ns: gives the host time at which a frame is taken."""
         if self._follows:
             return self._followed(first, frame_ns)
         act = next(self._script, None)
@@ -220,11 +217,8 @@ class Film:
 
     def frames(self, first: int, n: int, frame_ns: Callable[[int], int]) -> NDArray[Any]:
         """Frames `first` to `first + n` of the script [n, *shape], requested in order; after its
-        end all counts are 0.
-
-        frame_ns: gives the host time at which a frame is taken, and so the times of the edges of an
-        act.
-        """
+        end all counts are 0. frame_ns: gives the host time at which a frame is taken, and so the
+        times of the edges of an act."""
         if self._robot.skipped:
             begin, end = (i - self._base for i in self._robot.skipped)
             self._frames = np.delete(self._frames, slice(begin, end), axis=0)

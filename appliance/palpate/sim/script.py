@@ -49,8 +49,7 @@ MARGIN = 8
 _NAME_SKIN = "name another skin with --skin, or use --sim replay:FILE"
 _NAME_BUNDLE = (
     "name a bundle for this skin with --set classifier.bundle=DIR; palpate record --sim skin "
-    "--skin NAME, palpate-train fit "
-    "and export make one"
+    "--skin NAME, palpate-train fit and export make one"
 )
 
 

@@ -171,11 +171,8 @@ def band(
     passed: Array | float = 1.0,
 ) -> Array:
     """Noise [tracks, n] whose amplitude spectrum is a Gaussian over log frequency, with rms 1
-    before the gain `passed`.
-
-    centre, rate (sampling): both per second or both per mm. octaves: standard deviation. passed:
-    gain [n // 2 + 1] of the bins of rfft.
-    """
+    before the gain `passed`. centre, rate (sampling): both per second or both per mm. octaves:
+    standard deviation. passed: gain [n // 2 + 1] of the bins of rfft."""
     amplitude = np.exp(-0.5 * (np.log2(np.fft.rfftfreq(n, 1 / rate)[1:] / centre) / octaves) ** 2)
     amplitude *= n / 2 / np.sqrt(np.sum(amplitude**2))
     bins = np.zeros((tracks, n // 2 + 1), complex)
@@ -198,20 +195,15 @@ def position(placement: Placement, world: World) -> tuple[Array, Array]:
 
 def attachment(placement: Placement, world: World) -> tuple[Array, Array, Array]:
     """Effect: influence of the attachment: gains [R, C], bedding height [R, C] in mm, colour of
-    vibrations [7].
-
-    The colour is the logarithm of the gain at 6 Hz and at each octave above it, up to 375 Hz.
-    """
+    vibrations [7]. The colour is the logarithm of the gain at 6 Hz and at each octave above it, up
+    to 375 Hz."""
     grid = world.rows, world.cols
     if "attachment" in world.off:
         return np.ones(grid), np.zeros(grid), np.zeros(7)
     rng = np.random.default_rng(placement.seed)
     gain = np.exp(world.gain_spread * (rng.standard_normal() + rng.standard_normal(grid)))
-    return (
-        gain,
-        world.bedding_mm * rng.standard_normal(grid),
-        world.colour_spread * rng.standard_normal(7),
-    )
+    bedding = world.bedding_mm * rng.standard_normal(grid)
+    return gain, bedding, world.colour_spread * rng.standard_normal(7)
 
 
 def drift(n: int, rng: Generator, world: World) -> Array:
@@ -318,10 +310,7 @@ def loaded(
     tube: Material, placement: Placement, rng: Generator, world: World, slid: Whole, moving: Flags
 ) -> Array:
     """The readout's signal [n, R, C] or [n, R, C, 3] in counts for a finger in contact, without
-    noise and conversion.
-
-    slid: path along the tube in frames [n]. moving: [n].
-    """
+    noise and conversion. slid: path along the tube in frames [n]. moving: [n]."""
     of_drift, of_spot, of_texture, of_vibration = rng.spawn(4)
     x, y = position(placement, world)
     gain, bedding, colour = attachment(placement, world)
@@ -362,11 +351,8 @@ def sweep(
     after_s: float = 0.3,
 ) -> Counts:
     """Raw counts [n, 4, 4] or [n, 4, 4, 3] of a finger that rests on the tube, slides along it and
-    rests again.
-
-    The slide is in frames [rest_s * 750, (rest_s + slide_s) * 750). Raises ConfigError for an
-    unknown material.
-    """
+    rests again. The slide is in frames [rest_s * 750, (rest_s + slide_s) * 750). Raises ConfigError
+    for an unknown material."""
     return _touch(world.tube(material), placement, rng, world, *slide(rest_s, slide_s, after_s))
 
 
@@ -391,10 +377,7 @@ def _set_rng(name: SetName, seed: int) -> Generator:
 
 def placements(name: SetName, seed: int) -> list[Placement]:
     """Placements of a set: within 1 mm of the middle, in T-HARD one row (4 mm) forward; rotated by
-    2 degrees rms.
-
-    Raises ConfigError for an unknown set.
-    """
+    2 degrees rms. Raises ConfigError for an unknown set."""
     rng = _set_rng(name, seed)
     places = []
     for _ in range(SETS[name][0]):
@@ -410,11 +393,8 @@ def sweep_set(
     name: SetName, seed: int, per_material: int | None = None, world: World = WORLD
 ) -> LabelledWindows:
     """A set of the paper: windows [N, 1500, 4, 4] or [N, 1500, 4, 4, 3], labels int64 [N] into
-    MATERIALS, positions int64 [N].
-
-    per_material: windows of each tube at each position (default: as in the paper). Raises
-    ConfigError for an unknown set.
-    """
+    MATERIALS, positions int64 [N]. per_material: windows of each tube at each position (default: as
+    in the paper). Raises ConfigError for an unknown set."""
     places = placements(name, seed)
     each = SETS[name][1] if per_material is None else per_material
     position_of, label_of = np.divmod(

@@ -20,11 +20,9 @@ from palpate.sweeps.sweep_folder import SweepFolder
 
 
 class BlackBox(Observer):
-    """Keeps the last `most` sweeps in `folder`, also over restarts.
-
-    The oldest sweep is removed after the new sweep was written, on a full disk before. disk: does
-    that; a sweep that it refuses is not kept.
-    """
+    """Keeps the last `most` sweeps in `folder`, also over restarts. The oldest sweep is removed
+    after the new sweep was written, on a full disk before. disk: does that; a sweep that it refuses
+    is not kept."""
 
     def __init__(
         self, folder: Path, format: SweepFormat, most: int, disk: DiskWork | None = None

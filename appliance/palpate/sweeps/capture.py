@@ -127,11 +127,8 @@ def _set_aside(path: Path) -> None:
 
 class Playback:
     """Sensor, trigger, clock and source of commands of a replayed capture. Each record is returned
-    at its time.
-
-    Raises FormatError if the file cannot be read or is not a capture. An incomplete last record is
-    left out.
-    """
+    at its time. Raises FormatError if the file cannot be read or is not a capture. An incomplete
+    last record is left out."""
 
     def __init__(self, path: Path) -> None:
         try:

@@ -73,10 +73,7 @@ class FrameRing:
 
 def interpolate(frames: Frames, have: NDArray[np.int64], missing: NDArray[np.int64]) -> bool:
     """Interpolate the rows `missing` of `frames` in place from their neighbours in `have`; False if
-    a gap is too wide.
-
-    have, missing: int64, sorted row indices.
-    """
+    a gap is too wide. have, missing: int64, sorted row indices."""
     right = np.searchsorted(have, missing)
     if len(missing) and (right.min() == 0 or right.max() == len(have)):
         return False

@@ -10,11 +10,9 @@ MOST_SHOWN = 6
 
 
 class RecordingProgress:
-    """Counts sweeps per material and position. target: wanted number of sweeps of each pair.
-
-    A model learns a material from the positions at which it was recorded. So each material is
-    wanted at every position in the recording.
-    """
+    """Counts sweeps per material and position. target: wanted number of sweeps of each pair. A
+    model learns a material from the positions at which it was recorded. So each material is wanted
+    at every position in the recording."""
 
     def __init__(self, target: int) -> None:
         self.target = target
@@ -41,11 +39,8 @@ class RecordingProgress:
         """The missing sweeps of the known materials and positions, in words."""
         held = +self._count
         materials, positions = (sorted({pair[i] for pair in held}) for i in (0, 1))
-        lacking = [
-            f"{_name(*pair)}: {self.target - held[pair]}"
-            for pair in product(materials, positions)
-            if held[pair] < self.target
-        ]
+        wanted = ((pair, self.target - held[pair]) for pair in product(materials, positions))
+        lacking = [f"{_name(*pair)}: {number}" for pair, number in wanted if number > 0]
         more = len(lacking) - MOST_SHOWN
         if lacking:
             return f"missing: {', '.join(lacking[:MOST_SHOWN])}" + f" and {more} more" * (more > 0)

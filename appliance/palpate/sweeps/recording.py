@@ -261,10 +261,8 @@ class RecordingSession(Observer):
 
     def _discard(self, which: str) -> list[object]:
         """Remove the last stored sweep of this run; returns its number, the number of sweeps left,
-        and its file name.
-
-        which: the expected number, so that a later sweep is not removed by mistake; "" for any.
-        """
+        and its file name. which: the expected number, so that a later sweep is not removed by
+        mistake; "" for any."""
         if self._writing:
             raise ApplianceError("a sweep is still being written; wait for its REC sentence")
         if not self._stored:

@@ -28,10 +28,8 @@ UNCHECKED = Finding(Status.RECORDED, WHY)
 
 class SweepCheck(Observer):
     """Checks each window against the unloaded skin, which it finds by itself or takes from a TARE.
-
     slides: the reason why a window is not a slide, "" if it is one; None accepts all. model: "",
-    since there is no bundle. degraded: "", since nothing is bridged.
-    """
+    since there is no bundle. degraded: "", since nothing is bridged."""
 
     model = degraded = ""
 

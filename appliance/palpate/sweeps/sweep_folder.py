@@ -213,10 +213,8 @@ class SweepFolder:
 
     def remove(self, number: int, *, reserve: bool = False) -> None:
         """Remove a sweep, its .npy first, so that no .npy is ever without its sidecar. Raises
-        OSError.
-
-        reserve: do not use its number again after a restart, even if it was the highest.
-        """
+        OSError. reserve: do not use its number again after a restart, even if it was the
+        highest."""
         path = self.path(number)
         path.unlink(missing_ok=True)
         with suppress(FileNotFoundError):

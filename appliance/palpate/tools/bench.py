@@ -122,11 +122,8 @@ def _whole_way(format: SweepFormat, build: Build, seed: int) -> dict[str, Any]:
         lost = box.counters.lost_frames
     pairs = zip(watch.verdicts, simulated.robot.played, strict=True)
     right = sum(v.label == act.label and v.status is Status.OK for v, act in pairs)
-    accuracy = {
-        "right": right,
-        "total": SWEEPS,
-        "interval": [round(v, 4) for v in wilson(right, SWEEPS)],
-    }
+    interval = [round(v, 4) for v in wilson(right, SWEEPS)]
+    accuracy = {"right": right, "total": SWEEPS, "interval": interval}
     times = watch.answered_ms, watch.seen_ms
     answered, seen = map(_percentiles, times)
     figures = {"edge_to_sentence_ms": answered, "edge_seen_ms": seen}

@@ -105,10 +105,8 @@ class AnswerScore:
 
 class Demo:
     """Steps a box until the robot's end of its serial line has enough answers, and shows them.
-
     played: the acts of the simulated robot, with the true materials. far_end: non-blocking file
-    descriptor of the robot's end. labels: labels of the bundle. raw: print the sentences alone.
-    """
+    descriptor of the robot's end. labels: labels of the bundle. raw: print the sentences alone."""
 
     def __init__(
         self,

@@ -128,10 +128,7 @@ class Listener:
 
 def check(link: SkinLink, clock: Clock, seconds: float, *, port: bool) -> Iterator[PartResult]:
     """The results, one after the other. seconds: time for listening to frames. port: whether the
-    link is a serial port, whose buffers are large.
-
-    Raises SensorError if the link itself fails.
-    """
+    link is a serial port, whose buffers are large. Raises SensorError if the link itself fails."""
     listener = Listener(link, clock)
     link.request(Request.STOP, 0)  # the board may still send for an earlier program
     yield _result("identity", lambda: _identity(link))

@@ -1,8 +1,5 @@
-"""`palpate skin detect` and `list`: connected skins, and all profiles.
-
-A port is compared by its ids, then by listening. Commands are written only to a port that the user
-has named.
-"""
+"""`palpate skin detect` and `list`: connected skins, and all profiles. A port is compared by its
+ids, then by listening. Commands are written only to a port that the user has named."""
 
 from __future__ import annotations
 

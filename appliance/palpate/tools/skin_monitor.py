@@ -1,7 +1,5 @@
-"""The state of a skin, for `palpate skin show`: load, rate, noise and faults.
-
-No bundle is needed: the format is the skin's own, and the faults are visible in the signal alone.
-"""
+"""The state of a skin, for `palpate skin show`: load, rate, noise and faults. No bundle is needed:
+the format is the skin's own, and the faults are visible in the signal alone."""
 
 from __future__ import annotations
 

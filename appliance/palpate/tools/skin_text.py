@@ -23,10 +23,8 @@ Line = tuple[list[bytes], str]
 
 def proposed(data: bytes, seconds: float) -> str:
     """The text of a profile for lines of numbers, to be checked by a person; "" if the bytes are no
-    such lines. seconds: the time in which they came.
-
-    The number of values in a frame shows in the lines, the grid does not: it is the squarest.
-    """
+    such lines. seconds: the time in which they came. The number of values in a frame shows in the
+    lines, the grid does not: it is the squarest."""
     if not data.isascii() or b"\0" in data:
         return ""
     end = "\n" if b"\n" in data else "\r"

@@ -18,16 +18,12 @@ __all__ = ["Codec", "Decoded", "Rest", "arranged", "codec"]
 
 Codec = Callable[[Rest, bytes], Decoded]
 """Converts the rest of earlier bytes and new bytes to their content."""
-_MODULES = {
-    "fixed": "fixed",
-    "text": "text",
-    "papillarray": "papillarray",
-    "xela-can": "xela",
-    "robotiq-tsf": "robotiq",
-}
+_MODULES = {"xela-can": "xela", "robotiq-tsf": "robotiq"}
+"""Of the codecs that have another name than their module."""
 
 
 def codec(profile: SkinProfile) -> Codec:
     """The codec of a profile that does not speak PROTOCOL.md."""
     # a box has one skin, so it needs one of these modules
-    return partial(import_module(f"{__name__}.{_MODULES[profile.codec]}").decode, profile)
+    name = _MODULES.get(profile.codec, profile.codec)
+    return partial(import_module(f"{__name__}.{name}").decode, profile)
