@@ -179,10 +179,10 @@ class RecordingPhase(Phase):
     def run(self) -> bool:
         """Run; returns whether a bundle was made."""
         program, session = self._program, self._session
-        done, finished = self._teacher, program.devices.finished
+        teacher, finished = self._teacher, program.devices.finished
         self.box.run(
             lambda: (
-                program.ended or bool(session.taught) or done.done or finished(self.box.answered)
+                program.ended or bool(session.taught) or teacher.done or finished(self.box.answered)
             )
         )
         return bool(session.taught)

@@ -513,12 +513,6 @@ def test_find_through_link() -> None:
         assert find_lines(gpio, ["START"]) == {"START": (CHIP0, 0)}
 
 
-def test_one_line_two_roles() -> None:
-    """A line that is given two roles is refused before it is requested."""
-    with pytest.raises(LineError, match="START, START"):
-        GpioTrigger(trigger_config(stop="START"), sim({CHIP0: INPUTS}))
-
-
 @pytest.mark.parametrize(
     ("number", "why"),
     [(1, r"may not open.*'STOP'"), (13, r"may not open.*'STOP'"), (5, f"of {CHIP1}")],

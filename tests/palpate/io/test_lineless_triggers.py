@@ -137,21 +137,6 @@ def test_a_robot_sweeps_over_its_serial_line(rigged: Callable[..., Rigged]):
     assert [sweep.speed_mm_s for sweep in box.kept] == [None, None, None]
 
 
-def test_a_bad_value_is_answered_and_starts_no_sweep(rigged: Callable[..., Rigged]):
-    """A value that cannot be used is answered by an error; a good START begins a sweep."""
-    simulated = idle_devices()
-    box = rigged(simulated, sets=("trigger.mode=serial",))
-    box.seconds(0.5)
-    for text, quoted in ((",-3", "speed '-3'"), (",,x~!", "force 'x"), (",1,2,3", "3 values")):
-        assert f",START,error,{quoted}" in box.ask(f"$PPLP,START{text}")
-        box.seconds(0.1)
-        assert not box.box.health.sweeping
-    assert ",STOP,error,send it as PPLP STOP" in box.ask("$PPLP,STOP,30")
-    assert ",START,ok*" in box.ask("$PPLP,START,30,1.5")
-    box.seconds(0.1)
-    assert box.box.health.sweeping
-
-
 def test_the_space_bar_starts_and_stops(terminal: tuple[int, int]):
     """Each press counts once, whatever else is typed, and a message confirms each."""
     far, near = terminal

@@ -12,7 +12,6 @@ from palpate.cli.common import load_settings
 from palpate.cli.main import main
 from palpate.cli.parser import arguments
 from palpate.core import config
-from palpate.io.robot_link import command
 from palpate.learn import install
 from palpate.runtime import assembly
 from tests.factories import deliveries, install_scripts, lessons
@@ -122,13 +121,6 @@ def test_a_box_without_lines_waits_to_be_taught(
     args = arguments("run", ["--skin", "flexitac", *board])
     assert teach_command.until_taught(args, load_settings(args)) == 0
     assert modes == [mode]
-
-
-def test_its_commands_are_commands_of_the_line():
-    """TEACH and FORGET need a name, USE none."""
-    assert command("TEACH", "cork").line == "TEACH,cork"
-    assert command("USE").line == "USE"
-    assert command("FORGET").error == "send it as PPLP FORGET TEXT"
 
 
 @deliveries.NEEDED

@@ -7,7 +7,6 @@ import errno
 import json
 import os
 import resource
-import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -503,17 +502,6 @@ def test_what_cannot_be_written_leaves_nothing(tmp_path: Path, logged: list[str]
     assert desk.sweep(2)[1:3] == ["stored", "2"]
 
 
-def test_a_folder_that_is_taken_away(tmp_path: Path, logged: list[str]):
-    """Its sweeps fail with a report; once the folder is back, recording continues."""
-    folder = tmp_path / "a" / "b"
-    desk = Desk(folder)
-    shutil.rmtree(tmp_path / "a")
-    assert desk.outcome(1) == ["failed", "0", "No such file or directory"]
-    folder.mkdir(parents=True)
-    assert desk.sweep(2)[1] == "stored"
-    assert "stored again" in logged[-2]
-
-
 @pytest.mark.parametrize("folder", ["/proc/x", "/dev/null"])
 def test_a_folder_that_cannot_be_made(folder: str):
     """Reported before the robot sweeps."""
@@ -532,16 +520,6 @@ def test_folders_are_on_the_disk_before_their_sweeps(
         SweepFolder(tmp_path / "a" / "b", toy_bundle.FORMAT).close()
         assert {tmp_path, tmp_path / "a"} <= set(synced)
         synced.clear()
-
-
-def test_a_disk_that_is_full_costs_no_answer(recorded: Recorded, monkeypatch: pytest.MonkeyPatch):
-    """On the whole box: each sweep is answered, each REC says full, no frame is lost."""
-    refusing(monkeypatch, errno.ENOSPC)
-    simulated = simulated_tubes(4, 2)
-    box = recorded(simulated, WOOD)
-    assert len(box.until(lambda: simulated.finished(box.box.answered))) == 2
-    assert [rec[1] for rec in heard(box)] == ["full", "full"]
-    assert box.box.counters.lost_frames == 0
 
 
 def test_numbers_in_a_verdict_come_back_bit_for_bit():

@@ -122,14 +122,6 @@ def test_a_damaged_list_of_forgotten_sweeps_is_named(tmp_path: Path, content: st
             SweepFolder(tmp_path, SHORT)
 
 
-def test_sweeps_of_a_folder_in_use_are_not_forgotten_from_outside(tmp_path: Path):
-    """The program that records would not know."""
-    one = recording(tmp_path)
-    with pytest.raises(OSError, match="another program"):
-        SweepFolder(tmp_path, None)
-    one.close()
-
-
 def test_sweeps_of_another_folder_are_adopted(tmp_path: Path):
     """They get the next numbers and the material; the others stay."""
     session = recording(tmp_path / "old")
