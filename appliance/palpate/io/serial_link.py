@@ -122,7 +122,7 @@ def find(ids: Iterable[tuple[int, int]], serial_number: str, ports: Iterable[Por
     number = f" and serial number {serial_number}" if serial_number else ""
     there = ", ".join(map(str, ports)) or "none"
     raise SensorAbsent(
-        f"no serial port {wanted}{number}; there are: {there}; plug it in, or use --port"
+        f"no serial port {wanted}{number}; there are: {there}; plug it in, or set skin.port"
     )
 
 

@@ -98,6 +98,7 @@ class SerialSensor(LinkSensor):
             if self._config.tare:
                 for command in self._profile.commands(self._profile.tare, rate):
                     port.write(command)
+                self._tared_ns = self._clock.now_ns() + round(self._profile.tare_s * 1e9)
         except Exception:
             port.close()
             raise
