@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import subprocess
 import sys
 import threading
@@ -242,7 +243,9 @@ def units(tmp_path: Path) -> Iterator[dict[str, Offered]]:
 
 
 def test_the_program_reads_the_feeds(units: dict[str, Offered]):
-    """From the real feeds of two boxes to sentences on standard output, until SIGTERM."""
+    """From the real feeds of two boxes to sentences on standard output, until SIGTERM. A busy
+    machine may fuse a finger alone before the other is heard."""
+    both = re.compile(rb"(\$PPLP,FIN.*\r\n){2}\$PPLP,RES")
     fingers = [f"{name}={one.path}" for name, one in units.items()]
     words = [sys.executable, "-m", "palpate.bridges", "fuse", "--fingers", *fingers]
     with subprocess.Popen(words, cwd=ROOT, stdout=subprocess.PIPE) as bridge:
@@ -254,10 +257,9 @@ def test_the_program_reads_the_feeds(units: dict[str, Offered]):
                 one.turns()
                 one.feed.answered(OK)
             heard += bridge.stdout.read() or b""
-            if heard.count(b"$PPLP,RES") >= 2 or bridge.poll() is not None:
+            if both.search(heard) or bridge.poll() is not None:
                 break
             threading.Event().wait(0.01)
         bridge.terminate()
         assert bridge.wait(60) == 0
-    kinds = [sentences.read(line).kind for line in heard.splitlines()]
-    assert kinds[kinds.index("FIN") :][:3] == ["FIN", "FIN", "RES"]
+    assert both.search(heard), heard
