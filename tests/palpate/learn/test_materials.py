@@ -204,7 +204,7 @@ def test_a_model_or_disk_that_fails_leaves_the_bundle_in_service(
         raise error
 
     with monkeypatch.context() as patched:
-        patched.setattr(Classifier, "network", fail)
+        patched.setattr(Classifier, "outputs", fail)
         code, news = box.teach(capsys, *more)
     assert code
     assert news["type"] == "error"
