@@ -30,8 +30,53 @@ def _model(
     }
 
 
+def _points(*points: tuple[str, float, float]) -> list[Json]:
+    return [
+        {
+            "name": name,
+            "share": 1.0,
+            "accuracy": _accuracy(mean),
+            "behind": _difference(behind),
+            "fine": behind <= 0.012,
+        }
+        for name, mean, behind in points
+    ]
+
+
+def _curve(kind: str, points: list[Json], kept: str, **more: Any) -> Json:
+    return {
+        "kind": kind,
+        "points": points,
+        "kept": kept,
+        "set": f"set {kind} so",
+        "applied": False,
+    } | more
+
+
 def choice(**more: Any) -> Json:
-    """Four sizes. They reach the target."""
+    """Four sizes with all curves. They reach the target."""
+    curves = [
+        _curve(
+            "window",
+            _points(("all", 0.935, 0.0), ("0.5 s", 0.93, 0.005), ("0.2 s", 0.815, 0.12)),
+            "0.5 s",
+            applied=True,
+        ),
+        _curve("rate", _points(("750 Hz", 0.935, 0.0), ("375 Hz", 0.875, 0.06)), "750 Hz"),
+        _curve(
+            "taxels",
+            _points(("16", 0.935, 0.0), ("4", 0.928, 0.007)),
+            "4",
+            taxels=[[0, 0], [0, 3], [3, 0], [3, 3]],
+        ),
+        _curve("bits", _points(("8", 0.935, 0.0), ("6", 0.932, 0.003)), "6"),
+        _curve(
+            "classes",
+            _points(("3", 0.935, 0.0), ("2", 0.965, 0.0)),
+            "3",
+            proposed=[["metal", "plastic <smooth>"]],
+        ),
+    ]
     made = {
         "chosen": "pairs",
         "best": "64",
@@ -49,6 +94,7 @@ def choice(**more: Any) -> Json:
         "groups": ["place", "day"],
         "held_out": 960,
         "confused": [{"is": "metal", "named": "plastic <smooth>", "share": 0.115}],
+        "less": curves,
         "bundle": {
             "content": "relations at 3 scales, spectrum <i>",
             "kb": 12.0,
@@ -81,6 +127,7 @@ def missed() -> Json:
         rungs=alone,
         smaller=None,
         larger=None,
+        less=[],
         honest=None,
         confused=[],
         bundle={"content": "spectrum", "kb": 12.0, "ms": 0.118, "mb": 57.0, "used": {}},

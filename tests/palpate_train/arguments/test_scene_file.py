@@ -20,6 +20,7 @@ budget-ms = 5
 budget-kb = 96.5
 accuracy = 0.9
 slower = 3.0
+reduce = ["window", "rate"]
 reattached = true
 size = "64"
 """
@@ -52,7 +53,7 @@ def test_every_option_can_stand_in_the_file(tmp_path: Path):
     assert found.sets == [str(tmp_path / "a.npz"), "sim:T-LAB:1001:1"]
     assert (found.only, found.rename) == (["force<=180"], ["c=a"])
     assert (found.budget_ms, found.budget_kb, found.accuracy, found.slower) == (5, 96.5, 0.9, 3)
-    assert (found.reattached, found.size) == (True, "64")
+    assert (found.reduce, found.reattached, found.size) == (["window", "rate"], True, "64")
 
 
 def test_the_command_line_counts_more_than_the_file(tmp_path: Path):
@@ -108,3 +109,4 @@ def test_the_examples_are_scenes(name: str, monkeypatch: pytest.MonkeyPatch):
     assert found.sets
     if name == "tubes.toml":
         assert None not in (found.budget_ms, found.budget_kb, found.slower, found.accuracy)
+        assert found.reduce

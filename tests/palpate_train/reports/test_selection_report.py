@@ -9,13 +9,14 @@ from tests.factories import choice_data
 from tests.factories.page_reader import PageReader
 
 FACTS = (
-    "pairs is enough to distinguish 3 materials",
+    "pairs with 0.5 s of each sweep is enough to distinguish 3 materials",
     "a bundle of 12 kB, 0.118 ms a sweep",
     "relations at 3 scales, spectrum <i>",
     "tested on it (4 × pairs, 1 × 64).",
     "Reached: 90 % is wanted; it is not certain",
-    "bands classifies 12.3 [10.3, 14.3] points fewer correctly",
-    "64 classifies 0.8 [−1.2, 2.8] points more correctly",
+    "bands names 12.3 [10.3, 14.3] points fewer rightly",
+    "64 names 0.8 [−1.2, 2.8] points more rightly",
+    "0.5 s: 93.0 % of 93.5 %; 0.2 s loses 12.0 [10.0, 14.0] points.",
     "1 % of 50 ms, 2 % of 500 kB",
     "all sweeps are simulated.",
 )
@@ -43,7 +44,7 @@ def test_the_page_is_sound_and_the_terminal_has_a_line_for_each_model():
 
 
 def test_a_choice_that_is_not_good_enough_says_so_first():
-    """It has no smaller or larger model and no budget."""
+    """It has no smaller or larger model, curve or budget."""
     text = selection_report.text(choice_data.missed())
     page = selection_report.page(choice_data.missed())
     for fact in (

@@ -17,13 +17,14 @@ from palpate_train.cli.main import main
 from palpate_train.data import sets
 from palpate_train.data.run import Run
 from palpate_train.data.sets import Dataset
+from palpate_train.data.transforms import WHOLE, Change
 from palpate_train.export import measure
 from palpate_train.export.measure import Measurement
 from palpate_train.models.recipe import choice as head_choice
 from palpate_train.models.recipe import recipe
 from palpate_train.models.recipe.fitted import Fit
 from palpate_train.models.recipe.recipe import Settings
-from palpate_train.selection import dial
+from palpate_train.selection import dial, reduction_curves
 from palpate_train.selection.dial import (
     Budget,
     BundleCost,
@@ -32,6 +33,7 @@ from palpate_train.selection.dial import (
     NothingFits,
     SizeWish,
 )
+from palpate_train.selection.reduction_curves import ReducedFits
 
 CLOSED = Settings(steps=0)
 CLUSTERS = np.repeat(np.arange(8), 12)
@@ -160,6 +162,7 @@ def test_all_sizes_are_judged_on_the_same_sweeps():
     rights = {name: judged.right(name).mean() for name in judged.sizes}
     assert rights["bands"] < 0.8 < rights["pairs"]
     assert judged.choose(["bands", "pairs", "all"], 0.0, EVERYTHING) != "bands"
+    assert not judged.staged
     made = judged.fit("pairs")
     assert (made.architecture.pools, made.architecture.relations > 0) == (0, True)
 
@@ -197,13 +200,15 @@ def test_sizes_with_stages_are_judged_where_stages_were_not_trained(
     sweeps = skin(each=8)
     sweeps = replace(sweeps, groups={"position": sweeps.group("place")})
     judged = dial.judge(sweeps, Run(1), Settings(steps=2), ["bands", "stages", "all"])
-    assert len(trained) == 1
+    assert (judged.staged, len(trained)) == (True, 1)
     assert judged.sizes["bands"].trunk is None
     assert judged.sizes["stages"].trunk is not None
     held = sweeps.take(judged.setup.judging.out)
     np.testing.assert_array_equal(judged.labels, held.labels)
     np.testing.assert_array_equal(judged.clusters, held.group("position"))
     assert judged.by == ("position",)
+    assert judged.reduced("bands").steps == 0
+    assert judged.reduced("stages").steps == 2
 
 
 def test_a_size_that_the_windows_do_not_allow_is_named():
@@ -278,6 +283,77 @@ def test_the_result_has_every_size_with_its_reason():
     json.dumps(result, allow_nan=False)
 
 
+def reduced(sweeps: Dataset, kind: str, wanted: float = 0.0) -> tuple[dict[str, Any], Change]:
+    """The curve of one kind for the size "pairs", and the change of the fit."""
+    judged = dial.judge(sweeps, Run(1), CLOSED, ["pairs"])
+    some = SizeWish(accuracy=wanted, sizes=("pairs",))
+    cost = {"pairs": BundleCost(0.1, 10, 50)}
+    choice = dial.Selection(judged, some, ["pairs"], cost, {}, "pairs", cast(Any, None))
+    (curve,), change = reduction_curves.curves(choice, [kind])
+    return curve, change
+
+
+@pytest.mark.slow
+def test_two_taxels_are_all_that_is_needed():
+    """Of six taxels the third and the fifth have all the information: one alone is not enough.
+    Nothing is applied, because the sensor would have to be set."""
+    curve, change = reduced(skin(taxels=(2, 4)), "taxels")
+    assert curve["kept"] == "2 taxels"
+    assert curve["taxels"] == [[2, 0], [4, 0]]
+    assert [point["fine"] for point in curve["points"]] == [True, True, True, False]
+    assert (curve["applied"], change) == (False, WHOLE)
+    assert curve["set"].startswith("connect only these taxels")
+
+
+@pytest.mark.slow
+def test_a_shorter_window_is_applied_and_what_cannot_be_is_reported():
+    """Half of the frames are enough; a window that is too short ends the curve with the reason."""
+    curve, change = reduced(skin(), "window")
+    assert curve["applied"]
+    assert change.window < 1
+    short = skin()
+    curve, _ = reduced(replace(short, samples=short.samples[:, :48]), "window")
+    assert "too short" in curve["points"][-1]["refused"]
+
+
+@pytest.mark.slow
+def test_rate_and_bits_are_reported():
+    """White noise needs neither all frames nor all bits; how to set the sensor is said."""
+    curve, change = reduced(skin(), "rate")
+    assert curve["kept"] == "all" or curve["set"].startswith("set the readout board to average")
+    curve, change = reduced(skin(), "bits")
+    assert curve["kept"] == "all" or curve["set"].startswith("a converter of this many bits")
+    assert change == WHOLE
+
+
+def test_less_does_not_fall_below_what_is_wanted():
+    """A loss within the error is refused if the whole sweeps reach the wanted accuracy and the
+    reduced ones do not."""
+    less = missing(slice(1))
+
+    def fits(wanted: float) -> ReducedFits:
+        return ReducedFits(judgement(all=EVERYTHING), "all", wanted)
+
+    assert fits(0.9).fine(EVERYTHING, less)
+    assert not fits(0.995).fine(EVERYTHING, less)
+    assert fits(1.0).fine(less, less)
+
+
+@pytest.mark.slow
+def test_materials_that_look_alike_are_proposed_as_one():
+    """Only the first taxel has information, so that a and c, b and d are alike. The pairs are
+    proposed and not applied."""
+    sweeps = skin(taxels=(0, 5))
+    blind = sweeps.samples.copy()
+    blind[:, :, 5] = blind[:, :, 4]
+    curve, change = reduced(replace(sweeps, samples=blind), "classes", 0.9)
+    assert sorted(map(sorted, curve["proposed"])) == [["a", "c"], ["b", "d"]]
+    assert [point["name"] for point in curve["points"]] == ["4", "3", "2"]
+    assert curve["points"][-1]["accuracy"]["mean"] > 0.9
+    assert (curve["applied"], change) == (False, WHOLE)
+    assert not reduced(skin(), "classes", 0.9)[0]["proposed"]
+
+
 def command(folder: Path, *more: str) -> list[str]:
     """`fit` with a scene beside the set."""
     skin().save(folder / "skin.npz")
@@ -298,15 +374,17 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_command_fits_what_it_chose_and_says_why(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """A scene and options of the command line together. The page loads nothing from elsewhere."""
+    """A scene and options of the command line together; the fit has the shorter window, and so has
+    the set of --rest. The page loads nothing from elsewhere."""
     rest = tmp_path / "rest.npz"
-    more = ["--size", "pairs", "--accuracy", "0.8"]
+    more = ["--size", "pairs", "--reduce", "window", "classes", "--accuracy", "0.8"]
     more += ["--split", "place:0.75", "--rest", str(rest)]
     assert main(command(tmp_path, *more)) == 0
     result = json.loads((tmp_path / "mine-why" / "choice.json").read_text())
     made = Fit.load(tmp_path / "mine.npz")
     assert result["chosen"] == made.about["size"] == "pairs"
-    assert made.train.format.window == result["bundle"]["format"]["window"]
+    frames = round(120 * result["applied"]["window"])
+    assert made.train.format.window == result["bundle"]["format"]["window"] == frames < 120
     assert sets.load(str(rest)).format == made.train.format
     assert result["bundle"]["used"] == {"ms": 0.002}
     assert result["command"].startswith("palpate-train fit --scene ")
@@ -314,8 +392,24 @@ def test_the_command_fits_what_it_chose_and_says_why(
     page = (tmp_path / "mine-why" / "index.html").read_text()
     assert "http" not in page.replace("http://www.w3.org", "")
     output = capsys.readouterr().out
-    assert "pairs is" in output
+    assert "pairs with" in output
     assert "Reached: 80 % is wanted" in output
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("quick")
+def test_a_reduction_that_cannot_be_packed_is_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """The fit is that of whole sweeps, and the page says why."""
+
+    def never(*args: object) -> None:
+        raise FormatError("too few frames")
+
+    monkeypatch.setattr(dial, "reduced", never)
+    assert main(command(tmp_path, "--size", "pairs", "--reduce", "window")) == 0
+    assert Fit.load(tmp_path / "mine.npz").train.format.window == 120
+    assert "not shortened: too few frames" in capsys.readouterr().out
 
 
 @pytest.mark.slow

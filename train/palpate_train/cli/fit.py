@@ -20,6 +20,7 @@ from palpate_train.data import extras, labels
 from palpate_train.data.run import Run
 from palpate_train.data.sets import Dataset, digest
 from palpate_train.data.splitters import OF_THE_SET
+from palpate_train.data.transforms import WHOLE, Change
 from palpate_train.evaluate import trivial
 from palpate_train.evaluate.evaluate import CACHE
 from palpate_train.evaluate.fold import fingerprint
@@ -31,7 +32,7 @@ from palpate_train.models.recipe import memory, recipe
 from palpate_train.models.recipe.fitted import Fit
 from palpate_train.models.recipe.sizes import SIZES, UNLIMITED
 from palpate_train.reports import formatting
-from palpate_train.selection import dial
+from palpate_train.selection import dial, reduction_curves
 from palpate_train.selection.dial import Budget, SizeWish
 
 Json = dict[str, Any]
@@ -166,6 +167,16 @@ def _add_wish(command: argparse.ArgumentParser) -> None:
         metavar="SHARE",
         help="choose the smallest size that reaches this on held-out sweeps",
     )
+    command.add_argument(
+        "--reduce",
+        nargs="+",
+        choices=reduction_curves.REDUCTIONS,
+        metavar="WHAT",
+        help=(
+            f"show how much less suffices, of {', '.join(reduction_curves.REDUCTIONS)}; the fit "
+            "has the shorter window, the others need another sensor"
+        ),
+    )
 
 
 def run_fit(args: argparse.Namespace) -> None:
@@ -183,9 +194,9 @@ def run_fit(args: argparse.Namespace) -> None:
     if args.steps and not extras.installed("torch"):
         print(f"no trained stages, which need torch: {extras.advice('torch')}, or --steps 0")
     memory.check(sweeps, min(len(sweeps), args.most_sweeps))
-    made, unfinished = _fitted(args, sweeps)
+    made, change, unfinished = _fitted(args, sweeps)
     if args.rest and rest:
-        rest.save(args.rest)
+        change.of(rest).save(args.rest)
         made = replace(made, about=made.about | {"rest": str(args.rest)})
     made.save(args.out)
     shutil.rmtree(unfinished, ignore_errors=True)
@@ -232,7 +243,7 @@ def _check(args: argparse.Namespace) -> None:
         raise FormatError("no sweeps; name a set with --set, or with set in the file of --scene")
     if args.method:
         methods.find([args.method])
-        ours = ("rest", "split", "varies", "size", "budget_ms", "budget_kb", "accuracy")
+        ours = ("rest", "split", "varies", "size", "budget_ms", "budget_kb", "accuracy", "reduce")
         if given := [name for name in ours if getattr(args, name)]:
             option = given[0].replace("_", "-")
             raise FormatError(f"--{option} is of our recipe; leave it out with --method")
@@ -245,9 +256,9 @@ def _check(args: argparse.Namespace) -> None:
             options.writable_file(path, f"--{option}", *endings)
 
 
-def _fitted(args: argparse.Namespace, sweeps: Dataset) -> tuple[Fit, Path]:
-    """The fit for these options, and the folder that keeps its training until the fit is
-    written."""
+def _fitted(args: argparse.Namespace, sweeps: Dataset) -> tuple[Fit, Change, Path]:
+    """The fit for these options, the reduction of its sweeps, and the folder that keeps its
+    training until the fit is written."""
     use = SkinUse(args.reattached, float(args.mains), args.displaced, args.stretch)
     log, unfinished = options.Log(), _unfinished(args, sweeps, use)
     run = Run(args.seed, log, unfinished)
@@ -258,40 +269,50 @@ def _fitted(args: argparse.Namespace, sweeps: Dataset) -> tuple[Fit, Path]:
         varies=args.varies,
         most=args.most_sweeps,
     )
-    if args.budget_ms or args.budget_kb or args.accuracy:
-        made = _chosen(args, sweeps, run, settings)
+    wish = (args.budget_ms, args.budget_kb, args.accuracy, args.reduce)
+    if any(wish):
+        made, change = _chosen(args, sweeps, run, settings)
         log.end()
-        return made, unfinished
+        return made, change, unfinished
     made = recipe.fit(sweeps, run, settings)
     log.end()
     held_out = formatting.counted(made.about["validation"])
     print(f"chosen: {made.about['chosen']}; {held_out} of held-out parts")
-    return made, unfinished
+    return made, WHOLE, unfinished
 
 
-def _chosen(args: argparse.Namespace, sweeps: Dataset, run: Run, settings: recipe.Settings) -> Fit:
-    """The fit of the smallest size that suffices; writes the page with the reasons."""
+def _chosen(
+    args: argparse.Namespace, sweeps: Dataset, run: Run, settings: recipe.Settings
+) -> tuple[Fit, Change]:
+    """The fit of the smallest size that suffices, on reduced sweeps if they suffice; writes the
+    page with the reasons."""
     with extras.needed_for("the page with the reasons for a size"):
         from palpate_train.reports import selection_report
     budget = Budget(args.budget_ms or math.inf, args.budget_kb or math.inf, args.slower or 1.0)
     sizes = (args.size,) if args.size else tuple(dial.FAMILY)
     wish = SizeWish(budget, args.accuracy or 0.0, sizes)
     choice = dial.choose(sweeps, run, settings, wish)
-    result = choice.json() | _described(choice, budget) | _origin(args, sweeps, budget)
+    less, change = reduction_curves.curves(choice, args.reduce or ())
+    made, cost, refused = choice.fit, choice.costs[choice.chosen], ""
+    if change != WHOLE:
+        try:
+            made, cost = dial.reduced(choice, change)
+        except FormatError as e:
+            refused, change = str(e), WHOLE
+    result = choice.json() | {"less": less, "applied": asdict(change)}
+    result |= {"bundle": _described(made, cost, budget, refused)} | _origin(args, sweeps, budget)
     page = args.out.with_name(f"{args.out.stem}-why") / "index.html"
     put(page.with_name("choice.json"), (json.dumps(result, indent=1) + "\n").encode(), parents=True)
     put(page, selection_report.page(result).encode(), parents=True)
     print(selection_report.text(result))
     print(f"why: {page}")
-    return replace(choice.fit, about=choice.fit.about | {"size": choice.chosen})
+    return replace(made, about=made.about | {"size": choice.chosen}), change
 
 
-def _described(choice: dial.Selection, budget: Budget) -> Json:
-    """The bundle of the chosen size."""
-    made, cost = choice.fit, choice.costs[choice.chosen]
+def _described(made: Fit, cost: dial.BundleCost, budget: Budget, refused: str) -> Json:
     used = {k: round(v, 3) for k, v in budget.used(cost).items()}
     about = {"content": made.about["chosen"], "format": made.train.format.json(), "used": used}
-    return {"bundle": about | asdict(cost)}
+    return about | asdict(cost) | {"refused_with_less": refused}
 
 
 def _origin(args: argparse.Namespace, sweeps: Dataset, budget: Budget) -> Json:

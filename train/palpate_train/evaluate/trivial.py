@@ -17,6 +17,7 @@ from palpate.core.errors import FormatError
 from palpate_train.calibration.heads import fit_discriminant
 from palpate_train.data.sets import Dataset
 from palpate_train.data.splitters import inner_parts
+from palpate_train.data.transforms import log_powers
 from palpate_train.metrics.score import accuracy_figure
 
 Array = NDArray[Any]
@@ -26,11 +27,7 @@ MOST_TAXELS = 64
 DITHER = 1e-6
 """Deviation of the noise that is added to features whose deviation is 1. Without it, equal sweeps
 of a material would make weights infinite."""
-MEANS, SPREAD = "means alone", "spread, log bands"
-BANDS = 6
-"""Bands of a taxel's spectrum, equally wide on a logarithmic scale."""
-BATCH = 32
-"""Number of sweeps whose spectra are in memory at the same time."""
+MEANS, BANDS = "means alone", "spread, log bands"
 
 
 def features(sweeps: Dataset) -> dict[str, Array]:
@@ -43,8 +40,8 @@ def features(sweeps: Dataset) -> dict[str, Array]:
         means[i] = sweep[:, some].mean(axis=0, dtype=np.float64)
         spread[i] = sweep[:, some].std(axis=0, dtype=np.float64)
     logs = np.log(spread + 1e-3 * spread.mean() + np.finfo(float).tiny)
-    bands = _log_powers(sweeps.samples, some).reshape(n, -1)
-    return {MEANS: _scaled(means), SPREAD: _scaled(np.hstack([logs, bands]))}
+    bands = log_powers(sweeps.samples, some).reshape(n, -1)
+    return {MEANS: _scaled(means), BANDS: _scaled(np.hstack([logs, bands]))}
 
 
 def right(x: Array, labels: Array, train: Array, test: Array) -> int:
@@ -94,28 +91,3 @@ def _scaled(x: Array) -> Array:
         return np.zeros((len(x), 1))
     scaled: Array = (x - x.mean(axis=0)) / np.maximum(x.std(axis=0), np.finfo(float).tiny)
     return scaled + DITHER * np.random.default_rng(0).standard_normal(scaled.shape)
-
-
-def _log_powers(samples: Array, taxels: Array) -> Array:
-    """Log power [N, M, BANDS] of these M taxels in sweeps [N, T, R, C(, A)] without their
-    means."""
-    n, frames = samples.shape[:2]
-    bins = np.geomspace(1, max(frames // 2 + 1, 2), BANDS + 1)
-    starts = np.minimum(bins.astype(int)[:-1], frames // 2)
-    ends = np.maximum(bins.astype(int)[1:], starts + 1)
-    parts = []
-    for first in range(0, n, BATCH):
-        x = (
-            samples[first : first + BATCH]
-            .reshape(-1, frames, samples[0, 0].size)[:, :, taxels]
-            .astype(np.float64)
-        )
-        power = np.abs(np.fft.rfft(x - x.mean(axis=1, keepdims=True), axis=1)) ** 2 / frames
-        parts.append(
-            np.stack(
-                [power[:, a:b].mean(axis=1) for a, b in zip(starts, ends, strict=True)], axis=2
-            )
-        )
-    powers: Array = np.concatenate(parts)
-    logs: Array = np.log(powers + 1e-3 * powers.mean() + np.finfo(float).tiny)
-    return logs

@@ -1,4 +1,4 @@
-"""The picture of a choice of model, drawn from choice.json as SVG text."""
+"""The two pictures of a choice of model, drawn from choice.json as SVG text."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from palpate_train.reports.formatting import percent
 from palpate_train.reports.plot_style import (
@@ -16,6 +17,9 @@ from palpate_train.reports.plot_style import (
     GREY,
     MEDIUM,
     SMALL,
+    WIDTH,
+    add_axes,
+    set_categories,
     set_ticks,
     single_axes,
     to_svg,
@@ -23,6 +27,13 @@ from palpate_train.reports.plot_style import (
 )
 
 Json = Mapping[str, Any]
+TITLES = {
+    "window": "length of the window",
+    "rate": "frames a second",
+    "taxels": "taxels",
+    "bits": "bits",
+    "classes": "materials distinguished",
+}
 COLUMNS = (1.42, 1.75, 2.05)
 """Right ends of the columns of numbers beside `sizes`, as multiples of the plot's width."""
 
@@ -78,3 +89,55 @@ def _model(axes: Axes, y: float, entry: Json, chosen: bool) -> None:
             color=ACCENT if chosen else BLACK,
             weight="bold" if chosen else "normal",
         )
+
+
+def reductions(curves: Sequence[Json], about: str, columns: int = 2) -> str:
+    """A panel for each curve: accuracy over the share that is kept, from all to little.
+
+    A dot is filled if it loses at most one standard error; the smallest sufficient share has the
+    accent colour.
+    """
+    rows, above, each = -(-len(curves) // columns), 0.1, 1.35
+    figure = Figure((WIDTH, above + rows * each))
+    inch = 1 / figure.get_figheight()
+    points = [p for curve in curves for p in curve["points"] if "accuracy" in p]
+    bottom = max(np.floor(10 * min(p["accuracy"]["low"] for p in points)) / 10, 0)
+    for i, curve in enumerate(curves):
+        row, column = divmod(i, columns)
+        low = ((rows - 1 - row) * each + 0.42) * inch
+        left = 0.09 + 0.91 * column / columns
+        axes = add_axes(figure, left, left + 0.91 / columns - 0.04, low + 0.78 * inch, low)
+        _panel(axes, curve)
+        axes.set_ylim(bottom, 1.02)
+        set_ticks(
+            axes.yaxis,
+            np.arange(bottom, 1.01, 0.1 if bottom > 0.55 else 0.2),
+            percent=True,
+            bare=column > 0,
+        )
+    return to_svg(figure, about)
+
+
+def _panel(axes: Axes, curve: Json) -> None:
+    points = [p for p in curve["points"] if "accuracy" in p]
+    mean, low, high = np.array(
+        [[p["accuracy"][k] for k in ("mean", "low", "high")] for p in points]
+    ).T
+    x = np.arange(len(points))
+    axes.fill_between(x, low, high, color=ACCENT, alpha=0.13, linewidth=0)
+    axes.plot(x, mean, color=GREY, linewidth=1.2)
+    for at, point in enumerate(points):
+        kept = point["name"] == curve["kept"]
+        fine = point.get("fine", True)
+        axes.plot(
+            at,
+            mean[at],
+            "o",
+            markersize=7 if kept else 5,
+            color=ACCENT if kept else GREY,
+            markerfacecolor=(ACCENT if kept else GREY) if fine else "none",
+        )
+    axes.set_title(TITLES[curve["kind"]], color=BLACK, size=SMALL + 0.5, loc="left", pad=3)
+    axes.grid(axis="y", color=FAINT, linewidth=0.6)
+    axes.set_xlim(-0.35, len(points) - 0.65 if len(points) > 1 else 0.35)
+    set_categories(axes.xaxis, x, [p["name"].partition(" ")[0] for p in points])

@@ -12,6 +12,13 @@ from palpate_train.reports import formatting, html, provenance, selection_plots
 
 Json = Mapping[str, Any]
 UNITS = {"ms": "ms", "kb": "kB"}
+NAMES = {
+    "window": "window",
+    "rate": "rate",
+    "taxels": "taxels",
+    "bits": "bits",
+    "classes": "materials",
+}
 HEAD = ["size", "ms", "kB", "MB", "of the budget", "right", "behind the best, in points"]
 
 
@@ -26,6 +33,9 @@ def page(choice: Json) -> str:
         choice["rungs"], choice["chosen"], choice["wanted"], "accuracy of each size"
     )
     pictures = {"sizes": html.picture(sizes)}
+    if choice["less"]:
+        reductions = selection_plots.reductions(choice["less"], "accuracy with less of each thing")
+        pictures["reductions"] = html.picture(reductions)
     header = provenance.of({key: choice.get(key) for key in ("commit", "set", "seeds", "date")})
     return html.render(
         "selection.html.j2", header=header, choice=choice, pictures=pictures, **_facts(choice)
@@ -35,13 +45,22 @@ def page(choice: Json) -> str:
 def _facts(choice: Json) -> dict[str, Any]:
     """Values for the sentences that choice.json does not state directly."""
     models, smaller = choice["rungs"], choice["smaller"]
+    curves = list(_curves(choice))
     expected = choice["honest"] or choice["accuracy"]
     return {
         "to_expect": expected,
         "missed": expected["mean"] < choice["wanted"],
+        "cut": [
+            c["kept"] + " of each sweep" * (c["kind"] == "window")
+            for c in choice["less"]
+            if c["applied"]
+        ],
+        "applied": any(c["applied"] for c in choice["less"]),
         "smaller_behind": next(m["behind"] for m in models if m["method"] == smaller["method"])
         if smaller
         else None,
+        "curves": curves,
+        "merged": _merged(choice),
         "caveats": list(_caveats(choice)),
         "models": [_row(model, choice["best"]) for model in models],
         "model_head": HEAD,
@@ -68,6 +87,37 @@ def _row(model: Json, best: str) -> list[str]:
     return [model["method"], *costs, used, right, behind]
 
 
+def _curves(choice: Json) -> Iterator[dict[str, Any]]:
+    """The smallest sufficient window, rate and so on; whole: nothing may be left out."""
+    for curve in choice["less"]:
+        tried = [point for point in curve["points"] if "accuracy" in point]
+        kept = next(point for point in tried if point["name"] == curve["kept"])
+        yield {
+            "kind": curve["kind"],
+            "name": NAMES[curve["kind"]],
+            "kept": curve["kept"],
+            "whole": kept is tried[0],
+            "fails": next((point for point in tried if not point.get("fine", True)), None),
+            "set": curve["set"],
+            "accuracy": kept["accuracy"]["mean"],
+            "of": tried[0]["accuracy"]["mean"],
+            "applied": curve["applied"],
+            "taxels": curve.get("taxels"),
+        }
+
+
+def _merged(choice: Json) -> dict[str, Any] | None:
+    """The materials that could be merged, and the gain; None if there are none."""
+    curve = next((curve for curve in choice["less"] if curve["kind"] == "classes"), None)
+    if curve is None or not curve["proposed"]:
+        return None
+    names = len(choice["materials"]) - sum(len(those) - 1 for those in curve["proposed"])
+    accuracy = next(
+        point["accuracy"]["mean"] for point in curve["points"] if point["name"] == str(names)
+    )
+    return {"proposed": curve["proposed"], "names": names, "accuracy": accuracy}
+
+
 def _caveats(choice: Json) -> Iterator[str]:
     """Limits of the figures."""
     if choice["groups"] == ["recording"]:
@@ -76,3 +126,5 @@ def _caveats(choice: Json) -> Iterator[str]:
         yield "two thirds of the held-out sweeps are augmented copies, as of a skin put back"
     if choice["set"].startswith("sim:"):
         yield "all sweeps are simulated"
+    if refused := choice["bundle"].get("refused_with_less"):
+        yield f"not shortened: {refused}"

@@ -12,7 +12,7 @@ import math
 import tempfile
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from palpate.core.errors import ApplianceError, BundleError, FormatError
 from palpate.core.provenance import commit
 from palpate_train.data.run import Run
 from palpate_train.data.sets import Dataset
+from palpate_train.data.transforms import Change
 from palpate_train.export import measure, quantized_bundle
 from palpate_train.export.measure import Measurement
 from palpate_train.metrics.score import confusion, interval, row_shares
@@ -190,6 +191,17 @@ class Judgement:
             equal[name] = first.setdefault((one.trunk is None, *parts), name)
         return equal
 
+    def reduced(self, name: str) -> Settings:
+        """The settings for a fit of this size to reduced sweeps: stages only if the size has them
+        for the whole ones."""
+        steps = self.setup.settings.steps if self.sizes[name].trunk else 0
+        return replace(self.setup.settings, size=FAMILY[name], steps=steps)
+
+    @property
+    def staged(self) -> bool:
+        """Whether all sizes were judged on the sweeps that judge stages."""
+        return any(one.trunk is not None for one in self.sizes.values())
+
     def behind(self, name: str, ahead: str) -> Difference:
         """The difference between the size `ahead` and `name`."""
         return difference(self.right(ahead), self.right(name), self.clusters)
@@ -221,11 +233,13 @@ class Judgement:
         return estimate(right, self.clusters) | {"chose": dict(chose.most_common())}
 
 
-def judge(sweeps: Dataset, run: Run, settings: Settings, sizes: Sequence[str]) -> Judgement:
+def judge(
+    sweeps: Dataset, run: Run, settings: Settings, sizes: Sequence[str], staged: bool = False
+) -> Judgement:
     """Judge these sizes. Features, copies and stages are computed once for all of them.
 
-    Stages are judged only on the sweeps that they were not trained on; if a size has stages, all
-    sizes are judged on these sweeps. Raises FormatError as recipe.fit, or if
+    Stages are judged only on the sweeps that they were not trained on; if a size has stages, or
+    `staged` is set, all sizes are judged on these sweeps. Raises FormatError as recipe.fit, or if
     the windows are too short for every size.
     """
     setup = Setup.of(sweeps, run, settings)
@@ -238,7 +252,7 @@ def judge(sweeps: Dataset, run: Run, settings: Settings, sizes: Sequence[str]) -
             refused[name] = str(e)
     if not found:
         raise FormatError("; ".join(f"{name}: {why}" for name, why in refused.items()))
-    staged = any(trunk for trunk, _ in found.values())
+    staged = staged or any(trunk for trunk, _ in found.values())
     alike = {
         name: judged if trunk or not staged else _on_held_out(judged, setup)
         for name, (trunk, judged) in found.items()
@@ -369,6 +383,18 @@ def choose(sweeps: Dataset, run: Run, settings: Settings, wanted: SizeWish) -> S
         raise NothingFits(_nearest(costs, why_not, wanted.budget))
     chosen = judged.choose(order, wanted.accuracy, np.ones(len(judged.labels), bool))
     return Selection(judged, wanted, order, costs, why_not, chosen, fits[first[chosen]])
+
+
+def reduced(choice: Selection, change: Change) -> tuple[Fit, BundleCost]:
+    """The chosen size fitted to reduced sweeps, and the cost of its bundle. Raises FormatError if
+    the reduced sweeps cannot be fitted or packed."""
+    setup = choice.judgement.setup
+    sweeps, run = change.of(setup.sweeps), replace(setup.run, folder=None)
+    made = recipe.fit(sweeps, run, choice.judgement.reduced(choice.chosen))
+    costs, refused = bundle_costs({choice.chosen: made}, sweeps, run.log)
+    for why in refused.values():
+        raise FormatError(why)
+    return made, costs[choice.chosen]
 
 
 def bundle_costs(
