@@ -19,7 +19,7 @@ LOCKS = {
     "systemd/build.lock": (),
     "systemd/fleet.lock": ("deploy",),
     "train/desktop.lock": ("train", "reports"),
-    "tests/tools.lock": ("dev", "train", "reports", "peers", "files"),
+    "tests/tools.lock": ("dev", "train", "reports", "peers", "dask", "files"),
     "docs/site/site.lock": ("site",),
 }
 """Each lock with the extras that it covers; "train" stands for the desktop's own distribution."""

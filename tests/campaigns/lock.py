@@ -17,7 +17,7 @@ BUILD = "setuptools>=77"
 LOCKS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     BOX: (("-e .[page]",), ()),
     TEACH: (("-e .[page,teach]",), (BOX,)),
-    TOOLS: (("-e .[dev]", "-e train[reports,peers,files]", BUILD), (BOX, TEACH)),
+    TOOLS: (("-e .[dev]", "-e train[reports,peers,dask,files]", BUILD), (BOX, TEACH)),
     "systemd/build.lock": ((BUILD,), (TOOLS,)),
     "systemd/fleet.lock": (("-e .[deploy]",), (TOOLS,)),
     "train/desktop.lock": (("-e .", "-e train[reports]"), (TOOLS,)),

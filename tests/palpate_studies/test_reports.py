@@ -74,8 +74,8 @@ def test_the_list_says_what_would_run_and_why(project: Path, capsys: pytest.Capt
 def test_stale_results_are_made_in_order_and_none_twice(project: Path):
     """Only commands of folds get the options of the machine that runs them."""
     run, lines = RunCommands(), []
-    reports.make((), ("--jobs", "2"), lines.append, run)
-    older = ["palpate_train", "older", "--jobs", "2"]
+    reports.make((), ("--scheduler", "tcp://here"), lines.append, run)
+    older = ["palpate_train", "older", "--scheduler", "tcp://here"]
     assert run.words == [older, ["palpate", "new"]]
     assert NEED in lines[1]
     save(project / "docs" / "data" / "older.json", RESULTS | {"shipped": score.shipped()})

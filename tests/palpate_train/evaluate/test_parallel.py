@@ -1,14 +1,31 @@
-"""Parallel tasks: each once, in one thread, with its errors."""
+"""Parallel tasks on this machine, and on a real Dask cluster of two workers on loopback. Some tests
+kill a worker."""
 
 from __future__ import annotations
 
+import contextlib
+import importlib
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
 import warnings
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 import threadpoolctl
+from distributed import Client
 
-from palpate_train.evaluate import parallel
+from palpate.core.errors import FormatError
+from palpate_train.evaluate import evaluate, parallel
+from palpate_train.evaluate.evaluate import Plan, Where
+from palpate_train.models import methods
+from tests.factories.sweep_sets import tones
 
 pytestmark = pytest.mark.slow
 
@@ -56,3 +73,134 @@ def test_an_error_in_a_task_is_the_callers():
     """The error of a task is raised here."""
     with pytest.raises(IndexError):
         list(parallel.results(add, [99], [np.arange(3.0)], jobs=2))
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[tuple[str, list[subprocess.Popen[str]]]]:
+    """A scheduler and two workers without nannies, so that a dead worker stays dead."""
+    command, env = (
+        (sys.executable, "-m", "dask"),
+        os.environ | {"PYTHONPATH": str(Path(__file__).parent)},
+    )
+    scheduler = subprocess.Popen(
+        (*command, "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard"),
+        stderr=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        text=True,
+        env=env,
+    )
+    processes = [scheduler]
+    try:
+        for line in scheduler.stderr:
+            if found := re.search(r"tcp://127\.0\.0\.1:\d+", line):
+                break
+        address = found[0]
+        for _ in range(2):
+            options = ("--no-nanny", "--nthreads", "1", "--host", "127.0.0.1", "--no-dashboard")
+            processes.append(
+                subprocess.Popen(
+                    (*command, "worker", address, *options),
+                    stderr=subprocess.DEVNULL,
+                    stdout=subprocess.DEVNULL,
+                    text=True,
+                    env=env,
+                )
+            )
+        with Client(address, timeout=20, set_as_default=False) as client:
+            client.wait_for_workers(2, timeout=30)
+        yield address, processes[1:]
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+
+
+@pytest.mark.thorough  # a Dask cluster of two processes
+def test_a_cluster_gives_the_same_bits(cluster):
+    """An evaluation here and on the cluster gives equal logits, for features with an SVM and for a
+    network."""
+    plan = Plan(("L-svm", "recurrent"), ("leave:session",), effort=methods.Effort(0.02))
+    there, here = (
+        {result.method: result for result in evaluate.evaluate(tones(), plan, where)}
+        for where in (Where(scheduler=cluster[0], cache=None), Where(jobs=1, cache=None))
+    )
+    for name in plan.methods:
+        assert np.array_equal(there[name].logits, here[name].logits), name
+        assert there[name].json()["window"] == here[name].json()["window"]
+
+
+def noted(task: int, folder: str, data: np.ndarray) -> float:
+    """A task that leaves a note for each run. The first run of task 7 kills its worker."""
+    if task == 7:
+        with contextlib.suppress(FileExistsError):
+            Path(folder, "killed").touch(exist_ok=False)
+            os.kill(os.getpid(), signal.SIGKILL)
+    time.sleep(0.25)
+    Path(folder, f"{task}-{os.getpid()}").touch()
+    return float(data[task])
+
+
+@pytest.mark.thorough  # a Dask cluster of two processes
+def test_a_worker_that_dies_costs_only_what_it_was_running(cluster, tmp_path: Path):
+    """One of two workers is killed during twenty tasks: all tasks are done, and only the killed
+    task runs twice."""
+    address, workers = cluster
+    data = np.arange(20.0)
+    done = dict(parallel.results(noted, range(20), [str(tmp_path), data], scheduler=address))
+    assert done == {task: float(task) for task in range(20)}
+    assert sum(w.poll() is not None for w in workers) == 1
+    times = Counter(note.name.split("-")[0] for note in tmp_path.glob("*-*"))
+    assert set(times) == {str(task) for task in range(20)}
+    assert sum(times.values()) <= 21  # at most the result that was on its way when its worker died
+
+
+@pytest.mark.thorough  # a Dask cluster of two processes
+def test_an_error_on_a_worker_is_the_callers(cluster):
+    """The error of a task on the cluster is raised here."""
+    with pytest.raises(IndexError):
+        list(parallel.results(add, [99], [np.arange(3.0)], scheduler=cluster[0]))
+
+
+@pytest.mark.thorough  # a Dask cluster of two processes
+def test_a_cluster_without_the_project_is_named(
+    cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Workers without this version of the project are reported."""
+    (tmp_path / "only_here.py").write_text("def call(task):\n    return task\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(FormatError, match="version of palpate-train"):
+        list(
+            parallel.results(
+                importlib.import_module("only_here").call, [1], [], scheduler=cluster[0]
+            )
+        )
+
+
+def always_dies(task: int) -> None:
+    """A task that kills its worker."""
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+@pytest.mark.thorough  # a Dask cluster of two processes
+def test_a_task_that_kills_every_worker_ends_with_a_reason(
+    cluster, monkeypatch: pytest.MonkeyPatch
+):
+    """The call ends if no worker is left."""
+    monkeypatch.setattr(parallel, "CONNECT_S", 1)
+    with pytest.raises(FormatError, match=r"too often|has no worker"):
+        list(parallel.results(always_dies, [1], [], scheduler=cluster[0]))
+
+
+def test_a_cluster_that_does_not_answer_is_named(monkeypatch: pytest.MonkeyPatch):
+    """Without a scheduler at that address, the command that starts one is named within the
+    deadline."""
+    monkeypatch.setattr(parallel, "CONNECT_S", 1)
+    with pytest.raises(FormatError, match="no scheduler answers at"):
+        list(parallel.results(add, [1], [np.arange(3.0)], scheduler="tcp://127.0.0.1:9"))
+
+
+def test_without_dask_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch):
+    """The message names the extra to install."""
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(FormatError, match=r"palpate-train\[dask\]"):
+        list(parallel.results(add, [1], [np.arange(3.0)], scheduler="tcp://127.0.0.1:9"))

@@ -82,6 +82,9 @@ def add_where(command: argparse.ArgumentParser) -> None:
     """Add options for where tasks run and where their results are kept."""
     add_jobs(command)
     command.add_argument(
+        "--scheduler", default="", metavar="ADDRESS", help="of a Dask cluster that runs the tasks"
+    )
+    command.add_argument(
         "--cache",
         type=Path,
         default=evaluate.CACHE,
@@ -175,7 +178,7 @@ def effort(args: argparse.Namespace) -> methods.Effort:
 
 def where(args: argparse.Namespace) -> evaluate.Where:
     """Where tasks run and where their results are kept."""
-    return evaluate.Where(args.jobs, args.cache, getattr(args, "kept", False))
+    return evaluate.Where(args.jobs, args.scheduler, args.cache, getattr(args, "kept", False))
 
 
 class Log:

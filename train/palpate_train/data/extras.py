@@ -21,6 +21,7 @@ EXTRAS = {
     "python_calamine": "files",
     "nptdms": "files",
     "rosbags": "files",
+    "distributed": "dask",
 }
 """The extra of each library, as in train/pyproject.toml."""
 

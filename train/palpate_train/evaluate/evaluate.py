@@ -247,6 +247,7 @@ class Where:
     none. kept: train nothing and use only kept folds."""
 
     jobs: int = -1
+    scheduler: str = ""
     cache: Path | None = CACHE
     kept: bool = False
 
@@ -316,7 +317,7 @@ def _trained(
     except FormatError as e:
         yield from ((name, Fold.refusal(task, str(e))) for name, task in tasks)
         return
-    for (name, _), fold in parallel.results(_run, tasks, shared, where.jobs):
+    for (name, _), fold in parallel.results(_run, tasks, shared, where.jobs, where.scheduler):
         yield name, fold
 
 

@@ -210,7 +210,7 @@ def cases(wanted: Sequence[CaseTask], sweeps: Dataset, where: Where, log: Log) -
             f"{len(left)} of {len(wanted)} trainings are not kept; run without --kept first"
         )
     progress = parallel.Progress(len(left), log)
-    for (i, task), case in parallel.results(_learn, left, (sweeps,), where.jobs):
+    for (i, task), case in parallel.results(_learn, left, (sweeps,), where.jobs, where.scheduler):
         done[i] = case
         if where.cache:
             _save(case, where.cache / f"{keys[i]}.case.npz")

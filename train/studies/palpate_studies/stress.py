@@ -87,7 +87,9 @@ def run(
     done = {task: json.loads(path.read_text()) for task, path in paths.items() if path.exists()}
     left = [task for task in tasks if task not in done and not where.kept]
     progress = parallel.Progress(len(left), log)
-    for task, result in parallel.results(_run_task, left, (train, test, effort), where.jobs):
+    for task, result in parallel.results(
+        _run_task, left, (train, test, effort), where.jobs, where.scheduler
+    ):
         done[task] = result
         if where.cache:
             put(paths[task], json.dumps(result).encode(), parents=True)

@@ -62,7 +62,9 @@ def run_reports(args: argparse.Namespace) -> None:
     if args.list:
         print(reports.table(reports.named(args.names)))
         return
-    where = ["--jobs", str(args.jobs), "--cache", str(args.cache)]
+    where = ["--jobs", str(args.jobs), "--cache", str(args.cache)] + (
+        ["--scheduler", args.scheduler] if args.scheduler else []
+    )
     reports.make(args.names, where, options.Log().keep)
     run_tables(args)
 
