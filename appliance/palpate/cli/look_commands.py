@@ -10,7 +10,7 @@ from palpate.cli.common import load_bundle, load_settings
 from palpate.core import config
 from palpate.core.clock import SystemClock
 from palpate.core.errors import ConfigError
-from palpate.core.interrupts import StopFlag
+from palpate.core.interrupts import StopFlag, during_imports
 from palpate.core.log import TroubleLog, log
 from palpate.core.retry import retried
 from palpate.core.text import printable
@@ -18,8 +18,9 @@ from palpate.core.text import printable
 
 def run_check(args: argparse.Namespace) -> int:
     """Check each component by itself; 1 if any fails."""
-    from palpate.cli.devices import open_any
-    from palpate.runtime.selftest import check
+    with during_imports("palpate"):
+        from palpate.cli.devices import open_any
+        from palpate.runtime.selftest import check
 
     settings = load_settings(args)
     devices = open_any(args, settings)
@@ -39,7 +40,8 @@ def run_settings(args: argparse.Namespace) -> int:
 
 def run_replay(args: argparse.Namespace) -> int:
     """Print the sentences of a capture, sweep or folder; 1 if a verdict differs."""
-    from palpate.runtime.replay import replay
+    with during_imports("palpate"):
+        from palpate.runtime.replay import replay
 
     settings = load_settings(args)
     bundle = load_bundle(settings, answers=False)

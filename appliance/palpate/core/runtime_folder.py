@@ -26,12 +26,19 @@ def is_default() -> bool:
     folder = settings_folder()
     try:
         names = [name for name in os.listdir(folder) if name.endswith(".toml")]
-        for path in [*(os.path.join(folder, name) for name in names), SITE]:
-            with open(path, "rb") as f:
-                if b"runtime" in f.read():
-                    return False
     except FileNotFoundError:
-        return True  # there is no folder or no SITE, which comes last
+        names = []
     except OSError:
         return False  # who reads the settings says why
-    return True
+    return not any(map(_speaks_of_it, [*(os.path.join(folder, name) for name in names), SITE]))
+
+
+def _speaks_of_it(path: str) -> bool:
+    """Whether a settings file may set store.runtime; one that cannot be read may."""
+    try:
+        with open(path, "rb") as f:
+            return b"runtime" in f.read()
+    except FileNotFoundError:
+        return False
+    except OSError:
+        return True

@@ -87,7 +87,10 @@ class SweepSet:
             sweep, frame, *taxel = (int(i) for i in np.argwhere(np.abs(x) > LARGEST_READING)[0])
             place = f"sweep {sweep}, frame {frame}, taxel {', '.join(map(str, taxel))}"
             reads = f"{place} reads {x[(sweep, frame, *taxel)]:g} (counted from 0)"
-            raise self._error(f"{reads}, more than any skin; drop sweep {sweep} or fill it in")
+            raise self._error(
+                f"{reads}, and no skin more than {LARGEST_READING:g}; drop sweep {sweep} or fill "
+                "it in"
+            )
 
     def _check_numbers(self) -> None:
         """Check the arrays with an entry for each sweep."""

@@ -92,7 +92,9 @@ def slide_values(text: str) -> dict[str, float]:
     allowed, or for too many values."""
     values = text.replace(" ", ",").split(",")  # a person may type spaces for commas
     if len(values) > len(SLIDE_VALUES):
-        raise ApplianceError(f"{len(values)} values are too many; send a speed and a force")
+        raise ApplianceError(
+            f"{len(values)} values are too many; send at most a speed in mm/s and a force in N"
+        )
     found = {}
     for value, name in zip(values, SLIDE_VALUES, strict=False):
         if not value:

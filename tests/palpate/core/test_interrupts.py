@@ -48,6 +48,8 @@ def _loading(
     ("program", "module", "argv", "library"),
     [
         ("palpate", "palpate", ["skin", "list"], "numpy"),
+        ("palpate", "palpate", ["check"], "onnxruntime"),
+        ("palpate", "palpate", ["replay", "a.npy"], "onnxruntime"),
         (
             "palpate-train",
             "palpate_train",
