@@ -7,15 +7,15 @@ much that is, its trial shows in a limited process (deployment/sandbox.py).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import prod
+from math import isfinite, prod
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from palpate.bundle.onnx_check import operators, reader
-from palpate.bundle.onnx_check.operators import FIRST, INDEX, KINDS, OPERATORS, SECOND, need
+from palpate.bundle.onnx_check.operators import INDEX, KINDS, OPERATORS, SAME, need
 from palpate.bundle.onnx_check.reader import Message
 from palpate.core.errors import BundleError
 
@@ -45,6 +45,8 @@ KEEP_INDEX = ("Reshape", "Flatten")
 Shape = tuple[int, ...]
 ShapePattern = Sequence[int | None]
 """A shape; None means any number."""
+CONSTANTS = ("float32", "uint8", "int8", "int16", "int32", "int64")
+"""Types of constants. Values of other types only come from the sweep or from a comparison."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +129,7 @@ def _followed(graph: Message) -> dict[str, Value]:
     known = {declared.name: Value(_declared(declared)[0], varies=True)}
     for tensor in graph.initializer:
         need(tensor.name not in known, f"{tensor.name[:80]!r} is there twice")
-        known[tensor.name] = _constant(tensor)
+        known[tensor.name] = _constant(tensor, tensor.name[:80])
     for number, node in enumerate(graph.node):
         try:
             _follow(node, known)
@@ -145,11 +147,14 @@ def fits(shape: Sequence[int], pattern: ShapePattern) -> bool:
     )
 
 
-def _constant(tensor: Message) -> Value:
+def _constant(tensor: Message, name: str) -> Value:
     """A constant. onnxruntime compares its numbers with its sizes."""
     kind = KINDS.get(tensor.data_type, "")
-    need(kind != "", f"constant {tensor.name[:80]!r} is of type {tensor.data_type}")
-    _bounded(tensor.name, kind, tuple(tensor.dims))
+    need(
+        kind in CONSTANTS,
+        f"constant {name!r} is of type {kind or tensor.data_type}, none of {', '.join(CONSTANTS)}",
+    )
+    _bounded(name, kind, tuple(tensor.dims))
     return Value(kind, constant=tensor)
 
 
@@ -175,48 +180,73 @@ def _follow(node: Message, known: dict[str, Value]) -> None:
     operator = OPERATORS.get((node.domain, node.op_type))
     if operator is None:
         raise BundleError(f"there is no such operator of domain {node.domain[:80]!r} for a bundle")
-    for name in node.input:
-        need(name in known, f"no node before it gives {name[:80]!r}")
-    inputs = [known[name] for name in node.input]
-    for i, x in enumerate(inputs[operator.fixed :], operator.fixed + 1):
-        need(not x.varies, f"input {i} decides a size, but is not a constant")
-    settings = {a.name: a for a in node.attribute}
-    need(len(settings) == len(node.attribute), "a setting is there twice")
-    second = inputs[1].kind if len(inputs) > 1 else ""
-    if node.op_type == "Cast":
-        second = KINDS.get(settings["to"].i, "") if "to" in settings else ""
-        need(second != "", "it casts to a type that no model of a bundle may have")
-    if node.op_type == "Div":
-        need(inputs[0].kind == "float32", f"it divides {inputs[0].kind}, not float32")
-    if node.op_type == "Mod":
-        _check_divisors(inputs[1:])
-    if node.op_type == "ArrayFeatureExtractor":
-        need(second == INDEX, f"input 2 is of type {second}, not {INDEX}")
-    if node.op_type == "SVMClassifier":
-        try:
-            operators.check_tables(settings)
-        except (KeyError, TypeError) as e:
-            raise BundleError(f"its tables are not complete: {e}") from e
+    need(operator.least <= len(node.input) <= operator.most, f"it has {len(node.input)} inputs")
     need(
         len(node.output) == len(operator.gives),
         f"it has {len(node.output)} outputs instead of {len(operator.gives)}",
     )
+    for name in node.input:
+        need(name in known, f"no node before it gives {name[:80]!r}")
+    inputs = [known[name] for name in node.input]
+    for i, x in enumerate(inputs):
+        allowed = operator.kinds[min(i, len(operator.kinds) - 1)]
+        need(x.kind in allowed, f"input {i + 1} is of type {x.kind}, not {' or '.join(allowed)}")
+        decides = i >= operator.fixed
+        need(not (decides and x.varies), f"input {i + 1} decides a size, but is not a constant")
+    given = _settings(node, operator.settings)
+    operators.check_settings(node.op_type, given)
+    if node.op_type == "Mod":
+        _check_divisors(inputs[1])
     varies = any(x.varies for x in inputs)
     for name, kind in zip(node.output, operator.gives, strict=True):
         need(name != "" and name not in known, f"{name[:80]!r} is made twice, or has no name")
-        if kind == FIRST and inputs:
+        if node.op_type == "Cast":
+            need(given.get("to") in KINDS, f"it casts to type {given.get('to')}")
+            kind = KINDS[given["to"]]
+        if kind == SAME:
             kind = inputs[0].kind
             kind = "int64" if kind == INDEX and node.op_type not in KEEP_INDEX else kind
-        known[name] = Value(second if kind == SECOND else kind, varies)
+        known[name] = Value(kind, varies)
 
 
-def _check_divisors(by: Sequence[Value]) -> None:
+def _check_divisors(by: Value) -> None:
     """Raises BundleError unless the divisors of Mod are constants of the file above 0."""
-    held: Any = by[0].constant if by else None
+    held: Any = by.constant
     need(held is not None, "its divisors are not a constant of the file")
     raw = held.raw_data or b""
     numbers = [*np.frombuffer(raw[: len(raw) // 8 * 8], "<i8").tolist(), *(held.int64_data or ())]
     need(bool(numbers) and min(numbers) > 0, f"its divisors {numbers[:8]} must be above 0")
+
+
+def _settings(node: Message, allowed: Mapping[str, int]) -> dict[str, Any]:
+    """A node's settings by name. Raises BundleError for a setting or a type that is not in
+    `allowed`."""
+    found: dict[str, Any] = {}
+    for a in node.attribute:
+        name, code = a.name[:80], a.type
+        need(a.name not in found, f"{name!r} is set twice")
+        need(
+            code == allowed.get(a.name), f"setting {name!r} of type {code} is none that it may have"
+        )
+        there = {
+            operators.FLOAT: a.f,
+            operators.INT: a.i,
+            operators.TEXT: a.s,
+            operators.TENSOR: a.t,
+            operators.FLOATS: a.floats,
+            operators.INTS: a.ints or None,
+        }
+        need(
+            [c for c, value in there.items() if value is not None] == [code],
+            f"{name!r} is not as its type has it",
+        )
+        need(code != operators.FLOAT or isfinite(a.f), f"{name} = {a.f}")
+        found[a.name] = there[code]
+        if code == operators.TEXT:
+            found[a.name] = bytes(a.s)
+        if code == operators.TENSOR:
+            need(_constant(a.t, name).kind == "float32", f"{name} must be one float")
+    return found
 
 
 def _declared(declared: Message) -> tuple[str, Shape]:

@@ -24,38 +24,85 @@ library makes 1 GB of 20 MB of empty nodes. MiniRocket, our largest graph, has a
 weights counts once."""
 VARINT, BYTES, FOUR_BYTES = 0, 2, 5
 """Wire types of protobuf that are in use. Not used: 1 (eight bytes), 3 and 4 (groups)."""
-SCHEMA = """
-model: 1 ir_version code, 2 producer_name text, 3 producer_version text, 7 graph graph
-model: 8 opset_import opset*, 14 metadata_props entry*
-opset: 1 domain text, 2 version code
-entry: 1 key text, 2 value text
-graph: 1 node node*, 2 name text, 5 initializer tensor*, 11 input declared*
-graph: 12 output declared*, 13 value_info declared*
-node: 1 input text*, 2 output text*, 3 name text, 4 op_type text, 5 attribute attribute*
-node: 7 domain text
-attribute: 1 name text, 2 f float, 3 i signed, 4 s bytes, 5 t tensor, 7 floats floats
-attribute: 8 ints signed*, 20 type code
-tensor: 1 dims signed*, 2 data_type code, 4 float_data floats, 5 int32_data signed*
-tensor: 7 int64_data signed*, 8 name text, 9 raw_data bytes
-declared: 1 name text, 2 type type
-type: 1 tensor_type tensortype
-tensortype: 1 elem_type code, 2 shape shape
-shape: 1 dim dimension*
-dimension: 1 dim_value signed
-"""
-"""Number, name and content of the fields of each message; * marks repeated fields. Any other field
-is refused, such as a graph in an attribute or data outside the file. No message contains a message
-of its own kind, so the depth is limited."""
-FIELDS: dict[str, dict[int, tuple[str, str]]] = {}
-for _line in SCHEMA.strip().splitlines():
-    _kind, _, _rest = _line.partition(": ")
-    for _field in _rest.split(", "):
-        _number, _name, _holds = _field.split()
-        FIELDS.setdefault(_kind, {})[int(_number)] = _name, _holds
+REFUSED = "refused"
+"""Marks a field in FIELDS whose name the error message gives. A field that is not in FIELDS is
+refused, too."""
+FIELDS: dict[str, dict[int, tuple[str, str]]] = {
+    "model": {
+        1: ("ir_version", "code"),
+        2: ("producer_name", "text"),
+        3: ("producer_version", "text"),
+        7: ("graph", "graph"),
+        8: ("opset_import", "opset*"),
+        14: ("metadata_props", "entry*"),
+        20: ("training_info", REFUSED),
+        25: ("functions", REFUSED),
+    },
+    "opset": {1: ("domain", "text"), 2: ("version", "code")},
+    "entry": {1: ("key", "text"), 2: ("value", "text")},
+    "graph": {
+        1: ("node", "node*"),
+        2: ("name", "text"),
+        5: ("initializer", "tensor*"),
+        11: ("input", "declared*"),
+        12: ("output", "declared*"),
+        13: ("value_info", "declared*"),
+        15: ("sparse_initializer", REFUSED),
+    },
+    "node": {
+        1: ("input", "text*"),
+        2: ("output", "text*"),
+        3: ("name", "text"),
+        4: ("op_type", "text"),
+        5: ("attribute", "attribute*"),
+        7: ("domain", "text"),
+    },
+    "attribute": {
+        1: ("name", "text"),
+        2: ("f", "float"),
+        3: ("i", "signed"),
+        4: ("s", "bytes"),
+        5: ("t", "tensor"),
+        6: ("a graph in the graph", REFUSED),
+        7: ("floats", "floats"),
+        8: ("ints", "signed*"),
+        9: ("texts", REFUSED),
+        10: ("tensors", REFUSED),
+        11: ("graphs in the graph", REFUSED),
+        20: ("type", "code"),
+        22: ("a sparse tensor", REFUSED),
+    },
+    "tensor": {
+        1: ("dims", "signed*"),
+        2: ("data_type", "code"),
+        4: ("float_data", "floats"),
+        5: ("int32_data", "signed*"),
+        6: ("texts", REFUSED),
+        7: ("int64_data", "signed*"),
+        8: ("name", "text"),
+        9: ("raw_data", "bytes"),
+        10: ("numbers of 64 bits", REFUSED),
+        13: ("external_data", REFUSED),
+        14: ("data_location", REFUSED),
+    },
+    "declared": {1: ("name", "text"), 2: ("type", "type")},
+    "type": {
+        1: ("tensor_type", "tensortype"),
+        4: ("a sequence", REFUSED),
+        5: ("a map", REFUSED),
+        8: ("a sparse tensor", REFUSED),
+        9: ("an optional type", REFUSED),
+    },
+    "tensortype": {1: ("elem_type", "code"), 2: ("shape", "shape")},
+    "shape": {1: ("dim", "dimension*")},
+    "dimension": {1: ("dim_value", "signed"), 2: ("a name instead of a number", REFUSED)},
+}
+"""Name and content of each field, by message and number; * marks repeated fields. No message
+contains a message of its own kind, so the depth is limited."""
 
 
 class Message(SimpleNamespace):
-    """One message: an attribute for each of its FIELDS.
+    """One message: an attribute for each of its FIELDS that is not REFUSED.
 
     A field that the file leaves out is 0 (code), "" (text), () (with *) or else None. Floats are
     float32 [n], bytes a memoryview.
@@ -88,7 +135,11 @@ def _absent(kind: str) -> dict[str, Any]:
     """The values of fields that a message leaves out, by name."""
     usual: dict[str, Any] = {"code": 0, "text": ""}
     fields = FIELDS[kind].values()
-    return {name: () if holds[-1] == "*" else usual.get(holds) for name, holds in fields}
+    return {
+        name: () if holds[-1] == "*" else usual.get(holds)
+        for name, holds in fields
+        if holds != REFUSED
+    }
 
 
 class _Reader:
@@ -104,11 +155,9 @@ class _Reader:
         while at < end:
             begin = at
             tag, at = self.varint(at, end)
-            if tag >> 3 not in fields:
-                raise _wrong(
-                    begin, f"{kind}: field {tag >> 3}, which no model of a bundle may have"
-                )
-            name, holds = fields[tag >> 3]
+            name, holds = fields.get(tag >> 3, (f"field {tag >> 3}", REFUSED))
+            if holds == REFUSED:
+                raise _wrong(begin, f"{kind}: {name}, which no model of a bundle may have")
             if holds[-1] == "*":
                 values, at = self._values(holds[:-1], tag, at, end)
                 found.setdefault(name, []).extend(values)
