@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
@@ -19,7 +20,7 @@ SCRIPTS = ROOT / "systemd"
 
 
 SERVER = """
-import os, sys
+import json, os, sys
 fork, wait = os.fork, os.waitpid  # gevent may replace them
 try:
     import deploy, install
@@ -31,6 +32,8 @@ for line in sys.stdin:
         for fd, name in ((1, "said"), (2, "errors")):
             os.dup2(os.open(os.path.join(line.strip(), name), os.O_CREAT | os.O_WRONLY), fd)
         code = 1
+        os.environ.clear()
+        os.environ.update(json.load(open(os.path.join(line.strip(), "environment"))))
         try:
             exec(open(os.path.join(line.strip(), "code")).read(), {"__name__": "__main__"})
             code = 0
@@ -67,6 +70,8 @@ def run_here(code: str) -> str:
     assert server.stdout
     with tempfile.TemporaryDirectory() as folder:
         Path(folder, "code").write_text(code)
+        given = os.environ | {"PYTHONPATH": str(SCRIPTS)}
+        Path(folder, "environment").write_text(json.dumps(dict(given)))
         server.stdin.write(f"{folder}\n")
         server.stdin.flush()
         failed = server.stdout.readline().strip()

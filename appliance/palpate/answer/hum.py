@@ -9,7 +9,6 @@ soon as it is long enough for a line. Functions of raw counts; windows of one fo
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -32,6 +31,8 @@ IN_PHASE = 0.9
 SEARCHED = 2
 """Multiples in which hum is searched: each comb of the mains has one of them, as its strongest
 line or as one of several."""
+MULTIPLES = 12
+"""Multiples that are removed; those above are small, and their tables would be large."""
 FAINT = 2.0
 """Least ratio of the other lines of a comb that was found."""
 OFF_HZ, STEPS = 0.3, 13
@@ -54,7 +55,7 @@ class HumLines:
     parts: Array
 
     @classmethod
-    def of(cls, frames: int, rate_hz: float, multiples: float = math.inf) -> HumLines:
+    def of(cls, frames: int, rate_hz: float, multiples: int) -> HumLines:
         """Of windows with this number of frames, up to some multiple of the mains."""
         seconds = frames / rate_hz
         reach = max(ASIDE) / seconds
@@ -86,6 +87,7 @@ class HumFilter:
 
     def __init__(self, format: SweepFormat) -> None:
         self._rate_hz, self._type = format.rate_hz, format.numpy_type
+        self._frames = format.window
         self._lines: dict[tuple[int, bool], HumLines] = {}  # by frames, and whether of a whole comb
         self.hz = tuple(sorted(set(self._of(format.window).mains.tolist())))
 
@@ -113,10 +115,12 @@ class HumFilter:
 
     def _of(self, frames: int, *, comb: bool = False) -> HumLines:
         """The lines of windows of this length: those that are searched, or all."""
-        if (frames, comb) not in self._lines:
-            most = math.inf if comb else SEARCHED
-            self._lines[frames, comb] = HumLines.of(frames, self._rate_hz, most)
-        return self._lines[frames, comb]
+        lines = self._lines.get((frames, comb))
+        if lines is None:
+            lines = HumLines.of(frames, self._rate_hz, MULTIPLES if comb else SEARCHED)
+            if frames == self._frames or not comb:  # those of unfinished hummed windows are large
+                self._lines[frames, comb] = lines
+        return lines
 
     def _comb(
         self, searched: HumLines, strongest: int, taxels: Array, common: Array

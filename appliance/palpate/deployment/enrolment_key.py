@@ -35,9 +35,8 @@ class EnrolmentKey:
             self.verify(PROBE, self.sign(PROBE, namespace), namespace)
         except BundleError as e:
             raise ConfigError(
-                f"{self.folder / SIGNER} does not admit what {KEY} signs as {namespace}; run make "
-                "install, which adds that; if it stays so, remove both, run it again and teach "
-                "all labels again"
+                f"{self.folder / SIGNER} does not admit what {KEY} signs as {namespace}; remove "
+                "both, run make install, and teach all labels again"
             ) from e
 
     def sign(self, data: bytes, namespace: str = NAMESPACE) -> bytes:

@@ -81,7 +81,7 @@ def sign(
     done = _keygen(
         "sign", "-f", str(key), "-n", namespace, "-q", message=message, interactive=interactive
     )
-    if done.returncode:
+    if done.returncode or not done.stdout:
         raise ConfigError(
             f"{key} does not sign; name a key of yours, or make one with ssh-keygen -t ed25519"
         )

@@ -192,7 +192,7 @@ def test_palpate_run_is_killed_and_comes_back_under_a_reader(tmp_path: Path):
                     if line["type"] == "hello":
                         pids.append(line["pid"])
                         assert line["labels"]
-                    if {wait, "frame"} <= set(seen):
+                    if {wait, "frame", "hello"} <= set(seen):
                         break
                 begin = seen.index("hello")  # the last lines of the first box come before it
                 assert seen[begin : begin + 2] == ["hello", "health"]

@@ -55,10 +55,10 @@ def test_baselines_find_what_they_look_at():
     """Means distinguish offsets, bands distinguish pitches, and neither does the other's work."""
     folds = Protocol("leave:session").folds(tones(), 1)
     found = trivial.figures(tones(), folds)
-    assert found[trivial.SPREAD]["right"] == 36
+    assert found[trivial.BANDS]["right"] == 36
     assert found[trivial.MEANS]["accuracy"] < 0.7
     assert trivial.figures(tones(offset=200.0), folds)[trivial.MEANS]["right"] == 36
-    assert trivial.beside_a_fit(tones())[trivial.SPREAD]["accuracy"] == 1
+    assert trivial.beside_a_fit(tones())[trivial.BANDS]["accuracy"] == 1
     constant = replace(tones(), samples=np.ones_like(tones().samples))
     assert trivial.figures(constant, folds)[trivial.MEANS]["n"] == 36
     assert trivial.beside_a_fit(tones(recordings=1)) == {}

@@ -38,6 +38,7 @@ from palpate_train.metrics.answers import REFUSED
 from palpate_train.metrics.temperature import platt_temperature
 from palpate_train.models import methods
 from palpate_train.models.method_fit import MethodFit
+from palpate_train.models.recipe import graph as recipe_graph
 from palpate_train.models.recipe import loads, recipe, stages
 from palpate_train.models.recipe.fitted import Fit, finished
 from palpate_train.models.recipe.sizes import SIZES
@@ -99,7 +100,9 @@ def test_the_float_graph_is_the_network(dtype: str):
     form = SweepFormat(3, 2, 100.0, 128, dtype)
     torch.manual_seed(0)
     model = StagesNetwork(form, 3, 0.1, norm=False).eval()
-    graph = model.graph()
+    weights = model.weights()
+    trunk = recipe_graph.trunk_graph(model.format, model.scale, weights, model.architecture)
+    graph = graph_builder.with_head(trunk, weights["head.weight"], weights["head.bias"])
     counts = np.random.default_rng(0).integers(0, 200, (5, 128, 3, 2)).astype(dtype)
     with torch.no_grad():
         want = model(torch.from_numpy(counts.astype(np.float32))).numpy()

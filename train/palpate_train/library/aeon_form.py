@@ -27,8 +27,8 @@ class AeonPalpateClassifier(BaseClassifier):  # type: ignore[misc]  # aeon has n
         "algorithm_type": "feature",
     }
 
-    def __init__(self, **parameters: Any) -> None:
-        for name, value in PalpateClassifier(**parameters).get_params().items():
+    def __init__(self, *values: Any, **parameters: Any) -> None:
+        for name, value in PalpateClassifier(*values, **parameters).get_params().items():
             setattr(self, name, value)
         super().__init__()
 
