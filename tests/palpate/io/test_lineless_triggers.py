@@ -108,7 +108,7 @@ def test_a_bad_speed_or_force_starts_nothing(text: str, message: str):
     assert trigger.edges(20) == []
     line = sentence("ANS", "START", "error", refused.value)
     assert len(line) <= MAX_LINE
-    assert b"or leave it empty*" in line or b"and a force*" in line
+    assert b"or leave it empty*" in line or b"a force in N*" in line
 
 
 def test_a_robot_sweeps_over_its_serial_line(rigged: Callable[..., Rigged]):
