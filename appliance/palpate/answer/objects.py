@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.answer.pipeline import Context, Refusal
-from palpate.core.types import Status, Sweep
+from palpate.core.types import Status
 
 STRONG = 10.0
 """Least Bayes factor for another object: strong evidence (Jeffreys 1961, appendix B). Decision 6
@@ -148,21 +148,6 @@ def contradicts(own: NDArray[np.float64], fused: NDArray[np.float64]) -> bool:
     return bool(len(own) * (fused @ own) < 1 / STRONG)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ObjectAnswer:
-    """What the sweeps of the present object say together. scores: float64 [K], decided
-    (EnrolledLabels); of a refused sweep its own. fused: number of sweeps in them. after: number of
-    the last sweep before. conflict: a message if the sweep contradicts those before it, else "".
-    final: no further sweep of this object is wanted."""
-
-    scores: NDArray[np.float64]
-    fused: int
-    after: int
-    conflict: str
-    refused: bool
-    final: bool
-
-
 class ObjectSweeps:
     """Fuses the sweeps of one object after the other. labels: [K], for messages. fusion: "product",
     "vote" (see `Evidence.of`) or "none"."""
@@ -174,26 +159,27 @@ class ObjectSweeps:
         self.present = FusedSweeps()
         self._labels = labels
 
-    def put(self, sweep: Sweep, own: NDArray[np.float64]) -> ObjectAnswer:
-        """Fuse one more sweep, with the probabilities `own` float64 [K]."""
-        earlier = self.present
+    def apply(self, context: Context) -> Refusal | None:
+        """Fuse one more sweep with those of its object, and refuse one that contradicts them."""
+        sweep, own, earlier = context.sweep, context.probabilities, self.present
         if sweep.object == 0 or sweep.object != earlier.object or self.fusion == "none":
             earlier = FusedSweeps(sweep.object)
         before = None if earlier.ended(sweep.start_ns, self.rule) else earlier.evidence
         conflict = self._conflict(own, before)
+        context.own, context.after = own, earlier.last
         if conflict and self.rule.conflict == "refuse":
             self.present = replace(earlier, last=sweep.id, end_ns=sweep.stop_ns)
-            return ObjectAnswer(
-                self.enrolled.decided(own), 0, earlier.last, conflict, refused=True, final=False
-            )
+            return Refusal(Status.CONFLICT, conflict)
         votes = self.fusion == "vote"  # each sweep votes for the label that it is given
         kept = Evidence.of(
             self.enrolled.decided(own) if votes else own, self.fusion, None if conflict else before
         )
         self.present = FusedSweeps(sweep.object, kept, sweep.id, sweep.stop_ns)
-        final = 0 < self.rule.max_sweeps <= kept.sweeps
-        scores = kept.probabilities if votes else self.enrolled.decided(kept.probabilities)
-        return ObjectAnswer(scores, kept.sweeps, earlier.last, conflict, refused=False, final=final)
+        fused = kept.probabilities
+        context.scores = fused if votes else self.enrolled.decided(fused)
+        context.fused, context.detail = kept.sweeps, conflict
+        context.final = 0 < self.rule.max_sweeps <= kept.sweeps
+        return None
 
     def _conflict(self, own: NDArray[np.float64], before: Evidence | None) -> str:
         """A message if `own` [K] contradicts the sweeps `before`, "" if it can be fused with
@@ -207,16 +193,6 @@ class ObjectSweeps:
             self._labels[int(self.enrolled.decided(p).argmax())] for p in (own, fused)
         )
         return f"another object: {label} after {before_it}"
-
-    def apply(self, context: Context) -> Refusal | None:
-        """Fuse a sweep, and refuse one that contradicts its object."""
-        fused = self.put(context.sweep, context.probabilities)
-        context.own, context.after = context.probabilities, fused.after
-        if fused.refused:
-            return Refusal(Status.CONFLICT, fused.conflict)
-        context.scores, context.fused, context.final = fused.scores, fused.fused, fused.final
-        context.detail = fused.conflict
-        return None
 
 
 class GivesNumbers:

@@ -131,8 +131,9 @@ class Classifier(Observer):
         if m.contact and m.thresholds.contact is not None:
             stages.append(LocateContact(m.contact, m.thresholds.contact))
         pitch_mm = m.contact.pitch_mm if m.contact and slides else None
-        self._slide = MeasureSlide(m.format, pitch_mm)
-        if pitch_mm or m.disturbances or (m.sliding and m.sliding.pattern):
+        wanted = pitch_mm or m.disturbances or (m.sliding and m.sliding.pattern)
+        self._slide = MeasureSlide(m.format, pitch_mm) if wanted else None
+        if self._slide:
             stages.append(self._slide)
         if m.disturbances:
             stages.append(MeasureDisturbances(unloaded=bool(m.unloaded)))
@@ -146,7 +147,7 @@ class Classifier(Observer):
         rule, enrolled = m.displacement, self._objects.enrolled
         if rule and rule.farthest_mm:
             stages.append(WithinReach(rule.farthest_mm))
-        if m.sliding and m.sliding.pattern and self._slide.able:
+        if m.sliding and m.sliding.pattern and self._slide and self._slide.able:
             stages.append(ShowsPattern(m.sliding.pattern))
         if m.sliding:
             stages.append(Vibrates(m.sliding, m.labels, m.format.window, enrolled, m.disturbances))

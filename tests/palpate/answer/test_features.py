@@ -9,10 +9,10 @@ import pytest
 import scipy.signal
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 
 from palpate.answer import features
 from palpate.core.errors import FormatError
+from tests.factories.any_counts import any_counts
 
 RATE, FRAMES = 750.0, 1500
 
@@ -195,17 +195,8 @@ def test_few_frames_give_l_features() -> None:
         features.h_features(x[:1], RATE)
 
 
-_DIGITS = st.sampled_from(["uint8", "int16", "uint16", "float32"]).flatmap(
-    lambda dtype: hnp.arrays(
-        dtype,
-        st.tuples(st.integers(30, 90), st.integers(1, 3), st.integers(1, 3)),
-        elements={"allow_nan": False, "allow_infinity": False} if dtype == "float32" else None,
-    )
-)
-
-
 @settings(max_examples=60)
-@given(_DIGITS, st.floats(20, 300))
+@given(any_counts(30, 90), st.floats(20, 300))
 def test_results_are_finite_for_any_counts(taxels: np.ndarray, rate_hz: float) -> None:
     """Weights sum to 1, centroids stay below Nyquist, H-features are as many as `h_shape` says, 0
     to 1."""

@@ -11,12 +11,12 @@ import pytest
 import scipy.stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 
 from palpate.answer import features, time_series
 from palpate.core.errors import FormatError
 from palpate_studies.peers.prior_features import correlation, spectrogram, static
 from palpate_studies.peers.prior_work import explore
+from tests.factories.any_counts import any_counts
 
 FEATURES = (static, spectrogram, correlation)
 RATE = 750.0
@@ -156,17 +156,8 @@ def test_the_number_of_features_hangs_on_the_grid_alone(rows: int, cols: int):
         assert [len(of(x, 50.0)) for of in FEATURES] == [2 * rows * cols + 7, 125, 9]
 
 
-_DIGITS = st.sampled_from(["uint8", "int16", "uint16", "float32"]).flatmap(
-    lambda dtype: hnp.arrays(
-        dtype,
-        st.tuples(st.integers(20, 60), st.integers(1, 3), st.integers(1, 3)),
-        elements={"allow_nan": False, "allow_infinity": False} if dtype == "float32" else None,
-    )
-)
-
-
 @settings(max_examples=60)
-@given(_DIGITS, st.floats(1, 5000), st.sampled_from(FEATURES))
+@given(any_counts(20, 60), st.floats(1, 5000), st.sampled_from(FEATURES))
 def test_results_are_finite_for_any_digits(taxels: np.ndarray, rate_hz: float, of):
     """Finite numbers for any counts."""
     assert np.isfinite(of(taxels, rate_hz)).all()
