@@ -25,7 +25,7 @@ SCRATCH = $(or $(shell df -Pk /dev/shm 2>/dev/null | awk 'NR > 1 && $$4 > 100000
 PYTEST = PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -n $(shell expr `nproc` + 1)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo desktop test test-fast test-all lint types bundle bench site deploy install deb client clean
+.PHONY: help demo desktop test test-fast test-all lint bundle bench site deploy install deb client release clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -49,13 +49,11 @@ test-fast: $(TOOLS) ## run the tests that are neither `slow` nor `thorough`
 test-all: test ## run all tests; those on real sweeps need their folder in PALPATE_DATA
 	$(PYTEST) --dist loadfile -m thorough
 
-lint: $(TOOLS) ## check style, imports between packages, and prose
+lint: $(TOOLS) ## check style, imports between packages, prose, and types (mypy --strict)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 	$(BIN)/python -m tests.prose
-
-types: $(TOOLS) ## check types: mypy --strict
 	$(BIN)/mypy
 
 bundle: $(DESKTOP) ## train, quantize and pack the default bundle again
@@ -95,6 +93,10 @@ deb: $(FLEET) $(DESKTOP) ## pack the same as dist/palpate_*.deb for arm64 and am
 client: $(RUNTIME) ## build the robot's client alone: dist/palpate_client-*.whl
 	$(PIP) wheel --no-deps --no-build-isolation -w dist ./appliance/plugins/client
 	rm -rf appliance/plugins/client/build appliance/plugins/client/*.egg-info
+
+release: ## publish what `make deb` has packed as the release TAG=, with gh
+	gh release create $(if $(value TAG),$(call quoted,TAG),$(error name the release with TAG=v0.2.0)) \
+	  --title $(call quoted,TAG) --notes-file dist/notes.md dist/*.whl dist/*.deb dist/*.cdx.json
 
 clean: ## remove everything that was built, the virtual environment too
 	rm -rf $(VENV) build dist *.egg-info appliance/*.egg-info train/*.egg-info train/studies/*.egg-info

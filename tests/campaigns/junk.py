@@ -1,8 +1,8 @@
 """Counts the answers of the packaged bundle to junk: sweeps without a material that it knows.
 
-`python -m tests.campaigns junk` prints a row for each kind of sweep: how many the box names with
-status ok, and how many of these wrongly, for whole sweeps and with early answers. A sweep of two
-materials, or of none, is wrong under any label. Takes some minutes.
+`python -m tests.campaigns junk` prints a row for each kind of sweep: how many the box answers
+with `ok`, and how many of these labels are wrong, for whole sweeps and with early answers. A sweep
+of two materials, or of none, is wrong under any label. Takes some minutes.
 """
 
 from __future__ import annotations
@@ -357,7 +357,7 @@ def answer(box: Classifier, early: EarlyExit | None, taxels: NDArray[np.uint8]) 
 
 
 def counted(model: bundle.Bundle, world: skin.World, each: int) -> dict[str, dict[str, Any]]:
-    """The counts of each kind: sweeps, named and wrongly named whole and early, and the statuses of
+    """The counts of each kind: sweeps, labels and wrong labels whole and early, and the statuses of
     whole sweeps. Prints a row for each."""
     box = Classifier(model, VirtualClock())
     early = EarlyExit(box) if model.manifest.early else None

@@ -117,7 +117,7 @@ def exported(sweeps: Dataset, folder: Path, seed: int, steps: int = 0) -> Bundle
 
 
 def _right(of: Bundle, others: Dataset) -> Array:
-    """Whether the box names each sweep rightly, with status ok, bool [n]."""
+    """Whether the box classifies each sweep correctly, with status ok, bool [n]."""
     box, right = Classifier(of, SystemClock(), slides=False), np.zeros(len(others), bool)
     for i, verdict in bundle_score.verdicts(box, others):
         is_ok = verdict.status is Status.OK

@@ -9,6 +9,7 @@ from typing import Any
 from palpate.core.storage import put
 from palpate_studies import marked_text
 from palpate_train.reports import provenance
+from palpate_train.reports.formatting import estimate, percent
 
 Json = dict[str, Any]
 
@@ -22,24 +23,15 @@ def write(path: Path, results: Json) -> None:
     put(path, provenance.in_markdown(text, provenance.of(results)).encode())
 
 
-def _percent(share: float) -> str:
-    return f"{100 * share:.1f} %"
-
-
 def _way(found: dict[str, Json]) -> Iterator[str]:
     yield (
-        "| skin | as recorded | chosen by `fit` | classified correctly, at other positions "
-        "| 95 % interval | frames lost | bundle |"
+        "| skin | format | classified correctly, at other positions, 95 % interval "
+        "| frames lost | bundle, kB |"
     )
-    yield "|---|---|---|---|---|---|---|"
+    yield "|---|---|---|---|---|"
     for name, row in found.items():
-        low, high = map(_percent, row["interval"])
-        right = f"{row['right']} of {row['total']}: {_percent(row['right'] / row['total'])}"
-        described = f"{row['sweeps']} sweeps, {row['format']}"
-        yield (
-            f"| {name} | {described} | {row['chosen']} | {right} | {low} to {high} "
-            f"| {row['lost']} | {row['bundle_kb']} kB |"
-        )
+        right = estimate([row["right"] / row["total"], *row["interval"]])
+        yield f"| {name} | {row['format']} | {right} | {row['lost']} | {row['bundle_kb']} |"
 
 
 def _noise(found: dict[str, Json]) -> Iterator[str]:
@@ -49,36 +41,36 @@ def _noise(found: dict[str, Json]) -> Iterator[str]:
         "twice": "a part twice",
         "changed": "a byte changed",
     }
-    yield f"| skin | {' | '.join(kinds.values())} | frames taken of those not damaged |"
+    if found:
+        fewest = min(row[kind]["faults"] for row in found.values() for kind in kinds)
+        # the rule of three gives the highest rate that agrees with no wrong frame
+        yield (
+            f"In %, of at least {fewest:,} frames damaged in each way; 0 is a rate below "
+            f"{300 / fewest:.2g} % (95 %).\n"
+        )
+    yield f"| skin | {' | '.join(kinds.values())} | intact frames that arrived |"
     yield "|---|---|---|---|---|---|"
     for name, row in found.items():
         wrong = [_rate(row[kind]["wrong"], row[kind]["faults"]) for kind in kinds]
         sound = sum(row[kind]["sent"] - row[kind]["faults"] for kind in kinds)
         taken = sum(row[kind]["taken"] - row[kind]["wrong"] for kind in kinds)
-        yield f"| {name} | {' | '.join(wrong)} | {min(1.0, taken / sound):.1%} |"
+        yield f"| {name} | {' | '.join(wrong)} | {100 * min(1.0, taken / sound):.1f} |"
 
 
 def _rate(wrong: int, faults: int) -> str:
-    """Wrong frames in this many faults; if there are none, their highest rate by the rule of
-    three."""
-    if not wrong:
-        return f"0 of {faults:,} (below {3 / faults:.2%})"
-    return f"{wrong:,} of {faults:,} ({wrong / faults:.2%})"
+    """Share of wrong frames among the damaged ones, in %; without a wrong frame "0"."""
+    return f"{100 * wrong / faults:.2f}" if wrong else "0"
 
 
 def _load(found: dict[str, Json]) -> Iterator[str]:
-    yield "| skin | frames | share of a core | edge to sentence | time | frames that came | lost |"
-    yield "|---|---|---|---|---|---|---|"
+    yield (
+        "| skin | share of a core | edge to sentence: median, 99 % within, ms "
+        "| frames that came | lost |"
+    )
+    yield "|---|---|---|---|---|"
     for name, row in found.items():
-        times = (
-            f"{row['answer_ms']['p50']:.1f} ms, 99 % within {row['answer_ms']['p99']:.1f} ms "
-            f"(n = {row['answers']})"
-        )
-        yield (
-            f"| {name} | {row['format']} | {_percent(row['share'])} | {times} "
-            f"| {row['seconds']:.0f} s | {row['came']:,} "
-            f"| {row['missing']} |"
-        )
+        times = f"{row['answer_ms']['p50']:.1f}, {row['answer_ms']['p99']:.1f}"
+        yield f"| {name} | {percent(row['share'])} | {times} | {row['came']:,} | {row['missing']} |"
 
 
 TABLES: dict[str, Callable[[dict[str, Json]], Iterator[str]]] = {

@@ -55,7 +55,7 @@ def go(name: str, folder: Path) -> dict[str, Any]:
             labels = ("--material", material, "--position", f"p{seed}")
             box("record", *chosen, *played, *labels, "--out", sweeps)
     desktop("sets", "describe", sweeps)
-    fitted = desktop("fit", "--set", sweeps, "--seed", 1, "--out", fit)
+    desktop("fit", "--set", sweeps, "--seed", 1, "--out", fit)
     desktop("export", fit, "--out", bundle, "--name", name, "--version", 1)
     right = total = lost = 0
     for seed in TESTED:
@@ -64,12 +64,10 @@ def go(name: str, folder: Path) -> dict[str, Any]:
         good, of = map(int, re.findall(r"all sweeps\s+(\d+) / (\d+)", text)[-1])
         right, total = right + good, total + of
         lost += int(re.findall(r"frames lost\s+(\d+)", text)[-1])
-    chose = re.findall(r"chosen: (.*?);", fitted)
     return {
         "skin": name,
         "sweeps": len(TRAINED) * RECORDED * len(skin.MATERIALS),
         "format": str(load(bundle).format),
-        "chosen": chose[0] if chose else "",
         "right": right,
         "total": total,
         "lost": lost,

@@ -67,7 +67,7 @@ class Side:
 
 
 def renamed(old: Bundle, name: str = "aaaaaaaa") -> Bundle:
-    """The same bundle with its labels in another order, so that it names every material wrongly."""
+    """The same bundle with its labels in another order: every material gets a wrong label."""
     return replace(
         old,
         id=name,

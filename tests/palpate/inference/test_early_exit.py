@@ -572,8 +572,8 @@ def test_the_simulated_robot_stops_once(stop: str):
 @pytest.mark.slow
 def test_hum_costs_hardly_an_early_answer(default_bundle: Bundle, hz: tuple[float, ...]):
     """Unfinished sweeps pass the stages of whole ones: with hum of 8 counts as many of 12 slides
-    are answered early as without, and none wrongly. More hum than was tried is answered by
-    neither."""
+    are answered early as without, and none with a wrong label. More hum than was tried is
+    answered by neither."""
     box = Classifier(default_bundle, rig.VirtualClock())
     early, labels = EarlyExit(box), default_bundle.manifest.labels
     slides = [

@@ -22,7 +22,7 @@ def sweeps(n: int, seed: int, spread: float = 0.0):
 
 
 def made(n: int = 20, wrong: float = 0.0):
-    """A DisplacementFit. The share `wrong` of the held-out copies is named wrongly, with lower
+    """A DisplacementFit. The share `wrong` of the held-out copies gets a wrong label, with lower
     probability than the others."""
     x, labels, groups = sweeps(n, 0)
     held = groups >= 6
@@ -66,7 +66,7 @@ def test_the_box_measures_the_same_distances():
     )
 
 
-def test_a_moved_sweep_must_be_surer_where_copies_are_named_wrongly():
+def test_a_moved_sweep_must_be_surer_where_copies_get_wrong_labels():
     """If ten in a hundred copies are wrong with a probability of .62, more is required; if all are
     right, no more than for any sweep."""
     _, fit, _ = made()

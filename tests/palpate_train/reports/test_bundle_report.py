@@ -146,10 +146,10 @@ def test_the_headline_says_what_was_missed(figures: dict, sweeps: Dataset):
     text = PageReader(bundle_report.page(missed, sweeps)).text
     for line in (
         "classified correctly 75.0 %, 15 of 20",
-        "named wrongly 15.0 %, 3 of 20",
+        "wrong label 15.0 %, 3 of 20",
         "refused) 10.0 %, 2 of 20",
         "least often: wood 25.0 % [10.0, 50.0]",
-        "yet it names them 75.0 % [50.0, 90.0]",
+        "does not have, with a label 75.0 % [50.0, 90.0]",
         "10.0 % [0.0, 30.0] of the sweeps of its own materials are called unknown",
     ):
         assert line in text, line

@@ -89,7 +89,7 @@ def test_materials_that_cannot_be_told_apart_are_named():
 
 
 def test_the_material_with_most_errors_comes_next():
-    """Errors of a material and answers that name it wrongly both count."""
+    """Errors of a material and sweeps of others that get its label both count."""
     labels = [0] * 10 + [1] * 10 + [2] * 10
     named = list(labels)
     named[0], named[1] = 1, 1

@@ -23,7 +23,7 @@ Array = NDArray[Any]
 MOST_WRONG = 0.0125
 """Share of held-out copies that may get a wrong label with status ok. Heads that were fitted to
 copies name copies better than sweeps of a skin that was really displaced: with .0125 a fit for a
-reattached skin names 4 % of sim:T-HARD:201-236:2 wrongly."""
+reattached skin gives 4 % of sim:T-HARD:201-236:2 a wrong label."""
 UNSURE = np.arange(50, 100) / 100
 """Candidates for the least probability with which a displaced sweep is ok."""
 NEVER = 1.01

@@ -36,7 +36,7 @@ MATERIALS = [
     "material",
     "sweeps",
     "classified correctly",
-    "right where named",
+    "correct where labelled",
     "unsure",
     "unknown",
     "refused",
@@ -45,11 +45,11 @@ MATERIALS = [
 CORRUPTIONS = [
     "what goes wrong",
     "five points are lost at",
-    "at the largest tried: rightly / wrongly / not named",
+    "at the largest tried: classified correctly / wrong label / no label",
 ]
 LEFT_OUT = [
     "left out of training",
-    "gets a known name",
+    "gets a known label",
     "known sweeps kept",
     "AUROC",
     "sweeps, known / unknown",
@@ -136,8 +136,8 @@ def _in_short(figures: Json) -> Iterator[list[str]]:
     for what in ("right", "wrong", "not_named"):
         text = {
             "right": "classified correctly",
-            "wrong": "named wrongly",
-            "not_named": "not named (unsure, unknown or refused)",
+            "wrong": "wrong label",
+            "not_named": "no label (unsure, unknown or refused)",
         }[what]
         yield [text, f"{formatting.percent(named[what] / n)}, {named[what]} of {n}"]
     worst = min(
@@ -149,12 +149,12 @@ def _in_short(figures: Json) -> Iterator[list[str]]:
     ]
     if share := figures["foreign_named"]:
         yield [
-            "sweeps of materials that it does not have, yet it names them",
+            "sweeps of materials that it does not have, with a label",
             formatting.estimate(share),
         ]
     elif found := figures.get("left_out"):
         yield [
-            "sweeps of a material left out of training, yet named (mean)",
+            "sweeps of a material left out of training, with a label (mean)",
             formatting.percent(found["mean"]["false_known"]),
         ]
     if breaks := [row for row in figures["corruptions"] if row["falls"] is not None]:

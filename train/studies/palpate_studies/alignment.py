@@ -80,8 +80,8 @@ def _point(
     """The box's answers to the test sweeps, with the skin moved. The sweeps of an attachment are
     one cluster.
 
-    accuracy, wrong: named with status ok, rightly and wrongly. unsure, unknown: the other answers.
-    network: most probable label of the network alone is right.
+    accuracy, wrong: answered `ok` with the right and a wrong label. unsure, unknown: the other
+    answers. network: most probable label of the network alone is right.
     """
     assert test.scene
     sweeps, place, limits = test.sweeps, box.bundle.manifest.contact, box.bundle.manifest.thresholds

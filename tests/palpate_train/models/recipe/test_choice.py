@@ -138,8 +138,8 @@ def test_a_factor_from_before_does_not_count():
 
 
 def test_loss_alone_is_no_reason():
-    """If two candidates name the same sweeps rightly, neither is better, however certain one is of
-    its wrong answers."""
+    """If two candidates classify the same sweeps correctly, neither is better, however certain
+    one is of its wrong answers."""
     at = scores()
     one = at.score([HeadPart(GOOD, False)])
     wrong = one.logits.argmax(axis=1) != at.labels
