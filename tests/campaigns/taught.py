@@ -30,7 +30,8 @@ from palpate_train.data import sets
 from palpate_train.data.run import Run
 from palpate_train.data.sets import Dataset
 from palpate_train.data.splitters import draw
-from palpate_train.export import bundle_score, quantized_bundle
+from palpate_train.export import quantized_bundle
+from palpate_train.metrics import bundle_score
 from palpate_train.models.recipe import recipe
 from palpate_train.models.recipe.fitted import Fit
 

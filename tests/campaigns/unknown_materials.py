@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from palpate.answer.unknown import shaped_distances
 from palpate.core.clock import SystemClock
 from palpate.inference.classifier import Classifier
-from palpate_train.calibration.novelty import auroc
+from palpate_train.answer.embedding import auroc
 from palpate_train.data import sets
 from palpate_train.data.sets import Dataset
 from tests.campaigns.taught import exported

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from palpate_train.calibration.displacement import AugmentedCopies
-from palpate_train.models.recipe.calibrate import CalibrationInputs
+from palpate_train.answer.calibrate import CalibrationInputs
+from palpate_train.answer.fit_displacement import AugmentedCopies
 
 
 def plain_inputs(

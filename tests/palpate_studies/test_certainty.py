@@ -12,12 +12,12 @@ import pytest
 
 from palpate.core.errors import FormatError
 from palpate_studies import certainty, uncertainty_report
+from palpate_train.answer.calibrate import fit_calibration
 from palpate_train.data.sets import Dataset
 from palpate_train.evaluate import uncertainty, uncertainty_cases
 from palpate_train.evaluate.evaluate import Where
 from palpate_train.evaluate.uncertainty_cases import NONE_LEFT_OUT, Case
 from palpate_train.models.methods import Effort
-from palpate_train.models.recipe.calibrate import fit_calibration
 from tests.factories.calibration_inputs import plain_inputs
 
 pytestmark = pytest.mark.slow

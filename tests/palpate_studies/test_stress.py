@@ -13,10 +13,10 @@ import pytest
 
 from palpate.core.errors import FormatError
 from palpate_studies import stress
+from palpate_train.data import corruptions
+from palpate_train.data.evaluation_sweeps import EvaluationSweeps
 from palpate_train.data.sets import Dataset
-from palpate_train.evaluate import corruptions
 from palpate_train.evaluate.evaluate import Where
-from palpate_train.evaluate.evaluation_sweeps import EvaluationSweeps
 from palpate_train.models import methods
 from palpate_train.models.methods import Method, model_inputs
 

@@ -2,7 +2,7 @@
 
 A silent taxel does not change although its neighbours do, or gives no number: it is dead or stuck.
 A noisy taxel is far noisier than its neighbours. All limits were learned from the training sweeps
-of the bundle (train/palpate_train/export/bridging).
+of the bundle (train/palpate_train/answer/fit_taxels).
 """
 
 from __future__ import annotations

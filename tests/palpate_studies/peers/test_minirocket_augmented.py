@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from palpate_studies.peers import minirocket, minirocket_augmented
+from palpate_train.data.augment import copies
 from palpate_train.data.sets import Dataset
-from palpate_train.models.recipe.augment import copies
 from tests.factories.sweep_sets import easy
 
 

@@ -7,9 +7,10 @@ import json
 import numpy as np
 import pytest
 
+from palpate_train.data import corruptions
+from palpate_train.data.evaluation_sweeps import EvaluationSweeps
 from palpate_train.data.sets import Dataset
-from palpate_train.evaluate import corruptions, robustness
-from palpate_train.evaluate.evaluation_sweeps import EvaluationSweeps
+from palpate_train.evaluate import robustness
 
 
 @pytest.mark.parametrize(

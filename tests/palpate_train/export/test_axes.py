@@ -17,7 +17,7 @@ from palpate.sim import devices, rig, script
 from palpate.sweeps.black_box import BlackBox
 from palpate.sweeps.capture import CaptureWriter
 from palpate_train.cli.main import main
-from palpate_train.export import bundle_score
+from palpate_train.metrics import bundle_score
 from tests.factories.sheared import PITCH_MM, sheared
 from tests.factories.simulated_box import Rigged
 

@@ -17,7 +17,8 @@ from palpate.core.errors import BundleError, FormatError
 from palpate.inference.classifier import Classifier
 from palpate_train.cli.main import main
 from palpate_train.data.sets import Dataset
-from palpate_train.export import bundle_score, pack
+from palpate_train.export import pack
+from palpate_train.metrics import bundle_score
 from palpate_train.models import methods
 from palpate_train.models.method_fit import MethodFit
 from tests.factories.costly import quick_first

@@ -28,12 +28,13 @@ from palpate.sim import skin
 from palpate_studies import cost
 from palpate_studies.command import main as study
 from palpate_studies.peers import paper_cnn
-from palpate_train.calibration.heads import HeadData
+from palpate_train.answer.heads import HeadData
 from palpate_train.cli.main import main
 from palpate_train.data import sets
 from palpate_train.data.run import Run
-from palpate_train.export import bundle_score, pack, quantized_bundle
+from palpate_train.export import pack, quantized_bundle
 from palpate_train.export.pack import ExportRefused
+from palpate_train.metrics import bundle_score
 from palpate_train.metrics.answers import REFUSED
 from palpate_train.metrics.temperature import platt_temperature
 from palpate_train.models import methods

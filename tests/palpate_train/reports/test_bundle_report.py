@@ -18,9 +18,9 @@ from palpate.core.clock import SystemClock
 from palpate.inference.classifier import Classifier
 from palpate_train.cli.main import main
 from palpate_train.data import sets
+from palpate_train.data.evaluation_sweeps import EvaluationSweeps
 from palpate_train.data.sets import Dataset
-from palpate_train.evaluate.evaluation_sweeps import EvaluationSweeps
-from palpate_train.export import bundle_score
+from palpate_train.metrics import bundle_score
 from palpate_train.reports import bundle_experiment, bundle_report
 from tests.factories import rendered
 from tests.factories.page_reader import PageReader

@@ -17,20 +17,18 @@ from palpate.core.provenance import commit
 from palpate.core.storage import put
 from palpate.core.sweep_set import read
 from palpate.inference.classifier import Classifier
+from palpate_train.answer import (
+    altered_sweeps,
+    fit_displacement,
+    fit_early,
+    fit_slide,
+    fit_taxels,
+)
 from palpate_train.arguments import numbers, options
 from palpate_train.arguments.program import Add
 from palpate_train.data import repeats, sets
-from palpate_train.export import (
-    bridging,
-    bundle_score,
-    displacement_limit,
-    disturbed_sweeps,
-    early_checks,
-    measure,
-    pack,
-    quantized_bundle,
-    sliding,
-)
+from palpate_train.export import measure, pack, quantized_bundle
+from palpate_train.metrics import bundle_score
 from palpate_train.models.method_fit import MethodFit
 from palpate_train.models.recipe.fitted import WHAT, Fit
 from palpate_train.reports import formatting
@@ -141,10 +139,10 @@ def _print(manifest: Manifest, out: Path) -> None:
         print(f"no-contact cannot be detected: {why}")
     for line in formatting.figure_lines(manifest.figures):
         print(line)
-    print(bridging.text(manifest))
+    print(fit_taxels.text(manifest))
     if manifest.known:
-        print(disturbed_sweeps.text(manifest.figures))
-    for part in (quantized_bundle, early_checks, displacement_limit, sliding):
+        print(altered_sweeps.text(manifest.figures))
+    for part in (quantized_bundle, fit_early, fit_displacement, fit_slide):
         if text := part.text(manifest):
             print(text)
     if few := [

@@ -1,1 +1,1 @@
-"""Sweep sets: from files to arrays, checked, split and summed up."""
+"""Sweep sets: from files to arrays, checked, split, altered and summed up."""

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_train.evaluate.corruptions import Corruption
-from palpate_train.evaluate.evaluation_sweeps import EvaluationSweeps
+from palpate_train.data.corruptions import Corruption
+from palpate_train.data.evaluation_sweeps import EvaluationSweeps
 from palpate_train.metrics.score import interval
 
 Array = NDArray[Any]

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_train.calibration import level_check
 from palpate_train.data import repeats
 from palpate_train.data.sets import Dataset, shortened
 from palpate_train.data.splitters import OF_THE_SET
+from palpate_train.evaluate import level_check
 
 Array = NDArray[Any]
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core.errors import FormatError
-from palpate_train.calibration.heads import fit_discriminant
+from palpate_train.answer.heads import fit_discriminant
 from palpate_train.data.sets import Dataset
 from palpate_train.data.splitters import inner_parts
 from palpate_train.data.transforms import log_powers

@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core.errors import FormatError
-from palpate_train.calibration.novelty import auroc
+from palpate_train.answer.calibrate import Calibration
+from palpate_train.answer.embedding import auroc
 from palpate_train.data.sets import Dataset
 from palpate_train.evaluate.evaluate import Where
 from palpate_train.evaluate.uncertainty_cases import NONE_LEFT_OUT, Case, Log, Trainings, cases
 from palpate_train.models import methods
 from palpate_train.models.methods import Effort
-from palpate_train.models.recipe.calibrate import Calibration
 
 Array = NDArray[Any]
 Json = dict[str, Any]

@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 
 from palpate.core.errors import FormatError
 from palpate.core.storage import put
-from palpate_train.calibration.displacement import AugmentedCopies
-from palpate_train.calibration.heads import HeadPlan
+from palpate_train.answer.calibrate import Calibration, CalibrationInputs, fit_calibration
+from palpate_train.answer.fit_displacement import AugmentedCopies
+from palpate_train.answer.heads import HeadPlan
 from palpate_train.data.sets import Dataset, digest, join
 from palpate_train.data.splitters import Protocol
 from palpate_train.evaluate import parallel
@@ -29,7 +30,6 @@ from palpate_train.evaluate.evaluate import Where
 from palpate_train.evaluate.fold import fingerprint
 from palpate_train.models import methods
 from palpate_train.models.methods import Effort
-from palpate_train.models.recipe.calibrate import Calibration, CalibrationInputs, fit_calibration
 from palpate_train.models.recipe.fitted import Fit, calibration_inputs
 from palpate_train.onnx_tools.graph_builder import run as run_graph
 

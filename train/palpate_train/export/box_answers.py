@@ -12,8 +12,8 @@ from palpate.core.provenance import commit
 from palpate.inference.classifier import Classifier
 from palpate_train.data.sets import Dataset
 from palpate_train.evaluate.fold import BoxAnswers
-from palpate_train.export import bundle_score
 from palpate_train.export.quantized_bundle import export
+from palpate_train.metrics import bundle_score
 from palpate_train.models.methods import Model
 from palpate_train.models.recipe.fitted import FittedModel, finished
 

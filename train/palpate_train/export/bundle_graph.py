@@ -15,16 +15,14 @@ import onnx
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
-from palpate_train.calibration.early_exit import Heads
-from palpate_train.calibration.novelty import Embedding
-from palpate_train.models.recipe.calibrate import Calibration
+from palpate_train.answer.calibrate import Calibration
+from palpate_train.answer.embedding import Embedding
+from palpate_train.answer.fit_early import STEPS, Heads
 from palpate_train.onnx_tools.graph_builder import joined
 from palpate_train.onnx_tools.quantize import sixteen_bits
 
 Array = NDArray[Any]
 Add = Callable[..., str]
-STEPS = "early_embedding"
-"""Name of the output with the embeddings of unfinished sweeps."""
 DIRECTIONS, TURN, OFFSET = "embedding.axes", "embedding.turn", "embedding.offset"
 """Names of a model's matrices; see novelty.Embedding."""
 

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from palpate.core.errors import FormatError
 from palpate.core.types import Status
 from palpate.inference.classifier import Classifier
+from palpate_train.data.corruptions import Corruption, applicable
+from palpate_train.data.evaluation_sweeps import EvaluationSweeps
 from palpate_train.data.progress import Progress
 from palpate_train.data.sets import Dataset
 from palpate_train.evaluate import robustness
-from palpate_train.evaluate.corruptions import Corruption, applicable
-from palpate_train.evaluate.evaluation_sweeps import EvaluationSweeps
-from palpate_train.export import bundle_score
+from palpate_train.metrics import bundle_score
 
 Array = NDArray[Any]
 Json = dict[str, Any]

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from palpate.bundle.manifest import Manifest
+from palpate_train.answer import altered_sweeps, fit_taxels
 from palpate_train.data.sets import Dataset, digest
-from palpate_train.export import bridging, disturbed_sweeps
 
 NAME = "card.md"
 NOT_STATED = "not stated"
@@ -91,9 +91,9 @@ def _sentences(manifest: Manifest, protocol: str, figure: Json) -> list[str]:
             "They helped to choose the model, so expect slightly less of others.",
             "",
         ]
-    lines += ["## What breaks it", "", bridging.text(manifest), ""]
+    lines += ["## What breaks it", "", fit_taxels.text(manifest), ""]
     if manifest.known:
-        lines += [disturbed_sweeps.text(manifest.figures), ""]
+        lines += [altered_sweeps.text(manifest.figures), ""]
     else:
         lines += ["It cannot tell an unknown material: each gets the label of a known one.", ""]
     if why := manifest.made.get("contact_unknown_because"):

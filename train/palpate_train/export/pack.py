@@ -31,19 +31,14 @@ from palpate.core import provenance, storage
 from palpate.core.clock import SystemClock
 from palpate.core.errors import BundleError
 from palpate.inference.classifier import Classifier
-from palpate_train.calibration.contact import Contacts
-from palpate_train.calibration.slide_speeds import trained_speeds
+from palpate_train.answer import fit_displacement, fit_early, fit_slide, fit_taxels
+from palpate_train.answer.fit_contact import Contacts
+from palpate_train.answer.fit_slide import trained_speeds
 from palpate_train.data import extras, repeats
 from palpate_train.data.readers import counted
 from palpate_train.data.sets import Dataset
-from palpate_train.export import (
-    bridging,
-    bundle_score,
-    card,
-    displacement_limit,
-    early_checks,
-    sliding,
-)
+from palpate_train.export import card
+from palpate_train.metrics import bundle_score
 from palpate_train.metrics.answers import REFUSED, UNKNOWN
 from palpate_train.models.method_fit import MethodFit
 from palpate_train.models.methods import model_inputs
@@ -141,14 +136,14 @@ def pack(
 
 def limited(manifest: bundle.Manifest, train: Dataset) -> bundle.Manifest:
     """`manifest` with the limits that the training sweeps set: of displacement and of sliding."""
-    return sliding.limited(displacement_limit.limited(manifest, train), train)
+    return fit_slide.limited(fit_displacement.limited(manifest, train), train)
 
 
 def _early_checked(content: Content) -> Content:
     """`content` whose early answers need a known material; see early_checks."""
     if not (content.early and content.classes):
         return content
-    classes, limits = early_checks.measure(content.model, content.train, content.held_out)
+    classes, limits = fit_early.measure(content.model, content.train, content.held_out)
     return replace(
         content,
         early=replace(content.early, limits=limits),
@@ -205,7 +200,7 @@ def _tolerant(
         text = replace(manifest, files=entries, early=None).json()
         packed = bundle.from_files(files | {bundle.MANIFEST: text}, manifest.name)
     seed = int(content.about.get("seed", 0))
-    found = bridging.measure(packed, content.train, content.held_out, seed)
+    found = fit_taxels.measure(packed, content.train, content.held_out, seed)
     return found.written(manifest)
 
 

@@ -13,17 +13,17 @@ from numpy.typing import NDArray
 
 from palpate.bundle import bundle
 from palpate.core.errors import FormatError
-from palpate_train.calibration import novelty
-from palpate_train.calibration.contact import Contacts
-from palpate_train.calibration.novelty import Embedding
-from palpate_train.calibration.widened_shapes import Space
+from palpate_train.answer import altered_sweeps, embedding
+from palpate_train.answer.calibrate import Calibration, CalibrationInputs
+from palpate_train.answer.embedding import Embedding
+from palpate_train.answer.fit_contact import Contacts
+from palpate_train.answer.fit_unknown import Space
 from palpate_train.data import extras
-from palpate_train.export import disturbed_sweeps, pack
+from palpate_train.export import pack
 from palpate_train.export.bundle_graph import bundle_graph
 from palpate_train.export.pack import Content, ExportRefused
 from palpate_train.models.method_fit import MethodFit
 from palpate_train.models.methods import model_inputs
-from palpate_train.models.recipe.calibrate import Calibration, CalibrationInputs
 from palpate_train.models.recipe.fitted import Fit, calibration_inputs, finished
 from palpate_train.onnx_tools import parity
 from palpate_train.onnx_tools.graph_builder import run, with_head
@@ -127,7 +127,7 @@ def _calibrated(content: Content, fit: Fit, pitch_mm: float | None) -> Content:
         content = replace(content, known=known, disturbances=found.disturbances)
         wider = zip(classes, found.shapes, found.changes, strict=True)
         classes = [replace(of, shapes=shapes, changes=moved) for of, shapes, moved in wider]
-        figures |= {disturbed_sweeps.FIGURES: found.figures}
+        figures |= {altered_sweeps.FIGURES: found.figures}
     return replace(
         content,
         unseen=replace(content, model=bundle_graph(apart, fit.trunk()), classes=classes[0]),
@@ -142,14 +142,14 @@ def _calibrated(content: Content, fit: Fit, pitch_mm: float | None) -> Content:
 
 def _widened(
     fit: Fit, given: CalibrationInputs, apart: Embedding, whole: Embedding
-) -> disturbed_sweeps.Widened | None:
+) -> altered_sweeps.Widened | None:
     """Shapes of known materials that know how altered sweeps differ, and their limit; see
-    disturbed_sweeps. apart: an embedding that did not see the held-out sweeps."""
+    altered_sweeps. apart: an embedding that did not see the held-out sweeps."""
     trunk, spaces = fit.trunk(), map(Space.of, (apart, whole))
     seed = int(fit.about["seed"])
     contacts, shape = fit.contacts or Contacts.of(fit.train), fit.train.format.shape
     known = contacts.limit.known_tare()
-    found = disturbed_sweeps.measure(
+    found = altered_sweeps.measure(
         lambda samples: run(trunk, samples),
         fit.train,
         fit.held,
@@ -157,7 +157,7 @@ def _widened(
         tare=np.array(known).reshape(shape) if known else np.zeros(shape),
         seed=seed,
     )
-    return found and replace(found, limit=disturbed_sweeps.limit_of_conditions(found, given))
+    return found and replace(found, limit=altered_sweeps.limit_of_conditions(found, given))
 
 
 def _unseen(given: CalibrationInputs, calibration: Calibration) -> Calibration:
@@ -167,7 +167,7 @@ def _unseen(given: CalibrationInputs, calibration: Calibration) -> Calibration:
     weight, bias = given.naming_head(seen)
     return replace(
         calibration,
-        embedding=novelty.in_two_views(given.whole[seen], given.labels[seen], given.fixed),
+        embedding=embedding.in_two_views(given.whole[seen], given.labels[seen], given.fixed),
         weight=weight / calibration.temperature,
         bias=bias / calibration.temperature,
     )

@@ -14,8 +14,8 @@ from palpate.core.errors import FormatError
 from palpate.core.types import Verdict
 from palpate.inference.classifier import Classifier
 from palpate_train.data.sets import Dataset
-from palpate_train.export import bundle_score
 from palpate_train.library.sweeps import raw_counts
+from palpate_train.metrics import bundle_score
 
 Array = NDArray[Any]
 

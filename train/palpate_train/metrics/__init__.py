@@ -1,1 +1,1 @@
-"""Accuracy, its intervals, and calibration of probabilities."""
+"""Scores of answers and of bundles, their intervals, and calibration of probabilities."""

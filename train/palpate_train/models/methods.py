@@ -49,7 +49,7 @@ class SkinUse:
 
     reattached: the skin will be taken off and put back after the recordings; all heads then see
     augmented copies. mains_hz: frequency of the mains, to whose hum features do not respond.
-    displaced, stretch: of recipe.augment.Augmentation; None for its default.
+    displaced, stretch: of data.augment.Augmentation; None for its default.
     """
 
     reattached: bool = False

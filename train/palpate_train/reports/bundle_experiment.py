@@ -18,11 +18,12 @@ from palpate.bundle import bundle
 from palpate.core.clock import SystemClock
 from palpate.core.types import Status
 from palpate.inference.classifier import Classifier
+from palpate_train.data.evaluation_sweeps import EvaluationSweeps
 from palpate_train.data.sets import Dataset
 from palpate_train.evaluate import uncertainty
-from palpate_train.evaluate.evaluation_sweeps import EvaluationSweeps
 from palpate_train.evaluate.robustness import breaks_first
-from palpate_train.export import bundle_score, bundle_stress, measure
+from palpate_train.export import bundle_stress, measure
+from palpate_train.metrics import bundle_score
 from palpate_train.metrics.score import interval
 
 Array = NDArray[Any]

@@ -21,7 +21,7 @@ from palpate.core.errors import FormatError
 from palpate.core.types import Frames, Status, Sweep
 from palpate.inference.classifier import Classifier
 from palpate.sim import skin
-from palpate_train.evaluate.evaluation_sweeps import EvaluationSweeps
+from palpate_train.data.evaluation_sweeps import EvaluationSweeps
 from palpate_train.metrics.score import interval, provenance
 
 Array = NDArray[Any]

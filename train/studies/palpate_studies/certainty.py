@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.answer.objects import softmax
-from palpate_train.calibration.early_exit import decide
+from palpate_train.answer.fit_early import decide
 from palpate_train.data.sets import Dataset, digest
 from palpate_train.evaluate import uncertainty
 from palpate_train.evaluate.evaluate import Where

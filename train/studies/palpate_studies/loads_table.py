@@ -17,7 +17,8 @@ from palpate.inference.classifier import Classifier
 from palpate_train.data import sets
 from palpate_train.data.run import Run
 from palpate_train.data.sets import Dataset
-from palpate_train.export import bundle_score, quantized_bundle
+from palpate_train.export import quantized_bundle
+from palpate_train.metrics import bundle_score
 from palpate_train.metrics.answers import outcomes
 from palpate_train.models.methods import SkinUse
 from palpate_train.models.recipe import recipe

@@ -14,13 +14,13 @@ from palpate_studies import loads_table
 from palpate_studies.development_experiment import CASES
 from palpate_studies.study import NO_DATA, StudyRun
 from palpate_train.data import sets
+from palpate_train.data.augment import default_augmentation
 from palpate_train.data.run import Run
 from palpate_train.data.sets import Dataset
 from palpate_train.export import measure
 from palpate_train.metrics import score
 from palpate_train.models.recipe import graph, recipe, relations, stages
 from palpate_train.models.recipe.architectures import STAGES, Architecture
-from palpate_train.models.recipe.augment import default_augmentation
 from palpate_train.models.recipe.bank import Bank
 from palpate_train.models.recipe.recipe import FIXED, Settings, Trunk
 from palpate_train.onnx_tools.graph_builder import slim, with_head

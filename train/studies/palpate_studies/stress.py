@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from palpate.core.errors import FormatError
 from palpate.core.storage import put
+from palpate_train.data.corruptions import Change, Corruption, applicable, find
+from palpate_train.data.evaluation_sweeps import EvaluationSweeps
 from palpate_train.data.sets import Dataset, digest
 from palpate_train.evaluate import parallel
-from palpate_train.evaluate.corruptions import Change, Corruption, applicable, find
 from palpate_train.evaluate.evaluate import Where
-from palpate_train.evaluate.evaluation_sweeps import EvaluationSweeps
 from palpate_train.evaluate.fold import fingerprint
 from palpate_train.evaluate.robustness import CorruptionCounts, merge
 from palpate_train.models import methods

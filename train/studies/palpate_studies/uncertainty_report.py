@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from palpate_studies import TEMPLATES
-from palpate_train.calibration.novelty import KEPT
+from palpate_train.answer.embedding import KEPT
 from palpate_train.models.methods import PACKAGED, SHIPPED
 from palpate_train.reports import bundle_report, formatting, html, provenance
 

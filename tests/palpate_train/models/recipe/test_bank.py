@@ -11,9 +11,9 @@ import pytest
 
 from palpate.core.errors import FormatError
 from palpate.core.types import SweepFormat
+from palpate_train.data.augment import texture_scale
 from palpate_train.models.recipe import bank, graph
 from palpate_train.models.recipe.architectures import FLOOR, Architecture
-from palpate_train.models.recipe.augment import texture_scale
 from palpate_train.models.recipe.bank import DILATIONS, TAPS, Bank
 from palpate_train.models.recipe.recipe import FIXED
 from palpate_train.onnx_tools.graph_builder import run

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from palpate.answer.objects import softmax
-from palpate_train.calibration.heads import HeadData, HeadPart, HeadPlan, fit_discriminant
+from palpate_train.answer.heads import HeadData, HeadPart, HeadPlan, fit_discriminant
 from palpate_train.data.splitters import InnerPart
 from palpate_train.models.recipe import choice
 from palpate_train.models.recipe.choice import Candidates, FeatureColumns, HeldOutScores

@@ -10,8 +10,8 @@ import onnx
 import pytest
 
 from palpate.core.types import SweepFormat
+from palpate_train.data.augment import texture_scale
 from palpate_train.models.recipe import distribution, graph
-from palpate_train.models.recipe.augment import texture_scale
 from palpate_train.models.recipe.distribution import Levels
 from palpate_train.models.recipe.recipe import FIXED
 from palpate_train.onnx_tools.graph_builder import run

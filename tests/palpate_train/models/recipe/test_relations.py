@@ -15,7 +15,7 @@ from palpate.inference.classifier import Classifier
 from palpate.sim import skin
 from palpate_train.cli.main import main
 from palpate_train.data import sets
-from palpate_train.export import bundle_score
+from palpate_train.metrics import bundle_score
 from palpate_train.models.methods import Log
 from palpate_train.models.recipe import choice, relations
 from palpate_train.models.recipe.architectures import PREFIXES

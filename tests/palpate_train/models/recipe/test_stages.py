@@ -18,12 +18,12 @@ from palpate.core.errors import FormatError
 from palpate.core.types import SweepFormat
 from palpate.sim import skin
 from palpate_studies import cost
+from palpate_train.data.augment import Augmentation
 from palpate_train.data.run import Run
 from palpate_train.models import methods
 from palpate_train.models.methods import Effort
 from palpate_train.models.recipe import architectures, graph, spectrum, stages
 from palpate_train.models.recipe.architectures import STAGES, Architecture
-from palpate_train.models.recipe.augment import Augmentation
 from palpate_train.models.recipe.fitted import Fit
 from palpate_train.models.recipe.recipe import Settings, Setup
 from palpate_train.models.recipe.stages import StagesNetwork

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.answer.objects import softmax
-from palpate_train.calibration.heads import ABSENT, HeadData, HeadPart, HeadPlan
+from palpate_train.answer.heads import ABSENT, HeadData, HeadPart, HeadPlan
 from palpate_train.data.splitters import InnerPart
 from palpate_train.metrics.temperature import weighted_platt_temperature
 from palpate_train.models.methods import Log

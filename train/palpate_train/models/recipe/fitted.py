@@ -21,16 +21,16 @@ from onnx import checker, shape_inference
 from palpate.core import storage
 from palpate.core.errors import BundleError, FormatError
 from palpate.core.sweep_set import read
-from palpate_train.calibration.contact import Contacts
-from palpate_train.calibration.displacement import AugmentedCopies
-from palpate_train.calibration.heads import HeadPlan
+from palpate_train.answer.calibrate import Calibration, CalibrationInputs, fit_calibration
+from palpate_train.answer.fit_contact import Contacts
+from palpate_train.answer.fit_displacement import AugmentedCopies
+from palpate_train.answer.heads import HeadPlan
+from palpate_train.data.augment import COPIES, Augmentation, copies
 from palpate_train.data.sets import Dataset
 from palpate_train.models.linear_head import hold_out
 from palpate_train.models.methods import Model
 from palpate_train.models.recipe import graph, spectrum
 from palpate_train.models.recipe.architectures import Architecture
-from palpate_train.models.recipe.augment import COPIES, Augmentation, copies
-from palpate_train.models.recipe.calibrate import Calibration, CalibrationInputs, fit_calibration
 from palpate_train.onnx_tools.graph_builder import run, with_head
 
 Array = NDArray[Any]

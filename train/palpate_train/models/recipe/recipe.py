@@ -29,8 +29,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core.errors import FormatError
-from palpate_train.calibration.heads import HeadData, HeadPlan, condition_values
+from palpate_train.answer.heads import HeadData, HeadPlan, condition_values
 from palpate_train.data import extras
+from palpate_train.data.augment import (
+    COPIES,
+    Augmentation,
+    copies,
+    default_augmentation,
+    texture_scale,
+)
 from palpate_train.data.progress import StageLine
 from palpate_train.data.run import Log, Run
 from palpate_train.data.sets import Dataset
@@ -49,13 +56,6 @@ from palpate_train.models.recipe import (
     stage_heads,
 )
 from palpate_train.models.recipe.architectures import MAINS_HZ, STAGES, Architecture
-from palpate_train.models.recipe.augment import (
-    COPIES,
-    Augmentation,
-    copies,
-    default_augmentation,
-    texture_scale,
-)
 from palpate_train.models.recipe.bank import Bank
 from palpate_train.models.recipe.choice import Candidates, FeatureColumns, HeldOutScores, ScoredPlan
 from palpate_train.models.recipe.fitted import Fit, finished

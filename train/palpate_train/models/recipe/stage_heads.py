@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_train.calibration.heads import HeadPart, HeadPlan
+from palpate_train.answer.heads import HeadPart, HeadPlan
 from palpate_train.models.recipe.architectures import STAGES
 from palpate_train.models.recipe.choice import FeatureColumns
 

@@ -18,11 +18,11 @@ from torch import Generator, Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from palpate.core.types import SweepFormat
+from palpate_train.data.augment import Augmentation, augment
 from palpate_train.data.run import Run
 from palpate_train.data.sets import Dataset
 from palpate_train.models.networks import Network
 from palpate_train.models.recipe.architectures import FLOOR, NOISE_LIMIT, STAGES, Architecture
-from palpate_train.models.recipe.augment import Augmentation, augment
 from palpate_train.models.recipe.fitted import Fit
 from palpate_train.models.recipe.graph import Ranges, level_frames
 from palpate_train.models.training import (

@@ -21,11 +21,11 @@ from palpate_studies.study import results_file, save
 from palpate_train.arguments import numbers, options
 from palpate_train.arguments.program import Add
 from palpate_train.data import sets
+from palpate_train.data.corruptions import applicable
+from palpate_train.data.evaluation_sweeps import EvaluationSweeps
 from palpate_train.data.progress import Progress
 from palpate_train.data.run import Run
 from palpate_train.data.sets import Dataset
-from palpate_train.evaluate.corruptions import applicable
-from palpate_train.evaluate.evaluation_sweeps import EvaluationSweeps
 from palpate_train.export import bundle_stress
 from palpate_train.export.quantized_bundle import export
 from palpate_train.metrics import score

@@ -25,8 +25,8 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 from palpate.core.types import SweepFormat
 from palpate_studies.peers.ds_cnn import INT8_NODES, RECIPE
 from palpate_studies.peers.networks import PeerNetwork, layer_constants, network_method, scale_steps
+from palpate_train.data.augment import texture_scale
 from palpate_train.models.methods import FULL_EFFORT, Effort, Method
-from palpate_train.models.recipe.augment import texture_scale
 from palpate_train.onnx_tools.graph_builder import GraphBuilder, centred
 
 Array = NDArray[Any]

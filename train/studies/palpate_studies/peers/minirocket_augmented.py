@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from palpate.core.errors import FormatError
 from palpate_studies.peers import minirocket
 from palpate_studies.peers.linear_head import LinearHeadModel
+from palpate_train.data.augment import SLOW, Augmentation, copies, default_augmentation
 from palpate_train.data.sets import Dataset
 from palpate_train.models.methods import Method
 from palpate_train.models.recipe.architectures import STAGES
-from palpate_train.models.recipe.augment import SLOW, Augmentation, copies, default_augmentation
 
 Array = NDArray[Any]
 COPIES = 2

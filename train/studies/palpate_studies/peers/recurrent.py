@@ -18,8 +18,8 @@ from palpate_studies.peers.networks import (
     network_method,
     scale_steps,
 )
+from palpate_train.data.augment import texture_scale
 from palpate_train.models.methods import FULL_EFFORT, Effort, Method
-from palpate_train.models.recipe.augment import texture_scale
 from palpate_train.onnx_tools.graph_builder import GraphBuilder, centred
 
 Array = NDArray[Any]

@@ -1,0 +1,102 @@
+"""Calibration: the effect of copies with faults, and everything that they must not change."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from palpate.answer.early import Early
+from palpate_train.answer.calibrate import Calibration, fit_calibration
+from palpate_train.answer.fit_displacement import AugmentedCopies
+from palpate_train.answer.fit_early import EarlyRule
+from palpate_train.data.run import Run
+from palpate_train.models.recipe import recipe
+from palpate_train.models.recipe.fitted import ONE_IN, calibration_inputs
+from tests.factories.calibration_inputs import plain_inputs
+from tests.factories.sweep_sets import easy
+
+NOISE = np.array([0.0, 0.0, 0.0, 12.0])
+"""The fault: noise in the last feature, in which materials do not differ."""
+
+
+def world(n: int = 20) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Features [N, 10, 4] of three materials at eight places, labels [N], places [N]."""
+    labels, places = np.tile(np.repeat(np.arange(3), n), 8), np.repeat(np.arange(8), 3 * n)
+    means = 9 * np.eye(3, 4)
+    x = (
+        means[labels][:, None]
+        + np.random.default_rng(1).standard_normal((len(labels), 1, 4))
+        + np.zeros((1, 10, 1))
+    )
+    return x, labels, places
+
+
+def test_a_disturbed_sweep_of_a_known_material_stays_known():
+    """One in ten of the sweeps has a copy with the fault; then other sweeps with the fault are
+    known. A third material is still unknown, and head, temperature and judging sweeps are
+    unchanged."""
+    x, y, at = world()
+    known = y < 2
+    one = np.arange(known.sum()) % ONE_IN == 0
+    factors = np.random.default_rng(2).uniform(-1, 1, (one.sum(), 1, 1))
+    more = [np.concatenate([of[known], of[known][one]]) for of in (x, y, at)]
+    more[0][known.sum() :] += factors * NOISE
+    faulty = np.arange(len(more[0])) >= known.sum()
+    plain = fit_calibration(
+        plain_inputs(x[known], y[known], at[known], np.ones(known.sum(), bool), 1)
+    )
+    sturdy = fit_calibration(plain_inputs(*more, ~faulty, 1, faulty=faulty))
+    shaken = x[known][:, -1] + NOISE / 2
+    kept = [np.mean(done.embedding.novelty(shaken) <= done.limit) for done in (plain, sturdy)]
+    assert kept[0] < 0.3
+    assert kept[1] > 0.8
+    assert np.mean(sturdy.embedding.novelty(x[~known][:, -1]) <= sturdy.limit) < 0.05
+    np.testing.assert_array_equal(
+        sturdy.weight * sturdy.temperature, plain.weight * plain.temperature
+    )
+    assert (sturdy.held["recording"].numbers < known.sum()).all()
+
+
+@pytest.mark.slow
+def test_disturbed_sweeps_are_of_those_that_were_trained_on():
+    """One in ten training sweeps has a changed copy of the same material and group; none of the
+    copies judges."""
+    fit = recipe.fit(easy(16), Run(1), recipe.Settings(steps=0))
+    given = calibration_inputs(fit)
+    prefixes, labels, groups, held, faulty = (
+        given.prefixes,
+        given.labels,
+        given.groups,
+        given.held,
+        given.faulty,
+    )
+    assert (
+        len(prefixes) == len(labels) == len(groups) == len(fit.train) + len(fit.held) + faulty.sum()
+    )
+    assert faulty.sum() == -(-len(fit.train) // ONE_IN)
+    assert not (held & faulty).any()
+    assert not set(groups[faulty]) & set(groups[held])
+    assert not any((prefixes[~faulty] == row).all(axis=(1, 2)).any() for row in prefixes[faulty])
+
+
+@pytest.mark.parametrize("early", [None, Early((0.9,) * 9, 2)], ids=["no-rule", "rule"])
+@pytest.mark.parametrize("reattached", [False, True], ids=["no-copies", "copies"])
+def test_a_calibration_survives_its_file(early: Early | None, reattached: bool):
+    """Arrays and figures, as JSON, give the same calibration, with a rule for early answers and for
+    displaced contacts or without."""
+    x, y, at = world()
+    given = plain_inputs(x, y, at, at >= 6, 1)
+    if reattached:
+        copied = AugmentedCopies(x[:, -1], y, np.arange(len(y)), at >= 6)
+        given = replace(given, copied=copied)
+    made = replace(fit_calibration(given), rule=EarlyRule(early, "why", 0.5, 0.1, 7))
+    assert (made.displacement is not None) == reattached
+    again = Calibration.of(made.arrays(), json.loads(json.dumps(made.figures())))
+    assert again.figures() == made.figures()
+    assert again.displacement_rule() == made.displacement_rule()
+    assert again.arrays().keys() == made.arrays().keys()
+    for name, values in made.arrays().items():
+        np.testing.assert_array_equal(again.arrays()[name], values)

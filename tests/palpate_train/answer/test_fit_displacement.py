@@ -1,0 +1,109 @@
+"""Displaced sweeps on Gaussians: variation like that of copies is known, other variation unknown,
+and certainty is limited."""
+
+import numpy as np
+import pytest
+
+from palpate.answer.unknown import Classes
+from palpate_train.answer import embedding, fit_displacement
+from palpate_train.answer.fit_displacement import AugmentedCopies
+
+MEANS = 8 * np.eye(4)[:3]
+
+
+def sweeps(n: int, seed: int, spread: float = 0.0):
+    """n sweeps of each of three materials at each of eight positions, features [N, 4]; the last two
+    are untrained, and the third varies by `spread` more."""
+    rng = np.random.default_rng(seed)
+    labels, groups = np.tile(np.repeat(np.arange(3), n), 8), np.repeat(np.arange(8), 3 * n)
+    x = MEANS[labels] + rng.standard_normal((len(labels), 4))
+    x[:, 3] += spread * rng.standard_normal(len(labels))
+    return x, labels, groups
+
+
+def made(n: int = 20, wrong: float = 0.0):
+    """A DisplacementFit. The share `wrong` of the held-out copies gets a wrong label, with lower
+    probability than the others."""
+    x, labels, groups = sweeps(n, 0)
+    held = groups >= 6
+    copies, copied_labels, copied_groups = sweeps(n, 1, spread=10)
+    copied = AugmentedCopies(copies, copied_labels, np.arange(len(x)), copied_groups >= 6)
+    truth = copied_labels[copied_groups >= 6]
+    logits = 4 * np.eye(3)[truth]
+    others = np.arange(len(truth)) < wrong * len(truth)
+    logits[others] = 1.2 * np.eye(3)[(truth[others] + 1) % 3]
+    return (
+        embedding.embed(x, labels, 2),
+        fit_displacement.fit(x, labels, groups, held, 2, copied, logits),
+        copied,
+    )
+
+
+def test_what_the_copies_vary_in_makes_nothing_unknown():
+    """Sweeps far in the direction of the copies are beyond the limit in place, but within that of
+    displaced sweeps; in another direction they are beyond both."""
+    z, fit, _ = made()
+    assert fit
+    x = sweeps(50, 5, spread=10)[0]
+    turned = fit.embedding.novelty(z(x))
+    assert 0.95 < np.mean(turned <= fit.rule.limit) <= 1
+    assert np.mean(z.novelty(x) <= embedding.limit(z.novelty(sweeps(50, 6)[0]))) < 0.6
+    x[:, 1] += 30
+    assert (fit.embedding.novelty(z(x)) > fit.rule.limit).all()
+
+
+def test_the_box_measures_the_same_distances():
+    """turn, means and shapes of means.npz give the distances of their embedding."""
+    z, fit, _ = made()
+    assert fit
+    classes = fit.classes(z.classes())
+    assert isinstance(classes, Classes)
+    assert classes.displaced
+    x = sweeps(3, 7)[0]
+    away = (z(x) @ classes.displaced.turn)[:, None] - classes.displaced.means
+    assert (away**2).sum(axis=2) == pytest.approx(
+        fit.embedding.distances(fit.embedding(z(x))), rel=1e-3, abs=1e-3
+    )
+
+
+def test_a_moved_sweep_must_be_surer_where_copies_get_wrong_labels():
+    """If ten in a hundred copies are wrong with a probability of .62, more is required; if all are
+    right, no more than for any sweep."""
+    _, fit, _ = made()
+    assert fit
+    assert (fit.rule.unsure, fit.rule.temperature) == (fit_displacement.UNSURE[0], 1)
+    _, fit, _ = made(wrong=0.1)
+    assert fit
+    assert 0.5 < fit.rule.unsure < 0.95
+    p = np.exp(1.2 / fit.rule.temperature) / (2 + np.exp(1.2 / fit.rule.temperature))
+    assert fit.rule.unsure > p
+
+
+def test_copies_that_are_surely_wrong_leave_no_sure_answer():
+    """If half of the copies are certain and wrong, no probability is enough."""
+    x, labels, groups = sweeps(10, 0)
+    copied = AugmentedCopies(x, labels, np.arange(len(x)), groups >= 6)
+    truth = labels[groups >= 6]
+    logits = 40.0 * np.eye(3)[(truth + (np.arange(len(truth)) % 2)) % 3]
+    logits[:, :] = np.where(logits > 0, 1e6, 0)
+    fit = fit_displacement.fit(x, labels, groups, groups >= 6, 2, copied, logits)
+    assert fit
+    assert fit.rule.unsure == fit_displacement.NEVER
+
+
+def test_without_copies_that_judge_there_is_no_rule():
+    """The rule is None without copies of held-out sweeps, with a material without copies, or with a
+    material that only held-out sweeps have."""
+    x, labels, groups = sweeps(10, 0)
+    held = groups >= 6
+    none = AugmentedCopies(x[:0], labels[:0], groups[:0], held[:0])
+    assert fit_displacement.fit(x, labels, groups, held, 2, none, np.zeros((0, 3))) is None
+    copied = AugmentedCopies(x, labels, np.arange(len(x)), held)
+    logits = np.zeros((int(held.sum()), 3))
+    lacking = copied.take((labels < 2) | held)
+    assert fit_displacement.fit(x, labels, groups, held, 2, lacking, logits) is None
+    some = (labels < 2) | held
+    assert (
+        fit_displacement.fit(x[some], labels[some], groups[some], held[some], 2, copied, logits)
+        is None
+    )

@@ -1,0 +1,58 @@
+"""The range of the measured speeds of a training set."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from palpate.sim import skin
+from palpate_train.answer.fit_slide import trained_speeds
+from palpate_train.data.sets import Dataset
+
+
+def swept(speeds: list[float]) -> Dataset:
+    """One simulated sweep at each multiple of 30 mm/s."""
+    windows = [
+        skin.window(
+            "plastic rough",
+            skin.Placement(),
+            np.random.default_rng(i),
+            replace(skin.WORLD, speed=speed),
+        )
+        for i, speed in enumerate(speeds)
+    ]
+    labels = np.zeros(len(windows), np.int64)
+    groups = {"recording": np.arange(len(windows))}
+    return Dataset(np.array(windows), labels, skin.MATERIALS, 750.0, groups, "mine")
+
+
+def test_the_range_covers_the_sweeps():
+    """From the slowest to the fastest, within the error of the measurement."""
+    found, why = trained_speeds(swept([1.0, 2.0] * 4 + [1.5]), skin.PITCH_MM)
+    assert found
+    assert (found.least_mm_s, found.most_mm_s) == pytest.approx((30.0, 60.0), rel=0.03)
+    assert why == ""
+
+
+def test_two_of_a_hundred_do_not_widen_it():
+    """Speeds that are wrong in two of a hundred sweeps, one at each end."""
+    found, _ = trained_speeds(swept([1.0] * 98 + [0.6, 3.0]), skin.PITCH_MM)
+    assert found
+    assert (found.least_mm_s, found.most_mm_s) == pytest.approx((30.0, 30.0), rel=0.05)
+
+
+def test_without_a_range_the_reason_is_given():
+    """No pitch; too few sweeps; sweeps in which nothing slides."""
+    sweeps = swept([1.0] * 6)
+    resting = replace(sweeps, samples=np.repeat(sweeps.samples[:, :1], 1500, axis=1))
+    assert [
+        trained_speeds(sweeps, None),
+        trained_speeds(swept([1.0] * 4), skin.PITCH_MM),
+        trained_speeds(resting, skin.PITCH_MM),
+    ] == [
+        (None, "the distance between taxels is unknown; export with --pitch-mm"),
+        (None, "the speed was measured in 4 of 4 sweeps"),
+        (None, "the speed was measured in 0 of 6 sweeps"),
+    ]

@@ -1,0 +1,119 @@
+"""The scatter of altered copies widens the shapes of materials where it does no harm."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from palpate.answer.unknown import shaped_distances
+from palpate_train.answer.fit_unknown import DisturbedSweeps, Scatters, Space, choose
+
+MEANS = np.array([[0.0, 0, 0, 0], [12, 0, 0, 0], [0, 12, 0, 0]])
+"""Means of three materials, which differ in two of four directions."""
+SPACE = Space(lambda z: z, MEANS, np.eye(4)[:, 2:])
+"""The last two directions are features that were not trained."""
+HUM, LIKE_ANOTHER = np.array([0.0, 0, 8, 0]), np.array([-6.0, 6, 0, 0])
+
+
+def sweeps(rng: Generator, each: int = 60, **moves: NDArray[np.float64]) -> DisturbedSweeps:
+    """Sweeps of covariance 1 and copies of all, moved by up to each of `moves`."""
+    labels = np.repeat(np.arange(3), each)
+    z = MEANS[labels] + rng.standard_normal((3 * each, 4))
+    source = np.arange(len(z))
+    copies = {name: (z + rng.random((len(z), 1)) * move, source) for name, move in moves.items()}
+    return DisturbedSweeps(z, labels, copies)
+
+
+@pytest.fixture
+def rng() -> Generator:
+    return np.random.default_rng(0)
+
+
+def test_copies_are_kept_in_the_direction_of_their_change(rng: Generator):
+    """Held-out copies are within the limit, and an unknown material in a direction that no
+    alteration reaches is as far beyond it as before."""
+    scatters = Scatters.of(sweeps(rng, hum=HUM), SPACE)
+    rule = choose(scatters, sweeps(rng, hum=HUM))
+    assert rule
+    before, after = rule.kept["hum"]
+    assert before < 0.7
+    assert after > 0.95
+    assert rule.passed[1] <= rule.passed[0] + 0.01
+    shapes = rule.shapes(scatters).astype(np.float64)
+    unknown = MEANS[0] + [0, 0, 0, 8]
+    assert shaped_distances(unknown - MEANS, shapes).min() > 1.5 * rule.limit
+
+
+def test_an_alteration_that_looks_like_another_material_gets_less_weight(rng: Generator):
+    """With a large weight for it, sweeps of a material that is left out would pass."""
+    moves = {"hum": HUM, "other": LIKE_ANOTHER}
+    rule = choose(Scatters.of(sweeps(rng, **moves), SPACE), sweeps(rng, **moves))
+    assert rule
+    assert rule.passed[1] < 0.05
+    assert rule.weights["other"] < rule.weights["hum"] or rule.weights["other"] <= 1
+
+
+def test_a_sweep_lies_as_far_from_its_mean_as_without_shapes(rng: Generator):
+    """On average at a squared distance of r, so that distances of enrolled labels, which have no
+    shape, are comparable."""
+    scatters, judged = Scatters.of(sweeps(rng, hum=HUM), SPACE), sweeps(rng, hum=HUM)
+    rule = choose(scatters, judged)
+    assert rule
+    shapes = rule.shapes(scatters).astype(np.float64)
+    distances = shaped_distances(judged.z[:, None] - MEANS, shapes)
+    own = distances[np.arange(len(judged.z)), judged.labels]
+    assert own.mean() == pytest.approx(4, rel=0.01)
+    assert np.mean(own <= rule.limit) == pytest.approx(0.99, abs=0.011)
+
+
+def test_a_material_without_copies_has_the_scatter_of_the_others(rng: Generator):
+    """The copies are of two of three materials."""
+    given = sweeps(rng, hum=HUM)
+    z, source = given.copies["hum"]
+    few = given.labels[source] != 2
+    found = Scatters.of(replace(given, copies={"hum": (z[few], source[few])}), SPACE)
+    assert np.isfinite(found.by_kind["hum"]).all()
+    assert found.by_kind["hum"][2][2, 2] > 10
+
+
+def test_too_few_sweeps_give_no_rule(rng: Generator):
+    """Seven sweeps of each material, or no copies."""
+    scatters = Scatters.of(sweeps(rng, hum=HUM), SPACE)
+    assert choose(scatters, sweeps(rng, 7, hum=HUM)) is None
+    assert choose(scatters, replace(sweeps(rng), copies={})) is None
+
+
+def test_alterations_that_change_nothing_get_no_weight(rng: Generator):
+    """Their copies are kept anyway."""
+    still = np.zeros(4)
+    rule = choose(Scatters.of(sweeps(rng, still=still), SPACE), sweeps(rng, still=still))
+    assert rule
+    assert rule.kept["still"][1] == pytest.approx(0.99, abs=0.015)
+
+
+def test_what_shows_an_unknown_material_counts_more(rng: Generator):
+    """Materials that differ in the trained directions alone, and such that differ in features that
+    were not trained, too."""
+    far = np.array([[0.0, 0, 0, 0], [12, 0, 9, 0], [0, 12, 0, 9]])
+
+    def weight(means: NDArray[np.float64]) -> float:
+        given = sweeps(rng, 200, hum=HUM)
+        moved = replace(given, z=given.z + (means - MEANS)[given.labels])
+        return Scatters.of(moved, replace(SPACE, means=means)).weight_of_trained(moved)
+
+    assert weight(MEANS) > weight(far)
+
+
+def test_all_directions_count_where_no_feature_is_known_as_untrained(rng: Generator):
+    """An unknown material is refused in each of them."""
+    space = replace(SPACE, untrained=np.eye(4))
+    scatters = Scatters.of(sweeps(rng, hum=HUM), space)
+    rule = choose(scatters, sweeps(rng, hum=HUM))
+    assert rule
+    for direction in np.eye(4)[[0, 1, 3]]:
+        away = MEANS[0] - 9 * direction - MEANS
+        assert shaped_distances(away, rule.shapes(scatters).astype(float)).min() > rule.limit

@@ -1,0 +1,235 @@
+"""The check of the mean level: levels that a session sets, levels that the material sets, sets of
+one session, and sets that are too small or too odd for an answer."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from palpate_train.arguments import options
+from palpate_train.cli.main import PROGRAM, main
+from palpate_train.data.sets import Dataset
+from palpate_train.evaluate import level_check
+from tests.factories.recordings import record
+
+MATERIALS = ("a", "b", "c", "d")
+SESSIONS = re.compile(
+    r"warning: the mean level alone names 100 % of the sweeps within one session and (\d+) % "
+    r"across sessions \(chance 2[5-7] %\): a level that the session sets more than the material; "
+    r"leave sessions out when you evaluate \(--protocol leave:session\)"
+)
+ALONE = (
+    "the level is not used by the default recipe; alone it names 100 % of the sweeps "
+    "(32 of 32, chance 25 %)"
+)
+
+
+def leveled(
+    by_session: bool, each: int = 8, windows: int = 1, sessions: int = 3, dtype: str = "int16"
+) -> Dataset:
+    """`each` recordings of `windows` sweeps [6, 2, 2] of each of MATERIALS in each session.
+
+    The level of a material is its number times 100, or if `by_session` the next material's in the
+    next session.
+    """
+    session, material, _, _ = np.indices((sessions, len(MATERIALS), each, windows)).reshape(4, -1)
+    level = 100 * ((material + session * by_session) % len(MATERIALS))
+    noise = np.random.default_rng(1).normal(0, 4, (len(level), 6, 2, 2))
+    samples = (1000 + level[:, None, None, None] + noise).astype(dtype)
+    groups = {"recording": np.arange(len(level)) // windows, "session": session}
+    return Dataset(samples, material, MATERIALS, 50.0, groups, "leveled")
+
+
+def check_sessions(lines: Sequence[str]) -> None:
+    """The only line is that of the session; across sessions the level is worse than chance."""
+    (line,) = lines
+    assert (found := SESSIONS.fullmatch(line))
+    assert int(found[1]) < 25
+
+
+def with_levels(sweeps: Dataset, level: np.ndarray) -> Dataset:
+    """The set with other levels [N] under the same noise."""
+    noise = sweeps.samples - sweeps.samples.mean(axis=(1, 2, 3), keepdims=True)
+    return replace(sweeps, samples=(level[:, None, None, None] + noise).astype(np.int16))
+
+
+@pytest.mark.parametrize("dtype", ["int16", "uint16", "float32"])
+@pytest.mark.parametrize("windows", [1, 2])
+def test_a_level_that_the_session_sets_is_reported(dtype: str, windows: int):
+    """One line for the session with both accuracies and chance; none for a group that the level
+    does not depend on. Data type and windows of a recording do not matter."""
+    sweeps = leveled(True, windows=windows, dtype=dtype)
+    sweeps.groups["speed"] = sweeps.groups["recording"] % 2
+    check_sessions(level_check.warnings_of(sweeps))
+
+
+def test_a_taxel_may_have_three_axes():
+    """An axis counts as a taxel: a level of the second axis alone is reported."""
+    sweeps = leveled(True)
+    still = np.zeros_like(sweeps.samples)
+    samples = np.stack([still, sweeps.samples, still], axis=-1)
+    check_sessions(level_check.warnings_of(replace(sweeps, samples=samples)))
+
+
+def test_a_level_that_names_the_material_everywhere_is_counted():
+    """The level names the materials across sessions and speeds too: one line, with the count. It
+    names them nowhere: no line."""
+    sweeps = leveled(False)
+    sweeps.groups["speed"] = sweeps.groups["recording"] % 2
+    (line,) = level_check.warnings_of(sweeps)
+    assert "the mean of each taxel alone names 96 of 96 sweeps (chance 25 %), also where" in line
+    drawn = np.random.default_rng(2).uniform(0, 400, len(sweeps))
+    assert level_check.warnings_of(with_levels(sweeps, drawn)) == []
+
+
+def test_a_level_that_helps_across_sessions_is_not_reported():
+    """The level names 100 % within sessions and 75 % across them, since one session of three is
+    moved by most of a material's distance: it depends on both, so no line blames the session."""
+    sweeps = leveled(False)
+    moved = 100 * sweeps.labels + 75 * (sweeps.groups["session"] == 2)
+    assert not any(map(SESSIONS.fullmatch, level_check.warnings_of(with_levels(sweeps, moved))))
+
+
+def test_sets_of_one_session_have_a_line_of_their_own():
+    """No group, or groups of one value: recorded in one session. Sessions of one material each
+    cannot be left out. A level that names nothing has no line."""
+    one = leveled(False, sessions=1)
+    bare = replace(one, groups={})
+    assert level_check.warnings_of(one) == [f"warning: recorded in one session: {ALONE}"]
+    assert level_check.warnings_of(bare) == [f"warning: recorded in one session: {ALONE}"]
+    apart = replace(one, groups={"session": one.labels})
+    assert level_check.warnings_of(apart) == [f"warning: no group can be left out: {ALONE}"]
+    drawn = np.random.default_rng(2).uniform(0, 400, len(one))
+    assert level_check.warnings_of(with_levels(one, drawn)) == []
+
+
+def test_recordings_stay_whole():
+    """If each recording has levels of its own, its windows would reveal each other: there is a line
+    only if the set does not say which windows belong to a recording."""
+    sweeps = leveled(False, windows=6, sessions=1)
+    own = np.random.default_rng(3).uniform(0, 400, (32, 1, 6, 6))[sweeps.groups["recording"]]
+    noise = np.random.default_rng(4).normal(0, 4, (len(own), 6, 6, 6))
+    mixed = replace(sweeps, samples=(own + noise).astype(np.int16))
+    assert level_check.warnings_of(mixed) == []
+    assert "one session" in level_check.warnings_of(replace(mixed, groups={}))[0]
+
+
+def test_answers_are_materials_of_the_session():
+    """Each session holds two of the materials, so chance is 50 %. Equal levels of materials that
+    never meet in a session do not lower the accuracy across sessions."""
+    whole = leveled(True, each=12, sessions=6)
+    sweeps = whole.take((whole.labels - whole.groups["session"]) % 2 == 0)
+    rank, turn = sweeps.labels // 2, sweeps.groups["session"] // 2
+    (line,) = level_check.warnings_of(with_levels(sweeps, 100 * rank))
+    assert "names 144 of 144 sweeps (chance 50 %), also where their session is left out" in line
+    (line,) = level_check.warnings_of(with_levels(sweeps, 100 * ((rank + turn) % 2)))
+    assert "names 100 % of the sweeps within one session and " in line
+    assert "(chance 50 %)" in line
+
+
+def constant(sweeps: Dataset) -> Dataset:
+    """All raw counts are 7."""
+    return replace(sweeps, samples=np.full_like(sweeps.samples, 7))
+
+
+def mixed_recordings(sweeps: Dataset) -> Dataset:
+    """All materials in each recording."""
+    return replace(sweeps, groups=sweeps.groups | {"recording": np.arange(len(sweeps)) % 8})
+
+
+def first(sweeps: Dataset, materials: int, each: int) -> Dataset:
+    """The first `each` sweeps of the first `materials` in each session."""
+    return sweeps.take((sweeps.groups["recording"] % 8 < each) & (sweeps.labels < materials))
+
+
+@pytest.mark.parametrize("sessions", [1, 2, 3])
+@pytest.mark.parametrize(
+    "odd",
+    [
+        constant,
+        mixed_recordings,
+        lambda s: first(s, 4, 1),
+        lambda s: first(s, 2, 1),
+        lambda s: first(s, 2, 2),
+        lambda s: first(s, 1, 8),
+        lambda s: s.take(np.arange(1)),
+    ],
+)
+def test_small_and_odd_sets_have_no_line(odd, sessions: int):
+    """Constant taxels, recordings of all materials, one sweep of each, two materials, one material,
+    one sweep: no line, no error and no warning of numpy."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert level_check.warnings_of(odd(leveled(True, sessions=sessions))) == []
+
+
+def test_equal_sweeps_are_compared():
+    """Sweeps of a material that have the very same level, on many taxels, give finite weights: the
+    line is as usual, without a warning of numpy."""
+    sweeps = leveled(True)
+    equal = replace(sweeps, samples=np.tile((sweeps.samples + 50) // 100 * 100, (1, 1, 8, 8)))
+    assert len(np.unique(equal.samples)) == len(MATERIALS)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_sessions(level_check.warnings_of(equal))
+
+
+def test_counts_of_any_size_are_scaled():
+    """Counts of 1e30 and a constant taxel beside others do not change the line."""
+    sweeps = leveled(True, dtype="float32")
+    sweeps.samples[...] *= np.float32(1e30)
+    sweeps.samples[..., 0, 0] = 3
+    check_sessions(level_check.warnings_of(sweeps))
+    levels = level_check.levels_of(sweeps).samples
+    assert levels.shape == (len(sweeps), 1, 3, 1)
+    np.testing.assert_allclose(levels.std(axis=0), 1, rtol=1e-3)
+
+
+def test_large_sets_are_drawn_evenly():
+    """Of many sweeps whose materials take turns about MOST_SWEEPS are used, of each material alike;
+    of many taxels MOST_TAXELS. The line is as usual."""
+    sweeps = leveled(True, each=200)
+    turns = sweeps.take(np.argsort(sweeps.groups["recording"] % 200, kind="stable"))
+    wide = replace(turns, samples=np.tile(turns.samples, (1, 1, 10, 10)))
+    levels = level_check.levels_of(wide)
+    assert np.bincount(levels.labels).tolist() == [level_check.MOST_SWEEPS // 4] * 4
+    assert levels.samples.shape[2] == level_check.MOST_TAXELS
+    check_sessions(level_check.warnings_of(turns))
+
+
+def test_many_values_are_drawn():
+    """Discriminants are fitted within MOST_VALUES values of a group at most, from its first to its
+    last."""
+    sweeps = leveled(True, each=3, sessions=30)
+    answers, possible = level_check._within(sweeps, sweeps.groups["session"])
+    tested = np.unique(sweeps.groups["session"][answers != level_check.UNTESTED])
+    assert len(tested) == level_check.MOST_VALUES
+    assert (tested[0], tested[-1]) == (0, 29)
+    assert possible.any(axis=1).sum() == 12 * level_check.MOST_VALUES
+
+
+@pytest.mark.slow
+def test_the_commands_print_the_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """`sets describe` prints it below the set, of a file and of a folder; every command that loads
+    sets, `fit` among them, prints it as a warning, of the sweeps that --only keeps."""
+    file = tmp_path / "set.npz"
+    leveled(True).save(file)
+    for session, material, i in np.ndindex(3, 4, 8):
+        number = 100 * ((material + session) % 4) + 8 * session + i
+        path = tmp_path / "folder" / f"{number}.npy"
+        record(path, MATERIALS[material], id=number, session=str(session))
+    assert main(["sets", "describe", str(file), str(tmp_path / "folder")]) == 0
+    described = capsys.readouterr().out.splitlines()
+    assert len([line for line in described if SESSIONS.fullmatch(line.strip())]) == 2
+    words = ["fit", "--seed", "1", "--set", str(file), "--out", str(tmp_path / "fit.npz")]
+    options.load(PROGRAM.parser("fit").parse_args(words))
+    check_sessions([capsys.readouterr().err.removeprefix("palpate-train: ").strip()])
+    options.load(PROGRAM.parser("fit").parse_args([*words, "--only", "session=1"]))
+    alone = f"palpate-train: warning: recorded in one session: {ALONE}\n"
+    assert capsys.readouterr().err == alone

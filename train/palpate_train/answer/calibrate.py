@@ -1,0 +1,295 @@
+"""The calibration of a fit: everything that is fitted to the features of a finished trunk.
+
+It consists of the head that names the material and its temperature, a head for each early answer
+and the rule for these, the embedding and the limit of known materials, and the rule for displaced
+contacts. Temperatures, limits and rules are fitted to held-out sweeps, by heads that did not see
+the condition under which these were taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from functools import cached_property
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.answer.early import Early
+from palpate.answer.objects import LEAST_PROBABILITY, softmax
+from palpate.answer.unknown import UNSURE, Classes, DisplacementRule, Known
+from palpate_train.answer import fit_displacement, fit_early
+from palpate_train.answer.embedding import (
+    Embedding,
+    cross_fitted_distances,
+    in_two_views,
+    limit,
+    parts,
+)
+from palpate_train.answer.fit_displacement import AugmentedCopies, DisplacementFit
+from palpate_train.answer.fit_early import EarlyRule, Heads
+from palpate_train.answer.heads import HeadData, HeadPart, HeadPlan, condition_values
+from palpate_train.metrics.answers import UNKNOWN, Answers
+from palpate_train.metrics.score import fuse
+from palpate_train.metrics.temperature import sufficient_temperature
+
+Array = NDArray[Any]
+Json = dict[str, Any]
+Part = TypeVar("Part", Embedding, Heads, "HeldOut")
+NUMBERS = ("temperature", "class_mean_temperature", "limit")
+"""Attributes of a Calibration that are numbers."""
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOut:
+    """Answers to the held-out sweeps, by heads and embedding that were fitted without the sweep's
+    value of one condition.
+
+    numbers: of the sweeps [n]. probabilities: [n, K], of the network. known: bool [n], whether the
+    distance is within the limit.
+    """
+
+    numbers: Array
+    probabilities: Array
+    known: Array
+
+    def answers(self, recordings: Array) -> Answers:
+        """The answers of the box. recordings: int [n], the recording of each sweep; its known
+        sweeps are fused."""
+        labels = self.probabilities.argmax(1)
+        known = np.flatnonzero(self.known)
+        fused = np.full(len(labels), UNKNOWN)
+        if len(known):
+            logs = np.log(np.maximum(self.probabilities, LEAST_PROBABILITY))
+            scores, first = fuse(logs[known], recordings[known])
+            decided = np.where(softmax(scores).max(1) >= UNSURE, scores.argmax(1), UNKNOWN)
+            by_recording = dict(zip(recordings[known][first], decided, strict=True))
+            fused = np.array([by_recording.get(number, UNKNOWN) for number in recordings])
+        ok = self.probabilities.max(1) >= UNSURE
+        return Answers(np.where(self.known, labels, UNKNOWN), ok, fused, labels)
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """The calibration of a trunk.
+
+    weight [F, K], bias [K]: the head that names the material, divided by `temperature`.
+    class_mean_temperature: of logits that the box computes from class means. steps: heads of the
+    early answers, with their temperatures. limit: largest squared distance of a known material.
+    displacement: for displaced contacts; None without copies. held: for each condition, the hardest
+    first.
+    """
+
+    embedding: Embedding
+    weight: Array
+    bias: Array
+    temperature: float
+    class_mean_temperature: float
+    steps: Heads
+    rule: EarlyRule
+    limit: float
+    displacement: DisplacementFit | None
+    held: Mapping[str, HeldOut]
+
+    def logits(self, features: Array) -> Array:
+        """Features [..., F] of whole sweeps -> logits [..., K] whose softmax is calibrated."""
+        logits: Array = np.asarray(features, np.float64) @ self.weight + self.bias
+        return logits
+
+    def probabilities(self, prefixes: Array) -> Array:
+        """Features [n, D + 1, F] of prefixes of the window -> probabilities [n, D + 1, K] after
+        each of them."""
+        steps = self.steps.logits(self.embedding(prefixes))
+        return softmax(np.concatenate([steps, self.logits(prefixes[:, -1])[:, None]], axis=1))
+
+    def known(self) -> Known:
+        """The entry `known` of a manifest."""
+        return Known(self.limit, self.class_mean_temperature)
+
+    def displacement_rule(self) -> DisplacementRule | None:
+        """The entry `displacement` of a manifest."""
+        return self.displacement.rule if self.displacement else None
+
+    def classes(self) -> Classes:
+        """The means and shapes of the materials, and of displaced contacts, as a bundle holds
+        them."""
+        classes = self.embedding.classes()
+        return self.displacement.classes(classes) if self.displacement else classes
+
+    def arrays(self) -> dict[str, Array]:
+        """The arrays that the file of a fit keeps."""
+        parts: Json = {"embedding": self.embedding, "steps": self.steps}
+        parts |= {f"held {name}": held for name, held in self.held.items()}
+        parts |= {"displaced": self.displacement.embedding} if self.displacement else {}
+        arrays = {
+            f"{of}.{k.name}": getattr(v, k.name) for of, v in parts.items() for k in fields(v)
+        }
+        return arrays | {"weight": self.weight, "bias": self.bias}
+
+    def figures(self) -> Json:
+        """The rules and temperatures that the file of a fit keeps, for JSON."""
+        return {name: getattr(self, name) for name in NUMBERS} | {
+            "rule": asdict(self.rule),
+            "conditions": list(self.held),
+            "displacement": asdict(self.displacement.rule) if self.displacement else None,
+        }
+
+    @classmethod
+    def of(cls, arrays: Mapping[str, Array], figures: Json) -> Calibration:
+        """The calibration that gave `arrays` and `figures`. Raises KeyError or TypeError if they
+        are not of a calibration."""
+
+        def part(kind: type[Part], name: str) -> Part:
+            return kind(**{k.name: arrays[f"{name}.{k.name}"] for k in fields(kind)})
+
+        early, displaced = figures["rule"]["early"], figures["displacement"]
+        early = early and Early(tuple(early["least"]), early["agree"])
+        return cls(
+            part(Embedding, "embedding"),
+            arrays["weight"],
+            arrays["bias"],
+            steps=part(Heads, "steps"),
+            rule=EarlyRule(**figures["rule"] | {"early": early}),
+            displacement=displaced
+            and DisplacementFit(part(Embedding, "displaced"), DisplacementRule(**displaced)),
+            held={name: part(HeldOut, f"held {name}") for name in figures["conditions"]},
+            **{name: figures[name] for name in NUMBERS},
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationInputs:
+    """Features that a calibration is fitted to.
+
+    prefixes: [N, D + 1, F], features of the first tenth of the window, the first two tenths, and so
+    on to the whole window. labels: [N], 0 to K - 1. conditions: int [N] by name, the hardest first;
+    a sweep is judged without its value of each, and the hardest decides temperatures and rules.
+    held: bool [N], the sweeps of some values of the hardest, which trained stages did not see.
+    staged: whether there are such stages; if not, all sweeps judge. fixed: number of features, the
+    last ones, that were not trained (see `embed`). If there are any, most of a distance lies
+    in them; then all sweeps decide the limit, because more positions make it depend less on chance.
+    copied: augmented copies. faulty: bool [N], copies with
+    FAULTS; the embedding and its limit see them, the heads do not. plan: of the head that names the
+    material; None for one discriminant of all features.
+    """
+
+    prefixes: Array
+    labels: Array
+    conditions: Mapping[str, Array]
+    held: Array
+    staged: bool
+    fixed: int
+    copied: AugmentedCopies
+    faulty: Array
+    plan: HeadPlan | None = None
+
+    @property
+    def groups(self) -> Array:
+        """int [N], the values of the hardest condition."""
+        return next(iter(self.conditions.values()))
+
+    @property
+    def judged(self) -> Array:
+        """bool [N], the sweeps that judge."""
+        judged: Array = self.held if self.staged else ~self.faulty
+        return judged
+
+    @property
+    def whole(self) -> Array:
+        """Features [N, F] of the whole window."""
+        return self.prefixes[:, -1]
+
+    @cached_property
+    def head_data(self) -> HeadData:
+        """All sweeps, and the copies that heads are fitted to."""
+        copied = self.copied.take(~self.copied.held)
+        values = condition_values(self.conditions, len(self.labels))
+        return HeadData(self.whole, self.labels, copied.features, copied.source, values)
+
+    def naming_head(self, seen: Array) -> tuple[Array, Array]:
+        """Weight [F, K] and bias [K] of the head that names the material, fitted to the sweeps
+        `seen` (bool [N]) and their copies."""
+        plan = self.plan or HeadPlan((HeadPart(tuple(range(self.whole.shape[1])), copies=True),))
+        known = self.head_data.take(seen & ~self.faulty)
+        weight, bias = plan.fit(known, int(self.labels.max()) + 1)
+        return weight.T, bias
+
+
+def fit_calibration(given: CalibrationInputs) -> Calibration:
+    """The calibration that is fitted to these features. Raises FormatError as `embed`, and if there
+    is only one group or no sweep to judge by."""
+    whole, labels = given.whole, given.labels
+    logits, numbers, class_mean_temperature = _prefix_logits(given)
+    groups = given.groups[numbers]
+    temperatures = fit_early.fit_temperatures(logits, labels[numbers], groups)
+    p = softmax(logits / temperatures[:, None])
+    embedding, last = in_two_views(whole, labels, given.fixed), float(temperatures[-1])
+    steps = fit_early.heads(embedding(given.prefixes), labels, int(labels.max()) + 1)
+    distances = {name: _distances(given, values) for name, values in given.conditions.items()}
+    beyond = limit(np.concatenate(list(distances.values())))
+    held = {}
+    for name, values in given.conditions.items():
+        judging, named = _named(given, values)
+        known = distances[name][judging] <= beyond
+        held[name] = HeldOut(judging, softmax(named / last), known)
+    weight, bias = given.naming_head(np.ones(len(labels), bool))
+    return Calibration(
+        embedding,
+        weight / last,
+        bias / last,
+        last,
+        class_mean_temperature,
+        steps.cooled(temperatures[:-1]),
+        fit_early.find_rule(p, labels[numbers]),
+        beyond,
+        _displacement(given, last),
+        held,
+    )
+
+
+def _distances(given: CalibrationInputs, values: Array) -> Array:
+    """Novelty [N] of sweeps to embeddings that did not see their value of one condition."""
+    limiting = (given.judged | (given.fixed > 0)) & ~given.faulty
+    return cross_fitted_distances(given.whole, given.labels, values, limiting, given.fixed)
+
+
+def _named(given: CalibrationInputs, values: Array) -> tuple[Array, Array]:
+    """The numbers [n] of the judged sweeps, and logits [n, K] by heads that did not see their value
+    of one condition, at temperature 1. Sweeps of a material that occurs in no other part are left
+    out."""
+    numbers, logits = [], []
+    for seen, judging in parts(values, given.judged):
+        judging = judging[np.isin(given.labels[judging], given.labels[seen & ~given.faulty])]
+        weight, bias = given.naming_head(seen)
+        logits.append(given.whole[judging] @ weight + bias)
+        numbers.append(judging)
+    return np.concatenate(numbers), np.concatenate(logits)
+
+
+def _prefix_logits(given: CalibrationInputs) -> tuple[Array, Array, float]:
+    """Logits [n, D + 1, K] of the judged sweeps and their prefixes by heads that did not see their
+    value of the hardest condition, at temperature 1; the numbers [n] of these sweeps; the
+    temperature of logits from class means."""
+    labels, groups = given.labels, given.groups
+    logits, numbers = fit_early.cross_fitted_logits(
+        given.prefixes, labels, groups, given.judged, given.fixed
+    )
+    temperature = sufficient_temperature(logits[:, -1], labels[numbers], groups[numbers])
+    row_of = {number: row for row, number in enumerate(numbers)}
+    for number, named in zip(*_named(given, groups), strict=True):
+        if number in row_of:
+            logits[row_of[number], -1] = named
+    return logits, numbers, temperature
+
+
+def _displacement(given: CalibrationInputs, temperature: float) -> DisplacementFit | None:
+    """The rule for displaced contacts, by a head that did not see the groups of held sweeps."""
+    copied = given.copied
+    if not copied.held.any():
+        return None
+    weight, bias = given.naming_head(~np.isin(given.groups, given.groups[given.held]))
+    logits = (copied.features[copied.held] @ weight + bias) / temperature
+    return fit_displacement.fit(
+        given.whole, given.labels, given.groups, given.held, given.fixed, copied, logits
+    )

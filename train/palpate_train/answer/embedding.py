@@ -1,0 +1,368 @@
+"""Detection of unknown materials: an embedding of features, and the limit of its distances.
+
+The embedding is shrinkage LDA in another form: a linear map of the features after which the sweeps
+of every material scatter around its mean with covariance 1. The nearest mean names the material, as
+in LDA, and a sweep far from all means is of an unknown material. The box needs only this map and
+the means.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.answer.unknown import Classes, shaped_distances
+from palpate.core.errors import FormatError
+from palpate_train.answer.heads import shrinkage
+from palpate_train.onnx_tools.quantize import sixteen_bits
+
+Array = NDArray[Any]
+KEPT = 0.995
+"""Share of known sweeps within the limit. The robot gets no answer to the others, whatever the
+network computes (docs/decisions/0005)."""
+PARTS = 10
+"""Largest number of parts of the groups; each part is judged by a fit to the others."""
+FLAT = 1e-9
+"""Least variance of a direction, relative to that of the widest direction: a silent channel stays
+finite."""
+
+
+@dataclass(frozen=True, eq=False)
+class Embedding:
+    """z = features @ projection + offset. offset: float32 [r]; means: float32 [K, r], of each
+    label.
+
+    The projection [F, r] is kept in two factors, because most of it only selects features:
+    directions [F, d] and the last F' features themselves, side by side, times turn [d + F', r]. F'
+    is 0 if two factors would not be smaller.
+
+    The sweeps of all materials have the identity as covariance in z (Mahalanobis distance; Lee et
+    al. 2018). shapes: float16 [K, b, b], the scatter of each material's own sweeps in the last b
+    directions; see the box's shaped_distances.
+    """
+
+    directions: Array
+    turn: Array
+    offset: Array
+    means: Array
+    shapes: Array
+
+    @property
+    def selected(self) -> int:
+        """Number of features, the last ones, that `turn` takes as they are."""
+        return int(self.turn.shape[0] - self.directions.shape[1])
+
+    @cached_property
+    def projection(self) -> Array:
+        """float32 [F, r]."""
+        turn, rest = np.split(self.turn.astype(np.float64), [self.directions.shape[1]])
+        product = self.directions @ turn
+        product[len(product) - len(rest) :] += rest
+        return product.astype(np.float32)
+
+    @property
+    def untrained(self) -> Array:
+        """[r, b], multiplies differences of z to give differences of the features that `turn` takes
+        as they are; the identity if it takes none."""
+        return untrained(self.turn if self.selected else None, len(self.offset), self.selected)
+
+    def __call__(self, features: Array) -> Array:
+        """Features [..., F] -> z, float64 [..., r]."""
+        if features.ndim > 2:  # in float64, prefixes of all sweeps would not fit into memory
+            return np.stack([self(one) for one in features])
+        z: Array = np.asarray(features, np.float64) @ self.projection + self.offset
+        return z
+
+    def distances(self, z: Array) -> Array:
+        """Squared distances [..., K] of z [..., r] to the means."""
+        away = z[..., None, :] - self.means.astype(np.float64)
+        squares: Array = np.einsum("...kr,...kr->...k", away, away)
+        return squares
+
+    def classes(self) -> Classes:
+        """The means as a bundle holds them; each counts as trained."""
+        bias, k = -(self.means.astype(np.float64) ** 2).sum(1) / 2, len(self.means)
+        return Classes(
+            self.means,
+            bias.astype(np.float32),
+            np.zeros(k, np.int64),
+            np.ones(k, np.float32),
+            self.shapes,
+        )
+
+    def novelty(self, features: Array) -> Array:
+        """Squared distance [...] of features [..., F] to the nearest mean, with the scatter of each
+        material. The limit is a limit of this."""
+        away = self(features)[..., None, :] - self.means.astype(np.float64)
+        nearest: Array = shaped_distances(away, self.shapes.astype(np.float64)).min(axis=-1)
+        return nearest
+
+    def logits(self, features: Array, temperature: float = 1.0) -> Array:
+        """Features [..., F] -> logits [..., K] of LDA with equal priors, up to a term that all
+        labels share."""
+        means = self.means.astype(np.float64)
+        logits: Array = (self(features) @ means.T - (means**2).sum(1) / 2) / temperature
+        return logits
+
+
+def untrained(turn: Array | None, r: int, selected: int) -> Array:
+    """See Embedding.untrained. turn: [r, r] of an embedding with r directions; None without
+    `selected` features."""
+    if turn is None:
+        return np.eye(r)
+    view: Array = np.linalg.inv(turn.astype(np.float64))[:, r - selected :]
+    return view
+
+
+def embed(features: Array, labels: Array, fixed: int = 0) -> Embedding:
+    """The Embedding of training features [N, F] with labels [N] from 0 to K - 1, in r = min(K - 1 +
+    fixed, F) directions.
+
+    The covariance is Ledoit and Wolf's, as in heads.fit_discriminant. The first K - 1
+    directions hold everything that LDA uses. More are added until they contain the last `fixed`
+    features, which were not trained (see spectrum.py): trained materials do not differ there, but
+    an unknown one may. In these directions each material has its own shape.
+
+    Raises FormatError if there is one material, if a label is missing, or if each material has only
+    one sweep.
+    """
+    labels = np.asarray(labels)
+    if len(missing := np.setdiff1d(np.arange(labels.max(initial=0) + 1), labels)):
+        raise FormatError(
+            f"no sweep has the label {missing[0]}; number the materials that occur from 0 on"
+        )
+    if (classes := int(labels.max(initial=0)) + 1) < 2:
+        raise FormatError("all sweeps are of one material; a classifier needs two")
+    if len(labels) <= classes:
+        raise FormatError(
+            f"{len(labels)} sweeps of {classes} materials say nothing of how they vary; record more"
+        )
+    x = np.asarray(features, np.float64)
+    middle, size = x.mean(axis=0), x.shape[1]
+    means = np.stack([x[labels == k].mean(axis=0) for k in range(classes)]) - middle
+    white = _whitening(x, labels)
+    axes = np.linalg.svd(white.transposed(means - means.mean(axis=0)), full_matrices=False)[2][
+        : classes - 1
+    ].T
+    orthonormal, mixed = np.linalg.qr(np.hstack([axes, white.inverse(slice(size - fixed, size))]))
+    if fixed and classes - 1 + fixed < size:  # W times columns of its inverse selects features
+        directions, turn = white.apply(axes), np.linalg.inv(mixed)
+    else:
+        directions, turn = white.apply(orthonormal), np.eye(orthonormal.shape[1])
+    # rounded as the graph of a bundle holds them
+    (whole, steps), (turn, sizes) = sixteen_bits(directions), sixteen_bits(turn)
+    bare = Embedding(whole * steps, turn * sizes, *[np.empty(0)] * 3)
+    projection = bare.projection
+    means = (means @ projection).astype(np.float32)
+    own = min(fixed, projection.shape[1])
+    away = ((x - middle) @ projection - means[labels])[:, projection.shape[1] - own :]
+    shapes = np.stack([_shape(away[labels == k]) for k in range(classes)])
+    return replace(
+        bare, offset=(-middle @ projection).astype(np.float32), means=means, shapes=shapes
+    )
+
+
+def in_two_views(features: Array, labels: Array, fixed: int = 0) -> Embedding:
+    """As `embed`, with distances that are the sum of two: in the features that were not trained,
+    and in the directions in which the means differ. Which of them shows an unknown material depends
+    on the skin (docs/decisions/0005). In both, each material has its own scatter, and the sweeps
+    lie at r from their mean on average. Without untrained features it is `embed`."""
+    z = embed(features, labels, fixed)
+    if not z.shapes.shape[1]:
+        return z
+    away = z(features) - z.means[labels]
+    each = [away[labels == k] for k in range(len(z.means))]
+    own = np.stack([own_scatter(sweeps) for sweeps in each])
+    shapes = shapes_of(within(own, z.untrained) + within(own, differing(z.means)))
+    total = sum(float(((x @ w) ** 2).sum()) for x, w in zip(each, shapes, strict=True))
+    scale = np.sqrt(away.size / max(total, FLAT))
+    return replace(z, shapes=(scale * shapes).astype(np.float16))
+
+
+def differing(means: Array) -> Array:
+    """Orthonormal directions [r, K - 1] in which class means [K, r] differ."""
+    rows = np.linalg.svd(means - means.mean(axis=0), full_matrices=False)[2]
+    directions: Array = rows[: len(means) - 1].T
+    return directions
+
+
+def within(covariances: Array, view: Array) -> Array:
+    """M [K, r, r], so that away @ M @ away is the squared Mahalanobis distance of a difference in
+    the directions `view` [r, b], by covariances [K, r, r]."""
+    seen = view.T @ covariances @ view
+    size = max(seen.shape[1], 1)
+    flat = FLAT * np.trace(seen, axis1=1, axis2=2)[:, None, None] / size
+    squares: Array = view @ np.linalg.inv(seen + flat * np.eye(seen.shape[1])) @ view.T
+    return squares
+
+
+def shapes_of(squares: Array) -> Array:
+    """W [K, r, r] with W W' = M, for the matrices M [K, r, r] of `within` or sums of them."""
+    variances, vectors = np.linalg.eigh(squares)
+    shapes: Array = vectors * np.sqrt(np.maximum(variances, 0))[:, None]
+    return shapes
+
+
+def own_scatter(away: Array) -> Array:
+    """The covariance of differences [n, r] from a mean, pulled towards 1, the covariance of all
+    materials, as if r more sweeps had it (regularized discriminant analysis; Friedman 1989)."""
+    n, r = away.shape
+    covariance: Array = (away.T @ away + r * np.eye(r)) / (n + r)
+    return covariance
+
+
+def _shape(away: Array) -> Array:
+    """W float16 [b, b], so that |away @ W|^2 is the Mahalanobis distance of differences `away` [n,
+    b] from a class mean, by their own scatter."""
+    shape: Array = np.linalg.cholesky(np.linalg.inv(own_scatter(away))).astype(np.float16)
+    return shape
+
+
+def embed_present(features: Array, labels: Array, fixed: int = 0) -> tuple[Embedding, Array]:
+    """The Embedding of sweeps that may lack some labels, in two views, and the labels [K] of its
+    means."""
+    present, numbered = np.unique(labels, return_inverse=True)
+    return in_two_views(features, numbered, fixed), present
+
+
+@dataclass(frozen=True, eq=False)
+class _Whitening:
+    """W [F, F] with W' C W = 1, where C is the covariance within materials: a diagonal matrix plus
+    a matrix of a few directions.
+
+    C = R (1 + V S V') R and W = inverse of R times (1 + V S V') ^ -1/2. root: [F], the diagonal of
+    R. directions: V [F, n], orthonormal; variances: the diagonal [n] of S. No matrix of the size
+    [F, F] is computed if there are fewer sweeps.
+    """
+
+    root: Array
+    directions: Array
+    variances: Array
+
+    def apply(self, b: Array) -> Array:
+        """W times `b` [F, m]."""
+        return self._power(b, -0.5) / self.root[:, None]
+
+    def inverse(self, columns: slice) -> Array:
+        """Some columns of the inverse of W [F, m]."""
+        return self._power(np.eye(len(self.root))[:, columns] * self.root[columns], 0.5)
+
+    def transposed(self, b: Array) -> Array:
+        """`b` [m, F] times W."""
+        return self._power((b / self.root).T, -0.5).T
+
+    def _power(self, b: Array, power: float) -> Array:
+        """(1 + V S V') to this power times `b` [F, m]."""
+        factors = (1 + self.variances) ** power - 1
+        raised: Array = b + self.directions @ (factors[:, None] * (self.directions.T @ b))
+        return raised
+
+
+def _whitening(x: Array, labels: Array) -> _Whitening:
+    """The whitening for the covariance of LinearDiscriminantAnalysis(shrinkage="auto"): Ledoit and
+    Wolf's covariance of each material's features [n, F] at the same spread, averaged by the number
+    of sweeps."""
+    diagonal, rows = np.zeros(x.shape[1]), []
+    for label in np.unique(labels):
+        own = x[labels == label]
+        away, spread = centred(own)
+        z = away / spread
+        share, mean = shrinkage(z, z @ z.T if len(z) < len(spread) else z.T @ z)
+        diagonal += len(own) / len(x) * share * mean * spread**2
+        rows.append(np.sqrt((1 - share) / len(x)) * z * spread)
+    root = np.sqrt(np.maximum(diagonal, max(FLAT * float(diagonal.max()), FLAT)))
+    scattered = np.concatenate(rows) / root
+    few = len(scattered) < len(root)
+    variances, vectors = np.linalg.eigh(scattered @ scattered.T if few else scattered.T @ scattered)
+    seen = variances > FLAT * max(float(variances.max()), FLAT)
+    variances, vectors = variances[seen], vectors[:, seen]
+    return _Whitening(
+        root, scattered.T @ (vectors / np.sqrt(variances)) if few else vectors, variances
+    )
+
+
+def centred(x: Array) -> tuple[Array, Array]:
+    """Differences [n, F] of features [n, F] from their means, and their spread [F]; 1 for a
+    constant feature."""
+    spread = x.std(axis=0)
+    spread[spread <= 10 * np.finfo(float).eps * np.abs(x).max(axis=0)] = 1
+    return x - x.mean(axis=0), spread
+
+
+def parts(groups: Array, judged: Array, most: int = PARTS) -> Iterator[tuple[Array, Array]]:
+    """Pairs (bool [N] to fit to, numbers of the sweeps to judge the fit by).
+
+    Each sweep of `judged` (bool [N]) judges once, a fit that did not see its group. groups: int
+    [N], divided into `most` parts at most. Raises FormatError if there is only one group.
+    """
+    values = np.unique(groups[judged])
+    if len(np.unique(groups)) < 2:
+        raise FormatError(
+            "all sweeps are of one group; what judges must not be trained on; record a second "
+            "position"
+        )
+    part_of = np.full(len(groups), -1)
+    judging = np.isin(groups, values)
+    part_of[judging] = np.searchsorted(values, groups[judging]) % min(most, len(values))
+    for part in range(min(most, len(values))):
+        yield part_of != part, np.flatnonzero((part_of == part) & judged)
+
+
+def cross_fitted_distances(
+    features: Array, labels: Array, groups: Array, judged: Array, fixed: int = 0
+) -> Array:
+    """Novelty [N] of the sweeps `judged` (bool [N]) to embeddings that did not see their groups
+    (int [N]); NaN for the others.
+
+    Sweeps of a material that occurs in no other part are left out. Raises FormatError as `parts`
+    and `embed`.
+    """
+    distances = np.full(len(labels), np.nan)
+    for _, numbers, embedding, _ in cross_fitted(features, labels, groups, judged, fixed):
+        distances[numbers] = embedding.novelty(features[numbers])
+    return distances
+
+
+def cross_fitted(
+    features: Array, labels: Array, groups: Array, judged: Array, fixed: int = 0
+) -> Iterator[tuple[Array, Array, Embedding, Array]]:
+    """For each of `parts` the pair that it yields, the embedding of the sweeps to fit to, and the
+    labels [K] of its means. Sweeps of a material that occurs in no other part do not judge."""
+    for fit, numbers in parts(groups, judged):
+        embedding, present = embed_present(features[fit], labels[fit], fixed)
+        yield fit, numbers[np.isin(labels[numbers], present)], embedding, present
+
+
+def limit(novelty: Array, kept: float = KEPT) -> float:
+    """The limit that keeps `kept` of sweeps like those with this `novelty` [n], which were not
+    trained on. NaN is left out.
+
+    It is the ceil((n + 1) * kept)-th smallest, as in split conformal prediction, so that a new
+    sweep is kept with at least that probability (Vovk et al. 2005); the largest if n is too small.
+    Raises FormatError if only NaN is left.
+    """
+    novelty = novelty[~np.isnan(novelty)]
+    if not (n := len(novelty)):
+        raise FormatError(
+            "no known sweep is left to find the limit with; record each material in several "
+            "positions"
+        )
+    rank = min(int(np.ceil((n + 1) * kept)), n) - 1
+    return float(max(np.sort(novelty)[rank], np.finfo(np.float32).tiny))
+
+
+def auroc(known: Array, unknown: Array) -> float:
+    """The probability that a novelty of `unknown` [m] is above one of `known` [n], with ties
+    counted half (Mann and Whitney). Raises FormatError if either is empty."""
+    if not len(known) or not len(unknown):
+        raise FormatError(
+            "no AUROC without sweeps of both kinds; test on known and on unknown ones"
+        )
+    order = np.sort(known)
+    below = np.searchsorted(order, unknown, "left") + np.searchsorted(order, unknown, "right")
+    return float(below.mean() / (2 * len(known)))

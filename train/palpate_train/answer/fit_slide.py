@@ -1,0 +1,99 @@
+"""What the slides of a training set have in common: the range of their speeds, and what tells them
+from a rest, the least vibration of each material and the least pattern that passes from taxel to
+taxel. All is measured from counts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from palpate.answer.pipeline import Slide
+from palpate.answer.slide import CHANCE, SlideMeter, SpeedRange
+from palpate.answer.vibration import PARTS, TINY, SlideLimits, vibration
+from palpate.bundle.manifest import Manifest
+from palpate_train.data.sets import Dataset
+
+MOST_SWEEPS = 1000
+"""Most sweeps that are measured, evenly spread over the set."""
+LEAST_SHARE, LEAST_SWEEPS = 0.2, 5
+"""Least share and number of measured sweeps that give a range."""
+OUTER = 0.02
+"""Share of the measured sweeps at each end that the range leaves out, since a few speeds are
+wrong."""
+MARGIN = 0.05
+"""A part rests if it vibrates less than any part in training by this much (natural logarithm)."""
+FEWEST = 100
+"""Least number of training sweeps of each label. The next sweep has less vibration than the least
+of n sweeps with a probability of 1 / (n + 1)."""
+STILL = 0.5 * float(np.log(TINY)) / 2
+"""Below this vibration a part does not change at all."""
+_UNNOTICED = "a finger that rests: not noticed"
+
+
+def slides(meter: SlideMeter, sweeps: Dataset) -> list[Slide]:
+    """The slides of at most MOST_SWEEPS of the sweeps."""
+    count = min(len(sweeps), MOST_SWEEPS)
+    chosen = np.linspace(0, len(sweeps) - 1, count).round().astype(int)
+    return [meter(window) for window in sweeps.samples[chosen]]
+
+
+def trained_speeds(sweeps: Dataset, pitch_mm: float | None) -> tuple[SpeedRange | None, str]:
+    """The range of the measured speeds of `sweeps`, or None and the reason. pitch_mm: distance
+    between taxels, None if unknown."""
+    meter = SlideMeter(sweeps.format, pitch_mm)
+    if meter.why:
+        return None, meter.why
+    measured = slides(meter, sweeps)
+    count = len(measured)
+    speeds = [slide.speed_mm_s for slide in measured if slide.speed_mm_s is not None]
+    if len(speeds) < max(LEAST_SWEEPS, LEAST_SHARE * count):
+        return None, f"the speed was measured in {len(speeds)} of {count} sweeps"
+    ends = np.quantile(speeds, (OUTER, 1 - OUTER), method="nearest")
+    return SpeedRange(*map(float, ends)), ""
+
+
+def limited(manifest: Manifest, train: Dataset) -> Manifest:
+    """`manifest` with the limits of the training sweeps; unchanged if there are none."""
+    least, pattern = _least(manifest, train), _pattern(train)
+    if not least and pattern is None:
+        return manifest
+    return replace(manifest, sliding=SlideLimits(least, pattern))
+
+
+def _pattern(train: Dataset) -> float | None:
+    """The least height of a pattern, where nearly all training sweeps show one of twice the height;
+    else None. So a sweep with half of the usual pattern is answered."""
+    meter = SlideMeter(train.format, 1.0)
+    if meter.why:
+        return None
+    heights = [slide.height for slide in slides(meter, train)]
+    return CHANCE if np.quantile(heights, OUTER) >= 2 * CHANCE else None
+
+
+def _least(manifest: Manifest, train: Dataset) -> tuple[float, ...]:
+    """The least vibration of each label.
+
+    Empty if there are fewer than FEWEST sweeps of a label, or if windows are too short. Also empty
+    if a part of a sweep does not change at all, since slides then resemble rests.
+    """
+    if train.format.window < 2 * PARTS or set(train.materials) != set(manifest.labels):
+        return ()
+    if np.bincount(train.labels, minlength=len(train.materials)).min() < FEWEST:
+        return ()
+    least = np.array([vibration(window, manifest.tare).min() for window in train.samples])
+    labels = [train.materials.index(label) for label in manifest.labels]
+    found = [float(least[train.labels == k].min(initial=np.inf)) for k in labels]
+    if not all(np.isfinite(v) and v > STILL for v in found):
+        return ()
+    return tuple(round(v - MARGIN, 3) for v in found)
+
+
+def text(manifest: Manifest) -> str:
+    """Whether a finger that rests is noticed, in words."""
+    limits, by = manifest.sliding, []
+    if limits and limits.least:
+        by.append("in each tenth of the window by its lack of vibration")
+    if limits and limits.pattern:
+        by.append("in a whole window by its lack of a pattern that passes from taxel to taxel")
+    return f"a finger that rests: noticed {' and '.join(by)}" if by else _UNNOTICED

@@ -1,2 +1,0 @@
-"""Closed-form statistics of features: heads, early answers, unknown materials, displaced
-contacts."""
