@@ -17,15 +17,10 @@ from numpy.typing import NDArray
 
 from palpate.core.errors import FormatError
 from palpate.core.names import MOST_SHOWN, can_be_shown
-from palpate.core.types import DATA_TYPES, LARGEST_READING, SweepFormat
+from palpate.core.types import DATA_TYPES, LARGEST_READING, SweepFormat, native
 
 Array = NDArray[Any]
 Set = TypeVar("Set", bound="SweepSet")
-
-
-def native(values: Array) -> Array:
-    """The same numbers in this machine's byte order; the array itself if it has it."""
-    return values.astype(values.dtype.newbyteorder("="), copy=False)
 
 
 @dataclass(frozen=True, eq=False)

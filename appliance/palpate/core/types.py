@@ -106,6 +106,19 @@ def normal(counts: NDArray[Any], before: int) -> NDArray[Any]:
     return counts[..., -1] if counts.ndim == before + 3 else counts
 
 
+def native(values: NDArray[Any]) -> NDArray[Any]:
+    """The same numbers as a plain array in this machine's byte order; no copy if they are one.
+
+    onnxruntime and torch take the bytes of an array as they lie, and the name of its type hides
+    their order. Raises FormatError for masked numbers, which a plain array would show.
+    """
+    if isinstance(values, np.ma.MaskedArray) and np.ma.is_masked(values):
+        raise FormatError(
+            f"{np.ma.count_masked(values)} of {values.size} numbers are masked; fill them in"
+        )
+    return np.asarray(values, values.dtype.newbyteorder("="))
+
+
 def digitized(x: NDArray[Any], kind: np.dtype[Any]) -> NDArray[Any]:
     """Counts as the converter gives them: whole, within their type. float32 stays unchanged."""
     if kind.kind == "f":

@@ -18,6 +18,7 @@ from palpate.bundle.bundle import Bundle
 from palpate.bundle.onnx_check import check
 from palpate.bundle.pruning import prune
 from palpate.core.errors import BundleError, ModelError
+from palpate.core.types import native
 from palpate.inference.code_pages import give_back
 
 MOST_S = 3.0
@@ -77,9 +78,12 @@ class ModelRunner:
         return [out[0] for out in run(opened, outputs, {self._input: given[None]})]
 
 
-def run(opened: ort.InferenceSession, outputs: Sequence[str], given: dict[str, Any]) -> list[Any]:
-    """The graph's `outputs` for the input arrays `given` by name. Raises ModelError if they cannot
-    be computed."""
+def run(
+    opened: ort.InferenceSession, outputs: Sequence[str] | None, given: dict[str, Any]
+) -> list[Any]:
+    """The graph's `outputs`, all of them for None, for the input arrays `given` by name, in
+    whatever byte order. Raises ModelError if they cannot be computed."""
+    given = {name: native(values) for name, values in given.items()}
     try:
         values: list[Any] = opened.run(outputs, given)
     except Exception as e:  # as above

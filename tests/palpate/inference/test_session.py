@@ -3,13 +3,18 @@ the same outputs."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from palpate.answer.early import Early
 from palpate.bundle.bundle import Bundle
 from palpate.bundle.onnx_check import reader
-from palpate.core.errors import BundleError
+from palpate.core.errors import BundleError, FormatError
+from palpate.core.types import Status
 from palpate.inference import session
 from palpate.inference.classifier import Classifier
 from palpate.inference.early_exit import EarlyExit
@@ -107,3 +112,41 @@ def test_an_output_that_the_model_does_not_give(tmp_path):
         it(("early",), toy_bundle.window(0, 0))
     (logits,) = it(("logits",), toy_bundle.window(0, 0))
     assert logits.shape == (3,)
+
+
+FORMS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "highest byte first": lambda x: x.astype(x.dtype.newbyteorder(">")),
+    "by columns": np.asfortranarray,
+    "of a larger array": lambda x: np.repeat(x, 2, axis=0)[::2],
+    "backwards": lambda x: x[::-1].copy()[::-1],
+    "read only": lambda x: np.frombuffer(x.tobytes(), x.dtype).reshape(x.shape),
+    "nothing masked": np.ma.masked_array,
+}
+
+
+@pytest.mark.parametrize("kind", ["int16", "uint16", "float32"])
+@pytest.mark.parametrize("form", FORMS)
+def test_counts_are_the_same_however_they_lie_in_memory(kind: str, form: str):
+    """onnxruntime would take the bytes as they lie. Masked numbers are refused."""
+    format = replace(toy_bundle.FORMAT, dtype=kind)
+    it = ModelRunner(toy_bundle.model(format=format), "logits")
+    counts = toy_bundle.window(3, 1, format)
+    (want,), (found,) = (it(("logits",), x) for x in (counts, FORMS[form](counts)))
+    assert found.tobytes() == want.tobytes()
+    with pytest.raises(FormatError, match="masked"):
+        it(("logits",), np.ma.masked_less(counts, counts.max()))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_count_that_is_no_number_is_refused(tmp_path: Path, value: float):
+    """In a whole sweep and in an unfinished one: QuantizeLinear makes the lowest count of NaN."""
+    format = replace(toy_bundle.FORMAT, dtype="float32")
+    made = toy_bundle.load(tmp_path / "toy", early=EARLY, outputs=OUTPUTS, format=format)
+    it = Classifier(made, VirtualClock())
+    broken = toy_bundle.sweep(1, 0, format=format)
+    broken.frames.taxels[3, 1, 1] = value
+    with np.errstate(invalid="ignore"):
+        verdict = it(broken)
+        early = EarlyExit(it).judged(replace(broken, share=0.5))
+    assert (verdict.status, verdict.label) == (Status.DEAD_TAXEL, "")
+    assert early.status is Status.DEAD_TAXEL

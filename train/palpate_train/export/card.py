@@ -96,6 +96,12 @@ def _sentences(manifest: Manifest, protocol: str, figure: Json) -> list[str]:
         lines += [altered_sweeps.text(manifest.figures), ""]
     else:
         lines += ["It cannot tell an unknown material: each gets the label of a known one.", ""]
+    if manifest.format.dtype == "float32":
+        lines += [
+            "The box refuses a sweep with a count that is NaN or infinite. `model.onnx` alone, as "
+            "in the C API of onnxruntime, takes NaN for the lowest count: check counts there first.",
+            "",
+        ]
     if why := manifest.made.get("contact_unknown_because"):
         lines += [f"It cannot detect a missing contact: {why}.", ""]
     return lines

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from onnx import TensorProto, helper, numpy_helper
 
 from palpate.core.types import SweepFormat
-from palpate.inference.session import session
+from palpate.inference import session
 
 Array = NDArray[Any]
 TENSOR = {
@@ -364,7 +364,7 @@ def run(model: onnx.ModelProto, inputs: Array) -> Array:
     on_the_box, name = _session(model.SerializeToString()), model.graph.input[0].name
     outputs: Array | None = None
     for i, one in enumerate(inputs):
-        output = on_the_box.run(None, {name: one[None]})[0]
+        output = session.run(on_the_box, None, {name: one[None]})[0]
         if outputs is None:  # a list to join at the end would hold everything twice
             outputs = np.empty((len(inputs), *output.shape[1:]), output.dtype)
         outputs[i] = output[0]
@@ -377,4 +377,4 @@ def run(model: onnx.ModelProto, inputs: Array) -> Array:
 def _session(model: bytes) -> Any:
     """The session of a serialized model. Making one takes as long as tens of sweeps, and an export
     runs the same model on many altered copies."""
-    return session(model)
+    return session.session(model)

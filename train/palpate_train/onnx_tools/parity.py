@@ -12,8 +12,8 @@ import onnx
 from numpy.typing import NDArray
 
 from palpate.answer.objects import softmax
-from palpate.inference.session import session
 from palpate_train.metrics.score import widen
+from palpate_train.onnx_tools.graph_builder import run_output
 
 Array = NDArray[Any]
 Z95 = 1.96
@@ -86,8 +86,7 @@ def measure(
 def logits(model: onnx.ModelProto, inputs: Array) -> Array:
     """The output `logits` for each of `inputs`, float32 [n, K], in the same kind of session as on
     the box."""
-    run, name = session(model.SerializeToString()), model.graph.input[0].name
-    return np.concatenate([run.run(["logits"], {name: one[None]})[0] for one in inputs])
+    return run_output(model, "logits", inputs)
 
 
 def compare(float_logits: Array, int8_logits: Array) -> AnswerDifference:
