@@ -21,6 +21,7 @@ from palpate_train.data.files import (
     json_lines,
     matlab,
     numpy_files,
+    octave,
     parquet,
     sheets,
     tdms,
@@ -132,6 +133,8 @@ def _read(path: Path, wanted: ReadPlan) -> Table:
         return json_lines.read(data, wanted)
     content, notes = text.decoded(data)
     lines = text.lines_of(content)
+    if octave.wrote(lines):
+        return octave.read(lines, wanted)
     if tekscan.is_movie(lines):
         return tekscan.read(lines, wanted, notes)
     return text.table(lines, wanted, notes)

@@ -1,7 +1,9 @@
-"""Reads HDF5 and MATLAB's version 7.3, which is HDF5. Only the wanted arrays are read."""
+"""Reads HDF5, MATLAB's version 7.3 and what Octave's `save -hdf5` writes, which are HDF5. Only the
+wanted arrays are read."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
@@ -9,11 +11,17 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import numpy as np
 
-from palpate_train.data.files.table import Entry, ReadPlan, Table, chosen
+from palpate_train.data.files import octave
+from palpate_train.data.files.table import Array, Entry, ReadPlan, Table, chosen
 from palpate_train.data.readers import array_in
 
 CLASS = "MATLAB_class"
+OCTAVE = "OCTAVE_NEW_FORMAT"
+OCTAVE_RANGE = "OCTAVE_RANGE_NELEM"
+OCTAVE_REAL = re.compile(rb"(?!.*(complex|sparse|string)).*(matrix|scalar|bool|range)")
+"""Types of Octave's arrays of real numbers; seen in Octave 7.3.0."""
 INTERNAL = ("#refs#", "#subsystem#")
 """Groups in which MATLAB keeps the contents of cells and objects."""
 NUMERIC = (
@@ -28,18 +36,20 @@ NUMERIC = (
 def read(path: Path, wanted: ReadPlan) -> Table:
     """The wanted array of an HDF5 file, in whatever group it stands.
 
-    Arrays that MATLAB saved with -v7.3 get MATLAB's order of axes; those of its `h5write` carry no
-    sign of MATLAB. Raises FormatError.
+    Arrays that MATLAB saved with -v7.3 get MATLAB's order of axes, and Octave's theirs; what
+    MATLAB's `h5write` wrote carries no sign of MATLAB. Raises FormatError.
     """
     with h5py.File(path, "r") as file:
         table = chosen(entries(file), wanted)
-        saved = file.visititems(lambda name, one: True if CLASS in one.attrs else None)
+        saved = file.visititems(lambda name, one: {CLASS, OCTAVE} & set(one.attrs) or None)
         return replace(table, reversible=not saved)
 
 
 def entries(file: h5py.File, matlab: bool = False) -> Mapping[str, Entry]:
     """The arrays of a file by their paths in it. Texts, cells and objects of MATLAB are left
     out. matlab: arrays without a class are MATLAB's too."""
+    if any(OCTAVE in one.attrs for one in file.values() if isinstance(one, h5py.Group)):
+        return _octave(file)
     found: dict[str, Entry] = {}
 
     def keep(name: str, one: Any) -> None:
@@ -51,8 +61,42 @@ def entries(file: h5py.File, matlab: bool = False) -> Mapping[str, Entry]:
             found[name] = Entry.of(one.shape, one.dtype, partial(array_in, file, name))
         elif kind in (None, *NUMERIC) and "MATLAB_empty" not in one.attrs:
             # MATLAB stores by columns, with its own order of axes
-            read = partial(lambda name: array_in(file, name).T, name)
-            found[name] = Entry.of(one.shape[::-1], one.dtype, read)
+            found[name] = Entry.of(one.shape[::-1], one.dtype, partial(_reversed, file, name))
 
     file.visititems(keep)
     return found
+
+
+def _octave(file: h5py.File) -> Mapping[str, Entry]:
+    """The arrays of a file of Octave: each variable is a group of its type and its value, whose
+    axes are reversed; a range is its base, limit and increment."""
+    found: dict[str, Entry] = {}
+
+    def keep(name: str, one: Any) -> None:
+        if not (isinstance(one, h5py.Group) and OCTAVE in one.attrs):
+            return
+        kind, value = one.get("type"), one.get("value")
+        if not all(isinstance(part, h5py.Dataset) for part in (kind, value)):
+            return  # a structure or a cell, whose parts are such groups
+        at, short = f"{name}/value", "/".join(name.split("/")[::2])
+        if OCTAVE_RANGE in value.attrs:
+            count = int(value.attrs[OCTAVE_RANGE])
+            read = partial(_range, file, at, count)
+            found[short] = Entry.of((count,), np.dtype(np.float64), read)
+        elif OCTAVE_REAL.match(kind[()]) and "OCTAVE_EMPTY_MATRIX" not in one.attrs:
+            read = partial(_reversed, file, at)
+            found[short] = Entry.of(value.shape[::-1], value.dtype, read)
+
+    file.visititems(keep)
+    return found
+
+
+def _reversed(file: h5py.File, name: str) -> Array:
+    """A stored array in the order of axes of the program that wrote it by columns."""
+    return array_in(file, name).T
+
+
+def _range(file: h5py.File, name: str, count: int) -> Array:
+    """The numbers of a range of Octave."""
+    stored = array_in(file, name)
+    return octave.ascending(float(stored["base"]), float(stored["increment"]), count)

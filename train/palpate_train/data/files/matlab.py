@@ -1,4 +1,4 @@
-"""Reads MAT files of all versions.
+"""Reads MAT files of all versions, and what Octave's `save` calls so.
 
 Version 7.3 is HDF5; SciPy reads the others. It trusts the sizes in a damaged file: version 1.17.1
 ended its process with a segmentation fault in three of three runs of 3,000 damaged files. So a
@@ -24,7 +24,7 @@ import h5py
 import numpy as np
 
 from palpate.core.errors import FormatError
-from palpate_train.data.files import hdf5, numpy_files
+from palpate_train.data.files import hdf5, numpy_files, octave
 from palpate_train.data.files.table import Array, ReadPlan, Table, chosen
 
 DEADLINE_S = 120.0
@@ -38,6 +38,9 @@ def read(path: Path, wanted: ReadPlan) -> Table:
         with h5py.File(path, "r") as file:
             dotted = {name.replace("/", "."): e for name, e in hdf5.entries(file, True).items()}
             return chosen(dotted, wanted)
+    with path.open("rb") as head:
+        if head.read(len(octave.CREATED)) == octave.CREATED.encode():  # its usual format, not -v7
+            return octave.read(path.read_text(errors="replace").splitlines(), wanted)
     with tempfile.TemporaryDirectory() as folder:
         converted = Path(folder, "arrays.npz")
         _convert(path, converted)
