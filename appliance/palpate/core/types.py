@@ -113,10 +113,8 @@ def native(values: NDArray[Any]) -> NDArray[Any]:
     their order. Raises FormatError for masked numbers, which a plain array would show.
     """
     if isinstance(values, np.ma.MaskedArray) and np.ma.is_masked(values):
-        raise FormatError(
-            f"{np.ma.count_masked(values)} of {values.size} numbers are masked; fill them in"
-        )
-    return np.asarray(values, values.dtype.newbyteorder("="))
+        raise FormatError("some of the numbers are masked; fill them in")
+    return np.asarray(values.astype(values.dtype.newbyteorder("="), copy=False))
 
 
 def digitized(x: NDArray[Any], kind: np.dtype[Any]) -> NDArray[Any]:

@@ -98,8 +98,9 @@ def _sentences(manifest: Manifest, protocol: str, figure: Json) -> list[str]:
         lines += ["It cannot tell an unknown material: each gets the label of a known one.", ""]
     if manifest.format.dtype == "float32":
         lines += [
-            "The box refuses a sweep with a count that is NaN or infinite. `model.onnx` alone, as "
-            "in the C API of onnxruntime, takes NaN for the lowest count: check counts there first.",
+            "The box refuses a sweep with a count that is NaN or infinite. `model.onnx` alone, in "
+            "the C API of onnxruntime for example, takes NaN for the lowest count: check counts "
+            "before you call it.",
             "",
         ]
     if why := manifest.made.get("contact_unknown_because"):

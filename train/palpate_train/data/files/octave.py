@@ -53,7 +53,8 @@ def _entries(lines: Sequence[str]) -> Iterator[tuple[str, Entry]]:
         end = start + 1
         while end < stop and lines[end].startswith("#"):
             end += 1
-        head = dict(found.groups() for x in lines[start:end] if (found := HEAD.fullmatch(x)))
+        about = filter(None, map(HEAD.fullmatch, lines[start:end]))
+        head = {found[1]: found[2] for found in about}
         kind = TYPE.fullmatch(head.get("type", "").strip())
         if kind and kind[0] and "global" not in head:
             values = _values(name, kind, head, " ".join(lines[end:stop]).split())
@@ -67,19 +68,18 @@ def _given(values: Array) -> Array:
 def _values(name: str, kind: re.Match[str], head: dict[str, str], texts: list[str]) -> Array:
     """The numbers of one variable in their type and shape."""
     try:
-        numbers = np.array([x.replace("NA", "nan") for x in texts], np.float64)
+        numbers: Array = np.array([x.replace("NA", "nan") for x in texts], np.float64)
         if kind["range"]:
             base, limit, increment = numbers
             steps = (limit - base) / increment
             return ascending(base, increment, int(np.floor(steps + RANGE_STEPS)) + 1)
         if "rows" in head:
-            values = numbers.reshape(int(head["rows"]), int(head["columns"]))
-        elif "ndims" in head:
-            axes = int(head["ndims"])
-            values = numbers[axes:].reshape(numbers[:axes].astype(int), order="F")
+            numbers = numbers.reshape(int(head["rows"]), int(head["columns"]))
+        elif axes := int(head.get("ndims", 0)):
+            numbers = numbers[axes:].reshape(numbers[:axes].astype(int), order="F")
         else:
-            values = numbers.reshape(())
+            numbers = numbers.reshape(())
     except (ValueError, KeyError, ZeroDivisionError) as e:
         raise FormatError(f"{name}: its numbers are not those of its head: {e}") from e
     dtype = np.bool_ if kind["bool"] else np.float32 if kind["float"] else kind["int"] or np.float64
-    return values.astype(dtype)
+    return numbers.astype(dtype)
