@@ -23,7 +23,6 @@ def entry(case: str, method: str, mean: float, **more: Any) -> dict[str, Any]:
         "case": case,
         "method": method,
         "fit_s": 1.5,
-        "ms_p50": 0.25,
         "forms": forms,
     } | (ends | more)
 
@@ -39,9 +38,7 @@ def case(name: str, **more: Any) -> dict[str, Any]:
         "sweeps": 100,
         "materials": 4,
         "format": "2x2 int16 at 100 Hz, window 200",
-        "rate_hz": 100.0,
         "digest": f"digest of {name}",
-        "windows": [100],
         "simulated": name == "two",
     } | more
 

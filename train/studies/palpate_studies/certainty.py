@@ -139,7 +139,6 @@ def early(full: Sequence[Trained]) -> Json:
         for r in (done.rule for _, done in full)
     ]
     return {
-        "n": len(labels),
         "share": round(float(share.mean()), 4),
         "lost": round(float(lost.mean()), 4),
         "lost_low": low,

@@ -144,11 +144,10 @@ class ChartPanel:
 
 
 def by_case(results: Iterable[Json]) -> dict[str, dict[str, Json]]:
-    """Entries with all training sweeps: {case: {method: entry}}."""
+    """{case: {method: entry}}."""
     table: dict[str, dict[str, Json]] = {}
     for entry in results:
-        if not entry.get("each"):
-            table.setdefault(entry["case"], {})[entry["method"]] = entry
+        table.setdefault(entry["case"], {})[entry["method"]] = entry
     return table
 
 

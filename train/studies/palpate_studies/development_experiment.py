@@ -132,24 +132,22 @@ def _about(name: str, case: StudyCase, sweeps: Dataset) -> Json:
         "materials": len(sweeps.materials),
         "format": str(sweeps.format),
         "digest": digest(sweeps),
-        "rate_hz": sweeps.rate_hz,
     }
 
 
 def _entry(results: Sequence[Json]) -> Json:
-    """Accuracy with its interval, and costs, over the results of all seeds, for each precision."""
-    seeds = [result["seed"] for result in results]
+    """Accuracy with its interval over the results of all seeds, for each precision, and the time to
+    train a fold."""
     forms = {
-        name: _mean(
-            [
-                result["forms"][name] | {"seed": seed}
-                for result, seed in zip(results, seeds, strict=True)
-            ]
-        )
+        name: _mean([result["forms"][name] for result in results])
         for name in results[0].get("forms", {})
     }
-    costs = {name: max(float(result[name]) for result in results) for name in ("fit_s", "ms_p50")}
-    return _mean(results) | costs | {"forms": forms}
+    return _mean(results) | {
+        "n": results[0]["window"]["total"],
+        "seeds": sorted(result["seed"] for result in results),
+        "fit_s": max(float(result["fit_s"]) for result in results),
+        "forms": forms,
+    }
 
 
 def _mean(results: Sequence[Json]) -> Json:
@@ -160,4 +158,4 @@ def _mean(results: Sequence[Json]) -> Json:
     return {
         name: round(float(share), 4)
         for name, share in zip(("mean", "low", "high"), ends, strict=True)
-    } | {"n": results[0]["window"]["total"], "seeds": sorted(r["seed"] for r in results)}
+    }

@@ -46,6 +46,8 @@ PANELS = {
 }
 """For each panel of the chart the sweeps with which its methods are timed. Which views a model of
 ours has, and so its time, depends on the sweeps."""
+CHARTED = ("method", "form", "precision", "ms_p50")
+"""The keys of an entry that the chart reads."""
 ROUNDS = 10
 """Rounds of timing. The slowest methods take a thousand times as long as the quickest."""
 EVERY, SHARE = 5, 0.25
@@ -104,13 +106,16 @@ def measured(
 def of_panels(
     names: Sequence[str], data: Path | None, seed: int, cache: Path | None, log: Log, effort: Effort
 ) -> Json:
-    """`measured` for each panel of the chart. Panels of real sweeps need the folder `data`."""
+    """`measured` for each panel of the chart, with what the chart shows of each method. Panels of
+    real sweeps need the folder `data`."""
     found = {}
     for kind, case in PANELS.items():
         if (sweeps := case.load(data)) is not None:
             log(f"times of {kind}")
             sweeps = sweeps.without_means() if case.means_removed else sweeps
-            found[kind] = measured(names, sweeps, seed, cache, log, effort)
+            times = measured(names, sweeps, seed, cache, log, effort)
+            shown = [{key: one[key] for key in CHARTED} for one in times["entries"]]
+            found[kind] = times | {"entries": shown}
     return found
 
 
