@@ -1,7 +1,8 @@
 """The box as a Modbus TCP server, with the registers, inputs and coils of docs/robots/modbus.md.
 
 All registers of one request show the same moment. A coil is a command that is sent when the coil
-rises.
+rises: from a 0 that the same connection has written, so that a controller that writes its coils
+cyclically does not send a command again after a broken connection.
 """
 
 from __future__ import annotations
@@ -41,8 +42,6 @@ ORDER = ("ABORT", "NEW", "TARE", "START", "STOP")
 """Order in which the commands of one write are sent."""
 INPUTS = ("alive", "ready", "sweeping", "fault", "known", "early")
 LABEL_WORDS = 16
-IDLE_S = 60.0
-"""A connection without a request for this long is closed."""
 PACE_S = 0.005
 """Pause after each request of a connection, so that a flood of requests leaves the other programs
 of the computer their share."""
@@ -204,9 +203,9 @@ class ModbusBridge:
 
     async def serve(self, peer: TcpPeer) -> None:
         """Answer the requests of one connection until it ends, hangs, or sends invalid bytes."""
-        coils, slide = [False] * len(COILS), [0] * len(SLIDE)
-        rest = b""
-        while data := await peer.read(REQUEST_S if rest else IDLE_S):
+        coils: list[bool | None] = [None] * len(COILS)
+        slide, rest = [0] * len(SLIDE), b""
+        while data := await peer.read(REQUEST_S if rest else None):
             try:
                 found, rest = pdu.requests(data, rest)
             except FormatError:
@@ -216,9 +215,11 @@ class ModbusBridge:
             await peer.flush(REQUEST_S)
             await asyncio.sleep(PACE_S * len(found))
 
-    async def answer(self, request: ModbusRequest, coils: list[bool], slide: list[int]) -> bytes:
-        """The reply's function and data. coils, slide: the coils and the registers of SLIDE of this
-        connection; they change with its writes."""
+    async def answer(
+        self, request: ModbusRequest, coils: list[bool | None], slide: list[int]
+    ) -> bytes:
+        """The reply's function and data. coils, slide: the coils (None: not yet written as 0) and
+        the registers of SLIDE of this connection; they change with its writes."""
         try:
             wanted = pdu.parse(request.pdu)
             if isinstance(wanted, Reading):
@@ -228,9 +229,11 @@ class ModbusBridge:
         except RequestRefused as e:
             return pdu.refusal(request.pdu, e.fault)
 
-    def _values(self, function: int, coils: Sequence[bool], slide: Sequence[int]) -> Sequence[int]:
+    def _values(
+        self, function: int, coils: Sequence[bool | None], slide: Sequence[int]
+    ) -> Sequence[int]:
         if function == pdu.READ_COILS:
-            return coils
+            return [bool(coil) for coil in coils]
         view = self._source.view()
         alive = view.alive(self._clock.now_ns())
         return (
@@ -239,7 +242,7 @@ class ModbusBridge:
             else [*registers(view, alive=alive), *slide, *_words((*MEASURED, *FINGERS), view)]
         )
 
-    async def _write(self, wanted: Writing, coils: list[bool], slide: list[int]) -> None:
+    async def _write(self, wanted: Writing, coils: list[bool | None], slide: list[int]) -> None:
         if not self._writes:
             raise RequestRefused(ExceptionCode.FUNCTION)
         if wanted.function in (pdu.WRITE_REGISTER, pdu.WRITE_REGISTERS):
@@ -248,17 +251,24 @@ class ModbusBridge:
                 raise RequestRefused(ExceptionCode.ADDRESS)
             slide[first : first + len(wanted.values)] = wanted.values
             return
-        end = wanted.address + len(wanted.values)
-        if end > len(coils):
+        if wanted.address + len(wanted.values) > len(coils):
             raise RequestRefused(ExceptionCode.ADDRESS)
-        addresses = range(wanted.address, end)
-        rising = {
-            COILS[at]: at
-            for at, value in zip(addresses, wanted.values, strict=True)
-            if value and not coils[at]
-        }
-        for at, value in zip(addresses, wanted.values, strict=True):
-            coils[at] = coils[at] and bool(value)
+        on = [at for at, value in enumerate(wanted.values, wanted.address) if value]
+        rising = {COILS[at]: at for at in on if coils[at] is False}
+        for at, value in enumerate(wanted.values, wanted.address):
+            if not value:
+                coils[at] = False
+        if {"START", "STOP"} <= rising.keys():  # a sweep of 0 ms is nobody's wish
+            for name in ("START", "STOP"):
+                coils[rising.pop(name)] = None
+        await self._command_all(rising, coils, slide)
+        if any(coils[at] is None for at in on):
+            raise RequestRefused(ExceptionCode.VALUE)
+
+    async def _command_all(
+        self, rising: Mapping[str, int], coils: list[bool | None], slide: Sequence[int]
+    ) -> None:
+        """Send the commands of rising coils. Raises RequestRefused."""
         if not rising:
             return
         if self._commanding.locked():

@@ -1,12 +1,14 @@
 """A TCP server with limits, for the bridges: at most `most` connections at a time.
 
 If it is full, a silent connection is closed for a new one, so that idle or dead peers never keep a
-controller out.
+controller out. A browser is dropped at its first bytes: a page of anybody can send a request to any
+port that its reader reaches, with lines that would be commands of the serial line.
 """
 
 from __future__ import annotations
 
 import asyncio
+import re
 import signal
 import socket
 from collections.abc import Awaitable, Callable
@@ -24,6 +26,14 @@ BUFFER = 64 * 1024
 CLOSE_S = 1.0
 """Longest wait until a peer has read the rest."""
 
+KEEPALIVE = {"TCP_KEEPIDLE": 60, "TCP_KEEPINTVL": 15, "TCP_KEEPCNT": 4}
+"""Two minutes after a silent peer has died its connection ends; a live peer may be silent for
+hours."""
+HEAD = 64
+"""First bytes of a connection that are looked at."""
+BROWSER = re.compile(rb"[A-Za-z]+ (?:[/*]|[\w.-]+:)|\x16\x03")
+"""Begin of an HTTP request, or of TLS, whose first message can contain bytes of a page's server."""
+
 Serve = Callable[["TcpPeer"], Awaitable[None]]
 
 
@@ -35,12 +45,18 @@ class TcpPeer:
     ) -> None:
         self.heard_s = now_s()
         self._reader, self._writer, self._now_s = reader, writer, now_s
+        self._head = b""
 
     async def read(self, timeout_s: float | None) -> bytes:
-        """The bytes that have come, b"" at the end. Raises TimeoutError, ConnectionError."""
+        """The bytes that have come, b"" at the end. Raises TimeoutError, ConnectionError (also for
+        a browser)."""
         async with asyncio.timeout(timeout_s):
             data = await self._reader.read(4096)
         self.heard_s = self._now_s()
+        if len(self._head) < HEAD:
+            self._head += data[: HEAD - len(self._head)]
+            if BROWSER.match(self._head):
+                raise ConnectionAbortedError("a browser speaks; this port has another protocol")
         return data
 
     def write(self, data: bytes) -> None:
@@ -112,6 +128,8 @@ class TcpServer:
             return
         connection = writer.get_extra_info("socket")
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        for name, value in KEEPALIVE.items():
+            connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
         # the default of the kernel is some megabytes
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER)
         peer = TcpPeer(reader, writer, now_s)

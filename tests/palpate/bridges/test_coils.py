@@ -59,8 +59,13 @@ def ask(source: ScriptedSource) -> Callable[[bytes], bytes]:
 
 
 def connected(bridge: ModbusBridge) -> Callable[[bytes], bytes]:
-    """Ask a bridge over another connection."""
-    coils, slide = [False] * len(COILS), [0] * len(SLIDE)
+    """Ask a bridge over another connection, on which all coils were written as 0."""
+    return fresh(bridge, [False] * len(COILS))
+
+
+def fresh(bridge: ModbusBridge, coils: list[bool | None]) -> Callable[[bytes], bytes]:
+    """Ask a bridge over a connection with these coils."""
+    slide = [0] * len(SLIDE)
     return lambda pdu: asyncio.run(bridge.answer(ModbusRequest(1, 1, pdu), coils, slide))
 
 
@@ -97,23 +102,23 @@ def test_a_refused_command_is_carried_out_when_it_is_sent_again(
     assert source.sent == ["START"] * 3
 
 
-BOTH = START | STOP
+BOTH = NEW | START
 WRITES: dict[str, tuple[list[tuple[str, int, int]], list[str]]] = {
-    "no STOP goes out without its START": (
-        [("START", BOTH, 0), ("", BOTH, BOTH)],
-        ["START", "START", "STOP"],
+    "no START goes out without its NEW": (
+        [("NEW", BOTH, 0), ("", BOTH, BOTH)],
+        ["NEW", "NEW", "START"],
     ),
     "what was carried out is not repeated": (
-        [("STOP", BOTH, START), ("", BOTH, BOTH)],
-        ["START", "STOP", "STOP"],
+        [("START", BOTH, NEW), ("", BOTH, BOTH)],
+        ["NEW", "START", "START"],
     ),
     "a coil falls although another is refused": (
         [("", START, START), ("STOP", STOP, 0), ("", START, START)],
         ["START", "STOP", "START"],
     ),
     "the old sweep ends, then a new object, then its sweep": (
-        [("", 0b11111, 0b11111)],
-        ["ABORT", "NEW", "TARE", "START", "STOP"],
+        [("", 0b11101, 0b11101)],
+        ["ABORT", "NEW", "TARE", "START"],
     ),
 }
 """Writes of all coils: the command that the box refuses, the coils wanted and those on afterwards;
@@ -132,6 +137,41 @@ def test_several_coils_in_one_write(
         source.refused = {refused}
         assert ask(several(wanted))[:2] == (b"\x8f\x04" if refused else b"\x0f\x00")
         assert levels(ask) == on
+    assert source.sent == sent
+
+
+REFUSED = b"\x8f\x03"
+DONE = b"\x0f\x00"
+LEVELS: dict[str, tuple[list[tuple[int, bytes]], list[str]]] = {
+    "connected again within a slide": (
+        [(START, REFUSED), (START, REFUSED), (STOP, DONE), (0, DONE), (START, DONE)],
+        ["STOP", "START"],
+    ),
+    "START still up beside STOP": ([(START, REFUSED), (START | STOP, REFUSED)], ["STOP"]),
+    "all coils up": ([(31, REFUSED), (31, REFUSED)], []),
+    "START and STOP at rest": (
+        [
+            (0, DONE),
+            (START | STOP, REFUSED),
+            (START | STOP, REFUSED),
+            (START, REFUSED),
+            (STOP, DONE),
+        ],
+        ["STOP"],
+    ),
+    "a new object, with START and STOP": ([(0, DONE), (START | STOP | NEW, REFUSED)], ["NEW"]),
+}
+"""Writes of all coils on a new connection with their replies, and all commands that were sent."""
+
+
+@pytest.mark.parametrize(("writes", "sent"), LEVELS.values(), ids=LEVELS)
+def test_a_coil_that_was_not_0_on_this_connection_does_not_rise(
+    source: ScriptedSource, writes: list[tuple[int, bytes]], sent: list[str]
+):
+    """A controller that writes cyclically sends no command again after a broken connection, and
+    START with STOP is no sweep; what does rise is carried out."""
+    ask = fresh(ModbusBridge(source, SystemClock(), writes=True), [None] * len(COILS))
+    assert [ask(several(bits))[:2] for bits, _ in writes] == [reply for _, reply in writes]
     assert source.sent == sent
 
 

@@ -40,12 +40,17 @@ def address(box: SpeakingBox) -> Iterator[Address]:
         yield there
 
 
+LOWER = bytes.fromhex("0f000000050100")
+"""The write of 0 to all coils, with which a connection begins."""
+
+
 @pytest.fixture
 def raw(box: SpeakingBox, address: Address) -> Iterator[RawModbus]:
     """A hand-made client; the box has been heard, and its labels are known."""
     box.say(state())
     with RawModbus(address) as client:
         eventually(lambda: client.registers(ADDRESSES["labels"], 1) == [len(LABELS)])
+        client.ask(LOWER)
         yield client
 
 
@@ -145,6 +150,7 @@ def test_another_client_sweeps(box: SpeakingBox, raw: RawModbus, address: Addres
     each, in order, and the answer's number rises."""
     with ModbusTcpClient(address[0], port=address[1], timeout=LONG_S) as client:
         assert not client.write_registers(modbus.SLIDE_AT, [305, 150]).isError()
+        assert not client.write_coils(0, [False] * len(COILS)).isError()
         for coil in (NEW, START, STOP):
             assert not client.write_coil(coil, True).isError()
             assert not client.write_coil(coil, True).isError()  # still on: no second command
@@ -212,6 +218,7 @@ def test_one_command_at_a_time(box: SpeakingBox, raw: RawModbus, address: Addres
     raw.send(bytes.fromhex("050003ff00"))
     box.wait_for("TARE")
     with RawModbus(address) as other:
+        other.ask(LOWER)
         assert other.ask(bytes.fromhex("050000ff00")) == b"\x85\x06"
         assert other.registers(0, 1) == [1]
         assert raw.receive()[7:] == b"\x85\x04"  # no answer came in time
@@ -325,6 +332,7 @@ def test_the_feed_in_place_of_the_line(tmp_path: Path):
             assert {name: word(client, name) for name in wanted} == wanted
             assert client.registers(ADDRESSES["frames"], 2) == [1, 70_000 - 65_536]
             assert client.registers(MEASURED_AT, 2) == [612, 4]
+            client.ask(LOWER)
             assert client.ask(bytes.fromhex("050000ff00")) == b"\x85\x04"
             connection.close()
 

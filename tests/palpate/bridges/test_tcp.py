@@ -97,6 +97,36 @@ def test_what_a_peer_says_wrong_is_answered_to_it_alone(box: SpeakingBox):
     assert [s.kind for s in box.heard] == ["ID"]
 
 
+START = b"$PPLP,START\r\n"
+BROWSERS = {
+    "a form": (b"POST / HTTP/1.1\r\nHost: box:1503\r\n\r\n" + START,),
+    "a long path": (b"POST /" + b"a" * 3000 + b" HTTP/1.1\r\n\r\n" + START,),
+    "in pieces": (b"PO", b"ST", b" ", b"/ HTTP/1.1\r\n" + START),
+    "a preflight of all": (b"OPTIONS * HTTP/1.1\r\n" + START,),
+    "a WebSocket": (b"GET ws://box:1503/ HTTP/1.1\r\n" + START,),
+    "a proxy": (b"CONNECT box.example:1503 HTTP/1.1\r\n" + START,),
+    "a ticket of TLS": (b"\x16\x03\x01\x02\x00\r\n" + START,),
+}
+"""What the page of anybody can make a browser send to this port, in pieces."""
+
+
+@pytest.mark.parametrize("pieces", BROWSERS.values(), ids=BROWSERS)
+def test_a_browser_commands_nothing(box: SpeakingBox, pieces: tuple[bytes, ...]):
+    """It is dropped at its first bytes, with leave to write; the box hears no START, and the other
+    peer is served."""
+    with bridge("tcp", "--port", box.path, "--allow-writes") as address:
+        with socket.create_connection(address, timeout=LONG_S) as page:
+            page.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            with suppress(ConnectionError):
+                for piece in pieces:
+                    page.sendall(piece)
+            assert b"ANS" not in all_of(page)
+        with socket.create_connection(address, timeout=LONG_S) as peer:
+            peer.sendall(b"PPLP ID\r\n")
+            assert b"ANS,ID,ok" in peer.recv(4096)
+    assert {s.kind for s in box.heard} == {"ID"}
+
+
 def ask_often(client: Palpate) -> None:
     """Ask until the bridge has noticed that the line is gone."""
     for _ in range(1000):
@@ -143,6 +173,28 @@ def test_a_peer_that_never_reads_is_given_up(box: SpeakingBox):
             assert heard.count(b"$PPLP,RES,") == 5_000
         deaf.settimeout(LONG_S)
         assert all_of(deaf).count(b"$PPLP,RES,") < 5_000
+
+
+def test_a_dead_peer_is_found_by_the_kernel():
+    """Keep-alive within minutes, so that a live peer may be silent as long as it likes."""
+
+    async def run() -> list[int]:
+        server = TcpServer(lambda peer: asyncio.sleep(LONG_S), most=1)
+        await server.open("127.0.0.1", 0)
+        await asyncio.open_connection(*server.address)
+        while not server.peers:
+            await asyncio.sleep(0)
+        (peer,) = server.peers
+        kept = peer._writer.get_extra_info("socket")
+        names = (socket.TCP_KEEPIDLE, socket.TCP_KEEPINTVL, socket.TCP_KEEPCNT)
+        return [
+            kept.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE),
+            *(kept.getsockopt(socket.IPPROTO_TCP, name) for name in names),
+        ]
+
+    on, idle_s, every_s, times = asyncio.run(run())
+    assert on
+    assert idle_s + every_s * times <= 300
 
 
 class DeafPort:
