@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Container
 
+from palpate.core.text import printable
+
 MOST_LETTERS, MOST_SHOWN = 24, 60
 """Most characters of a label, and of a display name."""
 LABEL = re.compile(rf"[A-Za-z0-9][A-Za-z0-9 _.-]{{0,{MOST_LETTERS - 1}}}")
@@ -42,7 +44,7 @@ def can_be_shown(text: object) -> bool:
 
 def shown(text: str) -> str:
     """A display name for a text of any length and content; "" if nothing of it can be shown."""
-    printed = "".join(c if c.isprintable() else " " for c in text).strip()
+    printed = printable(text, " ").strip()
     return printed if len(printed) <= MOST_SHOWN else f"{printed[: MOST_SHOWN - 1]}…"
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable
 from io import TextIOWrapper
+from typing import TextIO
 
 
 def replace_unprintable() -> None:
@@ -14,9 +15,16 @@ def replace_unprintable() -> None:
             stream.reconfigure(errors="replace")
 
 
-def printable(text: str) -> str:
-    """`text` with "?" for characters that cannot be printed."""
-    return "".join(c if c.isprintable() else "?" for c in text)
+def printable(text: str, instead: str = "?") -> str:
+    """`text` with `instead` for characters that cannot be printed."""
+    return "".join(c if c.isprintable() else instead for c in text)
+
+
+def say(*lines: str, file: TextIO | None = None) -> None:
+    """Print lines at once, each made printable, since a text from a file can hold escape sequences
+    or a line break, which would forge another line. file: standard output if None."""
+    for line in lines:
+        print(printable(line), file=file, flush=True)
 
 
 def shown(value: object) -> str:

@@ -12,6 +12,7 @@ from typing import Any
 
 from palpate.core.errors import BundleError
 from palpate.core.schema import typed
+from palpate.core.text import printable
 
 STATE_FILE = "bundles.json"
 """The file of a StoreState."""
@@ -99,7 +100,7 @@ class StoreState:
     def left(self, sha: str, why: str) -> StoreState:
         """The state after the trial of `sha` failed for this reason. Its starts are set to the
         limit, in case the power fails before `current` changes."""
-        text = "".join(c if c.isprintable() else " " for c in why)
+        text = printable(why, " ")
         return self.changed(sha, starts=MOST_STARTS, why=text[:MOST_WHY], boot="")
 
     def exchanged(self, sha: str) -> StoreState:

@@ -7,6 +7,7 @@ import os
 
 from palpate.core.errors import ApplianceError, FormatError
 from palpate.core.runtime_folder import LAST_FAILURE
+from palpate.core.text import printable
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -140,7 +141,7 @@ def lines(report: Mapping[str, Any], now_ns: int) -> list[str]:
     }
     rows += [f"{name:<8} {text}" for name, text in facts.items()]
     rows += [verdict_line(v, now_ns) for v in reversed(report["verdicts"])]
-    return ["".join(c if c.isprintable() else "?" for c in line) for line in rows]
+    return [*map(printable, rows)]
 
 
 def _skin(report: Mapping[str, Any]) -> str:

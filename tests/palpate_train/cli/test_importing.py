@@ -27,6 +27,28 @@ def five() -> list[list[str]]:
     return [shlex.split(line) for line in block.splitlines()]
 
 
+EVIL = "\x1b[2J\n\x9b1mtaken: 9 files\u202e"
+
+
+def test_names_of_files_forge_no_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Escape sequences and line breaks in names, of files that are taken, left out and refused:
+    the terminal, the report and the description of the set show each as one printable line."""
+    folder, report = tmp_path / "recordings", tmp_path / "report.txt"
+    folder.mkdir()
+    for name in ("wood_1", f"wool_{EVIL}", f"broken_{EVIL}", EVIL):
+        rows = "1,2,3,4\n" * 40 if "broken" not in name else f"{EVIL}\n1,2\n"
+        (folder / f"{name}.csv").write_text(rows)
+    out = str(tmp_path / "set.npz")
+    words = ["--pattern", "{material}_{trial}.csv", "--grid", "2x2", "--rate", "20"]
+    main(["import", str(folder), *words, "--out", out, "--report", str(report)])
+    main(["sets", "describe", out])
+    told = capsys.readouterr()
+    lines = (told.out + told.err + report.read_text()).replace("\t", " ").splitlines()
+    assert [line for line in lines if not line.isprintable()] == []
+    assert [line for line in lines if line.startswith(("taken: 9", "?1mtaken"))] == []
+    assert sum("?[2J??1mtaken" in line for line in lines) >= 3
+
+
 @pytest.mark.slow
 @pytest.mark.thorough  # a whole way to a bundle
 def test_the_five_commands_of_the_page_make_a_bundle(

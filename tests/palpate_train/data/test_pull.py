@@ -284,6 +284,41 @@ def test_a_hostile_archive_is_refused(ground: Ground, archive: bytes):
     assert not ground.here.exists()
 
 
+A, B = (f"run 0/sweep-{i:06d}" for i in (0, 1))
+LONG_NAME = tarfile.TarInfo.create_pax_global_header({"comment": "x" * (2 << 20)})
+STREAMS = {
+    "parts of one after another": ((f"{A}.json", f"{B}.json", f"{A}.npy", f"{B}.npy"), b""),
+    "a recording again and again": ((f"{A}.json",) * 3, b""),
+    "a header without end": ((f"{A}.json",), LONG_NAME),
+}
+"""Requested files in a stream, and the bytes before them."""
+
+
+@pytest.mark.parametrize(("names", "before"), STREAMS.values(), ids=STREAMS)
+def test_a_hostile_stream_takes_no_memory(ground: Ground, names: tuple[str, ...], before: bytes):
+    """Of parts that wait for their other part only one recording's are kept, each file comes once,
+    and headers have a limit: nothing of it is stored."""
+    held = io.BytesIO()
+    held.write(before)
+    with tarfile.open(fileobj=held, mode="w") as archive:
+        for name in names:
+            info = tarfile.TarInfo(name)
+            info.size = (ground.box / name).stat().st_size
+            archive.addfile(info, io.BytesIO((ground.box / name).read_bytes()))
+    (ground.bin / "archive").write_bytes(held.getvalue())
+    ground.ssh("tar", f"exec cat '{ground.bin}/archive'")
+    with pytest.raises((ApplianceError, FormatError), match=r"only 0 of 4|the box sends"):
+        ground.fetch()
+    assert not ground.here.exists()
+
+
+def test_a_list_without_end_is_refused(ground: Ground, monkeypatch: pytest.MonkeyPatch):
+    """It is not read to its end."""
+    monkeypatch.setattr(pull, "MAX_LIST", 100)
+    with pytest.raises(FormatError, match="user@box lists files"):
+        ground.fetch()
+
+
 def test_a_member_beyond_all_size_is_refused(ground: Ground):
     """Refused before its bytes are read: the archive holds only its header."""
     info = tarfile.TarInfo("run 0/sweep-000000.json")

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from palpate.core.errors import FormatError
+from palpate.core.text import printable, say
 from palpate_train.arguments import numbers
 from palpate_train.data import labels, readers, sets
 from palpate_train.data.progress import ProgressLine, StageLine, spoken
@@ -147,7 +148,7 @@ def load(args: argparse.Namespace, seed: int = 1) -> sets.Dataset:
     whole = sets.join([labels.renamed(sweeps, pairs) for sweeps in loaded])
     part = whole.select(args.only)
     for line in [*warnings_of(part if args.only else whole), *set_warnings.of_set(part)]:
-        print(f"palpate-train: {line}", file=sys.stderr)
+        say(f"palpate-train: {line}", file=sys.stderr)
     return part
 
 
@@ -197,14 +198,14 @@ class Log:
                 self._check()
             self._stage = line
         if sys.stderr.isatty():
-            self._shown().update(0, description=line, **_share(line))
+            self._shown().update(0, description=printable(line), **_share(line))
         elif time.monotonic() - self._last > LOG_EVERY_S:
             self._last = time.monotonic()
-            print(line, file=sys.stderr, flush=True)
+            say(line, file=sys.stderr)
 
     def keep(self, line: str) -> None:
         """Show `line` at once and permanently."""
-        print(line, file=sys.stderr, flush=True)
+        say(line, file=sys.stderr)
 
     def end(self) -> None:
         """The work has ended: the last stage gets its line, and the bar disappears."""

@@ -11,10 +11,10 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from io import TextIOWrapper
 
 from palpate.core.errors import ApplianceError
 from palpate.core.interrupts import INTERRUPTED, during_imports, during_work
+from palpate.core.text import replace_unprintable, say
 
 Run = Callable[[argparse.Namespace], None]
 """Runs a command."""
@@ -56,9 +56,7 @@ class Program:
     def run(self, argv: Sequence[str] | None = None) -> int:
         """Run one command; its exit code. An error of this project is a line on standard error."""
         words = sys.argv[1:] if argv is None else list(argv)
-        for stream in (sys.stdout, sys.stderr):
-            if isinstance(stream, TextIOWrapper):  # show ? for what the terminal's encoding lacks
-                stream.reconfigure(errors="replace")
+        replace_unprintable()
         args = argparse.Namespace()
         try:
             with during_imports(self.name):
@@ -72,7 +70,7 @@ class Program:
                 args.run(args)
             sys.stdout.flush()
         except ApplianceError as e:
-            print(f"{self.name}: {e}", file=sys.stderr)
+            say(f"{self.name}: {e}", file=sys.stderr)
             return e.exit_code
         except BrokenPipeError:
             # the reader of the output has closed it; nothing can be printed any more, not even when
@@ -80,12 +78,12 @@ class Program:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 1
         except (OSError, MemoryError) as e:
-            print(f"{self.name}: {_fault(e)}", file=sys.stderr)
+            say(f"{self.name}: {_fault(e)}", file=sys.stderr)
             return ApplianceError.exit_code
         except KeyboardInterrupt:
             resumes = getattr(args, "resumes", hasattr(args, "cache"))
             kept = "goes on where it was" if resumes else "begins anew"
-            print(f"{self.name}: interrupted; the same command {kept}", file=sys.stderr)
+            say(f"{self.name}: interrupted; the same command {kept}", file=sys.stderr)
             return INTERRUPTED
         return 0
 

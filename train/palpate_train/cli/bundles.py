@@ -16,6 +16,7 @@ from palpate.core.errors import FormatError
 from palpate.core.provenance import commit
 from palpate.core.storage import put
 from palpate.core.sweep_set import read
+from palpate.core.text import say
 from palpate.inference.classifier import Classifier
 from palpate_train.answer import (
     altered_sweeps,
@@ -88,8 +89,8 @@ def run_export(args: argparse.Namespace) -> None:
     rest = made.about.get("rest")
     what = "the sweeps that fit --split left out" if rest else "sweeps that the fit has not seen"
     command = shlex.join(["palpate-train", "score", str(args.out), "--set", rest or "SET"])
-    print(f"to score it on {what}: {command}")
-    print(options.report_line(args.out, rest or ""))
+    say(f"to score it on {what}: {command}")
+    say(options.report_line(args.out, rest or ""))
 
 
 def run_score(args: argparse.Namespace) -> None:
@@ -101,14 +102,14 @@ def run_score(args: argparse.Namespace) -> None:
     seen = _seen(loaded.manifest, sweeps)
     if args.json:
         put(args.json, (json.dumps(found.json() | {"trained_on": seen}, indent=1) + "\n").encode())
-    print(found.text())
+    say(*found.text().split("\n"))
     if seen and seen["sweeps"]:
-        print(
+        say(
             f"warning: {seen['sweeps']} of {seen['of']} sweeps are the very ones that the bundle "
             "was fitted to; they say nothing of new ones: score sweeps that it has not seen"
         )
     elif not seen and loaded.manifest.made.get("set") == sweeps.source:
-        print(
+        say(
             f"the bundle was fitted to a set of this name, {sweeps.source}: sweeps that it "
             "has seen say nothing of new ones"
         )
@@ -134,29 +135,29 @@ def _print(manifest: Manifest, out: Path) -> None:
     """Print the figures of a bundle and its size; also why it is not in int8 or cannot detect
     contact, if so."""
     if why := manifest.made.get("float_because"):
-        print(f"the model is in float, which takes more time than int8: {why}")
+        say(f"the model is in float, which takes more time than int8: {why}")
     if why := manifest.made.get("contact_unknown_because"):
-        print(f"no-contact cannot be detected: {why}")
+        say(f"no-contact cannot be detected: {why}")
     for line in formatting.figure_lines(manifest.figures):
-        print(line)
-    print(fit_taxels.text(manifest))
+        say(line)
+    say(fit_taxels.text(manifest))
     if manifest.known:
-        print(altered_sweeps.text(manifest.figures))
+        say(altered_sweeps.text(manifest.figures))
     for part in (quantized_bundle, fit_early, fit_displacement, fit_slide):
         if text := part.text(manifest):
-            print(text)
+            say(text)
     if few := [
         f"{board} wires {bits}"
         for board, bits in _class_bits().items()
         if 1 << bits <= len(manifest.labels)
     ]:
         needed = len(manifest.labels).bit_length()
-        print(
+        say(
             f"answers on GPIO lines: {len(manifest.labels)} labels need {needed} of "
             f"output.class_bits; {', '.join(few)}"
         )
     size = measure.sizes(out)[1]
-    print(f"bundle: {manifest.name} {manifest.version}, {size} bytes in {out}")
+    say(f"bundle: {manifest.name} {manifest.version}, {size} bytes in {out}")
 
 
 def _class_bits() -> dict[str, int]:

@@ -10,6 +10,7 @@ from typing import Any
 
 from palpate.core.errors import FormatError
 from palpate.core.storage import put
+from palpate.core.text import say
 from palpate_train.arguments import options
 from palpate_train.arguments.program import Add
 from palpate_train.data.sets import Dataset
@@ -22,7 +23,7 @@ class ListMethods(argparse.Action):
     """Prints a line for each method and ends the process (--list)."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
-        print("\n".join(method_lines()), flush=True)
+        say(*method_lines())
         parser.exit()
 
 
@@ -119,7 +120,7 @@ def run_evaluate(args: argparse.Namespace) -> None:
             continue
         about = {"only": args.only, "each": args.each, "baselines": trivially[result.protocol]}
         results.append(result.json() | about)
-        print(evaluate.line(results[-1]), flush=True)
+        say(evaluate.line(results[-1]))
         if args.json:
             results[-1] |= {"each_fold": result.each_fold()}
             results.sort(
@@ -145,9 +146,9 @@ def _beside(sweeps: Dataset, plan: evaluate.Plan, log: options.Log) -> dict[str,
         for line in set_warnings.of_protocol(sweeps, text, folds[text]):
             log.keep(f"palpate-train: {line}")
     found = {text: trivial.figures(known, folds[text]) for text in plan.protocols}
-    print(evaluate.HEADER)
+    say(*evaluate.HEADER.split("\n"))
     for text in plan.protocols:
-        print(*trivial.lines(text, plan.means_removed, found[text]), sep="\n", flush=True)
+        say(*trivial.lines(text, plan.means_removed, found[text]))
     return found
 
 

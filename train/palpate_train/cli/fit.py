@@ -14,6 +14,7 @@ from typing import Any
 
 from palpate.core.errors import FormatError
 from palpate.core.storage import put
+from palpate.core.text import say
 from palpate_train.arguments import numbers, options, scene_file
 from palpate_train.arguments.program import Add
 from palpate_train.data import extras, labels
@@ -192,7 +193,7 @@ def run_fit(args: argparse.Namespace) -> None:
         _fit_method(args, sweeps)
         return
     if args.steps and not extras.installed("torch"):
-        print(f"no trained stages, which need torch: {extras.advice('torch')}, or --steps 0")
+        say(f"no trained stages, which need torch: {extras.advice('torch')}, or --steps 0")
     memory.check(sweeps, min(len(sweeps), args.most_sweeps))
     made, change, unfinished = _fitted(args, sweeps)
     if args.rest and rest:
@@ -200,19 +201,19 @@ def run_fit(args: argparse.Namespace) -> None:
         made = replace(made, about=made.about | {"rest": str(args.rest)})
     made.save(args.out)
     shutil.rmtree(unfinished, ignore_errors=True)
-    print(f"fit: {len(made.train)} sweeps, {made.train.format}; {args.out}")
+    say(f"fit: {len(made.train)} sweeps, {made.train.format}; {args.out}")
     if len(sweeps) > args.most_sweeps:
-        print(
+        say(
             f"used: {args.most_sweeps} of {len(sweeps)} sweeps, some of each recording; "
             "--most-sweeps N uses more, with more memory and time"
         )
     _print_held_out(made)
     if beside := trivial.beside_a_fit(sweeps, args.varies):
         told = "; ".join(f"{name} {formatting.counted(figure)}" for name, figure in beside.items())
-        print(f"trivial baselines on held-out parts: {told}")
+        say(f"trivial baselines on held-out parts: {told}")
     if args.rest and rest:
-        print(f"rest: {len(rest)} sweeps in {args.rest}, which no part of the fit has seen")
-    print(_next_commands(args.out, [str(args.rest)] if args.rest and rest else args.sets))
+        say(f"rest: {len(rest)} sweeps in {args.rest}, which no part of the fit has seen")
+    say(*_next_commands(args.out, [str(args.rest)] if args.rest and rest else args.sets))
 
 
 def _fit_method(args: argparse.Namespace, sweeps: Dataset) -> None:
@@ -220,11 +221,11 @@ def _fit_method(args: argparse.Namespace, sweeps: Dataset) -> None:
     (method,) = methods.find([args.method], options.effort(args))
     _, made = MethodFit.of(method, sweeps, args.seed)
     made.save(args.out)
-    print(f"fit: {made.about['method']} to {len(made.train)} sweeps; {args.out}")
-    print(_next_commands(args.out, args.sets))
+    say(f"fit: {made.about['method']} to {len(made.train)} sweeps; {args.out}")
+    say(*_next_commands(args.out, args.sets))
 
 
-def _next_commands(out: Path, judges: Sequence[str]) -> str:
+def _next_commands(out: Path, judges: Sequence[str]) -> list[str]:
     """The commands after a fit, as they can be pasted. judges: the sets to judge the bundle on."""
     folder = out.with_suffix("") if out.suffix else out.with_name(f"{out.name}-bundle")
     sets = [word for one in judges for word in ("--set", one)]
@@ -234,7 +235,7 @@ def _next_commands(out: Path, judges: Sequence[str]) -> str:
         ["score", str(folder), *sets],
         ["report", str(out), *sets, "--out", str(out.with_suffix(".html"))],
     )
-    return "\n".join(["next:", *(f"  palpate-train {shlex.join(words)}" for words in commands)])
+    return ["next:", *(f"  palpate-train {shlex.join(words)}" for words in commands)]
 
 
 def _check(args: argparse.Namespace) -> None:
@@ -277,7 +278,7 @@ def _fitted(args: argparse.Namespace, sweeps: Dataset) -> tuple[Fit, Change, Pat
     made = recipe.fit(sweeps, run, settings)
     log.end()
     held_out = formatting.counted(made.about["validation"])
-    print(f"chosen: {made.about['chosen']}; {held_out} of held-out parts")
+    say(f"chosen: {made.about['chosen']}; {held_out} of held-out parts")
     return made, WHOLE, unfinished
 
 
@@ -304,8 +305,8 @@ def _chosen(
     page = args.out.with_name(f"{args.out.stem}-why") / "index.html"
     put(page.with_name("choice.json"), (json.dumps(result, indent=1) + "\n").encode(), parents=True)
     put(page, selection_report.page(result).encode(), parents=True)
-    print(selection_report.text(result))
-    print(f"why: {page}")
+    say(*selection_report.text(result).split("\n"))
+    say(f"why: {page}")
     return replace(made, about=made.about | {"size": choice.chosen}), change
 
 
@@ -344,35 +345,33 @@ def _print_held_out(made: Fit) -> None:
     """Print the accuracy on the sweeps that judged the fit, and how they differ from those of
     --rest."""
     if made.about["held_out_by"] == "nothing":
-        print(
+        say(
             "nothing was held out that could judge the model, so export will refuse it: "
             f"{made.uncalibrated}"
         )
         return
     conditions = made.about["conditions"]
     if conditions == ["recording"]:
-        print(
-            "recorded under one condition: expect less under another; these figures are optimistic"
-        )
-    print(
+        say("recorded under one condition: expect less under another; these figures are optimistic")
+    say(
         f"held-out {', '.join(conditions)}: sweeps of this set, by heads that did not see their "
         f"{' or '.join(conditions)}; slightly too high, since they also helped to choose the model"
     )
     for name in conditions:
         if name != "recording" and len(made.values(name)) == 2:
-            print(
+            say(
                 f"there are two values of {name}: its figures are of heads that know only one, "
                 "so expect more"
             )
     for name in sorted(set(made.train.groups) - {*OF_THE_SET, *conditions}):
         if len(made.values(name)) == 1:
-            print(f"every sweep has the same {name}: expect less at another, no figure shows it")
+            say(f"every sweep has the same {name}: expect less at another, no figure shows it")
     if made.calibration:
-        print(*formatting.figure_lines(figures := made.held_out_figures()), sep="\n")
+        say(*formatting.figure_lines(figures := made.held_out_figures()))
         if len(conditions) > 1:
             mean = sum(figures[f"held-out {name}"]["accuracy"] for name in conditions)
             share = formatting.percent(mean / len(conditions))
-            print(f"to expect where one of these is new, as the box answers: {share} (their mean)")
+            say(f"to expect where one of these is new, as the box answers: {share} (their mean)")
     else:  # too few sweeps to judge by
         alone = formatting.counted(made.about["validation"])
-        print(f"network alone: {alone}; nothing judges the box's answers: {made.uncalibrated}")
+        say(f"network alone: {alone}; nothing judges the box's answers: {made.uncalibrated}")

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from palpate.core.errors import FormatError
 from palpate.core.storage import put
+from palpate.core.text import printable, say
 from palpate.core.types import DATA_TYPES
 from palpate_train.arguments import numbers, options
 from palpate_train.arguments.program import Add
@@ -101,10 +102,10 @@ def run(args: argparse.Namespace) -> None:
         taken = made.taken
         made.sweeps.save(args.out)
     finally:
-        print(*_left_out(left_out), sep="\n", end="\n" * bool(left_out))
+        say(*_left_out(left_out))
         if args.report:
             put(args.report, _report(taken, left_out).encode(errors="replace"))
-    print("\n".join([*_taken(made), *summary.description(made.sweeps), f"set: {args.out}"]))
+    say(*_taken(made), *summary.description(made.sweeps), f"set: {args.out}")
     if broken := sum(one.broken for one in left_out):
         raise FormatError(
             f"{broken} of {broken + len(taken)} files could not be used, as said above; "
@@ -183,4 +184,6 @@ def _report(taken: Sequence[Taken], left_out: Sequence[LeftOut]) -> str:
     for one in taken:
         notes = f"; {one.notes}" if one.notes else ""
         lines[one.name] = f"taken: {one.windows} windows of {one.frames} frames{notes}"
-    return "".join(f"{name}\t{line}\n" for name, line in sorted(lines.items()))
+    return "".join(
+        f"{printable(name)}\t{printable(line)}\n" for name, line in sorted(lines.items())
+    )

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from palpate.core.provenance import commit
 from palpate.core.storage import put
+from palpate.core.text import say
 from palpate_train.arguments import options
 from palpate_train.arguments.program import Add
 from palpate_train.data import extras, sets
@@ -72,4 +73,4 @@ def run_report(args: argparse.Namespace) -> None:
     put(args.out, bundle_report.page(figures, sweeps).encode(), parents=True)
     if args.json:
         put(args.json, (json.dumps(figures, allow_nan=False) + "\n").encode())
-    print(args.out)
+    say(str(args.out))

@@ -8,6 +8,7 @@ from pathlib import Path
 from palpate.core import outputs
 from palpate.core.errors import FormatError
 from palpate.core.storage import put
+from palpate.core.text import say
 from palpate_train.arguments import numbers, options
 from palpate_train.arguments.program import Add
 from palpate_train.data import extras, lerobot_writer, pull, sets, summary
@@ -82,12 +83,13 @@ def _add_pull(add: Add) -> None:
 
 def run_known(args: argparse.Namespace) -> None:
     """Print the sets that can be named."""
-    print(summary.known())
+    say(*summary.known().split("\n"))
 
 
 def run_describe(args: argparse.Namespace) -> None:
     """Print the content of the named sets."""
-    print("\n\n".join(summary.describe(spec, set_warnings.of_set) for spec in args.sets))
+    for number, spec in enumerate(args.sets):
+        say(*[""] * bool(number), *summary.describe(spec, set_warnings.of_set).split("\n"))
 
 
 def run_view(args: argparse.Namespace) -> None:
@@ -113,12 +115,12 @@ def run_view(args: argparse.Namespace) -> None:
         shown = sweep_pages.chosen(found, span)
         made = sweep_pages.page(found, shown, options.Log())
         if span is None and len(shown) < found.count:
-            print(
+            say(
                 f"{len(shown)} of {found.count} sweeps, from all over the set; --number "
                 "FIRST-LAST shows others"
             )
     put(args.out, made.encode(), parents=True)
-    print(args.out)
+    say(str(args.out))
 
 
 def run_lerobot(args: argparse.Namespace) -> None:
@@ -126,7 +128,7 @@ def run_lerobot(args: argparse.Namespace) -> None:
     sweeps = sets.load(args.set)
     lerobot_writer.write(sweeps, args.out)
     frames = len(sweeps) * sweeps.format.window
-    print(f"{args.out}: {len(sweeps)} episodes of {len(sweeps.materials)} tasks, {frames} frames")
+    say(f"{args.out}: {len(sweeps)} episodes of {len(sweeps.materials)} tasks, {frames} frames")
 
 
 def run_pull(args: argparse.Namespace) -> None:
@@ -139,12 +141,9 @@ def run_pull(args: argparse.Namespace) -> None:
     try:
         pull.pull(box, args.out, report, options.Log())
     finally:
-        print(
-            (
-                f"fetched {len(report.fetched)}, there already {len(report.present)}, refused "
-                f"{len(report.refused)}"
-            ),
-            flush=True,
+        say(
+            f"fetched {len(report.fetched)}, there already {len(report.present)}, refused "
+            f"{len(report.refused)}"
         )
         _print(report, args.out)
     if bad := len(report.refused) + len(report.different):
@@ -175,4 +174,4 @@ def _print(report: pull.PullReport, out: Path) -> None:
     ):
         if names:
             more = f" and {len(names) - pull.SHOWN} more" if len(names) > pull.SHOWN else ""
-            print(f"{', '.join(sorted(names)[: pull.SHOWN])}{more}: {what}")
+            say(f"{', '.join(sorted(names)[: pull.SHOWN])}{more}: {what}")

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from palpate.bundle import bundle
+from palpate.core.text import say
 from palpate_train.arguments import numbers
 from palpate_train.export import sign
 
@@ -37,7 +38,7 @@ def register(add: Add) -> None:
 def run(args: argparse.Namespace) -> None:
     """Sign the bundle; print its name, version, counter and identity."""
     signed = sign.sign(args.bundle, args.key or sign.own_key(), args.counter)
-    print(
+    say(
         f"signed: {signed.name} {signed.version}, counter {signed.counter}, "
         f"{bundle.identity(signed.json())} in {args.bundle}"
     )

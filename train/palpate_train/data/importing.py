@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 
 from palpate.core.errors import FormatError
 from palpate.core.names import shown
+from palpate.core.text import printable
 from palpate.core.types import DATA_TYPES
 from palpate_train.data import frames, labels, lerobot, number_types, raw_files, readers, sampling
 from palpate_train.data.file_names import NamePattern, group
-from palpate_train.data.files.table import MOST_LISTED, ReadPlan, Table, normal, printable
+from palpate_train.data.files.table import MOST_LISTED, ReadPlan, Table, normal
 from palpate_train.data.import_plan import ImportPlan
 from palpate_train.data.progress import Progress
 from palpate_train.data.sets import Dataset

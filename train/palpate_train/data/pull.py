@@ -19,12 +19,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO
+from typing import IO, cast
 
 from palpate.core import storage
 from palpate.core.config import StoreConfig
 from palpate.core.errors import ApplianceError, FormatError
 from palpate.core.sweep_file import load
+from palpate.core.text import say
 from palpate_train.data.progress import Progress
 
 FOLDER = f"{StoreConfig().folder}/sweeps"
@@ -55,6 +56,10 @@ SEND = 'cd -- "$1" && exec tar -c --null -T - -f -'
 LISTED = re.compile(rb"([0-9a-f]{64})  \./(.+)", re.S)
 MAX_BYTES = 1 << 30
 """Largest file that is accepted."""
+MAX_LIST = 1 << 26
+"""Longest list of files that is accepted, in bytes: half a million files."""
+MAX_HEADERS = 1 << 20
+"""Most bytes before a file in the stream, which tarfile reads into memory."""
 SHOWN = 5
 """Largest number of names in a line of the report."""
 
@@ -91,15 +96,17 @@ class RecordingHost:
                 try:
                     assert process.stdout
                     yield process.stdout
-                    process.stdout.read()
+                    while process.stdout.read(1 << 16):
+                        pass
                 except BaseException:
                     process.kill()
                     raise
                 code = process.wait()
             errors.seek(0)
-            messages = " / ".join(errors.read().decode(errors="replace").split("\n")).strip(" /")
+            said = errors.read(1 << 16).decode(errors="replace")
+            messages = " / ".join(said.split("\n")).strip(" /")
         if messages:
-            print(f"{self.host}: {messages}", file=sys.stderr)
+            say(f"{self.host}: {messages}", file=sys.stderr)
         self._check(code)
 
     def _check(self, code: int) -> None:
@@ -168,7 +175,13 @@ def listing(box: RecordingHost) -> dict[str, str]:
     """The SHA-256 of each file on the box, by its path. Raises FormatError if the box sends
     something else."""
     with box.output(LIST) as stream:
-        lines = stream.read().split(b"\0")
+        data = stream.read(MAX_LIST + 1)
+        if len(data) > MAX_LIST:
+            raise FormatError(
+                f"{box.host} lists files without end; check that box, or name a smaller folder "
+                "with --from"
+            )
+    lines = data.split(b"\0")
     listed = {}
     for line in filter(None, lines):
         if not (found := LISTED.fullmatch(line)):
@@ -213,27 +226,46 @@ def _sha256(path: Path) -> str | None:
         return None
 
 
+class _Bounded:
+    """A stream of a box, of which `left` bytes may still be read."""
+
+    def __init__(self, stream: IO[bytes]) -> None:
+        self._stream, self.left = stream, MAX_HEADERS
+
+    def read(self, size: int) -> bytes:
+        """Raises FormatError if it is more than that."""
+        self.left -= size
+        if self.left < 0:
+            raise FormatError("the box sends more than was requested; check that box")
+        return self._stream.read(size)
+
+
 def _pairs(stream: IO[bytes], names: Sequence[str]) -> Iterator[tuple[str, dict[str, bytes]]]:
-    """Each recording as soon as both of its files have arrived.
+    """Each recording as soon as both of its files have arrived, one after the other as requested;
+    at most these two are in memory.
 
     names: the requested files. Raises FormatError if the archive holds anything else: a link, a
-    device, a path outside the folder, or a file of more than MAX_BYTES. A stream that is cut off
-    ends the iteration.
+    device, a path outside the folder, a file twice, or a file of more than MAX_BYTES. A stream that
+    is cut off ends the iteration.
     """
     requested = set(names)
     received: dict[str, bytes] = {}
+    bounded = _Bounded(stream)
     try:
-        with tarfile.open(fileobj=stream, mode="r|") as archive:
+        with tarfile.open(fileobj=cast("IO[bytes]", bounded), mode="r|") as archive:
             for member in archive:
                 name = member.name
                 if not member.isreg() or name not in requested or member.size > MAX_BYTES:
                     raise FormatError(
                         f"the box sends {name!r}, which was not requested; check that box"
                     )
+                requested.remove(name)
+                bounded.left = member.size + MAX_HEADERS
                 file = archive.extractfile(member)
                 assert file
-                received[name] = file.read()
                 recording, _, _ = name.rpartition(".")
+                received = {k: v for k, v in received.items() if k.startswith(f"{recording}.")}
+                received[name] = file.read()
                 if all(recording + suffix in received for suffix in PAIR):
                     yield recording, {suffix: received.pop(recording + suffix) for suffix in PAIR}
     except (tarfile.TarError, EOFError):

@@ -15,6 +15,7 @@ import numpy as np
 
 from palpate.core.errors import FormatError
 from palpate.core.sweep_set import Array
+from palpate.core.text import printable
 from palpate.sim import skin
 from palpate.sweeps.sweep_folder import RecordedSweep
 from palpate_train.data import labels, readers, sets
@@ -34,13 +35,9 @@ def describe(spec: str, check: Check = lambda _: ()) -> str:
     folder = Path(spec)
     if spec.startswith("sim:") or not folder.is_dir():
         whole = sets.load(spec, 1)
-        return "\n".join(
-            [
-                *description(whole),
-                *(f"  {line}" for line in [*warnings_of(whole), *check(whole)]),
-                *_unsendable(whole.materials),
-            ]
-        )
+        said = [*description(whole), *(f"  {line}" for line in warnings_of(whole))]
+        said += [*(f"  {line}" for line in check(whole)), *_unsendable(whole.materials)]
+        return "\n".join(map(printable, said))
     recorded = readers.read_recorded(folder)
     whole = readers.from_recorded(_named(recorded), folder, Dataset)
     lines = [*description(whole), *(f"  {line}" for line in partly_unknown_tare(whole))]
@@ -56,12 +53,8 @@ def describe(spec: str, check: Check = lambda _: ()) -> str:
         lines += [f"  {line}" for line in check(trainable)]
     except FormatError as e:
         lines.append(f"  cannot be trained on yet: {e}")
-    return "\n".join(
-        [
-            *lines,
-            *_unsendable(sorted({one.sweep.material for one in readers.usable(recorded)} - {""})),
-        ]
-    )
+    lines += _unsendable(sorted({one.sweep.material for one in readers.usable(recorded)} - {""}))
+    return "\n".join(map(printable, lines))
 
 
 def warnings_of(sweeps: Dataset) -> list[str]:

@@ -21,6 +21,7 @@ from scipy.signal import spectrogram, welch
 
 from palpate.core.errors import FormatError
 from palpate.core.sweep_set import Array
+from palpate.core.text import printable
 from palpate.core.types import SweepFormat
 from palpate.sweeps.sweep_folder import RecordedSweep
 from palpate_train.data import readers, sets
@@ -251,7 +252,7 @@ def draw(sweep: ShownSweep, plain: bool = True) -> str:
             f"stronger colour for more, over {RANGE_DB} dB"
         )
     _caption(page, SPECTROGRAM[0] - 0.13, text)
-    return to_svg(figure, f"one sweep: {_printable(sweep.title)}", plain=plain)
+    return to_svg(figure, f"one sweep: {printable(sweep.title, '�')}", plain=plain)
 
 
 def _runs(sweep: ShownSweep, taxels: Array) -> list[tuple[int, Array]]:
@@ -285,10 +286,10 @@ def _caption(page: Axes, y: float, text: str) -> None:
 
 def _head(page: Axes, sweep: ShownSweep) -> None:
     """Title and notes, as many as fit into three lines."""
-    title = _cut(_printable(sweep.title), 80)
+    title = _cut(printable(sweep.title, "�"), 80)
     write(page, 0.12, 0.2, title, size=MEDIUM + 3, weight="bold", ha="left")
     lines = [""]
-    for note in map(_printable, sweep.notes):
+    for note in (printable(note, "�") for note in sweep.notes):
         together = f"{lines[-1]} · {note}" if lines[-1] else note
         lines = [*lines[:-1], together] if len(together) <= LINE else [*lines, note]
     for i, line in enumerate(lines[:3]):
@@ -449,10 +450,6 @@ def _thinned(time_s: Array, counts: Array) -> tuple[Array, Array]:
 def _edges(n: int, most: int) -> Array:
     """Ends [k + 1] of the k parts, at most `most`, into which n items are divided."""
     return np.linspace(0, n, min(most, n) + 1).astype(int)
-
-
-def _printable(text: str) -> str:
-    return "".join(c if c.isprintable() else "�" for c in text)
 
 
 def _cut(text: str, longest: int) -> str:

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from palpate.core.errors import FormatError
+from palpate.core.text import printable
 from palpate_train.data.extras import library
-from palpate_train.data.files.table import Array, ReadPlan, Table, from_columns, normal, printable
+from palpate_train.data.files.table import Array, ReadPlan, Table, from_columns, normal
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 WHAT = "a recording of ROS"

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core.errors import FormatError
+from palpate.core.text import printable
 
 Array = NDArray[Any]
 MOST_LISTED = 12
@@ -95,11 +96,6 @@ class Entry:
 def normal(name: str) -> str:
     """A name in Unicode's composed form (NFC), so that equal names have equal characters."""
     return unicodedata.normalize("NFC", name)
-
-
-def printable(name: str) -> str:
-    """A name from a file, safe for a terminal: names in a damaged file may hold any bytes."""
-    return name if name.isprintable() else repr(name)
 
 
 def excerpt(text: str) -> str:
