@@ -56,8 +56,8 @@ class Feed:
     """The feed at `path`. `read` connects if that is needed, so a missing box is not an error.
 
     frames_hz, sweeps: requested at each connection, see `ask`. trouble: the reason why nothing is
-    read now, "" if the feed is there. Only one thread may use it; `fileno` is for waiting
-    elsewhere.
+    read now, "" once a line has come: a socket that only takes connections is no feed. Only one
+    thread may use it; `fileno` is for waiting elsewhere.
     """
 
     def __init__(
@@ -69,7 +69,8 @@ class Feed:
         clock: Clock | None = None,
     ) -> None:
         self.path = Path(path)
-        self.trouble = "not connected yet"
+        self.trouble = "nothing has come yet; see palpate status"
+        self._reason = ""  # of the box, for closing this connection
         self._asked: dict[str, Any] = {"frames": frames_hz, "sweeps": sweeps}
         self._clock = clock or SystemClock()
         self._retry_ns = self._clock.now_ns()
@@ -89,9 +90,8 @@ class Feed:
         while True:
             line = self.read(10.0)
             if line is None:
-                raise FeedError(
-                    f"{self.path}: {self.trouble or 'nothing came for 10 s; see palpate status'}"
-                )
+                why = self.trouble or "nothing came for 10 s; see palpate status"
+                raise FeedError(f"{self.path}: {why}")
             yield line
 
     @property
@@ -139,7 +139,7 @@ class Feed:
         """Close, and connect again after a while. why: `trouble` until then, unless the box has
         sent a reason."""
         self.close()
-        self.trouble = self.trouble or why
+        self.trouble, self._reason = self._reason or why, ""
         self._retry_ns = self._clock.now_ns() + RETRY_NS
 
     def _connect(self) -> bool:
@@ -156,7 +156,7 @@ class Feed:
             connection.close()
             self.trouble = _why(e)
             return False
-        self._connection, self.trouble = connection, ""
+        self._connection = connection
         self._request()
         return self._connection is not None
 
@@ -182,8 +182,9 @@ class Feed:
             self.lose(str(e))
         else:
             for line in lines:
-                if line["type"] == "closed":  # the box gives its reason before it closes
-                    self.trouble = str(line.get("why"))
+                # the box gives its reason before it closes
+                self._reason = str(line.get("why")) if line["type"] == "closed" else ""
+                self.trouble = self._reason
             self._lines += lines
 
 

@@ -51,6 +51,6 @@ class PageWatcher:
             except FormatError as e:
                 self.feed.close()
                 trouble = str(e)
-        if not self.feed.connected:
+        if trouble:
             self.board.away(trouble)
-        self._log.update(trouble if not self.feed.connected else "")
+        self._log.update(trouble)

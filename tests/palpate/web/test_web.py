@@ -100,7 +100,7 @@ def test_a_box_that_ends_and_comes_back_with_another_bundle(watcher: PageWatcher
     history has the changes."""
     offered = Offered(path)
     reader = EventReader(watcher.server)
-    assert heard(watcher, offered, "box", reader) == {"there": True, "why": ""}
+    heard(watcher, offered, "box", reader, wanted={"there": True, "why": ""})
     heard(watcher, offered, "health", reader)
     offered.turns(3, HEALTH._replace(skin="lost", trouble="unplugged", ready=False))
     assert heard(watcher, None, "state", reader)["trouble"] == "unplugged"
