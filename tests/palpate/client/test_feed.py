@@ -132,7 +132,7 @@ def test_a_loop_over_lines_ends_with_the_reason(feed: Feed, monkeypatch: pytest.
 
 
 def test_a_box_is_read_and_its_reason_is_kept(tmp_path: Path):
-    """Silence does not end a connection, though it is a trouble, and verdicts come. After an invalid request the box's
+    """Silence does not end a connection, and verdicts come. After an invalid request the box's
     reason is in `trouble`, and is a line of its own."""
     offered = Offered(tmp_path / "feed.sock")
     offered.turns()
