@@ -35,6 +35,8 @@ def settle(kind: str, args: argparse.Namespace, settings: Config) -> None:
     if args.listen is None:
         args.listen = f"{settings.bridge.address}:{PORTS[kind]}"
     args.allow_writes = args.allow_writes or settings.bridge.allow_writes
+    if kind == "tcp":
+        args.short = args.short or settings.bridge.short
     if args.port or args.link or args.feed:
         return
     if settings.serial.port == LINKS[kind]:
@@ -68,7 +70,8 @@ def _tcp(args: argparse.Namespace) -> Served:
 
     name, opener = _port(args)
     loop = asyncio.get_running_loop()
-    bridge = TcpBridge(name, opener, writes=args.allow_writes, most=args.most, loop=loop)
+    options = {"writes": args.allow_writes, "short": args.short, "most": args.most}
+    bridge = TcpBridge(name, opener, **options, loop=loop)
     return bridge.server, name, partial(asyncio.sleep, 0), bridge.close
 
 

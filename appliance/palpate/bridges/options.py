@@ -62,6 +62,9 @@ def _add_server(one: argparse.ArgumentParser, kind: str) -> None:
     one.add_argument("--listen", metavar="HOST:PORT", help=text)
     text = "peers may start, stop, tare and abort, even if bridge.allow_writes is false"
     one.add_argument("--allow-writes", action="store_true", help=text)
+    if kind == "tcp":
+        text = "sentences of at most 80 characters, without their last fields (bridge.short)"
+        one.add_argument("--short", action="store_true", help=text)
     text = f"most connections at a time (default {MOST})"
     one.add_argument("--most", type=_number, default=MOST, metavar="N", help=text)
 

@@ -25,7 +25,8 @@ QUESTIONS = ("ID", "STATE", "LABEL")
 
 
 class TcpBridge:
-    """Passes sentences on. writes: whether peers may send commands that change the box."""
+    """Passes sentences on. writes: whether peers may send commands that change the box. short: in
+    their short form."""
 
     def __init__(
         self,
@@ -33,10 +34,12 @@ class TcpBridge:
         opener: Callable[[], Any],
         *,
         writes: bool,
+        short: bool = False,
         most: int,
         loop: asyncio.AbstractEventLoop,
     ) -> None:
         self.server = TcpServer(self.serve, most)
+        self._to_peer = sentences.short if short else sentence
         self._writes, self._loop, self._asking = writes, loop, asyncio.Lock()
         self._next_s = 0.0  # earliest time of the next command to the box
         self._asked = ""  # the command that the box has not answered yet
@@ -58,7 +61,7 @@ class TcpBridge:
             self._loop.call_soon_threadsafe(self._pass_on, heard)
 
     def _pass_on(self, heard: Sentence) -> None:
-        line = sentence(heard.kind, *heard.fields)
+        line = self._to_peer(heard.kind, *heard.fields)
         # an answer that came too late, or that no peer has asked for, is dropped
         if heard.kind == "ANS":
             if heard.fields[:1] == [self._asked] and not self._answer.done():
@@ -98,4 +101,4 @@ class TcpBridge:
                     why = f"the box has not answered within {ANSWER_S:g} s; check whether it is on"
                 finally:
                     self._asked = ""
-        return sentence("ANS", command.kind, "error", why)
+        return self._to_peer("ANS", command.kind, "error", why)

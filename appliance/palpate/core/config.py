@@ -238,12 +238,14 @@ class BridgeConfig:
     """`palpate bridge` on the box; its options override these values.
 
     address: where it listens, at the port of its kind. allow_writes: whether peers may start, stop,
-    tare and abort. A bridge has no password. fingers: units whose answers `palpate bridge fuse`
+    tare and abort. A bridge has no password. short: sentences of at most 80 characters on TCP, for
+    controllers whose strings hold no more. fingers: units whose answers `palpate bridge fuse`
     fuses and sends on serial.port, separated by spaces, as in "left right".
     """
 
     address: str = "127.0.0.1"
     allow_writes: bool = False
+    short: bool = False
     fingers: str = ""
 
 

@@ -16,6 +16,8 @@ MOST_FINGERS = 4
 """Largest number of fingers of a hand."""
 MAX_LINE = 128
 """Longest sentence or command, in characters."""
+SHORT_LINE = 80
+"""Longest sentence in the short form, with its end: strings of RAPID hold 80 characters."""
 UNSAFE = re.compile(r"[^ -~]|[$*,!\\~^]")
 """Characters that no field may contain."""
 _PATTERN = re.compile(
@@ -56,6 +58,14 @@ def sentence(kind: str, *fields: object) -> bytes:
             return sentence(kind, *fields[:-1])
         body = body[: MAX_LINE - 6]
     return f"${body}*{checksum(body)}\r\n".encode("ascii")
+
+
+def short(kind: str, *fields: object) -> bytes:
+    """A sentence in the short form: without the last fields that do not fit SHORT_LINE. The first
+    five of RES, up to the probability, always fit."""
+    while len(line := sentence(kind, *fields)) > SHORT_LINE and fields:
+        fields = fields[:-1]
+    return line
 
 
 def answer(

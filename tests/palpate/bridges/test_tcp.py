@@ -21,7 +21,7 @@ from palpate.bridges.server import QUIET_S, TcpServer
 from palpate.bridges.source import LinkPort
 from palpate.client.box import Palpate
 from palpate.core.errors import CommandRefused, ConfigError
-from palpate.core.sentences import Sentence, sentence
+from palpate.core.sentences import Sentence, read, sentence
 from tests.factories.bridges import LONG_S, bridge, eventually
 from tests.factories.paths import ROOT
 from tests.factories.speaking_box import LABELS, SpeakingBox, finger, result, state
@@ -50,6 +50,36 @@ def test_the_client_works_through_it(box: SpeakingBox):
         fingers = client.result(LONG_S).fingers
         assert [(of.finger, of.label) for of in fingers] == [("left", "wood"), ("right", "")]
     assert [s.fields for s in box.heard if s.kind == "START"] == [["30.5", "1.5"]]
+
+
+LONG_LABEL = "plastic very rough, black"[:24].replace(",", " ")
+LONGEST = (
+    *(1_234_567, "1234567.123", "displaced", LONG_LABEL, "0.987", "0.981", 12, 1234, "1234.56"),
+    *("9f3c2a1b", "replay", "1.00", "a long detail about taxels that are broken"),
+)
+
+
+def test_the_short_form_fits_a_string_of_80_characters(box: SpeakingBox):
+    """RES, STA and answers, the longest of each: sentences that the client reads, with status,
+    label and probability; nothing else is left out where it fits."""
+    lines = [sentence("RES", *LONGEST), state(), result(2)]
+    with (
+        bridge("tcp", "--port", box.path, "--short") as address,
+        socket.create_connection(address, timeout=LONG_S) as peer,
+    ):
+        peer.sendall(b"$PPLP,START\r\n")
+        heard = peer.recv(4096)
+        box.say(*lines)
+        while heard.count(b"\n") < 1 + len(lines):
+            heard += peer.recv(4096)
+    found = [line + b"\n" for line in heard.split(b"\n")[:-1]]
+    assert all(len(line) <= 80 for line in found)
+    told = [read(line) for line in found]
+    assert [one.kind for one in told] == ["ANS", "RES", "STA", "RES"]
+    assert all(one.summed and not one.error for one in told)
+    assert told[0].fields[:2] == ["START", "error"]
+    assert told[1].fields[:5] == [str(value) for value in LONGEST[:5]]
+    assert told[3].fields == read(result(2)).fields[: len(told[3].fields)]
 
 
 def test_without_leave_questions_alone_are_passed_on(box: SpeakingBox):
