@@ -301,6 +301,18 @@ def test_everything_on_it_has_a_role_and_a_name(browser: Any, recorded: Recorded
     assert json.dumps(seen.requests).count(".js") == 6
 
 
+def test_a_material_may_be_called_as_things_of_script(browser: Any, recorded: RecordedPage):
+    """`constructor` and `valueOf` are names like others."""
+    seen = opened(browser, recorded)
+    for name in ("constructor", "valueOf"):
+        seen.page.fill("#material", name)
+        seen.page.press("#material", "Enter")
+        until(lambda name=name: seen.text("#now") == f"{name} at 1")
+        assert name in seen.page.locator("#counts th").all_inner_texts()
+        assert seen.page.input_value("#material") == name
+    assert not seen.errors
+
+
 def test_a_material_has_a_name_in_any_language(
     browser: Any, recorded: RecordedPage, tmp_path: Path
 ):

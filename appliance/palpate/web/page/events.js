@@ -2,6 +2,9 @@
 
 const SILENT_MS = 3000, RETRY_MS = 1000;
 
+/* An object of the program without what every object of script has: a material may be called "constructor". */
+function bare(name, value) { return value && typeof value === "object" && !Array.isArray(value) ? Object.setPrototypeOf(value, null) : value; }
+
 /* heard: functions by the name of an event, called with its content. connection(there, answers): called where it changes;
    answers: whether there is a program at all, which then has no news. What was kept for newcomers is no news either. */
 export function listen(heard, connection) {
@@ -23,7 +26,7 @@ export function listen(heard, connection) {
           newsAt = performance.now();
           connected(true);
         }
-        act(JSON.parse(event.data));
+        act(JSON.parse(event.data, bare));
       });
     }
   }
