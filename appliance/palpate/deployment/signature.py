@@ -30,7 +30,7 @@ DEADLINE_S, INTERACTIVE_S = 10.0, 120.0
 """Time limits for ssh-keygen: by itself, which takes some milliseconds on a desktop; and with a
 person who types a passphrase or touches a key."""
 LINE = re.compile(
-    r'[\w.@+-]+[ \t]+(namespaces="[^"]*"[ \t]+)?'
+    r'(?P<name>[\w.@+-]+)[ \t]+(namespaces="[^"]*"[ \t]+)?'
     r"(?P<kind>ssh-ed25519|ssh-rsa|ecdsa-sha2-nistp(256|384|521)"
     r"|sk-(ssh-ed25519|ecdsa-sha2-nistp256)@openssh\.com)"
     r"[ \t]+(?P<key>[A-Za-z0-9+/]+={0,2})([ \t].*)?",
@@ -50,7 +50,8 @@ def verify(message: bytes, signature: bytes, signers: Path, namespace: str = NAM
     """
     if len(signature) > MOST_SIGNATURE:
         raise BundleError(f"signature has more than {MOST_SIGNATURE} bytes; sign the bundle again")
-    with _as_file(_trusted(signers)) as allowed, _as_file(signature) as signed:
+    trusted = _trusted(signers)
+    with _as_file(trusted) as allowed, _as_file(signature) as signed:
         found = _keygen("find-principals", "-f", allowed, "-s", signed)
         names = found.stdout.decode(errors="replace").splitlines()
         if found.returncode or not names:
@@ -59,15 +60,18 @@ def verify(message: bytes, signature: bytes, signers: Path, namespace: str = NAM
                 "with a key that is there (palpate-train sign), or have the administrator add the "
                 "key"
             )
-        checked = _keygen(
-            "verify", "-f", allowed, "-I", names[0], "-n", namespace, "-s", signed, message=message
-        )
-    if checked.returncode:
-        raise BundleError(
-            f"signature of {names[0]} does not fit the manifest ({_output(checked)}); copy the "
-            "bundle again, or sign it again (palpate-train sign)"
-        )
-    return names[0]
+        refused = []
+        for name in _holders(names[0], trusted):
+            checked = _keygen(
+                "verify", "-f", allowed, "-I", name, "-n", namespace, "-s", signed, message=message
+            )
+            if not checked.returncode:
+                return name
+            refused.append(_output(checked))
+    raise BundleError(
+        f"signature of {names[0]} does not fit the manifest ({refused[0]}); copy the "
+        "bundle again, or sign it again (palpate-train sign)"
+    )
 
 
 def sign(
@@ -122,6 +126,14 @@ def _trusted(signers: Path) -> bytes:
                 "as in a .pub file, without dates: a box may not know the time"
             )
     return "\n".join([*lines, ""]).encode()
+
+
+def _holders(name: str, trusted: bytes) -> list[str]:
+    """The names of all lines with a key of `name`, which comes first. ssh-keygen finds the first
+    line of a key alone, and a further line may allow what that line does not."""
+    lines = [found for line in trusted.decode().split("\n") if (found := LINE.fullmatch(line))]
+    keys = {line["key"] for line in lines if line["name"] == name}
+    return [*dict.fromkeys([name, *(line["name"] for line in lines if line["key"] in keys)])]
 
 
 def _is_signer(line: str) -> bool:

@@ -81,6 +81,21 @@ def test_a_signature_of_nobody_in_the_file_is_refused(signers: Signers):
         signers.verify(good)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("names", [("anna", "ben"), ("anna", "anna")])
+def test_the_order_of_two_lines_of_a_key_does_not_matter(signers: Signers, names: tuple[str, str]):
+    """One of them allows the key for git alone, the other for bundles: signed in either order, and
+    by whom is the other's name."""
+    good = signature.sign(MESSAGE, signers.ours)
+    lines = [line(signers.ours, names[0], 'namespaces="git" '), line(signers.ours, names[1])]
+    for order in (lines, lines[::-1]):
+        signers.write(*order)
+        assert signers.verify(good) == names[1]
+    signers.write(lines[0], lines[0])
+    with pytest.raises(BundleError, match="namespace"):
+        signers.verify(good)
+
+
 @pytest.mark.parametrize(
     ("text", "why"),
     [
