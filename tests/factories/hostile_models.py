@@ -329,6 +329,10 @@ def misfits() -> Models:
         """A model after a change of the node that has a setting."""
         return changed(one("LogSoftmax", axis=1), lambda m: change(m.graph.node[1].attribute))
 
+    def weight(n: int) -> dict[str, Any]:
+        """Numbers in int8 with their step and zero, as quantization writes them."""
+        return {"w": np.int8([[0, n]]), "s": np.float32(0.1), "z": np.int8(0)}
+
     texts = helper.make_tensor("w", TensorProto.STRING, [1], [b"a"])
     off = TensorProto(name="w", data_type=1, dims=[4], float_data=[1.0, 2.0])
     short = TensorProto(name="w", data_type=1, dims=[4], raw_data=bytes(4))
@@ -341,6 +345,10 @@ def misfits() -> Models:
         "too few floats": (one("Add", "x w", {"w": off}), TRIED),
         "too few numbers": (one("Add", "x w", {"w": short}), TRIED),
         "old file": (changed(one("Relu"), lambda m: setattr(m, "ir_version", 3)), "version 3"),
+        **{
+            f"a weight of {n}": (one("DequantizeLinear", "w s z", weight(n)), f"{n}.*seven bits")
+            for n in (-128, -65, 65)
+        },
         "setting of another type": (of_type, "setting 'axis'"),
         "setting of two types": (setting(lambda a: setattr(a[0], "f", 1.0)), "as its type has it"),
         "setting twice": (setting(lambda a: a.add().CopyFrom(a[0])), "'axis' is set twice"),

@@ -40,9 +40,9 @@ class Early:
                 f"early.least {list(self.least)} must be numbers above 0, one for each step; "
                 "export the bundle again"
             )
-        if type(self.agree) is not int or self.agree < 1:
+        if type(self.agree) is not int or not 1 <= self.agree <= len(self.least):
             raise BundleError(
-                f"early.agree {self.agree!r} must be a whole number from 1 on; "
+                f"early.agree {self.agree!r} must be a whole number from 1 on, at most the steps; "
                 "export the bundle again"
             )
         if self.limits and not (

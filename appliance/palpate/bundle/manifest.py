@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -106,6 +107,7 @@ class Manifest:
         _check_files(self.files)
         _check_labels(self.labels)
         _check_displays(self.displays, self.labels)
+        _check_thresholds(self.thresholds, self.format.rows * self.format.cols)
         _check_parts(self)
         if self.unloaded and len(self.unloaded) != self.format.channels:
             raise BundleError(
@@ -162,6 +164,24 @@ def version(text: object) -> tuple[int, ...]:
     if not isinstance(text, str) or not _VERSION.fullmatch(text):
         raise BundleError(f"version {text!r} is not of the form 1.2.3; export the bundle again")
     return tuple(map(int, text.split(".")))
+
+
+def _check_thresholds(limits: Thresholds, taxels: int) -> None:
+    """Raises BundleError for a limit out of range. taxels: of the skin."""
+    ranges = (
+        ("contact", 0, sys.float_info.max),
+        ("full_scale", sys.float_info.min, sys.float_info.max),
+        ("saturated", 0, 1),
+        ("dead_taxels", 0, taxels - 1),
+        ("unsure", 0, sys.float_info.max),  # above 1 no sweep is ok
+    )
+    for name, least, most in ranges:
+        value = getattr(limits, name)
+        if not (value is None and name == "contact") and not least <= value <= most:
+            raise BundleError(
+                f"manifest has {value} for thresholds.{name}, which must be {least:.3g} to "
+                f"{most:.3g}; export the bundle again"
+            )
 
 
 def _check_parts(manifest: Manifest) -> None:

@@ -7,7 +7,7 @@ import contextlib
 import io
 import json
 import shutil
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -291,6 +291,7 @@ def test_a_bundle_that_is_written_is_read_unchanged(tmp_path: Path):
 
 
 EARLY = {"least": [0.9, 0.8, 2.0], "agree": 2}
+LIMITS = asdict(toy_bundle.LIMITS)
 KNOWN = {"limit": 9.0, "temperature": 2.0}
 DISPLACEMENT = {"limit": 4.0, "temperature": 3.0, "unsure": 0.75}
 
@@ -308,7 +309,14 @@ def displaced(**changes: Any) -> dict[str, Any]:
             ({"early": EARLY | {"least": [0.5, n]}}, "numbers above 0")
             for n in (0.0, -1, float("nan"), True, "0.5")
         ),
-        *(({"early": EARLY | {"agree": n}}, "from 1 on") for n in (0, 1.0, True)),
+        *(({"early": EARLY | {"agree": n}}, "from 1 on") for n in (0, 1.0, True, 4)),
+        *(
+            ({"thresholds": LIMITS | {name: value}}, f"thresholds.{name}")
+            for name, value in (
+                *(("contact", -1.0), ("full_scale", 0.0), ("saturated", -0.1), ("saturated", 1.5)),
+                *(("dead_taxels", -1), ("dead_taxels", 4), ("unsure", -0.5)),
+            )
+        ),
         ({"early": EARLY | {"least": 0.5}}, UNREAD),
         ({"early": {"least": [0.9]}}, "agree"),
         ({"early": {"agree": 1}}, "least"),

@@ -38,6 +38,9 @@ MOST_TENSOR = 64 << 20
 """Bytes of one constant, and of the input and each output."""
 MOST_RANK = 8
 """Most dimensions of a tensor; those of our models have up to five."""
+MOST_INT8 = 64
+"""Largest weight in int8. Beside unsigned values, two products of a larger one overflow 16 bits on
+an x86 with AVX2 and without VNNI, and -128 gives wrong sums on Arm (onnxruntime 1.31.1, 1.32.0)."""
 MOST_LETTERS = 400
 """Longest error text in a message; its names and lists come from the file."""
 KEEP_INDEX = ("Reshape", "Flatten")
@@ -155,6 +158,15 @@ def _constant(tensor: Message, name: str) -> Value:
         f"constant {name!r} is of type {kind or tensor.data_type}, none of {', '.join(CONSTANTS)}",
     )
     _bounded(name, kind, tuple(tensor.dims))
+    if kind == "int8":
+        raw, listed = np.frombuffer(tensor.raw_data or b"", np.int8), tensor.int32_data or ()
+        least = min(int(raw.min(initial=0)), *listed, 0)
+        most = max(int(raw.max(initial=0)), *listed, 0)
+        need(
+            -MOST_INT8 <= least <= most <= MOST_INT8,
+            f"weights {name!r} are {least} to {most}, beyond {MOST_INT8} (seven bits), with which "
+            "processors compute different sums",
+        )
     return Value(kind, constant=tensor)
 
 
