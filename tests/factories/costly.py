@@ -17,6 +17,19 @@ COSTLY = {
     *("papillarray", "reskin", "flexitac"),
 }
 
+OF_LIBRARIES = (
+    *("static-svm", "spectrogram-svm", "correlation-svm"),
+    *("multirocket-hydra", "quant"),
+)
+"""Methods that have no graph for the box."""
+WITH_GRAPH = (
+    *("palpate-bands", "palpate-pairs", "palpate-64", "palpate-stages", "palpate-256", "palpate"),
+    *("palpate-reattached", "L-gauss", "L-knn", "L-svm", "H-knn", "H-svm", "fishel-bayes"),
+    *("st-hmp", "minirocket", "minirocket-augmented", "ds-cnn", "lite", "edge-spectral"),
+    *("paper-cnn", "paper-cnn-centred", "tactnet2", "recurrent"),
+)
+"""All other methods; `methods.every()` would import all of their libraries."""
+
 
 def quick_first(names: Iterable[str]) -> list[Any]:
     """The names as parameters of a test. The costly methods are marked thorough."""

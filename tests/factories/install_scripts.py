@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tempfile
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -93,3 +94,9 @@ def page_secrets(folder: Path) -> None:
     """Token, key and certificate of the page, as the install makes them."""
     code = f"import page_secrets, os; print(page_secrets.make({str(folder)!r}, str(os.getgid())))"
     subprocess.run(["bash", "-euc", run_here(code)], check=True, capture_output=True, timeout=120)
+
+
+def require_pyinfra() -> None:
+    """Skip the module of tests where pyinfra is not installed. Its import would take long."""
+    if find_spec("pyinfra") is None:
+        pytest.skip("no pyinfra here; pip install -e .[deploy]", allow_module_level=True)

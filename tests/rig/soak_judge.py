@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from palpate.core.statistics import wilson
 from palpate.core.types import Status
@@ -140,6 +139,8 @@ def band(rows: Sequence[Sequence[Any]]) -> tuple[list[float], list[list[int]]]:
     alone = [row[5] not in (row[2], *Status) for row in rows]  # a wrong label, but not a refusal
     rate = sum(alone) / len(rows) if rows else 0.0
     n = np.arange(1, len(rows) + 1)
+    from scipy import stats
+
     low, high = stats.binom.ppf([[0.025], [0.975]], n, rate).astype(int)
     return [row[0] for row in rows], np.stack([low, high], axis=1).tolist()
 
@@ -183,6 +184,8 @@ def slope(runs: Sequence[Json]) -> dict[str, Any]:
     alike = min(max(float(rest[:-1] @ rest[1:]) / power, 0.0), 0.99) if power > 0 else 0.0
     fewer = (1 + alike) / (1 - alike)
     error = math.sqrt(power / (n - fitted) / float(x @ x) * fewer)
+    from scipy import stats
+
     half = float(stats.t.ppf(0.975, max(n / fewer - fitted, 1))) * error
     return result | {"kib_h": round(b, 1), "low": round(b - half, 1), "high": round(b + half, 1)}
 

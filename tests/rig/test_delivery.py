@@ -24,6 +24,7 @@ from palpate.bundle import bundle
 from palpate.deployment.state import MOST_STARTS
 from palpate.sim import script
 from tests.factories import deliveries, emulated_machines, hosts
+from tests.factories.install_scripts import require_pyinfra
 from tests.rig.cell import Cell
 from tests.rig.image import GUEST, Image, ground, layer
 from tests.rig.kept import PALPATE, found
@@ -35,7 +36,7 @@ pytestmark = pytest.mark.skipif(
     HOW != "full",
     reason="installs a bare guest; PALPATE_RIG=full python -m tests.campaigns test-rig",
 )
-pytest.importorskip("pyinfra", reason="no pyinfra here; pip install -e .[deploy]")
+require_pyinfra()
 
 BOOT_S, BACK_S = 300, 180
 INSTALL_S = 1800

@@ -19,11 +19,11 @@ from pathlib import Path
 import pytest
 
 from tests.factories import emulated_machines, hosts
-from tests.factories.install_scripts import SCRIPTS
+from tests.factories.install_scripts import SCRIPTS, require_pyinfra
 from tests.factories.nspawn import PALPATE, SITE, WAIT_S
 from tests.factories.paths import ROOT
 
-pytest.importorskip("pyinfra", reason="no pyinfra here; pip install -e .[deploy]")
+require_pyinfra()
 APT = ("env", "DEBIAN_FRONTEND=noninteractive", "apt-get", "-y", "-q")
 AS_BOX = ("setpriv", "--reuid=palpate", "--regid=palpate", "--init-groups", PALPATE)
 APART = ("--set", "store.folder=/var/lib/palpate/simulated")

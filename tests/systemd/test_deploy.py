@@ -19,17 +19,18 @@ import time
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from importlib.util import find_spec
 from pathlib import Path
 from threading import Thread
 
 import pytest
 
 from tests.factories import deliveries, emulated_machines, hosts
-from tests.factories.install_scripts import SCRIPTS, run_here
+from tests.factories.install_scripts import SCRIPTS, require_pyinfra, run_here
 from tests.factories.nspawn import CABLE, CABLED, PALPATE, SIM, WAIT_S
 from tests.factories.paths import ROOT
 
-PYINFRA = pytest.importorskip("pyinfra", reason="no pyinfra here; pip install -e .[deploy]")
+require_pyinfra()
 
 
 @pytest.fixture(scope="session")
@@ -547,7 +548,8 @@ except fleet.Failed as e:
 def test_a_box_that_cannot_be_reached_comes_with_what_to_do(said: str, do: str):
     """By the words of pyinfra, which are looked up in its code, so that those of another version
     are missed here."""
-    assert f'"{said}' in (Path(PYINFRA.__file__).parent / "connectors" / "ssh.py").read_text()
+    pyinfra = Path(find_spec("pyinfra").origin).parent
+    assert f'"{said}' in (pyinfra / "connectors" / "ssh.py").read_text()
     assert f"; {do}" in run_here(f"import fleet; print(fleet.with_remedy('{said}: box'))")
 
 

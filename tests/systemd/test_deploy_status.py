@@ -6,9 +6,9 @@ import json
 
 import pytest
 
-from tests.factories.install_scripts import run_here
+from tests.factories.install_scripts import require_pyinfra, run_here
 
-pytest.importorskip("pyinfra", reason="no pyinfra here; pip install -e .[deploy]")
+require_pyinfra()
 SHA = "a" * 64
 ASK = """
 import json, sys, deploy

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.factories.install_scripts import run_here
+from tests.factories.install_scripts import require_pyinfra, run_here
 
-pytest.importorskip("pyinfra", reason="no pyinfra here; pip install -e .[deploy]")
+require_pyinfra()
 
 
 def shell(script: str) -> str:

@@ -6,13 +6,15 @@ import math
 
 import numpy as np
 import pytest
-import scipy.signal
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from palpate.answer import features
 from palpate.core.errors import FormatError
 from tests.factories.any_counts import any_counts
+from tests.factories.later import Later
+
+signal = Later("scipy.signal")
 
 RATE, FRAMES = 750.0, 1500
 
@@ -77,7 +79,7 @@ def test_l_features_are_equations_1_to_3(
     taxels at 100 Hz the upper band ends at 50 Hz."""
     frames, last = len(x), len(x) // 2
     series = x.reshape(frames, -1).T.astype(float)
-    hz, power = scipy.signal.periodogram(
+    hz, power = signal.periodogram(
         series, rate_hz, detrend="linear", return_onesided=False, scaling="spectrum"
     )
     hz, power = np.abs(hz[: last + 1]), power[:, : last + 1] * frames
@@ -122,7 +124,7 @@ def test_h_features_agree_with_a_spectrogram(window: str, scipys: str) -> None:
     end at 370 Hz."""
     x = _sweep(2000)
     taxels = x.reshape(2000, -1).T.astype(float)
-    _, _, spectrum = scipy.signal.spectrogram(
+    _, _, spectrum = signal.spectrogram(
         taxels, 1000.0, scipys, nperseg=100, noverlap=50, detrend="constant", mode="complex"
     )
     power = np.tensordot(features.taxel_weights(x), np.abs(spectrum) ** 2, 1)[1:38]

@@ -7,10 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from palpate_studies.peers import aeon_peers
 from palpate_train.data.sets import Dataset
 from palpate_train.models import methods
+from tests.factories.later import Later
 from tests.factories.sweep_sets import easy
+
+aeon_peers = Later("palpate_studies.peers.aeon_peers")
 
 NAMES = ("multirocket-hydra", "quant")
 names = pytest.mark.parametrize("name", NAMES)

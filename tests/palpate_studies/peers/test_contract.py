@@ -9,18 +9,22 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 from palpate.answer.objects import softmax
 from palpate.core.errors import FormatError
 from palpate.inference.session import session
-from palpate_studies.peers import aeon_peers, minirocket, sthmp
 from palpate_train.data.sets import Dataset
 from palpate_train.models import methods
 from palpate_train.models.methods import Effort, Model
-from tests.factories.costly import quick_first
+from tests.factories.costly import OF_LIBRARIES, WITH_GRAPH, quick_first
+from tests.factories.later import Later
 from tests.factories.sheared import sheared
 from tests.factories.sweep_sets import easy
+
+torch = Later("torch")
+aeon_peers = Later("palpate_studies.peers.aeon_peers")
+minirocket = Later("palpate_studies.peers.minirocket")
+sthmp = Later("palpate_studies.peers.sthmp")
 
 FEATURES = ("L-gauss", "L-knn", "L-svm", "fishel-bayes")
 DESKTOP = ("static-svm", "spectrogram-svm")
@@ -43,9 +47,9 @@ with_graph = pytest.mark.parametrize("name", [*FEATURES, *SLOW, *quick_first(NET
 @pytest.fixture(autouse=True)
 def light(monkeypatch: pytest.MonkeyPatch) -> None:
     """Models that are fitted in a moment."""
-    monkeypatch.setattr(minirocket, "FEATURES", 500)
+    monkeypatch.setattr("palpate_studies.peers.minirocket.FEATURES", 500)
     for key, value in {"ATOMS": 20, "SAMPLED": 300, "ROUNDS": 3}.items():
-        monkeypatch.setattr(sthmp, key, value)
+        monkeypatch.setattr(f"palpate_studies.peers.sthmp.{key}", value)
 
 
 def inputs(name: str, sweeps: Dataset) -> Any:
@@ -140,6 +144,12 @@ def test_too_little_to_learn_from_is_refused(name: str):
         fitted(name, long(4).take(np.arange(4)))
 
 
+def test_the_lists_of_methods_are_complete():
+    """Every installed method is tested: it has a graph, or says which library runs it."""
+    libraries = {name: bool(method.library) for name, method in methods.every().items()}
+    assert libraries == dict.fromkeys(WITH_GRAPH, False) | dict.fromkeys(OF_LIBRARIES, True)
+
+
 @pytest.fixture(scope="module")
 def three_axes() -> Dataset:
     """Half a second of six tubes at nine positions."""
@@ -147,7 +157,7 @@ def three_axes() -> Dataset:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", quick_first(methods.every()))
+@pytest.mark.parametrize("name", quick_first((*WITH_GRAPH, *OF_LIBRARIES)))
 def test_a_method_takes_three_axes(name: str, three_axes: Dataset):
     """Logits are finite; the graph takes [1, T, R, C, A] and answers as the desktop does; other
     shear gives other logits."""

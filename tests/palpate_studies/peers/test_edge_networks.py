@@ -5,17 +5,20 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 
 from palpate.answer.objects import softmax
 from palpate.bundle.onnx_check import reader
 from palpate.core.types import SweepFormat
 from palpate_studies import cost
-from palpate_studies.peers import ds_cnn, edge_spectral
 from palpate_train.models import methods
 from palpate_train.onnx_tools import graph_builder
 from palpate_train.onnx_tools.quantize import quantize
+from tests.factories.later import Later
 from tests.factories.sweep_sets import easy
+
+torch = Later("torch")
+ds_cnn = Later("palpate_studies.peers.ds_cnn")
+edge_spectral = Later("palpate_studies.peers.edge_spectral")
 
 
 @pytest.mark.parametrize(

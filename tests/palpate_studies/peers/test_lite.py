@@ -5,16 +5,18 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 
 from palpate.answer.objects import softmax
 from palpate.bundle.onnx_check import reader
 from palpate.core.types import SweepFormat
 from palpate_studies import cost
-from palpate_studies.peers import lite
 from palpate_train.models import methods
 from palpate_train.onnx_tools import graph_builder
+from tests.factories.later import Later
 from tests.factories.sweep_sets import easy
+
+torch = Later("torch")
+lite = Later("palpate_studies.peers.lite")
 
 
 def test_it_has_as_many_weights_as_published():

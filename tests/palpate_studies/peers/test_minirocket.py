@@ -10,10 +10,13 @@ import pytest
 
 from palpate.answer.objects import softmax
 from palpate.core.types import SweepFormat
-from palpate_studies.peers import linear_head, minirocket
 from palpate_train.data.sets import Dataset
 from palpate_train.onnx_tools import graph_builder
+from tests.factories.later import Later
 from tests.factories.sweep_sets import easy
+
+linear_head = Later("palpate_studies.peers.linear_head")
+minirocket = Later("palpate_studies.peers.minirocket")
 
 KINDS = {"uint8": (2, 2, 64), "int16": (3, 3, 40), "uint16": (1, 1, 9), "float32": (16, 1, 33)}
 
@@ -77,7 +80,7 @@ def test_the_features_are_aeons(monkeypatch: pytest.MonkeyPatch, dtype: str):
     """The shares are aeon's, in its order: exactly for integer counts, else unless a frame equals a
     bias within rounding."""
     aeon = pytest.importorskip("aeon.transformations.collection.convolution_based")
-    monkeypatch.setattr(minirocket, "FEATURES", 1000)
+    monkeypatch.setattr("palpate_studies.peers.minirocket.FEATURES", 1000)
     given, (rows, cols, window) = raw_counts(dtype), KINDS[dtype]
     graph = minirocket.transform(
         SweepFormat(rows, cols, 50.0, window, dtype), minirocket.fitted(given, 5)
@@ -97,7 +100,7 @@ def test_the_labels_are_aeons(monkeypatch: pytest.MonkeyPatch):
     """The whole method answers as aeon's own classifier, also for sweeps that are hard to
     separate."""
     aeon = pytest.importorskip("aeon.classification.convolution_based")
-    monkeypatch.setattr(minirocket, "FEATURES", 500)
+    monkeypatch.setattr("palpate_studies.peers.minirocket.FEATURES", 500)
     sweeps = easy(20)
     noise = np.random.default_rng(1).normal(0, 40, sweeps.samples.shape)
     sweeps = replace(sweeps, samples=np.clip(sweeps.samples + noise, 0, 255).astype(np.uint8))

@@ -8,10 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from palpate_studies.peers import minirocket, minirocket_augmented
 from palpate_train.data.augment import copies
 from palpate_train.data.sets import Dataset
+from tests.factories.later import Later
 from tests.factories.sweep_sets import easy
+
+minirocket_augmented = Later("palpate_studies.peers.minirocket_augmented")
 
 
 @pytest.mark.parametrize("dtype", ["int16", "float32"])
@@ -21,7 +23,8 @@ def test_copies_keep_label_and_recording_of_their_sweep(
     """There are two copies of each sweep, after the sweeps themselves; no two copies are equal."""
     seen: list[tuple[Dataset, np.ndarray]] = []
     monkeypatch.setattr(
-        minirocket, "train", lambda sweeps, inputs, seed: seen.append((sweeps, inputs))
+        "palpate_studies.peers.minirocket.train",
+        lambda sweeps, inputs, seed: seen.append((sweeps, inputs)),
     )
     sweeps = easy(6, pieces=2, dtype=dtype)
     minirocket_augmented.train(sweeps, sweeps.samples, 1)

@@ -9,22 +9,28 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
-from torch import nn
 
 from palpate.answer.objects import softmax
 from palpate.core.errors import FormatError
 from palpate.core.types import SweepFormat
 from palpate.sim import skin
-from palpate_studies.peers import ds_cnn, edge_spectral, lite, paper_cnn, recurrent
-from palpate_studies.peers.networks import NetworkModel
 from palpate_train.data.sets import Dataset
 from palpate_train.evaluate import evaluate, fold
-from palpate_train.models import methods, training
+from palpate_train.models import methods
 from palpate_train.models.methods import Effort, Method
 from palpate_train.onnx_tools import graph_builder
 from tests.factories.costly import quick_first
+from tests.factories.later import Later
 from tests.factories.sweep_sets import easy
+
+torch = Later("torch")
+ds_cnn = Later("palpate_studies.peers.ds_cnn")
+edge_spectral = Later("palpate_studies.peers.edge_spectral")
+lite = Later("palpate_studies.peers.lite")
+networks = Later("palpate_studies.peers.networks")
+paper_cnn = Later("palpate_studies.peers.paper_cnn")
+recurrent = Later("palpate_studies.peers.recurrent")
+training = Later("palpate_train.models.training")
 
 pytestmark = pytest.mark.slow
 
@@ -64,12 +70,12 @@ def made(
     )
 
 
-def train(name: str, s: Dataset, effort: Effort = BRIEF, seed: int = 1) -> NetworkModel:
+def train(name: str, s: Dataset, effort: Effort = BRIEF, seed: int = 1) -> networks.NetworkModel:
     """Train the method on all sweeps."""
     return method(name, effort).train(s, s.samples, seed)
 
 
-def check_agrees(model: NetworkModel, samples: np.ndarray) -> None:
+def check_agrees(model: networks.NetworkModel, samples: np.ndarray) -> None:
     """The graph in the box's session gives the logits of the model, which are finite."""
     want = model.logits(samples)
     assert want.dtype == np.float32
@@ -128,7 +134,7 @@ def test_the_loop_is_adam_as_the_paper_prints_it():
     for step in range(5):
         pick = order[4 * step : 4 * step + 4]
         logits = plain(torch.from_numpy(s.samples[pick.numpy()]))
-        loss = nn.functional.cross_entropy(logits, torch.from_numpy(s.labels)[pick])
+        loss = torch.nn.functional.cross_entropy(logits, torch.from_numpy(s.labels)[pick])
         adam.zero_grad()
         loss.backward()
         adam.step()
@@ -146,9 +152,11 @@ def test_adversarial_training_sees_the_worse_sweep():
     )
     x, labels = net.prepare(torch.from_numpy(s.samples)), torch.from_numpy(s.labels)
     still = x.clone().requires_grad_()
-    cost = nn.functional.cross_entropy(net.training_logits(still), labels)
+    cost = torch.nn.functional.cross_entropy(net.training_logits(still), labels)
     cost.backward()
-    worse = nn.functional.cross_entropy(net.training_logits(x + 0.1 * still.grad.sign()), labels)
+    worse = torch.nn.functional.cross_entropy(
+        net.training_logits(x + 0.1 * still.grad.sign()), labels
+    )
     assert worse > cost
     worse.backward()
     want = [p.grad.clone() for p in net.parameters()]
@@ -193,7 +201,7 @@ def test_the_skin_s_own_sweeps_agree_with_the_graph(name: str):
     with torch.random.fork_rng():
         torch.manual_seed(0)
         net = build(skin.FORMAT, 6, counts)
-    check_agrees(NetworkModel(net.eval(), ""), counts)
+    check_agrees(networks.NetworkModel(net.eval(), ""), counts)
 
 
 @pytest.mark.slow

@@ -8,15 +8,18 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-import scipy.stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from palpate.answer import features, time_series
 from palpate.core.errors import FormatError
 from palpate_studies.peers.prior_features import correlation, spectrogram, static
-from palpate_studies.peers.prior_work import explore
 from tests.factories.any_counts import any_counts
+from tests.factories.later import Later
+
+stats = Later("scipy.stats")
+
+prior_work = Later("palpate_studies.peers.prior_work")
 
 FEATURES = (static, spectrogram, correlation)
 RATE = 750.0
@@ -104,7 +107,7 @@ def test_correlations_are_those_of_scipy(frames: int):
     x = np.round(noise(frames)).astype(np.uint8)
     flat = x.reshape(frames, -1).T.astype(float)
     want = []
-    for r in (scipy.stats.pearsonr, scipy.stats.spearmanr):
+    for r in (stats.pearsonr, stats.spearmanr):
         each = [r(a, b).statistic for a, b in combinations(flat, 2)]
         want += [np.mean(each), np.std(each)]
     got = correlation(x, RATE)
@@ -182,15 +185,15 @@ def test_exploring_stops_when_the_posterior_is_sure():
     """.6, then .6 * .6 over the sum (.69), then .77: two sweeps for .65, three for .7, all of them
     for .99."""
     log_p = np.log(np.array([[0.6, 0.4]] * 3))
-    found = [explore(log_p, sure) for sure in (0.55, 0.65, 0.7, 0.99)]
+    found = [prior_work.explore(log_p, sure) for sure in (0.55, 0.65, 0.7, 0.99)]
     assert found == [(0, 1), (0, 2), (0, 3), (0, 3)]
 
 
 def test_later_sweeps_correct_the_first():
     """Later sweeps outweigh a wrong first sweep, even if it is certain beyond float64."""
     log_p = np.log(np.array([[0.6, 0.4], [0.1, 0.9], [0.1, 0.9]]))
-    assert explore(log_p, 0.95) == (1, 3)
-    assert explore(np.array([[0.0, -1e9]] + [[-12.0, 0.0]] * 4), 1)[0] == 1
+    assert prior_work.explore(log_p, 0.95) == (1, 3)
+    assert prior_work.explore(np.array([[0.0, -1e9]] + [[-12.0, 0.0]] * 4), 1)[0] == 1
 
 
 @pytest.mark.parametrize(
@@ -203,4 +206,4 @@ def test_later_sweeps_correct_the_first():
 def test_what_cannot_be_explored_is_named(log_p: np.ndarray, sure: float, hint: str):
     """No sweep, and a certainty that is not a probability."""
     with pytest.raises(FormatError, match=hint):
-        explore(log_p, sure)
+        prior_work.explore(log_p, sure)

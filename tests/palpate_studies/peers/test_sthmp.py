@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from sklearn.linear_model import orthogonal_mp
 
 from palpate.core.types import SweepFormat
-from palpate_studies.peers import sthmp
 from palpate_train.onnx_tools import graph_builder
+from tests.factories.later import Later
+
+linear_model = Later("sklearn.linear_model")
+sthmp = Later("palpate_studies.peers.sthmp")
 
 SETS = {"uint8": (4, 4, 90), "int16": (3, 3, 24), "uint16": (1, 1, 20), "float32": (16, 1, 128)}
 
@@ -17,7 +19,7 @@ SETS = {"uint8": (4, 4, 90), "int16": (3, 3, 24), "uint16": (1, 1, 20), "float32
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """A dictionary that is learned quickly."""
     for name, value in {"ATOMS": 20, "SAMPLED": 300, "ROUNDS": 3}.items():
-        monkeypatch.setattr(sthmp, name, value)
+        monkeypatch.setattr(f"palpate_studies.peers.sthmp.{name}", value)
 
 
 def patches(n: int, rows: int = 2, cols: int = 2, frames: int = 12) -> np.ndarray:
@@ -36,7 +38,7 @@ def test_the_codes_are_those_of_orthogonal_matching_pursuit():
     """Each patch gets the four atoms, and the amounts of them, that scikit-learn finds."""
     x, d = patches(50), atoms(40)
     codes = sthmp.encode(x, d)
-    want = orthogonal_mp(
+    want = linear_model.orthogonal_mp(
         d.reshape(40, -1).T.astype(np.float64), x.reshape(50, -1).T, n_nonzero_coefs=sthmp.ACTIVE
     ).T
     np.testing.assert_array_equal((codes != 0).sum(axis=1), sthmp.ACTIVE)
@@ -147,8 +149,8 @@ def test_an_offset_changes_nothing():
 def test_the_dictionary_finds_what_patches_are_made_of(monkeypatch: pytest.MonkeyPatch):
     """Of patches that consist of two out of twenty atoms most atoms are found again, and the
     residual is small."""
-    monkeypatch.setattr(sthmp, "ACTIVE", 2)
-    monkeypatch.setattr(sthmp, "ROUNDS", 15)
+    monkeypatch.setattr("palpate_studies.peers.sthmp.ACTIVE", 2)
+    monkeypatch.setattr("palpate_studies.peers.sthmp.ROUNDS", 15)
     rng, truth = np.random.default_rng(5), atoms(20).astype(np.float64)
     mix = np.zeros((1500, 20))
     for row in mix:

@@ -3,11 +3,13 @@ share."""
 
 import numpy as np
 import pytest
-from scipy.stats import norm
-from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
 from palpate.core.errors import FormatError
 from palpate_train.answer import embedding
+from tests.factories.later import Later
+
+discriminant_analysis = Later("sklearn.discriminant_analysis")
+stats = Later("scipy.stats")
 
 
 def gaussians(n: int, means, seed: int = 0, mix=None):
@@ -26,9 +28,9 @@ def test_the_embedding_is_lda(fixed: int):
     x, y = gaussians(200, np.random.default_rng(2).standard_normal((4, 7)) @ mix, mix=mix)
     one = embedding.embed(x, y, fixed)
     assert one.means.shape == (4, 3 + fixed)
-    lda = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto", store_covariance=True).fit(
-        x, y
-    )
+    lda = discriminant_analysis.LinearDiscriminantAnalysis(
+        solver="lsqr", shrinkage="auto", store_covariance=True
+    ).fit(x, y)
     want = x @ lda.coef_.T + lda.intercept_
     have = one.logits(x)
     assert np.allclose(
@@ -182,7 +184,7 @@ def test_auroc_of_a_known_separation():
     """Two normals two deviations apart: Phi(2 / sqrt 2); ties count half."""
     rng = np.random.default_rng(0)
     have = embedding.auroc(rng.standard_normal(20000), 2 + rng.standard_normal(20000))
-    assert abs(have - norm.cdf(2 / np.sqrt(2))) < 0.003
+    assert abs(have - stats.norm.cdf(2 / np.sqrt(2))) < 0.003
     assert embedding.auroc(np.zeros(3), np.zeros(5)) == 0.5
     with pytest.raises(FormatError, match="both kinds"):
         embedding.auroc(np.zeros(3), np.empty(0))

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
 from palpate.answer import early as box_early
 from palpate.answer.early import Early
@@ -20,7 +19,10 @@ from palpate_train.export.bundle_graph import bundle_graph
 from palpate_train.export.pack import means_file
 from palpate_train.onnx_tools.graph_builder import run
 from tests.factories.calibration_inputs import plain_inputs
+from tests.factories.later import Later
 from tests.factories.trunk import FORMAT, trunk
+
+lda = Later("sklearn.discriminant_analysis")
 
 
 def prefixes(n: int, places: int = 8, seed: int = 0, strength=None):
@@ -256,7 +258,7 @@ def test_the_heads_are_scikit_learns_shrinkage_lda(materials: int, each: int):
     x[:, 3] = 7
     weight, bias = fit_early.lda(x, labels, materials)
     prior = np.full(materials, 1 / materials)
-    theirs = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto", priors=prior)
+    theirs = lda.LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto", priors=prior)
     wanted = theirs.fit(x, labels).decision_function(x)
     logits = x @ weight + bias
     if materials == 2:

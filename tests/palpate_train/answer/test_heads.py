@@ -5,10 +5,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from sklearn.covariance import ledoit_wolf
 
 from palpate.core.errors import FormatError
 from palpate_train.answer import heads
+from tests.factories.later import Later
+
+covariances = Later("sklearn.covariance")
 
 
 def drawn(n: int, size: int, classes: int = 4) -> tuple[np.ndarray, np.ndarray]:
@@ -29,7 +31,11 @@ def test_it_is_the_inverse_of_ledoit_and_wolfs_covariance(n: int, size: int):
     means = np.stack([x[labels == k].mean(axis=0) for k in range(4)])
     scatter = x - means[labels]
     spread = scatter.std(axis=0)
-    covariance = ledoit_wolf(scatter / spread, assume_centered=True)[0] * spread[:, None] * spread
+    covariance = (
+        covariances.ledoit_wolf(scatter / spread, assume_centered=True)[0]
+        * spread[:, None]
+        * spread
+    )
     wanted = np.linalg.solve(covariance, (means - means.mean(axis=0)).T).T
     weight, bias = heads.fit_discriminant(x, labels, 4)
     np.testing.assert_allclose(weight, wanted, rtol=1e-3, atol=1e-3 * np.abs(wanted).max())
@@ -58,7 +64,7 @@ def test_values_of_a_condition_widen_the_scatter_to_one_more(n: int, size: int):
         for value in range(3):
             of = z[(labels == k) & (under == value)]
             added += 2 / (3 - 1) * len(of) * np.outer(of.mean(axis=0), of.mean(axis=0))
-    share = ledoit_wolf(z, assume_centered=True)[1]
+    share = covariances.ledoit_wolf(z, assume_centered=True)[1]
     covariance = (1 - share) * (z.T @ z + added) / n
     covariance += share * np.trace(z.T @ z + added) / n / size * np.eye(size)
     covariance *= spread[:, None] * spread

@@ -6,9 +6,11 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from scipy.stats import kurtosis
 
 from palpate_train.data.augment import SLOW, Augmentation, augment, default_augmentation
+from tests.factories.later import Later
+
+stats = Later("scipy.stats")
 
 OFF = Augmentation(**{f.name: 0.0 for f in fields(Augmentation)})
 NAMES = (
@@ -176,7 +178,7 @@ def test_noise_is_white_and_of_another_level_in_every_sweep():
     loud = added[level.mean(axis=1).argmax()]
     assert np.abs(np.corrcoef(loud) - np.eye(16)).max() < 0.15
     assert abs((loud[:, 1:] * loud[:, :-1]).mean()) < 0.05 * (loud**2).mean()
-    assert kurtosis(loud, axis=None) == pytest.approx(0, abs=0.15)
+    assert stats.kurtosis(loud, axis=None) == pytest.approx(0, abs=0.15)
 
 
 def test_a_noisy_taxel_is_noisy_alone():

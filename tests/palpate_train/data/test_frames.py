@@ -9,13 +9,15 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-import scipy.io
 
 from palpate.core.errors import FormatError
 from palpate_train.data import frames, raw_files
 from palpate_train.data.file_names import NamePattern
 from palpate_train.data.files.table import Table
 from palpate_train.data.import_plan import ImportPlan, Length
+from tests.factories.later import Later
+
+scipy_io = Later("scipy.io")
 
 NAMES = NamePattern("{material}.{}")
 
@@ -37,7 +39,7 @@ def stored(path: Path, values: np.ndarray, how: str) -> Table:
         np.save(path.with_suffix(".npy"), values)
         return raw_files.read(path.with_suffix(".npy"))
     if how == "mat":
-        scipy.io.savemat(path.with_suffix(".mat"), {"skin": values})
+        scipy_io.savemat(path.with_suffix(".mat"), {"skin": values})
         return raw_files.read(path.with_suffix(".mat"))
     suffix = ".mat" if how == "v7.3" else ".h5"
     with h5py.File(path.with_suffix(suffix), "w") as file:

@@ -12,7 +12,6 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-import scipy.io
 
 from palpate.core.errors import FormatError
 from palpate_train.data import sets
@@ -20,6 +19,9 @@ from palpate_train.data.file_names import NamePattern
 from palpate_train.data.import_plan import ImportPlan, Length
 from palpate_train.data.importing import Imported, LeftOut, import_folder
 from tests.factories.lab_files import write
+from tests.factories.later import Later
+
+scipy_io = Later("scipy.io")
 
 NAMES = NamePattern("{material}_{trial:d}.{}")
 COUNTS = np.arange(40 * 4).reshape(40, 4) % 150
@@ -75,7 +77,7 @@ FORMS = {
     "dat": lambda path: path.write_text(text(path, delimiter=";").read_text().replace("\n", ";\n")),
     "npy": lambda path: np.save(path, COUNTS.astype(np.uint8)),
     "npz": lambda path: np.savez(path, frames=COUNTS.astype(np.uint8), t=np.arange(40.0)),
-    "mat": lambda path: scipy.io.savemat(path, {"frames": COUNTS, "rate": 100.0}),
+    "mat": lambda path: scipy_io.savemat(path, {"frames": COUNTS, "rate": 100.0}),
     "h5": lambda path: h5py.File(path, "w").create_dataset("run/frames", data=COUNTS).file.close(),
 }
 
@@ -395,7 +397,7 @@ def test_columns_in_another_order_are_refused_unless_they_are_named(tmp_path: Pa
 
 ARRAYS = {
     "npz": lambda path, arrays: np.savez(path, **arrays),
-    "mat": lambda path, arrays: scipy.io.savemat(path, arrays),
+    "mat": lambda path, arrays: scipy_io.savemat(path, arrays),
     "h5": lambda path, arrays: [
         h5py.File(path, "a").create_dataset(f"day/{name}", data=x).file.close()
         for name, x in arrays.items()

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from sklearn.model_selection import LeaveOneGroupOut as Theirs
-from sklearn.model_selection import StratifiedGroupKFold
 
 from palpate.core.errors import FormatError
 from palpate_train.data.sets import Dataset
 from palpate_train.data.splitters import Protocol, draw, inner_parts
+from tests.factories.later import Later
+
+model_selection = Later("sklearn.model_selection")
 
 
 def a_set(labels: list[int], **groups: list[int]) -> Dataset:
@@ -40,7 +41,9 @@ def test_a_protocol_tests_what_it_did_not_train_on(text: str):
 
 def test_leave_is_scikit_learns_leave_one_group_out():
     """The same folds in the same order."""
-    theirs = Theirs().split(GRID.samples, GRID.labels, GRID.groups["position"])
+    theirs = model_selection.LeaveOneGroupOut().split(
+        GRID.samples, GRID.labels, GRID.groups["position"]
+    )
     for (train, test), (their_train, their_test) in zip(
         Protocol("leave:position").folds(GRID, 1), theirs, strict=True
     ):
@@ -177,7 +180,7 @@ def test_random_folds_are_scikit_learns(folds: int, seed: int, pieces: int, mixe
     recording = np.repeat(np.arange(20), pieces)
     label = np.random.default_rng(seed).permutation(20)[recording] % 3 if mixed else recording % 3
     sweeps = a_set(label.tolist(), recording=recording.tolist())
-    theirs = StratifiedGroupKFold(folds, shuffle=True, random_state=seed).split(
+    theirs = model_selection.StratifiedGroupKFold(folds, shuffle=True, random_state=seed).split(
         label, label, recording
     )
     for (_, test), (_, wanted) in zip(

@@ -19,13 +19,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import threadpoolctl
-from distributed import Client
 
 from palpate.core.errors import FormatError
 from palpate_train.evaluate import evaluate, parallel
 from palpate_train.evaluate.evaluate import Plan, Where
 from palpate_train.models import methods
+from tests.factories.later import Later
 from tests.factories.sweep_sets import tones
+
+distributed = Later("distributed")
 
 pytestmark = pytest.mark.slow
 
@@ -106,7 +108,7 @@ def cluster() -> Iterator[tuple[str, list[subprocess.Popen[str]]]]:
                     env=env,
                 )
             )
-        with Client(address, timeout=20, set_as_default=False) as client:
+        with distributed.Client(address, timeout=20, set_as_default=False) as client:
             client.wait_for_workers(2, timeout=30)
         yield address, processes[1:]
     finally:

@@ -21,45 +21,47 @@ from palpate_train.export import pack
 from palpate_train.metrics import bundle_score
 from palpate_train.models import methods
 from palpate_train.models.method_fit import MethodFit
-from tests.factories.costly import quick_first
+from tests.factories.costly import OF_LIBRARIES, WITH_GRAPH, quick_first
 from tests.factories.sweep_sets import tones
 
 pytestmark = pytest.mark.slow
 
 HARDLY = methods.Effort(0.1)
-METHODS = methods.every(HARDLY)
-ON_THE_BOX = [name for name, method in METHODS.items() if not method.library]
+
+
+def method_of(name: str) -> methods.Method:
+    (method,) = methods.find([name], HARDLY)
+    return method
 
 
 def trained(name: str, sweeps: Dataset) -> pack.Content:
     """The content of a bundle of this method."""
-    return pack.content_of(MethodFit.of(METHODS[name], sweeps, 1)[1])
+    return pack.content_of(MethodFit.of(method_of(name), sweeps, 1)[1])
 
 
-@pytest.mark.parametrize("name", quick_first(ON_THE_BOX))
+@pytest.mark.parametrize("name", quick_first(WITH_GRAPH))
 def test_the_box_answers_as_the_desktop(name: str, tmp_path: Path):
     """The bundle passes its golden sweeps; each held-out sweep gets the label that the model
     gives."""
     content = trained(name, tones())
     manifest = pack.pack(content, tmp_path / "b", "any", "1", "0123abcd")
-    assert manifest.input == METHODS[name].input
+    method = method_of(name)
+    assert manifest.input == method.input
     assert manifest.made["method"] == name
     assert manifest.speeds is None
     assert "the distance between taxels is unknown" in manifest.made["speeds_unknown_because"]
     it = Classifier(bundle.load(tmp_path / "b"), SystemClock())
     assert it.self_test() < 0.02
-    model = METHODS[name].train(
-        content.train, methods.model_inputs(METHODS[name].input, content.train), 1
-    )
-    want = model.logits(methods.model_inputs(METHODS[name].input, content.held_out)).argmax(1)
+    model = method.train(content.train, methods.model_inputs(method.input, content.train), 1)
+    want = model.logits(methods.model_inputs(method.input, content.held_out)).argmax(1)
     assert (bundle_score.labels_of(it, content.held_out)[0] == want).all()
 
 
-@pytest.mark.parametrize("name", sorted(METHODS.keys() - ON_THE_BOX))
+@pytest.mark.parametrize("name", OF_LIBRARIES)
 def test_what_the_box_cannot_run_is_refused(name: str):
     """It is refused before anything is trained, with the name of the method and its features or
     library."""
-    method = METHODS[name]
+    method = method_of(name)
     why = f"looks at the features '{method.input}' of prior work"
     if method.library:
         why = f"runs in {method.library} alone and has no graph"

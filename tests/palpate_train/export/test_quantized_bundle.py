@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import onnx
 import pytest
-import torch
 from onnx import numpy_helper
 
 from palpate.answer.objects import softmax
@@ -27,7 +26,6 @@ from palpate.inference.session import session
 from palpate.sim import skin
 from palpate_studies import cost
 from palpate_studies.command import main as study
-from palpate_studies.peers import paper_cnn
 from palpate_train.answer.heads import HeadData
 from palpate_train.cli.main import main
 from palpate_train.data import sets
@@ -40,15 +38,19 @@ from palpate_train.metrics.temperature import platt_temperature
 from palpate_train.models import methods
 from palpate_train.models.method_fit import MethodFit
 from palpate_train.models.recipe import graph as recipe_graph
-from palpate_train.models.recipe import loads, recipe, stages
+from palpate_train.models.recipe import loads, recipe
 from palpate_train.models.recipe.fitted import Fit, finished
 from palpate_train.models.recipe.sizes import SIZES
-from palpate_train.models.recipe.stages import StagesNetwork
 from palpate_train.onnx_tools import graph_builder, parity
 from palpate_train.onnx_tools.quantize import quantize
+from tests.factories.later import Later
 from tests.factories.parity import close
 from tests.factories.sweep_sets import easy
 from tests.factories.trained_stages import with_stages
+
+torch = Later("torch")
+paper_cnn = Later("palpate_studies.peers.paper_cnn")
+stages = Later("palpate_train.models.recipe.stages")
 
 pytestmark = pytest.mark.slow
 
@@ -100,7 +102,7 @@ def test_the_float_graph_is_the_network(dtype: str):
     counts as input."""
     form = SweepFormat(3, 2, 100.0, 128, dtype)
     torch.manual_seed(0)
-    model = StagesNetwork(form, 3, 0.1, norm=False).eval()
+    model = stages.StagesNetwork(form, 3, 0.1, norm=False).eval()
     weights = model.weights()
     trunk = recipe_graph.trunk_graph(model.format, model.scale, weights, model.architecture)
     graph = graph_builder.with_head(trunk, weights["head.weight"], weights["head.bias"])

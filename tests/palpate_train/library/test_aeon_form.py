@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate_train import PalpateClassifier
-
 pytestmark = pytest.mark.slow  # the import of aeon takes seconds
 RNG = np.random.default_rng(5)
 LABELS = np.array(["felt", "wood"])[np.arange(32) % 2]
@@ -31,6 +29,8 @@ def test_it_answers_as_the_classifier_does(form: Any):
     """Fit, labels and probabilities; it can stand at the end of a pipeline of aeon."""
     from aeon.classification.compose import ClassifierPipeline
     from aeon.transformations.collection import Normalizer
+
+    from palpate_train import PalpateClassifier
 
     made = form(**small()).fit(SWEEPS[:24], LABELS[:24])
     same = PalpateClassifier(**small()).fit(SWEEPS[:24], LABELS[:24])

@@ -4,18 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 import yaml
-from sklearn.base import clone
-from sklearn.exceptions import NotFittedError
-from sklearn.model_selection import LeaveOneGroupOut, cross_val_score
-from sklearn.utils import estimator_checks
 
 from palpate.core.errors import FormatError
-from palpate_train import PalpateClassifier, load_bundle
-from palpate_train.library.sweeps import raw_counts
+from tests.factories.later import Later
+
+base = Later("sklearn.base")
+exceptions = Later("sklearn.exceptions")
+model_selection = Later("sklearn.model_selection")
+estimator_checks = Later("sklearn.utils.estimator_checks")
+library = Later("palpate_train.library")
+sweeps = Later("palpate_train.library.sweeps")
+if TYPE_CHECKING:
+    from palpate_train import PalpateClassifier
 
 RNG = np.random.default_rng(0)
 LABELS = np.array(["felt", "wood"])[np.arange(48) % 2]
@@ -27,7 +32,7 @@ SWEEPS = np.rint(SWEEPS).astype(np.uint8)
 
 def small(**changes: object) -> PalpateClassifier:
     """A classifier that fits in seconds."""
-    return PalpateClassifier(**{"grid": (2, 2), "steps": 0, "size": "bands"} | changes)
+    return library.PalpateClassifier(**{"grid": (2, 2), "steps": 0, "size": "bands"} | changes)
 
 
 @pytest.fixture(scope="module")
@@ -44,12 +49,12 @@ def test_scikit_learn_accepts_it(fitted: PalpateClassifier):
         estimator_checks.check_parameters_default_constructible,
         estimator_checks.check_estimator_repr,
     ):
-        check("PalpateClassifier", PalpateClassifier())
+        check("PalpateClassifier", library.PalpateClassifier())
     with pytest.warns(UserWarning, match="Can't test estimator"):
-        estimator_checks.check_estimator(PalpateClassifier())
-    copy = clone(fitted)
+        estimator_checks.check_estimator(library.PalpateClassifier())
+    copy = base.clone(fitted)
     assert copy.get_params() == fitted.get_params()
-    with pytest.raises(NotFittedError):
+    with pytest.raises(exceptions.NotFittedError):
         copy.predict(SWEEPS)
 
 
@@ -62,7 +67,7 @@ def test_labels_and_probabilities(fitted: PalpateClassifier):
     np.testing.assert_allclose(found.sum(axis=1), 1)
     frames = SWEEPS.transpose(0, 2, 1).reshape(48, 100, 2, 2)
     np.testing.assert_array_equal(fitted.predict_proba(frames[36:]), found)
-    np.testing.assert_array_equal(raw_counts(frames), raw_counts(SWEEPS, (2, 2)))
+    np.testing.assert_array_equal(sweeps.raw_counts(frames), sweeps.raw_counts(SWEEPS, (2, 2)))
     assert fitted.sweeps.groups["position"].tolist() == GROUPS[:36].tolist()
 
 
@@ -70,7 +75,8 @@ def test_labels_and_probabilities(fitted: PalpateClassifier):
 @pytest.mark.thorough  # four fits
 def test_groups_are_left_out():
     """cross_val_score over whole groups."""
-    found = cross_val_score(small(), SWEEPS, LABELS, groups=GROUPS, cv=LeaveOneGroupOut())
+    leave = model_selection.LeaveOneGroupOut()
+    found = model_selection.cross_val_score(small(), SWEEPS, LABELS, groups=GROUPS, cv=leave)
     assert found.tolist() == [1, 1, 1, 1]
 
 
@@ -86,7 +92,7 @@ def test_a_bundle_answers_with_the_boxs_code(fitted: PalpateClassifier, tmp_path
     assert head["protocol"] == "held-out position"
     assert 0 <= head["interval_95"][0] <= head["accuracy"] <= head["interval_95"][1] <= 1
     assert len(head["training_digest"]) == 16
-    box = load_bundle(tmp_path / "b")
+    box = library.load_bundle(tmp_path / "b")
     assert box.score(SWEEPS[36:], LABELS[36:]) >= 0.8
     known = set(box.predict(SWEEPS[36:])) - {"unknown"}
     assert known == {"felt", "wood"}
@@ -119,7 +125,7 @@ def test_counts_are_the_same_however_they_lie_in_memory(fitted: PalpateClassifie
         x = FORMS[form](SWEEPS[36:].astype(kind))
         np.testing.assert_array_equal(fitted.predict_proba(x), expected)
         made = small()._dataset(x, LABELS[36:], GROUPS[36:])
-        np.testing.assert_array_equal(made.samples, raw_counts(SWEEPS[36:], (2, 2)))
+        np.testing.assert_array_equal(made.samples, sweeps.raw_counts(SWEEPS[36:], (2, 2)))
         assert made.samples.dtype.isnative
 
 

@@ -6,32 +6,34 @@ from __future__ import annotations
 from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
-import torch
-from torch import Generator, Tensor
 
-from palpate_train.models import checkpoint, training
-from palpate_train.models.recipe.stages import StagesNetwork
-from palpate_train.models.training import TrainingRecipe
+from tests.factories.later import Later
 from tests.factories.sweep_sets import tones
 
-PLAIN = TrainingRecipe(steps=9, batch=8, ema=0.0, dropout=0.0, cycle=False)
-EVERYTHING = TrainingRecipe(steps=9, batch=8, ema=0.5, dropout=0.3)
+torch = Later("torch")
+checkpoint = Later("palpate_train.models.checkpoint")
+training = Later("palpate_train.models.training")
+stages = Later("palpate_train.models.recipe.stages")
+
+PLAIN = {"steps": 9, "batch": 8, "ema": 0.0, "dropout": 0.0, "cycle": False}
+EVERYTHING = {"steps": 9, "batch": 8, "ema": 0.5, "dropout": 0.3}
 
 
 class Interrupted(Exception):
     """An exception instead of a power failure."""
 
 
-def noisy(x: Tensor, rng: Generator) -> Tensor:
+def noisy(x: torch.Tensor, rng: torch.Generator) -> torch.Tensor:
     """Sweeps with added noise."""
     return x + 0.1 * torch.randn(x.shape, generator=rng)
 
 
 def fit(
-    recipe: TrainingRecipe, path: Path | None, stop_after: int = 99
-) -> tuple[dict[str, Tensor], list, list[str]]:
+    recipe: dict[str, Any], path: Path | None, stop_after: int = 99
+) -> tuple[dict[str, torch.Tensor], list, list[str]]:
     """The trained weights, the cost of each step, and the lines of progress. stop_after: the step
     after which it is interrupted."""
     lines: list[str] = []
@@ -44,8 +46,10 @@ def fit(
     sweeps = tones()
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(5)
-        net = StagesNetwork(sweeps.format, 3, 0.1)
-        net, cost = training.learn(net, sweeps, recipe, 1, log, augment=noisy, unfinished=path)
+        net = stages.StagesNetwork(sweeps.format, 3, 0.1)
+        net, cost = training.learn(
+            net, sweeps, training.TrainingRecipe(**recipe), 1, log, augment=noisy, unfinished=path
+        )
     return net.state_dict(), cost, lines
 
 
@@ -57,11 +61,11 @@ def check_same(one: tuple, other: tuple) -> None:
 
 @pytest.mark.parametrize("recipe", [PLAIN, EVERYTHING], ids=["plain", "everything"])
 def test_an_interrupted_training_gives_the_same_bits(
-    recipe: TrainingRecipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    recipe: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     """After two interruptions dropout, noise, batch norms, the rate and the moving average continue
     unchanged."""
-    monkeypatch.setattr(checkpoint, "wait", lambda took: 0.0)
+    monkeypatch.setattr("palpate_train.models.checkpoint.wait", lambda took: 0.0)
     path = tmp_path / "deeper" / "half.pt"
     for stop in (3, 7):
         with pytest.raises(Interrupted):
@@ -78,7 +82,7 @@ def test_a_file_that_cannot_be_read_counts_as_none(
     """If the file is empty, truncated or of other bytes, the training begins anew."""
     path = tmp_path / "half.pt"
     if broken is None:
-        monkeypatch.setattr(checkpoint, "wait", lambda took: 0.0)
+        monkeypatch.setattr("palpate_train.models.checkpoint.wait", lambda took: 0.0)
         with pytest.raises(Interrupted):
             fit(PLAIN, path, 3)
         broken = path.read_bytes()[:-2000]
@@ -92,6 +96,8 @@ def test_it_is_written_from_time_to_time(
 ):
     """Nine steps within ten seconds write no file."""
     seconds = count(0, step_s)
-    monkeypatch.setattr(checkpoint, "time", SimpleNamespace(monotonic=lambda: next(seconds)))
+    monkeypatch.setattr(
+        "palpate_train.models.checkpoint.time", SimpleNamespace(monotonic=lambda: next(seconds))
+    )
     fit(PLAIN, tmp_path / "half.pt")
     assert bool(list(tmp_path.iterdir())) == written

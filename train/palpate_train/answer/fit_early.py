@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import onnx
 from numpy.typing import NDArray
-from scipy import linalg
 
 from palpate.answer.early import Early
 from palpate.answer.unknown import EarlyClasses, EarlyDistances
@@ -123,6 +122,8 @@ def lda(x: Array, labels: Array, classes: int) -> tuple[Array, Array]:
     own = [x[labels == label] for label in present]
     means = np.stack([sweeps.mean(axis=0) for sweeps in own])
     covariance = np.mean([_covariance(sweeps) for sweeps in own], axis=0)
+    from scipy import linalg
+
     coefficients = linalg.lstsq(covariance, means.T)[0].T
     intercepts = -0.5 * (means * coefficients).sum(axis=1) - np.log(len(present))
     if len(present) == 2:  # only the difference counts

@@ -18,7 +18,6 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.random import Generator
 from numpy.typing import NDArray
-from scipy import fft
 
 from palpate_train.data.sets import Dataset
 
@@ -167,6 +166,8 @@ def _filtered(x: Array, augmentation: Augmentation, rng: Generator) -> Array:
     n, _, frames = x.shape
     if not (augmentation.damped or augmentation.colour) or frames < 2:
         return x
+    from scipy import fft
+
     frequency = 2 * np.fft.rfftfreq(frames).astype(np.float32)  # 1 is half the sampling rate
     passed = np.ones((n, len(frequency)), np.float32)
     if augmentation.damped:

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
 
 from palpate.core.errors import FormatError
 from palpate.core.types import Frames, digitized
@@ -128,6 +127,8 @@ def _regrid(x: Array, rows: float, degrees: float, share: float, rng: Generator)
     Beyond its edge the grid is mirrored. With three axes, the two of shear along rows and columns
     turn with the skin. share: part of GAIN_LAW by which the gains spread.
     """
+    from scipy.ndimage import map_coordinates
+
     r, c = x.shape[2:4]
     i, j = np.indices((r, c)) - (np.array([r, c]) - 1)[:, None, None] / 2
     place = rows + (i + 1j * j) * np.exp(1j * np.deg2rad(degrees))

@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
 
 from palpate.answer.objects import LEAST_PROBABILITY, softmax
 
@@ -54,6 +53,8 @@ def platt_temperature(logits: Array, labels: Array) -> float:
 def weighted_platt_temperature(logits: Array, labels: Array, weights: Array) -> float:
     """The temperature with the lowest cross entropy, with Platt's correction as above and the
     `weights` [n] of the sweeps, which sum to 1. It may be below 1."""
+    from scipy.optimize import minimize_scalar
+
     wrong = 1 / (len(labels) + 2)
 
     def cost(log_temperature: float) -> float:

@@ -17,7 +17,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap, to_rgba
 from matplotlib.figure import Figure
-from scipy.signal import spectrogram, welch
 
 from palpate.core.errors import FormatError
 from palpate.core.sweep_set import Array
@@ -375,6 +374,8 @@ def _image(axes: Axes, sweep: ShownSweep, taxels: Array) -> str:
 def _spectrum(axes: Axes, taxels: Array, format: SweepFormat) -> None:
     """Plot the mean power of all taxels and their range as amplitudes per root hertz, with the
     noise of rounding. taxels: [T, n]."""
+    from scipy.signal import welch
+
     hz, power = welch(
         taxels,
         format.rate_hz,
@@ -407,6 +408,8 @@ def _spectrum(axes: Axes, taxels: Array, format: SweepFormat) -> None:
 def _spectrogram(axes: Axes, sweep: ShownSweep, taxels: Array, start_s: float) -> None:
     """Draw the mean power of all taxels [T, n] in decibels over time and frequency, on the time
     axis of the signals."""
+    from scipy.signal import spectrogram
+
     rate = sweep.format.rate_hz
     piece = min(len(taxels) // 4, PIECE)
     hz, s, power = spectrogram(

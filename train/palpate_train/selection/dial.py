@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
 
 from palpate.core.errors import ApplianceError, BundleError, FormatError
 from palpate.core.provenance import commit
@@ -126,6 +125,8 @@ def difference(better: Array, worse: Array, clusters: Array) -> Difference:
     cluster succeed or fail together. The standard error is that over clusters, or that over sweeps
     if this is larger, because a few clusters may agree by chance.
     """
+    from scipy.stats import t as student
+
     lost = better.astype(float) - worse
     member = np.unique(clusters, return_inverse=True)[1]
     mean, n = float(lost.mean()), int(member.max()) + 1

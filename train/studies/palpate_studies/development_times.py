@@ -25,7 +25,6 @@ from palpate.inference.session import session
 from palpate_studies import cost, precisions
 from palpate_studies.development_chart import SERIES, TACTILE
 from palpate_studies.development_experiment import CASES, OURS
-from palpate_studies.peers import minirocket
 from palpate_studies.precisions import Packed
 from palpate_studies.study import StudyCase
 from palpate_train.data.progress import Progress
@@ -150,6 +149,8 @@ def _callable(
         (_entry(one, some), _call(method, one, sweeps.rate_hz)) for one in made
     ]
     if method.name == "minirocket":
+        from palpate_studies.peers import minirocket  # only here: scikit-learn
+
         found.append((alone | {"runtime": "aeon"}, minirocket.in_aeon(few, seed)))
     return found
 

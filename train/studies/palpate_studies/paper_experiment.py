@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from palpate.answer.objects import LEAST_PROBABILITY, fuse, softmax
 from palpate_studies import paper_values
 from palpate_studies.paper_values import CNN
-from palpate_studies.peers import prior_work
 from palpate_studies.study import Study, StudyCase, StudyRun
 from palpate_train.data.sets import Dataset
 from palpate_train.evaluate.evaluate import Plan, Result, evaluate
@@ -261,6 +260,8 @@ def _fused(outcome: Outcome, n: int, rule: str) -> Array:
 def explored(those: Sequence[Outcome]) -> list[dict[str, Any]]:
     """Sweeps added until the posterior reaches SURE (Xu et al. 2013): estimate and mean number of
     sweeps."""
+    from palpate_studies.peers import prior_work  # only here: scikit-learn
+
     points = []
     for sure in SURE:
         right, used = [], []

@@ -19,7 +19,7 @@ from palpate_train.data.run import Run
 from palpate_train.data.sets import Dataset
 from palpate_train.export import measure
 from palpate_train.metrics import score
-from palpate_train.models.recipe import graph, recipe, relations, stages
+from palpate_train.models.recipe import graph, recipe, relations
 from palpate_train.models.recipe.architectures import STAGES, Architecture
 from palpate_train.models.recipe.bank import Bank
 from palpate_train.models.recipe.recipe import FIXED, Settings, Trunk
@@ -103,6 +103,8 @@ def alone(sweeps: Dataset) -> Mapping[str, Trunk]:
 def _stages(sweeps: Dataset, every: Trunk) -> Trunk:
     """Stages that are hardly trained, which costs a sweep the same time."""
     augmentation = default_augmentation(FIXED.zero_sum(sweeps.format.window))
+    from palpate_train.models.recipe import stages  # only here: PyTorch
+
     weights, ranges = stages.train_stages(sweeps, every.scale, Run(SEED), 2, augmentation, STAGES)
     return Trunk(sweeps, every.scale, weights, STAGES, ranges)
 

@@ -10,12 +10,15 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-import scipy.io
 
 from palpate.core.errors import FormatError
 from palpate_train.data import raw_files
 from palpate_train.data.files import matlab
 from palpate_train.data.files.table import ReadPlan
+from tests.factories.later import Later
+
+scipy_io = Later("scipy.io")
+sparse = Later("scipy.sparse")
 
 SKIN = np.arange(40 * 4.0).reshape(40, 4)
 TYPES = ("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "?")
@@ -23,17 +26,17 @@ TYPES = ("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "?")
 
 def saved(path: Path, **values: object) -> Path:
     """A MAT file of version 5, compressed."""
-    scipy.io.savemat(path, values, do_compression=True)
+    scipy_io.savemat(path, values, do_compression=True)
     return path
 
 
 @pytest.mark.parametrize("version", ["4", "5"])
 def test_numbers_are_read_in_their_type(tmp_path: Path, version: str):
     """Beside a vector of times, a text, complex and sparse numbers, which are passed over."""
-    others = {"who": "Ada", "z": SKIN * 1j, "t": np.arange(40.0), "s": scipy.sparse.eye(9)}
+    others = {"who": "Ada", "z": SKIN * 1j, "t": np.arange(40.0), "s": sparse.eye(9)}
     for kind in TYPES if version == "5" else ("f8", "f4", "i4", "i2", "u2", "u1"):
         skin = (SKIN % 100).astype(kind)
-        scipy.io.savemat(tmp_path / "a.mat", {"skin": skin} | others, format=version)
+        scipy_io.savemat(tmp_path / "a.mat", {"skin": skin} | others, format=version)
         found = raw_files.read(tmp_path / "a.mat", ReadPlan(time="t"))
         np.testing.assert_array_equal(found.values, skin)
         assert found.values.dtype == kind
@@ -113,7 +116,7 @@ def test_damage_is_told(tmp_path: Path):
     FormatError."""
     rng = np.random.default_rng(0)
     for version in ("4", "5"):
-        scipy.io.savemat(tmp_path / "a.mat", {"skin": SKIN, "t": np.arange(40.0)}, format=version)
+        scipy_io.savemat(tmp_path / "a.mat", {"skin": SKIN, "t": np.arange(40.0)}, format=version)
         whole = (tmp_path / "a.mat").read_bytes()
         for _ in range(10):
             data = bytearray(whole[: len(whole) - rng.integers(200)])

@@ -20,16 +20,18 @@ from palpate_train.data import sets
 from palpate_train.data.run import Run
 from palpate_train.data.sets import Dataset
 from palpate_train.data.splitters import inner_parts
-from palpate_train.models import checkpoint
 from palpate_train.models.methods import SkinUse
 from palpate_train.models.recipe import choice, palpate, recipe
 from palpate_train.models.recipe import fitted as fitted_module
 from palpate_train.models.recipe.architectures import STAGES
 from palpate_train.models.recipe.fitted import Fit
 from palpate_train.models.recipe.recipe import Settings
-from palpate_train.models.recipe.stages import StagesNetwork
 from palpate_train.onnx_tools.graph_builder import run, with_head
+from tests.factories.later import Later
 from tests.factories.sweep_sets import easy
+
+checkpoint = Later("palpate_train.models.checkpoint")
+stages = Later("palpate_train.models.recipe.stages")
 
 CLOSED = Settings(steps=0)
 INTERRUPTED = 130
@@ -214,11 +216,11 @@ def test_an_interrupted_fit_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     cache."""
     monkeypatch.setattr(recipe, "LEAST_SWEEPS", 1)
     monkeypatch.setattr(recipe, "ENOUGH", 1.01)
-    monkeypatch.setattr(checkpoint, "wait", lambda took: 0.0)
+    monkeypatch.setattr("palpate_train.models.checkpoint.wait", lambda took: 0.0)
     monkeypatch.setattr(fit_command, "CACHE", tmp_path / "cache")
     monkeypatch.setattr(fitted_module, "fit_calibration", uncalibrated)
     easy().save(tmp_path / "easy.npz")
-    plain, steps = StagesNetwork.backward, []
+    plain, steps = stages.StagesNetwork.backward, []
 
     def backward(*args):
         if len(steps) == stop:
@@ -232,7 +234,7 @@ def test_an_interrupted_fit_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         assert main(["fit", *args]) == (0 if stop < 0 else INTERRUPTED)
         return Fit.load(out) if stop < 0 else None
 
-    monkeypatch.setattr(StagesNetwork, "backward", backward)
+    monkeypatch.setattr(stages.StagesNetwork, "backward", backward)
     stop = 7
     fitted("first")
     assert len(list((tmp_path / "cache").iterdir())) == 1

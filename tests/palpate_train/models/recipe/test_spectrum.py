@@ -18,9 +18,11 @@ from palpate_train.data.run import Run
 from palpate_train.models.recipe import graph, recipe, spectrum
 from palpate_train.models.recipe.architectures import Architecture
 from palpate_train.models.recipe.sizes import SIZES
-from palpate_train.models.recipe.stages import StagesNetwork
 from palpate_train.onnx_tools import graph_builder
+from tests.factories.later import Later
 from tests.factories.sweep_sets import easy
+
+stages = Later("palpate_train.models.recipe.stages")
 
 BARE = Architecture((), planned=3, spectrum=True)
 SMALL = Architecture((6, 8, 8), 8, 2)
@@ -120,7 +122,7 @@ def test_a_noisy_taxel_is_attenuated_as_for_the_trunk(dtype: str):
     assert turned(counts.reshape(2, 600, 16).astype(float)).min() < 0.8
     assert np.abs(defined(format, counts, True, limited=False) - want).max() > 0.3
     np.testing.assert_allclose(graph_builder.run(trunk(format), counts), want[:, -1], atol=2e-3)
-    plain = StagesNetwork(format, 3, 0.1, norm=False, architecture=SMALL).eval()
+    plain = stages.StagesNetwork(format, 3, 0.1, norm=False, architecture=SMALL).eval()
     weights, found, size = plain.weights(), plain.ranges(counts), want.shape[2]
     for ranges in (None, found):
         for prefixes in (False, True):

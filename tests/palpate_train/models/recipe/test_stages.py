@@ -11,7 +11,6 @@ import numpy as np
 import onnx
 import onnxruntime
 import pytest
-import torch
 from onnx import numpy_helper
 
 from palpate.core.errors import FormatError
@@ -22,14 +21,17 @@ from palpate_train.data.augment import Augmentation
 from palpate_train.data.run import Run
 from palpate_train.models import methods
 from palpate_train.models.methods import Effort
-from palpate_train.models.recipe import architectures, graph, spectrum, stages
+from palpate_train.models.recipe import architectures, graph, spectrum
 from palpate_train.models.recipe.architectures import STAGES, Architecture
 from palpate_train.models.recipe.fitted import Fit
 from palpate_train.models.recipe.recipe import Settings, Setup
-from palpate_train.models.recipe.stages import StagesNetwork
 from palpate_train.onnx_tools import graph_builder
+from tests.factories.later import Later
 from tests.factories.sweep_sets import easy
 from tests.factories.trained_stages import joining, with_stages
+
+torch = Later("torch")
+stages = Later("palpate_train.models.recipe.stages")
 
 SMALL = Architecture((6, 8, 8), 8, 2)
 
@@ -50,11 +52,11 @@ def drawn(format: SweepFormat, n: int = 6, seed: int = 0) -> np.ndarray:
 
 def trunks(
     format: SweepFormat, architecture: Architecture = SMALL, **asked: bool
-) -> tuple[StagesNetwork, onnx.ModelProto, onnx.ModelProto]:
+) -> tuple[stages.StagesNetwork, onnx.ModelProto, onnx.ModelProto]:
     """A network with random weights, its float and its int8 trunk."""
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        model = StagesNetwork(format, 3, 0.1, architecture=architecture)
+        model = stages.StagesNetwork(format, 3, 0.1, architecture=architecture)
         model.train()(torch.from_numpy(drawn(format).astype(np.float32)))
     model = model.fused()
     weights, found = (
@@ -67,7 +69,7 @@ def trunks(
     )
 
 
-def seen(model: StagesNetwork, counts: np.ndarray) -> np.ndarray:
+def seen(model: stages.StagesNetwork, counts: np.ndarray) -> np.ndarray:
     """The features of the counts in PyTorch."""
     with torch.no_grad():
         return model.features(model.prepare(torch.from_numpy(counts.astype(np.float32)))).numpy()
@@ -117,7 +119,7 @@ def test_stages_are_as_large_as_stated():
 def test_stages_ignore_offsets():
     """A constant on each taxel changes nothing, because of the kernels and not because of
     `prepare`."""
-    model = StagesNetwork(skin.FORMAT, 6, 0.1, norm=False)
+    model = stages.StagesNetwork(skin.FORMAT, 6, 0.1, norm=False)
     rng = np.random.default_rng(0)
     counts = torch.from_numpy(rng.integers(0, 100, (2, 16, 1500)).astype(np.float32))
     offset = torch.from_numpy(rng.integers(0, 100, (2, 16, 1)).astype(np.float32))
@@ -132,7 +134,7 @@ def test_stages_ignore_offsets():
 
 def test_fused_norms_change_nothing():
     """The folded network answers as the trained one in evaluation."""
-    model = StagesNetwork(SweepFormat(2, 2, 100.0, 64, "uint8"), 3, 0.1)
+    model = stages.StagesNetwork(SweepFormat(2, 2, 100.0, 64, "uint8"), 3, 0.1)
     counts = torch.from_numpy(easy(8).samples.astype(np.float32))
     for norm in model.norms:
         torch.nn.init.uniform_(norm.weight, 0.5, 2)
@@ -243,7 +245,7 @@ def test_the_first_kernels_do_not_hear_the_mains(mains_hz: int):
     with torch.random.fork_rng():
         torch.manual_seed(0)
         deaf, short = (
-            StagesNetwork(
+            stages.StagesNetwork(
                 skin.FORMAT, 3, 1.0, architecture=Architecture((6, 8), kernel, 4, mains_hz=mains_hz)
             )
             for kernel in (16, 8)

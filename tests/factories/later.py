@@ -1,0 +1,21 @@
+"""Modules that take long to import: a process of tests that runs none of theirs does without."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+
+class Later:
+    """A module that is imported at its first use, not when the tests are collected.
+
+    A test patches it by its full name.
+    """
+
+    def __init__(self, name: str) -> None:
+        vars(self)["module"] = name
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith(("__", "_pytest")):  # pytest looks for its marks on every object
+            raise AttributeError(name)
+        return getattr(import_module(vars(self)["module"]), name)
