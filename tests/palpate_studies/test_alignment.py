@@ -58,10 +58,7 @@ def test_moving_is_measured(model: Bundle, monkeypatch: pytest.MonkeyPatch):
         "| T-HARD, a row ahead and all else anew",
         "| not at all",
     ]
-    assert (
-        f"| {home['unsure']} | {home['unknown']} | {100 * home['network'][0]:.1f} % ["
-        in table.splitlines()[-1]
-    )
+    assert f"| {home['unsure']} | {home['unknown']} | " in table.splitlines()[-1]
     with pytest.raises(FormatError, match="no positions"):
         alignment.measure(
             Classifier(

@@ -83,8 +83,8 @@ def test_the_table_has_a_row_for_each_view_with_its_sets():
     assert head.count("|") == line.count("|") == rows[0].count("|") == 7
     assert [row.split("|")[1].strip() for row in rows] == list(recipe_page.VIEWS)
     assert "| 13, 23.5 µs, 3 KB |" in rows[3]
-    assert rows[3].endswith("| 2 of 2: 7 fabrics, tubes |")
-    assert rows[-1].endswith("| 1 of 2: 7 fabrics |")
+    assert rows[3].endswith("| all 2 |")
+    assert rows[-1].endswith("| 7 fabrics |")
     assert rows[0].endswith("| no set |")
 
 

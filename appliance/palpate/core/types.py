@@ -159,7 +159,7 @@ class Frames:
 def entries(record: Any) -> dict[str, Any]:
     """The fields of a dataclass with slots, by name, for code that runs with each sweep. At each
     call dataclasses.asdict makes a tuple of a generator. Python keeps up to 2,000 tuples of each
-    length for later use, so memory would grow for hours (docs/faults.md)."""
+    length for later use, so memory would grow for hours."""
     return {name: getattr(record, name) for name in record.__slots__}
 
 

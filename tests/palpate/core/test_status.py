@@ -15,8 +15,8 @@ from tests.factories.paths import ROOT
 
 
 def test_all_that_is_said_of_a_status_is_of_the_table():
-    """PROTOCOL.md's list, the page of statuses, Modbus in code and page, the card of the page:
-    each has every status in the order of the codes, with the words of the table."""
+    """PROTOCOL.md's list, the page of statuses, Modbus, the card of the page: each has every status
+    in the order of the codes, with the words of the table."""
     protocol = (ROOT / "firmware_config" / "PROTOCOL.md").read_text()
     listed = protocol.split("| status | meaning")[1].split("\n\n")[0]
     assert re.findall(r"(?m)^\| `([a-z-]+)` \|", listed) == [*Status]
@@ -24,9 +24,6 @@ def test_all_that_is_said_of_a_status_is_of_the_table():
     rows = re.findall(r"(?m)^\| `([a-z-]+)` \| (\d+) \| ([^|]*) \| [^|]+ \| [^|]+ \|$", page)
     assert rows == [(s, str(w.code), w.robot) for s, w in WORDS.items()]
     assert {s: w.code for s, w in WORDS.items()} == STATUS_CODES
-    modbus = (ROOT / "docs" / "robots" / "modbus.md").read_text()
-    codes = modbus.partition("Status codes")[2].partition("\n\n")[0]
-    assert re.findall(r"(\d+)\s`([a-z-]+)`", codes) == [(str(w.code), s) for s, w in WORDS.items()]
     _, script = page_files()["/statuses.js"]
     shown = json.loads(script.decode().removeprefix("export const STATUSES = ").rstrip(";\n"))
     assert shown == {s: [w.colour, w.word, w.advice] for s, w in WORDS.items()}

@@ -1,8 +1,4 @@
-"""The results of the study `alignment` as tables in Markdown.
-
-They show the answers of the box beside the labels of the network alone, because these differ much
-for a displaced contact.
-"""
+"""The results of the study `alignment` as tables in Markdown: the answers of the box."""
 
 from __future__ import annotations
 
@@ -18,7 +14,6 @@ HEAD = (
     "wrongly",
     "`unsure`",
     "`unknown`",
-    "by label alone, correctly",
     "marked",
     "wrong and not marked",
 )
@@ -77,7 +72,6 @@ def _cells(text: str, point: Json) -> tuple[str, ...]:
         estimate(point["wrong_share"]),
         str(point["unsure"]),
         str(point["unknown"]),
-        estimate(point["network"]),
         estimate(point["moved"], 0),
         str(point["wrong_unflagged"]),
     )

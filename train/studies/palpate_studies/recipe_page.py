@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from palpate_train.reports.formatting import amount
@@ -17,7 +17,7 @@ VIEWS = {
     "shares": (
         "share of each filter's responses above a threshold",
         "stick and slip: rare strong responses, which a mean hides",
-        "beside the filters, in every second discriminant",
+        "with the filters, in every second discriminant",
     ),
     "distribution": (
         "shares of counts and of their differences above thresholds, of each taxel",
@@ -60,10 +60,20 @@ def table(results: Json) -> str:
         spent = (
             f"{cost['features']}, {amount(cost['us'], 'µs')}, {amount(cost['bytes'] / 1e3, 'KB')}"
         )
-        sets = [one["set"] for one in results["sets"] if name in one["views"]]
-        on = f"{len(sets)} of {len(results['sets'])}: {', '.join(sets)}" if sets else "no set"
+        on = _on(name, results["sets"])
         rows.append(f"| {name} | {features} | {purpose} | {spent} | {when} | {on} |")
     return "\n".join(rows)
+
+
+def _on(view: str, sets: Sequence[Json]) -> str:
+    """The sets whose fit has this view, or those without it where these are fewer."""
+    chosen = [one["set"] for one in sets if view in one["views"]]
+    without = [one["set"] for one in sets if view not in one["views"]]
+    if not without:
+        return f"all {len(sets)}"
+    if len(without) < len(chosen):
+        return f"all but {', '.join(without)}"
+    return ", ".join(chosen) or "no set"
 
 
 def loads(results: Json) -> str:
