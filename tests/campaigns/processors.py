@@ -24,7 +24,7 @@ NUMERICAL = (
     *(f"tests/palpate/{name}" for name in ("answer", "inference", "learn")),
     *(
         f"tests/palpate_train/{name}"
-        for name in ("calibration", "evaluate", "export", "metrics", "models")
+        for name in ("answer", "evaluate", "export", "metrics", "models")
     ),
 )
 """The packages that compute with matrices; the others read, write, wait and show."""
