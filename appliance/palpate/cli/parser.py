@@ -14,7 +14,7 @@ EXIT_CODES = """\
 exit codes: 0 done, and all is well; 1 another error or a failed check; 2 wrong
 arguments; 65 a file of another format; 69 hardware, an address or a port is missing;
 70 the model failed; 75 not possible now; 78 settings or bundle; 130 interrupted. `run`
-waits for a skin or a serial port without limit; `check` names what is missing"""
+waits for a skin or a serial port without limit; `check` says what is missing"""
 Parser = argparse.ArgumentParser
 
 
@@ -127,7 +127,7 @@ GROUPS: Mapping[str, Mapping[str, CommandEntry]] = {
             " record-page",
         ),
         "teach": CommandEntry(
-            "learn materials from sweeps beside the robot, without a desktop",
+            "learn materials from sweeps at the robot, without a desktop",
             "cli.teach_command.run",
             f"{_SKIN} {_TIMES} label good place attachment format window use unknown forget by"
             " steps teach-page",
@@ -157,7 +157,7 @@ COMMANDS: Mapping[str, CommandEntry] = {n: c for group in GROUPS.values() for n,
 def parser(*names: str) -> Parser:
     """The parser of `palpate`, with the options of the commands `names`; of all without any."""
     width = max(map(len, COMMANDS))
-    lines = ["Names the material that a robot has just touched."]
+    lines = ["Classifies the material that a robot has just touched."]
     for heading, commands in GROUPS.items():
         lines += ["", f"{heading}:", *(f"  {n:<{width}}  {c.text}" for n, c in commands.items())]
     lines += ["", "palpate COMMAND --help shows the options of a command."]

@@ -1,1 +1,1 @@
-"""Teaching: the box learns materials from sweeps beside the robot, without a desktop."""
+"""Teaching: the box learns materials from sweeps at the robot, without a desktop."""

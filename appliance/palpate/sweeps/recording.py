@@ -213,7 +213,7 @@ class RecordingSession(Observer):
             self._counted[number] = labels
 
     def _tell(self, verdict: Verdict, outcome: str, labels: Labels) -> None:
-        """Log the outcome of a sweep, for a person beside the robot and a person at a terminal."""
+        """Log the outcome of a sweep, for a person at the robot and a person at a terminal."""
         if outcome in ("full", "failed"):
             return  # that was logged when it began
         if verdict.status.faulty or outcome != "stored":
