@@ -10,14 +10,17 @@ position. For a skin with several axes only the normal axis counts.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.answer.pipeline import Context, Displacement, Refusal
+from palpate.answer.window import Window
 from palpate.core.errors import BundleError
 from palpate.core.types import Status, normal
 
@@ -74,14 +77,18 @@ class ContactPositions:
     def offset(self, centre: Point) -> Point:
         """Vector from the nearest trained position to `centre` (in taxels, from `centre()`): mm
         along rows and columns."""
-        rows = centre[0] * self.pitch_mm - np.array(self.rows_mm)
-        cols = centre[1] * self.pitch_mm - np.array(self.cols_mm)
-        nearest = np.hypot(rows, cols).argmin()
-        return float(rows[nearest]), float(cols[nearest])
+        away = complex(*centre) * self.pitch_mm - _points(self.rows_mm, self.cols_mm)
+        nearest = away[np.abs(away).argmin()]
+        return float(nearest.real), float(nearest.imag)
 
     def within(self, offset: Point) -> bool:
         """Whether a contact at this offset (mm) from a trained position counts as in place."""
-        return bool(np.hypot(*offset) <= self.limit_mm)
+        return math.hypot(*offset) <= self.limit_mm
+
+
+@lru_cache(maxsize=4)
+def _points(rows_mm: tuple[float, ...], cols_mm: tuple[float, ...]) -> NDArray[np.complex128]:
+    return np.array(rows_mm) + 1j * np.array(cols_mm)
 
 
 def _length(value: Any) -> bool:
@@ -100,22 +107,24 @@ def centre(taxels: NDArray[Any], tare: NDArray[np.float64], contact: float) -> P
     differ between attachments, which causes larger errors in a fit. A saturated taxel counts at
     full scale.
     """
-    taxels = normal(taxels, 1)
-    # contiguous: twice as fast to reduce
-    series = np.ascontiguousarray(taxels.reshape(len(taxels), -1).T)
-    mean = series.mean(axis=1, dtype=np.float64).reshape(taxels.shape[1:])
-    return centre_of(mean, normal(tare, 0), contact)
+    mean = Window(taxels).mean.reshape(taxels.shape[1:])
+    return centre_of(normal(mean, 0), normal(tare, 0), contact)
 
 
 def centre_of(mean: NDArray[np.float64], tare: NDArray[np.float64], contact: float) -> Point | None:
     """As `centre`, from the mean counts [R, C] along the normal. tare: [R, C]."""
     load = mean - tare
-    load = fill_dead_taxels(np.where(np.isfinite(load) & (load >= contact), load, 0))
-    total = load.sum()
-    if total <= 0:
-        return None
-    rows, cols = load.sum(axis=1), load.sum(axis=0)
-    return float(rows @ np.arange(len(rows)) / total), float(cols @ np.arange(len(cols)) / total)
+    if not contact <= load.min() <= load.max() < np.inf:
+        load = fill_dead_taxels(np.where((load >= contact) & (load < np.inf), load, 0))
+    total, row, column = (_moments(*load.shape) @ load.ravel()).tolist()
+    return (row / total, column / total) if total > 0 else None
+
+
+@lru_cache(maxsize=4)
+def _moments(rows: int, cols: int) -> NDArray[np.float64]:
+    """One, the row and the column of each taxel, [3, R * C]."""
+    row, column = np.divmod(np.arange(rows * cols), cols)
+    return np.stack([np.ones(rows * cols), row, column])
 
 
 def fill_dead_taxels(load: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -141,7 +150,7 @@ def advice(offset: Point, shape: Sequence[int]) -> str:
     """Describes the offset (mm along rows, columns) from a trained position on a skin of `shape`
     [R, C], for example "2.1 mm too far towards row 4". The larger direction comes first; a
     direction below LEAST_PART is left out."""
-    least = LEAST_PART * np.hypot(*offset)
+    least = LEAST_PART * math.hypot(*offset)
     parts = [
         (abs(mm), f"{name} {n if mm > 0 else 1}")
         for mm, name, n in zip(offset, ("row", "column"), shape, strict=True)
@@ -164,7 +173,7 @@ def displacement(
     found = centre_of(normal(mean, 0), normal(tare, 0), contact)
     if found is None or positions.within(offset := positions.offset(found)):
         return Displacement()
-    return Displacement(float(np.hypot(*offset)), f"moved {advice(offset, tare.shape[:2])}")
+    return Displacement(math.hypot(*offset), f"moved {advice(offset, tare.shape[:2])}")
 
 
 class LocateContact:

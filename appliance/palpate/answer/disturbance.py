@@ -8,7 +8,7 @@ disturbance is judged as before. docs/decisions/0005 has the gain and the cost.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.answer.pipeline import Context, Refusal
+from palpate.answer.window import Counts, Window, shares
 from palpate.core.errors import BundleError
 from palpate.core.types import Status, normal
 
@@ -47,19 +48,23 @@ TINY = 1e-30
 """Replaces a power or a load of 0."""
 
 
-def noise(taxels: Array) -> float:
+def noise(taxels: Counts) -> float:
     """Natural logarithm of the noise power of the median taxel, in counts squared. taxels: raw
     counts [T, R, C] or [T, R, C, A] of a window; only the normal axis is used."""
-    if len(taxels) <= ORDER:
+    counts = Window.of(taxels).counts
+    frames, values = counts.shape
+    if frames <= ORDER:
         return -math.inf
-    first = max(0, (len(taxels) - FRAMES) // 2)
-    some = normal(taxels, 1)[first : first + FRAMES]
-    counts = some.reshape(len(some), -1).astype(np.float32)
+    first = max(0, (frames - FRAMES) // 2)
+    steps = counts[first : first + FRAMES].ravel()
     with np.errstate(all="ignore"):  # float32 counts may be infinite
-        steps = np.diff(counts, ORDER, axis=0)
-        powers = np.sort(np.einsum("tv,tv->v", steps, steps))  # those that are not finite are last
-        middle = (powers[(len(powers) - 1) // 2] + powers[len(powers) // 2]) / 2
-    power = float(middle) / (len(steps) * math.comb(2 * ORDER, ORDER))
+        for _ in range(ORDER):
+            steps = steps[values:] - steps[:-values]
+        steps *= steps
+        squares = steps.reshape(-1, values)
+        powers = np.sort(shares(len(squares)).dot(squares))  # those that are not finite are last
+    middle = float(powers[(values - 1) // 2]) + float(powers[values // 2])
+    power = middle / 2 / math.comb(2 * ORDER, ORDER)
     return math.log(max(power, TINY)) if math.isfinite(power) else math.log(TINY)
 
 
@@ -155,10 +160,10 @@ class Disturbances:
                 "bundle again"
             )
 
-    def sizes(self, values: Mapping[str, float]) -> NDArray[np.float64]:
-        """Sizes float64 [D] of the disturbances of a sweep. values: by name; one that is missing
-        is not known."""
-        return np.array([a.size(values.get(a.of, math.nan)) for a in self.allowances])
+    def sizes(self, values: Mapping[str, float]) -> list[float]:
+        """Sizes [D] of the disturbances of a sweep. values: by name; one that is missing is not
+        known."""
+        return [a.size(values.get(a.of, math.nan)) for a in self.allowances]
 
     def beyond(self, name: str, values: Mapping[str, float]) -> float:
         """How far the value with this name is above training, 0 within it; see Allowance.size."""
@@ -171,10 +176,10 @@ class Disturbances:
         found = [a.untried(values.get(a.of, math.nan)) for a in self.allowances]
         return ", ".join(filter(None, found))
 
-    def growth(self, sizes: NDArray[np.float64]) -> float:
+    def growth(self, sizes: Sequence[float]) -> float:
         """Factor of the limit of known materials: that of the disturbance that allows most."""
-        slopes = np.array([a.slope for a in self.allowances])
-        return 1 + float((slopes * sizes).max(initial=0.0))
+        grown = (a.slope * size for a, size in zip(self.allowances, sizes, strict=True))
+        return 1 + max(grown, default=0.0)
 
 
 class MeasureDisturbances:
@@ -186,11 +191,11 @@ class MeasureDisturbances:
     def apply(self, context: Context) -> None:
         """Measure them in a checked window without hum."""
         assert context.mean is not None
-        tare = context.tare if self._unloaded else np.zeros_like(context.tare)
+        tare = context.tare * self._unloaded
         context.disturbed = {
             "lost": context.sweep.lost / len(context.taxels),
             "hum": hum(context.hum),
-            "noise": noise(context.taxels),
+            "noise": noise(context.window),
             "speed": speed(context.slide.taxels_s),
             "load": load(context.mean, tare),
         }

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.answer.pipeline import Context
+from palpate.answer.window import Counts, Waves, Window, waves
 from palpate.core.types import SweepFormat, digitized, normal
 
 Array = NDArray[Any]
@@ -45,14 +46,14 @@ TINY = 1e-30
 class HumLines:
     """The lines that a window of some length can show.
 
-    hz, mains, order: [L], frequency, that of the mains, and the multiple. parts: float32 [2 * L *
-    (1 + 2 * len(ASIDE)), T], real and imaginary waves at each line and at frequencies around it.
+    hz, mains, order: [L], frequency, that of the mains, and the multiple. waves: at each line and
+    at frequencies around it, F = L * (1 + 2 * len(ASIDE)).
     """
 
     hz: Array
     mains: Array
     order: Array
-    parts: Array
+    waves: Waves
 
     @classmethod
     def of(cls, frames: int, rate_hz: float, multiples: int) -> HumLines:
@@ -68,17 +69,8 @@ class HumLines:
         ]
         hz, mains, order = np.array(lines).reshape(-1, 3).T
         aside = np.array([0, *ASIDE, *(-step for step in ASIDE)]) / seconds
-        # a product of real numbers takes a quarter of the time
-        waves = _waves((hz[:, None] + aside).ravel(), np.hanning(frames), rate_hz)
-        parts = np.concatenate([waves.real, waves.imag])
-        return cls(hz, mains, order, np.ascontiguousarray(parts, np.float32))
-
-
-def _waves(hz: Array, hann: Array, rate_hz: float) -> NDArray[np.complex64]:
-    """Multiplies counts [T, V] to give complex amplitudes [F, V] at `hz` [F]."""
-    turns = np.exp(-2j * np.pi / rate_hz * hz[:, None] * np.arange(len(hann))) * hann
-    turns -= turns.mean(axis=1, keepdims=True)  # the constant part of the counts
-    return turns.astype(np.complex64)
+        every = (hz[:, None] + aside).ravel()
+        return cls(hz, mains, order, Waves(every, frames, rate_hz))
 
 
 class HumFilter:
@@ -91,22 +83,24 @@ class HumFilter:
         self._lines: dict[tuple[int, bool], HumLines] = {}  # by frames, and whether of a whole comb
         self.hz = tuple(sorted(set(self._of(format.window).mains.tolist())))
 
-    def ratio(self, taxels: Array) -> float:
+    def ratio(self, taxels: Counts) -> float:
         """How much the hum of one window stands out: the amplitude of a line by those beside it. 0
         without a line in phase. taxels: raw counts [T, R, C] or [T, R, C, A]; only the normal axis
         is used."""
-        return float(self._ratios(self._of(len(taxels)), taxels).max(initial=0.0))
+        window = Window.of(taxels)
+        return float(self._ratios(self._of(len(window)), window).max(initial=0.0))
 
-    def __call__(self, taxels: Array, least: float) -> tuple[Array, float]:
+    def __call__(self, taxels: Counts, least: float) -> tuple[Array, float]:
         """One window without hum, and the amplitude of this hum in counts; the window as it is and
         0 if no line stands out by `least`."""
-        searched = self._of(len(taxels))
-        found = self._ratios(searched, taxels, least)
+        window = Window.of(taxels)
+        taxels, searched = window.taxels, self._of(len(window))
+        found = self._ratios(searched, window, least)
         if not found.max(initial=0.0) >= least:
             return taxels, 0.0
         series = taxels.reshape(len(taxels), -1).astype(np.float64)
         series -= series.mean(axis=0)
-        every = self._comb(searched, int(found.argmax()), taxels, series.sum(axis=1))
+        every = self._comb(searched, int(found.argmax()), window, series.sum(axis=1))
         turns = 2 * np.pi / self._rate_hz * np.outer(np.arange(len(taxels)), every)
         waves = np.linalg.qr(np.concatenate([np.sin(turns), np.cos(turns)], axis=1))[0]
         hum = (waves @ (waves.T @ series)).reshape(taxels.shape)
@@ -123,35 +117,34 @@ class HumFilter:
         return lines
 
     def _comb(
-        self, searched: HumLines, strongest: int, taxels: Array, common: Array
+        self, searched: HumLines, strongest: int, window: Window, common: Array
     ) -> list[float]:
         """The frequencies of the lines that the window has of a comb. strongest: number of the line
         that was found. common: float64 [T], sum of all taxels."""
         mains, order = searched.mains[strongest], searched.order[strongest]
         hz = self._refined(common, searched.hz[strongest], OFF_HZ * order)
-        lines = self._of(len(taxels), comb=True)
-        present = (lines.mains == mains) & (self._ratios(lines, taxels) >= FAINT)
+        lines = self._of(len(window), comb=True)
+        present = (lines.mains == mains) & (self._ratios(lines, window) >= FAINT)
         others = [k for k in lines.order[present] if k != order]
         off_hz = OFF_HZ / STEPS
         return [hz, *(self._refined(common, hz / order * k, off_hz * k) for k in others)]
 
-    def _ratios(self, lines: HumLines, taxels: Array, least: float = 0.0) -> Array:
+    def _ratios(self, lines: HumLines, window: Window, least: float = 0.0) -> Array:
         """Ratio of each line [L], 0 for a line that is not in phase or surely below `least`."""
         found = np.zeros(len(lines.hz))
         if not len(found):
             return found
-        counts = normal(taxels, 1).reshape(len(taxels), -1).astype(np.float32)
-        counts -= counts[0]
         with np.errstate(all="ignore"):  # float32 counts may be infinite
-            parts = (lines.parts @ counts).reshape(2, len(found), 1 + 2 * len(ASIDE), -1)
-            power = (parts * parts).sum(axis=0)
-            beside = power[:, 1:].mean(axis=1)
+            parts = lines.waves(window.counts)
+            power = (parts * parts).reshape(2, len(found), 1 + 2 * len(ASIDE), -1).sum(axis=0)
+            beside = np.add.reduce(power[:, 1:], axis=1) / (2 * len(ASIDE))
             # the ratio of two sums is at most the largest ratio of their parts
-            possible = (power[:, 0] >= least**2 * beside).any(axis=1)
-            for i in np.flatnonzero(possible):
+            possible = power[:, 0] >= least**2 * beside
+            for i in np.flatnonzero(possible.any(axis=1)) if possible.any() else ():
                 near = np.sqrt(beside[i])
                 quiet = np.argsort(near)[: max(1, len(near) // QUIET)]
-                at = parts[0, i, 0, quiet] + 1j * parts[1, i, 0, quiet]
+                real, imaginary = parts[i * power.shape[1] :: len(parts) // 2, quiet]
+                at = real + 1j * imaginary
                 size = np.abs(at).sum()
                 ratio = size / max(near[quiet].sum(), TINY)
                 if np.abs(at.sum()) >= IN_PHASE * size > 0 and np.isfinite(ratio):
@@ -162,9 +155,7 @@ class HumFilter:
         """The frequency within `off_hz` of `hz` at which all taxels together, float64 [T], have
         most power: the highest of some frequencies, and the vertex of a parabola around it."""
         tried = hz + np.linspace(-off_hz, off_hz, STEPS)
-        power = np.log(
-            np.abs(_waves(tried, np.hanning(len(common)), self._rate_hz) @ common) + TINY
-        )
+        power = np.log(np.abs(waves(tried, len(common), self._rate_hz) @ common) + TINY)
         top = int(power.argmax())
         if top in (0, STEPS - 1):
             return float(tried[top])
@@ -182,4 +173,4 @@ class RemoveHum:
 
     def apply(self, context: Context) -> None:
         """Remove the hum."""
-        context.taxels, context.hum = self._filter(context.taxels, self._least)
+        context.taxels, context.hum = self._filter(context.window, self._least)

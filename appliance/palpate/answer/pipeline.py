@@ -14,6 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.answer.window import Window
 from palpate.core.types import Status, Sweep
 
 Array = NDArray[Any]
@@ -93,6 +94,14 @@ class Context:
     fused: int = 0
     after: int = 0
     final: bool = False
+    _window: Window | None = None
+
+    @property
+    def window(self) -> Window:
+        """The taxels, with what several stages need of them."""
+        if self._window is None or self._window.taxels is not self.taxels:
+            self._window = Window(self.taxels)
+        return self._window
 
 
 class Stage(Protocol):

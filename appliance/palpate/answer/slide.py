@@ -17,9 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.answer.pipeline import Context, Refusal, Slide
+from palpate.answer.window import Counts, Waves, Window
 from palpate.core.directions import DIRECTIONS
 from palpate.core.errors import BundleError
-from palpate.core.types import Status, SweepFormat, normal
+from palpate.core.types import Status, SweepFormat
 
 Array = NDArray[Any]
 
@@ -128,94 +129,98 @@ class SlideMeter:
         self._frames = int(seconds * format.rate_hz) // self._each
         hz = np.fft.rfftfreq(self._frames, self._each / format.rate_hz)
         hz = hz[(hz >= LEAST_CYCLES / seconds - 1e-9) & (hz <= BAND_HZ)]
-        self._transform = _transform(hz, self._frames, self._each / format.rate_hz)
+        self._waves = Waves(hz, self._frames, format.rate_hz / self._each, trend=1)
         self._first, self._second, self._of_pair = _pairs(*self._shape)
         steps = math.floor(math.log(fastest / slowest) / STEP)
         self._taxels_s = slowest * np.exp(STEP * np.arange(steps + 1))
         self._tables(hz, seconds)
 
     def _tables(self, hz: Array, seconds: float) -> None:
-        """Cosine, sine and use of each separation and frequency at each speed of the grid, [V, D *
-        F]."""
-        far = np.arange(1, SEPARATIONS + 1)[:, None]
-        lag_s = far / self._taxels_s[:, None, None]
+        """Cosine, sine and use of each separation and frequency at each speed of the grid, and
+        without a lag at last: [3, D * F, V + 1]."""
+        speeds, hz = np.append(self._taxels_s, np.inf), hz[:, None]
+        lag_s = np.arange(1, SEPARATIONS + 1)[:, None, None] / speeds
         phase = 2 * np.pi * hz * lag_s
-        use = (hz <= WAVES * self._taxels_s[:, None, None]) & (lag_s <= seconds / 2)
-        wide = len(self._taxels_s), -1
-        self._cos, self._sin, self._use = (
-            (table * use).reshape(wide).astype(np.float32)
-            for table in (np.cos(phase), np.sin(phase), np.ones_like(phase))
-        )
+        use = (hz <= WAVES * speeds) & (lag_s <= seconds / 2)
+        tables = np.stack([np.cos(phase) * use, np.sin(phase) * use, use])
+        self._grid = tables.reshape(3, -1, len(speeds)).astype(np.float32)
 
-    def __call__(self, taxels: Array) -> Slide:
+    def __call__(self, taxels: Counts) -> Slide:
         """The slide in one window of raw counts [T, R, C] or [T, R, C, A] of the format; only the
         normal axis is used."""
         if self.why:
             return Slide(why=self.why)
-        spectra = self._spectra(normal(taxels, 1)[: self._frames * self._each])
+        spectra = self._spectra(Window.of(taxels))
         if spectra is None:
             return Slide(why=f"the counts of fewer than {LEAST_TAXELS} taxels change")
-        return self._slide(*self._heights(spectra))
+        return self._slide(self._heights(spectra))
 
-    def _spectra(self, taxels: Array) -> Array | None:
-        """Spectra complex64 [F, M] of the M taxels of the block that moves most, without the part
-        that they have in common; None if too few of them change. Silent and broken taxels are 0,
-        and none is louder than the median."""
-        if taxels[0].size > BLOCK * BLOCK:
-            taxels = _busiest(taxels, self._shape)
-        frames = taxels.reshape(self._frames, self._each, -1)
-        summed = frames[:, 0].astype(np.float32)
+    def _spectra(self, window: Window) -> Array | None:
+        """Spectra float32 [M, 2 * F], real and then imaginary, of the M taxels of the block that
+        moves most, without the part that they have in common; None if too few of them change.
+        Silent and broken taxels are 0, and none is louder than the median."""
+        counts = window.counts[: self._frames * self._each]
+        if counts.shape[1] > BLOCK * BLOCK:
+            counts = _busiest(counts.reshape(-1, *window.taxels.shape[1:3]), self._shape)
+        # four times as fast as sum(axis=1)
+        summed = np.einsum("tev->tv", counts.reshape(self._frames, self._each, -1))
+        parts = self._waves(summed).T.copy()
         with np.errstate(over="ignore", invalid="ignore"):
-            for i in range(1, self._each):  # four times as fast as sum(axis=1)
-                summed += frames[:, i]
-            parts = self._transform @ (summed - summed[0])
-            power = (parts * parts).sum(axis=0)
-        broken = ~np.isfinite(power)
-        power[broken] = 0
-        heard = power > SILENT * power.max()
-        loud = np.sort(power[heard])
-        if len(loud) < LEAST_TAXELS:
+            power = np.vecdot(parts, parts)
+        if not math.isfinite(power.max()):
+            power[~np.isfinite(power)] = 0
+        silent = power <= SILENT * power.max()
+        heard = len(power) - int(np.count_nonzero(silent))
+        if heard < LEAST_TAXELS:
             return None
-        parts[:, ~heard] = 0
-        parts /= np.sqrt(np.maximum(power, loud[len(loud) // 2]))
-        common = parts.sum(axis=1)
-        parts -= common[:, None] * (common @ parts / max(float(common @ common), TINY))
-        bins = len(parts) // 2
-        spectra: Array = parts[:bins] + 1j * parts[bins:]
-        return spectra
+        if heard < len(power):
+            parts[silent] = 0
+        median = np.sort(power)[len(power) - heard + heard // 2]
+        parts /= np.sqrt(np.maximum(power, median))[:, None]
+        common = np.add.reduce(parts)
+        common_share = parts.dot(common) / max(float(common.dot(common)), TINY)
+        parts -= common_share[:, None] * common
+        return parts
 
-    def _heights(self, spectra: Array) -> tuple[Array, Array]:
-        """Heights [2, 2, V] of the sums for slides along rows and columns, towards higher and lower
-        numbers, at each speed; and [2] without a lag along rows and columns."""
-        crossed = spectra[:, self._first] * spectra[:, self._second].conj()
-        size = np.abs(crossed)
-        crossed *= 1 / np.sqrt(np.maximum(size, TINY))
-        real, imaginary = (
-            (part @ self._of_pair).T.reshape(2, -1) for part in (crossed.real, crossed.imag)
-        )
-        spread = (size @ self._of_pair).T.reshape(2, -1) / 2
-        straight, across = (self._cos @ real.T).T, (self._sin @ imaginary.T).T
-        deviation = np.sqrt(np.maximum(self._use @ spread.T, TINY)).T[:, None]
-        still = real.sum(axis=1) / np.sqrt(np.maximum(spread.sum(axis=1), TINY))
-        return np.stack([straight - across, straight + across], axis=1) / deviation, still
+    def _heights(self, spectra: Array) -> Array:
+        """Heights [2, 2, V + 1] of the sums for slides towards higher and lower numbers, along rows
+        and columns, at each speed and without a lag."""
+        real, imaginary = spectra[:, : spectra.shape[1] // 2], spectra[:, spectra.shape[1] // 2 :]
+        size = np.sqrt(real * real + imaginary * imaginary)
+        # the root of a product is the product of roots, of which there are fewer
+        root = np.sqrt(np.maximum(size, TINY))
+        rooted = np.empty(size.shape, np.complex64)
+        np.divide(real, root, out=rooted.real)
+        np.divide(imaginary, root, out=rooted.imag)
+        crossed = rooted.take(self._first, 0) * rooted.conj().take(self._second, 0)
+        sums = (self._of_pair @ crossed.view(np.float32)).view(np.complex64).reshape(2, -1)
+        spread = self._of_pair @ (size.take(self._first, 0) * size.take(self._second, 0))
+        given = np.array([sums.real, sums.imag, spread.reshape(2, -1) / 2])
+        straight, across, variance = given @ self._grid
+        heights = np.array([straight - across, straight + across])
+        heights /= np.sqrt(np.maximum(variance, TINY))
+        return heights
 
-    def _slide(self, heights: Array, still: Array) -> Slide:
+    def _slide(self, heights: Array) -> Slide:
         """The slide at the highest peak of an axis on which the pattern has a lag, or the reason
         why it is not one."""
-        tops = heights.max(axis=(1, 2))
-        height = float(tops.max(initial=0, where=tops >= RATIO * still))
+        speeds = len(self._taxels_s)
+        tops, still = heights[..., :speeds].max(axis=(0, 2)), heights[0, :, speeds]
+        lagging = (tops * (tops >= RATIO * still)).tolist()
+        height = max(0.0, *lagging)
         if height < LEAST_HEIGHT:
             return Slide(height=height, why=NO_PATTERN)
-        axis, sign, at = (int(i[0]) for i in np.nonzero(heights == height))
-        if at in (0, heights.shape[2] - 1):
+        axis = lagging.index(height)
+        heights = heights[:, axis, :speeds]
+        sign, at = divmod(int(heights.argmax()), speeds)
+        if at in (0, speeds - 1):
             limit = self.slowest_mm_s if at == 0 else self.fastest_mm_s
             why = f"{'slower' if at == 0 else 'faster'} than {limit:.3g} mm/s"
             return Slide(height=height, why=why)
-        others = heights[axis].copy()
-        others[sign, max(0, at - APART) : at + APART + 1] = 0
-        if height < RATIO * others.max():
+        before, top, after = heights[sign, at - 1 : at + 2].tolist()
+        heights[sign, max(0, at - APART) : at + APART + 1] = 0
+        if height < RATIO * heights.max():
             return Slide(height=height, why="the pattern fits several speeds")
-        before, top, after = (float(h) for h in heights[axis, sign, at - 1 : at + 2])
         bend = before - 2 * top + after
         shift = (before - after) / (2 * bend) if bend else 0.0  # the vertex of a parabola
         taxels_s = float(self._taxels_s[at]) * math.exp(STEP * shift)
@@ -223,20 +228,9 @@ class SlideMeter:
         return Slide(speed, DIRECTIONS[2 * axis + sign], height, taxels_s=taxels_s)
 
 
-def _transform(hz: Array, frames: int, period_s: float) -> Array:
-    """float32 [2 * F, frames]: multiplies a series to give the real and then the imaginary parts
-    of its spectrum at `hz` [F], with a Hann window and without its mean and trend, so that a drift
-    does not hide the pattern."""
-    turns = np.exp(-2j * np.pi * period_s * hz[:, None] * np.arange(frames)) * np.hanning(frames)
-    trend = np.linalg.qr(np.stack([np.ones(frames), np.arange(frames)], axis=1))[0]
-    turns -= turns @ trend @ trend.T
-    transform: Array = np.concatenate([turns.real, turns.imag]).astype(np.float32)
-    return transform
-
-
 def _pairs(rows: int, cols: int) -> tuple[Array, Array, Array]:
     """Pairs of taxels along rows and columns: the numbers of both taxels, int [P] each, and the
-    axis and separation of each pair as float32 [P, 2 * SEPARATIONS] of 0 and 1."""
+    axis and separation of each pair as float32 [2 * SEPARATIONS, P] of 0 and 1."""
     number = np.arange(rows * cols).reshape(rows, cols)
     first, second, kinds = [], [], []
     for kind in range(2 * SEPARATIONS):
@@ -246,8 +240,7 @@ def _pairs(rows: int, cols: int) -> tuple[Array, Array, Array]:
         first.append(lower)
         second.append(higher)
         kinds += [kind] * len(lower)
-    of_pair = np.zeros((len(kinds), 2 * SEPARATIONS), np.float32)
-    of_pair[np.arange(len(kinds)), kinds] = 1
+    of_pair = (np.arange(2 * SEPARATIONS)[:, None] == kinds).astype(np.float32)
     return np.concatenate(first), np.concatenate(second), of_pair
 
 
@@ -283,7 +276,7 @@ class MeasureSlide:
         """Measure the slide."""
         if not context.whole:
             return
-        slide = self._meter(context.taxels)
+        slide = self._meter(context.window)
         if not self._pitch_mm:
             slide = Slide(height=slide.height, why=NO_PITCH, taxels_s=slide.taxels_s)
         context.slide = slide

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from palpate.answer.load_modes import LoadModes
 from palpate.answer.pipeline import Context, Refusal
-from palpate.answer.taxel_statistics import TRIPLES, TaxelStatistics
+from palpate.answer.window import TRIPLES, Counts, Window
 from palpate.answer.window_check import Finding, WindowLimits, ceiling, enclosed, inspect
 from palpate.core.errors import BundleError
 from palpate.core.types import EPOCH_BITS, Frames, Status, SweepFormat, digitized, normal
@@ -150,7 +150,7 @@ class Comparison:
     """A stretch of the signal, each value of a frame beside the values of its neighbours on the
     same axis.
 
-    noise, still: of the value, [R * C, A], see TaxelStatistics. around: median noise of the
+    noise, still: of the value, [R * C, A], see Window. around: median noise of the
     neighbours that are not still, [R * C, A]; infinite if there are none. Of an even number the
     lower median counts, so that half of the neighbours may be noisy.
     """
@@ -160,21 +160,14 @@ class Comparison:
     around: NDArray[np.float32]
 
     @classmethod
-    def of(cls, measured: TaxelStatistics, grid: tuple[int, ...]) -> Comparison:
+    def of(cls, measured: Window, grid: tuple[int, ...]) -> Comparison:
         """Compare the values of `measured`. grid: R, C."""
-        noise = measured.noise().reshape(grid[0] * grid[1], -1)
+        noise = measured.noise.reshape(grid[0] * grid[1], -1)
         still = measured.still.reshape(noise.shape)
-        numbers, every, middle = _neighbours(*grid)
-        heard = np.empty((len(noise) + 1, noise.shape[1]), np.float32)
-        heard[:-1], heard[-1] = noise, np.inf
-        if still.any():
-            heard[:-1][still] = np.inf
-        around = heard[numbers]  # [R * C, K, A]
-        around.sort(axis=1)
-        if np.isfinite(heard[:-1]).all():
-            return cls(noise, still, around[every, middle])
-        known = np.isfinite(around).sum(axis=1, keepdims=True)
-        middles = np.maximum(known - 1, 0) // 2
+        beyond = np.full((1, noise.shape[1]), np.inf, np.float32)
+        around = np.concatenate([np.where(still, np.inf, noise), beyond])[_neighbours(*grid)]
+        around.sort(axis=1)  # [R * C, K, A]
+        middles = np.maximum(np.isfinite(around).sum(axis=1, keepdims=True) - 1, 0) // 2
         return cls(noise, still, np.take_along_axis(around, middles, axis=1)[:, 0])
 
     def lively(self, quietest: float) -> Mask:
@@ -183,8 +176,16 @@ class Comparison:
         return np.isfinite(self.around) & (self.around >= LIVELY * quietest)
 
 
+def surely_sound(measured: Window, bridging: Bridging) -> bool:
+    """Whether all values change, and none is far noisier than the quietest: then `find` finds none,
+    which takes longer."""
+    noise = measured.noise
+    quiet = max(float(noise.min()), bridging.quietest)
+    return measured.moving and measured.readable and bool(noise.max() <= bridging.noise * quiet)
+
+
 def find(
-    measured: TaxelStatistics,
+    measured: Window,
     compared: Comparison,
     tare: NDArray[np.float64],
     limits: WindowLimits,
@@ -209,36 +210,21 @@ def find(
         silent &= loaded | enclosed(loaded.reshape(grid)).reshape(-1, 1)
     top = (measured.highest >= limits.full_scale).reshape(silent.shape)
     taxels_at_top: Mask = np.logical_or.reduce(top, axis=1).reshape(grid)
-    silent &= ~(top & _beside(taxels_at_top).reshape(-1, 1))
+    silent &= ~top | enclosed(~taxels_at_top).reshape(-1, 1)
     silent |= dark.reshape(silent.shape)
-    noisy &= ~silent & (measured.series.shape[1] >= LEAST_FRAMES)
+    noisy &= ~silent & (len(measured) >= LEAST_FRAMES)
     kinds = np.stack([silent, noisy]).any(axis=2)
     return BrokenTaxels.of(kinds.reshape(2, *grid))
 
 
 @lru_cache(maxsize=4)
-def _neighbours(
-    rows: int, cols: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Numbers of the taxels around each taxel, [R * C, K], and R * C for places beyond the edge;
-    the number of each taxel, and the lower middle of the number of its neighbours, [R * C]."""
+def _neighbours(rows: int, cols: int) -> NDArray[np.int64]:
+    """Numbers of the taxels around each taxel, [R * C, K], and R * C for places beyond the edge."""
     r, c = np.divmod(np.arange(rows * cols), cols)
     steps = range(-REACH, REACH + 1)
     around = [(r + i, c + j) for i in steps for j in steps if i or j]
     there = np.stack([(i >= 0) & (i < rows) & (j >= 0) & (j < cols) for i, j in around], axis=1)
-    numbers = np.stack([i * cols + j for i, j in around], axis=1)
-    middle = np.maximum(there.sum(axis=1) - 1, 0) // 2
-    return np.where(there, numbers, rows * cols), np.arange(rows * cols), middle
-
-
-def _beside(mask: Mask) -> Mask:
-    """The taxels with a direct neighbour in `mask`, bool [R, C]."""
-    beside = np.zeros_like(mask)
-    beside[1:] |= mask[:-1]
-    beside[:-1] |= mask[1:]
-    beside[:, 1:] |= mask[:, :-1]
-    beside[:, :-1] |= mask[:, 1:]
-    return beside
+    return np.where(there, np.stack([i * cols + j for i, j in around], axis=1), rows * cols)
 
 
 def bridged(
@@ -334,7 +320,7 @@ class TaxelWatch:
     def _judge(self, taxels: NDArray[Any], tare: NDArray[np.float64]) -> None:
         """Count one stretch [n, R, C] or [n, R, C, A] for or against each taxel. While its
         neighbours are still, a taxel counts neither as silent nor as sound."""
-        measured, rule = TaxelStatistics.of(taxels), self._bridging
+        measured, rule = Window(taxels), self._bridging
         assert rule
         compared = Comparison.of(measured, self._format.shape[:2])
         found = find(measured, compared, tare, self._clipping(measured), rule)
@@ -349,52 +335,52 @@ class TaxelWatch:
 
     def apply(self, context: Context) -> Refusal | None:
         """Bridge broken taxels of the window, and refuse a faulty window."""
-        context.taxels, finding = self.repaired(context.taxels, context.tare)
+        context.taxels, finding = self.repaired(context.window, context.tare)
         context.degraded, context.mean, context.full = finding.degraded, finding.mean, finding.full
         if finding.status is not Status.OK:
             return Refusal(finding.status, finding.detail)
         return None
 
-    def repaired(
-        self, taxels: NDArray[Any], tare: NDArray[np.float64]
-    ) -> tuple[NDArray[Any], Finding]:
+    def repaired(self, taxels: Counts, tare: NDArray[np.float64]) -> tuple[NDArray[Any], Finding]:
         """Raw counts [T, R, C] or [T, R, C, A] of a window with its broken taxels bridged, and the
         result of its check. tare: raw counts [R, C] or [R, C, A]."""
-        measured, limits = TaxelStatistics.of(taxels), self._limits
-        broken = self._in_window(measured, tare, limits)
+        window, limits = Window.of(taxels), self._limits
+        broken = self._in_window(window, tare, limits)
         if self._beyond(broken):
-            limits = self._clipping(measured)
-            broken = self._in_window(measured, tare, limits)
+            limits = self._clipping(window)
+            broken = self._in_window(window, tare, limits)
         if broken and self._beyond(broken):
             broken = BrokenTaxels.of(broken.kinds & [[[True]], [[False]]])  # silent alone
         if not (broken and self._bridging):
-            return taxels, inspect(taxels, tare, limits, measured=measured)
+            return window.taxels, inspect(window, tare, limits)
         if self._beyond(broken):
-            return taxels, self._too_many(broken, measured, tare)
-        taxels = bridged(taxels, broken.mask, self._unloaded, self._bridging.loads)
-        return taxels, replace(inspect(taxels, tare, limits), degraded=broken.text)
+            return window.taxels, self._too_many(broken, window, tare)
+        filled = bridged(window.taxels, broken.mask, self._unloaded, self._bridging.loads)
+        return filled, replace(inspect(filled, tare, limits), degraded=broken.text)
 
     def _beyond(self, broken: BrokenTaxels | None) -> bool:
         """Whether more taxels are broken than the bundle tolerates."""
         return bool(broken and self._bridging and not self._bridging.allows(broken.mask))
 
-    def _clipping(self, measured: TaxelStatistics) -> WindowLimits:
+    def _clipping(self, measured: Window) -> WindowLimits:
         """The limits, with the count at which the amplifier clips as full scale: taxels that stay
         there are saturated, not stuck."""
         return replace(self._limits, full_scale=ceiling(measured, self._limits.full_scale))
 
     def _in_window(
-        self, measured: TaxelStatistics, tare: NDArray[np.float64], limits: WindowLimits
+        self, measured: Window, tare: NDArray[np.float64], limits: WindowLimits
     ) -> BrokenTaxels | None:
         """The broken taxels of a window and of the stream."""
         if self._bridging is None:
             return None
+        if surely_sound(measured, self._bridging):
+            return self.broken
         compared = Comparison.of(measured, self._format.shape[:2])
         found = find(measured, compared, tare, limits, self._bridging)
         return found | self.broken if found and self.broken else found or self.broken
 
     def _too_many(
-        self, broken: BrokenTaxels, measured: TaxelStatistics, tare: NDArray[np.float64]
+        self, broken: BrokenTaxels, measured: Window, tare: NDArray[np.float64]
     ) -> Finding:
         """The finding for silent taxels beyond the number that the bundle tolerates."""
         load = normal(measured.mean.reshape(tare.shape) - tare, 0)

@@ -252,7 +252,7 @@ class ClassDistances:
         # the rest of the bias, since the squared distance already contains -|m|^2 / 2; logits that
         # are computed from distances do not suffer from the cancellation of large products
         self._extra = classes.bias + (self._means**2).sum(axis=1) / 2
-        self._enrolled = classes.sweeps > 0
+        self._enrolled = bool((classes.sweeps > 0).any())
         self._softening = displacement.temperature if displacement else 1
         shapes = classes.shapes
         if displacement and classes.displaced:
@@ -267,7 +267,18 @@ class ClassDistances:
         # / n around it
         self._share = np.where(n, n / (n + 1), 1.0) / classes.spread
         changes = classes.changes.astype(np.float64)
-        self._changes = _of_all(changes, len(n)) @ self._turn if len(changes) else changes
+        changes = _of_all(changes, len(n)) @ self._turn if len(changes) else changes
+        changes = changes.reshape(len(changes), *self._means.shape)
+        self._novel = tuple(map(self._scattered, (self._turn[:, None], self._means[None], changes)))
+
+    def _scattered(self, away: Array) -> NDArray[np.float32]:
+        """Differences [n, K, r], or [n, 1, r] from all means, in the scatter of each label, [n, K *
+        r]: the sum of squares is the distance that is compared with the limit."""
+        away = np.broadcast_to(away, (len(away), *self._means.shape)).copy()
+        common = away.shape[2] - self._shapes.shape[2]
+        away[..., common:] = np.einsum("nkb,kbc->nkc", away[..., common:], self._shapes)
+        away *= np.sqrt(self._share)[:, None]
+        return away.reshape(len(away), self._means.size).astype(np.float32)
 
     def _away(self, embedding: NDArray[Any]) -> Array:
         """Differences [..., K, r] of embeddings [..., r] from the class means."""
@@ -299,7 +310,7 @@ class ClassDistances:
         divides the latter among them.
         """
         softened = np.asarray(network / self._softening, np.float32)
-        if not self._enrolled.any():
+        if not self._enrolled:
             return softened
         by_means = np.asarray(self.logits(self.distances(embedding)) / self._softening, np.float32)
         n, logs = network.shape[-1], log_softmax(by_means)
@@ -316,12 +327,14 @@ class ClassDistances:
         enrolled label is multiplied by n / (n + 1) / spread. About the same share of sweeps is
         then accepted for both.
         """
-        away, limit = self._away(embedding), self.limit
+        (turned, means, changes), limit = self._novel, self.limit
+        away = embedding.dot(turned) - means[0]
         sizes = self._disturbances.sizes(disturbed)
-        if sizes.any():
-            away -= np.tensordot(sizes, self._changes, axes=1)
+        if any(sizes):
+            away -= np.array(sizes, np.float32).dot(changes)
             limit *= self._disturbances.growth(sizes)
-        scaled = shaped_distances(away, self._shapes) * self._share
+        away = away.reshape(len(self.labels), -1)
+        scaled = np.vecdot(away, away)
         k = int(scaled.argmin())
         if scaled[k] <= limit:
             return ""

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from palpate.answer.disturbance import Disturbances
 from palpate.answer.objects import EnrolledLabels
 from palpate.answer.pipeline import Context, Refusal
+from palpate.answer.window import Counts, Window, shares
 from palpate.core.errors import BundleError
 from palpate.core.types import Status, normal
 
@@ -54,32 +54,28 @@ class SlideLimits:
         for an enrolled label, whose limit is unknown."""
         if label >= len(self.least):
             return []
-        found: list[int] = (np.flatnonzero(vibrations < self.least[label]) + 1).tolist()
-        return found
+        least = self.least[label]
+        return [part for part, found in enumerate(vibrations.tolist(), 1) if found < least]
 
 
-def vibration(taxels: NDArray[Any], tare: Array, parts: int = PARTS) -> Array:
+def vibration(taxels: Counts, tare: Array, parts: int = PARTS) -> Array:
     """Natural logarithm of vibration over load in each part, float64 [parts].
 
     taxels: raw counts [T, R, C] or [T, R, C, A], at least `parts` frames; only the normal axis
     counts. tare: counts [R, C] or [R, C, A] of the unloaded skin. The vibration is the root of the
     mean variance of the taxels within a part, the load their mean count above the tare.
     """
-    counts = normal(taxels, 1)
-    each = len(counts) // parts
-    # from the first frame on: squares of large counts would round small vibrations away
-    series = counts[: parts * each].reshape(parts, each, -1).astype(np.float32)
-    first = series[0, 0].copy()
-    series -= first
+    window = Window.of(taxels)
+    each = len(window) // parts
+    series = window.counts[: parts * each].reshape(parts, each, -1)
+    offset = normal(window.first.reshape(tare.shape) - tare, 0)
+    every = shares(offset.size)
     with np.errstate(all="ignore"):  # float32 counts may be infinite
-        # products take a third of the time of mean and einsum
-        means = (np.full((1, each), 1 / each, np.float32) @ series)[:, 0]
-        flat = series.reshape(parts, 1, -1)
-        variance = (flat @ flat.swapaxes(1, 2)).ravel() / series[0].size
-        variance -= (means * means).mean(axis=1)
-        load = np.abs((means + first - normal(tare, 0).reshape(-1)).mean(axis=1))
+        means, flat = shares(each) @ series, series.reshape(parts, -1)
+        variance = np.vecdot(flat, flat) / series[0].size - np.vecdot(means, means * every)
+        load = np.abs(means.dot(every) + every.dot(offset.ravel()))
         result: Array = 0.5 * np.log(np.maximum(variance, TINY)) - np.log(np.maximum(load, TINY))
-    return result.astype(np.float64)
+    return result
 
 
 class Vibrates:
@@ -109,7 +105,7 @@ class Vibrates:
         allowed = self._disturbances
         beyond = allowed.beyond("load", context.disturbed) if allowed else 0.0
         label = int(self._enrolled.decided(context.probabilities).argmax())
-        found = self._limits.resting(vibration(context.taxels, context.tare, parts) + beyond, label)
+        found = self._limits.resting(vibration(context.window, context.tare, parts) + beyond, label)
         if not found:
             return None
         where, name = " ".join(map(str, found)), self._labels[label]

@@ -6,14 +6,15 @@ unloaded skin.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.answer.taxel_statistics import TaxelStatistics
 from palpate.answer.unloaded import QUIET, UnloadedSkin
+from palpate.answer.window import Counts, Window
 from palpate.core.types import Status, normal
 
 FULL_SCALES = tuple(float(2**bits - 1) for bits in (8, 10, 12, 14, 15, 16, 24))
@@ -76,16 +77,10 @@ def _taxels(mask: NDArray[np.bool_]) -> str:
 
 
 def inspect(
-    taxels: NDArray[Any],
-    tare: NDArray[np.float64],
-    limits: WindowLimits,
-    *,
-    either_way: bool = False,
-    measured: TaxelStatistics | None = None,
+    taxels: Counts, tare: NDArray[np.float64], limits: WindowLimits, *, either_way: bool = False
 ) -> Finding:
     """Check a window before it is classified. taxels: raw counts [T, R, C] or [T, R, C, A]; tare:
-    counts [R, C] or [R, C, A] of the unloaded skin. measured: statistics of `taxels`, if they are
-    known already.
+    counts [R, C] or [R, C, A] of the unloaded skin.
 
     A taxel is loaded by its normal axis. A loaded taxel always varies, on each axis, so a constant
     axis is stuck. A constant unloaded taxel is dead if all its direct neighbours are loaded; at the
@@ -95,17 +90,20 @@ def inspect(
     the counts.
     """
     shape = (*tare.shape, 1)[:3]  # [R, C, A]
-    measured = measured or TaxelStatistics.of(taxels)
-    still = measured.still.reshape(shape)
-    load = measured.mean.reshape(shape) - tare.reshape(shape)
+    window = Window.of(taxels)
+    load = window.mean.reshape(shape) - tare.reshape(shape)
     load = np.abs(load) if either_way else load
     # possible with float32 counts; the network's output would then be meaningless
-    if (unreadable := measured.unreadable.reshape(shape) | ~np.isfinite(load)).any():
+    if not (window.readable and math.isfinite(load.sum())):
+        unreadable = window.unreadable.reshape(shape) | ~np.isfinite(load)
         return Finding(Status.DEAD_TAXEL, _taxels(unreadable))
     loaded = load[..., -1:] >= (-np.inf if limits.contact is None else limits.contact)  # [R, C, 1]
     if not loaded.any():
         return Finding(Status.NO_CONTACT, f"strongest taxel {load[..., -1].max():.1f} raw counts")
-    full = _at_full_scale(measured, limits.full_scale, shape)
+    full = _at_full_scale(window, limits.full_scale, shape)
+    if full is None and window.moving:
+        return Finding(Status.OK, mean=window.mean.reshape(tare.shape))
+    full, still = np.zeros(shape) if full is None else full, window.still.reshape(shape)
     stuck = still & loaded & (full < 1)
     if stuck.any():
         return Finding(Status.STUCK_TAXEL, _taxels(stuck))
@@ -117,10 +115,10 @@ def inspect(
         dead = silent & enclosed(loaded[..., 0])[..., None]
         if dead.sum() > limits.dead_taxels:
             return Finding(Status.DEAD_TAXEL, _taxels(dead & still))
-    return Finding(Status.OK, mean=measured.mean.reshape(tare.shape), full=share)
+    return Finding(Status.OK, mean=window.mean.reshape(tare.shape), full=share)
 
 
-def ceiling(measured: TaxelStatistics, full_scale: float) -> float:
+def ceiling(measured: Window, full_scale: float) -> float:
     """The count at which the amplifier clips in a window.
 
     It is the highest count of all. A value has to be constant there. Another one has to stay there
@@ -131,20 +129,22 @@ def ceiling(measured: TaxelStatistics, full_scale: float) -> float:
     constant = (at & measured.still).sum()
     if not (highest < full_scale and constant):
         return full_scale
-    stays = (measured.series[at & ~measured.still] == highest).mean(axis=1).max(initial=0.0)
+    stays = (measured.series[:, at & ~measured.still] == highest).mean(axis=0).max(initial=0.0)
     return highest if constant > 1 or stays >= STAYS else full_scale
 
 
 def _at_full_scale(
-    measured: TaxelStatistics, full_scale: float, shape: tuple[int, ...]
-) -> NDArray[np.float64]:
-    """Share of the frames at full scale, of `shape` [R, C, A]; on shear axes at its negative,
-    too."""
-    full, series = np.zeros(shape), measured.series
-    if measured.highest.max() >= full_scale:  # seldom; counting takes longer than all the rest
-        full = (series >= full_scale).mean(axis=1).reshape(shape)
-    if shape[2] > 1 and measured.lowest.reshape(shape)[..., :-1].min() <= -full_scale:
-        full[..., :-1] += (series <= -full_scale).mean(axis=1).reshape(shape)[..., :-1]
+    window: Window, full_scale: float, shape: tuple[int, ...]
+) -> NDArray[np.float64] | None:
+    """Share of the frames at full scale, of `shape` [R, C, A]; on shear axes at its negative, too.
+    None if there are none, as mostly: counting takes longer than all the rest."""
+    series = window.series
+    lowered = shape[2] > 1 and window.lowest.reshape(shape)[..., :-1].min() <= -full_scale
+    if not lowered and series.max() < full_scale:
+        return None
+    full: NDArray[np.float64] = (series >= full_scale).mean(axis=0).reshape(shape)
+    if lowered:
+        full[..., :-1] += (series <= -full_scale).mean(axis=0).reshape(shape)[..., :-1]
     return full
 
 
@@ -165,7 +165,7 @@ def inspect_readings(taxels: NDArray[Any]) -> Finding:
     if taxels.dtype.kind != "f":
         return Finding(Status.OK)
     shape = (*taxels.shape[1:], 1)[:3]
-    unreadable = TaxelStatistics.of(taxels).unreadable.reshape(shape)
+    unreadable = Window(taxels).unreadable.reshape(shape)
     return (
         Finding(Status.DEAD_TAXEL, _taxels(unreadable)) if unreadable.any() else Finding(Status.OK)
     )

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.answer.taxel_statistics import TRIPLES, TaxelStatistics
 from palpate.answer.taxels import (
     LEAST_FRAMES,
     Bridging,
@@ -18,6 +17,7 @@ from palpate.answer.taxels import (
     find,
     places,
 )
+from palpate.answer.window import TRIPLES, Window
 from palpate.answer.window_check import WindowLimits
 from palpate.core.errors import BundleError
 from palpate.core.types import SweepFormat
@@ -40,7 +40,7 @@ def slide(axes: int = 1, seed: int = 0) -> np.ndarray:
 
 def found(taxels: np.ndarray, rule: Bridging = RULE, limits: WindowLimits = LIMITS) -> str:
     """The broken taxels of a window in words; "" for none."""
-    measured = TaxelStatistics.of(taxels)
+    measured = Window(taxels)
     compared = Comparison.of(measured, (ROWS, COLS))
     broken = find(measured, compared, np.zeros(taxels.shape[1:]), limits, rule)
     return broken.text if broken else ""
@@ -140,10 +140,10 @@ def test_noise_is_measured_at_triples_of_frames():
     none; two frames show none."""
     rng = np.random.default_rng(0)
     white = rng.standard_normal((30 * TRIPLES, 1, 1)).astype(np.float32)
-    assert TaxelStatistics.of(white).noise()[0] == pytest.approx(np.sqrt(12 / np.pi), rel=0.2)
+    assert Window(white).noise[0] == pytest.approx(np.sqrt(12 / np.pi), rel=0.2)
     ramp = np.arange(300, dtype=np.int16).reshape(-1, 1, 1)
-    assert TaxelStatistics.of(ramp).noise().tolist() == [0]
-    assert TaxelStatistics.of(ramp[:2]).noise().tolist() == [0]
+    assert Window(ramp).noise.tolist() == [0]
+    assert Window(ramp[:2]).noise.tolist() == [0]
 
 
 def test_a_broken_taxel_gets_the_mean_of_its_direct_neighbours():

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from palpate.answer.taxel_statistics import TaxelStatistics
 from palpate.answer.unloaded import UnloadedSkin
+from palpate.answer.window import Window
 from palpate.answer.window_check import STAYS, ceiling, inspect, inspect_bare, inspect_readings
 from palpate.bundle.manifest import Thresholds
 from palpate.core.types import Status, shape
@@ -64,7 +64,7 @@ def test_an_amplifier_that_clips_below_full_scale():
     alone is stuck. A count that is reached now and then is a peak."""
 
     def clips(taxels: np.ndarray) -> float:
-        return ceiling(TaxelStatistics.of(taxels), 255.0)
+        return ceiling(Window(taxels), 255.0)
 
     taxels = moving()
     assert clips(taxels) == clips(np.minimum(taxels, 82)) == 255  # none is constant

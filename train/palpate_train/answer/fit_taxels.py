@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.answer.load_modes import LoadModes
-from palpate.answer.taxel_statistics import TaxelStatistics
 from palpate.answer.taxels import Bridging, Comparison, places
+from palpate.answer.window import Window
 from palpate.answer.window_check import MANY_FULL
 from palpate.bundle.bundle import Bundle
 from palpate.bundle.manifest import Manifest
@@ -147,11 +147,11 @@ def learned(sound: Dataset) -> Bridging:
     grid = sound.format.rows, sound.format.cols
     near, own, tenths = [], [], []
     for window in sound.samples:
-        compared = Comparison.of(TaxelStatistics.of(window), grid)
+        compared = Comparison.of(Window(window), grid)
         near.append(compared.around)
         own.append(compared.noise)
         tenth = window[: max(2, len(window) // PARTS)]
-        tenths.append(Comparison.of(TaxelStatistics.of(tenth), grid))
+        tenths.append(Comparison.of(Window(tenth), grid))
     around, noise = np.array(near), np.array(own)
     heard = np.isfinite(around) & (around > 0)
     if not heard.any():  # every window is constant
