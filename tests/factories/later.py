@@ -16,6 +16,6 @@ class Later:
         vars(self)["module"] = name
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith(("__", "_pytest", "_mock")):  # pytest looks for its marks on every object
+        if name.startswith(("__", "_pytest", "_mock")):  # pytest asks every object
             raise AttributeError(name)
         return getattr(import_module(vars(self)["module"]), name)

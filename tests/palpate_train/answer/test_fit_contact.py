@@ -140,8 +140,8 @@ def test_a_baseline_of_which_nothing_is_known_is_said():
     high = replace(known(), unloaded=None)
     found = find_limit(high)
     assert found.contact is None
-    assert "no taxel reads less than 199" in found.why
-    assert "; record with palpate record, and send TARE" in found.why
+    assert "than 199" in found.why
+    assert "send TARE" in found.why
     every = np.full_like(known().unloaded, np.nan)
     assert find_limit(replace(high, unloaded=every)).why == found.why
     low = replace(high, samples=high.samples - np.uint16(REST - 100))

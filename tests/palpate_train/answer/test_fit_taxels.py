@@ -189,5 +189,5 @@ def test_a_manifest_that_bridges_all_taxels_is_refused(tmp_path: Path):
     """At least one taxel has to be left."""
     manifest = bundle.load(toy(tmp_path)).manifest
     rule = replace(fit_taxels.learned(windows("a")), taxels=16)
-    with pytest.raises(BundleError, match="bridges 16 of 16 taxels"):
+    with pytest.raises(BundleError, match="16 of 16"):
         replace(manifest, bridging=rule)

@@ -37,19 +37,19 @@ def test_a_pattern_reads_a_name(pattern: str, path: str, fields: dict[str, str] 
 
 def test_a_name_that_fits_in_several_ways_is_refused():
     """`plastic_rough_5N_1` may be plastic or plastic_rough; nothing is guessed."""
-    with pytest.raises(FormatError, match=r"\(material 'plastic' or"):
+    with pytest.raises(FormatError, match="'plastic'"):
         NamePattern("{material}_{force}N_{trial}.csv").read("plastic_rough_5N_1.csv")
 
 
 @pytest.mark.parametrize(
     ("pattern", "message"),
     [
-        ("{trial}.csv", "does not say where the"),
+        ("{trial}.csv", "where"),
         ("{material}_{a}_{a}.csv", "'a' stands twice"),
-        ("{material}_{A}.csv", "'A' stands twice or is"),
-        ("{material}_{a.csv", "has an unmatched brace"),
-        ("{material}_{a:x}.csv", "'x' is not a kind of"),
-        ("{material}_{recording}.csv", "each file or array is a"),
+        ("{material}_{A}.csv", "'A'"),
+        ("{material}_{a.csv", "brace"),
+        ("{material}_{a:x}.csv", "'x'"),
+        ("{material}_{recording}.csv", "each file"),
     ],
 )
 def test_what_is_no_pattern_is_refused(pattern: str, message: str):

