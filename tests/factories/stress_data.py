@@ -22,8 +22,8 @@ METHODS = {
     "L-knn": {"dead": (80, 80, 79), "hum": (80, 79, 79), "gain-up": (80, 79, 10)},
 }
 BOX = {
-    "rightly": {"dead": (95, 5, 0), "hum": (95, 40, 10), "gain-up": (95, 95, 94)},
-    "wrongly": {"dead": (1, 0, 0), "hum": (1, 2, 3), "gain-up": (1, 1, 7)},
+    "correct": {"dead": (95, 5, 0), "hum": (95, 40, 10), "gain-up": (95, 95, 94)},
+    "wrong": {"dead": (1, 0, 0), "hum": (1, 2, 3), "gain-up": (1, 1, 7)},
     "unsure": {"dead": (2, 0, 0), "hum": (2, 8, 7), "gain-up": (2, 2, 0)},
     "unknown": {"dead": (2, 0, 0), "hum": (2, 50, 80), "gain-up": (2, 2, 0)},
     "refused": {"dead": (0, 100, 100), "hum": (0, 0, 0), "gain-up": (0, 0, 0)},

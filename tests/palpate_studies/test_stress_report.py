@@ -90,9 +90,9 @@ def test_the_box_is_shown_where_it_falls_silent_or_gives_wrong_labels():
     box = stress_data.figures()["box"]["curves"]
     shown = words(stress_plots.box(box))
     assert {"wrong label", "refused", "50 Hz hum", "dead taxels", "higher gain"} <= set(shown)
-    quiet = box["wrongly"] | {"gain-up": box["wrongly"]["gain-up"] | {"accuracy": [0, 0, 0]}}
-    assert "higher gain" not in words(stress_plots.box(box | {"wrongly": quiet}))
-    assert stress_report.most_wrong(box["wrongly"])["share"][0] == 0.07
+    quiet = box["wrong"] | {"gain-up": box["wrong"]["gain-up"] | {"accuracy": [0, 0, 0]}}
+    assert "higher gain" not in words(stress_plots.box(box | {"wrong": quiet}))
+    assert stress_report.most_wrong(box["wrong"])["share"][0] == 0.07
 
 
 def test_the_page_holds_the_figures():
@@ -152,7 +152,7 @@ def test_a_recorded_set_is_split_and_its_own_bundle_answers(tmp_path: Path):
     result = json.loads(out.read_text())
     assert (result["train_sweeps"], result["test_sweeps"]) == (48, 24)
     assert result["box"]["bundle"]["name"] == "stressed"
-    assert result["box"]["curves"]["rightly"]["noise"]["right"][0] >= 20
+    assert result["box"]["curves"]["correct"]["noise"]["right"][0] >= 20
     assert result["box"]["pairs"].keys() == result["box"]["curves"].keys()
     assert result["methods"]["H-svm"]["pairs"]["noise+dead"]["total"] == 24
     assert main([*words, "session:most"]) == FormatError.exit_code

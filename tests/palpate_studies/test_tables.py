@@ -100,7 +100,7 @@ def test_answers_of_the_bundle_add_up():
         assert len(rows) >= 3
     (first, *_) = tables.stressed(committed("stress")).split("\n")[3:]
     right, wrong, none = map(int, re.findall(r"\| (\d+) (?=\|)", first))
-    assert right + wrong + none == committed("stress")["box"]["curves"]["rightly"]["noise"]["total"]
+    assert right + wrong + none == committed("stress")["box"]["curves"]["correct"]["noise"]["total"]
 
 
 @pytest.mark.parametrize(

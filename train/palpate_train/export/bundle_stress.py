@@ -22,7 +22,7 @@ from palpate_train.metrics import bundle_score
 
 Array = NDArray[Any]
 Json = dict[str, Any]
-ANSWERS = ("rightly", "wrongly", "unsure", "unknown", "refused", "network")
+ANSWERS = ("correct", "wrong", "unsure", "unknown", "refused", "network")
 """The outcomes of a sweep: named with status ok, or one of three ways not to be named; and whether
 the network alone is right, whose most probable label counts without the checks of the box."""
 
@@ -74,7 +74,7 @@ def answers(box: Classifier, sweeps: Dataset, lost: int = 0) -> dict[str, Array]
     for i, verdict in bundle_score.verdicts(box, sweeps, lost=lost):
         truth = sweeps.materials[sweeps.labels[i]]
         if verdict.status is Status.OK:
-            answer = "rightly" if verdict.label == truth else "wrongly"
+            answer = "correct" if verdict.label == truth else "wrong"
         else:
             answer = (
                 str(verdict.status)

@@ -11,7 +11,7 @@ Json = dict[str, Any]
 HEAD = (
     "skin moved",
     "answered correctly",
-    "wrongly",
+    "wrong label",
     "`unsure`",
     "`unknown`",
     "marked",

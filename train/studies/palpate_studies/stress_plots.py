@@ -36,10 +36,10 @@ LOOKS: tuple[Mapping[str, Any], ...] = (
 )
 """Lines of the first methods, told apart by style as well as by colour."""
 AREAS: Mapping[str, tuple[tuple[str, ...], dict[str, Any]]] = {
-    "classified correctly": (("rightly",), {"color": ACCENT, "alpha": 0.5}),
+    "classified correctly": (("correct",), {"color": ACCENT, "alpha": 0.5}),
     "unsure, unknown": (("unsure", "unknown"), {"color": FAINT, "alpha": 0.7}),
     "refused": (("refused",), {"color": GREY, "alpha": 0.6}),
-    "wrong label": (("wrongly",), {"color": ORANGE}),
+    "wrong label": (("wrong",), {"color": ORANGE}),
 }
 """The kinds of answers of the box, from below."""
 AREA = 8.0
@@ -91,7 +91,7 @@ def box(curves: Mapping[str, Json]) -> str:
 
     A small picture for each corruption that costs five points, or that makes as many wrong labels.
     """
-    right, wrong = curves["rightly"], curves["wrongly"]
+    right, wrong = curves["correct"], curves["wrong"]
     named = [
         *breaks_first(right),
         *(name for name in wrong if max(wrong[name]["accuracy"]) >= POINTS),

@@ -52,7 +52,7 @@ def render(result: Json, name: str = "stress") -> tuple[str, dict[str, str]]:
         pictures={name: html.picture(svg) for name, svg in pictures.items()},
         headline=headline(curves[ours]),
         first=[[name, *first(those)] for name, those in _with_box(curves, result["box"]).items()],
-        most_wrong=most_wrong(box["wrongly"]) if box else None,
+        most_wrong=most_wrong(box["wrong"]) if box else None,
         falls=fall_lines(curves, box),
         missing=missing(curves, ours),
         methods=[[plain_name(name), about(name), name] for name in result["methods"]],
@@ -64,7 +64,7 @@ def render(result: Json, name: str = "stress") -> tuple[str, dict[str, str]]:
 def _with_box(curves: Json, box: Json) -> Json:
     """The curves of methods, and those of the box's right answers if there are any."""
     which = "the packaged bundle" if box["bundle"]["name"] == "default" else "its bundle"
-    answered = {f"{which}, as the box answers": box["curves"]["rightly"]} if box["curves"] else {}
+    answered = {f"{which}, as the box answers": box["curves"]["correct"]} if box["curves"] else {}
     return {**curves, **answered}
 
 
@@ -72,7 +72,7 @@ def _columns(result: Json, kind: str) -> Json:
     """The columns of a matrix: the box as it answers, its network alone, and the methods. kind:
     "curves", or "pairs" of corruptions, which older results lack."""
     box = result["box"].get(kind)
-    own = {BOX: box["rightly"], NETWORK: box["network"]} if box else {}
+    own = {BOX: box["correct"], NETWORK: box["network"]} if box else {}
     methods = {short_name(name): entry.get(kind) for name, entry in result["methods"].items()}
     return own | {name: curves for name, curves in methods.items() if curves}
 
@@ -154,7 +154,7 @@ def most_wrong(curves: Json) -> Json:
 def fall_lines(curves: Mapping[str, Json], box: Json) -> list[list[str]]:
     """For each corruption its description, and the severity at which each method, and the box, has
     lost five points."""
-    columns = [*curves.values(), *([box["rightly"]] if box else [])]
+    columns = [*curves.values(), *([box["correct"]] if box else [])]
     about = {name: curve for those in columns for name, curve in those.items()}
     return [
         [f"{curve['title']}: {curve['about']}", *(_cell(those.get(name)) for those in columns)]

@@ -51,7 +51,7 @@ def stressed(results: Any) -> str:
     """The packaged bundle's answers to corrupted sweeps, from the study `stress`."""
     curves, rows = results["box"]["curves"], []
     for name, severity, text in STRESSED:
-        right, wrong = (curves[answer][name] for answer in ("rightly", "wrongly"))
+        right, wrong = (curves[answer][name] for answer in ("correct", "wrong"))
         at = right["severities"].index(severity)
         rows.append((text, right["total"], right["right"][at], wrong["right"][at]))
     return _answers(rows)
