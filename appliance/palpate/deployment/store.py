@@ -151,21 +151,29 @@ class Store:
         """
         return self._install(self.examine(incoming), shadow, admit)
 
-    def learn(self, files: Mapping[str, bytes]) -> str:
+    def learn(self, files: Mapping[str, bytes], before: str | None = None) -> str:
         """Install, as `install`, the files of a bundle that this box has taught, or into which it
-        has enrolled a label. Returns its name."""
-        return self._install(self._proven(self.bundles.checked(files, self.folder)))
+        has enrolled a label. Returns its name. before: the current bundle when teaching began,
+        None for any. Raises BundleError if another one was put into service meanwhile."""
+        signed = self._proven(self.bundles.checked(files, self.folder))
+        return self._install(signed, before=before)
 
     def _install(
         self,
         signed: SignedBundle,
         shadow: bool = False,
         admit: Callable[[Bundle], object] = lambda bundle: None,
+        before: str | None = None,
     ) -> str:
         admit(signed.bundle)
         self._warn_of_removed_state()
         self.bundles.folder.mkdir(parents=True, exist_ok=True)
         with self._locked() as state:
+            if before not in (None, self.current):
+                raise BundleError(
+                    f"bundle {self.current[:8] or 'packaged'} was put into service meanwhile, and "
+                    "stays; teach again"
+                )
             self._admit(signed, state)
             needed = (signed.sha, *state.chain(self.current), state.candidate)
             self.bundles.keep(*needed)

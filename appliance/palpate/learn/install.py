@@ -6,10 +6,13 @@ fits all sweeps.
 
 from __future__ import annotations
 
+import fcntl
+import os
 import shutil
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 
@@ -59,12 +62,11 @@ def install(settings: Config, store: Store, by: str, clock: Clock, tell: Tell) -
     """
     check_allowed(settings)
     sweeps, key = settings.kept("sweeps"), EnrolmentKey(settings.store.enrolment_key)
+    before = store.current
     if running := base(store, sweep_folder.last_format(sweeps)):
         return _into(settings, store, running, key, tell)
     key.check(TAUGHT)
-    scratch = Path(settings.store.folder) / "teaching"
-    shutil.rmtree(scratch, ignore_errors=True)  # of a process that a power cut ended
-    try:
+    with _scratch(Path(settings.store.folder)) as scratch:
         out = scratch / "bundle"
         day = time.strftime("%Y-%m-%d %H:%M", time.gmtime())
         options = ("--out", str(out), "--version", version(store), "--by", by, "--at", day)
@@ -72,9 +74,28 @@ def install(settings: Config, store: Store, by: str, clock: Clock, tell: Tell) -
         _wait(words, settings.teach.limit_s, clock, tell)
         files = bundle.files(out)
         files[bundle.TAUGHT_SIGNATURE] = key.sign(files[bundle.MANIFEST], TAUGHT)
-        return store.learn(files)
+        return store.learn(files, before)
+
+
+@contextmanager
+def _scratch(store: Path) -> Iterator[Path]:
+    """A new folder in the store for one process that teaches. Raises TeachingFailed while another
+    has it."""
+    folder = store / "teaching"
+    store.mkdir(parents=True, exist_ok=True)
+    lock = os.open(store / ".teaching", os.O_RDONLY | os.O_CREAT, 0o600)
+    try:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as e:
+            raise TeachingFailed("another bundle is being made here; wait until it is there") from e
+        shutil.rmtree(folder, ignore_errors=True)  # of a process that a power cut ended
+        try:
+            yield folder
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
     finally:
-        shutil.rmtree(scratch, ignore_errors=True)
+        os.close(lock)
 
 
 def base(store: Store, format: SweepFormat | None) -> SignedBundle | None:
@@ -96,14 +117,14 @@ def _into(
     try:
         found = materials.recorded(running.bundle, sweeps := settings.kept("sweeps"))
         gone = tuple(sweep_folder.forgotten_in(sweeps))
-        new = materials.taught(running, found.windows, gone)
+        new = materials.taught(running, found.windows, gone, found.displays)
         if new.disagreement:
             raise BundleError(new.disagreement)
     except (ApplianceError, OSError) as e:
         raise TeachingFailed(f"{e}; the bundle in service stays") from e
     for warning in new.warnings:
         log.warning(f"teach: {warning}")
-    sha = store.learn(enrolment.files(running.files, new, key.sign(new.file)))
+    sha = store.learn(enrolment.files(running.files, new, key.sign(new.file)), running.sha)
     labels = [*new.bundle.manifest.labels]
     no_slides = [asdict(one) for one in found.no_slides]
     tell({"type": "taught", "no_slides": no_slides, "labels": labels, "figures": {}})

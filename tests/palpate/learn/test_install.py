@@ -57,6 +57,19 @@ def full(act: Callable[..., Any], count: list[int], at: int) -> Callable[..., An
     return run
 
 
+def test_two_that_teach_at_once_share_no_folder(tmp_path: Path):
+    """The second is refused while the first has it; what a power cut left is cleared."""
+    (tmp_path / "teaching" / "old").mkdir(parents=True)
+    with install._scratch(tmp_path) as first:
+        assert not first.exists()
+        (first / "bundle").mkdir(parents=True)
+        with pytest.raises(install.TeachingFailed), install._scratch(tmp_path):
+            pass
+        assert (first / "bundle").exists()
+    with install._scratch(tmp_path) as second:
+        assert not second.exists()
+
+
 def test_a_full_disk_leaves_the_bundle_in_service(
     box: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
 ):
