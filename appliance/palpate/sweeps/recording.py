@@ -127,12 +127,41 @@ class RecordingSession(Observer):
 
     def forget(self, material: str) -> None:
         """Learn no longer from the sweeps of a material so far, those that are still being written
-        included; they stay in the folder. Raises OSError."""
+        included; they stay in the folder. Raises ApplianceError."""
         held = [n for n, labels in self._counted.items() if labels.material == material]
         waiting = [n for n, label in self._writing.items() if label == material]
-        self._folder.forget(material, [*held, *waiting])
+        before = self._folder.forgotten
+        write = self._folder.forget(material, [*held, *waiting])
+        try:
+            self._beside(write, f"that {material!r} is forgotten is not kept", "make room")
+        except ApplianceError:
+            self._folder.forgotten = before
+            raise
         for number in held:
             self.leave_out(number)
+
+    def _beside(self, work: Callable[[], None], what: str, advice: str) -> None:
+        """Do work on the disk beside the loop, which a sync would halt for seconds. Raises
+        ApplianceError if it fails at once; a later failure is logged, and until the next start
+        what was asked for holds all the same."""
+
+        def tried() -> OSError | None:
+            try:
+                work()
+            except OSError as e:
+                return e
+            return None
+
+        def done(e: OSError | None) -> None:
+            if e:
+                log.warning(f"record: {what}: {e.strerror}; {advice}, and repeat it")
+                failed.append(e)
+
+        failed: list[OSError] = []
+        if not self._disk(tried, done):
+            raise ApplianceError(f"{what}: too much waits for the disk; try again")
+        if failed:
+            raise ApplianceError(f"{what}: {failed[0].strerror}; {advice}")
 
     def about(self) -> dict[str, Any]:
         """The progress of the recording, for JSON.
@@ -271,12 +300,8 @@ class RecordingSession(Observer):
         shown = number - self._folder.run
         if which and which != str(shown):
             raise ApplianceError(f"the last stored sweep is {shown}, not {which}; look at it first")
-        try:
-            self._folder.remove(number, reserve=True)
-        except OSError as e:
-            raise ApplianceError(
-                f"sweep {shown} cannot be discarded: {e.strerror}; look at the disk"
-            ) from e
+        remove = partial(self._folder.remove, number, reserve=True)
+        self._beside(remove, f"sweep {shown} cannot be discarded", "look at the disk")
         self._stored.pop()
         self.leave_out(number)
         if self._last and self._last["sweep"] == shown:

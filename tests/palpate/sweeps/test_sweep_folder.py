@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import json
 from collections import Counter
@@ -22,6 +23,11 @@ from palpate.sweeps import sweep_folder
 from palpate.sweeps.recording import Labels, RecordingSession
 from palpate.sweeps.sweep_folder import FORGOTTEN, RecordedSweep, SweepFolder
 from tests.cuts.recording import SHORT, taken
+
+
+def full(*given: object) -> None:
+    """A disk without room."""
+    raise OSError(errno.ENOSPC, "No space left on device")
 
 
 class SlowDisk:
@@ -72,7 +78,7 @@ def test_each_state_of_a_sweep(tmp_path: Path):
     for name in ("sweep-000007.npy", "notes.npy"):
         (tmp_path / name).write_bytes(b"half")
     folder = SweepFolder(tmp_path, None)
-    folder.forget("felt", [5])
+    folder.forget("felt", [5])()
     folder.close()
     reasons = "gap", "early", "no material", "forgotten", "no-contact", "damaged"
     assert learnt(tmp_path) == ([1], dict.fromkeys(reasons, 1))
@@ -111,6 +117,36 @@ def test_a_sweep_that_waits_for_the_card_is_forgotten_too(tmp_path: Path):
     assert again.materials() == {"cork": 1}
     assert learnt(tmp_path) == ([2], {"forgotten": 1})
     again.close()
+
+
+def test_forget_and_discard_do_not_wait_for_the_card(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, logged: list[str]
+):
+    """Their answers come at once and hold; the disk follows in order, also where it fails: then the
+    log says so, and it can be repeated."""
+    disk = SlowDisk()
+    one = recording(tmp_path, disk)
+    put(one, 1, 2)
+    disk.settle()
+    one.forget("cork")
+    assert one.materials() == {}
+    assert not (tmp_path / "forgotten").exists()
+    put(one, 3)
+    disk.settle()
+    assert learnt(tmp_path) == ([3], {"forgotten": 2})
+    assert one.commands["DISCARD"]("3")[0] == 3
+    assert one.materials() == {}
+    assert (tmp_path / "sweep-000003.npy").exists()
+    disk.settle()
+    assert not (tmp_path / "sweep-000003.npy").exists()
+    put(one, 4)
+    disk.settle()
+    monkeypatch.setattr(sweep_folder.storage, "put", full)
+    one.forget("cork")
+    disk.settle()
+    assert any("No space left" in line and "'cork'" in line for line in logged)
+    assert one.materials() == {}
+    one.close()
 
 
 @pytest.mark.parametrize("content", ["", "[]", '{"cork": 3}', '{"cork": ["x"]}', "[" * 9999])
