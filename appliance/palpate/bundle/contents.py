@@ -28,6 +28,7 @@ class AddedLabels:
     logits: float32 [G + n, K + n] of the bundle's G golden sweeps followed by `golden`, for the
         bundle's K labels followed by `labels`.
     least: as Known.enrolled.
+    displays: [n], names of the labels for people; "" shows the label.
     """
 
     base: str
@@ -38,6 +39,7 @@ class AddedLabels:
     golden: NDArray[Any]
     logits: NDArray[np.float32]
     least: float
+    displays: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,9 +1,9 @@
 """Applies enrolment.npz, the labels that a box has enrolled into a bundle by itself.
 
 The files of the bundle do not change, and its signature still covers them. For each label
-enrolment.npz holds the mean of its sweeps in the embedding, their number and spread, and a golden
-sweep. Bias, shape and the mean of displaced sweeps are computed from these. So an enrolment can add
-labels and nothing else.
+enrolment.npz holds its name for people, the mean of its sweeps in the embedding, their number and
+spread, and a golden sweep. Bias, shape and the mean of displaced sweeps are computed from these. So
+an enrolment can add labels and nothing else.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from palpate.bundle.contents import AddedLabels, Bundle
 from palpate.core.errors import BundleError
 
 ENROLMENT = "enrolment.npz"
-ARRAYS = ("base", "labels", "means", "sweeps", "spread", "changes", "logits", "least")
+TEXTS = ("base", "labels", "displays")
+ARRAYS = (*TEXTS, "means", "sweeps", "spread", "changes", "logits", "least")
 """Arrays in the file; `changes` are the packed golden sweeps (arrays.changes)."""
 MOST_SWEEPS = 1_000_000
 """Largest number of sweeps for a label that the file may give."""
@@ -39,6 +40,7 @@ def file(added: AddedLabels) -> bytes:
         changes=arrays.changes(added.golden),
         logits=added.logits,
         least=np.array(added.least),
+        displays=np.array(added.displays),
     )
 
 
@@ -49,7 +51,7 @@ def applied(bundle: Bundle, data: bytes, identity: str) -> Bundle:
     for k, label in enumerate(added.labels):
         bundle = with_label(
             bundle,
-            label,
+            (label, added.displays[k]),
             added.means[k],
             int(added.sweeps[k]),
             float(added.spread[k]),
@@ -71,7 +73,7 @@ def deciding(bundle: Bundle, least: float) -> Bundle:
 
 def with_label(
     bundle: Bundle,
-    label: str,
+    called: tuple[str, str],
     mean: NDArray[np.float32],
     sweeps: int,
     spread: float,
@@ -79,15 +81,17 @@ def with_label(
 ) -> Bundle:
     """`bundle` with one more label, from the mean [r] of its sweeps in the embedding, and one
     golden sweep [T, R, C] or [T, R, C, A]. The id and the logits of golden sweeps do not change.
+    called: the label and its name for people, "" for none.
 
     The early heads do not have the label, and the figures of `bundle` no longer hold, so both are
     removed. Raises BundleError for a label that is taken or cannot be sent.
     """
     assert bundle.classes
-    m = bundle.manifest
+    m, (label, display) = bundle.manifest, called
     manifest = replace(
         m,
         labels=(*m.labels, label),
+        displays=m.displays | ({label: display} if display else {}),
         version=f"{m.version}+{label}",
         early=None,
         figures={},
@@ -138,13 +142,13 @@ def _one_more(shapes: NDArray[np.float16]) -> NDArray[np.float16]:
 def _read(bundle: Bundle, data: bytes) -> AddedLabels:
     """The content of `data`, checked against `bundle`. Raises BundleError."""
     held = arrays.read(data, ENROLMENT, *ARRAYS)
-    base, labels = held["base"], held["labels"]
+    base, labels, displays = (held[name] for name in TEXTS)
     if (
-        base.dtype.kind != "U"
+        any(held[name].dtype.kind != "U" for name in TEXTS)
         or base.shape != ()
-        or labels.dtype.kind != "U"
         or labels.ndim != 1
         or not len(labels)
+        or displays.shape != labels.shape
     ):
         raise BundleError(f"{ENROLMENT} names no bundle and its labels; {AGAIN}")
     if base.item() != bundle.base:
@@ -168,6 +172,7 @@ def _read(bundle: Bundle, data: bytes) -> AddedLabels:
         golden,
         held["logits"],
         float(held["least"]),
+        tuple(displays.tolist()),
     )
 
 
@@ -185,7 +190,7 @@ def _check(held: Mapping[str, NDArray[Any]], bundle: Bundle, n: int) -> None:
         "logits": logits,
         "least": ("float64", ()),
     }
-    for name in ARRAYS[2:]:
+    for name in wanted:
         values, (kind, shape) = held[name], wanted[name]
         if values.dtype != kind or values.shape != shape:
             raise BundleError(

@@ -224,8 +224,8 @@ class WatchConfig:
 @dataclass(frozen=True, slots=True)
 class TeachConfig:
     """Teaching at the robot (`palpate teach`). allow: whether this box may learn materials by
-    itself, and run a bundle that it has taught. serial: whether the robot may teach it, by the
-    commands TEACH, USE and FORGET of the serial line."""
+    itself, and run a bundle that it has taught. serial: whether the robot may teach it by the
+    serial line: TEACH, USE and FORGET, and the commands of a recording."""
 
     allow: bool = True
     serial: bool = False

@@ -55,9 +55,9 @@ def admit(old: Bundle, label: str) -> None:
         )
 
 
-def enrol(old: Bundle, label: str, sweeps: NDArray[Any]) -> Enrolment:
+def enrol(old: Bundle, label: str, sweeps: NDArray[Any], display: str = "") -> Enrolment:
     """`old` with `label` as its last label, learned from `sweeps`: raw counts [n, T, R, C] or [n,
-    T, R, C, A]. Deterministic.
+    T, R, C, A]. display: its name for people, "" for the label. Deterministic.
 
     The early heads do not have the label, so the new bundle gives no early answers. The figures of
     `old` no longer hold and are removed. Further problems do not prevent the enrolment; they are
@@ -87,7 +87,7 @@ def enrol(old: Bundle, label: str, sweeps: NDArray[Any]) -> Enrolment:
     means = ClassDistances(classes, replace(m.known, enrolled=LEAST), (*m.labels, label))
     median = _median(softmax(means.joined(network, z)))
     outputs = network_outputs(run, np.append(old.golden, sweeps[median][None], axis=0))
-    new, file = _added(old, label, classes, sweeps[median], means.joined(*outputs))
+    new, file = _added(old, (label, display), classes, sweeps[median], means.joined(*outputs))
     trained, warnings = ClassDistances(old.classes, m.known, m.labels), []
     if close := _closeness(trained, label, z):
         warnings.append(close)
@@ -128,21 +128,29 @@ def extended(classes: Classes, z: NDArray[np.float64]) -> Classes:
 
 
 def _added(
-    old: Bundle, label: str, classes: Classes, golden: NDArray[Any], logits: NDArray[np.float32]
+    old: Bundle,
+    called: tuple[str, str],
+    classes: Classes,
+    golden: NDArray[Any],
+    logits: NDArray[np.float32],
 ) -> tuple[Bundle, bytes]:
-    """`old` with the last label of `classes`, and the enrolment.npz of all enrolled labels."""
+    """`old` with the last label of `classes`, and the enrolment.npz of all enrolled labels.
+    called: the label and its name for people."""
     means, sweeps, spread = classes.means[-1:], classes.sweeps[-1:], classes.spread[-1:]
     golden_sweeps = golden[None]
+    label, display = called
     labels: tuple[str, ...] = (label,)
+    displays: tuple[str, ...] = (display,)
     if before := old.added:
-        labels = (*before.labels, label)
+        labels, displays = (*before.labels, label), (*before.displays, display)
         means, spread = np.vstack([before.means, means]), np.append(before.spread, spread)
         sweeps = np.append(before.sweeps, sweeps)
         golden_sweeps = np.concatenate([before.golden, golden_sweeps])
-    added = AddedLabels(old.base, labels, means, sweeps, spread, golden_sweeps, logits, LEAST)
+    held = means, sweeps, spread, golden_sweeps, logits, LEAST
+    added = AddedLabels(old.base, labels, *held, displays)
     file = enrolled.file(added)
     n, wide = int(sweeps[-1]), float(spread[-1])
-    new = enrolled.with_label(old, label, means[-1], n, wide, golden)
+    new = enrolled.with_label(old, called, means[-1], n, wide, golden)
     new = enrolled.deciding(new, LEAST)
     return replace(new, golden_logits=logits, id=bundle.identity(file), added=added), file
 

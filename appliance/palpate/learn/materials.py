@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from palpate.bundle.bundle import Bundle
 from palpate.core.clock import SystemClock
 from palpate.core.config import Config
 from palpate.core.errors import BundleError, ConfigError
+from palpate.core.names import can_be_shown
 from palpate.deployment.signed import SignedBundle
 from palpate.inference.classifier import Classifier
 from palpate.learn import enrolment
@@ -37,11 +39,12 @@ Array = NDArray[Any]
 class NewSweeps:
     """Recorded sweeps of materials that a bundle has not been trained on. windows: raw counts [n,
     T, R, C] or [n, T, R, C, A] of each material; files: their names, without suffix. no_slides:
-    sweeps that are not learnt from."""
+    sweeps that are not learnt from. displays: names of materials for people, by label."""
 
     windows: Mapping[str, Array]
     files: Mapping[str, list[str]]
     no_slides: tuple[NoSlide, ...] = ()
+    displays: Mapping[str, str] = field(default_factory=dict)
 
 
 def check_settings(settings: Config) -> None:
@@ -69,22 +72,31 @@ def recorded(running: Bundle, folder: Path) -> NewSweeps:
     slides, no_slides = slides_alone(new, [check(one.sweep.frames.taxels) for one in new])
     windows: dict[str, list[Array]] = {}
     files: dict[str, list[str]] = {}
+    displays: dict[str, str] = {}
     for one in slides:
+        if can_be_shown(display := one.about.get("display")):
+            displays[one.sweep.material] = str(display)
         windows.setdefault(one.sweep.material, []).append(one.sweep.frames.taxels)
         files.setdefault(one.sweep.material, []).append(one.path.stem)
-    return NewSweeps({name: np.stack(of) for name, of in windows.items()}, files, no_slides)
+    return NewSweeps(
+        {name: np.stack(of) for name, of in windows.items()}, files, no_slides, displays
+    )
 
 
 def taught(
-    running: SignedBundle, windows: Mapping[str, Array], forgotten: tuple[str, ...] = ()
+    running: SignedBundle,
+    windows: Mapping[str, Array],
+    forgotten: tuple[str, ...] = (),
+    displays: Mapping[str, str] = MappingProxyType({}),
 ) -> Enrolment:
     """The bundle with these materials. One that was enrolled before is learnt anew, and a forgotten
-    one is left out. Raises BundleError and FormatError as `enrolment.enrol`."""
+    one is left out. displays: names for people, by label. Raises BundleError and FormatError as
+    `enrolment.enrol`."""
     new = _without(running, {*windows, *forgotten})
     warnings, disagreements = list[str](), list[str]()
     made: Enrolment | None = None
     for label, of in windows.items():
-        made = enrolment.enrol(new, label, of)
+        made = enrolment.enrol(new, label, of, displays.get(label, ""))
         new, warnings = made.bundle, [*warnings, *made.warnings]
         disagreements += [made.disagreement] if made.disagreement else []
     if made is None:
@@ -104,11 +116,13 @@ def _without(running: SignedBundle, labels: set[str]) -> Bundle:
     kept = [k for k, label in enumerate(added.labels) if label not in labels]
     for k in kept:
         mean, n, spread = added.means[k], int(added.sweeps[k]), float(added.spread[k])
-        new = enrolled.with_label(new, added.labels[k], mean, n, spread, added.golden[k])
+        called = added.labels[k], added.displays[k]
+        new = enrolled.with_label(new, called, mean, n, spread, added.golden[k])
     new_lists = {
         name: getattr(added, name)[kept] for name in ("means", "sweeps", "spread", "golden")
     }
-    still = replace(added, labels=tuple(added.labels[k] for k in kept), **new_lists)
+    labels_left, shown = (tuple(texts[k] for k in kept) for texts in (added.labels, added.displays))
+    still = replace(added, labels=labels_left, displays=shown, **new_lists)
     return replace(new, added=still if kept else None)
 
 

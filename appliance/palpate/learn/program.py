@@ -82,6 +82,10 @@ class TeachingProgram:
             format = self.base.bundle.format
             materials.check_settings(settings)
         self.format, self.names, self.again = format, TypedNames(), ""
+        if self.base:  # its labels are taken, whatever script a name is typed in
+            m = self.base.bundle.manifest
+            for label in m.labels:
+                self.names.add(label, m.displays.get(label))
         self._done, self._stopped = False, StopFlag()
         self.codes = 1 << len(bits) if (bits := settings.output.class_bits) else 0
 
@@ -165,7 +169,7 @@ class RecordingPhase(Phase):
             stack,
             capture=outputs.capture(stack),
             observers=[disk, *self._observers(), self._teacher, *outputs.pages],
-            commands={**session.recording_commands, **program.by_robot(session.commands)},
+            commands=program.by_robot({**session.recording_commands, **session.commands}),
             ordered=bool(outputs.pages or lesson.waits),
             serving=False,
             slides=slide_check(base.bundle) if base else SlidesAmong(program.format),

@@ -24,6 +24,8 @@ from palpate.sweeps.recording import Labels, RecordingSession
 
 FEWEST = 2
 """Fewest sweeps of a material that can be assessed, and fewest such materials."""
+MOST_NAMED = 64
+"""Most materials that wait for their first sweep: names cost nothing, and each is shown."""
 PAUSE_NS = 300_000_000
 """Time without a new sweep before an assessment begins."""
 
@@ -202,6 +204,10 @@ class TeachingSession(Observer):
             raise ApplianceError("TEACH needs the name of a material, such as PPLP TEACH cork")
         Labels(material=label)
         self.admit(label)
+        if list(self.materials().values()).count(0) >= MOST_NAMED and label not in self._named:
+            raise ApplianceError(
+                f"{MOST_NAMED} materials wait for a sweep; record one of them, or forget it"
+            )
         self._named.setdefault(label)
         self._recording.commands["MATERIAL"](label)
         return [label, self.materials().get(label, 0)]
@@ -235,10 +241,7 @@ class TeachingSession(Observer):
             )
         if self._using:
             raise ApplianceError("a bundle is being made; forget it afterwards")
-        try:
-            self._recording.forget(label)
-        except OSError as e:
-            raise ApplianceError(f"{label!r} is not forgotten: {e.strerror}; make room") from e
+        self._recording.forget(label)
         self._named.pop(label, None)
         self._trouble = self._too_many()
         self._due_ns = self._clock.now_ns()

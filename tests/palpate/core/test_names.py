@@ -40,6 +40,7 @@ def test_each_name_has_a_label_that_can_be_sent(name: str, label: str):
         (" ", False),
         ("a\nb", False),
         ("a\u202eb", False),
+        *((f"a{unseen}", False) for unseen in "\u3164\u2800\u115f\ufe0f\u034f\U000e0101"),
         (7, False),
     ],
 )
@@ -69,3 +70,14 @@ def test_a_typed_name_keeps_its_label():
     for bad in ("a\nb", "ä\nb", "-wood", "<b>", ""):
         assert known.label(bad) == bad
     assert known.displays == {"Holz": "Holz, geölt", "Filz weiss 2": "Filz weiß"}
+
+
+def test_labels_of_the_bundle_are_taken():
+    """A name in another script gets no label that means something else there; one word in both
+    forms of Unicode is one material, also if a file holds it otherwise."""
+    known = TypedNames()
+    known.add("material", None)
+    known.add("Spuele", "Spu\u0308le")
+    assert known.label("木") == "material 2"
+    assert known.label("石") == "material 3"
+    assert known.label("Sp\u00fcle") == known.label("Spu\u0308le") == "Spuele"

@@ -19,14 +19,20 @@ from palpate.cli.main import main
 from palpate.core.clock import SystemClock
 from palpate.core.config import load
 from palpate.core.devices import Devices
-from palpate.core.errors import BundleError, ConfigError, ModelError
+from palpate.core.errors import ApplianceError, BundleError, ConfigError, ModelError
 from palpate.core.observer import Observer
 from palpate.deployment.enrolment_key import EnrolmentKey
 from palpate.deployment.signed import SignedBundle
 from palpate.inference.classifier import Classifier
 from palpate.io.robot_link import command
 from palpate.learn import enrolment, install, materials
-from palpate.learn.program import Outputs, TaughtLesson, TeachingProgram, TryingPhase
+from palpate.learn.program import (
+    Outputs,
+    RecordingPhase,
+    TaughtLesson,
+    TeachingProgram,
+    TryingPhase,
+)
 from palpate.learn.session import TeachingSession
 from palpate.runtime import assembly
 from palpate.sim import skin
@@ -130,6 +136,44 @@ def test_more_sweeps_another_material_and_a_forgotten_one(box: TaughtDelivery, c
     assert box.teach(capsys, "--use")[0] == 0
     assert box.running.bundle.enrolled == {"felt": 1}
     assert first.enrolled == {"cork": 5}
+
+
+def test_a_material_keeps_its_name_for_people(box: TaughtDelivery, capsys: Any):
+    """From the sidecar into the bundle, and through every later USE, also without its sweeps; the
+    labels of the bundle are taken for whoever types a name later."""
+    for path in sorted((box.store / "sweeps").glob("*.json")):
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"display": "木"}))
+    assert box.teach(capsys, "--use")[0] == 0
+    assert box.running.bundle.manifest.displays == {"cork": "木"}
+    for path in (box.store / "sweeps").glob("sweep-*"):
+        path.unlink()
+    record(box.store, "felt", slides(FELT, 2), 20)
+    assert box.teach(capsys, "--use")[0] == 0
+    assert box.running.bundle.manifest.displays == {"cork": "木"}
+    devices = Devices(SystemClock())
+    typed = TeachingProgram(box.settings, devices, skin.FORMAT, TaughtLesson()).names
+    assert [typed.label(name) for name in ("木", "felt", "石")] == ["cork", "felt", "material"]
+    assert {*box.running.bundle.manifest.labels} <= {*typed.displays, *typed.plain}
+
+
+def test_a_delivery_during_use_is_not_replaced(
+    box: TaughtDelivery, capsys: Any, monkeypatch: pytest.MonkeyPatch
+):
+    """Another bundle comes into service while the sweeps are learnt: it stays, and the person who
+    teaches is told."""
+    taught = materials.taught
+
+    def slowly(*given: Any, **more: Any) -> enrolment.Enrolment:
+        made = taught(*given, **more)
+        (box.store / "current").unlink()  # stands for any other bundle
+        return made
+
+    with monkeypatch.context() as patched:
+        patched.setattr(materials, "taught", slowly)
+        code, news = box.teach(capsys, "--use")
+    assert code
+    assert "meanwhile" in news["text"]
+    assert not (box.store / "current").exists()
 
 
 def test_a_label_without_recorded_sweeps_stays(box: TaughtDelivery, capsys: Any):
@@ -296,6 +340,31 @@ def test_a_trained_material_is_refused_before_a_sweep(box: TaughtDelivery, capsy
         with pytest.raises(ConfigError, match="was trained on 'foam'"):
             phase.obey(command("TEACH", "foam"))
         assert phase.obey(command("TEACH", "cork")) == ["cork"]
+
+
+@pytest.mark.parametrize("allowed", [False, True])
+def test_the_robot_labels_nothing_unless_it_may_teach(box: TaughtDelivery, allowed: bool):
+    """With teach.serial = false the page alone sets labels, discards, teaches and forgets."""
+    trigger, teach = box.settings.trigger, box.settings.teach
+    settings = replace(box.settings, trigger=replace(trigger, mode="serial"))
+    settings = replace(settings, teach=replace(teach, serial=allowed))
+    devices = Devices(SystemClock())
+    program = TeachingProgram(settings, devices, skin.FORMAT, TaughtLesson(waits="no page"))
+    program.outputs = Outputs((), "", lambda facts: [], lambda facts: [], lambda stack: None)
+    orders = (("MATERIAL", "felt"), ("POSITION", "2"), ("SESSION", "b"), ("NEXT", ""))
+    with ExitStack() as stack:
+        phase = RecordingPhase(program, stack)
+        for name, text in (*orders, ("TEACH", "felt"), ("FORGET", "felt"), ("DISCARD", "")):
+            before = phase.about()
+            try:
+                phase.box.obey(command(name, text))
+                refused = ""
+            except ApplianceError as e:
+                refused = str(e)
+            assert ("may not teach" in refused) is not allowed, name
+            assert allowed or phase.about() == before
+        for name, text in orders:
+            assert phase.obey(command(name, text))
 
 
 def sessions(folder: Path, codes: int) -> TeachingSession:

@@ -272,6 +272,18 @@ def test_class_bits_that_are_too_few_are_said_before_recording(tmp_path: Path):
     narrower.recording.close()
 
 
+def test_names_alone_fill_no_box(taught: Taught, monkeypatch: pytest.MonkeyPatch):
+    """Only so many materials wait for their first sweep; one with sweeps does not count."""
+    monkeypatch.setattr(session, "MOST_NAMED", 2)
+    taught.sweeps("cork", 1)
+    for name in ("felt", "pine", "felt"):
+        taught.order("TEACH", name)
+    with pytest.raises(ApplianceError, match="2 materials wait"):
+        taught.order("TEACH", "oak")
+    taught.order("FORGET", "pine")
+    assert taught.order("TEACH", "oak") == ["oak", 0]
+
+
 def test_a_forgotten_material_is_gone_and_its_sweeps_stay(taught: Taught):
     """Also after a restart; recorded again, it counts from 1."""
     taught.sweeps("cork", 2)
