@@ -27,6 +27,7 @@ from palpate.sim import skin
 from palpate_studies import cost
 from palpate_studies.command import main as study
 from palpate_train.answer.heads import HeadData
+from palpate_train.answer.rules import RULES, Asked, present
 from palpate_train.cli.main import main
 from palpate_train.data import sets
 from palpate_train.data.run import Run
@@ -184,7 +185,15 @@ def test_a_bundle_passes_its_own_tests(fitted: Fit, packed: Path):
 def test_a_rule_for_moved_sweeps_needs_places(fitted: Fit, packed: Path, tmp_path: Path):
     """With the distance of the taxels the bundle has contact positions and a rule for displaced
     sweeps; without it the box could not recognise these, and the file has no arrays for them."""
-    quantized_bundle.export(fitted, tmp_path / "placed", "easy", "1", "0123abcd", pitch_mm=4.0)
+    quantized_bundle.export(
+        fitted,
+        tmp_path / "placed",
+        "easy",
+        "1",
+        "0123abcd",
+        pitch_mm=4.0,
+        asked=Asked(("displacement",)),
+    )
     placed, plain = bundle.load(tmp_path / "placed"), bundle.load(packed)
     assert placed.manifest.contact
     assert placed.manifest.displacement
@@ -193,6 +202,19 @@ def test_a_rule_for_moved_sweeps_needs_places(fitted: Fit, packed: Path, tmp_pat
     assert plain.manifest.displacement is None
     with np.load(packed / bundle.MEANS) as arrays:
         assert not [name for name in arrays if name.startswith("displaced")]
+
+
+def test_rules_are_left_out_as_asked(fitted: Fit, tmp_path: Path):
+    """Early answers are not in the graph, and nothing measures how well a material is known."""
+    asked = Asked(left_out=("unknown", "early", "taxels"))
+    quantized_bundle.export(
+        fitted, tmp_path / "less", "easy", "1", "0123abcd", proven=False, asked=asked
+    )
+    less = bundle.load(tmp_path / "less")
+    assert not set(present(less)) & set(asked.left_out)
+    assert less.classes is None
+    assert "early" not in [output.name for output in onnx.load_from_string(less.model).graph.output]
+    assert box(tmp_path / "less").self_test() < bundle.GOLDEN_TOLERANCE
 
 
 def test_figures_of_held_out_sweeps_are_not_of_heads_that_saw_them(fitted: Fit):
@@ -407,10 +429,10 @@ def test_the_box_must_answer_as_export_did(fitted: Fit, packed: Path):
     """If the labels of the box and of the int8 model differ, the message has the number of such
     sweeps."""
     logits = np.stack([box(packed).logits(x) for x in fitted.held.samples])
-    assert "held-out" in pack.judge(packed, fitted.held, logits, "held-out")
+    assert "held-out" in pack.judge(bundle.load(packed), fitted.held, logits, "held-out")
     logits[:2] = -logits[:2]
     with pytest.raises(ExportRefused, match="2 of 30"):
-        pack.judge(packed, fitted.held, logits, "held-out")
+        pack.judge(bundle.load(packed), fitted.held, logits, "held-out")
 
 
 def test_a_material_never_recognised_is_refused(fitted: Fit):
@@ -508,13 +530,16 @@ def test_references_are_what_they_are_called(tmp_path: Path, caplog: pytest.LogC
 def test_the_command_exports_what_fit_wrote(
     fitted: Fit, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """It prints one line for each figure, then the size, at last the command to score it; another
-    file has the exit code of FormatError."""
+    """It prints one line for each figure and each rule, then the size, at last the command to score
+    it; another file has the exit code of FormatError."""
     fitted.save(tmp_path / "fit.npz")
     args = ["--out", str(tmp_path / "bundle"), "--name", "easy", "--version", "3"]
     assert main(["export", str(tmp_path / "fit.npz"), *args]) == 0
     lines = capsys.readouterr().out.splitlines()
     lines = [line for line in lines if not line.startswith("  ")]  # each fault, each alteration
+    ruled = [line for line in lines if line.startswith(tuple(r.what for r in RULES.values()))]
+    assert any("not needed" in line for line in ruled)
+    lines = [line for line in lines if line not in ruled]
     assert [line.split(":")[0] for line in lines] == [
         "held-out speed, as the box answers",
         "held-out speed, network alone",

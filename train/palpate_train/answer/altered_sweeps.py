@@ -124,7 +124,7 @@ def disturbed(
         if (kind := corruption.name) in TAXEL_FAULTS:
             continue
         source = rng.permutation(len(sweeps))[:COPIES]
-        samples, severity = _copies(corruption, every, source, seed)
+        samples, severity = altered_copies(corruption, every, source, seed)
         name, counts = fit_disturbance.OF_KIND.get(kind), np.empty(0)
         if name == "hum":
             samples, counts = meter.clean(samples)
@@ -139,7 +139,7 @@ def disturbed(
     return DisturbedSweeps(features(sweeps.samples), sweeps.labels, copies, sizes)
 
 
-def _copies(
+def altered_copies(
     corruption: Corruption, every: EvaluationSweeps, source: Array, seed: int
 ) -> tuple[Array, Array]:
     """Copies of the sweeps `source` (numbers [M]), a part of them at each severity; and the

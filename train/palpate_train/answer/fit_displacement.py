@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from palpate.answer.contact import displacement
 from palpate.answer.objects import softmax
 from palpate.answer.unknown import Classes, DisplacedClasses, DisplacementRule
+from palpate.bundle.contents import Bundle
 from palpate.bundle.manifest import Manifest
 from palpate_train.answer.embedding import Embedding, embed, limit
 from palpate_train.data.augment import Augmentation, augment
@@ -157,3 +158,9 @@ def text(manifest: Manifest) -> str:
     if rule.farthest_mm is None:
         return "displaced contacts: named at any distance"
     return f"displaced contacts: named up to {rule.farthest_mm:.1f} mm"
+
+
+def without(bundle: Bundle) -> Bundle:
+    """The bundle that judges displaced contacts as it judges others."""
+    classes = bundle.classes and replace(bundle.classes, displaced=None)
+    return replace(bundle, manifest=replace(bundle.manifest, displacement=None), classes=classes)

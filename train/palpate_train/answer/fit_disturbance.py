@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from palpate.answer import disturbance
 from palpate.answer.disturbance import TINY, Allowance
-from palpate.answer.hum import HumFilter
 from palpate.answer.slide import SlideMeter
 from palpate.answer.unknown import shaped_distances
+from palpate.bundle.contents import Bundle
 from palpate.core.types import SweepFormat
+from palpate_train.answer import fit_hum
 from palpate_train.answer.fit_unknown import DisturbedSweeps
 
 Array = NDArray[Any]
@@ -51,11 +52,6 @@ SHRINK = 8
 this."""
 SEVERITIES = 6
 """Number of severities of a kind, at equal distances up to the largest."""
-STANDS_OUT, MOST_RATIO = 3.5, 20.0
-"""Least ratio of hum that is removed, and the largest limit: beyond it training sweeps have
-something like hum, so nothing is removed."""
-TRAINED, MOST_OF = 1.25, 0.995
-"""The limit is this many times the ratio of this share of the training sweeps."""
 
 
 class DisturbanceMeter:
@@ -64,22 +60,12 @@ class DisturbanceMeter:
     found on the training sweeps `trained` [n, T, ...]."""
 
     def __init__(self, format: SweepFormat, tare: Array, trained: Array) -> None:
-        self._tare, self._slide, self._hum = tare, SlideMeter(format, 1.0), HumFilter(format)
-        self.hum = self._limit(trained)
-
-    def _limit(self, trained: Array) -> float | None:
-        if not self._hum.hz:
-            return None
-        ratios = [self._hum.ratio(window) for window in trained]
-        limit = max(STANDS_OUT, TRAINED * float(np.quantile(ratios, MOST_OF)))
-        return round(limit, 2) if limit <= MOST_RATIO else None
+        self._format, self._tare, self._slide = format, tare, SlideMeter(format, 1.0)
+        self.hum = fit_hum.fit(format, trained)
 
     def clean(self, samples: Array) -> tuple[Array, Array]:
         """The windows without hum, and the amplitude that was removed of each [n]."""
-        if self.hum is None:
-            return samples, np.zeros(len(samples))
-        clean, counts = zip(*(self._hum(window, self.hum) for window in samples), strict=True)
-        return np.stack(clean), np.array(counts)
+        return fit_hum.cleaned(self._format, self.hum, samples)
 
     def values(self, name: str, samples: Array) -> Array:
         """The values [n] of noise, load or speed; NaN where one is not known."""
@@ -282,3 +268,15 @@ def _slope(judge: Judge, tried: _Tried, change: Array) -> _Slope:
         distances[np.arange(len(distances)), tried.labels] = np.inf
     passed = within(before, 1), within(after, limit)
     return _Slope(round(slope, 4), kept, passed, len(tried.labels))
+
+
+def without(bundle: Bundle) -> Bundle:
+    """The bundle that allows for no disturbance."""
+    allowed, classes = bundle.manifest.disturbances, bundle.classes
+    if not (allowed and allowed.allowances and classes):
+        return bundle
+    return replace(
+        bundle,
+        manifest=replace(bundle.manifest, disturbances=replace(allowed, allowances=())),
+        classes=replace(classes, changes=classes.changes[:0]),
+    )

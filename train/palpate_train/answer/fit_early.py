@@ -7,7 +7,7 @@ did not see; without a sufficient probability the box does not answer early.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from palpate.answer.early import Early
 from palpate.answer.unknown import EarlyClasses, EarlyDistances
+from palpate.bundle.contents import Bundle
 from palpate.bundle.manifest import Manifest
 from palpate_train.answer.embedding import centred, cross_fitted, limit
 from palpate_train.answer.heads import shrinkage
@@ -239,3 +240,9 @@ def text(manifest: Manifest) -> str:
     if not manifest.early.limits:
         return "early answers: unknown materials are not detected before the end of a sweep"
     return f"early answers: only of known materials, at each of {len(manifest.early.limits)} steps"
+
+
+def without(bundle: Bundle) -> Bundle:
+    """The bundle that answers whole sweeps only."""
+    classes = bundle.classes and replace(bundle.classes, early=None)
+    return replace(bundle, manifest=replace(bundle.manifest, early=None), classes=classes)

@@ -5,12 +5,14 @@ taxel. All is measured from counts."""
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from palpate.answer.pipeline import Slide
 from palpate.answer.slide import CHANCE, SlideMeter, SpeedRange
 from palpate.answer.vibration import PARTS, TINY, SlideLimits, vibration
+from palpate.bundle.contents import Bundle
 from palpate.bundle.manifest import Manifest
 from palpate_train.data.sets import Dataset
 
@@ -97,3 +99,21 @@ def text(manifest: Manifest) -> str:
     if limits and limits.pattern:
         by.append("in a whole window by its lack of a pattern that passes from taxel to taxel")
     return f"a finger that rests: noticed {' and '.join(by)}" if by else _UNNOTICED
+
+
+def without_pattern(bundle: Bundle) -> Bundle:
+    """The bundle that needs no pattern in a slide."""
+    return _limits(bundle, pattern=None)
+
+
+def without_vibration(bundle: Bundle) -> Bundle:
+    """The bundle that needs no vibration in a slide."""
+    return _limits(bundle, least=())
+
+
+def _limits(bundle: Bundle, **changed: Any) -> Bundle:
+    if bundle.manifest.sliding is None:
+        return bundle
+    limits = replace(bundle.manifest.sliding, **changed)
+    kept = limits if limits.least or limits.pattern else None
+    return replace(bundle, manifest=replace(bundle.manifest, sliding=kept))

@@ -308,7 +308,8 @@ def _lines(rows: int, cols: int, name: str) -> Iterable[Array]:
 def text(manifest: Manifest) -> str:
     """The broken taxels that a bundle tolerates, with the answers at the worst places, in words."""
     if manifest.bridging is None:
-        return "broken taxels: not measured, so the box refuses them"
+        unknown = "" if FIGURES in manifest.figures else "not measured, so "
+        return f"broken taxels: {unknown}the box refuses them"
     lines = [f"broken taxels: {manifest.bridging.text} bridged"]
     figures = manifest.figures.get(FIGURES, {})
     if figures:
@@ -329,3 +330,8 @@ def text(manifest: Manifest) -> str:
             "scale"
         )
     return "\n".join(lines)
+
+
+def without(bundle: Bundle) -> Bundle:
+    """The bundle that bridges no broken taxel: it refuses them."""
+    return replace(bundle, manifest=replace(bundle.manifest, bridging=None))

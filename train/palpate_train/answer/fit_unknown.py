@@ -10,13 +10,15 @@ materials that are left out. Directions that no alteration reaches count as befo
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.answer.unknown import shaped_distances
+from palpate.bundle.contents import Bundle
+from palpate.bundle.manifest import MEANS
 from palpate_train.answer.embedding import (
     Embedding,
     auroc,
@@ -251,3 +253,20 @@ def _moment(change: Array, otherwise: Array | None = None) -> Array:
         return otherwise
     moment: Array = change.T @ change / max(len(change), 1)
     return moment
+
+
+def without(bundle: Bundle) -> Bundle:
+    """The bundle that calls no material unknown. Early answers, disturbances and displaced contacts
+    are judged by the same distances, so their rules lose theirs."""
+    m = bundle.manifest
+    if m.known is None:
+        return bundle
+    manifest = replace(
+        m,
+        files={name: entry for name, entry in m.files.items() if name != MEANS},
+        known=None,
+        displacement=None,
+        disturbances=m.disturbances and replace(m.disturbances, allowances=()),
+        early=m.early and replace(m.early, limits=()),
+    )
+    return replace(bundle, manifest=manifest, classes=None)

@@ -24,6 +24,7 @@ from palpate_train.answer import (
     fit_early,
     fit_slide,
     fit_taxels,
+    rules,
 )
 from palpate_train.arguments import numbers, options
 from palpate_train.arguments.program import Add
@@ -41,6 +42,7 @@ def register(add: Add) -> None:
     score = add("score", run_score)
     score.add_argument("bundle", type=Path, metavar="BUNDLE", help="its folder")
     options.add_set(score)
+    _add_rules(score, "--without", "left_out", "score the bundle without these rules, too")
     score.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
 
 
@@ -66,13 +68,29 @@ def _add_export(export: argparse.ArgumentParser) -> None:
         help="distance between taxels; without it `palpate skin align` cannot show mm (known for "
         "the simulated skin)",
     )
+    _add_rules(export, "--with", "kept", "keep these rules even if they do not pay")
+    _add_rules(export, "--without", "left_out", "leave these rules out")
     export.add_argument(
         "--licence", default="", metavar="NAME", help="of the recordings, for card.md: CC-BY-4.0"
     )
 
 
+def _add_rules(command: argparse.ArgumentParser, option: str, into: str, what: str) -> None:
+    command.add_argument(
+        option,
+        dest=into,
+        nargs="+",
+        action="extend",
+        default=[],
+        choices=tuple(rules.RULES),
+        metavar="NAME",
+        help=f"{what}: {', '.join(rules.RULES)}",
+    )
+
+
 def run_export(args: argparse.Namespace) -> None:
     """Pack the bundle, print its figures and how to score it."""
+    asked = rules.Asked(tuple(args.kept), tuple(args.left_out))
     pack.check_target(args.out)
     arrays = read(args.fit, WHAT)
     named = args.out, args.name, args.version, commit(), args.full_scale, args.pitch_mm
@@ -80,11 +98,11 @@ def run_export(args: argparse.Namespace) -> None:
     if "model" in arrays:
         made = MethodFit.read(args.fit.name, arrays)
         made.about[pack.LICENCE] = args.licence
-        manifest = quantized_bundle.export_method(made, *named)
+        manifest = quantized_bundle.export_method(made, *named, asked=asked)
     else:
         made = Fit.read(args.fit.name, arrays)
         made.about[pack.LICENCE] = args.licence
-        manifest = quantized_bundle.export(made, *named)
+        manifest = quantized_bundle.export(made, *named, asked=asked)
     _print(manifest, args.out)
     rest = made.about.get("rest")
     what = "the sweeps that fit --split left out" if rest else "sweeps that the fit has not seen"
@@ -98,11 +116,15 @@ def run_score(args: argparse.Namespace) -> None:
     if args.json:
         options.writable_file(args.json, "--json", ".json")
     loaded, sweeps = bundle.load(args.bundle), options.load(args)
+    less = rules.without(loaded, args.left_out)
     found = bundle_score.score(Classifier(loaded, SystemClock()), sweeps)
     seen = _seen(loaded.manifest, sweeps)
     if args.json:
         put(args.json, (json.dumps(found.json() | {"trained_on": seen}, indent=1) + "\n").encode())
     say(*found.text().split("\n"))
+    if args.left_out:
+        without = bundle_score.score(Classifier(less, SystemClock()), sweeps)
+        say(f"without {', '.join(args.left_out)}: {without.short()}; with: {found.short()}")
     if seen and seen["sweeps"]:
         say(
             f"warning: {seen['sweeps']} of {seen['of']} sweeps are the very ones that the bundle "
@@ -143,7 +165,7 @@ def _print(manifest: Manifest, out: Path) -> None:
     say(fit_taxels.text(manifest))
     if manifest.known:
         say(altered_sweeps.text(manifest.figures))
-    for part in (quantized_bundle, fit_early, fit_displacement, fit_slide):
+    for part in (quantized_bundle, fit_early, fit_displacement, fit_slide, rules):
         if text := part.text(manifest):
             say(text)
     if few := [

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from palpate.bundle.manifest import Manifest
-from palpate_train.answer import altered_sweeps, fit_taxels
+from palpate_train.answer import altered_sweeps, fit_taxels, rules
 from palpate_train.data.sets import Dataset, digest
 
 NAME = "card.md"
@@ -92,6 +92,8 @@ def _sentences(manifest: Manifest, protocol: str, figure: Json) -> list[str]:
             "",
         ]
     lines += ["## What breaks it", "", fit_taxels.text(manifest), ""]
+    if judged := rules.text(manifest):
+        lines += [judged, ""]
     if manifest.known:
         lines += [altered_sweeps.text(manifest.figures), ""]
     else:

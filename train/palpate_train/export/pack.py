@@ -31,13 +31,14 @@ from palpate.core import provenance, storage
 from palpate.core.clock import SystemClock
 from palpate.core.errors import BundleError
 from palpate.inference.classifier import Classifier
-from palpate_train.answer import fit_displacement, fit_early, fit_slide, fit_taxels
+from palpate_train.answer import fit_displacement, fit_early, fit_slide, fit_taxels, rules
 from palpate_train.answer.fit_contact import Contacts
 from palpate_train.answer.fit_slide import trained_speeds
+from palpate_train.answer.rules import ALL, RULES, Asked, present
 from palpate_train.data import extras, repeats
 from palpate_train.data.readers import counted
 from palpate_train.data.sets import Dataset
-from palpate_train.export import card
+from palpate_train.export import card, trial
 from palpate_train.metrics import bundle_score
 from palpate_train.metrics.answers import REFUSED, UNKNOWN
 from palpate_train.models.method_fit import MethodFit
@@ -106,6 +107,7 @@ def pack(
     full_scale: float | None = None,
     pitch_mm: float | None = None,
     proven: bool = True,
+    asked: Asked = ALL,
 ) -> bundle.Manifest:
     """Check `content` and put it at `target`, whole or not at all; an older bundle there is
     replaced.
@@ -113,8 +115,9 @@ def pack(
     commit: of the code, for the manifest. full_scale: the sensor's highest raw count if that is not
     the maximum of its type. pitch_mm: distance between taxels; without it the box cannot say how
     far a contact is from the trained positions. proven: measure how many broken taxels the box may
-    bridge, which takes most of the time; without it the box refuses them. Raises ExportRefused if a
-    check fails, and BundleError if a label or the target cannot be used.
+    bridge, and which rules pay, which takes most of the time; without it the box refuses broken
+    taxels and has all other rules. asked: rules that stay or are left out in any case. Raises
+    ExportRefused if a check fails, and BundleError if a label or the target cannot be used.
     """
     content = _early_checked(content)
     files = _files(content)
@@ -122,12 +125,20 @@ def pack(
     manifest = limited(manifest, content.train)
     logits = run(content.model, model_inputs(content.input, content.held_out))
     with _replacing(target) as folder:
-        for file, data in (files | {bundle.MANIFEST: manifest.json()}).items():
-            (folder / file).write_bytes(data)
-        figures = judge(folder, content.held_out, logits, f"held-out {content.held_out_by}")
-        manifest = replace(manifest, figures=figures | content.figures)
-        if proven:
-            manifest = _tolerant(content, manifest, bundle.load(folder))
+        packed = bundle.from_files(files | {bundle.MANIFEST: manifest.json()}, name)
+        held_out, protocol = content.held_out, f"held-out {content.held_out_by}"
+        figures = judge(packed, held_out, logits, protocol)
+        chosen = _chosen(content, packed, proven, asked)
+        if present(chosen) != present(packed):
+            figures = judge(chosen, held_out, logits, protocol)
+        files |= {bundle.MEANS: means_file(chosen.classes)} if chosen.classes else {}
+        manifest = replace(
+            chosen.manifest,
+            files={k: bundle.file_entry(files[k]) for k in chosen.manifest.files},
+            figures=figures | content.figures | chosen.manifest.figures,
+        )
+        for file in manifest.files:
+            (folder / file).write_bytes(files[file])
         (folder / bundle.MANIFEST).write_bytes(manifest.json())
         (folder / card.NAME).write_text(card.text(manifest, pitch_mm), encoding="utf-8")
         bundle.load(folder)
@@ -189,19 +200,28 @@ def displays(sweeps: Dataset) -> dict[str, str]:
     return {name: text for name, text in sweeps.displays.items() if name in sweeps.materials}
 
 
-def _tolerant(
-    content: Content, manifest: bundle.Manifest, packed: bundle.Bundle
-) -> bundle.Manifest:
-    """`manifest` with the broken taxels that the bundle tolerates, by heads that did not see the
-    held-out sweeps."""
-    if content.unseen:
-        files = _files(content.unseen)
-        entries = {name: bundle.file_entry(data) for name, data in files.items()}
-        text = replace(manifest, files=entries, early=None).json()
-        packed = bundle.from_files(files | {bundle.MANIFEST: text}, manifest.name)
-    seed = int(content.about.get("seed", 0))
-    found = fit_taxels.measure(packed, content.train, content.held_out, seed)
-    return found.written(manifest)
+def _chosen(content: Content, packed: bundle.Bundle, proven: bool, asked: Asked) -> bundle.Bundle:
+    """`packed` with the broken taxels that it tolerates, if that is `proven`, and without the rules
+    that do not pay. Heads judge that have not seen the held-out sweeps."""
+    left_out, figures = list(asked.left_out), dict[str, Any]()
+    if proven:
+        judging, seed = packed, int(content.about.get("seed", 0))
+        if content.unseen:
+            files = _files(content.unseen)
+            entries = {name: bundle.file_entry(data) for name, data in files.items()}
+            text = replace(packed.manifest, files=entries, early=None).json()
+            judging = bundle.from_files(files | {bundle.MANIFEST: text}, packed.manifest.name)
+        found = fit_taxels.measure(judging, content.train, content.held_out, seed)
+        packed, judging = (
+            replace(of, manifest=found.written(of.manifest)) for of in (packed, judging)
+        )
+        left_out, figures = trial.decided(judging, content.held_out, seed, asked)
+    for name in left_out:
+        packed = RULES[name].without(packed)
+    figures = {rules.FIGURES: figures} if figures else {}
+    return replace(
+        packed, manifest=replace(packed.manifest, figures=packed.manifest.figures | figures)
+    )
 
 
 def _files(content: Content) -> dict[str, bytes]:
@@ -358,13 +378,13 @@ def thresholds(
     )
 
 
-def judge(folder: Path, held_out: Dataset, logits: Array, protocol: str) -> dict[str, Any]:
-    """Figures of the bundle in `folder` on `held_out`, run as the box runs it. logits: [N, K] of
-    the graph, for the same sweeps.
+def judge(packed: bundle.Bundle, held_out: Dataset, logits: Array, protocol: str) -> dict[str, Any]:
+    """Figures of a bundle on `held_out`, run as the box runs it. logits: [N, K] of the graph, for
+    the same sweeps.
 
     Raises ExportRefused if the box gives another label than the graph, or refuses too many sweeps.
     """
-    box = Classifier(bundle.load(folder), SystemClock(), slides=False)
+    box = Classifier(packed, SystemClock(), slides=False)
     box.self_test()
     answers = bundle_score.answers_to(box, held_out, logits)
     refused, unknown = answers.labels == REFUSED, answers.labels == UNKNOWN

@@ -3,6 +3,7 @@ does."""
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,9 @@ from palpate_train.answer import altered_sweeps, embedding
 from palpate_train.answer.calibrate import Calibration, CalibrationInputs
 from palpate_train.answer.embedding import Embedding
 from palpate_train.answer.fit_contact import Contacts
+from palpate_train.answer.fit_early import EarlyRule
 from palpate_train.answer.fit_unknown import Space
+from palpate_train.answer.rules import ALL, Asked
 from palpate_train.data import extras
 from palpate_train.export import pack
 from palpate_train.export.bundle_graph import bundle_graph
@@ -56,6 +59,7 @@ def export(
     full_scale: float | None = None,
     pitch_mm: float | None = None,
     proven: bool = True,
+    asked: Asked = ALL,
 ) -> bundle.Manifest:
     """Quantize `fit`, compare its precisions, and pack it; see pack.pack.
 
@@ -77,7 +81,7 @@ def export(
         content = replace(content, model=reference, about=about | {"float_because": str(e)})
         fit = finished(fit.in_float())
     return pack.pack(
-        _calibrated(content, fit, pitch_mm),
+        _calibrated(content, fit, pitch_mm, asked.left_out),
         target,
         name,
         version,
@@ -85,6 +89,7 @@ def export(
         full_scale,
         pitch_mm,
         proven,
+        asked,
     )
 
 
@@ -96,22 +101,28 @@ def export_method(
     commit: str,
     full_scale: float | None = None,
     pitch_mm: float | None = None,
+    asked: Asked = ALL,
 ) -> bundle.Manifest:
     """As `export`, of a method that is not of our family; it has no form in float to keep instead.
     Raises ExportRefused if a check fails."""
     content = pack.content_of(fit)
     if fit.reference is not None:
         content = checked(content, fit.reference)
-    return pack.pack(content, target, name, version, commit, full_scale, pitch_mm)
+    return pack.pack(content, target, name, version, commit, full_scale, pitch_mm, asked=asked)
 
 
-def _calibrated(content: Content, fit: Fit, pitch_mm: float | None) -> Content:
+def _calibrated(
+    content: Content, fit: Fit, pitch_mm: float | None, left_out: Collection[str]
+) -> Content:
     """`content` with the calibration of `fit`, if it has one: heads, early answers, novelty, and
     the figures of heads that did not see the held-out sweeps. The rule for displaced contacts needs
-    contact positions, and these need the distance between taxels."""
+    contact positions, and these need the distance between taxels. left_out: rules that the graph
+    does not serve."""
     calibration = fit.calibration
     if calibration is None:
         return content
+    if "early" in left_out:
+        calibration = replace(calibration, rule=EarlyRule(None, "left out"))
     if not (fit.contacts and fit.contacts.positions(pitch_mm)):
         calibration = replace(calibration, displacement=None)
     rule = calibration.rule

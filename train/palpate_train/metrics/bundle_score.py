@@ -119,6 +119,11 @@ class BundleScore:
             }
         return result | provenance()
 
+    def short(self) -> str:
+        """The figures in a line, to compare two bundles."""
+        counts = ", ".join(f"{status} {n}" for status, n in self.statuses.most_common())
+        return f"{self.right.sum()} of {len(self.right)} classified correctly ({counts})"
+
     def text(self) -> str:
         """The figures for a person, as lines."""
         by = "" if self.clusters is None else f", by {self.by} ({len(np.unique(self.clusters))})"

@@ -1,0 +1,139 @@
+"""Which rules of the answer pay: each is left out in turn while the box answers altered copies of
+held-out sweeps, and junk made of them.
+
+Held-out sweeps are clean, so they do not show what a rule is for. Copies are displaced, or have a
+fault of CORRUPTIONS that applies to raw counts, in rising severity. Junk has no label that is
+right. A rule pays if without it fewer copies are classified correctly, or more labels are wrong. A
+rule that does not pay stays out while the others are tried, so that of two that do the same one is
+kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from palpate.bundle.contents import Bundle
+from palpate.core.clock import SystemClock
+from palpate.core.types import Status, digitized
+from palpate.inference.classifier import Classifier
+from palpate_train.answer.altered_sweeps import altered_copies
+from palpate_train.answer.rules import RULES, Asked, present
+from palpate_train.data.augment import Augmentation, augment
+from palpate_train.data.corruptions import applicable
+from palpate_train.data.evaluation_sweeps import EvaluationSweeps
+from palpate_train.data.junk import JUNK, windows
+from palpate_train.data.sets import Dataset
+from palpate_train.metrics import bundle_score
+
+Array = NDArray[Any]
+EACH = 16
+"""Sweeps of each kind. With fewer held-out sweeps no rule is tried, and all stay."""
+LEAST = 0.005
+"""Share of the copies that a rule has to save."""
+MOVED = Augmentation(**dict.fromkeys(vars(Augmentation()), 0.0) | {"shift": 1.0, "displaced": 1.0})
+"""Displaced by up to a row, as a skin that was put back."""
+
+
+@dataclass(frozen=True)
+class Given:
+    """Sweeps for the box. junk: no label is right. lost: frames of each that never arrived."""
+
+    sweeps: Dataset
+    junk: bool = False
+    lost: int = 0
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Answers with status ok: the right ones, and the wrong ones, among them all to junk."""
+
+    right: int
+    wrong: int
+
+
+def decided(
+    judge: Bundle, held_out: Dataset, seed: int, asked: Asked
+) -> tuple[list[str], dict[str, Any]]:
+    """The rules to leave out, and the figures of all that were judged or asked for, by name.
+
+    judge: a bundle with all rules, best one that has not seen `held_out`.
+    """
+    figures: dict[str, Any] = {
+        name: {"kept": name in asked.kept, "because": "asked"}
+        for name in RULES
+        if name in asked.kept + asked.left_out
+    }
+    out = [name for name in asked.left_out if name in RULES]
+    for name in out:
+        judge = RULES[name].without(judge)
+    tried = [name for name in present(judge) if RULES[name].tried and name not in asked.kept]
+    if len(held_out) < EACH or len(np.unique(held_out.labels)) < 2 or not tried:
+        return out, figures
+    given = list(_given(held_out, judge, seed))
+    n = sum(len(one.sweeps) for one in given if not one.junk)
+    now = _counted(judge, given)
+    for name in tried:
+        less = RULES[name].without(judge)
+        then = _counted(less, given)
+        kept = now.right - then.right >= LEAST * n or then.wrong > now.wrong
+        figures[name] = {
+            "kept": kept,
+            "because": "tried",
+            "of": n,
+            "right": [now.right, then.right],
+            "wrong": [now.wrong, then.wrong],
+        }
+        if not kept:
+            out.append(name)
+            judge, now = less, then
+    return out, figures
+
+
+def _given(held_out: Dataset, judge: Bundle, seed: int) -> Iterator[Given]:
+    """Some of the held-out sweeps, their altered copies, and junk."""
+    every, rng = EvaluationSweeps(held_out), np.random.default_rng(seed)
+    yield Given(held_out.take(rng.permutation(len(held_out))[:EACH]))
+    for corruption in applicable(every):
+        source = rng.permutation(len(held_out))[:EACH]
+        samples, severity = altered_copies(corruption, every, source, seed)
+        altered = replace(held_out.take(source), samples=samples)
+        if corruption.name != "lost":
+            yield Given(altered)
+            continue
+        for share in np.unique(severity):
+            lost = round(share * held_out.format.window)
+            yield Given(altered.take(severity == share), lost=lost)
+    some = held_out.take(rng.permutation(len(held_out))[:EACH])
+    yield Given(_displaced(some, judge.manifest.tare, rng))
+    for kind in JUNK:
+        samples = windows(kind, held_out, EACH, judge.manifest.tare, seed)
+        some = held_out.take(np.arange(len(samples)))
+        yield Given(replace(some, samples=samples), junk=True)
+
+
+def _displaced(sweeps: Dataset, tare: Array, rng: Generator) -> Dataset:
+    """The sweeps with loads and vibrations displaced along the rows. tare: raw counts of the
+    unloaded skin, in the shape of a frame."""
+    (n, frames, rows, cols), samples = sweeps.samples.shape[:4], sweeps.samples
+    loads = (samples - tare).astype(np.float32).reshape(n, frames, -1).swapaxes(1, 2)
+    moved = augment(loads, rows if cols > 1 else 1, MOVED, rng).swapaxes(1, 2)
+    counts = digitized(moved.reshape(samples.shape) + tare, samples.dtype)
+    return replace(sweeps, samples=counts)
+
+
+def _counted(bundle: Bundle, given: list[Given]) -> Counts:
+    """The answers of the box with this bundle."""
+    box, right, wrong = Classifier(bundle, SystemClock(), slides=False), 0, 0
+    for one in given:
+        for i, verdict in bundle_score.verdicts(box, one.sweeps, lost=one.lost):
+            if verdict.status is Status.OK:
+                material = one.sweeps.materials[one.sweeps.labels[i]]
+                fits = not one.junk and verdict.label == material
+                right, wrong = right + fits, wrong + (not fits)
+    return Counts(right, wrong)
