@@ -91,4 +91,4 @@ class SweepCheck(Observer):
     def set_tare(self, taxels: NDArray[Any]) -> str:
         """Take frames [n, R, C] as the unloaded skin."""
         self._unloaded.set(taxels)
-        return f"largest {taxels.mean(axis=0).max():.1f} raw counts"
+        return f"largest {taxels.mean(axis=0, dtype=np.float64).max():.1f} raw counts"

@@ -258,7 +258,9 @@ def _lerp(start: Array, end: Array, share: Array) -> Array:
 def texture_scale(samples: NDArray[Any]) -> float:
     """The factor that gives raw counts [N, T, R, C] a deviation of 1 after the mean of each taxel
     over its sweep is subtracted."""
-    deviation = samples - samples.mean(axis=1, keepdims=True, dtype=np.float32)
+    # float32 would add row after row, and round the more the longer the sweeps are
+    means = samples.mean(axis=1, keepdims=True, dtype=np.float64).astype(np.float32)
+    deviation = samples - means
     return float(1 / max(np.sqrt(np.mean(deviation**2)), 1e-6))
 
 

@@ -80,7 +80,9 @@ def centred(g: GraphBuilder, format: SweepFormat) -> tuple[str, str]:
     time [1, R * C * A]), float32.
 
     They are matrix products, five times as fast in onnxruntime as ReduceMean and Sub along time.
-    For whole counts they are exact, whatever the order in which a processor adds.
+    For whole counts whose sum is below 2^24 (all windows of uint8 up to 65,793 frames) they are
+    exact, whatever the order in which a processor adds. Beyond, the mean of 8,800 frames at 50,000
+    counts was off by 0.4 counts at most.
     """
     taxels = format.channels
     one = helper.make_tensor("one", TensorProto.FLOAT, [1], [1.0])
