@@ -14,7 +14,7 @@ from palpate.core.errors import FormatError
 from palpate.core.types import Verdict
 from palpate.inference.classifier import Classifier
 from palpate_train.data.sets import Dataset
-from palpate_train.library.sweeps import raw_counts
+from palpate_train.library.sweeps import as_value_errors, of_type, raw_counts
 from palpate_train.metrics import bundle_score
 
 Array = NDArray[Any]
@@ -26,13 +26,14 @@ class BundleClassifier:
     def __init__(self, loaded: bundle.Bundle) -> None:
         self.bundle = loaded
         self.classes_: Array = np.array(loaded.manifest.labels)
+        self._box = Classifier(loaded, SystemClock())
 
+    @as_value_errors()
     def verdicts(self, x: Any) -> list[Verdict]:
         """The box's verdict on each sweep. x: as sweeps.raw_counts takes it, in the
         bundle's type. Raises FormatError if it has another format than the bundle."""
         sweeps = self._sweeps(x)
-        box = Classifier(self.bundle, SystemClock())
-        return [verdict for _, verdict in bundle_score.verdicts(box, sweeps)]
+        return [verdict for _, verdict in bundle_score.verdicts(self._box, sweeps)]
 
     def predict(self, x: Any) -> Array:
         """A material for each sweep, or the status of a sweep that the box does not name, such as
@@ -55,14 +56,7 @@ class BundleClassifier:
     def _sweeps(self, x: Any) -> Dataset:
         wanted = self.bundle.manifest.format
         samples = x.samples if isinstance(x, Dataset) else raw_counts(x, wanted.shape)
-        if samples.dtype != wanted.dtype:
-            kept = samples.astype(wanted.dtype)
-            if not np.array_equal(kept, samples):
-                raise FormatError(
-                    f"X holds {samples.dtype}, and the bundle takes {wanted.dtype}; "
-                    "give it the counts of its skin"
-                )
-            samples = kept
+        samples = of_type(samples, wanted.dtype)
         labels = np.zeros(len(samples), np.int64)
         made = Dataset(samples, labels, tuple(self.classes_), wanted.rate_hz, {}, "X")
         if made.format != wanted:

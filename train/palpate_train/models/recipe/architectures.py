@@ -10,6 +10,8 @@ from dataclasses import dataclass
 
 from palpate.core.errors import FormatError
 
+LEAST_WINDOW = 16
+"""Frames of the shortest window of a trunk."""
 PREFIXES = 10
 """Number of prefixes of a window, after each of which the box may answer early: the first tenth,
 the first two tenths, and so on to the whole window."""
@@ -95,7 +97,8 @@ class Architecture:
             kernel = kernel // 2 if stride > 1 else SHORT_KERNEL
         if plan[-1].steps < 1:
             raise FormatError(
-                f"a window of {window} frames is too short for the network; record at least 16"
+                f"a window of {window} frames is too short for the network; record at least "
+                f"{LEAST_WINDOW}"
             )
         return plan
 
