@@ -30,7 +30,7 @@ OFFSET = np.float32(50_000)
 
 
 def graph_means() -> np.ndarray:
-    """What the graph of a model leaves of each taxel's mean."""
+    """Mean of each taxel after the graph has subtracted it."""
     g, format = GraphBuilder(), SweepFormat(2, 2, 750.0, WINDOW, "float32")
     model = g.model(format, centred(g, format)[0], format.channels, WINDOW)
     return run(model, SWEEPS.samples).mean(axis=2, dtype=np.float64)

@@ -50,8 +50,8 @@ def fitted() -> PalpateClassifier:
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_scikit_learn_accepts_it():
-    """All of its checks of a classifier and transformer, of which only the one of the array API
-    does not run: X is a table there, each row a sweep of one channel."""
+    """All checks of a classifier and transformer pass, except the array API's, which is skipped.
+    X is a table there, each row a sweep of one channel."""
     found = estimator_checks.check_estimator(
         library.PalpateClassifier(steps=0, size="64"), on_skip=None, on_fail="raise"
     )
@@ -193,7 +193,7 @@ def test_a_table_is_one_channel():
 
 
 def broken(value: float) -> np.ndarray:
-    """Sweeps with one count that is no number."""
+    """Sweeps with one count replaced."""
     x = SWEEPS[36:].astype(np.float32)
     x[3, 1, 7] = value
     return x
@@ -244,7 +244,7 @@ def test_features_are_those_of_the_answers(fitted: PalpateClassifier):
 
 
 def test_a_pickle_answers_without_the_sweeps(fitted: PalpateClassifier, tmp_path: Path):
-    """It is smaller than the bundle, and says what it cannot do."""
+    """It is smaller than the bundle, and refuses to make one."""
     fitted.save_bundle(tmp_path / "b", proven=False)
     packed = pickle.dumps(fitted)
     assert len(packed) <= 2 * sum(file.stat().st_size for file in (tmp_path / "b").iterdir())
