@@ -266,3 +266,51 @@ def test_a_terminal_without_unicode_shows_replaced_characters(tmp_path: Path):
     )
     assert (done.returncode, done.stderr) == (0, b"")
     assert b"left out: k?per_?.txt: its name does not match the pattern" in done.stdout
+
+
+TABLE = (
+    "file;material;force\na/1.csv;felt;5N\n2.csv;cork;2.5N\n3.csv;felt;5N\nmissing.csv;cork;5N\n"
+)
+
+
+def test_labels_in_a_separate_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """By path or name; a file that the table lacks, the table itself and a missing file are left
+    out, of which the last is a fault. A pattern may give other fields."""
+    for name in ("a/1", "b/2", "b/3", "b/4"):
+        counts = np.random.default_rng(int(name[-1])).integers(0, 99, (30, 4))
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        np.savetxt(tmp_path / f"{name}.csv", counts, "%d", ",")
+    (tmp_path / "labels.csv").write_text(TABLE)
+    out = tmp_path.parent / "made.npz"
+    given = ("--rate", "100", "--grid", "2x2", "--window", "10", "--out", str(out))
+    labels = ("--labels", str(tmp_path / "labels.csv"), "--pattern", "{session}/{}.csv")
+    assert main(["import", str(tmp_path), *labels, *given]) == 65
+    made = sets.load(str(out))
+    assert [made.materials[k] for k in made.labels] == ["felt", "cork", "felt"]
+    assert made.groups["force"].tolist() == [5, 2.5, 5]
+    assert made.groups["session"].tolist() == ["a", "b", "b"]
+    said = capsys.readouterr().out
+    for name in ("b/4.csv", "labels.csv", "missing.csv"):
+        assert f"left out: {name}" in said
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("", "first line"),
+        ("file\n1.csv\n", "first line"),
+        ("file,material,material\n1.csv,a,b\n", "first line"),
+        ("file,material\n1.csv,a\n1.csv,b\n", "row 3"),
+        ("file,material\n1.csv,\n", "row 2"),
+        ("file,material\n1.csv,a,b\n", "row 2"),
+        ("file,position\n1.csv,3\n", "material"),
+    ],
+)
+def test_tables_of_labels_that_cannot_be_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, why: str
+):
+    """Before anything is imported."""
+    (tmp_path / "labels.csv").write_text(text)
+    given = ("--rate", "100", "--grid", "2x2", "--out", str(tmp_path / "a.npz"))
+    assert main(["import", str(tmp_path), "--labels", str(tmp_path / "labels.csv"), *given]) == 65
+    assert why in capsys.readouterr().err

@@ -180,16 +180,20 @@ def test_no_window_goes_over_a_gap(tmp_path: Path):
         ("", np.int16, "int16"),
         ("", np.float64, "uint8"),
         ("", np.int64, "uint8"),
+        ("", ">i2", "int16"),
+        ("", ">f4", "float32"),
         ("float32", np.int16, "float32"),
     ],
 )
 def test_types_stay_as_recorded_or_are_the_first_that_holds_all(
-    tmp_path: Path, dtype: str, recorded: type, expected: str
+    tmp_path: Path, dtype: str, recorded: str | type, expected: str
 ):
-    """Types that the box knows stay; others become the first type that holds every count; --dtype
-    overrides."""
+    """Types that the box knows stay, in this machine's byte order; others become the first type
+    that holds every count; --dtype overrides."""
     both(tmp_path, lambda path: np.save(path, COUNTS.astype(recorded)), "npy")
-    assert taken(tmp_path, dtype=dtype).sweeps.samples.dtype == expected
+    samples = taken(tmp_path, dtype=dtype).sweeps.samples
+    assert samples.dtype == expected
+    np.testing.assert_array_equal(samples[0].reshape(10, 4), COUNTS[15:25])
 
 
 @pytest.mark.parametrize(

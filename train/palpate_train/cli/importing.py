@@ -13,7 +13,7 @@ from palpate.core.text import printable, say
 from palpate.core.types import DATA_TYPES
 from palpate_train.arguments import numbers, options
 from palpate_train.arguments.program import Add
-from palpate_train.data import labels, lerobot, summary
+from palpate_train.data import label_table, labels, lerobot, summary
 from palpate_train.data.file_names import EXAMPLE, FIELD, GROUP, NamePattern
 from palpate_train.data.import_plan import ImportPlan, Length
 from palpate_train.data.importing import Imported, LeftOut, Taken, import_folder
@@ -57,6 +57,12 @@ def register(add: Add) -> None:
         "--pattern",
         metavar="PATTERN",
         help=f"meaning of the names below FOLDER: {EXAMPLE}, '{{material}}/{{speed}}/{{}}.csv'",
+    )
+    command.add_argument(
+        "--labels",
+        type=Path,
+        metavar="FILE",
+        help="a table of the files and their fields; its first line: file,material,position",
     )
     command.add_argument(
         "--field",
@@ -117,11 +123,12 @@ def _plan(args: argparse.Namespace) -> ImportPlan:
     """The options as a plan. A LeRobot data set states its frame rate."""
     fields = dict(_field(text) for text in args.field)
     in_variable = [name for name, _ in FIELD.findall(args.variable)]
-    rate = args.rate
+    rate, table = args.rate, label_table.read(args.labels) if args.labels else {}
+    labelled = next(iter(table.values()), {})
     if not (args.pattern or args.time or rate) and lerobot.is_data_set(args.folder):
         rate = lerobot.rate_hz(args.folder)
     return ImportPlan(
-        NamePattern(args.pattern, (*fields, *in_variable)) if args.pattern else None,
+        NamePattern(args.pattern, (*fields, *in_variable, *labelled)) if args.pattern else None,
         args.grid,
         args.columns,
         args.time,
@@ -135,6 +142,7 @@ def _plan(args: argparse.Namespace) -> ImportPlan:
         args.axes,
         args.decimal,
         fields,
+        table,
     )
 
 

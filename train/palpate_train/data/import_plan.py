@@ -10,6 +10,7 @@ from palpate.core.errors import FormatError
 from palpate.core.types import DATA_TYPES
 from palpate_train.data import sampling
 from palpate_train.data.file_names import NamePattern
+from palpate_train.data.label_table import LabelTable
 
 GRID = re.compile(r"[1-9]\d{0,2}x[1-9]\d{0,2}(x[1-8])?")
 LENGTH = re.compile(r"(\d+(?:\.\d+)?)(ms|s)|([1-9]\d*)")
@@ -64,6 +65,7 @@ class ImportPlan:
     show them.
     decimal: the decimal sign of texts, "" if each text must show it.
     fields: columns that hold a field of every frame, such as material or session, by field.
+    labels: fields of each file, see label_table; empty without one.
     Raises FormatError if an option cannot be read.
     """
 
@@ -81,6 +83,7 @@ class ImportPlan:
     axes: str = ""
     decimal: str = ""
     fields: Mapping[str, str] = field(default_factory=dict)
+    labels: LabelTable = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.grid and not GRID.fullmatch(self.grid):
@@ -124,15 +127,17 @@ class ImportPlan:
         if "material" not in (*in_names, *self.fields):
             raise FormatError(
                 "where the material stands is not known; give --pattern or --variable with "
-                "{material}, or --field material=COLUMN if a column holds it"
+                "{material}, --labels FILE with a column material, or --field material=COLUMN if "
+                "a column holds it"
             )
         if both := [name for name in in_names if in_names.count(name) > 1]:
             raise FormatError(
-                f"{both[0]} stands in --pattern and in --variable; call one of them something else"
+                f"{both[0]} stands in two of --pattern and --variable and --labels; call one of "
+                "them something else"
             )
         if twice := [name for name in in_names if name in self.fields]:
             raise FormatError(
-                f"{twice[0]} stands in --pattern or --variable and in --field; give one of them"
+                f"{twice[0]} stands in --field and in a name or in --labels; give one of them"
             )
 
     @property
@@ -152,7 +157,18 @@ class ImportPlan:
     def names(self) -> list[str]:
         """The names of all fields of a recording."""
         patterns = [one for one in (self.pattern, self.variables) if one]
-        return [*(name for one in patterns for name in one.names), *self.fields]
+        in_names = (name for one in patterns for name in one.names)
+        return [*in_names, *self.labelled, *self.fields]
+
+    @property
+    def of_files(self) -> tuple[str, ...]:
+        """The names of the fields that are known before a file is read."""
+        return (*(self.pattern.names if self.pattern else ()), *self.labelled)
+
+    @property
+    def labelled(self) -> tuple[str, ...]:
+        """The names of the fields in the table of labels."""
+        return tuple(next(iter(self.labels.values()), {}))
 
     @property
     def variables(self) -> NamePattern | None:
@@ -160,7 +176,7 @@ class ImportPlan:
         read."""
         if "{" not in self.variable:
             return None
-        elsewhere = (*(self.pattern.names if self.pattern else ()), *self.fields)
+        elsewhere = (*self.of_files, *self.fields)
         return NamePattern(self.variable, elsewhere, "--variable")
 
     def pattern_of(self, name: str) -> NamePattern | None:

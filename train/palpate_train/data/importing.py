@@ -135,7 +135,7 @@ def import_folder(
             left_out.append(LeftOut(name, str(e), broken=True))
         except FormatError as e:
             left_out.append(LeftOut(name, str(e), broken=True))
-    if "material" not in (plan.pattern.names if plan.pattern else ()) and recordings:
+    if "material" not in plan.of_files and recordings:
         _name_materials(folder, [one.fields for one in recordings], plan)
     cuts, rate_hz = _cuts(recordings, plan, left_out)
     del recordings  # their frames go as soon as they are in the set
@@ -154,7 +154,8 @@ def import_folder(
 def _named(
     folder: Path, plan: ImportPlan, left_out: list[LeftOut]
 ) -> dict[str, tuple[Path, Fields]]:
-    """Path and fields of each file whose name matches the pattern, by its path below `folder`.
+    """Path and fields of each file whose name matches the pattern, and which is in the table of
+    labels if there is one, by its path below `folder`.
 
     Materials have their new names. Files that only systems and editors read are passed over.
     """
@@ -164,22 +165,38 @@ def _named(
     paths = {normal(p.relative_to(folder).as_posix()): p for p in readers.files_below(folder)}
     found: dict[str, tuple[Path, Fields]] = {}
     for name, path in paths.items():
-        try:
-            if plan.pattern is None:
-                found[name] = path, {}
-            elif (fields := plan.pattern.read(name)) is not None:
-                found[name] = path, fields
-            else:
-                left_out.append(LeftOut(name, "its name does not match the pattern"))
-        except FormatError as e:
-            left_out.append(LeftOut(name, str(e), broken=True))
+        fields = _fields_of(name, plan)
+        if isinstance(fields, LeftOut):
+            left_out.append(fields)
+        else:
+            found[name] = path, fields
+    there = {*paths, *(path.name for path in paths.values())}
+    left_out += [
+        LeftOut(name, "it is in the table of --labels, but not in the folder", broken=True)
+        for name in plan.labels
+        if name not in there
+    ]
     if not found:
         first = f"the first file is {next(iter(paths))!r}" if paths else "it holds no files"
         pattern = f"matches --pattern {plan.pattern.text!r}" if plan.pattern else "is there"
         raise FormatError(f"{folder}: no file {pattern}; {first}")
-    if plan.pattern and "material" in plan.pattern.names:
+    if "material" in plan.of_files:
         _name_materials(folder, [fields for _, fields in found.values()], plan)
     return found
+
+
+def _fields_of(name: str, plan: ImportPlan) -> Fields | LeftOut:
+    """The fields of a file by its path below the folder and the table of labels."""
+    try:
+        in_name = plan.pattern.read(name) if plan.pattern else {}
+    except FormatError as e:
+        return LeftOut(name, str(e), broken=True)
+    if in_name is None:
+        return LeftOut(name, "its name does not match the pattern")
+    row = plan.labels.get(name, plan.labels.get(name.rpartition("/")[2], {}))
+    if plan.labels and not row:
+        return LeftOut(name, "it is not in the table of --labels")
+    return {**in_name, **row}
 
 
 def _name_materials(folder: Path, known: Sequence[Fields], plan: ImportPlan) -> None:
