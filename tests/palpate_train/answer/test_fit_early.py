@@ -16,7 +16,7 @@ from palpate.core.clock import SystemClock
 from palpate.inference import classifier
 from palpate_train.answer import calibrate, fit_early
 from palpate_train.export.bundle_graph import bundle_graph
-from palpate_train.export.pack import means_file
+from palpate_train.export.contents import means_file
 from palpate_train.onnx_tools.graph_builder import run
 from tests.factories.calibration_inputs import plain_inputs
 from tests.factories.later import Later

@@ -17,7 +17,7 @@ from palpate.core.errors import BundleError, FormatError
 from palpate.inference.classifier import Classifier
 from palpate_train.cli.main import main
 from palpate_train.data.sets import Dataset
-from palpate_train.export import pack
+from palpate_train.export import contents, pack
 from palpate_train.metrics import bundle_score
 from palpate_train.models import methods
 from palpate_train.models.method_fit import MethodFit
@@ -34,9 +34,9 @@ def method_of(name: str) -> methods.Method:
     return method
 
 
-def trained(name: str, sweeps: Dataset) -> pack.Content:
+def trained(name: str, sweeps: Dataset) -> contents.Content:
     """The content of a bundle of this method."""
-    return pack.content_of(MethodFit.of(method_of(name), sweeps, 1)[1])
+    return contents.content_of(MethodFit.of(method_of(name), sweeps, 1)[1])
 
 
 @pytest.mark.parametrize("name", quick_first(WITH_GRAPH))
@@ -95,21 +95,21 @@ def test_golden_sweeps_are_rounded():
     noisy = content.train.samples + rng.normal(0, 0.3, content.train.samples.shape)
     train = replace(content.train, samples=noisy.astype(np.float32))
     content = replace(content, train=train)
-    logits = pack.run(content.model, pack.model_inputs(content.input, train))
-    golden = pack.golden_sweeps(train, logits, logits)
-    data = pack.golden_file(content, golden)
+    logits = contents.run(content.model, contents.model_inputs(content.input, train))
+    golden = contents.golden_sweeps(train, logits, logits)
+    data = contents.golden_file(content, golden)
     assert len(data) < 0.4 * len(bundle.golden_file(golden.samples, logits[:2]))
     arrays = SimpleNamespace(format=train.format, labels=train.materials)
     samples, stored = bundle._golden(data, arrays)
     usual = np.median(np.abs(np.diff(golden.samples, axis=1)))
-    assert 0 < np.abs(samples - golden.samples).max() <= usual * pack.COARSEST / 2
-    again = pack.run(
-        content.model, pack.model_inputs(content.input, replace(golden, samples=samples))
+    assert 0 < np.abs(samples - golden.samples).max() <= usual * contents.COARSEST / 2
+    again = contents.run(
+        content.model, contents.model_inputs(content.input, replace(golden, samples=samples))
     )
     assert np.array_equal(stored, again.astype(np.float32))
     assert stored.argmax(1).tolist() == golden.labels.tolist()
-    exact = pack.run(content.model, pack.model_inputs(content.input, golden))
-    assert np.abs(softmax(stored) - softmax(exact)).max() <= pack.NEAR
+    exact = contents.run(content.model, contents.model_inputs(content.input, golden))
+    assert np.abs(softmax(stored) - softmax(exact)).max() <= contents.NEAR
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "int16", "uint16", "float32"])
@@ -119,12 +119,12 @@ def test_rounded_sweeps_keep_their_type(dtype: str):
     rng = np.random.default_rng(1)
     top = 255 if dtype == "float32" else np.iinfo(dtype).max
     samples = (top - rng.integers(0, 40, (2, 50, 3, 3))).astype(dtype)
-    made = list(pack._rounded(samples))
+    made = list(contents._rounded(samples))
     assert {rounded.dtype for rounded in made} == {samples.dtype}
     away = [float(np.abs(rounded.astype(np.float64) - samples).max()) for rounded in made]
     assert away == sorted(away, reverse=True)
     assert away[-1] > 0
-    assert list(pack._rounded(np.full_like(samples, 7))) == []
+    assert list(contents._rounded(np.full_like(samples, 7))) == []
 
 
 def test_a_method_that_never_names_a_material_is_no_bundle(tmp_path: Path):
@@ -137,12 +137,12 @@ def test_a_method_that_never_names_a_material_is_no_bundle(tmp_path: Path):
     logits = np.eye(3)[(content.train.labels + 1) % 3]
     content.train.samples[content.train.labels == 0, 0] = 1
     with pytest.raises(BundleError, match="'a'"):
-        pack.golden_sweeps(content.train, logits, logits)
+        contents.golden_sweeps(content.train, logits, logits)
     few = (
         np.flatnonzero(content.train.labels > 0).tolist()
         + np.flatnonzero(content.train.labels == 0)[:2].tolist()
     )
     with pytest.raises(BundleError, match="there are 2"):
-        pack.golden_sweeps(content.train.take(np.array(few)), logits[few], logits[few])
+        contents.golden_sweeps(content.train.take(np.array(few)), logits[few], logits[few])
     assert not (tmp_path / "b").exists()
     assert np.isin(content.held_out.labels, [0, 1, 2]).all()

@@ -31,8 +31,8 @@ from palpate_train.answer.rules import RULES, Asked, present
 from palpate_train.cli.main import main
 from palpate_train.data import sets
 from palpate_train.data.run import Run
-from palpate_train.export import pack, quantized_bundle
-from palpate_train.export.pack import ExportRefused
+from palpate_train.export import contents, pack, quantized_bundle
+from palpate_train.export.contents import ExportRefused
 from palpate_train.metrics import bundle_score
 from palpate_train.metrics.answers import REFUSED
 from palpate_train.metrics.temperature import platt_temperature
@@ -439,7 +439,7 @@ def test_a_material_never_recognised_is_refused(fitted: Fit):
     """It has no golden sweep."""
     logits = np.tile(np.float32([1, 0, 0]), (len(fitted.train), 1))
     with pytest.raises(ExportRefused, match="'high'"):
-        pack.golden_sweeps(fitted.train, logits, logits)
+        contents.golden_sweeps(fitted.train, logits, logits)
 
 
 def test_a_bundle_is_replaced_whole_or_not_at_all(fitted: Fit, packed: Path, tmp_path: Path):

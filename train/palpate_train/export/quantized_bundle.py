@@ -3,7 +3,6 @@ does."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,20 +13,13 @@ from numpy.typing import NDArray
 
 from palpate.bundle import bundle
 from palpate.core.errors import FormatError
-from palpate_train.answer import altered_sweeps, embedding
-from palpate_train.answer.calibrate import Calibration, CalibrationInputs
-from palpate_train.answer.embedding import Embedding
-from palpate_train.answer.fit_contact import Contacts
-from palpate_train.answer.fit_early import EarlyRule
-from palpate_train.answer.fit_unknown import Space
 from palpate_train.answer.rules import ALL, Asked
 from palpate_train.data import extras
-from palpate_train.export import pack
-from palpate_train.export.bundle_graph import bundle_graph
-from palpate_train.export.pack import Content, ExportRefused
+from palpate_train.export import fit_rules, pack
+from palpate_train.export.contents import Content, ExportRefused, content_of
 from palpate_train.models.method_fit import MethodFit
 from palpate_train.models.methods import model_inputs
-from palpate_train.models.recipe.fitted import Fit, calibration_inputs, finished
+from palpate_train.models.recipe.fitted import Fit, finished
 from palpate_train.onnx_tools import parity
 from palpate_train.onnx_tools.graph_builder import run, with_head
 from palpate_train.onnx_tools.parity import Parity
@@ -81,7 +73,7 @@ def export(
         content = replace(content, model=reference, about=about | {"float_because": str(e)})
         fit = finished(fit.in_float())
     return pack.pack(
-        _calibrated(content, fit, pitch_mm, asked.left_out),
+        fit_rules.from_features(content, fit, pitch_mm, asked.left_out),
         target,
         name,
         version,
@@ -105,83 +97,10 @@ def export_method(
 ) -> bundle.Manifest:
     """As `export`, of a method that is not of our family; it has no form in float to keep instead.
     Raises ExportRefused if a check fails."""
-    content = pack.content_of(fit)
+    content = content_of(fit)
     if fit.reference is not None:
         content = checked(content, fit.reference)
     return pack.pack(content, target, name, version, commit, full_scale, pitch_mm, asked=asked)
-
-
-def _calibrated(
-    content: Content, fit: Fit, pitch_mm: float | None, left_out: Collection[str]
-) -> Content:
-    """`content` with the calibration of `fit`, if it has one: heads, early answers, novelty, and
-    the figures of heads that did not see the held-out sweeps. The rule for displaced contacts needs
-    contact positions, and these need the distance between taxels. left_out: rules that the graph
-    does not serve."""
-    calibration = fit.calibration
-    if calibration is None:
-        return content
-    if "early" in left_out:
-        calibration = replace(calibration, rule=EarlyRule(None, "left out"))
-    if not (fit.contacts and fit.contacts.positions(pitch_mm)):
-        calibration = replace(calibration, displacement=None)
-    rule = calibration.rule
-    early = {"share": rule.share, "lost": rule.lost, "n": rule.n} if rule.early else rule.why
-    figures = fit.held_out_figures()
-    prefixes = fit.trunk(prefixes=True) if rule.early else None
-    content, given = replace(content, known=calibration.known()), calibration_inputs(fit)
-    apart = _unseen(given, calibration)
-    found = _widened(fit, given, apart.embedding, calibration.embedding)
-    classes = [apart.classes(), calibration.classes()]
-    if found:
-        known = replace(calibration.known(), limit=found.limit)
-        content = replace(content, known=known, disturbances=found.disturbances)
-        wider = zip(classes, found.shapes, found.changes, strict=True)
-        classes = [replace(of, shapes=shapes, changes=moved) for of, shapes, moved in wider]
-        figures |= {altered_sweeps.FIGURES: found.figures}
-    return replace(
-        content,
-        unseen=replace(content, model=bundle_graph(apart, fit.trunk()), classes=classes[0]),
-        model=bundle_graph(calibration, fit.trunk(), prefixes),
-        early=rule.early,
-        displacement=calibration.displacement_rule(),
-        classes=classes[1],
-        about=content.about | {"early": early},
-        figures=content.figures | figures,
-    )
-
-
-def _widened(
-    fit: Fit, given: CalibrationInputs, apart: Embedding, whole: Embedding
-) -> altered_sweeps.Widened | None:
-    """Shapes of known materials that know how altered sweeps differ, and their limit; see
-    altered_sweeps. apart: an embedding that did not see the held-out sweeps."""
-    trunk, spaces = fit.trunk(), map(Space.of, (apart, whole))
-    seed = int(fit.about["seed"])
-    contacts, shape = fit.contacts or Contacts.of(fit.train), fit.train.format.shape
-    known = contacts.limit.known_tare()
-    found = altered_sweeps.measure(
-        lambda samples: run(trunk, samples),
-        fit.train,
-        fit.held,
-        *spaces,
-        tare=np.array(known).reshape(shape) if known else np.zeros(shape),
-        seed=seed,
-    )
-    return found and replace(found, limit=altered_sweeps.limit_of_conditions(found, given))
-
-
-def _unseen(given: CalibrationInputs, calibration: Calibration) -> Calibration:
-    """`calibration` with a head and an embedding that did not see the groups of the held-out
-    sweeps."""
-    seen = ~np.isin(given.groups, given.groups[given.held])
-    weight, bias = given.naming_head(seen)
-    return replace(
-        calibration,
-        embedding=embedding.in_two_views(given.whole[seen], given.labels[seen], given.fixed),
-        weight=weight / calibration.temperature,
-        bias=bias / calibration.temperature,
-    )
 
 
 def _torch_difference(fit: Fit, reference: onnx.ModelProto) -> float:

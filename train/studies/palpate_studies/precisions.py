@@ -13,7 +13,7 @@ from palpate_studies import cost
 from palpate_train.data import sets
 from palpate_train.data.sets import Dataset
 from palpate_train.evaluate.fold import fingerprint
-from palpate_train.export import pack
+from palpate_train.export import contents, pack
 from palpate_train.models import methods
 from palpate_train.models.method_fit import MethodFit
 from palpate_train.models.methods import Method
@@ -77,7 +77,7 @@ def _packed_forms(
 ) -> Iterator[dict[str, Any]]:
     """Each precision packed in a folder of its own."""
     model, made = MethodFit.of(method, sweeps, seed)
-    content = pack.content_of(made)
+    content = contents.content_of(made)
     counted: dict[str, dict[str, Any]] = {}
     for form, graphed in {"": model, **getattr(model, "precisions", {})}.items():
         graph = graphed.graph()

@@ -1,0 +1,167 @@
+"""The rules of the answer in the order in which export fits them.
+
+From features: unknown materials, hum and disturbances, displaced contacts, early answers. From
+counts: contact, speeds, displacement, slides. From answers of the box: broken taxels, and which of
+all rules pay.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from palpate.bundle import bundle
+from palpate.bundle.bundle import Bundle, Manifest
+from palpate_train.answer import (
+    altered_sweeps,
+    embedding,
+    fit_displacement,
+    fit_early,
+    fit_slide,
+    fit_taxels,
+    rules,
+)
+from palpate_train.answer.calibrate import Calibration, CalibrationInputs
+from palpate_train.answer.embedding import Embedding
+from palpate_train.answer.fit_contact import Contacts
+from palpate_train.answer.fit_early import EarlyRule
+from palpate_train.answer.fit_unknown import Space
+from palpate_train.answer.rules import RULES, Asked
+from palpate_train.export import trial
+from palpate_train.export.bundle_graph import bundle_graph
+from palpate_train.export.contents import Content, files_of
+from palpate_train.models.recipe.fitted import Fit, calibration_inputs
+from palpate_train.onnx_tools.graph_builder import run
+
+
+def from_features(
+    content: Content, fit: Fit, pitch_mm: float | None, left_out: Collection[str]
+) -> Content:
+    """`content` with the calibration of `fit`, if it has one: heads, early answers, novelty, and
+    the figures of heads that did not see the held-out sweeps. The rule for displaced contacts needs
+    contact positions, and these need the distance between taxels. left_out: rules that the graph
+    does not serve."""
+    calibration = fit.calibration
+    if calibration is None:
+        return content
+    if "early" in left_out:
+        calibration = replace(calibration, rule=EarlyRule(None, "left out"))
+    if not (fit.contacts and fit.contacts.positions(pitch_mm)):
+        calibration = replace(calibration, displacement=None)
+    rule = calibration.rule
+    early = {"share": rule.share, "lost": rule.lost, "n": rule.n} if rule.early else rule.why
+    figures = fit.held_out_figures()
+    prefixes = fit.trunk(prefixes=True) if rule.early else None
+    content, given = replace(content, known=calibration.known()), calibration_inputs(fit)
+    apart = _unseen(given, calibration)
+    found = _widened(fit, given, apart.embedding, calibration.embedding)
+    classes = [apart.classes(), calibration.classes()]
+    if found:
+        known = replace(calibration.known(), limit=found.limit)
+        content = replace(content, known=known, disturbances=found.disturbances)
+        wider = zip(classes, found.shapes, found.changes, strict=True)
+        classes = [replace(of, shapes=shapes, changes=moved) for of, shapes, moved in wider]
+        figures |= {altered_sweeps.FIGURES: found.figures}
+    content = replace(
+        content,
+        unseen=replace(content, model=bundle_graph(apart, fit.trunk()), classes=classes[0]),
+        model=bundle_graph(calibration, fit.trunk(), prefixes),
+        early=rule.early,
+        displacement=calibration.displacement_rule(),
+        classes=classes[1],
+        about=content.about | {"early": early},
+        figures=content.figures | figures,
+    )
+    return _early_checked(content)
+
+
+def _early_checked(content: Content) -> Content:
+    """`content` whose early answers need a known material."""
+    if not (content.early and content.classes):
+        return content
+    classes, limits = fit_early.measure(content.model, content.train, content.held_out)
+    return replace(
+        content,
+        early=replace(content.early, limits=limits),
+        classes=replace(content.classes, early=classes),
+    )
+
+
+def _widened(
+    fit: Fit, given: CalibrationInputs, apart: Embedding, whole: Embedding
+) -> altered_sweeps.Widened | None:
+    """Shapes of known materials that know how altered sweeps differ, and their limit; see
+    altered_sweeps. apart: an embedding that did not see the held-out sweeps."""
+    trunk, spaces = fit.trunk(), map(Space.of, (apart, whole))
+    seed = int(fit.about["seed"])
+    contacts, shape = fit.contacts or Contacts.of(fit.train), fit.train.format.shape
+    known = contacts.limit.known_tare()
+    found = altered_sweeps.measure(
+        lambda samples: run(trunk, samples),
+        fit.train,
+        fit.held,
+        *spaces,
+        tare=np.array(known).reshape(shape) if known else np.zeros(shape),
+        seed=seed,
+    )
+    return found and replace(found, limit=altered_sweeps.limit_of_conditions(found, given))
+
+
+def _unseen(given: CalibrationInputs, calibration: Calibration) -> Calibration:
+    """`calibration` with a head and an embedding that did not see the groups of the held-out
+    sweeps."""
+    seen = ~np.isin(given.groups, given.groups[given.held])
+    weight, bias = given.naming_head(seen)
+    return replace(
+        calibration,
+        embedding=embedding.in_two_views(given.whole[seen], given.labels[seen], given.fixed),
+        weight=weight / calibration.temperature,
+        bias=bias / calibration.temperature,
+    )
+
+
+def from_counts(manifest: Manifest, content: Content, pitch_mm: float | None) -> Manifest:
+    """`manifest` with the rules that the counts of the training sweeps give. pitch_mm: as for
+    pack.pack."""
+    train, contacts = content.train, content.contacts or Contacts.of(content.train)
+    place = contacts.positions(pitch_mm)
+    speeds, unmeasured = fit_slide.trained_speeds(train, place.pitch_mm if place else None)
+    unknown = {"contact": contacts.limit.why, "speeds": unmeasured}
+    manifest = replace(
+        manifest,
+        thresholds=replace(manifest.thresholds, contact=contacts.limit.contact),
+        contact=place,
+        unloaded=contacts.limit.known_tare(),
+        speeds=speeds,
+        displacement=content.displacement,
+        made=manifest.made
+        | {f"{part}_unknown_because": why for part, why in unknown.items() if why},
+    )
+    return fit_slide.limited(fit_displacement.limited(manifest, train), train)
+
+
+def from_answers(content: Content, packed: Bundle, proven: bool, asked: Asked) -> Bundle:
+    """`packed` with the broken taxels that it tolerates, if that is `proven`, and without the rules
+    that do not pay. Heads judge that have not seen the held-out sweeps."""
+    left_out, figures = list(asked.left_out), dict[str, Any]()
+    if proven:
+        judging, seed = packed, int(content.about.get("seed", 0))
+        if content.unseen:
+            files = files_of(content.unseen)
+            entries = {name: bundle.file_entry(data) for name, data in files.items()}
+            text = replace(packed.manifest, files=entries, early=None).json()
+            judging = bundle.from_files(files | {bundle.MANIFEST: text}, packed.manifest.name)
+        found = fit_taxels.measure(judging, content.train, content.held_out, seed)
+        packed, judging = (
+            replace(of, manifest=found.written(of.manifest)) for of in (packed, judging)
+        )
+        left_out, figures = trial.decided(judging, content.held_out, seed, asked)
+    for name in left_out:
+        packed = RULES[name].without(packed)
+    figures = {rules.FIGURES: figures} if figures else {}
+    return replace(
+        packed, manifest=replace(packed.manifest, figures=packed.manifest.figures | figures)
+    )
