@@ -78,12 +78,13 @@ class RecordedPage:
             folder, skin.FORMAT, labels, clock, lambda line: None, target
         )
         self.done: list[str] = []
+        self.more: dict[str, Any] = {}  # further content of the page
         self.page = RecordPage(
             access or Access(0),
             skin.FORMAT,
             "sim",
             TriggerConfig(mode="serial"),
-            lambda: self.recording.about() | (TAUGHT if teaching else {}),
+            lambda: self.recording.about() | (TAUGHT if teaching else {}) | self.more,
             self.obey,
             clock,
             named=self.recording.names.label,

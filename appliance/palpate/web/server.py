@@ -302,7 +302,8 @@ class _Handler(RequestHandler):
         stream = request.connection.stream if request.connection else None  # type: ignore[attr-defined]
         own = stream.socket.getsockname()[0] if stream and stream.socket else ""
         if not access.is_host(request.headers.get("Host", ""), own):
-            raise HTTPError(421)
+            why = "of another machine: name it in watch.address, or send Host localhost"
+            raise HTTPError(421, reason=f"this name is {why}")
         scheme, _, given = request.headers.get("Authorization", "").partition(" ")
         given = given if scheme == "Bearer" else self.get_cookie(COOKIE, "") or ""
         if access.admits(given):
@@ -359,7 +360,7 @@ class FileHandler(_Handler):
     def write_error(self, status_code: int, **kwargs: Any) -> None:
         """Let a browser without a token enter it. Style and script of this page are not secret."""
         path = "/enter.html" if self.request.path == "/" else self.request.path
-        if status_code == 401 and path in ("/enter.html", "/enter.js", "/page.css"):
+        if status_code == 401 and path in ("/enter.html", "/enter.js", "/old.js", "/page.css"):
             self.set_status(401 if path == "/enter.html" else 200)
             self._send(path)
             self.finish()
@@ -446,6 +447,7 @@ class EventsHandler(_Handler):
         """Send the missed events, then each new event, until browser or page ends."""
         page, queue = self.page, asyncio.Queue[bytes](MOST_WAITING)
         self.set_header("Content-Type", "text/event-stream")
+        self.set_header("X-Accel-Buffering", "no")  # or nginx keeps events until they are 4 kB
         now = f"event: now\ndata: {page.now_ns()}\n\n".encode()
         missed = page.events.since(self.get_query_argument("last", ""))
         page.queues.add(queue)

@@ -178,6 +178,7 @@ def circles(seen: BrowsedPage, which: str) -> list[dict[str, float]]:
 FILES = {"data:,", "/", "/page.css", "/events"} | {
     f"/{name}.js"
     for name in [
+        "old",
         "tablet",
         "verdict",
         "statuses",

@@ -21,7 +21,7 @@ from tests.factories.recorded_page import RecordedPage
 
 pytestmark = pytest.mark.slow
 
-SECOND = 1_000_000_000
+SECOND, JS = 1_000_000_000, "text/javascript"
 SIZES = [(390, 844), (1024, 768), (1920, 1080)]
 
 
@@ -298,7 +298,78 @@ def test_everything_on_it_has_a_role_and_a_name(browser: Any, recorded: Recorded
     assert set(unnamed) <= {"banner", "said"}
     assert seen.page.get_attribute("#said", "role") == "status"
     assert seen.page.get_attribute("#now", "aria-live") == "polite"
-    assert json.dumps(seen.requests).count(".js") == 6
+    assert json.dumps(seen.requests).count(".js") == 7
+
+
+OLDER = """
+for (const [of, name] of [[Array.prototype, "at"], [Element.prototype, "replaceChildren"],
+  [String.prototype, "replaceAll"], [AbortSignal, "timeout"], [Object, "hasOwn"]]) delete of[name];
+"""
+
+
+def test_orders_of_an_older_browser_are_sent(browser: Any, recorded: RecordedPage):
+    """Without what came after 2020; and an error of script is not called one of the network, and
+    does not stop the next order."""
+    context = browser.new_context()
+    context.add_init_script(OLDER)
+    seen = BrowsedPage(context, recorded.page.server.address)
+    until(lambda: seen.page.locator("#counts button").count() == 4)
+    seen.page.click("#next:not([aria-disabled=true])")
+    until(lambda: seen.text("#said") == "next position")
+    assert not seen.errors
+    seen.page.evaluate("window.kept = window.fetch; window.fetch = undefined")
+    seen.page.click("#next")
+    until(lambda: bool(seen.errors))
+    assert "no connection" not in seen.text("#said")
+    seen.page.evaluate("window.fetch = window.kept")
+    seen.page.click("#next")
+    until(lambda: recorded.done.count("NEXT") == 2)
+    context.close()
+
+
+def test_a_browser_that_is_too_old_says_so(browser: Any, recorded: RecordedPage):
+    """Its modules do not run: one sentence, by a script that it understands."""
+    context = browser.new_context()
+    context.route("**/parts.js", lambda route: route.fulfill(body="a ??== 1", content_type=JS))
+    seen = BrowsedPage(context, recorded.page.server.address)
+    until(lambda: "too old" in seen.text("#banner"))
+    context.close()
+
+
+def test_finish_ends_the_page_in_words(browser: Any, tmp_path: Path):
+    """Done, with the way to the other page, and no red bar when the program has gone."""
+    with RecordedPage(tmp_path, Labels("metal", "1"), teaching=True) as one:
+        context = browser.new_context()
+        seen = BrowsedPage(context, one.page.server.address)
+        trying = {"model": "mine 1", "labels": ["metal"], "displays": {}, "taught": "here"}
+        one.more = {"trying": trying}
+        one.recording.commands["DONE"] = lambda text: []
+        seen.page.click("#done:not([aria-disabled=true])")
+        until(lambda: seen.text("#what") == "Done")
+    until(lambda: seen.text("#state") == "finished")
+    seen.page.wait_for_timeout(1500)
+    assert not seen.page.is_visible("#banner")
+    assert seen.text("#count").startswith("The box works")
+    context.close()
+
+
+def test_a_hidden_tab_lets_its_stream_go(browser: Any, recorded: RecordedPage):
+    """A browser has six connections to a box, for all of its tabs; seen again it goes on."""
+    context = browser.new_context()
+    context.add_init_script(
+        "let seen = 'visible'; window.show = (s) => { seen = s; "
+        "document.dispatchEvent(new Event('visibilitychange')); };"
+        "Object.defineProperty(document, 'visibilityState', {get: () => seen});"
+    )
+    seen = BrowsedPage(context, recorded.page.server.address)
+    until(lambda: len(recorded.page.server.queues) == 1)
+    seen.page.evaluate("window.show('hidden')")
+    until(lambda: not recorded.page.server.queues, 30)
+    seen.page.evaluate("window.show('visible')")
+    until(lambda: len(recorded.page.server.queues) == 1)
+    recorded.sweep()
+    until(lambda: seen.text("#sweep-title").startswith("Sweep 9,"))
+    context.close()
 
 
 def test_a_material_may_be_called_as_things_of_script(browser: Any, recorded: RecordedPage):

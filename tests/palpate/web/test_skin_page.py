@@ -46,7 +46,7 @@ def test_it_shows_loads_figures_and_faults(browser: Any, page: PageServer):
     faulty = seen.page.eval_on_selector_all(".taxel.faulty", "all => all.map(e => e.title)")
     assert [title.split(":")[0] for title in faulty] == ["taxel 2.1 axis 1", "taxel 1.2 axis 3"]
     asked = {request.removeprefix(page.address).split("?")[0] for request in seen.requests}
-    scripts = {f"/{name}.js" for name in ("skin_show", "events", "parts", "skin")}
+    scripts = {f"/{name}.js" for name in ("old", "skin_show", "events", "parts", "skin")}
     assert asked <= {"/", "/page.css", "/events", "data:,"} | scripts
     assert not seen.errors
     seen.page.close()

@@ -147,6 +147,26 @@ def test_an_unsure_answer_shows_its_candidate_small(browser: Any, shown: Shown):
         until(lambda: seen.text("#status") == status)  # noqa: B023
         assert "wood" not in seen.text("#label")
         assert seen.text("#sure") == "Perhaps wood, 48.1 %"
+    shown.board.take(verdict(42, 396.0, "wood", "unsure", probability=0.9996))
+    until(lambda: seen.text("#sure") == "Perhaps wood, 99.9 %")
+
+
+def test_an_open_sweep_does_not_wear_the_answer_of_the_last(browser: Any, shown: Shown):
+    """The state is large and the answer of before small, until this sweep is answered, early or at
+    its end."""
+    seen = opened(browser, shown)
+    sweep()(shown)
+    until(lambda: seen.text("#label") == "wood")
+    shown.board.take(feed_lines.health(NOW_S, sweeping=True, ready=False))
+    until(lambda: seen.text("#label") == "Sweeping")
+    assert seen.page.get_attribute("#verdict", "data-tone") == "plain"
+    assert "wood" in seen.text("#sure")
+    shown.board.take(verdict(42, 399.0, "paper", "ok", share=0.5))
+    until(lambda: seen.text("#label") == "paper")
+    for sweeping in (False, True):
+        ready = not sweeping
+        shown.board.take(feed_lines.health(NOW_S, sweeping=sweeping, ready=ready))
+    until(lambda: seen.text("#label") == "Sweeping")
 
 
 def test_the_whole_screen_has_the_verdict_alone(browser: Any, shown: Shown):

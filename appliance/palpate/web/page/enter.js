@@ -9,8 +9,8 @@ async function enter(token) {
   }
   said.textContent = "asking the box";
   try {
-    const answer = await fetch("/enter", {headers: {Authorization: `Bearer ${token}`}});
-    if (answer.ok) return location.replace("/");
+    const answer = await fetch("enter", {headers: {Authorization: `Bearer ${token}`}});
+    if (answer.ok) return location.replace(".");
     said.textContent = answer.status === 401 ? "this is not the token" : `the box answers ${answer.status}`;
   } catch {
     said.textContent = "no connection";
@@ -22,7 +22,7 @@ document.getElementById("go").addEventListener("click", () => enter(field.value.
 field.addEventListener("keydown", (event) => { if (event.key === "Enter") enter(field.value.trim()); });
 const given = location.hash.slice(1);
 if (given) {
-  history.replaceState(null, "", "/");
+  history.replaceState(null, "", location.pathname);
   enter(given);
 }
 field.focus();

@@ -5,7 +5,17 @@ const TONES = {ok: "good", recorded: "good", unsure: "warn", undecided: "warn", 
 
 const ORDER_MS = 10_000;
 
+document.documentElement.setAttribute("data-runs", "yes"); // see old.js
+
 export const byId = (id) => document.getElementById(id);
+
+export function last(values) { return values[values.length - 1]; }
+
+/* Makes `children` the only ones: Element.replaceChildren is younger than many tablets. */
+export function fill(parent, ...children) {
+  parent.textContent = "";
+  parent.append(...children);
+}
 
 export function put(id, text) { if (byId(id).textContent !== text) byId(id).textContent = text; }
 
@@ -35,14 +45,16 @@ export function frame({state, fine, source, why = ""}) {
 
 /* Sends a command with the page's key, as on the serial line. What became of it: "", or why it was refused. */
 export async function order(program, key, command, text = "") {
-  try {
-    const answer = await fetch("/order", {
-      method: "POST", body: JSON.stringify({command, text}), signal: AbortSignal.timeout(ORDER_MS),
-      headers: {"Content-Type": "application/json", "X-Palpate-Key": key},
-    });
+  const ending = new AbortController(), late = setTimeout(() => ending.abort(), ORDER_MS);
+  const headers = {"Content-Type": "application/json", "X-Palpate-Key": key};
+  const sent = fetch("order", {method: "POST", body: JSON.stringify({command, text}), signal: ending.signal, headers});
+  try { // of what the network does, and of nothing else
+    const answer = await sent;
     return answer.ok ? "" : (await answer.text()).trim() || `${program} answers ${answer.status}`;
   } catch {
     return `no connection to ${program}; what holds now is shown when it is back`;
+  } finally {
+    clearTimeout(late);
   }
 }
 
@@ -79,6 +91,9 @@ export function listenToPedal(press) {
     if (!event.repeat) press();
   });
 }
+
+/* Never more than it is: 99.96 % that did not suffice is not 100.0 %. */
+export function percentAtMost(p) { return percent(Math.floor(1000 * p + 1e-6) / 1000); }
 
 export function percent(p) { return `${(100 * p).toFixed(1)}\u00a0%`; }
 

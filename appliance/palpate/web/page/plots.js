@@ -1,6 +1,6 @@
 /* Pictures of numbers on a canvas: a sweep's signal and spectrogram, latency and loss over time. */
 
-import {shades} from "/skin.js";
+import {shades} from "./skin.js";
 
 const LEFT = 48, BOTTOM = 20, TOP = 22, RIGHT = 6;
 
@@ -98,7 +98,7 @@ export function spectrogram(canvas, picture, why) {
 /* points: [milliseconds of the clock, value, whether it is marked]; as dots, or as bars where `bars`. */
 export function course(canvas, points, {bars = false, clock, nothing}) {
   if (!points.length) return empty(canvas, nothing);
-  const [paper, w, h] = begin(canvas), last = points.at(-1)[0], first = Math.min(points[0][0], last - 600_000);
+  const [paper, w, h] = begin(canvas), last = points[points.length - 1][0], first = Math.min(points[0][0], last - 600_000);
   const most = round(Math.max(bars ? .01 : 1, ...points.map((point) => point[1])));
   axes(paper, w, h, 0, most, bars ? "% of each minute" : "milliseconds", "time of day", [clock(first).slice(0, 5), clock(last).slice(0, 5)]);
   const x = (at) => LEFT + (w * (at - first)) / (last - first || 1), y = (value) => TOP + h - (h * value) / most;

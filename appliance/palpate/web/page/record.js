@@ -1,9 +1,9 @@
 /* The page of a recording: what is there and what is missing, the last sweep, the skin; and the labels, which are set here. */
 
-import {byId, enable, made, mark, put} from "/parts.js";
-import {signal, spectrogram} from "/plots.js";
-import {drawHeader, lastPicture, live, ordered, run, seen, since} from "/recording.js";
-import {SkinPicture} from "/skin.js";
+import {byId, enable, fill, made, mark, put} from "./parts.js";
+import {signal, spectrogram} from "./plots.js";
+import {drawHeader, lastPicture, live, ordered, run, seen, since} from "./recording.js";
+import {SkinPicture} from "./skin.js";
 
 const FIELDS = ["material", "position", "session"], SKIN = new SkinPicture(document.querySelector(".skin"));
 let view, drawn = {}, table = "";
@@ -48,10 +48,10 @@ function drawCounts() {
     });
     made("td", "", undefined, head);
     for (const at of positions) made("th", "", at || "no position", head).scope = "col";
-    box.querySelector("thead").replaceChildren(...(materials.length ? [head] : []));
-    box.querySelector("tbody").replaceChildren(...body);
+    fill(box.querySelector("thead"), ...(materials.length ? [head] : []));
+    fill(box.querySelector("tbody"), ...body);
     for (const [id, names] of [["materials", materials.map(shown)], ["positions", positions]]) {
-      byId(id).replaceChildren(...names.filter(Boolean).map((value) => Object.assign(made("option"), {value})));
+      fill(byId(id), ...names.filter(Boolean).map((value) => Object.assign(made("option"), {value})));
     }
   }
   for (const field of box.querySelectorAll("button")) {

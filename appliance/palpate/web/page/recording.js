@@ -1,14 +1,14 @@
 /* What the pages of palpate record and palpate teach share: their events, the head, the call, the last sweep and orders. */
 
-import {listen} from "/events.js";
-import {ago, byId, call, frame, listenToPedal, order, put} from "/parts.js";
+import {listen} from "./events.js";
+import {ago, byId, call, frame, listenToPedal, order, put} from "./parts.js";
 
 /* key, recording, last: events of these names, as appliance/palpate/web/record.py sends them. picture: of the last sweep.
-   dirty: something is to be drawn. */
-export const seen = {key: "", recording: null, last: null, picture: null, reached: null, answers: true, wallMs: 0, dirty: true};
+   finished: the person has ended the program, so that no connection is no fault. dirty: something is to be drawn. */
+export const seen = {finished: false, key: "", recording: null, last: null, picture: null, reached: null, answers: true, wallMs: 0, dirty: true};
 let program = "", ordering = false;
 
-function begin() { Object.assign(seen, {key: "", recording: null, last: null}); }
+function begin() { Object.assign(seen, {finished: false, key: "", recording: null, last: null}); }
 
 export function live() { return seen.reached === true && seen.recording !== null; }
 
@@ -17,8 +17,8 @@ export function since(ns) { return `${ago(Date.now() - seen.wallMs - ns / 1e6)} 
 
 /* Why what is shown is not of this moment; "" where it is. */
 function trouble() {
-  const {reached, answers, recording} = seen;
-  if (reached === null) return "";
+  const {reached, answers, recording, finished} = seen;
+  if (reached === null || finished) return "";
   const heard = recording ? `; last heard of it ${since(recording.time_ns)}` : "";
   if (!reached) return `${answers ? `${program} answers, but has no news` : `no connection to ${program}`}${heard}; trying again`;
   if (recording && recording.skin !== "streaming") return `no skin: ${recording.skin}${recording.trouble && `; ${recording.trouble}`}`;
@@ -28,7 +28,7 @@ function trouble() {
 export function drawHeader() {
   const why = trouble(), {reached, recording} = seen;
   document.body.classList.toggle("stale", Boolean(why));
-  const state = !reached ? "no connection" : !recording ? "waiting" : recording.skin !== "streaming" ? `skin ${recording.skin}`
+  const state = seen.finished ? "finished" : !reached ? "no connection" : !recording ? "waiting" : recording.skin !== "streaming" ? `skin ${recording.skin}`
     : recording.sweeping ? "sweeping" : recording.ready ? "ready" : "not ready";
   frame({state, fine: live() && recording.skin === "streaming", source: recording?.source, why});
   byId("format").hidden = !recording;
@@ -53,7 +53,7 @@ async function fetchPicture(sweep) {
   seen.picture = {sweep, asked: true};
   let got = {sweep};
   try {
-    const answer = await fetch(`/sweep/${sweep}`, {cache: "no-store"});
+    const answer = await fetch(`sweep/${sweep}`, {cache: "no-store"});
     if (answer.ok) got = await answer.json();
   } catch { /* said where the signal would be; asked again when the connection is back */ }
   if (seen.last?.sweep === sweep) seen.picture = got;
@@ -64,10 +64,12 @@ async function fetchPicture(sweep) {
 export async function ordered(act) {
   if (ordering) return "the order before is not answered yet";
   ordering = seen.dirty = true;
-  const result = await act((command, text) => order(program, seen.key, command, text));
-  ordering = false;
-  seen.dirty = true;
-  return result;
+  try {
+    return await act((command, text) => order(program, seen.key, command, text));
+  } finally {
+    ordering = false;
+    seen.dirty = true;
+  }
 }
 
 /* name: of the program. draw: draws all. wanted: whether the call is shown. pedal: a press of it. heard: further events. */

@@ -1,7 +1,7 @@
 /* The sweeps of this shift: a list with filters, counts by material and status, and all of them as a CSV file. */
 
-import {byId, clock, count, made, mark, percent, put} from "/parts.js";
-import {WORDS} from "/verdict.js";
+import {byId, clock, count, fill, last, made, mark, percent, put} from "./parts.js";
+import {WORDS} from "./verdict.js";
 
 const SHOWN = 200;
 const statuses = new Set(); // which are shown; none: all
@@ -23,7 +23,7 @@ export function drawShift(known, chosen, again) {
       while (notes.length && notes[0].time_ns >= one.time_ns) parts.push(made("p", "note", `${clock(notes[0].at)}  ${notes.shift().text}`));
       parts.push(row(one));
     }
-    rows.replaceChildren(...parts);
+    fill(rows, ...parts);
     if (shown.length < wanted.length) made("button", "all", `show all ${count(wanted.length)}`, rows).addEventListener("click", () => { all = true; again(); });
     if (before > 0) rows.scrollTop = before + rows.scrollHeight - height;
   }
@@ -67,7 +67,7 @@ function drawTally(verdicts) {
   const sure = verdicts.filter((one) => one.status === "ok").length;
   put("counted", `${count(verdicts.length)} sweeps since ${clock(verdicts[0].at)}: ${count(sure)} named (${percent(sure / verdicts.length)}), `
     + `${count(named.length - sure)} not sure, ${count(nameless.length)} without a material`);
-  const content = `${verdicts.length} ${key(verdicts[0])} ${key(verdicts.at(-1))}`;
+  const content = `${verdicts.length} ${key(verdicts[0])} ${key(last(verdicts))}`;
   if (table.dataset.shown === content) return;
   table.dataset.shown = content;
   const columns = common(counted(named.map((one) => one.status))), head = made("tr"), body = [];
@@ -84,7 +84,7 @@ function drawTally(verdicts) {
   }
   const without = counted(nameless.map((one) => one.status));
   for (const status of common(without)) line(status, [...columns.map(() => ""), without.get(status)]);
-  table.replaceChildren(made("thead"), made("tbody"));
+  fill(table, made("thead"), made("tbody"));
   table.tHead.append(head);
   table.tBodies[0].append(...body);
 }
@@ -115,7 +115,7 @@ function stamp(ms) {
 /* A text for CSV (RFC 4180), which a spreadsheet must not take for a formula. */
 function cell(value) {
   const text = typeof value === "string" && /^[=+\-@\t]/.test(value) ? `'${value}` : `${value}`;
-  return /[",\r\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text;
+  return /[",\r\n]/.test(text) ? `"${text.replace(/"/g, '""')}"` : text;
 }
 
 export function csv(verdicts) {

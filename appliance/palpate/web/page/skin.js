@@ -1,6 +1,6 @@
 /* The skin as a picture: the load of each taxel, the contact, where it lay in training, and the way back. */
 
-import {figure} from "/parts.js";
+import {figure, fill} from "./parts.js";
 
 const SVG = "http://www.w3.org/2000/svg", TAXEL = 100, RING = 21, TIP = 90, RIM = 14, SIDE = 62;
 const NUMBERED = 8; // a larger skin gets no numbers, and names every fourth row and column
@@ -44,7 +44,7 @@ export class SkinPicture {
   show(view, unit = view.load_unit) {
     const drawn = JSON.stringify([view.shape, view.contact, view.fingertip]);
     if (drawn !== this.drawn) {
-      this.parent.replaceChildren();
+      fill(this.parent);
       this.build(view);
       this.drawn = drawn;
     }

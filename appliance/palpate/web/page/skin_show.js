@@ -1,13 +1,13 @@
 /* The page of `palpate skin show`: every axis of a skin, its noise and its faults. */
-import {listen} from "/events.js";
-import {byId, figure as text, frame, put} from "/parts.js";
-import {shades} from "/skin.js";
+import {listen} from "./events.js";
+import {byId, figure as text, fill, frame, last, put} from "./parts.js";
+import {shades} from "./skin.js";
 
 const NUMBERED = 8;
 let built = "", tiles = [];
 
 function build([rows, cols, axes], unit) {
-  byId("maps").replaceChildren();
+  fill(byId("maps"));
   tiles = [];
   for (let a = 0; a < axes; a++) {
     const figure = document.createElement("figure"), caption = document.createElement("figcaption");
@@ -46,7 +46,7 @@ function draw(view) {
     if (cols <= NUMBERED) tile.textContent = text(load, view.full, view.unit);
   })));
   const noise = view.noise.flat(2).sort((a, b) => a - b);
-  put("noise", noise.length ? `${noise[noise.length >> 1].toPrecision(2)}, ${noise.at(-1).toPrecision(2)} ${view.unit}` : "–");
+  put("noise", noise.length ? `${noise[noise.length >> 1].toPrecision(2)}, ${last(noise).toPrecision(2)} ${view.unit}` : "–");
   const found = kinds.filter((kind) => view[kind].length).map((kind) => `${kind}: ${view[kind].join(", ")}`);
   put("faults", found.join("; ") || "no fault seen");
   byId("faults").className = found.length ? "" : "fine";

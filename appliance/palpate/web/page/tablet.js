@@ -1,6 +1,6 @@
 /* The page on a tablet beside the robot: the whole screen, a screen that stays on, a tone on a refusal, and keys. */
 
-import {byId, made, put} from "/parts.js";
+import {byId, made, put} from "./parts.js";
 
 const TONES = {warn: [660, 660], bad: [440, 330], away: [440, 330, 220]}, TONE_S = .18;
 let lock = null, audio = null;
@@ -25,7 +25,7 @@ export function full(on) {
 
 function sound(on) {
   byId("tone").setAttribute("aria-pressed", on);
-  if (on) audio ??= new AudioContext(); // browsers allow it after a touch or a key alone
+  if (on && !audio) audio = new AudioContext(); // browsers allow it after a touch or a key alone
 }
 
 /* Plays the tone of a refusal, if it is wanted. */

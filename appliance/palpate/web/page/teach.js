@@ -1,11 +1,11 @@
 /* The page of `palpate teach`: what to do next, the materials, what was learnt, and the bundle that is made of it. */
 
-import {byId, enable, made, mark, put} from "/parts.js";
-import {signal} from "/plots.js";
-import {drawHeader, lastPicture, live, ordered, run, seen, since} from "/recording.js";
+import {byId, enable, fill, made, mark, put} from "./parts.js";
+import {signal} from "./plots.js";
+import {drawHeader, lastPicture, live, ordered, run, seen, since} from "./recording.js";
 
 const STEPS = {start: "starting", features: "looking at the sweeps", heads: "learning", bundle: "checking"};
-let listed = "";
+let listed = "", ended = false;
 
 function teach() { return seen.recording?.teach ?? null; }
 
@@ -44,7 +44,7 @@ function drawMaterials() {
   const content = JSON.stringify([held, recording?.displays, recording?.material, Boolean(recording?.trying), live()]);
   if (content === listed) return;
   listed = content;
-  byId("materials").replaceChildren(...Object.entries(held).map(([name, n]) => {
+  fill(byId("materials"), ...Object.entries(held).map(([name, n]) => {
     const row = made("li"), pick = made("button", "", n === null ? shown(name) : `${shown(name)}: ${n}`, row);
     pick.type = "button";
     pick.dataset.material = name;
@@ -80,7 +80,7 @@ function drawLearnt() {
   const suspects = [...(learnt?.no_slides ?? []), ...(learnt?.suspects ?? [])].map((one) => one.text);
   if (byId("suspects").dataset.text !== suspects.join()) {
     byId("suspects").dataset.text = suspects.join();
-    byId("suspects").replaceChildren(...suspects.map((text) => made("li", "", text)));
+    fill(byId("suspects"), ...suspects.map((text) => made("li", "", text)));
   }
   byId("use").hidden = Boolean(trying);
   byId("done").hidden = !trying;
@@ -112,8 +112,20 @@ function drawSweep() {
   signal(byId("signal"), picture, none, recording?.unit || undefined);
 }
 
+/* The box works for the robot now, and this program has ended. */
+function drawEnd() {
+  ended = true;
+  put("what", "Done");
+  put("count", "The box works for the robot now");
+  for (const one of document.querySelectorAll("#task .buttons, #teach > :not(#task)")) one.hidden = true;
+  byId("watched").hidden = location.port !== "8138";
+  byId("to-watch").href = `${location.protocol}//${location.hostname}:8137/`;
+}
+
 function draw() {
   drawHeader();
+  if (seen.finished) return drawEnd();
+  if (ended) return location.reload(); // it was started again
   drawTask();
   drawMaterials();
   drawLearnt();
@@ -134,13 +146,17 @@ function skip() {
   send("TEACH", names[(at + 1) % names.length]);
 }
 
+async function finish() {
+  if (!(await send("DONE"))) Object.assign(seen, {finished: true, dirty: true});
+}
+
 const PRESSED = {
   "sweep-button": () => send(seen.recording.sweeping ? "STOP" : "START"),
   discard: () => send("DISCARD", `${seen.recording.discard}`),
   skip,
   place: () => send("NEXT"),
   use: () => send("USE"),
-  done: () => send("DONE"),
+  done: finish,
 };
 
 byId("teach").addEventListener("click", (event) => {

@@ -1,7 +1,7 @@
 /* The card that is read from two metres: what the box said, whether that can be trusted, and what to do now. */
 
-import {ago, byId, clock, made, mark, percent, put} from "/parts.js";
-import {STATUSES} from "/statuses.js";
+import {ago, byId, clock, fill, made, mark, percent, percentAtMost, put} from "./parts.js";
+import {STATUSES} from "./statuses.js";
 
 /* By status: how the card is coloured, what the box says in words, and what to do. */
 export const WORDS = {...STATUSES, displaced: ["warn", "Displaced", "The skin has moved: align it."]};
@@ -42,9 +42,10 @@ function of(sweep, now) { return `sweep ${sweep.sweep}, ${clock(sweep.at)}, ${ag
 
 function before(last, now) { return last ? `Before that: ${last.name || last.status}, ${of(last, now)}.` : ""; }
 
-/* What the card shows. verdict: the last one with its time `at`, in ms; fresh: whether it is of the program that runs now. away:
+/* What the card shows. verdict: the last one with its time `at`, in ms; fresh: whether it is of the program that runs now. swept: whether
+   it is of a sweep before the one that is open now. away:
    "" or why nothing is heard, with lastAt (0: unknown). */
-export function card({verdict, fresh, health, windowS, away, detail, lastAt, now}) {
+export function card({verdict, fresh, swept, health, windowS, away, detail, lastAt, now}) {
   if (away) {
     const since = lastAt ? `Last heard at ${clock(lastAt)}, ${ago(now - lastAt)} ago.` : "";
     return {tone: "away", status: "off", words: away, advice: since, small: before(verdict, now), detail};
@@ -58,6 +59,7 @@ export function card({verdict, fresh, health, windowS, away, detail, lastAt, now
     const words = !health ? "Waiting" : health.ready || health.sweeping ? "Ready" : "Not ready";
     return {tone: "plain", status: "", words, advice: "No sweep yet since the box was started.", small: before(verdict, now), detail: "", next};
   }
+  if (swept) return {tone: "plain", status: "", words: "Sweeping", advice: "", small: before(verdict, now), detail: ""};
   return answer(verdict, windowS, next, now);
 }
 
@@ -65,7 +67,7 @@ function answer(verdict, windowS, next, now) {
   const status = verdict.moved && (verdict.status === "ok" || verdict.status === "unknown") ? "displaced" : verdict.status;
   let [tone, words, advice] = WORDS[status] ?? ["bad", verdict.status, verdict.reason];
   if (verdict.status === "short" && windowS) advice = `Slide for longer than ${windowS} s.`;
-  const named = verdict.status === "ok", candidate = verdict.label ? `${verdict.name}, ${percent(verdict.probability)}` : "";
+  const named = verdict.status === "ok", candidate = verdict.label ? `${verdict.name}, ${percentAtMost(verdict.probability)}` : "";
   const more = [named ? percent(verdict.probability) : candidate && `Perhaps ${candidate}`,
     verdict.fused > 1 ? `${verdict.fused} sweeps of one object` : "", verdict.share < 1 ? `early, at ${percent(verdict.share)} of the window` : ""];
   return {tone, status: named && !verdict.moved ? "ok" : status, words: named ? verdict.name : words, advice, next, of: of(verdict, now),
@@ -92,6 +94,6 @@ export function drawCard(shown) {
   put("detail", shown.detail);
   if (byId("moved").dataset.shown === (shown.moved ?? "")) return;
   byId("moved").dataset.shown = shown.moved ?? "";
-  byId("moved").replaceChildren(...(shown.moved ? [`${shown.moved}: `] : []));
+  fill(byId("moved"), ...(shown.moved ? [`${shown.moved}: `] : []));
   if (shown.moved) Object.assign(made("a", "", "align the skin", byId("moved")), {href: "#align"});
 }

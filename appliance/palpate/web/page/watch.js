@@ -1,12 +1,12 @@
 /* The page beside the robot: the box's last verdict first, then the skin, the sweep, the shift, and the box itself. */
 
-import {listen} from "/events.js";
-import {ago, byId, clock, count, figure, frame, made, percent, put} from "/parts.js";
-import {course, signal, spectrogram} from "/plots.js";
-import {drawShift, key, listenToShift, save} from "/shift.js";
-import {SkinPicture, wayBack} from "/skin.js";
-import {listenToTablet, play} from "/tablet.js";
-import {card, drawCard, skin} from "/verdict.js";
+import {listen} from "./events.js";
+import {ago, byId, clock, count, figure, fill, frame, last, made, percent, put} from "./parts.js";
+import {course, signal, spectrogram} from "./plots.js";
+import {drawShift, key, listenToShift, save} from "./shift.js";
+import {SkinPicture, wayBack} from "./skin.js";
+import {listenToTablet, play} from "./tablet.js";
+import {card, drawCard, skin} from "./verdict.js";
 
 const SPOKEN_MS = 3000, KEPT = 5000, PICTURES = 20, SCORES = 6;
 const SKIN = new SkinPicture(document.createElement("div"));
@@ -15,12 +15,18 @@ let reached = null, answers = true, wallMs = 0, dirty = true, spokenAt = -Infini
 
 function begin() {
   known = {run: "", hello: null, box: null, health: null, view: null, verdicts: [], notes: [], minutes: [], signals: new Map(),
-    labels: new Map(), pictures: new Map(), chosen: null, heardAt: 0};
+    labels: new Map(), pictures: new Map(), chosen: null, heardAt: 0, answers: 0, before: 0, sweeping: false};
 }
 begin();
 
 /* Times. The box counts nanoseconds since its start; `wallMs` is what this device's clock showed then. */
 function wall(ns) { return wallMs + ns / 1e6; }
+
+/* How many answers there were when the open sweep began: an answer after that is an early one, of this sweep. */
+function note(sweeping) {
+  if (sweeping && !known.sweeping) known.before = known.answers;
+  known.sweeping = sweeping;
+}
 
 /* Events, as appliance/palpate/web/board.py sends them. */
 const HEARD = {
@@ -28,10 +34,11 @@ const HEARD = {
   begin(run) { begin(); known.run = run; },
   hello(hello) { known.hello = hello; known.labels.set(hello.bundle, hello.names); },
   box(box) { known.box = box; },
-  health(health) { known.health = health; known.heardAt = wall(health.time_ns); },
-  state(state) { if (known.health) Object.assign(known.health, state); },
+  health(health) { known.health = health; known.heardAt = wall(health.time_ns); note(health.sweeping); },
+  state(state) { if (known.health) Object.assign(known.health, state); note(state.sweeping); },
   view(view) { known.view = view; if (!known.box) known.heardAt = Date.now(); },
   verdict(verdict) {
+    known.answers++;
     known.verdicts.push({...verdict, at: wall(verdict.time_ns)});
     if (known.verdicts.length > KEPT) known.verdicts.shift();
   },
@@ -98,8 +105,9 @@ function drawHeader() {
 let toned = "";
 
 function drawVerdict() {
-  const {health, hello, box} = known, verdict = known.verdicts.at(-1);
-  const shown = card({verdict, fresh: verdict?.pid === hello?.pid, health, windowS: hello?.window_s, away: away(), lastAt: known.heardAt, now: Date.now(),
+  const {health, hello, box} = known, verdict = last(known.verdicts);
+  const shown = card({verdict, fresh: verdict?.pid === hello?.pid, health,
+    swept: known.sweeping && known.answers === known.before, windowS: hello?.window_s, away: away(), lastAt: known.heardAt, now: Date.now(),
     detail: reached ? box?.why ?? "" : "The page tries again by itself."});
   drawCard(shown);
   const event = `${shown.tone} ${shown.tone === "away" ? "" : verdict && key(verdict)}`;
@@ -148,7 +156,7 @@ function drawWords() {
 }
 
 /* The sweep that is looked at: the one that was chosen, else the last. */
-function looked() { return known.verdicts.find((one) => key(one) === known.chosen) ?? known.verdicts.at(-1); }
+function looked() { return known.verdicts.find((one) => key(one) === known.chosen) ?? last(known.verdicts); }
 
 function drawSweep() {
   const one = looked();
@@ -179,7 +187,7 @@ function drawScores(one) {
   put("more", allScores ? `the ${SCORES} most probable` : `all ${every.length} materials`);
   if (list.dataset.shown === JSON.stringify(shown)) return;
   list.dataset.shown = JSON.stringify(shown);
-  list.replaceChildren(...shown.map(([label, p]) => {
+  fill(list, ...shown.map(([label, p]) => {
     const item = made("li"), bar = document.createElement("meter");
     made("span", "", label, item);
     bar.value = p;
@@ -195,7 +203,7 @@ async function fetchPicture(which, number) {
   const {pictures} = known;
   let picture = false;
   try {
-    const answer = await fetch(`/sweep/${number}`, {cache: "no-store"});
+    const answer = await fetch(`sweep/${number}`, {cache: "no-store"});
     if (answer.ok) picture = await answer.json();
   } catch { /* shown as no signal; asked again when the connection is back */ }
   pictures.set(which, picture);
@@ -211,7 +219,7 @@ function select(which) {
 function drawCourse() {
   const answered = known.verdicts.filter((one) => one.label);
   const sorted = answered.map((one) => one.latency_ns / 1e6).sort((a, b) => a - b);
-  const latency = sorted.length ? `median ${sorted[sorted.length >> 1].toFixed(1)} ms, longest ${sorted.at(-1).toFixed(1)} ms` : "no sweep yet";
+  const latency = sorted.length ? `median ${sorted[sorted.length >> 1].toFixed(1)} ms, longest ${last(sorted).toFixed(1)} ms` : "no sweep yet";
   put("latency-said", latency);
   course(byId("latency"), answered.map((one) => [one.at, one.latency_ns / 1e6, one.status !== "ok"]), {clock, nothing: "no sweep yet"});
   if (answered.length) byId("latency").setAttribute("aria-label", `latency of ${answered.length} sweeps: ${latency}`);
@@ -236,7 +244,7 @@ function drawFacts() {
     ...(health.garbage_bytes ? {wire: `${count(health.garbage_bytes)} bytes in no packet`} : {})};
   const list = byId("facts").querySelector("dl"), names = Object.keys(facts);
   if ([...list.querySelectorAll("dt")].map((one) => one.textContent).join() !== names.join()) {
-    list.replaceChildren(...names.flatMap((name) => [made("dt", "", name), made("dd")]));
+    fill(list, ...names.flatMap((name) => [made("dt", "", name), made("dd")]));
   }
   list.querySelectorAll("dd").forEach((one, i) => { if (one.textContent !== facts[names[i]]) one.textContent = facts[names[i]]; });
 }
