@@ -13,6 +13,11 @@ MAX_GAP = 2
 """Most consecutive missing frames that are interpolated; for more the status is `gap`."""
 
 
+NEAR = 32
+"""The frame at a time is searched first among so many frames before and after the place where it
+would be without lost frames and drift."""
+
+
 class FrameRing:
     """The frames of the last `seconds` and a window more. newest: number, -1 at first."""
 
@@ -58,17 +63,24 @@ class FrameRing:
         pad = MAX_GAP
         seq = np.arange(first - pad, first + n + pad)
         slots = seq % self._size
-        have = np.flatnonzero((self._seq[slots] == seq) & (seq >= 0))
-        missing = np.setdiff1d(np.arange(pad, pad + n), have, assume_unique=True)
+        there = (self._seq[slots] == seq) & (seq >= 0)
+        missing = pad + np.flatnonzero(~there[pad : pad + n])
         frames = Frames(self._t_ns[slots], seq, self._taxels[slots])
-        cut = slice(pad, pad + n) if interpolate(frames, have, missing) else slice(0)
+        whole = not len(missing) or interpolate(frames, np.flatnonzero(there), missing)
+        cut = slice(pad, pad + n) if whole else slice(0)
         window = Frames(frames.t_ns[cut], frames.seq[cut], frames.taxels[cut])
         return window, tuple((missing - pad).tolist())
 
     def seq_at(self, t_ns: float) -> int:
         """Number of the frame at `t_ns`, computed from the nearest frame in the ring."""
-        k = int(np.abs(self._t_ns - round(t_ns)).argmin())
-        return int(self._seq[k]) + round((t_ns - int(self._t_ns[k])) / self._period_ns)
+        guess = self.newest - round((self.newest_ns - t_ns) / self._period_ns)
+        for slots in (np.arange(guess - NEAR, guess + NEAR) % self._size, slice(None)):
+            away = np.abs(self._t_ns[slots] - round(t_ns))
+            k = int(away.argmin())
+            if away[k] <= self._period_ns / 2:  # no other frame is nearer
+                break
+        seq, at_ns = int(self._seq[slots][k]), int(self._t_ns[slots][k])
+        return seq + round((t_ns - at_ns) / self._period_ns)
 
 
 def interpolate(frames: Frames, have: NDArray[np.int64], missing: NDArray[np.int64]) -> bool:
