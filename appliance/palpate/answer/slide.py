@@ -127,7 +127,7 @@ class SlideMeter:
         self.slowest_mm_s, self.fastest_mm_s = slowest * pitch_mm, fastest * pitch_mm
         self._each = max(1, int(format.rate_hz / (4 * BAND_HZ)))
         self._frames = int(seconds * format.rate_hz) // self._each
-        hz = np.fft.rfftfreq(self._frames, self._each / format.rate_hz)
+        hz = np.arange(self._frames // 2 + 1) * (format.rate_hz / self._each / self._frames)
         hz = hz[(hz >= LEAST_CYCLES / seconds - 1e-9) & (hz <= BAND_HZ)]
         self._waves = Waves(hz, self._frames, format.rate_hz / self._each, trend=1)
         self._first, self._second, self._of_pair = _pairs(*self._shape)

@@ -112,7 +112,7 @@ def native(values: NDArray[Any]) -> NDArray[Any]:
     onnxruntime and torch take the bytes of an array as they lie, and the name of its type hides
     their order. Raises FormatError for masked numbers, which a plain array would show.
     """
-    if isinstance(values, np.ma.MaskedArray) and np.ma.is_masked(values):
+    if hasattr(values, "mask") and np.ma.is_masked(values):  # numpy.ma takes 2 MiB
         raise FormatError("some of the numbers are masked; fill them in")
     return np.asarray(values.astype(values.dtype.newbyteorder("="), copy=False))
 

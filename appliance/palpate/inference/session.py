@@ -11,7 +11,6 @@ from typing import Any
 
 import onnxruntime as ort
 from numpy.typing import NDArray
-from onnxruntime.capi import onnxruntime_pybind11_state
 
 from palpate.answer import features
 from palpate.bundle.bundle import Bundle
@@ -67,7 +66,7 @@ class ModelRunner:
         opened = next(able, None)
         if opened is None:
             opened = session(prune(self._model, set(outputs)))
-            give_back(onnxruntime_pybind11_state.__file__)
+            give_back()
         self._sessions[outputs] = opened
         return opened
 
