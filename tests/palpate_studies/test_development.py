@@ -350,6 +350,7 @@ def test_all_methods_are_timed_in_one_run(tmp_path: Path):
     assert found["left_out"] == {}
 
 
+@pytest.mark.slow
 def test_a_model_that_the_box_refuses_is_timed_all_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

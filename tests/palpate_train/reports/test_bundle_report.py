@@ -36,9 +36,9 @@ def sweeps() -> Dataset:
 
 @pytest.fixture(scope="module")
 def figures(sweeps: Dataset) -> dict:
-    """The figures of the packaged bundle. Six sweeps are corrupted."""
+    """The figures of the packaged bundle. Two sweeps are corrupted."""
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(EvaluationSweeps.of.__func__, "__defaults__", (6, 0))
+        patched.setattr(EvaluationSweeps.of.__func__, "__defaults__", (2, 0))
         found = bundle_experiment.run(bundle.DEFAULT, sweeps, NOTHING)
     return found | {"command": "palpate-train report"}
 
@@ -97,6 +97,7 @@ def test_a_material_that_others_are_taken_for_loses_precision(
     )
 
 
+@pytest.mark.slow
 def test_the_page_holds_the_figures(figures: dict, sweeps: Dataset):
     """The page has a headline and a row for each material and corruption; tags are closed, no
     template syntax is left, and nothing is loaded from elsewhere."""
@@ -203,6 +204,7 @@ def test_the_command_writes_page_and_figures(
     assert json.loads((tmp_path / "f.json").read_text())["bundle"]["name"] == "default"
 
 
+@pytest.mark.slow
 def test_people_read_display_names(figures: dict, sweeps: Dataset):
     """In tables and pictures; figures for programs keep the labels."""
     shown = figures | {"displays": {"wood": "Holz, geölt"}}

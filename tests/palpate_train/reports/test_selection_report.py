@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 
+import pytest
+
 from palpate_train.reports import selection_report
 from tests.factories import choice_data
 from tests.factories.page_reader import PageReader
@@ -30,6 +32,7 @@ def test_page_and_terminal_say_the_same():
         assert [fact for fact in FACTS if fact not in text] == []
 
 
+@pytest.mark.slow
 def test_the_page_is_sound_and_the_terminal_has_a_line_for_each_model():
     """Tags close and foreign names cannot become tags."""
     read = PageReader(selection_report.page(choice_data.choice()))

@@ -24,6 +24,7 @@ def source(count: int) -> SweepSource:
     return SweepSource("mine.npz", count, lambda number: one)
 
 
+@pytest.mark.slow
 def test_of_a_large_set_sweeps_from_all_over_it_are_shown(monkeypatch: pytest.MonkeyPatch):
     """The first and the last sweep are shown, in order, none twice; as many as are allowed, and as
     fit by their size."""
@@ -54,6 +55,7 @@ def test_what_a_page_cannot_show_is_refused(
         sweep_pages.chosen(source(count), numbers)
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_page_of_what_is_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):

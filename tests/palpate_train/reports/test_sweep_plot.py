@@ -98,6 +98,7 @@ def test_the_picture_says_what_is_known(small: str):
     )
 
 
+@pytest.mark.slow
 def test_a_sweep_that_was_recorded_without_a_bundle(tmp_path: Path):
     """A recording without a bundle shows the status alone, the trigger, and the unloaded skin."""
     about = {

@@ -35,6 +35,7 @@ def sure(*named: int) -> np.ndarray:
     return np.where(np.eye(3)[list(named)] > 0, 0.98, 0.01)
 
 
+@pytest.mark.slow
 def test_easy_materials_are_enough():
     """All sweeps are right, and the sentence agrees with the interval."""
     found = assess(lesson(easy(14)))

@@ -111,6 +111,7 @@ def test_objects_of_version_7_are_passed_over(tmp_path: Path):
     np.testing.assert_array_equal(raw_files.read(tmp_path / "a.mat").values, SKIN)
 
 
+@pytest.mark.slow
 def test_damage_is_told(tmp_path: Path):
     """Cut anywhere or with altered bytes, of both versions: the file gives an array, or a
     FormatError."""

@@ -392,6 +392,7 @@ def test_only_named_conditions_judge():
     assert next(iter(made.held_out_figures())) == "held-out batch"
 
 
+@pytest.mark.slow
 def test_a_condition_that_cannot_be_left_out_is_refused():
     """The error names it."""
     for name in ("recording ", "speed"):

@@ -132,6 +132,7 @@ def test_stages_ignore_offsets():
         ).abs().max() > 0.01
 
 
+@pytest.mark.slow
 def test_fused_norms_change_nothing():
     """The folded network answers as the trained one in evaluation."""
     model = stages.StagesNetwork(SweepFormat(2, 2, 100.0, 64, "uint8"), 3, 0.1)
@@ -376,6 +377,7 @@ def test_trained_stages_depend_on_their_seed_alone():
     assert not np.array_equal(trained(2)["convs.0.weight"], first["convs.0.weight"])
 
 
+@pytest.mark.slow
 def test_positions_are_held_out_where_there_are_several():
     """Stages are judged by a position that their training never saw."""
     s = easy()
