@@ -8,6 +8,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,9 +16,10 @@ import pytest
 from palpate.bundle import bundle
 from palpate.bundle.bundle import Bundle
 from palpate.core.errors import FormatError
-from palpate_train.cli import bundles
+from palpate_train.cli import bundles, fit
 from palpate_train.cli.main import PROGRAM, main
 from palpate_train.data import pull, sets
+from palpate_train.metrics.answers import Answers
 from palpate_train.models.recipe.fitted import Fit
 from tests.factories.sweep_sets import easy
 
@@ -308,3 +310,37 @@ def test_a_fit_names_groups_of_one_value(tmp_path: Path, capsys: pytest.CaptureF
     assert told == [
         "every sweep has the same direction: expect less at another, no figure shows it"
     ]
+
+
+@pytest.mark.parametrize(
+    ("group", "wrong", "told"),
+    [
+        ("speed", 2, ["worst speed: 3 mm/s, 75 % of 8; outermost"]),
+        ("speed", 1, ["worst speed: 2 mm/s, 75 % of 8"]),
+        ("position", 2, ["worst position: 3, 75 % of 8"]),
+        ("who", 0, ["worst who: v1, 75 % of 8"]),
+        ("recording", 0, []),
+        ("speed", None, []),
+    ],
+)
+def test_a_fit_tells_its_worst_value(group: str, wrong: int | None, told: list[str]):
+    """Of each condition, unless all are classified correctly; what lies beyond an outermost one is
+    not known. Positions and names have no order."""
+    values = np.repeat([1, 2, 3], 8)
+    held = easy(8)
+    held = replace(held, units={"speed": "mm/s"} if group == "speed" else {})
+    named = np.char.add("v", values.astype(str)) if group == "who" else values
+    held = replace(held, groups={group: named})
+    given = held.labels.copy()
+    if wrong is not None:
+        given[8 * wrong : 8 * wrong + 2] += 1
+    answers = Answers(given, np.ones(24, bool), given, given)
+    by = SimpleNamespace(numbers=np.arange(1, 25), answers=lambda of: answers)
+    calibration = SimpleNamespace(held={group: by})
+    made = SimpleNamespace(train=held.take(np.arange(1)), held=held, calibration=calibration)
+    made.worst_values = lambda: Fit.worst_values(made)
+    lines = list(fit._worst(made))
+    assert [line.partition(":")[0] for line in lines] == [one.partition(":")[0] for one in told]
+    for line, one in zip(lines, told, strict=True):
+        assert line.startswith(one)
+        assert ("outermost" in line) is ("outermost" in one)

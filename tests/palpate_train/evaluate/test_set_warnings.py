@@ -95,3 +95,12 @@ def test_evaluate_shows_the_answers_of_the_box(tmp_path: Path, capsys: pytest.Ca
     assert right == counts[0]
     assert main([*words, "--label-alone"]) == 0
     assert json.loads(out.read_text())[0]["box"] is None
+
+
+def test_a_baseline_above_a_method_is_told():
+    """With the name of the better one; not if the method is as good."""
+    baselines = {trivial.MEANS: {"accuracy": 0.7}, trivial.BANDS: {"accuracy": 0.8}}
+    result = {"method": "ours", "protocol": "leave:speed", "baselines": baselines}
+    for right, told in ((79, True), (80, False), (95, False)):
+        found = trivial.above(result | {"window": {"right": right, "total": 100}})
+        assert (trivial.BANDS in found) is told

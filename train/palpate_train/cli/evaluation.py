@@ -121,6 +121,8 @@ def run_evaluate(args: argparse.Namespace) -> None:
         about = {"only": args.only, "each": args.each, "baselines": trivially[result.protocol]}
         results.append(result.json() | about)
         say(evaluate.line(results[-1]))
+        if warning := trivial.above(results[-1]):
+            log.keep(f"palpate-train: {warning}")
         if args.json:
             results[-1] |= {"each_fold": result.each_fold()}
             results.sort(

@@ -7,7 +7,7 @@ import json
 import math
 import shlex
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from palpate.core.text import say
 from palpate_train.arguments import numbers, options, scene_file
 from palpate_train.arguments.program import Add
 from palpate_train.data import extras, labels
+from palpate_train.data.group_values import text_of
 from palpate_train.data.run import Run
 from palpate_train.data.sets import Dataset, digest
 from palpate_train.data.splitters import OF_THE_SET
@@ -201,7 +202,8 @@ def run_fit(args: argparse.Namespace) -> None:
         made = replace(made, about=made.about | {"rest": str(args.rest)})
     made.save(args.out)
     shutil.rmtree(unfinished, ignore_errors=True)
-    say(f"fit: {len(made.train)} sweeps, {made.train.format}; {args.out}")
+    of = f", {len(made.train)} of them to train stages" if made.architecture.channels else ""
+    say(f"fit: {made.sweeps} sweeps{of}, {made.train.format}; {args.out}")
     if len(sweeps) > args.most_sweeps:
         say(
             f"used: {args.most_sweeps} of {len(sweeps)} sweeps, some of each recording; "
@@ -341,6 +343,17 @@ def _unfinished(args: argparse.Namespace, sweeps: Dataset, use: SkinUse) -> Path
     return CACHE / fingerprint(about, *modules)
 
 
+def _worst(made: Fit) -> Iterator[str]:
+    """A line for each condition: the value with the worst accuracy. Beyond an outermost value no
+    figure of these sweeps shows what to expect."""
+    for name, (value, right, total, outermost) in made.worst_values().items():
+        if right < total:
+            unit = f" {made.train.units[name]}" if name in made.train.units else ""
+            share = formatting.percent(right / total, 0)
+            said = "; outermost: expect less beyond it" if outermost else ""
+            yield f"worst {name}: {text_of(value)}{unit}, {share} of {total}{said}"
+
+
 def _print_held_out(made: Fit) -> None:
     """Print the accuracy on the sweeps that judged the fit, and how they differ from those of
     --rest."""
@@ -368,6 +381,7 @@ def _print_held_out(made: Fit) -> None:
             say(f"every sweep has the same {name}: expect less at another, no figure shows it")
     if made.calibration:
         say(*formatting.figure_lines(figures := made.held_out_figures()))
+        say(*_worst(made))
         if len(conditions) > 1:
             mean = sum(figures[f"held-out {name}"]["accuracy"] for name in conditions)
             share = formatting.percent(mean / len(conditions))

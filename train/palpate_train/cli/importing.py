@@ -45,6 +45,10 @@ OPTIONS = {
     ),
 }
 """Options that are texts, "" without them."""
+FILES = {
+    "--labels": "a table of the files and their fields; its first line: file,material,position",
+    "--report": "a line for each file, imported or not",
+}
 
 
 def register(add: Add) -> None:
@@ -59,12 +63,6 @@ def register(add: Add) -> None:
         help=f"meaning of the names below FOLDER: {EXAMPLE}, '{{material}}/{{speed}}/{{}}.csv'",
     )
     command.add_argument(
-        "--labels",
-        type=Path,
-        metavar="FILE",
-        help="a table of the files and their fields; its first line: file,material,position",
-    )
-    command.add_argument(
         "--field",
         action="append",
         default=[],
@@ -74,9 +72,8 @@ def register(add: Add) -> None:
     command.add_argument(
         "--out", type=Path, required=True, metavar="SET", help="the sweep set (.npz, .h5)"
     )
-    command.add_argument(
-        "--report", type=Path, metavar="FILE", help="a line for each file, imported or not"
-    )
+    for option, text in FILES.items():
+        command.add_argument(option, type=Path, metavar="FILE", help=text)
     command.add_argument("--transpose", action="store_true", help="arrays are taxels x frames")
     for option, (metavar, text) in OPTIONS.items():
         command.add_argument(option, default="", metavar=metavar, help=text)

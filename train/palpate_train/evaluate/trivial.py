@@ -85,6 +85,20 @@ def lines(protocol: str, means_removed: bool, found: Json) -> Iterator[str]:
         yield f"{f'({name})':<20} {protocol:<22} {means:<6} {count} {ends}"
 
 
+def above(result: Json) -> str:
+    """A warning if a baseline beside a result of `evaluate` classifies more sweeps correctly, else
+    ""."""
+    window = result["window"]
+    share = window["right"] / window["total"]
+    name, best = max(result["baselines"].items(), key=lambda item: float(item[1]["accuracy"]))
+    if best["accuracy"] <= share:
+        return ""
+    return (
+        f"warning: ({name}) has {best['accuracy']:.3f}, more than {result['method']} under "
+        f"{result['protocol']}: so simple a rule suffices for these sweeps, or they are too few"
+    )
+
+
 def _scaled(x: Array) -> Array:
     x = x[:, np.ptp(x, axis=0) > 0]
     if not x.shape[1]:

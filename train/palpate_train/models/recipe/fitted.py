@@ -26,7 +26,8 @@ from palpate_train.answer.fit_contact import Contacts
 from palpate_train.answer.fit_displacement import AugmentedCopies
 from palpate_train.answer.heads import HeadPlan
 from palpate_train.data.augment import COPIES, Augmentation, copies
-from palpate_train.data.sets import Dataset
+from palpate_train.data.sets import OWN_NUMBERS, Dataset
+from palpate_train.metrics.answers import outcomes
 from palpate_train.models.linear_head import hold_out
 from palpate_train.models.methods import Model
 from palpate_train.models.recipe import graph, spectrum
@@ -124,6 +125,32 @@ class Fit:
                 of, at = held.numbers, recordings[held.numbers]
                 figures |= held.answers(at).figures(labels[of], at, f"held-out {name}")
         return figures
+
+    def worst_values(self) -> dict[str, tuple[Any, int, int, bool]]:
+        """For each condition of `held_out_figures` but recordings the value of whose sweeps the
+        smallest share is classified correctly: the value, its correct sweeps and all, and whether
+        it is the least or the largest of numbers."""
+        found: dict[str, tuple[Any, int, int, bool]] = {}
+        labels = np.append(self.train.labels, self.held.labels)
+        for name, held in self.calibration.held.items() if self.calibration else ():
+            of, group = held.numbers, np.append(self.train.group(name), self.held.group(name))
+            answers = held.answers(of)
+            right = outcomes(answers.labels, answers.ok, labels[of])["right"]
+            values, member = np.unique(group[of], return_inverse=True)
+            counts, total = np.bincount(member, right), np.bincount(member)
+            worst = int((counts / total).argmin())
+            scale = group.dtype.kind in "iuf" and name not in OWN_NUMBERS
+            outermost = scale and worst in (0, len(values) - 1)
+            if name != "recording" and len(values) > 1:
+                value = values[worst].item()
+                found[name] = value, int(counts[worst]), int(total[worst]), outermost
+        return found
+
+    @property
+    def sweeps(self) -> int:
+        """Number of sweeps that its heads saw; without a held-out part both sides are the same."""
+        alone = self.about["held_out_by"] == "nothing"
+        return len(self.train) if alone else len(self.train) + len(self.held)
 
     def save(self, path: Path) -> None:
         """Write the fit as one .npz without pickle. Training and held-out sweeps are one set, the
