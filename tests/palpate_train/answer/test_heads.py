@@ -140,3 +140,23 @@ def test_one_sweep_of_each_material_is_too_few():
     """The message counts them."""
     with pytest.raises(FormatError, match="3 sweeps"):
         heads.fit_discriminant(np.eye(3), np.arange(3), 3)
+
+
+@pytest.mark.parametrize("size", [10, 200])
+def test_weights_count_for_means_and_scatter(size: int):
+    """A weight of 0 is as if the sweep was not there, equal weights change nothing, and means are
+    weighted."""
+    x, labels = drawn(60, size)
+    under = (np.arange(60) % 3)[:, None]
+    kept = np.arange(60) % 5 > 0
+    for weights, same in ((np.full(60, 3.0), slice(None)), (kept.astype(float), kept)):
+        found = heads.fit_discriminant(x, labels, 4, under, weights)
+        wanted = heads.fit_discriminant(x[same], labels[same], 4, under[same])
+        for one, other in zip(found, wanted, strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5)
+    heavy = np.where(kept, 1.0, 1e6)
+    found, wanted = (
+        heads.fit_discriminant(x, labels, 4, None, weights) for weights in (heavy, 1.0 * ~kept)
+    )
+    alike = np.corrcoef(found[0].ravel(), wanted[0].ravel())[0, 1]
+    assert alike > 0.9

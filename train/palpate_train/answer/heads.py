@@ -49,12 +49,14 @@ class HeadPart:
     def fit(self, data: HeadData, classes: int) -> tuple[Array, Array]:
         """Weight [K, F] over all features, and bias [K]; see fit_discriminant."""
         columns, y, under = np.array(self.columns), data.labels, data.conditions
+        counts = data.weights
         weight = np.zeros((classes, data.features.shape[1]), np.float32)
         seen = data.features[:, columns]
         if self.copies:
             seen = np.concatenate([seen, data.copied[:, columns]])
             y, under = np.append(y, y[data.source]), np.concatenate([under, under[data.source]])
-        weight[:, columns], bias = fit_discriminant(seen, y, classes, under)
+            counts = None if counts is None else np.append(counts, counts[data.source])
+        weight[:, columns], bias = fit_discriminant(seen, y, classes, under, counts)
         return weight * np.float32(self.factor), bias * np.float32(self.factor)
 
 
@@ -62,13 +64,15 @@ class HeadPart:
 class HeadData:
     """Sweeps that a head is fitted to. features: [N, F], labels [N]. copied: [M, F] of augmented
     copies; source: the number [M] of the sweep of each copy. conditions: int [N, C], the value of
-    each condition that can be new in service."""
+    each condition that can be new in service. weights: [N], how much each sweep counts with its
+    copies; None if all count alike."""
 
     features: Array
     labels: Array
     copied: Array
     source: Array
     conditions: Array
+    weights: Array | None = None
 
     def take(self, kept: Array) -> HeadData:
         """The sweeps `kept` (mask) and their copies."""
@@ -80,6 +84,7 @@ class HeadData:
             self.copied[also],
             position[self.source[also]],
             self.conditions[kept],
+            None if self.weights is None else self.weights[kept],
         )
 
     def beside(self, other: HeadData) -> HeadData:
@@ -148,16 +153,26 @@ class HeadPlan:
 
 
 def fit_discriminant(
-    features: Array, labels: Array, classes: int, conditions: Array | None = None
+    features: Array,
+    labels: Array,
+    classes: int,
+    conditions: Array | None = None,
+    weights: Array | None = None,
 ) -> tuple[Array, Array]:
     """Weight [K, F] and bias [K], float32, from features [N, F] of sweeps with labels [N] below
     `classes`.
 
     conditions: int [N, C], the value of each condition; how the values differ widens the scatter to
-    what one more value is expected to add. The logits of a material without a sweep are ABSENT.
+    what one more value is expected to add. weights: [N], how much each sweep counts for the means
+    and the scatter; one that counts 0 is left out. The logits of a material without a sweep are
+    ABSENT.
     Raises FormatError if there is only one sweep of each material, which does not show how
     materials vary.
     """
+    if weights is not None and not weights.all():
+        kept = weights > 0
+        under = None if conditions is None else conditions[kept]
+        return fit_discriminant(features[kept], labels[kept], classes, under, weights[kept])
     present, member = np.unique(labels, return_inverse=True)
     x = np.array(features, np.float64)
     if len(x) <= len(present):
@@ -165,9 +180,7 @@ def fit_discriminant(
             f"{len(x)} sweeps of as many materials are too few for a linear discriminant; record "
             "more"
         )
-    means = np.stack([x[member == k].mean(axis=0) for k in range(len(present))])
-    for k in range(len(present)):  # in place: features of many sweeps fill the memory
-        x[member == k] -= means[k]
+    means = _centre(x, member, weights)
     columns = range(0, x.shape[1], BATCH)
     spread = np.concatenate([x[:, first : first + BATCH].std(axis=0) for first in columns])
     spread = np.maximum(spread, max(1e-6 * float(spread.max(initial=0)), 1e-12))
@@ -182,6 +195,21 @@ def fit_discriminant(
     weight[present] = centred / spread
     bias[present] = sizes.mean() - sizes - weight[present] @ middle
     return weight.astype(np.float32), bias.astype(np.float32)
+
+
+def _centre(x: Array, member: Array, weights: Array | None) -> Array:
+    """Means [K, F] of the rows of `x` [N, F] of each label; subtracts them, and scales each row so
+    that its square counts by its weight. In place: features of many sweeps fill the memory."""
+    counts = np.ones(len(x)) if weights is None else weights / weights.mean()
+    means = []
+    for k in range(int(member.max()) + 1):
+        of = member == k
+        own = x[of]
+        means.append(own.mean(axis=0) if weights is None else counts[of] @ own / counts[of].sum())
+        x[of] = own - means[-1]
+    if weights is not None:
+        x *= np.sqrt(counts)[:, None]
+    return np.stack(means)
 
 
 def _differences(z: Array, labels: Array, conditions: Array) -> Array:

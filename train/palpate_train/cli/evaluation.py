@@ -120,9 +120,7 @@ def run_evaluate(args: argparse.Namespace) -> None:
             continue
         about = {"only": args.only, "each": args.each, "baselines": trivially[result.protocol]}
         results.append(result.json() | about)
-        say(evaluate.line(results[-1]))
-        if warning := trivial.above(results[-1]):
-            log.keep(f"palpate-train: {warning}")
+        _tell(results[-1], log)
         if args.json:
             results[-1] |= {"each_fold": result.each_fold()}
             results.sort(
@@ -137,6 +135,13 @@ def run_evaluate(args: argparse.Namespace) -> None:
         raise FormatError(
             f"{', '.join(refused)} left out of {', '.join(names)}; the lines above say why"
         )
+
+
+def _tell(result: dict[str, Any], log: options.Log) -> None:
+    """Print a result as a line, and a warning if a baseline is better."""
+    say(evaluate.line(result))
+    if warning := trivial.above(result):
+        log.keep(f"palpate-train: {warning}")
 
 
 def _beside(sweeps: Dataset, plan: evaluate.Plan, log: options.Log) -> dict[str, Any]:

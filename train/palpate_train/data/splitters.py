@@ -192,8 +192,11 @@ def _checked(what: str, train: Array, test: Array, sweeps: Dataset) -> Fold:
     return np.flatnonzero(train), np.flatnonzero(test)
 
 
-OF_THE_SET = ("recording", "set", "split", "trial", "world")
-"""Groups that say where a sweep comes from. They are not conditions that a user would vary."""
+WEIGHT = "sample_weight"
+"""Group that says how much a sweep counts."""
+OF_THE_SET = ("recording", "set", "split", "trial", "world", WEIGHT)
+"""Groups that say where a sweep comes from, or what it counts. They are not conditions that a user
+would vary."""
 RANDOM_PARTS, MOST_PARTS = 5, 3
 """Parts of recordings, and most parts of another group."""
 

@@ -19,6 +19,7 @@ from sklearn.base import (
 )
 from sklearn.utils import check_random_state, column_or_1d
 from sklearn.utils.multiclass import check_classification_targets
+from sklearn.utils.validation import _check_sample_weight as check_sample_weight
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from palpate.answer.objects import softmax
@@ -29,6 +30,7 @@ from palpate.inference.session import ModelRunner
 from palpate_train.data import labels
 from palpate_train.data.run import Run
 from palpate_train.data.sets import Dataset
+from palpate_train.data.splitters import WEIGHT
 from palpate_train.export import pack, quantized_bundle
 from palpate_train.library.sweeps import (
     as_value_errors,
@@ -99,19 +101,26 @@ class PalpateClassifier(
         return tags
 
     @as_value_errors()
-    def fit(self, X: Any, y: Any = None, groups: Any = None) -> Self:
+    def fit(self, X: Any, y: Any = None, groups: Any = None, sample_weight: Any = None) -> Self:
         """Fit to sweeps.
 
         X: [n, channels, time], [n, time] of one channel or [n, time, rows, columns(, axes)], or a
         Dataset, which brings its labels, groups and rate. y: a label for each sweep. groups: a
         value for each sweep, or several groups by name, as a table or dictionary; sweeps with the
-        same value are not split. Raises FormatError, which is a ValueError too.
+        same value are not split. sample_weight: how much each sweep counts for the discriminants;
+        it counts 1 for their choice and for trained stages. Raises FormatError, which is a
+        ValueError too.
         """
         if self.size not in (None, *SIZES):
             raise FormatError(f"size {self.size!r} is unknown; use one of {', '.join(SIZES)}")
         sweeps = X if isinstance(X, Dataset) else self._dataset(X, y, groups)
         if isinstance(X, Dataset):
             self.classes_ = np.array(sweeps.materials)
+        if sample_weight is not None:
+            weights = check_sample_weight(
+                sample_weight, sweeps.samples, dtype=np.float64, ensure_non_negative=True
+            )
+            sweeps = replace(sweeps, groups=sweeps.groups | {WEIGHT: weights})
         use = SkinUse(self.reattached, float(self.mains_hz))
         size = SIZES[self.size] if self.size else UNLIMITED
         settings = recipe.Settings(

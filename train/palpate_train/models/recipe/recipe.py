@@ -41,7 +41,7 @@ from palpate_train.data.augment import (
 from palpate_train.data.progress import StageLine
 from palpate_train.data.run import Log, Run
 from palpate_train.data.sets import Dataset
-from palpate_train.data.splitters import InnerPart, inner_parts
+from palpate_train.data.splitters import WEIGHT, InnerPart, inner_parts
 from palpate_train.data.thinning import thinned
 from palpate_train.metrics.score import interval
 from palpate_train.models.linear_head import hold_out_or_all
@@ -231,6 +231,7 @@ class Setup:
             np.concatenate(of_copies),
             source,
             self.values,
+            self.sweeps.groups.get(WEIGHT),
         )
 
     def scores(self, data: HeadData, parts: list[InnerPart]) -> HeldOutScores:
