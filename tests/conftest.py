@@ -81,8 +81,7 @@ def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    """A browser, for the tests of pages. Not for the whole session: while it is open, asyncio.run
-    of another test would fail."""
+    """A browser for the module; while it is open, asyncio.run of another test would fail."""
     with browsers.launched() as one:
         yield one
 

@@ -110,9 +110,7 @@ class Backend(Protocol):
 
 
 def chosen() -> str:
-    """The name in PALPATE_BACKEND, by default the simulator. Raises BackendMissing if it is
-    unknown.
-    """
+    """The name in PALPATE_BACKEND, by default the simulator. Raises BackendMissing."""
     name = os.environ.get(VARIABLE) or "simulated"
     if name not in NAMES:
         raise BackendMissing(f"{VARIABLE} = {name!r} is unknown; known are {', '.join(NAMES)}")

@@ -73,9 +73,7 @@ class Mocked(real.Real):
 
 @contextmanager
 def opened() -> Iterator[Mocked]:
-    """A mocked machine. Raises BackendMissing if umockdev is not installed or does not wrap this
-    process.
-    """
+    """A mocked machine. Raises BackendMissing without umockdev, or if it wraps no ioctls here."""
     with ExitStack() as stack:
         bench = mocks.MockedDevices()
         stack.callback(bench.close)

@@ -151,9 +151,7 @@ class Chip:
                 self._levels[self._names[offset]] = bool(bits >> i & 1) != bool(flags & ACTIVE_LOW)
 
     def _look(self) -> None:
-        """Forget closed requests. Outputs keep their level, as on chips whose driver does not reset
-        them.
-        """
+        """Forget closed requests. Outputs keep their level, as some drivers leave them."""
         for slot, held in list(self._held.items()):
             with suppress(OSError):
                 if os.path.sameopenfile(held.file, held.pipe):

@@ -200,9 +200,7 @@ class Socket:
         self._bench.attach(self.name, device.answer)
 
     def unplug(self) -> None:
-        """Pull the board out: pending requests fail, the kernel sends a uevent and the node
-        disappears.
-        """
+        """Pull the board out: requests fail, the kernel sends a uevent, the node disappears."""
         if not self.device:
             return
         self.device.gone, self.device = True, None

@@ -100,9 +100,7 @@ class MockedDevices:
         return self._root / "dev" / name
 
     def take_away(self, name: str, on: bool) -> None:
-        """Hide /dev/NAME, or show it again, without a uevent. umockdev keeps a socket open for each
-        lookup.
-        """
+        """Hide /dev/NAME, or show it again, without a uevent (each look-up keeps a socket open)."""
         node, away = self.node(name), self.node(f"{name}.away")
         (node if on else away).rename(away if on else node)
 
@@ -119,10 +117,7 @@ class MockedDevices:
             be_to_files(os.geteuid() or NOBODY)
 
     def attach(self, name: str, answer: Callable[[int, Any, int], None]) -> None:
-        """Answer the ioctls of /dev/NAME with answer(number, argument, number of the open file).
-
-        An OSError of `answer` becomes the ioctl's errno.
-        """
+        """Answer its ioctls with answer(number, argument, open file); OSError becomes the errno."""
 
         class Handler(self._base):  # type: ignore[misc,name-defined]
             """umockdev's interface for handlers of ioctls."""

@@ -256,8 +256,7 @@ def sound(played: PlayedScene) -> None:
 def campaign(
     scene: str, every: int, *, lasting: bool, report: Callable[[str], object] = print
 ) -> tuple[int, int]:
-    """Throw at each `every`-th call of a scene; the number of runs, and of those with a fault.
-    lasting: the method fails from then on."""
+    """The runs, and those with a fault; throws at each `every`-th call. lasting: from then on."""
     model = bundle.load(bundle.DEFAULT)
     calls = ThrowingCalls(at=0)
     sound(play(scene, model, calls))

@@ -60,8 +60,7 @@ def flips(files: Files, name: str, count: int | None, seed: int) -> Iterator[Cas
 
 
 def swaps(one: Files, other: Files) -> Iterator[Case]:
-    """Each file, and each pair of files, replaced by those of another signed bundle; the manifest
-    with its signature is from that bundle."""
+    """Each file, and each pair of files, replaced by those of another signed bundle."""
     names = sorted(one)
     for i, name in enumerate(names):
         yield "a file swapped", name, one | {name: other[name]}
@@ -76,8 +75,7 @@ def without(files: Files, name: str) -> Files:
 
 
 def another(key: Path) -> Files:
-    """A bundle that shares no file with the default: its golden sweeps and means are packed
-    otherwise, its weights differ slightly."""
+    """A bundle that shares no file with the default; its weights differ slightly."""
     held = deliveries.files(4, None)
     model = bytearray(held[bundle.MODEL])
     model[len(model) // 2] ^= 1
@@ -144,8 +142,7 @@ def others(files: Files, box: Delivery) -> Iterator[Case]:
 
 
 def cases(box: Delivery, manifest_bits: int | None, seed: int) -> Iterator[Case]:
-    """All alterations of a bundle that the box would accept. manifest_bits: number of bits of its
-    manifest that are drawn, None for all."""
+    """All alterations. manifest_bits: number of drawn bits of its manifest, None for all."""
     good, other = deliveries.files(3, box.key), another(box.key)
     assert not any(good[name] == other[name] for name in good)
     yield from others(good, box)

@@ -55,8 +55,7 @@ SORRY = ("refused", "trial refused", "onnxruntime refused", "run refused", "ran"
 
 
 def tried(model: bytes, own: Own, rng: Random) -> dict[str, Any]:
-    """The outcome of one model in this process: its name, the reason, processor milliseconds of the
-    check, seconds, most MB more."""
+    """Its name, the reason, processor ms of the check, seconds, and most MB more."""
     before = memory("VmRSS")
     Path("/proc/self/clear_refs").write_text("5")
     begin, begin_cpu = time.perf_counter(), time.process_time()
@@ -92,8 +91,7 @@ def tried(model: bytes, own: Own, rng: Random) -> dict[str, Any]:
 
 
 def trial(model: bytes) -> None:
-    """The trial of the box in its sandbox: a sweep, here one at rest. Raises BundleError if it is
-    slow."""
+    """The box's trial in its sandbox: a sweep at rest. Raises BundleError if it is slow."""
     opened = session(model)
     begin_s = time.process_time()
     (takes,) = opened.get_inputs()
@@ -108,8 +106,7 @@ def kind_of(takes: Any) -> np.dtype[Any]:
 
 
 def checked(model: bytes, own: Own) -> Bundle | None:
-    """The box's first check of it; the bundle of an enrolment. Raises BundleError if it is
-    refused."""
+    """The box's first check; the bundle of an enrolment. Raises BundleError."""
     if own is ENROLLING:
         files = mutated_enrolments.packaged() | {bundle.ENROLMENT: model}
         return bundle.from_files(files, "a campaign")
@@ -132,8 +129,7 @@ def run(opened: Any, rng: Random) -> None:
 
 
 def classify(classifier: Classifier, rng: Random) -> None:
-    """Classify these sweeps, and the golden sweeps, which have contact and so reach the class
-    means."""
+    """Classify these sweeps, and the golden sweeps, whose contact reaches the class means."""
     f = classifier.format
     noise = np.random.default_rng(rng.getrandbits(32)).integers(0, 255, (f.window, *f.shape))
     noise, number = noise.astype(f.numpy_type), np.arange(f.window)

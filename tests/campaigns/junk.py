@@ -357,8 +357,7 @@ def answer(box: Classifier, early: EarlyExit | None, taxels: NDArray[np.uint8]) 
 
 
 def counted(model: bundle.Bundle, world: skin.World, each: int) -> dict[str, dict[str, Any]]:
-    """The counts of each kind: sweeps, labels and wrong labels whole and early, and the statuses of
-    whole sweeps. Prints a row for each."""
+    """Prints and returns the sweeps, labels and wrong labels of each kind, whole and early."""
     box = Classifier(model, VirtualClock())
     early = EarlyExit(box) if model.manifest.early else None
     print(f"{'of ' + str(each):32} whole: ok, wrong; early: ok, wrong; most frequent status")

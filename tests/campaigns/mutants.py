@@ -48,8 +48,7 @@ Tests = dict[str, float]
 
 
 def drawn(package: str, count: int, seed: int) -> Iterator[tuple[str, str, str]]:
-    """Changes of a package: name, file and changed source. A place with many operators counts
-    once."""
+    """Changes of a package: name, file and changed source; a place counts once."""
     from cosmic_ray import plugins
     from cosmic_ray.ast import ast_nodes, get_ast
     from cosmic_ray.mutating import mutate_code

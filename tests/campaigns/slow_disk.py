@@ -40,8 +40,7 @@ class SlowDiskRun:
 
 
 def run(sync_s: float, fifo_s: float, seconds: float, folder: Path) -> SlowDiskRun:
-    """Record for some seconds on a disk whose syncs take `sync_s`, from a board whose FIFO holds
-    `fifo_s`."""
+    """Record on a disk whose syncs take `sync_s`, from a board whose FIFO holds `fifo_s`."""
     real_sync, said, answers = os.fsync, list[str](), Counter[str]()
     simulated = devices.build(skin.FORMAT, script.tubes(1), SystemClock(), "sim")
     simulated.backend.board = rig.ReadoutBoard(

@@ -110,8 +110,7 @@ def _later(
 
 
 def exported(sweeps: Dataset, folder: Path, seed: int, steps: int = 0) -> Bundle:
-    """The bundle of a fit of sweeps, written to a folder. Taxels that may be bridged are not
-    measured. steps: of the training of stages."""
+    """Writes the bundle of a fit to a folder. steps: of the training of stages."""
     fit = recipe.fit(sweeps, Run(seed), recipe.Settings(steps=steps))
     quantized_bundle.export(fit, folder, "taught", "1", "", proven=False)
     return bundle.load(folder)
@@ -127,8 +126,7 @@ def _right(of: Bundle, others: Dataset) -> Array:
 
 
 def _parts(sweeps: Dataset, each: int, seed: int) -> tuple[Dataset, Dataset]:
-    """`each` sweeps of each material, one of a recording as far as possible, and sweeps of other
-    recordings."""
+    """`each` sweeps of each material, of many recordings, and sweeps of other recordings."""
     shuffled = np.random.default_rng(seed).permutation(len(sweeps))
     first = shuffled[np.sort(np.unique(sweeps.group("recording")[shuffled], return_index=True)[1])]
     chosen = draw(first, sweeps.labels, each, seed)

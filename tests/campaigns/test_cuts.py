@@ -66,8 +66,7 @@ def wrong(points: list[CrashPoint]) -> list[str]:
 
 
 def test_what_is_not_synced_may_be_there_or_not(play: Makes):
-    """A new file: no name, or a name with no content, half of it, zeros or all; after a sync of its
-    content, no name or all."""
+    """A new file: no name, or a name with none, half or all of its content."""
     played = play("a = open(f / 'a', 'wb', 0); a.write(b'1234'); os.fsync(a.fileno())")
     contents = [b"", b"12", b"1234", bytes(4)]
     assert left(played, "fsync") == [{}] + [{"a": held} for held in (b"1234", b"", b"12", bytes(4))]
@@ -78,16 +77,14 @@ def test_what_is_not_synced_may_be_there_or_not(play: Makes):
 
 
 def test_what_is_overwritten_may_be_the_old_or_nothing(play: Makes):
-    """Overwritten in place and not synced: the old content may still be there, or half of the
-    new."""
+    """Overwritten and not synced: the old content may still be there, or half of the new."""
     played = play("(f / 'a').write_bytes(b'NEW.')", "(f / 'a').write_bytes(b'old')")
     assert [found["a"] for found in left(played, None)] == [b"NEW.", b"old", b"", b"NE", bytes(4)]
     assert [found["a"] for found in left(played, "write")] == [b"", b"old"]
 
 
 def test_a_renaming_is_never_half_done(play: Makes):
-    """A rename between folders, and an exchange of two names: before or after; a sync of one folder
-    is enough."""
+    """A rename or an exchange of names: before or after; a sync of one folder is enough."""
     before = "[storage.put(f / name, name.encode()) for name in 'ab']; (f / 'x').mkdir()"
     played = play(
         "(f / 'a').rename(f / 'x' / 'a'); storage.sync(f / 'x'); "
@@ -105,8 +102,7 @@ def test_a_renaming_is_never_half_done(play: Makes):
 
 
 def test_names_of_two_folders_come_in_any_order(play: Makes):
-    """The later of two changes may be on the disk without the earlier, unless both are in the same
-    folder."""
+    """The later of two changes may be on the disk alone, unless both are in one folder."""
     played = play(
         "[(f / name).mkdir() for name in ('x/1', 'x/2', 'y/3')]",
         "(f / 'x').mkdir(); (f / 'y').mkdir()",
@@ -116,8 +112,7 @@ def test_names_of_two_folders_come_in_any_order(play: Makes):
 
 
 def test_a_symlink_is_swapped_in_one_step(play: Makes):
-    """disk.link: at every moment it leads to the old or the new target, also if a link was left
-    half done before."""
+    """The link leads to the old or the new target, also if it was left half done before."""
     played = play(
         "storage.link(f / 'current', 'new')",
         "storage.link(f / 'current', 'old'); (f / 'current.part').symlink_to('x')",
@@ -128,8 +123,7 @@ def test_a_symlink_is_swapped_in_one_step(play: Makes):
 
 
 def test_a_kill_comes_before_its_call(play: Makes):
-    """A program that is killed on entry to a renaming has not renamed; the judge gets its earlier
-    output."""
+    """A program killed on entry to a renaming has not renamed; its output reaches the judge."""
     judged = []
     played = play(
         "print('now'); sys.stdout.flush(); (f / 'a').rename(f / 'b'); print('then')",
@@ -156,15 +150,13 @@ def test_a_kill_comes_before_its_call(play: Makes):
     ids=["mapped", "allocated", "a child's", "nameless", "failed"],
 )
 def test_what_cannot_be_followed_is_told(play: Makes, does: str):
-    """A program that changes files in an unknown way, or fails, is not mistaken for a program that
-    changes none."""
+    """A program that changes files in an unknown way, or fails, is not taken for idle."""
     with pytest.raises(NotFollowed):
         play(does, "(f / 'a').write_bytes(b'0')")
 
 
 def test_recording_loses_no_more_than_the_sweep_in_progress(work: Path):
-    """The power is cut at every moment of two runs, with some kills: every sweep that was reported
-    as stored is there."""
+    """Power cut at every moment of two runs, some kills: every sweep said to be stored is there."""
     played = ScenePlay(recording.scene(), work)
     points = [played.power(moment) for moment in played.moments()]
     points += [played.kill(moment) for moment in list(played.moments())[8:60:10]]
@@ -187,8 +179,7 @@ def test_the_command_that_records_loses_no_more_than_the_sweep_in_progress(work:
     ids=lambda scene: scene.name,
 )
 def test_a_kill_at_each_call_of_the_disk_thread_loses_no_more(work: Path, scene: CutScene):
-    """Killed before each sync and each other call that changes a file, in either thread. The
-    threads are told apart, because both make calls of the same names."""
+    """Killed before each call that changes a file, in either thread."""
     played = ScenePlay(scene, work)
     moments = [moment for moment in played.moments() if moment.call]
     syncs = [m for m in moments if m.call.name == "fsync" and m.call.thread]
@@ -197,8 +188,7 @@ def test_a_kill_at_each_call_of_the_disk_thread_loses_no_more(work: Path, scene:
 
 
 def test_a_kill_and_then_a_loss_of_power_lose_no_more(work: Path):
-    """Killed after it has made the folder and before it has synced it; the next run must not rely
-    on it."""
+    """Killed between making and syncing the folder; the next run must not rely on it."""
     played = ScenePlay(recording.scene(), work)
     made = next(m for m in played.moments() if m.call and m.call.name == "fsync")
     assert wrong([played.kill_then_power(made)]) == []
@@ -215,8 +205,7 @@ def test_ways_that_are_wrong_are_found(work: Path, way: str):
 
 
 def test_the_black_box_loses_no_more_than_the_sweep_in_progress(work: Path):
-    """The power is cut at every moment of two runs: the last sweeps are there, and never many
-    more."""
+    """Power cut at every moment of two runs: the last sweeps are there, never many more."""
     played = ScenePlay(black_box.scene(), work)
     assert wrong([played.power(moment) for moment in played.moments()]) == []
 
@@ -230,8 +219,7 @@ def shop(tmp_path_factory: pytest.TempPathFactory) -> delivery.Shop:
 
 
 def cut_at_renames(played: ScenePlay) -> list[CrashPoint]:
-    """Killed before each file is renamed; the power is cut before the link to the bundle is
-    renamed."""
+    """Killed before each rename; power cut before the link to the bundle is renamed."""
     return [
         (played.power if moment.call.paths[1].endswith("/current") else played.kill)(moment)
         for moment in played.moments()
@@ -244,8 +232,7 @@ def cut_at_renames(played: ScenePlay) -> list[CrashPoint]:
 def test_a_command_that_is_cut_short_leaves_the_old_bundle_or_the_new(
     shop: delivery.Shop, work: Path, name: str
 ):
-    """Killed before each rename of a file, and a power cut before the link is swapped: the box
-    starts, answers, and takes the next bundle; no sweep and no decision is lost."""
+    """Cut anywhere, the box starts, answers and takes the next bundle; no sweep is lost."""
     once = teaching.TeachingShop(shop.folder).once
     scenes = {"delivery": shop.alone, "enrolment": shop.learns, "teaching": lambda way: once()}
     points = cut_at_renames(ScenePlay(scenes[name]("right"), work))
@@ -261,8 +248,7 @@ def test_a_command_that_is_cut_short_leaves_the_old_bundle_or_the_new(
 def test_what_happens_to_a_box_in_between_is_as_the_scene_says(
     shop: delivery.Shop, work: Path, name: str
 ):
-    """The power fails after each command: the bundle that the scene expects answers, and the next
-    is taken."""
+    """Power fails after each command: the expected bundle answers, and the next is taken."""
     taught = teaching.TeachingShop(shop.folder).teaching
     scenes = {"delivery": shop.scene, "enrolment": shop.enrolment, "teaching": taught}
     played = ScenePlay(scenes[name](), work)

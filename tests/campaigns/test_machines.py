@@ -36,8 +36,7 @@ SHOWN_SWEEPS = 8
 
 @pytest.fixture(scope="session")
 def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The default bundle with simulated sweeps, a freshly trained bundle for each type of raw
-    counts, and a network that overflows."""
+    """The default bundle, a fresh bundle for each type of raw counts, a network that overflows."""
     if os.environ.get("PALPATE_MACHINES") == "1":
         emulated_machines.set_up()
     folder = tmp_path_factory.mktemp("given")
@@ -68,8 +67,7 @@ def _show(folder: Path, name: str) -> None:
 
 
 def overflowing(folder: Path) -> None:
-    """A convolution with weights of eight bits over bytes at their maximum: two of its products
-    overflow 16 bits."""
+    """A convolution over bytes at their maximum: two of its products overflow 16 bits."""
     folder.mkdir()
     taps = np.full((32, 32, 5), 127, np.int8)
     constants = {
@@ -132,8 +130,7 @@ def there(
 def test_a_bundle_says_the_same_on_every_machine(
     here: dict[str, np.ndarray], there: tuple[str, dict[str, np.ndarray]]
 ):
-    """Golden sweeps and others: the same labels, and probabilities within the tolerance of the
-    box's self test."""
+    """The same labels, and probabilities within the tolerance of the box's self test."""
     name, there_result = there
     assert there_result.keys() == here.keys()
     for what in here:
@@ -151,8 +148,7 @@ def test_a_bundle_says_the_same_on_every_machine(
 def test_what_int8_computes_is_the_same_to_the_bit(
     here: dict[str, np.ndarray], there: tuple[str, dict[str, np.ndarray]]
 ):
-    """The inner tensors: at most one number in ten thousand differs, where an earlier float value
-    was rounded the other way."""
+    """One inner number in ten thousand may differ, where an earlier float was rounded otherwise."""
     name, there_result = there
     for what in here:
         if what.endswith(" inside/shown"):
@@ -165,8 +161,7 @@ def test_what_int8_computes_is_the_same_to_the_bit(
 
 
 def test_an_x86_without_vnni_is_one(there: tuple[str, dict[str, np.ndarray]]):
-    """Eight-bit weights overflow there, and only there: the machine has the processor of its name,
-    and would show a difference."""
+    """Eight-bit weights overflow there, and only there: it would show a difference."""
     name, there_result = there
     exact = round(32 * 5 * 127 * 255 / 2**15)
     assert (there_result[f"{EIGHT_BITS}/shown"] == exact).all() == (

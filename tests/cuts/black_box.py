@@ -59,8 +59,7 @@ def _goes_on(folder: Path, last: str) -> list[str]:
 
 
 def scene(how: str = "") -> CutScene:
-    """Two runs that keep sweeps; the second continues in the folder of the first. how: "thread" to
-    write beside the loop."""
+    """Two runs that keep sweeps in one folder. how: "thread" to write beside the loop."""
     program = [sys.executable, "-m", "tests.cuts.black_box"]
 
     def step(name: str) -> SceneStep:

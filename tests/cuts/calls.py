@@ -124,8 +124,7 @@ def output(call: SystemCall) -> str:
 
 
 def _calls(lines: list[str], folder: str) -> Iterator[SystemCall]:
-    """The calls in the order in which they ended; last those that did not end because the process
-    was killed."""
+    """The calls in the order of their ends; last those in which the process was killed."""
     counts: Counter[tuple[str, str]] = Counter()
     ranks: dict[str, int] = {}
     parsed = [_parsed(line) for line in _joined(lines)]

@@ -94,8 +94,7 @@ class Shop:
         return output + [word for value in (*where, *how) for word in ("--set", value)]
 
     def palpate(self, name: str, *words: str, way: str = "", code: int | None = None) -> SceneStep:
-        """A command of the box, in one of WAYS or unchanged. code: its exit code, if it differs
-        from that of its way."""
+        """A command of the box, in one of WAYS or unchanged. code: its exit code, if another."""
         program = ["tests.cuts.delivery", way] if way else ["palpate"]
         ends = code if code is not None else DIED if way == "crash" else 0
         return SceneStep(
@@ -143,8 +142,7 @@ class Shop:
         return self._scene("delivery", _bare, list(self.steps()))
 
     def enrolment(self) -> CutScene:
-        """A box that runs the first bundle learns LABELS, one after the other, removes a label, and
-        gets another bundle; each command is cut short."""
+        """A box learns LABELS, removes one and gets another bundle; each command is cut."""
         return self._scene("enrolment", self._delivered, list(self._enrolments()), self._learned())
 
     def records(self, label: str) -> SceneStep:
@@ -185,8 +183,7 @@ class Shop:
         yield "felt second", do("install another", "bundles", "install", "@second")
 
     def _learned(self, labels: tuple[str, ...] = LABELS) -> dict[str, str]:
-        """The ids of the bundle with each of the labels added: the same sweeps give the same
-        bytes."""
+        """The ids of the bundle with each label added: the same sweeps give the same bytes."""
         with TemporaryDirectory() as aside:
             self._delivered(folder := Path(aside))
             ids = {}
@@ -262,8 +259,7 @@ def _bare(folder: Path) -> None:
 
 
 def _promised(output: str) -> str:
-    """The bundle that must run from the next start on, if the command that is cut has just
-    announced it."""
+    """The bundle that must run from the next start, if the cut command has announced it."""
     reported = PROMISE.fullmatch(output.splitlines()[-1])
     return next(filter(None, reported.groups())) if reported else ""
 
@@ -282,8 +278,7 @@ def _end(output: str) -> str:
 
 
 def _apart(words: list[str]) -> tuple[int, str]:
-    """Run a command of the box in a child that has loaded its libraries already; exit code and
-    output."""
+    """Exit code and output of a command of the box, in a child with its libraries loaded."""
     reported = os.memfd_create("output")
     sys.stdout.flush()  # otherwise the child prints it too
     child = os.fork()

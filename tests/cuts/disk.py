@@ -35,8 +35,7 @@ earlier."""
 
 @dataclass(eq=False, slots=True)
 class File:
-    """A file. synced: its content that is certain to be on the disk. at: position of the next
-    write, None for the end."""
+    """synced: content certain to be on the disk. at: position of the next write, None: the end."""
 
     data: bytes = b""
     synced: bytes = b""
@@ -45,8 +44,7 @@ class File:
 
 @dataclass(eq=False, slots=True)
 class Folder:
-    """A folder. names: as a program sees them. synced: the names that are certain to be on the
-    disk."""
+    """names: as a program sees them. synced: those that are certain to be on the disk."""
 
     names: dict[str, Inode] = field(default_factory=dict)
     synced: dict[str, Inode] = field(default_factory=dict)

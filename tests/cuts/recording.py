@@ -85,8 +85,7 @@ def taken(number: int, format: SweepFormat) -> tuple[Sweep, Verdict]:
 def _aside(
     files: Files, write: Callable[[Path, bytes], object], settle: Callable[[Path], object]
 ) -> None:
-    """Write all files under temporary names, then rename them; settle: called for each name
-    afterwards."""
+    """Write all files under temporary names, then rename them. settle: called after each."""
     for path, data in files.items():
         write(path.with_name(path.name + storage.PART), data)
     for path in files:
@@ -150,8 +149,7 @@ def read(folder: Path) -> tuple[list[str], dict[str, str]]:
 
 
 def reported(output: str) -> tuple[dict[str, str], dict[str, str]]:
-    """The robot's knowledge: session and number of the stored sweeps, and of the discarded. A sweep
-    that is being discarded is in neither."""
+    """Session and number of the stored sweeps, and of the discarded; in neither meanwhile."""
     owed: dict[str, str] = {}
     gone: dict[str, str] = {}
     leaving = ""

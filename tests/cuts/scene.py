@@ -152,8 +152,7 @@ class ScenePlay:
         return self.work / "folder"
 
     def moments(self) -> Iterator[Moment]:
-        """All moments in their order. At each moment, the effects of the command before the
-        previous are on the disk."""
+        """All moments in order; the effects of the command before the previous are on the disk."""
         output = self.output
         for i, run in enumerate(self.runs):
             disk = Disk(self.folder, self.before[max(i - 1, 0)], self.scene.apart)

@@ -36,8 +36,7 @@ def write(found: Tree, folder: Path) -> None:
 
 
 def digest(found: Tree, apart: re.Pattern[str] = NOTHING) -> str:
-    """Equal for equal contents. Paths that match `apart` do not count, nor do names made by
-    tempfile."""
+    """Equal for equal contents. Paths that match `apart`, and tempfile's names, do not count."""
     digested = hashlib.sha256()
     for name, held in sorted(
         (MADE_UP.sub("-*", name), held) for name, held in found.items() if not apart.fullmatch(name)

@@ -41,8 +41,7 @@ def eventually(there: Callable[[], bool]) -> None:
 
 @contextmanager
 def bridge(kind: str, *options: str | Path) -> Iterator[tuple[str, int]]:
-    """Run a bridge in a thread, which takes a tenth of the time of a process; yields its
-    address."""
+    """Run a bridge in a thread, ten times as fast as a process; yields its address."""
     parser = argparse.ArgumentParser("bridge")
     add_arguments(parser)
     args = parser.parse_args([kind, "--listen", "127.0.0.1:0", *map(str, options)])

@@ -16,9 +16,7 @@ def plain_inputs(
     fixed: int = 0,
     faulty: np.ndarray | None = None,
 ) -> CalibrationInputs:
-    """Inputs from features [N, D + 1, F] and their labels. faulty: by default no sweep is
-    faulty.
-    """
+    """Inputs from features [N, D + 1, F] and labels. faulty: by default none."""
     none = AugmentedCopies(prefixes[:0, -1], labels[:0], groups[:0], np.zeros(0, bool))
     return CalibrationInputs(
         prefixes,

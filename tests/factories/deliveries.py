@@ -45,9 +45,7 @@ def line(key: Path, name: str = SIGNER, options: str = "") -> str:
 
 
 def files(counter: int, key: Path | None, **changes: object) -> dict[str, bytes]:
-    """The files of the default bundle with another counter, signed. changes: fields of its
-    manifest.
-    """
+    """The files of the default bundle with another counter, signed. changes: of its manifest."""
     held = {
         name: data
         for name, data in bundle.files(bundle.DEFAULT).items()
@@ -72,9 +70,7 @@ def signed(held: dict[str, bytes], key: Path) -> dict[str, bytes]:
 def enrolled(
     held: dict[str, bytes], key: EnrolmentKey | None, label: str = "cork"
 ) -> dict[str, bytes]:
-    """The files of a bundle with one more label, as the box makes them from the first golden
-    sweep.
-    """
+    """A bundle with one more label, made by the box from the first golden sweep."""
     made = bundle.from_files(held, "a test")
     new = enrolment.enrol(made, label, made.golden[:1])
     return enrolment.files(held, new, key.sign(new.file) if key else None)

@@ -69,10 +69,7 @@ def times(*entries: dict[str, Any]) -> dict[str, Any]:
 
 
 def figures(**changes: Any) -> dict[str, Any]:
-    """Three tests and four methods.
-
-    The third method cannot run the second test.
-    """
+    """Three tests and four methods; the third cannot run the second test."""
     results = [
         entry("one", "palpate", 0.9),
         entry("one", "quick <b>", 0.8),

@@ -65,9 +65,7 @@ def folder() -> Path:
 
 
 def qemu(kind: str) -> str:
-    """The emulator of an architecture: this machine's emulator, else that of `set_up`. Raises
-    Missing.
-    """
+    """The emulator of an architecture: this machine's, else that of `set_up`. Raises Missing."""
     for name in (f"qemu-{kind}-static", f"qemu-{kind}"):
         if found := shutil.which(
             name, path=f"{os.environ['PATH']}:{folder() / 'qemu' / 'usr' / 'bin'}"
@@ -128,9 +126,7 @@ def whole(target: Path, make: Callable[[Path], None]) -> Path:
 
 
 def set_up() -> Path:
-    """The folder of the arm64 userland, made if it is missing. Raises Missing if apt or pip
-    fail.
-    """
+    """The folder of the arm64 userland, made if missing. Raises Missing if apt or pip fail."""
     return whole(folder(), _make)
 
 

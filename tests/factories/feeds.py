@@ -96,8 +96,7 @@ class FeedPeer:
 
 
 class Offered:
-    """A feed whose turns a test takes. cost_ns: processor time of each look at the sockets.
-    known: more of the first line."""
+    """A feed whose turns a test takes. cost_ns: of each look at the sockets."""
 
     def __init__(
         self,

@@ -51,9 +51,7 @@ def check() -> None:
 
 
 def set_up() -> Path:
-    """The folder with the two Debians, `bare` and `ready`, made if it is missing. Raises
-    Missing.
-    """
+    """The folder with the Debians `bare` and `ready`, made if missing. Raises Missing."""
     check()
     return whole(folder(), _make)
 
@@ -81,9 +79,7 @@ fetch(locked(LOCK.read_text(), sys.argv[1], platform.machine()), sys.argv[1], pl
 
 
 def _fetch_wheels() -> None:
-    """Fetch the wheels for such a host, because a desktop in its network cannot reach their
-    registry.
-    """
+    """Fetch the wheels for such a host: its network does not reach their registry."""
     python = f"{nspawn.PYTHON}.2"
     run("env", f"PYTHONPATH={ROOT / 'systemd'}:{ROOT}", sys.executable, "-c", FETCH, python)
 
@@ -186,9 +182,7 @@ class Hosts:
     def desktop(
         self, command: str, *args: str | Path, inside: Host | None = None, limit_s: float = 600
     ) -> subprocess.CompletedProcess[str]:
-        """Run systemd/COMMAND.py as the user with the key, in the network of the host `inside` or
-        here.
-        """
+        """Run systemd/COMMAND.py as the user with the key, in the network of `inside` or here."""
         where = ("nsenter", "-t", inside.pid, "-n") if inside else ()
         return desktop(self.work, command, *args, where=where, limit_s=limit_s)
 

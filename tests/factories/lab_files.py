@@ -36,9 +36,7 @@ def csv_folder(folder: Path, each: int = 2, positions: int = 4) -> Path:
 def write(
     path: Path, counts: np.ndarray, rate_hz: float, time_ms: np.ndarray | None = None
 ) -> None:
-    """Write a CSV file of raw counts [n, columns] with a header and times in ms with three
-    decimals.
-    """
+    """Write raw counts [n, columns] as CSV with a header and times in ms to three decimals."""
     path.parent.mkdir(parents=True, exist_ok=True)
     times = 1000 * np.arange(len(counts)) / rate_hz if time_ms is None else time_ms
     names = ",".join(["time", *(f"s{k}" for k in range(counts.shape[1]))])

@@ -12,8 +12,7 @@ from palpate.core.types import Frames, Status, Sweep
 
 
 def write(folder: Path, sweeps: SweepSet, *, first: int = 1, position: bool = False) -> None:
-    """Write the sweeps of a set as `palpate record` stores them, numbered from `first`. position:
-    with the names of the group position."""
+    """Write a set's sweeps as `palpate record` does, numbered from `first`."""
     folder.mkdir(parents=True, exist_ok=True)
     window = sweeps.format.window
     for i, taxels in enumerate(sweeps.samples):

@@ -33,9 +33,7 @@ def sweeps(kind: str = "uint8", n: int = 24) -> Dataset:
 
 
 def loudness(format: SweepFormat = FORMAT) -> onnx.ModelProto:
-    """A graph that distinguishes both: a convolution takes differences, a threshold their mean
-    size.
-    """
+    """A graph that distinguishes both by the mean size of differences."""
     g, taxels = GraphBuilder(), format.rows * format.cols
     x = g(
         "Cast",

@@ -59,9 +59,7 @@ def own_default() -> Own:
 
 
 def own_models(names: tuple[str, ...] = ()) -> list[Own]:
-    """The models of the default bundle and of these methods (default: all), trained for a moment on
-    a small skin.
-    """
+    """The default bundle's model and those of these methods (all), trained for a moment."""
     from palpate_train.models import methods
     from tests.factories.sweep_sets import tones
 

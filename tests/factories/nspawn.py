@@ -273,9 +273,7 @@ class Service:
         self.machine.get("systemctl", "daemon-reload")
 
     def start(self, text: str = SIM) -> int:
-        """Start it with a drop-in and wait until it is active. Returns the number of its
-        process.
-        """
+        """Start it with a drop-in, wait until it is active; returns the number of its process."""
         self.configure(text)
         self.machine.get("systemctl", "start", "palpate")
         return int(self["MainPID"])

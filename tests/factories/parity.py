@@ -8,9 +8,7 @@ from palpate_train.data.sets import Dataset
 
 
 def close(n: int = 80) -> Dataset:
-    """Sweeps [n, 64, 2, 2] of three materials that hum at nearly equal rates in much noise, one
-    sweep a recording.
-    """
+    """Sweeps [n, 64, 2, 2] of three materials that hum at nearly equal rates, in much noise."""
     rng = np.random.default_rng(0)
     labels = np.repeat(np.arange(3), n)
     pitch = np.array([0.11, 0.15, 0.2])[labels] * rng.uniform(0.9, 1.1, 3 * n)

@@ -60,8 +60,7 @@ def key_of(page: Page) -> str:
 
 
 class RecordedPage:
-    """A recording in `folder` and its page, without a box. In a `with` a thread takes its turns.
-    teaching: the page is that of `palpate teach`."""
+    """A recording and its page, without a box; a thread takes its turns. teaching: its page."""
 
     def __init__(
         self,

@@ -89,9 +89,7 @@ FAULTS = """() => {
 
 
 def faults(browser: Any, address: str, width: int, scheme: str) -> Mapping[str, list[str]]:
-    """Illegible texts of a page or picture by kind of fault. width: of the window. scheme: light or
-    dark.
-    """
+    """Illegible texts of a page by kind of fault, at a width, by day ("light") or night."""
     context = browser.new_context(
         viewport={"width": width, "height": 900}, color_scheme=scheme, reduced_motion="reduce"
     )

@@ -21,9 +21,7 @@ TURN_S = 0.002
 
 
 class SerialBoard:
-    """A board behind a port. path: exists while the board is plugged in. board: may be exchanged
-    while it is unplugged.
-    """
+    """A board behind a port, which `path` shows; `board` may be exchanged while unplugged."""
 
     def __init__(self, board: rig.ReadoutBoard, stack: ExitStack) -> None:
         self.board = board

@@ -23,9 +23,7 @@ SETTLE_S = 0.02
 
 
 def numbered(n: int, format: SweepFormat = skin.FORMAT, first: int = 0) -> np.ndarray:
-    """Frames [n, R, C] or [n, R, C, A] whose raw counts identify the frame, the taxel and the
-    axis.
-    """
+    """Frames [n, R, C] or [n, R, C, A] whose counts tell frame, taxel and axis."""
     grid = np.arange(format.channels).reshape(1, *format.shape)
     return (
         (np.arange(first, first + n) % 97).reshape(-1, *(1,) * len(format.shape)) + grid

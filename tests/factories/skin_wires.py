@@ -227,9 +227,7 @@ class WiredSkin:
         return Frames.joined(parts)
 
     def which(self, frames: Frames) -> NDArray[np.int64]:
-        """Number [n] of each frame on the wire, by its content. Fails for a frame that was never
-        sent.
-        """
+        """Number [n] of each frame by its content. Fails for one that was never sent."""
         sent = {taxels(self.profile, i).tobytes(): i for i in range(199)}
         low = np.array([sent[one.tobytes()] for one in frames.taxels], np.int64)
         # The content repeats after 199 frames. The time decides between equal frames.

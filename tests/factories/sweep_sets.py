@@ -10,9 +10,7 @@ from palpate_train.data.sets import Dataset
 
 
 def easy(n: int = 40, pieces: int = 1, dtype: str = "uint8", seed: int = 0) -> Dataset:
-    """`n` sweeps [64, 2, 2] of each of three materials that hum at different rates, `pieces` a
-    recording.
-    """
+    """`n` sweeps [64, 2, 2] of each of three materials that hum, `pieces` a recording."""
     rng = np.random.default_rng(seed)
     labels = np.repeat(np.arange(3), n)
     pitch = np.array([0.05, 0.15, 0.35])[labels] * rng.uniform(0.9, 1.1, 3 * n)

@@ -50,9 +50,7 @@ def before(machine: nspawn.Machine) -> list[bool]:
 
 @pytest.fixture
 def service(machine: nspawn.Machine, before: list[bool]) -> Iterator[nspawn.Service]:
-    """The installed service, stopped. After the test it is stopped and has its packaged settings
-    again.
-    """
+    """The installed service, stopped; afterwards stopped, with its packaged settings."""
     yield nspawn.Service(machine)
     machine.run(
         "rm", "-rf", "/run/systemd/system/palpate.service.d", nspawn.SITE, "/run/skin", "/run/hang"

@@ -66,8 +66,7 @@ def scans(frames: Frames) -> np.ndarray:
 
 
 def check_all_there(frames: Frames) -> None:
-    """No frame of the readout board is missing, except those whose interrupt came too late, and the
-    numbers show these."""
+    """No frame is missing, but those whose interrupt came late, which the numbers show."""
     assert (np.diff(scans(frames)) % 97 == 1).all()
     assert (np.diff(frames.seq) >= 1).all()
 
@@ -81,8 +80,7 @@ def check_all_there(frames: Frames) -> None:
     ],
 )
 def test_the_box_reads_it(format: dict[str, Any]) -> None:
-    """Identity, format and frames with each taxel at its index, through multiplexers that the
-    firmware switches."""
+    """Identity, format, and each taxel at its index, through switched multiplexers."""
     given = {
         name.lower(): format[name]
         for name in ("ROWS", "COLS", "RATE_HZ", "DTYPE")
@@ -97,8 +95,7 @@ def test_the_box_reads_it(format: dict[str, Any]) -> None:
 
 
 def test_it_is_taken_up_again() -> None:
-    """A program that ended, with STOP or without, leaves a readout board that the next program can
-    use."""
+    """A program that ended, with STOP or without, leaves a board that the next can use."""
     with pico.plugged_in(**FORM) as port:
         with PortReader(port) as reader:
             reader.frames(20)
@@ -112,8 +109,7 @@ def test_it_is_taken_up_again() -> None:
 
 
 def test_counters_wrap() -> None:
-    """Sequence number, device time and the Pico's ticks wrap while the box reads: nothing is lost,
-    repeated or restarted."""
+    """Number, device time and ticks wrap while the box reads: nothing is lost or repeated."""
     near = {
         "seq": [65536 - 50, 65535],
         "t_us": [65536 - 30_000, 65535 - 3],
@@ -129,8 +125,7 @@ def test_counters_wrap() -> None:
 
 
 def test_late_interrupts_cost_frames_and_not_the_clock() -> None:
-    """Every twentieth interrupt comes 30 ms late: the numbers show the missed frames, and clock and
-    count agree."""
+    """Every twentieth interrupt is 30 ms late: numbers show it, clock and count agree."""
     with pico.plugged_in(**FORM, late_ms=30, late_every=20) as port, PortReader(port) as reader:
         frames = reader.frames(200)
         check_all_there(frames)
@@ -153,8 +148,7 @@ def ask(link: ReadoutLink, request: packets.Request) -> bytes:
 
 
 def test_requests_in_the_middle_of_frames() -> None:
-    """Between requests and other bytes in any order the stream stays whole, and each request is
-    answered."""
+    """Between requests and other bytes the stream stays whole; each request is answered."""
     with pico.plugged_in(**FORM) as port:
         fd = os.open(port, os.O_RDWR | os.O_NOCTTY)
         data, asked, end_s = b"", 0, time.monotonic() + LIMIT_S
@@ -176,8 +170,7 @@ def test_requests_in_the_middle_of_frames() -> None:
 
 
 def test_a_reader_that_stops() -> None:
-    """The FIFO overflows: the oldest frames are dropped, a flag shows it, and numbers and content
-    go on as if all had been read."""
+    """The FIFO drops the oldest frames and says so; numbers and content go on."""
     with pico.plugged_in(ROWS=16, COLS=16, RATE_HZ=400, DTYPE="uint16", FIFO_S=0.25) as port:
         link = ReadoutLink(port, 115200, SystemClock())
         format = packets.unpack_format(ask(link, packets.Request.FORMAT))
@@ -263,8 +256,7 @@ def allocating(change: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16"])
 def test_an_interrupt_allocates_nothing(dtype: str) -> None:
-    """3000 frames with gaps, through a FIFO that runs over, with the heap locked; the same with one
-    allocation fails."""
+    """3000 frames with gaps and an overflow, with the heap locked; one allocation fails."""
     done = allocating(f"settings.DTYPE = {dtype!r}; settings.FIFO_S = 0.5")
     assert done.stdout == "nothing True\n", done.stderr
     worse = allocating("main.readout.Fifo.filled = lambda self: [0] * 100")
@@ -320,8 +312,7 @@ except OSError:
 
 
 def test_ctrl_c_is_a_byte_while_it_serves() -> None:
-    """The number of START must not interrupt the program; after an error the prompt has its Ctrl-C
-    again."""
+    """The number of START must not interrupt it; after an error Ctrl-C works again."""
     done = pico.run("-c", CTRL_C.format(folder=str(pico.SHELL.parent)))
     assert done.stdout.splitlines() == [
         "kbd_intr -1",

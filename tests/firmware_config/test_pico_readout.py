@@ -18,8 +18,7 @@ SMALL = 1 << 30
 
 
 class DrivenBoard:
-    """A Readout whose time and interrupts are made by a test. Each taxel of its frames has the
-    number of the scan."""
+    """A Readout with time and interrupts of a test; each taxel has the number of the scan."""
 
     def __init__(self, ticks=0, wrap=SMALL, level=0, **settings):
         counters = {name: settings.pop(name) for name in ("seq", "t_us") if name in settings}
@@ -137,8 +136,7 @@ def test_a_setting_that_cannot_be_is_named(settings, named):
     ],
 )
 def test_replies_are_those_of_the_protocol(settings, format):
-    """Byte by byte as from the box's encoder; the FIFO is not shorter than the setting, the rate is
-    the timer's."""
+    """Byte by byte as from the box's encoder; FIFO and rate are at least the setting's."""
     made = DrivenBoard(**settings)
     made.ask(readout.IDENTITY)
     who = packets.Identity(packets.VERSION, (1, 0, 0), "palpate-pico", "0123456789abcdef")
@@ -152,8 +150,7 @@ def test_replies_are_those_of_the_protocol(settings, format):
 @pytest.mark.parametrize("dtype", ["uint8", "uint16"])
 @pytest.mark.parametrize("level", [0, 1])
 def test_packets_are_those_of_the_protocol(dtype, level):
-    """Byte by byte as from the box's encoder for the same frames, with the trigger line of the
-    first frame."""
+    """Byte by byte as from the box's encoder, with the trigger line of the first frame."""
     made = DrivenBoard(dtype=dtype, level=level, seq=(65534, 7))
     made.ask(readout.START)
     made.tick(8)
@@ -164,8 +161,7 @@ def test_packets_are_those_of_the_protocol(dtype, level):
 
 @pytest.mark.parametrize("rows", range(1, 17))
 def test_every_taxel_is_read_once_at_its_place(rows):
-    """The select lines stand at its row and column when it is read; at the end they are low again,
-    as at the beginning."""
+    """The select lines stand at its row and column when it is read, and end low."""
     for cols in range(1, 17):
         check_order(rows, cols)
 
@@ -238,8 +234,7 @@ def test_a_packet_ends_where_numbers_do_not_follow():
 
 
 def test_a_full_fifo_drops_the_oldest_and_says_so_once():
-    """The announced depth is kept; the packet after the loss carries the flag, the next does
-    not."""
+    """The announced depth is kept; only the packet after the loss carries the flag."""
     made = DrivenBoard()
     made.ask(readout.START)
     depth = made.format.packets * made.format.packet_frames
@@ -266,8 +261,7 @@ def test_what_is_being_sent_is_not_overwritten():
 
 
 def test_start_and_stop():
-    """START while it runs changes nothing, STOP drops unsent frames, and numbers go on after the
-    next START."""
+    """START while it runs changes nothing, STOP drops unsent frames, numbers go on."""
     made = DrivenBoard()
     made.ask(readout.STOP)
     assert made.callback is None
@@ -327,8 +321,7 @@ class SlowPort:
 
 @pytest.mark.parametrize("chunks", [(1000,), (7,), (64, 0, 0, 3)])
 def test_replies_wait_for_the_end_of_a_packet(chunks):
-    """However few bytes the port accepts at a time, no packet is torn apart by a request that comes
-    in its middle."""
+    """However few bytes the port takes at a time, no request tears a packet apart."""
     made = DrivenBoard()
     asked = {
         2: readout.START,

@@ -32,8 +32,7 @@ time."""
 
 @dataclass(frozen=True, slots=True)
 class FuzzRun:
-    """Figures of one run of libFuzzer. coverage: reached places of the instrumented code. features:
-    these places with their counts."""
+    """Figures of a run of libFuzzer. features: the reached places with their counts."""
 
     executions: int
     coverage: int

@@ -58,8 +58,7 @@ def _check_classes(old: Bundle, got: Bundle) -> None:
 
 
 def target(data: bytes, folder: Path) -> None:
-    """enrolled.applied: only labels that can be sent are added to the signed bundle; or a
-    BundleError."""
+    """enrolled.applied adds only labels that can be sent to the signed bundle, or refuses."""
     old = small()
     try:
         got = read(data, folder)
@@ -105,8 +104,7 @@ def _right(labels: int) -> bytes:
 
 
 def seeds() -> list[bytes]:
-    """One to three labels; each array with another invalid value;
-    the enrolment of another bundle, a label that exists, no label."""
+    """One to three labels, arrays with another value, another bundle's, a known label, none."""
     right = [_right(1), _right(2), _right(3)]
     with np.load(io.BytesIO(right[0])) as z:
         arrays = dict(z.items())

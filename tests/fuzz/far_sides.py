@@ -26,8 +26,7 @@ WORDS = {
 
 
 def modbus(data: bytes, folder: Path) -> None:
-    """modbus_pdu: the requests are the same wherever the bytes are cut; each is read or refused,
-    and replies fit into a packet."""
+    """modbus_pdu: wherever the bytes are cut, each request is read or refused; replies fit."""
     try:
         found, rest = modbus_pdu.requests(data)
     except FormatError as e:

@@ -38,8 +38,7 @@ def one_line(error: Exception) -> str:
 
 
 def settings(data: bytes, folder: Path) -> None:
-    """config.load: a site file is a valid Config that can be described and loads again, or a
-    ConfigError."""
+    """config.load: a valid Config that is described and loads again, or a ConfigError."""
     site = folder / "palpate.toml"
     (folder / "board-a.toml").write_text(BOARD)
     site.write_bytes(data)
@@ -94,8 +93,7 @@ def _names_the_place(message: str, data: bytes) -> None:
 
 
 def manifest(data: bytes, folder: Path) -> None:
-    """bundle.load: a manifest.json beside the default bundle's other files is a usable Bundle, or a
-    BundleError."""
+    """bundle.load: a manifest beside the default's files is a usable Bundle or BundleError."""
     for name in (bundle.MODEL, bundle.GOLDEN, bundle.MEANS):
         if not (folder / name).exists():
             (folder / name).write_bytes((bundle.DEFAULT / name).read_bytes())
@@ -146,8 +144,7 @@ def _usable(read: bundle.Manifest) -> None:
 
 
 def recording(data: bytes, folder: Path) -> None:
-    """sweep.load: a sidecar and bytes that begin with numpy's magic are a Sweep that saves and
-    loads again, or a FormatError."""
+    """sweep.load: a Sweep that saves and loads again, or a FormatError."""
     about, magic, table = data.partition(NPY)
     (folder / "sweep.json").write_bytes(about)
     (folder / "sweep.npy").write_bytes(magic + table)
@@ -175,8 +172,7 @@ def recording(data: bytes, folder: Path) -> None:
 
 
 def played(data: bytes, folder: Path) -> None:
-    """capture.Playback: a file plays to its end in as many turns as it has records, or raises
-    FormatError."""
+    """capture.Playback: a file plays in as many turns as records, or raises FormatError."""
     file = folder / "capture"
     file.write_bytes(data)
     try:

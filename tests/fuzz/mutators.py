@@ -106,8 +106,7 @@ def tables(data: bytes, random: Random, plain: Plain) -> bytes:
 
 
 def trees(data: bytes, random: Random, plain: Plain) -> bytes:
-    """An entry of the JSON gets an odd value, the value of another entry or another name, or is
-    removed; or bytes change."""
+    """An entry of the JSON gets an odd or another's value, another name, or goes."""
     try:
         tree = json.loads(data)
     except (ValueError, RecursionError):
@@ -134,8 +133,7 @@ def trees(data: bytes, random: Random, plain: Plain) -> bytes:
 
 
 def headed(data: bytes, random: Random, plain: Plain) -> bytes:
-    """The JSON at the head changed as by `trees`, or the bytes after it; the length before it is
-    corrected."""
+    """The JSON at the head, or the bytes after it, changed; the length is corrected."""
     start, end = data.find(b"{"), data.find(b"}\x93") + 1 or data.find(b"}") + 1
     if not 0 <= start < end or random.random() < 0.3:
         return plain(data)
@@ -149,8 +147,7 @@ def headed(data: bytes, random: Random, plain: Plain) -> bytes:
 
 
 def frames(data: bytes, random: Random, plain: Plain) -> bytes:
-    """Frames of a skin removed, repeated or moved, or bytes changed; then most sums of PapillArray
-    corrected."""
+    """Frames removed, repeated, moved or changed; most sums of PapillArray corrected."""
     pieces = [
         p for p in re.split(rb"(?=\xaa\x55|\x55\x66\x77\x88|\x9a\x00)|(?<=\n)|(?<=\r)", data) if p
     ]

@@ -71,8 +71,7 @@ def unpack() -> list[bytes]:
 
 
 def command() -> list[bytes]:
-    """Each command as programs and people send it, the document's sentences, and lines that are not
-    commands."""
+    """Commands as people send them, the document's sentences, and other lines."""
     sealed = [
         sentences.sentence(name, *["plastic rough"] * (name in robot_link.TEXT_COMMANDS))
         for name in robot_link.COMMANDS
@@ -92,8 +91,7 @@ def command() -> list[bytes]:
 
 
 def feed() -> list[bytes]:
-    """The requests of a reader, separately and in one line, the document's examples, and lines that
-    are not requests."""
+    """Requests of a reader, the document's examples, and other lines."""
     asked = [
         json.dumps(one).encode()
         for one in (*({"frames": hz} for hz in (0, 0.5, 20)), {"sweeps": True})
@@ -116,8 +114,7 @@ def feed() -> list[bytes]:
 
 
 def settings() -> list[bytes]:
-    """The files that come with the box, without their comments, and all settings as `palpate
-    config` prints them."""
+    """The files that come with the box, and all settings as `palpate config` prints them."""
     files = sorted((ROOT / "firmware_config").glob("*.toml"))
     values = [
         "".join(re.findall(r"^[^#\n].*\n", file.read_text("utf-8"), re.MULTILINE)) for file in files

@@ -108,8 +108,7 @@ def _fixed(profile: SkinProfile, before: bytes) -> Iterator[bytes]:
 
 
 def _text(profile: SkinProfile, before: bytes) -> Iterator[bytes]:
-    """The last lines: a line that is a frame, or the rows and a shorter line, which may hold
-    numbers too. Lists may stand in brackets, the time of day may stand before them."""
+    """The last lines: a frame, or rows and a shorter line; brackets and a time may stand there."""
     lines = before.split(b"\n")[:-1]
     count = profile.rows if profile.lines == "rows" else 1
     for tail in (lines[-count:], lines[-count - 1 : -1]):
@@ -239,8 +238,7 @@ ENCLOSED: dict[str, Enclosed] = {
 
 
 def profile(data: bytes, folder: Path) -> None:
-    """skin_profile.load: a profile's file is a profile that reads any bytes and has a name, or a
-    ConfigError."""
+    """skin_profile.load: a profile that reads any bytes and has a name, or a ConfigError."""
     path = folder / "a-skin.toml"
     path.write_bytes(data)
     try:
@@ -281,8 +279,7 @@ MARKS: dict[str, tuple[bytes, ...]] = {
 
 
 def seeds(name: str) -> list[bytes]:
-    """Frames of a skin; damaged frames between valid frames; the answers of an adapter among
-    them."""
+    """Frames of a skin, damaged ones among them, and the answers of an adapter."""
     subject, rng = SUBJECTS[name], np.random.default_rng(1)
     skin = subject.wire()
     frames = [subject.sent(skin, i) for i in range(8)]
@@ -295,8 +292,7 @@ def seeds(name: str) -> list[bytes]:
 
 
 def profile_seeds() -> list[bytes]:
-    """The delivered profiles without their comments, the smallest valid profile, and invalid
-    profiles."""
+    """The delivered profiles, the smallest valid one, and invalid ones."""
     files = sorted(PROFILES.glob("*.toml"))
     values = [
         "".join(re.findall(r"^[^#\n].*\n", file.read_text("utf-8"), re.MULTILINE)) for file in files

@@ -54,8 +54,7 @@ def cuts(data: bytes) -> set[int]:
 
 
 def by_the_document(data: bytes) -> list[bytes]:
-    """All whole packets in `data`, read by PROTOCOL.md's table; short code that need not be
-    fast."""
+    """All whole packets in `data` by PROTOCOL.md's table, in short, slow code."""
     found, at = [], 0
     while (at := data.find(b"\x50\xc1", at)) >= 0 and len(data) - at >= 20:
         version, kind, n, _, count, rows, cols, digit, axes = struct.unpack_from(
@@ -85,8 +84,7 @@ def shown(packets: list[wire.Packet], replies: list[wire.Reply]) -> list[tuple[o
 
 
 def unpack(data: bytes, folder: Path) -> None:
-    """wire.unpack: exactly the document's packets, every byte accounted for, the same in parts, in
-    one pass."""
+    """wire.unpack: the document's packets, every byte accounted for, also in parts."""
     scanned = Scanned(data)
     got = wire.unpack(scanned)
     assert scanned.searches <= 1 + data.count(wire.MAGIC), (
@@ -116,8 +114,7 @@ def unpack(data: bytes, folder: Path) -> None:
 
 
 def _stream(data: bytes, cut: int, sent: int) -> None:
-    """The frames that a sensor makes of the bytes: numbers rise, and each frame that came is
-    returned, stale or lost."""
+    """The frames of a sensor: numbers rise, and each frame that came is returned or counted."""
     counters = sensor.SensorCounters()
     stream = usb_sensor.Stream(SKIN, counters)
     stream.restart()
@@ -168,8 +165,7 @@ def _replies(data: bytes, replies: list[wire.Reply]) -> None:
 
 
 def command(data: bytes, folder: Path) -> None:
-    """sink.parse: one Command for each line, the same in parts, a bounded rest, and an answer to
-    each that can be sent."""
+    """sink.parse: one Command a line, also in parts, a bounded rest, an answer to each."""
     got, rest = robot_link.parse(data)
     assert len(rest) <= LINE + 1
     *lines, last = re.split(rb"[\r\n]+", data)

@@ -23,9 +23,7 @@ def model(default_bundle: Bundle) -> Bundle:
 
 @pytest.mark.slow
 def test_moving_is_measured(model: Bundle, monkeypatch: pytest.MonkeyPatch):
-    """A skin in place is not flagged; a skin displaced by a row always is. Figures and table
-    agree.
-    """
+    """A skin in place is not flagged, one displaced by a row is; figures and table agree."""
     monkeypatch.setattr(alignment, "OFF_MM", (8.0,))
     wide = replace(
         model, manifest=replace(model.manifest, contact=ContactPositions(4.0, (5.5,), (6.0,), 1.2))

@@ -26,10 +26,7 @@ NAMES = ("a", "b", "c", "d")
 
 
 def world(places: int, n: int, seed: int, apart: float = 6.0, first: int = 0):
-    """Features [N, 10, 4] of n sweeps of four materials at each position.
-
-    The materials differ from the middle of the sweep on.
-    """
+    """Features [N, 10, 4] of four materials, which differ from the middle of the sweep on."""
     rng = np.random.default_rng(seed)
     labels = np.tile(np.repeat(np.arange(4), n), places)
     at = np.repeat(np.arange(places), 4 * n) + first
@@ -80,11 +77,7 @@ def figures():
 
 
 def test_error_is_the_gap_between_probability_and_accuracy():
-    """A probability of 0.9 with an accuracy of 0.7 is an error of 0.2; a calibrated probability has
-    0.
-
-    Bins are weighted by their number of sweeps.
-    """
+    """0.9 with an accuracy of 0.7 is an error of 0.2; bins are weighted by their sweeps."""
     right = np.arange(100) < 70
     assert uncertainty.error(np.full(100, 0.9), right) == pytest.approx(0.2)
     assert uncertainty.error(np.full(100, 0.7), right) == pytest.approx(0)
@@ -100,10 +93,7 @@ def test_error_is_the_gap_between_probability_and_accuracy():
 
 
 def test_temperature_scaling_corrects_an_overconfident_head():
-    """If positions shift the materials, LDA is overconfident.
-
-    The temperature fitted across positions corrects that.
-    """
+    """Positions that shift the materials make LDA overconfident, which it corrects."""
     one = case(apart=2.5, places=12)
     # sweeps of one position close together: their scatter says little of other positions
     shift = 1.5 * np.random.default_rng(3).standard_normal((200, 1, 4))
@@ -127,9 +117,7 @@ def test_temperature_scaling_corrects_an_overconfident_head():
 
 
 def test_unknown_materials_six_deviations_away_are_detected(figures):
-    """A left-out material is six deviations away, known materials are chi-squared: AUROC above
-    0.95.
-    """
+    """Six deviations away, with known materials chi-squared: AUROC above 0.95."""
     for row in figures["unknown"]["materials"].values():
         assert row["low"] <= row["auroc"] <= row["high"]
         assert (row["known"], row["unknown"]) == (216, 72)
@@ -148,9 +136,7 @@ def test_an_unknown_material_that_does_not_differ_is_not_seen():
 
 
 def test_early_needs_half_the_sweep_where_that_suffices(figures):
-    """All is known at the fifth tenth. The share is below 0.6, the accuracy that of the whole
-    sweep.
-    """
+    """All is known at the fifth tenth: a share below 0.6, the accuracy of the whole."""
     early = figures["early"]
     assert early["share"] < 0.6
     assert abs(early["lost"]) <= 0.02

@@ -82,9 +82,7 @@ def test_a_graph_of_unknown_shapes_is_refused():
 
 
 def test_the_transforms_of_features_are_counted():
-    """L has one transform of 1500 frames for each of 16 taxels, H 40 of 75 frames; raw counts have
-    none.
-    """
+    """L has one transform of 1500 frames a taxel, H 40 of 75; raw counts have none."""
     assert cost.feature_macs("L", skin.FORMAT) == pytest.approx(16 * 1500 * np.log2(1500), abs=1)
     assert cost.feature_macs("H", skin.FORMAT) == pytest.approx(16 * 40 * 75 * np.log2(75), abs=1)
     assert cost.feature_macs("raw", skin.FORMAT) == 0

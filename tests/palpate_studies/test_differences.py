@@ -10,17 +10,13 @@ from palpate_studies import comparison, differences
 
 
 def test_a_difference_of_two_shares_is_newcombes():
-    """The first example of his table II: 56 of 70 minus 48 of 80 is .2; method 10 gives .0524 to
-    .3339.
-    """
+    """His table II: 56 of 70 minus 48 of 80 is .2; method 10 gives .0524 to .3339."""
     one, other = ((right / n, *wilson(right, n)) for right, n in ((56, 70), (48, 80)))
     assert differences.difference(one, other) == pytest.approx((0.2, 0.0524, 0.3339), abs=1e-4)
 
 
 def test_the_interval_of_a_difference_holds_what_it_says():
-    """Of 2,000 random pairs of shares at least 93 % of the intervals contain the true difference,
-    and not all.
-    """
+    """At least 93 % of 2,000 random intervals hold the true difference, and not all."""
     rng, inside = np.random.default_rng(0), []
     for one, other in zip(
         rng.binomial(80, 0.9, 2000) / 80, rng.binomial(80, 0.7, 2000) / 80, strict=True
@@ -32,9 +28,7 @@ def test_the_interval_of_a_difference_holds_what_it_says():
 
 
 def test_groups_of_a_mean_err_independently():
-    """The mean of four equal intervals is half as wide if they are independent, and as wide as each
-    if they are one group. The two ends of an interval are not exchanged.
-    """
+    """Four independent intervals halve that of their mean, one group does not."""
     one = (0.8, 0.7, 0.84)
     alone = differences.mean({str(i): [one] for i in range(4)})
     together = differences.mean({"a": [one] * 4})

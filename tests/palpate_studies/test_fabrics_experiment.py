@@ -21,10 +21,7 @@ MATERIALS = ("BeigeCotton", "BrownCotton", "Canvas", "Denim", "DenimFlex", "Line
 
 @pytest.fixture
 def data(tmp_path: Path) -> Path:
-    """A folder with a set of FabricSlide's names.
-
-    Each material is louder noise than the previous one; each condition has two values.
-    """
+    """FabricSlide's names; each material is louder noise than the one before."""
     labels, force, speed, rep, direction = (
         x.ravel() for x in np.meshgrid(range(len(MATERIALS)), (100, 180), (1, 2), (1, 2), (0, 1))
     )

@@ -14,10 +14,7 @@ from palpate_studies import overview_plot
 
 @pytest.mark.slow
 def test_it_shows_the_verdict_and_every_label():
-    """Each label occurs once with its probability, and the verdict also in the title.
-
-    The picture says that the sweep is simulated.
-    """
+    """Each label occurs once with its probability, the verdict in the title, "simulated" too."""
     svg = overview_plot.draw("paper")
     assert "the box answers paper (simulated)" in svg
     shares = [float(share) for share in re.findall(r">([0-9.]+) %<", svg)]

@@ -62,8 +62,7 @@ def results() -> dict[str, Any]:
 
 
 def test_printed_numbers_are_the_papers():
-    """One number of each figure by hand. Rows of the confusion matrix sum to one. .917 is 55 of
-    60."""
+    """One number of each figure by hand; rows of the confusion matrix sum to one."""
     at = (("lab", "H-svm"), ("lopo", "H-knn"), ("random", "L-svm"), ("hard", "L-knn"))
     assert [paper_values.ACCURACY[p][m] for p, m in at] == [0.96, 0.75, 0.83, 0.58]
     assert round(55 / 60, 3) == paper_values.ACCURACY["hard"]["paper-cnn"]
@@ -71,8 +70,7 @@ def test_printed_numbers_are_the_papers():
 
 
 def test_objects_begin_with_every_sweep_once_and_mix_nothing():
-    """The sweeps of an object differ, and are of one material and position; as many as the smallest
-    group of these has."""
+    """Sweeps of an object differ, are of one material and position, as many as there are."""
     o = outcome("lopo", "H-svm")
     keep = np.arange(len(o.labels)) != 5
     labels, place = o.labels[keep], o.place[keep]

@@ -35,8 +35,7 @@ RESULTS: dict[str, Any] = {
 
 @pytest.mark.slow
 def test_each_view_has_a_cost_of_its_own(monkeypatch: pytest.MonkeyPatch):
-    """All views are timed in turns in graphs with the features of one view; more lags of relations
-    are more features."""
+    """Each is timed in a graph of its features; more lags of relations are more features."""
     turns = []
     timed = measure.timed
 

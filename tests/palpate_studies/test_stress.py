@@ -125,8 +125,7 @@ def test_a_pair_is_both_corruptions_at_once():
 
 
 def test_what_cannot_be_done_is_said():
-    """A set of another kind is an error of the caller; a method that refuses its set is a
-    result."""
+    """A set of another kind is the caller's error; a refused set is a result."""
     with pytest.raises(FormatError, match="uint8"):
         stress.evaluate_method(FAKE, small(), EvaluationSweeps(small("uint8")), 0)
     short = small(shape=(4, 10, 3, 3))
@@ -135,8 +134,7 @@ def test_what_cannot_be_done_is_said():
 
 
 def test_methods_run_side_by_side_and_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Each method and seed is one task, all methods of a seed first; kept tasks do not run again;
-    unknown names are refused."""
+    """A task for each method and seed; kept tasks do not run again."""
     sweeps, trial = small(), EvaluationSweeps(small())
     monkeypatch.setattr(
         methods, "find", lambda names, effort: [replace(FAKE, name=name) for name in names]

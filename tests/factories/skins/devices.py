@@ -37,8 +37,7 @@ class PlayedDevices(RobotDevices):
 
 
 def on_wire(taxels: NDArray[Any], profile: SkinProfile) -> NDArray[Any]:
-    """A frame [R, C] or [R, C, A] in the order of the skin's own grid, before the profile turns
-    it."""
+    """A frame in the order of the skin's own grid, before the profile turns it."""
     for turn in reversed(profile.orientation):  # each turn is its own inverse
         taxels = {
             "transpose": taxels.swapaxes(0, 1),

@@ -29,9 +29,7 @@ SHAPES: dict[str, tuple[tuple[int, ...], str, float]] = {
 
 
 class Numbered:
-    """Frames that differ in their content: frame i as the whole number i, for floats in steps of
-    0.25.
-    """
+    """Frame i holds the whole number i, for floats in steps of 0.25."""
 
     def __init__(self, name: str) -> None:
         self.shape, dtype, self.rate_hz = SHAPES[name]

@@ -38,8 +38,7 @@ class FrameSource(Protocol):
     """The source of frames, by their numbers."""
 
     def frame(self, i: int, frame_ns: Callable[[int], int]) -> NDArray[Any]:
-        """Raw counts of frame `i`, requested in order; numbers may be left out. frame_ns: the time
-        of a frame."""
+        """Raw counts of frame `i`, asked for in order. frame_ns: its time."""
         ...
 
 
@@ -252,8 +251,7 @@ class PlayerClock:
 
 
 def _wait_for_bytes(fd: int, sent: int) -> bool:
-    """Whether bytes can be read from `fd`, once the kernel has delivered `sent` bytes; at once if
-    there are none."""
+    """Whether bytes can be read once the kernel has delivered those sent; at once if none."""
     if not sent:
         return wait_readable(fd, 0)
     begin = time.monotonic()

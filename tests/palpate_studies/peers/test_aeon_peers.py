@@ -34,8 +34,7 @@ def hard(n: int = 12) -> Dataset:
 @pytest.mark.parametrize("materials", [3, 2])
 @names
 def test_the_labels_are_aeons(name: str, materials: int):
-    """The labels are those of aeon's classifier with default settings and this seed, also for
-    sweeps that are hard to separate."""
+    """aeon's classifier with default settings and this seed, also on hard sweeps."""
     rockets = pytest.importorskip("aeon.classification.convolution_based")
     from aeon.classification.interval_based import QUANTClassifier
 
@@ -55,8 +54,7 @@ def test_the_labels_are_aeons(name: str, materials: int):
 @pytest.mark.parametrize(("frames", "taxels"), [(80, 16), (128, 1), (24, 1), (10, 1)])
 @names
 def test_small_windows_and_one_channel(name: str, frames: int, taxels: int):
-    """float32 sweeps of any window from ten frames on: logits are finite, and equal one by one and
-    all at once."""
+    """float32 sweeps of ten and more frames: finite logits, equal one by one and all at once."""
     pytest.importorskip("aeon")
     rng, labels = np.random.default_rng(0), np.arange(12) % 3
     samples = (

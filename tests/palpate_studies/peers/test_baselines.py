@@ -47,8 +47,7 @@ ESTIMATORS = {
 @pytest.mark.parametrize("present", [(0, 1), (1, 3), (0, 2, 4), (0, 1, 2, 3, 4, 5)])
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_the_graph_is_the_estimator(name: str, present: tuple[int, ...]):
-    """The graph gives scikit-learn's scores over the temperature, as log probabilities; a class
-    without a sweep has baselines.ABSENT."""
+    """scikit-learn's scores over the temperature, as log probabilities; ABSENT without sweeps."""
     rng = np.random.default_rng(3)
     y = np.array(present)[rng.integers(0, len(present), 90)]
     x = (
@@ -72,11 +71,7 @@ def test_the_graph_is_the_estimator(name: str, present: tuple[int, ...]):
 
 
 def test_gauss_is_a_normal_distribution():
-    """Log likelihoods are scipy's, with one pseudo-sweep of the whole set's spread; `independent`
-    drops covariances.
-
-    With `first`, features after the first ones change nothing.
-    """
+    """Log likelihoods are scipy's; `independent` drops covariances, `first` later features."""
     rng = np.random.default_rng(1)
     y = np.repeat([0, 1, 2], 20)
     x = rng.normal(0, 1, (60, 3)) @ rng.normal(0, 1, (3, 3)) * [1, 30, 5] + y[:, None] + [5, 100, 9]
@@ -99,8 +94,7 @@ def test_gauss_is_a_normal_distribution():
 
 
 def test_gauss_bears_little_and_collinear():
-    """With one sweep of a class, a copy of a feature and a constant feature, the nearest mean wins
-    and everything is finite."""
+    """With one sweep, a copied and a constant feature the nearest mean wins, all finite."""
     x = np.array([[0.0, 0, 7], [1, 1, 7], [5, 5, 7]])
     gauss = baselines.Gauss().fit(x, np.arange(3))
     assert gauss.predict(x + 0.1).tolist() == [0, 1, 2]
@@ -115,8 +109,7 @@ def folds_of(sweeps: Dataset) -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 def test_the_temperature_sees_whole_positions_or_recordings(tubes: Dataset):
-    """Every sweep is held out once, with its position; if each material has its own position, with
-    its recording. A material of two sweeps works as well."""
+    """Every sweep is held out once, with its position, or with its recording."""
     sweeps = tubes
     own = replace(
         sweeps, groups={"position": sweeps.labels, "recording": np.arange(len(sweeps)) // 2}
@@ -133,8 +126,7 @@ def test_the_temperature_sees_whole_positions_or_recordings(tubes: Dataset):
 
 
 def test_without_anything_to_hold_out_the_temperature_is_one(tubes: Dataset, given: np.ndarray):
-    """With one recording of each material there are no folds, and the model's logits are those of
-    the plain estimator."""
+    """One recording of each material: no folds, and the plain estimator's logits."""
     sweeps = replace(tubes, groups={"recording": tubes.labels})
     assert not folds_of(sweeps)
     want = baselines.FeatureModel(
@@ -149,8 +141,7 @@ def test_without_anything_to_hold_out_the_temperature_is_one(tubes: Dataset, giv
 @pytest.mark.parametrize(("strength", "most"), [(0.0, 0.62), (0.75, 0.8), (9.0, 1.0)])
 @pytest.mark.parametrize("name", ["gauss", "knn", "svm"])
 def test_probabilities_are_honest(name: str, strength: float, most: float):
-    """For two materials that are equal, overlap or are far apart, the mean probability of the label
-    is its accuracy within a tenth."""
+    """Equal, overlapping or far apart: the label's probability is the accuracy within a tenth."""
     rng = np.random.default_rng(2)
     labels, truth = np.arange(80) % 2, np.arange(2000) % 2
     some = Dataset(np.zeros((80, 1, 1, 1), np.uint8), labels, ("a", "b"), 1.0)

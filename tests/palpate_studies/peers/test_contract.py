@@ -112,8 +112,7 @@ def test_silence_and_saturation_get_finite_logits(name: str):
 @every
 @pytest.mark.slow
 def test_a_seed_gives_one_model_and_random_states_stay(name: str):
-    """aeon leaves numpy's global stream unchanged, networks PyTorch's; another seed gives another
-    network."""
+    """Global random states stay; another seed gives another network."""
     sweeps = long(6)
     np.random.seed(4)
     before, torch_before = np.random.get_state()[1].copy(), torch.get_rng_state()
@@ -159,8 +158,7 @@ def three_axes() -> Dataset:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", quick_first((*WITH_GRAPH, *OF_LIBRARIES)))
 def test_a_method_takes_three_axes(name: str, three_axes: Dataset):
-    """Logits are finite; the graph takes [1, T, R, C, A] and answers as the desktop does; other
-    shear gives other logits."""
+    """The graph takes [1, T, R, C, A] and answers as the desktop; shear changes the logits."""
     (method,) = methods.find([name])
     given = methods.model_inputs(method.input, three_axes)
     model = fitted(name, three_axes)

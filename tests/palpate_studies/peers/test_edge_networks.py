@@ -33,8 +33,7 @@ def test_the_first_convolution_leaves_about_fifty_steps(window: int, stride: int
 
 
 def test_its_weights_and_work_are_those_of_depthwise_separable_layers():
-    """Four blocks of 64 kernels of nine frames and 64 x 64 products, each with a bias after the
-    norms are folded in."""
+    """Four blocks of 64 kernels of nine frames and 64 x 64 products, norms folded in."""
     form = SweepFormat(2, 2, 100.0, 128, "int16")
     graph = ds_cnn.DepthwiseSeparable(form, 3, 1.0).eval().graph()
     first, block, head, steps = 64 * 4 * 10 + 64, 64 * (9 + 1) + 64 * 65, 3 * 65, 60
@@ -61,8 +60,7 @@ def test_ds_cnn_has_an_int8_form():
 
 @pytest.mark.parametrize("classes", [3, 26])
 def test_the_box_reads_its_int8_form(classes: int):
-    """A head of more than a kilobyte was once marked as lying in a file of its own, which the box
-    refuses."""
+    """A head of more than a kilobyte was once marked as lying in another file."""
     form = SweepFormat(2, 2, 100.0, 128, "int16")
     sweeps = np.random.default_rng(1).integers(-99, 99, (8, 128, 2, 2), np.int16)
     network = ds_cnn.build(form, classes, sweeps).eval()
@@ -84,8 +82,7 @@ def test_the_transform_is_as_long_as_the_window_allows(window: int, length: int)
 
 @pytest.mark.parametrize("window", [1500, 128, 80, 24])
 def test_the_features_are_the_definition(window: int):
-    """numpy's FFT of half-overlapping Hann frames, zeros behind a short window; moments of each
-    taxel."""
+    """numpy's FFT of half-overlapping Hann frames, zeros at the end; moments of each taxel."""
     rng = np.random.default_rng(2)
     x = rng.standard_normal((3, window)) * [[0.1], [1], [5]]
     x -= x.mean(1, keepdims=True)
@@ -105,8 +102,7 @@ def test_the_features_are_the_definition(window: int):
 
 
 def test_features_are_standardised_on_the_training_sweeps():
-    """They have mean 0 and deviation 1 over the sweeps that `build` got; a constant feature stays
-    finite."""
+    """Mean 0 and deviation 1 over the training sweeps; a constant feature stays finite."""
     s = easy(10)
     net = edge_spectral.build(s.format, 3, s.samples)
     with torch.no_grad():

@@ -20,16 +20,14 @@ lite = Later("palpate_studies.peers.lite")
 
 
 def test_it_has_as_many_weights_as_published():
-    """9,814 below the head for one series, as in the paper's table; the detectors are not
-    trained."""
+    """9,814 below the head for one series, as in the paper; detectors are not trained."""
     network = lite.Lite(SweepFormat(1, 1, 100.0, 200, "int16"), 3, 1.0)
     assert sum(p.numel() for p in network.parameters() if p.requires_grad) == 9814 + 3 * 33
     assert not any(p.requires_grad for p in network.detectors.parameters())
 
 
 def test_the_detectors_find_what_they_are_named_after():
-    """There are two rises for each length, which are negatives of each other; the weights of a peak
-    sum to zero around its hump."""
+    """Two opposite rises for each length; a peak's weights sum to zero around its hump."""
     np.testing.assert_array_equal(lite.rise_and_fall(4), [[-1, 1, -1, 1], [1, -1, 1, -1]])
     np.testing.assert_allclose(
         lite.peak(8), [[-0.25, -1, -1, -0.25, 0.5, 2, 2, 0.5, -0.25, -1, -1, -0.25]]
@@ -49,8 +47,7 @@ def test_a_same_convolution_keeps_the_steps(steps: int, stride: int, taps: int, 
 
 @pytest.mark.parametrize(("rows", "window"), [(1, 90), (3, 600), (2, 7)])
 def test_the_graph_answers_as_the_network(rows: int, window: int):
-    """With the norms folded in, for one taxel and for several, a window with a stride and one
-    shorter than a kernel."""
+    """Norms folded in; one taxel and several, a window with a stride and a short one."""
     form = SweepFormat(rows, 1, 100.0, window, "int16")
     sweeps = np.random.default_rng(1).integers(-99, 99, (8, window, rows, 1), np.int16)
     network, counts = lite.build(form, 5, sweeps), torch.from_numpy(sweeps.astype(np.float32))
@@ -68,8 +65,7 @@ def test_the_graph_answers_as_the_network(rows: int, window: int):
 @pytest.mark.slow
 @pytest.mark.thorough  # trains for seconds
 def test_lite_has_an_int8_form_that_the_box_reads():
-    """The int8 model has integer weights and answers nearly as the float model, trained on an easy
-    set."""
+    """The int8 model has integer weights and answers nearly as the float model."""
     s = easy(12)
     (method,) = methods.find(["lite"], methods.Effort(0.05))
     model = method.train(s, s.samples, 1)

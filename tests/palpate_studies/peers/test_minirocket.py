@@ -22,8 +22,7 @@ KINDS = {"uint8": (2, 2, 64), "int16": (3, 3, 40), "uint16": (1, 1, 9), "float32
 
 
 def raw_counts(dtype: str, n: int = 3) -> np.ndarray:
-    """Random walks [n, T, R, C] with the grid and length of the type in KINDS; float32 without
-    their means."""
+    """Random walks [n, T, R, C] as KINDS says for the type; float32 without their means."""
     rows, cols, window = KINDS[dtype]
     rng = np.random.default_rng(7)
     walk = 100 + rng.integers(-3, 4, (n, window, rows, cols)).cumsum(axis=1)
@@ -36,8 +35,7 @@ def raw_counts(dtype: str, n: int = 3) -> np.ndarray:
 
 
 def parameters(window: int, taxels: int) -> tuple[np.ndarray, ...]:
-    """A transform made up: all dilations that fit, one to three taxels a kernel, biases between
-    integer counts."""
+    """A transform made up: all dilations that fit, one to three taxels a kernel."""
     rng = np.random.default_rng(3)
     dilations = np.arange(1, (window - 1) // 8 + 1)
     per_kernel = rng.integers(1, 4, len(dilations))
@@ -64,8 +62,7 @@ def by_definition(sweep: np.ndarray, found: tuple[np.ndarray, ...]) -> np.ndarra
 
 @pytest.mark.parametrize("dtype", KINDS)
 def test_the_graph_is_the_definition(dtype: str):
-    """Kernels, dilations, sums over taxels, alternating padding, shares above biases: any grid,
-    data type and length."""
+    """Kernels, dilations, sums, alternating padding, shares: any grid, type and length."""
     sweep, (rows, cols, window) = raw_counts(dtype)[0], KINDS[dtype]
     found = parameters(window, rows * cols)
     graph = minirocket.transform(SweepFormat(rows, cols, 50.0, window, dtype), found)
@@ -77,8 +74,7 @@ def test_the_graph_is_the_definition(dtype: str):
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", ["int16", "float32"])
 def test_the_features_are_aeons(monkeypatch: pytest.MonkeyPatch, dtype: str):
-    """The shares are aeon's, in its order: exactly for integer counts, else unless a frame equals a
-    bias within rounding."""
+    """aeon's shares in its order, exact for integers, else but for rounding at a bias."""
     aeon = pytest.importorskip("aeon.transformations.collection.convolution_based")
     monkeypatch.setattr("palpate_studies.peers.minirocket.FEATURES", 1000)
     given, (rows, cols, window) = raw_counts(dtype), KINDS[dtype]
@@ -97,8 +93,7 @@ def test_the_features_are_aeons(monkeypatch: pytest.MonkeyPatch, dtype: str):
 
 @pytest.mark.slow
 def test_the_labels_are_aeons(monkeypatch: pytest.MonkeyPatch):
-    """The whole method answers as aeon's own classifier, also for sweeps that are hard to
-    separate."""
+    """The whole method answers as aeon's own classifier, also on hard sweeps."""
     aeon = pytest.importorskip("aeon.classification.convolution_based")
     monkeypatch.setattr("palpate_studies.peers.minirocket.FEATURES", 500)
     sweeps = easy(20)
@@ -126,8 +121,7 @@ def head(sweeps: Dataset) -> linear_head.LinearHeadModel:
 
 
 def test_the_temperature_comes_from_held_out_groups():
-    """The first head misses whole recordings, the second none; random labels give uncertain
-    probabilities."""
+    """The first head misses recordings, the second none; random labels are uncertain."""
     seen: list[np.ndarray] = []
 
     def spy(features: np.ndarray, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -55,8 +55,7 @@ def method(name: str, effort: Effort = BRIEF) -> Method:
 def made(
     shape: tuple[int, ...], dtype: str, classes: int = 3, seed: int = 0, rate_hz: float = 100.0
 ) -> Dataset:
-    """Sweeps [N, T, R, C] of noise, whose strength depends on the class; two sweeps to a
-    recording."""
+    """Noise [N, T, R, C] whose strength depends on the class; two sweeps a recording."""
     rng, labels = np.random.default_rng(seed), np.arange(shape[0]) // 2 % classes
     samples = 60 + (1 + 6 * labels)[:, None, None, None] * rng.standard_normal(shape)
     names = tuple(f"material {k}" for k in range(classes))
@@ -85,8 +84,7 @@ def check_agrees(model: networks.NetworkModel, samples: np.ndarray) -> None:
 
 
 def test_the_paper_s_cnn_is_the_paper_s():
-    """15,891,910 parameters; 1500 x 16 -> 150 -> 15; the recipe as printed, and in PyTorch's terms.
-    TactNet-II has about its published 1.84 M."""
+    """15,891,910 parameters; 1500 x 16 -> 150 -> 15; TactNet-II has about 1.84 M."""
     net = paper_cnn.build_paper_cnn(skin.FORMAT, 6, np.zeros((1, 1, 1, 1)))
     assert sum(p.numel() for p in net.parameters()) == 15_891_910
     assert [tuple(c.weight.shape) for c in net.convs] == [(32, 1, 15, 5), (64, 32, 15, 5)]
@@ -117,8 +115,7 @@ def test_pooling_runs_over_the_end(window: int, steps: tuple[int, int]):
 
 @pytest.mark.slow
 def test_the_loop_is_adam_as_the_paper_prints_it():
-    """Step by step it equals PyTorch's Adam: batches in sequence from a shuffled set, shuffled
-    again after each round."""
+    """Step by step PyTorch's Adam: batches of a set that is shuffled for each round."""
     s, r = (
         made((6, 12, 2, 1), "float32", 2),
         replace(paper_cnn.PAPER_RECIPE, steps=5, batch=4, dropout=0.0),
@@ -144,8 +141,7 @@ def test_the_loop_is_adam_as_the_paper_prints_it():
 
 
 def test_adversarial_training_sees_the_worse_sweep():
-    """The gradient is the sum of that of the sweep and that of the sweep moved by the fast gradient
-    sign."""
+    """The gradient is that of the sweep plus that of the sweep moved by its sign."""
     s = made((6, 20, 2, 2), "float32", 2)
     net = paper_cnn.ImageNetwork(
         s.format, 2, 0.1, 60.0, paper_cnn.ImageLayers((4, 4), ((2, 1), (2, 1)), 2, False, 8)
@@ -175,8 +171,7 @@ def test_adversarial_training_sees_the_worse_sweep():
     [((12, 64, 3, 3), "int16", 2), ((12, 21, 1, 1), "uint16", 3), ((12, 7, 16, 1), "float32", 3)],
 )
 def test_any_form_goes_all_the_way(name: str, shape: tuple[int, ...], dtype: str, classes: int):
-    """Odd grids, windows and data types are trained, give finite logits, and the box's session
-    gives the same."""
+    """Odd grids, windows and types: finite logits, the same in the box's session."""
     s = made(shape, dtype, classes)
     model = train(name, s)
     assert model.logits(s.samples[:5]).shape == (5, classes)
@@ -207,8 +202,7 @@ def test_the_skin_s_own_sweeps_agree_with_the_graph(name: str):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", quick_first(NETS))
 def test_small_sets_are_trained_whole(name: str):
-    """Two recordings of one sweep each cannot be split; one position alone does not prevent a split
-    by recording."""
+    """Two recordings of one sweep each cannot be split; one position alone can."""
     tiny = easy(2)
     check_agrees(train(name, tiny), tiny.samples)
     one = easy(6)
@@ -250,8 +244,7 @@ def test_effort_is_kept():
 
 @pytest.mark.parametrize("name", ["paper-cnn", "paper-cnn-centred"])
 def test_the_paper_s_cnn_has_an_int8_form(name: str):
-    """It has a quarter of the size and the same labels up to quantization; centred, an offset
-    changes nothing."""
+    """A quarter of the size, nearly the same labels; centred, an offset changes nothing."""
     s = easy(8)
     model = train(name, s)
     int8 = model.precisions["int8"]
@@ -264,8 +257,7 @@ def test_the_paper_s_cnn_has_an_int8_form(name: str):
 
 
 def test_forms_are_kept_and_counted(tmp_path: Path):
-    """Logits of the other precision are read from the file unchanged, and evaluate reports them
-    beside the others."""
+    """Logits of the other precision are read from the file and reported too."""
     s = easy(12)
     order = np.arange(len(s))
     made_ = fold.run(fold.FoldTask("paper-cnn", BRIEF, 1, order[::2], order[1::2]), s, s.samples)

@@ -34,8 +34,7 @@ def noise(frames: int = 300, rows: int = 2, cols: int = 3) -> np.ndarray:
 
 
 def test_static_features_are_what_they_say():
-    """Two frames of 1x2 taxels by hand: means, deviations, the pressure's four numbers, centre and
-    contact area."""
+    """Two frames of 1x2 taxels by hand: means, deviations, pressure, centre and area."""
     x = np.array([[[10, 0]], [[30, 2]]], np.uint8)
     centre = (-0.5 * 20 + 0.5 * 1) / 21
     want = [20, 1, 10, 1, 10.5, 5.5, 5, 16, 0, centre, 0.5]
@@ -50,8 +49,7 @@ def test_static_features_do_not_know_time():
 
 
 def test_a_spectrogram_is_its_formula():
-    """One part by formula: Hann window, Fourier sum without DC, mean over a band's six bins, taxels
-    by eq. 4, logarithm."""
+    """One part: Hann window, Fourier sum without DC, band mean, taxels by eq. 4, logarithm."""
     x = noise(1500)
     part = x.reshape(1500, -1).T.astype(float)[:, 300:600]
     n = np.arange(300)
@@ -64,8 +62,7 @@ def test_a_spectrogram_is_its_formula():
 
 
 def test_load_and_place_are_those_of_the_normal_axis():
-    """Shear of any size only adds its own means and deviations, and power weighted by its taxel's
-    load."""
+    """Shear only adds its means and deviations, and power weighted by the taxel's load."""
     x = noise()
     shear = np.random.default_rng(8).normal(-300, 9, (*x.shape, 2)).astype(np.float32)
     three = np.concatenate([shear, x[..., None]], axis=-1)
@@ -80,8 +77,7 @@ def test_load_and_place_are_those_of_the_normal_axis():
 
 @pytest.mark.parametrize(("frames", "band"), [(1500, 7), (128, 3), (100, 20)])
 def test_a_tone_lands_in_its_part_and_band(frames: int, band: int):
-    """A burst in the fourth fifth of the sweep is the maximum there, also where zeros must be
-    appended."""
+    """A burst in the fourth fifth is the maximum there, also where zeros are appended."""
     t = np.arange(frames)
     at = t * 5 // frames == 3
     tone = 100 + 50 * at * np.sin(2 * np.pi * (band + 0.5) / 50 * t)
@@ -102,8 +98,7 @@ def test_hjorth_parameters_of_a_sine():
 
 @pytest.mark.parametrize("frames", [300, 4])
 def test_correlations_are_those_of_scipy(frames: int):
-    """Mean and spread of Pearson's and Spearman's r over all pairs, with ties, for more frames than
-    taxels and fewer."""
+    """Mean and spread of Pearson's and Spearman's r over all pairs, with ties."""
     x = np.round(noise(frames)).astype(np.uint8)
     flat = x.reshape(frames, -1).T.astype(float)
     want = []
@@ -118,8 +113,7 @@ def test_correlations_are_those_of_scipy(frames: int):
 
 
 def test_a_still_taxel_takes_no_part_in_correlations():
-    """A dead taxel leaves the four numbers unchanged, however large its count; a single varying
-    taxel has no correlation."""
+    """A dead taxel changes none of the four numbers; one varying taxel has no correlation."""
     x = noise()
     for level in (0, 3.3e30):
         dead = np.concatenate([x, np.full((len(x), 2, 1), level, np.float32)], axis=2)
@@ -141,8 +135,7 @@ def test_a_silent_or_saturated_skin_has_plain_answers(level: int):
 
 
 def test_a_mean_that_rounding_left_is_none():
-    """Float32 counts without their means: the weights are equal, and no feature shows the rounding
-    error."""
+    """Without means the weights are equal, and no feature shows the rounding error."""
     x = noise()
     centred = (x - x.mean(axis=0, dtype=np.float64)).astype(np.float32)
     assert centred.mean(axis=0, dtype=np.float64).any()
@@ -182,8 +175,7 @@ def test_what_cannot_be_computed_is_refused(of, shape: tuple[int, ...], rate_hz:
 
 
 def test_exploring_stops_when_the_posterior_is_sure():
-    """.6, then .6 * .6 over the sum (.69), then .77: two sweeps for .65, three for .7, all of them
-    for .99."""
+    """.6, then .69, then .77: two sweeps for .65, three for .7, all of them for .99."""
     log_p = np.log(np.array([[0.6, 0.4]] * 3))
     found = [prior_work.explore(log_p, sure) for sure in (0.55, 0.65, 0.7, 0.99)]
     assert found == [(0, 1), (0, 2), (0, 3), (0, 3)]

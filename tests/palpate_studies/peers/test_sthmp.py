@@ -46,8 +46,7 @@ def test_the_codes_are_those_of_orthogonal_matching_pursuit():
 
 
 def test_a_patch_of_fewer_atoms_stays_so():
-    """For an empty patch, a patch of one atom and a dictionary of one atom the residual is zero and
-    no number grows."""
+    """An empty patch, one of one atom, a dictionary of one: no residual, nothing grows."""
     d = atoms(9)
     codes = sthmp.encode(np.stack([0 * d[0], -3 * d[4]]), d)
     np.testing.assert_allclose(
@@ -95,8 +94,7 @@ def by_loops(sweep: np.ndarray, d: np.ndarray, scale: float) -> np.ndarray:
 
 @pytest.mark.parametrize("dtype", SETS)
 def test_the_features_are_largest_codes_of_each_cell(dtype: str):
-    """The cells are the grid and its quarters, over the window, its halves and its quarters; signs
-    are separate, and the length of each cell is divided out; for any grid."""
+    """Over the grid and its quarters, the window and its parts; any grid, signs apart."""
     rows, cols, window = SETS[dtype]
     sweep = (120 + 9 * np.random.default_rng(2).standard_normal((window, rows, cols))).astype(dtype)
     d = atoms(7, min(rows, 2), min(cols, 2))
@@ -107,8 +105,7 @@ def test_the_features_are_largest_codes_of_each_cell(dtype: str):
 
 
 def test_a_patch_holds_all_axes_of_its_taxels():
-    """The codes are those of the taxels one by one, each with its axes beside each other; a patch
-    never holds part of a taxel."""
+    """The codes are those of whole taxels, each with its axes beside each other."""
     sweep = np.random.default_rng(2).standard_normal((64, 3, 2, 3)).astype(np.float32)
     d = atoms(7, 2, 6)
     graph = sthmp.pooled(SweepFormat(3, 2, 50.0, 64, "float32", 3), d, 0.1)
@@ -147,8 +144,7 @@ def test_an_offset_changes_nothing():
 
 
 def test_the_dictionary_finds_what_patches_are_made_of(monkeypatch: pytest.MonkeyPatch):
-    """Of patches that consist of two out of twenty atoms most atoms are found again, and the
-    residual is small."""
+    """Of patches of two out of twenty atoms most are found, and the residual is small."""
     monkeypatch.setattr("palpate_studies.peers.sthmp.ACTIVE", 2)
     monkeypatch.setattr("palpate_studies.peers.sthmp.ROUNDS", 15)
     rng, truth = np.random.default_rng(5), atoms(20).astype(np.float64)

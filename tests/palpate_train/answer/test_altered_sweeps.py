@@ -63,8 +63,7 @@ def space(sweeps: Dataset) -> tuple[Embed, Space]:
 
 
 def test_held_out_copies_widen_shapes_and_set_the_limit():
-    """A disturbance that the box measures is allowed for; of few held-out sweeps nothing is
-    learned."""
+    """A disturbance that the box measures is allowed for; few held-out sweeps teach nothing."""
     train, held = windows(), windows(seed=1)
     embed, judge = space(train)
     tare = np.zeros(FORMAT.shape)

@@ -35,9 +35,7 @@ def world(n: int = 20) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def test_a_disturbed_sweep_of_a_known_material_stays_known():
-    """One in ten of the sweeps has a copy with the fault; then other sweeps with the fault are
-    known. A third material is still unknown, and head, temperature and judging sweeps are
-    unchanged."""
+    """After copies of one in ten with the fault, other such sweeps are known; the rest stays."""
     x, y, at = world()
     known = y < 2
     one = np.arange(known.sum()) % ONE_IN == 0
@@ -62,8 +60,7 @@ def test_a_disturbed_sweep_of_a_known_material_stays_known():
 
 @pytest.mark.slow
 def test_disturbed_sweeps_are_of_those_that_were_trained_on():
-    """One in ten training sweeps has a changed copy of the same material and group; none of the
-    copies judges."""
+    """One in ten has a changed copy of its material and group; no copy judges."""
     fit = recipe.fit(easy(16), Run(1), recipe.Settings(steps=0))
     given = calibration_inputs(fit)
     prefixes, labels, groups, held, faulty = (
@@ -85,8 +82,7 @@ def test_disturbed_sweeps_are_of_those_that_were_trained_on():
 @pytest.mark.parametrize("early", [None, Early((0.9,) * 9, 2)], ids=["no-rule", "rule"])
 @pytest.mark.parametrize("reattached", [False, True], ids=["no-copies", "copies"])
 def test_a_calibration_survives_its_file(early: Early | None, reattached: bool):
-    """Arrays and figures, as JSON, give the same calibration, with a rule for early answers and for
-    displaced contacts or without."""
+    """Arrays and figures, as JSON, give the same calibration, with each rule or without."""
     x, y, at = world()
     given = plain_inputs(x, y, at, at >= 6, 1)
     if reattached:

@@ -22,8 +22,7 @@ def gaussians(n: int, means, seed: int = 0, mix=None):
 
 @pytest.mark.parametrize("fixed", [0, 3])
 def test_the_embedding_is_lda(fixed: int):
-    """Logits from distances are those of shrinkage LDA with equal priors up to a common term; the
-    covariance is 1."""
+    """Logits are those of shrinkage LDA up to a common term; the covariance is 1."""
     mix = np.random.default_rng(1).standard_normal((7, 7))
     x, y = gaussians(200, np.random.default_rng(2).standard_normal((4, 7)) @ mix, mix=mix)
     one = embedding.embed(x, y, fixed)
@@ -46,8 +45,7 @@ def test_the_embedding_is_lda(fixed: int):
 
 
 def test_untrained_features_are_kept_completely():
-    """With `fixed` all directions of the last features are kept: the distance is the full
-    Mahalanobis distance there."""
+    """With `fixed` the distance is the full Mahalanobis distance in the last features."""
     x, y = gaussians(300, [[0, 0, 0], [6, 0, 0]])
     unknown = np.array([[0.0, 0.0, 20.0]])
     assert embedding.embed(x, y, 0).novelty(unknown)[0] < 10

@@ -61,8 +61,7 @@ def test_nothing_varies_at_zero_and_nothing_is_drawn():
     ],
 )
 def test_every_parameter_changes_sweeps_each_otherwise_and_leaves_its_input(settings: Augmentation):
-    """The same generator gives the same bits, another generator gives others. Equal sweeps become
-    different, and the input does not change."""
+    """The same generator gives the same bits, another gives others; the input stays."""
     x = np.repeat(sweeps(1), 12, axis=0)
     before = x.copy()
     once, again, other = (
@@ -85,8 +84,7 @@ def test_sensors_without_vibrations_get_an_augmentation_of_their_own():
 
 @pytest.mark.slow
 def test_a_shift_reads_between_rows_and_fills_the_edge():
-    """Each row becomes a mixture of two neighbours, with the same shares in all rows; the row that
-    comes in is part of the row at the edge."""
+    """Each row is a mixture of two neighbours, with the same shares in all rows."""
     x = sweeps(200, frames=50)
     now = varied(x, shift=1.0, displaced=0.5).reshape(200, 4, 200)
     mixtures = now @ np.linalg.pinv(x.reshape(200, 4, 200))
@@ -106,15 +104,13 @@ def test_a_shift_reads_between_rows_and_fills_the_edge():
 
 @pytest.mark.parametrize("rows", [1, 16])
 def test_a_line_of_taxels_is_not_moved(rows: int):
-    """With one row, or one taxel in each row, the distance of the taxels along the slide is
-    unknown."""
+    """With one row, or one taxel a row, the distance along the slide is unknown."""
     x = sweeps()
     np.testing.assert_array_equal(varied(x, rows, shift=1.0, displaced=1.0), x)
 
 
 def test_gains_are_of_all_taxels_or_of_each():
-    """The logarithms have the wanted spread; `gain` is the same for all taxels of a sweep, `gains`
-    is not; both are constant over time."""
+    """`gain` is of all taxels of a sweep, `gains` of each; both are constant over time."""
     x = sweeps(400, frames=20)
     for name, taxels in (("gain", 1), ("gains", 16)):
         ratio = varied(x, **{name: 0.3}) / x
@@ -147,8 +143,7 @@ def test_a_stretch_changes_the_rate_by_no_more_than_asked():
 
 @pytest.mark.slow
 def test_damping_takes_high_rates_and_colour_any():
-    """Damping lowers the highest rates of its share of the sweeps, never the lowest; colour raises
-    some bands as well."""
+    """Damping lowers the highest rates, never the lowest; colour raises some bands."""
     x = sweeps(200, frames=512)
     damped = varied(x, damped=0.5)
     high, low = (band(damped, *edges) / band(x, *edges) for edges in ((0.8, 1), (0.002, 0.008)))
@@ -166,8 +161,7 @@ def test_damping_takes_high_rates_and_colour_any():
 
 
 def test_noise_is_white_and_of_another_level_in_every_sweep():
-    """Its level lies between almost nothing and the maximum, equal for all taxels of a sweep, and
-    the noise of taxels is independent."""
+    """Its level, equal for all taxels, lies between almost nothing and the maximum."""
     added = varied(np.zeros((100, 16, 2000), np.float32), noise=0.5)
     level = added.std(axis=2)
     assert level.max() < 0.53
@@ -229,8 +223,7 @@ def test_what_is_clipped_is_cut_off_above():
     [(1, 1, 1), (1, 1, 2), (3, 9, 20), (16, 16, 128), (1, 5, 33), (2, 6, 3000), (6, 12, 21)],
 )
 def test_any_grid_and_length_of_silence_is_finite(rows: int, taxels: int, frames: int):
-    """One taxel, one frame, odd lengths: with every parameter on, silent sweeps stay finite and
-    keep their shape."""
+    """One taxel, one frame, odd lengths, every parameter on: finite, and of the same shape."""
     everything = replace(Augmentation(), **dict.fromkeys(NAMES, 0.5))
     x = np.zeros((5, taxels, frames), np.float32)
     now = augment(x, rows, everything, np.random.default_rng(7))

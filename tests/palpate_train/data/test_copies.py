@@ -16,8 +16,7 @@ TYPES = ("uint8", "int16", "uint16", "float32")
 
 @pytest.mark.parametrize("dtype", TYPES)
 def test_without_augmentation_copies_are_the_sweeps_themselves(dtype: str):
-    """There are as many as asked for, of the same type, labels, materials and groups, also for more
-    sweeps than fit in one batch."""
+    """As many as asked for, with type, labels and groups, also beyond one batch."""
     sweeps = easy(BATCH // 2, dtype=dtype)
     made = list(copies(sweeps, STILL, 5, 3))
     assert len(made) == 3
@@ -33,8 +32,7 @@ def test_without_augmentation_copies_are_the_sweeps_themselves(dtype: str):
 
 @pytest.mark.parametrize("dtype", TYPES)
 def test_copies_are_augmented_raw_counts(dtype: str):
-    """The texture is augmented on the scale of the networks, and put back into raw counts around
-    the mean of each taxel."""
+    """The texture is augmented on the networks' scale, around the mean of each taxel."""
     sweeps = easy(6, dtype=dtype)
     scale = texture_scale(sweeps.samples)
     x = sweeps.samples.reshape(18, 64, 4).transpose(0, 2, 1).astype(np.float32)

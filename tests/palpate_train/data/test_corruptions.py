@@ -31,8 +31,7 @@ def small(
 
 @cache
 def scene() -> EvaluationSweeps:
-    """A small simulated scene: two worlds with one placement each and two sweeps of each
-    material."""
+    """Two worlds with one placement each and two sweeps of each material."""
     return EvaluationSweeps.simulated("sim:T-LAB:1001-1002:2")
 
 
@@ -47,8 +46,7 @@ def scene() -> EvaluationSweeps:
 )
 @pytest.mark.parametrize("name", DIGITAL)
 def test_counts_stay_counts(name: str, sweeps: Dataset):
-    """For any grid, rate and type, severity 0 changes no bit, and the severest gives a different
-    sweep of the same format, repeatably."""
+    """Severity 0 changes no bit; the severest gives another sweep of the same format."""
     entry, trial = BY_NAME[name], EvaluationSweeps(sweeps)
     before = sweeps.samples.copy()
     assert entry.apply(trial, 0, 3) is sweeps.samples
@@ -91,8 +89,7 @@ def test_no_severity_beyond_the_scale(severity: float):
 
 
 def test_corruptions_by_name():
-    """Corruptions are found by name, and unknown names are refused. Simulated sweeps are drawn
-    again; the raw counts of a file are changed."""
+    """Unknown names are refused; simulated sweeps are drawn again, files changed."""
     assert [s.name for s in corruptions.find(["hum", "dead"])] == ["hum", "dead"]
     with pytest.raises(FormatError, match="cold"):
         corruptions.find(["cold"])
@@ -105,8 +102,7 @@ def test_corruptions_by_name():
 
 
 def test_the_scene_is_what_the_simulator_draws():
-    """The sound sweeps, a shift by one row and a turn by 20 degrees are those of skin.sweep with
-    the same random stream."""
+    """Sound, shifted and turned sweeps are those of skin.sweep with the same stream."""
     trial, form = scene(), skin.FORMAT
     assert (trial.scene.draw() == trial.sweeps.samples).all()
     assert sorted(np.bincount(trial.sweeps.labels)) == [4] * 6
@@ -147,8 +143,7 @@ def test_force_is_the_worlds():
 
 
 def test_speed_is_the_fingers():
-    """At half the speed, the relief passes at half its frequencies; vibrations of friction keep
-    their frequencies."""
+    """At half the speed the relief has half its frequencies; those of friction stay."""
     still = replace(skin.WORLD, off=frozenset({"vibration", "drift", "noise", "spot"}))
     shaken = replace(skin.WORLD, off=frozenset({"texture", "drift", "noise", "spot"}))
 
@@ -171,8 +166,7 @@ def test_speed_is_the_fingers():
 
 
 def test_dead_stuck_and_noisy_taxels():
-    """The severity is the number of bad taxels, and the others are unchanged. Taxels that are dead
-    at 1 are also dead at 3."""
+    """The severity is the number of bad taxels; those dead at 1 are dead at 3."""
     trial = EvaluationSweeps(small())
     for name in ("dead", "stuck", "noisy"):
         one, three = (BY_NAME[name].apply(trial, n, 5) != trial.sweeps.samples for n in (1, 3))
@@ -195,8 +189,7 @@ def test_a_taxel_is_dead_on_all_its_axes():
 
 
 def test_shear_turns_with_the_skin():
-    """After a quarter turn, the grid is as with one axis, shear along the rows becomes shear
-    across, and the normal axis stays."""
+    """After a quarter turn shear along the rows is shear across; the normal axis stays."""
     flat = np.random.default_rng(0).uniform(10, 90, (2, 5, 3, 3)).astype(np.float32)
     along, normal = np.arange(90, dtype=np.float32).reshape(flat.shape), flat
     x = np.stack([along, 0 * along, normal], axis=-1)
@@ -209,8 +202,7 @@ def test_shear_turns_with_the_skin():
 
 @pytest.mark.slow
 def test_a_scene_with_shear_is_drawn_anew():
-    """A scene with shear keeps its skin: the format, the sweeps without a corruption, and those
-    with half the force."""
+    """It keeps its format, the sweeps without a corruption, and those with half the force."""
     trial = EvaluationSweeps.simulated("sim:T-LABx3:1001:1")
     assert str(trial.sweeps.format) == "4x4x3 int16 at 750 Hz, window 1500"
     drawn = BY_NAME["force-down"].apply(trial, 0.5, 0)
@@ -221,8 +213,7 @@ def test_a_scene_with_shear_is_drawn_anew():
 
 
 def test_lost_frames_lie_on_the_line():
-    """About a fifth of the frames is lost, never more than two in a row, and each is interpolated
-    between its neighbours."""
+    """A fifth is lost, never more than two in a row, each interpolated."""
     trial = EvaluationSweeps(small("float32", (6, 400, 1, 2)))
     got, was = BY_NAME["lost"].apply(trial, 0.2, 0), trial.sweeps.samples
     lost = (got != was).all(axis=(2, 3))
@@ -292,8 +283,7 @@ def test_counts_are_digitized_again():
 
 
 def test_the_grid_is_read_elsewhere():
-    """With a shift by one row, each row has the values of its neighbour, and the last row mirrors;
-    the gains differ."""
+    """Shifted by one row, each row has its neighbour's values; the last is mirrored."""
     trial = EvaluationSweeps(small("float32", (3, 50, 4, 2)))
     was = trial.sweeps.samples
     ratio = BY_NAME["shift-grid"].apply(trial, 1, 0) / was[:, :, [1, 2, 3, 2]]
@@ -310,8 +300,7 @@ def test_the_grid_is_read_elsewhere():
 
 
 def test_fewer_sweeps_as_many_of_each():
-    """About `most` sweeps of a file are used, evenly over the materials; a smaller file is used
-    whole."""
+    """About `most` sweeps of a file, evenly over materials; a smaller file is whole."""
     sweeps = small("uint8", (40, 20, 1, 1))
     assert len(EvaluationSweeps.of(sweeps).sweeps) == 40
     assert np.bincount(EvaluationSweeps.of(sweeps, 10, 1).sweeps.labels).tolist() == [5, 5]

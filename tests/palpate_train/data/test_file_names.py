@@ -81,8 +81,7 @@ def test_what_is_no_pattern_is_refused(pattern: str, message: str):
     ],
 )
 def test_values_stay_what_they_are(field: str, texts: list[str], values: list, unit: str):
-    """Numbers stay numbers and names stay names; a unit is read from the pattern, from every text,
-    or from the field's name."""
+    """Numbers and names stay; a unit is of the pattern, of every text, or of the field."""
     pattern = NamePattern("{material}_" + field + ".csv")
     found, of = group(pattern, pattern.names[-1], texts)
     assert found.tolist() == values

@@ -84,8 +84,7 @@ FORMS = {
 
 @pytest.mark.parametrize("suffix", FORMS)
 def test_every_format_gives_the_same_sweeps(tmp_path: Path, suffix: str):
-    """The middle ten frames of each file as a sweep [10, 2, 2] of the smallest type, with its
-    groups."""
+    """The middle ten frames of each file [10, 2, 2] in the smallest type, with groups."""
     for name in ("cork_1", "felt_1", "wool_2"):
         FORMS[suffix](tmp_path / f"{name}.{suffix}")
     s = taken(tmp_path).sweeps
@@ -125,8 +124,7 @@ def test_a_pattern_without_a_field_matches(tmp_path: Path, changes: dict):
 
 
 def test_windows_are_cut_as_asked(tmp_path: Path):
-    """The middle window, or a window at regular intervals from the start on; all belong to one
-    recording."""
+    """The middle window, or windows at intervals from the start; all of one recording."""
     both(tmp_path, text)
     s = taken(tmp_path, every=Length("150ms", "--every")).sweeps
     assert s.groups["recording"].tolist() == [0, 0, 0, 1, 1, 1]
@@ -135,8 +133,7 @@ def test_windows_are_cut_as_asked(tmp_path: Path):
 
 
 def test_times_give_the_rate_and_even_frames_are_kept(tmp_path: Path):
-    """Times rounded to milliseconds at 300 Hz: the counts stay as recorded, and the set has the
-    right rate."""
+    """Times rounded to ms at 300 Hz: counts as recorded, and the right rate."""
     both(tmp_path, lambda path: write(path, COUNTS, 300.0, np.round(1000 * np.arange(40) / 300)))
     made = taken(tmp_path, time="time:ms", rate_hz=None)
     assert made.sweeps.rate_hz == pytest.approx(300, rel=0.005)
@@ -145,8 +142,7 @@ def test_times_give_the_rate_and_even_frames_are_kept(tmp_path: Path):
 
 
 def test_times_that_wander_are_interpolated(tmp_path: Path):
-    """A ramp sampled at irregular times becomes a ramp again, in whole counts, and the report says
-    so."""
+    """A ramp at irregular times becomes a ramp in whole counts, and the report says so."""
     late = 25 * np.sin(np.arange(400) / 20)  # ms, for periods of 10 ms
     times = 10 * np.arange(400) + late
     ramp = np.repeat(np.rint(times)[:, None] + 100, 4, axis=1)
@@ -278,8 +274,7 @@ def test_each_bad_binary_gets_one_exact_line(tmp_path: Path, suffix: str, save, 
 
 
 def test_an_array_is_chosen_and_turned(tmp_path: Path):
-    """--variable chooses between two arrays; --transpose reads taxels x frames; times stand beside
-    the array."""
+    """--variable chooses an array; --transpose reads taxels x frames; times stand beside."""
     for name in ("cork_1", "felt_1"):
         np.savez(
             tmp_path / f"{name}.npz", other=np.zeros((3, 3)), frames=COUNTS.T, t=np.arange(40) / 50
@@ -303,8 +298,7 @@ def test_an_array_is_chosen_and_turned(tmp_path: Path):
     ],
 )
 def test_times_that_cannot_be_are_named(tmp_path: Path, times: np.ndarray, why: str):
-    """Times that go back, stand still, come in bursts or at another rate: the file is left out, the
-    others are imported."""
+    """Back, still, in bursts or at another rate: that file alone is left out."""
     both(tmp_path, lambda path: write(path, COUNTS, 100.0))
     write(tmp_path / "felt_2.csv", COUNTS, 100.0, times)
     ((name, said),) = reasons(tmp_path, time="time:ms", rate_hz=None).items()
@@ -321,8 +315,7 @@ def test_a_length_is_seconds_or_frames(length: str):
 
 
 def test_names_of_materials_are_checked_before_anything_is_read(tmp_path: Path):
-    """All bad new names at once; --rename changes names and joins materials; renaming an unknown
-    material is refused."""
+    """All bad names at once; --rename changes and joins; an unknown one is refused."""
     for name in ("a,b", "x" * 30, "felt"):
         (tmp_path / f"{name}_1.csv").write_text("nothing to read")
     bad = {"a,b": "c,d", "felt": "y" * 30}
@@ -337,8 +330,7 @@ def test_names_of_materials_are_checked_before_anything_is_read(tmp_path: Path):
 
 
 def test_shapes_that_differ_are_refused(tmp_path: Path):
-    """Arrays of two grids are not a set; nor is a path that is not a folder, or a folder in which
-    no file matches."""
+    """Arrays of two grids, a path that is no folder, no file that matches."""
     np.save(tmp_path / "cork_1.npy", np.zeros((20, 2, 2)))
     np.save(tmp_path / "felt_1.npy", np.zeros((20, 2, 3)))
     with pytest.raises(FormatError, match="shape"):
@@ -409,8 +401,7 @@ ARRAYS = {
 
 @pytest.mark.parametrize("suffix", ARRAYS)
 def test_each_array_whose_name_matches_is_a_recording(tmp_path: Path, suffix: str):
-    """The name of the array has the material and the trial, that of the file the session; times and
-    other arrays are passed over."""
+    """Material and trial from the array's name, the session from the file's."""
     for session, first in (("mo", 1), ("tu", 3)):
         arrays = {f"{m}_{k}": COUNTS + k for k in (first, first + 1) for m in ("felt", "wool")}
         ARRAYS[suffix](

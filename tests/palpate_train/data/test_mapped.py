@@ -36,8 +36,7 @@ def same(a: Dataset, b: Dataset) -> bool:
 
 @pytest.mark.parametrize("name", FORMS)
 def test_a_mapped_set_is_the_set(sweeps: Dataset, tmp_path: Path, name: str):
-    """Loaded, split and joined it stays mapped and holds the same; a small part is held in
-    memory."""
+    """Loaded, split and joined it stays mapped and the same; a small part is in memory."""
     sweeps.save(tmp_path / name)
     read = sets.load(str(tmp_path / name))
     assert mapped.is_mapped(read.samples)

@@ -19,8 +19,7 @@ class SteppedClock:
 
 
 def test_progress_shows_how_much_is_left():
-    """Tasks done, tasks in all, the time left estimated from finished tasks, and the task; the line
-    carries the same numbers."""
+    """Tasks done, tasks in all, the estimate of the time left, and the task."""
     lines: list[str] = []
     clock = SteppedClock()
     progress = Progress(4, lines.append, clock)
@@ -34,8 +33,7 @@ def test_progress_shows_how_much_is_left():
 
 
 def test_a_task_that_begins_is_not_done():
-    """It counts as done when the next task begins; an estimate needs a finished
-    task."""
+    """It counts when the next begins; an estimate needs a finished task."""
     lines: list[str] = []
     clock = SteppedClock()
     progress = Progress(3, lines.append, clock)

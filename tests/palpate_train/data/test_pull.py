@@ -110,8 +110,7 @@ def test_a_box_without_recordings_has_none(ground: Ground, capsys: pytest.Captur
 
 
 def test_names_that_a_shell_would_read_otherwise_are_kept(ground: Ground):
-    """Spaces, quotes, dollars, a leading dash, several dots, letters of other languages, and long
-    names."""
+    """Spaces, quotes, dollars, a dash, dots, other languages' letters, long names."""
     odd = ["a b", "it's $HOME", "-rf", "--checkpoint", "v1.2", "Häkelgarn", "x" * 150, "*", "\\n"]
     for name in odd:
         record(ground.box / name / f"{name}.npy", id=1)
@@ -121,8 +120,7 @@ def test_names_that_a_shell_would_read_otherwise_are_kept(ground: Ground):
 
 @pytest.mark.slow
 def test_a_connection_that_breaks_off_leaves_whole_pairs(ground: Ground):
-    """Wherever the stream ends: local files equal the box's, byte for byte and in pairs, and the
-    next call fetches the rest."""
+    """Wherever it ends, files are the box's, in pairs; the next call fetches the rest."""
     whole = sum(len(data) for data in files(ground.box).values()) + 8 * 512
     for cut in [*range(0, whole, 700), whole]:
         ground.ssh("tar", f'sh -c "$command" | head -c {cut}; exit 255')
@@ -157,8 +155,7 @@ def test_an_interrupted_call_goes_on(ground: Ground):
 
 
 def test_what_is_left_of_a_kill_is_made_whole(ground: Ground):
-    """A lone sidecar, as after a kill between the two files, or a temporary file: the pair is
-    fetched again."""
+    """A lone sidecar or a temporary file: the pair is fetched again."""
     ground.fetch()
     (ground.here / "run 0" / "sweep-000000.npy").unlink()
     (ground.here / "run 0" / "sweep-000001.npy").unlink()
@@ -169,8 +166,7 @@ def test_what_is_left_of_a_kill_is_made_whole(ground: Ground):
 
 
 def test_half_a_recording_is_left_there(ground: Ground, capsys: pytest.CaptureFixture[str]):
-    """A missing sidecar, or the sidecar of a sweep in progress: reported and not fetched; the
-    others are fetched."""
+    """A missing sidecar or table: reported and not fetched; the others are."""
     (ground.box / "run 0" / "sweep-000000.json").unlink()
     (ground.box / "run 1" / "sweep-000003.npy").unlink()
     (ground.box / "run 1" / "sweep-000004.npy.part").write_bytes(b"half")
@@ -197,8 +193,7 @@ def test_another_sweep_of_the_same_name_is_never_written_over(
 
 
 def test_a_label_that_was_set_right_here_stays(ground: Ground, capsys: pytest.CaptureFixture[str]):
-    """The user may edit a sidecar: it is reported, but is not a failure. The same if it was edited
-    on the box."""
+    """An edited sidecar, here or on the box, is reported and no failure."""
     ground.fetch()
     mine = ground.here / "run 0" / "sweep-000000.json"
     mine.write_text(json.dumps(json.loads(mine.read_text()) | {"material": "cork"}))
@@ -213,8 +208,7 @@ def test_a_label_that_was_set_right_here_stays(ground: Ground, capsys: pytest.Ca
 
 
 def test_what_is_no_recording_is_refused(ground: Ground, capsys: pytest.CaptureFixture[str]):
-    """A recording that is broken on the box is not stored; the others are. A recording without
-    frames is valid."""
+    """What is broken on the box is not stored; a recording without frames is valid."""
     (ground.box / "run 0" / "sweep-000000.npy").write_bytes(b"\x93NUMPY")
     (ground.box / "run 0" / "sweep-000001.json").write_text("{}")
     np.save(ground.box / "run 1" / "sweep-000002.npy", np.array([{}], object), allow_pickle=True)
@@ -275,8 +269,7 @@ SWEEP, LINK = "run 0/sweep-000000.npy", tarfile.SYMTYPE
     ],
 )
 def test_a_hostile_archive_is_refused(ground: Ground, archive: bytes):
-    """Paths outside the folder, absolute paths, links, devices, files that were not requested: none
-    is written."""
+    """Paths outside, links, devices, files not asked for: none is written."""
     (ground.bin / "archive").write_bytes(archive)
     ground.ssh("tar", f"exec cat '{ground.bin}/archive'")
     with pytest.raises(FormatError, match="sends '"):
@@ -296,8 +289,7 @@ STREAMS = {
 
 @pytest.mark.parametrize(("names", "before"), STREAMS.values(), ids=STREAMS)
 def test_a_hostile_stream_takes_no_memory(ground: Ground, names: tuple[str, ...], before: bytes):
-    """Of parts that wait for their other part only one recording's are kept, each file comes once,
-    and headers have a limit: nothing of it is stored."""
+    """One recording's parts wait at most, each file comes once, headers have a limit."""
     held = io.BytesIO()
     held.write(before)
     with tarfile.open(fileobj=held, mode="w") as archive:
@@ -370,8 +362,7 @@ def test_a_folder_of_others_is_read_with_sudo(ground: Ground):
 
 
 def test_a_folder_that_cannot_be_read_is_named(ground: Ground, capsys: pytest.CaptureFixture[str]):
-    """It does not exist for this user, and sudo asks for a password: one message, after the box's
-    messages."""
+    """Not there for this user, and sudo asks for a password: one message."""
     ground.program("sudo", "#!/bin/sh\necho 'sudo: a password is required' >&2\nexit 1\n")
     with pytest.raises(ApplianceError, match="/nowhere"):
         pull.pull(
@@ -390,8 +381,7 @@ def test_a_box_that_has_recorded_nothing_says_so(ground: Ground):
 
 
 def test_a_list_or_stream_that_is_cut_short_is_told(ground: Ground):
-    """Failing or missing tools never look like a box without recordings, however the connection
-    ends."""
+    """Failing or missing tools never look like a box without recordings."""
     ground.ssh("tar", "exit 0")
     with pytest.raises(ApplianceError, match="0 of 4"):
         ground.fetch()
@@ -411,8 +401,7 @@ def test_an_npy_takes_its_name_last(ground: Ground, monkeypatch: pytest.MonkeyPa
 
 
 def test_ssh_is_asked_without_questions(ground: Ground):
-    """The user's options come first, so they take effect; no password is asked for; a host is never
-    read as an option."""
+    """The user's options come first; no password is asked; a host is never an option."""
     ground.program("ssh", f'#!/bin/sh\nprintf "%s\\n" "$@" > "{ground.bin}/asked"\nexit 255\n')
     with pytest.raises(ApplianceError, match="no connection"):
         ground.pull("--port", "2222", "--ssh-option", "BatchMode=no")
@@ -455,8 +444,7 @@ def sshd(tmp_path: Path) -> list[str]:
 
 @pytest.mark.slow
 def test_through_a_real_sshd(tmp_path: Path, sshd: list[str]):
-    """Keys, a login shell, the real tools: everything is fetched, twice; a wrong key gives no
-    connection."""
+    """Keys, a login shell, the real tools: all is fetched; a wrong key connects not."""
     for i in range(3):
         record(tmp_path / "box" / "a session" / f"sweep-{i:06d}.npy", "ab"[i % 2], id=i)
     box = RecordingHost(f"{getpass.getuser()}@palpate", str(tmp_path / "box"), sshd)

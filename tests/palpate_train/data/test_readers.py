@@ -43,8 +43,7 @@ def tactmat(path: Path, dtype: str = "uint8", **more: object) -> np.ndarray:
 
 
 def test_hdf5_holds_what_an_npz_holds(tmp_path: Path):
-    """Names as text or bytes, the rate as a data set or an attribute, another name, another byte
-    order."""
+    """Names as text or bytes, the rate as set or attribute, another byte order."""
     a = sets.load(hdf5(tmp_path / "a.h5"))
     assert (str(a.format), a.materials) == ("2x3 int16 at 50 Hz, window 8", ("a", "b", "ç"))
     np.testing.assert_array_equal(a.samples, held()["samples"])
@@ -176,8 +175,7 @@ def test_a_damaged_hdf5_is_refused(tmp_path: Path, signature: bytes):
 
 @pytest.mark.parametrize("dtype", ["uint8", "int64", "float32", "float64"])
 def test_tactmat_is_read(tmp_path: Path, dtype: str):
-    """Labels from the first axis, repetitions from the second; counts of one byte, whatever type
-    they are stored in."""
+    """Labels from the first axis, repetitions from the second; counts of one byte."""
     samples = tactmat(tmp_path / "t.h5", dtype)
     s = sets.load(str(tmp_path / "t.h5"))
     assert str(s.format) == "4x4 uint8 at 750 Hz, window 50"
@@ -214,8 +212,7 @@ def test_a_broken_tactmat_is_refused(tmp_path: Path):
 
 
 def test_recordings_are_a_set(tmp_path: Path):
-    """Each file is a recording; materials and places keep their names, objects differ between
-    folders; sweeps that are not ok are counted."""
+    """Each file is a recording; objects differ between folders; others are counted."""
     for i, (material, position, obj) in enumerate(
         [("b", "tip", 0), ("a", "side", 1), ("b", "side", 1), ("a", "tip", 2)]
     ):
@@ -237,8 +234,7 @@ def test_recordings_are_a_set(tmp_path: Path):
 
 
 def test_a_place_that_is_a_number_keeps_it(tmp_path: Path):
-    """If all names are whole numbers, they are the group's numbers, so --only position=12 selects
-    the position named 12."""
+    """If all names are whole numbers, --only position=12 selects the one named 12."""
     for i, (position, session) in enumerate([("12", "7"), ("3", "07"), ("3", "8"), ("0", "7")]):
         record(tmp_path / f"{i}.npy", "ab"[i % 2], position=position, session=session)
     groups = sets.load(str(tmp_path)).groups
@@ -259,8 +255,7 @@ def test_what_else_a_sidecar_holds_changes_nothing(tmp_path: Path):
 
 
 def test_the_unloaded_skin_is_kept(tmp_path: Path):
-    """For each sweep whose sidecar has its numbers, NaN for the others; a set without any has no
-    such array."""
+    """For each sweep that has its numbers, NaN for others; without any no array."""
     level = [[1.0, 2, 3], [4, 5, 6]]
     for i in range(4):
         record(tmp_path / f"{i}.npy", "ab"[i % 2], id=i)
@@ -295,8 +290,7 @@ def test_an_unloaded_skin_of_another_form_is_named(tmp_path: Path, known: object
 
 
 def test_what_the_box_refused_is_left_out(tmp_path: Path):
-    """A skin that was not touched, or was broken, whatever the label; a window cut short by an
-    early answer."""
+    """Not touched, broken, or cut short by an early answer: whatever the label."""
     for i in range(9):
         record(tmp_path / f"{i}.npy", "ab"[i % 2], id=i)
     for i, status in enumerate(REFUSED):
@@ -319,8 +313,7 @@ def test_objects_of_several_runs_in_one_folder_stay_apart(tmp_path: Path):
 
 
 def test_speed_and_force_are_groups_if_all_have_them(tmp_path: Path):
-    """In um/s and mN, rounded; a value that only some have is a remark in the source and no
-    group."""
+    """In um/s and mN, rounded; what only some have is a remark and no group."""
     for i, speed in enumerate((30, 30.5, 12.3456, 0.1)):
         record(tmp_path / f"{i}.npy", "ab"[i % 2], id=i, speed_mm_s=speed)
     s = sets.load(str(tmp_path))
@@ -356,8 +349,7 @@ def test_a_recording_that_does_not_fit_is_named(tmp_path: Path, more: dict, mess
 
 
 def test_broken_recordings_are_named(tmp_path: Path):
-    """A truncated table, a missing or empty sidecar, no ok sweep, an empty folder, a single
-    material."""
+    """A truncated table, no sidecar, an empty one, no ok sweep, a single material."""
     with pytest.raises(FormatError, match="`palpate record`"):
         sets.load(str(tmp_path))
     record(tmp_path / "0.npy", status=Status.SHORT)
@@ -393,8 +385,7 @@ def test_a_recording_is_never_unpickled(tmp_path: Path):
 
 @pytest.mark.parametrize("suffix", [".csv", ".CSV", ".txt", ".tsv", ".dat", ".mat", ".npy"])
 def test_a_file_of_frames_names_the_import(tmp_path: Path, suffix: str):
-    """A single file of frames, or a folder of them, is not a set; the message gives the command
-    that makes one."""
+    """The message gives the command that makes a set of a file or folder of frames."""
     np.save(tmp_path / "x.npy", np.zeros((9, 4)))
     path = (tmp_path / "x.npy").rename(tmp_path / f"x{suffix}")
     with pytest.raises(FormatError, match="palpate-train import"):
@@ -455,8 +446,7 @@ def tared(folder: Path, levels: dict[str, float | None], dtype: str = "int16") -
 
 @pytest.mark.parametrize("dtype", ["int16", "float32", "uint16"])
 def test_recordings_that_were_tared_differently_compare(tmp_path: Path, dtype: str):
-    """Recordings of a tared skin are shifted to the most common level, in whole counts; small
-    drifts and unknown levels stay."""
+    """Shifted to the most common level, in whole counts; small drifts stay."""
     pressed = tared(tmp_path, {"a0": 300.0, "a1": 301.0, "b0": 0.0, "b1": 300.0, "b2": None}, dtype)
     s = sets.load(str(tmp_path))
     assert s.samples.dtype == dtype
@@ -468,8 +458,7 @@ def test_recordings_that_were_tared_differently_compare(tmp_path: Path, dtype: s
 
 
 def test_sets_that_were_tared_differently_compare_once_they_are_joined(tmp_path: Path):
-    """Each folder has one level; the smaller set is brought to the level of the other, and unknown
-    levels stay."""
+    """The smaller set is brought to the level of the other; unknown levels stay."""
     pressed = tared(tmp_path / "tared", {"a0": 0.0, "b0": 0.0})
     tared(tmp_path / "raw", {"a0": 300.0, "a1": 300.0, "b0": 300.0})
     joined = sets.join([sets.load(str(tmp_path / name)) for name in ("tared", "raw")])
@@ -484,8 +473,7 @@ def test_sets_that_were_tared_differently_compare_once_they_are_joined(tmp_path:
 
 
 def test_recordings_that_were_tared_alike_stay_to_the_bit(tmp_path: Path):
-    """If half of them were tared, the other half is shifted to an existing level; counts are
-    limited to the range of their type."""
+    """Of two halves one is shifted to a level that exists; counts stay in range."""
     pressed = tared(tmp_path, {"a0": 300.0, "b0": 301.0, "b1": 300.5})
     s = sets.load(str(tmp_path))
     assert s.source == str(tmp_path)

@@ -29,8 +29,7 @@ def windows(hop: int, dtype: str) -> np.ndarray:
 @pytest.mark.parametrize("dtype", ["uint8", "int16", "float32"])
 @pytest.mark.parametrize("hop", [16, 32, 50])
 def test_windows_that_share_frames_are_found(hop: int, dtype: str):
-    """All of them with the number of common frames, in any type; not if they are of one recording,
-    or do not overlap."""
+    """All of them with the number of common frames; not within one recording."""
     sweeps = a_set(windows(hop, dtype))
     found = repeats.pairs(sweeps)
     assert set(found.frames) == {64 - by for by in range(hop, 57, hop)}

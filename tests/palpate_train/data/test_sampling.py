@@ -18,8 +18,7 @@ from palpate_train.data import sampling
     ],
 )
 def test_the_rate_of_times_that_repeat_is_proposed(time_s: np.ndarray):
-    """A driver that delivers eight or four frames at once, and one that repeats every second time:
-    the message proposes the rate of the frames."""
+    """Four or eight frames at once, or each time twice: the rate of the frames."""
     frames = np.zeros((len(time_s), 2, 2))
     with pytest.raises(FormatError, match=r"--rate 10[0-4]") as raised:
         sampling.runs(frames, time_s, sampling.measured_hz(time_s))

@@ -18,8 +18,7 @@ from tests.factories.sweep_sets import easy, held, write
 
 
 def test_a_file_is_read_as_it_is_described(tmp_path: Path):
-    """Format, materials, groups and raw counts are read as they were written; save writes the same
-    arrays."""
+    """Format, materials, groups and counts as written; save writes the same arrays."""
     s = sets.load(write(tmp_path / "good.npz"))
     assert str(s.format) == "2x3 int16 at 50 Hz, window 8"
     assert s.materials == ("a", "b", "c")
@@ -108,8 +107,7 @@ def test_what_is_no_set_at_all_is_refused(tmp_path: Path):
 
 @pytest.mark.slow
 def test_simulated_sets_have_their_worlds():
-    """Sizes of the paper's sets, the position of the seed in the name, and separate positions of
-    joined scenes."""
+    """Sizes of the paper's sets, the seed in the name, positions of joined scenes."""
     real = sets.load("sim:T-REAL:5-6:1")
     assert (len(real), real.format, real.materials) == (2 * 9 * 6, skin.FORMAT, skin.MATERIALS)
     assert len(np.unique(real.groups["position"])) == 18
@@ -125,8 +123,7 @@ def test_simulated_sets_have_their_worlds():
 
 
 def test_a_named_world_is_drawn_in_its_physics() -> None:
-    """Equal seeds have equal positions in all worlds. An unknown world is refused with those that
-    exist."""
+    """Equal seeds have equal positions in all worlds; an unknown world is refused."""
     blind, usual = sets.load("sim:T-HARD/level-blind:6:1"), sets.load("sim:T-HARD:6:1")
     drawn = skin.sweep_set("T-HARD", 6, 1, skin.LEVEL_BLIND)[0]
     np.testing.assert_array_equal(blind.samples, drawn)
@@ -194,8 +191,7 @@ def test_select_takes_any_of_several_values():
     ],
 )
 def test_select_names_what_is_wrong(condition: str, message: str):
-    """A typing error, another unit, a limit of names or a value that the group does not have is
-    never treated as an empty filter."""
+    """A typing error, unit or missing value is never an empty filter."""
     force, pace = [0.0, 0.5, 1.0, 1.5] * 6, ["slow", "fast"] * 12
     s = easy(8)
     groups = s.groups | {"force": np.array(force), "pace": np.array(pace)}
@@ -207,8 +203,7 @@ def test_select_names_what_is_wrong(condition: str, message: str):
 @settings(max_examples=60)
 @given(st.integers(1, 7), st.floats(0.05, 0.95), st.integers(0, 2**32 - 1))
 def test_split_never_separates_a_recording(pieces: int, share: float, seed: int):
-    """No recording is on both sides, no sweep is lost or doubled, and both sides have each material
-    close to the share."""
+    """No recording on both sides, no sweep lost; each material close to the share."""
     s = easy(21, pieces=pieces) if 21 % pieces == 0 else easy(6 * pieces, pieces=pieces)
     first, second = s.split("recording", share, seed)
     assert not set(first.groups["recording"]) & set(second.groups["recording"])
@@ -257,8 +252,7 @@ def test_split_never_trains_without_a_material():
 
 
 def test_join_keeps_recordings_apart_and_forces_together():
-    """Number 0 of two sets becomes two recordings, also if one set has no numbers; a speed of 2
-    stays 2."""
+    """Number 0 of two sets becomes two recordings; a speed of 2 stays 2."""
     a, b = easy(4, pieces=2), easy(4, seed=1)
     both = sets.join([a, b])
     assert not set(both.groups["recording"][:12]) & set(both.groups["recording"][12:])
@@ -280,8 +274,7 @@ def grouped(**groups: object) -> sets.Dataset:
 
 @pytest.mark.parametrize("file", ["s.npz", "s.h5"])
 def test_values_of_groups_are_kept(tmp_path: Path, file: str):
-    """Numbers with fractions, names and units are in both files, in parts, and count for the
-    digest; recordings may be named in a file."""
+    """Fractions, names and units are in both files, in parts and in the digest."""
     s = grouped(force__N=[0.0, 0.5, 1.0, 1.5] * 3, speed=["slow", "fast", "käse"] * 4)
     s.save(tmp_path / file)
     again = sets.load(str(tmp_path / file))
@@ -313,8 +306,7 @@ def test_values_of_groups_are_kept(tmp_path: Path, file: str):
     ],
 )
 def test_conditions_speak_of_values(condition: str, kept: int):
-    """Numbers with fractions and their unit, names, a name with a comma, and a name that looks like
-    a number."""
+    """Numbers with fractions and units, names, one with a comma, one like a number."""
     speed, trial = ["slow", "fast", "a, b"] * 4, ["01", "1"] * 6
     s = grouped(force__N=[0.0, 0.5, 1.0, 1.5] * 3, speed=speed, trial=trial)
     assert len(s.select([condition])) == kept
@@ -341,8 +333,7 @@ def test_sets_are_joined_by_values():
 
 
 def test_joined_sets_are_told_apart():
-    """`set` counts in the given order, so that a protocol can train on one set and test on the
-    other; a single set has no such group."""
+    """`set` counts in the given order; a single set has no such group."""
     real, hard = sets.load("sim:T-REAL:1001:1"), sets.load("sim:T-HARD:1001-1002:2")
     both = sets.join([real, hard])
     np.testing.assert_array_equal(both.groups["set"], [0] * 54 + [1] * 24)
@@ -354,8 +345,7 @@ def test_joined_sets_are_told_apart():
 
 @pytest.mark.parametrize("dtype", ["uint8", "int16", "float32"])
 def test_without_means_leaves_the_texture(dtype: str):
-    """Float32, mean zero, a constant taxel exactly zero; differences in time, labels and groups are
-    unchanged."""
+    """Float32, mean zero, a constant taxel exactly zero; differences in time stay."""
     s = easy(4, dtype=dtype)
     s.samples[2, :, 1, 0] = 3.3 if dtype == "float32" else 3
     s = replace(s, samples=s.samples[:, :49])  # in float32 the mean of this many 3.3 is not 3.3
@@ -390,8 +380,7 @@ def test_the_unloaded_skin_goes_with_its_sweeps(tmp_path: Path, name: str):
 
 
 def test_digest_names_the_data_and_nothing_else(tmp_path: Path):
-    """Equal for a set that was read back from any file; different after each change that could
-    alter a result."""
+    """Equal for a set read back from any file; different after each change."""
     s = easy(4)
     for name in ("a.npz", "b.h5"):
         s.save(tmp_path / name)

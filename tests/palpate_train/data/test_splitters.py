@@ -131,8 +131,7 @@ def test_nothing_left_to_train_on_is_refused():
 
 
 def test_protocols_speak_of_values():
-    """Numbers with fractions and names; a value that the group does not have, or that is not a
-    number, is named."""
+    """Fractions and names; a value that is not there, or is no number, is named."""
     force, speed = [0.0, 0.5, 1.5] * 4, ["slow", "medium", "fast"] * 4
     sweeps = a_set([0, 0, 0, 1, 1, 1] * 2, force=force, speed=speed)
     for text, left in (("force=0,0.5->1.5", 2), ("speed=slow,medium->fast", 2)):
@@ -151,16 +150,14 @@ def test_protocols_speak_of_values():
 
 
 def test_clusters_are_what_was_left_out_or_recordings():
-    """The left-out groups for leave, else recordings of several windows; None if each sweep is
-    independent."""
+    """The left-out groups, else recordings of several windows, else None."""
     assert Protocol("leave:position").clusters(GRID).tolist() == GRID.groups["position"].tolist()
     assert Protocol("random:3").clusters(GRID).tolist() == GRID.groups["recording"].tolist()
     assert Protocol("random:3").clusters(a_set([0, 1])) is None
 
 
 def test_a_learning_curve_adds_to_what_was_there():
-    """At most this many sweeps of each material, from the training side only, equal for equal
-    seeds; all sweeps if there are fewer."""
+    """So many of each material, from the training side, equal for equal seeds."""
     labels = np.repeat([0, 1, 2], [20, 8, 3])
     train = np.flatnonzero(np.arange(31) % 5)
     few, more = (draw(train, labels, each, 1) for each in (2, 6))
@@ -175,8 +172,7 @@ def test_a_learning_curve_adds_to_what_was_there():
 @settings(max_examples=30)
 @given(st.integers(2, 5), st.integers(0, 99), st.integers(1, 4), st.booleans())
 def test_random_folds_are_scikit_learns(folds: int, seed: int, pieces: int, mixed: bool):
-    """The folds of StratifiedGroupKFold, although scikit-learn is not imported: results of earlier
-    versions stay comparable."""
+    """Those of StratifiedGroupKFold, which is not imported."""
     recording = np.repeat(np.arange(20), pieces)
     label = np.random.default_rng(seed).permutation(20)[recording] % 3 if mixed else recording % 3
     sweeps = a_set(label.tolist(), recording=recording.tolist())

@@ -26,8 +26,7 @@ def command(*words: str) -> None:
 
 
 def test_a_set_is_described():
-    """Sweeps, format, materials with their counts, recordings, groups with their values; long lists
-    are shortened."""
+    """Sweeps, format, materials, recordings, groups; long lists are shortened."""
     s = easy(20, pieces=2)
     s.groups["force"] = np.arange(60) % 12 * 10
     first, *more = summary.description(s)
@@ -43,8 +42,7 @@ def test_a_set_is_described():
 
 
 def test_what_is_confounded_is_told():
-    """Values with a single material, materials at a single value, recordings of several materials;
-    not a group of one value."""
+    """A single material at a value, or a single value; not a group of one value."""
     s = easy(4, pieces=8)
     s.groups.update(object=s.labels // 2, one=np.zeros(12, int))
     text = [

@@ -168,8 +168,7 @@ FRAMES = [{"t": k / 10, "skin": r} for k, r in enumerate(SKIN.tolist())]
     ],
 )
 def test_frames_inside_of_json_are_read(tmp_path: Path, content: bytes, note: str):
-    """In a list beside facts, behind a first line of facts, with commas between lines, and in the
-    forms of pandas."""
+    """In a list, behind a line of facts, with commas between lines, in pandas' forms."""
     (tmp_path / "a.json").write_bytes(content)
     found = raw_files.read(tmp_path / "a.json")
     np.testing.assert_array_equal(found.values[:, 1:], SKIN)

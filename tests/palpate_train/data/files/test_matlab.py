@@ -54,8 +54,7 @@ def test_the_other_byte_order_is_read(tmp_path: Path):
 
 
 def test_arrays_are_found_in_structures(tmp_path: Path):
-    """data.skin, runs(2).skin, c{2}: beside text, which is passed over; only one array of frames
-    needs no name."""
+    """data.skin, runs(2).skin, c{2}; a single array of frames needs no name."""
     path = saved(tmp_path / "a.mat", data={"skin": SKIN, "who": "Ada", "t": np.arange(40.0)})
     found = raw_files.read(path, ReadPlan(time="data.t"))
     np.testing.assert_array_equal(found.values, SKIN)
@@ -73,8 +72,7 @@ def test_arrays_are_found_in_structures(tmp_path: Path):
 
 @pytest.mark.parametrize("name", ["skin", "data/skin"])
 def test_version_7_3_is_read_beside_objects(tmp_path: Path, name: str):
-    """Strings, tables, cells and empty arrays are not arrays of frames; axes are MATLAB's; a
-    structure is walked into."""
+    """Strings, tables, cells and empty arrays are no frames; a structure is walked into."""
     path = tmp_path / "a.mat"
     with h5py.File(path, "w", userblock_size=512) as file:
 
@@ -113,8 +111,7 @@ def test_objects_of_version_7_are_passed_over(tmp_path: Path):
 
 @pytest.mark.slow
 def test_damage_is_told(tmp_path: Path):
-    """Cut anywhere or with altered bytes, of both versions: the file gives an array, or a
-    FormatError."""
+    """Cut anywhere or altered, of both versions: an array, or a FormatError."""
     rng = np.random.default_rng(0)
     for version in ("4", "5"):
         scipy_io.savemat(tmp_path / "a.mat", {"skin": SKIN, "t": np.arange(40.0)}, format=version)

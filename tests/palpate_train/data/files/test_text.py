@@ -178,8 +178,7 @@ def test_a_text_column_stands_beside_numbers(at: int, text: str):
 
 
 def test_rs_tables_are_read():
-    """write.table quotes names and rows and leaves the head one name short; write.csv leaves it
-    empty; quote=FALSE leaves numbers."""
+    """write.table leaves the head one name short, write.csv leaves it empty."""
     rows = [f'"{k}" {" ".join(map(str, row))}' for k, row in enumerate(ROWS, 1)]
     check_whole("\n".join(['"a" "b" "c" "d"', *rows]))
     check_whole("\n".join(["a b c d", *(row.replace('"', "") for row in rows)]))
