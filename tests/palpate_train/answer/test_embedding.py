@@ -53,8 +53,7 @@ def test_untrained_features_are_kept_completely():
 
 
 def test_each_material_has_its_own_shape_in_untrained_features():
-    """A sweep is far from a material whose own sweeps hardly vary, even if sweeps of other
-    materials reach it; for few sweeps the shape is the common one."""
+    """Far from a material that hardly varies, whatever others do; few sweeps share a shape."""
     x, y = gaussians(400, [[0, 0, 0], [60, 0, 0]])
     x[y == 0, 2] *= 0.1
     one = embedding.embed(x, y, 1)
@@ -81,8 +80,7 @@ def test_differences_of_untrained_features_come_back():
 
 
 def test_the_distance_is_the_sum_of_two_views():
-    """One in the last two features, one in the direction in which the materials differ; on average
-    a sweep lies at r from its mean. An unknown material shows in either."""
+    """Two untrained features and the trained direction; an unknown material shows in either."""
     x, y = gaussians(400, [[0, 0, 0, 0, 0, 0], [20, 0, 0, 0, 0, 0]])
     one = embedding.in_two_views(x, y, 2)
     r = one.means.shape[1]
@@ -120,8 +118,7 @@ def test_what_cannot_be_embedded_is_refused(labels, why: str):
 
 
 def test_the_limit_keeps_what_it_promises():
-    """Over many draws a limit of 99 sweeps keeps the stated share of new sweeps; with few sweeps it
-    is the largest."""
+    """A limit of 99 sweeps keeps the stated share of new ones; of few it is the largest."""
     rng = np.random.default_rng(0)
     for asked in (0.95, embedding.KEPT):
         kept = [
@@ -135,8 +132,7 @@ def test_the_limit_keeps_what_it_promises():
 
 
 def test_the_limit_knows_positions_that_were_not_seen():
-    """Positions shift all their sweeps: across groups the limit keeps 95 % at new positions, within
-    groups it does not."""
+    """Positions shift their sweeps: the limit keeps 95 % at new ones across groups alone."""
 
     def drawn(places, seed):
         x, y = gaussians(5 * places, [[0, 0], [30, 0]], seed)

@@ -40,8 +40,7 @@ def positions_of(
 
 
 def test_the_places_of_a_training_set():
-    """There is one centre per position, in mm; without numbered positions per recording; without
-    both per sweep."""
+    """One centre per numbered position, in mm, else per recording, else per sweep."""
     at = [(1.5, 1.5), (1.0, 1.5), (2.0, 2.0)]
     for group, each, entries in (("position", 2, 3), ("recording", 2, 3), ("force", 2, 6)):
         found = positions_of(trained(*at, group=group, each=each), LOADS, pitch_mm=2.0)
@@ -54,8 +53,7 @@ def test_the_places_of_a_training_set():
 
 
 def test_the_limit_leaves_each_position_out():
-    """It is the largest distance of a sweep from the other positions; with one position an eighth
-    of the pitch."""
+    """The largest distance of a sweep from the other positions; of one an eighth of the pitch."""
     found = positions_of(trained((1.5, 1.5), (1.5, 1.7), (1.5, 2.1)), LOADS, pitch_mm=4.0)
     assert found.limit_mm == pytest.approx(found.cols_mm[2] - found.cols_mm[1], abs=0.01)
     for positions in ([(1.5, 1.5)], [(1.5, 1.5)] * 3):
@@ -123,8 +121,7 @@ def test_a_load_is_above_the_unloaded_skin():
     "how", [{"load": 12.0}, {"drift": 400.0}, {"load": -1000.0}], ids=["weak", "drift", "falling"]
 )
 def test_what_does_not_separate_is_said(how: dict[str, float]):
-    """Contacts as weak as noise, a drift larger than a contact, and falling counts give no limit,
-    but a reason."""
+    """Contacts as weak as noise, a larger drift, falling counts: no limit, but a reason."""
     found = find_limit(known(**how))
     assert found.contact is None
     assert not found.tare.any()
@@ -135,8 +132,7 @@ def test_what_does_not_separate_is_said(how: dict[str, float]):
 
 
 def test_a_baseline_of_which_nothing_is_known_is_said():
-    """If counts can be loads they are taken as loads; if no taxel is ever near 0, the limit is
-    None. A single taxel cannot be compared with others."""
+    """Counts that can be loads are taken as loads; else None, and for a single taxel."""
     high = replace(known(), unloaded=None)
     found = find_limit(high)
     assert found.contact is None

@@ -22,8 +22,7 @@ def sweeps(n: int, seed: int, spread: float = 0.0):
 
 
 def made(n: int = 20, wrong: float = 0.0):
-    """A DisplacementFit. The share `wrong` of the held-out copies gets a wrong label, with lower
-    probability than the others."""
+    """A DisplacementFit; a share `wrong` of held-out copies gets an unlikely wrong label."""
     x, labels, groups = sweeps(n, 0)
     held = groups >= 6
     copies, copied_labels, copied_groups = sweeps(n, 1, spread=10)
@@ -40,8 +39,7 @@ def made(n: int = 20, wrong: float = 0.0):
 
 
 def test_what_the_copies_vary_in_makes_nothing_unknown():
-    """Sweeps far in the direction of the copies are beyond the limit in place, but within that of
-    displaced sweeps; in another direction they are beyond both."""
+    """Far in the direction of the copies is beyond the limit in place alone."""
     z, fit, _ = made()
     assert fit
     x = sweeps(50, 5, spread=10)[0]
@@ -67,8 +65,7 @@ def test_the_box_measures_the_same_distances():
 
 
 def test_a_moved_sweep_must_be_surer_where_copies_get_wrong_labels():
-    """If ten in a hundred copies are wrong with a probability of .62, more is required; if all are
-    right, no more than for any sweep."""
+    """Ten in a hundred copies wrong at .62 ask for more; none asks for no more."""
     _, fit, _ = made()
     assert fit
     assert (fit.rule.unsure, fit.rule.temperature) == (fit_displacement.UNSURE[0], 1)
@@ -92,8 +89,7 @@ def test_copies_that_are_surely_wrong_leave_no_sure_answer():
 
 
 def test_without_copies_that_judge_there_is_no_rule():
-    """The rule is None without copies of held-out sweeps, with a material without copies, or with a
-    material that only held-out sweeps have."""
+    """None without held-out copies, without copies of a material, or of one only held out."""
     x, labels, groups = sweeps(10, 0)
     held = groups >= 6
     none = AugmentedCopies(x[:0], labels[:0], groups[:0], held[:0])

@@ -70,8 +70,7 @@ def test_a_severity_that_costs_accuracy_is_not_allowed_for(rng: Generator):
 
 
 def test_stretched_copies_neither_move_the_means_nor_refuse(rng: Generator):
-    """They are harder than slides at another speed. The limit grows as far as they are named, and
-    up to the furthest copy it alone decides."""
+    """Harder than slides at another speed: the limit grows as far as they are named."""
     given = sweeps(rng, kind="stretch", worst=9.0)
     size, values = given.disturbed["stretch"]
     given = replace(given, disturbed={"stretch": (2.0 - size, values + 2.0)})

@@ -26,8 +26,7 @@ lda = Later("sklearn.discriminant_analysis")
 
 
 def prefixes(n: int, places: int = 8, seed: int = 0, strength=None):
-    """Features [N, 10, 5] of n sweeps of three materials at each position, better separated with
-    each tenth."""
+    """Features [N, 10, 5] of three materials at each position, better with each tenth."""
     rng = np.random.default_rng(seed)
     labels = np.tile(np.repeat(np.arange(3), n), places)
     means = 4 * np.eye(5)[:3]
@@ -50,8 +49,7 @@ def certain(labels, when, wrong=()):
 
 
 def test_the_rule_decides_when_the_steps_are_certain():
-    """All sweeps are clear from the third tenth on: the rule answers there with one step, and loses
-    nothing."""
+    """All are clear from the third tenth on: it answers there and loses nothing."""
     labels = np.arange(300) % 3
     found = fit_early.find_rule(certain(labels, np.full(300, 2)), labels)
     assert found.early
@@ -60,8 +58,7 @@ def test_the_rule_decides_when_the_steps_are_certain():
 
 
 def test_a_rule_asks_for_agreement_where_one_step_deceives():
-    """For 2 % of the sweeps one tenth is certain and wrong; two steps that agree are never
-    wrong."""
+    """One certain tenth is wrong in 2 % of the sweeps; two that agree never are."""
     labels = np.arange(300) % 3
     p = certain(labels, np.full(300, 2))
     p[:6, 2] = np.roll(p[:6, 2], 1, axis=1)
@@ -74,8 +71,7 @@ def test_a_rule_asks_for_agreement_where_one_step_deceives():
 
 @pytest.mark.parametrize(("wrong", "off"), [(1, False), (2, True)])
 def test_half_a_point_and_no_more(wrong: int, off: bool):
-    """Of 300 sweeps one may turn wrong, a third of a point; two, which stay wrong until the end,
-    may not."""
+    """Of 300 sweeps one may turn wrong, two, which stay wrong, may not."""
     labels = np.arange(300) % 3
     found = fit_early.find_rule(certain(labels, np.full(300, 2), range(wrong)), labels)
     assert (found.early is None) is off
@@ -83,8 +79,7 @@ def test_half_a_point_and_no_more(wrong: int, off: bool):
 
 
 def test_no_rule_without_data_or_gain():
-    """For few sweeps, or sweeps that are clear only at the end, there is a reason instead of a
-    rule."""
+    """Few sweeps, or sweeps clear only at the end: a reason instead of a rule."""
     labels = np.arange(30) % 3
     assert "30 sweeps" in fit_early.find_rule(certain(labels, np.full(30, 2)), labels).why
     labels = np.arange(300) % 3
@@ -107,8 +102,7 @@ def test_no_looser_level_after_one_that_lost():
 
 @pytest.mark.parametrize("agree", [1, 2, 3])
 def test_many_sweeps_are_decided_as_the_box_decides_each(agree: int):
-    """early.decide equals the appliance's inference.early_exit on random probabilities, with some
-    levels above 1."""
+    """early.decide equals inference.early_exit on random probabilities, some above 1."""
     rng = np.random.default_rng(agree)
     p = softmax(2 * rng.standard_normal((200, 10, 3)))
     rule = Early(tuple(rng.choice([0.5, 0.7, 0.9, 1.5], 9).tolist()), agree)
@@ -120,8 +114,7 @@ def test_many_sweeps_are_decided_as_the_box_decides_each(agree: int):
 
 @pytest.mark.slow
 def test_temperatures_calibrate_each_step():
-    """Cross-fitted over positions, the mean of the highest probability is the accuracy at every
-    step."""
+    """Cross-fitted over positions, the highest probability is the accuracy at every step."""
     x, y, at = prefixes(40)
     done = calibrate.fit_calibration(plain_inputs(x, y, at, np.ones(len(y), bool)))
     new, labels, _ = prefixes(60, seed=9)
@@ -152,8 +145,7 @@ def test_each_step_has_its_own_temperature():
 
 @pytest.mark.slow
 def test_a_material_of_one_place_and_two_materials():
-    """A material at only one position is still learned, and so are only two materials; nothing is
-    NaN."""
+    """A material at one position is learned, and two materials are; nothing is NaN."""
     x, y, at = prefixes(20)
     keep = (y != 2) | (at == 0)
     done = calibrate.fit_calibration(
@@ -250,8 +242,7 @@ def test_without_early_answers_the_box_runs_the_graph_that_has_none(made):
 
 @pytest.mark.parametrize(("materials", "each"), [(2, 5), (3, 20), (6, 4)])
 def test_the_heads_are_scikit_learns_shrinkage_lda(materials: int, each: int):
-    """Weight and bias are those of LinearDiscriminantAnalysis to the last bits of float32; a
-    constant feature changes nothing."""
+    """To the last bits of float32; a constant feature changes nothing."""
     rng = np.random.default_rng(materials)
     labels = np.repeat(np.arange(materials), each)
     x = rng.normal(size=(len(labels), 12)) + 2 * rng.normal(size=(materials, 12))[labels]

@@ -14,8 +14,7 @@ from palpate_train.data import sets
 
 
 def test_known_sweeps_are_within_the_limits_and_others_are_not():
-    """Of 400 sweeps that the classes have not seen, a share of KEPT; of those of another material
-    none."""
+    """Of 400 new sweeps a share of KEPT; of those of another material none."""
     rng = np.random.default_rng(0)
     means = np.array([[[0, 0, 0], [8, 0, 0]], [[0, 0, 0], [9, 0, 0]]])  # [D, K, r]
     labels = rng.integers(2, size=800)

@@ -18,8 +18,7 @@ from tests.factories import toy_bundle
 
 
 def test_limits_come_from_training_sweeps(monkeypatch: pytest.MonkeyPatch):
-    """No part of a training sweep rests by them. A part that does not change gives no limits of
-    vibration, nor do sweeps of other materials, or nine of each."""
+    """No part of a training sweep rests by them; still parts and nine sweeps give none."""
     train = sets.load("sim:T-REAL/level-blind:41:1")
     bare = replace(bundle.load(bundle.DEFAULT).manifest, sliding=None)
     monkeypatch.setattr(fit_slide, "_pattern", lambda train: None)
@@ -53,8 +52,7 @@ def test_the_packaged_bundle_sees_a_slide_that_ends_early():
 
 
 def test_slides_need_a_pattern_where_training_always_showed_one():
-    """Also with one sweep of each material. Sweeps without a pattern, and skins of two taxels, set
-    no limit."""
+    """Also with one sweep of each; without a pattern or with two taxels no limit."""
     bare = replace(bundle.load(bundle.DEFAULT).manifest, sliding=None)
     train = sets.load("sim:T-LAB/level-blind:3:1")
     found = fit_slide.limited(bare, train)

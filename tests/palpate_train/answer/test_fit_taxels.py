@@ -60,8 +60,7 @@ def test_sound_taxels_that_are_constant_are_noticed():
 
 
 def test_a_bundle_that_needs_one_taxel_tolerates_none(tmp_path: Path):
-    """The toy knows "b" from taxel 1.1 alone, so that no number holds at the worst place. A row or
-    a column may hold it as well."""
+    """The toy knows "b" from taxel 1.1 alone; a row or a column may hold it as well."""
     loaded, sweeps = bundle.load(toy(tmp_path)), windows("a", "b", "c")
     found = fit_taxels.measure(loaded, sweeps, sweeps)
     assert (found.bridging.taxels, found.bridging.row) == (0, False)
@@ -105,8 +104,7 @@ class Weighed:
 def test_loads_that_differ_in_every_sweep_bridge_better_than_neighbours(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ):
-    """Of a skin whose taxels are pressed differently the loads tell a broken taxel; the manifest
-    keeps them. Where neighbours do as well, these stay."""
+    """The loads tell a broken taxel there; where neighbours do as well, these stay."""
     sweeps = pressed()
 
     def counts(self: Any, given: Dataset) -> list[Any]:
@@ -134,8 +132,7 @@ def test_loads_that_differ_in_every_sweep_bridge_better_than_neighbours(
 
 @pytest.mark.slow
 def test_a_bundle_answers_clipped_sweeps_as_far_as_it_names_them(tmp_path: Path):
-    """The toy knows "b" from the load of a taxel, which is soon lost; for "a" alone half of the
-    taxels may be clipped, and the manifest says so."""
+    """ "b" is soon lost; for "a" half of the taxels may be clipped, as the manifest says."""
     loaded, all_three, one = bundle.load(toy(tmp_path)), windows("a", "b", "c"), windows("a")
     one.samples[:, :, 2:] += 60
     few, many = (fit_taxels.measure(loaded, sweeps, sweeps) for sweeps in (all_three, one))
@@ -162,8 +159,7 @@ def test_skins_and_sets_that_show_no_modes(shape: tuple[int, ...]):
 
 @pytest.mark.slow
 def test_the_packaged_bundle_bridges_what_its_manifest_says():
-    """A dead taxel at each place, of sweeps that it has not seen: none is refused, and the box
-    names them as with a sound skin."""
+    """Dead taxels in new sweeps: none is refused, all are named as with a sound skin."""
     packaged = bundle.load(bundle.DEFAULT)
     assert packaged.manifest.bridging
     box = Classifier(packaged, SystemClock())

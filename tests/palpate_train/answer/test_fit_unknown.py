@@ -34,8 +34,7 @@ def rng() -> Generator:
 
 
 def test_copies_are_kept_in_the_direction_of_their_change(rng: Generator):
-    """Held-out copies are within the limit, and an unknown material in a direction that no
-    alteration reaches is as far beyond it as before."""
+    """Held-out copies are within the limit; unknown materials elsewhere are as far as before."""
     scatters = Scatters.of(sweeps(rng, hum=HUM), SPACE)
     rule = choose(scatters, sweeps(rng, hum=HUM))
     assert rule
@@ -58,8 +57,7 @@ def test_an_alteration_that_looks_like_another_material_gets_less_weight(rng: Ge
 
 
 def test_a_sweep_lies_as_far_from_its_mean_as_without_shapes(rng: Generator):
-    """On average at a squared distance of r, so that distances of enrolled labels, which have no
-    shape, are comparable."""
+    """At a squared distance of r on average, as for enrolled labels without a shape."""
     scatters, judged = Scatters.of(sweeps(rng, hum=HUM), SPACE), sweeps(rng, hum=HUM)
     rule = choose(scatters, judged)
     assert rule
@@ -96,8 +94,7 @@ def test_alterations_that_change_nothing_get_no_weight(rng: Generator):
 
 
 def test_what_shows_an_unknown_material_counts_more(rng: Generator):
-    """Materials that differ in the trained directions alone, and such that differ in features that
-    were not trained, too."""
+    """In the trained directions alone, and in features that were not trained."""
     far = np.array([[0.0, 0, 0, 0], [12, 0, 9, 0], [0, 12, 0, 9]])
 
     def weight(means: NDArray[np.float64]) -> float:

@@ -93,8 +93,7 @@ def test_an_error_of_the_project_is_one_line(
 @pytest.mark.slow
 @pytest.mark.thorough  # starts a process for each command
 def test_a_reader_that_closes_the_pipe_ends_the_command_quietly():
-    """`palpate-train evaluate --list | head -1` gives exit code 1 and nothing on the error
-    stream."""
+    """`palpate-train evaluate --list | head -1`: exit code 1, nothing on the error stream."""
     command = [sys.executable, "-m", "palpate_train", "evaluate", "--list"]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -172,8 +171,7 @@ def test_an_interrupted_command_says_what_becomes_of_it(
 def test_more_labels_than_the_boards_wire_are_told_with_the_bundle(
     default_bundle: Bundle, capsys: pytest.CaptureFixture[str], labels: int, told: bool
 ):
-    """Four GPIO lines have fifteen codes beside 0. With one more label, the figures state the
-    number of lines that are needed."""
+    """Four GPIO lines have fifteen codes; one label more needs another line."""
     manifest = replace(default_bundle.manifest, labels=tuple(f"m{i}" for i in range(labels)))
     bundles._print(manifest, bundle.DEFAULT)
     line = (
@@ -183,8 +181,7 @@ def test_more_labels_than_the_boards_wire_are_told_with_the_bundle(
 
 
 def test_each_command_has_options_of_its_own(capsys: pytest.CaptureFixture[str]):
-    """Help lists all commands without their imports; each has its parser and its function. An
-    unknown command is refused."""
+    """Help needs no imports; each has its parser and function; others are refused."""
     parser = PROGRAM.parser(*PROGRAM.commands)
     (commands,) = (a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
     assert {*commands.choices} == {*PROGRAM.commands}
@@ -200,8 +197,7 @@ def test_each_command_has_options_of_its_own(capsys: pytest.CaptureFixture[str])
 
 
 def test_signing_does_without_the_imports_of_training():
-    """`sign` imports no training library: they take seconds, and the signing machine may lack
-    them."""
+    """`sign` imports no training library, which its machine may lack."""
     code = "import sys; from palpate_train.cli.main import main; main(['sign', '--help'])"
     code = f"import sys\ntry:\n    {code}\nexcept SystemExit:\n    print(*sys.modules)"
     done = subprocess.run(
@@ -226,8 +222,7 @@ def few(tmp_path: Path) -> Path:
 def test_what_a_set_lacks_is_told_by_each_command_that_reads_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], only: list[str]
 ):
-    """Materials without sweeps, which are left out, and constant taxels cause a warning. Materials
-    that --only leaves out do not."""
+    """Materials without sweeps and constant taxels; not what --only leaves out."""
     args = f"evaluate --set {few(tmp_path)} --method L-svm --protocol leave:speed --jobs 1".split()
     assert main([*args, "--cache", str(tmp_path), *only]) == 0
     err = capsys.readouterr().err
@@ -238,8 +233,7 @@ def test_what_a_set_lacks_is_told_by_each_command_that_reads_it(
 def test_a_material_of_one_recording_is_told_by_its_name(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """Too few sweeps are named by fit, which has none to judge with; by export, which refuses such
-    a fit; and by evaluate."""
+    """Too few sweeps to judge with: said by fit, by export, and by evaluate."""
     args = ["--set", str(few(tmp_path)), "--only", "material=low,high"]
     why = "split by 'recording' leaves one sweep of 'high'; record more of it"
     fit = str(tmp_path / "fit.npz")
@@ -298,8 +292,7 @@ def test_too_little_memory_is_one_line(
 
 @pytest.mark.slow
 def test_a_fit_names_groups_of_one_value(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """No figure can show another direction then; a group of several values and one that says where
-    sweeps come from are not named."""
+    """Not named: several values, and groups that say where sweeps come from."""
     tubes = sets.load("sim:T-REAL/level-blind:1:2").select(["position<=2"])
     tubes = replace(tubes, groups=tubes.groups | {"direction": np.zeros(len(tubes), int)})
     source = tmp_path / "set.npz"

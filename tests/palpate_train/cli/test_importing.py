@@ -94,8 +94,7 @@ def test_the_five_commands_of_the_page_make_a_bundle(
 def test_a_broken_file_is_told_and_the_others_are_imported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """A broken file gets a line; the other files make a set; the report has a line for each file;
-    the exit code is 65."""
+    """A line for each file in the report; the others make a set; exit code 65."""
     folder = csv_folder(tmp_path / "r", each=1, positions=1)
     (folder / "foam_p0_1.csv").write_text("time,s0\n0,1\n0,x\n")
     options = "--pattern {material}_p{position:d}_{trial:d}.csv --time time:ms --grid 4x4"
@@ -198,8 +197,7 @@ def test_names_are_equal_in_every_normal_form(tmp_path: Path):
 
 
 def test_the_same_content_counts_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """A copy under another name, or in another format, is left out and said; under another material
-    it is warned of."""
+    """A copy, in another format too, is left out; under another material it is warned of."""
     folder = nine(tmp_path / "r")
     content = (folder / "wood_1.csv").read_bytes()
     (folder / "wood_1copy.csv").write_bytes(content)
@@ -219,8 +217,7 @@ def test_the_same_content_counts_once(tmp_path: Path, capsys: pytest.CaptureFixt
 
 
 def test_columns_give_material_and_session(tmp_path: Path):
-    """One file with a label and a date beside the counts, without a pattern: each run of a label is
-    a recording."""
+    """A label and a date beside the counts: each run of a label is a recording."""
     folder = tmp_path / "r"
     folder.mkdir()
     rows = ["when,what,a,b,c,d"]

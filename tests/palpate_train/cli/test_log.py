@@ -32,8 +32,7 @@ sys.exit(3)
 
 
 def on_a_terminal(out_too: bool) -> tuple[str, str]:
-    """The text that the script shows on a terminal of 100 columns, and its output if that goes
-    elsewhere."""
+    """What the script shows on a terminal of 100 columns, and its output elsewhere."""
     far, near = pty.openpty()
     done = subprocess.Popen(
         [sys.executable, "-c", SCRIPT],
@@ -54,8 +53,7 @@ def on_a_terminal(out_too: bool) -> tuple[str, str]:
 @pytest.mark.slow
 @pytest.mark.thorough  # trains on a terminal
 def test_a_terminal_shows_a_bar_and_is_left_as_it_was():
-    """The bar shows the share that is done and the line as written; other output stands above it;
-    at the end the cursor is back."""
+    """The bar shows the share and the line, output stands above, the cursor comes back."""
     shown, printed = on_a_terminal(out_too=False)
     for text in (
         "━",

@@ -64,8 +64,7 @@ def test_what_is_confounded_is_told():
 
 
 def test_positions_and_sessions_are_counted_in_tables():
-    """Materials down, positions across, totals at both ends, a dot for none; with many positions
-    there is no table."""
+    """Materials down, positions across, totals, a dot for none; not with many positions."""
     s = easy(4)
     s.groups.update(position=np.array([0, 0, 0, 10] + [10] * 8), speed=np.zeros(12, int))
     assert summary.description(s)[3:] == [
@@ -90,8 +89,7 @@ def test_positions_and_sessions_are_counted_in_tables():
 
 
 def test_recordings_are_described_by_name(tmp_path: Path):
-    """Places by their names and by the numbers that select them; lost frames, left-out sweeps,
-    verdicts."""
+    """Places by names and numbers; lost frames, left-out sweeps, verdicts."""
     for i in range(6):
         path = tmp_path / f"run{i // 3}" / f"{i}.npy"
         position = ("tip", "side", "tip")[i % 3]
@@ -118,8 +116,7 @@ def test_recordings_are_described_by_name(tmp_path: Path):
 
 
 def test_recordings_without_a_tare_are_told(tmp_path: Path):
-    """If only some recordings know the unloaded skin, both kinds are counted; else nothing is
-    printed."""
+    """Both kinds are counted if only some know the unloaded skin."""
     for i in range(5):
         record(tmp_path / f"{i}.npy", "ab"[i % 2], id=i)
     assert "warning" not in summary.describe(str(tmp_path))
@@ -135,8 +132,7 @@ def test_recordings_without_a_tare_are_told(tmp_path: Path):
 
 
 def test_recordings_are_described_while_they_grow(tmp_path: Path):
-    """A single material, missing names: both are counted, with the reason why the set cannot be
-    trained on."""
+    """A single material, missing names: counted, with the reason against training."""
     record(tmp_path / "0.npy", "a", position="2")
     text = summary.describe(str(tmp_path)).splitlines()
     assert "  materials: 1: a 1" in text
@@ -156,8 +152,7 @@ def test_recordings_are_described_while_they_grow(tmp_path: Path):
 
 @pytest.mark.slow
 def test_still_taxels_and_empty_materials_are_told(tmp_path: Path):
-    """A taxel that never changes is named by row and column from 1, a material without sweeps by
-    its name; a good set has no such line."""
+    """By row and column from 1, and by name; a good set has no such line."""
     sound = easy()
     assert summary.warnings_of(sound) == []
     still = sound.samples.copy()
@@ -172,8 +167,7 @@ def test_still_taxels_and_empty_materials_are_told(tmp_path: Path):
 
 
 def test_what_is_known_can_be_loaded():
-    """Every simulated set in the list has the stated number of sweeps (for the large set: sixty for
-    each scene)."""
+    """Every simulated set has the stated number of sweeps (the large one: a scene's)."""
     stated = dict(re.findall(r"(sim:T-\S+) +(\d+) sweeps", summary.known()))
     sizes = {"sim:T-LAB": "240", "sim:T-REAL": "540", "sim:T-HARD": "60", "sim:T-HARD:1-20": "1200"}
     assert stated == sizes
@@ -183,8 +177,7 @@ def test_what_is_known_can_be_loaded():
 
 @pytest.mark.slow
 def test_the_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """`sets` lists sets, `describe` describes several, `view` writes a picture and prints its
-    path."""
+    """`sets` lists, `describe` describes several, `view` writes a picture."""
     command()
     assert capsys.readouterr().out == summary.known() + "\n"
     one = write(tmp_path / "a.npz")

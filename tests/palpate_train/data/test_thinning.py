@@ -13,8 +13,7 @@ from tests.factories.sweep_sets import easy
 
 
 def uneven() -> Dataset:
-    """Sweeps of three materials: 3, 40 and 200, in recordings of 1, 10 and 100 to 4; each sweep has
-    its number as its first count."""
+    """3, 40 and 200 sweeps of three materials; the first count is the sweep's number."""
     labels = np.repeat([0, 1, 2], [3, 40, 200])
     recording = np.concatenate(
         [

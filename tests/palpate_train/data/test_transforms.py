@@ -42,8 +42,7 @@ def test_the_window_is_the_middle():
 
 @pytest.mark.parametrize(("kind", "mean"), [("int16", [20, 70]), ("float32", [20, 70])])
 def test_frames_are_averaged(kind: str, mean: list[int]):
-    """Five frames become one, an incomplete group is left out; the data type stays, the rate is a
-    fifth."""
+    """Five become one, an incomplete group goes; the type stays, the rate is a fifth."""
     part = Change(rate=5).of(counting(kind=kind))
     assert part.samples[0, :, 0, 0].tolist() == mean
     assert (part.rate_hz, part.samples.dtype.name) == (12, kind)
@@ -64,8 +63,7 @@ def test_low_bits_are_cut_off():
 
 
 def test_rows_and_columns_stay_a_grid():
-    """If whole rows and columns are left: a smaller grid; otherwise one column, in the order of
-    their numbers."""
+    """Whole rows and columns left: a smaller grid; otherwise one column in order."""
     grid = Change(taxels=(5, 3, 0, 2)).of(counting()).samples
     assert grid.shape == (2, 12, 2, 2)
     assert grid[0, 0].tolist() == [[0, 2], [3, 5]]
@@ -82,8 +80,7 @@ def test_the_unloaded_skin_is_known_of_all_taxels_or_none():
 
 
 def test_a_taxel_goes_with_all_its_axes():
-    """The remaining grid keeps its axes; a taxel whose shear alone distinguishes materials comes
-    first."""
+    """The grid keeps its axes; a taxel whose shear alone tells materials comes first."""
     flat = counting()
     sheared = replace(flat, samples=np.stack([flat.samples, -flat.samples], axis=-1))
     grid = Change(taxels=(5, 3, 0, 2)).of(sheared)
@@ -108,8 +105,7 @@ def test_changes_add_up():
 
 
 def textured(factors_of: dict[int, list[float]], taxels: int = 9, each: int = 12) -> Dataset:
-    """White noise of strength 3 on every taxel; `factors_of`: by taxel, the factor of the strength
-    for each material."""
+    """White noise of strength 3; `factors_of`: for each material by taxel."""
     kinds = len(next(iter(factors_of.values())))
     labels = np.tile(np.arange(kinds), each)
     rng = np.random.default_rng(5)
@@ -127,8 +123,7 @@ def test_the_informative_taxels_come_first():
 
 
 def test_one_of_two_that_tell_the_same_stays():
-    """Each is dispensable while the other is there; but one of them must stay, before any weaker
-    taxel."""
+    """Each is dispensable beside the other; one must stay before any weaker taxel."""
     sweeps = textured({4: [1, 4], 2: [1, 1.6]}, each=30)
     x = sweeps.samples.copy()
     x[:, :, 6] = x[:, :, 4]

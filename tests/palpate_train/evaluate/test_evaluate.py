@@ -46,8 +46,7 @@ HERE = Where(jobs=1, cache=None)
 
 @pytest.mark.slow
 def test_it_finds_nothing_where_there_is_nothing():
-    """Labels drawn at random are guessed at about one in three, so nothing leaks from the test
-    sweeps."""
+    """Random labels are guessed at one in three: nothing leaks from test sweeps."""
     sweeps = tones(recordings=20, windows=1)
     labels = np.random.default_rng(2).permutation(sweeps.labels)
     shuffled = Dataset(sweeps.samples, labels, sweeps.materials, 100.0, sweeps.groups, "shuffled")
@@ -57,8 +56,7 @@ def test_it_finds_nothing_where_there_is_nothing():
 
 @pytest.mark.slow
 def test_the_counts_are_those_of_the_logits():
-    """Windows count by the largest logit, recordings by the product of their probabilities; the
-    confusion matrices agree with the counts."""
+    """Windows by the largest logit, recordings by the product; matrices agree."""
     sweeps = tones(noise=150.0)
     (result,) = every(sweeps, HERE, "L-knn")
     figures, labels = result.json(), sweeps.labels[result.test]
@@ -155,8 +153,7 @@ def test_a_fold_is_kept_under_all_that_it_depends_on(
 
 
 def test_a_fold_depends_on_the_code_that_its_method_runs():
-    """The code that a method imports counts, directly or indirectly; code around it and the
-    networks of other methods do not."""
+    """What a method imports counts, also indirectly; code around it does not."""
 
     def reached(method: str) -> set[str]:
         """Names of modules without the packages."""
@@ -229,8 +226,7 @@ def command(words: str, folder: Path, *more: str, code: int = 0) -> list[dict[st
 def test_the_command_writes_what_scripts_rely_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """A list of results with the documented keys, one for each method and seed, in the requested
-    order."""
+    """The documented keys, one result for each method and seed, in order."""
     tones(offset=9.0).save(tmp_path / "tones.npz")
     words = f"--set {tmp_path / 'tones.npz'} --protocol leave:session --method H-knn,L-gauss"
     words += " --seeds 2 --remove-means --only material=a,c session<=2"
@@ -268,8 +264,7 @@ def test_a_set_without_recordings_has_no_count_of_them(tmp_path: Path):
 def test_a_method_whose_features_cannot_be_computed_does_not_stop_the_others(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """Too few frames for H at this rate: named once, above the final line, and kept, so that --kept
-    names it too."""
+    """Named once, above the final line, and kept, so that --kept names it too."""
     whole = tones()
     fast = Dataset(whole.samples[:, :80], whole.labels, whole.materials, 1000.0, whole.groups, "f")
     fast.save(tmp_path / "fast.npz")
@@ -291,8 +286,7 @@ def test_a_method_whose_features_cannot_be_computed_does_not_stop_the_others(
 def test_a_method_refused_in_one_fold_loses_no_other_result(
     broken: str, monkeypatch: pytest.MonkeyPatch
 ):
-    """A refusal is named once for a protocol and seed, at once; the other protocols and methods are
-    complete."""
+    """A refusal is named once for a protocol and seed; the others are complete."""
     calls: list[int] = []
     (sound,) = methods.find(["L-gauss"])
 
@@ -341,8 +335,7 @@ class Spoilt:
 
 
 def test_a_model_without_a_graph_is_timed_in_its_library(monkeypatch: pytest.MonkeyPatch):
-    """One sweep is classified at a time, and its label is compared with the labels of all sweeps at
-    once; pack names the library."""
+    """One sweep at a time, with the label of all at once; pack names the library."""
     (sound,) = methods.find(["L-gauss"])
     asked: list[int] = []
 

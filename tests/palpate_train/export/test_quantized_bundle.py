@@ -247,8 +247,7 @@ def test_the_same_fit_gives_the_same_bytes(
 
 
 def test_scores_are_fused_by_recording(packed: Path):
-    """Each window gets the label of its recording's product, even if its own label differs; refused
-    windows get -1."""
+    """A window gets the label of its recording's product; refused ones get -1."""
     it, s = box(packed), easy(10, pieces=5, seed=7)
     s.samples[3] = 0
     s.samples[9] = s.samples[29]
@@ -262,8 +261,7 @@ def test_scores_are_fused_by_recording(packed: Path):
 
 
 def test_a_head_that_says_otherwise_stays_in_float(fitted: Fit, tmp_path: Path):
-    """int8 with its refitted head disagrees with a spoilt float head: the bundle holds the float
-    model, with the reason."""
+    """int8 disagrees with a spoilt float head: the bundle is float, with the reason."""
     made = quantized_bundle.export(negated(fitted), tmp_path / "bundle", "easy", "1", "")
     why = made.made["float_because"]
     assert re.match(
@@ -331,8 +329,7 @@ def ranged(fitted: Fit, responses: Sequence[float]) -> Fit:
 
 @pytest.mark.thorough  # a fit of its own
 def test_a_range_for_one_outlier_is_refused(tight: Fit):
-    """Ranges reach from the smallest to the largest value, and one sweep is a thousandfold: too
-    little is left for all others."""
+    """Ranges reach to the largest value: an outlier leaves too little for others."""
     wild = tight.train.samples[:1].astype(np.float32)
     wild = wild.mean(axis=1, keepdims=True) + 1000 * (wild - wild.mean(axis=1, keepdims=True))
     network = stages.network_of(tight)
@@ -344,16 +341,14 @@ def test_a_range_for_one_outlier_is_refused(tight: Fit):
 
 
 def test_a_layer_that_saturates_is_refused(tight: Fit):
-    """The first stage reaches 0.3 % of its range: no head can compensate, not even with the
-    spectrum."""
+    """The first stage reaches 0.3 % of its range: no head can compensate."""
     first, *others = tight.ranges.responses
     with pytest.raises(ExportRefused, match="limit"):
         judged(ranged(tight, (0.003 * first, *others)))
 
 
 def test_a_head_that_was_not_refitted_is_refused(tight: Fit):
-    """With an int8 trunk that saturates, the float head fails; only a head of its own copes with
-    the features."""
+    """Behind a saturated int8 trunk only a head of its own copes."""
     *before, last = tight.ranges.responses
     refitted = ranged(tight, (*before, 0.1 * last))
     judged(refitted)
@@ -363,8 +358,7 @@ def test_a_head_that_was_not_refitted_is_refused(tight: Fit):
 
 
 def found(n: int = 100, lost: int = 0, won: int = 0, **apart: float) -> parity.Parity:
-    """A comparison on `n` sweeps with some lost and some won by int8; the rest is perfect by
-    default."""
+    """`n` sweeps with some lost and some won by int8; the rest is perfect."""
     right = np.arange(n) >= won, np.arange(n) < n - lost
     usual = {"agreement": 1, "expected_loss": 0, "probability_difference": 0, "probability_mean": 0}
     difference = parity.AnswerDifference(**(usual | apart), logit_difference=0, logit_mean=0)
@@ -391,8 +385,7 @@ def found(n: int = 100, lost: int = 0, won: int = 0, **apart: float) -> parity.P
     ],
 )
 def test_each_limit_is_where_it_stands(good: dict, bad: dict, message: str):
-    """Within a limit the comparison passes; beyond it the message names number, limit and
-    remedy."""
+    """Beyond a limit the message names number, limit and remedy."""
     quantized_bundle.check(found(**good))
     with pytest.raises(ExportRefused, match=message) as refused:
         quantized_bundle.check(found(**bad))
@@ -402,8 +395,7 @@ def test_each_limit_is_where_it_stands(good: dict, bad: dict, message: str):
 
 
 def test_a_bundle_whose_sweeps_the_box_refuses_is_refused(fitted: Fit, tmp_path: Path):
-    """Sweeps beyond the full scale count as saturated, which export reports before a robot meets
-    it."""
+    """Beyond the full scale they count as saturated, said before a robot meets it."""
     refused = (
         r"the box would refuse \d+ of \d+ held-out sweeps \(limit 5%\), by status: "
         r"\d+ saturated\. .* --full-scale$"
@@ -426,8 +418,7 @@ def test_a_bundle_that_calls_too_many_sweeps_unknown_is_refused(
 
 
 def test_the_box_must_answer_as_export_did(fitted: Fit, packed: Path):
-    """If the labels of the box and of the int8 model differ, the message has the number of such
-    sweeps."""
+    """If labels of box and int8 model differ, their number is said."""
     logits = np.stack([box(packed).logits(x) for x in fitted.held.samples])
     assert "held-out" in pack.judge(bundle.load(packed), fitted.held, logits, "held-out")
     logits[:2] = -logits[:2]
@@ -443,8 +434,7 @@ def test_a_material_never_recognised_is_refused(fitted: Fit):
 
 
 def test_a_bundle_is_replaced_whole_or_not_at_all(fitted: Fit, packed: Path, tmp_path: Path):
-    """A refused export leaves the old bundle; a good one replaces it, stray files included; other
-    folders are safe."""
+    """A refusal leaves the old bundle; a good export replaces it, no other folder."""
     target = tmp_path / "bundle"
     quantized_bundle.export(fitted, target, "old", "1", "")
     (target / "stray").write_text("left over")
@@ -484,8 +474,7 @@ def test_a_label_that_cannot_be_sent_is_refused(fitted: Fit, tmp_path: Path):
 
 
 def test_the_default_bundle_is_what_the_box_needs():
-    """It has the skin's format and tubes, at most 128 KB, golden sweeps as exported, and names
-    unseen placements."""
+    """The skin's format and tubes, at most 128 KB; names unseen placements."""
     it = box(bundle.DEFAULT)
     assert it.self_test() <= bundle.GOLDEN_TOLERANCE
     assert (it.bundle.format, it.bundle.manifest.labels) == (skin.FORMAT, skin.MATERIALS)
@@ -582,8 +571,7 @@ def test_a_fit_without_a_convolution_is_exported(tmp_path: Path):
 
 
 def test_any_method_is_judged_by_the_same_limits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """The figures of an int8 method are in its bundle, also from its file; beyond a limit it is
-    refused."""
+    """An int8 method's figures are in its bundle; beyond a limit it is refused."""
     (method,) = methods.find(["palpate-64"])
     _, made = MethodFit.of(method, close(), 1)
     made.save(tmp_path / "fit.npz")

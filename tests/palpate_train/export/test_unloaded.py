@@ -28,8 +28,7 @@ EACH = 3
 def act(
     material: str, place: skin.Placement | None, rng: np.random.Generator, more: int = 0
 ) -> rig.Act:
-    """A sweep of three seconds between half seconds without contact; without a place nothing is
-    touched. more: counts above the skin's usual rest."""
+    """Three seconds between half seconds without contact. more: above the usual rest."""
     off = SEEN.idle(50, rng, skin.WORLD)
     on = SEEN.idle(320, rng, skin.WORLD)
     if place:

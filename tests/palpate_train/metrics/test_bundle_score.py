@@ -46,8 +46,7 @@ def classifier(tmp_path: Path) -> Classifier:
 
 
 def test_what_is_named_is_counted(classifier: Classifier):
-    """Right, wrong, unsure and unknown answers are counted by material; the interval resamples
-    positions."""
+    """By material; the interval resamples positions."""
     s = sweeps(
         (0, 0),
         (0, 0),
@@ -83,8 +82,7 @@ def test_what_is_named_is_counted(classifier: Classifier):
 
 
 def test_materials_go_by_name_and_others_are_not_counted(classifier: Classifier):
-    """The same names may be in another order; a material that the bundle lacks is listed with its
-    answers."""
+    """In another order; a material that the bundle lacks is listed with its answers."""
     s = sweeps(*HERE, (0, 6), labels=[1, 0, 2, 2], materials="bax")
     found = bundle_score.score(classifier, s)
     assert found.right.tolist() == [True, True]
@@ -93,8 +91,7 @@ def test_materials_go_by_name_and_others_are_not_counted(classifier: Classifier)
 
 
 def test_windows_of_a_recording_are_fused_too(classifier: Classifier):
-    """The last answer to each recording counts; without several windows in a recording that figure
-    is left out."""
+    """The last answer to each counts; without several windows no such figure."""
     s = sweeps((0, 0), (3, 0), (6, 0), (6, 0), labels=[0, 0, 1, 1], recording=[0, 0, 1, 1])
     found = bundle_score.score(classifier, s)
     assert found.recordings is not None
@@ -116,8 +113,7 @@ def test_a_set_of_another_form_is_refused(classifier: Classifier):
 def test_the_command_prints_and_writes_what_it_found(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """`palpate-train score`, with --json and --rename; sweeps of the training are counted by their
-    digests; a broken bundle is one line."""
+    """With --json and --rename; known sweeps by their digests; a broken bundle is a line."""
     toy_bundle.load(tmp_path / "toy")
     sweeps(*HERE, labels=[0, 1, 2], materials="Abc").save(tmp_path / "s.npz")
     args = ["score", str(tmp_path / "toy"), "--set", str(tmp_path / "s.npz")]
@@ -155,8 +151,7 @@ def test_the_command_prints_and_writes_what_it_found(
 def test_sweeps_outside_the_trained_positions_are_told(
     classifier: Classifier, monkeypatch: pytest.MonkeyPatch
 ):
-    """The number of displaced sweeps, their most frequent description, and the remedy; nothing if
-    there are none."""
+    """Their number, their most frequent description, the remedy; nothing for none."""
     s = sweeps(*HERE, (0, 0), labels=[0, 1, 2, 0])
     assert "trained positions" not in bundle_score.score(classifier, s).text()
     given = bundle_score.verdicts

@@ -20,8 +20,7 @@ def test_one_pool_has_the_papers_wilson_interval():
 
 
 def test_sweeps_that_fail_together_widen_the_interval():
-    """Two of ten positions all wrong: a much wider interval than of a pool with as many wrong;
-    never narrower than Wilson's."""
+    """Two of ten positions all wrong: wider than a pool's, never narrower than Wilson's."""
     position = np.repeat(np.arange(10), 50)
     right = position >= 2
     low, high = interval(right, position)
@@ -32,8 +31,7 @@ def test_sweeps_that_fail_together_widen_the_interval():
 
 
 def test_the_bootstrap_covers_the_truth():
-    """Of 200 experiments with 12 groups whose accuracies differ, about 19 in 20 intervals hold the
-    true mean."""
+    """Of 200 experiments with 12 groups about 19 in 20 intervals hold the mean."""
     rng, held = np.random.default_rng(1), 0
     for _ in range(200):
         p = rng.beta(8, 2, 12)
@@ -44,8 +42,7 @@ def test_the_bootstrap_covers_the_truth():
 
 
 def test_windows_of_a_recording_are_fused_as_a_product():
-    """The sum of log probabilities, recordings in the order of their numbers, with the first sweep
-    of each."""
+    """Log probabilities added, in the order of numbers, with the first sweep of each."""
     logits = np.array([[1.0, 0.0], [0.0, 3.0], [2.0, 0.0]], np.float32)
     scores, first = fuse(logits, np.array([7, 3, 7]))
     assert first.tolist() == [1, 0]

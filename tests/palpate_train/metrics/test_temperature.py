@@ -17,16 +17,14 @@ def drawn(n: int, groups: int, seed: int = 0, scale: float = 2.0):
 
 @pytest.mark.parametrize("times", [3.0, 6.0])
 def test_a_head_that_is_too_sure_is_cooled(times: float):
-    """For calibrated logits times `times`, the result is that factor, or within an error below it,
-    and never above."""
+    """Logits times `times` give that factor, or within an error below it."""
     logits, labels, groups = drawn(3000, 30)
     found = sufficient_temperature(times * logits, labels, groups)
     assert 0.8 * times < found < 1.05 * times
 
 
 def test_a_calibrated_head_stays_as_it_is():
-    """Without evidence of overconfidence the temperature is 1, also if all sweeps are right by a
-    large margin."""
+    """Without evidence the temperature is 1, also if all are right by far."""
     temperatures = [sufficient_temperature(*drawn(300, 10, seed)) for seed in range(20)]
     assert np.mean(np.array(temperatures) == 1) > 0.8
     assert max(temperatures) < 1.3
@@ -46,8 +44,7 @@ def test_sweeps_that_are_right_by_far_do_not_ask_for_a_temperature():
 
 
 def test_sweeps_that_fail_together_count_as_one():
-    """If all evidence comes from one group of thirty, it does not count. The same evidence from
-    every group does."""
+    """Evidence of one group of thirty does not count, that of every group does."""
     labels = np.zeros(300, int)
     logits = np.tile([6.0, 0.0], (300, 1))
     logits[:10] = [0.0, 6.0]

@@ -54,8 +54,7 @@ def test_named_fields_are_columns(tmp_path: Path, suffix: str):
 
 
 def test_a_camera_beside_the_skin_is_not_read(tmp_path: Path):
-    """A camera that is unfinished, virtual or larger than the memory does not matter if the skin is
-    named."""
+    """Unfinished, virtual or larger than memory: no matter if the skin is named."""
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["skin"] = SKIN
         file.create_dataset("camera .*not written", (4000, 480, 640), "u1", chunks=(1, 480, 640))

@@ -69,8 +69,7 @@ def trunk(
 
 @forms
 def test_the_graph_is_the_definition(format: SweepFormat):
-    """Each response is computed tap by tap; features are the log of its mean magnitude in
-    deviations and the share above its threshold."""
+    """Tap by tap: the log of the mean magnitude in deviations, the share above a threshold."""
     filters, given = small(format), counts(format)
     scaled = (given - given.mean(axis=1, keepdims=True)) * texture_scale(counts(format, 12))
     for sweep, row in zip(
@@ -98,8 +97,7 @@ def test_the_graph_is_the_definition(format: SweepFormat):
 
 @forms
 def test_int8_is_close_and_the_last_tenth_is_the_whole_window(format: SweepFormat):
-    """In both precisions, magnitudes agree within a few hundredths of a logarithm, shares within a
-    few responses."""
+    """Magnitudes agree within hundredths of a logarithm, shares within a few responses."""
     filters, given = small(format), counts(format)
     precise, rounded = (run(trunk(format, filters, int8), given) for int8 in (False, True))
     assert np.abs(precise - rounded).mean() < 0.03
@@ -110,8 +108,7 @@ def test_int8_is_close_and_the_last_tenth_is_the_whole_window(format: SweepForma
 
 
 def test_wide_counts_keep_what_a_byte_would_round_away():
-    """One sweep of eight is ten thousand times as large as the others, which are then below a step
-    of 8 bits: int8 still gives the features of float."""
+    """One sweep of eight is ten thousand times as large: int8 still gives float's features."""
     format = FORMATS[4]
     given = counts(format, 8)
     given[0] = (given[0] - 1000) * 1e4
@@ -148,8 +145,7 @@ def test_an_offset_changes_nothing(format: SweepFormat):
 
 @forms
 def test_filters_fit_the_window(format: SweepFormat):
-    """Filters have unit norm and sum to zero unless they are free; all dilations fit; some see one
-    taxel and some see all."""
+    """Unit norm, sum zero unless free; all dilations fit; one taxel or all."""
     for free in (False, True):
         drawn = bank.draw(format, np.random.default_rng(0), (free,))
         assert (drawn.along.sum(axis=1) == 0).all() is np.bool_(not free)

@@ -20,8 +20,7 @@ in one group and misleads in the others."""
 
 
 def known(n: int = 240, seed: int = 0) -> tuple[HeadData, list[InnerPart]]:
-    """Sweeps of three materials in three groups of equal size, with one copy of each, and a part
-    for each group."""
+    """Three materials in three equal groups, a copy of each, a part for each group."""
     rng = np.random.default_rng(seed)
     labels, group = np.arange(n) % 3, np.arange(n) // (n // 3)
     angle = 2 * np.pi * labels / 3
@@ -59,8 +58,7 @@ def scores() -> HeldOutScores:
 
 
 def test_a_plan_is_the_sum_of_its_discriminants():
-    """As one matrix over all features it equals the sum of its discriminants times their factors; a
-    discriminant sees copies only on request."""
+    """One matrix equals the sum of discriminants times factors; copies only on request."""
     given, _ = known()
     plan = HeadPlan((HeadPart(GOOD, False, factor=2.0), HeadPart((1, 2), True, factor=0.5)))
     weight, bias = plan.fit(given, 3)
@@ -92,8 +90,7 @@ def test_a_part_takes_the_copies_of_its_sweeps_alone():
 
 
 def test_what_lies_in_another_group_is_not_chosen():
-    """The feature that names every material within a group is the worst of all for an unseen
-    group."""
+    """What names every material within a group is the worst for an unseen group."""
     at = scores()
     losses = [at.loss(at.score([HeadPart(columns, False)])) for columns in (GOOD, NOISE, TRAP)]
     assert losses[0] < 0.2 < losses[1]
@@ -106,8 +103,7 @@ def test_what_lies_in_another_group_is_not_chosen():
 
 
 def test_what_is_clearly_better_is_chosen():
-    """Bands name most of the materials, and filters name others in each group: all chosen
-    discriminants see the bands."""
+    """Bands name most, filters others in each group: all chosen see the bands."""
     given, parts = known(600)
     x = given.features.copy()
     x[:, GOOD] += np.random.default_rng(1).standard_normal((600, 2))
@@ -138,8 +134,7 @@ def test_a_factor_from_before_does_not_count():
 
 
 def test_loss_alone_is_no_reason():
-    """If two candidates classify the same sweeps correctly, neither is better, however certain
-    one is of its wrong answers."""
+    """The same sweeps correct: neither is better, however sure of wrong answers."""
     at = scores()
     one = at.score([HeadPart(GOOD, False)])
     wrong = one.logits.argmax(axis=1) != at.labels
@@ -149,8 +144,7 @@ def test_loss_alone_is_no_reason():
 
 
 def test_fewer_filters_where_held_out_parts_show_no_loss():
-    """Of filters that all give the same response, a half, a quarter and so on are kept, but at
-    least `least`; other features stay."""
+    """Of equal responses a half, a quarter and so on stay, at least `least`."""
     given, parts = known(600)
     rng = np.random.default_rng(2)
     same = given.features[:, :1] @ np.ones((1, 16)) + given.features[:, 1:2] @ np.tile(
@@ -260,8 +254,7 @@ def test_the_temperature_is_the_best_for_held_out_sweeps():
 
 
 def test_candidates_are_what_the_features_allow():
-    """They are the usual one and magnitudes alone; the usual one without the spectrum; then the
-    best with copies, with the spectrum, and the spectrum alone."""
+    """The usual one, magnitudes, without spectrum; then with copies, and so on."""
     tried: list[str] = []
     choice.choose(scores(), candidates([[0], [1]], [0, 1], [2, 3], bands=[4]), tried.append)
     assert len(tried) == len(set(tried)) == 2 + 1 + 5
@@ -278,8 +271,7 @@ def test_candidates_are_what_the_features_allow():
 
 
 def test_every_discriminant_sees_copies_where_these_are_wanted():
-    """There are fewer candidates, because all of them see copies. One without copies shows that
-    they do no harm."""
+    """All see copies, so there are fewer; one without shows that they do no harm."""
     tried: list[str] = []
     heads = candidates([[0], [1]], [0, 1], [2, 3], bands=[4], copies=True)
     chosen = choice.choose(scores(), heads, tried.append)
@@ -289,8 +281,7 @@ def test_every_discriminant_sees_copies_where_these_are_wanted():
 
 
 def test_the_usual_one_sees_each_kind_three_times():
-    """Magnitudes; with shares and the spectrum; with the distribution and the spectrum. No
-    discriminant has a feature twice."""
+    """Magnitudes; shares and spectrum; distribution and spectrum; none twice."""
     given, parts = known()
     x = np.hstack([given.features[:, [0]]] * 6 + [given.features[:, [1]]] * 6)
     rng = np.random.default_rng(0)
@@ -310,8 +301,7 @@ def test_the_usual_one_sees_each_kind_three_times():
 
 
 def spoiled(*noise: int) -> HeldOutScores:
-    """The scores of sweeps whose features `noise` name the material in two groups, and another one
-    in the first."""
+    """The features `noise` name the material in two groups, and another in the first."""
     given, parts = known()
     rng = np.random.default_rng(1)
     x = given.features.copy()
@@ -323,8 +313,7 @@ def spoiled(*noise: int) -> HeldOutScores:
 
 
 def test_a_view_stays_away_where_it_harms():
-    """A distribution that names materials within a group alone makes the usual candidate worse on
-    the other groups, so no discriminant sees it; a harmless one stays."""
+    """What names materials within a group alone harms others and is not seen."""
     heads = candidates([[0, 1]], [0, 1], [0, 1], levels=[2, 3])
     harmed = choice.choose(spoiled(2, 3), heads, print)
     assert not {2, 3} & set(harmed.plan.columns().tolist())
@@ -343,8 +332,7 @@ def test_copies_stay_away_where_they_harm():
 
 
 def with_loads(seed: int = 3) -> tuple[HeldOutScores, FeatureColumns]:
-    """Scores of sweeps with one weak filter (0) and loads (1, 2) that name the material in all
-    groups."""
+    """Scores of sweeps with one weak filter (0), and loads (1, 2) that name materials."""
     given, parts = known(seed=seed)
     x = given.features[:, [3, 0, 1]].copy()
     x[:, 0] += 0.4 * given.features[:, 0]
@@ -372,8 +360,7 @@ def test_a_weight_is_the_size_of_logits_beside_others():
 
 
 def test_a_discriminant_that_is_mostly_wrong_does_not_outvote_others():
-    """One that names all held-out sweeps and one that names chance: scaled to the same size they
-    name a tenth less than the good one alone, here hardly less."""
+    """Scaled to the same size as a good one, here it costs hardly anything."""
     at = scores()
     good, noise = HeadPart(GOOD, False), HeadPart(NOISE, False)
     alone, both = at.accuracy(at.score([good])), at.score([good, noise])
@@ -410,8 +397,7 @@ def test_a_size_without_filters_has_relations_and_spectrum_in_one_discriminant()
 
 
 def test_relations_join_where_held_out_groups_show_it():
-    """Relations that name the material in all groups join, with a discriminant of few scales and
-    one of all; those that mislead in another group stay away."""
+    """In all groups: a few scales and all join; those that mislead elsewhere do not."""
     given, parts = known(seed=3)
     x = given.features[:, [3, 0, 1, 2, 4]].copy()
     x[:, 0] += 0.4 * given.features[:, 0]
@@ -429,8 +415,7 @@ def test_relations_join_where_held_out_groups_show_it():
 def test_relations_join_where_they_name_more_although_one_group_is_less_sure(
     monkeypatch: pytest.MonkeyPatch,
 ):
-    """The loss of a group depends on the size of logits as well; clearly more right answers count.
-    Loads stay away: their group may be the session whose level they know."""
+    """Clearly more right answers count; loads stay away, which a session may set."""
     given, parts = known(600)
     halves = [InnerPart("speed", np.arange(600) % 2 == half) for half in (0, 1)]
     at = HeldOutScores([given] * 5, [*parts, *halves], 3)

@@ -30,8 +30,7 @@ ALONE = replace(FIXED, distribution=True)
 
 
 def counts(format: SweepFormat, n: int = 3) -> np.ndarray:
-    """White noise [n, T, R, C] of raw counts, equal on all taxels, so that no taxel is
-    attenuated."""
+    """White noise [n, T, R, C], equal on all taxels, so that none is attenuated."""
     noise = np.random.default_rng(7).normal(100, 12, (n, format.window, *format.shape)).clip(0, 255)
     return noise.round().astype(format.dtype)
 
@@ -65,8 +64,7 @@ def defined(format: SweepFormat, some: Levels, given: np.ndarray) -> np.ndarray:
 
 @forms
 def test_the_graph_is_the_definition(format: SweepFormat):
-    """In both precisions, except for a few frames near a level: bytes minus their mean are rounded
-    to bytes again."""
+    """Both precisions, but for frames near a level, which bytes round again."""
     some, given = levels(format), counts(format)
     wanted = defined(format, some, given)
     for int8 in (False, True):

@@ -48,8 +48,7 @@ def peak(sweeps: Dataset) -> int:
 @pytest.mark.slow
 @pytest.mark.thorough  # fits twice
 def test_memory_does_not_grow_with_the_set():
-    """A set of thirty times as many sweeps takes as much beside itself, and no more than the
-    estimate says."""
+    """Thirty times the sweeps take as much beside themselves, within the estimate."""
     small, large = repeated(3), repeated(90)
     least, most = peak(small), peak(large)
     assert most < 1.1 * least + 64 * len(large), (least, most)  # 64: groups and labels
@@ -74,8 +73,7 @@ def test_a_set_under_the_cap_is_used_whole():
 def test_what_cannot_be_held_is_told_before(
     kilobytes: int, limit: str, advice: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """The message has the needed and the free memory, and a number that fits; the limit of a
-    container counts."""
+    """The needed and the free memory, and a number that fits; a container's limit counts."""
     (tmp_path / "meminfo").write_text(f"MemTotal: 1 kB\nMemAvailable: {kilobytes} kB\n")
     (tmp_path / "memory.max").write_text(limit + "\n")
     (tmp_path / "memory.current").write_text("100000000\n")

@@ -69,8 +69,7 @@ def fitted_by_command(folder: Path, *options: str) -> Fit:
 
 @pytest.mark.slow
 def test_a_skin_that_is_put_back_is_shown_to_every_head(tmp_path: Path, fitted: Fit):
-    """With --reattached all discriminants see copies, which the held-out parts of the easy set
-    would not demand."""
+    """With --reattached all discriminants see copies, which nothing else demands."""
     made = fitted_by_command(tmp_path, "--reattached")
     assert made.about["recipe"]["reattached"]
     assert all(part.copies for part in made.plan.parts)
@@ -80,8 +79,7 @@ def test_a_skin_that_is_put_back_is_shown_to_every_head(tmp_path: Path, fitted: 
 @pytest.mark.slow
 @pytest.mark.thorough  # fits twice
 def test_a_fit_for_60_hz_is_deaf_to_that(tmp_path: Path, fitted: Fit):
-    """The fit keeps and reports --mains. Its spectrum then responds to 60 Hz as little as that of
-    the usual fit to 50 Hz, and the usual fit responds to 60 Hz."""
+    """--mains is kept; each fit's spectrum is deaf to its own mains alone."""
     sixty = fitted_by_command(tmp_path, "--mains", "60")
     assert sixty.architecture.mains_hz == sixty.about["recipe"]["mains_hz"] == 60
     assert fitted.architecture.mains_hz == fitted.about["recipe"]["mains_hz"] == 50
@@ -136,8 +134,7 @@ def test_a_fit_is_read_as_it_was_written(fitted: Fit, tmp_path: Path):
 @pytest.mark.slow
 @pytest.mark.thorough  # fits twice; test_stages has a quick form
 def test_the_same_seed_gives_the_same_fit(fitted: Fit):
-    """Another seed gives other filters. If no stages can follow, the choice is the second part of
-    two."""
+    """Another seed gives other filters; without stages the choice is part two of two."""
     told: list[str] = []
     again, other = (recipe.fit(easy(), Run(seed, told.append), CLOSED) for seed in (1, 2))
     assert told[0].startswith("part 1 of 2, features of")
@@ -184,8 +181,7 @@ def test_stages_join_in(monkeypatch: pytest.MonkeyPatch):
 def test_stages_and_the_spectrum_are_enough_unless_more_is_better(
     monkeypatch: pytest.MonkeyPatch, better: bool
 ):
-    """For a reattached skin each stage then has a discriminant with the spectrum, and the trunk
-    holds no filters."""
+    """Each stage has a discriminant with the spectrum, and there are no filters."""
     for name, value in (("LEAST_SWEEPS", 1), ("ENOUGH", 1.01)):
         monkeypatch.setattr(recipe, name, value)
     monkeypatch.setattr(choice.PairedDifference, "better", property(lambda _: better))
@@ -297,8 +293,7 @@ def test_the_method_is_what_the_command_fits(fitted: Fit):
 
 @pytest.mark.slow
 def test_the_method_names_materials_that_it_never_saw_last():
-    """A material without a training sweep gets a logit below all others; labels keep their
-    numbers."""
+    """A material without a training sweep gets the lowest logit; labels stay."""
     sweeps = easy()
     part = sweeps.take(sweeps.labels != 1)
     model = palpate.train(part, part.samples, 1, settings=CLOSED)

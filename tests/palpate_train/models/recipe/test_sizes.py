@@ -81,8 +81,7 @@ def test_a_size_without_filters_needs_windows_with_a_spectrum():
 
 
 def test_each_size_is_a_method():
-    """They are the points of one family. The effort shortens the training of stages, where a size
-    has them."""
+    """Points of one family; the effort shortens the training of stages."""
     made = {m.name: m.effort for m in palpate.methods(Effort(share=0.01))}
     assert {f"palpate-{name}" for name in SIZES} < made.keys() < methods.every().keys()
     steps = "6 iterations of stages"
@@ -96,8 +95,7 @@ def test_each_size_is_a_method():
 
 @pytest.mark.slow
 def test_a_fit_of_the_spectrum_alone_survives_its_file(tmp_path: Path):
-    """Its weights are those of its heads. Nothing in its graph is int8, both precisions agree, and
-    it learns an easy set."""
+    """Nothing in its graph is int8, both precisions agree, an easy set is learned."""
     made = recipe.fit(easy(), Run(1), recipe.Settings(steps=0, size=SIZES["bands"]))
     assert (made.architecture, made.bands) == (replace(recipe.FIXED, spectrum=True), 5)
     assert sorted(made.weights) == ["head.bias", "head.weight", "int8.bias", "int8.weight"]

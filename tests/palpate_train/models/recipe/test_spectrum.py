@@ -42,8 +42,7 @@ FORMATS = {
 
 
 def drawn(format: SweepFormat, n: int = 2, seed: int = 0) -> np.ndarray:
-    """Raw counts of n sweeps: noise that all taxels share, and some of their own; all are about
-    equally noisy."""
+    """n sweeps of noise that all taxels share, and some of their own."""
     rng = np.random.default_rng(seed)
     own = rng.standard_normal((n, format.window, *format.shape))
     x = 90 + 8 * rng.standard_normal((n, format.window, *(1,) * len(format.shape))) + 4 * own
@@ -96,8 +95,7 @@ def defined(
 
 @pytest.mark.parametrize(("format", "mains"), FORMATS.values(), ids=FORMATS)
 def test_the_spectrum_is_that_of_its_definition(format: SweepFormat, mains: bool):
-    """This holds in the graph and in the graph of prefixes; the mains are removed if a tenth holds
-    two periods."""
+    """In the graph and in that of prefixes; mains are removed from two periods on."""
     counts = drawn(format)
     want = defined(format, counts, mains)
     rows, whole = (
@@ -113,8 +111,7 @@ def test_the_spectrum_is_that_of_its_definition(format: SweepFormat, mains: bool
 
 @pytest.mark.parametrize("dtype", ["uint8", "int16"])
 def test_a_noisy_taxel_is_attenuated_as_for_the_trunk(dtype: str):
-    """The bands come after the features of the stages, in float and in int8; without the limit a
-    noisy taxel would change them."""
+    """The bands come after the stages' features, in float and in int8."""
     format = SweepFormat(4, 4, 750.0, 600, dtype)
     counts = drawn(format)
     counts[:, :, 1, 2] = np.random.default_rng(3).integers(0, 250, counts.shape[:2])
@@ -163,8 +160,7 @@ def test_the_hum_of_the_mains_changes_nothing(
 
 
 def test_later_frames_and_offsets_do_not_matter():
-    """Row d depends on the first d + 1 tenths alone, to the bit. Frames left over at the end are
-    not used, and a constant load changes nothing."""
+    """Row d depends on the first d + 1 tenths, to the bit; a constant load is nothing."""
     counts = drawn(ODD)
     held, late = counts.copy(), counts.copy()
     held[:, 64:], late[:, 160:] = held[:, 63:64], 91
@@ -191,8 +187,7 @@ def test_silence_is_finite(name: str):
 
 
 def test_the_box_computes_no_wave_and_the_file_holds_none(tmp_path: Path):
-    """The graph makes the waves from a few numbers, and they are one constant once it is loaded;
-    the file stays below 10 kB instead of 180 kB."""
+    """Made of a few numbers, one constant once loaded; the file stays below 10 kB."""
     model = trunk(skin.FORMAT)
     assert len(model.SerializeToString()) < 10_000
     options = onnxruntime.SessionOptions()

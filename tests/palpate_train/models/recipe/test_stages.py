@@ -37,8 +37,7 @@ SMALL = Architecture((6, 8, 8), 8, 2)
 
 
 def drawn(format: SweepFormat, n: int = 6, seed: int = 0) -> np.ndarray:
-    """Raw counts of n sweeps: every taxel with its own offset, a tone and noise; all are about
-    equally noisy."""
+    """n sweeps: every taxel with its own offset, a tone and noise."""
     rng, t = (
         np.random.default_rng(seed),
         np.arange(format.window).reshape(-1, *(1,) * len(format.shape)),
@@ -83,8 +82,7 @@ def fitted() -> Fit:
 
 @pytest.mark.slow
 def test_stages_follow_the_window():
-    """The kernels are as expected for the two known windows; every window gets a last stage, or a
-    message."""
+    """The kernels of the two known windows; every window gets a last stage, or a message."""
     assert [(s.kernel, s.stride) for s in STAGES.stages(1500)] == [(32, 4), (5, 2), (5, 2)]
     assert [(s.kernel, s.stride) for s in STAGES.stages(128)] == [(4, 1), (5, 2), (5, 2)]
     assert STAGES.stages(1500)[-1] == architectures.FilterStage(5, 2, 89, 32 + 4 * 4 + 4 * 8, 16)
@@ -101,8 +99,7 @@ def test_stages_follow_the_window():
 
 
 def test_stages_are_as_large_as_stated():
-    """For the skin of the paper they have about 50,000 weights, in PyTorch and in the graph; with
-    the spectrum and a head for six materials they fill 96 kB in int8."""
+    """About 50,000 weights in PyTorch and graph; with a head for six 96 kB in int8."""
     model, plain, int8 = trunks(skin.FORMAT, STAGES)
     size = sum(p.numel() for p in model.convs.parameters())
     assert size == cost.weights(plain) == pytest.approx(50_000, rel=0.1)
@@ -117,8 +114,7 @@ def test_stages_are_as_large_as_stated():
 
 @pytest.mark.slow
 def test_stages_ignore_offsets():
-    """A constant on each taxel changes nothing, because of the kernels and not because of
-    `prepare`."""
+    """A constant changes nothing, because of the kernels and not of `prepare`."""
     model = stages.StagesNetwork(skin.FORMAT, 6, 0.1, norm=False)
     rng = np.random.default_rng(0)
     counts = torch.from_numpy(rng.integers(0, 100, (2, 16, 1500)).astype(np.float32))
@@ -158,8 +154,7 @@ def test_fused_norms_change_nothing():
     ],
 )
 def test_both_graphs_are_the_network(rows: int, cols: int, window: int, dtype: str, axes: int):
-    """For any data type and window, float agrees up to rounding and int8 closely; a silent sweep
-    gives the same features at any level."""
+    """Any type and window: float up to rounding, int8 closely; silence at any level."""
     format = SweepFormat(rows, cols, 100.0, window, dtype, axes)
     model, plain, int8 = trunks(format)
     counts = drawn(format, seed=1)
@@ -175,8 +170,7 @@ def test_both_graphs_are_the_network(rows: int, cols: int, window: int, dtype: s
 
 
 def test_no_offset_moves_a_bit_of_bytes():
-    """The integer taps of every kernel sum to zero in at most seven bits, so offsets change nothing
-    at all."""
+    """Integer taps sum to zero in at most seven bits, so offsets change nothing."""
     format = skin.FORMAT
     _, _, int8 = trunks(format)
     values = {c.name: numpy_helper.to_array(c) for c in int8.graph.initializer}
@@ -209,8 +203,7 @@ def test_rounding_to_zero_sums_moves_as_little_as_it_can():
 @pytest.mark.parametrize("int8", [False, True])
 @pytest.mark.parametrize(("window", "dtype"), [(1500, "uint8"), (128, "int16"), (25, "float32")])
 def test_a_tenth_knows_nothing_of_what_follows(int8: bool, window: int, dtype: str):
-    """Row d does not depend on any frame after (d + 1) / 10 of the window, to the bit, but on the
-    frames just before."""
+    """Row d does not depend on later frames, to the bit, but on those just before."""
     format = SweepFormat(2, 2, 100.0, window, dtype)
     trunk, whole = trunks(format, prefixes=True)[1 + int8], trunks(format)[1 + int8]
     counts, other = drawn(format, 3), drawn(format, 3, seed=7)
@@ -237,8 +230,7 @@ def test_a_tenth_knows_nothing_of_what_follows(int8: bool, window: int, dtype: s
 
 @pytest.mark.parametrize("mains_hz", [50, 60])
 def test_the_first_kernels_do_not_hear_the_mains(mains_hz: int):
-    """They do not respond to hum of any phase, but to twice its frequency, in training and after; a
-    kernel shorter than a period responds to both."""
+    """No response to hum of any phase, but to twice its frequency; short kernels to both."""
     at = torch.arange(750) / 750
     hum, tone = (
         torch.sin(2 * np.pi * hz * at + torch.rand(16, 1)) for hz in (mains_hz, 2 * mains_hz)
@@ -260,8 +252,7 @@ def test_the_first_kernels_do_not_hear_the_mains(mains_hz: int):
 
 
 def test_a_noisy_taxel_is_attenuated():
-    """It is attenuated to three times the noise of the fifth of sixteen. The others are unchanged
-    to the bit, and all are if only a few are touched."""
+    """To three times the noise of the fifth of sixteen; the others stay to the bit."""
     x = torch.randn(2, 16, 1500, generator=torch.Generator().manual_seed(0))
     loud = x.clone()
     loud[0, 3] *= 40
@@ -280,8 +271,7 @@ def test_a_noisy_taxel_is_attenuated():
 
 @pytest.mark.parametrize("dtype", ["uint8", "int16"])
 def test_int8_attenuates_as_the_network_does(dtype: str):
-    """A noisy taxel changes the features of the graphs as PyTorch's, and much less than without the
-    limit."""
+    """It changes the graphs' features as PyTorch's, much less than without the limit."""
     format = SweepFormat(4, 4, 750.0, 600, dtype)
     model, plain, int8 = trunks(format)
     counts = drawn(format, 4)
