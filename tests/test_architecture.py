@@ -85,8 +85,7 @@ def imports(path: Path) -> set[str]:
 
 
 def module_imports(*packages: str) -> dict[str, set[str]]:
-    """For each module of the packages those of them that it imports, also under TYPE_CHECKING and
-    in functions."""
+    """For each module those that it imports, also in functions and type hints."""
     dotted = {}
     for folder in map(PACKAGES.__getitem__, packages):
         for path in folder.glob("**/*.py"):
@@ -104,8 +103,7 @@ def module_imports(*packages: str) -> dict[str, set[str]]:
 
 
 def circles(graph: dict[str, set[str]]) -> list[str]:
-    """The modules that can be reached from themselves, with the imports that lead on to such
-    modules."""
+    """The modules that reach themselves, with the imports that lead to them."""
     left, kept = {}, graph
     while kept != left:  # a module is in no circle if it imports or serves nothing of the rest
         left, imported = kept, set().union(*kept.values())
@@ -116,8 +114,7 @@ def circles(graph: dict[str, set[str]]) -> list[str]:
 
 @pytest.mark.slow
 def test_no_module_imports_itself_through_others():
-    """No circle between modules, type hints and imports in functions included; one that is there
-    would be found."""
+    """Type hints and functions included; one that is there would be found."""
     graph = module_imports("palpate", "palpate_train", "palpate_studies")
     assert "palpate.core.errors" in graph["palpate.deployment.store"]
     assert circles(graph) == []
@@ -165,8 +162,7 @@ def foreign(path: Path) -> set[str]:
 
 @pytest.mark.slow
 def test_the_box_imports_five_libraries():
-    """The box imports the five libraries of the design, and itself by full names; a library of an
-    extra only in the part that the extra is for."""
+    """And itself by full names; a library of an extra only where that is for."""
     assert {shown(path): names for path in BOX if (names := foreign(path))} == {}
     assert foreign(ROOT / "train" / "palpate_train" / "models" / "training.py") >= {"torch"}
 
@@ -205,8 +201,7 @@ def test_the_simulator_is_not_loaded_unless_named():
 
 
 def test_onnxruntime_starts_no_thread_of_its_own():
-    """Telemetry off: no uploader, no pool; a session that has run leaves the process with its one
-    thread."""
+    """Telemetry off: a session that has run leaves the process with one thread."""
     code = (
         "import os; from palpate.bundle import bundle; from palpate.core import clock; "
         "from palpate.inference import classifier; import onnxruntime;"
@@ -308,8 +303,7 @@ def test_every_test_says_what_it_holds():
 
 
 def asserts(test: ast.FunctionDef) -> bool:
-    """Whether a test can fail by a judgement: assert, pytest.raises, fail or warns, or a helper
-    named after checking."""
+    """Whether a test can fail: assert, pytest.raises, fail, warns, or a checking helper."""
     if any(isinstance(node, ast.Assert) for node in ast.walk(test)):
         return True
     calls = [ast.unparse(node.func) for node in ast.walk(test) if isinstance(node, ast.Call)]
@@ -319,8 +313,7 @@ def asserts(test: ast.FunctionDef) -> bool:
 
 @pytest.mark.slow
 def test_every_test_asserts():
-    """Each test holds an assertion, or calls a helper whose name begins with check_, assert_ or
-    expect_."""
+    """Each asserts, or calls a helper named check_, assert_ or expect_."""
     assert [name for name, test in written_tests() if not asserts(test)] == []
 
 
@@ -383,8 +376,7 @@ def test_the_wheel_holds_the_box_alone(wheel: Path):
 @pytest.mark.slow
 @pytest.mark.thorough  # installs five libraries
 def test_the_wheel_works_in_a_clean_environment(wheel: Path, tmp_path: Path):
-    """Locked dependencies with hashes, the wheel, nothing else: `palpate check` on the rig says ok,
-    away from the checkout."""
+    """Locked dependencies and the wheel alone: `palpate check` on the rig says ok."""
     run(sys.executable, "-m", "venv", tmp_path / "venv", cwd=tmp_path)
     python = tmp_path / "venv" / "bin" / "python"
     pip = (python, "-m", "pip", "install", "-q", "--disable-pip-version-check")

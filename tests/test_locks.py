@@ -26,8 +26,7 @@ LOCKS = {
 
 
 def entries(lock: str) -> dict[str, list[str]]:
-    """Names in a lock, each with its whole entries; a name has several where versions differ
-    between systems."""
+    """Names in a lock with their entries; several where systems differ."""
     found: dict[str, list[str]] = {}
     for entry in re.split(r"\n(?=[a-z])", (ROOT / lock).read_text()):
         found.setdefault(re.split("[=@ ;]", entry)[0], []).append(entry)
@@ -65,8 +64,7 @@ def test_every_package_is_locked_with_hashes(lock: str):
 
 
 def test_all_locks_agree():
-    """A package has the same version in every lock. Tests and desktop run on the versions of a
-    box."""
+    """The same version everywhere: tests and desktop run on a box's versions."""
     versions: dict[str, set[tuple[str, ...]]] = {}
     for lock in LOCKS:
         for name, of_it in entries(lock).items():
@@ -99,7 +97,6 @@ def test_the_lock_covers_both_processors():
 
 
 def test_tests_run_on_the_numpy_of_the_box():
-    """The lock of the box and this environment have the same numpy, whatever else the desktop
-    installs."""
+    """Whatever else the desktop installs."""
     lock = (ROOT / "appliance" / "requirements.lock").read_text()
     assert re.findall(r"(?m)^numpy==(\S+)", lock) == [metadata.version("numpy")]

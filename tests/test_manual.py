@@ -58,8 +58,7 @@ def rows(page: str, column: str) -> list[list[str]]:
 
 
 def spoken() -> list[list[str]]:
-    """The arguments of each `palpate` command of the pages' code blocks; printed tables have wide
-    gaps."""
+    """Arguments of each `palpate` command in code blocks; tables have wide gaps."""
     found = (re.fullmatch(r"(?:sudo -u palpate )?palpate ([a-z].*)", line) for line in BLOCKS)
     return [shlex.split(m[1]) for m in found if m and "   " not in m[1]]
 
@@ -163,8 +162,7 @@ def test_wiring_is_that_of_the_board_files(board: str):
 
 
 def test_the_box_gets_the_manual(manual: ModuleType):
-    """As one text in ASCII: its contents list every page, markers are filled, links are gone,
-    drawings have stayed and fit into 80 columns."""
+    """One ASCII text: all pages, filled markers, no links, drawings of 80 columns."""
     text = manual.box_manual()
     titles = re.findall(r"(?m)^## \d+\. (.*)$", text)
     assert re.findall(r"(?m)^\d+\. (.*)$", text.partition("\n## ")[0]) == titles

@@ -57,8 +57,7 @@ def wheels(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 def run(wheels: list[Path], program: str, folder: Path) -> str:
-    """Run a program with these wheels and the libraries of this environment, in a folder with
-    files of the user; its output."""
+    """The output of a program with these wheels, in a folder with a user's files."""
     for name in OWN:
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_text("raise ImportError('a file of the user')\n")

@@ -19,8 +19,7 @@ from tests.rig.machine import Guest
 
 
 def show(cell: Cell, sweeps: int) -> None:
-    """Let the robot sweep; print the touched material, the answer of the box, and the levels of its
-    lines."""
+    """Let the robot sweep; print material, answer, and levels of its lines."""
     begun = time.monotonic()
     cell.plug()
     cell.until_ready()

@@ -89,8 +89,7 @@ class Cell:
         self.packet_frames = 6
 
     def board(self, **arguments: Any) -> rig.ReadoutBoard:
-        """A board in the robot's hand; arguments: those of sim.rig.ReadoutBoard (ppm, latency,
-        serial and others)."""
+        """A board in the robot's hand; arguments as of sim.rig.ReadoutBoard."""
         usual = {"fifo_frames": FIFO, "packet_frames": self.packet_frames}
         return rig.ReadoutBoard(skin.FORMAT, self.hand, self.clock, **usual | arguments)
 
@@ -109,8 +108,7 @@ class Cell:
         self.cable.unplug()
 
     def until(self, done: Callable[[], object], timeout_s: float, what: str) -> None:
-        """Wait until `done()`. Raises AssertionError with `what` and the log of the box if it is
-        not in time."""
+        """Wait until `done()`. Raises AssertionError with `what` and the box's log."""
         if not self.clock.until(done, timeout_s):
             raise AssertionError(f"{what} within {timeout_s} s; the box says: {self.journal()}")
 
@@ -120,15 +118,13 @@ class Cell:
         self.until(lambda: levels["READY"] and not levels["FAULT"], timeout_s, "not READY")
 
     def touch(self, *, start: bool = True, stop: bool = True) -> Touch:
-        """Begin a sweep, without waiting for its end. start, stop: whether the robot sends that
-        edge."""
+        """Begin a sweep. start, stop: whether the robot sends that edge."""
         touch = Touch(next(self.acts), start, stop)
         self.hand.touches.put(touch)
         return touch
 
     def sweep(self, timeout_s: float = ANSWER_S) -> tuple[Touch, Answer]:
-        """A whole sweep: the touch and the answer of the box. Raises AssertionError if no answer
-        comes."""
+        """A touch and the box's answer. Raises AssertionError if none comes."""
         since = len(self.serial.heard)
         touch = self.touch()
         self.begun(touch)

@@ -46,8 +46,7 @@ def count() -> Count:
 
 @pytest.fixture(scope="module")
 def shared(image: Image, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cell]:
-    """A guest for a whole file of tests. The answers to its sweeps are known, and its packets are
-    large: speed does not matter here."""
+    """A guest for a file of tests, with known answers and large packets."""
     with Guest(image, tmp_path_factory.mktemp("guest"), snapshot=True) as machine:
         cell = Cell(machine)
         cell.acts, cell.packet_frames = known(script.tubes(2)), 18
@@ -56,8 +55,7 @@ def shared(image: Image, tmp_path_factory: pytest.TempPathFactory) -> Iterator[C
 
 @pytest.fixture
 def cell(shared: Cell) -> Cell:
-    """The guest of this file, with a working skin, quiet lines and a robot that reads; the box is
-    READY."""
+    """The guest of this file: working skin, quiet lines, a robot that reads, READY."""
     shared.restore()
     return shared
 

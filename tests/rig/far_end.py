@@ -13,8 +13,7 @@ ADAPTER = "/dev/serial/by-id/usb-QEMU_QEMU_USB_SERIAL_R1-if00-port0"
 
 
 class FarEnd:
-    """heard: (ns, line) of all lines, in order. While `deaf`, nothing is read, and the guest's port
-    fills up."""
+    """heard: (ns, line) of all. While `deaf`, nothing is read and the port fills up."""
 
     def __init__(self, path: Path, clock: GuestClock) -> None:
         self.heard: list[tuple[int, str]] = []
@@ -60,8 +59,7 @@ class FarEnd:
         return self.wait_for("$PPLP,ANS,", timeout_s, since)
 
     def wait_for(self, start: str, timeout_s: float, since: int = 0) -> str:
-        """The first line that begins with `start`, from line number `since` on. Raises
-        AssertionError if none comes."""
+        """The first line with this `start`, from number `since` on. Raises AssertionError."""
         found: list[str] = []
 
         def there() -> bool:

@@ -95,8 +95,7 @@ class GuestClock:
 
 
 def find(qtest: Qtest, timeout_s: float) -> GuestClock:
-    """The clock of a guest whose kernel has set up its cards or is doing so. Raises TimeoutError if
-    it does not."""
+    """The clock of a guest whose kernel sets up its cards. Raises TimeoutError."""
     config, end_s = ECAM + (SLOT << 15), time.monotonic() + timeout_s
 
     def read(address: int) -> int:

@@ -61,8 +61,7 @@ TOOLS = {
 
 @dataclass(frozen=True, slots=True)
 class Image:
-    """The files of a box: kernel, ramdisk and device tree, and a disk with the snapshot `ready` in
-    it."""
+    """Kernel, ramdisk, device tree, and a disk with the snapshot `ready`."""
 
     ground: Path
     disk: Path
@@ -74,8 +73,7 @@ class Image:
 
 
 def image(log: Callable[[str], None] = print) -> Image:
-    """The box of this checkout, built if it is not cached. Raises Missing if that is not possible
-    here."""
+    """The box of this checkout, built if not cached. Raises Missing."""
     return box(ground(log), log)
 
 
@@ -86,8 +84,7 @@ def built() -> Image | None:
 
 
 def ground(log: Callable[[str], None] = print) -> Path:
-    """Folder with vmlinuz, ramdisk, tree.dtb and disk.img, built if it is not cached. Raises
-    Missing."""
+    """Folder of vmlinuz, ramdisk, tree.dtb, disk.img, built if not cached. Raises Missing."""
     target = CACHE / _ground_name()
     if not target.exists():
         _need(TOOLS)
@@ -193,8 +190,7 @@ def _make_ground(part: Path) -> None:
 
 
 def guest_lock() -> str:
-    """The locked dependencies for the guest's Python and processor; pip would choose them for this
-    machine's."""
+    """The locked dependencies for the guest's Python and processor."""
     return run_here(
         f"from release import LOCK, locked; print(locked(LOCK.read_text(), '{GUEST_PYTHON}.2', "
         "'aarch64'))"
@@ -215,8 +211,7 @@ def _make_root(part: Path, version: str) -> None:
 
 
 def _hooks(part: Path) -> tuple[str, ...]:
-    """Shell commands with which mmdebstrap installs the box's dependencies and the agent; $1 is the
-    root."""
+    """Commands by which mmdebstrap installs dependencies and agent; $1: the root."""
     pip = (
         "/opt/palpate/bin/pip install -q --disable-pip-version-check --no-index --find-links "
         "/wheels"
@@ -238,8 +233,7 @@ def _hooks(part: Path) -> tuple[str, ...]:
 
 
 def _modules(kernel: Path, root: Path, version: str, names: Iterable[str]) -> list[Path]:
-    """Copy modules and their dependencies to a root; returns their files in the order of
-    loading."""
+    """Copy modules and what they need to a root; its files in order of loading."""
     source, target = kernel / "lib/modules" / version, root / "lib/modules" / version
     if not (source / "modules.dep").exists():
         run("depmod", "-b", kernel, version)
@@ -276,8 +270,7 @@ def _make_ramdisk(part: Path, version: str) -> None:
 
 
 def _make_tree(path: Path) -> None:
-    """The machine's device tree, with names for its lines, and without its power button on one of
-    them."""
+    """The machine's device tree, lines named, without a power button on one."""
     option, machine, *rest = MACHINE
     run("qemu-system-aarch64", option, f"{machine},dumpdtb={path}", *rest, "-display", "none")
     run("fdtput", "-r", path, "/gpio-keys")

@@ -19,8 +19,7 @@ SETTLE_S = 0.2
 
 
 def pack(folder: Path, tests: Iterable[str]) -> None:
-    """Copy these files and folders of the checkout, and the packages that run them, into `folder`;
-    each keeps its place in the checkout."""
+    """Copy parts of the checkout, and the packages that run them, to `folder`."""
     for name in tests:
         source, place = ROOT / name, folder / name
         place.parent.mkdir(parents=True, exist_ok=True)
@@ -48,8 +47,7 @@ class GuestControls:
         return ["skin", "numbered", "plug", "garble", "silence", "lines", "serial", "stall"]
 
     def reset(self) -> None:
-        """As Backend.reset; the cable stays as it is. The other methods are described in Backend,
-        too."""
+        """As Backend.reset; the cable stays. Other methods: see Backend."""
         self.garble(False)
         for line in ("START", "STOP"):
             self.drive(line, False)

@@ -35,8 +35,7 @@ ANSWERED = {str(status) for status in Status if status.classified} | {"unknown",
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """An answer to a window: its number, and the time when the box had all that it needed, in s of
-    its clock."""
+    """An answer: its number, and when the box had all that it needed, in s of its clock."""
 
     sweep: int
     complete_s: float
@@ -68,8 +67,7 @@ def checked(cell: Cell) -> str:
 
 
 def found(disk: Path, folder: Path) -> tuple[int, list[Path]]:
-    """Examine an unused disk on a copy: the exit code of e2fsck after the journal is replayed, and
-    the kept sweeps."""
+    """Of a copy of a disk: e2fsck's exit code after the journal, and the kept sweeps."""
     raw, out = folder / "disk.raw", folder / "found"
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir()
@@ -97,8 +95,7 @@ def whole(line: str) -> list[str]:
 
 
 def owed(heard: Iterable[tuple[int, str]]) -> tuple[list[Heard], list[Heard]]:
-    """Answers whose sweep must be stored, and answers whose sweep may be missing. heard: (ns, line)
-    of one boot."""
+    """Answers whose sweep must be stored, and may be missing. heard: of one boot."""
     must: list[Heard] = []
     may: list[Heard] = []
     waiting: dict[int, Heard] = {}
@@ -116,8 +113,7 @@ def owed(heard: Iterable[tuple[int, str]]) -> tuple[list[Heard], list[Heard]]:
 
 
 def lost(heard: Iterable[tuple[int, str]], kept: list[Sweep]) -> dict[str, int]:
-    """Counts of answers with a window, of sweeps that must be stored, of those that are missing,
-    and of other missing sweeps."""
+    """Counts: answers with a window, sweeps owed, those missing, other missing ones."""
     must, may = owed(heard)
     gone = [h for h in must if not any(h.fits(k) for k in kept)]
     unfinished = [h for h in may if not any(h.fits(k) for k in kept)]

@@ -43,8 +43,7 @@ class GuestLines:
         self.run_through([(name, level)])
 
     def run_through(self, steps: Iterable[tuple[str, bool]]) -> None:
-        """Drive inputs one after the other, in one write to QEMU: some tens of microseconds from
-        step to step."""
+        """Drive inputs one after another in one write: some tens of us a step."""
         into = f"set_irq_in {self._place} unnamed-gpio-in"
         self._qtest.ask(
             *(f"{into} {self._names.index(name)} {int(level)}" for name, level in steps)

@@ -154,8 +154,7 @@ class Guest:
         return UsbRedirPeer(listener.accept()[0], self.clock)
 
     def qmp(self, execute: str, **arguments: Any) -> Any:
-        """Send a command to QEMU's monitor; returns its result. Raises GuestFailed if QEMU
-        refuses."""
+        """The result of a command to QEMU's monitor. Raises GuestFailed."""
         self._qmp.write(json.dumps({"execute": execute, "arguments": arguments}) + "\n")
         self._qmp.flush()
         for line in self._qmp:
@@ -173,8 +172,7 @@ class Guest:
     def run(
         self, line: str, *, timeout_s: float = 30, check: bool = False, stdin: bytes = b""
     ) -> Done:
-        """Run a shell command as root and wait for its end. Raises GuestFailed if the guest does
-        not answer, or if it fails and `check` is set."""
+        """Run a command as root to its end. Raises GuestFailed, also if `check` fails."""
         return self._shell.run(line, timeout_s=timeout_s, check=check, stdin=stdin)
 
     def out(self, line: str, timeout_s: float = 30) -> str:
@@ -190,8 +188,7 @@ class Guest:
         return base64.b64decode(self.run(f"base64 {path}", check=True).out)
 
     def save(self) -> None:
-        """Save the running guest in its disk as the snapshot `ready`, without the device on its USB
-        port, and end."""
+        """Save the guest as the snapshot `ready`, without a USB device, and end it."""
         self.qmp("device_del", id="cable")
         self.run("udevadm settle")
         text = self.qmp("human-monitor-command", **{"command-line": "savevm ready"})
@@ -200,8 +197,7 @@ class Guest:
         self.close()
 
     def bench(self) -> socket.socket:
-        """The other end of the guest's port palpate.bench, through which tests inside request
-        actions outside."""
+        """The far end of the port by which tests inside ask for actions outside."""
         return self._connect("bench")
 
     def console(self) -> str:
@@ -226,7 +222,6 @@ class Guest:
 
 
 def _network(ssh: int) -> tuple[str, ...]:
-    """Options of QEMU for a network without a way out; port `ssh` of this machine leads to port
-    22."""
+    """QEMU's options for a network without a way out; port `ssh` leads to 22."""
     forward = f"user,id=net,restrict=on,hostfwd=tcp:127.0.0.1:{ssh}-:22"
     return "-netdev", forward, "-device", "virtio-net-pci,netdev=net,addr=0xb,romfile="

@@ -10,8 +10,7 @@ SECOND = 1_000_000_000
 
 
 def before(cell: Cell, i: int) -> str:
-    """Pulled before a sweep: READY falls, FAULT rises; a start edge is answered at once, its stop
-    edge is not."""
+    """READY falls, FAULT rises; a start edge is answered, its stop edge is not."""
     cell.unplug()
     assert cell.lines.wait("FAULT", True, 20)
     assert cell.lines.wait("READY", False, 20)

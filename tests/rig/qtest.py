@@ -13,8 +13,7 @@ ANSWER_S = 60
 
 
 class Qtest:
-    """One guest's socket. changed: called for each change of an intercepted output, with its number
-    and level."""
+    """One guest's socket. changed: called with number and level of an output."""
 
     def __init__(self, connection: socket.socket) -> None:
         self.changed: Callable[[int, bool], None] = lambda number, level: None

@@ -39,8 +39,7 @@ class Shell:
     def run(
         self, line: str, *, timeout_s: float = 30, check: bool = False, stdin: bytes = b""
     ) -> Done:
-        """Run a shell command as root and wait for its end. Raises GuestFailed if the guest does
-        not answer, or if it fails and `check` is set."""
+        """Run a command as root to its end. Raises GuestFailed, also if `check` fails."""
         request = {"run": line, "timeout_s": timeout_s, "stdin": base64.b64encode(stdin).decode()}
         try:
             self._port.sendall(json.dumps(request).encode() + b"\n")

@@ -48,8 +48,7 @@ disk."""
 
 
 class Recorder:
-    """Writes the record of a run from the sentences of a box and samples of its process. All times
-    are the box's."""
+    """Writes a run's record from sentences and samples; times are the box's."""
 
     def __init__(self, box: BoxUnderTest, run: SoakRun, sweeps: Script) -> None:
         self.run = run
@@ -141,8 +140,7 @@ class Recorder:
 def record(
     box: BoxUnderTest, run: SoakRun, length_s: float, save: Callable[[], None], stopped: list[int]
 ) -> None:
-    """Let a box sweep for this long, or until a signal is in `stopped`; `save` is called each
-    minute and at the end. Faults are in the run."""
+    """Sweep for this long or until `stopped`; `save` is called each minute."""
     recorder = Recorder(box, run, Script(run.seed))
     try:
         recorder.start()
@@ -234,8 +232,7 @@ def main() -> int:
 
 
 def _together(arguments: list[str]) -> bool:
-    """Run each box that is available here in a process of its own. Interrupting this process
-    interrupts them. False if a box failed."""
+    """Each available box in a process of its own; False if one failed."""
     children = []
     for name, kind in BOXES.items():
         if missing := kind.missing():

@@ -50,8 +50,7 @@ class Gone(AssertionError):
 
 @dataclass(frozen=True, slots=True)
 class Fact:
-    """A sweep of the script: the touched material, the numbers of the frames at its edges, and the
-    label of the bundle by itself."""
+    """A sweep of the script: material, frames at its edges, the bundle's own label."""
 
     label: str
     start: int
@@ -60,8 +59,7 @@ class Fact:
 
 
 class Script:
-    """The robot's sweeps in order, as facts, computed on demand. Numbers begin with 1, as in
-    sentences."""
+    """The robot's sweeps in order, as facts, computed on demand, from number 1."""
 
     def __init__(self, seed: int) -> None:
         self._acts, self._facts, self._next = script.tubes(seed), list[Fact](), 0
@@ -180,8 +178,7 @@ class ThisMachine:
         self._box.wait()
 
     def heard(self, wait_s: float) -> list[tuple[float, str]]:
-        """Lines since the last call, each with its time; waits at most `wait_s` for more. Raises
-        Gone."""
+        """Lines since the last call with their times, after `wait_s` at most. Raises Gone."""
         if self._box.poll() is not None:
             raise Gone(f"the box ended with {self._box.returncode}: {self._log_text()}")
         return self._read(wait_s)
@@ -240,8 +237,7 @@ class ThisMachine:
         }
 
     def stop(self) -> list[tuple[float, str]]:
-        """End the box and wait for its end; returns the last lines. Raises Gone if its exit code is
-        not 0."""
+        """End the box; returns its last lines. Raises Gone unless its exit code is 0."""
         self._box.terminate()
         lines = list(self._until_ended())
         if self._box.poll() != 0:

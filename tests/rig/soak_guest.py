@@ -143,8 +143,7 @@ class VirtualBox:
         return sent[at - 1][1] if at else 0
 
     def _note(self, packet: bytes) -> bytes:
-        """Record the last frame of a packet that goes to the guest; returns the packet
-        unchanged."""
+        """Record the last frame of a packet to the guest; returns the packet."""
         _, _, _, _, _, count, *_, seq, _ = packets.HEADER.unpack_from(packet)
         if self._anew and self._sent:
             # frames from between the box's STOP and its START were not requested
@@ -171,8 +170,7 @@ class VirtualBox:
         return process(text, stat, int(files))
 
     def about(self) -> Mapping[str, Any]:
-        """As ThisMachine; only describes the emulated machine, since the guest does not run
-        yet."""
+        """As ThisMachine, but of the emulated machine, before the guest runs."""
         return {
             "what": "an arm64 Debian in QEMU; the skin on its USB port, the robot on its lines "
             "and its serial port",

@@ -68,8 +68,7 @@ def columns(rows: Sequence[Sequence[Any]], names: Sequence[str]) -> dict[str, li
 
 
 def numbering(number: int, last: int, started: int) -> str:
-    """An error message if the number of an answer is wrong after the answer `last`, when `started`
-    sweeps had begun; else ""."""
+    """What is wrong with the number of an answer after `last`, or ""."""
     if number == last + 1:
         return (
             ""
@@ -82,8 +81,7 @@ def numbering(number: int, last: int, started: int) -> str:
 
 
 def kind(status: str, label: str, touched: str) -> str:
-    """An answer as right, wrong, unsure or refused; cut if the end of the soak aborted the
-    sweep."""
+    """Right, wrong, unsure or refused; cut if the end of the soak aborted it."""
     if status == Status.OK:
         return "right" if label == touched else "wrong"
     if status == Status.ABORTED:
@@ -191,8 +189,7 @@ def slope(runs: Sequence[Json]) -> dict[str, Any]:
 
 
 def _counted(runs: Sequence[Json]) -> dict[str, Any]:
-    """Counters of the box, and the number of frames that the board took and the box never
-    counted."""
+    """Counters of the box, and frames that the board took and it never counted."""
     last = [columns(run["samples"], SAMPLE) for run in runs if run["samples"]]
     result: dict[str, Any] = {
         name: sum(c[name][-1] for c in last)
@@ -221,8 +218,7 @@ def unaccounted(behind: Sequence[float]) -> int:
 
 
 def targets(result: Json) -> Iterator[tuple[str, str, str, bool | None]]:
-    """(name, wanted, measured, whether it was reached) of each target; None if the run was too
-    short."""
+    """(name, wanted, measured, reached) of each target; None if too short."""
     for name, key, of in (
         ("sweeps without an answer", "unanswered", f" of {result['due']}"),
         ("sentences out of order, broken or missing", "faults", ""),

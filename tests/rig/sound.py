@@ -36,8 +36,7 @@ TRIES = 6
 
 
 def known(acts: Iterable[rig.Act]) -> Iterator[rig.Act]:
-    """Acts that the default bundle classifies right, even if shifted by a few frames; any other
-    answer is a fault."""
+    """Acts that the default bundle classifies right, also if shifted by some frames."""
     model, window = bundle.load(bundle.DEFAULT), skin.FORMAT.window
     alone = Classifier(model, SystemClock())
     for act in acts:
@@ -52,15 +51,13 @@ def known(acts: Iterable[rig.Act]) -> Iterator[rig.Act]:
 
 
 def not_wrong(touch: Touch, answer: Answer) -> str:
-    """The status of an answer. Raises AssertionError if it names another material than the
-    touched."""
+    """The status of an answer. Raises AssertionError for another material."""
     assert answer.label in ("", touch.act.label), f"{touch.act.label} was answered {answer}"
     return answer.status
 
 
 def check_recovers(cell: Cell) -> None:
-    """The box becomes READY by itself, then classifies a sweep right. Raises AssertionError
-    otherwise."""
+    """READY by itself, then a right sweep. Raises AssertionError otherwise."""
     received = []
     for _ in range(TRIES):
         cell.until_ready()
@@ -109,8 +106,7 @@ def let_go(cell: Cell) -> None:
 
 
 def only_answer(cell: Cell, since: int) -> Answer:
-    """The only answer since line number `since`. Raises AssertionError if a second answer comes
-    a moment later."""
+    """The only answer since line `since`. Raises AssertionError for a second one."""
     first = cell.answer(since)
     end = cell.clock.now_s() + 0.3
     while cell.clock.now_s() < end:

@@ -83,8 +83,7 @@ class BareBox:
 
     @contextmanager
     def on(self) -> Iterator[Cell]:
-        """Power on; a robot's cell around it, its skin plugged in. The power goes at the end, as it
-        is."""
+        """Power on, with a robot's cell; the power goes at the end, as it is."""
         with Guest(self._image, self.folder, disk=self.disk, ssh=self.port) as guest:
             guest.ready(BOOT_S)
             cell = Cell(guest)
@@ -93,8 +92,7 @@ class BareBox:
             yield cell
 
     def prepare(self, cell: Cell) -> None:
-        """The preparations before the first install: a card with a network, a key, and the settings
-        of the cell."""
+        """Before the first install: a card with a network, a key, the cell's settings."""
         run, put = cell.machine.run, cell.machine.put
         put("/etc/systemd/network/wire.network", NETWORK.encode())
         put("/etc/udev/rules.d/71-rig.rules", ROBOT_PORT.encode())

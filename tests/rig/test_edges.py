@@ -99,8 +99,7 @@ def toggle(cell: Cell, name: str, edges: int) -> None:
 
 
 def test_glitches(cell: Cell, count: Count, note: Note) -> None:
-    """Pulses that are over before the kernel can look are nothing, on both lines; longer ones are
-    an edge or nothing."""
+    """Pulses too short for the kernel are nothing; longer ones an edge or nothing."""
     since, times = len(cell.serial.heard), count(20, 500)
     for _ in range(times):
         for name in ("START", "STOP"):
@@ -127,8 +126,7 @@ def test_glitches(cell: Cell, count: Count, note: Note) -> None:
 
 
 def test_second_start_and_glitches_in_a_sweep(cell: Cell, count: Count, note: Note) -> None:
-    """A start edge while a sweep is open: `no-stop`, and the new sweep is right, though glitches
-    come all the time."""
+    """A start edge in an open sweep: `no-stop`, and the new sweep is right."""
     outcomes: Counter[str] = Counter()
     for _ in range(count(1, 10)):
         cell.until_ready()
@@ -156,8 +154,7 @@ def test_second_start_and_glitches_in_a_sweep(cell: Cell, count: Count, note: No
 
 
 def test_stop_without_start(cell: Cell, note: Note) -> None:
-    """A stop edge alone is `no-start`; so it is for each sweep while START is stuck, low or
-    high."""
+    """A stop edge alone is `no-start`, as is each sweep while START is stuck."""
     since = len(cell.serial.heard)
     pulse(cell, "STOP")
     assert statuses(cell, since, 1) == ["no-start"]
@@ -173,8 +170,7 @@ def test_stop_without_start(cell: Cell, note: Note) -> None:
 
 
 def test_stop_is_stuck(cell: Cell, count: Count, note: Note) -> None:
-    """With STOP stuck, low or high, a sweep is answered `long` after sweep.max_duration_s; the next
-    is right by itself."""
+    """STOP stuck: a sweep is `long` after sweep.max_duration_s, the next is right."""
     levels = [False, True][: count(0, 2)]
     if not levels:
         pytest.skip("twelve seconds each; in the full run")
@@ -193,8 +189,7 @@ def test_stop_is_stuck(cell: Cell, count: Count, note: Note) -> None:
 
 
 def test_storm(cell: Cell, note: Note) -> None:
-    """10,000 edges on START: each is a start or is joined with others; no verdict, and a right
-    sweep when it is quiet."""
+    """10,000 edges on START: starts or joined ones; no verdict, then a right sweep."""
     since = len(cell.serial.heard)
     toggle(cell, "START", 10_000)
     cell.wait(0.1)
@@ -209,8 +204,7 @@ def test_storm(cell: Cell, note: Note) -> None:
 
 
 def test_many_edges_in_one_turn(cell: Cell, note: Note) -> None:
-    """Start and stop in one turn are answered in order; of more than the kernel holds,
-    `edges-lost`; then all is well."""
+    """Answered in order; of more than the kernel holds `edges-lost`; then all is well."""
     since = len(cell.serial.heard)
     with halted(cell):
         pulse(cell, "START")
@@ -234,8 +228,7 @@ def test_many_edges_in_one_turn(cell: Cell, note: Note) -> None:
 
 
 def one_line_sweep(cell: Cell) -> tuple[Touch, int]:
-    """A whole sweep of a robot with one line, and the number of the line that was heard before
-    it."""
+    """A whole sweep of a robot with one line, and the last line heard before."""
     since = len(cell.serial.heard)
     touch = cell.touch(start=False, stop=False)
     cell.begun(touch)

@@ -32,8 +32,7 @@ def test_the_contract_holds_on_a_real_kernel(
     count: Count,
     note: Note,
 ):
-    """test_backends.py with real libusb, libgpiod and termios on xHCI, PL061 and a 16550; a part of
-    it where time is short."""
+    """test_backends.py on xHCI, PL061 and a 16550; a part where time is short."""
     code = tmp_path / "code"
     code.mkdir()
     pack(code, CODE)

@@ -29,8 +29,7 @@ HOLD = (
 
 
 def shown(cell: Cell) -> Touch:
-    """A sweep that is answered at least on the lines: RESULT VALID rises with the code of the
-    touched material, or of none."""
+    """RESULT VALID rises with the code of the touched material, or of none."""
     cell.until_ready()
     before, touch = len(cell.lines.log), cell.touch()
     valid = ("RESULT-VALID", True)
@@ -45,8 +44,7 @@ def shown(cell: Cell) -> Touch:
 
 
 def test_cable_out(cell: Cell, note: Note) -> None:
-    """Without a robot at the other end sweeps are shown on the lines; when it is back, it hears the
-    next sentence."""
+    """Without a robot sweeps show on the lines; when it is back it hears the next."""
     answered = int(cell.state()[3])
     cell.serial.close()
     try:
@@ -59,8 +57,7 @@ def test_cable_out(cell: Cell, note: Note) -> None:
 
 
 def test_peer_does_not_read(cell: Cell, count: Count, note: Note) -> None:
-    """Sentences pile up, the oldest are dropped and counted, no frame is lost; when it reads the
-    newest come, whole."""
+    """The oldest are dropped and counted, no frame is lost; the newest come whole."""
     begun, before = cell.clock.now_s(), cell.state()
     cell.serial.deaf = True
     since = len(cell.serial.heard)
@@ -101,8 +98,7 @@ def sound(line: str) -> bool:
 
 
 def test_break_and_noise(cell: Cell, count: Count, note: Note) -> None:
-    """After a break, noise, half sentences and a line without end, each whole command is answered,
-    and not twice."""
+    """After noise and half sentences each whole command is answered once."""
     for _ in range(count(3, 100)):
         cell.machine.qmp("chardev-send-break", id="robot")
         assert cell.serial.ask("$PPLP,ID").startswith("$PPLP,ANS,ID,ok")

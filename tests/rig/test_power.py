@@ -67,8 +67,7 @@ class EndlessRobot:
         return not touch.played.is_set() or self.cell.clock.now_ns() < touch.stop_ns + 300_000_000
 
     def harmed(self, kills: list[int]) -> list[str]:
-        """Answers with a window to sweeps in which the box was killed, each with its times; kills:
-        ns."""
+        """Answers in whose sweep the box was killed, with their times; kills: ns."""
         wrong = []
         for heard_ns, line in self.cell.serial.heard:
             touched = [t for t in self.touches if t.played.is_set() and t.stop_ns < heard_ns]
@@ -86,8 +85,7 @@ def statuses(cell: Cell) -> Counter[str]:
 
 
 def kill(cell: Cell) -> int:
-    """SIGKILL, as soon as there is a program to kill; when, in ns. READY falls, although nobody is
-    there to lower it."""
+    """SIGKILL once there is a program; when, in ns. READY falls by itself."""
     cell.machine.run(
         "until pid=$(systemctl show -P MainPID palpate) && [ $pid != 0 ]; do sleep .05; done; "
         "kill -KILL $pid",
@@ -100,8 +98,7 @@ def kill(cell: Cell) -> int:
 
 
 def killed(image: Image, folder: Path, ledger: CampaignLog, n: int, rng: random.Random) -> None:
-    """Kill the program `n` times: mostly at any moment after the last kill, now and then once it is
-    READY."""
+    """Kill it `n` times: mostly at any moment, now and then once READY."""
     with Guest(image, folder, snapshot=True) as machine:
         cell = Cell(machine)
         cell.acts = known(script.tubes(rng.randrange(1 << 30)))
@@ -141,8 +138,7 @@ def check_outcome(ledger: CampaignLog) -> str:
 
 
 def test_killed(image: Image, tmp_path: Path, count: Count, note: Note):
-    """SIGKILL at random moments, while starting, idle and sweeping: READY again each time, no kept
-    sweep is lost."""
+    """READY again each time, and no kept sweep is lost."""
     ledger, rng = CampaignLog("kills", image.disk), random.Random()
     wanted = count(ledger.sum("back") + 1, 200)
     while (left := wanted - ledger.sum("back")) > 0:

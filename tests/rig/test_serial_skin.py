@@ -56,8 +56,7 @@ class SerialCell(Cell):
         self._playing.start()
 
     def plug(self, board: rig.ReadoutBoard | None = None) -> rig.ReadoutBoard | None:
-        """Plug the adapter in; one that is in is pulled first, and a box that runs has seen it:
-        FAULT."""
+        """Plug the adapter in; one that is in is pulled, and the box sees it: FAULT."""
         if self._plugged:
             self.unplug()
             assert self.lines.wait("FAULT", True, SEEN_S)
@@ -73,8 +72,7 @@ class SerialCell(Cell):
         return board
 
     def unplug(self) -> None:
-        """Pull the adapter. Its line goes first: QEMU dies of bytes that come for an adapter that
-        it takes away."""
+        """Pull the adapter, its line first: QEMU dies of late bytes for it."""
         with self._hold:
             self.player.unplug()
         self.machine.qmp("device_del", id="adapter")
@@ -103,8 +101,7 @@ class SerialCell(Cell):
 
 @pytest.fixture(scope="module")
 def shared(image: Image, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cell]:
-    """A guest for this file; its settings name the profile, and the service has been started with
-    them."""
+    """A guest for this file, whose service runs with the profile."""
     folder = tmp_path_factory.mktemp("guest")
     with Guest(image, folder, snapshot=True) as machine:
         cell = SerialCell(machine, folder)
@@ -119,8 +116,7 @@ def shared(image: Image, tmp_path_factory: pytest.TempPathFactory) -> Iterator[C
 def test_pulled_and_put_back(
     cell: Cell, count: Count, note: Note, when: Callable[[Cell, int], str]
 ):
-    """Unplugged at any moment of a sweep: one answer that says so, READY by itself, then a right
-    sweep."""
+    """At any moment of a sweep: one answer that says so, then READY and a right sweep."""
     check_recovers(cell)
     wanted = {
         before: {"not-ready"},
@@ -144,8 +140,7 @@ def test_pulled_and_put_back(
 
 
 def test_check_finds_it_through_the_kernels_driver(cell: Cell):
-    """`palpate check` as the user of the service: the skin is there, on the port of ftdi_sio that
-    the settings name."""
+    """`palpate check` as the service's user finds it on the port of ftdi_sio."""
     run = cell.machine.run
     assert (
         "/ftdi_sio" in run("readlink -f /sys/bus/usb-serial/devices/ttyUSB*/driver", check=True).out

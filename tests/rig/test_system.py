@@ -60,8 +60,7 @@ for name in sorted(p.name for p in whole.iterdir()):
 
 @pytest.fixture(scope="module")
 def keeping(shared: Cell) -> Cell:
-    """The guest's service keeps sweeps and captures, each on a file system of its own that can be
-    made as small as a test wants."""
+    """The guest keeps sweeps and captures on file systems as small as wanted."""
     guest = shared.machine
     shared.acts, shared.packet_frames = known(script.tubes(2)), 48
     for place in (KEPT, CAPTURE):
@@ -82,8 +81,7 @@ def box(keeping: Cell, cell: Cell) -> Cell:
 
 
 def sound(cell: Cell) -> Answer:
-    """A sweep that is answered `recorded`, as a box does that keeps its sweeps, when all that
-    follows an answer in its turn has been done too."""
+    """A sweep answered `recorded`, and all that follows in its turn."""
     answers = []
     for _ in range(TRIES):
         touch, answer = cell.sweep(ANSWER_S)
@@ -122,8 +120,7 @@ def used_k(cell: Cell) -> int:
 
 
 def test_disk_full_at_each_write(box: Cell, note: Note):
-    """Space for n pages, or for no file: every sweep is answered, the first failure is logged, and
-    only whole files stay."""
+    """Every sweep is answered, the first failure is logged, only whole files stay."""
     empty = used_k(box)
     sound(box)
     before, used = files(box), used_k(box)
@@ -147,8 +144,7 @@ def test_disk_full_at_each_write(box: Cell, note: Note):
 
 
 def test_disk_full_of_a_capture(box: Cell, tmp_path: Path, note: Note):
-    """The capture's disk is full: this is logged once, the capture ends, sweeps go on, and the
-    partial file can be played."""
+    """Logged once, the capture ends, sweeps go on, the partial file plays."""
     until_logged(
         box, f"capture: {CAPTURE}/all cannot be written: No space left on device; it ends here"
     )
@@ -172,8 +168,7 @@ def test_disk_full_of_a_capture(box: Cell, tmp_path: Path, note: Note):
 
 @needs_time
 def test_disk_full_for_the_journal(box: Cell, note: Note):
-    """No space for the journal nor anywhere else: sweeps and plugs go on; it is written again when
-    there is space."""
+    """No space anywhere: sweeps and plugs go on; it is written again with space."""
     fill = (
         "fallocate -l $(df --output=avail -B1 {0} | tail -1) {0}/fill; "
         "dd if=/dev/zero of={0}/fill2 2>/dev/null;"
@@ -200,8 +195,7 @@ def test_disk_full_for_the_journal(box: Cell, note: Note):
 
 
 def test_clock_set(box: Cell, note: Note):
-    """An hour back and a year forward in the middle of sweeps: answers, times and files know
-    nothing of it."""
+    """An hour back, a year forward: answers, times and files know nothing of it."""
     for change in ("-1 hour", "+1 year"):
         touch, since = begin(box)
         box.machine.run(f"date -s \"$(date -d '{change}')\"", check=True)
@@ -240,8 +234,7 @@ def by_hand(cell: Cell) -> str:
 
 
 def swept(cell: Cell) -> str:
-    """The status of a sweep; by hand where the board cannot know when its frames reach a box that
-    is behind."""
+    """The status of a sweep; by hand where the board cannot know when frames come."""
     since = len(cell.serial.heard)
     touch = cell.touch()
     if cell.clock.until(touch.played.is_set, 10):
@@ -282,8 +275,7 @@ def test_processor_loaded(box: Cell, count: Count, note: Note):
 
 
 def test_permission_lost(box: Cell, note: Note):
-    """The skin's node and the folder are taken away from the service: named, sweeps `not-ready` or
-    not kept; given back, both are used again."""
+    """Skin and folder taken from the service: named; given back, used again."""
     guest = box.machine
     guest.run("chmod 000 /dev/bus/usb/*/*", check=True)
     sound(box)  # open files stay open
@@ -329,8 +321,7 @@ def test_permission_lost(box: Cell, note: Note):
 
 @needs_time
 def test_memory_limit(box: Cell, note: Note):
-    """The unit's memory is cut to nothing: the program is killed, started again, and READY once it
-    has its memory."""
+    """Memory cut to nothing: killed, started again, READY once it has memory."""
     restarts = "systemctl show -P NRestarts palpate"
     before, streamed = int(box.machine.run(restarts).out), journal_count(box, "skin: streaming")
     limit = "systemctl set-property --runtime palpate MemoryMax="
@@ -346,8 +337,7 @@ def test_memory_limit(box: Cell, note: Note):
 
 @needs_time
 def test_settings_and_bundle_broken(box: Cell, note: Note):
-    """A misspelt key, a bundle cut short: each is named, READY stays low, no restart; mended and
-    started, it comes up."""
+    """A misspelt key, a cut bundle: named, READY low, no restart; mended, it comes up."""
     guest, again = box.machine, "systemctl restart --no-block palpate"
     settings = guest.get(SITE)
     guest.run(f"cp -r {BUNDLE} /run/bundle && truncate -s 1000 /run/bundle/model.onnx", check=True)
@@ -376,8 +366,7 @@ def test_settings_and_bundle_broken(box: Cell, note: Note):
 
 
 def test_bundle_files_broken(box: Cell, note: Note):
-    """Each file of a bundle cut short, empty, missing, altered by one bit: each is refused as a
-    BundleError that names it."""
+    """Cut, empty, missing, altered by one bit: a BundleError names each file."""
     logged = box.machine.run(
         "cd / && /opt/palpate/bin/python -I -", stdin=DAMAGE.encode(), timeout_s=200, check=True
     ).out

@@ -65,8 +65,7 @@ class Offset:
 
 
 class KernelClock:
-    """Asks the guest's kernel for its time. Each trip's answer was read between its two ends, so
-    the offset lies in all of them."""
+    """The guest's kernel time; the offset lies within each trip's two ends."""
 
     def __init__(self, machine: Guest) -> None:
         machine.put("/run/report_time.py", REPORT_TIME.encode())
@@ -121,15 +120,13 @@ def errors(sweep: Sweep, board: rig.ReadoutBoard, offset: Offset) -> tuple[float
 
 
 def spikes(seed: int) -> Callable[[], int]:
-    """0.15 ms as a rule; one packet in a hundred comes 50 to 200 ms late, and those behind it
-    wait."""
+    """0.15 ms as a rule; one packet in a hundred comes 50 to 200 ms late."""
     rng = np.random.default_rng(seed)
     return lambda: 150_000 + int(rng.integers(50_000_000, 200_000_000)) * (rng.random() < 0.01)
 
 
 def windows(cell: Cell, folder: Path, n: int) -> Iterator[Sweep]:
-    """The windows of `n` sweeps that were not answered wrong. Raises AssertionError if they do not
-    come."""
+    """The windows of `n` sweeps not answered wrong. Raises AssertionError without."""
     for _ in range(3 * n):
         touch, answer = cell.sweep()
         if not_wrong(touch, answer) not in LATE - {"unsure", "unknown"}:

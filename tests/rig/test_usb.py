@@ -43,8 +43,7 @@ RESETS = {
 def test_pulled_and_put_back(
     cell: Cell, count: Count, note: Note, when: Callable[[Cell, int], str]
 ):
-    """Unplugged at any moment of a sweep: one answer that says so, READY by itself, each time
-    another enumeration."""
+    """At any moment of a sweep: one answer, READY by itself, another enumeration."""
     wanted = {
         before: {"not-ready"},
         during: {"sensor-lost"},
@@ -69,8 +68,7 @@ def test_pulled_and_put_back(
 
 
 def test_other_boards(cell: Cell, count: Count, note: Note):
-    """Another serial number streams and is reported by ID; another format or protocol is refused,
-    until a fitting one comes."""
+    """Another serial number streams; another format or protocol is refused."""
     cell.plug(cell.board(serial="SIM0002"))
     cell.until_ready()
     assert " SIM0002 " in cell.serial.ask("$PPLP,ID")
@@ -103,8 +101,7 @@ def test_other_boards(cell: Cell, count: Count, note: Note):
 
 @pytest.mark.parametrize("what", RESETS if HOW == "full" else list(RESETS)[:1])
 def test_resets(cell: Cell, count: Count, note: Note, what: str):
-    """The kernel takes the skin away for a moment, in mid sweep: the sweep is lost, the skin is
-    taken up again."""
+    """The kernel takes it away in mid sweep: that is lost, then it is taken up."""
     n, outcomes = count(1, 3), Counter[str]()
     for _ in range(n):
         touch, since = begin(cell)
@@ -143,8 +140,7 @@ def behind_a_hub(cell: Cell, tmp_path: Path) -> Iterator[UsbRedirPeer]:
 
 @pytest.mark.skipif(HOW != "full", reason="one of the full run's")
 def test_behind_a_hub(cell: Cell, behind_a_hub: UsbRedirPeer, count: Count, note: Note):
-    """The hub that the skin hangs on is reset, or pulled out with it, in mid sweep: the sweep is
-    lost, no more than that."""
+    """The hub is reset or pulled in mid sweep: that sweep is lost, no more."""
     behind_a_hub.plug(cell.board())
     check_recovers(cell)
     n = count(1, 3)

@@ -49,8 +49,7 @@ class Fault:
 
 
 def changed(change: Callable[[packets.Packet], tuple[int, int]]) -> Callable[[], Mangle]:
-    """Transfers whose packets have another number and another time, as `change` gives them; all
-    else is right, the CRC too."""
+    """Packets with number and time as `change` gives them; the CRC is right."""
 
     def mangle(data: bytes) -> bytes:
         packet = packets.unpack(data).packets[0]
@@ -61,8 +60,7 @@ def changed(change: Callable[[packets.Packet], tuple[int, int]]) -> Callable[[],
 
 
 def mirrored(pace: int) -> Callable[[], Mangle]:
-    """The board's clock goes on at `pace` times its own from the first transfer on: -1 is
-    backwards, 0 stands still."""
+    """The board's clock at `pace` times its own: -1 is backwards, 0 stands still."""
 
     def make() -> Mangle:
         first: list[int] = []
@@ -89,8 +87,7 @@ def babble() -> Mangle:
 
 
 def stale(fresh: bool) -> Callable[[], Mangle]:
-    """Packets from a moment ago, again and again: with the fresh ones in one transfer, or in their
-    place."""
+    """Packets from a moment ago again: with the fresh ones, or in their place."""
 
     def make() -> Mangle:
         old: list[bytes] = []
@@ -145,8 +142,7 @@ class Cable:
 
 @pytest.mark.parametrize("what", FAULTS if HOW == "full" else QUICK)
 def test_data_that_cannot_be_right(cell: Cell, count: Count, note: Note, what: str):
-    """Damaged during a sweep: a single answer that says so, none that is wrong; damage beside the
-    window has no effect."""
+    """One answer that says so, none wrong; beside the window it has no effect."""
     n = count(1, 3)
     fault, outcomes = FAULTS[what], Counter[str]()
     for _ in range(n):
@@ -172,8 +168,7 @@ def test_data_that_cannot_be_right(cell: Cell, count: Count, note: Note, what: s
 
 @pytest.mark.parametrize("what", ["halted", "silent"] if HOW == "full" else ["halted"])
 def test_a_skin_that_stops_sending(cell: Cell, count: Count, note: Note, what: str):
-    """Silent, or its endpoint stalled, in mid sweep: the sweep is lost, and it is started again
-    without being replugged."""
+    """Silent or stalled in mid sweep: that is lost, then it starts without a replug."""
     n = count(1, 3)
     for _ in range(n):
         touch, since = begin(cell)
@@ -189,8 +184,7 @@ def test_a_skin_that_stops_sending(cell: Cell, count: Count, note: Note, what: s
 
 
 def test_a_skin_that_does_not_answer(cell: Cell, count: Count, note: Note):
-    """Requests unanswered, refused or answered late: never READY, a start edge is answered, and it
-    ends by itself."""
+    """Unanswered, refused or late: never READY, an edge is answered, it ends."""
     fates = {
         "deaf": lambda: setattr(cell.cable, "deaf", True),
         "stalls each request": lambda: setattr(cell.cable.board, "request", lambda number: None),
@@ -213,8 +207,7 @@ def test_a_skin_that_does_not_answer(cell: Cell, count: Count, note: Note):
 
 
 def test_a_skin_that_answers_slowly(cell: Cell, count: Count, note: Note):
-    """Late for each request, its descriptors too, but within what PROTOCOL.md allows: it takes
-    longer, and is a sound skin."""
+    """Late, but within what PROTOCOL.md allows: a sound skin."""
     cell.unplug()
     cell.cable.slow_s = count(1, 25) / 100
     cell.plug()

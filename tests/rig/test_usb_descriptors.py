@@ -20,8 +20,7 @@ FACE, END = SOUND.configuration[9:18], SOUND.configuration[18:]
 
 
 def whole(*parts: bytes, total: int | None = None, faces: int = 1) -> Descriptors:
-    """A device with this configuration. total, faces: length and number of interfaces that it
-    claims."""
+    """A device with this configuration of `total` bytes and `faces` interfaces."""
     body = b"".join(parts)
     total = 9 + len(body) if total is None else total
     return Descriptors(
@@ -94,8 +93,7 @@ def service(cell: Cell) -> str:
 
 
 def looked_at(cell: Cell) -> set[str]:
-    """The states that the skin is in until the box has an opinion of it, or the kernel has given it
-    up."""
+    """The skin's states until the box judges it, or the kernel gives it up."""
     seen, asked, since = set[str](), cell.cable.asked, cell.clock.now_s()
     end = since + LOOK_S
     while not seen & OPINIONS and (cell.cable.asked == 0 or cell.clock.now_s() < since + QUIET_S):
@@ -109,8 +107,7 @@ def looked_at(cell: Cell) -> set[str]:
 
 
 def test_hostile_descriptors(cell: Cell, note: Note):
-    """Each liar is refused or works; commands are answered all the while by the same process, and
-    the sound skin streams."""
+    """Each liar is refused or works; commands are answered, the sound skin streams."""
     running = service(cell)
     for what in LIARS if HOW == "full" else QUICK:
         cell.unplug()

@@ -14,8 +14,7 @@ LABELS = bundle.load(bundle.DEFAULT).manifest.labels
 
 
 def test_sweeps_become_sentences_and_codes(cell: Cell, note: Note):
-    """Six tubes: each start edge has one answer, right or with the reason, in words and on the
-    lines; no frame is lost."""
+    """Each start edge has one answer, right or with a reason; no frame is lost."""
     cell.packet_frames = 6
     cell.restore()
     before, ms, right = cell.state(), [], 0
@@ -52,8 +51,7 @@ def test_the_golden_sweeps_are_the_same_on_arm64(cell: Cell):
 
 
 def test_the_service_has_no_more_rights_than_it_needs(cell: Cell):
-    """User palpate with no capability, device nodes by group, /etc out of reach; nothing of the
-    unit failed to apply."""
+    """No capability, nodes by group, /etc out of reach; all of the unit applied."""
     run = cell.machine.run
     pid = cell.machine.out("systemctl show -P MainPID palpate")
     about = dict(
@@ -72,8 +70,7 @@ def test_the_service_has_no_more_rights_than_it_needs(cell: Cell):
 
 
 def test_check_names_each_part(cell: Cell):
-    """`palpate check` in the place of the service: bundle, golden sweeps, skin, lines and port are
-    there."""
+    """`palpate check` in place of the service: every part is there."""
     assert "FAIL" not in checked(cell)
 
 

@@ -101,8 +101,7 @@ class UsbRedirPeer:
         self.do(self._disconnect)
 
     def do(self, job: Callable[[], None]) -> None:
-        """Run `job` between two messages, and return when it is done, because a board belongs to
-        one thread."""
+        """Run `job` between two messages and return: a board belongs to one thread."""
         done = threading.Event()
 
         def noted() -> None:

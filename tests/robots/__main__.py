@@ -48,8 +48,7 @@ Seen = Callable[[int], None]
 
 
 class Times:
-    """The time of each verdict, and the time at which each connection had it, in ns of the
-    monotonic clock."""
+    """Times of each verdict and of each connection that had it, in monotonic ns."""
 
     def __init__(self) -> None:
         self._judged: dict[tuple[str, int], int] = {}
@@ -135,8 +134,7 @@ def noting(seen: Seen) -> Callable[[Answer | BoxState], None]:
 
 
 def lines_ms(sweeps: int) -> list[float]:
-    """From a verdict to RESULT VALID, in this process, on simulated GPIO lines: the delay that the
-    program adds to a real line."""
+    """From a verdict to RESULT VALID on simulated lines: what the program adds."""
     current = bundle.load(bundle.DEFAULT)
     simulated = devices.build(current.format, script.tubes(3, sweeps), SystemClock(), "sim")
     settings = config.load(None, site=NO_SITE)

@@ -58,8 +58,7 @@ Address = str | tuple[str, int]
 
 
 def connected(address: Address) -> socket.socket | None:
-    """A connection that does not wait; None if the socket has no room for it now. address: of a
-    local socket or of TCP."""
+    """A connection that does not wait; None without room. address: local or TCP."""
     family = socket.AF_UNIX if isinstance(address, str) else socket.AF_INET
     one = socket.socket(family, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
     try:
@@ -186,8 +185,7 @@ def noise() -> bytes:
 
 
 def asker(address: Address, seen: Counter[str], request: bytes) -> Act:
-    """A peer that asks again when it has its answer, as a controller does; its answers are
-    counted."""
+    """A peer that asks again when it has its answer; its answers are counted."""
     asked: list[socket.socket] = []
 
     def goes_on(one: socket.socket) -> bool:

@@ -15,8 +15,7 @@ from tests.rig.soak_boxes import ThisMachine
 
 
 class SharedLine(ThisMachine):
-    """A ThisMachine with a bridge on its line. line: the port for `bridge tcp --port`, once the box
-    is started."""
+    """A ThisMachine with a bridge on its line. line: the port for `bridge tcp --port`."""
 
     line = ""
 

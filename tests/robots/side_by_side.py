@@ -72,8 +72,7 @@ class Measured:
 
 
 class LatencyListener:
-    """The robot's end of the line: the delay of each answer, and the frames that the box counts as
-    lost."""
+    """The robot's end: the delay of each answer, and frames counted as lost."""
 
     def __init__(self, box: ThisMachine, sweeps: Script) -> None:
         self._box, self._sweeps = box, sweeps
@@ -177,8 +176,7 @@ def sides(
 
 
 def listen(both: dict[str, BoxSide], seconds: float, *, measured: bool) -> None:
-    """Read both boxes for this long, each in a thread of high priority, and sample their
-    processes."""
+    """Read both boxes in threads of high priority, and sample their processes."""
     failed: list[BaseException] = []
 
     def one(side: BoxSide) -> None:

@@ -63,8 +63,7 @@ SEED = 7
 
 
 class Sliding:
-    """A finger that slides without end: the middle of a simulated sweep, repeated, with numbers in
-    two taxels."""
+    """The middle of a simulated sweep, repeated, with numbers in two taxels."""
 
     def __init__(self, name: str, profile: SkinProfile, format: SweepFormat) -> None:
         self._profile = profile
@@ -110,8 +109,7 @@ class FrameCheck(Observer):
 
 
 class PromptClock(SystemClock):
-    """The real clock. latest_ns: the largest delay at the end of a sleep, during which the machine
-    let no process run."""
+    """The real clock. latest_ns: the largest delay after a sleep."""
 
     latest_ns = 0
 
@@ -131,8 +129,7 @@ def hurry(priority: int) -> bool:
 
 
 def measure(name: str, folder: Path, seconds: float) -> dict[str, Any]:
-    """Run a box with the bundle in `folder` for this long on the skin `name`. Ends the program if
-    the skin was lost."""
+    """Run a box with the bundle in `folder` on the skin `name` for this long."""
     current, clock = bundle.load(folder), SystemClock()
     check = FrameCheck(clock)
     with ExitStack() as stack:
@@ -196,8 +193,7 @@ def playing(name: str, rate_hz: float, link: Path) -> subprocess.Popen[str]:
 
 
 def play(name: str, rate_hz: float, link: Path) -> None:
-    """Play a skin at `link` until SIGTERM; prints the number of bytes that nobody read, and its own
-    largest delay."""
+    """Play a skin at `link` until SIGTERM; prints unread bytes and its largest delay."""
     stop = Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
     profile = replace(skin_profile.load(name, [PROFILES]), rate_hz=rate_hz)

@@ -52,8 +52,7 @@ FAULTS: tuple[Fault, ...] = (lost, changed, added, twice)
 
 @dataclass(frozen=True, slots=True)
 class NoiseCount:
-    """faults: number of faults. taken: frames that the box accepted. wrong: accepted frames that
-    were not sent. sent: frames sent."""
+    """faults; frames taken; wrong: taken frames that were not sent; frames sent."""
 
     faults: int
     sent: int
@@ -62,8 +61,7 @@ class NoiseCount:
 
 
 def count(subject: Subject, fault: Fault, faults: int) -> NoiseCount:
-    """Play a stream with one damaged frame in APART, and compare the frames received with those
-    sent."""
+    """Play a stream with one damaged frame in APART; compare what comes with it."""
     known = {frame.tobytes() for frame in subject.frames}
     read, rest = codec(subject.profile), Rest()
     taken = wrong = 0

@@ -15,8 +15,7 @@ Json = dict[str, Any]
 
 
 def write(path: Path, results: Json) -> None:
-    """Put each table and the header into the page. Raises FormatError unless each pair of markers
-    occurs once."""
+    """Put tables and header into the page. Raises FormatError without each marker once."""
     text = path.read_text("utf-8")
     for part, table in TABLES.items():
         text = marked_text.insert(text, part, "\n".join(table(results.get(part, {}))), str(path))

@@ -29,8 +29,7 @@ def settings(name: str) -> config.Config:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", WIRES)
 def test_what_is_recorded_is_what_was_felt(name: str, tmp_path: Path) -> None:
-    """`record --sim skin:wood --skin NAME`: each window is the middle of its slide, to the frame
-    and to the count."""
+    """`record --sim skin:wood --skin NAME`: each window is its slide's middle, to the count."""
     words = f"record --sim skin:wood --skin {name} --virtual --seed {SEED} --sweeps {SWEEPS} --out"
     assert main([*words.split(), str(tmp_path)]) == 0
     profile = skins.profile(settings(name))
@@ -46,8 +45,7 @@ def test_what_is_recorded_is_what_was_felt(name: str, tmp_path: Path) -> None:
 
 
 def test_unplugged_and_plugged_in_again() -> None:
-    """The state shows it, the skin is used again without help, and numbers go on in the next
-    epoch."""
+    """The state shows it, the skin is used again, numbers go on in the next epoch."""
     chosen = settings("papillarray")
     profile = skins.profile(chosen)
     acts = script.tubes(1, seen=sweeps.view("papillarray", profile.format))

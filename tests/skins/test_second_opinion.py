@@ -51,8 +51,7 @@ the middle of a line."""
 @pytest.mark.slow
 @pytest.mark.parametrize("name", READERS)
 def test_a_package_that_is_not_ours_reads_what_was_played(name: str) -> None:
-    """Every frame that it reads is one that was played, in order; only text is rounded, to two
-    digits."""
+    """Every frame that it reads was played, in order; text is rounded to two digits."""
     end = "\nprint(json.dumps([np.asarray(f).ravel().tolist() for f in frames]))"
     with played(name) as player:
         program = (

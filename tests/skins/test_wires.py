@@ -21,8 +21,7 @@ in the tests of the project langxin11/parallel_gripper_tactile."""
 
 
 def test_papillarray_as_a_controller_sends_it() -> None:
-    """The layout of two sensors is that of a real controller to the byte; sum and end marker follow
-    from the layout."""
+    """Two sensors, to the byte; sum and end marker follow from the layout."""
     sent = wires.PapillArray(counter=0x32FA4E).frame(np.zeros((6, 3, 3), np.float32), 0x8F76AA31)
     assert sent.startswith(PREVIEW)
     body = sent[4:-6]
@@ -30,8 +29,7 @@ def test_papillarray_as_a_controller_sends_it() -> None:
 
 
 def test_papillarray_commands() -> None:
-    """f sets one of four rates, in parts, too; z makes the mean of two seconds the zero; nothing
-    answers."""
+    """f sets a rate, in parts too; z makes two seconds' mean the zero; no answers."""
     skin = wires.PapillArray(1000)
     assert skin.receive(b"f2") == b""
     assert skin.period_ns == 1e6
@@ -49,8 +47,7 @@ def test_papillarray_commands() -> None:
 
 
 def test_slcan() -> None:
-    """The adapter answers as Lawicel's; the sensor is quiet until the channel is open at 1 Mbit/s
-    and it was started."""
+    """As Lawicel's; the sensor is quiet until the channel is open and started."""
     skin = wires.Slcan(100)
     taxels = np.arange(48).reshape(4, 4, 3).astype(np.uint16) + 0x1234
     assert skin.receive(b"t20120700\rO\rS9\r") == b"\a\a\a"
@@ -72,8 +69,7 @@ def test_slcan() -> None:
 
 
 def test_a_zero_that_is_missing_makes_no_frame() -> None:
-    """The controller's sum does not detect a missing zero byte. Wherever it is missing, the box
-    reads the frame as it was sent, or no frame."""
+    """Wherever a zero byte is missing, the box reads the frame as sent, or none."""
     profile = skin_profile.load("papillarray", [ROOT / "firmware_config" / "skins"])
     force = np.arange(27, dtype=np.float32).reshape(3, 3, 3)
     sent = wires.PapillArray().frame(force, 1000)

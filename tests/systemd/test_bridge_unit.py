@@ -62,16 +62,14 @@ def bridges(machine: Machine, service: Service) -> Iterator[Service]:
 
 
 def test_the_unit_is_sound_hardened_and_off(machine: Machine, before: list[bool]):
-    """systemd reports no problem; the exposure is at most 1.5 of 10, as the service's; an install
-    enables neither bridge."""
+    """No problem for systemd, exposure at most 1.5 of 10; neither bridge is enabled."""
     machine.check_unit("palpate-bridge@.service")
     for unit in (TCP, MODBUS):
         assert machine.run("systemctl", "is-enabled", unit).stdout.strip() == "disabled"
 
 
 def test_modbus_reads_the_feed_and_outlives_the_service(machine: Machine, bridges: Service):
-    """As delivered: the skin's state is read, as a user of its own; without the service the state
-    is 0, the process goes on."""
+    """The skin's state as a user of its own; without the service 0, and it goes on."""
     bridges.start()
     bridges.until("StatusText", STREAMS)
     machine.get("systemctl", "start", MODBUS)

@@ -82,8 +82,7 @@ def host(site: hosts.Hosts, said: str) -> hosts.Host:
 
 
 def test_both_architectures_hold_the_same(wheels: list[Path], tmp_path: Path, said: str):
-    """A package for arm64 has the libraries of arm64 for both Pythons, and otherwise the files and
-    scripts of that for amd64."""
+    """arm64 has its libraries for both Pythons, otherwise the files of amd64."""
     found = {}
     packages = packed(tmp_path, wheels, "amd64", "arm64")
     for package, machine in zip(packages, ("x86_64", "aarch64"), strict=True):
@@ -117,8 +116,7 @@ def _by_python(archives: list[Path]) -> list[Path]:
 
 
 def test_apt_ends_with_a_ready_box(host: hosts.Host, said: str):
-    """From a Debian without Python to an active, enabled service, with users, keys, settings and
-    units; the last lines are those of `palpate status`."""
+    """From a Debian without Python to an active service; at last `palpate status`."""
     assert re.search(r"(?m)^running for .*\(process \d+, palpate ", said)
     assert re.search(r"(?m)^model +default ", said)
     assert (host.service["ActiveState"], host.service["UnitFileState"]) == ("active", "enabled")

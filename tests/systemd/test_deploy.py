@@ -94,8 +94,7 @@ def release(host: hosts.Host) -> str:
 
 
 def start_again(host: hosts.Host) -> None:
-    """As after a power cut: systemd reads the unit on the disk again and starts the release on the
-    disk."""
+    """As after a power cut: systemd starts the release on the disk."""
     if host.service["MainPID"] != "0":
         kill = ("systemctl", "kill", "--kill-whom=main", "--signal=SIGKILL", "palpate")
         done = host.machine.run(*kill)  # the delivery may just have stopped the process
@@ -106,8 +105,7 @@ def start_again(host: hosts.Host) -> None:
 
 
 def test_a_bare_host_is_installed_as_a_bare_user(host: hosts.Host, installed: str):
-    """From a Debian without Python to an active, enabled service; the board's name is in its
-    settings."""
+    """From a Debian without Python to an active service with the board's name."""
     assert re.fullmatch(r"robot@127\.0\.0\.1: \S+ is READY [0-9.]+ s .*\n", installed)
     assert (host.service["ActiveState"], host.service["UnitFileState"]) == ("active", "enabled")
     name = release(host)
@@ -193,8 +191,7 @@ def test_a_box_without_packages_and_mirror_is_refused(site: hosts.Hosts, wheel: 
 def test_what_a_person_put_there_stays(
     site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], wheel: Path
 ):
-    """A settings file of theirs is kept and named; a file in the way of the program ends the
-    install before anything else."""
+    """Their settings are kept; a file in the way ends it before anything else."""
     settings, program = "/etc/palpate/skin.toml", "/usr/local/bin/palpate"
     pid = host.service["MainPID"]
     for path in (settings, program):
@@ -240,8 +237,7 @@ def test_an_upgrade_swaps_everything_at_once(host: hosts.Host, upgraded: list[tu
 def test_a_release_that_does_not_start_gives_way_to_the_old_one(
     site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], wheel: Path, tmp_path: Path
 ):
-    """It passes its self-test and then does not start: the link is swapped back, and the old
-    release classifies."""
+    """Self-test passed, no start: the link is swapped back, the old one classifies."""
     before = release(host)
     broken = changed(wheel, tmp_path, "palpate/service/systemd.py", "\nNotifier.turn = None\n")
     done = site.desktop("install", *at, "--wheel", broken)
@@ -276,8 +272,7 @@ def test_an_install_that_is_cut_is_finished_by_the_next(
     said: str,
     after_s: float,
 ):
-    """The desktop dies during the copy, or while the box builds: the old release starts, and a
-    second command finishes."""
+    """Cut during the copy or the build: the old release starts, a second call ends it."""
     new = changed(wheel, tmp_path, "palpate/more.py", f"# {said} {after_s}\n")
     before = release(host)
     site.cut("install", *at, "--wheel", new, words=said, after_s=after_s)
@@ -290,8 +285,7 @@ def test_an_install_that_is_cut_is_finished_by_the_next(
 
 
 def test_a_swap_that_is_cut_leaves_old_or_new(host: hosts.Host, upgraded: list[tuple[str, str]]):
-    """The box dies before the N-th command of the swap, for each N: it starts with one release or
-    the other, complete."""
+    """Dead before the N-th command, for each N: one release or the other, complete."""
     new, old = release(host), host.machine.get("readlink", "/opt/palpate.previous")
     script = run_here(f"import install; print(install.swap('/opt/{old}', '{new}'))")
     found = []
@@ -351,8 +345,7 @@ def serves(host: hosts.Host) -> str:
 def test_a_bundle_is_delivered_and_runs_on_trial(
     site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], sender: Sender, tmp_path: Path
 ):
-    """READY with the new bundle, on trial, no files left behind; a second delivery changes
-    nothing."""
+    """READY and on trial, no files left behind; a second delivery changes nothing."""
     bundle = sender.made()
     more = ("--signers", site.work / "signers", "--json", tmp_path / "report.json")
     done = site.desktop("deploy", *at, bundle, *more)
@@ -398,8 +391,7 @@ def test_a_delivery_that_is_cut_leaves_old_or_new(
     said: str,
     after_s: float,
 ):
-    """The desktop dies at any time and the box restarts: it runs the old or the new bundle; a
-    second delivery finishes."""
+    """Cut at any time: the old bundle or the new; a second delivery finishes."""
     bundle, before = sender.made(), serves(host)
     site.cut("deploy", *at, bundle, "--verbose", words=said, after_s=after_s)
     start_again(host)
@@ -412,8 +404,7 @@ def test_a_delivery_that_is_cut_leaves_old_or_new(
 def test_without_a_skin_the_bundle_is_installed_and_ready_waits(
     site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], sender: Sender
 ):
-    """It is reported well before the deadline, and is not a failure of the bundle; with the skin it
-    is READY."""
+    """Reported well before the deadline, no failure of the bundle; then READY."""
     host.machine.put("/opt/palpate/cable.py", CABLE)
     host.service.configure(CABLED)
     bundle = sender.made()
@@ -443,8 +434,7 @@ def test_a_candidate_is_delivered_beside(
 def test_boxes_that_fail_do_not_stop_the_others(
     site: hosts.Hosts, host: hosts.Host, sender: Sender, tmp_path: Path
 ):
-    """One refuses the connection, one never answers, one hangs, one has no Palpate: each has its
-    reason, the good one is READY."""
+    """No connection, no answer, a hang, no Palpate: each its reason, the good one READY."""
     with socket.create_server(("127.0.0.1", 0)) as dumb, stalling(host) as hangs:
         shared = {"ssh_user": hosts.USER, "ssh_key": str(site.work / ".ssh/id_ed25519")}
         there = {"refuses": 1, "dumb": dumb.getsockname()[1], "hangs": hangs}
@@ -473,8 +463,7 @@ def test_boxes_that_fail_do_not_stop_the_others(
 
 @contextmanager
 def stalling(host: hosts.Host) -> Iterator[int]:
-    """A port that forwards to the host's sshd and stops after 6000 bytes from it, which is after
-    the login."""
+    """A port to the host's sshd that stops after 6000 bytes, behind the login."""
 
     def carry(source: socket.socket, sink: socket.socket, left: float) -> None:
         with suppress(OSError):
@@ -546,8 +535,7 @@ except fleet.Failed as e:
     ],
 )
 def test_a_box_that_cannot_be_reached_comes_with_what_to_do(said: str, do: str):
-    """By the words of pyinfra, which are looked up in its code, so that those of another version
-    are missed here."""
+    """pyinfra's words are looked up in its code, so another version's are missed."""
     pyinfra = Path(find_spec("pyinfra").origin).parent
     assert f'"{said}' in (pyinfra / "connectors" / "ssh.py").read_text()
     assert f"; {do}" in run_here(f"import fleet; print(fleet.with_remedy('{said}: box'))")
@@ -604,8 +592,7 @@ def test_the_self_test_of_a_release_speaks_of_the_setting(tmp_path: Path):
 
 @pytest.mark.slow
 def test_another_system_is_refused_with_what_is_needed():
-    """Not Debian, another architecture, /opt on a separate file system, an old Python: one line
-    names the requirement."""
+    """Not Debian, another architecture or file system, an old Python: one line."""
     code = """
 import install
 class Box:
@@ -639,8 +626,7 @@ for text in ("pi@box", "Box.lab:2222", "pi@[fe80::1]:22", "pi@", "a@b@c"):
 
 @pytest.mark.slow
 def test_the_lock_is_read_for_the_box_not_for_the_desktop():
-    """Markers are evaluated for the box's Python: numpy differs between 3.11 and 3.13; hashes stay
-    with their packages."""
+    """Markers for the box's Python: numpy differs between 3.11 and 3.13."""
     for python, numpy in (("3.11.2", "2.3.5"), ("3.13.5", "2.3.5")):
         locked = f"release.locked(release.LOCK.read_text(), {python!r}, 'aarch64')"
         lock = run_here(f"import release; print({locked})")

@@ -108,8 +108,7 @@ except Failed as e:
 
 @pytest.mark.slow
 def test_a_signer_is_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """The key is for this person alone; a damaged public key, or a folder that cannot be written,
-    is an error with the remedy."""
+    """For this person alone; a damaged one, or no folder for it, is an error."""
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
     key = tmp_path / "palpate" / "signing-key"
     made = run_here(SIGNER)

@@ -73,8 +73,7 @@ def open_units(machine: Machine, service: Service) -> Iterator[Machine]:
 
 @pytest.mark.parametrize("unit", ["palpate", PAGE, MODBUS, TCP])
 def test_a_crowd_leaves_room_within_the_limits(open_units: Machine, unit: str):
-    """300 connections at once: files and threads stay below the limits of the unit, which are in
-    force, and the program goes on."""
+    """300 connections: files and threads below the unit's limits, and it goes on."""
     pid = open_units.shown(unit, "MainPID")
     files, tasks = limit(open_units, unit, "LimitNOFILE"), limit(open_units, unit, "TasksMax")
     limits = open_units.get("cat", f"/proc/{pid}/limits")

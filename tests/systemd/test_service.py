@@ -33,8 +33,7 @@ import the packages."""
 
 
 def test_the_tools_of_systemd_make_what_the_service_needs(machine: Machine, before: list[bool]):
-    """User, groups and folders, with owners and modes; none of them existed before, and a second
-    run changes nothing."""
+    """User, groups, folders, owners, modes; a second run changes nothing."""
     assert before == [False, False, False]
     for _ in range(2):
         groups = machine.get("id", "-nG", "palpate").split()
@@ -53,8 +52,7 @@ def test_the_tools_of_systemd_make_what_the_service_needs(machine: Machine, befo
 
 
 def test_the_unit_is_sound_and_hardened(machine: Machine, before: list[bool]):
-    """systemd reports no problem and reads the times as meant; the exposure is at most 1.5 of
-    10."""
+    """No problem for systemd, times as meant, exposure at most 1.5 of 10."""
     machine.check_unit("palpate.service")
     shown = dict(
         line.split("=", 1) for line in machine.get("systemctl", "show", "palpate").splitlines()
@@ -89,8 +87,7 @@ def test_the_boot_does_not_wait_for_a_skin(machine: Machine, service: Service):
 
 
 def test_it_is_active_with_the_first_frames_of_its_skin(machine: Machine, service: Service):
-    """Without a skin it stays in its start and gives the reason; with a skin it becomes active, and
-    stays active without it."""
+    """Without a skin it says why it starts; with one it is active, and stays so."""
     service.configure(CABLED + f"TimeoutStartSec={START_S}\nWatchdogSec={START_S}")
     machine.get("systemctl", "start", "--no-block", "palpate")
     service.until("StatusText", r"skin absent: no skin 1209:7ac7 on USB .* answered: \d")
@@ -140,8 +137,7 @@ def test_a_process_that_stands_still_is_killed_and_started_again(service: Servic
 
 
 def test_a_turn_that_hangs_is_found_and_named(machine: Machine, service: Service):
-    """A read that never returns: the watchdog kills the program, and the journal shows where it
-    hung."""
+    """A read that never returns: the watchdog kills it, the journal shows where."""
     machine.put("/run/skin", "")
     service.start(CABLED + "WatchdogSec=3\nRestartSec=100ms")
     machine.put("/run/hang", "")
@@ -155,8 +151,7 @@ def test_a_turn_that_hangs_is_found_and_named(machine: Machine, service: Service
 
 @pytest.mark.parametrize("signal", ["SIGKILL", "SIGSEGV"])
 def test_a_killed_process_is_started_again(machine: Machine, service: Service, signal: str):
-    """However it dies, it restarts two seconds later; in between the lines of the same settings are
-    lowered."""
+    """Two seconds after any death; meanwhile the settings' lines are low."""
     # the simulated skin has lines of its own and ignores it
     machine.put(SITE, "[output]\nready = 'GPIO23'\n")
     first = service.start()
@@ -170,8 +165,7 @@ def test_a_killed_process_is_started_again(machine: Machine, service: Service, s
 
 
 def test_settings_that_cannot_be_used_end_it(machine: Machine, service: Service):
-    """Exit 78: the reason is logged once, without a restart; once it is corrected, the service
-    starts."""
+    """Exit 78 with one reason and no restart; once corrected it starts."""
     service.start()
     machine.put(SITE, "[sweep]\nmax_duration_s = 'for ever'\n")
     service.kill("SIGKILL")
@@ -187,8 +181,7 @@ def test_settings_that_cannot_be_used_end_it(machine: Machine, service: Service)
 
 
 def test_hardware_that_is_not_there_is_looked_for_again(machine: Machine, service: Service):
-    """Exit 69: no GPIO chip; a start every two seconds until there is one, each with one line in
-    the journal."""
+    """Exit 69: a start and a line every two seconds until there is a GPIO chip."""
     machine.put(SITE, "[trigger]\nstart = 'GPIO17'\nstop = 'GPIO27'\n")
     service.configure("")
     machine.get("systemctl", "start", "--no-block", "palpate")
@@ -216,8 +209,7 @@ def test_a_stop_answers_the_open_sweep(machine: Machine, service: Service):
 
 
 def test_the_journal_has_one_line_an_event(machine: Machine, service: Service):
-    """It has the skin's state and a line for each sweep; no sentences, nothing periodic; the lost
-    skin is a warning."""
+    """Skin and sweeps, no sentences, nothing periodic; a lost skin is a warning."""
     machine.put("/run/skin", "")
     service.start(CABLED)
     end = time.monotonic() + WAIT_S
@@ -236,8 +228,7 @@ def test_the_journal_has_one_line_an_event(machine: Machine, service: Service):
 
 
 def test_every_user_may_ask_how_it_is(machine: Machine, service: Service):
-    """`palpate status` by a user without privileges: running, skin away (exit 69), stopped (exit
-    1)."""
+    """`palpate status` unprivileged: running, skin away (69), stopped (1)."""
     ask = (*NOBODY, PALPATE, "status")
     machine.put("/run/skin", "")
     pid = service.start(CABLED)
@@ -271,8 +262,7 @@ def test_systemctl_says_how_it_is(machine: Machine, service: Service):
 
 
 def test_it_is_nobody_in_particular(machine: Machine, service: Service):
-    """Not root, no capability, no new privileges, system calls filtered; /etc/palpate can be read
-    and not written."""
+    """Not root, no capability, filtered calls; /etc/palpate is read-only."""
     pid = service.start()
     status = dict(
         re.findall(r"^(\w+):\t(.*)$", machine.get("cat", f"/proc/{pid}/status"), re.MULTILINE)
@@ -291,8 +281,7 @@ def test_it_is_nobody_in_particular(machine: Machine, service: Service):
 
 
 def test_what_it_can_write_it_cannot_execute(machine: Machine, service: Service):
-    """It can execute nothing in folders that it can write; Python and ssh-keygen it can, and libusb
-    is found."""
+    """Nothing in folders that it writes; Python, ssh-keygen and libusb it has."""
     pid = service.start()
     as_palpate = ("nsenter", "-t", str(pid), "-m", "--")
     for folder in ("/var/lib/palpate", "/run/palpate", "/tmp", "/var/tmp", "/dev/shm"):

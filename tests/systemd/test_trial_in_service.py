@@ -55,8 +55,7 @@ LEFT = "has failed its trial, and "
 
 
 class DeliveredStore:
-    """The store on the machine, for a person who deploys to it. a: the sha256 of bundle A's
-    manifest."""
+    """The store, for a person who deploys. a: sha256 of bundle A's manifest."""
 
     def __init__(self, machine: Machine, folder: Path) -> None:
         self.machine, self._folder, self._counters = machine, folder, itertools.count(1)
@@ -71,8 +70,7 @@ class DeliveredStore:
         return self.machine.get(*AS_PALPATE, "bundles", *command)
 
     def deploy(self, *options: str, **changes: Any) -> str:
-        """Copy a new bundle, A with changes to its manifest, to the box and install it; its
-        sha256."""
+        """Copy bundle A with changes to its manifest there and install it; its sha256."""
         counter = next(self._counters)
         held = deliveries.files(counter, self._key, **changes)
         made = deliveries.put(self._folder / f"b{counter}", held)
@@ -134,8 +132,7 @@ def serves(service: Service, sha: str) -> None:
 def test_a_bundle_that_does_its_work_is_committed(
     machine: Machine, service: Service, store: DeliveredStore
 ):
-    """On trial at its first start, which `palpate status` shows; committed after its sweeps, with a
-    line in the journal."""
+    """On trial at first, as `palpate status` shows; committed after its sweeps."""
     new = store.deploy()
     machine.put(SITE, "[store]\ntrial_sweeps = 1\n")
     service.start(RUN)
@@ -156,8 +153,7 @@ def test_a_bundle_that_does_its_work_is_committed(
 def test_a_bundle_with_which_the_program_dies_or_hangs_is_left(
     machine: Machine, service: Service, store: DeliveredStore, does: str, more: str
 ):
-    """Each start becomes READY and then fails or hangs: after three starts A serves again, without
-    help."""
+    """READY, then it fails or hangs: after three starts A serves again."""
     new = store.deploy()
     machine.put("/run/cursed", f"{new} {does}")
     begin = time.monotonic()
@@ -206,8 +202,7 @@ def test_a_bundle_that_does_not_fit_the_settings_is_left(
 def test_a_committed_bundle_that_is_altered_ends_it_and_rollback_mends(
     machine: Machine, service: Service, store: DeliveredStore
 ):
-    """Exit 78, no restarts, and the remedy in the journal; after `palpate bundles rollback` and a
-    start, A serves."""
+    """Exit 78 and the remedy; after `palpate bundles rollback` A serves."""
     new = store.deploy()
     store.do("commit")
     store.alter(new)
@@ -230,8 +225,7 @@ def test_a_committed_bundle_that_is_altered_ends_it_and_rollback_mends(
 def test_what_is_not_the_bundle_s_doing_leaves_it_on_trial(
     machine: Machine, service: Service, store: DeliveredStore, end: str
 ):
-    """Four restarts, four kills while the skin is away, or four ends with exit 69: still on trial,
-    at its first start."""
+    """Four restarts, kills without a skin, or ends with 69: still its first start."""
     new = store.deploy()
     if end == "without a GPIO chip":
         machine.put(SITE, "[trigger]\nstart = 'GPIO17'\nstop = 'GPIO27'\n")

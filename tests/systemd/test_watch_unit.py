@@ -57,15 +57,13 @@ def page(machine: Machine, service: Service) -> Iterator[Machine]:
 
 
 def test_the_unit_is_sound_hardened_and_off(machine: Machine, before: list[bool]):
-    """systemd reports no problem; the exposure is at most 1.5 of 10, as the service's; an install
-    does not enable it."""
+    """No problem for systemd, exposure at most 1.5 of 10; not enabled."""
     machine.check_unit(f"{UNIT}.service")
     assert machine.run("systemctl", "is-enabled", UNIT).stdout.strip() == "disabled"
 
 
 def test_the_page_is_served_with_the_token_of_the_install(page: Machine):
-    """Over TLS with the certificate that was made there: the box's name, state and verdicts come
-    through."""
+    """Over TLS: the box's name, state and verdicts come through."""
     found = asked(page)
     assert found["hello"]["source"] == "sim"
     assert found["box"] == {"there": True, "why": ""}
@@ -74,8 +72,7 @@ def test_the_page_is_served_with_the_token_of_the_install(page: Machine):
 
 
 def test_it_goes_on_without_the_service(page: Machine, service: Service):
-    """The service stops during its work: the page shows it, and is live again after the next
-    start."""
+    """A stop shows, and the page is live again after the next start."""
     before = page.shown(UNIT, "MainPID")
     page.get("systemctl", "stop", "palpate")
     assert asked(page, "away")["box"]["there"] is False
@@ -85,8 +82,7 @@ def test_it_goes_on_without_the_service(page: Machine, service: Service):
 
 
 def test_the_token_is_for_root_and_the_page_alone(page: Machine):
-    """Another user can read neither token nor key, nor the feed; the page cannot read the files of
-    the service."""
+    """Nobody else reads token, key or feed; the page reads no file of the service."""
     for name in ("token", "key.pem", "certificate.pem"):
         path = f"/etc/palpate/watch/{name}"
         assert page.get("stat", "-c", "%U:%G %a", path) == "root:palpate-watch 640"

@@ -162,16 +162,14 @@ def first(sweeps: Dataset, materials: int, each: int) -> Dataset:
     ],
 )
 def test_small_and_odd_sets_have_no_line(odd, sessions: int):
-    """Constant taxels, recordings of all materials, one sweep of each, two materials, one material,
-    one sweep: no line, no error and no warning of numpy."""
+    """Constant taxels, one sweep of each, one or two materials: no line, error or warning."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert level_check.warnings_of(odd(leveled(True, sessions=sessions))) == []
 
 
 def test_equal_sweeps_are_compared():
-    """Sweeps of a material that have the very same level, on many taxels, give finite weights: the
-    line is as usual, without a warning of numpy."""
+    """Equal sweeps on many taxels give finite weights, and the line is as usual."""
     sweeps = leveled(True)
     equal = replace(sweeps, samples=np.tile((sweeps.samples + 50) // 100 * 100, (1, 1, 8, 8)))
     assert len(np.unique(equal.samples)) == len(MATERIALS)
@@ -192,8 +190,7 @@ def test_counts_of_any_size_are_scaled():
 
 
 def test_large_sets_are_drawn_evenly():
-    """Of many sweeps whose materials take turns about MOST_SWEEPS are used, of each material alike;
-    of many taxels MOST_TAXELS. The line is as usual."""
+    """About MOST_SWEEPS of many, of each material alike, and MOST_TAXELS of the taxels."""
     sweeps = leveled(True, each=200)
     turns = sweeps.take(np.argsort(sweeps.groups["recording"] % 200, kind="stable"))
     wide = replace(turns, samples=np.tile(turns.samples, (1, 1, 10, 10)))
@@ -204,8 +201,7 @@ def test_large_sets_are_drawn_evenly():
 
 
 def test_many_values_are_drawn():
-    """Discriminants are fitted within MOST_VALUES values of a group at most, from its first to its
-    last."""
+    """At most MOST_VALUES values of a group, from its first to its last."""
     sweeps = leveled(True, each=3, sessions=30)
     answers, possible = level_check._within(sweeps, sweeps.groups["session"])
     tested = np.unique(sweeps.groups["session"][answers != level_check.UNTESTED])

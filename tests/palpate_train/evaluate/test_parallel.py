@@ -51,8 +51,7 @@ def test_every_task_is_done_once_with_its_data():
 
 
 def test_a_process_that_is_replaced_is_not_spoken_of():
-    """joblib warns when it replaces a process whose memory has grown. No task is lost by that, so
-    the warning is hidden; other warnings are shown."""
+    """joblib loses no task by that, so its warning is hidden; others are shown."""
     with warnings.catch_warnings(record=True) as shown:
         warnings.simplefilter("always")
         assert len(list(parallel.results(add, range(3), [np.arange(3.0)], jobs=1))) == 3
@@ -119,8 +118,7 @@ def cluster() -> Iterator[tuple[str, list[subprocess.Popen[str]]]]:
 
 @pytest.mark.thorough  # a Dask cluster of two processes
 def test_a_cluster_gives_the_same_bits(cluster):
-    """An evaluation here and on the cluster gives equal logits, for features with an SVM and for a
-    network."""
+    """Logits here and on the cluster are equal, for an SVM on features and for a network."""
     plan = Plan(("L-svm", "recurrent"), ("leave:session",), effort=methods.Effort(0.02))
     there, here = (
         {result.method: result for result in evaluate.evaluate(tones(), plan, where)}
@@ -144,8 +142,7 @@ def noted(task: int, folder: str, data: np.ndarray) -> float:
 
 @pytest.mark.thorough  # a Dask cluster of two processes
 def test_a_worker_that_dies_costs_only_what_it_was_running(cluster, tmp_path: Path):
-    """One of two workers is killed during twenty tasks: all tasks are done, and only the killed
-    task runs twice."""
+    """One of two is killed during twenty tasks: only its task runs twice."""
     address, workers = cluster
     data = np.arange(20.0)
     done = dict(parallel.results(noted, range(20), [str(tmp_path), data], scheduler=address))
@@ -194,8 +191,7 @@ def test_a_task_that_kills_every_worker_ends_with_a_reason(
 
 
 def test_a_cluster_that_does_not_answer_is_named(monkeypatch: pytest.MonkeyPatch):
-    """Without a scheduler at that address, the command that starts one is named within the
-    deadline."""
+    """The command that starts a scheduler is named within the deadline."""
     monkeypatch.setattr(parallel, "CONNECT_S", 1)
     with pytest.raises(FormatError, match="scheduler"):
         list(parallel.results(add, [1], [np.arange(3.0)], scheduler="tcp://127.0.0.1:9"))

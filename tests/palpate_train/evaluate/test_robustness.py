@@ -64,8 +64,7 @@ def test_merged_by_hand():
 
 
 def test_what_breaks_first_comes_first():
-    """Corruptions are ordered by the share of the range that they take, then by the loss. Those
-    without a fall are left out."""
+    """By the share of the range that they take, then by the loss; without a fall left out."""
     found = {
         name: {"lost": lost, "falls": fall, "severities": [0, most]}
         for name, lost, fall, most in (
@@ -79,8 +78,7 @@ def test_what_breaks_first_comes_first():
 
 
 def test_intervals_are_by_attachment():
-    """Sweeps of one attachment fail together, so the interval is wider than with independent
-    sweeps."""
+    """Sweeps of one attachment fail together: a wider interval."""
     right = np.repeat([True, True, False], 4)
     widths = []
     for groups in ({}, {"position": np.repeat([0, 1, 2], 4)}):

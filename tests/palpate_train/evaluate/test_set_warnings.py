@@ -22,8 +22,7 @@ def of_protocol(sweeps: Dataset, text: str) -> list[str]:
 
 
 def test_materials_that_cannot_be_named_are_counted():
-    """Sessions of one material each: every tested sweep, with a protocol that leaves sessions out;
-    no line with another protocol."""
+    """Every tested sweep, where sessions are left out; no line with another protocol."""
     sweeps = easy(8)
     sweeps.groups["session"] = sweeps.labels * 2 + np.arange(24) % 2
     half = replace(sweeps, groups=sweeps.groups | {"session": sweeps.labels})
@@ -37,8 +36,7 @@ def test_materials_that_cannot_be_named_are_counted():
 
 
 def test_shared_frames_are_counted_for_the_folds():
-    """Windows of pure noise that overlap, without recordings, in random folds; not if recordings
-    are stated."""
+    """Overlapping noise without recordings in random folds; not if recordings are stated."""
     rng = np.random.default_rng(1)
     long = rng.normal(0, 20, (8, 640, 2, 2)).astype(np.int16)
     samples = np.concatenate([[one[s : s + 64] for s in range(0, 577, 16)] for one in long])
@@ -67,8 +65,7 @@ def test_baselines_find_what_they_look_at():
 @pytest.mark.slow
 @pytest.mark.thorough  # fits and packs three models
 def test_evaluate_shows_the_answers_of_the_box(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """Beside the label alone, counted, and for each sweep of each fold with the left-out value; a
-    method that export does not pack has none."""
+    """For each sweep of each fold, and counted; none for what export does not pack."""
     file, out = tmp_path / "s.npz", tmp_path / "r.json"
     sweeps = easy(24)
     sweeps.groups["speed"] = np.array(["slow", "fast", "0.5"])[np.arange(72) % 3]

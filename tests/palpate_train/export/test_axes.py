@@ -85,8 +85,7 @@ def test_from_a_set_to_the_answers_of_the_box(
 def test_the_demo_slides_a_skin_that_feels_shear(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """With a bundle of the simulated set with three axes `palpate demo` simulates shear by itself,
-    and names most tubes."""
+    """With a bundle of three axes `palpate demo` simulates shear, and names most tubes."""
     fit, out = str(tmp_path / "fit.npz"), str(tmp_path / "bundle")
     assert (
         main(f"fit --set sim:T-REALx3/level-blind:1001:1 --seed 1 --out {fit} --size bands".split())

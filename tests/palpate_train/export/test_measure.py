@@ -16,8 +16,7 @@ from tests.factories.loud_model import loud, sweeps
 
 
 def test_every_form_is_a_bundle_of_its_own_and_made_once(tmp_path: Path):
-    """Both precisions load in the box's classifier and answer as the model; the second time nothing
-    is trained."""
+    """Both precisions answer as the model in the box; a second time nothing is trained."""
     calls: list[int] = []
     for _ in range(2):
         made = precisions.packed(loud(calls), sweeps(), 3, tmp_path / "kept")

@@ -41,8 +41,7 @@ def trained(name: str, sweeps: Dataset) -> contents.Content:
 
 @pytest.mark.parametrize("name", quick_first(WITH_GRAPH))
 def test_the_box_answers_as_the_desktop(name: str, tmp_path: Path):
-    """The bundle passes its golden sweeps; each held-out sweep gets the label that the model
-    gives."""
+    """It passes its golden sweeps; each held-out sweep gets the model's label."""
     content = trained(name, tones())
     manifest = pack.pack(content, tmp_path / "b", "any", "1", "0123abcd")
     method = method_of(name)
@@ -59,8 +58,7 @@ def test_the_box_answers_as_the_desktop(name: str, tmp_path: Path):
 
 @pytest.mark.parametrize("name", OF_LIBRARIES)
 def test_what_the_box_cannot_run_is_refused(name: str):
-    """It is refused before anything is trained, with the name of the method and its features or
-    library."""
+    """Before anything is trained, with the method and its features or library."""
     method = method_of(name)
     why = f"looks at the features '{method.input}' of prior work"
     if method.library:
@@ -70,8 +68,7 @@ def test_what_the_box_cannot_run_is_refused(name: str):
 
 
 def test_the_command_packs_what_the_box_plays(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """`fit --method` and `export`, then `palpate check` and a demo with the bundle: features of the
-    paper, SVM in ONNX."""
+    """`fit --method`, `export`, `palpate check` and a demo: paper's features, an SVM."""
     folder, fit = str(tmp_path / "h"), str(tmp_path / "h.npz")
     given = ["--set", "sim:T-LAB:1001:12", "--seed", "1", "--out", fit]
     assert main(["fit", "--method", "H-svm", *given]) == 0
@@ -114,8 +111,7 @@ def test_golden_sweeps_are_rounded():
 
 @pytest.mark.parametrize("dtype", ["uint8", "int16", "uint16", "float32"])
 def test_rounded_sweeps_keep_their_type(dtype: str):
-    """Each is coarser than the next, none leaves the range of the type, whole numbers go in steps
-    of 2 or more; constant sweeps are not rounded."""
+    """Each is coarser, within the type; whole steps of 2 or more; constants stay."""
     rng = np.random.default_rng(1)
     top = 255 if dtype == "float32" else np.iinfo(dtype).max
     samples = (top - rng.integers(0, 40, (2, 50, 3, 3))).astype(dtype)

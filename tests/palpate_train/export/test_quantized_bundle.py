@@ -99,8 +99,7 @@ def negated(fitted: Fit) -> Fit:
 
 @pytest.mark.parametrize("dtype", graph_builder.TENSOR)
 def test_the_float_graph_is_the_network(dtype: str):
-    """For each type of raw counts it has PyTorch's logits, fixed shapes, and the sensor's own
-    counts as input."""
+    """For each type PyTorch's logits, fixed shapes, and the sensor's counts as input."""
     form = SweepFormat(3, 2, 100.0, 128, dtype)
     torch.manual_seed(0)
     model = stages.StagesNetwork(form, 3, 0.1, norm=False).eval()
@@ -118,8 +117,7 @@ def test_the_float_graph_is_the_network(dtype: str):
 
 
 def test_the_int8_graph_computes_its_convolutions_in_int8(fitted: Fit, packed: Path):
-    """Weights have seven bits and one scale for each channel; every convolution is between
-    quantizers; the output is 1 x K."""
+    """Seven bits, a scale a channel; every convolution between quantizers; 1 x K."""
     model = onnx.load(packed / bundle.MODEL)
     maker = {name: n for n in model.graph.node for name in n.output}
     values = {c.name: numpy_helper.to_array(c) for c in model.graph.initializer}
@@ -153,8 +151,7 @@ def test_quantizing_leaves_its_model_alone(fitted: Fit):
 
 
 def test_a_bundle_passes_its_own_tests(fitted: Fit, packed: Path):
-    """It has golden sweeps of two materials, figures of held-out sweeps, thresholds from training,
-    and small files."""
+    """Golden sweeps of two materials, held-out figures, trained thresholds, small files."""
     it = box(packed)
     assert it.self_test() < 1e-6
     manifest = it.bundle.manifest
@@ -218,8 +215,7 @@ def test_rules_are_left_out_as_asked(fitted: Fit, tmp_path: Path):
 
 
 def test_figures_of_held_out_sweeps_are_not_of_heads_that_saw_them(fitted: Fit):
-    """Held-out sweeps get wrong labels: heads fitted to them would give these labels, heads of the
-    others do not."""
+    """Heads fitted to held-out sweeps would give their wrong labels; others do not."""
     wrong = replace(fitted.held, labels=(fitted.held.labels + 1) % 3)
     spoilt = replace(fitted, held=wrong)
     honest, misled = (

@@ -34,8 +34,7 @@ def noisy(x: torch.Tensor, rng: torch.Generator) -> torch.Tensor:
 def fit(
     recipe: dict[str, Any], path: Path | None, stop_after: int = 99
 ) -> tuple[dict[str, torch.Tensor], list, list[str]]:
-    """The trained weights, the cost of each step, and the lines of progress. stop_after: the step
-    after which it is interrupted."""
+    """Weights, the cost of each step, and progress. stop_after: the step of the interruption."""
     lines: list[str] = []
 
     def log(line: str) -> None:
@@ -63,8 +62,7 @@ def check_same(one: tuple, other: tuple) -> None:
 def test_an_interrupted_training_gives_the_same_bits(
     recipe: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """After two interruptions dropout, noise, batch norms, the rate and the moving average continue
-    unchanged."""
+    """Dropout, noise, norms, rate and moving average go on after two interruptions."""
     monkeypatch.setattr("palpate_train.models.checkpoint.wait", lambda took: 0.0)
     path = tmp_path / "deeper" / "half.pt"
     for stop in (3, 7):

@@ -54,8 +54,7 @@ def test_what_both_compute_is_there_once():
 
 
 def test_outputs_of_joined_graphs_keep_their_bits():
-    """Each equals the output of its own graph; without the other output, the first graph comes back
-    unchanged."""
+    """Each equals its own graph's; without the other the first graph is unchanged."""
     one, other = made("a", 0.5), made("b", 0.25)
     both = joined(one, other)
     for name, have in zip("ab", [run_output(both, name, drawn()) for name in "ab"], strict=True):
@@ -83,8 +82,7 @@ def test_constants_are_told_apart_by_type_and_shape():
 
 
 def test_a_slim_model_gives_the_same_bits_in_fewer_bytes():
-    """Equal constants once and short names; inputs, outputs and multiplying nodes keep their
-    names."""
+    """Equal constants once, short names; inputs, outputs and multiplying nodes stay."""
     g = GraphBuilder()
     x = g("Cast", g("Reshape", "sweep", g.constant([1, 20, 4], "int64")), to=1)
     y = g("MatMul", x, g.constant(np.arange(12).reshape(4, 3)))

@@ -16,8 +16,7 @@ def booleans(n: int, wrong: list[int]) -> np.ndarray:
 
 
 def test_what_is_lost_is_counted_in_pairs():
-    """Three sweeps lost, one won, checked by hand with the halves of Agresti and Min; no loss in a
-    hundred does not prove that there is none."""
+    """Three lost, one won, by hand; none lost in a hundred proves nothing."""
     lost = parity.loss(booleans(50, [7]), booleans(50, [1, 2, 3]))
     assert (lost.total, lost.float_right, lost.int8_right, lost.lost) == (
         50,
@@ -34,8 +33,7 @@ def test_what_is_lost_is_counted_in_pairs():
 
 
 def test_the_interval_holds_what_it_promises():
-    """In 400 draws of 80 sweeps, where int8 loses 4 % and wins 2 %, at least 93 % of the intervals
-    hold the truth."""
+    """At least 93 % of 400 intervals, where int8 loses 4 % and wins 2 %, hold the truth."""
     rng = np.random.default_rng(0)
     held = 0
     for _ in range(400):
@@ -46,8 +44,7 @@ def test_the_interval_holds_what_it_promises():
 
 
 def test_sweeps_that_fail_together_count_together():
-    """If all losses are in one of five recordings, the interval is wider than if they are
-    spread."""
+    """All losses in one of five recordings: a wider interval."""
     wrong = booleans(50, list(range(5)))
     alone, together = (
         parity.loss(np.ones(50, bool), wrong, of) for of in (None, np.arange(50) // 10)
@@ -58,8 +55,7 @@ def test_sweeps_that_fail_together_count_together():
 
 
 def test_differences_by_hand():
-    """The common part of logits does not count; maximum and mean of the probability differences are
-    over sweeps."""
+    """The common part of logits does not count; maximum and mean are over sweeps."""
     want = np.float32([[1, 0], [0, 0.1]])
     have = np.float32([[6, 5], [0.3, 0]])
     apart = parity.compare(want, have)

@@ -56,8 +56,7 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_figures_are_those_of_score(figures: dict, sweeps: Dataset, default_bundle: Bundle):
-    """The counts by material add up to the answers of the box's classifier, and precision includes
-    the sweeps of other materials."""
+    """Counts add up to the classifier's answers; precision includes other materials."""
     found = bundle_score.score(Classifier(default_bundle, SystemClock()), sweeps)
     assert figures["classified_correctly"]["right"] == found.right.sum()
     assert sum(row["sweeps"] for row in figures["materials"]) == len(sweeps)
@@ -99,8 +98,7 @@ def test_a_material_that_others_are_taken_for_loses_precision(
 
 @pytest.mark.slow
 def test_the_page_holds_the_figures(figures: dict, sweeps: Dataset):
-    """The page has a headline and a row for each material and corruption; tags are closed, no
-    template syntax is left, and nothing is loaded from elsewhere."""
+    """A row for each material and corruption; closed tags, nothing from elsewhere."""
     reader = PageReader(bundle_report.page(figures, sweeps))
     assert (reader.open, reader.wrong) == ([], [])
     assert all(link.startswith(("#", "data:")) for link in reader.links)
@@ -115,8 +113,7 @@ def test_the_page_holds_the_figures(figures: dict, sweeps: Dataset):
 
 @pytest.mark.usefixtures("undrawn")
 def test_a_set_with_a_foreign_material_and_many_labels(figures: dict, sweeps: Dataset):
-    """A material that the bundle lacks has its own table; with more than twelve labels there is no
-    matrix."""
+    """A material that the bundle lacks has its table; beyond twelve labels no matrix."""
     many = figures | {
         "labels": [f"m{i}" for i in range(13)],
         "not_in_the_bundle": {"felt": {"(unknown)": 7, "wood": 1}},
@@ -132,8 +129,7 @@ def test_a_set_with_a_foreign_material_and_many_labels(figures: dict, sweeps: Da
 
 @pytest.mark.usefixtures("undrawn")
 def test_the_headline_says_what_was_missed(figures: dict, sweeps: Dataset):
-    """Right, wrong and unnamed sweeps add up to all sweeps. The headline has the worst material,
-    the first corruption to break the bundle, errors and cost."""
+    """All sweeps are right, wrong or unnamed; the worst material, the first corruption."""
     named = figures["named"]
     assert named["right"] + named["wrong"] + named["not_named"] == named["n"] == len(sweeps)
     missed = figures | {
@@ -159,8 +155,7 @@ def test_the_headline_says_what_was_missed(figures: dict, sweeps: Dataset):
 def test_what_the_bundle_calls_a_foreign_material_is_counted(
     sweeps: Dataset, default_bundle: Bundle
 ):
-    """Six sweeps of felt, of which four get a label: two thirds. Wrong answers and missing answers
-    to the bundle's own materials are counted apart."""
+    """Four of six sweeps of felt get a label: two thirds; own materials apart."""
     found = bundle_score.score(Classifier(default_bundle, SystemClock()), sweeps)
     answered = {"wood": Counter({"wood": 5, "metal": 3, "(unsure)": 1, "(unknown)": 2})}
     mixed = replace(

@@ -30,8 +30,7 @@ def where(folder: Path) -> Where:
 
 @pytest.mark.slow
 def test_the_curve_rises_with_sweeps_to_all_of_them(tmp_path: Path):
-    """Points at 5 and 10 sweeps of each material, the last at all 16. Each tests all sweeps, and
-    more training is at least as good here."""
+    """Points at 5, 10 and all 16 of each; each tests all, and more is as good here."""
     made = {"method": "static-svm"}
     test = easy(30, seed=5)
     found = bundle_trainings.run(made, easy(16), test, where(tmp_path), NOTHING)
@@ -46,8 +45,7 @@ def test_the_curve_rises_with_sweeps_to_all_of_them(tmp_path: Path):
 @pytest.mark.slow
 @pytest.mark.thorough  # fits again for each material
 def test_each_material_is_left_out_where_the_method_knows_novelty(tmp_path: Path):
-    """The default recipe gives, for each material, a share that gets a known label and a share of
-    known sweeps that are kept."""
+    """For each material the share with a known label, and known sweeps that are kept."""
     train, test = tones(10), tones(4, noise=1.5)
     found = bundle_trainings.run({"chosen": "filters"}, train, test, where(tmp_path), NOTHING)
     assert set(found["left_out"]["materials"]) == {"a", "b", "c"}
@@ -98,8 +96,7 @@ def test_a_fit_gives_back_all_its_sweeps():
 def test_the_report_of_a_fit_is_that_of_its_bundle(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """Two commands lead from a fit to its page, and the first names the second; there is a curve,
-    since a fit holds its sweeps."""
+    """Two commands lead from a fit to its page, with a curve."""
     tones(12).save(tmp_path / "t.npz")
     fit, page = tmp_path / "mine.npz", tmp_path / "r.html"
     assert main(f"fit --set {tmp_path / 't.npz'} --seed 1 --steps 0 --out {fit}".split()) == 0

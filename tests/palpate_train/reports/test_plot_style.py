@@ -63,8 +63,7 @@ def titles(svg: str) -> list[str | None]:
     ids=["none", "one", "both", "shared", "no numbers", "names", "no ticks"],
 )
 def test_an_axis_with_numbers_says_what_it_shows_or_that_it_does_not(draw: Draw, there: list[str]):
-    """The title of an axis is an attribute, empty if it is missing; axes without numbers need
-    none."""
+    """The title of an axis is an attribute; axes without numbers need none."""
     assert titles(drawn(draw)) == there
 
 

@@ -77,8 +77,7 @@ def test_a_file_without_header_is_named(tmp_path: Path, text: str):
 
 
 def test_the_header_is_collected_wherever_figures_say_it():
-    """The origin is collected from joined runs, results in lists and sets of parts; names that
-    stand for several sets are left to their results."""
+    """From joined runs, lists and sets of parts, but names that stand for several."""
     figures = {
         "runs": [
             {
@@ -124,8 +123,7 @@ def test_a_run_records_its_origin():
 
 
 def test_a_page_of_an_older_default_says_so_in_its_first_line():
-    """The warning stands below the title, in HTML and in Markdown. A page of today's default, and a
-    page for others, has none."""
+    """Below the title, in HTML and Markdown; not for today's default or for others."""
     now, text = (
         score.shipped(),
         f"Made with an older default, bundle 12345678; the box ships bundle {score.shipped()} now.",
@@ -141,8 +139,7 @@ def test_a_page_of_an_older_default_says_so_in_its_first_line():
 
 
 def test_a_page_leads_back_to_the_readme_and_says_where_it_is_from():
-    """A link with text stands before the title, and the origin at the end; a page for others has no
-    such link."""
+    """A link before the title, the origin at the end; no link on a page for others."""
     page = as_html(ABOUT)
     assert '<nav><a href="../../README.md">← Palpate</a></nav>\n<h1>' in page
     assert "2026-11-22, commit abc, def+, bundle 12345678, seeds 1, 2." in PageReader(page).text
@@ -150,8 +147,7 @@ def test_a_page_leads_back_to_the_readme_and_says_where_it_is_from():
 
 
 def test_every_table_has_a_frame(tmp_path: Path):
-    """Headings of all tables have a scope, and wide tables take the focus; attributes set by a
-    template stay."""
+    """All headings have a scope, wide tables take the focus; a template's attributes stay."""
     (tmp_path / "a.html.j2").write_text(
         '<div class="wide"><table><thead><tr><th class="text">a</th></tr></thead>'
         '<tr><th scope="row">b</th></tr></table></div>'

@@ -26,8 +26,7 @@ def source(count: int) -> SweepSource:
 
 @pytest.mark.slow
 def test_of_a_large_set_sweeps_from_all_over_it_are_shown(monkeypatch: pytest.MonkeyPatch):
-    """The first and the last sweep are shown, in order, none twice; as many as are allowed, and as
-    fit by their size."""
+    """The first and the last, in order, none twice; as many as fit by their size."""
     assert sweep_pages.chosen(source(7), None) == list(range(7))
     shown = sweep_pages.chosen(source(1000), None)
     assert (len(shown), shown[0], shown[-1]) == (sweep_pages.MOST, 0, 999)
@@ -59,8 +58,7 @@ def test_what_a_page_cannot_show_is_refused(
 def test_the_command_writes_a_page_of_what_is_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """Sweeps of a set and of a folder are shown; an .svg shows one sweep, and other kinds of file
-    are refused."""
+    """Sweeps of a set and of a folder; an .svg shows one sweep; other files are refused."""
     easy(4).save(tmp_path / "s.npz")
     out = tmp_path / "v.html"
     assert (
@@ -90,8 +88,7 @@ def address(tmp_path: Path) -> str:
 
 @pytest.mark.slow
 def test_arrow_keys_turn_the_page(browser: Any, address: str):
-    """One sweep is visible at a time. Arrows, Home and End turn the page within its ends, and the
-    address names the sweep."""
+    """One at a time, within the ends, and the address names it."""
     seen_page = BrowsedPage(browser.new_context(), address)
     page = seen_page.page
 

@@ -75,8 +75,7 @@ def small(tmp_path: Path) -> str:
 
 
 def test_the_picture_says_what_is_known(small: str):
-    """Label, places, file, format, losses, verdict, bundle, device and clock are shown; numbers are
-    unchanged; both fields have units."""
+    """Label, places, file, losses, verdict, bundle, device, clock; fields have units."""
     shown = words(small)
     for text in (
         "cork, position 3, session mon",
@@ -141,8 +140,7 @@ def test_the_picture_is_whole_and_needs_nothing(tmp_path: Path, side: int):
 
 @pytest.mark.slow
 def test_offsets_do_not_flatten_the_lines(monkeypatch: pytest.MonkeyPatch):
-    """Taxels thousands of counts apart are drawn about their own level, which stands beside them;
-    the tare is that level if it is known."""
+    """Each about its own level, which stands beside it; the tare, if it is known."""
     limits = []
     monkeypatch.setattr(sweep_plot, "_taxel", lambda axes, *_: limits.append(axes.get_ylim()))
     samples = np.random.default_rng(0).integers(0, 20, (2, 64, 2, 2)).astype(np.int16)
@@ -158,8 +156,7 @@ def test_offsets_do_not_flatten_the_lines(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_a_tone_stands_at_its_frequency(monkeypatch: pytest.MonkeyPatch):
-    """A sine of 100 Hz has its peak there, with its height as a density: amplitude over the root of
-    twice the noise width of a bin."""
+    """A sine of 100 Hz has its peak there, with its height as a density."""
     format = SweepFormat(1, 1, 750.0, 1500, "float32")
     tone = 8 * np.sin(2 * np.pi * 100 * np.arange(1500) / 750)[:, None]
     axes = sweep_plot.add_axes(sweep_plot.Figure((5, 5)), 0, 1, 1, 0)
@@ -189,8 +186,7 @@ def test_a_tone_stands_at_its_frequency(monkeypatch: pytest.MonkeyPatch):
     ],
 )
 def test_every_grid_can_be_drawn(tmp_path: Path, rows: int, cols: int, window: int, dtype: str):
-    """Every grid from one taxel and one frame to the largest skin can be drawn, in a file that a
-    browser opens at once."""
+    """From one taxel and one frame to the largest skin, in a small file."""
     svg = drawn(tmp_path / "a.npy", SweepFormat(rows, cols, 0.5, window, dtype))
     ElementTree.fromstring(svg)
     assert len(svg) < 2_000_000
@@ -200,8 +196,7 @@ def test_every_grid_can_be_drawn(tmp_path: Path, rows: int, cols: int, window: i
 
 @pytest.mark.parametrize("grid", [(2, 3), (9, 2)])
 def test_axes_share_the_plot_of_their_taxel(tmp_path: Path, grid: tuple[int, int]):
-    """A plot has a line for each axis, the normal one dark; a larger skin is an image of all. A
-    tare of another shape is refused."""
+    """A line for each axis, or an image; a tare of another shape is refused."""
     format = SweepFormat(*grid, 100.0, 100, "int16", 3)
     shown = words(drawn(tmp_path / "a.npy", format, {"tare": np.ones(format.shape).tolist()}))
     small = max(grid) <= 8
@@ -242,8 +237,7 @@ def test_a_silent_skin_can_be_drawn(tmp_path: Path, count: int):
 def test_missing_frames_are_marked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, grid: tuple[int, int]
 ):
-    """A bar marks a jump of the numbers, as wide as the gap; the spectrum is of the longest part
-    without a gap."""
+    """A bar as wide as the gap; the spectrum is of the longest part without one."""
     format = SweepFormat(*grid, 100.0, 400, "uint8")
     whole = drawn(tmp_path / "a.npy", format)
     seen = sweep_plot.load(sweep(tmp_path / "b.npy", format, seq=np.r_[0:300, 350:400]))
@@ -264,8 +258,7 @@ def test_missing_frames_are_marked(
 
 @pytest.mark.slow
 def test_texts_are_shown_as_they_are(tmp_path: Path):
-    """Dollars do not start formulas, signs of markup are escaped, long texts end with …, and
-    characters that cannot be shown become �."""
+    """No formulas, no markup, long texts end with …, unknown characters become �."""
     format = SweepFormat(1, 1, 50.0, 9, "uint8")
     assert "$a_b$ <&>" in words(drawn(tmp_path / "a.npy", format, material="$a_b$ <&>"))
     first = words(drawn(tmp_path / "a.npy", format, material="x" * 300)).split("\n")[0]
@@ -279,8 +272,7 @@ def test_texts_are_shown_as_they_are(tmp_path: Path):
 
 
 def test_a_sweep_of_a_set_is_chosen_by_number(tmp_path: Path):
-    """A number selects a sweep of a file, a simulated set or a folder, counted as in training; its
-    groups are named."""
+    """Of a file, a simulated set or a folder, counted as in training."""
     s = easy(4)
     s.save(tmp_path / "s.npz")
     seen = sweep_plot.load(str(tmp_path / "s.npz"), 11)
@@ -309,8 +301,7 @@ def test_a_sweep_of_a_set_is_chosen_by_number(tmp_path: Path):
     ],
 )
 def test_what_cannot_be_drawn_is_refused(tmp_path: Path, what: str, number: int | None):
-    """A number too many or too few, no frames, a tare of another shape, no sweep: the error has the
-    name of the file."""
+    """Other numbers, no frames, another tare, no sweep: the file is named."""
     easy(4).save(tmp_path / "s.npz")
     record(tmp_path / "box" / "0.npy", status=Status.GAP, frames=0)
     record(tmp_path / "box" / "1.npy")
@@ -325,8 +316,7 @@ def test_what_cannot_be_drawn_is_refused(tmp_path: Path, what: str, number: int 
 
 @pytest.mark.slow
 def test_the_spectrogram_shows_when_a_tone_sounds(monkeypatch: pytest.MonkeyPatch):
-    """A tone of 25 Hz in the second half alone: its band is weak before and strong after, on the
-    time axis of the signals."""
+    """25 Hz in the second half alone: weak before and strong after."""
     rate = 100.0
     t = np.arange(400) / rate
     tone = np.where(t >= 2, 40 * np.sin(2 * np.pi * 25 * t), 0)

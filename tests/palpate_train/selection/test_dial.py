@@ -46,8 +46,7 @@ def nothing(line: str) -> None:
 
 
 def skin(places: int = 8, each: int = 3, taxels: tuple[int, ...] = (0, 1)) -> Dataset:
-    """Four materials at several places. Each of the named taxels has half of the information, in
-    the strength of its signal."""
+    """Four materials at several places; each taxel named has half of the information."""
     labels = np.tile(np.arange(4), places * each)
     rng = np.random.default_rng(3)
     bits = np.stack([labels % 2, labels // 2], axis=1)
@@ -96,8 +95,7 @@ def test_the_first_in_order_is_taken_where_all_suffice():
 
 
 def test_the_smallest_that_reaches_what_is_wanted_is_taken():
-    """87.5 % is enough where .85 is wanted; where nothing reaches it, the rule of one standard
-    error remains."""
+    """87.5 % is enough for .85; where nothing reaches it, one standard error decides."""
     judged = judgement(bands=missing(slice(0, None, 8)), all=missing(slice(1)))
     assert judged.choose(["bands", "all"], 0.85, EVERYTHING) == "bands"
     assert judged.choose(["bands", "all"], 0.9, EVERYTHING) == "all"
@@ -134,8 +132,7 @@ def test_the_error_is_that_of_what_fails_together():
 
 
 def test_cheap_is_what_takes_little_of_the_scarcer():
-    """Cost is the larger of the shares of time and bytes; without a budget the bytes, then the
-    time."""
+    """The larger of the shares of time and bytes; without a budget bytes, then time."""
     small, fast = BundleCost(0.4, 20, 60), BundleCost(0.1, 40, 50)
     for budget, dearer, cheaper in (
         (Budget(ms=1, kb=1000, slower=2), small, fast),
@@ -157,8 +154,7 @@ def judged_skin() -> Judgement:
 
 @pytest.mark.slow
 def test_all_sizes_are_judged_on_the_same_sweeps():
-    """Every held-out sweep once; the spectrum that all taxels share does not see which taxel is
-    strong, relations of taxels do."""
+    """The common spectrum does not see which taxel is strong, relations do."""
     judged = judged_skin()
     assert judged.by == ("place",)
     assert len(judged.labels) == len(judged.clusters) == 96
@@ -193,8 +189,7 @@ def test_a_size_alone_is_the_same_model():
 def test_sizes_with_stages_are_judged_where_stages_were_not_trained(
     monkeypatch: pytest.MonkeyPatch,
 ):
-    """All sizes then have the same held-out sweeps, those of some places, and stages were trained
-    once."""
+    """All sizes have the same held-out sweeps, and stages were trained once."""
     trained = []
     train = recipe._trained
     monkeypatch.setattr(recipe, "ENOUGH", 1.1)
@@ -215,8 +210,7 @@ def test_sizes_with_stages_are_judged_where_stages_were_not_trained(
 
 
 def test_a_size_that_the_windows_do_not_allow_is_named():
-    """Thirty frames have no spectrum; sizes with filters remain. If none remains, each reason is
-    named."""
+    """Thirty frames have no spectrum; with no size left each reason is named."""
     short = skin()
     short = replace(short, samples=short.samples[:, :30])
     judged = dial.judge(short, Run(1), CLOSED, ["bands", "64"])
@@ -251,8 +245,7 @@ def chosen(**budget: float) -> dial.Selection:
 
 @pytest.mark.usefixtures("costs")
 def test_what_is_over_the_budget_is_not_chosen():
-    """The best of the others is chosen, and each limit is named. Without limits the smallest that
-    suffices is."""
+    """The best of the others, with each limit; without limits the smallest."""
     assert chosen().chosen == "pairs"
     for budget in ({"ms": 0.15}, {"kb": 15}, {"ms": 0.3, "slower": 2.0}):
         found = chosen(**budget)
@@ -263,8 +256,7 @@ def test_what_is_over_the_budget_is_not_chosen():
 
 @pytest.mark.usefixtures("costs")
 def test_nothing_fits(monkeypatch: pytest.MonkeyPatch):
-    """The nearest size is named with the exceeded limit; a size that cannot be packed with the
-    reason."""
+    """The nearest size with its limit; what cannot be packed with the reason."""
     nearest = r"nearest is bands, over the budget: 10 kb of 5: raise the budget"
     with pytest.raises(NothingFits, match=nearest):
         chosen(kb=5)
@@ -300,8 +292,7 @@ def reduced(sweeps: Dataset, kind: str, wanted: float = 0.0) -> tuple[dict[str, 
 
 @pytest.mark.slow
 def test_two_taxels_are_all_that_is_needed():
-    """Of six taxels the third and the fifth have all the information: one alone is not enough.
-    Nothing is applied, because the sensor would have to be set."""
+    """The third and the fifth of six have all the information; nothing is applied."""
     curve, change = reduced(skin(taxels=(2, 4)), "taxels")
     assert curve["kept"] == "2 taxels"
     assert curve["taxels"] == [[2, 0], [4, 0]]
@@ -332,8 +323,7 @@ def test_rate_and_bits_are_reported():
 
 
 def test_less_does_not_fall_below_what_is_wanted():
-    """A loss within the error is refused if the whole sweeps reach the wanted accuracy and the
-    reduced ones do not."""
+    """A loss within the error is refused if it falls below what is wanted."""
     less = missing(slice(1))
 
     def fits(wanted: float) -> ReducedFits:
@@ -346,8 +336,7 @@ def test_less_does_not_fall_below_what_is_wanted():
 
 @pytest.mark.slow
 def test_materials_that_look_alike_are_proposed_as_one():
-    """Only the first taxel has information, so that a and c, b and d are alike. The pairs are
-    proposed and not applied."""
+    """With one taxel of information a and c, b and d are alike; only proposed."""
     sweeps = skin(taxels=(0, 5))
     blind = sweeps.samples.copy()
     blind[:, :, 5] = blind[:, :, 4]

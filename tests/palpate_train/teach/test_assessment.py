@@ -78,8 +78,7 @@ def test_a_mislabelled_sweep_is_found_in_signals():
 
 
 def test_materials_that_cannot_be_told_apart_are_named():
-    """Half of two materials is taken for the other: no label is suspected, and no number of
-    further sweeps is promised to help."""
+    """Half is taken for the other: no label is suspected, nothing is promised."""
     labels = [0] * 8 + [1] * 8 + [2] * 8
     named = [0, 1] * 4 + [1, 0] * 4 + [2] * 8
     found = answers(sure(*named), labels)

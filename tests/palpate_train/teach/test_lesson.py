@@ -24,8 +24,7 @@ def sweeps(folder: Path, *materials: str, first: int = 1, **more: object) -> Non
 
 
 def test_sweeps_that_cannot_be_taught_are_left_out_and_counted(tmp_path: Path):
-    """Damaged files, sweeps without a material, faulty ones and those of another format do not
-    prevent a lesson."""
+    """Damaged, unlabelled, faulty or of another format: the lesson goes on."""
     sweeps(tmp_path, "a", "b")
     sweeps(tmp_path, "", first=3)
     sweeps(tmp_path, "a", first=4, status=Status.GAP)
@@ -71,8 +70,7 @@ def test_a_single_sweep_is_not_judged_yet(tmp_path: Path):
 
 
 def test_sweeps_without_a_slide_are_not_learnt_from_and_named(tmp_path: Path):
-    """A finger at rest taught as foam, among slides: named by its number, whatever its place. A
-    material that has no slide left is said with the reason."""
+    """A finger at rest among slides is named by its number; so is a material without slides."""
     rng, place = np.random.default_rng(2), skin.placements("T-REAL", 1005)[0]
     windows = [skin.window(name, place, rng) for name in ("wood",) * 3 + ("foam",) * 3]
     rest = np.broadcast_to(windows[3].mean(axis=0).round(), windows[3].shape)

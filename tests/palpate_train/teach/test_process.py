@@ -204,8 +204,7 @@ def test_imports_that_spin_are_ended_by_the_kernel(tmp_path: Path):
 
 
 def test_up_to_twenty_sweeps_the_desktop_makes_the_same_model():
-    """`palpate-train fit` at its default trains stages from 25 sweeps of each material on. Below,
-    its model is the taught one, bit for bit."""
+    """Below 25 sweeps of each, `palpate-train fit` makes the taught model, bit for bit."""
     sweeps = easy(20)
     plain = replace(sweeps, groups={"recording": np.arange(len(sweeps))})
     assert recipe.Settings().steps > 0

@@ -282,8 +282,7 @@ def test_int8_attenuates_as_the_network_does(dtype: str):
 
 
 def test_tenths_are_means_of_what_was_known():
-    """In float, the features of the first half are those of a window of half the length, because
-    both have the same responses."""
+    """In float the first half's features are those of a window of half the length."""
     format = SweepFormat(2, 2, 100.0, 800, "uint8")
     model, trunk, _ = trunks(format, prefixes=True)
     counts = drawn(format, 3)
@@ -292,8 +291,7 @@ def test_tenths_are_means_of_what_was_known():
 
 
 def test_every_operator_of_int8_is_fused(tmp_path: Path):
-    """onnxruntime runs whole-number convolutions on bytes in their order, and integer sums, without
-    a transposition."""
+    """onnxruntime convolves bytes in whole numbers, without a transposition."""
     _, _, int8 = trunks(skin.FORMAT, STAGES)
     options = onnxruntime.SessionOptions()
     options.optimized_model_filepath = str(tmp_path / "optimized.onnx")
@@ -309,8 +307,7 @@ def test_every_operator_of_int8_is_fused(tmp_path: Path):
 
 @pytest.mark.slow
 def test_the_method_is_its_int8_graph():
-    """Logits are those of the graph to the bit; its precision "float" is the float trunk with a
-    head of its own; its features are those of its head."""
+    """Its logits to the bit; "float" is the float trunk with a head of its own."""
     s = easy(12)
     with joining():
         (method,) = methods.find(["palpate-stages"], Effort(share=0.02))
@@ -339,8 +336,7 @@ def test_the_method_is_its_int8_graph():
 
 @pytest.mark.slow
 def test_a_fit_learns_what_is_easy(fitted: Fit):
-    """Its accuracy is far above chance on sweeps of another seed, and so it says; recordings of
-    held-out sweeps are not trained on."""
+    """Far above chance on another seed, as it says; held-out recordings are not trained on."""
     other = easy(seed=9)
     model = graph_builder.with_head(fitted.trunk(), *fitted.int8_head())
     assert np.mean(graph_builder.run(model, other.samples).argmax(1) == other.labels) > 0.9
@@ -350,8 +346,7 @@ def test_a_fit_learns_what_is_easy(fitted: Fit):
 
 @pytest.mark.slow
 def test_trained_stages_depend_on_their_seed_alone():
-    """They have the same bits for any random state outside, which does not change; another seed
-    gives other bits."""
+    """The same bits for any random state outside; another seed gives other bits."""
 
     def trained(seed: int) -> dict[str, np.ndarray]:
         return stages.train_stages(easy(8), 0.1, Run(seed), 4, Augmentation())[0]
@@ -381,8 +376,7 @@ def test_positions_are_held_out_where_there_are_several():
 
 @pytest.mark.slow
 def test_a_fit_of_another_form_is_refused(tmp_path: Path, fitted: Fit):
-    """Weights that do not fit the architecture in the file are refused, and so is a file of an
-    older version."""
+    """Weights that do not fit the file's architecture are refused."""
     replace(fitted, architecture=SMALL).save(tmp_path / "fit.npz")
     with pytest.raises(FormatError, match=r"8, 8\).*; fit again$"):
         Fit.load(tmp_path / "fit.npz")
@@ -397,8 +391,7 @@ def test_a_fit_of_another_form_is_refused(tmp_path: Path, fitted: Fit):
 
 @pytest.mark.parametrize("frames", [64, 1500])
 def test_training_augments_as_its_generator_says(frames: int):
-    """PyTorch trains on the same sweeps for the same state of its generator, which moves on; the
-    original sweeps do not change."""
+    """The same sweeps for the same state of the generator, which moves on."""
     format, x = SweepFormat(2, 2, 100.0, frames, "uint8"), torch.randn(6, frames, 4).transpose(1, 2)
     before, rng, again = (
         x.clone(),
