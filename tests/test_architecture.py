@@ -1,5 +1,4 @@
-"""Checks of the architecture: imports, the content of the wheel, the form of modules, tests and
-texts."""
+"""Imports, the content of the wheel, the form of modules, tests and texts."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""The written pages beside the code: what they show can be typed, wired and read, and the box holds
-them as one text."""
+"""The written pages can be typed, wired and read, and the box holds them as one text."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""The site: its sources hold every page, each link leads somewhere, and the references are
-of the code."""
+"""The site holds every page, each link leads somewhere, references are of the code."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""The tutorial "Your first model": its commands run as they stand on the page, in the time that the
-page promises, and print the lines that the page shows."""
+"""The tutorial's commands run as on the page, and print the lines that it shows."""
 
 from __future__ import annotations
 

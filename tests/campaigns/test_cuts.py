@@ -1,5 +1,4 @@
-"""Cuts: the disk's content after a kill or a loss of power at any moment, for a small part of
-`python -m tests.cuts`; programs that are wrong on purpose are found."""
+"""Cuts: the disk after a kill or a loss of power at any moment; wrong programs are found."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""A part of `python -m tests.campaigns exceptions`: each trigger has one answer, whichever call of
-the loop fails."""
+"""Each trigger has one answer, whichever call of the loop fails: a part of the campaign."""
 
 from __future__ import annotations
 

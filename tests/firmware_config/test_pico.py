@@ -1,5 +1,4 @@
-"""The Pico's firmware as a whole, under MicroPython itself, at a pseudo-terminal that the box
-reads."""
+"""The Pico's firmware as a whole, under MicroPython, at a terminal that the box reads."""
 
 from __future__ import annotations
 

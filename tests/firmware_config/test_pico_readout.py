@@ -1,5 +1,4 @@
-"""The Pico's readout without pins, under this Python: bytes, order of reading, counters, FIFO,
-requests."""
+"""The Pico's readout without pins: bytes, order of reading, counters, FIFO, requests."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""The published series that aeon ships: their format, splits, and refusals without
-them."""
+"""The published series of aeon: format, splits, and refusals without them."""
 
 from __future__ import annotations
 

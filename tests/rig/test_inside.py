@@ -1,5 +1,4 @@
-"""The contract of skin, lines and port, run inside the guest on its real kernel; the test requests
-actions outside."""
+"""The contract of skin, lines and port inside the guest, on its real kernel."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""The whole way on a real kernel: skin on xHCI, edges on a GPIO chip, sentences on a serial port,
-as a service on arm64."""
+"""The whole way on a real kernel: skin, edges, sentences, as a service on arm64."""
 
 from __future__ import annotations
 

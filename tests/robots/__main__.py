@@ -134,7 +134,7 @@ def noting(seen: Seen) -> Callable[[Answer | BoxState], None]:
 
 
 def lines_ms(sweeps: int) -> list[float]:
-    """From a verdict to RESULT VALID on simulated lines: what the program adds."""
+    """From a verdict to RESULT VALID on simulated lines: the delay of the program."""
     current = bundle.load(bundle.DEFAULT)
     simulated = devices.build(current.format, script.tubes(3, sweeps), SystemClock(), "sim")
     settings = config.load(None, site=NO_SITE)

@@ -61,7 +61,7 @@ class NoiseCount:
 
 
 def count(subject: Subject, fault: Fault, faults: int) -> NoiseCount:
-    """Play a stream with one damaged frame in APART; compare what comes with it."""
+    """Play a stream with one damaged frame in APART; compare the received frames."""
     known = {frame.tobytes() for frame in subject.frames}
     read, rest = codec(subject.profile), Rest()
     taken = wrong = 0

@@ -1,5 +1,4 @@
-"""The box with an emulated skin instead of a real skin: the recorded counts are the simulated ones,
-through each skin's bytes."""
+"""The box with an emulated skin: the recorded counts are the simulated ones."""
 
 from __future__ import annotations
 

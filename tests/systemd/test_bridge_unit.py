@@ -1,5 +1,4 @@
-"""The bridges' unit under a real systemd, in a container: off at first, hardened; the feed and the
-line reach it."""
+"""The bridges' unit under a real systemd: off at first, hardened, with feed and line."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""The units have room within their limits when they are attacked, and their networks are closed,
-under a real systemd in a container."""
+"""Units under attack have room within their limits, and their networks are closed."""
 
 from __future__ import annotations
 

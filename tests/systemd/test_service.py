@@ -1,5 +1,4 @@
-"""The unit under a real systemd, in a container: start, notify, watchdog, restart, exit codes,
-stop, privileges, journal."""
+"""The unit under a real systemd: start, watchdog, restart, exit codes, stop, journal."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""The page's unit under a real systemd, in a container: off at first, hardened, over TLS with the
-install's token."""
+"""The page's unit under a real systemd: off at first, hardened, with TLS and token."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""What every peer has to hold: it learns, never gives what it never saw, stays finite, depends on
-its seed alone, and its graph answers as it does."""
+"""The contract of every peer: what it learns, never gives, and computes on the box."""
 
 from __future__ import annotations
 

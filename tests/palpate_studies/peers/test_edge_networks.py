@@ -1,5 +1,4 @@
-"""DS-CNN and the recipe of the edge tools: their layers, their features against the definition, and
-int8."""
+"""DS-CNN and the recipe of the edge tools: layers, features by definition, int8."""
 
 from __future__ import annotations
 

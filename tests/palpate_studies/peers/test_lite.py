@@ -1,5 +1,4 @@
-"""LITE: its weights and filters are the published ones, and its graph answers as the network
-does."""
+"""LITE: weights and filters are the published ones; the graph answers as the network."""
 
 from __future__ import annotations
 

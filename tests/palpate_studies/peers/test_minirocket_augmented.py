@@ -1,5 +1,4 @@
-"""MiniRocket with augmented copies: the copies, and that none of them is a copy of a held-out
-sweep."""
+"""MiniRocket with augmented copies, none of which is of a held-out sweep."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Neural methods: the paper's CNN as printed, graphs against PyTorch, small trainings with
-calibrated results."""
+"""Neural methods: the paper's CNN as printed, graphs against PyTorch, small trainings."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""The features of prior work against scipy and against formulas written out, and exploration until
-the posterior is certain."""
+"""The features of prior work against scipy and formulas, and exploration."""
 
 from __future__ import annotations
 

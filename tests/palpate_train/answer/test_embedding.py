@@ -1,5 +1,4 @@
-"""Novelty on Gaussians with known truth: the embedding is LDA, and the limit keeps its stated
-share."""
+"""Novelty on Gaussians of known truth: the embedding is LDA, the limit keeps its share."""
 
 import numpy as np
 import pytest
@@ -118,7 +117,7 @@ def test_what_cannot_be_embedded_is_refused(labels, why: str):
 
 
 def test_the_limit_keeps_what_it_promises():
-    """A limit of 99 sweeps keeps the stated share of new ones; of few it is the largest."""
+    """A limit of 99 sweeps keeps the stated share of new sweeps; of few it is the largest."""
     rng = np.random.default_rng(0)
     for asked in (0.95, embedding.KEPT):
         kept = [
@@ -132,7 +131,7 @@ def test_the_limit_keeps_what_it_promises():
 
 
 def test_the_limit_knows_positions_that_were_not_seen():
-    """Positions shift their sweeps: the limit keeps 95 % at new ones across groups alone."""
+    """Positions shift their sweeps: across groups the limit keeps 95 % at new positions."""
 
     def drawn(places, seed):
         x, y = gaussians(5 * places, [[0, 0], [30, 0]], seed)

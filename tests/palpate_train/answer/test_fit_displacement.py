@@ -1,5 +1,4 @@
-"""Displaced sweeps on Gaussians: variation like that of copies is known, other variation unknown,
-and certainty is limited."""
+"""Displaced sweeps on Gaussians: variation like that of copies is known, other is not."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,4 @@
-"""Early answers on the desktop: the rule on constructed prefixes, heads, and the graph against the
-box."""
+"""Early answers: the rule on constructed prefixes, heads, the graph against the box."""
 
 from dataclasses import replace
 

@@ -1,5 +1,4 @@
-"""The number of broken taxels that a bundle tolerates is measured with the classifier of the
-box."""
+"""The number of broken taxels that a bundle tolerates, by the classifier of the box."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""The discriminant: against scikit-learn's covariance, with more and with fewer features than
-sweeps, and with too few sweeps."""
+"""The discriminant against scikit-learn's covariance, also with too few sweeps."""
 
 from __future__ import annotations
 

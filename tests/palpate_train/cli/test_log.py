@@ -1,5 +1,4 @@
-"""Progress on the error stream: a bar on a terminal, which is erased at the end, and occasional
-lines in a log."""
+"""Progress: a bar on a terminal, erased at the end, and occasional lines in a log."""
 
 from __future__ import annotations
 
@@ -32,7 +31,7 @@ sys.exit(3)
 
 
 def on_a_terminal(out_too: bool) -> tuple[str, str]:
-    """What the script shows on a terminal of 100 columns, and its output elsewhere."""
+    """The script's text on a terminal of 100 columns, and its output elsewhere."""
     far, near = pty.openpty()
     done = subprocess.Popen(
         [sys.executable, "-c", SCRIPT],

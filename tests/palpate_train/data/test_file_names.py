@@ -1,5 +1,4 @@
-"""Patterns over file names: the fields that they read, ambiguous names, and texts that are not
-patterns."""
+"""Patterns over file names: their fields, ambiguous names, texts that are no pattern."""
 
 from __future__ import annotations
 

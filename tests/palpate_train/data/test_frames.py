@@ -1,5 +1,4 @@
-"""Frames of taxels: the axis of time, columns by name, fields in columns, readings that cannot
-be."""
+"""Frames of taxels: time, columns by name, fields in columns, impossible readings."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Import: folders of CSV, text, MAT, HDF5 and .npy become sets; each file that cannot be used gets
-one exact line."""
+"""Folders of CSV, text, MAT, HDF5 and .npy become sets; other files get a line each."""
 
 from __future__ import annotations
 
@@ -330,7 +329,7 @@ def test_names_of_materials_are_checked_before_anything_is_read(tmp_path: Path):
 
 
 def test_shapes_that_differ_are_refused(tmp_path: Path):
-    """Arrays of two grids, a path that is no folder, no file that matches."""
+    """Arrays of two grids, a path of a file, a pattern that matches nothing."""
     np.save(tmp_path / "cork_1.npy", np.zeros((20, 2, 2)))
     np.save(tmp_path / "felt_1.npy", np.zeros((20, 2, 3)))
     with pytest.raises(FormatError, match="shape"):

@@ -1,5 +1,4 @@
-"""Names of materials: all names that the box cannot send are listed at once, and can be
-replaced."""
+"""Names of materials that the box cannot send are listed at once, and replaced."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Progress of long work: the share that is done and the time that is left, as a line and as
-numbers."""
+"""Progress of long work: share done and time left, as a line and as numbers."""
 
 from __future__ import annotations
 

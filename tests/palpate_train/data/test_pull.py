@@ -208,7 +208,7 @@ def test_a_label_that_was_set_right_here_stays(ground: Ground, capsys: pytest.Ca
 
 
 def test_what_is_no_recording_is_refused(ground: Ground, capsys: pytest.CaptureFixture[str]):
-    """What is broken on the box is not stored; a recording without frames is valid."""
+    """Broken recordings of the box are not stored; a recording without frames is valid."""
     (ground.box / "run 0" / "sweep-000000.npy").write_bytes(b"\x93NUMPY")
     (ground.box / "run 0" / "sweep-000001.json").write_text("{}")
     np.save(ground.box / "run 1" / "sweep-000002.npy", np.array([{}], object), allow_pickle=True)

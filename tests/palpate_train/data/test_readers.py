@@ -1,5 +1,4 @@
-"""Readers: HDF5, TactMat and recordings of the box become sets; broken files are refused by
-name."""
+"""HDF5, TactMat and recordings become sets; broken files are refused by name."""
 
 from __future__ import annotations
 
@@ -234,7 +233,7 @@ def test_recordings_are_a_set(tmp_path: Path):
 
 
 def test_a_place_that_is_a_number_keeps_it(tmp_path: Path):
-    """If all names are whole numbers, --only position=12 selects the one named 12."""
+    """If all names are whole numbers, --only position=12 selects the position 12."""
     for i, (position, session) in enumerate([("12", "7"), ("3", "07"), ("3", "8"), ("0", "7")]):
         record(tmp_path / f"{i}.npy", "ab"[i % 2], position=position, session=session)
     groups = sets.load(str(tmp_path)).groups

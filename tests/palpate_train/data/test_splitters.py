@@ -131,7 +131,7 @@ def test_nothing_left_to_train_on_is_refused():
 
 
 def test_protocols_speak_of_values():
-    """Fractions and names; a value that is not there, or is no number, is named."""
+    """Fractions and names; an absent value, or a text, is named."""
     force, speed = [0.0, 0.5, 1.5] * 4, ["slow", "medium", "fast"] * 4
     sweeps = a_set([0, 0, 0, 1, 1, 1] * 2, force=force, speed=speed)
     for text, left in (("force=0,0.5->1.5", 2), ("speed=slow,medium->fast", 2)):

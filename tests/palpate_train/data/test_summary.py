@@ -1,5 +1,4 @@
-"""Descriptions of sets: counts by position and session, losses, and reasons why a set cannot be
-trained on."""
+"""Descriptions of sets: counts, losses, and reasons against training on them."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Reductions: the remaining sweeps are those that a sensor with such settings would give, and
-informative taxels stay."""
+"""Reductions: sweeps as a sensor with such settings gives them; good taxels stay."""
 
 from __future__ import annotations
 

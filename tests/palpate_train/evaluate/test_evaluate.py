@@ -1,5 +1,4 @@
-"""The grid of methods, protocols, folds and seeds: its counts, its cache, and its results for
-scripts."""
+"""The grid of methods, protocols, folds and seeds: counts, cache, results for scripts."""
 
 from __future__ import annotations
 
@@ -153,7 +152,7 @@ def test_a_fold_is_kept_under_all_that_it_depends_on(
 
 
 def test_a_fold_depends_on_the_code_that_its_method_runs():
-    """What a method imports counts, also indirectly; code around it does not."""
+    """The imports of a method count, also indirectly; code around it does not."""
 
     def reached(method: str) -> set[str]:
         """Names of modules without the packages."""

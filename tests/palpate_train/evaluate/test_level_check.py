@@ -1,5 +1,4 @@
-"""The check of the mean level: levels that a session sets, levels that the material sets, sets of
-one session, and sets that are too small or too odd for an answer."""
+"""The check of the mean level: levels of sessions, levels of materials, odd sets."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Parallel tasks on this machine, and on a real Dask cluster of two workers on loopback. Some tests
-kill a worker."""
+"""Parallel tasks here and on a real Dask cluster of two workers, which may die."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""A skin with three axes from a set to the box: fit, export, and the same answers there and in a
-replay."""
+"""A skin with three axes from a set to the box: fit, export, the same answers, replay."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""A skin that reads thousands without contact, from its recording to the box: an untouched window
-is `no-contact`."""
+"""A skin that reads thousands without contact, from its recording to the box."""
 
 from __future__ import annotations
 

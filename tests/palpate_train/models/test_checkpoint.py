@@ -1,5 +1,4 @@
-"""An interrupted training gives the same bits as an uninterrupted one, for any file that it
-finds."""
+"""An interrupted training gives the same bits, whatever file it finds."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Trainings for a report: points of the learning curve, materials left out, and sets that are
-joined."""
+"""Trainings for a report: learning curve, materials left out, joined sets."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""The header of pages, pictures and results: made once, found in each kind of file, with a warning
-for older figures."""
+"""The header of pages, pictures and results, with a warning for older figures."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""The picture of a sweep, for every grid and length: its content, the same in every run, with
-nothing loaded from elsewhere."""
+"""The picture of a sweep for every grid and length, the same in every run."""
 
 from __future__ import annotations
 

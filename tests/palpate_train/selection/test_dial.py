@@ -323,7 +323,7 @@ def test_rate_and_bits_are_reported():
 
 
 def test_less_does_not_fall_below_what_is_wanted():
-    """A loss within the error is refused if it falls below what is wanted."""
+    """A loss within the error is refused below the wanted accuracy."""
     less = missing(slice(1))
 
     def fits(wanted: float) -> ReducedFits:

@@ -1,5 +1,4 @@
-"""HDF5 and NumPy: only the wanted array is read, whatever stands beside it; named fields are
-columns."""
+"""HDF5 and NumPy: only the wanted array is read; named fields are columns."""
 
 from __future__ import annotations
 

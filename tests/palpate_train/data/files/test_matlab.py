@@ -72,7 +72,7 @@ def test_arrays_are_found_in_structures(tmp_path: Path):
 
 @pytest.mark.parametrize("name", ["skin", "data/skin"])
 def test_version_7_3_is_read_beside_objects(tmp_path: Path, name: str):
-    """Strings, tables, cells and empty arrays are no frames; a structure is walked into."""
+    """Strings, tables, cells and empty arrays are not frames; a structure is walked into."""
     path = tmp_path / "a.mat"
     with h5py.File(path, "w", userblock_size=512) as file:
 

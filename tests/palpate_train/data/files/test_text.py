@@ -1,5 +1,4 @@
-"""Text: each kind of table that programs write gives its numbers, or an error that names line,
-cell and remedy."""
+"""Text: each kind of table gives its numbers, or an error with line, cell and remedy."""
 
 from __future__ import annotations
 

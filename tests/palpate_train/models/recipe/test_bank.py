@@ -1,5 +1,4 @@
-"""The filter bank: its graph against the definition, float against int8, offsets, and windows that
-are too short."""
+"""The filter bank: graph by definition, float and int8, offsets, short windows."""
 
 from __future__ import annotations
 

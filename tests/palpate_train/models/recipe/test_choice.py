@@ -90,7 +90,7 @@ def test_a_part_takes_the_copies_of_its_sweeps_alone():
 
 
 def test_what_lies_in_another_group_is_not_chosen():
-    """What names every material within a group is the worst for an unseen group."""
+    """The feature that is best within a group is the worst for an unseen group."""
     at = scores()
     losses = [at.loss(at.score([HeadPart(columns, False)])) for columns in (GOOD, NOISE, TRAP)]
     assert losses[0] < 0.2 < losses[1]
@@ -254,7 +254,7 @@ def test_the_temperature_is_the_best_for_held_out_sweeps():
 
 
 def test_candidates_are_what_the_features_allow():
-    """The usual one, magnitudes, without spectrum; then with copies, and so on."""
+    """The usual candidate, magnitudes, without spectrum; then with copies, and so on."""
     tried: list[str] = []
     choice.choose(scores(), candidates([[0], [1]], [0, 1], [2, 3], bands=[4]), tried.append)
     assert len(tried) == len(set(tried)) == 2 + 1 + 5
@@ -313,7 +313,7 @@ def spoiled(*noise: int) -> HeldOutScores:
 
 
 def test_a_view_stays_away_where_it_harms():
-    """What names materials within a group alone harms others and is not seen."""
+    """A view that helps within a group alone harms others and is not seen."""
     heads = candidates([[0, 1]], [0, 1], [0, 1], levels=[2, 3])
     harmed = choice.choose(spoiled(2, 3), heads, print)
     assert not {2, 3} & set(harmed.plan.columns().tolist())

@@ -1,5 +1,4 @@
-"""The distribution of counts: its graph against the definition, offsets, and the number of
-features."""
+"""The distribution of counts: its graph by definition, offsets, number of features."""
 
 from __future__ import annotations
 
@@ -64,7 +63,7 @@ def defined(format: SweepFormat, some: Levels, given: np.ndarray) -> np.ndarray:
 
 @forms
 def test_the_graph_is_the_definition(format: SweepFormat):
-    """Both precisions, but for frames near a level, which bytes round again."""
+    """Both precisions agree except for frames near a level, which are rounded again."""
     some, given = levels(format), counts(format)
     wanted = defined(format, some, given)
     for int8 in (False, True):

@@ -1,5 +1,4 @@
-"""The memory of a fit: it does not grow with the set. A fit that needs too much is refused
-first."""
+"""The memory of a fit does not grow with the set; too much is refused first."""
 
 from __future__ import annotations
 

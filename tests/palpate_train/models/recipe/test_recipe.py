@@ -1,5 +1,4 @@
-"""The default recipe: its choice, agreement of its precisions, independence of PyTorch, and
-refusals."""
+"""The default recipe: choice, precisions, independence of PyTorch, refusals."""
 
 from __future__ import annotations
 
@@ -181,7 +180,7 @@ def test_stages_join_in(monkeypatch: pytest.MonkeyPatch):
 def test_stages_and_the_spectrum_are_enough_unless_more_is_better(
     monkeypatch: pytest.MonkeyPatch, better: bool
 ):
-    """Each stage has a discriminant with the spectrum, and there are no filters."""
+    """Each stage has a discriminant with the spectrum; filters are absent."""
     for name, value in (("LEAST_SWEEPS", 1), ("ENOUGH", 1.01)):
         monkeypatch.setattr(recipe, name, value)
     monkeypatch.setattr(choice.PairedDifference, "better", property(lambda _: better))
