@@ -21,7 +21,7 @@ MATERIALS = ("BeigeCotton", "BrownCotton", "Canvas", "Denim", "DenimFlex", "Line
 
 @pytest.fixture
 def data(tmp_path: Path) -> Path:
-    """FabricSlide's names; each material is louder noise than the one before."""
+    """FabricSlide's names; each material is louder noise than the previous material."""
     labels, force, speed, rep, direction = (
         x.ravel() for x in np.meshgrid(range(len(MATERIALS)), (100, 180), (1, 2), (1, 2), (0, 1))
     )

@@ -1,4 +1,4 @@
-"""The contract of every peer: what it learns, never gives, and computes on the box."""
+"""The contract of every peer: learning, absent materials, its seed, its graph."""
 
 from __future__ import annotations
 

@@ -74,7 +74,7 @@ def test_the_graph_is_the_definition(dtype: str):
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", ["int16", "float32"])
 def test_the_features_are_aeons(monkeypatch: pytest.MonkeyPatch, dtype: str):
-    """aeon's shares in its order, exact for integers, else but for rounding at a bias."""
+    """aeon's shares in its order, exact for integers, close for floats."""
     aeon = pytest.importorskip("aeon.transformations.collection.convolution_based")
     monkeypatch.setattr("palpate_studies.peers.minirocket.FEATURES", 1000)
     given, (rows, cols, window) = raw_counts(dtype), KINDS[dtype]

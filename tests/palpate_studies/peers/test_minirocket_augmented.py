@@ -1,4 +1,4 @@
-"""MiniRocket with augmented copies, none of which is of a held-out sweep."""
+"""MiniRocket with augmented copies: never of a held-out sweep."""
 
 from __future__ import annotations
 
