@@ -14,6 +14,8 @@ import pytest
 from tests.factories import feed_lines, lerobot
 from tests.factories.bridges import eventually
 
+pytestmark = pytest.mark.usefixtures("hurried")
+
 NOTHING = feed_lines.load(1.5, 1.5, 0)
 PRESSED = feed_lines.load(1.5, 1.5)
 

@@ -29,6 +29,8 @@ from tests.factories import feed_lines, speaking_box
 from tests.factories.bridges import LONG_S, RawModbus, bridge, eventually, page_blocks
 from tests.factories.speaking_box import LABELS, SpeakingBox, finger, obeying, result, state
 
+pytestmark = pytest.mark.usefixtures("hurried")
+
 Address = tuple[str, int]
 START, STOP, NEW = (COILS.index(name) for name in ("START", "STOP", "NEW"))
 

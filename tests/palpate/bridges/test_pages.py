@@ -26,6 +26,8 @@ from tests.factories.bridges import LONG_S, bridge, eventually, page_blocks
 from tests.factories.paths import ROOT
 from tests.factories.speaking_box import SpeakingBox, obeying, result, state
 
+pytestmark = pytest.mark.usefixtures("hurried")
+
 FAULTS = [s for s in Status if not s.classified and s not in (Status.UNKNOWN, Status.RECORDED)]
 
 

@@ -21,6 +21,8 @@ from palpate.core.status import Status
 from tests.factories.bridges import LONG_S, eventually
 from tests.factories.speaking_box import SpeakingBox, obeying, result, state
 
+pytestmark = pytest.mark.usefixtures("hurried")
+
 
 class Wanted(NamedTuple):
     """Parameters of a sweep."""

@@ -26,6 +26,8 @@ from tests.factories.bridges import LONG_S, bridge, eventually
 from tests.factories.paths import ROOT
 from tests.factories.speaking_box import LABELS, SpeakingBox, finger, result, state
 
+pytestmark = pytest.mark.usefixtures("hurried")
+
 Address = tuple[str, int]
 
 

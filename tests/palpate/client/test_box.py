@@ -24,6 +24,8 @@ from palpate.core.status import Status
 from tests.factories.paths import ROOT
 from tests.factories.speaking_box import LABELS, SpeakingBox, finger, obeying, result, state
 
+pytestmark = pytest.mark.usefixtures("hurried")
+
 LONG_S = 30.0
 """A deadline that nothing reaches."""
 SHORT_S = 0.05

@@ -20,6 +20,8 @@ from palpate.core.errors import FeedError, FormatError
 from tests.factories.feeds import OK, Offered
 from tests.factories.paths import ROOT
 
+pytestmark = pytest.mark.usefixtures("hurried")
+
 HELLO = b'{"type": "hello", "schema": 1}\n'
 
 

@@ -24,6 +24,8 @@ from tests.factories.browser import WAIT_S, until
 from tests.factories.feeds import HEALTH, OK, Offered, cut, frames
 from tests.factories.page_client import EventReader, PageAddress, ask, status
 
+pytestmark = pytest.mark.usefixtures("hurried")
+
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
