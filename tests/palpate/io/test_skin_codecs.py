@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import struct
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -242,27 +241,23 @@ def test_papillarray_with_a_tail_inside():
     assert found.garbage == 0
 
 
-def test_papillarray_of_changing_form():
-    """Packets are read by their own tables, the same at once or one by one."""
-    p = replace(profile("papillarray"), rows=6)
-    grids = [np.arange(108, dtype=np.float32).reshape(6, 3, 6) + i for i in range(5)]
-    data = [papillarray(grid, i, sensors=2 if i % 2 else 1) for i, grid in enumerate(grids)]
-    # garbage, after which all packets are equally far apart
-    data[2] += bytes(len(data[1]) - len(data[2]))
-    alike = papillarray(grids[0], 7, sensors=2)
-    other = bytearray(alike)
-    at = other.index(b"\x02\x00", 40)
-    other[at], other[at + 2] = (
-        3,
-        (other[at + 2] - 1) % 256,
-    )  # numbers of another type with the same sum
-    stream = [*data, alike, bytes(other), alike]
-    found = decoded(p, b"".join(stream))
-    single = [decoded(p, packet).taxels for packet in stream]
-    assert found.taxels.tolist() == np.concatenate(single).tolist()
-    assert [len(one) for one in single] == [1, 1, 1, 1, 1, 1, 0, 1]
-    assert found.taxels[3].tolist() == grids[3][..., :3].tolist()
-    assert found.skipped.tolist() == [0, 0, 0, len(data[2]) - len(data[0]), 0, 0, len(other)]
+def test_a_packet_of_another_form_is_read_by_its_own_table():
+    """Among packets of one form, one with any byte changed and a right sum is decoded as alone;
+    so are packets of another number of sensors, and those after garbage."""
+    p = replace(profile("papillarray"), rows=2, cols=1)
+    grid = np.arange(1, 13, dtype=np.float32).reshape(2, 1, 6)
+    good = papillarray(grid, 70_000, sensors=2)
+    end = len(good) - 6
+    for at in range(4, end):
+        other = bytearray(good)
+        other[at] ^= 1
+        other[end : end + 2] = struct.pack("<H", sum(other[4:end]) & 0xFFFF)
+        stream = [good, bytes(other), good, good + bytes(7), papillarray(grid, 1)]
+        alone = [decoded(p, packet) for packet in stream]
+        found = decoded(p, b"".join(stream))
+        assert found.taxels.tobytes() == b"".join(one.taxels.tobytes() for one in alone), at
+        assert found.counts.tolist() == [n for one in alone for n in one.counts.tolist()], at
+        assert len(found.skipped) == len(found.ends) == len(found.taxels)
 
 
 def test_papillarray_of_two_sensors():
@@ -362,7 +357,7 @@ def test_split_or_whole_is_the_same(name: str):
     )
     whole = decoded(p, data)
     assert len(whole) >= 5
-    for size in (1, 7, 50):
+    for size in (1, 7, 50)[len(data) > 8000 :]:
         rest, frames, garbage = Rest(), [], 0
         for at in range(0, len(data), size):
             part = codec(p)(rest, data[at : at + size])
@@ -391,13 +386,14 @@ def test_no_bytes_raise(name: str, data: bytes, at: int):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_what_is_left_over_stays_small(name: str):
-    """Bytes without an end do not pile up."""
-    decode = partial(codec(profile(name)))
+    """Bytes without an end do not pile up: 8 kB wait, of a text so much for each row."""
+    decode = codec(profile(name))
+    most = 8200 * (profile(name).rows if profile(name).lines == "rows" else 1)
     for fill in (b"\x00", b"\xaa\x55", b"7", b"\x55\x66\x77\x88", b"\x9a\x00\x61\xff"):
         rest = Rest()
-        for _ in range(300):
-            rest = decode(rest, fill * 500).rest
-            assert len(rest.data) < 200_000
+        for _ in range(most // 4000 + 2):
+            rest = decode(rest, fill * (4000 // len(fill))).rest
+            assert len(rest.data) <= most
 
 
 @pytest.mark.parametrize("name", ["matrix", "flexitac", "anyskin"])

@@ -186,7 +186,7 @@ def test_wrong_rate(name: str, rate: float):
 
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "papillarray"])
 def test_a_rate_that_wanders(name: str):
-    """2 % are followed, a tenth is a mismatch. Skins with their own clock: test_pace.py."""
+    """2 % are followed, a tenth is a mismatch. Skins with their own clock: test_usb_sensor.py."""
     skin = WiredSkin(name)
     skin.seconds(4)
     for rate in (1.02, 0.98, 1.0):
