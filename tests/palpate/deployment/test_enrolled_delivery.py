@@ -67,7 +67,7 @@ def test_the_next_delivery_counts_from_the_bundle_that_was_signed(box: Delivery)
     assert box.store.install(box.made(1)) != with_cork
     assert box.store.learn(old) == with_cork
     box.committed(2)
-    with pytest.raises(BundleError, match="counter 1, and 2"):
+    with pytest.raises(BundleError, match="1, and 2"):
         box.store.learn(old)
     box.store.rollback()
     assert box.store.learn(grown(box, "felt"))
@@ -123,7 +123,7 @@ def test_a_lost_key_or_signer_does_not_end_what_runs_unless_it_must(box: Deliver
     (box.enrolment_key.folder / KEY).rename(box.folder / "kept")
     assert box.store.running().bundle.enrolled
     (box.enrolment_key.folder / SIGNER).unlink()
-    with pytest.raises(ConfigError, match="make install"):
+    with pytest.raises(ConfigError, match="install"):
         box.store.choose()
     (box.folder / "kept").rename(box.enrolment_key.folder / KEY)
     install_scripts.enrolment_key(box.enrolment_key.folder)
@@ -139,7 +139,7 @@ def test_a_program_with_another_packaged_bundle_does_not_take_the_label(
     assert box.store.commit()
     newer = deliveries.put(box.folder / "newer", deliveries.files(0, None, version="99"))
     monkeypatch.setattr(bundle, "DEFAULT", newer)
-    with pytest.raises(BundleError, match=r"teach again.*rollback"):
+    with pytest.raises(BundleError, match="rollback"):
         box.store.choose()
     assert box.store.rollback() == PACKAGED
     assert box.store.running().bundle.manifest.version == "99"

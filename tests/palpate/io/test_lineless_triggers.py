@@ -194,7 +194,7 @@ def test_a_terminal_that_is_gone_ends_it(terminal: tuple[int, int]):
     far, near = terminal
     with closing(KeyTrigger(near, rig.VirtualClock(), lambda line: None)) as trigger:
         os.close(far)
-        with pytest.raises(PortError, match="was closed"):
+        with pytest.raises(PortError, match="closed"):
             trigger.edges(1)
 
 
@@ -289,7 +289,7 @@ def test_a_box_that_could_not_sweep_does_not_start(
     monkeypatch.setattr("sys.stdin", None)
     with pytest.raises(ConfigError, match=hint):
         rigged(sets=sets)
-    with open("/dev/null") as null, pytest.raises(ConfigError, match="needs a terminal"):
+    with open("/dev/null") as null, pytest.raises(ConfigError, match="terminal"):
         KeyTrigger(null.fileno(), rig.VirtualClock(), lambda line: None)
 
 

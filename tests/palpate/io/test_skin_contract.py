@@ -112,7 +112,7 @@ def test_absent_is_found_by_its_ids(name: str):
         assert len(frames)
     else:
         assert skin.sensor.state == "absent"
-        assert "/dev/serial/by-id/skin (1a86:7523" in str(skin.sensor.trouble)
+        assert "1a86:7523" in str(skin.sensor.trouble)
         assert "skin.port" in str(skin.sensor.trouble)
 
 
@@ -161,7 +161,7 @@ def test_wrong_format_of_the_bundle(name: str):
         skin = WiredSkin(name, wanted)
         skin.seconds(0.3)
         assert skin.sensor.state == "mismatch"
-        assert "wanted is" in str(skin.sensor.trouble)
+        assert "wanted" in str(skin.sensor.trouble)
         assert skin.port.sent == []
 
 

@@ -62,15 +62,15 @@ def test_a_form_that_a_person_describes():
     """The error's examples are understood, with a window of two seconds."""
     assert skins.described("5x3:float32:100") == SweepFormat(5, 3, 100.0, 200, "float32")
     assert skins.described(" 4x4x3:int16:250 ") == SweepFormat(4, 4, 250.0, 500, "int16", 3)
-    with pytest.raises(ConfigError, match=r"--format 5x3: not"):
+    with pytest.raises(ConfigError, match="5x3"):
         skins.described("5x3")
-    with pytest.raises(ConfigError, match=r"--format 0x3:int16:9: a"):
+    with pytest.raises(ConfigError, match="0x3:int16:9"):
         skins.described("0x3:int16:9")
 
 
 def test_a_wrong_profile_is_named():
     """The profile is not guessed."""
-    with pytest.raises(ConfigError, match="did you mean flexitac"):
+    with pytest.raises(ConfigError, match="flexitac"):
         skins.sensor(settings("skin.profile=flexitak"), skin.FORMAT, idle_devices())
 
 

@@ -110,9 +110,9 @@ def test_a_full_disk_drops_the_oldest_first(
     assert numbers(tmp_path) == [8, 9]
     trouble, end = logged
     assert trouble.startswith("<4>black box: ")
-    assert "No space left" in trouble
+    assert "space" in trouble
     assert str(tmp_path) in trouble
-    assert "kept again" in end
+    assert "again" in end
 
 
 def test_another_error_removes_no_sweep(
@@ -124,7 +124,7 @@ def test_another_error_removes_no_sweep(
     failing(monkeypatch, errno.EIO, lambda: True)
     put(black, 2)
     assert numbers(tmp_path) == [1]
-    assert "Input/output error" in logged[0]
+    assert "Input/output" in logged[0]
 
 
 def test_a_folder_that_cannot_be_used_yet(tmp_path: Path, logged: list[str]):

