@@ -136,7 +136,4 @@ def test_the_commands(
     (tmp_path / "skins").mkdir()
     (tmp_path / "skins" / "broken.toml").write_text("rows = 0\n")
     assert main(["skin", "list", "--config-dir", str(tmp_path)]) == 1
-    assert (
-        "255"
-        in capsys.readouterr().out
-    )
+    assert "255" in capsys.readouterr().out
