@@ -75,7 +75,7 @@ def states(views: list[View]) -> list[str]:
     return [v.state for i, v in enumerate(views) if i == 0 or v.state != views[i - 1].state]
 
 
-def test_views_follow_the_touches(model: Bundle):
+def test_views_follow_the_touches(model):
     """Finger off, then four touches, each nearer than the last: the message follows, and the last
     touch is in place."""
     views = views_of(resting(), model)
@@ -100,7 +100,7 @@ def pressed(*loads: float) -> devices.SimDevices:
     return devices.build(skin.FORMAT, [rig.Act(on, 0, len(on) - 1, "")], rig.VirtualClock(), "sim")
 
 
-def test_a_finger_that_lay_on_the_skin_at_the_start_is_noticed(model: Bundle):
+def test_a_finger_that_lay_on_the_skin_at_the_start_is_noticed(model):
     """No advice until each taxel was unloaded once; then the load is right."""
     views = views_of(pressed(80, 95, 2, 80), model)
     seen = views(4)
@@ -110,15 +110,13 @@ def test_a_finger_that_lay_on_the_skin_at_the_start_is_noticed(model: Bundle):
     assert seen[-1].load[3][3] == 0
 
 
-def test_a_skin_that_is_never_near_zero(model: Bundle):
+def test_a_skin_that_is_never_near_zero(model):
     """The bundle's counts of the unloaded skin are subtracted: the finger is detected, and the hint
     counts above them."""
     rest = replace(model, manifest=replace(model.manifest, unloaded=(50.0,) * 16))
     seen = views_of(pressed(130, 145, 52, 130), rest)(4)
     assert states(seen) == ["wait", "lift", "no-contact", "in-place"]
-    assert (
-        "unloaded" in next(v for v in seen if v.state == "lift").hint
-    )
+    assert "unloaded" in next(v for v in seen if v.state == "lift").hint
     assert states(views_of(pressed(130, 145, 52, 130), model)(4)) == ["wait", "lift"]
 
 
@@ -128,7 +126,7 @@ def known(model: Bundle, **changes: object) -> Expected:
 
 
 @pytest.mark.parametrize("lacks", ["a threshold", "positions", "a bundle"])
-def test_without_trained_positions_the_centre_alone_is_shown(model: Bundle, lacks: str):
+def test_without_trained_positions_the_centre_alone_is_shown(model, lacks):
     """The threshold comes from the present unloaded skin if the bundle has none. The centre is in
     taxels, and the hint says what to do."""
     bare = {"contact": None, "displacement": None}
@@ -146,7 +144,7 @@ def test_without_trained_positions_the_centre_alone_is_shown(model: Bundle, lack
     assert hint in last.hint
 
 
-def test_an_unplugged_skin_is_shown_and_waited_for(model: Bundle):
+def test_an_unplugged_skin_is_shown_and_waited_for(model):
     """While the skin is unplugged, the View has its state and advice, and no old picture. After it
     is plugged in, the unloaded skin is measured anew."""
     simulated = resting()
@@ -165,7 +163,7 @@ def test_an_unplugged_skin_is_shown_and_waited_for(model: Bundle):
 @pytest.mark.parametrize(
     ("source", "word"), [("usb", ""), ("sim", "SIMULATED  "), ("replay", "REPLAYED  ")]
 )
-def test_a_line_says_what_it_is_of(source: str, word: str):
+def test_a_line_says_what_it_is_of(source, word):
     """A replayed set is not called simulated, a real skin has no note; a View without a contact has
     no centre."""
     shown = line(replace(VIEW, source=source))
@@ -175,14 +173,7 @@ def test_a_line_says_what_it_is_of(source: str, word: str):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("which", "want"), [("skin", "SIMULATED"), ("replay", "REPLAYED")])
-def test_align_with_what_is_simulated(
-    which: str,
-    want: str,
-    tmp_path: Path,
-    default_bundle: Bundle,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-):
+def test_align_with_what_is_simulated(which, want, tmp_path, default_bundle, capsys, monkeypatch):
     """`align --sim skin` and `--sim replay:SET` find a contact, and say that they are simulated or
     replayed."""
     np.savez(
@@ -201,7 +192,7 @@ def test_align_with_what_is_simulated(
     assert any("centre" in text for text in lines)
 
 
-def test_another_skin_shape(model: Bundle):
+def test_another_skin_shape(model):
     """A skin of 2 x 3 taxels with floating-point counts, some of them NaN."""
     format = replace(model.format, rows=2, cols=3, dtype="float32")
     other = replace(
@@ -221,7 +212,7 @@ def test_another_skin_shape(model: Bundle):
     assert seen[-1].load[0][0] == 0
 
 
-def test_only_the_normal_axis_is_looked_at(model: Bundle):
+def test_only_the_normal_axis_is_looked_at(model):
     """A finger on the simulated skin with shear is found at its position. Shear, which may be
     negative, is not shown."""
     world = skin.World(shear=True)
@@ -241,9 +232,7 @@ VIEW = View(
 )
 
 
-def test_a_view_is_shown_five_times_a_second_and_printed_once(
-    model: Bundle, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_view_is_shown_five_times_a_second_and_printed_once(model, monkeypatch):
     """There is a View every VIEW_NS, not a View for each frame; lines come once a second. `stopped`
     ends the command, and the skin is released."""
     for line_ns, lines in ((0, range(24, 27)), (SECOND, range(5, 7))):
@@ -258,7 +247,7 @@ def test_a_view_is_shown_five_times_a_second_and_printed_once(
         assert not simulated.backend.board.running
 
 
-def test_a_denied_skin_is_named(model: Bundle):
+def test_a_denied_skin_is_named(model):
     """The View says why the skin cannot be read and what to do. The command goes on."""
     simulated = idle_devices()
     simulated.backend.errors["open"] = errno.EACCES
@@ -281,7 +270,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_ctrl_c_ends_it(folder: Path):
+def test_ctrl_c_ends_it(folder):
     """The command prints plain lines until Ctrl-C."""
     command = [sys.executable, "-m", "palpate", "skin", "align", "--sim", "rest"]
     command += ["--set", f"classifier.bundle={folder}"]
@@ -304,6 +293,6 @@ def test_ctrl_c_ends_it(folder: Path):
         (310.4, 600.0, "uT", "310"),
     ],
 )
-def test_newtons_have_two_digits(value: float, full: float, unit: str, text: str):
+def test_newtons_have_two_digits(value, full, unit, text):
     """Raw counts have none, other units as many as three digits in all leave."""
     assert figure(value, full, unit) == text

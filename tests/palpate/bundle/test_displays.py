@@ -8,11 +8,11 @@ from dataclasses import replace
 
 import pytest
 
-from palpate.bundle.bundle import Bundle, Manifest
+from palpate.bundle.bundle import Manifest
 from palpate.core.errors import BundleError
 
 
-def test_a_manifest_keeps_display_names(default_bundle: Bundle):
+def test_a_manifest_keeps_display_names(default_bundle):
     """It is read as it was written."""
     plain = default_bundle.manifest
     named = replace(plain, displays={plain.labels[0]: "木, geölt"})
@@ -32,7 +32,7 @@ def test_a_manifest_keeps_display_names(default_bundle: Bundle):
         (["wood"], "manifest cannot be read"),
     ],
 )
-def test_what_is_no_display_name_is_refused(default_bundle: Bundle, displays: object, message: str):
+def test_what_is_no_display_name_is_refused(default_bundle, displays, message):
     """Its label, its text and the remedy are named."""
     content = json.loads(default_bundle.manifest.json()) | {"displays": displays}
     with pytest.raises(BundleError, match=re.escape(message)):

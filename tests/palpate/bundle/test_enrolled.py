@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import zipfile
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -53,7 +52,7 @@ def changed(files: dict[str, bytes], **arrays: np.ndarray) -> dict[str, bytes]:
     return files | {bundle.ENROLMENT: toy_bundle.npz(**held)}
 
 
-def test_the_bundle_stays_as_it_is(base: dict[str, bytes], made: dict[str, bytes], tmp_path: Path):
+def test_the_bundle_stays_as_it_is(base, made, tmp_path):
     """Its files do not change, and one file is added. All trained tensors are the same, and the id
     is another."""
     assert {name: data for name, data in made.items() if name != bundle.ENROLMENT} == base
@@ -76,7 +75,7 @@ def test_the_bundle_stays_as_it_is(base: dict[str, bytes], made: dict[str, bytes
     assert new.id != old.id
 
 
-def test_what_an_enrolment_cannot_say_is_computed(made: dict[str, bytes]):
+def test_what_an_enrolment_cannot_say_is_computed(made):
     """Bias and shape of a label are computed from its mean and number of sweeps, and are not in the
     file."""
     assert set(content(made)) == set(enrolled.ARRAYS)
@@ -134,7 +133,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_an_enrolment_that_is_not_as_it_must_be_is_refused(made: dict[str, bytes], case: str):
+def test_an_enrolment_that_is_not_as_it_must_be_is_refused(made, case):
     """An enrolment of another bundle, with wrong types or shapes, or out of range raises a
     BundleError that says what to do."""
     changes, why = WRONG[case]
@@ -142,7 +141,7 @@ def test_an_enrolment_that_is_not_as_it_must_be_is_refused(made: dict[str, bytes
 
 
 @pytest.mark.parametrize("name", [bundle.ENROLMENT, bundle.GOLDEN, bundle.MEANS])
-def test_a_member_that_is_no_array_is_refused(made: dict[str, bytes], name: str):
+def test_a_member_that_is_no_array_is_refused(made, name):
     """numpy returns such a member as bytes. The error names it before its type is used."""
     file = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(made[name])) as whole, zipfile.ZipFile(file, "w") as damaged:
@@ -154,7 +153,7 @@ def test_a_member_that_is_no_array_is_refused(made: dict[str, bytes], name: str)
         arrays.read(file.getvalue(), name)
 
 
-def test_a_file_that_is_no_npz_is_refused(made: dict[str, bytes]):
+def test_a_file_that_is_no_npz_is_refused(made):
     """A cut or empty file, other bytes, or a zip file that unpacks without end."""
     whole = made[bundle.ENROLMENT]
     for data in (b"", b"PK", whole[:200], b"\0" * 1000):
@@ -170,7 +169,7 @@ def test_a_file_that_is_no_npz_is_refused(made: dict[str, bytes]):
     check_refused(made | {bundle.ENROLMENT: bomb.getvalue()}, "unpacks to .* bytes")
 
 
-def test_a_bundle_without_class_means_takes_no_labels(made: dict[str, bytes]):
+def test_a_bundle_without_class_means_takes_no_labels(made):
     """The labels cannot be added without class means."""
     plain = toy_bundle.files(known=None, outputs=("logits",))
     base = np.array(bundle.digest(plain[bundle.MANIFEST]))
@@ -179,9 +178,7 @@ def test_a_bundle_without_class_means_takes_no_labels(made: dict[str, bytes]):
     )
 
 
-def test_a_label_with_a_huge_spread_leaves_the_others_as_they_were(
-    base: dict[str, bytes], made: dict[str, bytes]
-):
+def test_a_label_with_a_huge_spread_leaves_the_others_as_they_were(base, made):
     """A forged label can only win itself. For any sweep the order of the trained labels does not
     change."""
     forged = changed(made, means=np.float32([[6, 0], [0, 0]]), spread=np.float32([1e6, 1e6]))
@@ -193,7 +190,7 @@ def test_a_label_with_a_huge_spread_leaves_the_others_as_they_were(
         assert np.argsort(scores[0]).tolist() == np.argsort(scores[1]).tolist()
 
 
-def test_labels_are_read_in_the_order_in_which_they_were_enrolled(base: dict[str, bytes]):
+def test_labels_are_read_in_the_order_in_which_they_were_enrolled(base):
     """So the class codes of all other labels stay the same. The same labels give the same bytes."""
     one, other = grown(grown(base, "felt"), "cork"), grown(grown(base, "cork"), "felt")
     first, second = (bundle.from_files(files, "toy") for files in (one, other))

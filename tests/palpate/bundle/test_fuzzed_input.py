@@ -42,7 +42,7 @@ def check_inputs(target: str, folder: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("target", TARGETS)
-def test_what_was_found_still_holds(target: str, tmp_path: Path) -> None:
+def test_what_was_found_still_holds(target, tmp_path):
     """Seeds, saved corpus and former crashes keep every promise."""
     check_inputs(target, tmp_path)
 
@@ -102,7 +102,7 @@ def taken(target: str, data: bytes, folder: Path) -> bool:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("target", TARGETS)
-def test_the_corpus_reaches_what_lies_behind_the_checks(target: str, tmp_path: Path) -> None:
+def test_the_corpus_reaches_what_lies_behind_the_checks(target, tmp_path):
     """Several inputs are accepted and several refused, since a corpus of broken files alone would
     prove little."""
     check_inputs(target, tmp_path)  # writes the other files of a manifest's bundle
@@ -266,9 +266,7 @@ BREAKS: dict[str, tuple[Any, str, Any]] = {
 
 
 @pytest.mark.parametrize("what", BREAKS)
-def test_each_promise_can_be_seen_broken(
-    what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_each_promise_can_be_seen_broken(what, tmp_path, monkeypatch):
     """A module that is broken on purpose is detected by the known inputs."""
     monkeypatch.setattr(*BREAKS[what])
     with pytest.raises((AssertionError, AttributeError, ApplianceError)):

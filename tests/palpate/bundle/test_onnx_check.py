@@ -6,7 +6,6 @@ from __future__ import annotations
 import os
 import signal
 from dataclasses import replace
-from pathlib import Path
 from random import Random
 from typing import Any
 
@@ -47,7 +46,7 @@ def default() -> mutated_models.Own:
 
 
 @pytest.mark.slow
-def test_our_own_models_pass(owns: list[mutated_models.Own]):
+def test_our_own_models_pass(owns):
     """The default bundle's model, models of all kinds of methods, and a graph of opset 18."""
     for own in owns:
         check.check(own.model, own.manifest)
@@ -63,7 +62,7 @@ def test_a_harmless_model_of_the_hostile_kind_passes():
 
 
 @pytest.mark.parametrize("name", [name for name, (_, words) in HOSTILE.items() if words])
-def test_a_hostile_model_is_refused(name: str):
+def test_a_hostile_model_is_refused(name):
     """The error is one printable line that says why and what to try."""
     data, words = HOSTILE[name]
     with pytest.raises(BundleError, match=words) as refused:
@@ -76,7 +75,7 @@ def test_a_hostile_model_is_refused(name: str):
 
 @pytest.mark.parametrize("name", [name for name, (_, words) in HOSTILE.items() if not words])
 @pytest.mark.slow
-def test_what_is_too_large_or_too_slow_fails_its_trial(name: str, monkeypatch: pytest.MonkeyPatch):
+def test_what_is_too_large_or_too_slow_fails_its_trial(name, monkeypatch):
     """Models that the check lets pass: the kernel and the clock end their trial."""
     monkeypatch.setattr("palpate.deployment.sandbox.PROCESSOR_S", 2)
     check.check(HOSTILE[name][0], MANIFEST)
@@ -85,16 +84,14 @@ def test_what_is_too_large_or_too_slow_fails_its_trial(name: str, monkeypatch: p
 
 
 @pytest.mark.slow
-def test_a_file_that_ends_anywhere_is_refused(default: mutated_models.Own):
+def test_a_file_that_ends_anywhere_is_refused(default):
     """The default bundle's model, cut off at every byte."""
     for end in range(len(default.model)):
         with pytest.raises(BundleError):
             check.check(default.model[:end], default.manifest)
 
 
-def test_a_link_and_a_file_beside_the_model_are_never_followed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_link_and_a_file_beside_the_model_are_never_followed(tmp_path, monkeypatch):
     """A model with external data in a file or a symlink is refused before anything is opened."""
     (tmp_path / "secret").write_bytes(bytes(16))
     (tmp_path / "weights.bin").symlink_to(tmp_path / "secret")
@@ -113,9 +110,7 @@ def test_a_link_and_a_file_beside_the_model_are_never_followed(
         (reader, "MOST_VALUES"),
     ],
 )
-def test_every_cap_caps(
-    module: Any, limit: str, default: mutated_models.Own, monkeypatch: pytest.MonkeyPatch
-):
+def test_every_cap_caps(module, limit, default, monkeypatch):
     """Our own model is refused if a cap is lower than its needs."""
     monkeypatch.setattr(module, limit, 20)
     with pytest.raises(BundleError, match=r"\b20\b"):
@@ -167,13 +162,7 @@ def test_an_output_of_another_shape_than_declared_fails_its_trial():
 @pytest.mark.slow
 @pytest.mark.thorough  # a sample of the campaign hostile
 @pytest.mark.parametrize(("enrolled", "count", "ran"), [(0.0, 150, 15), (1.0, 100, 5)])
-def test_fuzzed_models_neither_hang_nor_kill(
-    enrolled: float,
-    count: int,
-    ran: int,
-    owns: list[mutated_models.Own],
-    monkeypatch: pytest.MonkeyPatch,
-):
+def test_fuzzed_models_neither_hang_nor_kill(enrolled, count, ran, owns, monkeypatch):
     """Models and enrolments of the campaign run in children with limited memory and time. Enough of
     them reach onnxruntime, and none gives a label without a probability."""
     monkeypatch.setattr(hostile_fuzz, "ENROLLED", enrolled)
@@ -187,9 +176,7 @@ def test_fuzzed_models_neither_hang_nor_kill(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("how", ["dies", "hangs", "swells"])
-def test_the_campaign_would_tell(
-    how: str, owns: list[mutated_models.Own], monkeypatch: pytest.MonkeyPatch
-):
+def test_the_campaign_would_tell(how, owns, monkeypatch):
     """A child that dies, hangs or takes too much memory is reported with its number, and the next
     model is tried."""
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from palpate.bundle.bundle import Bundle
 from palpate.bundle.onnx_check import check, reader
 from palpate.bundle.pruning import prune
 from palpate.core.errors import BundleError
@@ -25,7 +24,7 @@ def names(model: bytes, field: str) -> list[str]:
 @pytest.mark.parametrize(
     "outputs", [("logits",), ("logits", "embedding"), ("early",), ("embedding",)]
 )
-def test_outputs_keep_their_bits(default_bundle: Bundle, outputs: tuple[str, ...]):
+def test_outputs_keep_their_bits(default_bundle, outputs):
     """For golden sweeps and noise, each output of the pruned model equals that of the whole model
     bit for bit."""
     whole, pruned = (
@@ -41,7 +40,7 @@ def test_outputs_keep_their_bits(default_bundle: Bundle, outputs: tuple[str, ...
         assert [a.tobytes() for a in have] == [a.tobytes() for a in want]
 
 
-def test_what_only_early_heads_need_is_gone(default_bundle: Bundle):
+def test_what_only_early_heads_need_is_gone(default_bundle):
     """All nodes and constants of the heads are removed, and exactly those that the outputs need are
     left."""
     pruned = prune(default_bundle.model, {"logits", "embedding"})
@@ -59,7 +58,7 @@ def test_what_only_early_heads_need_is_gone(default_bundle: Bundle):
     assert len(pruned) < 0.95 * len(default_bundle.model)
 
 
-def test_what_is_left_passes_the_check(default_bundle: Bundle):
+def test_what_is_left_passes_the_check(default_bundle):
     """The check accepts a pruned model as the model of a bundle without early heads."""
     pruned = prune(default_bundle.model, {"logits", "embedding"})
     manifest = default_bundle.manifest
@@ -90,9 +89,7 @@ def test_declarations_of_what_is_gone_are_gone():
 def test_an_output_that_is_not_there_is_refused():
     """The message names the missing output and the outputs of the model. Bytes that are not a model
     are refused, too."""
-    with pytest.raises(
-        BundleError, match="early"
-    ):
+    with pytest.raises(BundleError, match="early"):
         prune(toy_bundle.model(), {"logits", "early"})
     with pytest.raises(BundleError, match=r"\['logits'\]"):
         prune(b"", {"logits"})

@@ -39,7 +39,7 @@ def streaming(settings: Config, health: Health | None) -> object:
     return bundle_commands.streaming(settings, Store(settings.store, lambda bundle: None))
 
 
-def test_the_skin_that_streams_is_known_by_the_bundle_that_runs(settings: Config):
+def test_the_skin_that_streams_is_known_by_the_bundle_that_runs(settings):
     """Without a service, without a skin, or with a bundle from elsewhere, the format is unknown."""
     assert streaming(settings, None) is None
     assert streaming(settings, HEALTH) == RUNNING.format
@@ -55,10 +55,7 @@ def test_a_bundle_for_another_skin_is_refused_with_both_formats():
         RUNNING,
         manifest=replace(RUNNING.manifest, format=replace(format, rows=5, cols=3, rate_hz=100.0)),
     )
-    with pytest.raises(
-        BundleError,
-        match=r"5x3 .*4x4",
-    ):
+    with pytest.raises(BundleError, match=r"5x3 .*4x4"):
         bundle_commands.suits(other, format)
     bundle_commands.suits(other, None)
     shorter = replace(
@@ -68,9 +65,7 @@ def test_a_bundle_for_another_skin_is_refused_with_both_formats():
 
 
 @deliveries.NEEDED
-def test_the_command_refuses_it_unless_it_is_told(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_the_command_refuses_it_unless_it_is_told(tmp_path, capsys):
     """`palpate bundles install` beside a service whose skin streams changes nothing; with
     `--other-skin` the bundle is on trial."""
     box = Delivery(tmp_path)
@@ -90,9 +85,7 @@ def test_the_command_refuses_it_unless_it_is_told(
     before = sorted(Path(box.how.folder).rglob("*"))
     assert main(command) == 78
     said = capsys.readouterr()
-    assert (
-        "OTHER_SKIN=1" in said.err
-    )
+    assert "OTHER_SKIN=1" in said.err
     assert sorted(Path(box.how.folder).rglob("*")) == before
     assert main([*command, "--other-skin"]) == 0
     assert "installed" in capsys.readouterr().out
@@ -101,15 +94,10 @@ def test_the_command_refuses_it_unless_it_is_told(
 @deliveries.NEEDED
 @pytest.mark.parametrize(
     ("sets", "named"),
-    [
-        ([], ""),
-        (["classifier.bundle=/own"], "classifier.bundle"),
-    ],
+    [([], ""), (["classifier.bundle=/own"], "classifier.bundle")],
     ids=["store", "box"],
 )
-def test_a_bundle_that_the_settings_name_stays(
-    sets: list[str], named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_a_bundle_that_the_settings_name_stays(sets, named, tmp_path, capsys):
     """A setting of another bundle stays in force, and the message has its name."""
     box = Delivery(tmp_path)
     own, new = box.made(1), box.made(2)

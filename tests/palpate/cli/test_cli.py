@@ -29,14 +29,7 @@ from palpate.cli.main import main
 from palpate.core import config, runtime_folder, statistics, storage
 from palpate.core.clock import SystemClock
 from palpate.core.devices import Devices
-from palpate.core.errors import (
-    ApplianceError,
-    BundleError,
-    ConfigError,
-    FormatError,
-    LineError,
-    SensorError,
-)
+from palpate.core.errors import BundleError, ConfigError, FormatError, LineError, SensorError
 from palpate.core.sweep_file import save
 from palpate.core.types import Frames, Status, Sweep
 from palpate.inference.classifier import Classifier
@@ -86,7 +79,7 @@ def python(code: str, **more: Any) -> str:
     return done.stdout.splitlines()[-1]
 
 
-def test_run_prints_sentences_and_ends_with_its_script(capsys: pytest.CaptureFixture[str]):
+def test_run_prints_sentences_and_ends_with_its_script(capsys):
     """Without a serial port the sentences are printed, and say that they are simulated."""
     assert main(RUN) == 0
     assert [fields[12] for fields in results(capsys)] == ["sim"] * 3
@@ -131,7 +124,7 @@ def test_run_on_a_serial_port():
         assert heard.count(b",RES,") == 3
 
 
-def test_kept_and_captured_sweeps_are_replayed(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_kept_and_captured_sweeps_are_replayed(tmp_path, capsys):
     """A black box, a capture, and the same sweeps recorded without a bundle, each replayed: the
     same labels and probabilities."""
 
@@ -149,9 +142,7 @@ def test_kept_and_captured_sweeps_are_replayed(tmp_path: Path, capsys: pytest.Ca
         assert output() == first
 
 
-def test_a_full_disk_costs_the_recording_never_the_classifying(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-):
+def test_a_full_disk_costs_the_recording_never_the_classifying(tmp_path, monkeypatch, capfd):
     """Neither sweeps nor capture can be written: each is logged once, every sweep is answered."""
     full = OSError(errno.ENOSPC, "No space left on device")
     monkeypatch.setattr("palpate.core.storage.write", mock.Mock(side_effect=full))
@@ -176,9 +167,7 @@ def test_a_log_on_a_full_disk_costs_the_log_alone():
     assert (done.returncode, done.stdout.count(b"$PPLP,RES,")) == (0, 3)
 
 
-def test_replay_of_a_sweep_set(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], default_bundle: bundle.Bundle
-):
+def test_replay_of_a_sweep_set(tmp_path, capsys, default_bundle):
     """`run --sim replay:FILE`: each window of a set, over the wire, gets the verdict that the
     window itself gets."""
     golden, n = default_bundle.golden, len(default_bundle.golden)
@@ -194,9 +183,7 @@ def test_replay_of_a_sweep_set(
 
 
 @pytest.mark.slow
-def test_the_sequential_test_is_configured(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], default_bundle: bundle.Bundle
-):
+def test_the_sequential_test_is_configured(tmp_path, capsys, default_bundle):
     """classifier.min_probability and classifier.max_sweeps reach the classifier, in `run` and in
     `replay`."""
     box, known = Classifier(default_bundle, SystemClock()), []
@@ -223,7 +210,7 @@ def test_the_sequential_test_is_configured(
     assert [r[4] for r in results(capsys)] == ["ok"] * 3
 
 
-def test_early_needs_a_bundle_that_can(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_early_needs_a_bundle_that_can(tmp_path, capsys):
     """classifier.early with a bundle without early heads ends before the first sweep; `check` names
     it."""
     folder = Path(shutil.copytree(bundle.DEFAULT, tmp_path / "bundle"))
@@ -237,9 +224,7 @@ def test_early_needs_a_bundle_that_can(tmp_path: Path, capsys: pytest.CaptureFix
     assert "FAIL  golden sweeps" in capsys.readouterr().out
 
 
-def test_a_sweep_that_was_answered_early_is_replayed_so(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_a_sweep_that_was_answered_early_is_replayed_so(tmp_path, capsys):
     """A replay stops at the step at which this bundle decides; another bundle is named."""
     frames = Frames(np.arange(10), np.arange(10), toy_bundle.window(1, 0)[:10])
     save(tmp_path / "s.npy", Sweep(1, 0, 0, Status.OK, frames, share=0.5), toy_bundle.FORMAT)
@@ -263,9 +248,7 @@ def test_a_sweep_that_was_answered_early_is_replayed_so(
         (["trigger.mode=serial"], 1, {"trigger": "serial.port"}),
     ],
 )
-def test_check_says_ok_part_by_part(
-    capsys: pytest.CaptureFixture[str], sets: list[str], code: int, parts: dict[str, str]
-):
+def test_check_says_ok_part_by_part(capsys, sets, code, parts):
     """On the rig all devices are present; a trigger without lines asks for none, and commands need
     a port."""
     assert main([*CHECK, *with_sets(*sets)]) == code
@@ -278,7 +261,7 @@ def test_check_says_ok_part_by_part(
 
 
 @pytest.mark.slow
-def test_check_names_what_fails(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_check_names_what_fails(tmp_path, capsys):
     """On a machine without devices: the bundle is fine, the devices are not, each with its own
     line, and exit code 1."""
     gone = with_sets(f"serial.port={tmp_path}/none", "skin.usb=1209:0001")
@@ -290,7 +273,7 @@ def test_check_names_what_fails(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert "FAIL  bundle" in capsys.readouterr().out
 
 
-def test_check_needs_no_bundle(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_check_needs_no_bundle(tmp_path, capsys):
     """The skin is checked without a bundle. A bundle for another skin is named with both formats
     and the remedy."""
     assert main([*CHECK, *with_sets(f"classifier.bundle={tmp_path / 'none'}")]) == 1
@@ -307,7 +290,7 @@ def test_check_needs_no_bundle(tmp_path: Path, capsys: pytest.CaptureFixture[str
         assert words in fail
 
 
-def test_folders_and_files_that_are_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_folders_and_files_that_are_not_there(tmp_path, capsys):
     """A missing folder of settings, a file that is no set, and a result that could not be written.
     Nothing is begun."""
     none, json_file = str(tmp_path / "none"), ["check", "--bench", "--json"]
@@ -328,9 +311,7 @@ def test_folders_and_files_that_are_not_there(tmp_path: Path, capsys: pytest.Cap
     assert not (tmp_path / "no").exists()
 
 
-def test_a_box_without_rights_names_the_service_s(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-):
+def test_a_box_without_rights_names_the_service_s(capsys, monkeypatch):
     """A user without rights to the deployed bundle hears how to use the service's rights."""
     refused = mock.Mock(side_effect=PermissionError(13, "denied", "/var/lib/palpate/state.json"))
     monkeypatch.setattr("palpate.runtime.assembly.running", refused)
@@ -341,7 +322,7 @@ def test_a_box_without_rights_names_the_service_s(
     assert "palpate" in told
 
 
-def test_a_full_disk_names_the_file_and_leaves_none(tmp_path: Path):
+def test_a_full_disk_names_the_file_and_leaves_none(tmp_path):
     """An error of a write has the name of its file, and no part of it stays."""
     target, full = tmp_path / "figures.json", OSError(28, "No space left on device")
 
@@ -369,9 +350,7 @@ def test_a_full_disk_names_the_file_and_leaves_none(tmp_path: Path):
 
 
 @pytest.mark.parametrize("form", ["", "4x4:uint8:750"])
-def test_record_on_a_machine_without_gpio(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], form: str
-):
+def test_record_on_a_machine_without_gpio(tmp_path, monkeypatch, capsys, form):
     """A PC without wired lines, gpiod and bundle: sweeps by the clock are recorded, in the
     announced or the described format."""
     how = argparse.Namespace(seed=1, sweeps=None, virtual=True)
@@ -391,7 +370,7 @@ def test_record_on_a_machine_without_gpio(
     assert about["verdict"]["status"] == "recorded"
 
 
-def test_record_takes_a_set_of_any_form(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_record_takes_a_set_of_any_form(tmp_path, capsys):
     """`record --sim replay:SET` of a skin without a bundle: each recorded window equals the window
     of the set, after a warning that the skin is too slow for textures."""
     samples = np.random.default_rng(1).integers(100, 4000, (3, 40, 5, 3)).astype(np.int16)
@@ -405,7 +384,7 @@ def test_record_takes_a_set_of_any_form(tmp_path: Path, capsys: pytest.CaptureFi
 
 
 @pytest.mark.slow
-def test_the_space_bar_in_a_real_terminal(tmp_path: Path):
+def test_the_space_bar_in_a_real_terminal(tmp_path):
     """`palpate record --trigger key` as a person uses it: lines and no sentences; Ctrl-C ends it,
     the terminal is as before."""
     far, near = os.openpty()
@@ -438,7 +417,7 @@ def test_the_space_bar_in_a_real_terminal(tmp_path: Path):
     assert b"$PPLP" not in shown
 
 
-def test_settings_have_their_sources(capsys: pytest.CaptureFixture[str]):
+def test_settings_have_their_sources(capsys):
     """Each value with the file it comes from."""
     sets = with_sets("sweep.max_duration_s=9")
     assert main(["check", "--settings", "--board", "rpi5", *sets]) == 0
@@ -490,14 +469,7 @@ FORM = ["record", "--format"]
         (["run", "--sim", "skin", "--virtual", "--capture", "/proc/x"], ConfigError, "/proc/x"),
     ],
 )
-def test_exit_codes(
-    args: list[str],
-    trouble: type[ApplianceError],
-    hint: str,
-    capsys: pytest.CaptureFixture[str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-):
+def test_exit_codes(args, trouble, hint, capsys, tmp_path, monkeypatch):
     """Each kind of trouble has its exit code and one line that says what to do."""
     if trouble is LineError and any(Path("/dev").glob("gpiochip*")):
         pytest.skip("this machine has gpio chips")
@@ -509,9 +481,7 @@ def test_exit_codes(
 
 @pytest.mark.parametrize("text", ["0", "-2", "nan", "inf", "long"])
 @pytest.mark.parametrize("words", [[*RECORD, "--window"], ["skin", "check", "--seconds"]])
-def test_a_window_is_a_length_of_time(
-    words: list[str], text: str, capsys: pytest.CaptureFixture[str]
-):
+def test_a_window_is_a_length_of_time(words, text, capsys):
     """Other values are wrong arguments."""
     with pytest.raises(SystemExit, match="2"):
         main([*words, text])
@@ -519,7 +489,7 @@ def test_a_window_is_a_length_of_time(
 
 
 @pytest.mark.parametrize("words", [[], ["--skin", "anyskin"]])
-def test_a_missing_port_is_named(words: list[str], capsys: pytest.CaptureFixture[str]):
+def test_a_missing_port_is_named(words, capsys):
     """`skin check` on a port that is not there: exit code 69."""
     port = words and ["--port", "/dev/none"]
     link = with_sets("skin.link=serial", "skin.port=/dev/none")
@@ -528,7 +498,7 @@ def test_a_missing_port_is_named(words: list[str], capsys: pytest.CaptureFixture
 
 
 @pytest.mark.parametrize("key", ["samples", "labels", "materials", "rate_hz"])
-def test_sets_that_lack_something(tmp_path: Path, key: str, capsys: pytest.CaptureFixture[str]):
+def test_sets_that_lack_something(tmp_path, key, capsys):
     """If a sweep set lacks an array, the error names the array."""
     sweep_set(tmp_path / "s.npz", np.zeros((2, 5, 4, 4), np.uint8))
     with np.load(tmp_path / "s.npz") as whole:
@@ -537,7 +507,7 @@ def test_sets_that_lack_something(tmp_path: Path, key: str, capsys: pytest.Captu
     assert key in capsys.readouterr().err
 
 
-def test_a_set_of_another_format(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_a_set_of_another_format(tmp_path, capsys):
     """A set of another format is refused, with both formats."""
     sim = sweep_set(tmp_path / "s.npz", np.zeros((2, 5, 3, 3), np.int16), rate_hz=100.0)
     assert main(["run", "--sim", sim, "--virtual"]) == FormatError.exit_code
@@ -547,7 +517,7 @@ def test_a_set_of_another_format(tmp_path: Path, capsys: pytest.CaptureFixture[s
 
 
 @pytest.mark.parametrize("words", [[], ["--help"], ["skin", "--help"], ["stauts"], ["status"]])
-def test_help_and_status_load_little(words: list[str]):
+def test_help_and_status_load_little(words):
     """They answer at once, because nothing slow is imported for them; `status` prints a file."""
     slow = {"numpy", "onnxruntime", "usb", "serial", "gpiod"}
     slow |= {"dataclasses", "logging", "argparse", "tomllib"} if words == ["status"] else set()
@@ -560,9 +530,7 @@ def test_help_and_status_load_little(words: list[str]):
     assert python(code) == "set()"
 
 
-def test_status_finds_another_runtime_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
+def test_status_finds_another_runtime_folder(tmp_path, monkeypatch, capsys):
     """A settings file that names store.runtime is read, and a missing one is not needed."""
     monkeypatch.setattr(runtime_folder, "CHECKOUT", str(tmp_path))
     (tmp_path / "skin.toml").write_text("skin.rate_hz = 100.0\n")
@@ -600,7 +568,7 @@ def test_output_that_nobody_reads():
     assert "Traceback" not in done.stderr
 
 
-def test_skin_format_is_the_default_bundles(default_bundle: bundle.Bundle):
+def test_skin_format_is_the_default_bundles(default_bundle):
     """The default bundle was trained for the simulated skin."""
     assert default_bundle.format == skin.FORMAT
     assert set(default_bundle.manifest.labels) == set(skin.MATERIALS)
@@ -611,9 +579,7 @@ def test_wilson():
     assert statistics.wilson(55, 60) == pytest.approx([0.819, 0.964], abs=5e-4)
 
 
-def test_skin_check_prints_a_verdict_for_each_part(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
+def test_skin_check_prints_a_verdict_for_each_part(monkeypatch, capsys):
     """On the simulated board all is ok, and no bundle is loaded; with a wrong CRC one line says
     FAIL, and the exit code is 1."""
     words = ["skin", "check", "--sim", "skin", "--virtual"]

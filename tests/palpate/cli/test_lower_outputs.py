@@ -20,9 +20,7 @@ def chip() -> gpio.SimGpio:
     return gpio.SimGpio(rig.VirtualClock(), {"/dev/gpiochip0": [f"GPIO{i}" for i in range(28)]})
 
 
-def test_all_outputs_are_requested_low_and_given_back(
-    chip: gpio.SimGpio, monkeypatch: pytest.MonkeyPatch
-):
+def test_all_outputs_are_requested_low_and_given_back(chip, monkeypatch):
     """Each output of the board is requested once, as an output at its low level, and released;
     inputs are not touched."""
     asked = []
@@ -47,9 +45,7 @@ def test_all_outputs_are_requested_low_and_given_back(
     assert chip.requests == []
 
 
-def test_a_box_without_lines_has_nothing_to_lower(
-    chip: gpio.SimGpio, capsys: pytest.CaptureFixture[str]
-):
+def test_a_box_without_lines_has_nothing_to_lower(chip, capsys):
     """Without a board the command touches no line and prints nothing."""
     assert lower_outputs.main(["--set", "output.ready="], chip) == 0
     assert capsys.readouterr() == ("", "")
@@ -62,9 +58,7 @@ def test_a_box_without_lines_has_nothing_to_lower(
         (["--board", "rpi9"], 78, "board = 'rpi9' has no board-NAME.toml"),
     ],
 )
-def test_what_cannot_be_lowered_is_said(
-    chip: gpio.SimGpio, args: list[str], code: int, message: str, capsys: pytest.CaptureFixture[str]
-):
+def test_what_cannot_be_lowered_is_said(chip, args, code, message, capsys):
     """Lines of another program, or settings that cannot be read, cause one line and the exit code
     of their kind."""
     request = chip.request_lines("/dev/gpiochip0", {(23,): chip.LineSettings()})

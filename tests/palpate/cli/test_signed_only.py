@@ -27,18 +27,12 @@ def box(tmp_path: Path) -> Delivery:
 
 def of(box: Delivery) -> list[str]:
     """The options that name the box's store, keys and status."""
-    how = {
-        "store.folder": box.how.folder,
-        "store.keys": box.how.keys,
-        "store.runtime": box.folder,
-    }
+    how = {"store.folder": box.how.folder, "store.keys": box.how.keys, "store.runtime": box.folder}
     return [word for name, value in how.items() for word in ("--set", f"{name}={value}")]
 
 
 @pytest.mark.parametrize("command", [("run",), ("check",), ("run", "--shadow")])
-def test_a_robot_is_answered_by_signed_bundles_alone(
-    box: Delivery, command: tuple[str, ...], capsys: pytest.CaptureFixture[str]
-):
+def test_a_robot_is_answered_by_signed_bundles_alone(box, command, capsys):
     """`classifier.bundle` and `--shadow DIR` with an unsigned bundle: refused, with both remedies,
     before anything else."""
     folder = toy_bundle.put(box.folder / "toy", toy_bundle.files())
@@ -55,9 +49,7 @@ def test_a_robot_is_answered_by_signed_bundles_alone(
     assert SAID not in text
 
 
-def test_words_of_a_bundle_do_not_steer_a_terminal(
-    box: Delivery, capsys: pytest.CaptureFixture[str]
-):
+def test_words_of_a_bundle_do_not_steer_a_terminal(box, capsys):
     """A program that took the service over could sign a bundle whose words hold control characters;
     a person may look at it as root."""
     words = {"by": "anna\n\x1b[2Jok    all is well\u202e", "at": "1"}
@@ -68,7 +60,7 @@ def test_words_of_a_bundle_do_not_steer_a_terminal(
     assert text.replace("\n", "").isprintable()
 
 
-def test_a_signed_bundle_may_be_named(box: Delivery, capsys: pytest.CaptureFixture[str]):
+def test_a_signed_bundle_may_be_named(box, capsys):
     """By a person or by this box: `check` loads it, whatever else is missing here."""
     one = box.copied(deliveries.files(1, box.key))
     two = box.copied(deliveries.enrolled(deliveries.files(1, box.key), box.enrolment_key))
@@ -79,7 +71,7 @@ def test_a_signed_bundle_may_be_named(box: Delivery, capsys: pytest.CaptureFixtu
         assert f", {said}" in lines[0]
 
 
-def test_what_answers_no_robot_takes_any_bundle(box: Delivery, capsys: pytest.CaptureFixture[str]):
+def test_what_answers_no_robot_takes_any_bundle(box, capsys):
     """With simulated devices, whose sentences say so."""
     folder = toy_bundle.put(box.folder / "toy", toy_bundle.files())
     sim = ["--sim", "skin", "--virtual", "--set", f"classifier.bundle={folder}"]
@@ -89,9 +81,7 @@ def test_what_answers_no_robot_takes_any_bundle(box: Delivery, capsys: pytest.Ca
     assert "signed" not in output.out
 
 
-def test_the_setting_is_said_at_each_start_by_check_and_by_status(
-    box: Delivery, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
+def test_the_setting_is_said_at_each_start_by_check_and_by_status(box, monkeypatch, capsys):
     """While it is on, whatever runs; the status file has it for `palpate status`, and the feed for
     the page."""
     monkeypatch.setattr(StatusFile, "stopping", lambda self: None)
@@ -105,7 +95,7 @@ def test_the_setting_is_said_at_each_start_by_check_and_by_status(
         assert (f"ok    signatures     warning: {SAID}" in capsys.readouterr().out) == said
 
 
-def test_a_bench_may_allow_unsigned_bundles(box: Delivery, capsys: pytest.CaptureFixture[str]):
+def test_a_bench_may_allow_unsigned_bundles(box, capsys):
     """With the setting an unsigned bundle starts, after a warning. Here the start fails, because no
     trigger line is wired."""
     folder = toy_bundle.put(box.folder / "toy", toy_bundle.files())

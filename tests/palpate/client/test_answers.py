@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -29,7 +28,7 @@ SLID = {"measured_mm_s": 61.04, "direction": "cols-"}
 
 
 @pytest.mark.parametrize("status", list(Status))
-def test_an_answer_survives_its_sentence(status: Status):
+def test_an_answer_survives_its_sentence(status):
     """All fields of RES, for each status, which is known, unsure, faulty, or final without a label
     to use, and has its advice with the detail."""
     read = Answer.read(result(verdict(status, "moved 2.1 mm"), "usb").decode())
@@ -62,7 +61,7 @@ def test_the_answer_of_a_finger_survives_its_sentence():
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_optional_fields_survive_their_sentence(known: bool):
+def test_optional_fields_survive_their_sentence(known):
     """Field 14 says that the loss is unknown; speed and direction stand in 15 and 16, whether field
     14 is empty or not. A reader of 14 fields finds the same answer without them."""
     plain = Answer.read(result(verdict(), "usb", loss_known=known).decode())
@@ -90,7 +89,7 @@ def test_optional_fields_survive_their_sentence(known: bool):
         (BoxIdentity.of, "mine,2"),
     ],
 )
-def test_a_sentence_of_another_form_is_named(read: Callable[..., object], fields: str):
+def test_a_sentence_of_another_form_is_named(read, fields):
     """Too few fields, a status that is not known, a word for a number: an error that repeats
     them."""
     with pytest.raises(FormatError, match="older") as e:
@@ -109,7 +108,7 @@ def test_a_damaged_line_is_no_answer():
     ("skin", "sweeping", "ready"),
     [("streaming", 0, True), ("streaming", 1, False), ("lost", 0, False)],
 )
-def test_the_state_is_read_with_all_counts(skin: str, sweeping: int, ready: bool):
+def test_the_state_is_read_with_all_counts(skin, sweeping, ready):
     """STA as the box sends it; ready if the skin streams and no sweep is open."""
     line = speaking_box.state(skin, answered=3, sweeping=sweeping)
     read = BoxState.of(sentences.read(line).fields)
@@ -120,7 +119,7 @@ def test_the_state_is_read_with_all_counts(skin: str, sweeping: int, ready: bool
 @pytest.mark.parametrize(
     ("last", "degraded"), [((), ""), ((1,), ""), ((1, "silent row 2"), "silent row 2")]
 )
-def test_a_state_names_broken_taxels(last: tuple[object, ...], degraded: str):
+def test_a_state_names_broken_taxels(last, degraded):
     """Field 19 of STA; a box that bridges none does not send it. In a long line the names are cut
     or left out, and no count is."""
     fields = ("1.000", "streaming", 0, 1, 2, 3, 4, 5, 6, "9f3c2a1b", "usb", *[0] * 6)

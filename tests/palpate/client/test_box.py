@@ -47,7 +47,7 @@ def box(speaking: SpeakingBox) -> Iterator[Palpate]:
         yield client
 
 
-def test_a_sweep_by_command(speaking: SpeakingBox, box: Palpate):
+def test_a_sweep_by_command(speaking, box):
     """The example of the module: ready, START, STOP, the answer; the commands come in this
     order."""
     box.new_object()
@@ -68,16 +68,14 @@ def test_a_sweep_by_command(speaking: SpeakingBox, box: Palpate):
         ({"force_n": 1 / 3}, ["", "0.333333"]),
     ],
 )
-def test_start_has_speed_and_force(
-    speaking: SpeakingBox, box: Palpate, values: dict[str, float], fields: list[str]
-):
+def test_start_has_speed_and_force(speaking, box, values, fields):
     """As decimals without an exponent; an unknown value stays empty."""
     box.start(**values)
     assert speaking.heard[-1].kind == "START"
     assert speaking.heard[-1].fields == fields
 
 
-def test_what_the_box_is(box: Palpate):
+def test_what_the_box_is(box):
     """State, identity, labels and tare."""
     assert box.state().frames == 3000
     assert (box.identify().name, box.identify().skin) == ("mine", "skin-4x4 A0017 1.2.0")
@@ -86,7 +84,7 @@ def test_what_the_box_is(box: Palpate):
     assert box.tare() == "16 taxels"
 
 
-def test_the_answer_of_a_hand_has_those_of_its_fingers(speaking: SpeakingBox, box: Palpate):
+def test_the_answer_of_a_hand_has_those_of_its_fingers(speaking, box):
     """FIN sentences before a RES belong to it if they are of its sweep. The next answer has none of
     them, and they do not count as answers."""
     speaking.say(finger("left", 6))
@@ -104,7 +102,7 @@ def test_the_answer_of_a_hand_has_those_of_its_fingers(speaking: SpeakingBox, bo
     assert box.damaged == 0
 
 
-def test_an_old_answer_is_not_taken_for_a_new_one(speaking: SpeakingBox, box: Palpate):
+def test_an_old_answer_is_not_taken_for_a_new_one(speaking, box):
     """A late answer to an abandoned sweep is dropped by `wait_ready` and by `start`."""
     for forget in (lambda: box.wait_ready(LONG_S), box.start):
         speaking.say(result(8, label="paper"))
@@ -114,7 +112,7 @@ def test_an_old_answer_is_not_taken_for_a_new_one(speaking: SpeakingBox, box: Pa
             box.result(SHORT_S)
 
 
-def test_answers_are_given_in_order_with_their_gaps(speaking: SpeakingBox):
+def test_answers_are_given_in_order_with_their_gaps(speaking):
     """Sweeps 2 and 3 were answered but not heard; 3 comes late after all. REC and kinds of later
     versions are skipped. A listener hears answers and states once each."""
     heard: list[Answer | BoxState] = []
@@ -130,7 +128,7 @@ def test_answers_are_given_in_order_with_their_gaps(speaking: SpeakingBox):
     assert [type(one) for one in heard] == [BoxState, *[Answer] * 4, BoxState]
 
 
-def test_a_restart_of_the_program_is_no_gap(speaking: SpeakingBox, box: Palpate):
+def test_a_restart_of_the_program_is_no_gap(speaking, box):
     """Numbers begin anew: told once, whether an answer or a state shows it first; answers that it
     gave meanwhile are counted."""
     speaking.say(result(40), state(answered=40), result(1), state(answered=1))
@@ -141,7 +139,7 @@ def test_a_restart_of_the_program_is_no_gap(speaking: SpeakingBox, box: Palpate)
     assert (box.restarts, box.missed) == (2, 1)
 
 
-def test_damage_is_counted_and_never_believed(speaking: SpeakingBox, box: Palpate):
+def test_damage_is_counted_and_never_believed(speaking, box):
     """A flipped character, a missing checksum, noise, an endless line, a status of a newer box: no
     answer, a count, and the gap at the next. An ANS without a checksum answers nothing."""
     speaking.say(
@@ -167,7 +165,7 @@ def test_damage_is_counted_and_never_believed(speaking: SpeakingBox, box: Palpat
 
 
 @pytest.mark.parametrize("kind", ["START", ""])
-def test_a_command_that_is_refused(speaking: SpeakingBox, box: Palpate, kind: str):
+def test_a_command_that_is_refused(speaking, box, kind):
     """The box's reason is raised, also for a command that was damaged on its way. The late answer
     to an abandoned command is not taken for that to the next command."""
     speaking.script = lambda s: [sentence("ANS", kind, "error", "set trigger.mode")]
@@ -187,9 +185,7 @@ def test_a_command_that_is_refused(speaking: SpeakingBox, box: Palpate, kind: st
         (Palpate.labels, sentence("ANS", "LABEL", "ok")),
     ],
 )
-def test_an_answer_of_another_form(
-    speaking: SpeakingBox, box: Palpate, ask: Callable, answer: bytes
-):
+def test_an_answer_of_another_form(speaking, box, ask, answer):
     """Fields that are missing are an error, not a guess."""
     speaking.script = lambda s: [answer]
     with pytest.raises(FormatError):
@@ -197,7 +193,7 @@ def test_an_answer_of_another_form(
 
 
 @pytest.mark.parametrize("ask", [Palpate.state, Palpate.result, Palpate.wait_ready])
-def test_a_silent_box(speaking: SpeakingBox, box: Palpate, ask: Callable[..., object]):
+def test_a_silent_box(speaking, box, ask):
     """Nothing is waited for without end."""
     speaking.script = lambda s: []
     with pytest.raises(NoAnswer, match=r"within 0\.05 s"):
@@ -207,7 +203,7 @@ def test_a_silent_box(speaking: SpeakingBox, box: Palpate, ask: Callable[..., ob
 @pytest.mark.parametrize(
     ("said", "why"), [(("lost",), "the skin is lost"), (("streaming",), "a sweep is open")]
 )
-def test_a_box_that_is_not_ready(speaking: SpeakingBox, box: Palpate, said: tuple[str], why: str):
+def test_a_box_that_is_not_ready(speaking, box, said, why):
     """The reason stands in the error."""
     fields = state(*said, sweeping=int(said[0] == "streaming")).decode().strip()[10:-3].split(",")
     speaking.script = lambda s: [sentence("ANS", "STATE", "ok", *fields)]
@@ -231,9 +227,7 @@ def waiting(job: Callable[[], object]) -> tuple[threading.Thread, list[Appliance
 
 
 @pytest.mark.parametrize("job", [lambda box: box.ask("TEST"), lambda box: box.result(LONG_S)])
-def test_unplugging_ends_every_wait(
-    speaking: SpeakingBox, box: Palpate, job: Callable[[Palpate], object]
-):
+def test_unplugging_ends_every_wait(speaking, box, job):
     """A pending command ends with an error at once, and after plugging in the same client goes
     on."""
     speaking.script = lambda s: [] if s.kind == "TEST" else obeying(s)
@@ -280,7 +274,7 @@ def test_a_port_is_not_closed_while_a_command_is_written():
     assert early[0] is False
 
 
-def test_a_port_that_is_not_there(tmp_path: Path):
+def test_a_port_that_is_not_there(tmp_path):
     """It is waited for: commands fail at once and name it, `wait_ready` fails at its deadline, also
     where pyserial refuses."""
     with Palpate(str(tmp_path / "ttyUSB0")) as box:
@@ -298,7 +292,7 @@ def test_a_port_that_is_not_there(tmp_path: Path):
         box.wait_ready(SHORT_S)
 
 
-def test_the_oldest_of_too_many_answers_is_dropped(speaking: SpeakingBox, box: Palpate):
+def test_the_oldest_of_too_many_answers_is_dropped(speaking, box):
     """A program that never asks costs no memory; the loss is counted."""
     for number in range(1, KEPT + 3):
         speaking.say(result(number))
@@ -309,7 +303,7 @@ def test_the_oldest_of_too_many_answers_is_dropped(speaking: SpeakingBox, box: P
     assert box.missed == 2
 
 
-def test_commands_of_several_threads_do_not_mix(speaking: SpeakingBox, box: Palpate):
+def test_commands_of_several_threads_do_not_mix(speaking, box):
     """Two threads that ask get each its own answers."""
     names: list[str] = []
     threads = [waiting(lambda: names.append(box.identify().name))[0] for _ in range(8)]

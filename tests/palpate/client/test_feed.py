@@ -76,7 +76,7 @@ def test_lines_come_whole_however_they_are_split():
         (b'{"type": "hello"}\n', "speaks schema None"),
     ],
 )
-def test_what_is_no_feed_is_named(feed: Feed, data: bytes, why: str):
+def test_what_is_no_feed_is_named(feed, data, why):
     """`parse` raises; a Feed closes the connection and gives the reason."""
     with pytest.raises(FormatError, match=why):
         parse(data)
@@ -92,7 +92,7 @@ def test_what_is_no_feed_is_named(feed: Feed, data: bytes, why: str):
 
 
 @pytest.mark.slow
-def test_what_is_asked_for_is_asked_again_after_a_restart(feed: Feed):
+def test_what_is_asked_for_is_asked_again_after_a_restart(feed):
     """Each new connection begins with the requests of this reader."""
     server = FakeFeed(feed.path)
     feed.ask(frames_hz=5)
@@ -111,7 +111,7 @@ def test_what_is_asked_for_is_asked_again_after_a_restart(feed: Feed):
 
 
 @pytest.mark.slow
-def test_without_a_box_it_says_what_to_do(feed: Feed, tmp_path: Path):
+def test_without_a_box_it_says_what_to_do(feed, tmp_path):
     """No socket, or a socket without a server: a reason and not an error."""
     assert feed.read(0) is None
     assert "start" in feed.trouble
@@ -125,7 +125,7 @@ def test_without_a_box_it_says_what_to_do(feed: Feed, tmp_path: Path):
     assert file.trouble
 
 
-def test_a_loop_over_lines_ends_with_the_reason(feed: Feed, monkeypatch: pytest.MonkeyPatch):
+def test_a_loop_over_lines_ends_with_the_reason(feed, monkeypatch):
     """`for line in feed` without a box is an error with exit code 69."""
     monkeypatch.setattr(Feed, "read", lambda self, timeout_s: None)
     with pytest.raises(FeedError, match="nothing") as e:
@@ -133,7 +133,7 @@ def test_a_loop_over_lines_ends_with_the_reason(feed: Feed, monkeypatch: pytest.
     assert e.value.exit_code == 69
 
 
-def test_a_box_is_read_and_its_reason_is_kept(tmp_path: Path):
+def test_a_box_is_read_and_its_reason_is_kept(tmp_path):
     """Silence does not end a connection, and verdicts come. After an invalid request the box's
     reason is in `trouble`, and is a line of its own."""
     offered = Offered(tmp_path / "feed.sock")
@@ -181,7 +181,7 @@ def running(path: Path) -> Iterator[subprocess.Popen]:
 
 
 @pytest.mark.slow
-def test_palpate_run_is_killed_and_comes_back_under_a_reader(tmp_path: Path):
+def test_palpate_run_is_killed_and_comes_back_under_a_reader(tmp_path):
     """One reader over two processes: hello again with another pid, though the first left its socket
     behind. The second ends in order, sends its reason, and removes the socket."""
     path = tmp_path / "feed.sock"

@@ -45,7 +45,7 @@ def _shipped(board: str | None = None, *sets: str) -> config.Config:
     return config.load(board, sets, folder=FIRMWARE, site=Path(os.devnull))
 
 
-def test_later_layers_win_and_each_value_knows_its_source(folder: Path) -> None:
+def test_later_layers_win_and_each_value_knows_its_source(folder):
     """Defaults, skin.toml, board, site and --set each decide one value; of two --set the last
     wins."""
     (folder / "palpate.toml").write_text("[trigger]\nglitch_us = 300\nactive_low = true\n")
@@ -66,14 +66,14 @@ def test_later_layers_win_and_each_value_knows_its_source(folder: Path) -> None:
     assert len(c.sources) == 1 + sum(len(schema.keys(type(getattr(c, s)))) for s in sections)
 
 
-def test_the_site_file_can_name_the_board_and_the_command_line_wins(folder: Path) -> None:
+def test_the_site_file_can_name_the_board_and_the_command_line_wins(folder):
     """`board = "a"` in palpate.toml, then --board b over it."""
     (folder / "palpate.toml").write_text('board = "a"\n')
     assert (_load(folder).trigger.start, _load(folder).sources["board"]) == ("L1", "palpate.toml")
     assert (_load(folder, "b").trigger.start, _load(folder, "b").output.ready) == ("", "L9")
 
 
-def test_without_a_board_and_files_no_line_is_wired(tmp_path: Path) -> None:
+def test_without_a_board_and_files_no_line_is_wired(tmp_path):
     """Without skin.toml the defaults apply, and no line is wired."""
     (tmp_path / "palpate.toml").write_text("")
     c = _load(tmp_path)
@@ -82,7 +82,7 @@ def test_without_a_board_and_files_no_line_is_wired(tmp_path: Path) -> None:
     assert (c.output.ready, c.output.class_bits, c.trigger.start, c.serial.port) == ("", (), "", "")
 
 
-def test_a_config_cannot_be_changed(folder: Path) -> None:
+def test_a_config_cannot_be_changed(folder):
     """Sections are frozen and the sources are read-only."""
     c = _load(folder)
     with pytest.raises(dataclasses.FrozenInstanceError):
@@ -118,9 +118,7 @@ def test_a_config_cannot_be_changed(folder: Path) -> None:
     ],
 )
 @pytest.mark.parametrize("file", ["skin.toml", "board-a.toml", "palpate.toml"])
-def test_a_wrong_file_is_told_with_the_key_and_what_is_allowed(
-    folder: Path, file: str, text: str, name: str, hint: str
-) -> None:
+def test_a_wrong_file_is_told_with_the_key_and_what_is_allowed(folder, file, text, name, hint):
     """The same mistakes in each layer's file: the message has path, key with value, and advice."""
     (folder / file).write_text(text)
     with pytest.raises(ConfigError) as e:
@@ -137,7 +135,7 @@ def test_a_wrong_file_is_told_with_the_key_and_what_is_allowed(
         ("glitch_us=3", "section.key=value"),
     ],
 )
-def test_a_wrong_set_option_is_told(folder: Path, option: str, said: str) -> None:
+def test_a_wrong_set_option_is_told(folder, option, said):
     """--set goes through the same checks as a file."""
     with pytest.raises(ConfigError, match=f"^--set.*{said}"):
         _load(folder, None, option)
@@ -155,7 +153,7 @@ def test_a_wrong_set_option_is_told(folder: Path, option: str, said: str) -> Non
         ('serial.port="a" x=1', '"a" x=1'),
     ],
 )
-def test_set_takes_toml_or_a_bare_string(folder: Path, option: str, value: object) -> None:
+def test_set_takes_toml_or_a_bare_string(folder, option, value):
     """A text that is not one TOML value is used as a string."""
     section, key = option.partition("=")[0].split(".")
     got = getattr(getattr(_load(folder, None, option), section), key)
@@ -163,7 +161,7 @@ def test_set_takes_toml_or_a_bare_string(folder: Path, option: str, value: objec
 
 
 @pytest.mark.parametrize("board", ["c", "../a", "a.toml", 0, [], ["a"], True])
-def test_a_missing_board_lists_the_boards_there(folder: Path, board: object) -> None:
+def test_a_missing_board_lists_the_boards_there(folder, board):
     """By option and by site file; no name leads out of the folder, and an invalid name is an
     error."""
     (folder / "palpate.toml").write_text(f"board = {json.dumps(board)}\n")
@@ -174,14 +172,14 @@ def test_a_missing_board_lists_the_boards_there(folder: Path, board: object) -> 
             _load(folder, board)
 
 
-def test_only_the_site_file_may_choose_the_board(folder: Path) -> None:
+def test_only_the_site_file_may_choose_the_board(folder):
     """`board` in skin.toml would be read too late."""
     (folder / "skin.toml").write_text('board = "a"\n')
     with pytest.raises(ConfigError, match=r"skin\.toml.*--board"):
         _load(folder)
 
 
-def test_a_line_with_two_meanings_is_refused(folder: Path) -> None:
+def test_a_line_with_two_meanings_is_refused(folder):
     """Across layers and inside class_bits; the message has both roles and both sources."""
     with pytest.raises(ConfigError) as e:
         _load(folder, "a", "output.busy=L1")
@@ -191,7 +189,7 @@ def test_a_line_with_two_meanings_is_refused(folder: Path) -> None:
         _load(folder, None, "output.class_bits=['X', 'X']")
 
 
-def test_files_that_cannot_be_read_are_named(folder: Path) -> None:
+def test_files_that_cannot_be_read_are_named(folder):
     """A named site file that is missing, a folder at its path, and bytes that are not UTF-8."""
     with pytest.raises(ConfigError, match=r"other\.toml"):
         config.load(None, folder=folder, site=folder / "other.toml")
@@ -207,13 +205,13 @@ _NAMES = ["skin.grid", "skin.usb", "serial.baud", "output.class_bits", "trigger.
 
 @pytest.mark.slow
 @given(st.text(max_size=30), st.sampled_from(_NAMES))
-def test_any_set_text_is_a_value_or_a_config_error(text: str, name: str) -> None:
+def test_any_set_text_is_a_value_or_a_config_error(text, name):
     """No text raises another exception."""
     with contextlib.suppress(ConfigError):
         assert _shipped(None, f"{name}={text}").sources[name] == "--set"
 
 
-def test_describe_gives_each_value_with_its_source_and_loads_again(folder: Path) -> None:
+def test_describe_gives_each_value_with_its_source_and_loads_again(folder):
     """The printed text is a palpate.toml with the same settings."""
     sets = [
         "output.class_bits=['A', 'B']",
@@ -238,17 +236,16 @@ def test_describe_gives_each_value_with_its_source_and_loads_again(folder: Path)
     ("usb", "ids"),
     [("1209:7ac7", (0x1209, 0x7AC7, "")), ("2E8A:0005:E661:4", (0x2E8A, 5, "E661:4"))],
 )
-def test_usb_ids_and_serial_number(folder: Path, usb: str, ids: tuple[int, int, str]) -> None:
+def test_usb_ids_and_serial_number(folder, usb, ids):
     """One setting holds both."""
     skin = _load(folder, None, f"skin.usb={usb}").skin
     assert (skin.vendor_id, skin.product_id, skin.serial) == ids
 
 
 @pytest.mark.parametrize(
-    "section",
-    [n for n in config.Config.__slots__ if n not in ("board", "sources", "folder")],
+    "section", [n for n in config.Config.__slots__ if n not in ("board", "sources", "folder")]
 )
-def test_each_field_is_explained(section: str) -> None:
+def test_each_field_is_explained(section):
     """The name of each setting stands in the docstring of its group."""
     group = type(getattr(_shipped(), section))
     assert [
@@ -256,7 +253,7 @@ def test_each_field_is_explained(section: str) -> None:
     ] == []
 
 
-def test_skin_toml_shows_every_skin_setting_as_the_code_has_it() -> None:
+def test_skin_toml_shows_every_skin_setting_as_the_code_has_it():
     """The shipped skin.toml is complete and changes nothing."""
     table = tomllib.loads((FIRMWARE / "skin.toml").read_text())
     known = schema.keys(config.SkinConfig)
@@ -299,7 +296,7 @@ def _drawing(board: str) -> tuple[dict[int, str], dict[str, str]]:
 
 
 @pytest.mark.parametrize("board", BOARDS)
-def test_the_drawing_of_a_board_shows_the_lines_that_its_values_name(board: str) -> None:
+def test_the_drawing_of_a_board_shows_the_lines_that_its_values_name(board):
     """Each pin is where the 40-pin header has it, in the drawing and beside the values; each role
     is at its line."""
     c = _shipped(board)
@@ -318,7 +315,7 @@ def test_the_drawing_of_a_board_shows_the_lines_that_its_values_name(board: str)
 
 
 @pytest.mark.parametrize("board", BOARDS)
-def test_a_dead_program_is_not_ready(board: str) -> None:
+def test_a_dead_program_is_not_ready(board):
     """READY is on a line that is low from power-on, and the page asks for strict_gpiod and the
     pull-down."""
     assert int(_shipped(board).output.ready.removeprefix("GPIO")) >= 9
@@ -326,13 +323,13 @@ def test_a_dead_program_is_not_ready(board: str) -> None:
         assert words in _page(board)
 
 
-def test_one_cable_fits_both_boards() -> None:
+def test_one_cable_fits_both_boards():
     """The Raspberry Pi 4 and 5 files agree on every value."""
     four, five = map(_shipped, ("rpi4", "rpi5"))
     assert dataclasses.replace(four, board="rpi5") == five
 
 
-def test_rules_and_unit_agree_with_the_settings() -> None:
+def test_rules_and_unit_agree_with_the_settings():
     """The udev rules have the skin's ids, and the unit's groups are those that sysusers makes and
     the rules use."""
     skin = config.SkinConfig()
@@ -348,9 +345,7 @@ def test_rules_and_unit_agree_with_the_settings() -> None:
     assert set(re.findall(r'GROUP="(\w+)"', rules)) <= groups
 
 
-def test_a_unit_has_settings_and_folders_of_its_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_unit_has_settings_and_folders_of_its_name(tmp_path, monkeypatch):
     """The unit reads left.toml, not palpate.toml, and its default folders end in -left."""
     monkeypatch.setattr(config, "SITE", tmp_path / "palpate.toml")
     (tmp_path / "palpate.toml").write_text("[skin]\nport = '/dev/a'")

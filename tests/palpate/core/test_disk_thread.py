@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 
@@ -24,7 +22,7 @@ def held(most: int = 3) -> tuple[DiskThread, threading.Event]:
 
 
 @pytest.mark.parametrize("make", [AtOnce, DiskThread])
-def test_results_come_back_in_order(make: Callable[[], AtOnce | DiskThread]):
+def test_results_come_back_in_order(make):
     """Each piece of work is done once, and its result is given back in the caller's thread."""
     disk, given = make(), []
     for n in range(5):
@@ -33,7 +31,7 @@ def test_results_come_back_in_order(make: Callable[[], AtOnce | DiskThread]):
     assert given == [(n, threading.main_thread()) for n in range(5)]
 
 
-def test_work_beyond_the_bound_is_refused_counted_and_told(logged: list[str]):
+def test_work_beyond_the_bound_is_refused_counted_and_told(logged):
     """The caller does not wait, or the test would not end. The loss and its end are logged once."""
     disk, free = held()
     done: list[int] = []
@@ -62,7 +60,7 @@ def test_a_fault_comes_back_to_the_loop():
     assert done == [1]
 
 
-def test_the_end_waits_for_a_bounded_time(monkeypatch: pytest.MonkeyPatch, logged: list[str]):
+def test_the_end_waits_for_a_bounded_time(monkeypatch, logged):
     """A disk that hangs cannot keep the program from ending; the log has the loss."""
     monkeypatch.setattr(disk_thread, "SETTLE_S", 0.05)
     disk, free = held()
@@ -71,7 +69,7 @@ def test_the_end_waits_for_a_bounded_time(monkeypatch: pytest.MonkeyPatch, logge
     free.set()
 
 
-def test_a_slow_disk_costs_recordings_and_tells_so(tmp_path: Path):
+def test_a_slow_disk_costs_recordings_and_tells_so(tmp_path):
     """A sweep that cannot be written is reported as failed, a written one as stored; no sweep that
     is being written can be discarded."""
     disk, free = held(2)
@@ -96,7 +94,7 @@ def test_a_slow_disk_costs_recordings_and_tells_so(tmp_path: Path):
     assert len(list((tmp_path / "kept").glob("*.npy"))) == 1
 
 
-def test_the_black_box_does_not_wait(tmp_path: Path):
+def test_the_black_box_does_not_wait(tmp_path):
     """Sweeps are kept in order beside the loop, the oldest are removed, and the end waits."""
     disk, free = held(10)
     box = BlackBox(tmp_path / "box", SHORT, 2, disk)

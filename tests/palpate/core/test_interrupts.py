@@ -59,9 +59,7 @@ def _loading(
         ("palpate-train", "palpate_train", ["evaluate", "--list"], "scipy"),  # while the command is
     ],
 )
-def test_ctrl_c_during_the_imports_is_one_line(
-    program: str, module: str, argv: list[str], library: str, tmp_path: Path
-):
+def test_ctrl_c_during_the_imports_is_one_line(program, module, argv, library, tmp_path):
     """Exit code 130, although the library makes another error of an exception."""
     process = _loading(module, argv, library, tmp_path)
     process.send_signal(signal.SIGINT)
@@ -70,7 +68,7 @@ def test_ctrl_c_during_the_imports_is_one_line(
 
 
 @pytest.mark.slow
-def test_ctrl_c_during_a_late_import_is_one_line(tmp_path: Path):
+def test_ctrl_c_during_a_late_import_is_one_line(tmp_path):
     """A library that a command imports during its work: exit code 130 without a traceback, although
     the command takes the library's error for a missing library."""
     (tmp_path / "tables").mkdir()
@@ -83,7 +81,7 @@ def test_ctrl_c_during_a_late_import_is_one_line(tmp_path: Path):
     assert (process.returncode, err) == (130, line)
 
 
-def test_ctrl_c_that_is_ignored_stays_ignored(tmp_path: Path):
+def test_ctrl_c_that_is_ignored_stays_ignored(tmp_path):
     """A program in the background of a script goes on importing; SIGTERM ends it."""
     process = _loading("palpate", ["skin", "list"], "numpy", tmp_path, ignored=True)
     process.send_signal(signal.SIGINT)

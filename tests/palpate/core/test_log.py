@@ -6,7 +6,6 @@ from __future__ import annotations
 import logging
 import os
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -29,16 +28,14 @@ from palpate.core.log import LineHandler, SparseLog, TroubleLog, in_journal, log
         ("a\x1b[31mred\x07\x9b2J", logging.INFO, False, "palpate: a?[31mred??2J"),
     ],
 )
-def test_a_line_for_the_journal_and_for_a_terminal(
-    text: str, level: int, journal: bool, shown: str
-):
+def test_a_line_for_the_journal_and_for_a_terminal(text, level, journal, shown):
     """A terminal shows the program's name and no priority; the journal knows the name and needs the
     priority. Text of a device cannot control a terminal."""
     record = logging.LogRecord("palpate", level, "", 0, text, None, None)
     assert LineHandler(journal=journal).format(record) == shown
 
 
-def test_the_journal_is_known_by_its_stream(tmp_path: Path):
+def test_the_journal_is_known_by_its_stream(tmp_path):
     """JOURNAL_STREAM must name this very stream: a child with its output elsewhere is not in the
     journal."""
     with (tmp_path / "out").open("w") as f:
@@ -50,7 +47,7 @@ def test_the_journal_is_known_by_its_stream(tmp_path: Path):
     assert not in_journal(environ, 1_000_000)
 
 
-def test_one_line_on_standard_error_however_often_it_is_set_up(capsys: pytest.CaptureFixture[str]):
+def test_one_line_on_standard_error_however_often_it_is_set_up(capsys):
     """Two commands in one process print each line once."""
     to_stderr()
     to_stderr()
@@ -58,7 +55,7 @@ def test_one_line_on_standard_error_however_often_it_is_set_up(capsys: pytest.Ca
     assert capsys.readouterr().err == "palpate: ready\n"
 
 
-def test_a_full_disk_costs_the_line_alone(monkeypatch: pytest.MonkeyPatch):
+def test_a_full_disk_costs_the_line_alone(monkeypatch):
     """Standard error that cannot be written: nothing is raised, nothing else is printed."""
     to_stderr()
     full = open("/dev/full", "w")  # noqa: SIM115 (its close fails, too)
@@ -69,7 +66,7 @@ def test_a_full_disk_costs_the_line_alone(monkeypatch: pytest.MonkeyPatch):
         full.close()
 
 
-def test_trouble_is_logged_when_it_begins_changes_and_ends(logged: list[str]):
+def test_trouble_is_logged_when_it_begins_changes_and_ends(logged):
     """Each once, as a warning except the end; without a text for the end it has no line. A first
     state that is not known is news."""
     trouble = TroubleLog("skin", "look at the cable", end="skin: streaming")
@@ -91,7 +88,7 @@ def test_trouble_is_logged_when_it_begins_changes_and_ends(logged: list[str]):
     ]
 
 
-def test_an_attempt_is_repeated_in_silence(logged: list[str]):
+def test_an_attempt_is_repeated_in_silence(logged):
     """The same error is one line until it went well; another kind of error is the caller's."""
     trouble = TroubleLog("status: cannot be written", "classifying goes on")
 
@@ -110,7 +107,7 @@ def test_an_attempt_is_repeated_in_silence(logged: list[str]):
     assert logged == [f"{begin}{why}{end}" for why in ["No space left on device"] * 2 + ["in use"]]
 
 
-def test_what_others_cause_is_logged_sparsely(logged: list[str]):
+def test_what_others_cause_is_logged_sparsely(logged):
     """Refusals as fast as a peer can ask: one line in ten seconds, with the number left out."""
     now = [0]
     sparse = SparseLog(lambda: now[0])

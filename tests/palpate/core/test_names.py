@@ -21,7 +21,7 @@ from palpate.core.text import closest
         ("x" * 30, "x" * 24),
     ],
 )
-def test_each_name_has_a_label_that_can_be_sent(name: str, label: str):
+def test_each_name_has_a_label_that_can_be_sent(name, label):
     """It is like the name, and another where that is taken."""
     assert names.sendable(name) == label
     assert names.LABEL.fullmatch(names.sendable(name, {label})) or name == label
@@ -44,7 +44,7 @@ def test_each_name_has_a_label_that_can_be_sent(name: str, label: str):
         (7, False),
     ],
 )
-def test_only_short_printed_texts_are_shown(text: object, can: bool):
+def test_only_short_printed_texts_are_shown(text, can):
     """No line breaks, nothing that turns the direction of a text; `shown` replaces them."""
     assert names.can_be_shown(text) is can
     if isinstance(text, str) and text.strip():

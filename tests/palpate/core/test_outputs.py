@@ -36,9 +36,7 @@ STUDIES = (("fabrics", "--method", "H-svm"),)
     ],
     ids=lambda x: x[0] if isinstance(x, tuple) else "",
 )
-def test_no_command_writes_another_kind_of_file(
-    run, words: tuple[str, ...], name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_no_command_writes_another_kind_of_file(run, words, name, tmp_path, capsys):
     """Its name is in the message, nothing is read or written, and the exit code is that of bad
     options or data."""
     out = tmp_path / name
@@ -54,7 +52,7 @@ def test_no_command_writes_another_kind_of_file(
     assert not [*tmp_path.iterdir()]
 
 
-def test_a_folder_may_have_a_point_in_its_name(tmp_path: Path):
+def test_a_folder_may_have_a_point_in_its_name(tmp_path):
     """As in the version of a bundle; and a folder that is there keeps the name that it has."""
     assert outputs.folder("bundle-1.2") == Path("bundle-1.2")
     (tmp_path / "old.csv").mkdir()

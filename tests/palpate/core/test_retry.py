@@ -31,9 +31,7 @@ def refusing(times: int):
     return clock, calls, make
 
 
-def test_a_service_tries_again_with_a_growing_pause(
-    monkeypatch: pytest.MonkeyPatch, logged: list[str]
-):
+def test_a_service_tries_again_with_a_growing_pause(monkeypatch, logged):
     """The pause doubles up to a minute; the log has one line."""
     monkeypatch.setattr(retry, "in_journal", lambda: True)
     clock, calls, make = refusing(9)
@@ -51,7 +49,7 @@ def test_a_person_is_told_at_once():
     assert len(calls) == 1
 
 
-def test_a_stop_ends_the_wait(monkeypatch: pytest.MonkeyPatch):
+def test_a_stop_ends_the_wait(monkeypatch):
     """A service that waits ends within a step when it is stopped."""
     monkeypatch.setattr(retry, "in_journal", lambda: True)
     clock, _, make = refusing(99)

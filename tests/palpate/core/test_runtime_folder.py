@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import pytest
-
 from palpate.core import runtime_folder
 
 
-def test_settings_are_read_if_a_file_may_speak_of_the_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_settings_are_read_if_a_file_may_speak_of_the_folder(tmp_path, monkeypatch):
     """Also behind a link to nothing, as an editor leaves it, and in a file that is a folder; not
     where there are no settings at all."""
     folder, site = tmp_path / "settings", tmp_path / "site.toml"

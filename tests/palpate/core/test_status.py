@@ -39,7 +39,7 @@ def test_the_table_is_whole():
 
 
 @pytest.mark.parametrize("status", Status)
-def test_a_client_hears_what_to_do(status: Status):
+def test_a_client_hears_what_to_do(status):
     """A robot's program gets a text for each status, with the detail of the box."""
     fields = ["1", "0", status, "wood", "0.5", "0.1", "1", "0", "1", "b", "sim", "1", "taxel 2.3"]
     text = Answer.of(fields).what_to_do

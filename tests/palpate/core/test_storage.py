@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import errno
 import os
-from pathlib import Path
 
 import pytest
 
 from palpate.core import storage
 
 
-def test_folders_are_made_once(tmp_path: Path):
+def test_folders_are_made_once(tmp_path):
     """`parents` makes the folders that are missing, and takes those that are there."""
     for name in ("a", "b"):
         storage.put(tmp_path / "one" / "two" / name, name.encode(), parents=True)
@@ -19,9 +18,7 @@ def test_folders_are_made_once(tmp_path: Path):
 
 
 @pytest.mark.parametrize("durable", [True, False])
-def test_only_a_durable_file_is_synced(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, durable: bool
-):
+def test_only_a_durable_file_is_synced(tmp_path, monkeypatch, durable):
     """Each file and then its folder are synced, or nothing is."""
     synced = list[str]()
     monkeypatch.setattr(os, "fsync", lambda fd: synced.append(os.readlink(f"/proc/self/fd/{fd}")))
@@ -30,14 +27,14 @@ def test_only_a_durable_file_is_synced(
     assert synced == (wanted if durable else [])
 
 
-def test_what_could_not_be_written(tmp_path: Path):
+def test_what_could_not_be_written(tmp_path):
     """A folder and a file in no folder are refused; a new file is not."""
     assert "folder" in storage.refused(tmp_path)
     assert "folder" in storage.refused(tmp_path / "none" / "file")
     assert not storage.refused(tmp_path / "file")
 
 
-def test_a_failed_exchange_says_why(tmp_path: Path):
+def test_a_failed_exchange_says_why(tmp_path):
     """The error of the system call arrives with its number and the name."""
     with pytest.raises(FileNotFoundError) as e:
         storage.exchange(tmp_path, tmp_path / "none")

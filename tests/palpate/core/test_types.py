@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -33,13 +32,13 @@ def test_a_format_with_axes():
 
 
 @pytest.mark.parametrize("axes", [0, 9, -1])
-def test_axes_out_of_range(axes: int):
+def test_axes_out_of_range(axes):
     """The message has the number."""
     with pytest.raises(FormatError, match=f"{axes} axes"):
         SweepFormat(3, 3, 1000.0, 2000, "float32", axes)
 
 
-def test_a_recording_with_axes_comes_back(tmp_path: Path):
+def test_a_recording_with_axes_comes_back(tmp_path):
     """All counts and the format; records of one axis under a sidecar with three are refused."""
     taxels = np.arange(5 * 27, dtype="<f4").reshape(5, 3, 3, 3)
     sweep = Sweep(1, 0, 9, Status.OK, Frames(np.arange(5), np.arange(5), taxels))
@@ -53,7 +52,7 @@ def test_a_recording_with_axes_comes_back(tmp_path: Path):
         load(tmp_path / "s.npy")
 
 
-def test_a_recording_is_written_byte_for_byte(tmp_path: Path):
+def test_a_recording_is_written_byte_for_byte(tmp_path):
     """A recorded file is read, and written again with the same bytes."""
     sweep, format = load(ONE_AXIS / "sweep.npy")
     assert (format, sweep.frames.taxels.shape) == (toy_bundle.FORMAT, (20, 2, 2))
@@ -63,6 +62,6 @@ def test_a_recording_is_written_byte_for_byte(tmp_path: Path):
         assert (tmp_path / name).read_bytes() == (ONE_AXIS / name).read_bytes()
 
 
-def test_the_packaged_manifest_is_written_as_it_is(default_bundle: bundle.Bundle):
+def test_the_packaged_manifest_is_written_as_it_is(default_bundle):
     """Byte for byte, so that its id stays."""
     assert default_bundle.manifest.json() == (bundle.DEFAULT / bundle.MANIFEST).read_bytes()

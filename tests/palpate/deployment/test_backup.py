@@ -37,9 +37,7 @@ def own_names(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(("user", "given"), [(0, [(0, 0)]), (1000, [])])
-def test_only_root_gives_files_to_others(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, user: int, given: list[tuple[int, int]]
-):
+def test_only_root_gives_files_to_others(tmp_path, monkeypatch, user, given):
     """To the user and the group of the same names; a name that is missing here is an error."""
     member, found = tarfile.TarInfo(), list[tuple[int, int]]()
     member.uname = member.gname = "root"
@@ -87,7 +85,7 @@ def seen(root: Path) -> dict[str, str]:
     }
 
 
-def test_a_box_comes_back_on_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_box_comes_back_on_another(tmp_path, monkeypatch):
     """By one command each: settings, keys, bundles and sweeps come from the old box. The
     certificate and the links of the program stay; the former files of the new box stay beside them.
     The service stands still meanwhile."""
@@ -116,7 +114,7 @@ def test_a_box_comes_back_on_another(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert {name: seen(new)[name] for name in SAVED} == SAVED
 
 
-def test_every_cut_and_every_changed_byte_is_found(tmp_path: Path):
+def test_every_cut_and_every_changed_byte_is_found(tmp_path):
     """Nothing of the box has changed then, and nothing is left beside it."""
     data, new = saved(old_box(tmp_path / "old")), box(tmp_path / "new", {})
     before = seen(new)
@@ -168,16 +166,14 @@ def member(name: str, kind: bytes = tarfile.REGTYPE, link: str = "") -> tarfile.
     ],
     ids=lambda one: one.name,
 )
-def test_a_member_that_no_box_has_saved_is_refused(tmp_path: Path, hostile: tarfile.TarInfo):
+def test_a_member_that_no_box_has_saved_is_refused(tmp_path, hostile):
     """Paths that lead elsewhere, links, devices."""
     new = box(tmp_path / "new", {})
     with pytest.raises(FormatError, match="saved"):
         backup.unpack(archive(hostile), new)
 
 
-def test_a_missing_current_bundle_and_another_schema_are_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_missing_current_bundle_and_another_schema_are_refused(tmp_path, monkeypatch):
     """The reason names them."""
     new = box(tmp_path / "new", {})
     link = member("data/current", tarfile.SYMTYPE, f"bundles/{SHA}")
@@ -190,7 +186,7 @@ def test_a_missing_current_bundle_and_another_schema_are_refused(
         backup.unpack(io.BytesIO(later), new)
 
 
-def test_a_computer_without_palpate_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_a_computer_without_palpate_is_refused(tmp_path, capsys):
     """Both ways; the message names the missing part."""
     with pytest.raises(ApplianceError, match="installed"):
         backup.save(io.BytesIO(), tmp_path)
@@ -200,7 +196,7 @@ def test_a_computer_without_palpate_is_refused(tmp_path: Path, capsys: pytest.Ca
     assert "nowhere" in capsys.readouterr().err
 
 
-def test_a_full_disk_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_full_disk_changes_nothing(tmp_path, monkeypatch):
     """The restore ends with the reason, and the box is as it was."""
     data, new = saved(old_box(tmp_path / "old")), box(tmp_path / "new", {})
     before = seen(new)
@@ -214,7 +210,7 @@ def test_a_full_disk_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert seen(new) == before
 
 
-def test_a_stopped_restore_is_completed_by_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_stopped_restore_is_completed_by_another(tmp_path, monkeypatch):
     """After a power cut at any rename of the swap, the same command restores the rest."""
     data = saved(old_box(tmp_path / "old"))
     for cut in range(4):

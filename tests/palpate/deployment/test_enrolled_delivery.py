@@ -29,7 +29,7 @@ def grown(box: Delivery, label: str = "cork") -> dict[str, bytes]:
     return deliveries.enrolled(dict(box.store.running().files), box.enrolment_key, label)
 
 
-def test_a_label_is_on_trial_and_gone_back_from(box: Delivery):
+def test_a_label_is_on_trial_and_gone_back_from(box):
     """A label is enrolled into a delivered bundle. The new bundle runs on trial and is committed;
     `rollback` leads to the bundle without the label."""
     one = box.committed(1)
@@ -44,7 +44,7 @@ def test_a_label_is_on_trial_and_gone_back_from(box: Delivery):
     assert box.store.rollback() == with_cork
 
 
-def test_a_second_label_and_the_packaged_bundle(box: Delivery):
+def test_a_second_label_and_the_packaged_bundle(box):
     """The packaged bundle is trusted like the program. A second label is enrolled into the same
     bundle."""
     first = box.store.learn(grown(box))
@@ -57,7 +57,7 @@ def test_a_second_label_and_the_packaged_bundle(box: Delivery):
     assert box.store.rollback() == PACKAGED
 
 
-def test_the_next_delivery_counts_from_the_bundle_that_was_signed(box: Delivery):
+def test_the_next_delivery_counts_from_the_bundle_that_was_signed(box):
     """After a newer bundle was committed, labels that were enrolled into the older bundle are
     refused. Delivering the running bundle again may remove its label."""
     box.committed(1)
@@ -85,7 +85,7 @@ def check_refused(
     assert box.store.current == before
 
 
-def test_no_part_can_be_exchanged(box: Delivery, tmp_path: Path):
+def test_no_part_can_be_exchanged(box, tmp_path):
     """Refused: an enrolment without a signature, signed by another box, or by a signer of bundles;
     labels of another bundle, other labels of this bundle; a base that is unsigned, altered, or by
     an unknown signer. So the box's private key can add labels and nothing else."""
@@ -114,7 +114,7 @@ def test_no_part_can_be_exchanged(box: Delivery, tmp_path: Path):
     assert box.store.learn(good)
 
 
-def test_a_lost_key_or_signer_does_not_end_what_runs_unless_it_must(box: Delivery):
+def test_a_lost_key_or_signer_does_not_end_what_runs_unless_it_must(box):
     """Without the private key the box continues. Without the signer the error says what to do, and
     the box continues after the signer was made again."""
     box.committed(1)
@@ -130,9 +130,7 @@ def test_a_lost_key_or_signer_does_not_end_what_runs_unless_it_must(box: Deliver
     assert box.start() == box.store.current
 
 
-def test_a_program_with_another_packaged_bundle_does_not_take_the_label(
-    box: Delivery, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_program_with_another_packaged_bundle_does_not_take_the_label(box, monkeypatch):
     """An upgrade replaced the base: the error says what to do, and `rollback` leads to the new
     packaged bundle."""
     box.store.learn(grown(box))

@@ -24,7 +24,7 @@ def key(tmp_path: Path) -> EnrolmentKey:
     return install_scripts.enrolment_key(tmp_path / "enrolment")
 
 
-def test_an_install_makes_a_private_key_once(key: EnrolmentKey):
+def test_an_install_makes_a_private_key_once(key):
     """Nobody else may read the key, it signs, and its signatures are valid. Another install changes
     nothing."""
     assert (key.folder / KEY).stat().st_mode & 0o777 == 0o400
@@ -38,7 +38,7 @@ def test_an_install_makes_a_private_key_once(key: EnrolmentKey):
     key.verify(DATA, key.sign(DATA))
 
 
-def test_two_boxes_do_not_believe_each_other(key: EnrolmentKey, tmp_path: Path):
+def test_two_boxes_do_not_believe_each_other(key, tmp_path):
     """A signature of another box, of other data, or for another use, and a cut signature are
     refused."""
     other = install_scripts.enrolment_key(tmp_path / "other")
@@ -57,7 +57,7 @@ def test_two_boxes_do_not_believe_each_other(key: EnrolmentKey, tmp_path: Path):
     key.verify(DATA, good)
 
 
-def test_the_key_signs_no_bundle(key: EnrolmentKey, tmp_path: Path):
+def test_the_key_signs_no_bundle(key, tmp_path):
     """Its signatures are not valid for bundles, even if an administrator adds its line to the
     signers of bundles."""
     signers = tmp_path / "allowed_signers"
@@ -92,7 +92,7 @@ SPOILS: dict[str, tuple[Callable[[EnrolmentKey], None], str]] = {
 
 
 @pytest.mark.parametrize("spoil", SPOILS)
-def test_a_key_that_cannot_be_used_is_told_with_what_to_do(key: EnrolmentKey, spoil: str):
+def test_a_key_that_cannot_be_used_is_told_with_what_to_do(key, spoil):
     """A key that is missing, readable by others, damaged, or of another box, or has no signer, is
     reported in one line before the robot sweeps."""
     spoiled, why = SPOILS[spoil]
@@ -103,7 +103,7 @@ def test_a_key_that_cannot_be_used_is_told_with_what_to_do(key: EnrolmentKey, sp
     assert "\n" not in str(e.value)
 
 
-def test_a_lost_signer_is_made_again_and_a_lost_key_is_not(key: EnrolmentKey):
+def test_a_lost_signer_is_made_again_and_a_lost_key_is_not(key):
     """`make install` makes the signer again, and earlier signatures are valid again. A new key
     would make them invalid: without the private key the enrolled labels stay valid."""
     signed, before = key.sign(DATA), (key.folder / SIGNER).read_bytes()
@@ -117,9 +117,7 @@ def test_a_lost_signer_is_made_again_and_a_lost_key_is_not(key: EnrolmentKey):
 
 
 @pytest.mark.parametrize("namespace", [NAMESPACE, TAUGHT])
-def test_an_ssh_keygen_that_dies_once_is_tried_again(
-    key: EnrolmentKey, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, namespace: str
-):
+def test_an_ssh_keygen_that_dies_once_is_tried_again(key, tmp_path, monkeypatch, namespace):
     """At the start of a box with enrolled labels or a taught bundle, and before a lesson: the error
     passes, so the service is restarted, not ended for good (exit code 78)."""
     signed = key.sign(DATA, namespace)

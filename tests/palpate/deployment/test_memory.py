@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -72,7 +71,7 @@ print(next(line.split()[1] for line in status if line.startswith("VmHWM")))
 
 
 @pytest.mark.slow
-def test_a_bundle_near_the_limit_leaves_the_service_alive(tmp_path: Path):
+def test_a_bundle_near_the_limit_leaves_the_service_alive(tmp_path):
     """The program runs a bundle near the largest that its trial admits, below the unit's limit."""
     folder = toy_bundle.put(tmp_path / "large", large(1_400_000))
     made = bundle.load(folder)

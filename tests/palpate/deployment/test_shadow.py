@@ -129,7 +129,7 @@ def test_a_sweep_on_which_they_differ_is_kept_with_both_verdicts(side):
     ]
 
 
-def test_nothing_is_written_while_a_sweep_is_open(side, monkeypatch: pytest.MonkeyPatch):
+def test_nothing_is_written_while_a_sweep_is_open(side, monkeypatch):
     """During an open sweep sweeps are only counted. Afterwards one file is written in each turn, up
     to the limit."""
     monkeypatch.setattr(shadow, "KEPT", 2)
@@ -191,7 +191,7 @@ def test_taxels_that_are_broken_over_the_stream_count_for_both(side):
     assert pair.shadow.agreement.pairs == {"b": {"b": 1, "a": 1}}
 
 
-def test_an_early_answer_is_compared_where_the_candidate_gives_one(tmp_path: Path):
+def test_an_early_answer_is_compared_where_the_candidate_gives_one(tmp_path):
     """If the candidate has no early heads, or needs more of the sweep, the sweep is counted but not
     compared."""
     files = {"outputs": ("logits", "early"), "known": None}
@@ -237,7 +237,7 @@ def strange() -> None:
     raise type("Fail", (Exception,), {})("[ONNXRuntimeError] : 1 : FAIL : no")
 
 
-def test_a_candidate_that_fails_ends_its_shadow_and_nothing_else(side, logged: list[str]):
+def test_a_candidate_that_fails_ends_its_shadow_and_nothing_else(side, logged):
     """After three failures in a row, one line is logged and the candidate is stopped. A success
     resets the count; computing for over a tenth of a second is a failure."""
     pair = side()
@@ -262,7 +262,7 @@ def test_a_candidate_that_fails_ends_its_shadow_and_nothing_else(side, logged: l
     assert "200 ms" in logged[1]
 
 
-def test_the_counts_go_on_over_restarts_and_begin_anew_with_another_pair(side, tmp_path: Path):
+def test_the_counts_go_on_over_restarts_and_begin_anew_with_another_pair(side, tmp_path):
     """The same pair continues its counts; for another candidate, or another current bundle, counts
     and sweeps start anew."""
     pair = side(renamed)
@@ -305,9 +305,7 @@ def test_a_candidate_that_kills_the_program_stays_away(side):
             start(1)
 
 
-def test_a_full_disk_costs_the_record_alone(
-    side, monkeypatch: pytest.MonkeyPatch, logged: list[str]
-):
+def test_a_full_disk_costs_the_record_alone(side, monkeypatch, logged):
     """It is logged once; verdicts are still compared."""
     pair = side(renamed)
 
@@ -323,7 +321,7 @@ def test_a_full_disk_costs_the_record_alone(
     ]
 
 
-def test_a_candidate_that_cannot_be_one_is_named(side, tmp_path: Path, default_bundle: Bundle):
+def test_a_candidate_that_cannot_be_one_is_named(side, tmp_path, default_bundle):
     """Another format, two large models, failing golden sweeps, and a folder that is a
     file are errors that say what to try."""
     with pytest.raises(BundleError, match="4x4"):
@@ -342,7 +340,7 @@ def test_a_candidate_that_cannot_be_one_is_named(side, tmp_path: Path, default_b
 @pytest.mark.parametrize(
     "text", ["", "[]", '{"candidate": "x"}', '{"candidate": "x", "current": "y", "schema": 2}']
 )
-def test_a_broken_agreement_begins_anew(side, tmp_path: Path, text: str, logged: list[str]):
+def test_a_broken_agreement_begins_anew(side, tmp_path, text, logged):
     """The log names the file, and the counts begin with this start."""
     (tmp_path / "shadow").mkdir()
     (tmp_path / "shadow" / shadow.FILE).write_text(text)
@@ -361,7 +359,7 @@ def test_the_interval_is_wilson_s():
         assert statistics.wilson(k, n) == pytest.approx((want.low, want.high), abs=1e-6)
 
 
-def test_the_robot_notices_nothing(rigged, default_bundle: Bundle, tmp_path: Path):
+def test_the_robot_notices_nothing(rigged, default_bundle, tmp_path):
     """With a candidate that is always wrong, the simulated box sends the same sentences, and each
     sweep is kept."""
     heard = []

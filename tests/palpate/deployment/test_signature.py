@@ -48,7 +48,7 @@ def signers(tmp_path: Path) -> Signers:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["ed25519", "rsa", "ecdsa"])
-def test_a_signer_is_named(tmp_path: Path, kind: str):
+def test_a_signer_is_named(tmp_path, kind):
     """The file has several signers, comments, empty lines, and the namespace in an option."""
     own, other = deliveries.key(tmp_path, "own", kind), deliveries.key(tmp_path, "other")
     file = tmp_path / "signers"
@@ -60,7 +60,7 @@ def test_a_signer_is_named(tmp_path: Path, kind: str):
 
 
 @pytest.mark.slow
-def test_a_signature_of_nobody_in_the_file_is_refused(signers: Signers):
+def test_a_signature_of_nobody_in_the_file_is_refused(signers):
     """Another key, namespace or message, and a cut, empty or huge signature are refused. A byte
     order mark and CR LF in the file of signers do no harm."""
     good = signature.sign(MESSAGE, signers.ours)
@@ -119,9 +119,7 @@ def test_the_order_of_two_lines_of_a_key_does_not_matter(signers: Signers, names
         ("#" * 300_000, "262144 bytes"),
     ],
 )
-def test_a_file_of_signers_is_understood_to_its_last_line_or_refused(
-    signers: Signers, text: str | None, why: str
-):
+def test_a_file_of_signers_is_understood_to_its_last_line_or_refused(signers, text, why):
     """The error names a line that ssh-keygen would skip silently, or that depends on the time."""
     key = line(signers.ours).removeprefix(f"{SIGNER} ")
     if text is None:
@@ -145,9 +143,7 @@ def test_a_file_of_signers_is_understood_to_its_last_line_or_refused(
         (PermissionError(13, "Permission denied"), 78),
     ],
 )
-def test_faults_of_ssh_keygen_that_pass_are_tried_again(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, fault: object, code: int
-):
+def test_faults_of_ssh_keygen_that_pass_are_tried_again(monkeypatch, tmp_path, fault, code):
     """Only what a person can mend keeps the service down; being killed for want of memory says
     nothing about the signature."""
 
@@ -162,7 +158,7 @@ def test_faults_of_ssh_keygen_that_pass_are_tried_again(
     assert e.value.exit_code == code
 
 
-def test_an_ssh_keygen_that_hangs_is_ended(signers: Signers, monkeypatch: pytest.MonkeyPatch):
+def test_an_ssh_keygen_that_hangs_is_ended(signers, monkeypatch):
     """The box does not hang with it."""
     good = signature.sign(MESSAGE, signers.ours)
     program = signers.file.parent / "ssh-keygen"
@@ -174,7 +170,7 @@ def test_an_ssh_keygen_that_hangs_is_ended(signers: Signers, monkeypatch: pytest
         signers.verify(good)
 
 
-def test_labels_that_a_box_enrolled_are_signed_for_all_boxes(tmp_path: Path, signers: Signers):
+def test_labels_that_a_box_enrolled_are_signed_for_all_boxes(tmp_path, signers):
     """`palpate-train sign` turns a bundle with an enrolment into an ordinary bundle with the same
     labels and answers and another signer."""
     folder = deliveries.put(
@@ -199,7 +195,7 @@ def test_labels_that_a_box_enrolled_are_signed_for_all_boxes(tmp_path: Path, sig
     Classifier(after, SystemClock()).self_test()
 
 
-def test_signing_a_bundle(tmp_path: Path, signers: Signers, capsys: pytest.CaptureFixture[str]):
+def test_signing_a_bundle(tmp_path, signers, capsys):
     """`palpate-train sign` writes the counter into the manifest and the signature beside it. It
     refuses to sign without a counter."""
     folder = deliveries.put(tmp_path / "bundle", deliveries.files(0, None))

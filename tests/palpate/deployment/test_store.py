@@ -16,13 +16,7 @@ from palpate.bundle import bundle
 from palpate.bundle.bundle import Bundle
 from palpate.cli import bundle_commands
 from palpate.core.config import StoreConfig
-from palpate.core.errors import (
-    ApplianceError,
-    BundleError,
-    ConfigError,
-    ModelError,
-    TemporaryError,
-)
+from palpate.core.errors import ApplianceError, BundleError, ConfigError, ModelError, TemporaryError
 from palpate.deployment import store
 from palpate.deployment.state import MOST_STARTS, PACKAGED, Standing, StoreState
 from tests.campaigns import flips
@@ -39,7 +33,7 @@ def box(tmp_path: Path) -> Delivery:
     return Delivery(tmp_path)
 
 
-def test_a_fresh_box_runs_the_packaged_bundle(box: Delivery):
+def test_a_fresh_box_runs_the_packaged_bundle(box):
     """Nothing was deployed: no current bundle, nothing to commit, nothing to go back to, no store
     folder needed."""
     assert box.start() == PACKAGED
@@ -53,7 +47,7 @@ def test_a_fresh_box_runs_the_packaged_bundle(box: Delivery):
         box.store.promote()
 
 
-def test_the_progress_of_a_trial_is_noted(box: Delivery):
+def test_the_progress_of_a_trial_is_noted(box):
     """Starts, sweeps and tenths of a second; a start that ended in order counts for no boot."""
     for counted in (True, False):
         box.store.note("a", 2, counted, 3, 12.34)
@@ -63,7 +57,7 @@ def test_the_progress_of_a_trial_is_noted(box: Delivery):
 
 
 @pytest.mark.parametrize("sha", ["a", "z"])
-def test_what_comes_after_a_committed_bundle_is_on_trial(sha: str):
+def test_what_comes_after_a_committed_bundle_is_on_trial(sha):
     """It goes back to the committed one, which stays as it is."""
     state = StoreState(candidate=sha)
     after = state.activated(sha, 3, "m")
@@ -94,7 +88,7 @@ refused, is:N asks which is current and committed."""
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SEQUENCES)
-def test_what_runs_after(box: Delivery, name: str):
+def test_what_runs_after(box, name):
     """Installs, commits, starts and rollbacks in any order lead to the bundle of the table."""
     shas = {"0": PACKAGED}
     for step in SEQUENCES[name].split():
@@ -119,7 +113,7 @@ def test_what_runs_after(box: Delivery, name: str):
 
 
 @pytest.mark.slow
-def test_the_table_says_what_a_person_wants_to_know(box: Delivery, logged: list[str]):
+def test_the_table_says_what_a_person_wants_to_know(box, logged):
     """One line a bundle: role, id, name, counter, signer, trial; why a bundle was left is logged
     once and stays in the table."""
     one, two = box.committed(1), box.store.install(box.made(2, name="tubes", version="7"))
@@ -188,7 +182,7 @@ BAD: dict[str, tuple[Ways, str]] = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_a_bad_bundle_is_refused_and_leaves_nothing(box: Delivery, name: str):
+def test_a_bad_bundle_is_refused_and_leaves_nothing(box, name):
     """A bad bundle is refused with its reason. The current bundle, the state and the folder of
     bundles do not change."""
     one = PACKAGED if name == "never counted" else box.committed(1)  # which is also below that one
@@ -200,7 +194,7 @@ def test_a_bad_bundle_is_refused_and_leaves_nothing(box: Delivery, name: str):
     assert [p.name for p in box.store.bundles.folder.glob("*")] == [one] * bool(one)
 
 
-def test_what_else_lies_there_is_not_taken(box: Delivery):
+def test_what_else_lies_there_is_not_taken(box):
     """A file that the manifest does not name is not copied."""
     folder = box.made(1)
     (folder / "extra").write_bytes(b"x")
@@ -209,7 +203,7 @@ def test_what_else_lies_there_is_not_taken(box: Delivery):
     assert {p.name for p in box.store.bundles.at(sha).iterdir()} <= names
 
 
-def test_what_was_checked_is_what_is_written(box: Delivery):
+def test_what_was_checked_is_what_is_written(box):
     """The owner of the folder changes it after the check: the checked files are installed."""
     folder = box.made(1)
 
@@ -238,12 +232,7 @@ def hang(held: Bundle) -> None:
     ],
     ids=["dies", "asks for memory", "raises", "hangs"],
 )
-def test_a_model_that_kills_its_runtime_is_refused(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    does: Callable[[Bundle], object],
-    why: str,
-):
+def test_a_model_that_kills_its_runtime_is_refused(tmp_path, monkeypatch, does, why):
     """The model runs in a child process. This process continues, and reports what became of the
     child."""
     if does is hang:
@@ -255,9 +244,7 @@ def test_a_model_that_kills_its_runtime_is_refused(
 
 
 @pytest.mark.slow
-def test_a_bundle_that_fails_its_trial_at_the_start_is_left_in_that_start(
-    box: Delivery, logged: list[str]
-):
+def test_a_bundle_that_fails_its_trial_at_the_start_is_left_in_that_start(box, logged):
     """Damaged files, other results for the golden sweeps, or unfit settings: the committed bundle
     runs."""
     one = box.committed(1)
@@ -278,7 +265,7 @@ def test_a_bundle_that_fails_its_trial_at_the_start_is_left_in_that_start(
         assert str(error) in logged[-1]
 
 
-def test_a_committed_bundle_that_is_refused_stops_the_box(box: Delivery):
+def test_a_committed_bundle_that_is_refused_stops_the_box(box):
     """The box does not choose another bundle by itself. The error names the way back, and that way
     works."""
     one, two = box.committed(1), box.committed(2)
@@ -288,7 +275,7 @@ def test_a_committed_bundle_that_is_refused_stops_the_box(box: Delivery):
     assert box.store.rollback() == one == box.start()
 
 
-def test_what_was_changed_by_hand_is_refused(box: Delivery):
+def test_what_was_changed_by_hand_is_refused(box):
     """Another complete and signed bundle under the name of the current one; then a link out of the
     store."""
     one, two = box.committed(1), box.committed(2)
@@ -303,7 +290,7 @@ def test_what_was_changed_by_hand_is_refused(box: Delivery):
         box.start()
 
 
-def test_a_removed_state_is_told(box: Delivery, logged: list[str]):
+def test_a_removed_state_is_told(box, logged):
     """Without the state nothing is known of committed counters: each start and each delivery say
     so. A new box says nothing."""
     box.committed(5)
@@ -316,7 +303,7 @@ def test_a_removed_state_is_told(box: Delivery, logged: list[str]):
     assert any("bundles" in line for line in logged)
 
 
-def test_a_damaged_bundle_is_mended_by_deploying_it_again(box: Delivery):
+def test_a_damaged_bundle_is_mended_by_deploying_it_again(box):
     """Its folder is replaced by a complete folder, even if the bundle is current."""
     one = box.committed(1)
     (box.store.bundles.at(one) / bundle.MODEL).write_bytes(b"rotten")
@@ -326,7 +313,7 @@ def test_a_damaged_bundle_is_mended_by_deploying_it_again(box: Delivery):
 
 
 @pytest.mark.slow
-def test_leftovers_and_old_bundles_go_at_the_next_install(box: Delivery):
+def test_leftovers_and_old_bundles_go_at_the_next_install(box):
     """Incomplete folders are removed, and bundles to which no other bundle goes back."""
     shas = [box.committed(n) for n in range(1, 5)]
     left = box.store.bundles.folder / f".{shas[0]}-abc"
@@ -343,7 +330,7 @@ def test_leftovers_and_old_bundles_go_at_the_next_install(box: Delivery):
 
 
 @pytest.mark.slow
-def test_a_candidate_waits_and_is_promoted(box: Delivery):
+def test_a_candidate_waits_and_is_promoted(box):
     """The candidate does not change which bundle runs. After its promotion it is on trial."""
     one = box.committed(1)
     two = box.store.install(box.made(2), shadow=True)
@@ -363,7 +350,7 @@ def test_a_candidate_waits_and_is_promoted(box: Delivery):
         box.store.promote()
 
 
-def test_one_command_at_a_time(box: Delivery, monkeypatch: pytest.MonkeyPatch):
+def test_one_command_at_a_time(box, monkeypatch):
     """A second command waits for a limited time. Only the owner of the folder may change the
     store."""
     monkeypatch.setattr(store, "LOCK_S", 0.1)
@@ -376,9 +363,7 @@ def test_one_command_at_a_time(box: Delivery, monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.mark.slow
-def test_a_disk_that_takes_no_note_runs_what_was_committed(
-    box: Delivery, monkeypatch: pytest.MonkeyPatch, logged: list[str]
-):
+def test_a_disk_that_takes_no_note_runs_what_was_committed(box, monkeypatch, logged):
     """A bundle on trial is not started if the start cannot be counted: a loop of crashes would go
     unnoticed."""
 
@@ -406,7 +391,7 @@ def test_a_disk_that_takes_no_note_runs_what_was_committed(
         '{"standings": {"": {"starts": "many"}}}',
     ],
 )
-def test_a_state_that_cannot_be_read_is_named(box: Delivery, text: str):
+def test_a_state_that_cannot_be_read_is_named(box, text):
     """Its content is not guessed."""
     box.installed(1)
     Path(box.how.folder, "bundles.json").write_text(text)
@@ -416,7 +401,7 @@ def test_a_state_that_cannot_be_read_is_named(box: Delivery, text: str):
 
 @pytest.mark.slow
 @pytest.mark.thorough  # hundreds of altered bundles
-def test_no_altered_bundle_is_accepted(tmp_path: Path):
+def test_no_altered_bundle_is_accepted(tmp_path):
     """A sample of `python -m tests.campaigns flips`, with and without an enrolled label: flipped
     bits in each file, files of another signed bundle, cut files, unsigned and older bundles."""
     found = flips.campaign(tmp_path, 50, seed=2)
@@ -428,9 +413,7 @@ def test_no_altered_bundle_is_accepted(tmp_path: Path):
     )
 
 
-def test_a_slow_check_does_not_count_against_a_trial(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_slow_check_does_not_count_against_a_trial(tmp_path, monkeypatch):
     """ssh-keygen that takes too long ends the start with an exit code that is restarted, as often
     as it likes, and the bundle stays on trial."""
     box = Delivery(tmp_path)
@@ -450,7 +433,7 @@ def test_a_slow_check_does_not_count_against_a_trial(
     assert box.store.state.of(two).starts == 1
 
 
-def test_memory_that_is_short_at_a_start_counts_and_the_trial_goes_on(tmp_path: Path):
+def test_memory_that_is_short_at_a_start_counts_and_the_trial_goes_on(tmp_path):
     """The program ends with an exit code that is restarted. Once there is memory, the bundle on
     trial runs; a bundle for which there never is any gives way after MOST_STARTS."""
     short: list[str] = []

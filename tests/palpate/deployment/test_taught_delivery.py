@@ -32,7 +32,7 @@ def taught(box: Delivery, version: str = "1", namespace: str = TAUGHT) -> dict[s
     return held | {bundle.TAUGHT_SIGNATURE: signed}
 
 
-def test_it_runs_on_trial_and_a_delivery_always_wins(box: Delivery):
+def test_it_runs_on_trial_and_a_delivery_always_wins(box):
     """It needs no counter, even after a delivery with one, nor does the next; `rollback` leads
     back, and each newer delivery is accepted."""
     delivered = box.committed(5)
@@ -51,7 +51,7 @@ def test_it_runs_on_trial_and_a_delivery_always_wins(box: Delivery):
     assert not box.store.running().taught
 
 
-def test_only_this_box_accepts_it_and_only_as_it_was(box: Delivery, tmp_path: Path):
+def test_only_this_box_accepts_it_and_only_as_it_was(box, tmp_path):
     """Refused: on another box, with the signature of a label or of a bundle, or altered."""
     held, elsewhere = taught(box), Delivery(tmp_path / "other")
     shutil.rmtree(elsewhere.enrolment_key.folder)
@@ -67,7 +67,7 @@ def test_only_this_box_accepts_it_and_only_as_it_was(box: Delivery, tmp_path: Pa
             there.store.learn(files)
 
 
-def test_a_setting_refuses_it(box: Delivery):
+def test_a_setting_refuses_it(box):
     """With teach.allow = false the key of the box can bring no model, and one that runs stops."""
     box.store.learn(taught(box))
     strict = Store(box.how, lambda bundle: None, taught=False)
@@ -77,7 +77,7 @@ def test_a_setting_refuses_it(box: Delivery):
         strict.running()
 
 
-def test_a_label_is_enrolled_into_a_taught_bundle(box: Delivery):
+def test_a_label_is_enrolled_into_a_taught_bundle(box):
     """Both signatures are of this box, and both are shown."""
     box.store.learn(taught(box))
     grown = deliveries.enrolled(dict(box.store.running().files), box.enrolment_key)
@@ -85,7 +85,7 @@ def test_a_label_is_enrolled_into_a_taught_bundle(box: Delivery):
     assert box.store.running().signer == "taught here, enrolled here"
 
 
-def test_signed_on_a_desktop_it_is_a_delivery(box: Delivery):
+def test_signed_on_a_desktop_it_is_a_delivery(box):
     """The desktop's signature counts then, with its counter."""
     held = taught(box)
     own = held.pop(bundle.TAUGHT_SIGNATURE)

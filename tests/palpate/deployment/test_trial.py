@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +22,6 @@ from palpate.deployment.trial import Trial
 from palpate.sim import devices, rig, script, skin
 from tests.factories import deliveries, feeds
 from tests.factories.deliveries import Delivery
-from tests.factories.simulated_box import Rigged
 
 pytestmark = deliveries.NEEDED
 SECOND = 1_000_000_000
@@ -85,7 +83,7 @@ def booted(box: Trying, name: str) -> None:
     box.store = Store(box.how, lambda bundle: None, boot=file)
 
 
-def test_power_cuts_do_not_count_against_the_bundle(box: Trying):
+def test_power_cuts_do_not_count_against_the_bundle(box):
     """After nine power cuts in its trial the bundle still runs. A crash within one boot counts,
     also after power cuts."""
     for cut in range(9):
@@ -99,7 +97,7 @@ def test_power_cuts_do_not_count_against_the_bundle(box: Trying):
 
 
 @pytest.mark.slow
-def test_a_bundle_under_which_the_computer_is_reset_again_and_again_gives_way(box: Trying):
+def test_a_bundle_under_which_the_computer_is_reset_again_and_again_gives_way(box):
     """The bundle is replaced after ten power cuts. Else a bundle that resets the computer would
     stay for ever. An id of the boot that cannot be read is that of a crash."""
     box.store = Store(box.how, lambda bundle: None, boot=box.folder / "none")
@@ -115,7 +113,7 @@ def test_a_bundle_under_which_the_computer_is_reset_again_and_again_gives_way(bo
     assert box.start() == box.one
 
 
-def test_a_start_counts_until_the_program_ends_in_order(box: Trying):
+def test_a_start_counts_until_the_program_ends_in_order(box):
     """A start that crashes stays counted, also over power cuts after orderly ends, which are not
     counted. A person's commit ends the trial."""
     booted(box, "first")
@@ -135,7 +133,7 @@ def test_a_start_counts_until_the_program_ends_in_order(box: Trying):
 
 
 @pytest.mark.slow
-def test_a_skin_that_is_unplugged_never_counts(box: Trying):
+def test_a_skin_that_is_unplugged_never_counts(box):
     """Starts without a skin do not count. Once the skin streams, the start counts."""
     for _ in range(3 * MOST_STARTS):
         trial = box.tried()
@@ -149,7 +147,7 @@ def test_a_skin_that_is_unplugged_never_counts(box: Trying):
     assert box.standing.starts == 0
 
 
-def test_nothing_is_written_while_nothing_is_new(box: Trying):
+def test_nothing_is_written_while_nothing_is_new(box):
     """There is a turn about every millisecond; a file is written only when a fact has changed."""
     trial = box.tried()
     trial.turn(health(0))
@@ -160,7 +158,7 @@ def test_nothing_is_written_while_nothing_is_new(box: Trying):
     assert before == (book.stat().st_mtime_ns, book.stat().st_ino)
 
 
-def test_enough_sweeps_commit(box: Trying, logged: list[str]):
+def test_enough_sweeps_commit(box, logged):
     """Sweeps with a label count, and the commit waits until no sweep is open. Afterwards older
     bundles are refused."""
     trial = box.tried()
@@ -183,7 +181,7 @@ def test_enough_sweeps_commit(box: Trying, logged: list[str]):
     assert box.start() == box.two
 
 
-def test_enough_time_commits(box: Trying):
+def test_enough_time_commits(box):
     """Only time with a streaming skin counts."""
     trial = box.tried()
     for t in range(0, 400):
@@ -198,7 +196,7 @@ def test_enough_time_commits(box: Trying):
     assert box.standing.committed
 
 
-def test_what_an_orderly_run_has_shown_counts_in_the_next(box: Trying):
+def test_what_an_orderly_run_has_shown_counts_in_the_next(box):
     """A robot that is switched off each evening also commits its bundle. The progress of a crashed
     start is lost."""
     for n in range(2):
@@ -226,9 +224,7 @@ def test_what_an_orderly_run_has_shown_counts_in_the_next(box: Trying):
     ],
     ids=repr,
 )
-def test_what_ends_the_program_decides_whether_the_start_counts(
-    box: Trying, error: BaseException | None, counts: int
-):
+def test_what_ends_the_program_decides_whether_the_start_counts(box, error, counts):
     """Missing hardware and a person who stops the program do not count; an error that the bundle
     may have caused does."""
     with suppress(type(error)), box.tried():
@@ -237,9 +233,7 @@ def test_what_ends_the_program_decides_whether_the_start_counts(
     assert box.standing.starts == counts
 
 
-def test_a_full_disk_is_told_once_and_tried_again(
-    box: Trying, monkeypatch: pytest.MonkeyPatch, logged: list[str]
-):
+def test_a_full_disk_is_told_once_and_tried_again(box, monkeypatch, logged):
     """Nothing is raised; the commit comes when the disk can be written again."""
     trial = box.tried()
     calls: list[float] = []
@@ -265,7 +259,7 @@ def test_a_full_disk_is_told_once_and_tried_again(
     assert box.standing.committed
 
 
-def test_another_command_is_not_waited_for(box: Trying, logged: list[str]):
+def test_another_command_is_not_waited_for(box, logged):
     """The loop goes on, and the write is tried again later."""
     trial = box.tried()
     with box.store._locked():
@@ -277,7 +271,7 @@ def test_another_command_is_not_waited_for(box: Trying, logged: list[str]):
 
 
 @pytest.mark.slow
-def test_a_bundle_that_is_no_longer_current_is_not_committed(box: Trying):
+def test_a_bundle_that_is_no_longer_current_is_not_committed(box):
     """Another bundle was deployed, or a person rolled back, while the old bundle still runs."""
     for way in (lambda: box.installed(3), box.store.rollback):
         trial = box.tried()
@@ -291,7 +285,7 @@ def test_a_bundle_that_is_no_longer_current_is_not_committed(box: Trying):
         box.store.install(box.made(2))
 
 
-def test_a_box_at_work_commits(box: Trying, rigged: Callable[..., Rigged]):
+def test_a_box_at_work_commits(box, rigged):
     """On the simulated box: five sweeps of the simulated robot, each with its answer."""
     trial = box.tried()
     simulated = devices.build(skin.FORMAT, script.tubes(1), rig.VirtualClock(), "sim")
@@ -305,7 +299,7 @@ def failed() -> Verdict:
     return replace(verdict(""), status=Status.FAILED)
 
 
-def test_a_bundle_that_fails_on_sweeps_gives_way(box: Trying):
+def test_a_bundle_that_fails_on_sweeps_gives_way(box):
     """The program ends after some failed sweeps; three such starts end the trial."""
     for _ in range(MOST_STARTS):
         trial = box.tried()
@@ -315,7 +309,7 @@ def test_a_bundle_that_fails_on_sweeps_gives_way(box: Trying):
     assert box.start() == box.one
 
 
-def test_a_failed_sweep_begins_the_trial_anew(box: Trying):
+def test_a_failed_sweep_begins_the_trial_anew(box):
     """Sweeps and time before it do not count, also not those that were recorded already."""
     trial = box.tried()
     for _ in range(4):

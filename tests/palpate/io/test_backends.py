@@ -141,7 +141,7 @@ def check_content(u: Backend, frames: Frames) -> None:
         assert (frames.taxels == skins.counts(frames.seq, u.format)).all()
 
 
-def test_streams_without_a_gap(need: Need):
+def test_streams_without_a_gap(need):
     """Every frame comes once and in order, its time later than that of the frame before and never
     in the future. Then the skin is released."""
     u = need("skin")
@@ -164,7 +164,7 @@ def test_streams_without_a_gap(need: Need):
         check_content(u, reader.frames(100))
 
 
-def test_absent_then_plugged(need: Need):
+def test_absent_then_plugged(need):
     """No skin: absent, a message with the ids, no frames; it is used when it is plugged in."""
     u = need("plug")
     u.unplug()
@@ -176,7 +176,7 @@ def test_absent_then_plugged(need: Need):
         check_content(u, reader.frames(100))
 
 
-def test_unplugged_in_mid_read(need: Need):
+def test_unplugged_in_mid_read(need):
     """Pulled while frames come: lost, then absent; plugged in again, a new epoch."""
     u = need("plug")
     with SensorReader(u) as reader:
@@ -198,7 +198,7 @@ def test_unplugged_in_mid_read(need: Need):
         assert reader.sensor.counters.enumerations == 2
 
 
-def test_driver_taken_and_given_back(need: Need):
+def test_driver_taken_and_given_back(need):
     """Without its driver it is lost; with it, it streams again, and nothing is left open."""
     u = need("unbind")
     with SensorReader(u) as reader:
@@ -223,7 +223,7 @@ def timers() -> int:
     )
 
 
-def test_serial_number_chooses(need: Need):
+def test_serial_number_chooses(need):
     """Only the skin with the serial number is used; the message counts the others."""
     u = need("plug")
     u.plug(Skin(serial="0042"))
@@ -247,7 +247,7 @@ def test_serial_number_chooses(need: Need):
         ({"rate_hz": 765.0}, "765 Hz"),
     ],
 )
-def test_another_protocol_or_format(need: Need, change: dict[str, Any], hint: str):
+def test_another_protocol_or_format(need, change, hint):
     """Another protocol or format is refused with both named; a matching skin is then used."""
     u = need("plug")
     u.plug(Skin(**change))
@@ -263,7 +263,7 @@ def test_another_protocol_or_format(need: Need, change: dict[str, Any], hint: st
     ("control", "state", "code", "hint"),
     [("hold", "busy", 16, "another program"), ("deny", "denied", 13, "udev rule")],
 )
-def test_a_skin_that_cannot_be_opened(need: Need, control: str, state: str, code: int, hint: str):
+def test_a_skin_that_cannot_be_opened(need, control, state, code, hint):
     """Held or not allowed: a state of its own, advice, and frames once that is over."""
     u = need("skin", control)
     refuse = getattr(u, control)
@@ -280,7 +280,7 @@ def test_a_skin_that_cannot_be_opened(need: Need, control: str, state: str, code
         refuse(False)
 
 
-def test_a_silent_skin_is_started_again(need: Need):
+def test_a_silent_skin_is_started_again(need):
     """A skin that sends nothing is silent after `silence_ms` and is started again."""
     u = need("silence")
     with SensorReader(u, silence_ms=300) as reader:
@@ -292,7 +292,7 @@ def test_a_silent_skin_is_started_again(need: Need):
         assert reader.sensor.counters.enumerations == 2
 
 
-def test_garbage_on_the_cable(need: Need):
+def test_garbage_on_the_cable(need):
     """Corrupted transfers are counted in bytes and in missing frames; intact frames are correct."""
     u = need("garble")
     with SensorReader(u) as reader:
@@ -365,7 +365,7 @@ def pulse(u: Backend, line: str) -> tuple[int, int]:
     return before, now(u)
 
 
-def test_start_and_stop(need: Need):
+def test_start_and_stop(need):
     """The edges as they were driven, in order, each with its time; falls have no meaning."""
     u = need("lines")
     t = u.trigger
@@ -383,7 +383,7 @@ def test_start_and_stop(need: Need):
         assert before <= t_ns < after
 
 
-def test_one_line(need: Need):
+def test_one_line(need):
     """A rise is START and a fall STOP, in one call or one by one; a line that is high at first
     makes no START."""
     u = need("lines")
@@ -399,7 +399,7 @@ def test_one_line(need: Need):
         assert before <= start_ns < stop_ns < after
 
 
-def test_glitches(need: Need):
+def test_glitches(need):
     """A pulse shorter than `glitch_us` is only counted; the edge after it is reported."""
     u = need("lines")
     with Watcher(u, mode="one-line", glitch_us=1_000_000) as watcher:
@@ -410,7 +410,7 @@ def test_glitches(need: Need):
         assert [kind for kind, _ in watcher.edges(1)] == [EdgeKind.START]
 
 
-def test_more_edges_than_the_kernel_keeps(need: Need):
+def test_more_edges_than_the_kernel_keeps(need):
     """Dropped edges are one LOST, and counted; when the line is quiet, edges come again."""
     u = need("lines", "overrun")
     with Watcher(u) as watcher:
@@ -423,7 +423,7 @@ def test_more_edges_than_the_kernel_keeps(need: Need):
         assert [kind for kind, _ in watcher.edges(1)] == [EdgeKind.START]
 
 
-def test_lines_that_are_held(need: Need):
+def test_lines_that_are_held(need):
     """A second program is refused with errno 16; after the first the lines are free again."""
     u = need("lines")
     with Watcher(u), pytest.raises(LineError, match="errno 16"):
@@ -433,7 +433,7 @@ def test_lines_that_are_held(need: Need):
         assert [kind for kind, _ in watcher.edges(1)] == [EdgeKind.START]
 
 
-def test_a_line_that_is_not_there(need: Need):
+def test_a_line_that_is_not_there(need):
     """A name without a line is refused, and so is a line in two roles."""
     u = need("lines")
     with pytest.raises(LineError, match="NO-SUCH-LINE"):
@@ -460,7 +460,7 @@ def check_seen(u: Backend, *wanted: str) -> None:
     until(u, lambda: seen(u) == set(filter(None, wanted)))
 
 
-def test_outputs(need: Need):
+def test_outputs(need):
     """All low at first; then as set by `show` and `result`; low again once closed."""
     u = need("lines")
     o = u.output
@@ -485,7 +485,7 @@ def test_outputs(need: Need):
     check_seen(u)
 
 
-def test_inputs_and_outputs_together(need: Need):
+def test_inputs_and_outputs_together(need):
     """The box has both at once: driving outputs causes no edge, and edges change no output."""
     u = need("lines")
     with Watcher(u) as watcher, Lines(u.output, u.gpio, u.clock) as lines:
@@ -533,7 +533,7 @@ def sink_on() -> Iterator[Callable[..., SerialSink]]:
         sink.close()
 
 
-def test_sentences_arrive_whole(need: Need, sink_on: Callable[..., SerialSink]):
+def test_sentences_arrive_whole(need, sink_on):
     """All sentences that were sent are received, byte by byte, none twice and none missing."""
     u = need("serial")
     sink = sink_on(u)
@@ -548,7 +548,7 @@ def test_sentences_arrive_whole(need: Need, sink_on: Callable[..., SerialSink]):
     assert sink.trouble == ""
 
 
-def test_commands_come_in(need: Need, sink_on: Callable[..., SerialSink]):
+def test_commands_come_in(need, sink_on):
     """As a program and as a person sends them, cut anywhere; a wrong one gets its fault."""
     u = need("serial")
     sink = sink_on(u)
@@ -562,7 +562,7 @@ def test_commands_come_in(need: Need, sink_on: Callable[..., SerialSink]):
     assert "checksum 00" in peer.commands[2].error
 
 
-def test_a_peer_that_does_not_read(need: Need, sink_on: Callable[..., SerialSink]):
+def test_a_peer_that_does_not_read(need, sink_on):
     """The oldest sentences are dropped and counted; no call waits, and none is cut."""
     u = need("serial", "stall")
     sink = sink_on(u, queue=8)
@@ -588,7 +588,7 @@ def test_a_peer_that_does_not_read(need: Need, sink_on: Callable[..., SerialSink
 
 
 @pytest.mark.slow
-def test_a_port_that_goes_and_comes(need: Need, sink_on: Callable[..., SerialSink]):
+def test_a_port_that_goes_and_comes(need, sink_on):
     """Unplugged: `trouble` has the reason; plugged in again, the sentence is sent whole."""
     u = need("serial", "pull")
     sink = sink_on(u)

@@ -28,12 +28,12 @@ CHECK = {
 
 
 @pytest.mark.parametrize("name", sorted(CHECK))
-def test_the_check_values_of_the_catalogue(name: str) -> None:
+def test_the_check_values_of_the_catalogue(name):
     """Each name gives the value that the catalogue prints."""
     assert NAMED[name].of(b"123456789") == CHECK[name]
 
 
-def test_a_negated_sum_makes_the_sum_of_all_bytes_zero() -> None:
+def test_a_negated_sum_makes_the_sum_of_all_bytes_zero():
     """With its negated sum, the sum of all bytes is 0; an inverted one gives all ones."""
     data = b"\x12\xff\x80\x01"
     assert (sum(data) + NAMED["sum8-negated"].of(data)) & 0xFF == 0
@@ -41,7 +41,7 @@ def test_a_negated_sum_makes_the_sum_of_all_bytes_zero() -> None:
     assert (sum(data) + NAMED["sum8-inverted"].of(data)) & 0xFF == 0xFF
 
 
-def test_parameters_describe_a_checksum_without_a_name() -> None:
+def test_parameters_describe_a_checksum_without_a_name():
     """Polynomial, initial value and final exclusive or; other values are refused."""
     icode = Checksum("crc8", 0x1D, 0xFD)
     assert parsed("crc8 poly=1d init=fd xorout=00") == icode

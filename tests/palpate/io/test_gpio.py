@@ -265,9 +265,7 @@ counters at the end."""
 
 
 @pytest.mark.parametrize(("how", "edges", "calls", "counters"), CASES.values(), ids=CASES)
-def test_what_calls_report(
-    how: dict[str, Any], edges: dict[str, list[int]], calls: list[Call], counters: dict[str, int]
-) -> None:
+def test_what_calls_report(how, edges, calls, counters):
     """Edges with the kernel's time stamps, in order; glitches, losses and storms are counted."""
     setup = TriggerSetup(**how)
     for name, times in edges.items():
@@ -279,7 +277,7 @@ def test_what_calls_report(
 
 
 @pytest.mark.parametrize("step_ns", [US, 10 * US])
-def test_storm(step_ns: int) -> None:
+def test_storm(step_ns):
     """10,000 edges are one LOST at the first above the limit; a quiet line works again."""
     setup = TriggerSetup(**ONE)
     setup.drive("START", *(10 * MS + i * step_ns for i in range(10_000)))
@@ -290,7 +288,7 @@ def test_storm(step_ns: int) -> None:
 
 
 @pytest.mark.parametrize(("active_low", "bias"), [(False, "PULL_DOWN"), (True, "PULL_UP")])
-def test_what_is_requested(active_low: bool, bias: str) -> None:
+def test_what_is_requested(active_low, bias):
     """Both edges on the monotonic clock, not debounced, with a long queue, pulled to the inactive
     level; a request for each line, so that the kernel numbers its events without gaps."""
     setup = TriggerSetup(new_object="NEW", active_low=active_low)
@@ -306,7 +304,7 @@ def test_what_is_requested(active_low: bool, bias: str) -> None:
         assert request.queue.maxlen == 1024
 
 
-def test_level_seen_too_late() -> None:
+def test_level_seen_too_late():
     """The same edge twice is one edge, and a return to the level is not an edge."""
     setup = TriggerSetup()
     setup.queue((False, MS, 1), (False, MS + US, 2))
@@ -316,7 +314,7 @@ def test_level_seen_too_late() -> None:
     assert setup.poll(6 * MS) == [(START, 4 * MS)]
 
 
-def test_interrupts_overtake() -> None:
+def test_interrupts_overtake():
     """An edge that is delivered late, but within `glitch_us`, is in order and no loss."""
     setup = TriggerSetup()
     setup.drive("START", MS)
@@ -332,7 +330,7 @@ def test_interrupts_overtake() -> None:
     assert setup.trigger.edge_counters.lost_edges == 0
 
 
-def test_edges_that_the_kernel_joins() -> None:
+def test_edges_that_the_kernel_joins():
     """Two interrupts in one event, with the level after both, are never a loss."""
     setup = TriggerSetup()
     rise, fall = gpiod.EdgeEvent.Type.RISING_EDGE.value, gpiod.EdgeEvent.Type.FALLING_EDGE.value
@@ -347,7 +345,7 @@ def test_edges_that_the_kernel_joins() -> None:
     assert (setup.trigger.edge_counters.lost_edges, setup.trigger.edge_counters.glitches) == (0, 1)
 
 
-def test_event_numbers_wrap() -> None:
+def test_event_numbers_wrap():
     """The kernel's 32-bit event numbers wrap without a loss."""
     setup = TriggerSetup()
     setup.trigger._lines[0].seqno = 2**32 - 2
@@ -356,7 +354,7 @@ def test_event_numbers_wrap() -> None:
     assert setup.trigger.edge_counters.lost_edges == 0
 
 
-def test_blind_until_quiet() -> None:
+def test_blind_until_quiet():
     """After a loss nothing counts until all lines were quiet; then levels are read again."""
     setup = TriggerSetup(mode="one-line", stop="", queue=4)
     setup.drive("START", *(t * 100 * US for t in (100, 110, 120, 130, 140, 144, 148)))
@@ -368,7 +366,7 @@ def test_blind_until_quiet() -> None:
     assert setup.poll(30 * MS) == [(STOP, 20 * MS)]
 
 
-def test_reading_is_bounded() -> None:
+def test_reading_is_bounded():
     """A call reads no more than `storm_edges` events and leaves the rest to the next one."""
     setup = TriggerSetup(storm_edges=100)
     setup.drive("START", *(10 * MS + i * US for i in range(1000)))
@@ -378,7 +376,7 @@ def test_reading_is_bounded() -> None:
     assert not setup.trigger.blind
 
 
-def test_chip_pulled_out() -> None:
+def test_chip_pulled_out():
     """A chip that is unplugged is a LineError that names its line and the errno."""
     setup = TriggerSetup()
     setup.gpio.refuse[CHIP0] = 19
@@ -414,7 +412,7 @@ def settled(times_ns: list[int]) -> list[tuple[int, bool]]:
 
 @pytest.mark.slow
 @given(st.tuples(gaps, gaps, gaps), st.integers(20, 5000))
-def test_any_edges(lines: tuple[list[int], list[int], list[int]], step_us: int) -> None:
+def test_any_edges(lines, step_us):
     """Any edges on three lines of two chips, read at any times, are the reference's, in order."""
     setup = TriggerSetup({CHIP0: ("NEW", "STOP"), CHIP1: ("START",)}, new_object="NEW")
     wanted = []
@@ -429,9 +427,7 @@ def test_any_edges(lines: tuple[list[int], list[int], list[int]], step_us: int) 
 
 
 @given(gaps, st.integers(20, 5000), st.integers(2, 30), st.sampled_from([2, 8, 64]), st.booleans())
-def test_any_losses(
-    gaps_us: list[int], step_us: int, storm_edges: int, queue: int, high: bool
-) -> None:
+def test_any_losses(gaps_us, step_us, storm_edges, queue, high):
     """Without LOST between them START and STOP alternate, in time, and skip short pulses."""
     setup = TriggerSetup(
         high="START" if high else "", mode="one-line", stop="", storm_edges=storm_edges, queue=queue
@@ -470,9 +466,7 @@ NAMELESS = {CHIP0: ("", "", "A"), CHIP1: ("", "")}
         ({}, {}),
     ],
 )
-def test_lines_are_found(
-    chips: dict[str, tuple[str, ...]], wanted: dict[str, tuple[str, int]]
-) -> None:
+def test_lines_are_found(chips, wanted):
     """By name on any chip, or by chip and offset; a box without lines needs no chip."""
     assert find_lines(sim(chips), list(wanted)) == wanted
 
@@ -492,15 +486,13 @@ def test_lines_are_found(
         ({}, ["START"], "no /dev/gpiochip"),
     ],
 )
-def test_lines_that_are_not_found(
-    chips: dict[str, tuple[str, ...]], names: list[str], why: str
-) -> None:
+def test_lines_that_are_not_found(chips, names, why):
     """A missing, nameless, ambiguous or doubled line is named, with what there is instead."""
     with pytest.raises(LineError, match=why):
         find_lines(sim(chips), names)
 
 
-def test_find_through_link() -> None:
+def test_find_through_link():
     """A second path to a chip (Raspberry Pi OS has one) makes no name ambiguous."""
     gpio = sim({CHIP0: ("START",)})
     chip = gpio.Chip
@@ -517,7 +509,7 @@ def test_find_through_link() -> None:
     ("number", "why"),
     [(1, r"may not open.*'STOP'"), (13, r"may not open.*'STOP'"), (5, f"of {CHIP1}")],
 )
-def test_a_chip_that_cannot_be_opened(number: int, why: str) -> None:
+def test_a_chip_that_cannot_be_opened(number, why):
     """It is named, if a line is on no other chip."""
     gpio = sim({CHIP0: ("START",), CHIP1: ("STOP",)})
     gpio.refuse[CHIP1] = number
@@ -531,7 +523,7 @@ def test_a_chip_that_cannot_be_opened(number: int, why: str) -> None:
 @pytest.mark.parametrize(
     "module", [SimpleNamespace(__version__="1.6.3", Chip=object), SimpleNamespace()]
 )
-def test_binding_of_libgpiod_1(module: Any) -> None:
+def test_binding_of_libgpiod_1(module):
     """The old binding, or another module of that name, is refused with its version; the installed
     one and the double are accepted."""
     version = getattr(module, "__version__", "of unknown version")
@@ -543,7 +535,7 @@ def test_binding_of_libgpiod_1(module: Any) -> None:
     check_binding(sim({}))
 
 
-def test_busy_line() -> None:
+def test_busy_line():
     """A line that is in use is a LineError with errno 16, and the free lines are released."""
     gpio = sim({CHIP0: ("START",), CHIP1: ("STOP",)})
     with GpioTrigger(trigger_config(stop="", start="STOP", mode="one-line"), gpio):
@@ -564,7 +556,7 @@ def panel() -> tuple[SimGpio, VirtualClock, Lines]:
     return gpio, clock, Lines(output_config(), gpio, clock)
 
 
-def test_outputs_begin_low(panel: tuple[SimGpio, VirtualClock, Lines]) -> None:
+def test_outputs_begin_low(panel):
     """All outputs are requested low, with one request per chip, and nothing is written."""
     gpio, _, _ = panel
     settings = [s for request in gpio.requests for s in request.settings.values()]
@@ -610,11 +602,7 @@ def coded(code: int | None) -> Callable[[Lines], None]:
         ),
     ],
 )
-def test_what_is_written(
-    panel: tuple[SimGpio, VirtualClock, Lines],
-    calls: list[Callable[[Lines], None]],
-    written: list[list[str]],
-) -> None:
+def test_what_is_written(panel, calls, written):
     """The changes of each call: microseconds since its begin, line and level."""
     gpio, clock, lines = panel
     for call, wanted in zip(calls, written, strict=True):
@@ -626,7 +614,7 @@ def test_what_is_written(
 
 
 @pytest.mark.parametrize("code", [-1, 8])
-def test_code_that_does_not_fit(panel: tuple[SimGpio, VirtualClock, Lines], code: int) -> None:
+def test_code_that_does_not_fit(panel, code):
     """A code that is too large for the bits is a LineError and leaves RESULT VALID low."""
     gpio, _, lines = panel
     assert lines.capacity == 8
@@ -637,7 +625,7 @@ def test_code_that_does_not_fit(panel: tuple[SimGpio, VirtualClock, Lines], code
     assert gpio.written == [(200 * US, "VALID", False)]
 
 
-def test_not_wired() -> None:
+def test_not_wired():
     """Lines without a name are not searched or written; without outputs no chip is needed."""
     gpio = SimGpio(VirtualClock(0), {CHIP0: ("READY",)})
     lines = Lines(
@@ -653,7 +641,7 @@ def test_not_wired() -> None:
     )
 
 
-def test_close_drops_all(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_close_drops_all(monkeypatch):
     """Closing drives all lines low, also on a chip that keeps levels; twice does no harm."""
     clock = VirtualClock(0)
     gpio = SimGpio(clock, {CHIP0: OUTPUTS})
@@ -672,7 +660,7 @@ def test_close_drops_all(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(gpio.written) == 3
 
 
-def test_close_of_a_dead_chip(panel: tuple[SimGpio, VirtualClock, Lines]) -> None:
+def test_close_of_a_dead_chip(panel):
     """A chip that is gone is a LineError, and the other lines are still released."""
     gpio, _, lines = panel
     lines.show(ready=True, busy=False, fault=False)

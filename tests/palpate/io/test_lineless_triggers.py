@@ -7,7 +7,7 @@ import os
 import pty
 import termios
 import tty
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 
 import numpy as np
@@ -17,14 +17,9 @@ from palpate.core.config import TriggerConfig
 from palpate.core.errors import ApplianceError, ConfigError, PortError
 from palpate.core.sentences import MAX_LINE, sentence
 from palpate.core.types import Edge, EdgeKind, Status, Verdict
-from palpate.io.lineless_triggers import (
-    AnswerWatch,
-    CommandTrigger,
-    KeyTrigger,
-    TimedTrigger,
-)
+from palpate.io.lineless_triggers import AnswerWatch, CommandTrigger, KeyTrigger, TimedTrigger
 from palpate.sim import devices, rig, script, skin
-from tests.factories.simulated_box import SECOND, Rigged, idle_devices
+from tests.factories.simulated_box import SECOND, idle_devices
 
 START, STOP = EdgeKind.START, EdgeKind.STOP
 
@@ -76,7 +71,7 @@ def test_a_command_is_an_edge_at_the_time_of_its_arrival():
         ("10000,1000", 10_000.0, 1_000.0),
     ],
 )
-def test_start_may_have_speed_and_force(text: str, speed_mm_s: float | None, force_n: float | None):
+def test_start_may_have_speed_and_force(text, speed_mm_s, force_n):
     """They are in the start edge, each may be empty; a person may type a space for the comma."""
     trigger = CommandTrigger(rig.VirtualClock(5))
     trigger.commands["START"](text)
@@ -99,7 +94,7 @@ def test_start_may_have_speed_and_force(text: str, speed_mm_s: float | None, for
         ("1,2,3", "3 values"),
     ],
 )
-def test_a_bad_speed_or_force_starts_nothing(text: str, message: str):
+def test_a_bad_speed_or_force_starts_nothing(text, message):
     """The error quotes the value, has its advice, and fits into a sentence to its end."""
     trigger = CommandTrigger(rig.VirtualClock(5))
     with pytest.raises(ApplianceError) as refused:
@@ -111,7 +106,7 @@ def test_a_bad_speed_or_force_starts_nothing(text: str, message: str):
     assert b"or leave it empty*" in line or b"a force in N*" in line
 
 
-def test_a_robot_sweeps_over_its_serial_line(rigged: Callable[..., Rigged]):
+def test_a_robot_sweeps_over_its_serial_line(rigged):
     """The whole box with START, STOP and NEW as commands; no input line is used."""
     simulated = idle_devices()
     box = rigged(simulated, sets=("trigger.mode=serial",))
@@ -137,7 +132,7 @@ def test_a_robot_sweeps_over_its_serial_line(rigged: Callable[..., Rigged]):
     assert [sweep.speed_mm_s for sweep in box.kept] == [None, None, None]
 
 
-def test_the_space_bar_starts_and_stops(terminal: tuple[int, int]):
+def test_the_space_bar_starts_and_stops(terminal):
     """Each press counts once, whatever else is typed, and a message confirms each."""
     far, near = terminal
     said: list[str] = []
@@ -157,7 +152,7 @@ def test_the_space_bar_starts_and_stops(terminal: tuple[int, int]):
     ]
 
 
-def test_after_an_answer_the_space_bar_starts(terminal: tuple[int, int]):
+def test_after_an_answer_the_space_bar_starts(terminal):
     """A sweep that was answered `long` is over; a late answer to an older one changes nothing."""
     far, near = terminal
     with KeyTrigger(near, rig.VirtualClock(), lambda line: None) as trigger:
@@ -172,7 +167,7 @@ def test_after_an_answer_the_space_bar_starts(terminal: tuple[int, int]):
         assert kinds(trigger.edges(3)) == [STOP]
 
 
-def test_the_terminal_is_restored(terminal: tuple[int, int]):
+def test_the_terminal_is_restored(terminal):
     """Keys come at once, unseen, and none but Ctrl-C ends the program; then all is as before."""
     _, near = terminal
     tty.setcbreak(near)  # some settings that are not the default
@@ -189,7 +184,7 @@ def test_the_terminal_is_restored(terminal: tuple[int, int]):
     assert termios.tcgetattr(near) == before
 
 
-def test_a_terminal_that_is_gone_ends_it(terminal: tuple[int, int]):
+def test_a_terminal_that_is_gone_ends_it(terminal):
     """A PortError, not a loop for ever; closing does not fail."""
     far, near = terminal
     with closing(KeyTrigger(near, rig.VirtualClock(), lambda line: None)) as trigger:
@@ -249,7 +244,7 @@ def test_no_sweep_is_started_while_it_is_held():
     assert said == ["start in 1 s", "start: slide for 3 s", "stop"]
 
 
-def test_nobody_slides_for_a_skin_that_is_away(rigged: Callable[..., Rigged]):
+def test_nobody_slides_for_a_skin_that_is_away(rigged):
     """The skin is waited for at the start and after a plug; no sweep is `not-ready`."""
     simulated = idle_devices()
     simulated.backend.unplug()
@@ -263,7 +258,7 @@ def test_nobody_slides_for_a_skin_that_is_away(rigged: Callable[..., Rigged]):
     assert [s.status for s in box.kept] == [Status.OK, Status.SENSOR_LOST]
 
 
-def test_sweeps_by_the_clock_are_answered(rigged: Callable[..., Rigged]):
+def test_sweeps_by_the_clock_are_answered(rigged):
     """The whole box: windows are cut from the middle of timed sweeps."""
     simulated = idle_devices()
     box = rigged(simulated, sets=("trigger.mode=timed", "trigger.every_s=4"))
@@ -282,9 +277,7 @@ def test_sweeps_by_the_clock_are_answered(rigged: Callable[..., Rigged]):
         (("trigger.mode=key",), "needs a terminal"),
     ],
 )
-def test_a_box_that_could_not_sweep_does_not_start(
-    rigged: Callable[..., Rigged], sets: tuple[str, ...], hint: str, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_box_that_could_not_sweep_does_not_start(rigged, sets, hint, monkeypatch):
     """Settings with which every sweep would fail, and no standard input, are refused."""
     monkeypatch.setattr("sys.stdin", None)
     with pytest.raises(ConfigError, match=hint):
@@ -294,7 +287,7 @@ def test_a_box_that_could_not_sweep_does_not_start(
 
 
 @pytest.mark.parametrize("name", ["START", "STOP"])
-def test_commands_of_another_trigger_are_refused(rigged: Callable[..., Rigged], name: str):
+def test_commands_of_another_trigger_are_refused(rigged, name):
     """With lines, START and STOP are answered by an error that names the setting."""
     box = rigged(devices.build(skin.FORMAT, script.tubes(1, 1), rig.VirtualClock(), "sim"))
     box.seconds(0.5)

@@ -44,7 +44,7 @@ def test_bytes_are_the_documents_table():
 @pytest.mark.parametrize(
     ("byte", "shape"), [(0, (4, 2)), (1, (4, 2)), (2, (2, 2, 2)), (8, (1, 1, 8))]
 )
-def test_axes_of_a_taxel(byte: int, shape: tuple[int, ...]):
+def test_axes_of_a_taxel(byte, shape):
     """The byte after the data type; 0 means one axis, and the box writes one as 0."""
     payload = bytes(range(8))
     head = struct.pack("<BBBBHBBBBBBII", 0x50, 0xC1, 1, 0, 8, 0, 1, *shape[:2], 0, byte, 5, 7)
@@ -56,7 +56,7 @@ def test_axes_of_a_taxel(byte: int, shape: tuple[int, ...]):
 
 
 @pytest.mark.parametrize(("byte", "size"), [(9, 9), (3, 8), (255, 255)])
-def test_axes_that_cannot_be(byte: int, size: int):
+def test_axes_that_cannot_be(byte, size):
     """More than eight axes, or another number than in the payload: the bytes are garbage."""
     head = struct.pack("<BBBBHBBBBBBII", 0x50, 0xC1, 1, 0, size, 0, 1, 1, 1, 0, byte, 5, 7)
     data = head + bytes(size) + struct.pack("<I", zlib.crc32(head + bytes(size)))
@@ -65,7 +65,7 @@ def test_axes_that_cannot_be(byte: int, size: int):
 
 
 @pytest.mark.parametrize("dtype", DATA_TYPES)
-def test_every_data_type_survives(dtype: str):
+def test_every_data_type_survives(dtype):
     """Raw counts of each type arrive as they were sent."""
     sent = stream(2, dtype=dtype)
     got = wire.unpack(b"".join(sent))
@@ -78,7 +78,7 @@ def test_every_data_type_survives(dtype: str):
 
 
 @given(cuts=st.lists(st.integers(0, 400), max_size=12), data=st.data())
-def test_any_split_gives_the_same(cuts: list[int], data: st.DataObject):
+def test_any_split_gives_the_same(cuts, data):
     """However a stream is cut into transfers, the same frames come out and nothing is counted."""
     whole = b"".join(stream(8, first=data.draw(st.integers(0, 2**32 - 1))))
     edges = sorted({0, *(c % len(whole) for c in cuts), len(whole)})
@@ -133,7 +133,7 @@ def test_only_intact_frames_and_all_bytes_accounted(pieces):
 
 
 @given(st.binary(max_size=3000))
-def test_garbage_never_raises_and_is_counted(data: bytes):
+def test_garbage_never_raises_and_is_counted(data):
     """Random bytes give no frames; each byte is garbage or part of the rest."""
     got = wire.unpack(data)
     assert got.packets == []
@@ -141,7 +141,7 @@ def test_garbage_never_raises_and_is_counted(data: bytes):
 
 
 @given(st.lists(st.integers(0, 30), max_size=40), st.integers(0, 2**32 - 1))
-def test_follow_accounts_for_every_frame(order: list[int], first: int):
+def test_follow_accounts_for_every_frame(order, first):
     """In any order: numbers rise, and fresh plus lost frames cover the whole range."""
     packets = [
         wire.Packet((first + 3 * k) % 2**32, 0, wire.Flag(0), np.zeros((3, 1, 1), np.uint8))

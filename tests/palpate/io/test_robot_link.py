@@ -8,10 +8,8 @@ import os
 import re
 import struct
 import sys
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pynmea2
@@ -80,7 +78,7 @@ def test_a_slide_without_room_is_left_out():
 
 @pytest.mark.slow
 @given(st.text(max_size=200), st.text(max_size=40), st.sampled_from(list(Status)))
-def test_pynmea2_parses_every_sentence(detail: str, label: str, status: Status):
+def test_pynmea2_parses_every_sentence(detail, label, status):
     """For any texts an independent parser accepts the checksum and finds all fields."""
     line = result(verdict(label, status, detail), "sim").decode("ascii")
     assert len(line) <= MAX_LINE
@@ -107,13 +105,13 @@ def test_pynmea2_parses_every_sentence(detail: str, label: str, status: Status):
         (b"$PPLP,ABORT*" + checksum("PPLP,ABORT").lower().encode(), Command("ABORT")),
     ],
 )
-def test_commands_are_read(line: bytes, want: Command):
+def test_commands_are_read(line, want):
     """With checksum or without, by program or person; noise before the $ is ignored."""
     assert parse(line + b"\r\n") == ([want], b"")
 
 
 @pytest.mark.parametrize("line", ["START", "START,30,1.5", "STOP", "MATERIAL,", "LABEL,3"])
-def test_a_command_keeps_its_line(line: str):
+def test_a_command_keeps_its_line(line):
     """The line that a capture has gives the same command again."""
     ((command,), _) = parse(f"$PPLP,{line}\r\n".encode())
     assert command.line == line
@@ -130,7 +128,7 @@ def test_a_command_keeps_its_line(line: str):
         (b"\xff\xfe\x00", "not a command"),
     ],
 )
-def test_bad_commands_are_answered(line: bytes, hint: str):
+def test_bad_commands_are_answered(line, hint):
     """A wrong checksum, unknown command, other protocol, noise: an error with the remedy."""
     (command,), rest = parse(line + b"\n")
     assert hint in command.error
@@ -138,7 +136,7 @@ def test_bad_commands_are_answered(line: bytes, hint: str):
 
 
 @pytest.mark.parametrize("line", [b"ID", b"help", b"$PPLP,MATERIAL", b"$PPLP,ID,now", b"\xff"])
-def test_the_example_of_an_error_can_be_copied(line: bytes):
+def test_the_example_of_an_error_can_be_copied(line):
     """The command that an ANS error suggests is understood when it is sent, whatever was typed
     before. No part of it is lost to NMEA's reserved characters."""
     ((bad,), _) = parse(line + b"\r\n")
@@ -159,7 +157,7 @@ def test_a_line_without_end_is_dropped():
 
 
 @given(st.binary(max_size=300), st.lists(st.integers(0, 300), max_size=5))
-def test_parse_never_raises_and_splits_anywhere(data: bytes, cuts: list[int]):
+def test_parse_never_raises_and_splits_anywhere(data, cuts):
     """Any bytes, split anywhere, give the same commands as in one piece."""
     edges = sorted({0, len(data), *(c % (len(data) + 1) for c in cuts)})
     rest, got = b"", []
@@ -174,7 +172,7 @@ def sink_on(name: str, clock=None, **settings) -> SerialSink:
     return SerialSink(SerialConfig(port=name, **settings), clock or rig.VirtualClock(), "sim")
 
 
-def test_a_port_that_is_not_there_and_comes(tmp_path: Path):
+def test_a_port_that_is_not_there_and_comes(tmp_path):
     """It is named with what to do, sentences wait in the queue, and it is opened later."""
     clock = rig.VirtualClock()
     sink = sink_on(str(tmp_path / "ttyUSB0"), clock)
@@ -209,7 +207,7 @@ def is_shut(port: int) -> bool:
 
 
 @pytest.mark.parametrize("real", [True, False])
-def test_a_port_is_kept_from_others(monkeypatch: pytest.MonkeyPatch, real: bool):
+def test_a_port_is_kept_from_others(monkeypatch, real):
     """While the box has a port the kernel refuses it to others; after closing it is free, even if
     another had it open. A pseudo-terminal is not shut: it would stay so if the box is killed while
     the other end is open."""
@@ -259,7 +257,7 @@ def levels(chip: gpio.SimGpio) -> dict[str, bool]:
         *((status, {"VALID"}) for status in (Status.UNSURE, Status.CONFLICT, Status.NO_CONTACT)),
     ],
 )
-def test_the_code_of_an_answer(status: Status, on: set[str]):
+def test_the_code_of_an_answer(status, on):
     """The label's code if it is ok, else code 0; RESULT VALID rises with either."""
     lines, chip = lines_on(2)
     sink = LineSink(lines, LABELS)
@@ -298,7 +296,7 @@ def test_a_line_that_echoes_gets_no_answers():
     ],
     ids=["lower case", "cut", "quoted", "damaged", "doubled"],
 )
-def test_an_echo_with_changes_is_not_answered_without_end(change: Callable[[bytes], bytes]):
+def test_an_echo_with_changes_is_not_answered_without_end(change):
     """Each answer comes back changed, for a minute: eight answers, and then one a second. A command
     in between is carried out, and a bad line after it is answered at once."""
     clock = rig.VirtualClock()
@@ -346,7 +344,7 @@ class StandardOutput:
     "error",
     [OSError(28, "No space left"), OSError(27, "File too large"), ValueError("closed file")],
 )
-def test_standard_output_that_takes_nothing(monkeypatch: pytest.MonkeyPatch, error: Exception):
+def test_standard_output_that_takes_nothing(monkeypatch, error):
     """Sentences are dropped and counted, with the reason; they go on once it works again."""
     output = StandardOutput(error)
     monkeypatch.setattr(sys, "stdout", output)
@@ -363,7 +361,7 @@ def test_standard_output_that_takes_nothing(monkeypatch: pytest.MonkeyPatch, err
     assert port.dropped == 3
 
 
-def test_a_pipe_that_nobody_reads_does_not_hold_the_loop(monkeypatch: pytest.MonkeyPatch):
+def test_a_pipe_that_nobody_reads_does_not_hold_the_loop(monkeypatch):
     """When the pipe is full, sentences are dropped at once; a reader that goes ends the command."""
     reader, writer = os.pipe()
     with suppress(BrokenPipeError), os.fdopen(writer, "w") as stream:  # closing writes the rest

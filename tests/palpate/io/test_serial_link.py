@@ -10,7 +10,6 @@ import termios
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,14 +17,7 @@ import serial
 
 from palpate.core.clock import SystemClock
 from palpate.core.config import SkinConfig
-from palpate.core.errors import (
-    SensorAbsent,
-    SensorBusy,
-    SensorDenied,
-    SensorError,
-    SensorLost,
-    SensorMismatch,
-)
+from palpate.core.errors import SensorAbsent, SensorBusy, SensorDenied, SensorLost, SensorMismatch
 from palpate.core.types import EPOCH_BITS, Frames, SweepFormat
 from palpate.io import packets, serial_link
 from palpate.io.serial_link import ReadoutLink, SerialLink
@@ -71,7 +63,7 @@ def read_until(sensor: UsbSensor, done: Callable[[int], bool]) -> Frames:
     return Frames.joined(parts)
 
 
-def test_streams_and_stops(board: SerialBoard):
+def test_streams_and_stops(board):
     """Identity, format, start, frames with the content of their numbers, stop at the end."""
     board.plug()
     with closing(sensor_on(board)) as sensor:
@@ -87,7 +79,7 @@ def test_streams_and_stops(board: SerialBoard):
         assert CLOCK.now_ns() < end_ns, "it was not stopped"
 
 
-def test_unplugged_and_replugged(board: SerialBoard):
+def test_unplugged_and_replugged(board):
     """Pulled while frames come: lost, then absent; back, a new epoch with right frames."""
     board.plug()
     with closing(sensor_on(board)) as sensor:
@@ -106,7 +98,7 @@ def test_unplugged_and_replugged(board: SerialBoard):
             assert (frames.taxels == skins.counts(frames.seq, FMT)).all()
 
 
-def test_a_reply_in_the_middle_of_an_old_stream(line: tuple[int, str]):
+def test_a_reply_in_the_middle_of_an_old_stream(line):
     """Frames that an earlier program left running come before the reply and are left out."""
     far, path = line
     who = packets.Identity(1, (1, 2, 3), "board", "7")
@@ -127,7 +119,7 @@ def test_a_reply_in_the_middle_of_an_old_stream(line: tuple[int, str]):
     ("sent", "hint"),
     [(b"", "sends nothing"), (b"hello", "sends 5 other bytes"), (bytes(20_000), "other bytes but")],
 )
-def test_no_reply(line: tuple[int, str], sent: bytes, hint: str):
+def test_no_reply(line, sent, hint):
     """Another device or none: the attempt ends after half a second or too many bytes."""
     far, path = line
     with closing(SerialLink(path, 115200, CLOCK)) as link:
@@ -143,7 +135,7 @@ def test_no_reply(line: tuple[int, str], sent: bytes, hint: str):
             link.request(packets.Request.FORMAT, 64)
 
 
-def test_what_came_before_the_port_was_opened_is_not_read(line: tuple[int, str]):
+def test_what_came_before_the_port_was_opened_is_not_read(line):
     """Bytes from before are discarded, since they would be taken for new frames."""
     far, path = line
     os.write(far, b"old")
@@ -152,7 +144,7 @@ def test_what_came_before_the_port_was_opened_is_not_read(line: tuple[int, str])
         assert link.read(10, 1000) == b"new"
 
 
-def test_read_and_write(line: tuple[int, str]):
+def test_read_and_write(line):
     """All byte values pass; none in time is b""; a longer text is cut at `size`."""
     far, path = line
     with closing(SerialLink(path, 2_000_000, CLOCK)) as link:
@@ -165,9 +157,7 @@ def test_read_and_write(line: tuple[int, str]):
 
 
 @pytest.mark.parametrize(("held", "pause_ns"), [(100, 8_000_000), (2100, 4_000_000), (4095, 0)])
-def test_the_pause_after_a_read(
-    line: tuple[int, str], held: int, pause_ns: int, monkeypatch: pytest.MonkeyPatch
-):
+def test_the_pause_after_a_read(line, held, pause_ns, monkeypatch):
     """The fuller the port was, the sooner it is read again, so that a backlog is caught up with."""
     far, path = line
     clock = VirtualClock()
@@ -180,7 +170,7 @@ def test_the_pause_after_a_read(
         assert clock.now_ns() - before == pause_ns
 
 
-def test_a_port_that_takes_nothing(line: tuple[int, str], monkeypatch: pytest.MonkeyPatch):
+def test_a_port_that_takes_nothing(line, monkeypatch):
     """A skin that does not read its requests is lost; the box does not wait for it without end."""
     monkeypatch.setattr(serial_link, "REPLY_MS", 10)
     with (
@@ -190,17 +180,14 @@ def test_a_port_that_takes_nothing(line: tuple[int, str], monkeypatch: pytest.Mo
         link.write(bytes(1_000_000))
 
 
-def test_a_port_that_another_program_holds(line: tuple[int, str]):
+def test_a_port_that_another_program_holds(line):
     """Held by a lock: busy; free again after it."""
-    with (
-        serial.Serial(line[1], exclusive=True),
-        pytest.raises(SensorBusy, match="another"),
-    ):
+    with serial.Serial(line[1], exclusive=True), pytest.raises(SensorBusy, match="another"):
         SerialLink(line[1], 115200, CLOCK)
     SerialLink(line[1], 115200, CLOCK).close()
 
 
-def test_others_are_kept_out_and_dtr_stays(line: tuple[int, str], monkeypatch: pytest.MonkeyPatch):
+def test_others_are_kept_out_and_dtr_stays(line, monkeypatch):
     """Others get errno 11 meanwhile; closing keeps DTR, which restarts many boards."""
     link = SerialLink(line[1], 115200, CLOCK)
     with open(line[1], "rb", buffering=0) as other:
@@ -220,7 +207,7 @@ def test_others_are_kept_out_and_dtr_stays(line: tuple[int, str], monkeypatch: p
         (errno.EIO, SensorLost, "baud"),
     ],
 )
-def test_a_port_that_cannot_be_opened(code: int, kind: type[SensorError], hint: str):
+def test_a_port_that_cannot_be_opened(code, kind, hint):
     """Each errno of opening has its state and names the port."""
 
     def refuse(*args, **options) -> None:
@@ -233,13 +220,13 @@ def test_a_port_that_cannot_be_opened(code: int, kind: type[SensorError], hint: 
 
 
 @pytest.mark.parametrize("path", ["/dev/null", "/etc/passwd", "/tmp"])
-def test_a_file_that_is_not_a_serial_port(path: str):
+def test_a_file_that_is_not_a_serial_port(path):
     """The message says so and names the option, with the real pyserial."""
     with pytest.raises(SensorLost, match=f"{path} is not a serial port; correct --port"):
         SerialLink(path, 115200, CLOCK)
 
 
-def test_ids_find_the_port(tmp_path: Path):
+def test_ids_find_the_port(tmp_path):
     """The first port with the ids and the serial number; without one, all are named."""
     ports = [
         PortInfo("/dev/ttyS0"),

@@ -40,7 +40,7 @@ def test_noise_leaves_what_may_begin_a_mark():
 
 
 @pytest.mark.parametrize("cut", [0, 3])
-def test_a_mark_among_the_numbers_of_some_frames(cut: int):
+def test_a_mark_among_the_numbers_of_some_frames(cut):
     """The numbers of the first three frames hold a mark: frames begin at the mark that stays, also
     where the stream begins at the other."""
     numbers = ["01aa55040506"] * 3 + ["010203040506"] * 6
@@ -144,7 +144,7 @@ TEXT = SkinProfile(about="a", source="s", codec="text", lines="frames", number="
         ({"line_end": "\r"}, b"1 -2.5 300 nan"),
     ],
 )
-def test_lines_with_other_text_around_their_numbers(keys: dict, line: bytes):
+def test_lines_with_other_text_around_their_numbers(keys, line):
     """Brackets, labels, JSON, units, times, NMEA: numbers are read, other text is not."""
     p = replace(TEXT, cols=4, **keys)
     end = p.line_end.encode()
@@ -165,7 +165,7 @@ def test_lines_with_other_text_around_their_numbers(keys: dict, line: bytes):
         ("uint16", b"a:1 b:2 c:3 d:4", "'a:b:c:d:'"),
     ],
 )
-def test_the_value_that_does_not_fit_is_named(number: str, line: bytes, misfit: str):
+def test_the_value_that_does_not_fit_is_named(number, line, misfit):
     """A line that is refused says why."""
     found = decoded(replace(TEXT, cols=4, number=number), line + b"\n")
     assert (len(found), found.garbage) == (0, len(line) + 1)
@@ -209,7 +209,7 @@ def test_reskin_and_vitac_lines():
 @pytest.mark.parametrize(
     "word", [b"1_0", b"0x10", b"1.5", b"+-1", b"", b"nan", b"99999999999999999999", b"-1"]
 )
-def test_a_word_that_is_no_whole_number(word: bytes):
+def test_a_word_that_is_no_whole_number(word):
     """A text of whole numbers contains no other word."""
     p = replace(profile("3d-vitac"), rows=1, cols=2)
     assert len(decoded(p, b"1 2 \n\n1 " + word + b"\n\n")) == 1
@@ -340,7 +340,7 @@ def test_robotiq_byte_by_byte():
         (("transpose", "flip-rows"), [[3, 6], [2, 5], [1, 4]]),
     ],
 )
-def test_orientation(orientation: tuple[str, ...], wanted: list[list[int]]):
+def test_orientation(orientation, wanted):
     """Turns in their order; the format has the shape of the result."""
     p = replace(SMALL, orientation=orientation)
     got = arranged(p, np.arange(1, 7, dtype=np.uint8)[None])
@@ -349,7 +349,7 @@ def test_orientation(orientation: tuple[str, ...], wanted: list[list[int]]):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_split_or_whole_is_the_same(name: str):
+def test_split_or_whole_is_the_same(name):
     """Any split gives the frames, ends, garbage of the whole, with garbage in between."""
     p = profile(name)
     data = wire(name, 0)[7:] + b"".join(
@@ -370,7 +370,7 @@ def test_split_or_whole_is_the_same(name: str):
 @pytest.mark.parametrize("name", NAMES)
 @settings(max_examples=40)
 @given(data=st.binary(max_size=600), at=st.integers(0, 500))
-def test_no_bytes_raise(name: str, data: bytes, at: int):
+def test_no_bytes_raise(name, data, at):
     """Any bytes, within frames too: each is in a frame, garbage, or left over."""
     p = profile(name)
     sent = wire(name, 0) + wire(name, 1)
@@ -385,7 +385,7 @@ def test_no_bytes_raise(name: str, data: bytes, at: int):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_what_is_left_over_stays_small(name: str):
+def test_what_is_left_over_stays_small(name):
     """Bytes without an end do not pile up: 8 kB wait, of a text so much for each row."""
     decode = codec(profile(name))
     most = 8200 * (profile(name).rows if profile(name).lines == "rows" else 1)
@@ -397,7 +397,7 @@ def test_what_is_left_over_stays_small(name: str):
 
 
 @pytest.mark.parametrize("name", ["matrix", "flexitac", "anyskin"])
-def test_nothing_but_marks_is_passed_over(name: str, monkeypatch: pytest.MonkeyPatch):
+def test_nothing_but_marks_is_passed_over(name, monkeypatch):
     """Frames full of marks have no recognizable beginning. They are skipped as a whole and not byte
     by byte, which would take longer than their arrival: the number of tried positions shows it."""
     p, looked = profile(name), []
@@ -421,7 +421,7 @@ def test_nothing_but_marks_is_passed_over(name: str, monkeypatch: pytest.MonkeyP
         ("int32", "big", "ffffffff 80000000 00ffffff", [-1, -(1 << 31), (1 << 24) - 1]),
     ],
 )
-def test_numbers_of_every_width(number: str, order: str, wire: str, values: list[int]):
+def test_numbers_of_every_width(number, order, wire, values):
     """Both byte orders and signs. Above 16 bits they become float32, which rounds the lowest bits
     of more than 24. A text has no width."""
     if "4" in number:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,7 +25,7 @@ def consecutive(skin: WiredSkin, frames) -> bool:
 
 
 @each
-def test_streaming(name: str):
+def test_streaming(name):
     """Every frame once and in order, without a gap, its time correct, never ahead."""
     skin = WiredSkin(name)
     skin.seconds(3)
@@ -45,7 +44,7 @@ def test_streaming(name: str):
 
 
 @each
-def test_jitter(name: str):
+def test_jitter(name):
     """Reads up to 20 ms late and a clock 2 % off: times correct to a few milliseconds."""
     skin = WiredSkin(name, rate=1.0 if name == "papillarray" else 1.02)
     rng = np.random.default_rng(1)
@@ -79,9 +78,7 @@ def test_jitter(name: str):
         ("busy", 0.0, ["busy"], "held by another program"),
     ],
 )
-def test_a_fault_has_its_state_and_ends(
-    name: str, fault: str, before_s: float, states: list[str], why: str
-):
+def test_a_fault_has_its_state_and_ends(name, fault, before_s, states, why):
     """Pulled, silent or held by another program, also from the start: no frame and never streaming
     meanwhile; then a new epoch with the right frames."""
     skin = WiredSkin(name)
@@ -102,7 +99,7 @@ def test_a_fault_has_its_state_and_ends(
 
 
 @each
-def test_absent_is_found_by_its_ids(name: str):
+def test_absent_is_found_by_its_ids(name):
     """No port set: the profile's ids choose; without a port the message lists what there is."""
     skin = WiredSkin(name)
     config = replace(skin.sensor._config, port="")
@@ -117,7 +114,7 @@ def test_absent_is_found_by_its_ids(name: str):
 
 
 @each
-def test_garbage(name: str):
+def test_garbage(name):
     """One frame in twenty is damaged: all others are right, and the damage is counted."""
     skin = WiredSkin(name)
     rng = np.random.default_rng(3)
@@ -142,7 +139,7 @@ def test_garbage(name: str):
 
 
 @each
-def test_wrong_skin(name: str):
+def test_wrong_skin(name):
     """Bytes of another skin: no frame, never streaming, a mismatch that names the profile."""
     other = "3d-vitac" if name != "3d-vitac" else "flexitac"
     skin = WiredSkin(name)
@@ -154,7 +151,7 @@ def test_wrong_skin(name: str):
 
 
 @each
-def test_wrong_format_of_the_bundle(name: str):
+def test_wrong_format_of_the_bundle(name):
     """Another grid or rate is refused with both named, before a byte is sent to the skin."""
     has = profile(name).format
     for wanted in (replace(has, rows=has.rows + 1), replace(has, rate_hz=1.7 * has.rate_hz)):
@@ -167,7 +164,7 @@ def test_wrong_format_of_the_bundle(name: str):
 
 @each
 @pytest.mark.parametrize("rate", [0.5, 0.9, 1.1, 2.0])
-def test_wrong_rate(name: str, rate: float):
+def test_wrong_rate(name, rate):
     """Too slow or too fast: a mismatch with the figure, until the rate is right for a while."""
     skin = WiredSkin(name, rate=rate)
     skin.seconds(12)
@@ -185,7 +182,7 @@ def test_wrong_rate(name: str, rate: float):
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "papillarray"])
-def test_a_rate_that_wanders(name: str):
+def test_a_rate_that_wanders(name):
     """2 % are followed, a tenth is a mismatch. Skins with their own clock: test_usb_sensor.py."""
     skin = WiredSkin(name)
     skin.seconds(4)
@@ -211,7 +208,7 @@ def _change_rate(skin: WiredSkin, rate: float) -> None:
 
 @each
 @pytest.mark.parametrize("pause_s", [0.2, 1.0, 3.0])
-def test_a_backlog_after_a_pause(name: str, pause_s: float):
+def test_a_backlog_after_a_pause(name, pause_s):
     """The driver keeps all: each frame comes with the time at which it was taken."""
     skin = WiredSkin(name)
     skin.seconds(5)
@@ -226,7 +223,7 @@ def test_a_backlog_after_a_pause(name: str, pause_s: float):
 
 
 @each
-def test_a_driver_that_throws_away(name: str):
+def test_a_driver_that_throws_away(name):
     """The driver keeps 0.4 s of two: losses are counted, and no frame has a wrong time."""
     skin = WiredSkin(name)
     before = skin.seconds(5)
@@ -247,7 +244,7 @@ def test_a_driver_that_throws_away(name: str):
 
 
 @each
-def test_back_pressure(name: str):
+def test_back_pressure(name):
     """A host slower than the skin gets later frames with true times; then it catches up."""
     skin = WiredSkin(name)
     skin.seconds(5)
@@ -262,7 +259,7 @@ def test_back_pressure(name: str):
 
 
 @each
-def test_commands(name: str):
+def test_commands(name):
     """Only the profile's commands are written at start and end; a tare only if it is set."""
     skin = WiredSkin(name)
     skin.seconds(1)
@@ -283,7 +280,7 @@ def test_tare():
 
 
 @pytest.mark.parametrize("name", ["flexitac", "matrix", "anyskin"])
-def test_a_mark_in_the_payload(name: str):
+def test_a_mark_in_the_payload(name):
     """The mark occurs among the numbers, in every frame at the same place while the skin is at
     rest: no frame is cut at the wrong place, and once the number changes frames come."""
     skin = WiredSkin(name)
@@ -312,7 +309,7 @@ def test_a_mark_in_the_payload(name: str):
 
 
 @pytest.mark.parametrize("name", ["flexitac", "anyskin"])
-def test_once_in_step_a_mark_in_the_payload_does_no_harm(name: str):
+def test_once_in_step_a_mark_in_the_payload_does_no_harm(name):
     """In step it stays so while numbers hold marks; a lost byte invents no frame."""
     skin = WiredSkin(name)
     skin.seconds(2)
@@ -336,7 +333,7 @@ def test_once_in_step_a_mark_in_the_payload_does_no_harm(name: str):
     assert all(one.tobytes() in known for one in skin.seconds(3).taxels)
 
 
-def test_a_port_named_by_id_tells_its_serial_number(tmp_path: Path):
+def test_a_port_named_by_id_tells_its_serial_number(tmp_path):
     """A name by id is a link; the identity of the skin does not depend on the name of its port."""
     link = tmp_path / "usb-skin-S1"
     link.symlink_to(PATH)
@@ -348,7 +345,7 @@ def test_a_port_named_by_id_tells_its_serial_number(tmp_path: Path):
 
 
 @pytest.mark.parametrize("name", ["flexitac", "reskin"])
-def test_a_board_that_boots_whenever_it_is_opened(name: str):
+def test_a_board_that_boots_whenever_it_is_opened(name):
     """It sends nothing, or a boot message, for two seconds after each opening: the box waits longer
     each time until frames come, and the message names the setting."""
     skin = WiredSkin(name)

@@ -34,7 +34,7 @@ def settings(*sets: str) -> Config:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_each_profile_has_its_sensor_and_form(name: str):
+def test_each_profile_has_its_sensor_and_form(name):
     """Other skins are read from a serial port, in the profile's format, without asking."""
     simulated = idle_devices()
     chosen = settings(f"skin.profile={name}")
@@ -99,7 +99,7 @@ def playing() -> Iterator[str]:
         thread.join()
 
 
-def test_on_a_real_terminal(playing: str):
+def test_on_a_real_terminal(playing):
     """Real pyserial on a terminal: frames as they were sent, and a free port after it."""
     clock = SystemClock()
     chosen = settings("skin.profile=flexitac", f"skin.port={playing}")

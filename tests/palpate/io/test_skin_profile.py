@@ -68,7 +68,7 @@ def written(tmp_path: Path, text: str) -> Path:
         ("x = [" * 3000, "not TOML"),
     ],
 )
-def test_a_wrong_file(tmp_path: Path, text: str, hint: str):
+def test_a_wrong_file(tmp_path, text, hint):
     """Each mistake names the file, the key with its value, and the allowed values."""
     with pytest.raises(ConfigError) as e:
         load("own", [written(tmp_path, text)])
@@ -77,7 +77,7 @@ def test_a_wrong_file(tmp_path: Path, text: str, hint: str):
     assert "\n" not in str(e.value)
 
 
-def test_names(tmp_path: Path):
+def test_names(tmp_path):
     """A misspelt name, a name that leads out of the folder, an empty name. The first folder has
     priority; palpate needs no file; a name with the ending .toml is a file."""
     folder = written(tmp_path, GOOD)
@@ -97,7 +97,7 @@ def test_names(tmp_path: Path):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_delivered(name: str):
+def test_delivered(name):
     """Each describes itself and its source, claims no measurement, and survives JSON."""
     p = profile(name)
     assert p.about
@@ -151,7 +151,7 @@ def test_what_each_lacks():
         ("anyskin", {}, SweepFormat(5, 1, 28, 56, "float32", 3)),
     ],
 )
-def test_settings_change_a_profile(name: str, settings: dict, wanted: SweepFormat):
+def test_settings_change_a_profile(name, settings, wanted):
     """Grid, rate and baud come from the settings where they are set."""
     new = adapted(profile(name), SkinConfig(**settings))
     assert (new.format, new.baud) == (wanted, profile(name).baud)
@@ -172,7 +172,7 @@ def test_settings_change_a_profile(name: str, settings: dict, wanted: SweepForma
         ("robotiq-tsf", {"grid": "5x5"}, "neither one finger"),
     ],
 )
-def test_settings_that_do_not_fit(name: str, settings: dict, hint: str):
+def test_settings_that_do_not_fit(name, settings, hint):
     """The error names the setting and the allowed values."""
     with pytest.raises(ConfigError) as e:
         adapted(profile(name), SkinConfig(**settings))
@@ -202,7 +202,7 @@ def test_slow_skins_are_warned_of():
     assert "1.5" in warning(SweepFormat(5, 1, 28, 56, "float32", 3))
 
 
-def test_settings_find_own_profiles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_settings_find_own_profiles(tmp_path, monkeypatch):
     """`/etc/palpate/skins` has priority over the delivered profiles."""
     monkeypatch.setattr(skins, "OWN", written(tmp_path, GOOD))
     settings = config.load(None, ["skin.profile=own", "skin.grid=2x3"], site=NO_SITE)
@@ -216,7 +216,7 @@ def test_settings_find_own_profiles(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     )
 )
 @pytest.mark.slow
-def test_any_value_of_any_key_is_taken_or_refused(value: object):
+def test_any_value_of_any_key_is_taken_or_refused(value):
     """Any value in a file gives a profile or a ConfigError."""
     for key in skin_profile._KEYS:
         with contextlib.suppress(ConfigError):

@@ -3,9 +3,6 @@ and their replay."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
-
 import numpy as np
 
 from palpate.core import config
@@ -16,7 +13,6 @@ from palpate.sweeps.black_box import BlackBox
 from palpate.sweeps.capture import CaptureWriter
 from tests.factories import toy_bundle
 from tests.factories.paths import NO_SITE
-from tests.factories.simulated_box import Rigged
 
 FMT = toy_bundle.THREE_AXES
 
@@ -32,7 +28,7 @@ def act(z1: float, z2: float, label: str) -> rig.Act:
     return rig.Act(np.concatenate([off, slide, off]), OFF, OFF + len(slide) - 1, label)
 
 
-def test_answers_are_those_of_the_replay(rigged: Callable[..., Rigged], tmp_path: Path, capsys):
+def test_answers_are_those_of_the_replay(rigged, tmp_path, capsys):
     """Labels are right. Kept sweeps have all axes and replay bit for bit. The capture gives the
     same sentences."""
     model = toy_bundle.load(tmp_path / "bundle", format=FMT)

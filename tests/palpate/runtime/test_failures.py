@@ -59,7 +59,7 @@ def fail(box: Rigged, on: Callable[[int], bool], error: Exception = BAD_ALLOC) -
 
 
 @pytest.mark.parametrize("error", [BAD_ALLOC, MemoryError(), ModelError("Gather: index 7")])
-def test_a_sweep_on_which_the_model_fails_is_answered(rigged: Make, error: Exception):
+def test_a_sweep_on_which_the_model_fails_is_answered(rigged, error):
     """Its status is `failed`, its detail the reason, and the sweeps after it are answered."""
     simulated = sweeping(3)
     box = rigged(simulated)
@@ -70,7 +70,7 @@ def test_a_sweep_on_which_the_model_fails_is_answered(rigged: Make, error: Excep
     assert (verdicts[1].detail, verdicts[1].label) == (str(error) or "MemoryError", "")
 
 
-def test_repeated_failures_end_the_program_once_all_are_answered(rigged: Make):
+def test_repeated_failures_end_the_program_once_all_are_answered(rigged):
     """After the third failed sweep the program ends with exit code 70, which the unit restarts."""
     box = rigged(sweeping(5))
     fail(box, lambda number: True)
@@ -99,14 +99,14 @@ def run_of(failures: np.ndarray, model: bundle.Bundle) -> int | None:
     return None
 
 
-def test_failures_far_apart_do_not_end_it(default_bundle: bundle.Bundle):
+def test_failures_far_apart_do_not_end_it(default_bundle):
     """A failure counts until SOUND sweeps were classified after it."""
     numbers = np.arange(1, 100)
     assert run_of(numbers % (SOUND + 1) == 0, default_bundle) is None
     assert run_of(numbers % SOUND == 0, default_bundle) == SOUND * FAILURES
 
 
-def test_early_heads_that_fail_leave_the_whole_sweep(rigged: Make, logged: list[str]):
+def test_early_heads_that_fail_leave_the_whole_sweep(rigged, logged):
     """An error of the early heads is logged once, and the whole window is answered."""
     simulated = sweeping(2)
     box = rigged(simulated, sets=("classifier.early=true",))
@@ -139,7 +139,7 @@ class Breaking(Observer):
         raise self._error
 
 
-def test_a_fault_in_an_observer_costs_nothing_else(rigged: Make, logged: list[str]):
+def test_a_fault_in_an_observer_costs_nothing_else(rigged, logged):
     """It is logged, the sweeps are answered, and the other observers are called."""
     simulated = sweeping(3)
     box = rigged(simulated, observers=[Breaking(KeyError("none of these"))])
@@ -149,9 +149,7 @@ def test_a_fault_in_an_observer_costs_nothing_else(rigged: Make, logged: list[st
     assert any("KeyError" in line for line in logged)
 
 
-def test_a_failed_output_ends_the_program_and_the_open_sweep_is_answered(
-    rigged: Make,
-):
+def test_a_failed_output_ends_the_program_and_the_open_sweep_is_answered(rigged):
     """An error of the GPIO lines is a fault that the robot must see: the program ends with 69."""
     simulated = sweeping(3)
     box = rigged(simulated)
@@ -167,7 +165,7 @@ def test_a_failed_output_ends_the_program_and_the_open_sweep_is_answered(
 
 
 @pytest.mark.parametrize("error", [RuntimeError("no"), SystemExit(3), KeyboardInterrupt()])
-def test_any_end_answers_the_open_sweep(rigged: Make, error: BaseException):
+def test_any_end_answers_the_open_sweep(rigged, error):
     """Whatever ends the loop, the open sweep is answered `aborted`."""
     simulated = sweeping(1)
     box = rigged(simulated)
@@ -183,7 +181,7 @@ def test_any_end_answers_the_open_sweep(rigged: Make, error: BaseException):
     assert heard(box) == [(1, "aborted")]
 
 
-def test_a_command_that_fails_is_answered(rigged: Make, monkeypatch: pytest.MonkeyPatch):
+def test_a_command_that_fails_is_answered(rigged, monkeypatch):
     """An unexpected error of a command becomes its answer."""
     box = rigged()
     box.seconds(1)
@@ -195,9 +193,7 @@ def test_a_command_that_fails_is_answered(rigged: Make, monkeypatch: pytest.Monk
 @pytest.mark.parametrize(
     ("why", "code"), [("std::bad_alloc", 70), ("Failed to allocate memory", 70), ("no op X", 78)]
 )
-def test_memory_that_is_short_is_no_fault_of_the_bundle(
-    monkeypatch: pytest.MonkeyPatch, why: str, code: int
-):
+def test_memory_that_is_short_is_no_fault_of_the_bundle(monkeypatch, why, code):
     """std::bad_alloc while a model is opened or run has an exit code that is restarted; a model
     that onnxruntime refuses has not."""
 

@@ -13,7 +13,6 @@ import numpy as np
 import pynmea2
 import pytest
 
-from palpate.bundle import bundle
 from palpate.client.answers import Answer
 from palpate.core import config
 from palpate.core.health import Health
@@ -65,7 +64,7 @@ def quiet(level: tuple[int, int] = (0, 1)) -> devices.SimDevices:
     return simulated_devices([rig.Act(counts, 10**7, 10**7 + 1, "")])
 
 
-def test_sweeps_become_sentences(rigged: Make):
+def test_sweeps_become_sentences(rigged):
     """Twelve sweeps: each answered once, with a right checksum, nothing lost, at the far end of the
     serial line. The window equals the middle of the act that the robot played, to one frame."""
     simulated = simulated_devices(script.tubes(1000, 12))
@@ -84,7 +83,7 @@ def test_sweeps_become_sentences(rigged: Make):
         assert any((act.frames[k : k + 1500] == sweep.frames.taxels).all() for k in begins)
 
 
-def test_lines_follow_the_sweep(rigged: Make):
+def test_lines_follow_the_sweep(rigged):
     """READY falls and BUSY rises with the sweep. Class bits are set before RESULT VALID, and both
     fall when the next sweep starts."""
     simulated = simulated_devices(script.tubes(1002, 2))
@@ -100,7 +99,7 @@ def test_lines_follow_the_sweep(rigged: Make):
     assert falls == [t for t, name, level in written if name == BUSY and level][1]
 
 
-def test_dead_process_is_not_ready(default_bundle: bundle.Bundle):
+def test_dead_process_is_not_ready(default_bundle):
     """After the process was killed the kernel releases its lines, and READY reads low."""
     simulated = quiet()
     box = assembly.box(config.load(None), default_bundle, simulated, StdoutPort("sim"), ExitStack())
@@ -112,7 +111,7 @@ def test_dead_process_is_not_ready(default_bundle: bundle.Bundle):
     assert levels(simulated, READY) == [True, False]
 
 
-def test_unplugged_during_a_sweep(rigged: Make):
+def test_unplugged_during_a_sweep(rigged):
     """The sweep is answered `sensor-lost` at once, and FAULT rises. A trigger meanwhile is
     `not-ready`. After replugging the box works again."""
     simulated = simulated_devices(script.tubes(1003, 3))
@@ -132,7 +131,7 @@ def test_unplugged_during_a_sweep(rigged: Make):
     assert levels(simulated, FAULT) == [True, False]
 
 
-def test_a_board_that_sends_no_frame_is_never_ready(rigged: Make, logged: list[str]):
+def test_a_board_that_sends_no_frame_is_never_ready(rigged, logged):
     """The board answers and sends nothing: READY stays low and FAULT high, a trigger is
     `not-ready`, and READY rises with the first frame, like the log says."""
     simulated = quiet()
@@ -150,7 +149,7 @@ def test_a_board_that_sends_no_frame_is_never_ready(rigged: Make, logged: list[s
     assert logged.count("skin: streaming") == 1
 
 
-def test_trigger_while_not_ready_is_answered(rigged: Make):
+def test_trigger_while_not_ready_is_answered(rigged):
     """Without a skin the start edge is answered, and its stop edge is not."""
     simulated = quiet()
     simulated.backend.unplug()
@@ -171,7 +170,7 @@ def test_trigger_while_not_ready_is_answered(rigged: Make):
         ([(START, 0.5), (STOP, 3.5)], ["no-contact"]),
     ],
 )
-def test_triggers_out_of_order(rigged: Make, edges: list[tuple[str, float]], want: list[str]):
+def test_triggers_out_of_order(rigged, edges, want):
     """Short, long, lone and double edges: a defined answer each, in sentences."""
     box = rigged(quiet())
     for name, after_s in edges:
@@ -180,7 +179,7 @@ def test_triggers_out_of_order(rigged: Make, edges: list[tuple[str, float]], wan
     assert [a.status for a in answers(box)] == want
 
 
-def test_storm_of_edges(rigged: Make):
+def test_storm_of_edges(rigged):
     """10,000 edges in a second: answered `edges-lost`, no frame lost, and the next sweep is
     fine."""
     box = rigged(touched(slide(), quiet_s=6.5))
@@ -199,7 +198,7 @@ def test_storm_of_edges(rigged: Make):
 
 
 @pytest.mark.parametrize(("packet_frames", "statuses"), [(2, {"ok", "unsure"}), (4, {"gap"})])
-def test_missing_frames(rigged: Make, packet_frames: int, statuses: set[str]):
+def test_missing_frames(rigged, packet_frames, statuses):
     """A lost packet within the window: two frames are interpolated and counted, four make it a
     `gap`."""
     simulated = touched(slide())
@@ -233,7 +232,7 @@ def spoiled(fault: str) -> np.ndarray:
 @pytest.mark.parametrize(
     ("fault", "detail"), [("saturated", "taxel 1.1"), ("no-contact", "raw counts")]
 )
-def test_a_spoiled_skin_is_seen_before_the_network_is_asked(rigged: Make, fault: str, detail: str):
+def test_a_spoiled_skin_is_seen_before_the_network_is_asked(rigged, fault, detail):
     """Saturation and no contact: a status with the place, and no label."""
     box = rigged(touched(spoiled(fault)))
     (verdict,) = box.until(lambda: box.box.answered == 1)
@@ -242,7 +241,7 @@ def test_a_spoiled_skin_is_seen_before_the_network_is_asked(rigged: Make, fault:
 
 
 @pytest.mark.parametrize(("fault", "place"), [("stuck-taxel", "2.3"), ("dead-taxel", "3.2")])
-def test_a_broken_taxel_is_bridged_and_named_everywhere(rigged: Make, fault: str, place: str):
+def test_a_broken_taxel_is_bridged_and_named_everywhere(rigged, fault, place):
     """The answer is ok with the taxel in its detail. READY stays; after some seconds of the same
     slide STA and the state have the taxel, too."""
     box = rigged(touched(spoiled(fault)))
@@ -258,10 +257,9 @@ def test_a_broken_taxel_is_bridged_and_named_everywhere(rigged: Make, fault: str
 
 
 @pytest.mark.parametrize(
-    ("sets", "fused"),
-    [((), [1, 1, 2, 3, 1, 2]), (("classifier.fuse=none",), [1] * 6)],
+    ("sets", "fused"), [((), [1, 1, 2, 3, 1, 2]), (("classifier.fuse=none",), [1] * 6)]
 )
-def test_sweeps_of_one_object_are_fused(rigged: Make, sets: tuple[str, ...], fused: list[int]):
+def test_sweeps_of_one_object_are_fused(rigged, sets, fused):
     """Before NEW OBJECT sweeps are answered alone. After it they are fused, until the next NEW
     OBJECT; with `classifier.fuse=none` it changes nothing."""
     tubes = script.tubes(1005, 6, only="wood")
@@ -270,7 +268,7 @@ def test_sweeps_of_one_object_are_fused(rigged: Make, sets: tuple[str, ...], fus
     assert [v.fused for v in box.until(lambda: box.box.answered == 6)] == fused
 
 
-def test_commands(rigged: Make, default_bundle: bundle.Bundle):
+def test_commands(rigged, default_bundle):
     """Identity, state, self-test, tare, new object and abort are answered. The answer to a wrong
     command shows the right command."""
     box, labels = rigged(quiet()), default_bundle.manifest.labels
@@ -293,7 +291,7 @@ def test_commands(rigged: Make, default_bundle: bundle.Bundle):
     assert "SIM0001" in box.ask("$PPLP,ID")
 
 
-def test_tare_moves_the_contact_threshold(rigged: Make):
+def test_tare_moves_the_contact_threshold(rigged):
     """After a tare an offset is not taken for contact. A tare during a sweep is refused."""
     box = rigged(quiet((40, 42)))
     box.seconds(1)
@@ -306,7 +304,7 @@ def test_tare_moves_the_contact_threshold(rigged: Make):
 
 
 @pytest.mark.parametrize("by_command", [True, False])
-def test_an_open_sweep_is_answered_aborted(rigged: Make, by_command: bool):
+def test_an_open_sweep_is_answered_aborted(rigged, by_command):
     """By ABORT, and its stop edge gets no further answer; or when the loop is stopped."""
     box = rigged(quiet())
     box.pulse(START, 0.2)
@@ -322,7 +320,7 @@ def test_an_open_sweep_is_answered_aborted(rigged: Make, by_command: bool):
     assert [a.status for a in answers(box)] == ["aborted"]
 
 
-def test_state_is_sent_once_a_second(rigged: Make):
+def test_state_is_sent_once_a_second(rigged):
     """One STA sentence a second, with the frames so far."""
     box = rigged(quiet())
     box.seconds(10)
@@ -333,7 +331,7 @@ def test_state_is_sent_once_a_second(rigged: Make):
 
 
 @pytest.mark.slow
-def test_a_robot_that_does_not_read_costs_no_frame(rigged: Make):
+def test_a_robot_that_does_not_read_costs_no_frame(rigged):
     """The serial line is full: sentences are dropped and counted, and no frame or sweep is
     lost."""
     simulated = simulated_devices(script.tubes(1006, 20))
@@ -344,7 +342,7 @@ def test_a_robot_that_does_not_read_costs_no_frame(rigged: Make):
     assert (box.box.counters.lost_frames, box.box.answered) == (0, 20)
 
 
-def test_trouble_is_logged_once(rigged: Make, logged: list[str]):
+def test_trouble_is_logged_once(rigged, logged):
     """Trouble is logged when it begins and when it ends, not at every turn. The log has the open
     port once."""
     simulated = quiet()
@@ -360,7 +358,7 @@ def test_trouble_is_logged_once(rigged: Make, logged: list[str]):
     assert [line for line in logged if "serial" in line] == [f"serial: {box.port.name} open"]
 
 
-def test_a_box_without_a_port_logs_none(default_bundle: bundle.Bundle, logged: list[str]):
+def test_a_box_without_a_port_logs_none(default_bundle, logged):
     """The box runs without it."""
     simulated = quiet()
     with ExitStack() as stack:
@@ -390,7 +388,7 @@ class EffectLog(Observer):
             self._effects.append(f"{self._name} turn {health.answered}")
 
 
-def test_observers_are_called_in_order_and_sweeps_after_all_answers(rigged: Make):
+def test_observers_are_called_in_order_and_sweeps_after_all_answers(rigged):
     """Two answers in one turn reach the port and each observer before any sweep is passed on;
     health comes last."""
     effects: list[str] = []

@@ -5,20 +5,15 @@ from __future__ import annotations
 import gc
 import re
 import sys
-from collections.abc import Callable
 
 import pytest
-
-from tests.factories.simulated_box import Rigged
 
 SWEEPS = 8
 FREE = re.compile(r"(\d+) free +(\d+)-sized PyTupleObjects")
 
 
 @pytest.mark.skipif(not hasattr(sys, "_debugmallocstats"), reason="counts of CPython's allocator")
-def test_the_store_of_freed_tuples_does_not_grow_with_sweeps(
-    rigged: Callable[..., Rigged], capfd: pytest.CaptureFixture[str]
-):
+def test_the_store_of_freed_tuples_does_not_grow_with_sweeps(rigged, capfd):
     """A tuple that is made of a generator is kept after its end, up to 2,000 of each length."""
 
     def kept() -> dict[str, int]:

@@ -117,9 +117,7 @@ def kept_toy(path: Path, sweep: Sweep | None = None, **about: object) -> Path:
 
 
 @pytest.mark.slow
-def test_all_verdicts_are_the_same_bit_for_bit(
-    in_service: tuple[Path, list[str]], default_bundle: Bundle
-):
+def test_all_verdicts_are_the_same_bit_for_bit(in_service, default_bundle):
     """With any present settings, fused and early answers give the sentences that were sent,
     including times."""
     folder, heard = in_service
@@ -134,9 +132,7 @@ def test_all_verdicts_are_the_same_bit_for_bit(
 
 
 @pytest.mark.slow
-def test_one_sweep_is_judged_after_those_of_its_object(
-    in_service: tuple[Path, list[str]], default_bundle: Bundle
-):
+def test_one_sweep_is_judged_after_those_of_its_object(in_service, default_bundle):
     """A single file is fused with the earlier sweeps of its object alone. A sweep of another bundle
     in another object would end their replay."""
     folder, heard = in_service
@@ -147,9 +143,7 @@ def test_one_sweep_is_judged_after_those_of_its_object(
 
 
 @pytest.mark.slow
-def test_sweeps_whose_object_is_cut_off_are_compared_by_themselves(
-    in_service: tuple[Path, list[str]], default_bundle: Bundle
-):
+def test_sweeps_whose_object_is_cut_off_are_compared_by_themselves(in_service, default_bundle):
     """The black box has removed an object's first or second sweep: the scores of the others are
     compared by themselves, and the output says so."""
     folder, _ = in_service
@@ -168,7 +162,7 @@ def test_sweeps_whose_object_is_cut_off_are_compared_by_themselves(
     assert different.startswith(at(folder, one - 1).name)
 
 
-def test_an_early_answer_that_only_earlier_sweeps_made_sure(tmp_path: Path):
+def test_an_early_answer_that_only_earlier_sweeps_made_sure(tmp_path):
     """Without the earlier sweeps the answer would not be early: the scores are compared, and no
     sentence is written."""
     model = early_toy(tmp_path / "bundle")
@@ -188,10 +182,9 @@ def test_an_early_answer_that_only_earlier_sweeps_made_sure(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    "conflict",
-    ["new", *(pytest.param(one, marks=pytest.mark.slow) for one in ("refuse", "fuse"))],
+    "conflict", ["new", *(pytest.param(one, marks=pytest.mark.slow) for one in ("refuse", "fuse"))]
 )
-def test_objects_end_in_a_replay_as_they_did(tmp_path: Path, toy: Bundle, conflict: str):
+def test_objects_end_in_a_replay_as_they_did(tmp_path, toy, conflict):
     """NEW OBJECT once, then sweeps that contradict, a pause, and more than max_sweeps: the same
     verdicts. With any sweep missing, the sweeps that depended on it are compared by themselves."""
     it = Classifier(toy, rig.VirtualClock(), max_sweeps=3, conflict=conflict, object_s=60.0)
@@ -220,7 +213,7 @@ def test_objects_end_in_a_replay_as_they_did(tmp_path: Path, toy: Bundle, confli
             assert outcomes[-1] == "15 sweeps: 14 the same, 1 the same by itself"
 
 
-def test_every_difference_is_told(in_service: tuple[Path, list[str]], default_bundle: Bundle):
+def test_every_difference_is_told(in_service, default_bundle):
     """For a score one bit off, another label or another tare the output has the difference, and the
     exit code is 1."""
     folder, _ = in_service
@@ -234,7 +227,7 @@ def test_every_difference_is_told(in_service: tuple[Path, list[str]], default_bu
     assert outcomes[-1].startswith("30 sweeps: ")
 
 
-def test_a_changed_byte_is_told(in_service: tuple[Path, list[str]], default_bundle: Bundle):
+def test_a_changed_byte_is_told(in_service, default_bundle):
     """At any position in the file. The lowest bit of a raw count may change no score, but it
     changes the checksum."""
     folder, _ = in_service
@@ -252,7 +245,7 @@ def test_a_changed_byte_is_told(in_service: tuple[Path, list[str]], default_bund
     assert re.search("29 the same|the same by itself", outcomes[-1])
 
 
-def test_another_bundle_is_named(in_service: tuple[Path, list[str]], default_bundle: Bundle):
+def test_another_bundle_is_named(in_service, default_bundle):
     """For one sweep the error has both ids and says what to try. In a folder the sweeps of the
     bundle are classified, and the others are listed."""
     folder, _ = in_service
@@ -268,7 +261,7 @@ def test_another_bundle_is_named(in_service: tuple[Path, list[str]], default_bun
     assert outcomes[-1] == "30 sweeps: 29 the same, 1 of another bundle"
 
 
-def test_the_next_run_begins_anew(tmp_path: Path, toy: Bundle):
+def test_the_next_run_begins_anew(tmp_path, toy):
     """Objects are counted anew in each run: object 1 of a later run in the same folder is not fused
     with object 1 of an earlier run."""
     for n, run in ((1, 0), (2, 1)):
@@ -278,7 +271,7 @@ def test_the_next_run_begins_anew(tmp_path: Path, toy: Bundle):
     assert outcomes[-1] == "2 sweeps: 2 no verdict to compare with"
 
 
-def test_a_sweep_that_is_not_answered_early_any_more(tmp_path: Path):
+def test_a_sweep_that_is_not_answered_early_any_more(tmp_path):
     """Without an early answer of this bundle the output says so, and no sentence is written."""
     frames = Frames(np.arange(10), np.arange(10), toy_bundle.window(1, 0)[:10])
     path = kept_toy(tmp_path, Sweep(1, 0, 0, Status.OK, frames, share=0.5))
@@ -290,7 +283,7 @@ def test_a_sweep_that_is_not_answered_early_any_more(tmp_path: Path):
     assert "answered" in outcomes[0]
 
 
-def test_a_recording_without_a_tare_is_judged_with_the_bundle_s(tmp_path: Path, toy: Bundle):
+def test_a_recording_without_a_tare_is_judged_with_the_bundle_s(tmp_path, toy):
     """The box would do it, too. A recording with a tare is classified with its own tare. The
     verdict on a sweep without a window is its status."""
     high = replace(toy, manifest=replace(toy.manifest, unloaded=(1e4,) * 4))
@@ -302,7 +295,7 @@ def test_a_recording_without_a_tare_is_judged_with_the_bundle_s(tmp_path: Path, 
     assert ",gap," in played(kept_toy(tmp_path, gap), toy)[1][0]
 
 
-def test_taxels_that_were_broken_over_the_stream_are_bridged_again(tmp_path: Path, toy: Bundle):
+def test_taxels_that_were_broken_over_the_stream_are_bridged_again(tmp_path, toy):
     """The sidecar has them, and the verdict is the same. Without the entry it differs."""
     rule = Bridging(taxels=1, row=False, column=False, noise=4.0, quietest=2.0, still=False)
     model = replace(toy, manifest=replace(toy.manifest, bridging=rule))
@@ -341,14 +334,14 @@ RULE = {"fuse": "vote", "min_probability": 0.5, "max_sweeps": 0}
         {"verdict": {"time_ns": "now"}},
     ],
 )
-def test_sidecars_that_make_no_sense(tmp_path: Path, toy: Bundle, about: dict[str, object]):
+def test_sidecars_that_make_no_sense(tmp_path, toy, about):
     """The error has the file and no traceback."""
     with pytest.raises(FormatError, match=r"s\.npy: "):
         played(kept_toy(tmp_path, **about), toy)
 
 
 @pytest.mark.parametrize(("n", "share"), [(3, 1.0), (20, 0.5), (0, 0.5), (0, 1.0)])
-def test_sweeps_of_another_length(tmp_path: Path, n: int, share: float):
+def test_sweeps_of_another_length(tmp_path, n, share):
     """Frames that are too few for a window, or too many for an early answer."""
     frames = Frames(np.arange(n), np.arange(n), toy_bundle.window(1, 0)[:n])
     path = kept_toy(tmp_path, Sweep(1, 0, 0, Status.OK, frames, share=share))
@@ -356,7 +349,7 @@ def test_sweeps_of_another_length(tmp_path: Path, n: int, share: float):
         played(path, early_toy(tmp_path / "bundle"))
 
 
-def test_another_skin_and_an_empty_folder(tmp_path: Path, default_bundle: Bundle):
+def test_another_skin_and_an_empty_folder(tmp_path, default_bundle):
     """The error has both formats. A folder without sweeps is an error, too."""
     with pytest.raises(FormatError, match="sweep"):
         played(tmp_path, default_bundle)

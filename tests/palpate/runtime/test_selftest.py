@@ -5,8 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -39,7 +37,7 @@ def spending(clock: Clock, share: float) -> Callable[[], int]:
 @pytest.mark.parametrize(
     ("share", "ok"), [(0.043, True), (0.49, True), (0.51, False), (0.97, False)]
 )
-def test_what_reading_takes_of_a_core(default_bundle: bundle.Bundle, share: float, ok: bool):
+def test_what_reading_takes_of_a_core(default_bundle, share, ok):
     """The check shows the share of a core. Above half a core it fails and says what to do."""
     found = results_of(default_bundle, share)["skin"]
     assert found.ok == ok
@@ -59,9 +57,7 @@ def test_what_reading_takes_of_a_core(default_bundle: bundle.Bundle, share: floa
         ("bundle", {"disturbances": None}, "look like an unknown material"),
     ],
 )
-def test_check_says_what_the_bundle_allows(
-    default_bundle: bundle.Bundle, component: str, changes: dict[str, Any], part: str
-):
+def test_check_says_what_the_bundle_allows(default_bundle, component, changes, part):
     """Speeds that can be measured and those of training, broken taxels that are bridged, and
     disturbances. A bundle without these figures still passes."""
     changed = replace(default_bundle, manifest=replace(default_bundle.manifest, **changes))
@@ -76,7 +72,7 @@ def test_check_says_what_the_bundle_allows(
 @pytest.mark.parametrize(
     ("sent_hz", "ok"), [(28.0, True), (29.0, True), (100.0, False), (20.0, False)]
 )
-def test_the_rate_of_a_skin_without_a_clock(sent_hz: float, ok: bool, tmp_path: Path):
+def test_the_rate_of_a_skin_without_a_clock(sent_hz, ok, tmp_path):
     """Frames are counted for long enough: another rate fails with both figures."""
     profile = skin_profile.load("anyskin", [config.load(None).folder / "skins"])
     seen = sweeps.view("anyskin", profile.format)

@@ -4,7 +4,6 @@ beside each sweep."""
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -28,10 +27,7 @@ PROFILE = from_json(MATRIX, "test")
 
 
 def on_a_matrix(
-    rigged: Make,
-    monkeypatch: pytest.MonkeyPatch,
-    capture: CaptureWriter | None = None,
-    **more,
+    rigged: Make, monkeypatch: pytest.MonkeyPatch, capture: CaptureWriter | None = None, **more
 ) -> tuple[Rigged, WiredSkin]:
     """A box whose skin is a matrix of 4x4 at 750 Hz, with a marker and nothing else."""
     simulated = idle_devices()
@@ -61,7 +57,7 @@ class Circumstances(Observer):
         self.kept.append(dict(circumstances))
 
 
-def test_it_is_said_everywhere(rigged: Make, monkeypatch: pytest.MonkeyPatch):
+def test_it_is_said_everywhere(rigged, monkeypatch):
     """RES has a 14th field, STA an 18th, and the status and the sidecar have a word. Frames are
     used as usual."""
     observer = Circumstances()
@@ -81,7 +77,7 @@ def test_it_is_said_everywhere(rigged: Make, monkeypatch: pytest.MonkeyPatch):
     assert any("least" in line for line in status.lines(report, 10**12))
 
 
-def test_a_board_that_counts_says_nothing_of_it(rigged: Make):
+def test_a_board_that_counts_says_nothing_of_it(rigged):
     """Sentences for readout boards of PROTOCOL.md do not have the fields."""
     box = rigged(idle_devices())
     assert len(swept(box).split(",")) == 15
@@ -98,9 +94,7 @@ def test_the_detail_gives_way():
 
 
 @pytest.mark.parametrize("pause_s", [0.0, 0.4])
-def test_a_capture_of_such_a_skin(
-    rigged: Make, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, pause_s: float
-):
+def test_a_capture_of_such_a_skin(rigged, monkeypatch, tmp_path, pause_s):
     """The capture holds the profile, so that its bytes give the same frames, numbers and times
     again."""
     path = tmp_path / "capture"

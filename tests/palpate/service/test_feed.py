@@ -34,7 +34,7 @@ from palpate.service.feed import (
 from palpate.service.feed_reader import HEARD_BYTES, QUEUE_BYTES, FeedRequest, requests
 from palpate.sim import devices, rig, script, skin
 from tests.factories.feeds import HEALTH, OK, FeedPeer, Offered, cut, frames
-from tests.factories.simulated_box import SECOND, Rigged
+from tests.factories.simulated_box import SECOND
 
 Offering = Callable[..., Offered]
 Lines = list[dict[str, Any]]
@@ -83,7 +83,7 @@ def asking(offered: Offered, request: str = '{"sweeps": true}') -> FeedPeer:
     return peer
 
 
-def test_hello_health_and_states(offered: Offered) -> None:
+def test_hello_health_and_states(offered):
     """hello, then health as in the status file, once a second for all readers, and a state with
     each change."""
     peer = offered.peer()
@@ -107,7 +107,7 @@ def test_hello_health_and_states(offered: Offered) -> None:
     assert (gone["skin"], gone["trouble"]) == ("absent", "no skin on USB")
 
 
-def test_a_verdict_has_the_probabilities_of_all_labels(offered: Offered) -> None:
+def test_a_verdict_has_the_probabilities_of_all_labels(offered):
     """All fields of the verdict, with the shift of the contact; absent speed and force are left
     out."""
     peer = asking(offered)
@@ -122,7 +122,7 @@ def test_a_verdict_has_the_probabilities_of_all_labels(offered: Offered) -> None
 
 
 @pytest.mark.parametrize("hz", [0.5, 1, 5, 8, 20])
-def test_frames_come_at_the_rate_that_was_asked_for(offered: Offered, hz: float) -> None:
+def test_frames_come_at_the_rate_that_was_asked_for(offered, hz):
     """In ten seconds at 125 turns a second: the newest frame so often, and none once 0 was asked
     for."""
     peer, other = offered.peer(), offered.peer()
@@ -144,7 +144,7 @@ def test_frames_come_at_the_rate_that_was_asked_for(offered: Offered, hz: float)
     assert "frame" not in kinds(peer.lines() + other.lines())
 
 
-def test_of_a_large_skin_fewer_frames_are_offered(offers: Offering) -> None:
+def test_of_a_large_skin_fewer_frames_are_offered(offers):
     """Text of 10,000 counts a second at most: 32x32 taxels at 9.8 frames a second, whatever was
     asked for."""
     format = SweepFormat(32, 32, 100.0, 200, "uint16")
@@ -160,7 +160,7 @@ def test_of_a_large_skin_fewer_frames_are_offered(offers: Offering) -> None:
     assert found == pytest.approx(97.65625, abs=1)
 
 
-def test_counts_that_are_no_numbers_become_null(offers: Offering) -> None:
+def test_counts_that_are_no_numbers_become_null(offers):
     """A float skin with a broken taxel: the line is valid JSON."""
     format = SweepFormat(1, 3, 100.0, 200, "float32", 3)
     offered = offers(format)
@@ -172,7 +172,7 @@ def test_counts_that_are_no_numbers_become_null(offers: Offering) -> None:
     assert of(peer.lines(), "frame")[0]["taxels"][0][1] == [None, None, 0.5]
 
 
-def test_a_clock_that_jumps_ahead_gives_one_line(offered: Offered) -> None:
+def test_a_clock_that_jumps_ahead_gives_one_line(offered):
     """After a suspend of a day: one health and one frame, and no frame is repeated."""
     peer = asking(offered, '{"frames": 20}')
     offered.feed.frames(frames())
@@ -181,7 +181,7 @@ def test_a_clock_that_jumps_ahead_gives_one_line(offered: Offered) -> None:
     assert sorted(kinds(peer.lines())) == ["frame", "health"]
 
 
-def test_a_verdict_is_not_kept_for_the_next_look(offered: Offered) -> None:
+def test_a_verdict_is_not_kept_for_the_next_look(offered):
     """It is there with the turn that has it, 8 ms after the last look; a storm of them is sent each
     5 ms at most."""
     peer = asking(offered)
@@ -200,7 +200,7 @@ def test_a_verdict_is_not_kept_for_the_next_look(offered: Offered) -> None:
 
 
 @pytest.mark.parametrize("format", [skin.FORMAT, LARGE])
-def test_the_window_of_a_sweep_comes_bit_for_bit(offers: Offering, format: SweepFormat) -> None:
+def test_the_window_of_a_sweep_comes_bit_for_bit(offers, format):
     """After the verdict, for those who asked; over 64 kB in pieces as the readers accept them, with
     other lines in their order. A sweep without a window gives no line."""
     offered = offers(format)
@@ -225,7 +225,7 @@ def test_the_window_of_a_sweep_comes_bit_for_bit(offers: Offering, format: Sweep
     assert "sweep" not in kinds(other.lines())
 
 
-def test_one_large_window_is_on_its_way_at_a_time(offers: Offering) -> None:
+def test_one_large_window_is_on_its_way_at_a_time(offers):
     """While a reader does not take a window, all readers lose the next. After five seconds this
     reader is closed, with the reason as its last line, and the other reader gets the third window.
     """
@@ -243,7 +243,7 @@ def test_one_large_window_is_on_its_way_at_a_time(offers: Offering) -> None:
     assert slow.ended
 
 
-def test_readers_that_never_read_cost_little_memory(offers: Offering) -> None:
+def test_readers_that_never_read_cost_little_memory(offers):
     """Sixty-three of them that asked for everything, and a sweep a second: the box needs less than
     4 MiB more, and goes on serving others."""
     large = offers(LARGE)
@@ -268,7 +268,7 @@ def test_readers_that_never_read_cost_little_memory(offers: Offering) -> None:
     assert len(large.feed._readers) < len(peers)
 
 
-def test_a_window_that_is_too_large_is_counted(offers: Offering) -> None:
+def test_a_window_that_is_too_large_is_counted(offers):
     """Over 640 kB: the reader gets a `lost` line for one line."""
     format = SweepFormat(32, 32, 100.0, 250, "uint16")
     offered = offers(format)
@@ -278,7 +278,7 @@ def test_a_window_that_is_too_large_is_counted(offers: Offering) -> None:
     assert peer.lines() == [{"type": "lost", "lines": 1}]
 
 
-def test_who_does_not_keep_up_loses_old_lines_and_hears_how_many(offered: Offered) -> None:
+def test_who_does_not_keep_up_loses_old_lines_and_hears_how_many(offered):
     """Two thousand verdicts, and a reader that does not read: its lines in the end and its lost
     lines add up to all of them. Another reader has them all, and the queue stayed within its limit.
     """
@@ -306,7 +306,7 @@ def test_who_does_not_keep_up_loses_old_lines_and_hears_how_many(offered: Offere
     assert rest[: len(whole) - first] == whole[first:]
 
 
-def test_a_window_takes_no_room_from_what_waits_already(offered: Offered) -> None:
+def test_a_window_takes_no_room_from_what_waits_already(offered):
     """A reader that reads nothing: of four windows two fit, and of eight lines in all each is there
     or counted."""
     peer = offered.peer()
@@ -327,7 +327,7 @@ def test_a_window_takes_no_room_from_what_waits_already(offered: Offered) -> Non
     assert kinds(got).count("sweep") + 4 + lost == 8
 
 
-def test_the_65th_reader_is_told_why_it_is_not_served(offered: Offered) -> None:
+def test_the_65th_reader_is_told_why_it_is_not_served(offered):
     """It gets one line and its end; when another leaves there is room again. A verdict reaches
     SERVED of 64 readers in each round, and all in the end."""
     peers = [offered.peer() for _ in range(MOST_READERS)]
@@ -348,7 +348,7 @@ def test_the_65th_reader_is_told_why_it_is_not_served(offered: Offered) -> None:
     assert kinds(offered.peer().lines()) == BOTH
 
 
-def test_a_thousand_connections_leave_no_file_open(offered: Offered) -> None:
+def test_a_thousand_connections_leave_no_file_open(offered):
     """Some read nothing, some go at once, some send half a request: no descriptor and no reader is
     left of them."""
     before = len(os.listdir("/proc/self/fd"))
@@ -385,7 +385,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("data", WRONG)
-def test_what_is_no_request_closes_its_reader_alone(offered: Offered, data: str) -> None:
+def test_what_is_no_request_closes_its_reader_alone(offered, data):
     """It hears why; another reader goes on."""
     sent, why = WRONG[data]
     peer, other = offered.peer(), offered.peer()
@@ -401,7 +401,7 @@ def test_what_is_no_request_closes_its_reader_alone(offered: Offered, data: str)
     assert "verdict" in kinds(other.lines())
 
 
-def test_requests_in_parts_are_requests(offered: Offered) -> None:
+def test_requests_in_parts_are_requests(offered):
     """Byte by byte, and several in one."""
     peer = offered.peer()
     for byte in b'{"frames": 2.5}\n{"sweeps": true}\n{"sweeps": false, "frames": 4}\n':
@@ -413,9 +413,7 @@ def test_requests_in_parts_are_requests(offered: Offered) -> None:
     assert (found, rest) == ([FeedRequest(1.0), FeedRequest(None, True)], b'{"fr')
 
 
-def test_endless_requests_are_read_a_little_each_turn(
-    offered: Offered, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_endless_requests_are_read_a_little_each_turn(offered, monkeypatch):
     """Only a few bytes of a reader that sends without a pause are read in a turn, and others are
     served."""
     taken: list[int] = []
@@ -450,9 +448,7 @@ def test_endless_requests_are_read_a_little_each_turn(
         (PERIOD_NS, MOST_PERIOD_NS),
     ],
 )
-def test_a_costly_look_at_the_sockets_puts_off_the_next(
-    offered: Offered, monkeypatch: pytest.MonkeyPatch, cost_ns: int, period_ns: int
-) -> None:
+def test_a_costly_look_at_the_sockets_puts_off_the_next(offered, monkeypatch, cost_ns, period_ns):
     """Rounds use no more than SHARE of a core: a round of three times that length is followed by a
     pause three times as long."""
     offered.cost_ns = cost_ns
@@ -463,7 +459,7 @@ def test_a_costly_look_at_the_sockets_puts_off_the_next(
     assert {b - a for a, b in pairwise(looks)} == {period_ns}
 
 
-def test_one_that_only_listens_may_close_its_own_side(offered: Offered) -> None:
+def test_one_that_only_listens_may_close_its_own_side(offered):
     """As `socat` does when its input ends: its last request stays valid, and lines go on; when it
     leaves, it is closed."""
     peer = offered.peer()
@@ -481,7 +477,7 @@ def test_one_that_only_listens_may_close_its_own_side(offered: Offered) -> None:
 
 
 @pytest.mark.parametrize("mask", [0o000, 0o077])
-def test_members_of_the_group_may_read_and_nobody_else(offers: Offering, mask: int) -> None:
+def test_members_of_the_group_may_read_and_nobody_else(offers, mask):
     """Mode 660, whatever the umask, and the umask is as before."""
     before = os.umask(mask)
     try:
@@ -493,9 +489,7 @@ def test_members_of_the_group_may_read_and_nobody_else(offers: Offering, mask: i
     assert not offered.path.exists()
 
 
-def test_the_socket_of_a_process_that_died_is_replaced(
-    tmp_path: Path, offers: Offering, logged: list[str]
-) -> None:
+def test_the_socket_of_a_process_that_died_is_replaced(tmp_path, offers, logged):
     """A killed box's socket refuses connections. A second box beside a living one logs it once, and
     offers its feed when the first has ended."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as dead:
@@ -513,9 +507,7 @@ def test_the_socket_of_a_process_that_died_is_replaced(
     assert kinds(second.peer().lines()) == BOTH
 
 
-def test_a_path_that_cannot_be_bound_is_told_once(
-    tmp_path: Path, offers: Offering, logged: list[str]
-) -> None:
+def test_a_path_that_cannot_be_bound_is_told_once(tmp_path, offers, logged):
     """A missing folder, a file at the path, a path that is too long: one log line each, and turns
     go on. Once the reason is gone the feed is there."""
     offered = offers(path=tmp_path / "run" / "feed.sock")
@@ -533,7 +525,7 @@ def test_a_path_that_cannot_be_bound_is_told_once(
     assert len(logged) == 4
 
 
-def test_a_box_that_ends_says_so_and_nothing_is_sent_after_it(offered: Offered) -> None:
+def test_a_box_that_ends_says_so_and_nothing_is_sent_after_it(offered):
     """Readers get the waiting lines, the reason, and an end. The later verdict of an open sweep is
     not an error."""
     peer = offered.peer()
@@ -547,9 +539,7 @@ def test_a_box_that_ends_says_so_and_nothing_is_sent_after_it(offered: Offered) 
     assert peer.ended
 
 
-def test_without_readers_nothing_is_written_as_text(
-    offered: Offered, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_readers_nothing_is_written_as_text(offered, monkeypatch):
     """No verdict, no frame, no health is encoded; only changes of the state are."""
     made: list[str] = []
     monkeypatch.setattr(module, "encode", lambda kind, content: made.append(kind) or b"")
@@ -561,9 +551,7 @@ def test_without_readers_nothing_is_written_as_text(
     assert set(made) <= {"state"}
 
 
-def test_a_running_box_offers_its_verdicts_frames_and_sweeps(
-    rigged: Callable[..., Rigged], tmp_path: Path
-) -> None:
+def test_a_running_box_offers_its_verdicts_frames_and_sweeps(rigged, tmp_path):
     """On simulated devices: the verdicts that the robot gets, frames, and the windows that the box
     has cut."""
     simulated = devices.build(skin.FORMAT, script.tubes(1), rig.VirtualClock(), "sim")

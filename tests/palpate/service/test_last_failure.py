@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from palpate.cli import lower_outputs
-from palpate.core.errors import AddressError, ApplianceError, BundleError, LineError
+from palpate.core.errors import AddressError, BundleError, LineError
 from palpate.service import last_failure, status
 from palpate.service.last_failure import PAUSES_S, Failure
 from palpate.sim import gpio
@@ -27,7 +27,7 @@ def failed(folder: Path, clock: VirtualClock, error: Exception) -> Failure:
     return found
 
 
-def test_status_says_which_end_a_person_must_mend(tmp_path: Path):
+def test_status_says_which_end_a_person_must_mend(tmp_path):
     """Exit code 78 stays stopped until somebody acts; everything else is started again."""
     clock = VirtualClock()
     failed(tmp_path, clock, BundleError("golden sweeps differ"))
@@ -42,7 +42,7 @@ def test_status_says_which_end_a_person_must_mend(tmp_path: Path):
     assert "KeyError" in status.read(tmp_path / "status.json", 0)["why"]
 
 
-def test_the_pause_grows_and_begins_anew(tmp_path: Path):
+def test_the_pause_grows_and_begins_anew(tmp_path):
     """Failures in a row lengthen it up to a limit; a run of a minute makes it short again, and an
     end in order leaves nothing."""
     clock = VirtualClock()
@@ -60,20 +60,17 @@ def test_the_pause_grows_and_begins_anew(tmp_path: Path):
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"[]", b'{"why": 3}', b"\xff" * 99])
-def test_a_damaged_note_is_none(tmp_path: Path, content: bytes):
+def test_a_damaged_note_is_none(tmp_path, content):
     """Whatever is in the file, it is ignored and written anew."""
     (tmp_path / last_failure.FILE).write_bytes(content)
     assert last_failure.read(tmp_path) is None
     assert failed(tmp_path, VirtualClock(), LineError("no chip")).failures == 1
 
 
-def test_a_note_that_cannot_be_written_changes_nothing(tmp_path: Path):
+def test_a_note_that_cannot_be_written_changes_nothing(tmp_path):
     """The error itself is raised, without the folder as well."""
     for folder in (None, tmp_path / "not there"):
-        with (
-            pytest.raises(LineError, match="chip"),
-            last_failure.recorded(folder, VirtualClock()),
-        ):
+        with pytest.raises(LineError, match="chip"), last_failure.recorded(folder, VirtualClock()):
             raise LineError("no chip")
 
 
@@ -86,9 +83,7 @@ def test_a_note_that_cannot_be_written_changes_nothing(tmp_path: Path):
         (AddressError("in use"), "69", True),
     ],
 )
-def test_the_start_after_a_failure_waits(
-    tmp_path: Path, error: ApplianceError, exit_status: str, waits: bool
-):
+def test_the_start_after_a_failure_waits(tmp_path, error, exit_status, waits):
     """ExecStopPost waits after failures that are started again, and not after others."""
     clock = VirtualClock()
     for _ in range(3):

@@ -77,7 +77,7 @@ def status_file(tmp_path: Path) -> ClockedStatus:
     return ClockedStatus(tmp_path)
 
 
-def test_it_is_written_once_a_second_and_soon_after_news(status_file: ClockedStatus):
+def test_it_is_written_once_a_second_and_soon_after_news(status_file):
     """Four times in four seconds of turns; a verdict, and a lost skin, are there a tenth of a
     second later."""
     assert status_file.turns(4) in (4, 5)
@@ -89,7 +89,7 @@ def test_it_is_written_once_a_second_and_soon_after_news(status_file: ClockedSta
     assert status_file.read()["skin"] == "absent"
 
 
-def test_a_storm_of_verdicts_writes_ten_times_a_second_at_most(status_file: ClockedStatus):
+def test_a_storm_of_verdicts_writes_ten_times_a_second_at_most(status_file):
     """Verdicts with every turn: one write in a tenth of a second, and the last twenty are kept."""
     written = 0
     for i in range(100):
@@ -102,7 +102,7 @@ def test_a_storm_of_verdicts_writes_ten_times_a_second_at_most(status_file: Cloc
     assert len(status_file.read()["verdicts"]) == 20
 
 
-def test_every_user_may_read_it_whole(status_file: ClockedStatus):
+def test_every_user_may_read_it_whole(status_file):
     """Mode 644 under the service's umask; the file is replaced, so a reader that had it open still
     has it whole."""
     before = os.umask(0o027)
@@ -117,7 +117,7 @@ def test_every_user_may_read_it_whole(status_file: ClockedStatus):
     assert [p.name for p in status_file.path.parent.iterdir()] == ["status.json"]
 
 
-def test_in_words_it_says_how_it_is_and_what_to_do(tmp_path: Path):
+def test_in_words_it_says_how_it_is_and_what_to_do(tmp_path):
     """Since when, skin, bundle, further facts, the last verdicts newest first; advice where
     something is wrong."""
     more = {"trial": "start 1 of 3, 7 of 20 sweeps", "shadow": "", "steps": [1]}
@@ -157,7 +157,7 @@ def test_in_words_it_says_how_it_is_and_what_to_do(tmp_path: Path):
     assert status.exit_code(status_file.read()) == 69
 
 
-def test_a_program_that_has_ended_is_not_running(status_file: ClockedStatus):
+def test_a_program_that_has_ended_is_not_running(status_file):
     """Stopped in order: the file is gone. Killed, hung, or from before the last boot: `why` has the
     reason. All exit with 1."""
     assert status.exit_code(status_file.read()) == 1
@@ -181,7 +181,7 @@ def test_a_program_that_has_ended_is_not_running(status_file: ClockedStatus):
 @pytest.mark.parametrize(
     "text", ["", "{", "[]", "{}", '{"schema": 2}', "[" * 100_000, '{"schema": 1, "pid": "x"}']
 )
-def test_a_file_of_another_form_is_named(status_file: ClockedStatus, text: str):
+def test_a_file_of_another_form_is_named(status_file, text):
     """A status of another version is an error, not a guess, and so is a folder at its path."""
     status_file.path.write_text(text)
     with pytest.raises(FormatError):
@@ -192,7 +192,7 @@ def test_a_file_of_another_form_is_named(status_file: ClockedStatus, text: str):
         status_file.read()
 
 
-def test_trouble_with_the_file_is_logged_once(tmp_path: Path, logged: list[str]):
+def test_trouble_with_the_file_is_logged_once(tmp_path, logged):
     """Without its folder the box goes on; one line, and another only after it had worked in
     between."""
     status_file = ClockedStatus(tmp_path / "run")
@@ -209,7 +209,7 @@ def test_trouble_with_the_file_is_logged_once(tmp_path: Path, logged: list[str])
     assert len(logged) == 2
 
 
-def test_a_running_box_reports_its_verdicts(rigged, tmp_path: Path, logged: list[str]):
+def test_a_running_box_reports_its_verdicts(rigged, tmp_path, logged):
     """On simulated devices: skin, bundle and verdicts of the box, and the same verdicts in the
     log."""
     clock = rig.VirtualClock()
@@ -254,7 +254,7 @@ SURE = "plastic rough, 98.7 %"
         ),
     ],
 )
-def test_the_log_has_one_line_a_verdict(verdict: Verdict, line: str, logged: list[str]):
+def test_the_log_has_one_line_a_verdict(verdict, line, logged):
     """In words; a verdict that needs attention is a warning."""
     VerdictLog().answered(verdict)
     assert logged == [line]
@@ -297,14 +297,7 @@ def asleep(box: Rigged) -> None:
         ("storms", 17, burst(devices.STOP, 60, 1e-4), "1 storms of edges; "),
     ],
 )
-def test_what_is_counted_is_shown(
-    rigged: Callable[..., Rigged],
-    tmp_path: Path,
-    name: str,
-    field: int,
-    fault: Callable[[Rigged], None],
-    text: str,
-):
+def test_what_is_counted_is_shown(rigged, tmp_path, name, field, fault, text):
     """Each fault is in the STA sentence, in its answer to STATE, in the file and in words, and was
     not before it."""
     simulated = idle_devices(60)

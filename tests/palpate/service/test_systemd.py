@@ -8,7 +8,6 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,7 +19,7 @@ from palpate.core.health import Health
 from palpate.core.observer import Observer
 from palpate.service.systemd import Notifier
 from palpate.sim import devices, rig, script, skin
-from tests.factories.simulated_box import SECOND, OnSweep, Rigged, idle_devices
+from tests.factories.simulated_box import SECOND, OnSweep, idle_devices
 
 WATCHDOG = {"WATCHDOG_USEC": "10000000"}
 
@@ -68,7 +67,7 @@ def state(streams: bool, text: str) -> Any:
     return SimpleNamespace(streams=streams, text=text)
 
 
-def test_only_what_is_new_is_sent(socket_end: ManagerSocket):
+def test_only_what_is_new_is_sent(socket_end):
     """STATUS when it changes, READY once, even where the skin is lost later; STOPPING at the
     end."""
     sender, _ = notifier(socket_end)
@@ -80,7 +79,7 @@ def test_only_what_is_new_is_sent(socket_end: ManagerSocket):
     assert socket_end.heard() == sent
 
 
-def test_the_watchdog_is_fed_by_turns_alone(socket_end: ManagerSocket):
+def test_the_watchdog_is_fed_by_turns_alone(socket_end):
     """At the first turn, then at most each second of its ten; a box that takes no turn is
     silent."""
     sender, clock = notifier(socket_end, **WATCHDOG, WATCHDOG_PID=str(os.getpid()))
@@ -96,7 +95,7 @@ def test_the_watchdog_is_fed_by_turns_alone(socket_end: ManagerSocket):
     assert socket_end.heard() == []
 
 
-def test_turns_without_a_skin_keep_the_start_alive(socket_end: ManagerSocket):
+def test_turns_without_a_skin_keep_the_start_alive(socket_end):
     """Until READY each feeding moves the end of the start on, by the watchdog's time; none after
     it."""
     sender, clock = notifier(socket_end, **WATCHDOG)
@@ -107,7 +106,7 @@ def test_turns_without_a_skin_keep_the_start_alive(socket_end: ManagerSocket):
     assert socket_end.heard() == [later, later, ["READY=1", "WATCHDOG=1"], ["WATCHDOG=1"]]
 
 
-def test_text_of_a_device_is_no_message(socket_end: ManagerSocket):
+def test_text_of_a_device_is_no_message(socket_end):
     """A line break in a status would begin another message. Bytes that are not text are sent,
     too."""
     sender, _ = notifier(socket_end)
@@ -115,7 +114,7 @@ def test_text_of_a_device_is_no_message(socket_end: ManagerSocket):
     assert socket_end.heard() == [["STATUS=skin absent: no READY=1 MAINPID=1 ?"]]
 
 
-def test_a_socket_that_is_gone_costs_nothing(socket_end: ManagerSocket, tmp_path: Path):
+def test_a_socket_that_is_gone_costs_nothing(socket_end, tmp_path):
     """Without a listener, or with a full socket, the box goes on; unsent messages are sent
     later."""
     sender, _ = notifier(socket_end)
@@ -147,9 +146,7 @@ TEXTS = ["10s", "-5", "1e6", "\u0663", "9" * 5000, "0x10", " "]
         *(({"WATCHDOG_USEC": text}, 1) for text in TEXTS),
     ],
 )
-def test_no_watchdog_or_another_s_is_not_fed(
-    socket_end: ManagerSocket, more: dict[str, str], told: int, logged: list[str]
-):
+def test_no_watchdog_or_another_s_is_not_fed(socket_end, more, told, logged):
     """WATCHDOG_USEC unset or WATCHDOG_PID not ours; if it is no number, a line of the log says
     so."""
     sender, clock = notifier(socket_end, **more)
@@ -178,7 +175,7 @@ class TurnLog(Observer):
         self.notes.append("stopping")
 
 
-def test_a_box_is_ready_with_the_first_frames_of_its_skin(rigged: Callable[..., Rigged]):
+def test_a_box_is_ready_with_the_first_frames_of_its_skin(rigged):
     """Without a skin the status has the missing part; then it streams, and counts the answered
     sweeps."""
     turn_log, simulated = TurnLog(), idle_devices()
@@ -200,7 +197,7 @@ def test_a_box_is_ready_with_the_first_frames_of_its_skin(rigged: Callable[..., 
     assert (ready, status[:10]) == (False, "skin lost:")
 
 
-def test_a_turn_ends_after_everything_in_it(rigged: Callable[..., Rigged]):
+def test_a_turn_ends_after_everything_in_it(rigged):
     """One call for each whole turn: none for the turn that hangs after its sentence, at the
     disk."""
     turn_log = TurnLog()
@@ -219,7 +216,7 @@ def test_a_turn_ends_after_everything_in_it(rigged: Callable[..., Rigged]):
     assert turn_log.turns == turns > 100
 
 
-def test_stopping_is_sent_before_the_last_answer(rigged: Callable[..., Rigged]):
+def test_stopping_is_sent_before_the_last_answer(rigged):
     """An open sweep is answered after systemd has been notified."""
     turn_log = TurnLog()
     note = OnSweep(lambda sweep, verdict: turn_log.notes.append(str(sweep.status)))
@@ -231,7 +228,7 @@ def test_stopping_is_sent_before_the_last_answer(rigged: Callable[..., Rigged]):
 
 
 @pytest.mark.slow
-def test_the_command_notifies_systemd(tmp_path: Path):
+def test_the_command_notifies_systemd(tmp_path):
     """`palpate run` under systemd: first a status, READY once, the watchdog fed while it runs,
     STOPPING on SIGTERM."""
     socket_end = ManagerSocket(str(tmp_path / "notify"))

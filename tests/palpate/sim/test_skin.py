@@ -38,7 +38,7 @@ def centre(frames: np.ndarray) -> np.ndarray:
 SHEAR = World(shear=True)
 
 
-def test_the_normal_axis_of_a_skin_with_shear_is_that_without() -> None:
+def test_the_normal_axis_of_a_skin_with_shear_is_that_without():
     """With the same finger and random numbers, the pressure differs only by the noise of the
     readout; shear only adds axes."""
     off = frozenset({"noise"})
@@ -49,7 +49,7 @@ def test_the_normal_axis_of_a_skin_with_shear_is_that_without() -> None:
     np.testing.assert_array_equal(three[..., 2], plain)
 
 
-def test_friction_pulls_against_the_motion_while_the_finger_slides() -> None:
+def test_friction_pulls_against_the_motion_while_the_finger_slides():
     """Without relief the shear along the rows is 0.4 of the pressure and negative; before and after
     the slide it is 0."""
     frames = skin.sweep("metal", PLACE, rng(), replace(only("position"), shear=True)).astype(float)
@@ -63,7 +63,7 @@ def test_friction_pulls_against_the_motion_while_the_finger_slides() -> None:
     assert np.abs(centred[..., 1] - centred[..., 2] * y / 25).max() <= 1
 
 
-def test_a_steeper_relief_shears_more() -> None:
+def test_a_steeper_relief_shears_more():
     """Shear along the rows is the pressure times the slope of the relief, that is, the change of
     the normal axis."""
     world = World(
@@ -77,7 +77,7 @@ def test_a_steeper_relief_shears_more() -> None:
     assert np.corrcoef(along[1:] / normal[1:], np.diff(normal))[0, 1] < -0.9
 
 
-def test_sets_and_idle_skins_with_shear() -> None:
+def test_sets_and_idle_skins_with_shear():
     """Format, reproducibility; shear is noise around 0 without contact."""
     samples, labels, _ = skin.sweep_set("T-HARD", 5, 1, SHEAR)
     assert (samples.shape, samples.dtype) == ((6, 1500, 4, 4, 3), np.int16)
@@ -89,7 +89,7 @@ def test_sets_and_idle_skins_with_shear() -> None:
 
 
 @pytest.mark.parametrize("material", MATERIALS)
-def test_a_sweep_rests_slides_and_rests(material: str) -> None:
+def test_a_sweep_rests_slides_and_rests(material):
     """Shape and type are the format's, and only the slide makes the taxels vibrate."""
     taxels = skin.sweep(material, PLACE, rng(), only("texture", "vibration"))
     assert taxels.shape == (2700, 4, 4)
@@ -99,7 +99,7 @@ def test_a_sweep_rests_slides_and_rests(material: str) -> None:
     assert (np.ptp(taxels[225:2475], axis=0) > 0).all()
 
 
-def test_lengths_of_rest_and_slide_are_taken_from_the_caller() -> None:
+def test_lengths_of_rest_and_slide_are_taken_from_the_caller():
     """Seconds become frames at 750 Hz."""
     assert (
         len(skin.sweep("wood", PLACE, rng(), rest_s=0.1, slide_s=0.4, after_s=0.2))
@@ -107,7 +107,7 @@ def test_lengths_of_rest_and_slide_are_taken_from_the_caller() -> None:
     )
 
 
-def test_the_same_seed_gives_the_same_counts() -> None:
+def test_the_same_seed_gives_the_same_counts():
     """A sweep, a window, an idle skin and a set repeat exactly; another seed differs."""
     for make in (
         lambda seed: skin.sweep("foam", PLACE, rng(seed)),
@@ -119,7 +119,7 @@ def test_the_same_seed_gives_the_same_counts() -> None:
         assert not np.array_equal(make(1), make(2))
 
 
-def test_an_idle_skin_reads_zero_and_noise() -> None:
+def test_an_idle_skin_reads_zero_and_noise():
     """Without contact counts are 0 with an occasional 1 or 2; without noise they are 0."""
     idle = skin.idle(3000, rng())
     assert idle.shape == (3000, 4, 4)
@@ -128,7 +128,7 @@ def test_an_idle_skin_reads_zero_and_noise() -> None:
     assert not skin.idle(10, rng(), STILL).any()
 
 
-def test_without_effects_the_load_is_constant_and_centred() -> None:
+def test_without_effects_the_load_is_constant_and_centred():
     """With everything off the load is constant and symmetric about the middle of the skin."""
     frames = skin.window("metal", PLACE, rng(), STILL)
     assert (np.ptp(frames, axis=0) == 0).all()
@@ -137,7 +137,7 @@ def test_without_effects_the_load_is_constant_and_centred() -> None:
 
 
 @pytest.mark.parametrize("effect", EFFECTS)
-def test_every_effect_changes_the_signal(effect: str) -> None:
+def test_every_effect_changes_the_signal(effect):
     """Removing any one effect changes the counts."""
     assert not np.array_equal(
         skin.sweep("paper", PLACE, rng()),
@@ -167,7 +167,7 @@ def test_every_effect_changes_the_signal(effect: str) -> None:
         ("noise", lambda w: skin.noise(99, rng(), w)),
     ],
 )
-def test_a_switch_reaches_its_own_effect_only(effect: str, call) -> None:
+def test_a_switch_reaches_its_own_effect_only(effect, call):
     """An effect is the same whether all others are on or off, and neutral if it is off itself."""
     alone = call(only(effect))
     assert np.array_equal(alone, call(World()))
@@ -176,7 +176,7 @@ def test_a_switch_reaches_its_own_effect_only(effect: str, call) -> None:
 
 
 @pytest.mark.parametrize("effect", ["drift", "spot", "texture", "vibration"])
-def test_removing_an_effect_keeps_the_random_numbers_of_the_others(effect: str) -> None:
+def test_removing_an_effect_keeps_the_random_numbers_of_the_others(effect):
     """The readout noise, as the difference with and without it, is the same with and without
     another effect."""
     loud = World(noise_counts=2.0)
@@ -190,7 +190,7 @@ def test_removing_an_effect_keeps_the_random_numbers_of_the_others(effect: str) 
     assert alike > 0.9  # not 1: each of the four is rounded to whole digits
 
 
-def test_noise_alone_is_white_and_has_its_standard_deviation() -> None:
+def test_noise_alone_is_white_and_has_its_standard_deviation():
     """Noise differs between taxels and has the standard deviation of the World, plus that of
     rounding."""
     taxels = skin.window("metal", PLACE, rng(), only("noise")).reshape(-1, 16).astype(float)
@@ -198,7 +198,7 @@ def test_noise_alone_is_white_and_has_its_standard_deviation() -> None:
     assert abs(np.corrcoef(taxels.T) - np.eye(16)).max() < 0.15
 
 
-def test_vibration_alone_shakes_all_taxels_together_by_their_pressure() -> None:
+def test_vibration_alone_shakes_all_taxels_together_by_their_pressure():
     """Friction adds one signal to all taxels, in proportion to their pressure."""
     loud = replace(only("vibration"), counts_per_kpa=25.0)
     taxels = skin.window("plastic rough", PLACE, rng(), loud).reshape(-1, 16).astype(float)
@@ -207,7 +207,7 @@ def test_vibration_alone_shakes_all_taxels_together_by_their_pressure() -> None:
     assert share.max() / share.min() < 1.1
 
 
-def test_vibration_is_where_the_material_puts_it() -> None:
+def test_vibration_is_where_the_material_puts_it():
     """The metal's vibration lies higher than the foam's, and reaches up to half the sampling rate
     for some tube."""
     spectra = {}
@@ -224,7 +224,7 @@ def test_vibration_is_where_the_material_puts_it() -> None:
     assert spectra["plastic smooth"][hz > 350].sum() > 0.001 * spectra["plastic smooth"].sum()
 
 
-def test_the_pad_damps_vibration_more_further_forward() -> None:
+def test_the_pad_damps_vibration_more_further_forward():
     """A skin one row forward gets less of the high vibrations than one in the middle."""
     power = []
     for dx_mm in (0.0, skin.PITCH_MM):
@@ -235,7 +235,7 @@ def test_the_pad_damps_vibration_more_further_forward() -> None:
     assert power[1] < 0.75 * power[0]
 
 
-def test_the_relief_is_higher_further_forward() -> None:
+def test_the_relief_is_higher_further_forward():
     """A skin one row forward gets the same relief higher, by as much as the World says for 4 mm."""
     tube, felt = World().tube("plastic rough"), []
     for dx_mm in (0.0, skin.PITCH_MM):
@@ -245,7 +245,7 @@ def test_the_relief_is_higher_further_forward() -> None:
     assert felt[1].std() > 1.2 * felt[0].std()
 
 
-def test_rows_see_the_texture_one_after_another() -> None:
+def test_rows_see_the_texture_one_after_another():
     """Row 2 of the rough tube shows what row 3 showed 100 frames (4 mm at 3 cm/s) before; columns
     differ."""
     frames = skin.window("plastic rough", Placement(), rng(), only("texture")).astype(float)
@@ -259,7 +259,7 @@ def test_rows_see_the_texture_one_after_another() -> None:
     assert abs(np.corrcoef(frames[:, 1, 1], frames[:, 1, 2])[0, 1]) < 0.6
 
 
-def test_a_taxel_averages_the_texture_over_its_length() -> None:
+def test_a_taxel_averages_the_texture_over_its_length():
     """A relief much finer than a taxel is averaged out; a much coarser one has its full height."""
     x = skin.position(Placement(), STILL)[0]
     felt = []
@@ -270,7 +270,7 @@ def test_a_taxel_averages_the_texture_over_its_length() -> None:
     assert felt[1] > 0.6
 
 
-def test_force_keeps_within_a_fifth() -> None:
+def test_force_keeps_within_a_fifth():
     """For any error of the controller forces stay within 20 % of 1 N; they differ between sweeps
     and vary slowly."""
     for world in (World(), World(force_spread=0.5)):
@@ -282,7 +282,7 @@ def test_force_keeps_within_a_fifth() -> None:
 
 
 @pytest.mark.parametrize("kpa_per_mm", [2.0, 4.0])
-def test_the_springs_carry_the_force(kpa_per_mm: float) -> None:
+def test_the_springs_carry_the_force(kpa_per_mm):
     """Pressure summed over the whole patch is the force that presses; a softer bed sinks in
     deeper."""
     force = np.array([0.8, 1.0, 1.2])
@@ -293,7 +293,7 @@ def test_the_springs_carry_the_force(kpa_per_mm: float) -> None:
     assert (depth > skin.indentation(force, 2 * kpa_per_mm, World())).all()
 
 
-def test_the_pressure_centre_moves_against_the_skin() -> None:
+def test_the_pressure_centre_moves_against_the_skin():
     """A skin that is further forward (or across) has the contact at lower rows (or columns), if the
     end of the pad is near."""
     still = replace(skin.LEVEL_BLIND, off=only("position").off)
@@ -307,7 +307,7 @@ def test_the_pressure_centre_moves_against_the_skin() -> None:
     assert across[0] == pytest.approx(middle[0], abs=0.02)
 
 
-def test_a_flat_pad_shows_a_displacement_across_alone() -> None:
+def test_a_flat_pad_shows_a_displacement_across_alone():
     """The pad is flat along the tube for longer than the skin, so that the contact moves against
     the skin across the tube and hardly along it."""
     still = only("position")
@@ -318,7 +318,7 @@ def test_a_flat_pad_shows_a_displacement_across_alone() -> None:
     assert across[1] < middle[1] - 0.1
 
 
-def test_a_row_leaves_the_contact_when_the_skin_sits_a_row_ahead() -> None:
+def test_a_row_leaves_the_contact_when_the_skin_sits_a_row_ahead():
     """In T-HARD the leading row of the level-blind world is beyond the end of the pad, and the
     others are still loaded. On the flat pad it keeps most of its load."""
     samples, _, _ = skin.sweep_set("T-HARD", 0, 1, skin.LEVEL_BLIND)
@@ -332,7 +332,7 @@ def test_a_row_leaves_the_contact_when_the_skin_sits_a_row_ahead() -> None:
     assert (share < 1).all()
 
 
-def test_softer_tubes_spread_the_pressure() -> None:
+def test_softer_tubes_spread_the_pressure():
     """Foam presses the middle of the skin less than metal does, at the same force."""
     metal, foam = (
         skin.window(m, Placement(), rng(), STILL)[0].astype(float) for m in ("metal", "foam")
@@ -341,7 +341,7 @@ def test_softer_tubes_spread_the_pressure() -> None:
     assert foam.max() < metal.max()
 
 
-def test_reattaching_changes_the_load_but_not_the_position() -> None:
+def test_reattaching_changes_the_load_but_not_the_position():
     """Another seed of the placement gives other gains; the same seed the same. In the level-blind
     world they differ more."""
     off = only("attachment").off
@@ -354,7 +354,7 @@ def test_reattaching_changes_the_load_but_not_the_position() -> None:
         assert abs(first - other).mean() > least
 
 
-def test_a_window_looks_like_the_middle_of_a_sweep() -> None:
+def test_a_window_looks_like_the_middle_of_a_sweep():
     """Level and power of `window` are those of `sweep`'s slide."""
     long = np.array([skin.sweep("wood", PLACE, rng(s))[600:2100] for s in range(20)]).astype(float)
     short = np.array([skin.window("wood", PLACE, rng(s)) for s in range(20)]).astype(float)
@@ -364,7 +364,7 @@ def test_a_window_looks_like_the_middle_of_a_sweep() -> None:
 
 
 @pytest.mark.parametrize("name", ["T-LAB", "T-REAL"])
-def test_loads_are_in_the_range_of_the_converter(name: skin.SetName) -> None:
+def test_loads_are_in_the_range_of_the_converter(name):
     """Middle taxels are loaded, none saturates for long, and no loaded one is constant. In the
     level-blind world the outer columns are loaded too; else only soft tubes reach them."""
     for world in skin.WORLDS.values():
@@ -381,7 +381,7 @@ def test_loads_are_in_the_range_of_the_converter(name: skin.SetName) -> None:
 @pytest.mark.parametrize(
     ("name", "places", "each"), [("T-LAB", 1, 40), ("T-REAL", 9, 10), ("T-HARD", 1, 10)]
 )
-def test_sets_have_the_papers_counts(name: skin.SetName, places: int, each: int) -> None:
+def test_sets_have_the_papers_counts(name, places, each):
     """Every tube is swept equally often at every position."""
     samples, labels, positions = skin.sweep_set(name, 5)
     assert samples.shape == (places * 6 * each, 1500, 4, 4)
@@ -392,7 +392,7 @@ def test_sets_have_the_papers_counts(name: skin.SetName, places: int, each: int)
     assert (counts == each).all()
 
 
-def test_positions_are_those_of_the_paper() -> None:
+def test_positions_are_those_of_the_paper():
     """T-REAL has nine positions within 1 mm, T-HARD one a row further forward, and no two share an
     attachment."""
     lab, real, hard = (skin.placements(name, 5) for name in ("T-LAB", "T-REAL", "T-HARD"))
@@ -405,7 +405,7 @@ def test_positions_are_those_of_the_paper() -> None:
     assert skin.placements("T-REAL", 6) != real
 
 
-def test_a_set_is_made_of_windows_at_its_positions() -> None:
+def test_a_set_is_made_of_windows_at_its_positions():
     """Without random effects each window depends only on its material and position."""
     world = only("position", "attachment")
     samples, labels, positions = skin.sweep_set("T-REAL", 5, 1, world)
@@ -415,7 +415,7 @@ def test_a_set_is_made_of_windows_at_its_positions() -> None:
         assert np.array_equal(samples[i], expected)
 
 
-def test_unknown_names_are_refused() -> None:
+def test_unknown_names_are_refused():
     """A material, an effect and a set that do not exist are named in the error."""
     with pytest.raises(ConfigError, match="'glass'"):
         skin.window("glass", PLACE, rng())

@@ -55,7 +55,7 @@ def failing(monkeypatch: pytest.MonkeyPatch, code: int, fails: Callable[[], bool
     monkeypatch.setattr(sweep_folder, "save", tight)
 
 
-def test_the_last_sweeps_are_kept_over_restarts(tmp_path: Path):
+def test_the_last_sweeps_are_kept_over_restarts(tmp_path):
     """Each new sweep pushes out the oldest sweep, also in a later run and for any status. A sweep
     without a window does not. The folder is there before the first sweep, and free at the end."""
     folder = tmp_path / "b"
@@ -76,7 +76,7 @@ def test_the_last_sweeps_are_kept_over_restarts(tmp_path: Path):
     assert numbers(folder) == [7]
 
 
-def test_the_oldest_goes_once_the_newest_is_safe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_the_oldest_goes_once_the_newest_is_safe(tmp_path, monkeypatch):
     """The last sweeps exist at every moment: a sweep is removed only after the new sweep has its
     name."""
     black = box(tmp_path)
@@ -93,9 +93,7 @@ def test_the_oldest_goes_once_the_newest_is_safe(tmp_path: Path, monkeypatch: py
     assert there == [4, 3]
 
 
-def test_a_full_disk_drops_the_oldest_first(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, logged: list[str]
-):
+def test_a_full_disk_drops_the_oldest_first(tmp_path, monkeypatch, logged):
     """The oldest sweep is removed for a new sweep. If that does not help, one line is logged, and
     another when writing works again."""
     black, limit = box(tmp_path), [2]
@@ -115,9 +113,7 @@ def test_a_full_disk_drops_the_oldest_first(
     assert "again" in end
 
 
-def test_another_error_removes_no_sweep(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, logged: list[str]
-):
+def test_another_error_removes_no_sweep(tmp_path, monkeypatch, logged):
     """If the disk fails although it is not full, existing sweeps are kept."""
     black = box(tmp_path)
     put(black, 1)
@@ -127,7 +123,7 @@ def test_another_error_removes_no_sweep(
     assert "Input/output" in logged[0]
 
 
-def test_a_folder_that_cannot_be_used_yet(tmp_path: Path, logged: list[str]):
+def test_a_folder_that_cannot_be_used_yet(tmp_path, logged):
     """With a file instead of the folder, or another program in it, the box starts and logs one
     line. Later the folder can be used."""
     folder = tmp_path / "b"
@@ -145,7 +141,7 @@ def test_a_folder_that_cannot_be_used_yet(tmp_path: Path, logged: list[str]):
     assert [text in line for text, line in zip(told, logged, strict=True)] == [True] * 3
 
 
-def test_on_the_whole_box_answers_go_out_first(rigged: Callable[..., Rigged], tmp_path: Path):
+def test_on_the_whole_box_answers_go_out_first(rigged, tmp_path):
     """The sentence is sent before any access to the disk, and the sweep is stored."""
     simulated = devices.build(skin.FORMAT, script.tubes(1, 2), rig.VirtualClock(), "sim")
     made: Rigged

@@ -61,7 +61,7 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "capture"
 
 
-def test_frames_before_the_skin_counts_as_streaming_are_not_replayed(path: Path):
+def test_frames_before_the_skin_counts_as_streaming_are_not_replayed(path):
     """A skin that was too fast must send for some seconds before it streams. Replay gives exactly
     the frames that the sensor returned."""
     capture = CaptureWriter(path, profile("matrix").format, profile("matrix"))
@@ -86,9 +86,7 @@ def test_frames_before_the_skin_counts_as_streaming_are_not_replayed(path: Path)
 
 
 @pytest.mark.slow
-def test_a_capture_gives_the_same_verdicts_bit_for_bit(
-    rigged: Make, default_bundle: Bundle, path: Path
-):
+def test_a_capture_gives_the_same_verdicts_bit_for_bit(rigged, default_bundle, path):
     """With drift, spikes, lost transfers, an unplugged skin and NEW OBJECT, replay gives the same
     windows, times and scores."""
     rng = np.random.default_rng(5)
@@ -121,7 +119,7 @@ def test_a_capture_gives_the_same_verdicts_bit_for_bit(
 
 
 @pytest.mark.slow
-def test_commands_are_part_of_a_capture(rigged: Make, default_bundle: Bundle, path: Path):
+def test_commands_are_part_of_a_capture(rigged, default_bundle, path):
     """NEW and ABORT affect later sweeps, so they are captured: replayed sweeps are fused and end as
     before."""
     simulated = simulated_tubes(1014, 5, only="wood")
@@ -139,9 +137,7 @@ def test_commands_are_part_of_a_capture(rigged: Make, default_bundle: Bundle, pa
     assert list(map(all_values, verdicts)) == list(map(all_values, first))
 
 
-def test_a_capture_of_a_skin_that_sent_another_format(
-    rigged: Make, default_bundle: Bundle, path: Path
-):
+def test_a_capture_of_a_skin_that_sent_another_format(rigged, default_bundle, path):
     """After packets of another grid in the stream the sweep is `sensor-lost`, live and in the
     replay. After a power cut within a record, all earlier records are played."""
     simulated = simulated_tubes(1015, 2)
@@ -161,7 +157,7 @@ def test_a_capture_of_a_skin_that_sent_another_format(
         assert list(map(all_values, played(path, default_bundle)[0])) == whole[:answered]
 
 
-def test_a_restart_keeps_the_capture_before(tmp_path: Path, path: Path, logged: list[str]):
+def test_a_restart_keeps_the_capture_before(tmp_path, path, logged):
     """Earlier captures get the next number. If there are too many, the start is refused and nothing
     is overwritten."""
     for edges in range(3):
@@ -188,7 +184,7 @@ def test_a_restart_keeps_the_capture_before(tmp_path: Path, path: Path, logged: 
         (None, "cannot be read"),
     ],
 )
-def test_other_files_are_named(path: Path, content: bytes | None, hint: str):
+def test_other_files_are_named(path, content, hint):
     """The error says that the file is not a capture, or is not there."""
     if content:
         path.write_bytes(content)
@@ -196,7 +192,7 @@ def test_other_files_are_named(path: Path, content: bytes | None, hint: str):
         Playback(path)
 
 
-def test_speed_and_force_are_part_of_a_capture(path: Path):
+def test_speed_and_force_are_part_of_a_capture(path):
     """Edges come back with them, and edges without them are written shorter."""
     plain, with_speed = Edge(EdgeKind.STOP, 5), Edge(EdgeKind.START, 6, 30.0)
     capture = CaptureWriter(path, skin.FORMAT)
@@ -214,7 +210,7 @@ def test_speed_and_force_are_part_of_a_capture(path: Path):
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -1.0])
-def test_a_record_that_was_never_written_is_refused(path: Path, value: float):
+def test_a_record_that_was_never_written_is_refused(path, value):
     """A speed that the box cannot have received, and a record of an unknown kind."""
     capture = CaptureWriter(path, skin.FORMAT)
     capture.edges(7, [Edge(EdgeKind.START, 6, value)])
@@ -237,7 +233,7 @@ def kept(n: int) -> Sweep:
     return Sweep(n, 7, 40, Status.OK, frames)
 
 
-def test_saved_sweeps_are_read_as_they_were(tmp_path: Path):
+def test_saved_sweeps_are_read_as_they_were(tmp_path):
     """Frames, times, numbers and status are read again, and there are only the two files."""
     sweep = kept(3)
     save(tmp_path / "s.npy", sweep, skin.FORMAT)
@@ -263,7 +259,7 @@ def test_saved_sweeps_are_read_as_they_were(tmp_path: Path):
         ("npy", lambda data: toy_bundle.npy(np.array([{}]))),
     ],
 )
-def test_broken_recordings_are_named(tmp_path: Path, name: str, spoil: Callable[[bytes], bytes]):
+def test_broken_recordings_are_named(tmp_path, name, spoil):
     """A missing or broken sidecar, an unknown schema, another grid, a broken array, a pickle."""
     save(tmp_path / "s.npy", kept(1), skin.FORMAT)
     path = tmp_path / f"s.{name}"
@@ -275,7 +271,7 @@ def test_broken_recordings_are_named(tmp_path: Path, name: str, spoil: Callable[
         load(tmp_path / "s.npy")
 
 
-def test_a_name_that_cannot_be_taken_leaves_nothing(tmp_path: Path):
+def test_a_name_that_cannot_be_taken_leaves_nothing(tmp_path):
     """If the second of the two files cannot be renamed, the first file is removed, too."""
     (tmp_path / "sweep-000001.npy").mkdir()
     with pytest.raises(OSError, match="directory"):

@@ -129,7 +129,7 @@ def heard(box: Rigged) -> list[list[str]]:
     return [line.split("*")[0].split(",")[2:] for line in box.heard if ",REC," in line]
 
 
-def test_a_label_applies_to_sweeps_that_start_after_it(recorded: Recorded, tmp_path: Path):
+def test_a_label_applies_to_sweeps_that_start_after_it(recorded, tmp_path):
     """On the serial line with real edges, a label that is sent during a sweep applies to the next
     sweep. The three seconds before the first sweep are enough for the first command."""
     first, *others = script.tubes(1, 3)
@@ -154,7 +154,7 @@ def test_a_label_applies_to_sweeps_that_start_after_it(recorded: Recorded, tmp_p
     assert all(pynmea2.parse(line, check=True) for line in box.heard)
 
 
-def test_a_sidecar_holds_everything(recorded: Recorded, tmp_path: Path):
+def test_a_sidecar_holds_everything(recorded, tmp_path):
     """The sidecar has verdict, readout board, clock, trigger, unloaded skin and run in plain JSON,
     and nothing of a bundle. The start was a GPIO line, without speed and force."""
     simulated = simulated_tubes(2, 1)
@@ -177,7 +177,7 @@ def test_a_sidecar_holds_everything(recorded: Recorded, tmp_path: Path):
     assert again.frames.taxels.tobytes() == box.kept[0].frames.taxels.tobytes()
 
 
-def test_a_recording_is_a_set_to_train_on(recorded: Recorded, tmp_path: Path):
+def test_a_recording_is_a_set_to_train_on(recorded, tmp_path):
     """`palpate-train --set DIR` reads the materials, positions, sessions and windows that the box
     recorded."""
     simulated = simulated_tubes(3, 2)
@@ -192,7 +192,7 @@ def test_a_recording_is_a_set_to_train_on(recorded: Recorded, tmp_path: Path):
     assert (made.samples[1] == box.kept[1].frames.taxels).all()
 
 
-def test_speed_and_force_reach_sidecar_feed_and_set(rigged: Callable[..., Rigged], tmp_path: Path):
+def test_speed_and_force_reach_sidecar_feed_and_set(rigged, tmp_path):
     """Two sweeps by command with `palpate record`: the values are in each sidecar, in the feed's
     verdict, and are groups of the set."""
     acts = [rig.Act(np.zeros((20 * 750, 4, 4), np.uint8), 10**7, 10**7 + 1, "")]
@@ -217,7 +217,7 @@ def test_speed_and_force_reach_sidecar_feed_and_set(rigged: Callable[..., Rigged
     assert groups["force"].tolist() == [1_500, 250]
 
 
-def test_rec_says_what_became_of_each_sweep(tmp_path: Path):
+def test_rec_says_what_became_of_each_sweep(tmp_path):
     """Stored with its count, labels and file; a fault of the window; skipped without a window."""
     desk = Desk(tmp_path, Labels("wood", "3", "a b"))
     assert desk.sweep(1) == ["1", "stored", "1", "wood", "3", "a b", "sweep-000001"]
@@ -233,7 +233,7 @@ def test_rec_says_what_became_of_each_sweep(tmp_path: Path):
     assert desk.sweep(999_999)[3:7] == ["x" * 24] * 3 + ["sweep-999999"]
 
 
-def test_the_label_at_the_start_edge_counts(tmp_path: Path):
+def test_the_label_at_the_start_edge_counts(tmp_path):
     """Each sweep has the labels that applied at its start, even if it is answered after a later
     sweep. A sweep that began before all kept changes has no label."""
     desk = Desk(tmp_path, Labels())
@@ -256,7 +256,7 @@ def test_the_label_at_the_start_edge_counts(tmp_path: Path):
         *((text, "") for text in ("", "left", "2.5", "9" * 24)),
     ],
 )
-def test_next_position(tmp_path: Path, text: str, after: str):
+def test_next_position(tmp_path, text, after):
     """A whole number is increased by one; anything else is an error and stays."""
     desk = Desk(tmp_path, Labels("wood", text))
     if after:
@@ -268,7 +268,7 @@ def test_next_position(tmp_path: Path, text: str, after: str):
 
 
 @pytest.mark.parametrize("text", ["-1", "a,b", "blé", "x" * 25, "a\nb", "$"])
-def test_labels_that_cannot_be_sent(tmp_path: Path, text: str):
+def test_labels_that_cannot_be_sent(tmp_path, text):
     """They are refused, by command and as an option, and the label before stays."""
     desk = Desk(tmp_path)
     with pytest.raises(ApplianceError, match="1 to 24"):
@@ -278,7 +278,7 @@ def test_labels_that_cannot_be_sent(tmp_path: Path, text: str):
         Labels(session=text)
 
 
-def test_discard_takes_the_last_and_then_the_one_before(tmp_path: Path):
+def test_discard_takes_the_last_and_then_the_one_before(tmp_path):
     """DISCARD can remove all sweeps of this run and no sweep of an earlier run. No number is used
     twice, even after a restart."""
     before = Desk(tmp_path)
@@ -303,7 +303,7 @@ def test_discard_takes_the_last_and_then_the_one_before(tmp_path: Path):
     assert names(tmp_path) == pairs(1, 7)
 
 
-def test_discard_of_the_sweep_that_was_seen(tmp_path: Path):
+def test_discard_of_the_sweep_that_was_seen(tmp_path):
     """With a number, DISCARD removes the last stored sweep only if it has this number, and never a
     later sweep."""
     desk = Desk(tmp_path)
@@ -317,7 +317,7 @@ def test_discard_of_the_sweep_that_was_seen(tmp_path: Path):
 
 
 @pytest.mark.parametrize("earlier", [0, 2])
-def test_what_became_of_the_last_sweep_is_kept(tmp_path: Path, earlier: int):
+def test_what_became_of_the_last_sweep_is_kept(tmp_path, earlier):
     """For displays of the recording: the outcome as in REC, and the sweep that DISCARD would
     remove. Sweeps of an earlier run do not count."""
     before = Desk(tmp_path)
@@ -343,7 +343,7 @@ def test_what_became_of_the_last_sweep_is_kept(tmp_path: Path, earlier: int):
     assert (last["sweep"], last["outcome"], discard) == (3, "discarded", 1)
 
 
-def test_the_log_says_what_is_missing(tmp_path: Path, logged: list[str]):
+def test_the_log_says_what_is_missing(tmp_path, logged):
     """After each sweep, per material and position, with those of earlier runs; a faulty window does
     not count."""
     before = Desk(tmp_path, Labels("wood", "1"), target=2)
@@ -374,7 +374,7 @@ def test_the_log_says_what_is_missing(tmp_path: Path, logged: list[str]):
         assert part in line
 
 
-def test_a_folder_of_another_format_is_refused(tmp_path: Path):
+def test_a_folder_of_another_format_is_refused(tmp_path):
     """A model cannot be trained on sweeps of two formats. The folder does not change and can be
     used by other programs; a damaged sweep there is neither counted nor refused."""
     first = Desk(tmp_path)
@@ -387,7 +387,7 @@ def test_a_folder_of_another_format_is_refused(tmp_path: Path):
     assert Desk(tmp_path).sweep(1)[6] == "sweep-000003"
 
 
-def test_discard_that_fails_can_be_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_discard_that_fails_can_be_repeated(tmp_path, monkeypatch):
     """A disk that fails in the middle is an error; the sweep still counts as stored, and DISCARD
     can remove the rest."""
     desk, rename = Desk(tmp_path), Path.replace
@@ -407,7 +407,7 @@ def test_discard_that_fails_can_be_repeated(tmp_path: Path, monkeypatch: pytest.
     assert names(tmp_path) == ["sweep-000001.discarded"]
 
 
-def test_a_later_run_writes_nothing_over(tmp_path: Path):
+def test_a_later_run_writes_nothing_over(tmp_path):
     """Numbers continue; only unfinished files of a killed run are removed; an incomplete sweep
     keeps its number."""
     first = Desk(tmp_path)
@@ -425,7 +425,7 @@ def test_a_later_run_writes_nothing_over(tmp_path: Path):
     assert (about["run"], about["id"]) == (3, 1)
 
 
-def test_one_program_at_a_time_has_a_folder(tmp_path: Path):
+def test_one_program_at_a_time_has_a_folder(tmp_path):
     """A second program would use the same numbers, so it is refused, and the first continues."""
     first = Desk(tmp_path)
     with pytest.raises(ConfigError, match="another"):
@@ -444,12 +444,7 @@ def test_one_program_at_a_time_has_a_folder(tmp_path: Path):
     ],
 )
 def test_no_room_for_the_system_stops_recording(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    blocks: int,
-    left: int,
-    detail: str,
-    logged: list[str],
+    tmp_path, monkeypatch, blocks, left, detail, logged
 ):
     """In the reserved space nothing is written: REC says so, and one line is logged. Each sweep
     tries again, and one line is logged after a success."""
@@ -474,9 +469,7 @@ def test_no_room_for_the_system_stops_recording(
 @pytest.mark.parametrize(
     ("code", "outcome"), [(errno.ENOSPC, "full"), (errno.EDQUOT, "full"), (errno.EROFS, "failed")]
 )
-def test_a_disk_that_refuses(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int, outcome: str, logged: list[str]
-):
+def test_a_disk_that_refuses(tmp_path, monkeypatch, code, outcome, logged):
     """No space and no quota are `full`, anything else is `failed`, with the reason."""
     desk = Desk(tmp_path)
     refusing(monkeypatch, code)
@@ -484,7 +477,7 @@ def test_a_disk_that_refuses(
     assert len(logged) == 1
 
 
-def test_what_cannot_be_written_leaves_nothing(tmp_path: Path, logged: list[str]):
+def test_what_cannot_be_written_leaves_nothing(tmp_path, logged):
     """If the disk is full after n bytes, for any n within both files, the sweep has failed, no part
     of it stays, and existing files are complete."""
     desk = Desk(tmp_path)
@@ -503,15 +496,13 @@ def test_what_cannot_be_written_leaves_nothing(tmp_path: Path, logged: list[str]
 
 
 @pytest.mark.parametrize("folder", ["/proc/x", "/dev/null"])
-def test_a_folder_that_cannot_be_made(folder: str):
+def test_a_folder_that_cannot_be_made(folder):
     """Reported before the robot sweeps."""
     with pytest.raises(ConfigError, match=f"--out {folder}: "):
         Desk(Path(folder))
 
 
-def test_folders_are_on_the_disk_before_their_sweeps(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_folders_are_on_the_disk_before_their_sweeps(tmp_path, monkeypatch):
     """Each folder is synced into its parent at every start, so a power failure cannot remove the
     sweeps later."""
     synced: list[Path] = []
@@ -534,7 +525,7 @@ def test_numbers_in_a_verdict_come_back_bit_for_bit():
     assert replace(verdict, speed_mm_s=30.0).as_dict()["speed_mm_s"] == 30.0
 
 
-def test_display_names_outlast_the_run(tmp_path: Path):
+def test_display_names_outlast_the_run(tmp_path):
     """The sidecar keeps the typed name; the next run and the set of the folder have it; a name that
     cannot be shown is passed over."""
     for run in range(2):

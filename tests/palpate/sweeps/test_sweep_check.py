@@ -58,7 +58,7 @@ def sweep(taxels: np.ndarray) -> Sweep:
     return Sweep(1, 0, 0, Status.OK, Frames(n, n, taxels))
 
 
-def test_good_sweeps_are_recorded(rigged: Make):
+def test_good_sweeps_are_recorded(rigged):
     """The answer has no label, bundle or class code, and the robot gets RESULT VALID."""
     simulated = devices.build(skin.FORMAT, script.tubes(1, 6), rig.VirtualClock(), "sim")
     box = rigged(simulated, commands={})
@@ -81,7 +81,7 @@ def test_good_sweeps_are_recorded(rigged: Make):
     ],
     ids=["lifted", "stuck", "dead", "saturated"],
 )
-def test_a_faulty_skin_is_seen(rigged: Make, frames: np.ndarray, status: Status, detail: str):
+def test_a_faulty_skin_is_seen(rigged, frames, status, detail):
     """Faults are detected after a good sweep, which shows the skin with and without contact."""
     box = recording(rigged, played(slide()), played(frames))
     first, second = box.until(lambda: box.box.answered == 2)
@@ -89,14 +89,14 @@ def test_a_faulty_skin_is_seen(rigged: Make, frames: np.ndarray, status: Status,
     assert detail in second.detail
 
 
-def test_a_sweep_that_is_too_short_keeps_its_status(rigged: Make):
+def test_a_sweep_that_is_too_short_keeps_its_status(rigged):
     """Faults of the trigger and of the stream come first."""
     box = recording(rigged, played(slide()[:RATE]))
     assert [v.status for v in box.until(lambda: box.box.answered == 1)] == [Status.SHORT]
 
 
 @pytest.mark.parametrize("tare", [False, True])
-def test_contact_that_cannot_be_judged_is_said(rigged: Make, tare: bool):
+def test_contact_that_cannot_be_judged_is_said(rigged, tare):
     """If the finger never touched the skin, sweeps are recorded, and the answer says that contact
     was not checked. TARE says that nothing touches the skin now, and makes it certain."""
     box = recording(rigged, rig.Act(lifted(12), 3 * RATE, 6 * RATE, ""))
@@ -109,7 +109,7 @@ def test_contact_that_cannot_be_judged_is_said(rigged: Make, tare: bool):
     assert (box.box.circumstances()["unloaded"] is None) is not tare
 
 
-def test_commands_that_need_a_bundle(rigged: Make):
+def test_commands_that_need_a_bundle(rigged):
     """ID says that sweeps are recorded, and gives the skin's format. TEST says that there is
     nothing to test."""
     box = recording(rigged, played(slide()))

@@ -67,7 +67,7 @@ def learnt(folder: Path) -> tuple[list[int], dict[str, int]]:
     return [sweep_folder.number_of(one.path) for one in found], dict(left_out)
 
 
-def test_each_state_of_a_sweep(tmp_path: Path):
+def test_each_state_of_a_sweep(tmp_path):
     """One of each: all who learn from a folder leave out the same sweeps for the same reasons."""
     changes = [{}, {"status": Status.GAP}, {"share": 0.5}, {"material": ""}, {"material": "felt"}]
     for number, change in enumerate([*changes, {}], 1):
@@ -84,7 +84,7 @@ def test_each_state_of_a_sweep(tmp_path: Path):
     assert learnt(tmp_path) == ([1], dict.fromkeys(reasons, 1))
 
 
-def test_forgotten_sweeps_of_an_emptied_folder_hide_no_later_ones(tmp_path: Path):
+def test_forgotten_sweeps_of_an_emptied_folder_hide_no_later_ones(tmp_path):
     """A person removes all sweeps, and the program starts again: later ones are taught."""
     one = recording(tmp_path)
     put(one, 1, 2)
@@ -100,7 +100,7 @@ def test_forgotten_sweeps_of_an_emptied_folder_hide_no_later_ones(tmp_path: Path
     again.close()
 
 
-def test_a_sweep_that_waits_for_the_card_is_forgotten_too(tmp_path: Path):
+def test_a_sweep_that_waits_for_the_card_is_forgotten_too(tmp_path):
     """FORGET comes before it is written: it is stored and stays forgotten, also after a start."""
     disk = SlowDisk()
     one = recording(tmp_path, disk)
@@ -150,7 +150,7 @@ def test_forget_and_discard_do_not_wait_for_the_card(
 
 
 @pytest.mark.parametrize("content", ["", "[]", '{"cork": 3}', '{"cork": ["x"]}', "[" * 9999])
-def test_a_damaged_list_of_forgotten_sweeps_is_named(tmp_path: Path, content: str):
+def test_a_damaged_list_of_forgotten_sweeps_is_named(tmp_path, content):
     """Nothing is taught by mistake, and the folder is free again."""
     (tmp_path / FORGOTTEN).write_text(content)
     for _ in range(2):
@@ -158,7 +158,7 @@ def test_a_damaged_list_of_forgotten_sweeps_is_named(tmp_path: Path, content: st
             SweepFolder(tmp_path, SHORT)
 
 
-def test_sweeps_of_another_folder_are_adopted(tmp_path: Path):
+def test_sweeps_of_another_folder_are_adopted(tmp_path):
     """They get the next numbers and the material; the others stay."""
     session = recording(tmp_path / "old")
     put(session, 1, 2)
@@ -175,7 +175,7 @@ def test_sweeps_of_another_folder_are_adopted(tmp_path: Path):
     ]
 
 
-def test_a_table_of_another_form_is_no_sweep(tmp_path: Path):
+def test_a_table_of_another_form_is_no_sweep(tmp_path):
     """Records in two dimensions, with the sum of their file."""
     path, out = tmp_path / "sweep-000001.npy", io.BytesIO()
     save(path, taken(1, SHORT)[0], SHORT, {})

@@ -94,7 +94,7 @@ SCRIPTS = {
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
-def test_each_trigger_is_answered_once(name: str):
+def test_each_trigger_is_answered_once(name):
     """In the order of the triggers, and at the time at which it is due. The numbers of the sweeps
     count from 1."""
     bench, answers = Bench(late_ms=500, max_duration_s=6), []
@@ -130,7 +130,7 @@ def test_middle_window():
 
 
 @given(start=st.integers(100, 1000), length=st.integers(1500, 1900), offset=st.floats(-0.45, 0.45))
-def test_window_lies_in_the_middle_to_the_frame(start: int, length: int, offset: float):
+def test_window_lies_in_the_middle_to_the_frame(start, length, offset):
     """For any sweep, the window's middle is the sweep's to one frame, whatever the edges' phase."""
     sweep = sweep_of(frames(0, 3000), start + offset, start + length + offset)
     middle = (sweep.frames.seq[0] + sweep.frames.seq[-1]) / 2
@@ -152,7 +152,7 @@ def test_every_axis_is_interpolated():
 @pytest.mark.parametrize(
     "drop", [(1000,), (1000, 1001), (875,), (875, 876), (2373, 2374), (900, 905, 906, 2000)]
 )
-def test_short_gaps_are_interpolated_and_counted(drop: tuple[int, ...]):
+def test_short_gaps_are_interpolated_and_counted(drop):
     """One or two missing frames, also at the window's ends: filled on the line between neighbours,
     counted as lost."""
     sweep = sweep_of(frames(0, 3000, drop))
@@ -169,7 +169,7 @@ def test_short_gaps_are_interpolated_and_counted(drop: tuple[int, ...]):
 
 
 @pytest.mark.parametrize("first", [873, 875, 1500, 2372, 2374])
-def test_wider_gaps_are_not_interpolated(first: int):
+def test_wider_gaps_are_not_interpolated(first):
     """Three frames in a row that are missing, wholly or partly in the window, make the status
     `gap`, without frames."""
     sweep = sweep_of(frames(0, 3000, tuple(range(first, first + MAX_GAP + 1))))
@@ -191,7 +191,7 @@ def test_frames_that_come_after_the_stop_edge_are_waited_for():
 
 
 @pytest.mark.parametrize("ready", [False, True])
-def test_a_start_with_lost_edges_gets_one_answer(ready: bool):
+def test_a_start_with_lost_edges_gets_one_answer(ready):
     """Both come in one turn, with the trigger blind already or not: the sweep is answered once."""
     bench = Bench()
     edges = [Edge(START, t_ns(100)), Edge(EdgeKind.LOST, t_ns(101))]
@@ -242,7 +242,7 @@ def test_latest_is_complete_or_none():
 
 
 @pytest.mark.parametrize("packet", [1, 6, 40, 1000])
-def test_an_open_sweep_so_far(packet: int):
+def test_an_open_sweep_so_far(packet):
     """Nine steps of 150 frames, counted from `lead_ms` after the start edge, each once, however the
     frames come."""
     bench, seen = Bench(lead_ms=400), []
@@ -353,7 +353,7 @@ EDGES = st.tuples(
 
 @pytest.mark.slow
 @given(st.lists(EDGES, max_size=30))
-def test_every_start_gets_exactly_one_answer(script: list[tuple[EdgeKind, bool, int, int]]):
+def test_every_start_gets_exactly_one_answer(script):
     """For any edges in any order, with some sweeps settled at a step: each number is answered
     once."""
     bench = Bench(max_duration_s=5, lead_ms=0)

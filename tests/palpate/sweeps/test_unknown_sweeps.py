@@ -41,7 +41,7 @@ def numbers(folder: Path, box: Classifier) -> list[list[int]]:
     return [[*one.paths] for one in unknown_sweeps.groups(folder, box.bundle.id)]
 
 
-def test_sweeps_of_a_material_that_comes_again_are_a_group(tmp_path: Path, box: Classifier):
+def test_sweeps_of_a_material_that_comes_again_are_a_group(tmp_path, box):
     """Each run counts from 1; a material that was seen once is none, nor is a known one, nor an
     answer of another bundle."""
     folder = tmp_path / "black-box"
@@ -67,9 +67,7 @@ def test_sweeps_of_a_material_that_comes_again_are_a_group(tmp_path: Path, box: 
         b'{"verdict": {"status": "unknown", "bundle": "ID", "detail": ""}, "id": "x"}',
     ],
 )
-def test_a_damaged_sidecar_is_named_and_left_out(
-    tmp_path: Path, box: Classifier, logged: list[str], damage: bytes
-):
+def test_a_damaged_sidecar_is_named_and_left_out(tmp_path, box, logged, damage):
     """The others are still offered."""
     kept(tmp_path, box, *FELT)
     path = tmp_path / "sweep-000003.json"
@@ -78,7 +76,7 @@ def test_a_damaged_sidecar_is_named_and_left_out(
     assert len([line for line in logged if f"{path} is left out" in line]) == 1
 
 
-def test_which_group_is_never_guessed(tmp_path: Path, box: Classifier):
+def test_which_group_is_never_guessed(tmp_path, box):
     """Without a number there has to be one only; the message lists what there is."""
     with pytest.raises(ApplianceError, match=r"store\.black_box"):
         unknown_sweeps.chosen([], 0, tmp_path)

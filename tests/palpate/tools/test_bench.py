@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import re
-from pathlib import Path
 
 import pytest
 
@@ -16,9 +15,7 @@ from palpate.tools import bench, bench_process
 
 
 @pytest.mark.slow
-def test_bench_writes_its_figures(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
+def test_bench_writes_its_figures(tmp_path, monkeypatch, capsys):
     """A small bench: every key that scripts rely on, in JSON, with commit, seed and machine."""
     for name, value in {"SWEEPS": 6, "STARTS": 1, "ROUNDS": 5}.items():
         monkeypatch.setattr(bench, name, value)
@@ -53,9 +50,7 @@ def test_bench_writes_its_figures(
 
 
 @pytest.mark.slow
-def test_bench_parts(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
+def test_bench_parts(tmp_path, monkeypatch, capsys):
     """Short measurements of memory and processor share."""
     monkeypatch.setattr(bench_process, "MEMORY_SWEEPS", 20)
     monkeypatch.setattr(bench_process, "STREAM_S", 0.5)

@@ -22,7 +22,7 @@ from tests.factories import deliveries, terminals
 VIRTUAL = ["--virtual", "--sweeps", "3", "--seed", "7"]
 
 
-def test_demo_prints_plain_lines_without_a_terminal(capsys: pytest.CaptureFixture[str]):
+def test_demo_prints_plain_lines_without_a_terminal(capsys):
     """Heads, each sweep with truth and answer, then the sum and what to do next."""
     assert main(["demo", *VIRTUAL]) == 0
     out = capsys.readouterr().out
@@ -36,7 +36,7 @@ def test_demo_prints_plain_lines_without_a_terminal(capsys: pytest.CaptureFixtur
 
 
 @pytest.mark.slow
-def test_the_tour_has_each_special_sweep_with_its_right_answer(capsys: pytest.CaptureFixture[str]):
+def test_the_tour_has_each_special_sweep_with_its_right_answer(capsys):
     """A stuck taxel is bridged; an untaught material is unknown; a sweep over two materials is
     unsure; a pulled cable is sensor-lost, and the next sweep is named again. If a new default
     bundle is sure about two materials, tour.SEED has to be drawn again."""
@@ -60,7 +60,7 @@ def test_the_tour_has_each_special_sweep_with_its_right_answer(capsys: pytest.Ca
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 0)])
-def test_ctrl_c_ends_with_its_exit_code(number: int, code: int):
+def test_ctrl_c_ends_with_its_exit_code(number, code):
     """As the table of exit codes says; SIGTERM is an orderly end."""
     with subprocess.Popen(
         [sys.executable, "-m", "palpate", "demo", "--raw"],
@@ -74,7 +74,7 @@ def test_ctrl_c_ends_with_its_exit_code(number: int, code: int):
         assert run.wait(timeout=30) == code
 
 
-def test_demo_raw_prints_sentences_alone(capsys: pytest.CaptureFixture[str]):
+def test_demo_raw_prints_sentences_alone(capsys):
     """The output is sentences alone, and the same in every run with the same seed."""
     assert main(["demo", "--raw", *VIRTUAL]) == 0
     first = capsys.readouterr().out
@@ -99,13 +99,7 @@ def played_set(folder: Path, bundle: Bundle, each: int = 4) -> str:
 
 
 @pytest.mark.parametrize(("each", "more"), [(4, []), (1, ["--sweeps", "50"])])
-def test_demo_of_a_set(
-    each: int,
-    more: list[str],
-    tmp_path: Path,
-    default_bundle: Bundle,
-    capsys: pytest.CaptureFixture[str],
-):
+def test_demo_of_a_set(each, more, tmp_path, default_bundle, capsys):
     """Each of three materials is shown once, also where the set ends before the sweeps."""
     which = ["--sim", played_set(tmp_path, default_bundle, each)]
     assert main(["demo", *VIRTUAL, *which, *more]) == 0
@@ -114,9 +108,7 @@ def test_demo_of_a_set(
     assert "bundle" in out
 
 
-def test_materials_that_the_bundle_never_learnt_are_counted_apart(
-    tmp_path: Path, default_bundle: Bundle, capsys: pytest.CaptureFixture[str]
-):
+def test_materials_that_the_bundle_never_learnt_are_counted_apart(tmp_path, default_bundle, capsys):
     """They do not count as wrong, and `unknown` is their right answer."""
     files = bundle.files(bundle.DEFAULT)
     names = [f"x{i}" for i in range(len(default_bundle.manifest.labels))]
@@ -137,10 +129,7 @@ def test_materials_that_the_bundle_never_learnt_are_counted_apart(
 
 
 def test_a_user_who_may_not_read_the_store_sees_the_packaged_bundle(
-    tmp_path: Path,
-    default_bundle: Bundle,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    tmp_path, default_bundle, monkeypatch, capsys
 ):
     """A message says so with the remedy, and the demo plays."""
 

@@ -6,14 +6,10 @@ import errno
 import os
 import re
 
-import pytest
-
 from palpate.cli.main import main
 
 
-def test_a_system_without_pseudo_terminals_is_said(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
+def test_a_system_without_pseudo_terminals_is_said(monkeypatch, capsys):
     """The error names their folder and how to mount it."""
 
     def absent() -> tuple[int, int]:

@@ -8,7 +8,6 @@ import re
 import threading
 import tomllib
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
@@ -33,7 +32,7 @@ def stream(p: SkinProfile, n: int = 8) -> bytes:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_frames_of_every_skin_are_shown_and_fit(name: str):
+def test_the_frames_of_every_skin_are_shown_and_fit(name):
     """A stream that begins and ends within a frame: frames with their numbers, and no misfit."""
     data = b"".join(wire(name, i) for i in range(12))[5:-3]
     lines, good = skin_bytes.report(profile(name), data)
@@ -55,7 +54,7 @@ def test_the_frames_of_every_skin_are_shown_and_fit(name: str):
     ],
     ids=["other grid", "lost byte", "other marker", "damaged", "other checksum"],
 )
-def test_the_byte_that_does_not_fit_is_in_brackets(p: SkinProfile, change, at: int):
+def test_the_byte_that_does_not_fit_is_in_brackets(p, change, at):
     """Offset and value of the first byte that is not as the profile says."""
     sent = replace(p, cols=4, marker=MARKED.marker if p.marker else b"")
     data = change(stream(replace(sent, checksum="crc8" if p.checksum else "")))
@@ -101,7 +100,7 @@ TEXTS = {
 
 
 @pytest.mark.parametrize(("data", "expected"), TEXTS.values(), ids=TEXTS)
-def test_a_profile_is_proposed_for_lines_of_numbers(data: bytes, expected: dict[str, object]):
+def test_a_profile_is_proposed_for_lines_of_numbers(data, expected):
     """It has the form of the lines, and reads nearly all of their frames at their rate."""
     table = tomllib.loads(skin_text.proposed(data, 2.0))
     assert table | expected == table
@@ -116,12 +115,12 @@ def test_a_profile_is_proposed_for_lines_of_numbers(data: bytes, expected: dict[
     "data",
     [b"", b"boot\nready\n" * 9, bytes(range(256)) * 4, b"1 2 3\n" * 5, b"1\n1 2\n1 2 3\n" * 9],
 )
-def test_no_profile_is_proposed_for_anything_else(data: bytes):
+def test_no_profile_is_proposed_for_anything_else(data):
     """Too few lines, words, bytes, and lines of different lengths."""
     assert skin_text.proposed(data, 1.0) == ""
 
 
-def test_the_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_the_commands(tmp_path, capsys):
     """`skin detect` proposes, the file is written as printed, and `skin check` reads its frames."""
     stop = threading.Event()
 

@@ -181,7 +181,7 @@ DEPENDS = {
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_each_fault_is_found(name: str):
+def test_each_fault_is_found(name):
     """The part fails with a remedy, and independent parts are ok."""
     simulated = idle_devices(acm=True)
     FAULTS[name](simulated)
@@ -194,7 +194,7 @@ def test_each_fault_is_found(name: str):
 
 
 @pytest.mark.parametrize("acm", [False, True])
-def test_a_sound_board_passes(acm: bool):
+def test_a_sound_board_passes(acm):
     """Every part, over bulk transfers and over a serial port of USB."""
     found = findings(idle_devices(acm=acm))
     assert tuple(found) == PARTS
@@ -299,7 +299,7 @@ def of_a_port(
 
 
 @pytest.mark.slow
-def test_the_pico_passes(capsys: pytest.CaptureFixture[str]):
+def test_the_pico_passes(capsys):
     """The reference firmware under MicroPython: nothing fails but by the busy machine."""
     with pico.plugged_in(ROWS=16, COLS=16, RATE_HZ=200, DTYPE="uint16", FIFO_S=0.5) as port:
         found = of_a_port(capsys, port, "--seconds", "2")
@@ -309,7 +309,7 @@ def test_the_pico_passes(capsys: pytest.CaptureFixture[str]):
 
 
 @pytest.mark.slow
-def test_a_pico_that_is_too_slow_is_found(capsys: pytest.CaptureFixture[str]):
+def test_a_pico_that_is_too_slow_is_found(capsys):
     """Late interrupts: frames are missing, while count and clock agree."""
     with pico.plugged_in(RATE_HZ=200, late_ms=20, late_every=10) as port:
         found = of_a_port(capsys, port, "--seconds", "3")

@@ -4,7 +4,6 @@ nothing is written to a port unasked."""
 from __future__ import annotations
 
 import os
-from pathlib import Path
 
 import pytest
 
@@ -31,7 +30,7 @@ def found_on(
 
 @pytest.mark.parametrize("rate", [1.0, 0.8])
 @pytest.mark.parametrize("name", NAMES)
-def test_every_skin_is_found(name: str, rate: float):
+def test_every_skin_is_found(name, rate):
     """A streaming skin is found with profile, rate and settings; not a byte is written."""
     clock, p = VirtualClock(), profile(name)
     port = WirePort(clock, lambda i: wire(name, i), p.format.period_ns / rate)
@@ -86,7 +85,7 @@ def test_a_board_of_the_protocol_has_to_be_asked():
 @pytest.mark.parametrize(
     "sent", [b"hello world\n", bytes(range(256)), b"\xaa\x55", b"\x0d\x0a" * 40]
 )
-def test_something_else_is_no_skin(sent: bytes):
+def test_something_else_is_no_skin(sent):
     """Bytes without frames: no profile, and the file that describes a skin."""
     clock = VirtualClock()
     found = found_on(WirePort(clock, lambda i: sent, 1e7), clock)
@@ -109,9 +108,7 @@ def test_a_port_that_is_held():
     assert second.profile == "matrix"
 
 
-def test_the_commands(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_the_commands(capsys, tmp_path, monkeypatch):
     """list: a table of all profiles, and a line for one that cannot be read; detect: --write needs
     --port, a silent port says what to do."""
     assert main(["skin", "list"]) == 0

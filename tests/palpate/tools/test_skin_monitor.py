@@ -35,14 +35,14 @@ def monitor(taxels: np.ndarray, dtype: str = "float32", piece: int = 7) -> dict[
     return watched.measured()
 
 
-def test_rate_and_noise_are_measured() -> None:
+def test_rate_and_noise_are_measured():
     """Rate and noise are measured."""
     found = monitor(signal(4))
     assert found["rate_hz"] == pytest.approx(RATE, rel=1e-6)
     assert np.array(found["noise"]) == pytest.approx(np.full((1, 3, 4), 2.0), rel=0.25)
 
 
-def test_a_slow_touch_is_load_and_no_noise() -> None:
+def test_a_slow_touch_is_load_and_no_noise():
     """A slow touch is load and no noise."""
     taxels = signal(4)
     taxels[200:, 1, 2] += np.linspace(0, 400, 200)
@@ -54,7 +54,7 @@ def test_a_slow_touch_is_load_and_no_noise() -> None:
     assert np.array(found["noise"]).max() < 4
 
 
-def test_a_taxel_that_has_one_value_is_stuck_and_no_other_is() -> None:
+def test_a_taxel_that_has_one_value_is_stuck_and_no_other_is():
     """A taxel that has one value is stuck and no other is."""
     taxels = signal(STUCK_S + 1)
     taxels[:, 0, 3] = 255
@@ -62,12 +62,12 @@ def test_a_taxel_that_has_one_value_is_stuck_and_no_other_is() -> None:
     assert monitor(taxels[: 100 * 4])["stuck"] == ()
 
 
-def test_where_all_stand_still_nothing_says_which_is_stuck() -> None:
+def test_where_all_stand_still_nothing_says_which_is_stuck():
     """Where all stand still nothing says which is stuck."""
     assert monitor(np.full((1000, 3, 4), 7.0))["stuck"] == ()
 
 
-def test_a_taxel_that_does_not_move_when_the_others_are_touched_is_dead() -> None:
+def test_a_taxel_that_does_not_move_when_the_others_are_touched_is_dead():
     """A taxel that does not move when the others are touched is dead."""
     taxels = signal(6, noise=0.5)
     taxels[300:] += 100
@@ -76,7 +76,7 @@ def test_a_taxel_that_does_not_move_when_the_others_are_touched_is_dead() -> Non
     assert monitor(signal(6))["dead"] == ()
 
 
-def test_a_count_at_the_end_of_its_type_is_saturated() -> None:
+def test_a_count_at_the_end_of_its_type_is_saturated():
     """A count at the end of its type is saturated."""
     taxels = signal(1)
     taxels[:, 1, 1] = 255
@@ -85,7 +85,7 @@ def test_a_count_at_the_end_of_its_type_is_saturated() -> None:
     assert monitor(taxels * 1e6)["saturated"] == ()
 
 
-def test_axes_have_their_own_maps_and_names() -> None:
+def test_axes_have_their_own_maps_and_names():
     """Axes have their own maps and names."""
     taxels = signal(STUCK_S + 1, (2, 2, 3))
     taxels[:, 1, 0, 2] = 0
@@ -94,7 +94,7 @@ def test_axes_have_their_own_maps_and_names() -> None:
     assert np.array(found["load"]).shape == (3, 2, 2)
 
 
-def test_before_the_second_frame_nothing_is_measured_and_a_new_skin_starts_anew() -> None:
+def test_before_the_second_frame_nothing_is_measured_and_a_new_skin_starts_anew():
     """Before the second frame nothing is measured and a new skin starts anew."""
     watched = SkinMonitor(SweepFormat(3, 4, RATE, 200, "float32"))
     assert watched.measured() == {}
@@ -125,7 +125,7 @@ VIEW = LiveView(
         ({"source": "sim", "state": "absent", "trouble": "plug it in"}, "absent: plug it in"),
     ],
 )
-def test_a_line_has_rate_loss_noise_and_faults(changes: dict[str, object], words: str) -> None:
+def test_a_line_has_rate_loss_noise_and_faults(changes, words):
     """Many faulty taxels are counted; a skin that does not stream says why."""
     shown = line(replace(VIEW, **changes))
     assert words in shown

@@ -96,7 +96,7 @@ def reached(seen: BrowsedPage, wanted: Callable[[dict[str, Any]], bool]) -> dict
     return shown
 
 
-def test_the_whole_way(browser: Any, box: tuple[subprocess.Popen[bytes], str]):
+def test_the_whole_way(browser, box):
     """The real command: the page waits, advises, follows a touch; then "no connection"."""
     run, address = box
     context = browser.new_context(viewport={"width": 820, "height": 1180})
@@ -125,7 +125,7 @@ def test_the_whole_way(browser: Any, box: tuple[subprocess.Popen[bytes], str]):
     context.close()
 
 
-def test_the_page_draws_what_the_box_says(browser: Any, page: PageServer):
+def test_the_page_draws_what_the_box_says(browser, page):
     """Loads, points at their coordinates, and the message, also for screen readers."""
     context = browser.new_context(viewport={"width": 1180, "height": 820})
     seen = BrowsedPage(context, page.address)
@@ -202,9 +202,7 @@ FILLS = "all => all.map(e => getComputedStyle(e).fill.match(/\\d+/g).map(Number)
         ((6.0, 11.0), "5.0 mm too far towards column 4", (1, 0)),
     ],
 )
-def test_the_arrow_points_where_the_skin_has_to_go(
-    browser: Any, page: PageServer, centre: tuple[float, float], message: str, way: tuple[int, int]
-):
+def test_the_arrow_points_where_the_skin_has_to_go(browser, page, centre, message, way):
     """Towards the row or column that the message names, in the picture and beside the words: a skin
     on which the contact lies too far towards row 1 is moved towards row 1."""
     nearest = min(
@@ -226,7 +224,7 @@ def test_the_arrow_points_where_the_skin_has_to_go(
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_every_count_can_be_read_on_its_taxel(browser: Any, page: PageServer, scheme: str):
+def test_every_count_can_be_read_on_its_taxel(browser, page, scheme):
     """A contrast of 4.5 from no load to the full one (WCAG 2.1, 1.4.3)."""
     rising = tuple(tuple(float(4 * r + c) for c in range(4)) for r in range(4))
     page.show(replace(VIEW, load=rising, full=15.0))
@@ -249,9 +247,7 @@ def test_every_count_can_be_read_on_its_taxel(browser: Any, page: PageServer, sc
         ("last-column", "right"),
     ],
 )
-def test_the_picture_shows_which_end_is_the_fingertip(
-    browser: Any, page: PageServer, side: str, at: str
-):
+def test_the_picture_shows_which_end_is_the_fingertip(browser, page, side, at):
     """A cap at that side; where it is not set, the page says how to find it out."""
     seen = BrowsedPage(browser.new_context(viewport={"width": 1024, "height": 768}), page.address)
     seen.state("off")
@@ -276,7 +272,7 @@ def beyond(board: dict[str, float], box: dict[str, float]) -> str:
     return max(out, key=lambda side: out[side])
 
 
-def test_a_box_that_says_nothing_new_is_no_news(browser: Any, page: PageServer):
+def test_a_box_that_says_nothing_new_is_no_news(browser, page):
     """A loop that hangs behind a server: the page says so and shows no old picture."""
     context = browser.new_context()
     seen = BrowsedPage(context, page.address)
@@ -292,9 +288,7 @@ def test_a_box_that_says_nothing_new_is_no_news(browser: Any, page: PageServer):
     ("width", "height", "scheme"),
     [(360, 640, "light"), (844, 390, "dark"), (820, 1180, "dark"), (1440, 900, "light")],
 )
-def test_it_fits_phone_tablet_and_desktop(
-    browser: Any, page: PageServer, width: int, height: int, scheme: str
-):
+def test_it_fits_phone_tablet_and_desktop(browser, page, width, height, scheme):
     """All on one screen without scrolling, light and dark, with enough contrast."""
     longest = "12.5 mm too far towards column 4 and 10.5 mm towards row 4"
     page.show(replace(VIEW, message=longest, source="sim"))

@@ -50,7 +50,7 @@ def frames(board: PageBoard, at_s: float, row: float, col: float, strength: floa
         board.take(feed_lines.frame(at_s + i / 20, feed_lines.load(row, col, strength)))
 
 
-def test_the_first_lines_say_what_box_it_is(board: PageBoard, events: Events):
+def test_the_first_lines_say_what_box_it_is(board, events):
     """The page gets the box's presence, its labels and its state."""
     assert events.of("box") == [{"there": True, "why": ""}]
     assert events.of("hello")[0]["labels"] == list(feed_lines.LABELS)
@@ -61,7 +61,7 @@ def test_the_first_lines_say_what_box_it_is(board: PageBoard, events: Events):
     ]
 
 
-def test_people_read_display_names(events: Events):
+def test_people_read_display_names(events):
     """The labels stay; names beside them are those of the bundle, and labels where it has none."""
     board = PageBoard(events)
     board.take(feed_lines.hello(displays={"wood": "Holz, geölt", "gone": "weg"}))
@@ -76,9 +76,7 @@ def test_people_read_display_names(events: Events):
 
 
 @pytest.mark.parametrize("status", ["ok", "unsure", "unknown", "gap", "sensor-lost"])
-def test_a_verdict_comes_with_its_probabilities_or_its_reason(
-    board: PageBoard, events: Events, status: str
-):
+def test_a_verdict_comes_with_its_probabilities_or_its_reason(board, events, status):
     """Rounded probabilities of all labels, else the reason and the remedy."""
     board.take(feed_lines.verdict(7, 2.0, "wood", status))
     (shown,) = events.of("verdict")
@@ -92,7 +90,7 @@ def test_a_verdict_comes_with_its_probabilities_or_its_reason(
     assert "own" not in shown
 
 
-def test_frames_become_the_view_of_palpate_align(board: PageBoard, events: Events):
+def test_frames_become_the_view_of_palpate_align(board, events):
     """Load, centre and way back, at most five times a second."""
     frames(board, 2.0, 0.7, 1.5, 0)
     assert events.of("view")[-1]["state"] == "no-contact"
@@ -108,7 +106,7 @@ def test_frames_become_the_view_of_palpate_align(board: PageBoard, events: Event
     assert len(numbers) <= 6
 
 
-def test_without_a_bundle_the_picture_has_no_positions(events: Events):
+def test_without_a_bundle_the_picture_has_no_positions(events):
     """Without a bundle, as in `palpate record`, the picture has the load and the centre alone."""
     board = PageBoard(events)
     board.take(
@@ -126,7 +124,7 @@ def test_without_a_bundle_the_picture_has_no_positions(events: Events):
     assert events.of("view")[-1]["state"] == "no-positions"
 
 
-def test_a_skin_that_goes_is_shown_at_once(board: PageBoard, events: Events):
+def test_a_skin_that_goes_is_shown_at_once(board, events):
     """With the next line; the counts of another skin get their own lowest value."""
     frames(board, 2.0, 1.5, 1.5)
     board.take(feed_lines.state("absent", "check the cable"))
@@ -139,7 +137,7 @@ def test_a_skin_that_goes_is_shown_at_once(board: PageBoard, events: Events):
     assert events.of("view")[-1]["state"] == "wait"
 
 
-def test_loss_is_counted_by_the_minute(board: PageBoard, events: Events):
+def test_loss_is_counted_by_the_minute(board, events):
     """Frames and lost frames of each minute, not over a restart."""
     for at_s in range(2, 125):
         board.take(feed_lines.health(float(at_s), lost_frames=3 if at_s > 70 else 0))
@@ -154,7 +152,7 @@ def test_loss_is_counted_by_the_minute(board: PageBoard, events: Events):
     assert (events.of("minute")[-1]["frames"], events.of("minute")[-1]["lost"]) == (45_000, 0)
 
 
-def test_a_restart_is_noted_with_what_has_changed(board: PageBoard, events: Events):
+def test_a_restart_is_noted_with_what_has_changed(board, events):
     """A note with the new bundle; a cut connection makes none."""
     board.away("the connection was cut")
     assert events.of("box")[-1] == {"there": False, "why": "the connection was cut"}
@@ -169,7 +167,7 @@ def test_a_restart_is_noted_with_what_has_changed(board: PageBoard, events: Even
     assert note["text"] == "the box was restarted, with bundle aaaa0001 in place of 9f3c2a1b"
 
 
-def test_the_latest_sweeps_are_kept(board: PageBoard, events: Events):
+def test_the_latest_sweeps_are_kept(board, events):
     """By a number of their own, since the box counts anew after a restart."""
     for number in range(SWEEPS + 3):
         board.take(feed_lines.sweep(number))
@@ -180,7 +178,7 @@ def test_the_latest_sweeps_are_kept(board: PageBoard, events: Events):
     assert board.sweep(str(SWEEPS + 4)) is None
 
 
-def test_lines_of_a_later_version_are_passed_over(board: PageBoard, events: Events):
+def test_lines_of_a_later_version_are_passed_over(board, events):
     """Lines of an unknown type and unknown fields change nothing."""
     before = len(events.all)
     board.take({"type": "weather", "sun": True})
@@ -220,7 +218,7 @@ HELLO, SWEEP = feed_lines.hello(), feed_lines.sweep(1)
         SWEEP | {"shape": [0, 4, 4], "data": ""},
     ],
 )
-def test_a_line_that_is_not_as_it_must_be_is_refused(board: PageBoard, line: dict[str, Any]):
+def test_a_line_that_is_not_as_it_must_be_is_refused(board, line):
     """The error names the type and the remedy; the board continues with the next line."""
     with pytest.raises(FormatError, match=f"{line['type']}.*update"):
         board.take(line)

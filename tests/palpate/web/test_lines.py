@@ -7,7 +7,6 @@ import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -49,7 +48,7 @@ def offered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Offered
         ({"type": "frame", "taxels": [[1]]}, ""),
     ],
 )
-def test_each_event_in_words(line: dict[str, Any], said: str):
+def test_each_event_in_words(line, said):
     """Control characters of a device do not reach the terminal; unknown lines say nothing."""
     assert event(line, {}, 0) == said
 
@@ -70,16 +69,14 @@ def test_a_verdict_has_the_name_for_people():
         {"type": "state", "skin": "lost"},
     ],
 )
-def test_a_malformed_line_is_an_error(line: dict[str, Any]):
+def test_a_malformed_line_is_an_error(line):
     """Its type is in the message."""
     with pytest.raises(FormatError, match=line["type"]):
         event(line, {}, 0)
 
 
 @pytest.mark.slow
-def test_connection_events_end_and_return_of_the_box(
-    offered: Offered, monkeypatch: pytest.MonkeyPatch
-):
+def test_connection_events_end_and_return_of_the_box(offered, monkeypatch):
     """A line each; no frames are asked for."""
     out = io.StringIO()
     watch = LineWatch(str(offered.path), out, SystemClock())
@@ -109,7 +106,7 @@ def test_connection_events_end_and_return_of_the_box(
     again.feed.stopping()
 
 
-def test_what_cannot_be_read_closes_the_connection(offered: Offered):
+def test_what_cannot_be_read_closes_the_connection(offered):
     """A malformed verdict causes one line."""
     out = io.StringIO()
     watch = LineWatch(str(offered.path), out, SystemClock())
@@ -125,7 +122,7 @@ def test_what_cannot_be_read_closes_the_connection(offered: Offered):
     assert "malformed" in out.getvalue()
 
 
-def test_json_passes_the_lines_on(offered: Offered):
+def test_json_passes_the_lines_on(offered):
     """The lines that any reader gets; a missing box is explained on standard error."""
     peer = offered.peer()
     out, said, turns = io.StringIO(), [], [0]
@@ -146,7 +143,7 @@ def test_json_passes_the_lines_on(offered: Offered):
     assert said[-1]
 
 
-def test_a_feed_that_is_off_cannot_be_watched(capsys: pytest.CaptureFixture[str]):
+def test_a_feed_that_is_off_cannot_be_watched(capsys):
     """The message gives the setting."""
     assert main(["watch", "--set", "store.runtime="]) == ConfigError.exit_code
     assert "store.runtime" in capsys.readouterr().err

@@ -39,7 +39,7 @@ def status(page: PageServer, host: str = "127.0.0.1") -> tuple[int, str]:
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
-def test_the_owner_of_a_connection(host: str):
+def test_the_owner_of_a_connection(host):
     """This user for both families, and nobody for a connection that is not there."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with (
@@ -59,7 +59,7 @@ def test_who_may_see_the_box():
     assert not local_users.may_see(987_654)
 
 
-def test_another_user_gets_nothing(page: PageServer, monkeypatch: pytest.MonkeyPatch):
+def test_another_user_gets_nothing(page, monkeypatch):
     """Neither the page nor its events; the answer names the group."""
     assert status(page)[0] == 200
     monkeypatch.setattr(local_users, "owner", lambda peer, own: 987_654)

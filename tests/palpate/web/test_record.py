@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -30,15 +30,9 @@ from palpate.web.access import Access
 from palpate.web.record import MOST_WAITING, RecordPage, order
 from palpate.web.server import PageServer
 from tests.factories.browser import WAIT_S, until
-from tests.factories.page_client import (
-    EventReader,
-    PageAddress,
-    ask,
-    port,
-    status,
-)
+from tests.factories.page_client import EventReader, PageAddress, ask, port, status
 from tests.factories.recorded_page import KIND, RecordedPage, key_of, ordered
-from tests.factories.simulated_box import Rigged, idle_devices
+from tests.factories.simulated_box import idle_devices
 
 ALLOWED = ("MATERIAL", "POSITION", "SESSION", "NEXT", "DISCARD")
 WOOD = {"command": "MATERIAL", "text": "wood"}
@@ -89,7 +83,7 @@ def waiting(recorded: RecordedPage) -> int:
         (b'{"command": "DISCARD", "text": "7"}', Command("DISCARD", "7")),
     ],
 )
-def test_an_order_is_a_command_of_the_serial_line(body: bytes, command: Command):
+def test_an_order_is_a_command_of_the_serial_line(body, command):
     """With its text, or without one."""
     assert order(body, ALLOWED) == command
 
@@ -119,7 +113,7 @@ def test_an_order_is_a_command_of_the_serial_line(body: bytes, command: Command)
         b'{"command": "MATERIAL\\n"}',
     ],
 )
-def test_what_is_no_order(body: bytes):
+def test_what_is_no_order(body):
     """Each is refused with one line that describes an order."""
     with pytest.raises(FormatError, match=r"^[^\n]+$"):
         order(body, ALLOWED)
@@ -127,7 +121,7 @@ def test_what_is_no_order(body: bytes):
 
 @pytest.mark.parametrize("text", ["-1", "a,b", "blé", "x" * 25, "a\nb", "$"])
 @pytest.mark.parametrize("name", record.LABELS)
-def test_a_bad_label_is_refused_as_the_command_refuses_it(tmp_path: Path, name: str, text: str):
+def test_a_bad_label_is_refused_as_the_command_refuses_it(tmp_path, name, text):
     """In the command's words, before the loop or a capture gets the order."""
     recording = RecordingSession(
         tmp_path, skin.FORMAT, Labels(), idle_devices().clock, lambda line: None
@@ -139,9 +133,7 @@ def test_a_bad_label_is_refused_as_the_command_refuses_it(tmp_path: Path, name: 
     assert str(by_page.value) == str(by_command.value)
 
 
-def test_labels_from_the_page_are_those_of_the_stored_sweep(
-    rigged: Callable[..., Rigged], tmp_path: Path
-):
+def test_labels_from_the_page_are_those_of_the_stored_sweep(rigged, tmp_path):
     """On a whole box, by the page alone, after the robot had set other labels."""
     simulated, box = idle_devices(), None
     recording = RecordingSession(
@@ -195,7 +187,7 @@ def test_labels_from_the_page_are_those_of_the_stored_sweep(
     assert not any(",ANS,START" in line or ",ANS,NEXT" in line for line in box.heard)
 
 
-def test_the_page_hears_what_there_is(recorded: RecordedPage):
+def test_the_page_hears_what_there_is(recorded):
     """The page gets labels, counts, missing sweeps, and the result and checks of the last sweep;
     the skin only while a browser is connected."""
     reader = EventReader(recorded.page.server)
@@ -232,7 +224,7 @@ REFUSED: list[tuple[int, dict[str, str | None]]] = [
 ]
 
 
-def test_an_order_of_another_site_is_refused(recorded: RecordedPage):
+def test_an_order_of_another_site_is_refused(recorded):
     """Requests that a page of another site can send are refused: wrong or missing key, another
     origin, a content type without preflight, other methods, a preflight among them, and a name that
     is not this machine's. Each run has a key of its own."""
@@ -252,7 +244,7 @@ def test_an_order_of_another_site_is_refused(recorded: RecordedPage):
 
 
 @pytest.mark.parametrize("chunked", [False, True])
-def test_too_large_a_body_is_refused(recorded: RecordedPage, chunked: bool):
+def test_too_large_a_body_is_refused(recorded, chunked):
     """Announced or in chunks, it is not read to its end; the next request is answered."""
     page = recorded.page.server
     body = json.dumps({"command": "MATERIAL", "text": "x" * 2000}).encode()
@@ -265,7 +257,7 @@ def test_too_large_a_body_is_refused(recorded: RecordedPage, chunked: bool):
     assert status(ask(page)) == 200
 
 
-def test_refusals_say_why(recorded: RecordedPage, tmp_path: Path):
+def test_refusals_say_why(recorded, tmp_path):
     """As a line of text that names the value; the labels stay. Orders that wait when the recording
     ends are refused, and none is carried out."""
     page = recorded.page.server
@@ -287,9 +279,7 @@ def test_refusals_say_why(recorded: RecordedPage, tmp_path: Path):
     ending.recording.close()
 
 
-def test_many_requests_wait_in_bounds_and_the_loop_takes_one_a_turn(
-    recorded: RecordedPage, monkeypatch: pytest.MonkeyPatch
-):
+def test_many_requests_wait_in_bounds_and_the_loop_takes_one_a_turn(recorded, monkeypatch):
     """Beyond MOST_WAITING they are refused at once; each turn takes one."""
     monkeypatch.setattr(server, "DONE_S", 60.0)  # a busy machine sends the requests slowly
     asking = Asking(recorded, *[WOOD] * (MOST_WAITING + 6))
@@ -306,9 +296,7 @@ def test_many_requests_wait_in_bounds_and_the_loop_takes_one_a_turn(
 @pytest.mark.parametrize(
     ("under_way", "why"), [(False, b"was not carried out"), (True, b"may still be carried out")]
 )
-def test_a_loop_that_is_late(
-    recorded: RecordedPage, monkeypatch: pytest.MonkeyPatch, under_way: bool, why: bytes
-):
+def test_a_loop_that_is_late(recorded, monkeypatch, under_way, why):
     """After DONE_S the page learns whether the order is under way, as on a slow disk, or was never
     taken up; then it is not carried out later."""
     monkeypatch.setattr(server, "DONE_S", 0.05)
@@ -331,7 +319,7 @@ def test_a_loop_that_is_late(
     assert recorded.done == []
 
 
-def test_a_sweep_is_drawn_once(recorded: RecordedPage, monkeypatch: pytest.MonkeyPatch):
+def test_a_sweep_is_drawn_once(recorded, monkeypatch):
     """Only the last sweep has a picture, and none without a window."""
     drawn: list[int] = []
     draw = record.picture
@@ -350,7 +338,7 @@ def test_a_sweep_is_drawn_once(recorded: RecordedPage, monkeypatch: pytest.Monke
 
 
 @pytest.mark.slow
-def test_the_command_records_what_its_page_orders(tmp_path: Path):
+def test_the_command_records_what_its_page_orders(tmp_path):
     """The real command without a serial line; it ends with the page open."""
     words = "-m palpate record --sim skin --trigger serial --web 0 --set store.runtime= --out"
     command = [sys.executable, *words.split(), str(tmp_path)]
@@ -373,9 +361,7 @@ def test_the_command_records_what_its_page_orders(tmp_path: Path):
         draining.join(WAIT_S)
 
 
-def test_a_serial_trigger_needs_a_line_or_a_page(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-):
+def test_a_serial_trigger_needs_a_line_or_a_page(capsys, tmp_path):
     """Without either, the error names the way by the page."""
     command = ["record", "--sim", "skin", "--trigger", "serial", "--out", os.fspath(tmp_path)]
     assert main(command) == ConfigError.exit_code

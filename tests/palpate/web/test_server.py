@@ -72,7 +72,7 @@ def test_events_are_numbered_and_the_newest_are_kept():
         assert b"begin" in log.since(other)[0], other
 
 
-def test_a_browser_gets_what_is_kept_and_then_what_comes(page: PageServer):
+def test_a_browser_gets_what_is_kept_and_then_what_comes(page):
     """The clock is first; a browser that comes back gets only the events it missed."""
     reader = EventReader(page)
     assert [reader.next() for _ in range(3)] == [
@@ -94,7 +94,7 @@ def test_a_browser_gets_what_is_kept_and_then_what_comes(page: PageServer):
     again.socket.close()
 
 
-def test_a_number_that_json_lacks_is_an_error_of_who_publishes(page: PageServer):
+def test_a_number_that_json_lacks_is_an_error_of_who_publishes(page):
     """ValueError there; the server goes on."""
     with pytest.raises(ValueError, match="JSON"):
         page.publish("view", float("nan"))
@@ -105,7 +105,7 @@ def test_a_number_that_json_lacks_is_an_error_of_who_publishes(page: PageServer)
 @pytest.mark.parametrize(
     "path", ["/", "/page.css", "/watch.js", "/events", "/sweep/7", "/sweep/8", "/nothing"]
 )
-def test_every_answer_says_what_a_browser_may_do(page: PageServer, path: str):
+def test_every_answer_says_what_a_browser_may_do(page, path):
     """No caching, frames, sources elsewhere or server version; in errors, too."""
     with connected(page) as one:
         one.sendall(f"GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
@@ -160,9 +160,7 @@ def test_every_answer_says_what_a_browser_may_do(page: PageServer, path: str):
         ("/", "GET", "", 421),
     ],
 )
-def test_the_page_for_this_machine_and_no_more(
-    page: PageServer, path: str, method: str, host: str, answer: int
-):
+def test_the_page_for_this_machine_and_no_more(page, path, method, host, answer):
     """The page and its data under this machine's names; others get their HTTP status."""
     told = ask(page, path, method, host)
     assert status(told) == answer
@@ -210,9 +208,7 @@ def test_pages_run_in_browsers_of_2020_behind_any_path():
         "GET /ö HTTP/1.1\r\nHost: localhost\r\n\r\n".encode(),
     ],
 )
-def test_malformed_requests_are_refused(
-    page: PageServer, sent: bytes, capfd: pytest.CaptureFixture[str]
-):
+def test_malformed_requests_are_refused(page, sent, capfd):
     """Each ends with an error or a closed connection, silently; the next is served."""
     with connected(page) as one:
         with suppress(OSError):
@@ -226,7 +222,7 @@ def test_malformed_requests_are_refused(
 @pytest.mark.parametrize(
     "sent", [b"", b"GET / HTTP/1.1\r\nHost: localhost\r\n", b"x" * (MOST_HEAD - 1)]
 )
-def test_half_a_request_ends_at_the_deadline(monkeypatch: pytest.MonkeyPatch, sent: bytes):
+def test_half_a_request_ends_at_the_deadline(monkeypatch, sent):
     """A closed connection, even if its other side goes on sending; others are served."""
     monkeypatch.setattr(server, "HEAD_S", 0.3)
     with (
@@ -251,7 +247,7 @@ def test_half_a_request_ends_at_the_deadline(monkeypatch: pytest.MonkeyPatch, se
 
 
 @pytest.mark.parametrize("body", [False, True])
-def test_slow_requests_lock_nobody_out(page: PageServer, body: bool):
+def test_slow_requests_lock_nobody_out(page, body):
     """Slow heads and bodies hold all places: a new request is served, readers stay."""
     reader = EventReader(page)
     assert reader.until("view") == {"number": 1}
@@ -270,9 +266,7 @@ def test_slow_requests_lock_nobody_out(page: PageServer, body: bool):
         assert reader.until("view") == {"number": 2}
 
 
-def test_of_served_connections_the_oldest_makes_room(
-    page: PageServer, monkeypatch: pytest.MonkeyPatch
-):
+def test_of_served_connections_the_oldest_makes_room(page, monkeypatch):
     """A tablet that lost its network many times still gets a place."""
     monkeypatch.setattr(server, "MOST_OPEN", 3)
     readers = [EventReader(page) for _ in range(5)]
@@ -282,7 +276,7 @@ def test_of_served_connections_the_oldest_makes_room(
 
 
 @pytest.mark.slow
-def test_one_who_reads_nothing_holds_nobody_up(page: PageServer, monkeypatch: pytest.MonkeyPatch):
+def test_one_who_reads_nothing_holds_nobody_up(page, monkeypatch):
     """It is disconnected when too many events wait; others get all events."""
     lazy = EventReader(page)
     busy = EventReader(page)
@@ -297,7 +291,7 @@ def test_one_who_reads_nothing_holds_nobody_up(page: PageServer, monkeypatch: py
 
 
 @pytest.mark.parametrize("rudely", [False, True])
-def test_a_browser_that_goes_is_forgotten(page: PageServer, rudely: bool):
+def test_a_browser_that_goes_is_forgotten(page, rudely):
     """In the middle of the events, with or without a word: nothing waits for it any longer."""
     reader = EventReader(page)
     assert reader.until("view") == {"number": 1}
@@ -308,21 +302,21 @@ def test_a_browser_that_goes_is_forgotten(page: PageServer, rudely: bool):
     until(lambda: not page.watched)
 
 
-def test_it_listens_on_this_machine_alone(page: PageServer):
+def test_it_listens_on_this_machine_alone(page):
     """The socket is bound to 127.0.0.1; another address of this machine is refused."""
     assert page.address.startswith("http://127.0.0.1:")
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection(("127.0.0.2", port(page)), timeout=WAIT_S)
 
 
-def test_a_port_that_is_taken_is_named(page: PageServer):
+def test_a_port_that_is_taken_is_named(page):
     """A ConfigError names the port and the remedy, also for an invalid port number."""
     for taken in (port(page), 70_000):
         with pytest.raises(ConfigError, match=f"port {taken} .*--web PORT"):
             PageServer("watch.html", Access(taken), now_ns)
 
 
-def test_without_tornado_it_says_what_to_install(tmp_path: Path):
+def test_without_tornado_it_says_what_to_install(tmp_path):
     """One line that names the extra; nothing else of the box needs it."""
     command = ["record", "--sim", "skin", "--virtual", "--out", str(tmp_path), "--web", "0"]
     code = (
@@ -334,7 +328,7 @@ def test_without_tornado_it_says_what_to_install(tmp_path: Path):
     assert "palpate[page]" in done.stderr.splitlines()[-1]
 
 
-def test_on_the_network_it_takes_a_token(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_on_the_network_it_takes_a_token(tmp_path, monkeypatch):
     """Without the token the server answers with the page that asks for it. With the token, in a
     header or in the server's cookie, everything is served. A browser that trusts the certificate
     accepts it."""
@@ -359,7 +353,7 @@ def test_on_the_network_it_takes_a_token(tmp_path: Path, monkeypatch: pytest.Mon
         assert status(ask(page, host=f"{socket.gethostname()}:1", **by_header)) == 200
 
 
-def test_plain_http_is_not_answered_on_the_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_plain_http_is_not_answered_on_the_network(tmp_path, monkeypatch):
     """It would reveal the token; a handshake that never ends is cut off."""
     monkeypatch.setattr(server, "HEAD_S", 0.3)
     with guarded(tmp_path, monkeypatch) as (page, token, trusts):
@@ -369,9 +363,7 @@ def test_plain_http_is_not_answered_on_the_network(tmp_path: Path, monkeypatch: 
         assert status(ask(page, tls=trusts)) == 401
 
 
-def test_wrong_tokens_are_slowed_and_logged_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, logged: list[str]
-):
+def test_wrong_tokens_are_slowed_and_logged_once(tmp_path, monkeypatch, logged):
     """Each waits for WRONG_S; the first is logged with its address."""
     waited = []
 
@@ -394,9 +386,7 @@ def test_wrong_tokens_are_slowed_and_logged_once(
     assert line.startswith("<4>page: wrong token from 127.0.0.1")
 
 
-def test_beyond_this_machine_token_and_certificate_must_be_there(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_beyond_this_machine_token_and_certificate_must_be_there(tmp_path, monkeypatch):
     """Missing, broken and unreadable files are named; an invalid address is refused."""
     network, token = WatchConfig(address="0.0.0.0", folder=str(tmp_path)), tmp_path / "token"
     with pytest.raises(ConfigError, match="cannot"):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
 
 import pytest
 
@@ -33,7 +32,7 @@ def page() -> Iterator[PageServer]:
         yield one
 
 
-def test_it_shows_loads_figures_and_faults(browser: Any, page: PageServer):
+def test_it_shows_loads_figures_and_faults(browser, page):
     """A map for each axis; faulty taxels outlined; unknown loss is not called 0."""
     seen = BrowsedPage(browser.new_context(), page.address)
     until(lambda: seen.text("#rate") == "99.8 Hz")
@@ -52,7 +51,7 @@ def test_it_shows_loads_figures_and_faults(browser: Any, page: PageServer):
     seen.page.close()
 
 
-def test_a_skin_that_is_gone_and_a_box_that_is_dead_are_told_apart(browser: Any, page: PageServer):
+def test_a_skin_that_is_gone_and_a_box_that_is_dead_are_told_apart(browser, page):
     """A missing skin has a reason, a dead box has no news; news bring the page back."""
     seen = BrowsedPage(browser.new_context(), page.address)
     page.show(replace(VIEW, number=2, state="lost", trouble="the skin was unplugged"))
@@ -67,7 +66,7 @@ def test_a_skin_that_is_gone_and_a_box_that_is_dead_are_told_apart(browser: Any,
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [390, 1024, 1920])
-def test_nothing_is_cut_off(browser: Any, page: PageServer, width: int, scheme: Any):
+def test_nothing_is_cut_off(browser, page, width, scheme):
     """No wider than the screen; counts have a contrast of 4.5 at least (WCAG 2.1, 1.4.3)."""
     context = browser.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme)
     seen = BrowsedPage(context, page.address)

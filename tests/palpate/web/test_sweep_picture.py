@@ -39,7 +39,7 @@ def test_a_vibration_stands_at_its_frequency():
 
 
 @pytest.mark.parametrize("frames", [1, 7, FINEST, 1500, 12_345])
-def test_no_peak_is_lost(frames: int):
+def test_no_peak_is_lost(frames):
     """Lowest and highest count of the whole sweep are in the lines, in at most FINEST steps."""
     counts = np.random.default_rng(frames).normal(100, 20, (frames, 2, 2)).astype("<f4")
     shown = picture(Window(1, 750.0, counts))
@@ -79,7 +79,7 @@ def _nan() -> NDArray[np.float32]:
         (_nan(), 750.0, "not a number"),
     ],
 )
-def test_without_a_spectrogram_it_says_why(counts: NDArray[np.uint8], rate_hz: float, why: str):
+def test_without_a_spectrogram_it_says_why(counts, rate_hz, why):
     """The lines are present and can be sent as JSON."""
     shown = picture(Window(1, rate_hz, counts))
     assert why in shown["trouble"]

@@ -5,8 +5,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -32,7 +30,7 @@ def shown() -> Iterator[Shown]:
         yield one
 
 
-def test_people_read_display_names_and_programs_labels(browser: Any, shown: Shown, tmp_path: Path):
+def test_people_read_display_names_and_programs_labels(browser, shown, tmp_path):
     """Card, list, counts and probabilities have the name in any language; the CSV has the label."""
     shown.board.take(feed_lines.hello(displays={"wood": "Holz, <b>geölt</b>"}))
     shown.board.take(feed_lines.verdict(41, 390.0, "wood"))
@@ -50,7 +48,7 @@ def test_people_read_display_names_and_programs_labels(browser: Any, shown: Show
     assert not seen.errors
 
 
-def test_a_sweep_without_a_label_says_why(browser: Any, shown: Shown):
+def test_a_sweep_without_a_label_says_why(browser, shown):
     """The card has words for an operator, the fold the reason; the probabilities are gone."""
     seen = opened(browser, shown)
     shown.board.take(feed_lines.verdict(41, 390.0, status="sensor-lost"))
@@ -64,7 +62,7 @@ def test_a_sweep_without_a_label_says_why(browser: Any, shown: Shown):
     assert seen.page.locator("#scores li").count() == 0
 
 
-def test_probabilities_signal_and_spectrogram_of_a_chosen_sweep(browser: Any, shown: Shown):
+def test_probabilities_signal_and_spectrogram_of_a_chosen_sweep(browser, shown):
     """The last sweep is shown by itself, and another sweep after a click, until the latest is asked
     for. An old sweep no longer has a signal."""
     seen = opened(browser, shown)
@@ -88,7 +86,7 @@ def test_probabilities_signal_and_spectrogram_of_a_chosen_sweep(browser: Any, sh
     assert not seen.errors
 
 
-def test_the_shift_is_filtered_by_status(browser: Any, shown: Shown):
+def test_the_shift_is_filtered_by_status(browser, shown):
     """A button for each status with its count; several at a time; `all` again."""
     seen = opened(browser, shown)
     buttons = seen.page.locator("#filter button")
@@ -105,7 +103,7 @@ def test_the_shift_is_filtered_by_status(browser: Any, shown: Shown):
     until(lambda: seen.page.locator(".row").count() == 41)
 
 
-def test_a_moved_skin_and_the_way_back(browser: Any, shown: Shown):
+def test_a_moved_skin_and_the_way_back(browser, shown):
     """The verdict leads to the view with the direction in which to move the skin."""
     seen = opened(browser, shown)
     moved = "moved 2.2 mm too far towards row 1"
@@ -124,7 +122,7 @@ def test_a_moved_skin_and_the_way_back(browser: Any, shown: Shown):
 
 
 @pytest.mark.parametrize(("width", "height"), SIZES)
-def test_a_large_skin_is_drawn_without_numbers(browser: Any, shown: Shown, width: int, height: int):
+def test_a_large_skin_is_drawn_without_numbers(browser, shown, width, height):
     """12 x 32 taxels: numbers of rows and columns do not overlap; the ring is large."""
     shape = {"rows": 12, "cols": 32, "rate_hz": 100.0, "window": 200, "dtype": "uint16"}
     known = {"contact": 5.0, "place": None, "unloaded": 0.0, "fingertip": "first-column"}
@@ -151,7 +149,7 @@ def test_a_large_skin_is_drawn_without_numbers(browser: Any, shown: Shown, width
     seen.page.context.close()
 
 
-def test_loss_latency_and_the_box(browser: Any, shown: Shown):
+def test_loss_latency_and_the_box(browser, shown):
     """In words beside their pictures; bundle and trial by name."""
     seen = opened(browser, shown)
     assert re.fullmatch(r"median 1\.\d ms, longest 1\.\d ms", seen.text("#latency-said"))
@@ -164,7 +162,7 @@ def test_loss_latency_and_the_box(browser: Any, shown: Shown):
     until(lambda: "least" in seen.text("#loss-said"))
 
 
-def test_unsigned_bundles_are_told_at_the_top(browser: Any, shown: Shown):
+def test_unsigned_bundles_are_told_at_the_top(browser, shown):
     """While a setting allows them, at every size, without scrolling."""
     for text in ("", "bundles are allowed: classifier.allow_unsigned = true"):
         shown.board.take(feed_lines.health(380.0, unsigned=text))
@@ -179,7 +177,7 @@ def test_unsigned_bundles_are_told_at_the_top(browser: Any, shown: Shown):
             seen.page.context.close()
 
 
-def test_a_box_that_dies_and_comes_back_while_the_page_is_open(browser: Any, shown: Shown):
+def test_a_box_that_dies_and_comes_back_while_the_page_is_open(browser, shown):
     """The page says at once that the box is off, and since when; the reason is behind a fold. It
     shows the new box and bundle by itself, and its card waits for a sweep of the new box."""
     seen = opened(browser, shown)
@@ -212,7 +210,7 @@ def test_a_box_that_dies_and_comes_back_while_the_page_is_open(browser: Any, sho
     assert not seen.errors
 
 
-def test_a_page_program_that_dies_and_comes_back(browser: Any):
+def test_a_page_program_that_dies_and_comes_back(browser):
     """The page says so at once; the new program's content replaces the old."""
     first = Shown(Access(0))
     with first:
@@ -232,7 +230,7 @@ def test_a_page_program_that_dies_and_comes_back(browser: Any):
         seen.page.context.close()
 
 
-def test_it_is_used_with_the_keyboard(browser: Any, shown: Shown):
+def test_it_is_used_with_the_keyboard(browser, shown):
     """Tab has a visible focus; arrows choose a sweep, space a status."""
     seen = opened(browser, shown)
     stops = []
@@ -257,7 +255,7 @@ def test_it_is_used_with_the_keyboard(browser: Any, shown: Shown):
     until(lambda: seen.page.locator(".row").count() == 36)
 
 
-def test_everything_has_a_role_and_a_name(browser: Any, shown: Shown):
+def test_everything_has_a_role_and_a_name(browser, shown):
     """Names for screen readers, which speak urgent changes."""
     seen = opened(browser, shown)
     unnamed = seen.page.evaluate(
@@ -277,9 +275,7 @@ def test_everything_has_a_role_and_a_name(browser: Any, shown: Shown):
     ("width", "height", "scheme"), [(*SIZES[0], "dark"), (*SIZES[1], "light"), (*SIZES[2], "dark")]
 )
 @pytest.mark.parametrize("at", ["/", "/#align"])
-def test_every_text_can_be_read(
-    browser: Any, shown: Shown, width: int, height: int, scheme: str, at: str
-):
+def test_every_text_can_be_read(browser, shown, width, height, scheme, at):
     """All text has a contrast of 4.5 with its background (WCAG 2.1, 1.4.3), also with a banner and
     each tone; nothing is too wide."""
     for number, status in enumerate(("unsure", "unknown", "gap", "aborted"), 41):
@@ -300,7 +296,7 @@ def test_every_text_can_be_read(
     context.close()
 
 
-def test_nothing_moves_when_something_new_comes(browser: Any, shown: Shown):
+def test_nothing_moves_when_something_new_comes(browser, shown):
     """Each section stays where it is over verdicts of all kinds, views and a box that goes away."""
     seen = opened(browser, shown)
     boxes = (
@@ -320,7 +316,7 @@ def test_nothing_moves_when_something_new_comes(browser: Any, shown: Shown):
     assert seen.page.evaluate(boxes)[:2] == before[:2]
 
 
-def test_on_a_tablet_in_the_network(browser: Any, tmp_path: Path):
+def test_on_a_tablet_in_the_network(browser, tmp_path):
     """Over TLS the page asks for the token, and refuses a wrong token. The right token, or a link
     with it, opens the page; a reload needs no token. The address does not show it."""
     page_secrets(tmp_path)

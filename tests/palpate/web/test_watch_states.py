@@ -114,9 +114,7 @@ def fits(seen: BrowsedPage, width: int, height: int) -> None:
 @pytest.mark.parametrize(
     ("width", "height", "scheme"), [(*SIZES[0], "light"), (*SIZES[1], "dark"), (*SIZES[2], "light")]
 )
-def test_each_state_is_told_from_two_metres(
-    browser: Any, shown: Shown, width: int, height: int, scheme: str
-):
+def test_each_state_is_told_from_two_metres(browser, shown, width, height, scheme):
     """Colour, shape and word differ between an answer, a refusal, a fault and a box that is off;
     what to do stands beside it. All text can be read (WCAG 2.1, 1.4.3), on the whole screen too."""
     size = {"width": width, "height": height}
@@ -139,7 +137,7 @@ def test_each_state_is_told_from_two_metres(
     context.close()
 
 
-def test_an_unsure_answer_shows_its_candidate_small(browser: Any, shown: Shown):
+def test_an_unsure_answer_shows_its_candidate_small(browser, shown):
     """The name of a material that the box does not answer for is never the large word."""
     seen = opened(browser, shown)
     for status in ("unsure", "undecided"):
@@ -169,7 +167,7 @@ def test_an_open_sweep_does_not_wear_the_answer_of_the_last(browser: Any, shown:
     until(lambda: seen.text("#label") == "Sweeping")
 
 
-def test_the_whole_screen_has_the_verdict_alone(browser: Any, shown: Shown):
+def test_the_whole_screen_has_the_verdict_alone(browser, shown):
     """With a key or the button; the way back is the same key, or Escape."""
     seen = opened(browser, shown)
     seen.page.keyboard.press("f")
@@ -202,7 +200,7 @@ DEVICE = """() => {
 """A tablet that notes how often its screen is kept on, and its tones in Hz."""
 
 
-def test_a_tablet_stays_awake_and_sounds_on_a_refusal(browser: Any, shown: Shown):
+def test_a_tablet_stays_awake_and_sounds_on_a_refusal(browser, shown):
     """The screen is kept on; if wanted, a refusal sounds once, an answer not."""
     context = browser.new_context()
     context.add_init_script(f"({DEVICE})()")
@@ -227,7 +225,7 @@ def test_a_tablet_stays_awake_and_sounds_on_a_refusal(browser: Any, shown: Shown
     context.close()
 
 
-def test_keys_lead_to_views_and_history(browser: Any, shown: Shown):
+def test_keys_lead_to_views_and_history(browser, shown):
     """A letter each, listed on the page; with Ctrl a letter belongs to the browser."""
     seen = opened(browser, shown)
     seen.page.keyboard.press("a")
@@ -245,7 +243,7 @@ def test_keys_lead_to_views_and_history(browser: Any, shown: Shown):
     assert seen.page.locator("#keys dt").all_text_contents() == list("ftwalhs")
 
 
-def test_the_shift_is_counted_and_saved(browser: Any, shown: Shown):
+def test_the_shift_is_counted_and_saved(browser, shown):
     """A sentence, a table, and a CSV file with each sweep and its time on the wall."""
     shown.board.take(verdict(41, 395.0, "=1+1", detail='a "word", and more'))
     seen = opened(browser, shown, rows=41)
@@ -273,9 +271,7 @@ def test_the_shift_is_counted_and_saved(browser: Any, shown: Shown):
 
 
 @pytest.mark.parametrize(("width", "height"), SIZES)
-def test_long_names_and_many_materials_are_not_cut(
-    browser: Any, shown: Shown, width: int, height: int
-):
+def test_long_names_and_many_materials_are_not_cut(browser, shown, width, height):
     """24 characters, 26 materials: nothing is cut anywhere."""
     names = [f"Schaumstoff-beschichtet{chr(65 + i)}" for i in range(26)]
     shown.board.take(feed_lines.hello(labels=names))
@@ -298,7 +294,7 @@ def test_long_names_and_many_materials_are_not_cut(
     seen.page.context.close()
 
 
-def test_a_taxel_of_a_large_skin_tells_its_value(browser: Any, shown: Shown):
+def test_a_taxel_of_a_large_skin_tells_its_value(browser, shown):
     """Row, column and value, in newtons where the profile says newtons."""
     shape = {"rows": 16, "cols": 32, "rate_hz": 100.0, "window": 200, "dtype": "float32"}
     known = {"contact": 0.05, "place": None, "unloaded": 0.0, "fingertip": ""}

@@ -63,7 +63,7 @@ def heard(
     raise AssertionError(f"no {name}")
 
 
-def test_what_the_box_does_comes_to_the_page(watcher: PageWatcher, path: Path):
+def test_what_the_box_does_comes_to_the_page(watcher, path):
     """Verdicts, views of the frames, and the sweep's picture under its number."""
     offered = Offered(path)
     reader = EventReader(watcher.server)
@@ -79,7 +79,7 @@ def test_what_the_box_does_comes_to_the_page(watcher: PageWatcher, path: Path):
     assert heard(watcher, offered, "view", reader)["shape"] == [4, 4]
 
 
-def test_frames_are_asked_for_while_somebody_watches(watcher: PageWatcher, path: Path):
+def test_frames_are_asked_for_while_somebody_watches(watcher, path):
     """From the first browser to the last: without one the page costs nothing."""
     offered = Offered(path)
     until(lambda: (offered.turns(3), watcher.step(), watcher.feed.connected)[-1])
@@ -97,7 +97,7 @@ def test_frames_are_asked_for_while_somebody_watches(watcher: PageWatcher, path:
     assert not watcher.server.watched
 
 
-def test_a_box_that_ends_and_comes_back_with_another_bundle(watcher: PageWatcher, path: Path):
+def test_a_box_that_ends_and_comes_back_with_another_bundle(watcher, path):
     """The page gets at once that the box is away, and why. Then it gets the new box, and the
     history has the changes."""
     offered = Offered(path)
@@ -116,9 +116,7 @@ def test_a_box_that_ends_and_comes_back_with_another_bundle(watcher: PageWatcher
     assert "aaaa0001" in heard(watcher, again, "note", reader)["text"]
 
 
-def test_a_box_that_is_not_there_is_shown_as_away(
-    watcher: PageWatcher, path: Path, logged: list[str]
-):
+def test_a_box_that_is_not_there_is_shown_as_away(watcher, path, logged):
     """The page gets it again and again; the log has it once."""
     reader = EventReader(watcher.server)
     for _ in range(2):
@@ -141,9 +139,7 @@ RUBBISH = [
 
 
 @pytest.mark.parametrize("sent", RUBBISH, ids=range(len(RUBBISH)))
-def test_a_socket_that_is_no_feed_is_shown_as_a_box_that_is_away(
-    watcher: PageWatcher, path: Path, sent: bytes
-):
+def test_a_socket_that_is_no_feed_is_shown_as_a_box_that_is_away(watcher, path, sent):
     """For any content the page shows a box that is away. The server continues, and reads a real
     feed that comes later."""
     with socket.socket(socket.AF_UNIX) as listener:
@@ -169,7 +165,7 @@ def test_a_socket_that_is_no_feed_is_shown_as_a_box_that_is_away(
 
 
 @pytest.mark.slow
-def test_the_command_serves_its_page_until_it_is_ended(tmp_path: Path):
+def test_the_command_serves_its_page_until_it_is_ended(tmp_path):
     """The real command: address, page, a box that is away, exit 0 at SIGTERM."""
     command = [sys.executable, *["-m", "palpate", "watch", "--web", "0", "--set"]]
     command += [f"store.runtime={tmp_path}/none"]
