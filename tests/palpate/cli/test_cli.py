@@ -124,6 +124,7 @@ def test_run_on_a_serial_port():
         assert heard.count(b",RES,") == 3
 
 
+@pytest.mark.slow
 def test_kept_and_captured_sweeps_are_replayed(tmp_path, capsys):
     """A black box, a capture, and the same sweeps recorded without a bundle, each replayed: the
     same labels and probabilities."""

@@ -49,7 +49,6 @@ def _loading(
     [
         ("palpate", "palpate", ["skin", "list"], "numpy"),
         ("palpate", "palpate", ["check"], "onnxruntime"),
-        ("palpate", "palpate", ["replay", "a.npy"], "onnxruntime"),
         (
             "palpate-train",
             "palpate_train",

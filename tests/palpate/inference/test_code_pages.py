@@ -76,3 +76,14 @@ def test_what_linux_refuses_counts_nothing(tmp_path: Path):
     """Linux refuses a range that is not mapped."""
     (tmp_path / "maps").write_text("1000-2000 r-xp 00000000 00:00 1 /lib.so\n")
     assert give_back("/lib.so", tmp_path / "maps") == 0
+
+
+def test_a_name_with_blanks_is_a_name(tmp_path):
+    """All code pages of the file are released, and none of another."""
+    lines = [line for line in Path("/proc/self/maps").read_text().splitlines() if " r-xp " in line]
+    own = [line.replace(LIBRARY, "/a  library.so") for line in lines if line.endswith(LIBRARY)]
+    (tmp_path / "maps").write_text("\n".join([*own, *lines]))
+    bounds = [line.split()[0].split("-") for line in own]
+    size = sum(int(end, 16) - int(begin, 16) for begin, end in bounds)
+    assert give_back("/a  library.so", tmp_path / "maps") == size > 0
+    assert give_back("/a", tmp_path / "maps") == 0

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ import pytest
 from palpate.answer.early import Early
 from palpate.bundle.bundle import Bundle
 from palpate.bundle.onnx_check import reader
-from palpate.core.errors import BundleError, FormatError
+from palpate.core.errors import BundleError, FormatError, ModelError
 from palpate.core.types import Status
 from palpate.inference import session
 from palpate.inference.classifier import Classifier
@@ -150,3 +151,29 @@ def test_a_count_that_is_no_number_is_refused(tmp_path: Path, value: float):
         early = EarlyExit(it).judged(replace(broken, share=0.5))
     assert (verdict.status, verdict.label) == (Status.DEAD_TAXEL, "")
     assert early.status is Status.DEAD_TAXEL
+
+
+def test_a_session_leaves_the_core_to_the_skin(monkeypatch):
+    """One thread that does not spin, no arena of memory, and errors alone in the log."""
+    given = []
+    monkeypatch.setattr(
+        session.ort, "InferenceSession", lambda model, options, providers: given.append(options)
+    )
+    session.session(b"")
+    (options,) = given
+    assert (options.intra_op_num_threads, options.inter_op_num_threads) == (1, 1)
+    assert options.get_session_config_entry("session.intra_op.allow_spinning") == "0"
+    assert (options.log_severity_level, options.enable_cpu_mem_arena) == (3, False)
+
+
+@pytest.mark.parametrize("does", ["open", "run"])
+def test_what_onnxruntime_says_is_cut(monkeypatch, does):
+    """Its first 200 characters are told."""
+
+    def refuse(*given: object, **options: object) -> None:
+        raise RuntimeError("~" * 1000)
+
+    monkeypatch.setattr(session.ort, "InferenceSession", refuse)
+    with pytest.raises(BundleError if does == "open" else ModelError) as e:
+        session.session(b"") if does == "open" else session.run(mock.Mock(run=refuse), [], {})
+    assert str(e.value).count("~") == 200

@@ -59,7 +59,10 @@ def test_the_tour_has_each_special_sweep_with_its_right_answer(capsys):
     assert "8 of 8" in out
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 0)])
+@pytest.mark.parametrize(
+    ("number", "code"),
+    [(signal.SIGINT, 130), pytest.param(signal.SIGTERM, 0, marks=pytest.mark.slow)],
+)
 def test_ctrl_c_ends_with_its_exit_code(number, code):
     """As the table of exit codes says; SIGTERM is an orderly end."""
     with subprocess.Popen(
@@ -108,6 +111,7 @@ def test_demo_of_a_set(each, more, tmp_path, default_bundle, capsys):
     assert "bundle" in out
 
 
+@pytest.mark.slow
 def test_materials_that_the_bundle_never_learnt_are_counted_apart(tmp_path, default_bundle, capsys):
     """They do not count as wrong, and `unknown` is their right answer."""
     files = bundle.files(bundle.DEFAULT)

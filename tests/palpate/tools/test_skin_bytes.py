@@ -120,6 +120,7 @@ def test_no_profile_is_proposed_for_anything_else(data):
     assert skin_text.proposed(data, 1.0) == ""
 
 
+@pytest.mark.slow
 def test_the_commands(tmp_path, capsys):
     """`skin detect` proposes, the file is written as printed, and `skin check` reads its frames."""
     stop = threading.Event()

@@ -61,7 +61,7 @@ def labels(recorded: RecordedPage) -> tuple[str, str, str]:
     return about["material"], about["position"], about["session"]
 
 
-def test_what_is_there_and_what_is_missing(browser: Any, recorded: RecordedPage):
+def test_what_is_there_and_what_is_missing(browser, recorded):
     """Materials by positions, with recorded and missing sweeps; the trigger in words."""
     seen = opened(browser, recorded)
     assert seen.page.locator("#counts th").all_inner_texts() == ["1", "2", "metal", "wood"]
@@ -79,7 +79,7 @@ def test_what_is_there_and_what_is_missing(browser: Any, recorded: RecordedPage)
     assert not seen.errors
 
 
-def test_the_last_sweep_with_its_checks(browser: Any, recorded: RecordedPage):
+def test_the_last_sweep_with_its_checks(browser, recorded):
     """Status, checks, path and signal, also of a faulty sweep and without a window."""
     seen = opened(browser, recorded)
     number = recorded.sweep()
@@ -97,7 +97,7 @@ def test_the_last_sweep_with_its_checks(browser: Any, recorded: RecordedPage):
     assert not seen.errors
 
 
-def test_labels_are_set_with_the_keyboard(browser: Any, recorded: RecordedPage, tmp_path: Path):
+def test_labels_are_set_with_the_keyboard(browser, recorded, tmp_path):
     """Tab reaches every control, Enter sets the labels, and the stored sweep has them."""
     seen, stops = opened(browser, recorded), []
     for _ in range(11):
@@ -128,7 +128,7 @@ def test_labels_are_set_with_the_keyboard(browser: Any, recorded: RecordedPage, 
     assert not seen.errors
 
 
-def test_labels_are_set_in_fields_and_in_the_table(browser: Any, recorded: RecordedPage):
+def test_labels_are_set_in_fields_and_in_the_table(browser, recorded):
     """The reason of a refusal stands beside the field, which keeps the text; a good label removes
     it. What a person types stays when the robot sets labels. A cell of the table sets two labels
     and keeps the focus."""
@@ -157,7 +157,7 @@ def test_labels_are_set_in_fields_and_in_the_table(browser: Any, recorded: Recor
     assert [one for one in seen.errors if "409" not in one] == []
 
 
-def test_start_and_stop(browser: Any, recorded: RecordedPage):
+def test_start_and_stop(browser, recorded):
     """By the buttons, which can be pressed while they have an effect, and by Space, also after a
     button was pressed with the mouse; in a field it is a space."""
     seen = opened(browser, recorded)
@@ -185,9 +185,7 @@ def test_start_and_stop(browser: Any, recorded: RecordedPage):
     ("width", "height", "scheme"), [(390, 844, "light"), (1024, 768, "dark"), (1400, 900, "light")]
 )
 @pytest.mark.parametrize("teaching", [False, True], ids=["record", "teach"])
-def test_timed_sweeps_are_counted_down(
-    browser: Any, tmp_path: Path, width: int, height: int, scheme: str, teaching: bool
-):
+def test_timed_sweeps_are_counted_down(browser, tmp_path, width, height, scheme, teaching):
     """In sight, in letters of 96 px or more; a skin that is away has no countdown."""
     with RecordedPage(tmp_path, Labels("metal", "1"), teaching=teaching) as one:
         size = {"width": width, "height": height}
@@ -210,7 +208,7 @@ def test_timed_sweeps_are_counted_down(
         context.close()
 
 
-def test_the_sweep_on_the_button_is_discarded(browser: Any, recorded: RecordedPage, tmp_path: Path):
+def test_the_sweep_on_the_button_is_discarded(browser, recorded, tmp_path):
     """The button has the number of the sweep, and then that of the sweep before."""
     seen = opened(browser, recorded)
     number = recorded.sweep()
@@ -222,7 +220,7 @@ def test_the_sweep_on_the_button_is_discarded(browser: Any, recorded: RecordedPa
     until(lambda: seen.text("#discard") == f"Discard sweep {number - 1}")
 
 
-def test_a_recorder_that_ends_and_comes_back_while_the_page_is_open(browser: Any, tmp_path: Path):
+def test_a_recorder_that_ends_and_comes_back_while_the_page_is_open(browser, tmp_path):
     """The page says that the recorder has ended, and its controls are off. It shows the next run by
     itself, and orders have the new key."""
     first = begun(tmp_path / "a")
@@ -255,9 +253,7 @@ CUT = """() => [...document.querySelectorAll("main :not(svg *, #counts)")]
 @pytest.mark.parametrize(
     ("width", "height", "scheme"), [(*SIZES[0], "dark"), (*SIZES[1], "light"), (*SIZES[2], "dark")]
 )
-def test_every_text_of_it_can_be_read(
-    browser: Any, recorded: RecordedPage, width: int, height: int, scheme: str
-):
+def test_every_text_of_it_can_be_read(browser, recorded, width, height, scheme):
     """Text, an error and a banner have a contrast of 4.5 with their background (WCAG 2.1, 1.4.3).
     The longest names and more positions than fit stay within the page."""
     recorded.recording.commands["MATERIAL"]("corrugated cardboard 2mm")
@@ -286,7 +282,7 @@ def test_every_text_of_it_can_be_read(
     seen.page.context.close()
 
 
-def test_everything_on_it_has_a_role_and_a_name(browser: Any, recorded: RecordedPage):
+def test_everything_on_it_has_a_role_and_a_name(browser, recorded):
     """Sections, fields, pictures and buttons have names for screen readers, which speak changes."""
     seen = opened(browser, recorded)
     unnamed = seen.page.evaluate(
@@ -372,7 +368,7 @@ def test_a_hidden_tab_lets_its_stream_go(browser: Any, recorded: RecordedPage):
     context.close()
 
 
-def test_a_material_may_be_called_as_things_of_script(browser: Any, recorded: RecordedPage):
+def test_a_material_may_be_called_as_things_of_script(browser, recorded):
     """`constructor` and `valueOf` are names like others."""
     seen = opened(browser, recorded)
     for name in ("constructor", "valueOf"):
@@ -384,9 +380,7 @@ def test_a_material_may_be_called_as_things_of_script(browser: Any, recorded: Re
     assert not seen.errors
 
 
-def test_a_material_has_a_name_in_any_language(
-    browser: Any, recorded: RecordedPage, tmp_path: Path
-):
+def test_a_material_has_a_name_in_any_language(browser, recorded, tmp_path):
     """Shown as written; command and sweep have a label in ASCII, the sidecar both."""
     seen = opened(browser, recorded)
     seen.page.fill("#material", "Holz, geölt")
