@@ -18,7 +18,7 @@ from palpate import __version__
 from palpate.core.errors import ApplianceError, FormatError
 from palpate.core.health import Health
 from palpate.core.status import REASONS
-from palpate.core.types import Status, Verdict
+from palpate.core.types import Status
 from palpate.service import status
 from palpate.service.status_file import StatusFile
 from palpate.service.systemd import VerdictLog
@@ -28,19 +28,7 @@ from tests.factories.simulated_box import SECOND, Rigged, idle_devices
 
 HEALTH = feeds.HEALTH._replace(ready=False)
 AWAY = HEALTH._replace(skin="absent", trouble="no skin on USB; check cable", streams=False)
-OK = Verdict(
-    sweep=7,
-    time_ns=0,
-    status=Status.OK,
-    label="plastic rough",
-    probability=0.987,
-    margin=0.9,
-    scores=np.ones(2) / 2,
-    fused=1,
-    lost=0,
-    latency_ns=1_200_000,
-    bundle="9f3c2a1b",
-)
+OK = replace(feeds.OK, displacement="")
 SHORT = replace(
     OK, sweep=8, status=Status.SHORT, label="", probability=0.0, fused=0, scores=np.empty(0)
 )

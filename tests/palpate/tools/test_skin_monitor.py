@@ -35,15 +35,47 @@ def monitor(taxels: np.ndarray, dtype: str = "float32", piece: int = 7) -> dict[
     return watched.measured()
 
 
-def test_rate_and_noise_are_measured():
-    """Rate and noise are measured."""
+def at(taxels: np.ndarray, *changes: tuple[object, float]) -> np.ndarray:
+    """Taxels with other values at these places."""
+    for place, value in changes:
+        taxels[place] = value
+    return taxels
+
+
+ALL, LONG = slice(None), STUCK_S + 1
+LEFT_OUT = signal(6, noise=0.5)
+LEFT_OUT[300:] += 100
+LEFT_OUT[300:, 2, 1] -= 100
+ENDS = at(signal(1), ((ALL, 1, 1), 255), ((ALL, 0, 0), 0))
+
+
+@pytest.mark.parametrize(
+    ("taxels", "dtype", "kind", "names"),
+    [
+        (at(signal(LONG), ((ALL, 0, 3), 255)), "float32", "stuck", ("1.4",)),
+        (at(signal(4), ((ALL, 0, 3), 255)), "float32", "stuck", ()),
+        (np.full((1000, 3, 4), 7.0), "float32", "stuck", ()),
+        (at(signal(LONG, (2, 2, 3)), ((ALL, 1, 0, 2), 0)), "float32", "stuck", ("2.1 axis 3",)),
+        (LEFT_OUT, "float32", "dead", ("3.2",)),
+        (signal(6), "float32", "dead", ()),
+        (ENDS, "uint8", "saturated", ("2.2",)),
+        (ENDS * 1e6, "float32", "saturated", ()),
+    ],
+)
+def test_faulty_taxels_are_named(taxels, dtype, kind, names):
+    """One value for seconds while others move, no load while others are touched, and a count at
+    the end of its type. Where all stand still nothing says which is stuck."""
+    found = monitor(taxels, dtype)
+    assert found[kind] == names
+    axes = taxels.shape[3:] or (1,)
+    assert np.array(found["load"]).shape == (*axes, *taxels.shape[1:3])
+
+
+def test_rate_noise_and_load_are_measured():
+    """A slow touch is load and no noise."""
     found = monitor(signal(4))
     assert found["rate_hz"] == pytest.approx(RATE, rel=1e-6)
     assert np.array(found["noise"]) == pytest.approx(np.full((1, 3, 4), 2.0), rel=0.25)
-
-
-def test_a_slow_touch_is_load_and_no_noise():
-    """A slow touch is load and no noise."""
     taxels = signal(4)
     taxels[200:, 1, 2] += np.linspace(0, 400, 200)
     found = monitor(taxels)
@@ -52,46 +84,6 @@ def test_a_slow_touch_is_load_and_no_noise():
     assert load[1, 2] > 380
     assert found["full"] == pytest.approx(load.max(), rel=0.01)
     assert np.array(found["noise"]).max() < 4
-
-
-def test_a_taxel_that_has_one_value_is_stuck_and_no_other_is():
-    """A taxel that has one value is stuck and no other is."""
-    taxels = signal(STUCK_S + 1)
-    taxels[:, 0, 3] = 255
-    assert monitor(taxels)["stuck"] == ("1.4",)
-    assert monitor(taxels[: 100 * 4])["stuck"] == ()
-
-
-def test_where_all_stand_still_nothing_says_which_is_stuck():
-    """Where all stand still nothing says which is stuck."""
-    assert monitor(np.full((1000, 3, 4), 7.0))["stuck"] == ()
-
-
-def test_a_taxel_that_does_not_move_when_the_others_are_touched_is_dead():
-    """A taxel that does not move when the others are touched is dead."""
-    taxels = signal(6, noise=0.5)
-    taxels[300:] += 100
-    taxels[300:, 2, 1] -= 100
-    assert monitor(taxels)["dead"] == ("3.2",)
-    assert monitor(signal(6))["dead"] == ()
-
-
-def test_a_count_at_the_end_of_its_type_is_saturated():
-    """A count at the end of its type is saturated."""
-    taxels = signal(1)
-    taxels[:, 1, 1] = 255
-    taxels[:, 0, 0] = 0
-    assert monitor(taxels, "uint8")["saturated"] == ("2.2",)
-    assert monitor(taxels * 1e6)["saturated"] == ()
-
-
-def test_axes_have_their_own_maps_and_names():
-    """Axes have their own maps and names."""
-    taxels = signal(STUCK_S + 1, (2, 2, 3))
-    taxels[:, 1, 0, 2] = 0
-    found = monitor(taxels)
-    assert found["stuck"] == ("2.1 axis 3",)
-    assert np.array(found["load"]).shape == (3, 2, 2)
 
 
 def test_before_the_second_frame_nothing_is_measured_and_a_new_skin_starts_anew():
