@@ -196,7 +196,7 @@ def test_canceled_when_the_answer_came(swept: Swept):
     swept.box.script = script
     swept.at_phase = lambda phase: swept.canceled.set()
     assert swept.run(**LONG).known
-    with pytest.raises(CommandRefused, match="canceled before"):
+    with pytest.raises(CommandRefused, match="canceled"):
         swept.run()
     assert swept.has_heard("START", "ABORT")
 
@@ -249,7 +249,7 @@ def test_an_error_of_the_caller_leaves_no_sweep_open(swept: Swept):
         raise RuntimeError("no publisher")
 
     swept.at_phase = fails
-    with pytest.raises(RuntimeError, match="no publisher"):
+    with pytest.raises(RuntimeError, match="publisher"):
         swept.run()
     assert swept.has_heard("START", "ABORT")
 

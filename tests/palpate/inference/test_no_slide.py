@@ -90,7 +90,7 @@ def test_no_early_answer_to_a_finger_that_rests(toy: Bundle):
 
 def test_more_limits_than_labels_are_refused(toy: Bundle):
     """Four limits for three labels."""
-    with pytest.raises(BundleError, match=r"4 limits .* 3 labels"):
+    with pytest.raises(BundleError, match=r"4 .* 3 "):
         replace(toy.manifest, sliding=SlideLimits((LEAST,) * 4))
 
 
