@@ -169,7 +169,7 @@ def test_a_coil_that_was_not_0_on_this_connection_does_not_rise(
     source: ScriptedSource, writes: list[tuple[int, bytes]], sent: list[str]
 ):
     """A controller that writes cyclically sends no command again after a broken connection, and
-    START with STOP is no sweep; what does rise is carried out."""
+    START with STOP is no sweep; a coil that rises is carried out."""
     ask = fresh(ModbusBridge(source, SystemClock(), writes=True), [None] * len(COILS))
     assert [ask(several(bits))[:2] for bits, _ in writes] == [reply for _, reply in writes]
     assert source.sent == sent

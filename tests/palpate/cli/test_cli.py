@@ -275,7 +275,7 @@ def test_check_needs_no_bundle(tmp_path, capsys):
 
 
 def test_folders_and_files_that_are_not_there(tmp_path, capsys):
-    """A missing folder of settings, a file that is no set, and a result that could not be written.
+    """Settings without a folder, a file of another kind, and a result without a place.
     Nothing is begun."""
     none, json_file = str(tmp_path / "none"), ["check", "--bench", "--json"]
     for words, code, said in (

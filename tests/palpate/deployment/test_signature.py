@@ -144,8 +144,8 @@ def test_a_file_of_signers_is_understood_to_its_last_line_or_refused(signers, te
     ],
 )
 def test_faults_of_ssh_keygen_that_pass_are_tried_again(monkeypatch, tmp_path, fault, code):
-    """Only what a person can mend keeps the service down; being killed for want of memory says
-    nothing about the signature."""
+    """Only a fault that a person can mend keeps the service down; being killed for want of memory
+    says nothing about the signature."""
 
     def fails(*words: object, **options: object) -> object:
         if isinstance(fault, Exception):

@@ -435,7 +435,7 @@ def test_a_slow_check_does_not_count_against_a_trial(tmp_path, monkeypatch):
 
 def test_memory_that_is_short_at_a_start_counts_and_the_trial_goes_on(tmp_path):
     """The program ends with an exit code that is restarted. Once there is memory, the bundle on
-    trial runs; a bundle for which there never is any gives way after MOST_STARTS."""
+    trial runs; a bundle that never gets enough gives way after MOST_STARTS."""
     short: list[str] = []
 
     def prove(bundle: Bundle) -> None:

@@ -168,7 +168,7 @@ def test_a_session_leaves_the_core_to_the_skin(monkeypatch):
 
 @pytest.mark.parametrize("does", ["open", "run"])
 def test_what_onnxruntime_says_is_cut(monkeypatch, does):
-    """Its first 200 characters are told."""
+    """The message has its first 200 characters."""
 
     def refuse(*given: object, **options: object) -> None:
         raise RuntimeError("~" * 1000)

@@ -79,7 +79,7 @@ def check_content(frames: Frames, format: SweepFormat = FMT) -> None:
 @pytest.mark.parametrize("acm", [False, True])
 def test_streams_without_loss(acm):
     """A healthy board, vendor class or CDC-ACM: every frame, its time correct to 1 ms. cdc_acm has
-    the device at first, and a board on a serial port is told that somebody reads."""
+    the device at first; a board on a serial port gets DTR."""
     reading = Reading(acm=acm)
     assert reading.bus.kernel_driver is acm
     frames = reading.seconds(5)

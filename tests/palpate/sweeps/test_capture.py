@@ -51,7 +51,7 @@ def simulated_tubes(seed: int, n: int, **more: str) -> devices.SimDevices:
 
 
 def all_values(v: Verdict) -> tuple[object, ...]:
-    """What a replay must give again."""
+    """The values that a replay must repeat."""
     return v.sweep, v.status, v.label, v.fused, v.lost, v.scores.tobytes()
 
 
