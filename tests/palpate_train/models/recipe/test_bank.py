@@ -13,7 +13,7 @@ from palpate.core.types import SweepFormat
 from palpate_train.data.augment import texture_scale
 from palpate_train.models.recipe import bank, graph
 from palpate_train.models.recipe.architectures import FLOOR, Architecture
-from palpate_train.models.recipe.bank import DILATIONS, TAPS, Bank
+from palpate_train.models.recipe.bank import TAPS, Bank
 from palpate_train.models.recipe.recipe import FIXED
 from palpate_train.onnx_tools.graph_builder import run
 
@@ -25,6 +25,8 @@ FORMATS = [
     SweepFormat(4, 2, 750.0, 600, "float32"),
     SweepFormat(2, 2, 750.0, 600, "int16", 3),
 ]
+MANY = SweepFormat(8, 10, 100.0, 160, "uint8")
+LONG = SweepFormat(1, 1, 2200.0, 8800, "uint8")
 forms = pytest.mark.parametrize("format", FORMATS, ids=str)
 BANK = replace(FIXED, pools=2)
 
@@ -142,7 +144,7 @@ def test_an_offset_changes_nothing(format: SweepFormat):
     )
 
 
-@forms
+@pytest.mark.parametrize("format", [*FORMATS, MANY, LONG], ids=str)
 def test_filters_fit_the_window(format: SweepFormat):
     """Unit norm, sum zero unless free; all dilations fit; one taxel or all."""
     for free in (False, True):
@@ -150,12 +152,41 @@ def test_filters_fit_the_window(format: SweepFormat):
         assert (drawn.along.sum(axis=1) == 0).all() is np.bool_(not free)
         assert 0 < max(np.abs(drawn.across).max(), np.abs(drawn.along).max()) <= bank.LARGEST
         np.testing.assert_allclose(np.linalg.norm(drawn.taps(), axis=(1, 2)), 1, atol=1e-5)
-        assert set(drawn.dilations) == {d for d in DILATIONS if 8 * d < format.window}
+        assert set(drawn.dilations) == set(bank.dilations(format.window))
         seen = (drawn.across != 0).sum(axis=1)
-        assert (seen.min(), seen.max()) == (1, format.channels)
-        assert len(drawn) * format.channels * TAPS <= bank.MOST_TAPS
+        assert seen.min() == 1
+        assert seen.max() > 0.9 * format.channels
+        assert len(drawn) * format.channels * TAPS <= bank.MOST_TAPS * (4 if format == MANY else 1)
         last = bank.stage(format, int(drawn.dilations.max()))
         assert (last.steps - 1) * last.hop + last.reach <= format.window
+
+
+@pytest.mark.parametrize(
+    ("window", "longest"), [(9, 1), (17, 2), (66, 8), (128, 8), (251, 16), (1500, 64), (8800, 512)]
+)
+def test_dilations_grow_with_the_window(window: int, longest: int):
+    """Every power of two up to the longest, whose filters fit; in long windows they span half."""
+    found = bank.dilations(window)
+    assert found == [2**k for k in range(len(found))]
+    assert found[-1] == longest
+    assert (TAPS - 1) * longest < window
+
+
+@pytest.mark.parametrize(
+    ("format", "filters", "stride"),
+    [
+        (SweepFormat(4, 4, 750.0, 1500, "uint8"), 256, 5),
+        (MANY, 204, 1),
+        (LONG, 512, 8),
+        (SweepFormat(40, 40, 50.0, 100, "uint8"), 64, 2),
+    ],
+    ids=str,
+)
+def test_filters_and_stride_follow_the_budgets(format: SweepFormat, filters: int, stride: int):
+    """Of taps, of multiply-accumulates and of responses; a large skin has four times of the
+    first two."""
+    assert bank.count(format) == filters
+    assert bank.stage(format, 1).stride == stride
 
 
 def test_thresholds_leave_the_shares_that_were_drawn():

@@ -44,9 +44,11 @@ def candidates(
     loads: Sequence[int] = (),
     grouped: bool = True,
     relations: Sequence[Sequence[int]] = ((),),
+    slow: Sequence[int] = (),
 ) -> Candidates:
     """The candidates of a trunk with these features."""
-    parts = [np.array(part, int) for part in (magnitudes, shares, levels, loads, relations, bands)]
+    views = magnitudes, shares, levels, loads, relations, slow, bands
+    parts = [np.array(part, int) for part in views]
     columns = FeatureColumns(*parts[:2], tuple(map(np.array, kinds)), *parts[2:])
     return Candidates(columns, copies, grouped)
 
@@ -100,6 +102,22 @@ def test_what_lies_in_another_group_is_not_chosen():
         sum(TRAP[0] in part.columns for part in chosen.plan.parts) <= 1
     )  # where the usual one sees the spectrum
     assert at.accuracy(chosen) > 0.9
+
+
+@pytest.mark.parametrize(("slow", "joins"), [(NOISE, True), (TRAP, False)])
+def test_slow_waves_join_unless_they_harm(slow: tuple[int, ...], joins: bool):
+    """They count as much as all other discriminants together. Noise does no harm and joins; what
+    misleads in two of three groups does not."""
+    given, parts = known(600)
+    rng, x = np.random.default_rng(1), given.features.copy()
+    x[:, GOOD] += 0.8 * rng.standard_normal((600, 2))
+    x[:, TRAP] += rng.standard_normal((600, 1))
+    at = HeldOutScores([replace(given, features=x, copied=x)] * 3, parts, 3)
+    *others, last = choice.choose(at, candidates([[0, 1]], GOOD, GOOD, slow=slow), print).plan.parts
+    assert (last.columns == slow) is joins
+    assert last.weight == (sum(part.weight for part in others) if joins else 1)
+    put_back = candidates([[0, 1]], GOOD, GOOD, slow=slow, copies=True)
+    assert not put_back.beside(put_back.usual())
 
 
 def test_what_is_clearly_better_is_chosen():

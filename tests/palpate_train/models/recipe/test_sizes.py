@@ -41,6 +41,7 @@ def test_a_fit_contains_at_most_its_size(name: str):
     assert size.filters is None or filters <= size.filters
     assert size.scales is None or found.relations <= size.scales
     assert size.distribution or not found.distribution
+    assert size.slow or not found.slow
     assert not found.channels
     assert made.about["validation"]["accuracy"] > 0.9
 
@@ -54,19 +55,21 @@ def test_filters_of_a_size_are_spread_evenly_over_each_kind():
         np.arange(40, 44),
         np.arange(44, 46),
         np.arange(46, 58).reshape(4, 3),
+        np.arange(60, 63),
         np.arange(58, 60),
     )
-    few = columns.limited(ModelSize(filters=4, scales=2, distribution=False))
+    few = columns.limited(ModelSize(filters=4, scales=2, distribution=False, slow=False))
     assert few.magnitudes.tolist() == [0, 3, 7, 11, 12, 14, 16, 19]
     assert few.shares.tolist() == [20, 23, 27, 31, 32, 34, 36, 39]
     assert [kind.tolist() for kind in few.kinds] == [[0, 1, 2, 3], [4, 5, 6, 7]]
     assert few.relations.tolist() == [[46, 47, 48], [49, 50, 51]]
+    assert not len(few.slow)
     assert (len(few.levels), few.loads.tolist(), few.bands.tolist()) == (0, [44, 45], [58, 59])
     assert few.filters()[few.magnitudes].tolist() == list(range(8))
     every = columns.limited(UNLIMITED)
     assert all(
         np.array_equal(getattr(every, name), getattr(columns, name))
-        for name in ("magnitudes", "shares", "levels", "loads", "relations", "bands")
+        for name in ("magnitudes", "shares", "levels", "loads", "relations", "slow", "bands")
     )
 
 

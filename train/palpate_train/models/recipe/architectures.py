@@ -64,7 +64,8 @@ class Architecture:
     the head sees the bands of spectrum.py after all other features. pools: pooling of the filter
     bank of bank.py: 0 without a bank, 1 by magnitudes, 2 by shares as well. distribution: whether
     the head sees the shares of distribution.py. loads: whether it sees those of loads.py.
-    relations: number of scales of relations.py that it sees. mains_hz: frequency of the mains, to
+    relations: number of scales of relations.py that it sees. slow: whether it sees the waves of
+    slow.py. mains_hz: frequency of the mains, to
     whose hum stages and spectrum do not respond.
     """
 
@@ -77,6 +78,7 @@ class Architecture:
     distribution: bool = False
     loads: bool = False
     relations: int = 0
+    slow: bool = False
     mains_hz: float = MAINS_HZ
 
     def stages(self, window: int) -> tuple[FilterStage, ...]:

@@ -26,17 +26,22 @@ from palpate_train.onnx_tools.graph_builder import FLOAT, MIDDLE, GraphBuilder
 from palpate_train.onnx_tools.quantize import PERCENTILE
 
 Array = NDArray[Any]
-TAPS, DILATIONS = 9, (1, 2, 4, 8, 16)
+TAPS, DILATED, PART = 9, 16, 16
+"""Taps of a filter in time. A dilation is at most DILATED or, in long windows, a PART of the
+window; the filters then span half of it."""
 MOST_FILTERS, LEAST_FILTERS = 512, 64
-MOST_TAPS = 36_864
-"""Largest number of taps of all filters of a kind: 256 filters of sixteen taxels, 512 of eight or
-fewer."""
+MOST_TAPS, MOST_MACS = 36_864, 12_000_000
+"""Largest number of taps of all filters of a kind (256 filters of sixteen taxels, 512 of eight or
+fewer), and of their multiply-accumulates for a window, from which the stride follows."""
+LARGE, MORE = 40, 4
+"""A skin of more channels than LARGE may have MORE times of both; the filters of fewer would be too
+few to see each part of it."""
 LARGEST, SPREAD = 8, 3.0
 """Largest factor of a taxel and of a frame, whose product is a tap of seven bits; deviation of the
 normal numbers that are rounded to such factors."""
-MOST_MACS, MOST_STEPS = 6_000_000, 256
-"""Largest number of multiply-accumulates of one kind, and of responses of a filter, for a window;
-the stride follows from them."""
+MOST_STEPS = 1024
+"""Largest number of responses of a filter for a window. The logarithm of a mean over few is
+noisy."""
 SHARES = (0.1, 0.9)
 """Range of the share of training responses above the threshold of a filter, which is drawn
 uniformly."""
@@ -86,7 +91,23 @@ class Bank:
 
 def count(format: SweepFormat) -> int:
     """Number of filters of one kind for `format`."""
-    return int(np.clip(MOST_TAPS // (format.channels * TAPS), LEAST_FILTERS, MOST_FILTERS))
+    most = _more(format) * MOST_TAPS // (format.channels * TAPS)
+    return int(np.clip(most, LEAST_FILTERS, MOST_FILTERS))
+
+
+def _more(format: SweepFormat) -> int:
+    return MORE if format.channels > LARGE else 1
+
+
+def dilations(window: int) -> list[int]:
+    """The dilations of filters for a window of this many frames: 1, 2, 4 and so on. Raises
+    FormatError if the window is shorter than a filter."""
+    if window < TAPS:
+        raise FormatError(
+            f"a window of {window} frames is too short for a filter; record at least {TAPS}"
+        )
+    most = min(max(DILATED, window // PART), (window - 1) // (TAPS - 1))
+    return [2**k for k in range(most.bit_length())]
 
 
 def draw(format: SweepFormat, rng: np.random.Generator, kinds: Sequence[bool]) -> Bank:
@@ -95,11 +116,7 @@ def draw(format: SweepFormat, rng: np.random.Generator, kinds: Sequence[bool]) -
 
     Raises FormatError if the window is shorter than a filter.
     """
-    fitting = [d for d in DILATIONS if (TAPS - 1) * d < format.window]
-    if not fitting:
-        raise FormatError(
-            f"a window of {format.window} frames is too short for a filter; record at least {TAPS}"
-        )
+    fitting = dilations(format.window)
     taxels, filters = format.channels, count(format)
     free = np.repeat(kinds, filters)
     across = np.rint(SPREAD * rng.standard_normal((len(free), taxels))).clip(-LARGEST, LARGEST)
@@ -158,7 +175,7 @@ def fitted(drawn: Bank, seen: Sequence[Array], rng: np.random.Generator) -> Bank
 def stage(format: SweepFormat, dilation: int) -> FilterStage:
     """The responses of a filter of this dilation."""
     macs = count(format) * format.channels * TAPS * format.window
-    stride = max(1, format.window // MOST_STEPS, -(-macs // MOST_MACS))
+    stride = max(1, format.window // MOST_STEPS, -(-macs // (_more(format) * MOST_MACS)))
     reach = (TAPS - 1) * dilation + 1
     return FilterStage(TAPS, stride, (format.window - reach) // stride + 1, reach, stride)
 

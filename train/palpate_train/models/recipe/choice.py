@@ -219,8 +219,8 @@ class FeatureColumns:
     """Numbers of the features of a trunk, by their source.
 
     magnitudes, shares: int [n], the two features of each filter. kinds: the filters of each kind,
-    zero-sum ones first. levels, loads, relations, bands: of the distribution, the loads, the
-    relations [scales, n] and the spectrum; may be empty.
+    zero-sum ones first. levels, loads, relations, slow, bands: of the distribution, the loads, the
+    relations [scales, n], the slow waves and the spectrum; may be empty.
     """
 
     magnitudes: Array
@@ -229,19 +229,20 @@ class FeatureColumns:
     levels: Array
     loads: Array
     relations: Array
+    slow: Array
     bands: Array
 
     @classmethod
     def of(cls, layout: Mapping[str, slice], free: Array, scales: int) -> FeatureColumns:
         """The columns of a trunk with this graph.layout. free: bool [n], of its filters. scales:
         number of scales of its relations."""
-        magnitudes, shares, levels, loads, relations, bands = (
+        magnitudes, shares, levels, loads, relations, slow, bands = (
             np.arange(layout[name].start, layout[name].stop) if name in layout else np.empty(0, int)
-            for name in ("magnitudes", "shares", "levels", "loads", "relations", "bands")
+            for name in ("magnitudes", "shares", "levels", "loads", "relations", "slow", "bands")
         )
         kinds = tuple(np.flatnonzero(free == kind) for kind in np.unique(free))
         by_scale = relations.reshape(max(scales, 1), -1)
-        return cls(magnitudes, shares, kinds, levels, loads, by_scale, bands)
+        return cls(magnitudes, shares, kinds, levels, loads, by_scale, slow, bands)
 
     def limited(self, size: ModelSize) -> FeatureColumns:
         """Only the features that a model of this size may see; of many filters evenly spaced
@@ -260,11 +261,12 @@ class FeatureColumns:
             kinds=tuple(np.searchsorted(numbers, kind) for kind in kept if len(kind)),
             levels=self.levels if size.distribution else self.levels[:0],
             relations=self.relations[: size.scales],
+            slow=self.slow if size.slow else self.slow[:0],
         )
 
     def filters(self) -> Array:
         """The filter [F] of each feature, -1 if it is not of a filter."""
-        views = (self.levels, self.loads, self.relations, self.bands)
+        views = (self.levels, self.loads, self.relations, self.slow, self.bands)
         every = (self.magnitudes, self.shares, *views)
         filters = np.full(1 + max(int(part.max(initial=-1)) for part in every), -1)
         for part in (self.magnitudes, self.shares):
@@ -364,6 +366,16 @@ class Candidates:
         alone = HeadPart(tuple(loads.tolist()), best[0].copies)
         return {"with loads beside": (*best, alone), "with loads in each": _with(best, loads)}
 
+    def beside(self, best: Heads) -> dict[str, Heads]:
+        """What joins the best candidate unless it makes it worse: a discriminant of the slow waves,
+        which counts as much as all others together. On a skin that is put back the waves move from
+        taxel to taxel."""
+        slow = self.columns.slow
+        if self.copies or not len(slow):
+            return {}
+        alone = HeadPart(tuple(slow.tolist()), best[0].copies, weight=sum(p.weight for p in best))
+        return {"with slow waves beside": (*best, alone)}
+
     def by_kind(self, shares: bool) -> Heads:
         """A discriminant of each kind of filters, zero-sum ones first: of their magnitudes, or of
         magnitudes and shares."""
@@ -401,6 +413,9 @@ def choose(scores: HeldOutScores, candidates: Candidates, log: Log) -> ScoredPla
         rivals += [score(*named) for named in heads.items()]
         best = min(rivals, key=scores.loss, default=chosen)
         chosen, rivals = best if accepts(scores.paired(best, chosen)) else chosen, []
+    for named in candidates.beside(chosen.plan.parts).items():
+        joined = score(*named)
+        chosen = chosen if scores.paired(joined, chosen).worse else joined
     return chosen
 
 

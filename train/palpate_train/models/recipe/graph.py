@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from onnx import helper
 
 from palpate.core.types import SweepFormat
-from palpate_train.models.recipe import bank, distribution, loads, relations, spectrum
+from palpate_train.models.recipe import bank, distribution, loads, relations, slow, spectrum
 from palpate_train.models.recipe.architectures import (
     FLOOR,
     NOISE_LIMIT,
@@ -88,6 +88,7 @@ def trunk_graph(
     parts += nodes.distribution(weights) if architecture.distribution else []
     parts += nodes.loads() if architecture.loads else []
     parts += nodes.relations() if architecture.relations else []
+    parts += nodes.slow() if architecture.slow else []
     parts += nodes.spectrum() if architecture.spectrum else []
     size = max(part.stop for part in layout(format, weights, architecture).values())
     g = nodes.g
@@ -102,7 +103,7 @@ def layout(
     format: SweepFormat, weights: Mapping[str, Array], architecture: Architecture
 ) -> dict[str, slice]:
     """The features of each part of a trunk, by name: `stages`, `magnitudes` and `shares` of the
-    bank, `levels` of the distribution, `loads`, `relations`, `bands`."""
+    bank, `levels` of the distribution, `loads`, `relations`, `slow`, `bands`."""
     filters = len(weights["bank.unit"]) if architecture.pools else 0
     counts = {
         "stages": sum(architecture.channels),
@@ -111,6 +112,7 @@ def layout(
         "levels": len(distribution.Levels.of(weights)) if architecture.distribution else 0,
         "loads": architecture.loads * loads.count(format),
         "relations": architecture.relations * relations.each(format),
+        "slow": architecture.slow * slow.count(format),
         "bands": architecture.spectrum * spectrum.count(format),
     }
     ends = np.cumsum(list(counts.values())).tolist()
@@ -202,6 +204,11 @@ class _TrunkNodes:
         """See relations.nodes."""
         given = self._format, self._scale, self._architecture.relations, self._prefixes
         return [relations.nodes(self.g, self.raw, self.attenuation, *given)]
+
+    def slow(self) -> list[str]:
+        """See slow.nodes."""
+        given = self._format, self._scale, self._architecture.mains_hz, self._prefixes
+        return [slow.nodes(self.g, self.raw, self.attenuation, *given)]
 
     def spectrum(self) -> list[str]:
         """See spectrum.nodes."""

@@ -52,6 +52,7 @@ from palpate_train.models.recipe import (
     distribution,
     graph,
     relations,
+    slow,
     spectrum,
     stage_heads,
 )
@@ -361,11 +362,11 @@ def pruned(fixed: Trunk, stages: Trunk | None, plan: HeadPlan) -> tuple[Trunk, H
     """Step 5: the trunk with only the features that discriminants of `plan` see, and the plan for
     it."""
     size, layout, used = sum(STAGES.channels) if stages else 0, fixed.layout(), plan.columns()
-    filters, shares, levels, loads, related, bands = (
+    filters, shares, levels, loads, related, waves, bands = (
         used[(used >= size + part.start) & (used < size + part.stop)] - size - part.start
         for part in (
             layout.get(k, slice(0, 0))
-            for k in ("magnitudes", "shares", "levels", "loads", "relations", "bands")
+            for k in ("magnitudes", "shares", "levels", "loads", "relations", "slow", "bands")
         )
     )
     architecture = replace(
@@ -374,6 +375,7 @@ def pruned(fixed: Trunk, stages: Trunk | None, plan: HeadPlan) -> tuple[Trunk, H
         distribution=len(levels) > 0,
         loads=len(loads) > 0,
         relations=len(related) // relations.each(fixed.sweeps.format),
+        slow=len(waves) > 0,
         spectrum=len(bands) > 0,
     )
     weights = dict(stages.weights) if stages else {}
@@ -433,6 +435,7 @@ def fixed_trunk(sweeps: Dataset, seed: int, mains_hz: float = MAINS_HZ) -> Trunk
         distribution=True,
         loads=True,
         relations=relations.scales(format),
+        slow=slow.count(format) > 0,
         mains_hz=mains_hz,
     )
     kinds = (False,) if architecture.zero_sum(format.window) else (False, True)
@@ -481,6 +484,7 @@ def describe(trunk: Trunk, plan: HeadPlan) -> str:
     words += ["loads"] * trunk.architecture.loads
     scales = trunk.architecture.relations
     words += [f"relations at {scales} scales"] * (scales > 0)
+    words += ["slow waves"] * trunk.architecture.slow
     words += ["spectrum"] * trunk.architecture.spectrum
     words += [f"stages of {', '.join(map(str, channels))} channels"] * (len(channels) > 0)
     copied = sum(part.copies for part in plan.parts)

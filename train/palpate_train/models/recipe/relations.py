@@ -40,7 +40,7 @@ NEARLY_ONE = 0.99
 def scales(format: SweepFormat) -> int:
     """Number of scales: the signal itself and lags up to a quarter of the window. 0 if there is
     only one channel, or if the window has fewer frames than early answers."""
-    if len(_cells(format)) < 2 or format.window < PREFIXES:
+    if len(cells(format)) < 2 or format.window < PREFIXES:
         return 0
     return 1 + sum(lag <= format.window // 4 for lag in LAGS)
 
@@ -48,7 +48,7 @@ def scales(format: SweepFormat) -> int:
 def each(format: SweepFormat) -> int:
     """Number of features of one scale: a deviation for each channel, a correlation for each
     pair."""
-    size = len(_cells(format))
+    size = len(cells(format))
     return size + size * (size - 1) // 2
 
 
@@ -66,11 +66,8 @@ def nodes(
     rows = PREFIXES if prefixes else 1
     length = format.window // PREFIXES
     hop = _hop(length, format.window)
-    x = g("Mul", g("Cast", raw, to=FLOAT), g("Mul", attenuation, g.constant(scale)))
-    cells = _cells(format)
-    if len(cells) < cells.shape[1]:
-        x = g("MatMul", x, g.constant(cells.T / cells.sum(axis=1)))
-    size, steps = len(cells), length * PREFIXES // hop
+    x = celled(g, raw, attenuation, format, scale)
+    size, steps = len(cells(format)), length * PREFIXES // hop
     changes = _changes(g, x, length * PREFIXES, hop, size, used)
     parts = g("Reshape", changes, g.constant([used, rows, steps // rows, size], "int64"))
     squares = g("MatMul", g("Transpose", parts, perm=[0, 1, 3, 2]), parts)
@@ -83,6 +80,16 @@ def nodes(
     features = _relations(g, squares, means, size)
     features = g("Transpose", features, perm=[1, 0, 2])
     return g("Reshape", features, g.constant([1, rows, used * each(format)], "int64"))
+
+
+def celled(g: GraphBuilder, raw: str, attenuation: str, format: SweepFormat, scale: float) -> str:
+    """Raw counts [1, T, M] and the factor of each [1, 1, M] -> scaled counts [1, T, k], averaged
+    over each of `cells`."""
+    x = g("Mul", g("Cast", raw, to=FLOAT), g("Mul", attenuation, g.constant(scale)))
+    belongs = cells(format)
+    if len(belongs) < belongs.shape[1]:
+        x = g("MatMul", x, g.constant(belongs.T / belongs.sum(axis=1)))
+    return x
 
 
 def _relations(g: GraphBuilder, squares: str, means: str, size: int) -> str:
@@ -133,7 +140,7 @@ def _hop(length: int, window: int) -> int:
     return next(n for n in range(min(fewest, length), length + 1) if length % n == 0)
 
 
-def _cells(format: SweepFormat) -> NDArray[np.float64]:
+def cells(format: SweepFormat) -> NDArray[np.float64]:
     """Ones where a channel belongs to a cell of the skin [k, M]; each channel is one cell if there
     are at most MOST_CHANNELS."""
     rows, cols, axes = format.rows, format.cols, format.axes

@@ -16,7 +16,7 @@ class ModelSize:
     """The views of a size; every size has the spectrum.
 
     about: its content in words. filters: most filters of each kind; scales: most scales of the
-    relations; None for no limit. distribution, stages, loads: whether they may join.
+    relations; None for no limit. distribution, stages, loads, slow: whether they may join.
     """
 
     about: str = "all views"
@@ -25,12 +25,13 @@ class ModelSize:
     distribution: bool = True
     stages: bool = True
     loads: bool = True
+    slow: bool = True
 
 
 SIZES = {
-    "bands": ModelSize("the spectrum", 0, 0, False, False),
+    "bands": ModelSize("the spectrum", 0, 0, False, False, slow=False),
     "pairs": ModelSize(
-        "the spectrum and relations of few scales", 0, relations.SHORT, False, False
+        "the spectrum and relations of few scales", 0, relations.SHORT, False, False, slow=False
     ),
     "64": ModelSize(
         "64 filters of each kind, the spectrum and relations of few scales",
@@ -38,9 +39,14 @@ SIZES = {
         relations.SHORT,
         False,
         False,
+        slow=False,
     ),
     "stages": ModelSize(
-        "the spectrum, relations of few scales and trained stages", 0, relations.SHORT, False
+        "the spectrum, relations of few scales and trained stages",
+        0,
+        relations.SHORT,
+        False,
+        slow=False,
     ),
     "256": ModelSize("256 filters of each kind and all views in closed form", 256, stages=False),
 }

@@ -69,7 +69,7 @@ def nodes(
             perm=[0, 2, 1],
         )
     x = g("Reshape", x, g.constant([SEGMENTS * axes, length], "int64"))
-    x = g("MatMul", x, _wave_nodes(g, length, mains(format, mains_hz)))
+    x = g("MatMul", x, wave_nodes(g, length, mains(format, mains_hz), length + 1))
     power = g("MatMul", g("Mul", x, x), _averaging_nodes(g, _edges(length)))
     if axes > 1:
         power = g("Reshape", power, g.constant([SEGMENTS, count(format)], "int64"))
@@ -115,16 +115,17 @@ def _window(length: int) -> Array:
     return scaled
 
 
-def _wave_nodes(g: GraphBuilder, length: int, mains: float) -> str:
-    """Nodes that compute the waves. onnxruntime folds them into one constant when it loads the
-    model, so that the file does not hold them."""
+def wave_nodes(g: GraphBuilder, length: int, mains: float, end: int) -> str:
+    """Nodes that compute the waves [length, 2 * (end - 2)] of 2 to `end` - 1 half periods: cosines,
+    then sines, tapered and orthogonal to offset and mains. onnxruntime folds them into one constant
+    when it loads the model, so that the file does not hold them."""
     one = g.constant(1, "int64")
     n = g(
         "Unsqueeze",
         g("Range", g.constant(0, "int64"), g.constant(length, "int64"), one),
         g.constant([1], "int64"),
     )
-    k = g("Range", g.constant(2, "int64"), g.constant(length + 1, "int64"), one)
+    k = g("Range", g.constant(2, "int64"), g.constant(end, "int64"), one)
     phase = g(
         "Cast", g("Mod", g("Mul", n, k), g.constant(2 * length, "int64")), to=TensorProto.FLOAT
     )
@@ -139,7 +140,7 @@ def _wave_nodes(g: GraphBuilder, length: int, mains: float) -> str:
 
 def _averaging_nodes(g: GraphBuilder, edges: Array) -> str:
     """Nodes that compute the matrix that averages squares over each band; folded like those of
-    `_wave_nodes`."""
+    `wave_nodes`."""
     k = g("Range", *(g.constant(n, "int64") for n in (2, int(edges[-1]), 1)))
     k = g("Unsqueeze", g("Concat", k, k, axis=0), g.constant([1], "int64"))
     below, beyond = (g("Less", k, g.constant(side, "int64")) for side in (edges[:-1], edges[1:]))
