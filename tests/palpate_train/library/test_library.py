@@ -140,6 +140,13 @@ def test_a_bundle_answers_with_the_boxs_code(fitted: PalpateClassifier, tmp_path
     ):
         if verdict.label:
             assert found.max() == pytest.approx(verdict.probability)
+    want = box.predict_proba(SWEEPS[36:])
+    for form in FORMS.values():
+        np.testing.assert_array_equal(box.predict_proba(form(SWEEPS[36:].astype("i2"))), want)
+    for x, why in REFUSED.values():
+        if 0 not in getattr(x, "shape", ()):
+            with pytest.raises(ValueError, match=f"{why}|holds|inf|objects|grid|impossible"):
+                box.predict(x)
     with pytest.raises(FormatError, match="takes 2x2 uint8"):
         box.predict(SWEEPS[36:, :, :50])
     with pytest.raises(FormatError, match="no uint8"):

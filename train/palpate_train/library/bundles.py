@@ -43,8 +43,8 @@ class BundleClassifier:
     def predict_proba(self, x: Any) -> Array:
         """The probability of each material, float64 [n, K]; NaN for a sweep that the box does not
         score."""
-        found = np.full((len(x), len(self.classes_)), np.nan)
-        for i, verdict in enumerate(self.verdicts(x)):
+        found = np.full((len(given := self.verdicts(x)), len(self.classes_)), np.nan)
+        for i, verdict in enumerate(given):
             if len(verdict.scores):
                 found[i] = verdict.scores
         return found
