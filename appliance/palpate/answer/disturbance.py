@@ -26,18 +26,13 @@ NAMES = ("noise", "load", "speed", "lost", "hum")
 passes in a second. lost: share of the frames that never arrived. hum: square root of the amplitude
 that was removed, in counts; large hum moves the embedding hardly further than small hum."""
 SAID = {
-    ("noise", 1): "more noise",
-    ("noise", -1): "less noise",
-    ("load", 1): "a higher load",
-    ("load", -1): "a lower load",
-    ("speed", 1): "a faster slide",
-    ("speed", -1): "a slower slide",
-    ("lost", 1): "more lost frames",
-    ("lost", -1): "fewer lost frames",
-    ("hum", 1): "more hum",
-    ("hum", -1): "less hum",
+    "noise": ("less noise", "more noise"),
+    "load": ("a lower load", "a higher load"),
+    "speed": ("a slower slide", "a faster slide"),
+    "lost": ("fewer lost frames", "more lost frames"),
+    "hum": ("less hum", "more hum"),
 }
-"""Disturbances in messages, by name and direction."""
+"""Disturbances in messages: a value that is too low, or too high."""
 ORDER = 4
 """Noise is measured in the fourth difference of the counts, in which the vibrations of a slide
 hardly appear: at a tenth of the rate it has a hundredth of the power that noise has."""
@@ -57,12 +52,10 @@ def noise(taxels: Counts) -> float:
         return -math.inf
     first = max(0, (frames - FRAMES) // 2)
     steps = counts[first : first + FRAMES].ravel()
-    with np.errstate(all="ignore"):  # float32 counts may be infinite
-        for _ in range(ORDER):
-            steps = steps[values:] - steps[:-values]
-        steps *= steps
-        squares = steps.reshape(-1, values)
-        powers = np.sort(shares(len(squares)).dot(squares))  # those that are not finite are last
+    for _ in range(ORDER):
+        steps = steps[values:] - steps[:-values]
+    squares = (steps * steps).reshape(-1, values)
+    powers = np.sort(shares(len(squares)).dot(squares))  # those that are not finite are last
     middle = float(powers[(values - 1) // 2]) + float(powers[values // 2])
     power = middle / 2 / math.comb(2 * ORDER, ORDER)
     return math.log(max(power, TINY)) if math.isfinite(power) else math.log(TINY)
@@ -139,7 +132,7 @@ class Allowance:
         furthest = self.end if self.tried is None else self.tried
         if not self._way * (value - furthest) > 0:
             return ""
-        return f"{SAID[self.of, self._way]} than was tried with this bundle"
+        return f"{SAID[self.of][self._way > 0]} than was tried with this bundle"
 
 
 @dataclass(frozen=True, slots=True)

@@ -165,8 +165,7 @@ class SlideMeter:
         # four times as fast as sum(axis=1)
         summed = np.einsum("tev->tv", counts.reshape(self._frames, self._each, -1))
         parts = self._waves(summed).T.copy()
-        with np.errstate(over="ignore", invalid="ignore"):
-            power = np.vecdot(parts, parts)
+        power = np.vecdot(parts, parts)
         if not math.isfinite(power.max()):
             power[~np.isfinite(power)] = 0
         silent = power <= SILENT * power.max()
@@ -248,8 +247,7 @@ def _busiest(taxels: Array, shape: tuple[int, int]) -> Array:
     """The block of `shape` of frames [T, R, C] whose counts change most, judged by 64 frames. A
     loud taxel counts like the median of those that change."""
     some = taxels[:: max(1, len(taxels) // 64)].astype(np.float64)
-    with np.errstate(over="ignore", invalid="ignore"):
-        moving = np.nan_to_num(some.std(axis=0), posinf=0)
+    moving = np.nan_to_num(some.std(axis=0))
     if moving.any():
         moving = np.minimum(moving, np.median(moving[moving > 0]))
     total = np.pad(moving, ((1, 0), (1, 0))).cumsum(axis=0).cumsum(axis=1)

@@ -70,11 +70,10 @@ def vibration(taxels: Counts, tare: Array, parts: int = PARTS) -> Array:
     series = window.counts[: parts * each].reshape(parts, each, -1)
     offset = normal(window.first.reshape(tare.shape) - tare, 0)
     every = shares(offset.size)
-    with np.errstate(all="ignore"):  # float32 counts may be infinite
-        means, flat = shares(each) @ series, series.reshape(parts, -1)
-        variance = np.vecdot(flat, flat) / series[0].size - np.vecdot(means, means * every)
-        load = np.abs(means.dot(every) + every.dot(offset.ravel()))
-        result: Array = 0.5 * np.log(np.maximum(variance, TINY)) - np.log(np.maximum(load, TINY))
+    means, flat = shares(each) @ series, series.reshape(parts, -1)
+    variance = np.vecdot(flat, flat) / series[0].size - np.vecdot(means, means * every)
+    load = np.abs(means.dot(every) + every.dot(offset.ravel()))
+    result: Array = 0.5 * np.log(np.maximum(variance, TINY)) - np.log(np.maximum(load, TINY))
     return result
 
 

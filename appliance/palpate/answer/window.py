@@ -17,7 +17,7 @@ TRIPLES = 100
 """Number of places in a stretch at which the noise is measured. More places take more time and
 change the result by less than a tenth."""
 WIDE = 100
-"""Frames that are computed side by side: numpy is slow with short rows."""
+"""Most frames in a row of an extreme."""
 
 
 class Window:
@@ -48,12 +48,9 @@ class Window:
     @cached_property
     def values(self) -> NDArray[np.float32]:
         """Counts [T, V] above the first frame: squares of large counts would round small vibrations
-        away."""
-        values: NDArray[np.float32] = self.series.astype(np.float32, order="C")
-        rows = self._wide(values)
-        with np.errstate(all="ignore"):  # float32 counts may be infinite
-            rows -= self.first[None].repeat(rows.shape[1] // len(self.first), axis=0).ravel()
-        return values
+        away. NaN throughout for a value that is not readable."""
+        first = self.first if self.readable else np.where(self.unreadable, np.nan, self.first)
+        return np.subtract(self.series, first, dtype=np.float32)
 
     @cached_property
     def counts(self) -> NDArray[np.float32]:
@@ -65,8 +62,7 @@ class Window:
     @cached_property
     def mean(self) -> NDArray[np.float64]:
         """Mean raw counts [V]."""
-        with np.errstate(all="ignore"):
-            above = shares(len(self)).dot(self.values)
+        above = shares(len(self)).dot(self.values)
         mean: NDArray[np.float64] = np.add(self.first, above, dtype=np.float64)
         return mean
 
@@ -81,12 +77,10 @@ class Window:
         return self._extreme(np.minimum)
 
     def _extreme(self, of: np.ufunc) -> Array:
-        extreme: Array = of.reduce(of.reduce(self._wide(self.series)).reshape(-1, len(self.first)))
+        """In long rows of several frames, because numpy is slow with short ones."""
+        rows = self.series.reshape(len(self) // math.gcd(len(self), WIDE), -1)
+        extreme: Array = of.reduce(of.reduce(rows).reshape(-1, self.series.shape[1]))
         return extreme
-
-    def _wide(self, series: Array) -> Array:
-        """Several frames of [T, V] as one row."""
-        return series.reshape(len(series) // math.gcd(len(series), WIDE), -1)
 
     @property
     def still(self) -> NDArray[np.bool_]:
@@ -125,10 +119,9 @@ class Window:
         if not places:
             return np.zeros(values, np.float32)
         triples = self.values[: places * step].reshape(places, step, values)
-        with np.errstate(all="ignore"):
-            second = triples[:, 0] + triples[:, 2]
-            second -= 2 * triples[:, 1]
-            noise: NDArray[np.float32] = shares(places).dot(np.abs(second))
+        second = triples[:, 0] + triples[:, 2]
+        second -= 2 * triples[:, 1]
+        noise: NDArray[np.float32] = shares(places).dot(np.abs(second))
         return noise
 
 
@@ -166,5 +159,4 @@ class Waves:
         """The amplitudes; not finite where a series is not."""
         half = self._even.shape[1]
         start, end = series[:half], series[: -half - 1 : -1].copy()  # long rows are quick to add
-        with np.errstate(all="ignore"):
-            return np.concatenate([self._even @ (start + end), self._odd @ (start - end)])
+        return np.concatenate([self._even @ (start + end), self._odd @ (start - end)])

@@ -296,17 +296,16 @@ class Classifier(Observer):
         """The verdict on a judged sweep."""
         sweep, scores, label, best, second = context.sweep, context.scores, "", 0.0, 0.0
         if len(scores):
-            order = np.argsort(-scores, kind="stable")  # the first of equal scores, as argmax does
-            label = self.bundle.manifest.labels[order[0]]
-            best, second = scores[order[:2]]
+            label = self.bundle.manifest.labels[scores.argmax()]
+            *_, second, best = sorted(scores.tolist())
         now = self._clock.now_ns()
         return Verdict(
             sweep=sweep.id,
             time_ns=now,
             status=context.status,
             label=label,
-            probability=float(best),
-            margin=float(best - second),
+            probability=best,
+            margin=best - second,
             scores=scores,
             fused=context.fused,
             lost=sweep.lost,

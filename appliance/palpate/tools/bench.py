@@ -30,7 +30,7 @@ from palpate.core.errors import BundleError
 from palpate.core.observer import Observer
 from palpate.core.provenance import commit, processor
 from palpate.core.statistics import wilson
-from palpate.core.types import Status, Sweep, SweepFormat, Verdict
+from palpate.core.types import Frames, Status, Sweep, SweepFormat, Verdict
 from palpate.inference.classifier import Classifier
 from palpate.inference.session import session
 from palpate.sim import devices, rig, script, skin
@@ -131,11 +131,15 @@ def _whole_way(format: SweepFormat, build: Build, seed: int) -> dict[str, Any]:
 
 
 def _inference(bundle: Bundle, references: Path, seed: int) -> dict[str, Any]:
-    """Times of the bundle, of its network in float, and of the paper's in int8, in turns."""
-    rng = np.random.default_rng(seed)
+    """Times of the bundle's network, of whole answers with it, of its network in float, and of the
+    paper's in int8, in turns."""
+    rng, classifier = np.random.default_rng(seed), Classifier(bundle, SystemClock())
     window = rng.integers(0, 256, bundle.golden[0].shape).astype(bundle.format.numpy_type)
+    times = np.arange(len(window))
+    sweep = Sweep(1, 0, 0, Status.OK, Frames(times, times, bundle.golden[0]))
     calls: dict[str, Callable[[], object]] = {}
-    calls["int8"] = partial(Classifier(bundle, SystemClock()).logits, window)
+    calls["int8"] = partial(classifier.logits, window)
+    calls["answer"] = partial(classifier, sweep)
     _make_references(references)
     for name in ("fp32", "paper_int8"):
         path = references / f"{name}.onnx"

@@ -32,6 +32,7 @@ def test_bench_writes_its_figures(tmp_path, monkeypatch, capsys):
     assert figures["frames_lost"] == 0
     assert figures["edge_to_sentence_ms"].keys() >= {"p50", "p99"}
     assert figures["inference_ms"]["int8"]["p50"] > 0
+    assert figures["inference_ms"]["answer"]["p50"] > 0
     assert figures["cold_start_s"] > 0
     assert figures["memory"] == {"seed": 2000}
     assert {"commit", "seed", "machine"} <= figures.keys()
