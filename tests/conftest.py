@@ -7,8 +7,6 @@ No test can hang: pytest-timeout fails a test after `timeout` of pyproject.toml 
 and a process that is stuck in C even then shows where and ends.
 """
 
-from __future__ import annotations
-
 import faulthandler
 import gc
 import os

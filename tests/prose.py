@@ -10,8 +10,6 @@ plain sentence with its subject first, a noun instead of "what ...", the noun ag
 "one", "is not a" instead of "is no", and one thought.
 """
 
-from __future__ import annotations
-
 import argparse
 import ast
 import math

@@ -1,7 +1,5 @@
 """Imports, the content of the wheel, the form of modules, tests and texts."""
 
-from __future__ import annotations
-
 import ast
 import functools
 import gc

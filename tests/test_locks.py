@@ -1,7 +1,5 @@
 """The locks: whatever `make` installs is in one of them with its hashes, and all of them agree."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from collections.abc import Iterable, Iterator

@@ -1,7 +1,5 @@
 """The written pages can be typed, wired and read, and the box holds them as one text."""
 
-from __future__ import annotations
-
 import re
 import shlex
 import sys

@@ -1,7 +1,5 @@
 """One rule over every place that raises an error: its message says what to do."""
 
-from __future__ import annotations
-
 import ast
 import inspect
 import re

@@ -1,7 +1,5 @@
 """The site holds every page, each link leads somewhere, references are of the code."""
 
-from __future__ import annotations
-
 import importlib.util
 import inspect
 import re

@@ -1,7 +1,5 @@
 """The tutorial's commands run as on the page, and print the lines that it shows."""
 
-from __future__ import annotations
-
 import os
 import re
 import shlex

@@ -1,7 +1,5 @@
 """The three distributions, installed from their wheels, in a folder with modules of the user."""
 
-from __future__ import annotations
-
 import ast
 import os
 import shutil

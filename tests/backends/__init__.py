@@ -4,8 +4,6 @@ tests/palpate/io/test_backends.py is the contract of Sensor, Trigger, Lines and 
 runs over every backend.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from contextlib import AbstractContextManager

@@ -4,8 +4,6 @@ It needs a process under umockdev-wrapper, and runs in real time. It offers the 
 GPIO chip and a pseudo-terminal.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace

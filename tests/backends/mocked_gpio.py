@@ -5,8 +5,6 @@ from it, as it does with the kernel. A full pipe drops its oldest event, as the 
 but after 1360 events instead of 1024.
 """
 
-from __future__ import annotations
-
 import errno
 import os
 import struct

@@ -1,7 +1,5 @@
 """A USB socket over umockdev: usbfs ioctls and uevents of a simulated board, below real libusb."""
 
-from __future__ import annotations
-
 import errno
 import struct
 import time

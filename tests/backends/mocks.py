@@ -4,8 +4,6 @@ They answer open, read and ioctl of this process. It needs `umockdev-wrapper` ar
 and Debian's python3-gi.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import shutil

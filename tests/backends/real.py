@@ -1,7 +1,5 @@
 """The shared part of backends in real time: the machine's clock and libraries."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from contextlib import ExitStack

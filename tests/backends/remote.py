@@ -5,8 +5,6 @@ Requests over a character device control the devices: JSON lines, one request, o
 capabilities, as in `can`. `reset` does not touch the cable.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import select

@@ -3,8 +3,6 @@
 Its serial line is a pseudo-terminal.
 """
 
-from __future__ import annotations
-
 import errno
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager

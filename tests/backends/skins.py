@@ -1,7 +1,5 @@
 """The skins that tests plug in: boards of the rig that number their frames in the raw counts."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import count, repeat

@@ -1,7 +1,5 @@
 """The serial line of backends without a serial port: a pseudo-terminal with a stable name."""
 
-from __future__ import annotations
-
 import os
 import select
 import tempfile

@@ -23,8 +23,6 @@ because it would hold pins 19 to 26. The far end is the header's second serial p
 serial tests are skipped, without a skin those of the sensor.
 """
 
-from __future__ import annotations
-
 import errno
 import os
 from collections.abc import Iterator

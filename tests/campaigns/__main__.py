@@ -6,8 +6,6 @@ Debian packages and wheels that it lacks. Its options are appended to the comman
 shows, so the last value counts.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import shutil

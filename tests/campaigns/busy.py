@@ -4,8 +4,6 @@
 endless loops.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections.abc import Sequence

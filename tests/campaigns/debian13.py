@@ -5,8 +5,6 @@ options go to pytest. The Debian with its virtual environment is kept in ~/.cach
 it takes some minutes and 6 GB. `build` brings it up to date and runs nothing.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import shlex

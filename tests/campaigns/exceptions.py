@@ -6,8 +6,6 @@ carried out. Each trigger must have exactly one answer, and a fault of the model
 must not end the program: `python -m tests.campaigns exceptions`.
 """
 
-from __future__ import annotations
-
 import argparse
 import logging
 import re

@@ -7,8 +7,6 @@ materials at four speeds in five sessions, 128 frames of 16 taxels in int16, 20 
 Options after `--` go to fit, such as `--split recording:0.9`.
 """
 
-from __future__ import annotations
-
 import argparse
 import resource
 import subprocess

@@ -9,8 +9,6 @@ delivered bundle, with `Store.install`. Bits of the signature's own file do not 
 ends, for example, may differ without changing the signature.
 """
 
-from __future__ import annotations
-
 import argparse
 import io
 import json

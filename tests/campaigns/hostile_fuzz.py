@@ -8,8 +8,6 @@ memory and a minute, after its trial. The result is the number of models that hu
 it, or exceeded the memory. Seed and number identify a model.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

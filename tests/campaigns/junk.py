@@ -5,8 +5,6 @@ with `ok`, and how many of these labels are wrong, for whole sweeps and with ear
 of two materials, or of none, is wrong under any label. Takes some minutes.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 from collections import Counter

@@ -5,8 +5,6 @@ versions.
 its build depends on the graphics card (docs/security.md).
 """
 
-from __future__ import annotations
-
 import subprocess
 from pathlib import Path
 

@@ -4,8 +4,6 @@
 picture names the bundle that it was taken with.
 """
 
-from __future__ import annotations
-
 import re
 import struct
 import subprocess

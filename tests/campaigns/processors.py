@@ -5,8 +5,6 @@ kind of processor that OpenBLAS knows and this one can imitate, with one thread 
 turn (`--all`: with both); options go to pytest.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -4,8 +4,6 @@ A simulated skin streams in real time, with the FIFO of a readout board, while s
 and each `fsync` takes as long as asked: `python -m tests.campaigns slow-disk`.
 """
 
-from __future__ import annotations
-
 import argparse
 import logging
 import os

@@ -5,8 +5,6 @@ Threads open requests that never end, and a browser orders sweeps meanwhile. The
 unless each sweep is started and answered.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import socket

@@ -9,8 +9,6 @@ With `--added N` each material in turn comes later, with N sweeps: into a bundle
 stays, as the box teaches it, and into a fit of all materials.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import tempfile

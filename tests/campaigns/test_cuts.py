@@ -1,7 +1,5 @@
 """Cuts: the disk after a kill or a loss of power at any moment; wrong programs are found."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import sys

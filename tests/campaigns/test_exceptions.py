@@ -1,7 +1,5 @@
 """Each trigger has one answer, whichever call of the loop fails: a part of the campaign."""
 
-from __future__ import annotations
-
 import pytest
 
 from tests.campaigns.exceptions import SCENES, campaign

@@ -6,8 +6,6 @@ tests/factories/emulated_machines.py) and fails without them; otherwise tests wi
 are skipped.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """The names that documents and CI use: targets of make, campaigns, studies."""
 
-from __future__ import annotations
-
 import importlib.util
 import re
 import subprocess

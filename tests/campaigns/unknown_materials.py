@@ -8,8 +8,6 @@ AUROC. Real fabrics: `--set $PALPATE_DATA/fabricslide/fabricslide.npz --only dir
 'force<=180'`, where sweeps of the last repetition test.
 """
 
-from __future__ import annotations
-
 import argparse
 import tempfile
 from dataclasses import dataclass

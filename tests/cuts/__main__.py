@@ -4,8 +4,6 @@ Prints a line for each command, and writes to build/cuts.jsonl a line for each c
 machine and the commit. The exit code is 1 if anything is wrong.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

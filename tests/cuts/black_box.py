@@ -5,8 +5,6 @@ beyond the sweep in progress.
 reports each sweep that it has kept. thread: it writes beside the loop, as the box does.
 """
 
-from __future__ import annotations
-
 import re
 import sys
 from pathlib import Path

@@ -6,8 +6,6 @@ entered. So a kill at call k leaves the disk as it is after call k-1 and before 
 delivers no signal while its seccomp filter is in use, so killed runs do without it.)
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

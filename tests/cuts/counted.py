@@ -6,8 +6,6 @@ the thread is the first to reach a number. THREAD 0 is the main thread; any othe
 writes to the disk.
 """
 
-from __future__ import annotations
-
 import ctypes
 import runpy
 import sys

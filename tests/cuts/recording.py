@@ -5,8 +5,6 @@ and a judge of losses beyond the sweep in progress.
 prints the sentences to the robot, and names the sweep that it is asked to discard.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import sys

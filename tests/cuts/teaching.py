@@ -6,8 +6,6 @@ lost a sweep or a decision; or that cannot be taught again. `python -m tests.cut
 ...` is `palpate` whose fit takes no time: its files are those of the packaged bundle.
 """
 
-from __future__ import annotations
-
 import shutil
 import sys
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """A folder as a value that can be compared, hashed, and written again."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import re

@@ -1,7 +1,5 @@
 """Raw counts of any type and any small grid, for properties that hold for all of them."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp

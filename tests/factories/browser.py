@@ -1,7 +1,5 @@
 """A real browser for the tests of pages, and the page that it shows."""
 
-from __future__ import annotations
-
 import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence

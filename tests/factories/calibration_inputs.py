@@ -1,7 +1,5 @@
 """Inputs of `fit_calibration` for tests, without augmented copies."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from palpate_train.answer.calibrate import CalibrationInputs

@@ -1,7 +1,5 @@
 """Invented contents of choice.json: a choice that reaches the target, and one that misses it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 Json = dict[str, Any]

@@ -1,7 +1,5 @@
 """Contacts on a skin of 4 x 4 taxels for tests: loads, frames and trained positions."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -4,8 +4,6 @@
 `make test` tries the others; `make test-all` tries these as well.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any
 

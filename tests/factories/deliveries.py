@@ -1,7 +1,5 @@
 """Deliveries of bundles for tests: keys, signed bundles, a store that trusts one signer."""
 
-from __future__ import annotations
-
 import atexit
 import shutil
 import subprocess

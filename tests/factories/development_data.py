@@ -1,7 +1,5 @@
 """Results for the page of development: a tactile, a simulated and a published test."""
 
-from __future__ import annotations
-
 from typing import Any
 
 SERIES = "GunPoint, published split"

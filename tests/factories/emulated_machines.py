@@ -7,8 +7,6 @@ needs no root and changes nothing outside that folder. With two arguments, FROM 
 the program that runs on each machine, this machine included.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import platform

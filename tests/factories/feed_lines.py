@@ -1,7 +1,5 @@
 """Lines of the feed as the box writes them (PROTOCOL.md, part 4), for an invented shift."""
 
-from __future__ import annotations
-
 from base64 import b64encode
 from typing import Any
 

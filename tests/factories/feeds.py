@@ -1,7 +1,5 @@
 """A feed on a virtual clock, and plain sockets that read it."""
 
-from __future__ import annotations
-
 import json
 import select
 import socket

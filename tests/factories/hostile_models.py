@@ -5,8 +5,6 @@ not models. onnx makes some of them. It refuses to write the others, so they are
 All declare the sweep of FORMAT as their input.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 

@@ -8,8 +8,6 @@ install in apt's cache, as from a mirror; `ready` has them installed. Changes on
 when it stops. A drop-in for the unit selects the simulated skin.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import platform

@@ -1,7 +1,5 @@
 """The scripts of systemd/ that run on the box at its install, run on this machine."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

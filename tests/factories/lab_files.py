@@ -1,7 +1,5 @@
 """Folders of recordings as laboratories keep them: simulated sweeps in CSV files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Modules that take long to import: a process of tests that runs none of theirs does without."""
 
-from __future__ import annotations
-
 from importlib import import_module
 from typing import Any
 

@@ -1,7 +1,5 @@
 """LeRobot: a Python that has it, stand-ins for its names elsewhere, and a feed for its plug-in."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib.util
 import json

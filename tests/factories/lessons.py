@@ -1,7 +1,5 @@
 """Folders of recorded sweeps to teach a box from."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -2,8 +2,6 @@
 louder.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

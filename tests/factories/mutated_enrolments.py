@@ -4,8 +4,6 @@ An attacker with the key of a box might sign them. There are two kinds of change
 mostly break the file, changes of arrays leave a readable file.
 """
 
-from __future__ import annotations
-
 import io
 import warnings
 from functools import cache

@@ -4,8 +4,6 @@ There are two kinds of change. Changes of bytes mostly break the file. Changes o
 readable file, which reaches the rules of the operators.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from random import Random

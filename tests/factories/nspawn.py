@@ -6,8 +6,6 @@ in half a second. Changes stay in memory and are lost at the end. The container 
 its limits of memory and processor are not enforced. It needs root.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -1,7 +1,5 @@
 """Browsers without a screen: plain connections to a page's server, and their bytes."""
 
-from __future__ import annotations
-
 import json
 import socket
 import ssl

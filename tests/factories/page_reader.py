@@ -1,7 +1,5 @@
 """Reads HTML: its visible text, its addresses and the tags that are not closed in order."""
 
-from __future__ import annotations
-
 from html.parser import HTMLParser
 
 VOID = {"meta", "br", "!doctype", "path", "use", "image", "input", "rect", "circle", "line"}

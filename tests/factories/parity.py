@@ -1,7 +1,5 @@
 """Sweeps of materials that are hard to distinguish, for comparisons of logits."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from palpate_train.data.sets import Dataset

@@ -3,8 +3,6 @@
 Its pure module runs in this Python, all of it under MicroPython.
 """
 
-from __future__ import annotations
-
 import json
 import platform
 import select

@@ -1,7 +1,5 @@
 """A page of a recording whose turns a test or a thread takes, and the requests of a browser."""
 
-from __future__ import annotations
-
 import json
 import threading
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Illegible parts of a page or picture in a browser, at several widths, light and dark."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The bridge to ROS 2 and a second node: two processes over loopback, in the Python with ROS 2."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -4,8 +4,6 @@ The four names accept the arguments of ROS 2's (github.com/ros2/launch, launch/a
 launch/substitutions) that the project uses. A launch file that uses more fails here.
 """
 
-from __future__ import annotations
-
 import runpy
 import sys
 from dataclasses import dataclass, field

@@ -3,8 +3,6 @@
 A board of the rig answers in a thread of this process.
 """
 
-from __future__ import annotations
-
 import os
 import select
 import tempfile

@@ -1,7 +1,5 @@
 """Settings for tests."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Simulated sweeps of a skin of 2x2 taxels with three axes."""
 
-from __future__ import annotations
-
 from palpate.sim import skin
 from palpate_train.data.sets import Dataset
 

@@ -1,7 +1,5 @@
 """The page of `palpate watch --web` without a box: a test writes the lines of its feed."""
 
-from __future__ import annotations
-
 import threading
 from typing import Any, Self
 

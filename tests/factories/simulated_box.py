@@ -2,8 +2,6 @@
 port.
 """
 
-from __future__ import annotations
-
 import os
 import select
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """The box's end of a serial line, played by a script, for tests of programs at the other end."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import select

@@ -1,8 +1,6 @@
 """Invented results of the study stress: six methods and a bundle under three corruptions, and
 under two pairs of them."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from palpate_train.evaluate import robustness

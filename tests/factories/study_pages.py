@@ -1,7 +1,5 @@
 """Pages of studies, drawn from results of a test or from those in docs/data."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Sweep sets in files, with materials that are easy to distinguish."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -5,8 +5,6 @@ simulated, in real time. PALPATE_SYSTEMD=1 makes the container (see nspawn.py) a
 Otherwise tests are skipped without a container.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 

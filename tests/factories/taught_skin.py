@@ -1,7 +1,5 @@
 """A serial skin that a robot slides over materials, and `palpate teach` beside it as a process."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import tempfile

@@ -4,8 +4,6 @@ On failure an AssertionError contains the text so far, and the process is killed
 for it forever.
 """
 
-from __future__ import annotations
-
 import os
 import select
 import subprocess

@@ -5,8 +5,6 @@ materials "a", "b" and "c" lie at (0, 0), (6, 0) and (0, 6). With several axes i
 axis.
 """
 
-from __future__ import annotations
-
 import io
 from collections.abc import Sequence
 from dataclasses import replace

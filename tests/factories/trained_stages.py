@@ -1,7 +1,5 @@
 """Fits with trained stages that take a second, whatever held-out sweeps ask for."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 

@@ -1,7 +1,5 @@
 """The Pico's readout without pins: bytes, order of reading, counters, FIFO, requests."""
 
-from __future__ import annotations
-
 import io
 import itertools
 

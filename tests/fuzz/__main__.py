@@ -6,8 +6,6 @@ crashes/ each input that broke a promise. New inputs are kept in build/fuzz/; th
 with them, also after an interruption.
 """
 
-from __future__ import annotations
-
 import argparse
 import re
 import resource

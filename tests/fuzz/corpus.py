@@ -4,8 +4,6 @@ bytes, the shortest first.
 So a change shows the added inputs, and no tool is needed to read them.
 """
 
-from __future__ import annotations
-
 from ast import literal_eval
 from collections.abc import Iterable
 from hashlib import sha256

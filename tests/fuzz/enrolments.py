@@ -4,8 +4,6 @@ leave the archive readable.
 The target raises an error if a promise is broken, as in `targets`.
 """
 
-from __future__ import annotations
-
 import io
 import zipfile
 from collections.abc import Callable

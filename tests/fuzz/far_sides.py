@@ -4,8 +4,6 @@ also seeds, and words of their formats.
 A target raises an error if a promise is broken, as in `targets`.
 """
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

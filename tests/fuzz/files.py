@@ -5,8 +5,6 @@ Each target writes the bytes to a folder and reads them. It raises an error if a
 as in `targets`.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import re

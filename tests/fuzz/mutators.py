@@ -3,8 +3,6 @@
 Each takes an input, a random generator and the fuzzer's own mutator, and returns another input.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import zlib

@@ -1,8 +1,6 @@
 """The seeds of each target and the words of its format, from the simulator, PROTOCOL.md, the board
 files and the default bundle."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable, Mapping, Sequence

@@ -6,8 +6,6 @@ bytes. It follows the skins' published layouts and shares no code with the codec
 an error if a promise is broken, as in `targets`.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import struct

@@ -4,8 +4,6 @@ A target raises an AssertionError if a promise is broken; any other error would 
 It depends on its bytes alone: its folder only holds files that it wrote itself.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import struct

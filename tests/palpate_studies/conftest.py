@@ -4,8 +4,6 @@ Neither reaches a box: a study publishes, and a peer is trained by studies alone
 their other tests.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

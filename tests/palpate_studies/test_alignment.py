@@ -1,7 +1,5 @@
 """The study `alignment`: answers to sweeps of a displaced skin, and its page."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """The costs that are counted in a graph: weights and multiply-accumulates."""
 
-from __future__ import annotations
-
 import numpy as np
 import onnx
 import pytest

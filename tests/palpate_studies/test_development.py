@@ -1,7 +1,5 @@
 """The study `development`: its runs, its cache, its omissions, and the figures of its page."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Means and differences of estimates, compared with known intervals."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """`python -m palpate_studies fabrics`: its tests, the results that it keeps, and its errors."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The README's picture shows an answer of the packaged bundle."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

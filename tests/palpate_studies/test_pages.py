@@ -1,7 +1,5 @@
 """Pages of results: each is sound, says where its figures are from, and can be read."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The paper's experiment: fused sweeps, counts of results, joined runs, and its page."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

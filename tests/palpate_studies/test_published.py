@@ -1,7 +1,5 @@
 """The published series of aeon: format, splits, and refusals without them."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The study `recipe`: the cost of views, the views of sets, and their table."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any

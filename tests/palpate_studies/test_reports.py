@@ -1,7 +1,5 @@
 """`python -m palpate_studies reports`: stale results and reasons, their commands, and failures."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

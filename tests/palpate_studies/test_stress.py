@@ -1,7 +1,5 @@
 """The study of corruptions: tasks of methods that count right answers under each of them."""
 
-from __future__ import annotations
-
 import json
 import pickle
 from dataclasses import dataclass, replace

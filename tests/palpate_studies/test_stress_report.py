@@ -1,7 +1,5 @@
 """The study `stress`: its page by the cost of each corruption, and the command."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

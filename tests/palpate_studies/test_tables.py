@@ -1,7 +1,5 @@
 """Tables of results in documents: all are written, between their markers, and nothing else."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

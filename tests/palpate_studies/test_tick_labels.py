@@ -1,7 +1,5 @@
 """Every tick label of every picture shows the value at the position of its tick."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from typing import Any
 

@@ -4,8 +4,6 @@
 that are missing on this machine.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import tempfile

@@ -4,8 +4,6 @@ controller does.
 It returns the answers of the box, with the material and the times of each touch.
 """
 
-from __future__ import annotations
-
 import queue
 import threading
 from collections.abc import Callable

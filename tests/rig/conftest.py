@@ -2,8 +2,6 @@
 counts of the report; otherwise they are skipped. `python -m tests.campaigns test-rig` sets it, and
 builds the box first."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

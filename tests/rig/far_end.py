@@ -1,7 +1,5 @@
 """The robot's end of the guest's serial port. Sentences that arrive have times of the guest."""
 
-from __future__ import annotations
-
 import socket
 import threading
 from pathlib import Path

@@ -7,8 +7,6 @@ controller that no driver of the guest claims: 24 MHz, 32 bits. It is read over 
 the guest (High Definition Audio Specification 1.0a, 3.3.22).
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable

@@ -7,8 +7,6 @@ the box's locked dependencies. It takes minutes and is the same for every commit
 person would, and a snapshot of the guest after its service has started.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import shutil

@@ -1,8 +1,6 @@
 """Support for tests that run inside the guest: a folder for its second disk, and controls outside
 that such tests can request (tests/backends/remote.py)."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterable
 from importlib.metadata import distribution

@@ -8,8 +8,6 @@ must be stored whole. Each run may lack the sweeps that were still being written
 The module also holds the log of a campaign of kills, which a later run continues.
 """
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess

@@ -5,8 +5,6 @@ All times are the guest's. The lines are a PL061 of QEMU's machine `virt`: input
 outputs watched through the qtest socket, and the guest's stock driver sees interrupts.
 """
 
-from __future__ import annotations
-
 import heapq
 import threading
 from collections.abc import Iterable, Sequence

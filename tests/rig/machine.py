@@ -6,8 +6,6 @@ of a run is kept: each run has a disk of its own on top of the image's, unless i
 into the image itself.
 """
 
-from __future__ import annotations
-
 import base64
 import json
 import shutil

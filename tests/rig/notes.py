@@ -1,7 +1,5 @@
 """The outcome of each injected fault: a line from each test in build/rig/faults.jsonl."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Callable

@@ -1,8 +1,6 @@
 """The skin's cable, pulled at a moment of a sweep. Each function takes a cell and the number of the
 attempt, and returns the status of the only answer."""
 
-from __future__ import annotations
-
 from tests.rig.cell import Cell
 from tests.rig.sound import begin, let_go, not_wrong, only_answer
 

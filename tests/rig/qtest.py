@@ -1,8 +1,6 @@
 """QEMU's qtest socket: sends commands of its protocol, returns the answers, and reports changes of
 intercepted outputs."""
 
-from __future__ import annotations
-
 import queue
 import socket
 import threading

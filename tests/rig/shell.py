@@ -1,8 +1,6 @@
 """Shell commands in the guest, run from outside through the port at which its agent listens
 (guest/agent.py)."""
 
-from __future__ import annotations
-
 import base64
 import json
 import select

@@ -4,8 +4,6 @@ The results are a record of each box with its sums, and exit code 1 if a target 
 process of its own records each box.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

@@ -6,8 +6,6 @@ as its serial line. soak_guest.py has the virtual box, with its skin, lines and 
 buses of the guest.
 """
 
-from __future__ import annotations
-
 import os
 import platform
 import re

@@ -5,8 +5,6 @@ The skin is on the guest's USB port, the robot drives its lines, and sentences c
 port, as on a real box. Only its use of memory is read inside the guest.
 """
 
-from __future__ import annotations
-
 import os
 import platform
 import re

@@ -4,8 +4,6 @@ targets.
 Nothing is read, started or timed here, so an invented record is judged like a real record.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence

@@ -4,8 +4,6 @@ touched.
 A failed check raises AssertionError with the log of the box.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 
 import numpy as np

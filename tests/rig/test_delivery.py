@@ -6,8 +6,6 @@ port of this machine. Out: which bundle answers the robot. The stages share the 
 come in their order.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import re

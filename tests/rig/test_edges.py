@@ -4,8 +4,6 @@ one answer each.
 Seen from the robot: statuses, READY, FAULT and the other lines, and a right sweep afterwards.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager

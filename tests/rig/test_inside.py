@@ -1,7 +1,5 @@
 """The contract of skin, lines and port inside the guest, on its real kernel."""
 
-from __future__ import annotations
-
 import re
 import threading
 from pathlib import Path

@@ -4,8 +4,6 @@ or disappears, a port that disappears, another program on it.
 Sentences resume without help, and until then sweeps are answered on the lines.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

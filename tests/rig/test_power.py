@@ -6,8 +6,6 @@ the contents of QEMU's memory, the disk's tables of newly written clusters, whic
 guest flushes. A cut therefore loses as much as a real disk's cache would.
 """
 
-from __future__ import annotations
-
 import random
 import shutil
 import subprocess

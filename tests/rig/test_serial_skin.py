@@ -6,8 +6,6 @@ that classifies, of one that records, and what `palpate check` says. The skin is
 into a terminal, which is the adapter's line.
 """
 
-from __future__ import annotations
-
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator

@@ -5,8 +5,6 @@ The service of a guest keeps its sweeps on small file systems. Sweeps are answer
 loss is logged once, and the box recovers without help.
 """
 
-from __future__ import annotations
-
 import base64
 import json
 import time

@@ -6,8 +6,6 @@ knows. The guest's kernel stamps edges with its own clock. The shortest of many 
 this clock to the board's, so edges can be compared with the times of the frames.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Nothing may hang, no answer may name a material that was not touched, and a work
 again without help.
 """
 
-from __future__ import annotations
-
 import socket
 from collections import Counter
 from collections.abc import Callable, Iterator

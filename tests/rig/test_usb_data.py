@@ -4,8 +4,6 @@ The answer to an affected sweep says so; an unaffected sweep is answered right; 
 used again without help.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ The kernel refuses some, libusb or the box others. The service neither dies nor 
 working skin streams afterwards.
 """
 
-from __future__ import annotations
-
 import struct
 from dataclasses import dataclass
 

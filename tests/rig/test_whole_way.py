@@ -1,7 +1,5 @@
 """The whole way on a real kernel: skin, edges, sentences, as a service on arm64."""
 
-from __future__ import annotations
-
 import statistics
 
 from palpate.bundle import bundle

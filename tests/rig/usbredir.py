@@ -6,8 +6,6 @@ guest's kernel to a device (messages as in usbredirproto.h of usbredir 0.13). A 
 answers, as it does on the simulated bus.
 """
 
-from __future__ import annotations
-
 import select
 import socket
 import struct

@@ -6,8 +6,6 @@ feed, the second `bridge tcp` on its line. Needs ROS 2 (python -m tests.campaign
 with other work: chrt -f 10 python -m tests.robots.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

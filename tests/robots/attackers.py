@@ -6,8 +6,6 @@ JSON with the number of connections and the answers that good peers got. All pee
 process of low priority. It pauses between its rounds, so it takes less than a core.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import random

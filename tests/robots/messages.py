@@ -6,8 +6,6 @@ The wheels were built elsewhere: their CMake files contain the paths of Python's
 on the machine that built them, and no prefix is set.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Writes the tables of docs/robots/README.md between their markers; other lines stay."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from pathlib import Path

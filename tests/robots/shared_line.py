@@ -4,8 +4,6 @@ The box's sentences are first read and timed here, with real-time priority if th
 then passed on. So a box with a bridge on its line is measured like a box without.
 """
 
-from __future__ import annotations
-
 import os
 import select
 from contextlib import suppress

@@ -10,8 +10,6 @@ are attached to the first; each of these four has hostile peers. Only boxes and 
 real-time priority, if that is allowed.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

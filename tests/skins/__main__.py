@@ -6,8 +6,6 @@ share of a core, lost frames and time to the answer, with the bundles of `way`. 
 all of them, then the page.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

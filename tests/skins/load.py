@@ -6,8 +6,6 @@ classifies one sweep after the other. Both run under real-time scheduling if tha
 other programs of the machine are not measured.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import signal

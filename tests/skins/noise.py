@@ -5,8 +5,6 @@ no wrong frames. A skin without a checksum cannot distinguish a changed number f
 number. Its promise is that lost and added bytes invent no frame.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Writes the tables of docs/skins.md from docs/data/skins.json, each between its markers."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any

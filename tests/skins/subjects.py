@@ -1,8 +1,6 @@
 """The skins that are measured: the profile, the emulator and numbered frames of a delivered
 profile."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import lru_cache
 

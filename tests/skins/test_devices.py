@@ -1,7 +1,5 @@
 """The box with an emulated skin: the recorded counts are the simulated ones."""
 
-from __future__ import annotations
-
 from itertools import islice
 from pathlib import Path
 

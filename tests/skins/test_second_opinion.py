@@ -4,8 +4,6 @@ played.
 The packages block while nothing comes, so each runs in a process of its own that is given a minute.
 """
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,8 +1,6 @@
 """The bytes of the emulated skins, compared with bytes put together by hand from the published
 layouts. None of the skins was available."""
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np

@@ -4,8 +4,6 @@ run.
 The result is the answers of the last command to sweeps at positions that no recording has.
 """
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

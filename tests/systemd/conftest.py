@@ -1,7 +1,5 @@
 """Tests that install on hosts in containers are thorough: the first install takes minutes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """The bridges' unit under a real systemd: off at first, hardened, with feed and line."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator

@@ -4,8 +4,6 @@ with a host's name alone. One host, one test after another: each begins where th
 It takes minutes, so it runs only with PALPATE_SYSTEMD=1.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -5,8 +5,6 @@ The skin is simulated. That takes minutes, so it runs only with PALPATE_SYSTEMD=
 the containers.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

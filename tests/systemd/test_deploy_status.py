@@ -1,7 +1,5 @@
 """A box whose status file cannot be read does not stop the delivery to it or to others."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

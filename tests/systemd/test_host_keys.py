@@ -1,7 +1,5 @@
 """Keys of boxes: stored at the first contact, refused with KNOWN=1, always refused when changed."""
 
-from __future__ import annotations
-
 import os
 import socket
 import subprocess

@@ -1,7 +1,5 @@
 """`make install` with a host's name alone: the board and the signer that it finds or makes."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Units under attack have room within their limits, and their networks are closed."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The list of all that the box carries: complete, and the same on the page."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """The unit under a real systemd: start, watchdog, restart, exit codes, stop, journal."""
 
-from __future__ import annotations
-
 import json
 import re
 import time

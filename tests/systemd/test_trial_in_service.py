@@ -4,8 +4,6 @@ candidate.
 Bundle A is deployed and committed; each test deploys another, B, signed and with a higher counter.
 """
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import io

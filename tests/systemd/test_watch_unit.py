@@ -1,7 +1,5 @@
 """The page's unit under a real systemd: off at first, hardened, with TLS and token."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from typing import Any

@@ -1,8 +1,6 @@
 """The command line of the box with emulators of makers' skins: `python -m
 tests.factories.skins.command record --sim skin --skin flexitac ...`."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from itertools import islice

@@ -1,8 +1,6 @@
 """A simulated robot whose skin is an emulated skin on a terminal, built from the name of its
 profile and acts."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace

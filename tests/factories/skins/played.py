@@ -1,7 +1,5 @@
 """Emulated skins on terminals that send numbered frames, by the name of a profile."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

@@ -4,8 +4,6 @@ fast as they are read.
 A link to the near end stands for the plug: it comes and goes.
 """
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import os

@@ -5,8 +5,6 @@ and noise here are round numbers that were not fitted. Such sweeps test the way 
 through the box. They do not show how well that skin distinguishes materials.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any

@@ -5,8 +5,6 @@ Sources are the readers and firmware published by makers and users, named at eac
 skins was available.
 """
 
-from __future__ import annotations
-
 import re
 import struct
 from collections.abc import Callable, Mapping, Sequence

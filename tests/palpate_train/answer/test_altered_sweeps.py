@@ -1,7 +1,5 @@
 """Disturbed copies of sweeps widen the shapes of known materials."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

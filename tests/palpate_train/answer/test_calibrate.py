@@ -1,7 +1,5 @@
 """Calibration: the effect of copies with faults, and everything that they must not change."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

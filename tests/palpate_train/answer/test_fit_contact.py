@@ -1,7 +1,5 @@
 """Contact limits and contact positions of a training set."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace

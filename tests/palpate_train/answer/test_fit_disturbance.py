@@ -1,7 +1,5 @@
 """Allowances for disturbances are found from altered copies."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

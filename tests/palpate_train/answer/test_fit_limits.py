@@ -1,7 +1,5 @@
 """The check of unknown materials in unfinished sweeps, and the limit of displaced ones."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The range of the measured speeds of a training set."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The least vibration of each material in training tells a slide from a rest."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The number of broken taxels that a bundle tolerates, by the classifier of the box."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The scatter of altered copies widens the shapes of materials where it does no harm."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Options of `fit` in a file: the words that it becomes, and its errors."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

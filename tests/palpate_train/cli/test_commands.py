@@ -1,7 +1,5 @@
 """The command palpate-train: options, messages and exit codes."""
 
-from __future__ import annotations
-
 import argparse
 import re
 import subprocess

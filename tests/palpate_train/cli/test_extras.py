@@ -1,7 +1,5 @@
 """palpate-train without its extras, and the messages about them."""
 
-from __future__ import annotations
-
 import ast
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """palpate-train import as users call it: the commands of its page, its report, its exit codes."""
 
-from __future__ import annotations
-
 import os
 import re
 import shlex

@@ -1,7 +1,5 @@
 """Progress: a bar on a terminal, erased at the end, and occasional lines in a log."""
 
-from __future__ import annotations
-
 import os
 import pty
 import subprocess

@@ -1,7 +1,5 @@
 """Augmented copies of raw counts: changes, invariants, and independence of PyTorch."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 
 import numpy as np

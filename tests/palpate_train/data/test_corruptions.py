@@ -1,7 +1,5 @@
 """Corruptions change one property, grow with their severity, and give the same for a seed."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -1,7 +1,5 @@
 """Patterns over file names: their fields, ambiguous names, texts that are no pattern."""
 
-from __future__ import annotations
-
 import pytest
 
 from palpate.core.errors import FormatError

@@ -268,7 +268,7 @@ def test_a_reading_that_cannot_be_is_named(value: float, shown: str):
         ({"grid": "4"}, "--grid 4"),
         ({"dtype": "int8"}, "--dtype int8"),
         ({"pattern": None}, "give --pattern"),
-        ({"fields": {"material": "l"}}, "or --variable"),
+        ({"fields": {"material": "l"}}, "--labels"),
     ],
 )
 def test_an_option_that_cannot_be_read_is_named(changes: dict, why: str):

@@ -1,7 +1,5 @@
 """Names of materials that the box cannot send are listed at once, and replaced."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,8 +1,6 @@
 """LeRobot data sets: episodes become recordings, tasks become materials; versions 2.1 and 3.0.
 Sets are written as version 3.0, and LeRobot reads them where it is installed."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

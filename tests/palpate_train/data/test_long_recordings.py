@@ -1,8 +1,6 @@
 """Means and deviations of float32 counts over many frames: float32 alone adds row after row, and
 the mean of half an hour at 50,000 counts would be off by 600."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Large sets are mapped: they are the same sets, and hardly any of them is held in memory."""
 
-from __future__ import annotations
-
 import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Progress of long work: share done and time left, as a line and as numbers."""
 
-from __future__ import annotations
-
 import pytest
 
 from palpate_train.data.progress import Progress, ProgressLine, spoken

@@ -5,8 +5,6 @@ The box is this machine: an `ssh` that hands its command to sh, with the real fi
 tar. One test uses a real sshd if openssh-server is installed.
 """
 
-from __future__ import annotations
-
 import getpass
 import io
 import json

@@ -1,7 +1,5 @@
 """HDF5, TactMat and recordings become sets; broken files are refused by name."""
 
-from __future__ import annotations
-
 import io
 import json
 import zlib

@@ -1,7 +1,5 @@
 """Sweeps that a set holds twice: copies, windows that share frames, and quiet skins."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Rates of recordings whose times repeat."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

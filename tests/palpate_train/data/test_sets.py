@@ -1,7 +1,5 @@
 """Sweep sets: refused sets and their messages, and groups that stay together."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Descriptions of sets: counts, losses, and reasons against training on them."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace

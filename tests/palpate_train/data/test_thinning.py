@@ -1,7 +1,5 @@
 """Fewer sweeps of a large set: of each material and recording alike."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Reductions: sweeps as a sensor with such settings gives them; good taxels stay."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

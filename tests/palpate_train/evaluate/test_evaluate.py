@@ -1,7 +1,5 @@
 """The grid of methods, protocols, folds and seeds: counts, cache, results for scripts."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError

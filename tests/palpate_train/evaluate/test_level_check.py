@@ -1,7 +1,5 @@
 """The check of the mean level: levels of sessions, levels of materials, odd sets."""
 
-from __future__ import annotations
-
 import re
 import warnings
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Counts under corruptions: joined over seeds, with intervals over attachments."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

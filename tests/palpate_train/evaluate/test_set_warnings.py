@@ -1,7 +1,5 @@
 """Warnings before an evaluation, and trivial baselines beside it."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

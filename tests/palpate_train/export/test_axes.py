@@ -1,7 +1,5 @@
 """A skin with three axes from a set to the box: fit, export, the same answers, replay."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Packing all precisions of a method, and the only way to time, size and weigh a model."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Every method becomes a bundle that the appliance runs with the answers of the desktop."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace

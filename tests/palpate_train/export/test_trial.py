@@ -1,7 +1,5 @@
 """A bundle holds the rules that pay on altered copies of its held-out sweeps and on junk."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

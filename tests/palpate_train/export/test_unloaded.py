@@ -1,7 +1,5 @@
 """A skin that reads thousands without contact, from its recording to the box."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The recipe with aeon's base class: aeon's own checks, and the answers of the other classifier."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The page of the library: its code runs from top to bottom, as a notebook."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Scoring a bundle: a set through the box's classifier, with interval and confusions."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from dataclasses import replace

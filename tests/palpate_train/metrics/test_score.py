@@ -1,7 +1,5 @@
 """Counting: intervals and fused windows."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

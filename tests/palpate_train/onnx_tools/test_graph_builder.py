@@ -1,7 +1,5 @@
 """Joined graphs: nodes that both have in common occur once, and each output keeps its bits."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

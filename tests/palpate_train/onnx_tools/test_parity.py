@@ -1,7 +1,5 @@
 """Float against int8: the difference of answers, and the loss of accuracy with its interval."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

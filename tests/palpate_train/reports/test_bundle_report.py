@@ -1,7 +1,5 @@
 """The report on a bundle: its figures are the box's answers, and the page holds all of them."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections import Counter

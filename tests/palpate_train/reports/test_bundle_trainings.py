@@ -1,7 +1,5 @@
 """Trainings for a report: learning curve, materials left out, joined sets."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

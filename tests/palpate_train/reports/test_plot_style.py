@@ -1,7 +1,5 @@
 """The style of all pictures: light and dark without a page, and titles of axes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from xml.etree import ElementTree
 

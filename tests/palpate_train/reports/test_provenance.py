@@ -1,7 +1,5 @@
 """The header of pages, pictures and results, with a warning for older figures."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The report of a choice of model: the same sentences on a page and in a terminal."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

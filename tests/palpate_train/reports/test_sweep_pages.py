@@ -1,7 +1,5 @@
 """The page to leaf through a set: the sweeps that it shows, its size, and its keys in a browser."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The picture of a sweep for every grid and length, the same in every run."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The choice of the smallest size within the budget, the accuracy to expect, and its page."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The assessment of a box: accuracy, confusion, wrong labels, and what to record next."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The sweeps that a box is taught from: omissions and completions."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

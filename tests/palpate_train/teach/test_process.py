@@ -1,7 +1,5 @@
 """`python -m palpate_train.teach` as a process: its imports, output, files and failures."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

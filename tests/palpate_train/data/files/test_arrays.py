@@ -1,7 +1,5 @@
 """HDF5 and NumPy: only the wanted array is read; named fields are columns."""
 
-from __future__ import annotations
-
 import json
 import tracemalloc
 from pathlib import Path

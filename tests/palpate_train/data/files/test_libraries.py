@@ -1,7 +1,5 @@
 """Formats that a library reads: spreadsheets, Parquet, TDMS, recordings of ROS."""
 
-from __future__ import annotations
-
 import sys
 from decimal import Decimal
 from pathlib import Path

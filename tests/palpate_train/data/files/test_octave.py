@@ -1,7 +1,5 @@
 """What Octave 7.3.0 writes: HDF5 with reversed axes, text with one number a line, ranges."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import h5py

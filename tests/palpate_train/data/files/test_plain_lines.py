@@ -1,7 +1,5 @@
 """What people and programs write around numbers is left out of lines that all have it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

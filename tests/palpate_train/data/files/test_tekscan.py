@@ -1,7 +1,5 @@
 """Tekscan's exports: movies as blocks of lines, with or without places that have no sensel."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

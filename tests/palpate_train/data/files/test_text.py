@@ -1,7 +1,5 @@
 """Text: each kind of table gives its numbers, or an error with line, cell and remedy."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

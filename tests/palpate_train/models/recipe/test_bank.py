@@ -1,7 +1,5 @@
 """The filter bank: graph by definition, float and int8, offsets, short windows."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

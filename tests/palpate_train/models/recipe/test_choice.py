@@ -1,7 +1,5 @@
 """Heads that add discriminants, and the choice among candidates by held-out parts."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The distribution of counts: its graph by definition, offsets, number of features."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Loads of taxels as features: their means, and the movements of the first and the last tenth."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The memory of a fit does not grow with the set; too much is refused first."""
 
-from __future__ import annotations
-
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """How taxels move together as features: log deviations and correlations over several lags."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The sizes of the recipe limit the content of a model."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
