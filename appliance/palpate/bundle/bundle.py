@@ -13,7 +13,7 @@ as `features`. All scaling is inside the graph. Its outputs by name:
   have covariance 1.
 
 Golden sweeps are test sweeps with the logits that were computed at export, or by the box at
-enrolment.
+enrolment, and where export refused one of them (`refusals`) with its status.
 
 Enrolment on a box does not change these files; it adds `enrolment.npz` (enrolled.py).
 """
@@ -23,7 +23,7 @@ from __future__ import annotations
 import errno
 import os
 import stat
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +48,7 @@ from palpate.bundle.manifest import (
 from palpate.bundle.onnx_check import check
 from palpate.core.errors import BundleError, TemporaryError, passes
 from palpate.core.names import LABEL
+from palpate.core.status import Status
 
 try:  # not from hashlib, which loads OpenSSL (4 MB) although Python has this function built in
     from _sha2 import sha256  # type: ignore[import-not-found,unused-ignore]
@@ -174,7 +175,7 @@ def from_files(files: Mapping[str, bytes], where: str) -> Bundle:
     Raises BundleError as `load`."""
     manifest = Manifest.parse(files[MANIFEST])
     model, golden = (_checked(files, manifest, name, where) for name in (MODEL, GOLDEN))
-    samples, logits = _golden(golden, manifest)
+    samples, logits, refusals = _golden(golden, manifest)
     classes = (
         _classes(_checked(files, manifest, MEANS, where), manifest) if manifest.known else None
     )
@@ -185,7 +186,8 @@ def from_files(files: Mapping[str, bytes], where: str) -> Bundle:
     )
     check.check(model, manifest, numbers, untrained, rank)
     text = files[MANIFEST]
-    made = Bundle(manifest, identity(text), model, samples, logits, classes, base=digest(text))
+    held = manifest, identity(text), model, samples, logits, classes
+    made = Bundle(*held, base=digest(text), golden_refusals=refusals)
     return (
         enrolled.applied(made, files[ENROLMENT], identity(files[ENROLMENT]))
         if ENROLMENT in files
@@ -205,14 +207,17 @@ def _checked(files: Mapping[str, bytes], manifest: Manifest, name: str, where: s
     return files[name]
 
 
-def golden_file(samples: NDArray[Any], logits: NDArray[Any]) -> bytes:
+def golden_file(samples: NDArray[Any], logits: NDArray[Any], refusals: Sequence[str] = ()) -> bytes:
     """The bytes of golden.npz for sweeps [G, T, R, C] or [G, T, R, C, A], packed by
-    `arrays.changes`, and their logits [G, K]."""
-    return arrays.packed(changes=arrays.changes(samples), logits=logits)
+    `arrays.changes`, and their logits [G, K]. refusals: as Bundle.golden_refusals."""
+    more = {"refusals": np.array([*refusals])} if any(refusals) else {}
+    return arrays.packed(changes=arrays.changes(samples), logits=logits, **more)
 
 
-def _golden(data: bytes, manifest: Manifest) -> tuple[NDArray[Any], NDArray[np.float32]]:
-    """Golden sweeps [G, T, R, C] or [G, T, R, C, A] and their logits [G, K]."""
+def _golden(
+    data: bytes, manifest: Manifest
+) -> tuple[NDArray[Any], NDArray[np.float32], tuple[str, ...]]:
+    """Golden sweeps [G, T, R, C] or [G, T, R, C, A], their logits [G, K] and refusals."""
     held = arrays.read(data, GOLDEN, "logits", "changes")
     samples, logits = arrays.summed(held["changes"], manifest.format, GOLDEN), held["logits"]
     if not len(samples):
@@ -222,7 +227,14 @@ def _golden(data: bytes, manifest: Manifest) -> tuple[NDArray[Any], NDArray[np.f
             f"{GOLDEN} holds logits {logits.shape} for {len(samples)} sweeps, "
             f"{len(manifest.labels)} labels; export the bundle again"
         )
-    return samples, logits.astype(np.float32)
+    refusals = held.get("refusals", np.array([], str))
+    known = refusals.dtype.kind == "U" and {*refusals.ravel().tolist()} <= {"", *map(str, Status)}
+    if not known or refusals.ndim != 1 or len(refusals) > len(samples):
+        raise BundleError(
+            f"{GOLDEN} holds refusals {refusals.dtype} {list(refusals.shape)}, where each of "
+            f"{len(samples)} sweeps has a status or none; export the bundle again"
+        )
+    return samples, logits.astype(np.float32), tuple(refusals.tolist())
 
 
 def _classes(data: bytes, manifest: Manifest) -> Classes:

@@ -48,7 +48,9 @@ class Bundle:
 
     id: see `bundle.identity`.
     model: the bytes of model.onnx.
-    golden: raw counts [G, T, R, C] or [G, T, R, C, A]; golden_logits: float32 [G, K].
+    golden: raw counts [G, T, R, C] or [G, T, R, C, A]; golden_logits: float32 [G, K];
+        golden_refusals: the status of each that export refused, "" for the others; () if there are
+        none.
     classes: the class means, None if the manifest has no `known`.
     added: labels that a box has enrolled, None if there are none. Manifest, golden sweeps and
         classes include them.
@@ -64,6 +66,7 @@ class Bundle:
     classes: Classes | None = None
     added: AddedLabels | None = None
     base: str = ""
+    golden_refusals: tuple[str, ...] = ()
 
     @property
     def enrolled(self) -> dict[str, int]:

@@ -222,10 +222,12 @@ class Classifier(Observer):
         """The result of `self_test` in words."""
         return f"{len(self.bundle.golden)} golden sweeps differ by {self.self_test():.2g}"
 
-    def self_test(self) -> float:
+    def self_test(self, *, checks: bool = True) -> float:
         """Run the golden sweeps; returns the largest difference of a probability.
 
-        Raises BundleError if a label differs or the difference is above GOLDEN_TOLERANCE.
+        Raises BundleError if a label differs or the difference is above GOLDEN_TOLERANCE, and with
+        `checks` if a sweep is refused that export did not refuse so: the network may be right where
+        numpy, which computes all checks, is not.
         """
         computed = softmax(np.stack([self.logits(g) for g in self.bundle.golden]))
         expected = softmax(self.bundle.golden_logits)
@@ -240,7 +242,28 @@ class Classifier(Observer):
             )
         if self._means:
             self._test_means(self._means)
+        for k, now in enumerate(self.refusals() if checks else ()):
+            before = next(iter(self.bundle.golden_refusals[k : k + 1]), "")
+            if now not in ("", before):
+                raise BundleError(
+                    f"golden sweep {k} is refused as {now}, at export {before or 'it was not'}: "
+                    "numpy computes otherwise on this machine; install the locked version"
+                )
         return worst
+
+    def refusals(self) -> list[str]:
+        """The status of each golden sweep of trained labels that the stages refuse, "" for one that
+        gets a label. The stream does not count: neither its tare nor its broken taxels."""
+        m, present, found = self.bundle.manifest, self._objects.present, []
+        taxels = TaxelWatch(m.format, m.thresholds, m.bridging, m.tare)
+        stages = [taxels, *(one for one in self._stages if one is not self.taxels)]
+        none = Frames.empty(m.format)
+        for golden in self.bundle.golden[: len(self.bundle.golden) - len(self.bundle.enrolled)]:
+            sweep = Sweep(0, 0, 0, Status.OK, none)
+            status = run(stages, Context(sweep, golden, m.tare, whole=True)).status
+            found.append("" if status.classified else str(status))
+        self._objects.present = present
+        return found
 
     def _test_means(self, means: ClassDistances) -> None:
         """Raises BundleError if the class means and the model's own logits give a golden sweep

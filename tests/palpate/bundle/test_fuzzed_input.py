@@ -230,7 +230,7 @@ BREAKS: dict[str, tuple[Any, str, Any]] = {
     "manifest: two lines": (manifest.json, "loads", broken_json),
     "manifest: golden sweeps of any shape": (
         *(bundle, "_golden"),
-        lambda data, manifest: (np.ones((1, 2, 3, 4)), None),
+        lambda data, manifest: (np.ones((1, 2, 3, 4)), None, ()),
     ),
     "manifest: something else is written": (bundle.Manifest, "json", lambda manifest: b"{}"),
     "recording: a time is lost": (

@@ -169,9 +169,8 @@ def test_it_judges_with_the_box_s_tare(side):
 
 def test_without_a_tare_each_bundle_has_its_own(side):
     """The candidate has another unloaded skin, which it uses until the robot sends a TARE."""
-    pair = side(
-        lambda b: replace(b, id="bbbbbbbb", manifest=replace(b.manifest, unloaded=(1e4,) * 4))
-    )
+    other = {"id": "bbbbbbbb", "golden_refusals": ("no-contact",) * 2}
+    pair = side(lambda b: replace(b, **other, manifest=replace(b.manifest, unloaded=(1e4,) * 4)))
     pair.judge(A)
     assert pair.shadow.agreement.pairs == {"a": {"(no-contact)": 1}}
     pair.tare = pair.current.tare = np.ones((2, 2))

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.answer import features
+from palpate.answer import features, vibration
 from palpate.answer.early import Early
 from palpate.answer.objects import fuse, softmax
 from palpate.bundle import bundle
@@ -95,6 +95,25 @@ def test_golden_sweeps_are_compared(default_bundle: Bundle):
         logits[:, label] = logits.max() + 9
         with pytest.raises(BundleError, match=r"\[\d"):
             box(replace(default_bundle, golden_logits=logits)).self_test()
+
+
+def test_a_machine_that_computes_the_checks_otherwise_is_refused(
+    default_bundle: Bundle, monkeypatch: pytest.MonkeyPatch
+):
+    """The network is right, and numpy finds no slide, as under a processor whose products of
+    float32 matrices are wrong: said by the self test, unless export refused the sweep just so. The
+    stream's tare and broken taxels do not count."""
+    it = box(default_bundle)
+    it.tare = it.tare + 200.0
+    assert it.self_test() < bundle.GOLDEN_TOLERANCE
+    monkeypatch.setattr(vibration, "vibration", lambda *given: np.full(vibration.PARTS, -99.0))
+    with pytest.raises(BundleError, match="no-slide"):
+        it.self_test()
+    assert it.self_test(checks=False) < bundle.GOLDEN_TOLERANCE
+    refused = ("no-slide",) * len(default_bundle.golden)
+    assert box(replace(default_bundle, golden_refusals=refused)).self_test() < 1
+    with pytest.raises(BundleError, match="no-slide"):
+        box(replace(default_bundle, golden_refusals=("stuck-taxel", "no-slide"))).self_test()
 
 
 def test_verdict_carries_what_is_known(default_bundle: Bundle):
@@ -243,7 +262,12 @@ def test_golden_sweeps_are_packed_without_loss(dtype: str, axes: int):
     samples[0] = np.cumsum(rng.integers(-2, 3, samples[0].shape), axis=0).astype(format.numpy_type)
     logits = rng.normal(size=(2, 4)).astype(np.float32)
     manifest = SimpleNamespace(format=format, labels=("a", "b", "c", "d"))
-    got, answers = bundle._golden(bundle.golden_file(samples, logits), manifest)
+    told = ("", "no-contact")
+    got, answers, refusals = bundle._golden(bundle.golden_file(samples, logits, told), manifest)
+    assert refusals == told
+    for wrong in (("\x1b[2J", ""), ("ok", "ok", "ok")):
+        with pytest.raises(BundleError, match="refusals"):
+            bundle._golden(bundle.golden_file(samples, logits, wrong), manifest)
     assert (got.tobytes(), got.dtype) == (samples.tobytes(), format.numpy_type)
     assert answers.tolist() == logits.tolist()
     smooth, plain = np.repeat(samples[:1], 2, axis=0), io.BytesIO()

@@ -328,7 +328,8 @@ def test_a_browser_that_is_too_old_says_so(browser: Any, recorded: RecordedPage)
     context = browser.new_context()
     context.route("**/parts.js", lambda route: route.fulfill(body="a ??== 1", content_type=JS))
     seen = BrowsedPage(context, recorded.page.server.address)
-    until(lambda: "too old" in seen.text("#banner"))
+    until(lambda: seen.page.is_visible("#banner"))
+    assert "too old" in seen.text("#banner")
     context.close()
 
 
@@ -363,8 +364,9 @@ def test_a_hidden_tab_lets_its_stream_go(browser: Any, recorded: RecordedPage):
     until(lambda: not recorded.page.server.queues, 30)
     seen.page.evaluate("window.show('visible')")
     until(lambda: len(recorded.page.server.queues) == 1)
-    recorded.sweep()
-    until(lambda: seen.text("#sweep-title").startswith("Sweep 9,"))
+    number = recorded.sweep()
+    until(lambda: seen.text("#sweep-title").startswith(f"Sweep {number},"))
+    assert not seen.errors
     context.close()
 
 

@@ -95,7 +95,7 @@ def test_golden_sweeps_are_rounded():
     data = contents.golden_file(content, golden)
     assert len(data) < 0.4 * len(bundle.golden_file(golden.samples, logits[:2]))
     arrays = SimpleNamespace(format=train.format, labels=train.materials)
-    samples, stored = bundle._golden(data, arrays)
+    samples, stored, _ = bundle._golden(data, arrays)
     usual = np.median(np.abs(np.diff(golden.samples, axis=1)))
     assert 0 < np.abs(samples - golden.samples).max() <= usual * contents.COARSEST / 2
     again = contents.run(

