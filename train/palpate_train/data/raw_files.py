@@ -87,6 +87,7 @@ MAGIC = {
     b"SQLite format 3": "a database; a recording of ROS 2 has the suffix .db3",
     b"TDSm": "a TDMS file; give it the suffix .tdms",
     b"\x93NUMPY": "an array of NumPy; give it the suffix .npy",
+    b"Octave-1": "in Octave's binary format; save it with -hdf5, -v7 or as text",
     b"MATLAB 5.0": "a MAT file; give it the suffix .mat",
     b"\xd0\xcf\x11\xe0": "an old file of Office; give it the suffix .xls, or export it as CSV",
 }
