@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from palpate.answer.pipeline import Context, Displacement, Refusal
 from palpate.answer.window import Window
 from palpate.core.errors import BundleError
+from palpate.core.status import Reason, Remark
 from palpate.core.types import Status, normal
 
 MOST_POSITIONS, MOST_MM = 1000, 1e6
@@ -199,5 +200,7 @@ class WithinReach:
     def apply(self, context: Context) -> Refusal | None:
         """Refuse a sweep that is too far off."""
         if context.displacement.mm > self._farthest_mm:
-            return Refusal(Status.UNKNOWN, f"named up to {self._farthest_mm:.1f} mm")
+            return Refusal(
+                Status.UNKNOWN, Remark(Reason.TOO_FAR, {"farthest_mm": self._farthest_mm})
+            )
         return None

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from palpate.answer.pipeline import Context, Refusal
 from palpate.answer.window import Counts, Window, shares
 from palpate.core.errors import BundleError
+from palpate.core.status import Reason, Remark
 from palpate.core.types import Status, normal
 
 Array = NDArray[Any]
@@ -127,12 +128,13 @@ class Allowance:
         beyond = self._way * (value - self.start)
         return min(beyond, abs(self.end - self.start)) if beyond > 0 else 0.0
 
-    def untried(self, value: float) -> str:
-        """A message if `value` is beyond what was tried, else ""."""
+    def untried(self, value: float) -> bool:
+        """Whether `value` is beyond what was tried."""
         furthest = self.end if self.tried is None else self.tried
-        if not self._way * (value - furthest) > 0:
-            return ""
-        return f"{SAID[self.of][self._way > 0]} than was tried with this bundle"
+        return self._way * (value - furthest) > 0
+
+    def __str__(self) -> str:
+        return SAID[self.of][self._way > 0]
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,11 +165,9 @@ class Disturbances:
         above = (a for a in self.allowances if a.of == name and a.end > a.start)
         return max((a.size(values.get(name, math.nan)) for a in above), default=0.0)
 
-    def untried(self, values: Mapping[str, float]) -> str:
-        """A message with the disturbances of a sweep that are beyond what export has tried, ""
-        without one."""
-        found = [a.untried(values.get(a.of, math.nan)) for a in self.allowances]
-        return ", ".join(filter(None, found))
+    def untried(self, values: Mapping[str, float]) -> list[str]:
+        """The disturbances of a sweep that are beyond what export has tried, in words."""
+        return [str(a) for a in self.allowances if a.untried(values.get(a.of, math.nan))]
 
     def growth(self, sizes: Sequence[float]) -> float:
         """Factor of the limit of known materials: that of the disturbance that allows most."""
@@ -203,4 +203,7 @@ class WasTried:
     def apply(self, context: Context) -> Refusal | None:
         """Refuse an untried disturbance."""
         untried = self._allowed.untried(context.disturbed)
-        return Refusal(Status.UNKNOWN, untried) if untried else None
+        if not untried:
+            return None
+        what = ", ".join(f"{one} than was tried with this bundle" for one in untried)
+        return Refusal(Status.UNKNOWN, Remark(Reason.UNTRIED, {"what": what}))

@@ -17,6 +17,7 @@ from palpate.answer.objects import softmax
 from palpate.answer.pipeline import Context, Refusal
 from palpate.answer.unknown import EarlyDistances, positive
 from palpate.core.errors import BundleError
+from palpate.core.status import Reason, Remark
 from palpate.core.types import Status
 
 
@@ -93,7 +94,7 @@ class EarlyNetwork:
         logits, *embedded = self._network(np.concatenate([taxels, rest]))
         context.logits = logits[step - 1]
         if not decides(softmax(logits[:step]), self._rule):
-            return Refusal(Status.UNSURE, "the rest of the sweep is needed")
+            return Refusal(Status.UNSURE, Remark(Reason.REST_NEEDED))
         if self._distances and not self._distances.known(embedded[0][:step])[-agree:].all():
             return Refusal(Status.UNKNOWN)
         return None

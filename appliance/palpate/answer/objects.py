@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.answer.pipeline import Context, Refusal
+from palpate.core.status import Reason, Remark
 from palpate.core.types import Status
 
 STRONG = 10.0
@@ -177,22 +178,22 @@ class ObjectSweeps:
         self.present = FusedSweeps(sweep.object, kept, sweep.id, sweep.stop_ns)
         fused = kept.probabilities
         context.scores = fused if votes else self.enrolled.decided(fused)
-        context.fused, context.detail = kept.sweeps, conflict
+        context.fused, context.remark = kept.sweeps, conflict
         context.final = 0 < self.rule.max_sweeps <= kept.sweeps
         return None
 
-    def _conflict(self, own: NDArray[np.float64], before: Evidence | None) -> str:
-        """A message if `own` [K] contradicts the sweeps `before`, "" if it can be fused with
+    def _conflict(self, own: NDArray[np.float64], before: Evidence | None) -> Remark | None:
+        """A remark if `own` [K] contradicts the sweeps `before`; None if it can be fused with
         them."""
         if not before or self.rule.conflict == "fuse":
-            return ""
+            return None
         fused = before.probabilities
         if not contradicts(own, fused):
-            return ""
+            return None
         label, before_it = (
             self._labels[int(self.enrolled.decided(p).argmax())] for p in (own, fused)
         )
-        return f"another object: {label} after {before_it}"
+        return Remark(Reason.ANOTHER_OBJECT, {"label": label, "before": before_it})
 
 
 class GivesNumbers:
@@ -203,7 +204,7 @@ class GivesNumbers:
         context.probabilities = softmax(context.logits)
         if not math.isnan(context.probabilities[0]):  # all are NaN or none
             return None
-        return Refusal(Status.UNKNOWN, "the model gives no number")
+        return Refusal(Status.UNKNOWN, Remark(Reason.NO_NUMBER))
 
 
 class Certain:
@@ -215,7 +216,7 @@ class Certain:
 
     def apply(self, context: Context) -> Refusal | None:
         """Refuse an uncertain answer."""
-        if context.scores.max() < self._least[bool(context.displacement.text)]:
+        if context.scores.max() < self._least[context.displacement.off]:
             status = Status.UNDECIDED if context.final else Status.UNSURE
-            return Refusal(status, context.detail)
+            return Refusal(status, context.remark)
         return None

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.answer.window import Window
+from palpate.core.status import Remark
 from palpate.core.types import Status, Sweep
 
 Array = NDArray[Any]
@@ -26,19 +27,24 @@ def _none() -> Array:
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """Why a sweep gets no label: its status, with the subject of the status in `detail`."""
+    """Why a sweep gets no label: its status, and a remark with the subject of the status."""
 
     status: Status
-    detail: str = ""
+    remark: Remark | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Displacement:
-    """The displacement of a contact from the trained positions: its length, and a description, for
-    example "moved 2.1 mm too far towards row 4"; 0 and "" for a contact in place."""
+    """The displacement of a contact from the trained positions: its length, and a description for
+    people, for example "moved 2.1 mm too far towards row 4"; 0 for a contact in place."""
 
     mm: float = 0.0
     text: str = ""
+
+    @property
+    def off(self) -> bool:
+        """Whether the contact is not in place."""
+        return self.mm > 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +60,7 @@ class Slide:
     speed_mm_s: float | None = None
     direction: str = ""
     height: float = 0.0
-    why: str = ""
+    why: str | None = None
     taxels_s: float = 0.0
 
 
@@ -65,12 +71,12 @@ class Context:
     taxels: raw counts [T, R, C] or [T, R, C, A], as the network gets them: broken taxels bridged,
     without hum. tare: raw counts [R, C] or [R, C, A] of the unloaded skin. whole: whether all
     frames of the window are there. mean: counts of the checked window, in the shape of a frame.
-    full: share of its counts at full scale. degraded: the broken taxels that were bridged, "" for
-    none. hum: amplitude that was removed, in counts. disturbed: values of the disturbances by name.
-    logits, embedding: [K], [r], of the network. probabilities: float64 [K], of this sweep. own: the
-    same, of a sweep that belongs to an object. scores: float64 [K], of all `fused` sweeps of the
-    object. after: as in Verdict. final: no further sweep of the object is wanted. status, detail:
-    of the answer.
+    full: share of its counts at full scale. degraded: the broken taxels that were bridged, None
+    for none. hum: amplitude that was removed, in counts. disturbed: values of the disturbances by
+    name. logits, embedding: [K], [r], of the network. probabilities: float64 [K], of this sweep.
+    own: the same, of a sweep that belongs to an object. scores: float64 [K], of all `fused` sweeps
+    of the object. after: as in Verdict. final: no further sweep of the object is wanted. status,
+    remark: of the answer.
     """
 
     sweep: Sweep
@@ -78,10 +84,10 @@ class Context:
     tare: Array
     whole: bool
     status: Status = Status.OK
-    detail: str = ""
+    remark: Remark | None = None
     mean: Array | None = None
     full: float = 0.0
-    degraded: str = ""
+    degraded: str | None = None
     hum: float = 0.0
     displacement: Displacement = Displacement()
     slide: Slide = Slide()
@@ -116,6 +122,6 @@ def run(stages: Sequence[Stage], context: Context) -> Context:
     """Let the stages look at a sweep in their order, up to the first that refuses it."""
     for stage in stages:
         if refusal := stage.apply(context):
-            context.status, context.detail = refusal.status, refusal.detail
+            context.status, context.remark = refusal.status, refusal.remark
             break
     return context

@@ -20,6 +20,7 @@ from palpate.answer.pipeline import Context, Refusal, Slide
 from palpate.answer.window import Counts, Waves, Window
 from palpate.core.directions import DIRECTIONS
 from palpate.core.errors import BundleError
+from palpate.core.status import Reason, Remark
 from palpate.core.types import Status, SweepFormat
 
 Array = NDArray[Any]
@@ -54,7 +55,6 @@ RATIO = 1.5
 """Least ratio of a peak to the next separate peak of its axis, and to the sum without a lag. The
 other axis is left out, because a pattern of straight ridges passes along both."""
 NO_PATTERN = "no pattern passes from taxel to taxel"
-STILL = f"{NO_PATTERN}, as with a finger that rests"
 NO_PITCH = "the distance between taxels is unknown; export with --pitch-mm"
 APART = 9
 """Peaks further apart than this many steps of the grid are separate."""
@@ -102,8 +102,8 @@ class SlideMeter:
     """Measures windows of one format on a skin with a known pitch. The tables are computed once.
 
     pitch_mm: distance between neighbouring taxels; None if unknown. why: the reason why no window
-    can be measured, "" if windows can be measured. slowest_mm_s, fastest_mm_s: range of
-    speeds; 0 where `why` is not empty.
+    can be measured, None if windows can be measured. slowest_mm_s, fastest_mm_s: range of
+    speeds; 0 where there is such a reason.
     """
 
     def __init__(self, format: SweepFormat, pitch_mm: float | None) -> None:
@@ -111,7 +111,7 @@ class SlideMeter:
         self._shape = min(format.rows, BLOCK), min(format.cols, BLOCK)
         seconds = min(format.window / format.rate_hz, LONGEST_S)
         slowest, fastest = LEAST_LAGS / seconds, min(MOST_LAGS, format.rate_hz)
-        self.why = ""
+        self.why: str | None = None
         if pitch_mm is None:
             self.why = NO_PITCH
         elif format.rows * format.cols < LEAST_TAXELS:
@@ -121,7 +121,7 @@ class SlideMeter:
                 f"a window of {seconds:.3g} s at {format.rate_hz:g} Hz is too short, or a frame "
                 "longer than the time from taxel to taxel"
             )
-        if self.why or pitch_mm is None:
+        if self.why is not None or pitch_mm is None:
             return
         self._pitch_mm = pitch_mm
         self.slowest_mm_s, self.fastest_mm_s = slowest * pitch_mm, fastest * pitch_mm
@@ -148,7 +148,7 @@ class SlideMeter:
     def __call__(self, taxels: Counts) -> Slide:
         """The slide in one window of raw counts [T, R, C] or [T, R, C, A] of the format; only the
         normal axis is used."""
-        if self.why:
+        if self.why is not None:
             return Slide(why=self.why)
         spectra = self._spectra(Window.of(taxels))
         if spectra is None:
@@ -268,7 +268,7 @@ class MeasureSlide:
     @property
     def able(self) -> bool:
         """Whether slides on this skin can be measured at all."""
-        return not self._meter.why
+        return self._meter.why is None
 
     def apply(self, context: Context) -> None:
         """Measure the slide."""
@@ -290,6 +290,6 @@ class ShowsPattern:
     def apply(self, context: Context) -> Refusal | None:
         """Refuse a sweep without a pattern. Bridged taxels move with their neighbours, which hides
         the pattern."""
-        if context.whole and not context.degraded and context.slide.height < self._least:
-            return Refusal(Status.NO_SLIDE, STILL)
+        if context.whole and context.degraded is None and context.slide.height < self._least:
+            return Refusal(Status.NO_SLIDE, Remark(Reason.NO_PATTERN))
         return None

@@ -48,26 +48,26 @@ class SlideCheck:
         # the height of a pattern does not depend on the pitch
         self._meter = SlideMeter(format, 1.0 if patterned else None)
 
-    def __call__(self, taxels: NDArray[Any]) -> str:
-        """The reason why a window of raw counts [T, R, C] or [T, R, C, A] is not a slide; "" if it
-        is one, or if that cannot be seen on this skin."""
+    def __call__(self, taxels: NDArray[Any]) -> str | None:
+        """The reason why a window of raw counts [T, R, C] or [T, R, C, A] is not a slide; None if
+        it is one, or if that cannot be seen on this skin."""
         load = np.abs(normal(taxels.mean(axis=0, dtype=np.float64) - self._tare, 0))
         if self._contact is not None:
             if load.max() < self._contact:
                 return f"no contact: the strongest taxel has {load.max():.1f} raw counts"
-            if why := only_taxel(load, self._contact):
+            if (why := only_taxel(load, self._contact)) is not None:
                 return why
         if self._least is not None and len(taxels) >= 2 * PARTS:
             rests = np.flatnonzero(vibration(taxels, self._tare) < self._least) + 1
             if len(rests):
                 where = " ".join(map(str, rests))
                 return f"the finger rests: hardly any vibration in part {where} of {PARTS}"
-        if self._meter.why:
-            return ""
+        if self._meter.why is not None:
+            return None
         slide = self._meter(taxels)
         if slide.height < CHANCE:
             return NO_SLIDE
-        return ""
+        return None
 
 
 class SlidesAmong:
@@ -77,22 +77,22 @@ class SlidesAmong:
     def __init__(self, format: SweepFormat) -> None:
         self._meter, self._heights = SlideMeter(format, 1.0), list[float]()
 
-    def __call__(self, taxels: NDArray[Any]) -> str:
+    def __call__(self, taxels: NDArray[Any]) -> str | None:
         """As SlideCheck."""
-        if self._meter.why:
-            return ""
+        if self._meter.why is not None:
+            return None
         height = self._meter(taxels).height
         if _patterned(self._heights) and height < CHANCE:
             return NO_SLIDE
         self._heights.append(height)
-        return ""
+        return None
 
-    def among(self, windows: Iterable[NDArray[Any]]) -> list[str]:
+    def among(self, windows: Iterable[NDArray[Any]]) -> list[str | None]:
         """The reason for each of these windows. They are judged by one another."""
         for taxels in windows:
-            self._heights.append(0.0 if self._meter.why else self._meter(taxels).height)
+            self._heights.append(0.0 if self._meter.why is not None else self._meter(taxels).height)
         skin = _patterned(self._heights)
-        return [NO_SLIDE if skin and one < CHANCE else "" for one in self._heights]
+        return [NO_SLIDE if skin and one < CHANCE else None for one in self._heights]
 
 
 def _patterned(heights: Sequence[float]) -> bool:
@@ -100,11 +100,11 @@ def _patterned(heights: Sequence[float]) -> bool:
     return len(heights) >= MANY and float(np.median(heights)) >= CLEAR
 
 
-def only_taxel(load: NDArray[np.float64], contact: float) -> str:
+def only_taxel(load: NDArray[np.float64], contact: float) -> str | None:
     """The reason if a single taxel of `load` [R, C] reaches `contact`, on a skin of FEW taxels or
-    more; "" else."""
+    more; None else."""
     loaded = np.argwhere(load >= contact)
     if len(loaded) != 1 or load.size < FEW:
-        return ""
+        return None
     row, column = loaded[0] + 1
     return f"only taxel {row}.{column} is loaded"

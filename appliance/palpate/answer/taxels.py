@@ -20,6 +20,7 @@ from palpate.answer.pipeline import Context, Refusal
 from palpate.answer.window import TRIPLES, Counts, Window
 from palpate.answer.window_check import Finding, WindowLimits, ceiling, enclosed, inspect
 from palpate.core.errors import BundleError
+from palpate.core.status import Reason, Remark
 from palpate.core.types import EPOCH_BITS, Frames, Status, SweepFormat, digitized, normal
 
 REACH = 2
@@ -338,7 +339,7 @@ class TaxelWatch:
         context.taxels, finding = self.repaired(context.window, context.tare)
         context.degraded, context.mean, context.full = finding.degraded, finding.mean, finding.full
         if finding.status is not Status.OK:
-            return Refusal(finding.status, finding.detail)
+            return Refusal(finding.status, finding.remark)
         return None
 
     def repaired(self, taxels: Counts, tare: NDArray[np.float64]) -> tuple[NDArray[Any], Finding]:
@@ -387,4 +388,4 @@ class TaxelWatch:
         contact = self._limits.contact
         stuck = contact is None or (load[broken.silent] >= contact).any()
         status = Status.STUCK_TAXEL if stuck else Status.DEAD_TAXEL
-        return Finding(status, places(broken.silent))
+        return Finding(status, Remark(Reason.TAXELS, {"taxels": places(broken.silent)}))

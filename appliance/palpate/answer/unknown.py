@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from palpate.answer.disturbance import Disturbances
 from palpate.answer.pipeline import Context, Refusal
 from palpate.core.errors import BundleError
+from palpate.core.status import Reason, Remark
 from palpate.core.types import Status
 
 Array = NDArray[np.float64]
@@ -318,8 +319,10 @@ class ClassDistances:
         logits = np.concatenate([trained + log_softmax(softened), logs[..., n:]], axis=-1)
         return np.asarray(logits, np.float32)
 
-    def novelty(self, embedding: NDArray[Any], disturbed: Mapping[str, float] = UNDISTURBED) -> str:
-        """A message with the distance to the nearest material if it is beyond the limit; "" for a
+    def novelty(
+        self, embedding: NDArray[Any], disturbed: Mapping[str, float] = UNDISTURBED
+    ) -> dict[str, Any] | None:
+        """The distance to the nearest label, and the limit, if it is beyond the limit; None for a
         known material.
 
         embedding: [r]. disturbed: values of the sweep's disturbances by name. Each material has
@@ -337,8 +340,8 @@ class ClassDistances:
         scaled = np.vecdot(away, away)
         k = int(scaled.argmin())
         if scaled[k] <= limit:
-            return ""
-        return f"squared distance {scaled[k]:.4g} from {self.labels[k]}, limit {limit:.4g}"
+            return None
+        return {"distance": float(scaled[k]), "label": self.labels[k], "limit": limit}
 
     def apart(self, embedding: NDArray[Any], others: NDArray[Any]) -> Array:
         """Half of the squared distance [n] of an embedding [r] from others [n, r], with the mean
@@ -369,13 +372,14 @@ class KnownMaterial:
 
     def apply(self, context: Context) -> Refusal | None:
         """Refuse an unknown material."""
-        off = bool(context.displacement.text and self._displaced)
+        off = context.displacement.off and self._displaced is not None
         means = self._displaced if off and self._displaced else self._means
         z = context.embedding
         context.logits = means.joined(context.logits, z)
         novelty = means.novelty(z, context.disturbed)
-        if not novelty:
+        if novelty is None:
             return None
         if not off and (alike := self._unknown.put(context.sweep.id, z)):
-            novelty += f"; as sweep {alike}"
-        return Refusal(Status.UNKNOWN, novelty)
+            again = Remark(Reason.UNLIKE_ALL_AGAIN, novelty | {"sweep": alike})
+            return Refusal(Status.UNKNOWN, again)
+        return Refusal(Status.UNKNOWN, Remark(Reason.UNLIKE_ALL, novelty))

@@ -19,6 +19,7 @@ from palpate.answer.objects import EnrolledLabels
 from palpate.answer.pipeline import Context, Refusal
 from palpate.answer.window import Counts, Window, shares
 from palpate.core.errors import BundleError
+from palpate.core.status import Reason, Remark
 from palpate.core.types import Status, normal
 
 Array = NDArray[np.float64]
@@ -108,7 +109,5 @@ class Vibrates:
         if not found:
             return None
         where, name = " ".join(map(str, found)), self._labels[label]
-        return Refusal(
-            Status.NO_SLIDE,
-            f"hardly any vibration in part {where} of {PARTS}, less than {name} gives",
-        )
+        numbers = {"parts": where, "of": PARTS, "label": name}
+        return Refusal(Status.NO_SLIDE, Remark(Reason.RESTS, numbers))

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from palpate.answer.unloaded import QUIET, UnloadedSkin
 from palpate.answer.window import Counts, Window
+from palpate.core.status import Reason, Remark
 from palpate.core.types import Status, normal
 
 FULL_SCALES = tuple(float(2**bits - 1) for bits in (8, 10, 12, 14, 15, 16, 24))
@@ -48,21 +49,26 @@ class WindowLimits:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Finding:
-    """Result of the check of a window: status ok, or another status with the taxels in `detail`.
+    """Result of the check of a window: status ok, or another status with a remark.
 
-    degraded: the broken taxels that were bridged, "" for none. mean: counts of the window that was
-    checked, in the shape of a frame, if the check passed. full: share of the counts at full scale,
-    likewise.
+    degraded: the broken taxels that were bridged, None for none. mean: counts of the window that
+    was checked, in the shape of a frame, if the check passed. full: share of the counts at
+    full scale, likewise.
     """
 
     status: Status
-    detail: str = ""
-    degraded: str = ""
+    remark: Remark | None = None
+    degraded: str | None = None
     mean: NDArray[np.float64] | None = field(default=None, compare=False)
     full: float = field(default=0.0, compare=False)
 
+    @property
+    def detail(self) -> str:
+        """The remark in words."""
+        return self.remark.text if self.remark else ""
 
-def _taxels(mask: NDArray[np.bool_]) -> str:
+
+def _taxels(mask: NDArray[np.bool_]) -> Remark:
     """The taxels of a mask [R, C, A], with their axes if not all of several are meant: "taxel 1.2
     and 2.3 axis 1"."""
     named = []
@@ -73,7 +79,8 @@ def _taxels(mask: NDArray[np.bool_]) -> str:
             else " axis " + " ".join(str(a + 1) for a in np.flatnonzero(mask[r, c]))
         )
         named.append(f"{r + 1}.{c + 1}{axes}")
-    return "taxel " + (" " if mask.shape[2] == 1 else " and ").join(named)
+    text = "taxel " + (" " if mask.shape[2] == 1 else " and ").join(named)
+    return Remark(Reason.TAXELS, {"taxels": text})
 
 
 def inspect(
@@ -99,7 +106,8 @@ def inspect(
         return Finding(Status.DEAD_TAXEL, _taxels(unreadable))
     loaded = load[..., -1:] >= (-np.inf if limits.contact is None else limits.contact)  # [R, C, 1]
     if not loaded.any():
-        return Finding(Status.NO_CONTACT, f"strongest taxel {load[..., -1].max():.1f} raw counts")
+        strongest = float(load[..., -1].max())
+        return Finding(Status.NO_CONTACT, Remark(Reason.UNLOADED, {"counts": strongest}))
     full = _at_full_scale(window, limits.full_scale, shape)
     if full is None and window.moving:
         return Finding(Status.OK, mean=window.mean.reshape(tare.shape))

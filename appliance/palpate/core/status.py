@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from enum import StrEnum
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 
 class Status(StrEnum):
@@ -46,6 +47,58 @@ class Status(StrEnum):
 
 USE, AGAIN, ASIDE = "use the label", "sweep again", "set the object aside"
 HALT, NOTHING = "stop and call a person", "nothing"
+
+
+class Reason(StrEnum):
+    """Why a rule of the answer refuses a sweep, or what it remarks; DETAILS has the words."""
+
+    TAXELS = "taxels"
+    UNLOADED = "unloaded"
+    TOO_FAR = "too-far"
+    NO_PATTERN = "no-pattern"
+    RESTS = "rests"
+    UNTRIED = "untried"
+    UNLIKE_ALL = "unlike-all"
+    UNLIKE_ALL_AGAIN = "unlike-all-again"
+    NO_NUMBER = "no-number"
+    ANOTHER_OBJECT = "another-object"
+    REST_NEEDED = "rest-needed"
+    UNCHECKED = "unchecked"
+    NOT_A_SLIDE = "not-a-slide"
+
+
+_UNLIKE = "squared distance {distance:.4g} from {label}, limit {limit:.4g}"
+DETAILS: Mapping[Reason, str] = MappingProxyType(
+    {
+        Reason.TAXELS: "{taxels}",
+        Reason.UNLOADED: "strongest taxel {counts:.1f} raw counts",
+        Reason.TOO_FAR: "named up to {farthest_mm:.1f} mm",
+        Reason.NO_PATTERN: "no pattern passes from taxel to taxel, as with a finger that rests",
+        Reason.RESTS: "hardly any vibration in part {parts} of {of}, less than {label} gives",
+        Reason.UNTRIED: "{what}",
+        Reason.UNLIKE_ALL: _UNLIKE,
+        Reason.UNLIKE_ALL_AGAIN: _UNLIKE + "; as sweep {sweep}",
+        Reason.NO_NUMBER: "the model gives no number",
+        Reason.ANOTHER_OBJECT: "another object: {label} after {before}",
+        Reason.REST_NEEDED: "the rest of the sweep is needed",
+        Reason.UNCHECKED: "contact not checked: the skin was not both touched and let go so far",
+        Reason.NOT_A_SLIDE: "{why}",
+    }
+)
+"""The words of each reason, with places for its numbers."""
+
+
+@dataclass(frozen=True, slots=True)
+class Remark:
+    """A reason with its numbers, by their names in DETAILS."""
+
+    reason: Reason
+    numbers: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def text(self) -> str:
+        """The words for people."""
+        return DETAILS[self.reason].format_map(self.numbers)
 
 
 class Words(NamedTuple):

@@ -338,7 +338,7 @@ class Classifier(Observer):
             share=sweep.share,
             own=context.own,
             displacement=context.displacement.text,
-            degraded=context.degraded,
+            degraded=context.degraded or "",
             after=context.after,
             speed_mm_s=sweep.speed_mm_s,
             force_n=sweep.force_n,
@@ -354,7 +354,7 @@ class Classifier(Observer):
         texts = (
             context.displacement.text,
             trained.outside(context.slide) if trained and uncertain else "",
-            context.detail,
+            context.remark.text if context.remark else "",
             f"hum of {hum:.2g} counts removed" if hum else "",
             f"{full:.0%} of the counts at full scale" if full > MANY_FULL else "",
             f"degraded: {degraded}" if degraded else "",

@@ -75,7 +75,7 @@ def enrol(old: Bundle, label: str, sweeps: NDArray[Any], display: str = "") -> E
     sweeps = np.stack([run.cleaned(sweep) for sweep in sweeps])
     is_no_slide = slide_check(old)
     for number, sweep in enumerate(sweeps, 1):
-        if why := is_no_slide(sweep):
+        if (why := is_no_slide(sweep)) is not None:
             which = f"sweep {number} of {len(sweeps)} is not a slide over {label!r}"
             raise FormatError(f"{which}: {why}; take others")
     network, z = network_outputs(run, sweeps)

@@ -106,7 +106,7 @@ def recorder(
     commands: Mapping[str, CommandHandler] = NO_COMMANDS,
     ordered: bool = False,
     serving: bool = True,
-    slides: Callable[[NDArray[Any]], str] | None = None,
+    slides: Callable[[NDArray[Any]], str | None] | None = None,
 ) -> Box:
     """The box that records sweeps of a format and needs no bundle; the class bits stay 0. ordered:
     commands also come from another source than the port. serving: whether READY may rise. slides:

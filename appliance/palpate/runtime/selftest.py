@@ -116,7 +116,7 @@ def _speed(manifest: Manifest) -> str:
     """The speeds that can be measured, and those of training."""
     place, trained = manifest.contact, manifest.speeds
     meter = SlideMeter(manifest.format, place.pitch_mm if place else None)
-    if meter.why:
+    if meter.why is not None:
         return f"not measured: {meter.why}"
     measured = f"measured from {meter.slowest_mm_s:.3g} to {meter.fastest_mm_s:.3g} mm/s"
     if trained is None:

@@ -18,23 +18,26 @@ from palpate.answer.window_check import Finding, inspect_bare, inspect_readings
 from palpate.core.clock import Clock
 from palpate.core.errors import ApplianceError
 from palpate.core.observer import Observer
+from palpate.core.status import Reason, Remark
 from palpate.core.types import EPOCH_BITS, Frames, Status, Sweep, SweepFormat, Verdict, normal
 
 MEASURED = "level", "noise"
 """The entry `unloaded` of a sidecar: level and noise of the unloaded skin."""
-WHY = "contact not checked: the skin was not both touched and let go so far"
-UNCHECKED = Finding(Status.RECORDED, WHY)
+UNCHECKED = Finding(Status.RECORDED, Remark(Reason.UNCHECKED))
 
 
 class SweepCheck(Observer):
     """Checks each window against the unloaded skin, which it finds by itself or takes from a TARE.
-    slides: the reason why a window is not a slide, "" if it is one; None accepts all. model: "",
+    slides: the reason why a window is not a slide, None if it is one; None accepts all. model: "",
     since there is no bundle. degraded: "", since nothing is bridged."""
 
     model = degraded = ""
 
     def __init__(
-        self, format: SweepFormat, clock: Clock, slides: Callable[[NDArray[Any]], str] | None = None
+        self,
+        format: SweepFormat,
+        clock: Clock,
+        slides: Callable[[NDArray[Any]], str | None] | None = None,
     ) -> None:
         self.format, self._clock, self._slides = format, clock, slides
         self._unloaded = UnloadedTracker(format)
@@ -61,12 +64,14 @@ class SweepCheck(Observer):
     def _slid(self, taxels: NDArray[Any]) -> Finding | None:
         """Why a window is not a slide, None if it is one."""
         assert self._slides
-        why, bare = "", self._unloaded.skin
+        why, bare = None, self._unloaded.skin
         if bare and self._unloaded.certain:
             load = np.abs(normal(taxels.mean(axis=0, dtype=np.float64) - bare.level, 0))
             why = only_taxel(load, bare.contact)
-        why = why or self._slides(taxels)
-        return Finding(Status.NO_SLIDE, why) if why else None
+        why = self._slides(taxels) if why is None else why
+        if why is None:
+            return None
+        return Finding(Status.NO_SLIDE, Remark(Reason.NOT_A_SLIDE, {"why": why}))
 
     def _checked(self, taxels: NDArray[Any]) -> Finding:
         if not (self._unloaded.skin and self._unloaded.certain):

@@ -143,14 +143,14 @@ class NoSlide:
 
 
 def slides_alone(
-    kept: Sequence[RecordedSweep], reasons: Iterable[str]
+    kept: Sequence[RecordedSweep], reasons: Iterable[str | None]
 ) -> tuple[list[RecordedSweep], tuple[NoSlide, ...]]:
-    """The sweeps that are slides, and the others. reasons: why each is not one, "" if it is."""
+    """The sweeps that are slides, and the others. reasons: why each is not one, None if it is."""
     slides, no_slides, number = [], [], Counter[str]()
     for one, why in zip(kept, reasons, strict=True):
         material = one.sweep.material
         number[material] += 1
-        if why:
+        if why is not None:
             text = f"sweep {number[material]} of {material} is not learnt from: {why}"
             no_slides.append(NoSlide(number_of(one.path), text))
         else:

@@ -52,7 +52,7 @@ def expect_measured(
 ) -> None:
     """Assert that this slide is measured, within a share of its speed."""
     found = meter(taxels)
-    assert (found.direction, found.why) == (direction, "")
+    assert (found.direction, found.why) == (direction, None)
     assert found.speed_mm_s == pytest.approx(speed, rel=within)
     assert found.height >= LEAST_HEIGHT
 

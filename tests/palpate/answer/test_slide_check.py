@@ -42,7 +42,7 @@ def test_slides_over_every_material_are_accepted(model: Bundle, world: str):
     rng = np.random.default_rng(5)
     for place in skin.placements("T-REAL", 1005)[:4]:
         for material in skin.MATERIALS:
-            assert check(skin.window(material, place, rng, skin.WORLDS[world])) == ""
+            assert check(skin.window(material, place, rng, skin.WORLDS[world])) is None
 
 
 @pytest.mark.parametrize("kind", JUNK)
@@ -80,7 +80,7 @@ def test_a_sweep_that_is_answered_can_be_taught(model: Bundle):
             known = meter(taxels).height
             weak += CHANCE <= known < LEAST_HEIGHT
             if answer is Status.OK or CHANCE <= known < LEAST_HEIGHT:
-                assert check(taxels) == "", amplitude
+                assert check(taxels) is None, amplitude
     assert weak
 
 
@@ -92,7 +92,7 @@ def test_only_one_loaded_taxel_is_named():
     assert SlideCheck(format, np.zeros((4, 4)), 5.0)(counts) == "only taxel 2.3 is loaded"
     assert "contact" in SlideCheck(format, np.zeros((4, 4)), 90.0)(counts)
     small = SweepFormat(1, 2, 100, 200, "uint8")
-    assert SlideCheck(small, np.zeros((1, 2)), 5.0)(counts[:, 1:2, 2:4]) == ""
+    assert SlideCheck(small, np.zeros((1, 2)), 5.0)(counts[:, 1:2, 2:4]) is None
 
 
 def slides(count: int) -> list[np.ndarray]:
@@ -107,19 +107,19 @@ def test_where_slides_show_a_pattern_others_are_refused_without_a_bundle(kind: s
     kind = kind.replace("chirp", "a chirp")
     rest = window(kind, skin.WORLDS["level-blind"], 1)[0]
     check = SlidesAmong(skin.FORMAT)
-    assert check(rest) == ""  # so far nothing shows what a slide looks like
-    assert [check(one) for one in slides(MANY)] == [""] * MANY
+    assert check(rest) is None  # so far nothing shows what a slide looks like
+    assert [check(one) for one in slides(MANY)] == [None] * MANY
     assert check(rest).startswith("no slide")
-    assert check(slides(1)[0]) == ""
+    assert check(slides(1)[0]) is None
     first = SlidesAmong(skin.FORMAT).among([rest, *slides(MANY)])
     assert first[0].startswith("no slide")
-    assert first[1:] == [""] * MANY
+    assert first[1:] == [None] * MANY
 
 
 def test_a_skin_without_patterns_is_not_judged_by_them():
     """Its slides look like rests, so all are accepted; nor is a skin of two taxels judged."""
     rests = [window("finger rests", skin.WORLDS["level-blind"], n)[0] for n in range(6)]
-    assert SlidesAmong(skin.FORMAT).among(rests) == [""] * 6
+    assert SlidesAmong(skin.FORMAT).among(rests) == [None] * 6
     tiny = SlidesAmong(SweepFormat(1, 2, 100, 200, "uint8"))
-    assert tiny.among([np.zeros((200, 1, 2), np.uint8)] * MANY) == [""] * MANY
-    assert tiny(np.zeros((200, 1, 2), np.uint8)) == ""
+    assert tiny.among([np.zeros((200, 1, 2), np.uint8)] * MANY) == [None] * MANY
+    assert tiny(np.zeros((200, 1, 2), np.uint8)) is None

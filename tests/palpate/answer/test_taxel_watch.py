@@ -188,7 +188,7 @@ def test_a_taxel_is_broken_over_the_stream_after_several_stretches(watch: TaxelW
     assert [seen(watch, bad) for _ in range(CERTAIN)] == [""] * (CERTAIN - 1) + [named]
     assert watch.repaired(GOOD, tare)[1].degraded == named
     assert [seen(watch, GOOD) for _ in range(SOUND)] == [named] * (SOUND - 1) + [""]
-    assert watch.repaired(GOOD, tare)[1].degraded == ""
+    assert watch.repaired(GOOD, tare)[1].degraded is None
 
 
 @pytest.mark.parametrize(

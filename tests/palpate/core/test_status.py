@@ -9,7 +9,7 @@ import pytest
 
 from palpate.bridges.modbus import STATUS_CODES
 from palpate.client.answers import Answer
-from palpate.core.status import ASIDE, HALT, REASONS, USE, WORDS, Status
+from palpate.core.status import ASIDE, DETAILS, HALT, REASONS, USE, WORDS, Reason, Remark, Status
 from palpate.web.server import page_files
 from tests.factories.paths import ROOT
 
@@ -27,6 +27,14 @@ def test_all_that_is_said_of_a_status_is_of_the_table():
     _, script = page_files()["/statuses.js"]
     shown = json.loads(script.decode().removeprefix("export const STATUSES = ").rstrip(";\n"))
     assert shown == {s: [w.colour, w.word, w.advice] for s, w in WORDS.items()}
+
+
+def test_every_reason_of_a_rule_has_words():
+    """With a place for each of its numbers."""
+    assert set(DETAILS) == set(Reason)
+    remark = Remark(Reason.UNLIKE_ALL, {"distance": 41.25, "label": "wood", "limit": 30.0})
+    assert [part in remark.text for part in ("41.25", "wood", "30")] == [True] * 3
+    assert "sweep 7" in Remark(Reason.UNLIKE_ALL_AGAIN, remark.numbers | {"sweep": 7}).text
 
 
 def test_the_table_is_whole():

@@ -158,7 +158,7 @@ def test_while_the_box_is_taught_a_sweep_must_be_a_slide():
 
     dead = (Status.DEAD_TAXEL, "taxel 2.2")
     assert answers(None) == [(Status.RECORDED, "")] * 3 + [dead]
-    assert answers(lambda taxels: "no slide: it rests" if taxels is resting else "") == [
+    assert answers(lambda taxels: "no slide: it rests" if taxels is resting else None) == [
         (Status.NO_SLIDE, "only taxel 3.2 is loaded"),
         (Status.NO_SLIDE, "no slide: it rests"),
         (Status.RECORDED, ""),

@@ -44,7 +44,7 @@ def trained_speeds(sweeps: Dataset, pitch_mm: float | None) -> tuple[SpeedRange 
     """The range of the measured speeds of `sweeps`, or None and the reason. pitch_mm: distance
     between taxels, None if unknown."""
     meter = SlideMeter(sweeps.format, pitch_mm)
-    if meter.why:
+    if meter.why is not None:
         return None, meter.why
     measured = slides(meter, sweeps)
     count = len(measured)
@@ -67,7 +67,7 @@ def _pattern(train: Dataset) -> float | None:
     """The least height of a pattern, where nearly all training sweeps show one of twice the height;
     else None. So a sweep with half of the usual pattern is answered."""
     meter = SlideMeter(train.format, 1.0)
-    if meter.why:
+    if meter.why is not None:
         return None
     heights = [slide.height for slide in slides(meter, train)]
     return CHANCE if np.quantile(heights, OUTER) >= 2 * CHANCE else None
