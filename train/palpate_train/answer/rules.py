@@ -21,6 +21,7 @@ from palpate_train.answer import (
     fit_taxels,
     fit_unknown,
 )
+from palpate_train.data.sets import Dataset
 
 FIGURES = "rules"
 """Key of the figures in a manifest."""
@@ -29,20 +30,24 @@ FIGURES = "rules"
 @dataclass(frozen=True)
 class Rule:
     """A rule that a bundle may lack. what: for people. without: makes a bundle without it; the same
-    bundle if it has none. tried: whether recordings can show that it is not needed; no recording
-    shows a material that was not taught, and an early answer saves time alone."""
+    bundle if it has none. limited: a manifest with its limits, from the counts of training sweeps.
+    tried: whether recordings can show that it is not needed; no recording shows a material that was
+    not taught, and an early answer saves time alone."""
 
     what: str
     without: Callable[[Bundle], Bundle]
+    limited: Callable[[Manifest, Dataset], Manifest] = lambda manifest, train: manifest
     tried: bool = True
 
 
 RULES: Mapping[str, Rule] = {
     "early": Rule("early answers", fit_early.without, tried=False),
     "disturbance": Rule("allowances for disturbances", fit_disturbance.without),
-    "displacement": Rule("a rule for displaced contacts", fit_displacement.without),
+    "displacement": Rule(
+        "a rule for displaced contacts", fit_displacement.without, fit_displacement.limited
+    ),
     "vibration": Rule("a least vibration of slides", fit_slide.without_vibration),
-    "slide": Rule("a least pattern of slides", fit_slide.without_pattern),
+    "slide": Rule("a least pattern of slides", fit_slide.without_pattern, fit_slide.limited),
     "hum": Rule("hum removal", fit_hum.without),
     "taxels": Rule("bridging of broken taxels", fit_taxels.without),
     "unknown": Rule("detection of unknown materials", fit_unknown.without, tried=False),

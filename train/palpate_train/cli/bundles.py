@@ -162,12 +162,12 @@ def _print(manifest: Manifest, out: Path) -> None:
         say(f"no-contact cannot be detected: {why}")
     for line in formatting.figure_lines(manifest.figures):
         say(line)
-    say(fit_taxels.text(manifest))
+    say(*fit_taxels.text(manifest).split("\n"))
     if manifest.known:
-        say(altered_sweeps.text(manifest.figures))
+        say(*altered_sweeps.text(manifest.figures).split("\n"))
     for part in (quantized_bundle, fit_early, fit_displacement, fit_slide, rules):
         if text := part.text(manifest):
-            say(text)
+            say(*text.split("\n"))
     if few := [
         f"{board} wires {bits}"
         for board, bits in _class_bits().items()

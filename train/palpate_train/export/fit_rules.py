@@ -18,7 +18,6 @@ from palpate.bundle.bundle import Bundle, Manifest
 from palpate_train.answer import (
     altered_sweeps,
     embedding,
-    fit_displacement,
     fit_early,
     fit_slide,
     fit_taxels,
@@ -140,7 +139,9 @@ def from_counts(manifest: Manifest, content: Content, pitch_mm: float | None) ->
         made=manifest.made
         | {f"{part}_unknown_because": why for part, why in unknown.items() if why},
     )
-    return fit_slide.limited(fit_displacement.limited(manifest, train), train)
+    for rule in RULES.values():
+        manifest = rule.limited(manifest, train)
+    return manifest
 
 
 def from_answers(content: Content, packed: Bundle, proven: bool, asked: Asked) -> Bundle:
