@@ -304,7 +304,7 @@ def test_a_contact_is_named_up_to_the_farthest_displacement(
     assert verdict.status is status
     assert verdict.displacement.startswith("moved 0.")
     assert (exit_of(made)(elsewhere(half(0, 0))) is not None) == (status is Status.OK)
-    assert ("0.3" in verdict.detail) == (status is Status.UNKNOWN)
+    assert ("up to 0.3" in verdict.detail) == (status is Status.UNKNOWN)
     assert answer(made, toy_bundle.sweep(0, 0)).status is Status.OK
 
 
