@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from palpate.answer.disturbance import Allowance, Disturbances, load, noise
+from palpate.answer.disturbance import NAMES, Allowance, Disturbances, load, noise
 from palpate.core.errors import BundleError
 
 SLOWER = Allowance("speed", 2.0, 1.5, 4.0)
@@ -63,6 +63,16 @@ def test_what_was_not_tried_is_said():
     assert allowed.untried({"speed": math.nan}) == []
     both = allowed.untried({"speed": 1.4, "lost": 0.3})
     assert both == ["a slower slide", "more lost frames"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_disturbance_is_said_in_its_direction(name):
+    """More and less of it, and neither up to what was tried."""
+    more, less = Allowance(name, 0.0, 1.0, 1.0), Allowance(name, 0.0, -1.0, 1.0)
+    assert (more.untried(1.0), less.untried(-1.0)) == ("", "")
+    assert more.untried(1.1)
+    assert less.untried(-1.1)
+    assert more.untried(1.1) != less.untried(-1.1)
 
 
 def test_between_proven_and_tried_the_limit_alone_decides():
