@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import io
 import math
 import signal
@@ -27,7 +26,7 @@ from palpate.core import config
 from palpate.core.interrupts import StopFlag
 from palpate.sim import devices, rig, script, skin
 from tests.factories.paths import NO_SITE
-from tests.factories.simulated_box import SECOND, idle_devices
+from tests.factories.simulated_box import SECOND
 
 MIDDLE = ContactPositions(4.0, (6.0, 6.4), (6.0, 5.8), 0.6)
 
@@ -245,17 +244,6 @@ def test_a_view_is_shown_five_times_a_second_and_printed_once(model, monkeypatch
         live.run(settings, Expected.by(model), simulated, [printer], stopped)
         assert len(out.getvalue().splitlines()) in lines
         assert not simulated.backend.board.running
-
-
-def test_a_denied_skin_is_named(model):
-    """The View says why the skin cannot be read and what to do. The command goes on."""
-    simulated = idle_devices()
-    simulated.backend.errors["open"] = errno.EACCES
-    alignment = Alignment(config.load(None, [], site=NO_SITE), Expected.by(model), simulated)
-    alignment.read()
-    view = alignment.view()
-    assert (view.state, view.skin, view.message) == ("no-skin", "denied", "no skin: denied")
-    assert "udev" in view.hint
 
 
 @pytest.fixture(scope="module")

@@ -545,12 +545,6 @@ def test_output_that_nobody_reads():
     assert "Traceback" not in done.stderr
 
 
-def test_skin_format_is_the_default_bundles(default_bundle):
-    """The default bundle was trained for the simulated skin."""
-    assert default_bundle.format == skin.FORMAT
-    assert set(default_bundle.manifest.labels) == set(skin.MATERIALS)
-
-
 def test_skin_check_prints_a_verdict_for_each_part(monkeypatch, capsys):
     """On the simulated board all is ok, and no bundle is loaded; with a wrong CRC one line says
     FAIL, and the exit code is 1."""

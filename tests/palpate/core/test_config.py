@@ -82,15 +82,6 @@ def test_without_a_board_and_files_no_line_is_wired(tmp_path):
     assert (c.output.ready, c.output.class_bits, c.trigger.start, c.serial.port) == ("", (), "", "")
 
 
-def test_a_config_cannot_be_changed(folder):
-    """Sections are frozen and the sources are read-only."""
-    c = _load(folder)
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        c.skin.silence_ms = 1  # type: ignore[misc]
-    with pytest.raises(TypeError):
-        c.sources["skin.silence_ms"] = "me"  # type: ignore[index]
-
-
 @pytest.mark.parametrize(
     ("text", "name", "hint"),
     [

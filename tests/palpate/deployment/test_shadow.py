@@ -158,15 +158,6 @@ def test_it_fuses_by_the_same_rule(side):
     assert told == {"(unsure) a": {"(unsure) a": 1}, "a": {"a": 2}}
 
 
-def test_it_judges_with_the_box_s_tare(side):
-    """A load that the robot has tared does not count as contact for the candidate."""
-    pair = side()
-    pair.tare = np.full((2, 2), 1e4)
-    pair.current.tare = pair.tare
-    pair.judge(A)
-    assert pair.shadow.agreement.pairs == {"(no-contact)": {"(no-contact)": 1}}
-
-
 def test_without_a_tare_each_bundle_has_its_own(side):
     """The candidate has another unloaded skin, which it uses until the robot sends a TARE."""
     other = {"id": "bbbbbbbb", "golden_refusals": ("no-contact",) * 2}

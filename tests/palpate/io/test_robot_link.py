@@ -14,7 +14,6 @@ from dataclasses import replace
 import numpy as np
 import pynmea2
 import pytest
-import serial
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -221,17 +220,6 @@ def test_a_port_is_kept_from_others(monkeypatch, real):
         assert is_shut(other.fileno()) == real
         sink.close()
         assert not is_shut(other.fileno())
-
-
-def test_an_opener_that_refuses():
-    """pyserial's own errors become trouble."""
-
-    def refuse(*args, **kwargs):
-        raise serial.SerialException(13, "permission denied")
-
-    sink = SerialSink(SerialConfig(port="/dev/x"), rig.VirtualClock(), "sim", refuse)
-    sink.say(b"x")
-    assert "permission" in sink.trouble
 
 
 LABELS = ("metal", "wood", "plastic rough")

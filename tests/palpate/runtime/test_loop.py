@@ -4,7 +4,7 @@ each way to fail."""
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
 from typing import Any
@@ -27,7 +27,6 @@ from tests.factories.simulated_box import SECOND, SETTLE_S, Rigged
 RATE = round(skin.FORMAT.rate_hz)
 READY, BUSY, FAULT = devices.READY, devices.BUSY, devices.FAULT
 START, STOP, RESULT_VALID = devices.START, devices.STOP, devices.RESULT_VALID
-Make = Callable[..., Rigged]
 
 
 def answers(box: Rigged) -> list[Answer]:
@@ -147,16 +146,6 @@ def test_a_board_that_sends_no_frame_is_never_ready(rigged, logged):
     box.seconds(1)
     assert (levels(simulated, READY), levels(simulated, FAULT)) == ([True], [True, False])
     assert logged.count("skin: streaming") == 1
-
-
-def test_trigger_while_not_ready_is_answered(rigged):
-    """Without a skin the start edge is answered, and its stop edge is not."""
-    simulated = quiet()
-    simulated.backend.unplug()
-    box = rigged(simulated)
-    box.pulse(START, 0.5)
-    box.pulse(STOP, 3)
-    assert [v.status for v in box.seconds(4)] == [Status.NOT_READY]
 
 
 @pytest.mark.parametrize(

@@ -197,26 +197,6 @@ def test_trouble_with_the_file_is_logged_once(tmp_path, logged):
     assert len(logged) == 2
 
 
-def test_a_running_box_reports_its_verdicts(rigged, tmp_path, logged):
-    """On simulated devices: skin, bundle and verdicts of the box, and the same verdicts in the
-    log."""
-    clock = rig.VirtualClock()
-    file = StatusFile(tmp_path / "status.json", clock)
-    box: Rigged = rigged(observers=[file, VerdictLog()])
-    verdicts = box.until(lambda: box.box.answered >= 2)
-    clock.sleep_until(SECOND * 60)
-    box.seconds(0.2)
-    read = status.read(tmp_path / "status.json", clock.now_ns())
-    assert (read["skin"], read["answered"], read["bundle"]) == ("streaming", 2, verdicts[0].bundle)
-    assert [(v["sweep"], v["label"]) for v in read["verdicts"]] == [
-        (v.sweep, v.label) for v in verdicts
-    ]
-    lines = [line.removeprefix("<4>") for line in logged if line.startswith(("sweep", "<4>sweep"))]
-    assert [line.split(",")[0] for line in lines] == [
-        f"sweep {v.sweep}: {v.label}" for v in verdicts
-    ]
-
-
 SURE = "plastic rough, 98.7 %"
 
 

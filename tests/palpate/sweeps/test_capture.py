@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import os
 import struct
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -25,10 +24,8 @@ from palpate.sweeps.capture import MOST_KEPT, CaptureWriter, Playback, RecordKin
 from palpate.sweeps.sweep_window import SweepCutter
 from tests.factories import toy_bundle
 from tests.factories.settings import load as load_settings
-from tests.factories.simulated_box import SECOND, OnSweep, Rigged
+from tests.factories.simulated_box import SECOND, OnSweep
 from tests.factories.skin_wires import WiredSkin, profile
-
-Make = Callable[..., Rigged]
 
 
 def played(path: Path, model: Bundle) -> tuple[list[Verdict], list[Sweep]]:
@@ -231,19 +228,6 @@ def kept(n: int) -> Sweep:
     """Sweep number `n` of 40 frames."""
     frames = Frames(np.arange(40) + 5, np.arange(40), np.full((40, 4, 4), n, np.uint8))
     return Sweep(n, 7, 40, Status.OK, frames)
-
-
-def test_saved_sweeps_are_read_as_they_were(tmp_path):
-    """Frames, times, numbers and status are read again, and there are only the two files."""
-    sweep = kept(3)
-    save(tmp_path / "s.npy", sweep, skin.FORMAT)
-    again, format = load(tmp_path / "s.npy")
-    assert format == skin.FORMAT
-    for name in ("id", "status", "start_ns", "stop_ns"):
-        assert getattr(again, name) == getattr(sweep, name)
-    for name in ("t_ns", "seq", "taxels"):
-        assert (getattr(again.frames, name) == getattr(sweep.frames, name)).all()
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["s.json", "s.npy"]
 
 
 @pytest.mark.parametrize(
