@@ -3,19 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 
-from palpate.answer.contact import (
-    ContactPositions,
-    advice,
-    centre,
-    displacement,
-    fill_dead_taxels,
-)
-from palpate.bundle.bundle import Bundle, Manifest
+from palpate.answer.contact import ContactPositions, advice, centre, displacement, fill_dead_taxels
+from palpate.bundle.bundle import Manifest
 from palpate.core.errors import BundleError
 from palpate.core.sentences import MAX_LINE
 from palpate.core.types import Status, Verdict
@@ -35,7 +28,7 @@ NAN, INF = float("nan"), float("inf")
         *(("cols_mm", value) for value in ((6.0, None), (6.0,))),
     ],
 )
-def test_a_place_that_makes_no_sense_is_refused(name: str, value: Any):
+def test_a_place_that_makes_no_sense_is_refused(name, value):
     """Values that are not numbers, not finite, too many or not in pairs."""
     with pytest.raises(BundleError, match=name):
         replace(MIDDLE, **{name: value})
@@ -43,14 +36,14 @@ def test_a_place_that_makes_no_sense_is_refused(name: str, value: Any):
         replace(MIDDLE, rows_mm=(6.0,) * 1001, cols_mm=(6.0,) * 1001)
 
 
-def test_a_place_goes_through_the_manifest(default_bundle: Bundle):
+def test_a_place_goes_through_the_manifest(default_bundle):
     """Written as JSON and read again it is the same."""
     manifest = replace(default_bundle.manifest, contact=MIDDLE)
     assert Manifest.parse(manifest.json()).contact == MIDDLE
 
 
 @pytest.mark.parametrize("at", [(1.5, 1.5), (1.0, 2.0), (1.8, 1.4), (2.0, 1.0)])
-def test_the_centre_of_a_contact_that_lies_on_the_skin(at: tuple[float, float]):
+def test_the_centre_of_a_contact_that_lies_on_the_skin(at):
     """It is found to 0.15 of a taxel, with any tare and any load below the contact threshold."""
     load = patch(*at)
     for tare in (TARE, np.arange(16.0).reshape(4, 4)):
@@ -96,7 +89,7 @@ def test_pulled_and_silent_taxels_have_no_weight():
 
 
 @pytest.mark.parametrize("dead", [(1, 1), (2, 2), (1, 0), (0, 2)])
-def test_a_dead_taxel_does_not_push_the_centre_away(dead: tuple[int, int]):
+def test_a_dead_taxel_does_not_push_the_centre_away(dead):
     """Silent between two loaded ones it is filled in: the centre stays within 0.15 taxels; without
     that it would not."""
     load = patch(1.5, 1.5) + 30
@@ -112,7 +105,7 @@ def test_a_dead_taxel_does_not_push_the_centre_away(dead: tuple[int, int]):
     ("along", "axis", "towards"),
     [("dx_mm", 0, ("row 4", "row 1")), ("dy_mm", 1, ("column 4", "column 1"))],
 )
-def test_the_advice_follows_the_simulated_skin(along: str, axis: int, towards: tuple[str, str]):
+def test_the_advice_follows_the_simulated_skin(along, axis, towards):
     """The further forward the skin is, the further back is the centre, if the end of the pad is
     near; the advice names the right end."""
     found, rng = [], np.random.default_rng(0)
@@ -135,7 +128,7 @@ def test_the_advice_follows_the_simulated_skin(along: str, axis: int, towards: t
         ((-3.0, -1.0), "3.0 mm too far towards row 1 and 1.0 mm towards column 1"),
     ],
 )
-def test_the_advice_names_direction_and_distance(offset: tuple[float, float], text: str):
+def test_the_advice_names_direction_and_distance(offset, text):
     """The larger direction first; an insignificant one is left out."""
     assert advice(offset, (4, 5)) == text
 

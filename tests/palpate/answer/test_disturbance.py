@@ -51,7 +51,7 @@ def test_load_is_the_sum_above_the_tare():
 @pytest.mark.parametrize(
     ("value", "size"), [(2.5, 0), (2.0, 0), (1.8, 0.2), (1.5, 0.5), (1.0, 0.5), (math.nan, 0)]
 )
-def test_a_size_counts_from_the_edge_of_training(value: float, size: float):
+def test_a_size_counts_from_the_edge_of_training(value, size):
     """Up to the furthest value that was tried; an unknown value has none."""
     assert SLOWER.size(value) == pytest.approx(size)
 
@@ -106,14 +106,14 @@ def test_the_limit_grows_by_the_disturbance_that_allows_most():
         (("speed", 2.0, 1.5, 1.0, "1"), "tried '1'"),
     ],
 )
-def test_values_out_of_range_are_refused(values: tuple, why: str):
+def test_values_out_of_range_are_refused(values, why):
     """The message names the value."""
     with pytest.raises(BundleError, match=why):
         Allowance(*values)
 
 
 @pytest.mark.parametrize("hum", [0.0, -1.0, math.nan, math.inf, "4"])
-def test_a_limit_of_hum_out_of_range_is_refused(hum: object):
+def test_a_limit_of_hum_out_of_range_is_refused(hum):
     """It must be above 0."""
     with pytest.raises(BundleError, match="hum "):
         Disturbances((), hum)  # type: ignore[arg-type]

@@ -35,7 +35,7 @@ def _tone(hz: float, rate_hz: float, frames: int, amplitude: float = 50.0) -> np
     return (100 + amplitude * np.sin(2 * np.pi * hz * t)).astype(np.float32).reshape(-1, 1, 1)
 
 
-def test_weights_are_equation_4() -> None:
+def test_weights_are_equation_4():
     """Each weight is the taxel's sum of counts over the sum of all counts, row by row. A negative
     taxel is left out; without activation, or with a negative one, all weights are 1 / M."""
     x = _sweep()
@@ -48,7 +48,7 @@ def test_weights_are_equation_4() -> None:
         np.testing.assert_array_equal(none, [0.25] * 4)
 
 
-def test_each_axis_is_a_series_weighted_by_the_load_of_its_taxel() -> None:
+def test_each_axis_is_a_series_weighted_by_the_load_of_its_taxel():
     """With three equal axes all features are those of one; shear alone changes no weight."""
     x = _sweep()
     three = np.stack([x, x, x], axis=-1)
@@ -72,9 +72,7 @@ def test_each_axis_is_a_series_weighted_by_the_load_of_its_taxel() -> None:
         (np.random.default_rng(2).integers(-200, 3000, (300, 3, 3), np.int16), 100.0, 6, 60),
     ],
 )
-def test_l_features_are_equations_1_to_3(
-    x: np.ndarray, rate_hz: float, first: int, split: int
-) -> None:
+def test_l_features_are_equations_1_to_3(x, rate_hz, first, split):
     """The same numbers from scipy's periodogram: bins 40 to 750 and 4 to 40 of 0.5 Hz; for 3x3
     taxels at 100 Hz the upper band ends at 50 Hz."""
     frames, last = len(x), len(x) // 2
@@ -108,7 +106,7 @@ def _h_by_the_formula(x: np.ndarray) -> np.ndarray:
     return p / p.sum(axis=1, keepdims=True)
 
 
-def test_h_features_are_equation_5() -> None:
+def test_h_features_are_equation_5():
     """All 760 numbers equal the paper's sum, with the mean subtracted and two neighbouring bins in
     a band."""
     x = _sweep()
@@ -119,7 +117,7 @@ def test_h_features_are_equation_5() -> None:
 
 
 @pytest.mark.parametrize(("window", "scipys"), [("rect", "boxcar"), ("hann", "hann")])
-def test_h_features_agree_with_a_spectrogram(window: str, scipys: str) -> None:
+def test_h_features_agree_with_a_spectrogram(window, scipys):
     """At 1000 Hz steps are whole frames: all windows but the cut-off one equal scipy's; the bins
     end at 370 Hz."""
     x = _sweep(2000)
@@ -138,7 +136,7 @@ def test_h_features_agree_with_a_spectrogram(window: str, scipys: str) -> None:
 @pytest.mark.parametrize(
     ("rate_hz", "frames", "hz"), [(750.0, 1500, 133.0), (750.0, 1500, 361.5), (100.0, 200, 31.0)]
 )
-def test_a_tone_lands_in_its_band_and_centroid(rate_hz: float, frames: int, hz: float) -> None:
+def test_a_tone_lands_in_its_band_and_centroid(rate_hz, frames, hz):
     """c1 is the tone's frequency, and in every short window the band of the tone is the
     strongest."""
     x = _tone(hz, rate_hz, frames)
@@ -148,7 +146,7 @@ def test_a_tone_lands_in_its_band_and_centroid(rate_hz: float, frames: int, hz: 
         assert set(h.argmax(axis=1)) == {int(hz // 20)}
 
 
-def test_slow_tones_and_drift_stay_in_their_bands() -> None:
+def test_slow_tones_and_drift_stay_in_their_bands():
     """A ripple of 7 Hz sets c2, and a ramp of 60 counts changes none of the three features by more
     than rounding."""
     assert features.l_features(_tone(7.0, RATE, FRAMES), RATE)[2] == pytest.approx(7.0, abs=0.05)
@@ -158,7 +156,7 @@ def test_slow_tones_and_drift_stay_in_their_bands() -> None:
     np.testing.assert_allclose(features.l_features(tone + ramp, RATE), want, rtol=1e-5)
 
 
-def test_a_gain_adds_to_the_roughness_only() -> None:
+def test_a_gain_adds_to_the_roughness_only():
     """Counts three times as large: roughness + 2 log 3, centroids and H-features as before."""
     x = _sweep().astype(np.int16)
     small, large = features.l_features(x, RATE), features.l_features(3 * x, RATE)
@@ -169,7 +167,7 @@ def test_a_gain_adds_to_the_roughness_only() -> None:
 
 
 @pytest.mark.parametrize("kind", ["L", "H"])
-def test_the_order_of_taxels_does_not_matter(kind: str) -> None:
+def test_the_order_of_taxels_does_not_matter(kind):
     """Taxels in another order give the same features, like the paper's sums over taxels."""
     x = _sweep()
     want = features.compute(kind, x, RATE)
@@ -178,7 +176,7 @@ def test_the_order_of_taxels_does_not_matter(kind: str) -> None:
 
 
 @pytest.mark.parametrize("level", [0, 255])
-def test_a_silent_or_saturated_skin_has_finite_features(level: int) -> None:
+def test_a_silent_or_saturated_skin_has_finite_features(level):
     """Constant counts: the floor's logarithm, the middle of each band, and H-features of zero."""
     x = np.full((FRAMES, 4, 4), level, np.uint8)
     want = [math.log(16 * features.FLOOR * 711 / 710), (20 + 375) / 2, (2 + 20) / 2]
@@ -186,7 +184,7 @@ def test_a_silent_or_saturated_skin_has_finite_features(level: int) -> None:
     assert not features.h_features(x, RATE).any()
 
 
-def test_few_frames_give_l_features() -> None:
+def test_few_frames_give_l_features():
     """A band without a bin keeps the bin above its lower edge: ten frames at 750 Hz have bins 75 Hz
     apart; at 30 Hz none lies above 15 Hz. Of one frame there are no H-features."""
     x = _sweep(10)
@@ -199,7 +197,7 @@ def test_few_frames_give_l_features() -> None:
 
 @settings(max_examples=60)
 @given(any_counts(30, 90), st.floats(20, 300))
-def test_results_are_finite_for_any_counts(taxels: np.ndarray, rate_hz: float) -> None:
+def test_results_are_finite_for_any_counts(taxels, rate_hz):
     """Weights sum to 1, centroids stay below Nyquist, H-features are as many as `h_shape` says, 0
     to 1."""
     weights = features.taxel_weights(taxels)
@@ -224,9 +222,7 @@ def test_results_are_finite_for_any_counts(taxels: np.ndarray, rate_hz: float) -
         (3000, 1500.0, (40, 19)),
     ],
 )
-def test_the_number_of_h_features_follows_from_frames_and_rate(
-    frames: int, rate_hz: float, shape: tuple[int, int]
-) -> None:
+def test_the_number_of_h_features_follows_from_frames_and_rate(frames, rate_hz, shape):
     """Whole steps of 0.05 s times bands of 20 Hz up to 375 Hz or Nyquist, as many as `h_features`
     gives."""
     assert features.h_shape(frames, rate_hz) == shape
@@ -244,15 +240,13 @@ def test_the_number_of_h_features_follows_from_frames_and_rate(
         ("H", (80, 4, 4), 12.0, r"12 Hz .* 20 Hz"),
     ],
 )
-def test_what_cannot_be_computed_is_named(
-    kind: str, shape: tuple[int, ...], rate_hz: float, message: str
-) -> None:
+def test_what_cannot_be_computed_is_named(kind, shape, rate_hz, message):
     """Each refusal is a FormatError with the value that was wrong."""
     with pytest.raises(FormatError, match=message):
         features.compute(kind, np.ones(shape, np.uint8), rate_hz)
 
 
-def test_counts_that_are_no_numbers_and_unknown_windows_are_refused() -> None:
+def test_counts_that_are_no_numbers_and_unknown_windows_are_refused():
     """NaN among float32 counts, and an unknown window function."""
     x = np.ones((80, 2, 2), np.float32)
     with pytest.raises(FormatError, match="'hamming'"):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -35,7 +34,7 @@ def counts(x: NDArray[np.float64], format: SweepFormat = FORMAT) -> NDArray[np.u
 
 
 @pytest.mark.parametrize("hz", [50.0, 60.0, 49.85, 60.2])
-def test_hum_is_removed(hz: float):
+def test_hum_is_removed(hz):
     """At the frequencies of mains and somewhat beside them. The sweep remains except for
     rounding."""
     filter, clean = HumFilter(FORMAT), sweep()
@@ -56,7 +55,7 @@ COMBS = {
 
 @pytest.mark.parametrize("share", [1.0, 0.4, 0.3])
 @pytest.mark.parametrize("comb", COMBS.values(), ids=COMBS.keys())
-def test_a_comb_is_removed(comb: dict[float, float], share: float):
+def test_a_comb_is_removed(comb, share):
     """All lines of the mains are removed from whole windows and from unfinished ones. The sweep
     remains except for rounding and for the little that it has at these frequencies."""
     frames = int(share * FORMAT.window)
@@ -68,7 +67,7 @@ def test_a_comb_is_removed(comb: dict[float, float], share: float):
 
 
 @pytest.mark.parametrize("hz", [45.0, 75.0, 110.0])
-def test_other_frequencies_stay(hz: float):
+def test_other_frequencies_stay(hz):
     """A sine that is not of the mains is part of the material."""
     given = counts(sweep() + hum(hz=hz))
     found, amplitude = HumFilter(FORMAT)(given, LIMIT)
@@ -101,7 +100,7 @@ def test_each_axis_is_cleaned():
 
 
 @pytest.mark.parametrize("changes", [{"window": 30}, {"rate_hz": 100.0, "window": 200}])
-def test_a_window_that_cannot_show_it_stays(changes: dict[str, Any]):
+def test_a_window_that_cannot_show_it_stays(changes):
     """Too short for 120 Hz among other frequencies, or with a rate that 50 Hz folds into."""
     format = replace(FORMAT, **changes)
     filter, given = HumFilter(format), counts(sweep(format), format)

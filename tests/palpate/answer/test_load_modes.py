@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -30,7 +28,7 @@ def frames(n: int = 30) -> np.ndarray:
 
 
 @pytest.mark.parametrize("places", [[0], [5], [1, 2], [0, 2, 4], [0, 1, 2, 3]])
-def test_sound_values_tell_the_broken_ones(places: list[int]):
+def test_sound_values_tell_the_broken_ones(places):
     """Exactly, where the modes are all there is; whatever the broken ones read."""
     broken = np.isin(np.arange(6), places)
     read = np.where(broken, np.nan, frames())
@@ -38,7 +36,7 @@ def test_sound_values_tell_the_broken_ones(places: list[int]):
 
 
 @pytest.mark.parametrize(("shape", "mask"), [((3, 2), (1, 0)), ((3, 1, 2), (0, 0))])
-def test_a_broken_taxel_is_filled_on_all_axes(shape: tuple[int, ...], mask: tuple[int, int]):
+def test_a_broken_taxel_is_filled_on_all_axes(shape, mask):
     """Neighbours, which are pressed harder or less, would be far off. Counts stay whole, the given
     ones as they were."""
     taxels = np.rint(frames()).astype(np.int16).reshape(-1, *shape)
@@ -72,13 +70,13 @@ def test_filled_counts_stay_in_the_range_of_their_type():
         ({"modes": ((1e300,) * 6,)}, "finite"),
     ],
 )
-def test_values_that_cannot_be_computed_with_are_refused(change: dict[str, Any], why: str):
+def test_values_that_cannot_be_computed_with_are_refused(change, why):
     """The error has the wrong field."""
     with pytest.raises(BundleError, match=why):
         replace(LOADS, **change)
 
 
-def test_a_manifest_holds_them_or_none(tmp_path: Path):
+def test_a_manifest_holds_them_or_none(tmp_path):
     """A bundle may have none; loads of another skin are refused."""
     rule = Bridging(1, False, False, 4.0, 2.0, False)
     toy = bundle.load(toy_bundle.put(tmp_path / "toy", toy_bundle.files())).manifest

@@ -73,7 +73,7 @@ def toy(tmp_path: Path) -> Bundle:
 
 
 @pytest.mark.parametrize("labels", [2, 6, 50])
-def test_a_bayes_factor_of_ten_contradicts(labels: int):
+def test_a_bayes_factor_of_ten_contradicts(labels):
     """The likelihood ratio K * sum(fused * own) is compared with 1 / 10, however many labels there
     are. Unsure sweeps contradict nothing."""
 
@@ -97,7 +97,7 @@ def test_a_pause_is_from_the_end_to_the_start():
     assert not before.ended(0, ObjectRule(object_s=60))
 
 
-def test_a_contradiction_begins_another_object(toy: Bundle):
+def test_a_contradiction_begins_another_object(toy):
     """Its evidence is that sweep alone, the detail has both labels, and later sweeps are fused with
     it. With `vote` the sweep is compared with the share of the votes."""
     assert [short(one) for one in map(classifier(toy), felt(A, A, B, B, A))] == [
@@ -110,7 +110,7 @@ def test_a_contradiction_begins_another_object(toy: Bundle):
     assert labels(classifier(toy, fuse="vote"), A, A, B) == [("a", 1), ("a", 2), ("b", 1)]
 
 
-def test_an_unsure_sweep_is_fused(toy: Bundle):
+def test_an_unsure_sweep_is_fused(toy):
     """A sweep that is not sure of another label does not end the object, and neither does a sure
     sweep after unsure ones."""
     it = classifier(toy, min_probability=0.9)
@@ -119,7 +119,7 @@ def test_an_unsure_sweep_is_fused(toy: Bundle):
     assert labels(it, NEAR_A, B) == [("a", 1), ("b", 2)]
 
 
-def test_a_contradiction_can_be_refused(toy: Bundle):
+def test_a_contradiction_can_be_refused(toy):
     """The answer is `conflict` without a label, and the evidence stays as it was, until NEW
     OBJECT."""
     it, sweeps = classifier(toy, conflict="refuse"), felt(A, B, A, B)
@@ -132,7 +132,7 @@ def test_a_contradiction_can_be_refused(toy: Bundle):
     assert short(it(replace(sweeps[3], object=2))) == ("ok", "b", 1, "")
 
 
-def test_a_refused_sweep_is_not_a_pause(toy: Bundle):
+def test_a_refused_sweep_is_not_a_pause(toy):
     """The object goes on while sweeps of it are refused; it ends after a pause without sweeps."""
     it = classifier(toy, conflict="refuse", object_s=10)
     sweeps = felt(A, B, B, B)
@@ -142,13 +142,13 @@ def test_a_refused_sweep_is_not_a_pause(toy: Bundle):
 
 
 @pytest.mark.parametrize(("pause_s", "fused"), [(60.0, [1, 2, 3]), (60.5, [1, 1, 1])])
-def test_a_pause_ends_an_object(toy: Bundle, pause_s: float, fused: list[int]):
+def test_a_pause_ends_an_object(toy, pause_s, fused):
     """By the times of the sweeps; the default is 60 s."""
     it = classifier(toy)
     assert [it(sweep).fused for sweep in felt(A, A, A, pause_s=pause_s)] == fused
 
 
-def test_after_max_sweeps_another_object_begins(toy: Bundle):
+def test_after_max_sweeps_another_object_begins(toy):
     """Whether the last answer was `ok` or `undecided`, and without the evidence of the object."""
     it = classifier(toy)
     assert [it(sweep).fused for sweep in felt(*[A] * 12)] == [1, 2, 3, 4, 5, 1, 2, 3, 4, 5, 1, 2]
@@ -158,7 +158,7 @@ def test_after_max_sweeps_another_object_begins(toy: Bundle):
 
 
 @pytest.mark.parametrize(("object", "fuse"), [(0, "product"), (1, "none")])
-def test_sweeps_by_themselves_end_no_object(toy: Bundle, object: int, fuse: str):
+def test_sweeps_by_themselves_end_no_object(toy, object, fuse):
     """Before NEW OBJECT and with `none` nothing is compared."""
     it = classifier(toy, fuse=fuse, conflict="refuse")
     given = [short(it(replace(sweep, object=object))) for sweep in felt(A, B)]
@@ -168,7 +168,7 @@ def test_sweeps_by_themselves_end_no_object(toy: Bundle, object: int, fuse: str)
 @pytest.mark.parametrize(
     ("conflict", "label", "fused"), [("new", "b", 1), ("refuse", None, 3), ("fuse", "a", 4)]
 )
-def test_early_answers_end_objects_too(toy: Bundle, conflict: str, label: str | None, fused: int):
+def test_early_answers_end_objects_too(toy, conflict, label, fused):
     """A sure early answer of another label begins an object. If it is refused, or not ok, the sweep
     goes on and does not count."""
     it = classifier(toy, conflict=conflict)
@@ -181,7 +181,7 @@ def test_early_answers_end_objects_too(toy: Bundle, conflict: str, label: str | 
     assert it(fourth).fused == fused
 
 
-def test_enrolled_labels_contradict(tmp_path: Path):
+def test_enrolled_labels_contradict(tmp_path):
     """A label that was enrolled counts as any other."""
     arrays = toy_bundle.means(sweeps=np.array([0, 0, 5]))
     it = classifier(toy_bundle.load(tmp_path / "enrolled", arrays=arrays, labels=2))
@@ -223,7 +223,7 @@ ORDERS = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("order", ORDERS)
-def test_new_object_forgotten(default_bundle: Bundle, order: str):
+def test_new_object_forgotten(default_bundle, order):
     """NEW OBJECT once, then 240 sweeps of six materials: at most 1 % of the answers are wrong
     though the sweep alone is right. If all are fused, over half are."""
     truth, sweeps = zip(*drawn(ORDERS[order](), 41), strict=True)
@@ -239,7 +239,7 @@ def test_new_object_forgotten(default_bundle: Bundle, order: str):
 
 
 @pytest.mark.slow
-def test_new_object_before_each(default_bundle: Bundle):
+def test_new_object_before_each(default_bundle):
     """NEW OBJECT before each third sweep: no answer gets worse than if only NEW OBJECT ended an
     object, except to the few sweeps that are wrong by themselves."""
     truth, sweeps = zip(*drawn([i // 3 % 6 for i in range(180)], 43), strict=True)
@@ -255,7 +255,7 @@ def test_new_object_before_each(default_bundle: Bundle):
     assert set(worse) <= set(stray)
 
 
-def test_the_settings_reach_the_classifier(toy: Bundle):
+def test_the_settings_reach_the_classifier(toy):
     """By `assembly.classifier`, which the box, its shadow and replays of captures use; the rule is
     kept with each sweep."""
     sets = ("conflict=refuse", "object_s=7.5", "max_sweeps=3", "fuse=vote", "min_probability=0.6")
@@ -270,7 +270,7 @@ def test_the_settings_reach_the_classifier(toy: Bundle):
 
 
 @pytest.mark.parametrize("fusion", ["product", "vote"])
-def test_an_object_without_end_takes_no_more_memory_or_time(toy: Bundle, fusion: str):
+def test_an_object_without_end_takes_no_more_memory_or_time(toy, fusion):
     """After 2,000 sweeps of one object the fused sweeps are as small as after two, and the fused
     probabilities are those of all sweeps."""
     it = classifier(toy, UNTIL_NEW_OBJECT, fuse=fusion)

@@ -59,7 +59,7 @@ def expect_measured(
 
 @pytest.mark.parametrize("direction", DIRECTIONS)
 @pytest.mark.parametrize("speed", [15.0, 30.0, 61.0, 150.0, 300.0])
-def test_speed_and_direction_are_those_of_the_pattern(speed: float, direction: str):
+def test_speed_and_direction_are_those_of_the_pattern(speed, direction):
     """Within 3 %, in each direction, between the limits of the meter."""
     meter = SlideMeter(FORMAT, PITCH_MM)
     expect_measured(meter, turned(passed(FORMAT, speed), direction), speed, direction)
@@ -72,7 +72,7 @@ def test_the_pitch_scales_the_speed():
 
 
 @pytest.mark.parametrize("shear", [False, True])
-def test_the_simulators_texture_travels(shear: bool):
+def test_the_simulators_texture_travels(shear):
     """The simulated finger slides towards row 4, which leads, at 30 mm/s; a skin with shear, whose
     normal axis is the last, gives the same."""
     world = replace(skin.WORLD, shear=shear)
@@ -92,7 +92,7 @@ BREAKS = {
 
 
 @pytest.mark.parametrize("broken", BREAKS)
-def test_two_broken_taxels_change_little(broken: str):
+def test_two_broken_taxels_change_little(broken):
     """A taxel of the middle and one of the edge that are silent, loud or give no number."""
     rng, taxels = np.random.default_rng(2), passed(FORMAT, 30.0)
     for r, c in ((1, 2), (3, 0)):
@@ -117,9 +117,7 @@ def test_vibrations_of_all_taxels_are_left_out():
         (replace(FORMAT, window=1), 4.0, "too short"),
     ],
 )
-def test_a_skin_that_cannot_be_measured_says_why(
-    format: SweepFormat, pitch: float | None, why: str
-):
+def test_a_skin_that_cannot_be_measured_says_why(format, pitch, why):
     """No pitch, too few taxels, too few frames: the reason, also as the result."""
     meter = SlideMeter(format, pitch)
     found = meter(np.zeros((format.window, *format.shape), np.float32))
@@ -179,7 +177,7 @@ def test_slow_frames_are_enough_where_the_lag_is_longer():
 
 
 @pytest.mark.parametrize(("rows", "cols", "direction"), [(8, 1, "rows+"), (1, 8, "cols+")])
-def test_a_single_line_of_taxels_is_enough(rows: int, cols: int, direction: str):
+def test_a_single_line_of_taxels_is_enough(rows, cols, direction):
     """A slide along the line."""
     taxels = turned(passed(replace(FORMAT, rows=8, cols=1), 30.0), direction)
     meter = SlideMeter(replace(FORMAT, rows=rows, cols=cols), PITCH_MM)

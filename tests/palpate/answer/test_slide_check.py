@@ -36,7 +36,7 @@ def model() -> Bundle:
 
 
 @pytest.mark.parametrize("world", skin.WORLDS)
-def test_slides_over_every_material_are_accepted(model: Bundle, world: str):
+def test_slides_over_every_material_are_accepted(model, world):
     """In both worlds, also over a material that the bundle does not know."""
     check = enrolment.slide_check(model)
     rng = np.random.default_rng(5)
@@ -46,7 +46,7 @@ def test_slides_over_every_material_are_accepted(model: Bundle, world: str):
 
 
 @pytest.mark.parametrize("kind", JUNK)
-def test_what_is_no_slide_is_refused_with_its_reason(model: Bundle, kind: str):
+def test_what_is_no_slide_is_refused_with_its_reason(model, kind):
     """A finger at rest, noise, hum, one taxel, in any disguise."""
     assert kind in KINDS
     check = enrolment.slide_check(model)
@@ -56,7 +56,7 @@ def test_what_is_no_slide_is_refused_with_its_reason(model: Bundle, kind: str):
 
 
 @pytest.mark.parametrize("kind", ["finger rests", "load and white noise", "one taxel loaded"])
-def test_enrolment_names_the_sweep_that_was_none(model: Bundle, kind: str):
+def test_enrolment_names_the_sweep_that_was_none(model, kind):
     """The second of three sweeps is not a slide: nothing is learned, and it is named."""
     rng, place = np.random.default_rng(6), skin.placements("T-REAL", 1005)[0]
     sweeps = [skin.window("wood", place, rng, skin.WORLDS["level-blind"]) for _ in range(3)]
@@ -65,7 +65,7 @@ def test_enrolment_names_the_sweep_that_was_none(model: Bundle, kind: str):
         enrolment.enrol(model, "cork", np.stack(sweeps))
 
 
-def test_a_sweep_that_is_answered_can_be_taught(model: Bundle):
+def test_a_sweep_that_is_answered_can_be_taught(model):
     """Slides under more and more noise: a pattern that is enough for an answer is enough for a
     lesson."""
     run, meter = Classifier(model, VirtualClock()), SlideMeter(model.format, 1.0)
@@ -102,7 +102,7 @@ def slides(count: int) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("kind", ["finger rests", "rests, noise", "load and chirp", "random bytes"])
-def test_where_slides_show_a_pattern_others_are_refused_without_a_bundle(kind: str):
+def test_where_slides_show_a_pattern_others_are_refused_without_a_bundle(kind):
     """After MANY slides; also if the rest came first, once all are judged by one another."""
     kind = kind.replace("chirp", "a chirp")
     rest = window(kind, skin.WORLDS["level-blind"], 1)[0]

@@ -85,7 +85,7 @@ def sweep(taxels: np.ndarray, share: float = 1.0) -> Sweep:
         (broken(ONE, "noisy"), "noisy taxel 2.2"),
     ],
 )
-def test_a_broken_taxel_is_bridged_and_named(run: Classifier, taxels: np.ndarray, degraded: str):
+def test_a_broken_taxel_is_bridged_and_named(run, taxels, degraded):
     """The answer is ok, and the recorded sweep stays as it was. Taxel 1.1 carries the material of
     the toy; its neighbour 1.2 does not, so that the bridged load is that of material a."""
     before = taxels.copy()
@@ -96,9 +96,7 @@ def test_a_broken_taxel_is_bridged_and_named(run: Classifier, taxels: np.ndarray
     assert (taxels == before).all()
 
 
-def test_clipped_taxels_are_answered_as_far_as_the_bundle_tolerates(
-    run: Classifier, tmp_path: Path
-):
+def test_clipped_taxels_are_answered_as_far_as_the_bundle_tolerates(run, tmp_path):
     """Six constant taxels are more than may be bridged. They are at the ceiling, so they are not
     broken; a bundle that tolerates as many full counts answers and says the share."""
     few = made(tmp_path)
@@ -122,16 +120,14 @@ def test_clipped_taxels_are_answered_as_far_as_the_bundle_tolerates(
         (np.s_[:, :, 1], 0, Status.DEAD_TAXEL, "column 2"),
     ],
 )
-def test_more_silent_taxels_than_are_proven_are_refused(
-    run: Classifier, place: Any, count: int, status: Status, detail: str
-):
+def test_more_silent_taxels_than_are_proven_are_refused(run, place, count, status, detail):
     """The status and the places are those of a box that bridges nothing."""
     verdict = run(sweep(broken(place, count=count)))
     assert (verdict.status, verdict.label, verdict.detail) == (status, "", detail)
     assert verdict.degraded == ""
 
 
-def test_more_noisy_taxels_than_are_proven_reach_the_network(run: Classifier):
+def test_more_noisy_taxels_than_are_proven_reach_the_network(run):
     """Silent taxels near them are still bridged."""
     noise = np.rint(30 * np.random.default_rng(0).standard_normal((100, 3))).astype(np.int16)
     taxels = GOOD.copy()
@@ -145,9 +141,7 @@ def test_more_noisy_taxels_than_are_proven_reach_the_network(run: Classifier):
 @pytest.mark.parametrize(
     ("taxels", "status"), [(BAD, Status.DEAD_TAXEL), (broken(ONE, "noisy"), Status.OK)]
 )
-def test_a_bundle_without_the_figure_bridges_nothing(
-    tmp_path: Path, taxels: np.ndarray, status: Status
-):
+def test_a_bundle_without_the_figure_bridges_nothing(tmp_path, taxels, status):
     """A dead taxel is refused, a noisy one reaches the network, and the stream changes nothing."""
     bare = Classifier(made(tmp_path, None), VirtualClock())
     bare.frames(frames(taxels))
@@ -155,14 +149,14 @@ def test_a_bundle_without_the_figure_bridges_nothing(
     assert (verdict.status, verdict.degraded, bare.degraded) == (status, "", "")
 
 
-def test_a_bridged_window_without_contact_is_refused(run: Classifier):
+def test_a_bridged_window_without_contact_is_refused(run):
     """A single stuck taxel does not count as contact."""
     taxels = np.where(np.arange(100) % 2, 5, 0)[:, None, None] * np.ones((4, 4))
     taxels[:, 2, 2] = 90
     assert run(sweep(taxels.astype(np.int16))).status is Status.NO_CONTACT
 
 
-def test_the_place_of_the_contact_is_computed_from_bridged_taxels(tmp_path: Path):
+def test_the_place_of_the_contact_is_computed_from_bridged_taxels(tmp_path):
     """A dead taxel at the edge would move the centre of the contact."""
     at = replace(toy_bundle.IN_PLACE, rows_mm=(1.5,), cols_mm=(1.5,), limit_mm=0.05)
     dead = broken(np.s_[:, 3, 3])
@@ -171,7 +165,7 @@ def test_the_place_of_the_contact_is_computed_from_bridged_taxels(tmp_path: Path
     assert Classifier(made(tmp_path, None, contact=at), VirtualClock())(sweep(dead)).displacement
 
 
-def test_an_early_answer_bridges_too(tmp_path: Path):
+def test_an_early_answer_bridges_too(tmp_path):
     """The answer has the taxel; with too many broken taxels the rest of the sweep is needed."""
     outputs, rule = ("logits", "embedding", "early"), Early((0.5,) * 3, 1)
     early = EarlyExit(Classifier(made(tmp_path, early=rule, outputs=outputs), VirtualClock()))
@@ -182,7 +176,7 @@ def test_an_early_answer_bridges_too(tmp_path: Path):
 
 
 @pytest.mark.parametrize("kind", ["silent", "noisy"])
-def test_a_taxel_is_broken_over_the_stream_after_several_stretches(watch: TaxelWatch, kind: str):
+def test_a_taxel_is_broken_over_the_stream_after_several_stretches(watch, kind):
     """It is then bridged in every window, until it has been sound for a while."""
     bad, named, tare = broken(ONE, kind), f"{kind} taxel 2.2", np.zeros((4, 4))
     assert [seen(watch, bad) for _ in range(CERTAIN)] == [""] * (CERTAIN - 1) + [named]
@@ -203,22 +197,20 @@ def test_a_taxel_is_broken_over_the_stream_after_several_stretches(watch: TaxelW
         ([BAD[:30], BAD[30:60]], "silent taxel 2.2"),
     ],
 )
-def test_which_streams_make_a_taxel_broken(
-    watch: TaxelWatch, stretches: list[np.ndarray], named: str
-):
+def test_which_streams_make_a_taxel_broken(watch, stretches, named):
     """Single bad stretches are forgiven; the grouping of frames does not matter. Another skin
     begins without broken taxels."""
     assert seen(watch, *stretches, times=4 * CERTAIN) == named
     assert seen(watch, GOOD, epoch=1) == ""
 
 
-def test_a_resting_skin_does_not_clear_a_silent_taxel(watch: TaxelWatch):
+def test_a_resting_skin_does_not_clear_a_silent_taxel(watch):
     """A constant skin says nothing about silent taxels."""
     assert seen(watch, BAD, times=CERTAIN)
     assert seen(watch, np.full((100, 4, 4), 50, np.int16), times=2 * SOUND) == "silent taxel 2.2"
 
 
-def test_too_many_taxels_over_the_stream_are_refused(run: Classifier):
+def test_too_many_taxels_over_the_stream_are_refused(run):
     """Also in a window in which they happen to be sound. A sidecar has an entry only of a skin with
     broken taxels."""
     assert "broken" not in run.about()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -63,7 +62,7 @@ def found(taxels: np.ndarray, rule: Bridging = RULE, limits: WindowLimits = LIMI
         (np.s_[17, 1, 1], -np.inf, "silent taxel 2.2"),
     ],
 )
-def test_a_constant_taxel_is_silent(place: Any, count: float, named: str):
+def test_a_constant_taxel_is_silent(place, count, named):
     """Dead, stuck, or without a number in one frame. A broken wire of a matrix silences a row or a
     column, also at the edge. A sound skin has no broken taxel."""
     taxels = slide() if np.isfinite(count) else slide().astype(np.float32)
@@ -199,7 +198,7 @@ def test_bridged_counts_stay_in_the_range_of_their_type():
         (np.s_[:2, :2], False),
     ],
 )
-def test_the_number_that_may_be_bridged(place: Any, allowed: bool):
+def test_the_number_that_may_be_bridged(place, allowed):
     """Up to three anywhere, or any number in one row or one column."""
     mask = np.zeros((ROWS, COLS), bool)
     mask[place] = True
@@ -218,7 +217,7 @@ def test_the_number_that_may_be_bridged(place: Any, allowed: bool):
         (replace(RULE, taxels=0, row=False, column=False), "no broken taxel"),
     ],
 )
-def test_the_rule_in_words(rule: Bridging, text: str):
+def test_the_rule_in_words(rule, text):
     """`check` and `export` print it."""
     assert rule.text.endswith(text)
 
@@ -232,7 +231,7 @@ def test_the_rule_in_words(rule: Bridging, text: str):
         ({"quietest": float("inf")}, "quietest inf"),
     ],
 )
-def test_a_rule_out_of_range_is_refused(change: dict[str, Any], why: str):
+def test_a_rule_out_of_range_is_refused(change, why):
     """The message names the field and its value."""
     with pytest.raises(BundleError, match=why):
         replace(RULE, **change)

@@ -66,7 +66,7 @@ def displaced_box(tmp_path: Path) -> Classifier:
     return Classifier(made, VirtualClock(), max_sweeps=2)
 
 
-def test_a_material_has_its_own_shape(displaced_box: Classifier):
+def test_a_material_has_its_own_shape(displaced_box):
     """In the second direction "a" scatters twice as far as "b": it is known at a distance of 5.5,
     and "b" is not."""
     places = [(0, -5.5), (0, -6.5), (6, -2.5), (6, -3.5)]
@@ -74,7 +74,7 @@ def test_a_material_has_its_own_shape(displaced_box: Classifier):
     assert displaced_box(toy_bundle.sweep(6, -3.5)).status is Status.UNKNOWN
 
 
-def test_a_displacement_makes_no_material_unknown(displaced_box: Classifier, tmp_path: Path):
+def test_a_displacement_makes_no_material_unknown(displaced_box, tmp_path):
     """For displaced contacts the first direction has a tenth of the weight, and the limit is
     another: a sweep may be unknown without displacement and known with it, and the reverse. Without
     a rule the sweep is marked, and the usual distances apply."""
@@ -91,7 +91,7 @@ def test_a_displacement_makes_no_material_unknown(displaced_box: Classifier, tmp
     assert answer(bare, away(0, -2.5)).label == "a"
 
 
-def test_a_displaced_sweep_needs_its_own_probability(displaced_box: Classifier):
+def test_a_displaced_sweep_needs_its_own_probability(displaced_box):
     """Its logits are divided by the rule's temperature, and below the rule's probability it is
     unsure. A second sweep of the object decides, or `max_sweeps` ends the object."""
     z = (2.2, 0.0)  # logits of "a" and "b" are (0, 6 * 2.2 - 18) / 2 = (0, -2.4), in place
@@ -105,7 +105,7 @@ def test_a_displaced_sweep_needs_its_own_probability(displaced_box: Classifier):
     assert least(away(*z, 4)).status is Status.UNSURE
 
 
-def test_enrolled_labels_are_compared_where_the_skin_is(tmp_path: Path):
+def test_enrolled_labels_are_compared_where_the_skin_is(tmp_path):
     """After an enrolment the probability of an enrolled label is computed from means, and for
     displaced contacts from the means of displaced sweeps."""
     arrays = toy_bundle.means(**toy_bundle.displaced_arrays(), sweeps=np.array([0, 0, 2]))
@@ -117,7 +117,7 @@ def test_enrolled_labels_are_compared_where_the_skin_is(tmp_path: Path):
     assert scores[2] == pytest.approx(softmax(logits)[2], abs=1e-3)
 
 
-def test_an_unknown_material_that_comes_again_is_noticed(displaced_box: Classifier):
+def test_an_unknown_material_that_comes_again_is_noticed(displaced_box):
     """A sweep as near to an earlier unknown one as two of one material names it, the nearest if
     there are several. A known sweep between them changes nothing; a third material is like none."""
 
@@ -142,7 +142,7 @@ def disturbed(tmp_path: Path, allowed: Disturbances = ALLOWED, **more: Any) -> B
     return toy_bundle.load(tmp_path / "toy", arrays=arrays, disturbances=allowed, **more)
 
 
-def test_means_and_limits_move_with_the_disturbance(tmp_path: Path):
+def test_means_and_limits_move_with_the_disturbance(tmp_path):
     """A fifth of the frames lost moves "a" by 4, and the limit from 9 to 12.6. A sweep there is
     unknown without that loss. More than was tried is unknown even on a mean, with the reason."""
     given = disturbed(tmp_path)
@@ -159,7 +159,7 @@ def test_means_and_limits_move_with_the_disturbance(tmp_path: Path):
     assert answer(bare, lost(0, 0, 6)).label == "a"  # without means nothing is allowed
 
 
-def test_displaced_sweeps_are_allowed_the_same(tmp_path: Path):
+def test_displaced_sweeps_are_allowed_the_same(tmp_path):
     """In the turned embedding of displaced contacts."""
     place = {"contact": replace(toy_bundle.IN_PLACE, limit_mm=0.001)}
     given = disturbed(tmp_path, arrays=toy_bundle.displaced_arrays(), **DISPLACED | place)
@@ -168,7 +168,7 @@ def test_displaced_sweeps_are_allowed_the_same(tmp_path: Path):
     assert answer(given, lost(1, -4)).status is not Status.UNKNOWN
 
 
-def test_an_enrolled_label_moves_as_the_others_do_on_average(tmp_path: Path):
+def test_an_enrolled_label_moves_as_the_others_do_on_average(tmp_path):
     """By 5.3 with a fifth of the frames lost."""
     sweeps = np.stack([toy_bundle.window(20, 20)] * 5)
     now = enrolment.enrol(disturbed(tmp_path), "new", sweeps).bundle
@@ -178,7 +178,7 @@ def test_an_enrolled_label_moves_as_the_others_do_on_average(tmp_path: Path):
 
 
 @pytest.mark.parametrize("tried", [None, 0.5])
-def test_a_manifest_holds_what_was_tried(tmp_path: Path, tried: float | None):
+def test_a_manifest_holds_what_was_tried(tmp_path, tried):
     """It is read as it was written."""
     first, *others = ALLOWED.allowances
     allowed = replace(ALLOWED, allowances=(replace(first, tried=tried), *others))
@@ -186,7 +186,7 @@ def test_a_manifest_holds_what_was_tried(tmp_path: Path, tried: float | None):
     assert bundle.Manifest.parse(text).disturbances == allowed
 
 
-def test_hum_is_removed_and_said(tmp_path: Path):
+def test_hum_is_removed_and_said(tmp_path):
     """A sweep with hum gets the answer of a sweep without it, unless the bundle removes none."""
     given, clean = disturbed(tmp_path, format=HUMMING), toy_bundle.sweep(6, 0, format=HUMMING)
     noisy = np.rint(clean.frames.taxels + HUM).astype(np.int16)
@@ -198,7 +198,7 @@ def test_hum_is_removed_and_said(tmp_path: Path):
     assert (kept.label, kept.detail) == ("b", "")
 
 
-def test_a_material_is_enrolled_without_hum(tmp_path: Path):
+def test_a_material_is_enrolled_without_hum(tmp_path):
     """Sweeps with hum and without it give the same mean, like they give the same answer."""
     given = disturbed(tmp_path, format=HUMMING)
     clean = np.stack([toy_bundle.window(20, 20, HUMMING)] * 3)
@@ -211,7 +211,7 @@ def test_a_material_is_enrolled_without_hum(tmp_path: Path):
 
 
 @pytest.mark.parametrize("changes", [CHANGES[:1], CHANGES[:, :2], CHANGES[:, :, :1]])
-def test_changes_of_another_shape_are_refused(tmp_path: Path, changes: np.ndarray):
+def test_changes_of_another_shape_are_refused(tmp_path, changes):
     """A row for each allowance, a column for each trained label."""
     with pytest.raises(BundleError, match="float16"):
         disturbed(tmp_path, arrays={"changes": changes})
@@ -229,7 +229,7 @@ def exit_of(of: Bundle) -> EarlyExit:
     return EarlyExit(Classifier(of, VirtualClock()))
 
 
-def test_no_early_answer_for_an_unknown_material(tmp_path: Path):
+def test_no_early_answer_for_an_unknown_material(tmp_path):
     """At a squared distance of 9 from "b" its head is certain, and so is an early answer without
     limits; with limits the rest of the sweep is needed. Each step that must agree has its limit."""
     early = exit_of(early_toy(tmp_path))
@@ -275,7 +275,7 @@ def test_distances_have_the_shape_of_each_step():
         ({"known": None}, "without `known`"),
     ],
 )
-def test_a_bundle_with_incomplete_checks_is_refused(tmp_path: Path, more: dict, why: str):
+def test_a_bundle_with_incomplete_checks_is_refused(tmp_path, more, why):
     """Without the means of unfinished sweeps, with those of other steps or of another type, with a
     model that does not give the embeddings of as many steps, or without `known`."""
     with pytest.raises(BundleError, match=why):
@@ -283,7 +283,7 @@ def test_a_bundle_with_incomplete_checks_is_refused(tmp_path: Path, more: dict, 
 
 
 @pytest.mark.parametrize("limits", [(4.0,), (4.0, 0.0, 4.0), (4.0, "4", 4.0)])
-def test_limits_out_of_range_are_refused(limits: tuple):
+def test_limits_out_of_range_are_refused(limits):
     """Too few limits, 0, and text."""
     with pytest.raises(BundleError, match=r"early\.limits"):
         Early((0.6, 0.6, 0.6), 2, limits)
@@ -292,9 +292,7 @@ def test_limits_out_of_range_are_refused(limits: tuple):
 @pytest.mark.parametrize(
     ("farthest_mm", "status"), [(None, Status.OK), (0.5, Status.OK), (0.3, Status.UNKNOWN)]
 )
-def test_a_contact_is_named_up_to_the_farthest_displacement(
-    tmp_path: Path, farthest_mm: float | None, status: Status
-):
+def test_a_contact_is_named_up_to_the_farthest_displacement(tmp_path, farthest_mm, status):
     """It lies 0.3 mm from its position in training. Beyond the limit the answer is `unknown` with
     the direction, and no early answer is given."""
     rule = replace(toy_bundle.DISPLACEMENT, farthest_mm=farthest_mm)

@@ -29,7 +29,7 @@ def tracked(*parts: np.ndarray, format: SweepFormat = FORMAT, packet: int = 7) -
 
 
 @pytest.mark.parametrize("first", ["lifted", "touched"])
-def test_it_is_the_skin_that_nothing_touches(first: str):
+def test_it_is_the_skin_that_nothing_touches(first):
     """Whether the finger is there at first or not; it is certain once both were seen."""
     lifted, touched = skin(500, 3), skin(800, 40, seed=1)
     found = tracked(
@@ -48,7 +48,7 @@ def test_a_finger_at_rest_is_not_taken_for_the_unloaded_skin():
 
 
 @pytest.mark.parametrize("noise", [3, 40])
-def test_without_a_change_nothing_is_certain(noise: float):
+def test_without_a_change_nothing_is_certain(noise):
     """A skin that was never touched, and one that was never let go, look alike."""
     assert not tracked(skin(500, noise, 2000)).certain
 

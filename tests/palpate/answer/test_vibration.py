@@ -50,7 +50,7 @@ def test_a_constant_part_rests_and_numbers_that_are_none_do_not():
 
 
 @pytest.mark.parametrize("least", [(math.inf,), (math.nan, -1.0), ("-5",)])
-def test_limits_that_are_not_numbers_are_refused(least: tuple):
+def test_limits_that_are_not_numbers_are_refused(least):
     """Infinity, NaN and text."""
     with pytest.raises(BundleError, match=r"sliding\.least"):
         SlideLimits(least)

@@ -4,7 +4,6 @@ status."""
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -38,7 +37,7 @@ def moving(level: float = 80, shape: tuple[int, ...] = (300, 4, 4)) -> np.ndarra
         (np.s_[:60, 2:, 2:], 255, Status.SATURATED, "taxel 3.3 3.4 4.3 4.4"),
     ],
 )
-def test_a_spoiled_window_is_named(place: Any, value: int, status: Status, detail: str):
+def test_a_spoiled_window_is_named(place, value, status, detail):
     """Each kind of fault, with its taxel (row.column from 1). A loaded, vibrating skin is accepted.
     As many dead taxels as the bundle allows are, too."""
     taxels = moving()
@@ -95,7 +94,7 @@ def test_without_a_threshold_every_taxel_counts_as_loaded():
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_a_taxel_that_gives_no_number_is_dead(value: float):
+def test_a_taxel_that_gives_no_number_is_dead(value):
     """One frame of it is enough, also at the edge, and for any number of dead taxels that the
     bundle tolerates."""
     taxels = moving().astype(np.float32)
@@ -137,7 +136,7 @@ def test_shear_is_at_full_scale_on_both_sides():
         (np.s_[:200, 0, 1, 0], -2000, Status.SATURATED, "taxel 1.2 axis 1"),
     ],
 )
-def test_a_spoiled_axis_is_named(place: Any, value: int, status: Status, detail: str):
+def test_a_spoiled_axis_is_named(place, value, status, detail):
     """Each kind of fault on one axis or all of them; a taxel whose every axis is meant is named
     alone."""
     taxels = sheared()
@@ -173,7 +172,7 @@ def test_tare_counts():
     st.integers(0, 255),
     st.integers(0, 2**32 - 1),
 )
-def test_any_window_gets_a_status(sizes: tuple[int, ...], spread: int, seed: int):
+def test_any_window_gets_a_status(sizes, spread, seed):
     """Any counts of any shape, one frame long or constant: a status, never an error."""
     n, *rest = sizes
     form = shape(*rest)
@@ -195,7 +194,7 @@ UNLOADED = UnloadedSkin.measured(
         (np.s_[:, 0, 1], 255, Status.SATURATED, "taxel 1.2"),
     ],
 )
-def test_faults_are_found_without_a_bundle(place: Any, value: int, status: Status, detail: str):
+def test_faults_are_found_without_a_bundle(place, value, status, detail):
     """Contact, stuck and dead taxels by comparison with the unloaded skin, saturation by the
     highest count."""
     taxels = moving()
@@ -222,7 +221,7 @@ def test_a_touch_is_a_difference_from_the_unloaded_skin():
 @pytest.mark.parametrize(
     ("bits", "status"), [(10, Status.SATURATED), (12, Status.SATURATED), (11, Status.OK)]
 )
-def test_the_full_scale_of_usual_converters(bits: int, status: Status):
+def test_the_full_scale_of_usual_converters(bits, status):
     """Counts of ten bits in sixteen are saturated at 1023; a limit that no usual converter has is
     not guessed."""
     taxels = moving().astype(np.uint16)
@@ -231,17 +230,13 @@ def test_the_full_scale_of_usual_converters(bits: int, status: Status):
 
 
 @pytest.mark.parametrize("value", [1e20, -3e15, np.inf, np.nan])
-def test_one_impossible_reading_kills_its_taxel(value: float):
+def test_one_impossible_reading_kills_its_taxel(value):
     """A single count beyond any skin, with a bundle, without one, and before the unloaded skin is
     known: the taxel is named, so the sweep is not called good."""
     taxels = moving().astype(np.float32)
     taxels[17, 1, 2] = value
     bare = UnloadedSkin(np.zeros((4, 4)), np.ones((4, 4)), 10.0)
-    checks = (
-        inspect(taxels, BARE, LIMITS),
-        inspect_bare(taxels, bare),
-        inspect_readings(taxels),
-    )
+    checks = (inspect(taxels, BARE, LIMITS), inspect_bare(taxels, bare), inspect_readings(taxels))
     assert {(one.status, one.detail) for one in checks} == {(Status.DEAD_TAXEL, "taxel 2.3")}
     for dtype in (np.uint8, np.float32):
         assert inspect_readings(moving().astype(dtype)).status is Status.OK

@@ -86,9 +86,7 @@ def levels(ask: Callable[[bytes], bytes]) -> int:
 
 @pytest.mark.parametrize("error", [CommandRefused("no"), NoAnswer("no answer to START")])
 @pytest.mark.parametrize("write", [one(START, True), several(START)])
-def test_a_refused_command_is_carried_out_when_it_is_sent_again(
-    source: ScriptedSource, ask: Callable[[bytes], bytes], write: bytes, error: Exception
-):
+def test_a_refused_command_is_carried_out_when_it_is_sent_again(source, ask, write, error):
     """Exception 4 twice, with the coil off; then the box obeys, and the coil is on."""
     source.refused, source.error = {"START"}, error
     for _ in range(2):
@@ -126,12 +124,7 @@ and all commands that were sent."""
 
 
 @pytest.mark.parametrize(("writes", "sent"), WRITES.values(), ids=WRITES)
-def test_several_coils_in_one_write(
-    source: ScriptedSource,
-    ask: Callable[[bytes], bytes],
-    writes: list[tuple[str, int, int]],
-    sent: list[str],
-):
+def test_several_coils_in_one_write(source, ask, writes, sent):
     """Exception 4 if a command is refused; a coil is on only if its command was carried out."""
     for refused, wanted, on in writes:
         source.refused = {refused}
@@ -165,9 +158,7 @@ LEVELS: dict[str, tuple[list[tuple[int, bytes]], list[str]]] = {
 
 
 @pytest.mark.parametrize(("writes", "sent"), LEVELS.values(), ids=LEVELS)
-def test_a_coil_that_was_not_0_on_this_connection_does_not_rise(
-    source: ScriptedSource, writes: list[tuple[int, bytes]], sent: list[str]
-):
+def test_a_coil_that_was_not_0_on_this_connection_does_not_rise(source, writes, sent):
     """A controller that writes cyclically sends no command again after a broken connection, and
     START with STOP is no sweep; a coil that rises is carried out."""
     ask = fresh(ModbusBridge(source, SystemClock(), writes=True), [None] * len(COILS))
@@ -192,9 +183,7 @@ def test_a_coil_that_was_not_0_on_this_connection_does_not_rise(
         ("100028007cf8" + "0001" * 124, 3),
     ],
 )
-def test_other_registers_are_not_written(
-    source: ScriptedSource, ask: Callable[[bytes], bytes], pdu: str, code: int
-):
+def test_other_registers_are_not_written(source, ask, pdu, code):
     """Other registers or wrong lengths in functions 6 and 16 are refused and change nothing."""
     data = bytes.fromhex(pdu)
     assert ask(data) == bytes([data[0] | 0x80, code])
@@ -203,9 +192,7 @@ def test_other_registers_are_not_written(
     assert ask(bytes.fromhex("0300280002")) == bytes.fromhex("030400000000")
 
 
-def test_start_has_the_registers_of_its_connection(
-    source: ScriptedSource, ask: Callable[[bytes], bytes]
-):
+def test_start_has_the_registers_of_its_connection(source, ask):
     """Tenths of mm/s and hundredths of N, written in one request or in two, and read back; 0 is
     left out. Other commands and other connections have none."""
     assert SLIDE_AT == 40

@@ -34,7 +34,7 @@ def settled(kind: str, *options: str, sets: tuple[str, ...] = ()) -> argparse.Na
 @pytest.mark.slow
 @pytest.mark.thorough  # starts processes and waits for them
 @pytest.mark.parametrize("kind", ["tcp", "modbus"])
-def test_ctrl_c_while_the_box_owes_an_answer(kind: str):
+def test_ctrl_c_while_the_box_owes_an_answer(kind):
     """A command is pending: the bridge ends at once with exit code 130 and without a traceback."""
     far, near = os.openpty()
     tty.setraw(near)
@@ -59,7 +59,7 @@ def test_ctrl_c_while_the_box_owes_an_answer(kind: str):
     assert (bridge.returncode, "Traceback" in rest) == (130, False), rest
 
 
-def test_a_serial_line_that_is_not_there_gets_a_warning(caplog: pytest.LogCaptureFixture):
+def test_a_serial_line_that_is_not_there_gets_a_warning(caplog):
     """A port that does not exist is named; sockets and existing ports are not."""
     command._warn(settled("modbus", "--port", "/dev/nonexist"))
     assert "/dev/nonexist" in caplog.text
@@ -79,7 +79,7 @@ def test_the_settings_of_a_new_box():
 
 
 @pytest.mark.parametrize("kind", LINKS)
-def test_the_line_of_the_bridge(kind: str):
+def test_the_line_of_the_bridge(kind):
     """serial.port names its link: the bridge makes it, with the address of the settings."""
     sets = (f"serial.port={LINKS[kind]}", "bridge.address=192.168.0.10", "bridge.allow_writes=true")
     args = settled(kind, sets=sets)
@@ -105,7 +105,7 @@ def test_options_hold():
         ("serial.port=/dev/ttyAMA0", "store.runtime="),
     ],
 )
-def test_no_way_to_the_box(sets: tuple[str, ...]):
+def test_no_way_to_the_box(sets):
     """Commands without a line, or neither line nor feed: refused, with what to set."""
     with pytest.raises(ConfigError, match="/run/palpate-modbus/line"):
         settled("modbus", sets=sets)
@@ -120,7 +120,7 @@ def test_no_way_to_the_box(sets: tuple[str, ...]):
         ("modbuss",),
     ],
 )
-def test_options_that_do_not_fit(options: tuple[str, ...]):
+def test_options_that_do_not_fit(options):
     """An option of another kind, or two ways to the box: exit code 2."""
     with pytest.raises(SystemExit) as ended:
         settled(*options)

@@ -79,7 +79,7 @@ def scored(p: dict[str, float], sweep: int = 1, **other: Any) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("fingers", [("left", "right"), ("a", "b", "c", "d")])
-def test_each_finger_answers_then_the_hand(fingers: tuple[str, ...]):
+def test_each_finger_answers_then_the_hand(fingers):
     """FIN in the order of the names whatever comes first, then RES with the product, all with the
     hand's own number; nothing before the last finger has answered."""
     fused = Fused(*fingers)
@@ -97,7 +97,7 @@ def test_each_finger_answers_then_the_hand(fingers: tuple[str, ...]):
         assert (hand.label, hand.status, own[0].probability) == ("wood", "ok", 0.6)
 
 
-def test_labels_are_fused_by_name(two: Fused):
+def test_labels_are_fused_by_name(two):
     """The second bundle has the same labels in another order."""
     turned = [*reversed(LABELS)]
     two.take("right", feed_lines.hello(labels=turned), feed_lines.health(0))
@@ -125,9 +125,7 @@ UNSURE = {"status": "unsure"}
         ({"degraded": "silent taxel 1.1"}, {}, "ok", "wood", "degraded: left silent taxel 1.1"),
     ],
 )
-def test_what_becomes_of_a_finger_that_differs(
-    two: Fused, left: dict, right: dict, status: str, label: str, detail: str
-):
+def test_what_becomes_of_a_finger_that_differs(two, left, right, status, label, detail):
     """A finger without probabilities is left out and named; an unknown material is the hand's."""
     for name, other in (("left", left), ("right", right)):
         two.take(name, scored({"wood": 0.8}) | other)
@@ -141,14 +139,14 @@ def test_what_becomes_of_a_finger_that_differs(
     ("p", "status", "wanted"),
     [(0.45, "unsure", "ok"), (0.2, "unsure", "unsure"), (0.2, "undecided", "undecided")],
 )
-def test_two_fingers_may_be_sure_together(two: Fused, p: float, status: str, wanted: str):
+def test_two_fingers_may_be_sure_together(two, p, status, wanted):
     """The least probability is asked of the product; final where a finger takes no more sweeps."""
     for name in ("left", "right"):
         two.take(name, scored({"wood": p}, status=status, fused=3))
     assert (two.said[-1].status, two.said[-1].fused) == (wanted, 3)
 
 
-def test_other_labels_are_not_fused(two: Fused):
+def test_other_labels_are_not_fused(two):
     """A material was taught to one finger only: `failed`, with the reason."""
     two.take("right", feed_lines.hello(labels=[*LABELS[1:], "cork"]), feed_lines.health(0))
     two.take("left", scored({"wood": 0.9}))
@@ -157,7 +155,7 @@ def test_other_labels_are_not_fused(two: Fused):
     assert "labels" in two.said[-1].detail
 
 
-def test_a_finger_that_sweeps_is_waited_for(two: Fused):
+def test_a_finger_that_sweeps_is_waited_for(two):
     """The skin of the left finger is away, so it is `not-ready` at the start edge; the right one
     answers seconds later."""
     two.take("right", feed_lines.state(sweeping=True))
@@ -169,7 +167,7 @@ def test_a_finger_that_sweeps_is_waited_for(two: Fused):
 
 
 @pytest.mark.parametrize("how", ["idle", "gone", "next"])
-def test_a_finger_without_an_answer_is_not_waited_for(two: Fused, how: str):
+def test_a_finger_without_an_answer_is_not_waited_for(two, how):
     """It heard no edge, its unit has ended, or the other finger answers the next sweep already."""
     if how == "gone":
         two.take("right", feed_lines.state(sweeping=True))
@@ -183,7 +181,7 @@ def test_a_finger_without_an_answer_is_not_waited_for(two: Fused, how: str):
     assert [of.finger for of in two.said] == ["left", ""]
 
 
-def test_state(two: Fused):
+def test_state(two):
     """Once a second; sums over the skins, and the fingers that are away or have broken taxels."""
     del two.lines[:]
     two.take("left", feed_lines.state("absent", "no skin"))
@@ -202,7 +200,7 @@ def test_state(two: Fused):
     assert BoxState.of([str(field) for field in two.hand.state()]).skin == "absent"
 
 
-def test_commands(two: Fused):
+def test_commands(two):
     """STATE and LABEL are answered here, all others by the units."""
 
     def asked(text: str) -> list[str]:
@@ -224,7 +222,7 @@ def test_bundles_have_one_id_together():
 @pytest.mark.parametrize(
     "given", ["left", "left left", "a b c d e", "left RIGHT", "left toolongname"]
 )
-def test_which_fingers_is_checked(given: str):
+def test_which_fingers_is_checked(given):
     """2 to 4 names of units, which fit into a sentence."""
     with pytest.raises(ConfigError):
         command.feeds(given.split())
@@ -242,7 +240,7 @@ def units(tmp_path: Path) -> Iterator[dict[str, Offered]]:
         yield made
 
 
-def test_the_program_reads_the_feeds(units: dict[str, Offered]):
+def test_the_program_reads_the_feeds(units):
     """From the real feeds of two boxes to sentences on standard output, until SIGTERM. A busy
     machine may fuse a finger alone before the other is heard."""
     both = re.compile(rb"(\$PPLP,FIN.*\r\n){2}\$PPLP,RES")

@@ -65,7 +65,7 @@ def taken(camera: Any, *lines: dict[str, Any]) -> dict[str, float]:
     return camera.observation()
 
 
-def test_frames_verdict_and_displacement(camera: Any):
+def test_frames_verdict_and_displacement(camera):
     """Raw counts by taxel, the code as on the class bits, and the distance from the nearest trained
     position; a running sweep clears the previous answer."""
     assert camera.feed.asked[0] == {"frames": 10, "sweeps": False}
@@ -87,7 +87,7 @@ def test_frames_verdict_and_displacement(camera: Any):
     eventually(lambda: camera.observation()["moved_rows_mm"] > 2)
 
 
-def test_the_image(camera: Any):
+def test_the_image(camera):
     """Counts from black to white, four fifths high; below them verdict and displacement."""
     for _ in range(12):
         taken(camera, feed_lines.verdict(1, 2.5))
@@ -101,7 +101,7 @@ def test_the_image(camera: Any):
     assert np.abs(image[150, 120, :2].astype(int) - 128).max() <= 3
 
 
-def test_three_axes_have_colours(plugin: Any):
+def test_three_axes_have_colours(plugin):
     """Counts between `low` and `high`; no frame is black, and no displacement is marked."""
     form = {"rows": 1, "cols": 2, "axes": 3, "dtype": "float32", "rate_hz": 100, "window": 9}
     touch = plugin.LastTouch(feed_lines.hello(format=form, alignment=None))
@@ -116,7 +116,7 @@ def test_three_axes_have_colours(plugin: Any):
         touch.take({"type": "frame", "taxels": [[1, 2]]})
 
 
-def test_a_restarted_box_is_read_again(camera: Any):
+def test_a_restarted_box_is_read_again(camera):
     """Nothing of the program before stays, and a skin that does not stream gives its reason."""
     taken(camera, feed_lines.verdict(1, 2.5))
     camera.feed.say(feed_lines.hello(pid=72), feed_lines.state("no-device", "the skin is off"))
@@ -138,7 +138,7 @@ def _old(camera: Any) -> bool:
     return False
 
 
-def test_what_cannot_be_read_is_refused(plugin: Any, tmp_path: Path, monkeypatch: Any):
+def test_what_cannot_be_read_is_refused(plugin, tmp_path, monkeypatch):
     """A wrong configuration, a box that is off, and calls out of turn."""
     for wrong, why in (
         ({"fps": 50}, "fps is 50; the feed gives 1 to 20"),
@@ -198,7 +198,7 @@ print(json.dumps({
 
 
 @pytest.mark.slow
-def test_lerobot_itself_finds_and_reads_it(tmp_path: Path):
+def test_lerobot_itself_finds_and_reads_it(tmp_path):
     """By its distribution's prefix and a command line; observations become features."""
     lerobot.required()
     with lerobot.played(tmp_path / "feed") as feed, saying(feed, PRESSED):

@@ -9,7 +9,6 @@ import random
 import socket
 import struct
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -66,7 +65,7 @@ def sweeps(box: SpeakingBox) -> list[str]:
     return [s.kind for s in box.heard if s.kind in COILS]
 
 
-def test_another_client_reads_the_map(box: SpeakingBox, raw: RawModbus, address: Address):
+def test_another_client_reads_the_map(box, raw, address):
     """pymodbus finds the answer in input and in holding registers, and the inputs."""
     box.say(result(70_000, label="paper"), state(answered=7))
     eventually(
@@ -114,7 +113,7 @@ MEASURED = (
 """The optional fields of an answer, and the two registers."""
 
 
-def test_the_measured_slide_is_read(box: SpeakingBox, raw: RawModbus):
+def test_the_measured_slide_is_read(box, raw):
     """Two registers: tenths of mm/s, and a code for each direction; 0 where RES has no
     speed, or a direction of a later version. They are refused to writers."""
     for number, (optional, words) in enumerate(MEASURED, 1):
@@ -127,7 +126,7 @@ def test_the_measured_slide_is_read(box: SpeakingBox, raw: RawModbus):
 FINGERS_AT = 44
 
 
-def test_the_fingers_are_read(box: SpeakingBox, raw: RawModbus):
+def test_the_fingers_are_read(box, raw):
     """Their number, then name, status, label code and probability of each; 0 where there is none,
     and after the next answer of a box with one skin."""
     box.say(finger("left", 1, "ok", "paper"))
@@ -147,7 +146,7 @@ def test_the_fingers_are_read(box: SpeakingBox, raw: RawModbus):
     assert raw.registers(FINGERS_AT, 1 + 4 * 7) == [0] * 29
 
 
-def test_another_client_sweeps(box: SpeakingBox, raw: RawModbus, address: Address):
+def test_another_client_sweeps(box, raw, address):
     """pymodbus writes speed and force, and pulses NEW, START and STOP: the box hears them once
     each, in order, and the answer's number rises."""
     with ModbusTcpClient(address[0], port=address[1], timeout=LONG_S) as client:
@@ -163,7 +162,7 @@ def test_another_client_sweeps(box: SpeakingBox, raw: RawModbus, address: Addres
     assert [s.fields for s in box.heard if s.kind == "START"] == [["30.5", "1.5"]]
 
 
-def test_bytes_by_hand(raw: RawModbus):
+def test_bytes_by_hand(raw):
     """Requests and replies as the specification prints them, with exception codes."""
     raw.send(bytes.fromhex("0400000001"), transaction=0x1234, unit=7)
     assert raw.receive().hex() == "123400000005" + "07" + "0402" + "0001"
@@ -192,7 +191,7 @@ def test_bytes_by_hand(raw: RawModbus):
         assert reply == bytes([int(pdu[:2], 16) | 0x80, code]), pdu
 
 
-def test_a_request_in_pieces_and_several_in_one(raw: RawModbus):
+def test_a_request_in_pieces_and_several_in_one(raw):
     """TCP keeps no boundaries: byte by byte, and three at once."""
     one = struct.pack(">HHHB", 9, 0, 6, 1) + bytes.fromhex("0400000001")
     for byte in one:
@@ -204,7 +203,7 @@ def test_a_request_in_pieces_and_several_in_one(raw: RawModbus):
     ] * 3
 
 
-def test_nothing_is_written_without_leave(box: SpeakingBox):
+def test_nothing_is_written_without_leave(box):
     """Without --allow-writes a write is an illegal function; reading works."""
     with bridge("modbus", "--port", box.path) as address, RawModbus(address) as client:
         for pdu in ("050000ff00", "0f0000000501ff", "060028000a", "1000280001020001"):
@@ -213,7 +212,7 @@ def test_nothing_is_written_without_leave(box: SpeakingBox):
     assert {s.kind for s in box.heard} <= {"LABEL"}
 
 
-def test_one_command_at_a_time(box: SpeakingBox, raw: RawModbus, address: Address):
+def test_one_command_at_a_time(box, raw, address):
     """While the box carries out a command, another peer gets the exception BUSY, and reading goes
     on; afterwards the same write sends the command."""
     box.script = lambda s: [] if s.kind == "TARE" else obeying(s)
@@ -228,7 +227,7 @@ def test_one_command_at_a_time(box: SpeakingBox, raw: RawModbus, address: Addres
     assert sweeps(box) == ["TARE", "START"]
 
 
-def test_a_silent_box_is_stale_and_comes_back(box: SpeakingBox, raw: RawModbus):
+def test_a_silent_box_is_stale_and_comes_back(box, raw):
     """Unplugged: status 99, state 0, FAULT, a still heartbeat, until it is plugged in again."""
     box.say(result(1))
     eventually(lambda: word(raw, "status") == 1)
@@ -249,7 +248,7 @@ def test_a_silent_box_is_stale_and_comes_back(box: SpeakingBox, raw: RawModbus):
     assert (word(raw, "status"), word(raw, "state of the skin")) == (1, 1)
 
 
-def test_another_bundle_brings_its_labels(box: SpeakingBox, raw: RawModbus):
+def test_another_bundle_brings_its_labels(box, raw):
     """The box restarts with another bundle: its labels are asked for, codes follow them."""
 
     def other(heard: Sentence) -> list[bytes]:
@@ -271,7 +270,7 @@ def flood(peer: socket.socket) -> None:
         peer.sendall((struct.pack(">HHHB", 9, 0, 6, 1) + bytes.fromhex("0400000020")) * 1000)
 
 
-def test_hostile_bytes_reach_nobody_else(raw: RawModbus, address: Address):
+def test_hostile_bytes_reach_nobody_else(raw, address):
     """Noise, wrong headers, an endless stream without sense, a peer that stops in the middle and
     one that never reads: each loses its own connection at most."""
     generator = random.Random(1)
@@ -301,7 +300,7 @@ def test_hostile_bytes_reach_nobody_else(raw: RawModbus, address: Address):
     assert raw.registers(0, 1) == [1]
 
 
-def test_the_feed_in_place_of_the_line(tmp_path: Path):
+def test_the_feed_in_place_of_the_line(tmp_path):
     """On the box, beside a robot that has the serial line: the same map. Commands are refused;
     lines of a later version are counted and do no harm."""
     told = {"margin": 0.3, "share": 0.5, "measured_mm_s": 61.2, "direction": "cols-"}
@@ -340,7 +339,7 @@ def test_the_feed_in_place_of_the_line(tmp_path: Path):
 
 
 @given(st.binary(max_size=300), st.lists(st.integers(0, 300), max_size=5))
-def test_requests_split_anywhere(data: bytes, cuts: list[int]):
+def test_requests_split_anywhere(data, cuts):
     """Any bytes, split anywhere: the same requests, or the same refusal."""
     data = b"\0\1\0\0\0\6\1\4\0\0\0\1" + data
     edges = sorted({0, len(data), *(c % (len(data) + 1) for c in cuts)})
@@ -363,7 +362,7 @@ def test_requests_split_anywhere(data: bytes, cuts: list[int]):
 
 
 @given(st.binary(min_size=1, max_size=253))
-def test_every_pdu_is_parsed_or_refused(pdu: bytes):
+def test_every_pdu_is_parsed_or_refused(pdu):
     """No other error is raised; parsed requests stay within the limits of the specification."""
     try:
         wanted = modbus_pdu.parse(pdu)
@@ -381,7 +380,7 @@ def viewed(answer: Answer | None = None, **counts: int) -> BoxView:
 
 
 @pytest.mark.parametrize("status", list(Status))
-def test_each_status_has_its_code(status: Status):
+def test_each_status_has_its_code(status):
     """In the order of PROTOCOL.md, from 1; the label's code stands with `ok` alone."""
     label = "paper" if status.classified else ""
     words = registers(viewed(Answer(1, 1.0, status, label, 0.9, 0.8, 1, 0, 1e9)), alive=True)
@@ -398,7 +397,7 @@ def test_before_anything_was_heard():
     assert inputs(BoxView(), alive=False) == [False, False, False, True, False, False]
 
 
-def test_the_python_of_the_page_runs(box: SpeakingBox, raw: RawModbus, address: Address):
+def test_the_python_of_the_page_runs(box, raw, address):
     """docs/robots/modbus.md: `unsure` is swept again, `ok` gives its code, others errors."""
     names: dict[str, Any] = {}
     exec(page_blocks("modbus.md", "python")[0], names)
@@ -434,9 +433,7 @@ def test_the_python_of_the_page_runs(box: SpeakingBox, raw: RawModbus, address: 
         (["--port", "x", "--link", "y"], 2, "--link"),
     ],
 )
-def test_settings_that_cannot_be(
-    options: list[str], code: int, why: str, capsys: pytest.CaptureFixture[str]
-):
+def test_settings_that_cannot_be(options, code, why, capsys):
     """The value is named, and the exit code is that of its kind."""
     try:
         ended = main(["bridge", "modbus", *options])

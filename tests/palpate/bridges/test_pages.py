@@ -12,7 +12,6 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -47,7 +46,7 @@ def sweeps(box: SpeakingBox) -> list[str]:
     return [s.kind for s in box.heard if s.kind in ("NEW", "START", "STOP")]
 
 
-def test_python(box: SpeakingBox):
+def test_python(box):
     """python.md: `unsure` is swept again without NEW, `undecided` and `unknown` are set aside,
     each fault is an error."""
     names: dict[str, Any] = {}
@@ -140,7 +139,7 @@ def by_socket(address: tuple[str, int]) -> dict[str, Any]:
     )
 
 
-def test_urscript_by_socket(box: SpeakingBox):
+def test_urscript_by_socket(box):
     """urscript.md against a real bridge: a retry without NEW, each fault by its name."""
     with bridge("tcp", "--port", box.path, "--allow-writes") as address:
         classify = by_socket(address)["palpate_classify"]
@@ -164,7 +163,7 @@ def test_urscript_by_socket(box: SpeakingBox):
         (True, ["fault"], -3),
     ],
 )
-def test_urscript_by_lines(ready: bool, answers: list[Any], want: int):
+def test_urscript_by_lines(ready, answers, want):
     """urscript.md with lines: READY is waited for, code 0 is swept again, FAULT ends it."""
     inputs = {0: ready} | dict.fromkeys(range(1, 7), False)
     pulsed: list[int] = []
@@ -196,7 +195,7 @@ def test_urscript_by_lines(ready: bool, answers: list[Any], want: int):
     [(0, "Toucher", {"timeout_s": 20.0}), (1, "Sweeper", {"timeout_s": 20.0, "slide_s": 0.1})],
     ids=["services", "action"],
 )
-def test_ros(box: SpeakingBox, block: int, program: str, settings: dict[str, float]):
+def test_ros(box, block, program, settings):
     """ros2.md: a node in a process of its own, by services and by the action."""
     ros.required()
     ros.messages_required()
@@ -224,7 +223,7 @@ def test_ros(box: SpeakingBox, block: int, program: str, settings: dict[str, flo
 
 @pytest.mark.slow
 @pytest.mark.thorough  # starts processes and waits for them
-def test_the_manuals_client_without_hardware(tmp_path: Path):
+def test_the_manuals_client_without_hardware(tmp_path):
     """Its three commands, with another path and a free port: the program names the bundle and
     prints three answers, all `ok`, since the simulated finger follows START and STOP."""
     text = (ROOT / "docs" / "how-to" / "write-a-client.md").read_text()
@@ -267,7 +266,7 @@ def test_the_manuals_client_without_hardware(tmp_path: Path):
 
 @pytest.mark.slow
 @pytest.mark.thorough  # starts processes and waits for them
-def test_a_box_that_is_killed_and_started_again(tmp_path: Path):
+def test_a_box_that_is_killed_and_started_again(tmp_path):
     """Killed within a sweep: the wait ends, the restart is counted, the client sweeps on."""
     command = [sys.executable, "-m", "palpate", "run", "--sim", "skin", "--trigger", "serial"]
     command += ["--set", f"serial.port={tmp_path / 'line'}", "--set", "store.runtime="]

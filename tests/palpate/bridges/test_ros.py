@@ -57,7 +57,7 @@ def verdict(box: SpeakingBox, node: RosPeer, line: bytes) -> dict:
     return node.on("verdict")[-1]
 
 
-def test_an_answer_becomes_a_message(box: SpeakingBox, node: RosPeer):
+def test_an_answer_becomes_a_message(box, node):
     """OK with the label; WARN if it cannot be used; ERROR if nothing was learned; with time stamp
     and frame; early answers are marked."""
     eventually(lambda: [s.kind for s in box.heard].count("LABEL") == 3)
@@ -83,7 +83,7 @@ def test_an_answer_becomes_a_message(box: SpeakingBox, node: RosPeer):
     assert verdict(box, node, result(5, share="0.40"))["values"]["early"] == "true"
 
 
-def test_an_answer_names_its_fingers(box: SpeakingBox, node: RosPeer):
+def test_an_answer_names_its_fingers(box, node):
     """The answer of the hand, then a status for each finger under its name, with its own label and
     probability; one without contact is an ERROR as in a box with one skin. The next answer, without
     fingers, has its own status alone."""
@@ -103,7 +103,7 @@ def test_an_answer_names_its_fingers(box: SpeakingBox, node: RosPeer):
     assert verdict(box, node, result(2))["fingers"] == []
 
 
-def test_the_box_is_unplugged_dead_and_back(box: SpeakingBox, node: RosPeer):
+def test_the_box_is_unplugged_dead_and_back(box, node):
     """Diagnostics: OK, WARN once where something was lost, ERROR without a skin, STALE without a
     box, and OK again; the state follows."""
 
@@ -136,7 +136,7 @@ def test_the_box_is_unplugged_dead_and_back(box: SpeakingBox, node: RosPeer):
     assert verdict(box, node, result(6))["message"] == "wood"
 
 
-def test_services(box: SpeakingBox, node: RosPeer):
+def test_services(box, node):
     """Each is its command; the message is the box's reply; a refusal is not a success."""
     assert node.call("tare") == {"service": "tare", "success": True, "message": "16 taxels"}
     for name in ("new_object", "start", "stop", "abort"):
@@ -151,7 +151,7 @@ def test_services(box: SpeakingBox, node: RosPeer):
     }
 
 
-def test_the_lifecycle(box: SpeakingBox, node: RosPeer):
+def test_the_lifecycle(box, node):
     """Inactive, it publishes no verdict but diagnostics; cleaned up, it has let go of the line;
     configured and activated again, it works."""
     assert node.call("deactivate")["success"]
@@ -166,7 +166,7 @@ def test_the_lifecycle(box: SpeakingBox, node: RosPeer):
     eventually(lambda: said(box, lambda: len(node.on("verdict")) > before, result(2)))
 
 
-def test_the_bridge_dies_and_comes_back(box: SpeakingBox):
+def test_the_bridge_dies_and_comes_back(box):
     """Killed, not ended: the other node stays, and hears the next bridge."""
     with ros.peer() as node:
         for number in range(2):
@@ -180,7 +180,7 @@ def test_the_bridge_dies_and_comes_back(box: SpeakingBox):
                 process.wait(LONG_S)
 
 
-def test_a_late_node_gets_the_state(box: SpeakingBox, node: RosPeer):
+def test_a_late_node_gets_the_state(box, node):
     """The last state is kept for later subscribers; the first node stands for the cell, the second
     for a screen."""
     with ros.peer() as late:
@@ -200,7 +200,7 @@ def fed(folder: Path) -> Iterator[tuple[socket.socket, RosPeer]]:
                 yield connection, node
 
 
-def test_frames_from_the_feed(tmp_path: Path):
+def test_frames_from_the_feed(tmp_path):
     """On the box: frames as images with one channel an axis, little-endian; nan where a skin gave
     no number."""
     form = {"rows": 2, "cols": 1, "axes": 3, "dtype": "float32", "rate_hz": 100, "window": 200}
@@ -250,13 +250,13 @@ def test_an_end_that_wakes_nobody_is_seen():
     assert done.returncode == 0
 
 
-def test_without_ros_the_command_says_what_to_do(capsys: pytest.CaptureFixture[str]):
+def test_without_ros_the_command_says_what_to_do(capsys):
     """This environment has no rclpy: exit code 78, one line with the remedy."""
     assert main(["bridge", "ros"]) == 78
     assert "setup.bash" in capsys.readouterr().err
 
 
-def test_the_launch_file(box: SpeakingBox):
+def test_the_launch_file(box):
     """The process that it describes is the bridge with the parameters beside it, configured and
     activated. It goes through its lifecycle, and ends with SIGINT, which launch sends first.
     `launch` itself is not available as a wheel and was not run."""
@@ -283,7 +283,7 @@ def test_the_launch_file(box: SpeakingBox):
             launched.kill()
 
 
-def test_the_launch_file_configures_where_it_is_told_to(box: SpeakingBox, tmp_path: Path):
+def test_the_launch_file_configures_where_it_is_told_to(box, tmp_path):
     """With autostart: false in the YAML beside it, the node waits unconfigured for a manager of its
     lifecycle."""
     for name in ("palpate.launch.py", "palpate.yaml"):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -78,7 +77,7 @@ def silent(heard: Sentence) -> list[bytes]:
     return obeying(heard)[:1]
 
 
-def test_a_sweep(box: SpeakingBox, node: RosPeer):
+def test_a_sweep(box, node):
     """START, the slide, STOP, the answer with all fields of RES; feedback announces the slide; NEW
     if it is requested."""
     found = swept(node, slide_s=0.1, timeout_s=LONG_S, new_object=True, speed_mm_s=30.1)
@@ -94,7 +93,7 @@ def test_a_sweep(box: SpeakingBox, node: RosPeer):
     eventually(lambda: node.on("verdict") != [])
 
 
-def test_an_early_answer(box: SpeakingBox, node: RosPeer):
+def test_an_early_answer(box, node):
     """Feedback has it while the finger slides; the result follows at once."""
     box.script = lambda s: [
         *silent(s),
@@ -107,7 +106,7 @@ def test_an_early_answer(box: SpeakingBox, node: RosPeer):
     assert (found["state"], found["label"], round(found["share"], 3)) == ("succeeded", "paper", 0.4)
 
 
-def test_what_was_not_ok(box: SpeakingBox, node: RosPeer):
+def test_what_was_not_ok(box, node):
     """`unsure` is an answer; a fault is none, and its status and remedy are there."""
     lines = iter((result(1, "unsure"), result(2, "stuck-taxel", "", detail="taxel 2.3")))
     box.script = lambda s: [*silent(s), *([next(lines)] if s.kind == "STOP" else [])]
@@ -119,7 +118,7 @@ def test_what_was_not_ok(box: SpeakingBox, node: RosPeer):
     assert stuck["message"] == "a loaded taxel shows a constant count; check the skin (taxel 2.3)"
 
 
-def test_one_at_a_time_and_canceled(box: SpeakingBox, node: RosPeer):
+def test_one_at_a_time_and_canceled(box, node):
     """A second goal is rejected and disturbs nothing; canceled, the box aborts its sweep; the next
     goal works."""
     box.script = lambda s: [*obeying(s), *([result(1, "aborted", "")] if s.kind == "ABORT" else [])]
@@ -134,7 +133,7 @@ def test_one_at_a_time_and_canceled(box: SpeakingBox, node: RosPeer):
     assert swept(node, slide_s=0.1)["state"] == "succeeded"
 
 
-def test_unplugged_meanwhile(box: SpeakingBox, node: RosPeer):
+def test_unplugged_meanwhile(box, node):
     """Aborted with the reason, at once; a goal without a line, too; plugged in again, the next
     works."""
     begun(node)
@@ -150,7 +149,7 @@ def test_unplugged_meanwhile(box: SpeakingBox, node: RosPeer):
     assert swept(node, slide_s=0.1)["state"] == "succeeded"
 
 
-def test_cleaned_up_meanwhile(box: SpeakingBox, node: RosPeer):
+def test_cleaned_up_meanwhile(box, node):
     """The box's sweep is aborted before its line is closed, and the goal has its result; without a
     line, goals are aborted; configured again, they work."""
     box.script = lambda s: [*silent(s), *([result(1, "aborted", "")] if s.kind == "ABORT" else [])]
@@ -166,7 +165,7 @@ def test_cleaned_up_meanwhile(box: SpeakingBox, node: RosPeer):
     assert swept(node, slide_s=0.1)["state"] == "succeeded"
 
 
-def test_the_bridge_ends_meanwhile(box: SpeakingBox):
+def test_the_bridge_ends_meanwhile(box):
     """By SIGTERM: the box's sweep is aborted."""
     with ros.peer() as peer:
         with ros.bridge("-p", f"port:={box.path}", *WRITES) as process:
@@ -177,7 +176,7 @@ def test_the_bridge_ends_meanwhile(box: SpeakingBox):
         assert commands(box) == ["START", "ABORT"]
 
 
-def test_commands_need_allow_writes(box: SpeakingBox):
+def test_commands_need_allow_writes(box):
     """Without it neither action nor services reach the box, and no other node can set it; verdicts
     come."""
     with ros.peer() as peer, ros.bridge("-p", f"port:={box.path}"):
@@ -194,7 +193,7 @@ def test_commands_need_allow_writes(box: SpeakingBox):
         eventually(lambda: bool(box.say(result(1))) or peer.on("verdict") != [])
 
 
-def test_without_the_messages(box: SpeakingBox, tmp_path: Path):
+def test_without_the_messages(box, tmp_path):
     """palpate_msgs cannot be imported: one log line about it, and everything else works."""
     broken = tmp_path / "path" / "palpate_msgs"
     broken.mkdir(parents=True)
@@ -213,7 +212,7 @@ def test_without_the_messages(box: SpeakingBox, tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_with_the_box_itself(tmp_path: Path):
+def test_with_the_box_itself(tmp_path):
     """The box's program on a simulated skin, a bridge on its serial line, another node: the box
     numbers, times and answers sweeps, whatever the simulated finger did; it decides about a second
     START."""

@@ -136,7 +136,7 @@ def test_a_frame_is_a_tactile_state():
     assert sheared.sensors[0].name == "fingertip"
 
 
-def test_without_the_packages_nothing_is_published(packages: None, monkeypatch: pytest.MonkeyPatch):
+def test_without_the_packages_nothing_is_published(packages, monkeypatch):
     """The reason is kept for the log: a package that is missing, or too old."""
     monkeypatch.setitem(sys.modules, "tactile_msgs.msg", None)
     monkeypatch.delattr(sys.modules["vision_msgs.msg"], "Classification")

@@ -12,7 +12,7 @@ LONG_S = 60.0
 """Far longer than the end may take, even on a busy machine."""
 
 
-def test_a_peer_that_never_reads_does_not_hold_the_end() -> None:
+def test_a_peer_that_never_reads_does_not_hold_the_end():
     """With bytes waiting for it: the rest is thrown away, and the task that served it ends."""
     assert asyncio.run(asyncio.wait_for(_peers_after_the_end(), LONG_S)) == 0
 
@@ -41,7 +41,7 @@ async def _peers_after_the_end() -> int:
         return len(server.peers)
 
 
-def test_a_task_that_is_cancelled_as_bytes_arrive_ends() -> None:
+def test_a_task_that_is_cancelled_as_bytes_arrive_ends():
     """A cancelled task ends, in whichever turn of the loop the bytes came. With asyncio.wait_for of
     Python 3.11 it went on, and the bridge never ended after SIGTERM."""
 

@@ -149,14 +149,13 @@ CASES = {
         {}, (NoAnswer, r"0\.3"), "START STOP ABORT", "sliding judging", {"timeout_s": 0.3}
     ),
     "unplugged": SweepCase(
-        *(None, (LinkLost, "was lost"), "START", "sliding", LONG),
-        lambda swept: swept.box.unplug(),
+        *(None, (LinkLost, "was lost"), "START", "sliding", LONG), lambda swept: swept.box.unplug()
     ),
 }
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_what_becomes_of_a_sweep(swept: Swept, monkeypatch: pytest.MonkeyPatch, name: str):
+def test_what_becomes_of_a_sweep(swept, monkeypatch, name):
     """The answer or the error, the commands that the box has heard, and the phases. After an error
     the box is not left with an open sweep if it can be reached."""
     case = CASES[name]
@@ -178,7 +177,7 @@ def test_what_becomes_of_a_sweep(swept: Swept, monkeypatch: pytest.MonkeyPatch, 
         assert swept.run().known
 
 
-def test_start_has_the_speed_and_force_of_the_goal(swept: Swept):
+def test_start_has_the_speed_and_force_of_the_goal(swept):
     """0 is not sent."""
     for terms in ({"speed_mm_s": 30.5}, {"force_n": 1.5}, {}):
         swept.run(**terms)
@@ -186,7 +185,7 @@ def test_start_has_the_speed_and_force_of_the_goal(swept: Swept):
     assert started == [["30.5"], ["", "1.5"], []]
 
 
-def test_canceled_when_the_answer_came(swept: Swept):
+def test_canceled_when_the_answer_came(swept):
     """The box has nothing to abort any more: the answer that it gave is the answer. A sweep that is
     canceled before START is not begun."""
 
@@ -201,7 +200,7 @@ def test_canceled_when_the_answer_came(swept: Swept):
     assert swept.has_heard("START", "ABORT")
 
 
-def test_an_answer_to_an_earlier_sweep_is_none_to_this(swept: Swept):
+def test_an_answer_to_an_earlier_sweep_is_none_to_this(swept):
     """What came before START is forgotten."""
     swept.box.script = saying()
     swept.sweep.notice(Answer(6, 1.0, Status.OK, "paper", 0.9, 0.8, 1, 0, 1.0))
@@ -209,7 +208,7 @@ def test_an_answer_to_an_earlier_sweep_is_none_to_this(swept: Swept):
         swept.run(timeout_s=0.3)
 
 
-def test_a_box_that_falls_silent(swept: Swept):
+def test_a_box_that_falls_silent(swept):
     """Without a sentence for 3.5 s the sweep ends, long before its time limit. Each sentence begins
     the 3.5 s anew: then only the time limit ends the wait."""
     swept.use(Hurried())
@@ -227,7 +226,7 @@ def test_a_box_that_falls_silent(swept: Swept):
         spoken.run(Wanted(slide_s=0.0, timeout_s=20.0))
 
 
-def test_a_box_that_refuses_or_is_not_ready(swept: Swept, monkeypatch: pytest.MonkeyPatch):
+def test_a_box_that_refuses_or_is_not_ready(swept, monkeypatch):
     """Its reason is the reason; nothing of another's is aborted."""
     swept.box.script = lambda s: [REFUSES] if s.kind == "START" else obeying(s)
     with pytest.raises(CommandRefused, match=r"trigger\.mode"):
@@ -242,7 +241,7 @@ def test_a_box_that_refuses_or_is_not_ready(swept: Swept, monkeypatch: pytest.Mo
     assert swept.has_heard("START")
 
 
-def test_an_error_of_the_caller_leaves_no_sweep_open(swept: Swept):
+def test_an_error_of_the_caller_leaves_no_sweep_open(swept):
     """A `say` that fails ends the sweep at the box, too, and is not hidden."""
 
     def fails(phase: str) -> None:
@@ -254,7 +253,7 @@ def test_an_error_of_the_caller_leaves_no_sweep_open(swept: Swept):
     assert swept.has_heard("START", "ABORT")
 
 
-def test_the_feed_begins_nothing(tmp_path: Path):
+def test_the_feed_begins_nothing(tmp_path):
     """It is read-only, and the error names it."""
     source = FeedSource(str(tmp_path / "feed.sock"))
     with pytest.raises(CommandRefused, match="read-only"):
@@ -273,7 +272,7 @@ def test_the_feed_begins_nothing(tmp_path: Path):
         ({"timeout_s": 3601.0}, "timeout_s = 3601"),
     ],
 )
-def test_times_that_cannot_be(swept: Swept, terms: dict[str, float], text: str):
+def test_times_that_cannot_be(swept, terms, text):
     """Refused with the value, before anything is sent."""
     with pytest.raises(ConfigError, match=text):
         swept.run(**terms)

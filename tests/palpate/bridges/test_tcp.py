@@ -11,7 +11,6 @@ import subprocess
 import sys
 import threading
 from contextlib import suppress
-from pathlib import Path
 
 import pytest
 import serial
@@ -24,7 +23,7 @@ from palpate.core.errors import CommandRefused, ConfigError
 from palpate.core.sentences import Sentence, read, sentence
 from tests.factories.bridges import LONG_S, bridge, eventually
 from tests.factories.paths import ROOT
-from tests.factories.speaking_box import LABELS, SpeakingBox, finger, result, state
+from tests.factories.speaking_box import LABELS, finger, result, state
 
 pytestmark = pytest.mark.usefixtures("hurried")
 
@@ -36,7 +35,7 @@ def url(address: Address) -> str:
     return f"socket://{address[0]}:{address[1]}"
 
 
-def test_the_client_works_through_it(box: SpeakingBox):
+def test_the_client_works_through_it(box):
     """The client of the serial line, on the other side of a network: a sweep from end to end, and
     the answer of a hand with its fingers."""
     with (
@@ -61,7 +60,7 @@ LONGEST = (
 )
 
 
-def test_the_short_form_fits_a_string_of_80_characters(box: SpeakingBox):
+def test_the_short_form_fits_a_string_of_80_characters(box):
     """RES, STA and answers, the longest of each: sentences that the client reads, with status,
     label and probability; nothing else is left out where it fits."""
     lines = [sentence("RES", *LONGEST), state(), result(2)]
@@ -84,7 +83,7 @@ def test_the_short_form_fits_a_string_of_80_characters(box: SpeakingBox):
     assert told[3].fields == read(result(2)).fields[: len(told[3].fields)]
 
 
-def test_without_leave_questions_alone_are_passed_on(box: SpeakingBox):
+def test_without_leave_questions_alone_are_passed_on(box):
     """STATE, ID and LABEL are answered; the box never hears what would change something."""
     with (
         bridge("tcp", "--port", box.path) as address,
@@ -98,7 +97,7 @@ def test_without_leave_questions_alone_are_passed_on(box: SpeakingBox):
     assert {s.kind for s in box.heard} == {"STATE", "ID"}
 
 
-def test_every_peer_hears_everything_and_noise_stays_out(box: SpeakingBox):
+def test_every_peer_hears_everything_and_noise_stays_out(box):
     """Two peers get the same sentences, and each the answers only to its own commands; damaged
     sentences are not passed on."""
     with bridge("tcp", "--port", box.path) as address:
@@ -116,7 +115,7 @@ def test_every_peer_hears_everything_and_noise_stays_out(box: SpeakingBox):
             peer.close()
 
 
-def test_what_a_peer_says_wrong_is_answered_to_it_alone(box: SpeakingBox):
+def test_what_a_peer_says_wrong_is_answered_to_it_alone(box):
     """Noise, an endless line and a wrong checksum: an error each; the box hears none of it."""
     with bridge("tcp", "--port", box.path, "--allow-writes") as address:
         with socket.create_connection(address, timeout=LONG_S) as peer:
@@ -143,7 +142,7 @@ BROWSERS = {
 
 
 @pytest.mark.parametrize("pieces", BROWSERS.values(), ids=BROWSERS)
-def test_a_browser_commands_nothing(box: SpeakingBox, pieces: tuple[bytes, ...]):
+def test_a_browser_commands_nothing(box, pieces):
     """It is dropped at its first bytes, with leave to write; the box hears no START, and the other
     peer is served."""
     with bridge("tcp", "--port", box.path, "--allow-writes") as address:
@@ -165,7 +164,7 @@ def ask_often(client: Palpate) -> None:
         client.ask("ID", timeout_s=LONG_S)
 
 
-def test_a_line_that_is_gone(box: SpeakingBox):
+def test_a_line_that_is_gone(box):
     """A command is answered with the reason; when the line is back the same connection works."""
     with (
         bridge("tcp", "--port", box.path, "--allow-writes") as address,
@@ -188,7 +187,7 @@ def all_of(peer: socket.socket) -> bytes:
     return got
 
 
-def test_a_peer_that_never_reads_is_given_up(box: SpeakingBox):
+def test_a_peer_that_never_reads_is_given_up(box):
     """It fills its buffer and is dropped; the other peer gets every sentence."""
     with bridge("tcp", "--port", box.path) as address:
         deaf = socket.socket()
@@ -249,7 +248,7 @@ class DeafPort:
         """Nothing to close."""
 
 
-def test_a_flood_of_commands_does_not_reach_the_box(monkeypatch: pytest.MonkeyPatch):
+def test_a_flood_of_commands_does_not_reach_the_box(monkeypatch):
     """Of many commands at once one is sent, the next after its pause, whichever peer's."""
     monkeypatch.setattr(tcp, "PACE_S", 3600.0)
     monkeypatch.setattr(tcp, "ANSWER_S", 0.01)
@@ -271,7 +270,7 @@ def test_a_flood_of_commands_does_not_reach_the_box(monkeypatch: pytest.MonkeyPa
     assert port.written == [sentence("STATE")]
 
 
-def test_a_box_that_does_not_answer(monkeypatch: pytest.MonkeyPatch):
+def test_a_box_that_does_not_answer(monkeypatch):
     """The peer gets an error; an answer that comes too late, or to another command, is dropped."""
     monkeypatch.setattr(tcp, "ANSWER_S", 0.1)
     monkeypatch.setattr(tcp, "PACE_S", 0.0)
@@ -332,7 +331,7 @@ def test_a_silent_peer_makes_room():
     asyncio.run(run())
 
 
-def test_a_box_opens_what_the_bridge_makes(tmp_path: Path):
+def test_a_box_opens_what_the_bridge_makes(tmp_path):
     """--link: one name, for serial.port of a box on this machine. Bytes written before the bridge
     came are not read later, and the name goes with the bridge."""
     path = tmp_path / "line"
@@ -349,7 +348,7 @@ def test_a_box_opens_what_the_bridge_makes(tmp_path: Path):
     eventually(lambda: not path.is_symlink())
 
 
-def test_a_link_that_was_left_behind(tmp_path: Path):
+def test_a_link_that_was_left_behind(tmp_path):
     """The link of a killed bridge is replaced; another program's file is not."""
     path = tmp_path / "line"
     path.symlink_to("/dev/pts/999999")
@@ -363,7 +362,7 @@ def test_a_link_that_was_left_behind(tmp_path: Path):
     assert path.read_text() == "mine"
 
 
-def test_a_link_that_nobody_reads(tmp_path: Path):
+def test_a_link_that_nobody_reads(tmp_path):
     """Writing does not hang: if the buffer is full it raises."""
     port = LinkPort(tmp_path / "line")
     with pytest.raises(BlockingIOError):
@@ -371,7 +370,7 @@ def test_a_link_that_nobody_reads(tmp_path: Path):
     port.close()
 
 
-def test_it_ends_with_the_service_manager(box: SpeakingBox):
+def test_it_ends_with_the_service_manager(box):
     """SIGTERM: exit code 0 within the time of one command, with a peer connected."""
     command = [*(sys.executable, "-m", "palpate", "bridge", "tcp"), *("--listen", "127.0.0.1:0")]
     with subprocess.Popen(
@@ -395,7 +394,7 @@ def test_it_ends_with_the_service_manager(box: SpeakingBox):
         ("palpate.cli.parser", "asyncio palpate.bridges.server"),
     ],
 )
-def test_bridges_load_little(loaded: str, absent: str):
+def test_bridges_load_little(loaded, absent):
     """All of a bridge without numpy and the model; the options alone load nothing of a bridge."""
     code = f"import sys, {loaded}; sys.exit(bool({{*'{absent}'.split()}} & {{*sys.modules}}))"
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, timeout=120).returncode == 0

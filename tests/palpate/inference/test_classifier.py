@@ -85,7 +85,7 @@ def test_fusion_is_the_papers_and_bayes():
     assert {v: int(fuse(list(label[list(v)]), "vote").argmax()) for v in votes} == votes
 
 
-def test_golden_sweeps_are_compared(default_bundle: Bundle):
+def test_golden_sweeps_are_compared(default_bundle):
     """This machine runs the default bundle as it was exported; other logits are refused."""
     assert box(default_bundle).self_test() < bundle.GOLDEN_TOLERANCE
     with pytest.raises(BundleError, match=r"\[\]"):
@@ -97,9 +97,7 @@ def test_golden_sweeps_are_compared(default_bundle: Bundle):
             box(replace(default_bundle, golden_logits=logits)).self_test()
 
 
-def test_a_machine_that_computes_the_checks_otherwise_is_refused(
-    default_bundle: Bundle, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_machine_that_computes_the_checks_otherwise_is_refused(default_bundle, monkeypatch):
     """The network is right, and numpy finds no slide, as under a processor whose products of
     float32 matrices are wrong: said by the self test, unless export refused the sweep just so. The
     stream's tare and broken taxels do not count."""
@@ -116,7 +114,7 @@ def test_a_machine_that_computes_the_checks_otherwise_is_refused(
         box(replace(default_bundle, golden_refusals=("stuck-taxel", "no-slide"))).self_test()
 
 
-def test_verdict_carries_what_is_known(default_bundle: Bundle):
+def test_verdict_carries_what_is_known(default_bundle):
     """Label, probability, margin, fused and bundle id; probabilities add up to one. Below the
     threshold the label is still reported, but not as ok."""
     sweep = replace(sweep_of(default_bundle.golden[0], lost=1), complete_ns=1000)
@@ -135,7 +133,7 @@ def test_verdict_carries_what_is_known(default_bundle: Bundle):
 
 
 @pytest.mark.parametrize("status", [s for s in Status if not s.classified])
-def test_refused_sweeps_keep_their_status(default_bundle: Bundle, status: Status):
+def test_refused_sweeps_keep_their_status(default_bundle, status):
     """A sweep with another status than ok is not classified."""
     v = box(default_bundle)(replace(sweep_of(default_bundle.golden[0]), status=status))
     assert (v.status, v.label, v.fused, len(v.scores)) == (status, "", 0, 0)
@@ -178,7 +176,7 @@ def test_default_bundle_is_small():
 
 
 @pytest.mark.parametrize("name", [bundle.MODEL, bundle.GOLDEN])
-def test_altered_and_missing_files_are_named(folder: Path, name: str):
+def test_altered_and_missing_files_are_named(folder, name):
     """One flipped byte, or no file."""
     data = bytearray((folder / name).read_bytes())
     data[len(data) // 2] ^= 1
@@ -213,14 +211,14 @@ NO_CONTACT = {"contact": None, "full_scale": 255.0}
         ({"labels": ["a", "b"], "sliding": None}, "logits"),
     ],
 )
-def test_broken_manifests_are_named(folder: Path, changes: dict, hint: str):
+def test_broken_manifests_are_named(folder, changes, hint):
     """Unknown schema, input, key; labels that cannot be sent; files that are not named; labels that
     do not fit."""
     with pytest.raises(BundleError, match=hint):
         bundle.load(edit(folder, **changes))
 
 
-def test_a_bundle_may_know_the_unloaded_skin(folder: Path):
+def test_a_bundle_may_know_the_unloaded_skin(folder):
     """The box uses it as its first tare. Without it the first tare is 0."""
     before = bundle.load(folder)
     assert not box(before).tare.any()
@@ -231,7 +229,7 @@ def test_a_bundle_may_know_the_unloaded_skin(folder: Path):
     assert bundle.Manifest.parse(after.manifest.json()) == after.manifest
 
 
-def test_what_is_no_bundle_is_refused(tmp_path: Path, folder: Path, default_bundle: Bundle):
+def test_what_is_no_bundle_is_refused(tmp_path, folder, default_bundle):
     """A folder without a manifest, a manifest that is not JSON, golden sweeps of another format or
     with Python objects, and a model that onnxruntime cannot open."""
     with pytest.raises(BundleError, match="bundle"):
@@ -252,7 +250,7 @@ def test_what_is_no_bundle_is_refused(tmp_path: Path, folder: Path, default_bund
 
 @pytest.mark.parametrize("dtype", ["uint8", "int16", "uint16", "float32"])
 @pytest.mark.parametrize("axes", [1, 3])
-def test_golden_sweeps_are_packed_without_loss(dtype: str, axes: int):
+def test_golden_sweeps_are_packed_without_loss(dtype, axes):
     """Every value of every type is the same after unpacking, even if changes wrap. Smooth sweeps
     need less space."""
     format = SweepFormat(2, 3, 100.0, 50, dtype, axes)
@@ -283,7 +281,7 @@ def test_golden_sweeps_are_packed_without_loss(dtype: str, axes: int):
         (None, "cannot be read"),
     ],
 )
-def test_golden_sweeps_of_another_shape_are_refused(shape: tuple[int, ...] | None, hint: str):
+def test_golden_sweeps_of_another_shape_are_refused(shape, hint):
     """Too few bytes or frames, no changes, no sweeps, or logits alone."""
     manifest = SimpleNamespace(format=SweepFormat(2, 2, 100.0, 20, "int16"), labels=("a", "b"))
     more = {} if shape is None else {"changes": np.zeros(shape, np.uint8)}
@@ -291,7 +289,7 @@ def test_golden_sweeps_of_another_shape_are_refused(shape: tuple[int, ...] | Non
         bundle._golden(toy_bundle.npz(logits=np.zeros((2, 2)), **more), manifest)
 
 
-def test_optional_rules_may_be_missing(folder: Path):
+def test_optional_rules_may_be_missing(folder):
     """A bundle without rules has none."""
     old = json.loads((folder / bundle.MANIFEST).read_text())
     for name in ("early", "known", "contact", "displacement", "runtime", "counter"):
@@ -303,7 +301,7 @@ def test_optional_rules_may_be_missing(folder: Path):
     assert (read.classes, read.enrolled) == (None, {})
 
 
-def test_a_bundle_that_is_written_is_read_unchanged(tmp_path: Path):
+def test_a_bundle_that_is_written_is_read_unchanged(tmp_path):
     """With early heads and class means."""
     rule = Early((0.9, 0.8, 2.0), 2)
     new = toy_bundle.load(tmp_path / "toy", early=rule, outputs=WITH_EARLY)
@@ -363,7 +361,7 @@ def displaced(**changes: Any) -> dict[str, Any]:
         (displaced(), "npz cannot be read"),
     ],
 )
-def test_broken_early_and_known_are_named(toy_folder: Path, changes: dict, hint: str):
+def test_broken_early_and_known_are_named(toy_folder, changes, hint):
     """Numbers out of range, fields that are missing or unknown, `known` without means.npz and the
     reverse."""
     with pytest.raises(BundleError, match=hint):
@@ -397,7 +395,7 @@ def test_broken_early_and_known_are_named(toy_folder: Path, changes: dict, hint:
         ({"bias": np.array([object()] * 3)}, "npz cannot be read"),
     ],
 )
-def test_broken_means_are_named(toy_folder: Path, arrays: dict, hint: str):
+def test_broken_means_are_named(toy_folder, arrays, hint):
     """Wrong number of labels, wrong types, NaN, wrong order, pickled objects."""
     more = toy_bundle.displaced_arrays() if "displaced" in str([*arrays]) else {}
     given = toy_bundle.means(**(more | arrays))
@@ -406,7 +404,7 @@ def test_broken_means_are_named(toy_folder: Path, arrays: dict, hint: str):
         bundle.load(edit(toy_folder, bundle.MEANS, data))
 
 
-def test_early_heads_and_enrolled_labels_exclude_each_other(toy_folder: Path):
+def test_early_heads_and_enrolled_labels_exclude_each_other(toy_folder):
     """A head that was not trained on a label cannot give it."""
     data = toy_bundle.npz(**THIRD_ENROLLED["arrays"])
     with pytest.raises(BundleError, match="enrolled"):
@@ -414,7 +412,7 @@ def test_early_heads_and_enrolled_labels_exclude_each_other(toy_folder: Path):
 
 
 @pytest.mark.parametrize("data", [b"", b"PK\x03\x04", b"nonsense", toy_bundle.npy(np.arange(3))])
-def test_means_that_are_no_npz(toy_folder: Path, data: bytes):
+def test_means_that_are_no_npz(toy_folder, data):
     """The error names the file, for any content."""
     with pytest.raises(BundleError, match=r"means\.npz"):
         bundle.load(edit(toy_folder, bundle.MEANS, data))
@@ -440,14 +438,14 @@ def test_means_that_are_no_npz(toy_folder: Path, data: bytes):
         ({"arrays": THIRD_ENROLLED["arrays"]}, False),  # K0 = 2, the model knows 3
     ],
 )
-def test_outputs_of_the_model_are_those_of_the_manifest(tmp_path: Path, more: dict, fine: bool):
+def test_outputs_of_the_model_are_those_of_the_manifest(tmp_path, more, fine):
     """Required outputs exist, existing ones fit, unknown ones are refused."""
     refused = pytest.raises(BundleError, match="opened")
     with contextlib.nullcontext() if fine else refused:
         assert toy_bundle.load(tmp_path / "toy", **more).model
 
 
-def test_a_far_sweep_is_unknown(toy: Bundle):
+def test_a_far_sweep_is_unknown(toy):
     """Up to 3 deviations from the nearest mean a sweep is known, beyond it has no label and no
     scores. A fault of the window has precedence."""
     it = box(toy)
@@ -460,7 +458,7 @@ def test_a_far_sweep_is_unknown(toy: Bundle):
     assert it(sweep_of(np.zeros((20, 2, 2), np.int16))).status is Status.NO_CONTACT
 
 
-def test_an_unknown_sweep_does_not_count_for_its_object(toy: Bundle):
+def test_an_unknown_sweep_does_not_count_for_its_object(toy):
     """The object's other sweeps are kept unchanged."""
     it = box(toy)
     one = it(toy_bundle.sweep(2.9, 0, object=1))
@@ -470,7 +468,7 @@ def test_an_unknown_sweep_does_not_count_for_its_object(toy: Bundle):
     assert two.scores == pytest.approx(fuse([one.scores, one.scores], "product"))
 
 
-def test_a_model_that_gives_no_number_is_unknown(tmp_path: Path):
+def test_a_model_that_gives_no_number_is_unknown(tmp_path):
     """Weights that overflow with large float32 counts: no label, no NaN, and the object's other
     sweeps are unaffected."""
     format = replace(toy_bundle.FORMAT, dtype="float32")
@@ -496,7 +494,7 @@ def borderline(**more: Any) -> Sweep:
     return toy_bundle.sweep(2.8, -1, **more)
 
 
-def test_sweeps_are_requested_until_the_probability_suffices(toy: Bundle):
+def test_sweeps_are_requested_until_the_probability_suffices(toy):
     """Unsure, unsure, ok: after n sweeps the odds are the odds of one sweep to the power n. A
     further sweep is fused, too."""
     it = box(toy, min_probability=0.85, max_sweeps=5)
@@ -508,7 +506,7 @@ def test_sweeps_are_requested_until_the_probability_suffices(toy: Bundle):
     assert it(borderline(object=2)).status is Status.UNSURE
 
 
-def test_at_the_limit_the_answer_is_final(toy: Bundle):
+def test_at_the_limit_the_answer_is_final(toy):
     """The answer is undecided, with label and probability. A robot that continues is answered by
     the same rule, and may get ok."""
     it = box(toy, min_probability=0.85, max_sweeps=2)
@@ -521,7 +519,7 @@ def test_at_the_limit_the_answer_is_final(toy: Bundle):
 
 
 @pytest.mark.parametrize(("object", "fusion"), [(0, "product"), (1, "none")])
-def test_sweeps_that_stand_alone_never_reach_the_limit(toy: Bundle, object: int, fusion: str):
+def test_sweeps_that_stand_alone_never_reach_the_limit(toy, object, fusion):
     """Without NEW OBJECT, or without fusion, each sweep is answered alone. A limit of one makes the
     answer final."""
     for limit, status in ((2, Status.UNSURE), (1, Status.UNDECIDED)):
@@ -529,7 +527,7 @@ def test_sweeps_that_stand_alone_never_reach_the_limit(toy: Bundle, object: int,
         assert [it(borderline(object=object)).status for _ in range(3)] == [status] * 3
 
 
-def test_sure_is_the_bundles_where_none_is_given(toy: Bundle):
+def test_sure_is_the_bundles_where_none_is_given(toy):
     """0 stands for thresholds.unsure; without a limit nothing is ever undecided."""
     assert box(toy).min_probability == toy_bundle.LIMITS.unsure
     assert box(toy)(borderline()).status is Status.OK
@@ -537,7 +535,7 @@ def test_sure_is_the_bundles_where_none_is_given(toy: Bundle):
     assert {it(borderline(object=1)).status for _ in range(20)} == {Status.UNSURE}
 
 
-def test_what_is_not_ok_need_not_count(toy: Bundle):
+def test_what_is_not_ok_need_not_count(toy):
     """An early answer that would not be ok is not given, and the object's state is unchanged."""
     it = box(toy, min_probability=0.85)
     assert it(borderline(object=1)).share == 1
@@ -552,14 +550,14 @@ def test_what_is_not_ok_need_not_count(toy: Bundle):
     assert it(borderline(object=1)).fused == 4
 
 
-def test_early_logits(tmp_path: Path):
+def test_early_logits(tmp_path):
     """One row a step."""
     it = toy_bundle.load(tmp_path / "toy", early=Early((0.9,) * 3, 1), outputs=WITH_EARLY)
     (rows,) = box(it).outputs(toy_bundle.window(1, 0), "early")
     assert rows.tolist() == pytest.approx(np.outer([1, 2, 3], [0, -6, -9]), abs=1e-4)
 
 
-def test_an_enrolled_label_changes_all_logits(tmp_path: Path):
+def test_an_enrolled_label_changes_all_logits(tmp_path):
     """The logits are (means . z + bias) / temperature. The nearest label wins, and an enrolled
     label's spread is wider by 1 + 1 / n."""
     bias = np.float32([0, -18, -18 + 2 / 4])
@@ -587,7 +585,7 @@ def test_an_enrolled_label_changes_all_logits(tmp_path: Path):
         {"bias": np.float32([0, 30, -18])},
     ],
 )
-def test_means_of_another_training_are_found(toy_folder: Path, arrays: dict):
+def test_means_of_another_training_are_found(toy_folder, arrays):
     """Class means that give a golden sweep another label than the model's logits are refused."""
     data = toy_bundle.npz(**toy_bundle.means(**arrays))
     it = box(bundle.load(edit(toy_folder, bundle.MEANS, data)))
@@ -595,7 +593,7 @@ def test_means_of_another_training_are_found(toy_folder: Path, arrays: dict):
         it.self_test()
 
 
-def test_of_equal_probabilities_the_first_label_is_reported(default_bundle: Bundle):
+def test_of_equal_probabilities_the_first_label_is_reported(default_bundle):
     """Like argmax: equal votes of neighbours, or coarse logits, must give the same label as at
     export."""
     scores = np.array([0.0, 0.4, 0.0, 0.4, 0.1, 0.1])

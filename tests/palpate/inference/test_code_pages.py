@@ -37,7 +37,7 @@ def it(default_bundle: Bundle) -> Classifier:
     return it
 
 
-def test_what_is_given_back_is_read_again(it: Classifier):
+def test_what_is_given_back_is_read_again(it):
     """None of the code stays in memory. The next answer is the same, bit for bit, and reads a part
     of it again."""
     golden = it.bundle.golden[0]
@@ -48,7 +48,7 @@ def test_what_is_given_back_is_read_again(it: Classifier):
     assert 0 < resident_code() < before + 1
 
 
-def test_opening_a_model_gives_its_code_back(default_bundle: Bundle):
+def test_opening_a_model_gives_its_code_back(default_bundle):
     """Before its first answer a classifier has less resident code than a bare session."""
     session(default_bundle.model)
     opened = resident_code()
@@ -56,7 +56,7 @@ def test_opening_a_model_gives_its_code_back(default_bundle: Bundle):
     assert resident_code() < opened
 
 
-def test_nothing_else_is_touched(tmp_path: Path):
+def test_nothing_else_is_touched(tmp_path):
     """Without a file of this name, or a list of mappings, nothing is released. Data and writable
     code stay."""
     assert give_back("/no/such/library.so") == 0
@@ -72,7 +72,7 @@ def test_nothing_else_is_touched(tmp_path: Path):
     assert give_back(LIBRARY, tmp_path / "maps") == 0
 
 
-def test_what_linux_refuses_counts_nothing(tmp_path: Path):
+def test_what_linux_refuses_counts_nothing(tmp_path):
     """Linux refuses a range that is not mapped."""
     (tmp_path / "maps").write_text("1000-2000 r-xp 00000000 00:00 1 /lib.so\n")
     assert give_back("/lib.so", tmp_path / "maps") == 0

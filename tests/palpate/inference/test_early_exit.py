@@ -47,10 +47,7 @@ def toy(least: tuple[float, ...] = (0.9,) * STEPS, agree: int = 1, early: bool =
     """A bundle whose logit of "left" is a tenth of the left minus the right taxels' mean. The logit
     of "right" is 0. Head d gets the mean of exactly the frames of its step."""
     node, value = helper.make_node, helper.make_tensor_value_info
-    nodes = [
-        node("Cast", ["sweep"], ["float"], to=1),
-        node("Reshape", ["float", "series"], ["x"]),
-    ]
+    nodes = [node("Cast", ["sweep"], ["float"], to=1), node("Reshape", ["float", "series"], ["x"])]
     for name in ("early", "logits"):
         nodes += [
             node("MatMul", [f"{name}_share", "x"], [f"{name}_mean"]),
@@ -149,14 +146,14 @@ def levels(simulated: devices.SimDevices, *names: str) -> list[tuple[str, bool]]
         ([np.nan], 1, False),
     ],
 )
-def test_the_rule(scores: list[float], agree: int, want: bool):
+def test_the_rule(scores, agree, want):
     """An answer needs the step's least probability and the same label in the last `agree` steps. A
     least probability above 1 is never reached."""
     rule = Early((0.9, 0.8, 1.1, 0.5), agree)
     assert decides(np.array([[p, 1 - p] for p in scores]), rule) is want
 
 
-def test_an_early_answer(rigged: Make):
+def test_an_early_answer(rigged):
     """Left less right: -10, then 60. After 0.4 of the window the mean is 25, so sigmoid(2.5): more
     than 0.9. Where two steps must agree, the third answers: the first was "right"."""
     box = rigged(simulated_slides(slid(-10, 60)), SETS, toy())
@@ -171,7 +168,7 @@ def test_an_early_answer(rigged: Make):
 
 
 @pytest.mark.parametrize(("sets", "least"), [((), 0.9), (SETS, 1.1)])
-def test_otherwise_the_answer_is_the_usual_one(rigged: Make, sets: tuple[str, ...], least: float):
+def test_otherwise_the_answer_is_the_usual_one(rigged, sets, least):
     """With early exit off, or if no step is sufficient, the middle window is answered once, bit for
     bit the same."""
     (want,) = all_of(rigged(simulated_slides(slid(20, 20)), (), toy(early=False)))
@@ -182,7 +179,7 @@ def test_otherwise_the_answer_is_the_usual_one(rigged: Make, sets: tuple[str, ..
     assert (devices.DECIDED, True) not in levels(simulated, devices.DECIDED)
 
 
-def test_the_robot_stops_and_is_faster(rigged: Make):
+def test_the_robot_stops_and_is_faster(rigged):
     """DECIDED ends the slide: three sweeps, three answers, each touch as short as its share, the
     rest of a packet, 20 ms to react, and up to the next frame."""
     simulated = simulated_slides(slid(60), slid(-10, 60), slid(10))
@@ -199,7 +196,7 @@ def test_the_robot_stops_and_is_faster(rigged: Make):
     assert box.box.counters.lost_frames == 0
 
 
-def test_lines_change_in_order(rigged: Make):
+def test_lines_change_in_order(rigged):
     """Sentence, class bits, RESULT VALID, then DECIDED with READY and BUSY, then the observers,
     since a disk may be slow; DECIDED falls when the next sweep starts."""
     simulated = simulated_slides(slid(60), slid(10))
@@ -226,7 +223,7 @@ def test_lines_change_in_order(rigged: Make):
     assert kept_after == [True, True]
 
 
-def test_a_start_edge_with_the_answer(rigged: Make):
+def test_a_start_edge_with_the_answer(rigged):
     """In the turn of an early answer the next sweep starts: RESULT VALID and DECIDED were high, and
     fall. Frame 69 comes with frame 89, and the finger still slides."""
     simulated = simulated_slides(slid(60), stops=False, packet_frames=30)
@@ -239,7 +236,7 @@ def test_a_start_edge_with_the_answer(rigged: Make):
     assert summary(box.seconds(1)) == [("ok", "left", 0.2)]
 
 
-def test_a_robot_that_slides_on_gets_no_second_answer(rigged: Make):
+def test_a_robot_that_slides_on_gets_no_second_answer(rigged):
     """The stop edge at the slide's usual end gives no answer, and the next sweep is treated as
     usual."""
     simulated = simulated_slides(slid(60), slid(60), stops=False)
@@ -248,7 +245,7 @@ def test_a_robot_that_slides_on_gets_no_second_answer(rigged: Make):
 
 
 @pytest.mark.parametrize("packet_frames", [1, 7, 30])
-def test_how_frames_come_changes_nothing(rigged: Make, packet_frames: int):
+def test_how_frames_come_changes_nothing(rigged, packet_frames):
     """Single frames, or packets that hold a step and a half: the same steps, the same scores bit
     for bit."""
     slides = slid(-10, 20, 60), slid(-10, -10, 60), slid(60)
@@ -258,7 +255,7 @@ def test_how_frames_come_changes_nothing(rigged: Make, packet_frames: int):
     assert [v.scores.tobytes() for v in have] == [v.scores.tobytes() for v in want]
 
 
-def test_one_run_of_the_graph_at_each_step(rigged: Make, monkeypatch: pytest.MonkeyPatch):
+def test_one_run_of_the_graph_at_each_step(rigged, monkeypatch):
     """The heads run four times for a sweep without early answer, twice for one answered at step
     two, never when idle. The window is completed by repeating the newest frame."""
     asked: list[int] = []
@@ -293,14 +290,14 @@ def spoiled(fault: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize("fault", ["saturated", "stuck-taxel", "dead-taxel", "no-contact", ""])
-def test_a_spoiled_skin_is_not_decided_early(rigged: Make, fault: str):
+def test_a_spoiled_skin_is_not_decided_early(rigged, fault):
     """For any output of the heads the whole sweep reports the fault. Without the fault the answer
     is early."""
     want = [(fault, "", 1.0)] if fault else [("ok", "left", 0.2)]
     assert answers(rigged, spoiled(fault), model=toy((0.5,) * STEPS)) == want
 
 
-def test_a_taxel_that_moves_late_is_no_fault(rigged: Make):
+def test_a_taxel_that_moves_late_is_no_fault(rigged):
     """Constant in the first step, varying in the second: no answer there, an answer here."""
     frames = slid(60)
     frames[: LEAD + NEEDS[0], 0, 0] = 160
@@ -327,9 +324,7 @@ def test_a_tare_counts():
         (NEEDS[1], 3, 0, ("ok", "left", 0.4)),
     ],
 )
-def test_missing_frames(
-    rigged: Make, at: int, lost: int, counted: int, want: tuple[str, str, float]
-):
+def test_missing_frames(rigged, at, lost, counted, want):
     """Two lost frames, also at the end of a step, are interpolated and counted. A wider gap
     prevents an early answer."""
     simulated = simulated_slides(slid(-10, 60), packet_frames=1)
@@ -350,7 +345,7 @@ def test_missing_frames(
         ("stop", ["no-start"]),  # the edge of the slide's end has no start any more
     ],
 )
-def test_what_goes_wrong_after_the_answer(rigged: Make, what: str, want: list[str]):
+def test_what_goes_wrong_after_the_answer(rigged, what, want):
     """After unplugging, another start, an abort or lost edges, the early answer stays the only
     answer to its trigger."""
     simulated = simulated_slides(slid(60), stops=False)
@@ -369,7 +364,7 @@ def test_what_goes_wrong_after_the_answer(rigged: Make, what: str, want: list[st
     assert [str(v.status) for v in box.seconds(3)] == want
 
 
-def test_what_goes_wrong_before_the_answer(rigged: Make):
+def test_what_goes_wrong_before_the_answer(rigged):
     """Unplugged in a sweep: `sensor-lost` at once, and no early answer after it is plugged in
     again. If the start edge comes while the skin is away, the clear slide is `not-ready`."""
     simulated = simulated_slides(slid(-10, 60), stops=False)
@@ -387,7 +382,7 @@ def test_what_goes_wrong_before_the_answer(rigged: Make):
     assert [str(v.status) for v in all_of(box)] == ["not-ready"]
 
 
-def test_an_early_answer_counts_as_one_sweep_of_its_object(rigged: Make):
+def test_an_early_answer_counts_as_one_sweep_of_its_object(rigged):
     """Three sweeps of an object, the second whole since sigmoid(2) is below 0.9: fused 1, 2, 3,
     with the product of their probabilities."""
     simulated = simulated_slides(slid(60), slid(20), slid(30), new_object=(0,))
@@ -397,7 +392,7 @@ def test_an_early_answer_counts_as_one_sweep_of_its_object(rigged: Make):
     assert [v.probability for v in verdicts] == pytest.approx(1 / (1 + np.exp(-logits)), abs=1e-6)
 
 
-def test_without_ok_the_sweep_goes_on(rigged: Make):
+def test_without_ok_the_sweep_goes_on(rigged):
     """One sweep does not reach `min_probability`, so its answer is not early and requests another
     sweep. Fused with that, the answer is early."""
     simulated = simulated_slides(slid(30), slid(30), new_object=(0,))
@@ -406,7 +401,7 @@ def test_without_ok_the_sweep_goes_on(rigged: Make):
     assert found == [("unsure", 1, 1.0), ("ok", 2, 0.2)]
 
 
-def test_a_bundle_without_heads_says_so(rigged: Make):
+def test_a_bundle_without_heads_says_so(rigged):
     """At start, with the bundle and the setting."""
     with pytest.raises(BundleError, match=r"1 .*classifier\.early"):
         rigged(simulated_slides(slid(60)), SETS, toy(early=False))
@@ -424,7 +419,7 @@ class Ticking(rig.VirtualClock):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("packet_frames", [1, 30])
-def test_a_capture_gives_the_same_answers(rigged: Make, tmp_path: Path, packet_frames: int):
+def test_a_capture_gives_the_same_answers(rigged, tmp_path, packet_frames):
     """With lost packets, early, whole and fused answers, and a stop edge anywhere near the last
     step, the replay is the same."""
     rng, model = np.random.default_rng(7), toy((0.97, 0.95, 0.93, 0.7))
@@ -464,7 +459,7 @@ def test_a_capture_gives_the_same_answers(rigged: Make, tmp_path: Path, packet_f
     assert counts == want
 
 
-def test_a_kept_sweep_gives_the_same_answer(rigged: Make, tmp_path: Path):
+def test_a_kept_sweep_gives_the_same_answer(rigged, tmp_path):
     """The frames of an early answer are kept; replayed they give the same answer with the same
     scores."""
     box = rigged(simulated_slides(slid(-10, 60)), SETS, toy())
@@ -487,7 +482,7 @@ def recorded(path: Path, windows: np.ndarray) -> Path:
     return path
 
 
-def test_the_command_replays_what_it_decided(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_the_command_replays_what_it_decided(tmp_path, capsys):
     """`palpate run` on a set with a capture and kept sweeps, then `palpate replay` of each: the
     same answers."""
     model, folder = toy(), tmp_path / "toy"
@@ -518,7 +513,7 @@ def test_the_command_replays_what_it_decided(tmp_path: Path, capsys: pytest.Capt
 
 
 @pytest.mark.parametrize(("counts", "early"), [((60, 10), 1), ((10, 10), 0)])
-def test_the_demo_shows_what_it_saves(rigged: Make, counts: tuple[int, ...], early: int):
+def test_the_demo_shows_what_it_saves(rigged, counts, early):
     """The share of an early answer, and the mean touch time below; neither without early
     answers."""
     simulated = simulated_slides(*map(slid, counts))
@@ -530,7 +525,7 @@ def test_the_demo_shows_what_it_saves(rigged: Make, counts: tuple[int, ...], ear
     assert ("touch" in out.getvalue()) == bool(early)
 
 
-def test_a_set_is_played_so_that_early_answers_see_it(tmp_path: Path):
+def test_a_set_is_played_so_that_early_answers_see_it(tmp_path):
     """The recorded window begins `sweep.lead_ms` (as delivered) after the start edge and lies in
     the middle."""
     windows = np.random.default_rng(0).integers(0, 256, (2, 100, 2, 2)).astype(np.uint8)
@@ -542,7 +537,7 @@ def test_a_set_is_played_so_that_early_answers_see_it(tmp_path: Path):
 
 
 @pytest.mark.parametrize("stop", ["STOP", ""])
-def test_the_simulated_robot_stops_once(stop: str):
+def test_the_simulated_robot_stops_once(stop):
     """Two lines or one: scheduled edges are cancelled, the stop edge comes after the reaction,
     frames are omitted. DECIDED just before the end of a slide changes nothing."""
 
@@ -570,7 +565,7 @@ def test_the_simulated_robot_stops_once(stop: str):
 
 @pytest.mark.parametrize("hz", [(50,), (50, 150), (100, 200)], ids=["sine", "odd", "rectifier"])
 @pytest.mark.slow
-def test_hum_costs_hardly_an_early_answer(default_bundle: Bundle, hz: tuple[float, ...]):
+def test_hum_costs_hardly_an_early_answer(default_bundle, hz):
     """Unfinished sweeps pass the stages of whole ones: with hum of 8 counts as many of 12 slides
     are answered early as without, and none with a wrong label. More hum than was tried is
     answered by neither."""

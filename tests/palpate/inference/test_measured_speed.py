@@ -51,7 +51,7 @@ def concluded(it: Classifier, sweep: Sweep, probabilities: np.ndarray) -> Verdic
     return it.verdict(it.judged(sweep, told(it, probabilities)))
 
 
-def test_a_verdict_has_the_measured_slide(default_bundle: Bundle):
+def test_a_verdict_has_the_measured_slide(default_bundle):
     """Speed and direction of the finger; the speed of START stands beside it unchanged."""
     for speed in (1.0, 2.0):
         v = box(default_bundle)(slid(speed, speed_mm_s=99.0))
@@ -60,7 +60,7 @@ def test_a_verdict_has_the_measured_slide(default_bundle: Bundle):
         assert v.as_dict()["measured_mm_s"] == v.measured_mm_s
 
 
-def test_a_verdict_without_a_measured_slide_has_no_such_fields(default_bundle: Bundle):
+def test_a_verdict_without_a_measured_slide_has_no_such_fields(default_bundle):
     """A bundle without a pitch, a finger that rests, an early answer, a refused sweep."""
     bare = replace(default_bundle.manifest, contact=None, displacement=None)
     resting = skin.sweep("wood", skin.Placement(), np.random.default_rng(1), rest_s=2, slide_s=0.1)
@@ -75,7 +75,7 @@ def test_a_verdict_without_a_measured_slide_has_no_such_fields(default_bundle: B
     assert [v.as_dict().keys() & {"measured_mm_s", "direction"} for v in found] == [set()] * 4
 
 
-def test_a_uncertain_answer_reports_a_speed_outside_of_training(default_bundle: Bundle):
+def test_a_uncertain_answer_reports_a_speed_outside_of_training(default_bundle):
     """Unsure, undecided and unknown; before the other findings, after a displacement."""
     probable = np.array([0.9, 0.1, 0, 0, 0, 0])
     unsure = box(trained(default_bundle), min_probability=0.95)
@@ -98,7 +98,7 @@ def test_a_uncertain_answer_reports_a_speed_outside_of_training(default_bundle: 
     assert v.displacement.startswith("moved")
 
 
-def test_other_answers_do_not_report_it(default_bundle: Bundle):
+def test_other_answers_do_not_report_it(default_bundle):
     """An answer that is ok, a speed of training, a bundle without the range."""
     sure, probable = np.eye(6)[0], np.array([0.9, 0.1, 0, 0, 0, 0])
     found = [
@@ -111,7 +111,7 @@ def test_other_answers_do_not_report_it(default_bundle: Bundle):
     assert all(v.measured_mm_s for v in found)
 
 
-def test_a_manifest_may_state_the_speeds(default_bundle: Bundle):
+def test_a_manifest_may_state_the_speeds(default_bundle):
     """It is read as it was written."""
     manifest = trained(default_bundle).manifest
     assert json.loads(manifest.json())["speeds"] == {"least_mm_s": 28.0, "most_mm_s": 33.0}
@@ -129,7 +129,7 @@ def test_a_manifest_may_state_the_speeds(default_bundle: Bundle):
         ([28, 33], "manifest"),
     ],
 )
-def test_wrong_speeds_are_named(default_bundle: Bundle, speeds: object, hint: str):
+def test_wrong_speeds_are_named(default_bundle, speeds, hint):
     """Numbers out of range and other types are refused with the value."""
     content = json.loads(default_bundle.manifest.json()) | {"speeds": speeds}
     with pytest.raises(BundleError, match=hint):

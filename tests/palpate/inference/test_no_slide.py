@@ -43,7 +43,7 @@ def resting(z1: float, z2: float, begin: int, end: int) -> Sweep:
     return sweep
 
 
-def test_a_rest_is_answered_no_slide(toy: Bundle):
+def test_a_rest_is_answered_no_slide(toy):
     """The detail names the tenths. The sweep is not fused, and the next one is answered."""
     box = Classifier(toy, VirtualClock(), max_sweeps=3)
     verdict = box(replace(resting(0, 0, 10, 14), object=1))
@@ -53,7 +53,7 @@ def test_a_rest_is_answered_no_slide(toy: Bundle):
     assert (after.status, after.fused) == (Status.OK, 1)
 
 
-def test_a_load_beyond_training_counts_as_that_of_training(toy: Bundle):
+def test_a_load_beyond_training_counts_as_that_of_training(toy):
     """Counts around 100 that swing by 1 vibrate too little, but not for a load of 75."""
     total = math.log(100 * toy.format.rows * toy.format.cols)
     load = Allowance("load", total - 0.3, total + 0.5, 1.0)
@@ -69,14 +69,14 @@ def test_a_load_beyond_training_counts_as_that_of_training(toy: Bundle):
         assert Classifier(pressed, VirtualClock())(toy_bundle.sweep(0, 0)).status is status
 
 
-def test_without_a_limit_nothing_is_checked(toy: Bundle):
+def test_without_a_limit_nothing_is_checked(toy):
     """For a label without one, and for an older bundle."""
     assert Classifier(toy, VirtualClock())(resting(0, 6, 10, 14)).label == "c"
     older = replace(toy, manifest=replace(toy.manifest, sliding=None))
     assert Classifier(older, VirtualClock())(resting(0, 0, 10, 14)).label == "a"
 
 
-def test_no_early_answer_to_a_finger_that_rests(toy: Bundle):
+def test_no_early_answer_to_a_finger_that_rests(toy):
     """It rests in the second tenth of the window; half of the window has come."""
     early = EarlyExit(Classifier(toy, VirtualClock()))
 
@@ -88,13 +88,13 @@ def test_no_early_answer_to_a_finger_that_rests(toy: Bundle):
     assert early(half(resting(0, 0, 2, 4))) is None
 
 
-def test_more_limits_than_labels_are_refused(toy: Bundle):
+def test_more_limits_than_labels_are_refused(toy):
     """Four limits for three labels."""
     with pytest.raises(BundleError, match=r"4 .* 3 "):
         replace(toy.manifest, sliding=SlideLimits((LEAST,) * 4))
 
 
-def test_the_manifest_keeps_the_limits(toy: Bundle):
+def test_the_manifest_keeps_the_limits(toy):
     """It is read as it was written."""
     manifest = toy.manifest
     assert bundle.Manifest.parse(manifest.json()) == manifest
@@ -135,7 +135,7 @@ def any_material(made: Bundle, pattern: float | None) -> Classifier:
     return Classifier(replace(made, manifest=manifest), VirtualClock(), slides=False)
 
 
-def test_a_whole_window_without_a_pattern_is_no_slide(packaged: Bundle):
+def test_a_whole_window_without_a_pattern_is_no_slide(packaged):
     """The slide is named. Without the limit the mixed window has a label as well. An answer without
     speeds (`slides`) is checked, too."""
     assert packaged.manifest.sliding
@@ -151,7 +151,7 @@ def test_a_whole_window_without_a_pattern_is_no_slide(packaged: Bundle):
 
 
 @pytest.mark.parametrize("pattern", [0.0, -1.0, math.inf, math.nan])
-def test_a_limit_of_patterns_out_of_range_is_refused(pattern: float):
+def test_a_limit_of_patterns_out_of_range_is_refused(pattern):
     """It is a number above 0."""
     with pytest.raises(BundleError, match=r"sliding\.pattern"):
         SlideLimits((), pattern)

@@ -5,14 +5,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from unittest import mock
 
 import numpy as np
 import pytest
 
 from palpate.answer.early import Early
-from palpate.bundle.bundle import Bundle
 from palpate.bundle.onnx_check import reader
 from palpate.core.errors import BundleError, FormatError, ModelError
 from palpate.core.types import Status
@@ -54,9 +52,7 @@ def opened(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
         ),
     ],
 )
-def test_a_classifier_opens_what_its_answers_need(
-    tmp_path, opened: list[list[str]], more: dict, wanted: list[str]
-):
+def test_a_classifier_opens_what_its_answers_need(tmp_path, opened, more, wanted):
     """Self-test and sweep run on one session, whatever else the model gives."""
     it = Classifier(toy_bundle.load(tmp_path / "toy", **more), VirtualClock())
     it.self_test()
@@ -64,7 +60,7 @@ def test_a_classifier_opens_what_its_answers_need(
     assert opened == [wanted]
 
 
-def test_early_heads_have_their_own_session(tmp_path, opened: list[list[str]]):
+def test_early_heads_have_their_own_session(tmp_path, opened):
     """It is opened with the EarlyExit, before the first sweep, and once."""
     it = Classifier(toy_bundle.load(tmp_path / "toy", early=EARLY, outputs=OUTPUTS), VirtualClock())
     EarlyExit(it)
@@ -74,7 +70,7 @@ def test_early_heads_have_their_own_session(tmp_path, opened: list[list[str]]):
     assert len(opened) == 2
 
 
-def test_answers_are_the_same_with_early_heads_and_without(default_bundle: Bundle):
+def test_answers_are_the_same_with_early_heads_and_without(default_bundle):
     """The logits of golden sweeps and noise are the same, bit for bit, from classifiers with and
     without early answers, and from all outputs of the delivered model at once."""
     plain, early = (
@@ -94,9 +90,7 @@ def test_answers_are_the_same_with_early_heads_and_without(default_bundle: Bundl
             assert it.outputs(window, "embedding")[0].tobytes() == want["embedding"].tobytes()
 
 
-def test_an_enrolled_bundle_runs_without_the_early_heads(
-    default_bundle: Bundle, opened: list[list[str]]
-):
+def test_an_enrolled_bundle_runs_without_the_early_heads(default_bundle, opened):
     """The bundle keeps the delivered model. Its heads, which do not have the label, are not
     computed."""
     new = enrol(default_bundle, "cork", default_bundle.golden[:1]).bundle
@@ -127,7 +121,7 @@ FORMS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 @pytest.mark.parametrize("kind", ["int16", "uint16", "float32"])
 @pytest.mark.parametrize("form", FORMS)
-def test_counts_are_the_same_however_they_lie_in_memory(kind: str, form: str):
+def test_counts_are_the_same_however_they_lie_in_memory(kind, form):
     """onnxruntime would take the bytes as they lie. Masked numbers are refused."""
     format = replace(toy_bundle.FORMAT, dtype=kind)
     it = ModelRunner(toy_bundle.model(format=format), "logits")
@@ -139,7 +133,7 @@ def test_counts_are_the_same_however_they_lie_in_memory(kind: str, form: str):
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_a_count_that_is_no_number_is_refused(tmp_path: Path, value: float):
+def test_a_count_that_is_no_number_is_refused(tmp_path, value):
     """In a whole sweep and in an unfinished one: QuantizeLinear makes the lowest count of NaN."""
     format = replace(toy_bundle.FORMAT, dtype="float32")
     made = toy_bundle.load(tmp_path / "toy", early=EARLY, outputs=OUTPUTS, format=format)

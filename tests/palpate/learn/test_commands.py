@@ -32,7 +32,7 @@ def said(words: list[str], capsys: pytest.CaptureFixture[str]) -> tuple[int, str
     return code, "".join(capsys.readouterr())
 
 
-def test_a_setting_forbids_it(options: list[str], capsys: pytest.CaptureFixture[str]):
+def test_a_setting_forbids_it(options, capsys):
     """With teach.allow = false nothing of it works; the message names the setting."""
     for more in (["--use"], ["--label", "cork", "--sim", "skin"], ["--forget", "cork"]):
         code, text = said([*options, "--set", "teach.allow=false", *more], capsys)
@@ -40,25 +40,21 @@ def test_a_setting_forbids_it(options: list[str], capsys: pytest.CaptureFixture[
         assert "teach.allow" in text
 
 
-def test_simulated_sweeps_stay_out_of_a_box(capsys: pytest.CaptureFixture[str]):
+def test_simulated_sweeps_stay_out_of_a_box(capsys):
     """--sim needs a folder of its own."""
     code, text = said(["--label", "cork", "--sim", "skin"], capsys)
     assert code == 78
     assert "--sim" in text
 
 
-def test_a_box_without_a_key_says_so_before_sweeps(
-    options: list[str], capsys: pytest.CaptureFixture[str]
-):
+def test_a_box_without_a_key_says_so_before_sweeps(options, capsys):
     """No sweep is made in vain."""
     code, text = said([*options, "--label", "cork", "--sim", "skin", "--virtual"], capsys)
     assert code == 78
     assert "install" in text
 
 
-def test_materials_beyond_the_class_bits_are_refused_before_a_sweep(
-    options: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_materials_beyond_the_class_bits_are_refused_before_a_sweep(options, tmp_path, capsys):
     """Of two materials the single bit can show one; no sweep is recorded, of the first neither."""
     install_scripts.enrolment_key(tmp_path / "enrolment")
     bits = ["--set", 'output.class_bits=["GPIO5"]']
@@ -69,7 +65,7 @@ def test_materials_beyond_the_class_bits_are_refused_before_a_sweep(
     assert not list((tmp_path / "store" / "sweeps").glob("*.npy"))
 
 
-def test_nothing_recorded_yet(options: list[str], capsys: pytest.CaptureFixture[str]):
+def test_nothing_recorded_yet(options, capsys):
     """The reason, and no bundle."""
     code, text = said(options, capsys)
     assert code == 1
@@ -86,7 +82,7 @@ def test_nothing_recorded_yet(options: list[str], capsys: pytest.CaptureFixture[
         (["--skin", "flexitac", "--sim", "skin"], False),
     ],
 )
-def test_a_box_without_a_bundle_for_its_skin_is_taught_first(words: list[str], untaught: bool):
+def test_a_box_without_a_bundle_for_its_skin_is_taught_first(words, untaught):
     """Only where the profile says that the packaged bundle is for another skin."""
     args = arguments("run", words)
     packaged = bundle.load(bundle.DEFAULT)
@@ -101,16 +97,14 @@ def test_a_box_without_a_bundle_for_its_skin_is_taught_first(words: list[str], u
         (["--web", "--trigger", "timed"], "timed"),
     ],
 )
-def test_the_page_triggers_where_no_line_is_wired(words: list[str], mode: str):
+def test_the_page_triggers_where_no_line_is_wired(words, mode):
     """With lines, or another trigger by choice, the page waits for it."""
     args = arguments("teach", words)
     assert teach_command.without_lines(args, load_settings(args)).trigger.mode == mode
 
 
 @pytest.mark.parametrize(("board", "mode"), [([], "serial"), (["--board", "rpi5"], "two-lines")])
-def test_a_box_without_lines_waits_to_be_taught(
-    board: list[str], mode: str, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_box_without_lines_waits_to_be_taught(board, mode, monkeypatch):
     """It does not end because no line can start a sweep: the page or a command does later."""
     modes = []
     monkeypatch.setattr(
@@ -126,9 +120,7 @@ def test_a_box_without_lines_waits_to_be_taught(
 @deliveries.NEEDED
 @pytest.mark.slow
 @pytest.mark.thorough  # a fit with all checks of an export
-def test_recorded_sweeps_become_the_bundle_of_the_box(
-    options: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_recorded_sweeps_become_the_bundle_of_the_box(options, tmp_path, capsys):
     """Signed by the box, on trial, with who has taught it; taught again, the version counts up.
     Scratch files are gone, the sweeps are not."""
     install_scripts.enrolment_key(tmp_path / "enrolment")

@@ -35,7 +35,7 @@ def distances(new: Bundle, least: float | None) -> ClassDistances:
     return ClassDistances(new.classes, replace(toy_bundle.KNOWN, enrolled=least), LABELS)
 
 
-def test_the_network_divides_what_the_distances_leave(new: Bundle):
+def test_the_network_divides_what_the_distances_leave(new):
     """The enrolled label has its probability by distances; the others share the rest as the network
     says, whatever the distances among them say."""
     rng, means = np.random.default_rng(0), distances(new, 0.6)
@@ -48,7 +48,7 @@ def test_the_network_divides_what_the_distances_leave(new: Bundle):
     assert np.abs(p[:, :3] - own[:, :3]).max() > 0.5
 
 
-def test_without_enrolled_labels_the_network_answers_alone(tmp_path: Path):
+def test_without_enrolled_labels_the_network_answers_alone(tmp_path):
     """Its logits are not changed in any bit; for displaced contacts they are divided by the
     temperature of the rule."""
     classes = toy_bundle.load(tmp_path / "toy").classes
@@ -60,7 +60,7 @@ def test_without_enrolled_labels_the_network_answers_alone(tmp_path: Path):
     assert moved.joined(network, z).tobytes() == (network / 3.0).tobytes()
 
 
-def test_golden_sweeps_of_new_materials_need_not_agree(tmp_path: Path):
+def test_golden_sweeps_of_new_materials_need_not_agree(tmp_path):
     """The network and the means may call a sweep of an enrolled material different trained labels:
     neither knows it. For trained golden sweeps this is a fault."""
     arrays = toy_bundle.means(means=np.float32([[0, 0], [6, 0], [0, 6]]))
@@ -85,7 +85,7 @@ def test_golden_sweeps_of_new_materials_need_not_agree(tmp_path: Path):
         ([0.5, 0.5, 0], [0.5, 0.5, 0]),
     ],
 )
-def test_an_enrolled_label_needs_its_least_probability(p: list[float], want: list[float]):
+def test_an_enrolled_label_needs_its_least_probability(p, want):
     """Below it the trained labels are as without it, so none of their answers becomes unsure."""
     assert RULE.decided(np.array(p)) == pytest.approx(want)
     assert RULE.decided(np.array([p, p])) == pytest.approx(np.array([want, want]))
@@ -117,7 +117,7 @@ def near_b(new: Bundle, p: float) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize(("fusion", "fused"), [("product", "felt"), ("none", ""), ("vote", "")])
-def test_sweeps_that_are_not_enough_are_enough_together(new: Bundle, fusion: str, fused: str):
+def test_sweeps_that_are_not_enough_are_enough_together(new, fusion, fused):
     """The least probability holds for the product of the sweeps. Alone each gets a trained label,
     without a trace of felt; with votes each is counted for that."""
     z = near_b(new, 0.6)
@@ -135,7 +135,7 @@ def test_sweeps_that_are_not_enough_are_enough_together(new: Bundle, fusion: str
         assert verdicts[2].probability > enrolment.LEAST
 
 
-def test_a_displaced_contact_is_named_by_the_same_rule(tmp_path: Path):
+def test_a_displaced_contact_is_named_by_the_same_rule(tmp_path):
     """Its distances are those of displaced sweeps, and network and distances are divided by its
     temperature."""
     arrays = toy_bundle.means(**toy_bundle.displaced_arrays())
@@ -158,7 +158,7 @@ def test_a_displaced_contact_is_named_by_the_same_rule(tmp_path: Path):
     assert verdict.scores == pytest.approx([*softmax(network / 3.0), 0], rel=1e-4)
 
 
-def test_left_out_sweeps_are_answered_as_the_box_would(new: Bundle, tmp_path: Path):
+def test_left_out_sweeps_are_answered_as_the_box_would(new, tmp_path):
     """Each answer of the assessment is that of a bundle without the sweep. A sweep between b and
     felt gets b, because felt does not have its least probability."""
     old, near = toy_bundle.load(tmp_path / "old"), toy_bundle.window(*near_b(new, 0.55))

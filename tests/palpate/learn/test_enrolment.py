@@ -35,7 +35,7 @@ def counts(*at: tuple[float, float]) -> np.ndarray:
     return np.stack([toy_bundle.window(*z) for z in at])
 
 
-def test_a_label_is_added_by_arithmetic(old: Bundle):
+def test_a_label_is_added_by_arithmetic(old):
     """Mean, bias, count, version, golden sweeps, `made`; the old rows unchanged."""
     new = enrolment.enrol(old, "felt", counts(*FELT))
     assert new.warnings == ()
@@ -56,7 +56,7 @@ def test_a_label_is_added_by_arithmetic(old: Bundle):
     assert enrolment.files(files, new, None) == files | {bundle.ENROLMENT: new.file}
 
 
-def test_a_label_for_a_skin_with_axes(tmp_path: Path):
+def test_a_label_for_a_skin_with_axes(tmp_path):
     """As with one axis. Sweeps without the axes are refused with the format."""
     old = toy_bundle.load(tmp_path / "old", format=toy_bundle.THREE_AXES)
     sweeps = np.stack([toy_bundle.window(*z, format=toy_bundle.THREE_AXES) for z in FELT])
@@ -70,7 +70,7 @@ def test_a_label_for_a_skin_with_axes(tmp_path: Path):
             enrolment.enrol(old, "felt", wrong)
 
 
-def test_the_new_bundle_runs(old: Bundle, tmp_path: Path):
+def test_the_new_bundle_runs(old, tmp_path):
     """Written and read again, the bundle equals the result of `enrol` and passes its self-test. It
     gives the new label, the old labels, and unknown."""
     new = enrolment.enrol(old, "felt", counts(*FELT))
@@ -91,13 +91,13 @@ def test_the_new_bundle_runs(old: Bundle, tmp_path: Path):
     assert it(toy_bundle.sweep(-30, 0)).status is Status.UNKNOWN
 
 
-def test_same_sweeps_same_bytes(old: Bundle):
+def test_same_sweeps_same_bytes(old):
     """The files depend on neither clock nor random numbers."""
     one, other = (enrolment.enrol(old, "felt", counts(*FELT)).file for _ in range(2))
     assert one == other
 
 
-def test_a_material_that_scatters_is_kept(old: Bundle):
+def test_a_material_that_scatters_is_kept(old):
     """Its spread is computed from its sweeps and one assumed sweep at the trained distance: (2 + 4
     * 9) / (2 * 4)."""
     new = enrolment.enrol(old, "felt", counts((23, 20), (17, 20), (20, 23), (20, 17)))
@@ -109,7 +109,7 @@ def test_a_material_that_scatters_is_kept(old: Bundle):
     assert it(toy_bundle.sweep(20 + edge + 0.1, 20)).status is Status.UNKNOWN
 
 
-def test_the_golden_sweep_is_the_median_of_those_recognised(old: Bundle):
+def test_the_golden_sweep_is_the_median_of_those_recognised(old):
     """The median of the new label's probability, over the sweeps that get the new label."""
     near = [(3.0, 5.0), (3.0, 5.5), (4.0, 8.0), (3.2, 6.0), (0.5, 6.0)]
     new = enrolment.enrol(old, "felt", counts(*near))
@@ -120,7 +120,7 @@ def test_the_golden_sweep_is_the_median_of_those_recognised(old: Bundle):
     assert new.bundle.golden[2].tolist() == toy_bundle.window(*near[mine[2][1]]).tolist()
 
 
-def test_one_sweep_is_enough_and_labels_add_up(old: Bundle):
+def test_one_sweep_is_enough_and_labels_add_up(old):
     """With one sweep the mean is that sweep; a second label is added to the first."""
     first = enrolment.enrol(old, "felt", counts((7, 8)))
     assert first.warnings == ()
@@ -139,7 +139,7 @@ def test_one_sweep_is_enough_and_labels_add_up(old: Bundle):
 
 
 @pytest.mark.parametrize("n", [1, 2, 5, 10])
-def test_the_limit_keeps_as_many_sweeps_of_an_enrolled_label_as_of_a_trained_one(n: int):
+def test_the_limit_keeps_as_many_sweeps_of_an_enrolled_label_as_of_a_trained_one(n):
     """In two dimensions a share 1 - exp(-limit / 2) is within the limit, around a known mean or the
     mean of n sweeps."""
     rng, known = np.random.default_rng(1), replace(toy_bundle.KNOWN, limit=4.0)
@@ -158,7 +158,7 @@ def test_the_limit_keeps_as_many_sweeps_of_an_enrolled_label_as_of_a_trained_one
     assert np.mean(kept) == pytest.approx(1 - np.exp(-2), abs=0.025)
 
 
-def test_an_enrolled_label_has_the_common_shape_and_moves_as_the_others(tmp_path: Path):
+def test_an_enrolled_label_has_the_common_shape_and_moves_as_the_others(tmp_path):
     """Its shape is 1. For displaced contacts its mean is turned and shifted like the means of the
     trained labels."""
     arrays = toy_bundle.means(**toy_bundle.displaced_arrays())
@@ -179,7 +179,7 @@ def test_an_enrolled_label_has_the_common_shape_and_moves_as_the_others(tmp_path
     assert classes.displaced.means[:3].tolist() == arrays["displaced_means"].tolist()
 
 
-def test_early_answers_end_with_an_enrolment(tmp_path: Path):
+def test_early_answers_end_with_an_enrolment(tmp_path):
     """The early heads do not have the label; the command says so."""
     quick = toy_bundle.load(
         tmp_path / "q", early=Early((0.9,) * 3, 1), outputs=("logits", "embedding", "early")
@@ -203,9 +203,7 @@ def test_early_answers_end_with_an_enrolment(tmp_path: Path):
         ([(0, 0), (6.2, 0)], ["disagree", "close to"]),
     ],
 )
-def test_unsuitable_sweeps_are_told_with_numbers(
-    old: Bundle, at: list[tuple[float, float]], hints: list[str]
-):
+def test_unsuitable_sweeps_are_told_with_numbers(old, at, hints):
     """Sweeps that are like a trained material, or unlike each other, give a warning and are
     enrolled."""
     new = enrolment.enrol(old, "felt", counts(*at))
@@ -216,7 +214,7 @@ def test_unsuitable_sweeps_are_told_with_numbers(
     assert "felt" in new.bundle.manifest.labels
 
 
-def test_materials_that_lie_close_anyway_make_no_warning(tmp_path: Path):
+def test_materials_that_lie_close_anyway_make_no_warning(tmp_path):
     """Closer than the limit, but no closer than two trained materials are, which the bundle accepts
     already."""
     arrays = toy_bundle.means(
@@ -228,7 +226,7 @@ def test_materials_that_lie_close_anyway_make_no_warning(tmp_path: Path):
 
 
 @pytest.mark.parametrize("label", ["b", "a,b", "", "x" * 25])
-def test_labels_that_cannot_be_enrolled(old: Bundle, label: str):
+def test_labels_that_cannot_be_enrolled(old, label):
     """Labels that are used already, or not allowed in a sentence, are reported before the first
     sweep."""
     for refused in (enrolment.admit, lambda *it: enrolment.enrol(*it, counts((7, 8)))):
@@ -236,7 +234,7 @@ def test_labels_that_cannot_be_enrolled(old: Bundle, label: str):
             refused(old, label)
 
 
-def test_a_bundle_without_embedding(tmp_path: Path):
+def test_a_bundle_without_embedding(tmp_path):
     """A bundle without class means is refused."""
     plain = toy_bundle.load(tmp_path / "p", known=None, outputs=("logits",))
     with pytest.raises(BundleError, match="embedding"):
@@ -247,13 +245,13 @@ def test_a_bundle_without_embedding(tmp_path: Path):
     "sweeps",
     [counts((7, 8))[0], counts((7, 8))[:0], counts((7, 8))[:, 1:], counts((7, 8)).astype(np.uint8)],
 )
-def test_sweeps_of_another_format(old: Bundle, sweeps: np.ndarray):
+def test_sweeps_of_another_format(old, sweeps):
     """Sweeps with a dimension too few, no sweeps, another window, another type."""
     with pytest.raises(FormatError, match="enrolled"):
         enrolment.enrol(old, "felt", sweeps)
 
 
-def test_sweeps_that_give_no_number(tmp_path: Path):
+def test_sweeps_that_give_no_number(tmp_path):
     """A mean that is NaN would make every later answer invalid."""
     format = replace(toy_bundle.FORMAT, dtype="float32")
     made = toy_bundle.load(tmp_path / "f", format=format)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 import subprocess
-from pathlib import Path
 
 import pytest
 
@@ -20,7 +19,7 @@ from tests.factories.feeds import HEALTH
 from tests.factories.paths import ROOT
 
 
-def test_the_file_comes_once_between_two_sweeps(tmp_path: Path):
+def test_the_file_comes_once_between_two_sweeps(tmp_path):
     """Not before an installation has seen the service run, and not during a sweep."""
     clock = VirtualClock()
     one, quiet = HandOver(tmp_path, clock), HEALTH._replace(sweeping=False)
@@ -37,7 +36,7 @@ def test_the_file_comes_once_between_two_sweeps(tmp_path: Path):
     assert not (tmp_path / FILE).exists()
 
 
-def test_a_file_that_cannot_be_written_ends_nothing(tmp_path: Path, logged: list[str]):
+def test_a_file_that_cannot_be_written_ends_nothing(tmp_path, logged):
     """It is said once."""
     clock = VirtualClock()
     one = HandOver(tmp_path / "nowhere", clock)
@@ -49,7 +48,7 @@ def test_a_file_that_cannot_be_written_ends_nothing(tmp_path: Path, logged: list
 
 
 @pytest.mark.parametrize("kind", ["file", "folder", "link"])
-def test_the_units_name_the_file(tmp_path: Path, kind: str):
+def test_the_units_name_the_file(tmp_path, kind):
     """The path unit waits for it; the page removes it before it starts. A service that was taken
     over could make something else of this name."""
     path = f"/run/palpate/{FILE}"
@@ -95,13 +94,13 @@ def test_the_service_alone_can_write_the_file():
     ],
     ids=["this machine", "network", "wrong", "forbidden"],
 )
-def test_the_address_is_known_without_the_token(more: list[str], address: str):
+def test_the_address_is_known_without_the_token(more, address):
     """The service may not read the token; why there is no page is said in its place."""
     settings = load_settings(arguments("run", more))
     assert re.fullmatch(address, teach_command.page_address(settings))
 
 
-def test_a_box_without_the_libraries_has_no_page(monkeypatch: pytest.MonkeyPatch):
+def test_a_box_without_the_libraries_has_no_page(monkeypatch):
     """It does not hand over to a program that could not run."""
     settings = load_settings(arguments("run", []))
     with monkeypatch.context() as patched:

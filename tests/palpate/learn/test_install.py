@@ -57,7 +57,7 @@ def full(act: Callable[..., Any], count: list[int], at: int) -> Callable[..., An
     return run
 
 
-def test_two_that_teach_at_once_share_no_folder(tmp_path: Path):
+def test_two_that_teach_at_once_share_no_folder(tmp_path):
     """The second is refused while the first has it; what a power cut left is cleared."""
     (tmp_path / "teaching" / "old").mkdir(parents=True)
     with install._scratch(tmp_path) as first:
@@ -70,9 +70,7 @@ def test_two_that_teach_at_once_share_no_folder(tmp_path: Path):
         assert not second.exists()
 
 
-def test_a_full_disk_leaves_the_bundle_in_service(
-    box: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
-):
+def test_a_full_disk_leaves_the_bundle_in_service(box, tmp_path, monkeypatch, capsys):
     """Whichever write fails: the reason is a line for the page, all sweeps are there, the box runs
     the bundle of before or the new one, whole, and with room it can be taught."""
     sweeps, done, at = tmp_path / "store" / "sweeps", False, 0

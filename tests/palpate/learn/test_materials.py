@@ -101,7 +101,7 @@ def box(tmp_path: Path) -> TaughtDelivery:
     return one
 
 
-def test_a_new_material_joins_the_delivered_ones(box: TaughtDelivery, capsys: Any):
+def test_a_new_material_joins_the_delivered_ones(box, capsys):
     """It is signed by this box and on trial, without a fit; model and trained labels stay byte for
     byte; the sweep that was not a slide is named and not learnt from."""
     before = box.running
@@ -121,7 +121,7 @@ def test_a_new_material_joins_the_delivered_ones(box: TaughtDelivery, capsys: An
     assert not (box.store / "teaching").exists()
 
 
-def test_more_sweeps_another_material_and_a_forgotten_one(box: TaughtDelivery, capsys: Any):
+def test_more_sweeps_another_material_and_a_forgotten_one(box, capsys):
     """Each USE learns all that is recorded anew; a material that `enrol` has added stays; one that
     is forgotten leaves."""
     box.teach(capsys, "--use")
@@ -138,7 +138,7 @@ def test_more_sweeps_another_material_and_a_forgotten_one(box: TaughtDelivery, c
     assert first.enrolled == {"cork": 5}
 
 
-def test_a_material_keeps_its_name_for_people(box: TaughtDelivery, capsys: Any):
+def test_a_material_keeps_its_name_for_people(box, capsys):
     """From the sidecar into the bundle, and through every later USE, also without its sweeps; the
     labels of the bundle are taken for whoever types a name later."""
     for path in sorted((box.store / "sweeps").glob("*.json")):
@@ -156,9 +156,7 @@ def test_a_material_keeps_its_name_for_people(box: TaughtDelivery, capsys: Any):
     assert {*box.running.bundle.manifest.labels} <= {*typed.displays, *typed.plain}
 
 
-def test_a_delivery_during_use_is_not_replaced(
-    box: TaughtDelivery, capsys: Any, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_delivery_during_use_is_not_replaced(box, capsys, monkeypatch):
     """Another bundle comes into service while the sweeps are learnt: it stays, and the person who
     teaches is told."""
     taught = materials.taught
@@ -176,7 +174,7 @@ def test_a_delivery_during_use_is_not_replaced(
     assert not (box.store / "current").exists()
 
 
-def test_a_label_without_recorded_sweeps_stays(box: TaughtDelivery, capsys: Any):
+def test_a_label_without_recorded_sweeps_stays(box, capsys):
     """One that `enrol` has added, whose sweeps are not kept, has the same mean after each USE."""
     store, key = assembly.store(box.settings), EnrolmentKey(box.settings.store.enrolment_key)
     running = box.running
@@ -189,7 +187,7 @@ def test_a_label_without_recorded_sweeps_stays(box: TaughtDelivery, capsys: Any)
         assert np.array_equal(box.running.bundle.classes.means[-2], new.bundle.classes.means[-1])
 
 
-def test_kept_sweeps_of_an_unknown_material_are_taught(box: TaughtDelivery, capsys: Any):
+def test_kept_sweeps_of_an_unknown_material_are_taught(box, capsys):
     """Listed, and chosen by one of them; without the skin they become a material."""
     record(box.store, "", slides(FELT, 3), 1, "black-box")
     for number in (1, 2, 3):
@@ -205,7 +203,7 @@ def test_kept_sweeps_of_an_unknown_material_are_taught(box: TaughtDelivery, caps
     assert box.running.bundle.enrolled == {"cork": 5, "felt": 2}
 
 
-def test_nothing_new_leaves_the_bundle_in_service(box: TaughtDelivery, capsys: Any):
+def test_nothing_new_leaves_the_bundle_in_service(box, capsys):
     """Sweeps of trained materials, of rests alone, or of another format teach nothing."""
     assert main(["teach", *box.words, "--forget", "cork"]) == 0
     record(box.store, "foam", slides(CORK, 3), 20)
@@ -221,7 +219,7 @@ def test_nothing_new_leaves_the_bundle_in_service(box: TaughtDelivery, capsys: A
     assert box.running.sha == before
 
 
-def test_sweeps_that_disagree_are_refused(box: TaughtDelivery, capsys: Any):
+def test_sweeps_that_disagree_are_refused(box, capsys):
     """As by `enrol`: the sweep that is most of all another material is named."""
     record(box.store, "oak", [*slides(CORK, 4), *slides(FELT, 1)], 20)
     code, news = box.teach(capsys, "--use")
@@ -235,11 +233,7 @@ def test_sweeps_that_disagree_are_refused(box: TaughtDelivery, capsys: Any):
 )
 @pytest.mark.parametrize("more", [(), ("--use",)], ids=["assess", "use"])
 def test_a_model_or_disk_that_fails_leaves_the_bundle_in_service(
-    box: TaughtDelivery,
-    capsys: Any,
-    monkeypatch: pytest.MonkeyPatch,
-    error: Exception,
-    more: tuple[str, ...],
+    box, capsys, monkeypatch, error, more
 ):
     """The reason is a line for the page; the next attempt succeeds."""
     before = box.running.sha
@@ -257,7 +251,7 @@ def test_a_model_or_disk_that_fails_leaves_the_bundle_in_service(
     assert box.teach(capsys, *more)[0] == 0
 
 
-def test_a_reader_that_is_gone_gets_an_exit_code(box: TaughtDelivery):
+def test_a_reader_that_is_gone_gets_an_exit_code(box):
     """Standard output is full: the result could not be told, and nothing hangs or is half done."""
     words = [sys.executable, "-P", "-m", "palpate", "teach", *box.words, "--json", "--use"]
     with open("/dev/full", "wb") as full:
@@ -269,7 +263,7 @@ def test_a_reader_that_is_gone_gets_an_exit_code(box: TaughtDelivery):
     assert box.running.bundle.enrolled in ({}, {"cork": 5})
 
 
-def test_a_taught_bundle_and_another_skin_are_fitted_anew(box: TaughtDelivery):
+def test_a_taught_bundle_and_another_skin_are_fitted_anew(box):
     """Only a delivered bundle for this skin is taught into; the packaged one is not."""
     store = assembly.store(box.settings)
     assert install.base(store, skin.FORMAT)
@@ -283,14 +277,14 @@ def test_a_taught_bundle_and_another_skin_are_fitted_anew(box: TaughtDelivery):
     assert install.base(store, skin.FORMAT) is None
 
 
-def test_early_answers_are_refused_before_a_sweep(box: TaughtDelivery):
+def test_early_answers_are_refused_before_a_sweep(box):
     """They cannot name a label without heads."""
     classifier = replace(box.settings.classifier, early=True)
     with pytest.raises(ConfigError, match=r"classifier.early"):
         materials.check_settings(replace(box.settings, classifier=classifier))
 
 
-def test_a_sweep_of_another_new_material_is_suspected(box: TaughtDelivery):
+def test_a_sweep_of_another_new_material_is_suspected(box):
     """Left out, it is named as what it is."""
     found = materials.recorded(box.running.bundle, box.store / "sweeps")
     other = slides(FELT, 4)
@@ -304,7 +298,7 @@ def test_a_sweep_of_another_new_material_is_suspected(box: TaughtDelivery):
         materials.assessed(box.running, materials.NewSweeps({}, {}))
 
 
-def test_the_session_needs_one_material_and_refuses_trained_ones(tmp_path: Path):
+def test_the_session_needs_one_material_and_refuses_trained_ones(tmp_path):
     """Beside the delivered labels one material is enough; class bits count all."""
     session: TeachingSession = sessions(tmp_path, codes=8)
     with pytest.raises(ConfigError, match="'oak'"):
@@ -323,7 +317,7 @@ def test_the_session_needs_one_material_and_refuses_trained_ones(tmp_path: Path)
     assert narrow.commands["TEACH"]("cork") == ["cork", 0]
 
 
-def test_a_trained_material_is_refused_before_a_sweep(box: TaughtDelivery, capsys: Any):
+def test_a_trained_material_is_refused_before_a_sweep(box, capsys):
     """In the terminal, and on the page or the serial line after a trial: more sweeps of it would
     teach nothing here."""
     words = [*box.words, "--label", "foam", "--sim", "skin", "--virtual"]
@@ -343,7 +337,7 @@ def test_a_trained_material_is_refused_before_a_sweep(box: TaughtDelivery, capsy
 
 
 @pytest.mark.parametrize("allowed", [False, True])
-def test_the_robot_labels_nothing_unless_it_may_teach(box: TaughtDelivery, allowed: bool):
+def test_the_robot_labels_nothing_unless_it_may_teach(box, allowed):
     """With teach.serial = false the page alone sets labels, discards, teaches and forgets."""
     trigger, teach = box.settings.trigger, box.settings.teach
     settings = replace(box.settings, trigger=replace(trigger, mode="serial"))
@@ -379,11 +373,5 @@ def sessions(folder: Path, codes: int) -> TeachingSession:
     recording = RecordingSession(sweeps, skin.FORMAT, Labels(), SystemClock(), say, 3)
     base = ("oak", "pine", "cork")
     return TeachingSession(
-        recording,
-        TeachConfig(),
-        lambda by: [],
-        say,
-        codes=codes,
-        base=base,
-        trained=base[:2],
+        recording, TeachConfig(), lambda by: [], say, codes=codes, base=base, trained=base[:2]
     )

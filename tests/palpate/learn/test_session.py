@@ -94,7 +94,7 @@ def taught(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Taught]:
     one.recording.close()
 
 
-def test_it_assesses_from_the_second_sweep_of_two_materials_on(taught: Taught):
+def test_it_assesses_from_the_second_sweep_of_two_materials_on(taught):
     """Before, there is nothing to say."""
     taught.sweeps("cork", 3)
     taught.sweeps("pine", 1)
@@ -107,14 +107,14 @@ def test_it_assesses_from_the_second_sweep_of_two_materials_on(taught: Taught):
     assert not about["trouble"]
 
 
-def test_faulty_sweeps_do_not_count(taught: Taught):
+def test_faulty_sweeps_do_not_count(taught):
     """They are stored, and neither counted nor taught."""
     taught.sweeps("cork", 2)
     taught.sweeps("cork", 2, Status.NO_CONTACT)
     assert taught.session.materials() == {"cork": 2}
 
 
-def test_sweeps_that_were_no_slides_are_said_and_not_counted(taught: Taught):
+def test_sweeps_that_were_no_slides_are_said_and_not_counted(taught):
     """At once if the check finds it; later if the process does, by comparing all sweeps. Each is
     said once; files stay."""
     taught.assess = printed(
@@ -137,7 +137,7 @@ def test_sweeps_that_were_no_slides_are_said_and_not_counted(taught: Taught):
     assert len(list((taught.folder / "sweeps").glob("*.npy"))) == 7
 
 
-def test_use_makes_a_bundle_and_says_so(taught: Taught):
+def test_use_makes_a_bundle_and_says_so(taught):
     """Steps are shown with the time left; the end is a sentence for a robot."""
     step = {"type": "step", "step": "heads", "done": 0.2, "left_s": 4.0}
     go = taught.folder / "go"
@@ -169,7 +169,7 @@ def test_use_makes_a_bundle_and_says_so(taught: Taught):
         (["/nowhere/python"], "cannot be started"),
     ],
 )
-def test_a_failed_process_is_said_and_changes_nothing(taught: Taught, learn: list[str], why: str):
+def test_a_failed_process_is_said_and_changes_nothing(taught, learn, why):
     """Whatever becomes of the process: the reason is shown, all sweeps stay, and the next attempt
     is possible."""
     taught.sweeps("cork", 2)
@@ -189,7 +189,7 @@ def test_a_failed_process_is_said_and_changes_nothing(taught: Taught, learn: lis
     taught.until(lambda about: about["taught"])
 
 
-def test_an_assessment_that_cannot_start_is_said(taught: Taught):
+def test_an_assessment_that_cannot_start_is_said(taught):
     """The turn of the loop raises nothing."""
     taught.assess = ["/nowhere/python"]
     taught.sweeps("cork", 2)
@@ -209,7 +209,7 @@ class HandClock(SystemClock):
 @pytest.mark.parametrize(
     ("quiet_s", "why"), [(1e6, "not done within 300 s"), (200.0, "no further for 200 s")]
 )
-def test_a_process_that_hangs_is_killed(quiet_s: float, why: str):
+def test_a_process_that_hangs_is_killed(quiet_s, why):
     """It spins as a library does that gets no memory. After its limit, or after a time without a
     line, it ends with a reason, together with the processes that it started."""
     code = (
@@ -235,7 +235,7 @@ def test_a_process_that_hangs_is_killed(quiet_s: float, why: str):
         time.sleep(0.02)
 
 
-def test_use_needs_two_materials(taught: Taught):
+def test_use_needs_two_materials(taught):
     """A single material has nothing to be confused with; the message names the remedy."""
     taught.sweeps("cork", 5)
     with pytest.raises(ApplianceError, match=r"1 materials"):
@@ -243,14 +243,14 @@ def test_use_needs_two_materials(taught: Taught):
 
 
 @pytest.mark.parametrize("label", ["", " ", "käse", "a,b", "x" * 25])
-def test_a_label_that_cannot_be_sent_is_refused(taught: Taught, label: str):
+def test_a_label_that_cannot_be_sent_is_refused(taught, label):
     """Before any sweep of it is recorded."""
     with pytest.raises(ApplianceError, match=r"name of|cannot be"):
         taught.order("TEACH", label)
     assert taught.session.materials() == {}
 
 
-def test_class_bits_that_are_too_few_are_said_before_recording(tmp_path: Path):
+def test_class_bits_that_are_too_few_are_said_before_recording(tmp_path):
     """Two bits name three materials: the fourth is refused by TEACH, before a sweep of it is made.
     Recorded by a box with more bits, it is said at the next start, until one is forgotten."""
     narrow = Taught(tmp_path, codes=4)
@@ -272,7 +272,7 @@ def test_class_bits_that_are_too_few_are_said_before_recording(tmp_path: Path):
     narrower.recording.close()
 
 
-def test_names_alone_fill_no_box(taught: Taught, monkeypatch: pytest.MonkeyPatch):
+def test_names_alone_fill_no_box(taught, monkeypatch):
     """Only so many materials wait for their first sweep; one with sweeps does not count."""
     monkeypatch.setattr(session, "MOST_NAMED", 2)
     taught.sweeps("cork", 1)
@@ -284,7 +284,7 @@ def test_names_alone_fill_no_box(taught: Taught, monkeypatch: pytest.MonkeyPatch
     assert taught.order("TEACH", "oak") == ["oak", 0]
 
 
-def test_a_forgotten_material_is_gone_and_its_sweeps_stay(taught: Taught):
+def test_a_forgotten_material_is_gone_and_its_sweeps_stay(taught):
     """Also after a restart; recorded again, it counts from 1."""
     taught.sweeps("cork", 2)
     taught.sweeps("pine", 2)
@@ -301,7 +301,7 @@ def test_a_forgotten_material_is_gone_and_its_sweeps_stay(taught: Taught):
     assert again.session.materials() == {"pine": 2, "cork": 1}
 
 
-def test_a_discarded_sweep_is_not_taught(taught: Taught):
+def test_a_discarded_sweep_is_not_taught(taught):
     """It is removed and the rest is assessed again."""
     taught.sweeps("cork", 3)
     taught.order("DISCARD", "3")
@@ -310,7 +310,7 @@ def test_a_discarded_sweep_is_not_taught(taught: Taught):
         taught.order("DISCARD", "3")
 
 
-def test_the_teacher_leads_from_material_to_material(taught: Taught):
+def test_the_teacher_leads_from_material_to_material(taught):
     """Each label until its sweeps are there, those of earlier sessions not counted."""
     taught.sweeps("pine", 1)
     teacher = Teacher(taught.session, ["cork", "pine"], 2)
@@ -327,7 +327,7 @@ def test_the_teacher_leads_from_material_to_material(taught: Taught):
     assert teacher.done
 
 
-def test_a_box_without_the_extra_says_what_to_install(monkeypatch: pytest.MonkeyPatch):
+def test_a_box_without_the_extra_says_what_to_install(monkeypatch):
     """Before a person records anything."""
     monkeypatch.setattr(process, "find_spec", lambda name: None if name == "scipy" else name)
     with pytest.raises(ConfigError, match="needs"):

@@ -72,7 +72,7 @@ class Hand:
             self.page.wait_for_timeout(50)
 
 
-def test_from_nothing_to_right_verdicts_on_four_materials(browser: Any, box: TaughtBox):
+def test_from_nothing_to_right_verdicts_on_four_materials(browser, box):
     """By the page alone. The machine's time is measured, and clicks are counted."""
     hand = Hand(browser, box)
     assert "materials" in hand.seen.text("#accuracy")
@@ -106,7 +106,7 @@ def test_from_nothing_to_right_verdicts_on_four_materials(browser: Any, box: Tau
     print(json.dumps({"clicks": hand.clicks, "waited_s": round(waited, 1), "slides": slides}))
 
 
-def test_browsers_and_skin_come_and_go(browser: Any, box: TaughtBox):
+def test_browsers_and_skin_come_and_go(browser, box):
     """Two browsers show the same; one that is closed in the middle of a sweep loses nothing; a skin
     that is unplugged is said, and teaching goes on when it is back; a killed program continues with
     what it had."""
@@ -133,7 +133,7 @@ def test_browsers_and_skin_come_and_go(browser: Any, box: TaughtBox):
     assert len(list((box.folder / "store" / "sweeps").glob("*.npy"))) == 3
 
 
-def test_no_name_is_lost_while_the_page_cannot_send(browser: Any, box: TaughtBox):
+def test_no_name_is_lost_while_the_page_cannot_send(browser, box):
     """Before the first event, and while an order is not answered, a typed name stays."""
     context = browser.new_context()
     news = re.compile(r"/events\?")
@@ -159,7 +159,7 @@ def test_no_name_is_lost_while_the_page_cannot_send(browser: Any, box: TaughtBox
     context.close()
 
 
-def test_the_page_refuses_what_cannot_be(browser: Any, box: TaughtBox):
+def test_the_page_refuses_what_cannot_be(browser, box):
     """A name that cannot be sent is refused with the reason; USE waits for two materials."""
     hand = Hand(browser, box)
     hand.page.fill("#name", "-oak")
