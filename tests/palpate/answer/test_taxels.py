@@ -9,6 +9,7 @@ import pytest
 
 from palpate.answer.taxels import (
     LEAST_FRAMES,
+    REACH,
     Bridging,
     BrokenTaxels,
     Comparison,
@@ -132,6 +133,18 @@ def test_a_skin_whose_sound_taxels_may_be_constant():
         == found(taxels)
         == ("silent taxel 1.1 1.2 1.3 1.4 1.5 4.3 5.5")
     )
+
+
+def test_a_taxel_is_compared_with_the_lower_median_around_it():
+    """Up to REACH taxels away; constant ones are left out, and without others there is none."""
+    noise = np.random.default_rng(2).standard_normal((FRAMES, 1, 7)) * np.arange(1, 8)
+    noise[:, 0, 6] = 5
+    measured = Window(noise.astype(np.float32))
+    around = Comparison.of(measured, (1, 7)).around[:, 0]
+    for k in range(7):
+        near = [*range(max(0, k - REACH), k), *range(k + 1, min(6, k + REACH + 1))]
+        assert around[k] == sorted(measured.noise[near])[(len(near) - 1) // 2]
+    assert np.isinf(Comparison.of(Window(np.ones((FRAMES, 1, 2), np.float32)), (1, 2)).around).all()
 
 
 def test_noise_is_measured_at_triples_of_frames():
