@@ -190,7 +190,7 @@ def test_palpate_run_is_killed_and_comes_back_under_a_reader(tmp_path):
         for wait in ("sweep", "health"):
             with running(path) as process:
                 seen: list[str] = []
-                for line in feed:
+                for line in iter(lambda: feed.read(120), None):
                     seen.append(line["type"])
                     if line["type"] == "hello":
                         pids.append(line["pid"])
