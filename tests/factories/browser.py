@@ -16,7 +16,7 @@ BROWSERS = (
     "google-chrome",
     "google-chrome-stable",
 )
-WAIT_S = 10
+WAIT_S = 60
 
 
 @contextmanager

@@ -29,7 +29,7 @@ def port(page: PageServer) -> int:
 
 def status(page: PageServer, host: str = "127.0.0.1") -> tuple[int, str]:
     """The answer to a request for the page. host: address of the client."""
-    asked = HTTPConnection("127.0.0.1", port(page), timeout=5, source_address=(host, 0))
+    asked = HTTPConnection("127.0.0.1", port(page), timeout=60, source_address=(host, 0))
     try:
         asked.request("GET", "/")
         answer = asked.getresponse()
