@@ -87,181 +87,138 @@ class TriggerSetup:
             edge for t_ns in range(now_ns, until_ns + step_ns, step_ns) for edge in self.poll(t_ns)
         ]
 
-    def queue(self, *events: tuple[bool, int, int]) -> None:
-        """Put (rise, t_ns, number) into the kernel's queue for the first line of the first chip."""
-        kinds = gpiod.EdgeEvent.Type
-        for rise, t_ns, number in events:
-            kind = kinds.RISING_EDGE if rise else kinds.FALLING_EDGE
-            self.gpio.requests[0].queue.append(
-                gpiod.EdgeEvent(kind.value, self.t0 + t_ns, 1, number, number)
-            )
-
 
 # ---------------------------------------------------------------- edges, bursts and losses
 TWO_CHIPS = {CHIP0: ("START",), CHIP1: ("STOP",)}
+THREE_CHIPS = TWO_CHIPS | {"/dev/gpiochip2": ("NEW",)}
 ONE = {"mode": "one-line", "stop": ""}
-Call = tuple[int, list[tuple[EdgeKind, int]]]
+KINDS = {"START": START, "STOP": STOP, "NEW": NEW_OBJECT, "LOST": LOST}
 
 
-def us(*times: int) -> list[int]:
-    """Times in microseconds as ns."""
-    return [t * US for t in times]
-
-
-def ms(*times: int) -> list[int]:
+def ms(*times: float) -> list[int]:
     """Times in milliseconds as ns."""
-    return [t * MS for t in times]
+    return [round(t * MS) for t in times]
 
 
-CASES: dict[str, tuple[dict[str, Any], dict[str, list[int]], list[Call], dict[str, int]]] = {
+def reported(text: str) -> list[tuple[EdgeKind, int]]:
+    """Edges as `KIND milliseconds` one after the other."""
+    words = text.split()
+    return [(KINDS[k], *ms(float(t))) for k, t in zip(words[::2], words[1::2], strict=True)]
+
+
+BURST = [10 + t / 1000 for t in (0, 20, 90, 300, 420, 900, 1300)]
+BOUNCING = [10, 10.4, 10.8, 11.2, 11.6]
+CASES: dict[
+    str, tuple[dict[str, Any], dict[str, list[float]], dict[float, str], dict[str, int]]
+] = {
     "two lines; a fall has no meaning": (
         {"new_object": "NEW"},
-        {
-            "NEW": [3 * MS + 1, 5 * MS],
-            "START": [10 * MS + 7, 30 * MS],
-            "STOP": [200 * MS + 13, 220 * MS],
-        },
-        [(300 * MS, [(NEW_OBJECT, 3 * MS + 1), (START, 10 * MS + 7), (STOP, 200 * MS + 13)])],
+        {"NEW": [3.000001, 5], "START": [10.000007, 30], "STOP": [200.000013, 220]},
+        {300: "NEW 3.000001 START 10.000007 STOP 200.000013"},
         {},
     ),
     "one line; its stop line is not requested": (
         {"mode": "one-line", "stop": "NOWHERE"},
-        {"START": [10 * MS + 7, 200 * MS + 13]},
-        [(300 * MS, [(START, 10 * MS + 7), (STOP, 200 * MS + 13)])],
+        {"START": [10.000007, 200.000013]},
+        {300: "START 10.000007 STOP 200.000013"},
         {},
     ),
     "reported once, exactly when settled": (
-        {},
-        {"START": [MS]},
-        [(MS, []), (MS + GLITCH - 1, []), (MS + GLITCH, [(START, MS)]), (9 * MS, [])],
-        {},
+        *({}, {"START": [1]}, {1: "", 1.499999: "", 1.5: "START 1", 9: ""}, {}),
     ),
     "complete sweeps between two calls": (
-        ONE,
-        {"START": ms(10, 200, 300, 400)},
-        [(500 * MS, list(zip((START, STOP) * 2, ms(10, 200, 300, 400), strict=True)))],
-        {},
+        *(ONE, {"START": [10, 200, 300, 400]}, {500: "START 10 STOP 200 START 300 STOP 400"}, {}),
     ),
     "active low": (
-        ONE | {"active_low": True},
-        {"-START": ms(10, 200)},
-        [(300 * MS, [(START, 10 * MS), (STOP, 200 * MS)])],
-        {},
+        *(ONE | {"active_low": True}, {"-START": [10, 200]}, {300: "START 10 STOP 200"}, {}),
     ),
     "high at start-up": (
-        ONE | {"high": "START"},
-        {"-START": ms(100, 200)},
-        [(50 * MS, []), (300 * MS, [(STOP, 100 * MS), (START, 200 * MS)])],
-        {},
+        *(ONE | {"high": "START"}, {"-START": [100, 200]}, {50: "", 300: "STOP 100 START 200"}, {}),
     ),
     "bounce keeps the first stamp": (
-        ONE,
-        {"START": [10 * MS + t * US for t in (0, 20, 90, 300, 420, 900, 1300)] + [100 * MS]},
-        [(200 * MS, [(START, 10 * MS), (STOP, 100 * MS)])],
-        {"glitches": 0},
+        *(ONE, {"START": [*BURST, 100]}, {200: "START 10 STOP 100"}, {"glitches": 0}),
     ),
     "a pulse of exactly glitch_us": (
-        ONE,
-        {"START": [10 * MS, 10 * MS + GLITCH]},
-        [(20 * MS, [(START, 10 * MS), (STOP, 10 * MS + GLITCH)])],
-        {},
+        *(ONE, {"START": [10, 10.5]}, {20: "START 10 STOP 10.5"}, {}),
     ),
     **{
-        f"a pulse of {width} ns, {'down' if high else 'up'}": (
+        f"a pulse of {width} ms, {'down' if high else 'up'}": (
             ONE | ({"high": "START"} if high else {}),
-            {"-START" if high else "START": [10 * MS, 10 * MS + width]},
-            [(20 * MS, [])],
+            {"-START" if high else "START": [10, 10 + width]},
+            {20: ""},
             {"glitches": 1},
         )
-        for width in (10 * US, 100 * US, GLITCH - 1)
+        for width in (0.01, 0.1, 0.499999)
         for high in (False, True)
     },
     **{
         f"a clean STOP waits for an older START that bounces, {len(chips)} chips": (
             {"chips": chips},
-            {"START": us(10_000, 10_400, 10_800, 11_200, 11_600), "STOP": us(10_100)},
-            [
-                (11 * MS, []),
-                (12 * MS, []),
-                (13 * MS, [(START, 10 * MS), (STOP, 10 * MS + 100 * US)]),
-            ],
+            {"START": BOUNCING, "STOP": [10.1]},
+            {11: "", 12: "", 13: "START 10 STOP 10.1"},
             {},
         )
         for chips in ({CHIP0: INPUTS}, {CHIP0: ("START",), CHIP1: ("NEW", "STOP")})
     },
+    # it is low after the loss, though a START was reported last
     "dropped events are one LOST": (
         ONE | {"queue": 4},
-        {"START": ms(5, *range(10, 17), 30, 40)},
-        [
-            (6 * MS, [(START, 5 * MS)]),
-            (20 * MS, [(LOST, 13 * MS)]),  # the first that was left
-            # it is low now, though a START was reported last
-            (50 * MS, [(START, 30 * MS), (STOP, 40 * MS)]),
-        ],
+        {"START": [5, *range(10, 17), 30, 40]},
+        {6: "START 5", 20: "LOST 13", 50: "START 30 STOP 40"},
         {"lost_edges": 3, "glitches": 0, "storms": 0},
     ),
     "a loss upon a loss is only counted": (
         {"queue": 32},
-        {"START": [10 * MS + i * US for i in range(100)]},
-        [(10 * MS + 49 * US, [(LOST, 10 * MS + 18 * US)]), (10 * MS + 99 * US, []), (20 * MS, [])],
+        {"START": [10 + i / 1000 for i in range(100)]},
+        {10.049: "LOST 10.018", 10.099: "", 20: ""},
         {"lost_edges": 50 - 32 + 50 - 32},
     ),
     "a loss discards open bursts, after a settled edge": (
         {"chips": TWO_CHIPS, "queue": 4},
-        {"START": us(*range(5000, 8000, 400)), "STOP": us(5100)},
-        [(5_900 * US, []), (10 * MS, [(STOP, 5_100 * US), (LOST, 6_600 * US)]), (20 * MS, [])],
+        {"START": [5 + 0.4 * i for i in range(8)], "STOP": [5.1]},
+        {5.9: "", 10: "STOP 5.1 LOST 6.6", 20: ""},
         {},
     ),
     "nothing counts between a loss and quiet": (
         {"chips": TWO_CHIPS, "queue": 4},
-        {"STOP": ms(*range(10, 15)), "START": ms(15, 17)},
-        [(20 * MS, [(LOST, 11 * MS)]), (30 * MS, [])],
+        {"STOP": [*range(10, 15)], "START": [15, 17]},
+        {20: "LOST 11", 30: ""},
         {},
     ),
     "storm_edges edges are no storm": (
         {"storm_edges": 5},
-        {"START": [10 * MS + i * US for i in range(5)]},
-        [(20 * MS, []), (21 * MS, []), (22 * MS, [(START, 10 * MS)])],
+        {"START": [10 + i / 1000 for i in range(5)]},
+        {20: "", 21: "", 22: "START 10"},
         {"storms": 0},
     ),
     "of a storm between two calls the kernel keeps the last": (
         {},
-        {"START": [*(10 * MS + i * US for i in range(10_000)), 60 * MS]},
-        [(50 * MS, [(LOST, 10 * MS + 8976 * US)]), (51 * MS, []), (70 * MS, [(START, 60 * MS)])],
+        {"START": [*(10 + i / 1000 for i in range(10_000)), 60]},
+        {50: "LOST 18.976", 51: "", 70: "START 60"},
         {"lost_edges": 8976},
     ),
+    # one event of each chip a call
     "a burst with unread events is not settled": (
-        {"chips": TWO_CHIPS, "storm_edges": 3},  # one event of each chip a call
-        {"START": us(10_000, 10_100, 10_200), "STOP": us(11_000)},
-        [
-            (50 * MS, []),
-            (51 * MS, []),
-            (52 * MS, []),
-            (53 * MS, [(START, 10 * MS), (STOP, 11 * MS)]),
-        ],
+        {"chips": TWO_CHIPS, "storm_edges": 3},
+        {"START": [10, 10.1, 10.2], "STOP": [11]},
+        {50: "", 51: "", 52: "", 53: "START 10 STOP 11"},
         {"glitches": 0},
     ),
     "edges are reported while another chip is read": (
-        {"chips": TWO_CHIPS, "storm_edges": 2},  # one event of each chip a call
-        {"START": ms(10, 20), "STOP": ms(1, 2, 3, 4)},
-        list(
-            zip(
-                ms(*range(50, 56)),
-                [[], [(STOP, MS)], [], [(STOP, 3 * MS)], [(START, 10 * MS)], []],
-                strict=True,
-            )
-        ),
+        {"chips": TWO_CHIPS, "storm_edges": 2},
+        {"START": [10, 20], "STOP": [1, 2, 3, 4]},
+        {50: "", 51: "STOP 1", 52: "", 53: "STOP 3", 54: "START 10", 55: ""},
         {},
     ),
     "each of three chips is read in each call": (
-        {"chips": TWO_CHIPS | {"/dev/gpiochip2": ("NEW",)}, "new_object": "NEW", "storm_edges": 2},
-        {"START": [MS]},
-        [(MS, []), (2 * MS, [(START, MS)])],
+        {"chips": THREE_CHIPS, "new_object": "NEW", "storm_edges": 2},
+        {"START": [1]},
+        {1: "", 2: "START 1"},
         {},
     ),
 }
 """Set-up, edges by line ("-": the first is a fall), the edges that a call at a time reports, and
-counters at the end."""
+counters at the end. Times are in milliseconds."""
 
 
 @pytest.mark.parametrize(("how", "edges", "calls", "counters"), CASES.values(), ids=CASES)
@@ -269,11 +226,11 @@ def test_what_calls_report(how, edges, calls, counters):
     """Edges with the kernel's time stamps, in order; glitches, losses and storms are counted."""
     setup = TriggerSetup(**how)
     for name, times in edges.items():
-        setup.drive(name.removeprefix("-"), *times, level=not name.startswith("-"))
-    assert [(t, setup.poll(t)) for t, _ in calls] == calls
+        setup.drive(name.removeprefix("-"), *ms(*times), level=not name.startswith("-"))
+    assert [setup.poll(t) for t in ms(*calls)] == [reported(text) for text in calls.values()]
     for name, count in counters.items():
         assert getattr(setup.trigger.edge_counters, name) == count
-    assert setup.poll(calls[-1][0] + 10 * MS) == []
+    assert setup.poll(ms(max(calls) + 10)[0]) == []
 
 
 @pytest.mark.parametrize("step_ns", [US, 10 * US])
@@ -304,16 +261,6 @@ def test_what_is_requested(active_low, bias):
         assert request.queue.maxlen == 1024
 
 
-def test_level_seen_too_late():
-    """The same edge twice is one edge, and a return to the level is not an edge."""
-    setup = TriggerSetup()
-    setup.queue((False, MS, 1), (False, MS + US, 2))
-    assert setup.poll(3 * MS) == []
-    assert setup.trigger.edge_counters.glitches == 1
-    setup.queue((True, 4 * MS, 3), (True, 4 * MS + US, 4))
-    assert setup.poll(6 * MS) == [(START, 4 * MS)]
-
-
 def test_interrupts_overtake():
     """An edge that is delivered late, but within `glitch_us`, is in order and no loss."""
     setup = TriggerSetup()
@@ -330,28 +277,34 @@ def test_interrupts_overtake():
     assert setup.trigger.edge_counters.lost_edges == 0
 
 
-def test_edges_that_the_kernel_joins():
-    """Two interrupts in one event, with the level after both, are never a loss."""
-    setup = TriggerSetup()
-    rise, fall = gpiod.EdgeEvent.Type.RISING_EDGE.value, gpiod.EdgeEvent.Type.FALLING_EDGE.value
-    reported = (
-        (fall, MS + 20 * US, 2, 1),
-        (rise, 5 * MS + 20 * US, 5, 2),
-    )  # kind, stamp, edges so far, events so far
-    setup.gpio.requests[0].queue.extend(
-        gpiod.EdgeEvent(k, setup.t0 + t, 1, edges, n) for k, t, edges, n in reported
-    )
-    assert setup.poll(9 * MS) == [(START, 5 * MS + 20 * US)]
-    assert (setup.trigger.edge_counters.lost_edges, setup.trigger.edge_counters.glitches) == (0, 1)
+FALL, RISE = gpiod.EdgeEvent.Type.FALLING_EDGE.value, gpiod.EdgeEvent.Type.RISING_EDGE.value
+LAST = 2**32 - 1
+QUEUES = {
+    "the same edge twice is one": ([(FALL, 1, 1), (FALL, 1.001, 2)], "", 1),
+    "a return to the level is none": ([(RISE, 4, 1), (RISE, 4.001, 2)], "START 4", 0),
+    "two interrupts in one event are no loss": (
+        [(FALL, 1.02, 1), (RISE, 5.02, 2)],
+        "START 5.02",
+        1,
+    ),
+    "event numbers wrap": (*([(RISE, 1, LAST), (FALL, 3, 0), (RISE, 5, 1)], "START 1 START 5", 0),),
+}
+"""Events of a line as (kind, milliseconds, number), what is reported, and glitches."""
 
 
-def test_event_numbers_wrap():
-    """The kernel's 32-bit event numbers wrap without a loss."""
-    setup = TriggerSetup()
-    setup.trigger._lines[0].seqno = 2**32 - 2
-    setup.queue((True, MS, 2**32 - 1), (False, 3 * MS, 0), (True, 5 * MS, 1))
-    assert setup.poll(9 * MS) == [(START, MS), (START, 5 * MS)]
-    assert setup.trigger.edge_counters.lost_edges == 0
+@pytest.mark.parametrize("name", QUEUES)
+def test_events_in_the_queue_of_a_line(name):
+    """The level is that after an event, and the kernel numbers events without gaps."""
+    setup, (events, wanted, glitches) = TriggerSetup(), QUEUES[name]
+    setup.trigger._lines[0].seqno = (events[0][2] - 1) % 2**32
+    for kind, t_ms, number in events:
+        edges = number + (name[:3] == "two")  # edges so far
+        setup.gpio.requests[0].queue.append(
+            gpiod.EdgeEvent(kind, setup.t0 + round(t_ms * MS), 1, edges, number)
+        )
+    assert setup.poll(9 * MS) == reported(wanted)
+    counted = setup.trigger.edge_counters
+    assert (counted.lost_edges, counted.glitches) == (0, glitches)
 
 
 def test_blind_until_quiet():
