@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from palpate.answer.disturbance import NAMES, Allowance, Disturbances, load, noise
+from palpate.answer.disturbance import NAMES, SAID, Allowance, Disturbances, load, noise
 from palpate.core.errors import BundleError
 
 SLOWER = Allowance("speed", 2.0, 1.5, 4.0)
@@ -69,10 +69,9 @@ def test_what_was_not_tried_is_said():
 def test_each_disturbance_is_said_in_its_direction(name):
     """More and less of it, and neither up to what was tried."""
     more, less = Allowance(name, 0.0, 1.0, 1.0), Allowance(name, 0.0, -1.0, 1.0)
-    assert (more.untried(1.0), less.untried(-1.0)) == ("", "")
-    assert more.untried(1.1)
-    assert less.untried(-1.1)
-    assert more.untried(1.1) != less.untried(-1.1)
+    assert (more.untried(1.0), less.untried(-1.0)) == (False, False)
+    assert (more.untried(1.1), less.untried(-1.1)) == (True, True)
+    assert (str(less), str(more)) == SAID[name]
 
 
 def test_between_proven_and_tried_the_limit_alone_decides():
