@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.answer.pipeline import Context, Refusal
-from palpate.answer.window import Counts, Window, shares
+from palpate.answer.window import Counts, Window, ones
 from palpate.core.errors import BundleError
 from palpate.core.status import Reason, Remark
 from palpate.core.types import Status, normal
@@ -56,9 +56,9 @@ def noise(taxels: Counts) -> float:
     for _ in range(ORDER):
         steps = steps[values:] - steps[:-values]
     squares = (steps * steps).reshape(-1, values)
-    powers = np.sort(shares(len(squares)).dot(squares))  # those that are not finite are last
+    powers = np.sort(ones(len(squares)).dot(squares))  # those that are not finite are last
     middle = float(powers[(values - 1) // 2]) + float(powers[values // 2])
-    power = middle / 2 / math.comb(2 * ORDER, ORDER)
+    power = middle / 2 / len(squares) / math.comb(2 * ORDER, ORDER)
     return math.log(max(power, TINY)) if math.isfinite(power) else math.log(TINY)
 
 

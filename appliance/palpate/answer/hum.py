@@ -134,16 +134,15 @@ class HumFilter:
         found = np.zeros(len(lines.hz))
         if not len(found):
             return found
-        parts = lines.waves(window.counts)
-        power = (parts * parts).reshape(2, len(found), 1 + 2 * len(ASIDE), -1).sum(axis=0)
+        parts = lines.waves(window.counts).reshape(len(found), 1 + 2 * len(ASIDE), -1)
+        power = np.square(np.abs(parts))
         beside = np.add.reduce(power[:, 1:], axis=1) / (2 * len(ASIDE))
         # the ratio of two sums is at most the largest ratio of their parts
         possible = power[:, 0] >= least**2 * beside
         for i in np.flatnonzero(possible.any(axis=1)) if possible.any() else ():
             near = np.sqrt(beside[i])
             quiet = np.argsort(near)[: max(1, len(near) // QUIET)]
-            real, imaginary = parts[i * power.shape[1] :: len(parts) // 2, quiet]
-            at = real + 1j * imaginary
+            at = parts[i, 0, quiet]
             size = np.abs(at).sum()
             ratio = size / max(near[quiet].sum(), TINY)
             if np.abs(at.sum()) >= IN_PHASE * size > 0 and np.isfinite(ratio):

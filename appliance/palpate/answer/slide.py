@@ -130,7 +130,7 @@ class SlideMeter:
         hz = np.arange(self._frames // 2 + 1) * (format.rate_hz / self._each / self._frames)
         hz = hz[(hz >= LEAST_CYCLES / seconds - 1e-9) & (hz <= BAND_HZ)]
         self._waves = Waves(hz, self._frames, format.rate_hz / self._each, trend=1)
-        self._first, self._second, self._of_pair = _pairs(*self._shape)
+        self._pairs, self._of_pair = _pairs(*self._shape)
         steps = math.floor(math.log(fastest / slowest) / STEP)
         self._taxels_s = slowest * np.exp(STEP * np.arange(steps + 1))
         self._tables(hz, seconds)
@@ -156,16 +156,16 @@ class SlideMeter:
         return self._slide(self._heights(spectra))
 
     def _spectra(self, window: Window) -> Array | None:
-        """Spectra float32 [M, 2 * F], real and then imaginary, of the M taxels of the block that
-        moves most, without the part that they have in common; None if too few of them change.
-        Silent and broken taxels are 0, and none is louder than the median."""
+        """Spectra complex64 [M, F] of the M taxels of the block that moves most, without the part
+        that they have in common; None if too few of them change. Silent and broken taxels are 0,
+        and none is louder than the median."""
         counts = window.counts[: self._frames * self._each]
         if counts.shape[1] > BLOCK * BLOCK:
             counts = _busiest(counts.reshape(-1, *window.taxels.shape[1:3]), self._shape)
         # four times as fast as sum(axis=1)
         summed = np.einsum("tev->tv", counts.reshape(self._frames, self._each, -1))
-        parts = self._waves(summed).T.copy()
-        power = np.vecdot(parts, parts)
+        spectra = self._waves(summed).T.copy()
+        power = np.vecdot(spectra, spectra).real
         if not math.isfinite(power.max()):
             power[~np.isfinite(power)] = 0
         silent = power <= SILENT * power.max()
@@ -173,27 +173,25 @@ class SlideMeter:
         if heard < LEAST_TAXELS:
             return None
         if heard < len(power):
-            parts[silent] = 0
+            spectra[silent] = 0
         median = np.sort(power)[len(power) - heard + heard // 2]
-        parts /= np.sqrt(np.maximum(power, median))[:, None]
-        common = np.add.reduce(parts)
-        common_share = parts.dot(common) / max(float(common.dot(common)), TINY)
-        parts -= common_share[:, None] * common
-        return parts
+        spectra *= 1 / np.sqrt(np.maximum(power, median))[:, None]
+        common = np.add.reduce(spectra)
+        shares = np.vecdot(common, spectra).real / max(np.vecdot(common, common).real, TINY)
+        spectra -= shares[:, None] * common
+        return spectra
 
     def _heights(self, spectra: Array) -> Array:
         """Heights [2, 2, V + 1] of the sums for slides towards higher and lower numbers, along rows
         and columns, at each speed and without a lag."""
-        real, imaginary = spectra[:, : spectra.shape[1] // 2], spectra[:, spectra.shape[1] // 2 :]
-        size = np.sqrt(real * real + imaginary * imaginary)
+        size = np.abs(spectra)
         # the root of a product is the product of roots, of which there are fewer
-        root = np.sqrt(np.maximum(size, TINY))
-        rooted = np.empty(size.shape, np.complex64)
-        np.divide(real, root, out=rooted.real)
-        np.divide(imaginary, root, out=rooted.imag)
-        crossed = rooted.take(self._first, 0) * rooted.conj().take(self._second, 0)
-        sums = (self._of_pair @ crossed.view(np.float32)).view(np.complex64).reshape(2, -1)
-        spread = self._of_pair @ (size.take(self._first, 0) * size.take(self._second, 0))
+        rooted = spectra * (1 / np.sqrt(np.maximum(size, TINY)))
+        first, second = rooted.take(self._pairs, 0)
+        sums = self._of_pair @ (first * second.conj()).view(np.float32)
+        sums = sums.view(np.complex64).reshape(2, -1)
+        first, second = size.take(self._pairs, 0)
+        spread = self._of_pair @ (first * second)
         given = np.array([sums.real, sums.imag, spread.reshape(2, -1) / 2])
         straight, across, variance = given @ self._grid
         heights = np.array([straight - across, straight + across])
@@ -227,8 +225,8 @@ class SlideMeter:
         return Slide(speed, DIRECTIONS[2 * axis + sign], height, taxels_s=taxels_s)
 
 
-def _pairs(rows: int, cols: int) -> tuple[Array, Array, Array]:
-    """Pairs of taxels along rows and columns: the numbers of both taxels, int [P] each, and the
+def _pairs(rows: int, cols: int) -> tuple[Array, Array]:
+    """Pairs of taxels along rows and columns: the numbers of both taxels, int [2, P], and the
     axis and separation of each pair as float32 [2 * SEPARATIONS, P] of 0 and 1."""
     number = np.arange(rows * cols).reshape(rows, cols)
     first, second, kinds = [], [], []
@@ -240,7 +238,7 @@ def _pairs(rows: int, cols: int) -> tuple[Array, Array, Array]:
         second.append(higher)
         kinds += [kind] * len(lower)
     of_pair = (np.arange(2 * SEPARATIONS)[:, None] == kinds).astype(np.float32)
-    return np.concatenate(first), np.concatenate(second), of_pair
+    return np.stack([np.concatenate(first), np.concatenate(second)]), of_pair
 
 
 def _busiest(taxels: Array, shape: tuple[int, int]) -> Array:

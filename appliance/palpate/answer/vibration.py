@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from palpate.answer.disturbance import Disturbances
 from palpate.answer.objects import EnrolledLabels
 from palpate.answer.pipeline import Context, Refusal
-from palpate.answer.window import Counts, Window, shares
+from palpate.answer.window import Counts, Window, ones
 from palpate.core.errors import BundleError
 from palpate.core.status import Reason, Remark
 from palpate.core.types import Status, normal
@@ -70,10 +70,9 @@ def vibration(taxels: Counts, tare: Array, parts: int = PARTS) -> Array:
     each = len(window) // parts
     series = window.counts[: parts * each].reshape(parts, each, -1)
     offset = normal(window.first.reshape(tare.shape) - tare, 0)
-    every = shares(offset.size)
-    means, flat = shares(each) @ series, series.reshape(parts, -1)
-    variance = np.vecdot(flat, flat) / series[0].size - np.vecdot(means, means * every)
-    load = np.abs(means.dot(every) + every.dot(offset.ravel()))
+    means, flat = ones(each) @ series / each, series.reshape(parts, -1)
+    variance = (np.vecdot(flat, flat) / each - np.vecdot(means, means)) / offset.size
+    load = np.abs(means.dot(ones(offset.size)) + offset.sum()) / offset.size
     result: Array = 0.5 * np.log(np.maximum(variance, TINY)) - np.log(np.maximum(load, TINY))
     return result
 

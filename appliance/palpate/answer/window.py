@@ -62,9 +62,8 @@ class Window:
     @cached_property
     def mean(self) -> NDArray[np.float64]:
         """Mean raw counts [V]."""
-        above = shares(len(self)).dot(self.values)
-        mean: NDArray[np.float64] = np.add(self.first, above, dtype=np.float64)
-        return mean
+        above = ones(len(self)).dot(self.values)  # of whole counts exact
+        return np.asarray(self.first + above / np.float64(len(self)))
 
     @cached_property
     def highest(self) -> Array:
@@ -121,18 +120,16 @@ class Window:
         triples = self.values[: places * step].reshape(places, step, values)
         second = triples[:, 0] + triples[:, 2]
         second -= 2 * triples[:, 1]
-        noise: NDArray[np.float32] = shares(places).dot(np.abs(second))
-        return noise
+        return np.asarray(ones(places).dot(np.abs(second)) / places, np.float32)
 
 
 Counts = Array | Window
 
 
 @lru_cache(maxsize=16)
-def shares(number: int) -> NDArray[np.float32]:
-    """Multiplies this number of values to give their mean. A product takes a third of the time of
-    numpy's mean."""
-    return np.full(number, 1 / number, np.float32)
+def ones(number: int) -> NDArray[np.float32]:
+    """Multiplies this number of values to give their sum, in a third of the time of numpy's sum."""
+    return np.ones(number, np.float32)
 
 
 def waves(hz: Array, frames: int, rate_hz: float, trend: int = 0) -> NDArray[np.complex128]:
@@ -147,8 +144,8 @@ def waves(hz: Array, frames: int, rate_hz: float, trend: int = 0) -> NDArray[np.
 
 
 class Waves:
-    """Gives real and then imaginary amplitudes float32 [2 * F, N] of series float32 [T, N], as
-    `waves`. A wave is even or odd around the middle, so half of it suffices."""
+    """Gives amplitudes complex64 [F, N] of series float32 [T, N], as `waves`. The real part of a
+    wave is even around the middle, the imaginary part odd, so half of it suffices."""
 
     def __init__(self, hz: Array, frames: int, rate_hz: float, trend: int = 0) -> None:
         half = waves(hz, frames, rate_hz, trend)[:, : (frames + 1) // 2]
@@ -157,6 +154,8 @@ class Waves:
 
     def __call__(self, series: Array) -> Array:
         """The amplitudes; not finite where a series is not."""
-        half = self._even.shape[1]
+        frequencies, half = self._even.shape
         start, end = series[:half], series[: -half - 1 : -1].copy()  # long rows are quick to add
-        return np.concatenate([self._even @ (start + end), self._odd @ (start - end)])
+        amplitudes = np.empty((frequencies, series.shape[1]), np.complex64)
+        amplitudes.real, amplitudes.imag = self._even @ (start + end), self._odd @ (start - end)
+        return amplitudes
