@@ -70,13 +70,18 @@ def test_scikit_learn_accepts_it():
     assert others <= {*UNEQUAL, "check_array_api_input"}
 
 
-def test_a_sweep_that_counts_nothing_changes_no_head():
-    """Sweeps with a wrong label and weight 0: the others are classified as without them."""
+def test_a_sweep_that_counts_nothing_changes_no_head(tmp_path: Path):
+    """Sweeps with a wrong label and weight 0: the others are classified as without them, by a
+    bundle too."""
     weights = np.where(np.arange(48) < 12, 0.0, 1.0)
     y = np.where(weights > 0, LABELS, LABELS[::-1])
     one = small().fit(SWEEPS, y, sample_weight=weights)
     assert one.score(SWEEPS[12:], LABELS[12:]) == 1
     assert one.fit_.about["conditions"] == ["recording"]
+    one.save_bundle(tmp_path / "b", proven=False)
+    scores = library.load_bundle(tmp_path / "b").predict_proba(SWEEPS[12:])
+    named = np.array(one.classes_)[np.nan_to_num(scores).argmax(axis=1)]
+    assert np.mean(named == LABELS[12:]) > 0.9
     for bad in (weights[:-1], -weights, weights * np.nan):
         with pytest.raises(ValueError, match=r"(?i)sample.weight"):
             small().fit(SWEEPS, y, sample_weight=bad)

@@ -171,7 +171,8 @@ class CalibrationInputs:
     in them; then all sweeps decide the limit, because more positions make it depend less on chance.
     copied: augmented copies. faulty: bool [N], copies with
     FAULTS; the embedding and its limit see them, the heads do not. plan: of the head that names the
-    material; None for one discriminant of all features.
+    material; None for one discriminant of all features. weights: [N], how much each sweep counts
+    for that head; None if all count alike, as they do for the embedding.
     """
 
     prefixes: Array
@@ -183,6 +184,7 @@ class CalibrationInputs:
     copied: AugmentedCopies
     faulty: Array
     plan: HeadPlan | None = None
+    weights: Array | None = None
 
     @property
     def groups(self) -> Array:
@@ -205,7 +207,9 @@ class CalibrationInputs:
         """All sweeps, and the copies that heads are fitted to."""
         copied = self.copied.take(~self.copied.held)
         values = condition_values(self.conditions, len(self.labels))
-        return HeadData(self.whole, self.labels, copied.features, copied.source, values)
+        return HeadData(
+            self.whole, self.labels, copied.features, copied.source, values, self.weights
+        )
 
     def naming_head(self, seen: Array) -> tuple[Array, Array]:
         """Weight [F, K] and bias [K] of the head that names the material, fitted to the sweeps

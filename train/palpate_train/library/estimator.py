@@ -108,7 +108,8 @@ class PalpateClassifier(
         Dataset, which brings its labels, groups and rate. y: a label for each sweep. groups: a
         value for each sweep, or several groups by name, as a table or dictionary; sweeps with the
         same value are not split. sample_weight: how much each sweep counts for the discriminants;
-        it counts 1 for their choice and for trained stages. Raises FormatError, which is a
+        it counts 1 for their choice, for trained stages and for the limit of known materials in a
+        bundle. Raises FormatError, which is a
         ValueError too.
         """
         if self.size not in (None, *SIZES):

@@ -27,6 +27,7 @@ from palpate_train.answer.fit_displacement import AugmentedCopies
 from palpate_train.answer.heads import HeadPlan
 from palpate_train.data.augment import COPIES, Augmentation, copies
 from palpate_train.data.sets import OWN_NUMBERS, Dataset
+from palpate_train.data.splitters import WEIGHT
 from palpate_train.metrics.answers import outcomes
 from palpate_train.models.linear_head import hold_out
 from palpate_train.models.methods import Model
@@ -280,6 +281,7 @@ def calibration_inputs(fit: Fit) -> CalibrationInputs:
         _augmented_copies(fit),
         role == 2,
         fit.plan,
+        np.concatenate([s.groups[WEIGHT] for s in of_all]) if WEIGHT in train.groups else None,
     )
 
 
