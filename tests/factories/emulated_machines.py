@@ -10,6 +10,7 @@ the program that runs on each machine, this machine included.
 import hashlib
 import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -208,13 +209,17 @@ def run(*args: str | Path) -> str:
 def work(given: Path, target: Path) -> None:
     """Run the models in the folders of `given`, each with sweeps [n, T, R, C] in its sweeps.npy.
 
-    The results are in one .npz: the logits of a bundle as NAME/golden and NAME/sweeps, the outputs
-    of a shown.onnx for the sweeps, one after another, as NAME/shown [n, ...].
+    The results are in one .npz: the logits of a bundle as NAME/golden and NAME/sweeps, its whole
+    answers to both as NAME/answers (status, label, and the reason without its numbers), whether it
+    passes its self test as NAME/sound, the outputs of a shown.onnx for the sweeps, one after
+    another, as NAME/shown [n, ...].
     """
     import numpy as np
 
     from palpate.bundle import bundle
     from palpate.core import clock
+    from palpate.core.errors import BundleError
+    from palpate.core.types import Frames, Status, Sweep
     from palpate.inference import classifier, session
 
     outputs = {}
@@ -226,6 +231,17 @@ def work(given: Path, target: Path) -> None:
                 [box.logits(sweep) for sweep in box.bundle.golden]
             )
             outputs[f"{path.name}/sweeps"] = np.stack([box.logits(sweep) for sweep in sweeps])
+            answers = []
+            for sweep in (*box.bundle.golden, *sweeps):
+                n = np.arange(len(sweep))
+                said = box(Sweep(1, 0, 0, Status.OK, Frames(n, n, sweep)))
+                answers.append(f"{said.status} {said.label} {re.sub('[0-9.]+', '', said.detail)}")
+            outputs[f"{path.name}/answers"] = np.array(answers)
+            try:
+                sound = box.self_test() >= 0
+            except BundleError:
+                sound = False
+            outputs[f"{path.name}/sound"] = np.array(sound)
         if (path / "shown.onnx").exists():
             shown = session.session((path / "shown.onnx").read_bytes())
             each = [shown.run(None, {shown.get_inputs()[0].name: sweep[None]}) for sweep in sweeps]
