@@ -104,3 +104,12 @@ def test_text_of_several_axes(tmp_path: Path):
     path.write_text(path.read_text()[:-20])
     with pytest.raises(FormatError, match="skin"):
         raw_files.read(path)
+
+
+@pytest.mark.parametrize("text", ["0 1e12 1e-3", "0 inf 1", "0 1 0", "0 nan 1", "0 -5 1", "0 1"])
+def test_a_range_that_no_recording_has_is_refused(tmp_path: Path, text: str):
+    """Before it fills the memory."""
+    path = tmp_path / "a.txt"
+    path.write_text(f"{HEAD}# name: t\n# type: range\n# base, limit, increment\n{text}\n")
+    with pytest.raises(FormatError):
+        raw_files.read(path)

@@ -7,6 +7,7 @@ as base, limit and increment. Seen in Octave 7.3.0.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Sequence
 from functools import partial
@@ -23,6 +24,8 @@ TYPE = re.compile(
 )
 """Types of real numbers; structures, cells and texts have others, and sparse and complex ones."""
 HEAD = re.compile(r"# ([a-z]+): (.*)")
+MOST = 100_000_000
+"""Largest number of frames of a recording: a damaged range would fill the memory."""
 RANGE_STEPS = 1e-6
 """Part of a step by which the limit of a range may be missed: it is stored rounded."""
 
@@ -38,7 +41,10 @@ def read(lines: Sequence[str], wanted: ReadPlan) -> Table:
 
 
 def ascending(base: float, increment: float, count: int) -> Array:
-    """The numbers of a range, float64 [count]."""
+    """The numbers of a range, float64 [count]. Raises FormatError if it is longer than a
+    recording."""
+    if not 0 <= count <= MOST:
+        raise FormatError(f"holds a range of {count} numbers")
     return base + increment * np.arange(count)
 
 
@@ -70,16 +76,16 @@ def _values(name: str, kind: re.Match[str], head: dict[str, str], texts: list[st
     try:
         numbers: Array = np.array([x.replace("NA", "nan") for x in texts], np.float64)
         if kind["range"]:
-            base, limit, increment = numbers
+            base, limit, increment = numbers.tolist()
             steps = (limit - base) / increment
-            return ascending(base, increment, int(np.floor(steps + RANGE_STEPS)) + 1)
+            return ascending(base, increment, math.floor(steps + RANGE_STEPS) + 1)
         if "rows" in head:
             numbers = numbers.reshape(int(head["rows"]), int(head["columns"]))
         elif axes := int(head.get("ndims", 0)):
             numbers = numbers[axes:].reshape(numbers[:axes].astype(int), order="F")
         else:
             numbers = numbers.reshape(())
-    except (ValueError, KeyError, ZeroDivisionError) as e:
+    except (ValueError, ArithmeticError, KeyError) as e:
         raise FormatError(f"{name}: its numbers are not those of its head: {e}") from e
     dtype = np.bool_ if kind["bool"] else np.float32 if kind["float"] else kind["int"] or np.float64
     return numbers.astype(dtype)
