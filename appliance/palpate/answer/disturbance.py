@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.answer.pipeline import Context, Refusal
-from palpate.answer.window import Counts, Window, ones
+from palpate.answer.window import TINY, Counts, Window, ones
 from palpate.core.errors import BundleError
 from palpate.core.status import Reason, Remark
 from palpate.core.types import Status, normal
@@ -40,8 +40,6 @@ hardly appear: at a tenth of the rate it has a hundredth of the power that noise
 FRAMES = 512
 """Frames in the middle of the window that show the noise; all of them would take three times as
 long."""
-TINY = 1e-30
-"""Replaces a power or a load of 0."""
 
 
 def noise(taxels: Counts) -> float:

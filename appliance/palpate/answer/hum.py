@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.answer.pipeline import Context
-from palpate.answer.window import Counts, Waves, Window, waves
+from palpate.answer.window import TINY, Counts, Waves, Window, waves
 from palpate.core.types import SweepFormat, digitized, normal
 
 Array = NDArray[Any]
@@ -38,8 +38,6 @@ FAINT = 2.0
 """Least ratio of the other lines of a comb that was found."""
 OFF_HZ, STEPS = 0.3, 13
 """Largest error of the mains' frequency, and number of frequencies that are tried within it."""
-TINY = 1e-30
-"""Replaces a divisor of 0."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.answer.pipeline import Context, Refusal, Slide
-from palpate.answer.window import Counts, Waves, Window
+from palpate.answer.window import TINY, Counts, Waves, Window
 from palpate.core.directions import DIRECTIONS
 from palpate.core.errors import BundleError
 from palpate.core.status import Reason, Remark
@@ -62,8 +62,6 @@ MARGIN = 1.2
 """A speed within this factor of the trained range counts as trained."""
 MOST_MM_S = 1e6
 """Highest speed that a bundle may state."""
-TINY = 1e-30
-"""Replaces 0 as a divisor."""
 SILENT = 1e-6
 """A taxel with less than this share of the power of the strongest taxel is silent."""
 

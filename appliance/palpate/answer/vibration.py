@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from palpate.answer.disturbance import Disturbances
 from palpate.answer.objects import EnrolledLabels
 from palpate.answer.pipeline import Context, Refusal
-from palpate.answer.window import Counts, Window, ones
+from palpate.answer.window import TINY, Counts, Window, ones
 from palpate.core.errors import BundleError
 from palpate.core.status import Reason, Remark
 from palpate.core.types import Status, normal
@@ -25,8 +25,6 @@ from palpate.core.types import Status, normal
 Array = NDArray[np.float64]
 PARTS = 10
 """Parts of a window. Early answers are given after whole parts."""
-TINY = 1e-30
-"""Replaces a load or a vibration of 0."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,6 +16,8 @@ Array = NDArray[Any]
 TRIPLES = 100
 """Number of places in a stretch at which the noise is measured. More places take more time and
 change the result by less than a tenth."""
+TINY = 1e-30
+"""Replaces 0 as a divisor, or where a logarithm is taken."""
 WIDE = 100
 """Most frames in a row of an extreme."""
 

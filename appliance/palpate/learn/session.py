@@ -22,7 +22,7 @@ from palpate.io.verdict_lines import check_bits
 from palpate.learn.process import News, TeachingProcess, learning
 from palpate.sweeps.recording import Labels, RecordingSession
 
-FEWEST = 2
+FEWEST_TAUGHT = 2
 """Fewest sweeps of a material that can be assessed, and fewest such materials."""
 MOST_NAMED = 64
 """Most materials that wait for their first sweep: names cost nothing, and each is shown."""
@@ -64,7 +64,7 @@ class TeachingSession(Observer):
     ) -> None:
         self._recording, self._settings = recording, settings
         self._codes, self._base, self._trained = codes, base, trained
-        self._fewest = 1 if base else FEWEST
+        self._fewest = 1 if base else FEWEST_TAUGHT
         self._learn, self._clock, self._say = learn, clock or SystemClock(), say
         self._named: dict[str, None] = {}  # materials without a sweep so far, in order
         self._process: TeachingProcess | None = None
@@ -152,7 +152,7 @@ class TeachingSession(Observer):
                 self._process, self._using, self._step = None, False, None
         elif self._due_ns is not None and self._clock.now_ns() >= self._due_ns:
             self._due_ns = None
-            if sum(n >= FEWEST for n in self.materials().values()) >= self._fewest:
+            if sum(n >= FEWEST_TAUGHT for n in self.materials().values()) >= self._fewest:
                 self._assess()
             else:
                 self._learnt = None

@@ -27,7 +27,7 @@ BOOT_S = 3.0
 """Additional time for the first byte after a port was opened; many boards boot then."""
 FITS = 0.9
 """Share of the bytes that must be in frames of a profile."""
-FEWEST = 4
+FEWEST_FRAMES = 4
 """Number of frames that cannot be chance."""
 SAME_RATE = 0.02
 """Relative difference of rates that needs no setting."""
@@ -182,7 +182,7 @@ def fits(profile: SkinProfile, heard: HeardBytes) -> bool:
     found = skin_codecs.codec(profile)(Rest(), heard.data)
     # opening the port cut the first frame, closing it cut the last frame
     most = len(heard.data) - len(found.rest.data) - found.size
-    return len(found) >= FEWEST and len(found) * found.size >= FITS * most
+    return len(found) >= FEWEST_FRAMES and len(found) * found.size >= FITS * most
 
 
 def measured_hz(profile: SkinProfile, heard: HeardBytes) -> float:
@@ -265,7 +265,7 @@ def other_grid(profile: SkinProfile, heard: HeardBytes) -> int:
     step, times = steps.most_common(1)[0]
     each = wire_numbers.size(profile.number) * profile.values
     found, most = times * step, len(data) - 2 * step
-    whole = times >= FEWEST and found >= FITS * most and (step - len(mark)) % each == 0
+    whole = times >= FEWEST_FRAMES and found >= FITS * most and (step - len(mark)) % each == 0
     return (step - len(mark)) // each if whole else 0
 
 

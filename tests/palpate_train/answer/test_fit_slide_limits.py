@@ -21,7 +21,7 @@ def test_limits_come_from_training_sweeps(monkeypatch: pytest.MonkeyPatch):
     bare = replace(bundle.load(bundle.DEFAULT).manifest, sliding=None)
     monkeypatch.setattr(fit_slide, "_pattern", lambda train: None)
     assert fit_slide.limited(bare, train) is bare
-    monkeypatch.setattr(fit_slide, "FEWEST", 9)
+    monkeypatch.setattr(fit_slide, "FEWEST_SLIDES", 9)
     found = fit_slide.limited(bare, train)
     assert found.sliding
     assert len(found.sliding.least) == 6

@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.answer import disturbance
-from palpate.answer.disturbance import TINY, Allowance
+from palpate.answer.disturbance import Allowance
 from palpate.answer.slide import SlideMeter
 from palpate.answer.unknown import shaped_distances
+from palpate.answer.window import TINY
 from palpate.bundle.contents import Bundle
 from palpate.core.types import SweepFormat
 from palpate_train.answer import fit_hum
@@ -45,7 +46,7 @@ KEPT = 0.99
 LOSS = 0.15
 """Accuracy that the nearest means may lose, as a share. Copies of a severity that costs more are
 not allowed for."""
-FEWEST = 30
+FEWEST_COPIES = 30
 """Least number of judged copies of a disturbance."""
 SHRINK = 8
 """The change of a material counts as many copies, the mean change of all materials as many as
@@ -160,7 +161,7 @@ def fit(judge: Judge, *training: DisturbedSweeps) -> AllowanceFit:
     for (name, sign), (start, made) in _edges(training[0]).items():
         every = _Tried.of(judge.altered, made, sign, start)
         tried = every.take(judge.bearable(made) & (every.size > 0))
-        if len(tried.size) < FEWEST:
+        if len(tried.size) < FEWEST_COPIES:
             continue
         end = MARGIN * float(tried.size.max())
         copies = [_Tried.of(altered, made, sign, start) for altered in training]

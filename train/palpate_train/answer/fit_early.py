@@ -19,7 +19,7 @@ from palpate.answer.unknown import EarlyClasses, EarlyDistances
 from palpate.bundle.contents import Bundle
 from palpate.bundle.manifest import Manifest
 from palpate_train.answer.embedding import centred, cross_fitted, limit
-from palpate_train.answer.heads import shrinkage
+from palpate_train.answer.heads import ABSENT, shrinkage
 from palpate_train.data.sets import Dataset
 from palpate_train.metrics.temperature import sufficient_temperature
 from palpate_train.onnx_tools.graph_builder import run_output
@@ -33,8 +33,6 @@ FLAT = 1e-6
 """Least variance of a direction, relative to the mean variance of all directions."""
 AGREE = (1, 2, 3)
 """Numbers of successive steps that a rule may require to agree."""
-ABSENT = -1e4
-"""Logit of a label without a sweep, before it is divided by the temperature."""
 MAX_LOSS = 0.005
 """Share of sweeps whose right answer may become wrong by an early answer."""
 MIN_SWEEPS = 40

@@ -11,7 +11,8 @@ import numpy as np
 
 from palpate.answer.pipeline import Slide
 from palpate.answer.slide import CHANCE, SlideMeter, SpeedRange
-from palpate.answer.vibration import PARTS, TINY, SlideLimits, vibration
+from palpate.answer.vibration import PARTS, SlideLimits, vibration
+from palpate.answer.window import TINY
 from palpate.bundle.contents import Bundle
 from palpate.bundle.manifest import Manifest
 from palpate_train.data.sets import Dataset
@@ -25,7 +26,7 @@ OUTER = 0.02
 wrong."""
 MARGIN = 0.05
 """A part rests if it vibrates less than any part in training by this much (natural logarithm)."""
-FEWEST = 100
+FEWEST_SLIDES = 100
 """Least number of training sweeps of each label. The next sweep has less vibration than the least
 of n sweeps with a probability of 1 / (n + 1)."""
 STILL = 0.5 * float(np.log(TINY)) / 2
@@ -76,12 +77,12 @@ def _pattern(train: Dataset) -> float | None:
 def _least(manifest: Manifest, train: Dataset) -> tuple[float, ...]:
     """The least vibration of each label.
 
-    Empty if there are fewer than FEWEST sweeps of a label, or if windows are too short. Also empty
-    if a part of a sweep does not change at all, since slides then resemble rests.
+    Empty if there are fewer than FEWEST_SLIDES sweeps of a label, or if windows are too short. Also
+    empty if a part of a sweep does not change at all, since slides then resemble rests.
     """
     if train.format.window < 2 * PARTS or set(train.materials) != set(manifest.labels):
         return ()
-    if np.bincount(train.labels, minlength=len(train.materials)).min() < FEWEST:
+    if np.bincount(train.labels, minlength=len(train.materials)).min() < FEWEST_SLIDES:
         return ()
     least = np.array([vibration(window, manifest.tare).min() for window in train.samples])
     labels = [train.materials.index(label) for label in manifest.labels]

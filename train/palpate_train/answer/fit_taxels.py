@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from palpate.answer.load_modes import LoadModes
 from palpate.answer.taxels import Bridging, Comparison, places
+from palpate.answer.vibration import PARTS
 from palpate.answer.window import Window
 from palpate.answer.window_check import MANY_FULL
 from palpate.bundle.bundle import Bundle
@@ -36,8 +37,6 @@ FIGURES = "broken taxels"
 """Key of the figures in a manifest."""
 MARGIN = 1.25
 """A noisy taxel has this many times the noise, against its neighbours, of any taxel in training."""
-PARTS = 10
-"""A sound taxel may be constant in the window's tenth from which the box answers earliest."""
 SILENT = ("dead", "stuck")
 """Faults that the box refuses where it does not bridge them. A noisy taxel that it does not bridge
 costs what it costs without bridging, so it does not decide the number."""
@@ -145,6 +144,7 @@ def _short(values: Iterable[float]) -> tuple[float, ...]:
 def learned(sound: Dataset) -> Bridging:
     """The limits of noisy and silent taxels from sound sweeps, with no broken taxel allowed."""
     grid = sound.format.rows, sound.format.cols
+    # a sound taxel may be constant in the tenth from which the box answers earliest
     near, own, tenths = [], [], []
     for window in sound.samples:
         compared = Comparison.of(Window(window), grid)

@@ -41,7 +41,7 @@ OWN = 0.5
 materials."""
 ROUNDS = 3
 """Largest number of rounds over all kinds in the search of weights."""
-FEWEST = 8
+FEWEST_JUDGED = 8
 """Least number of judged sweeps of each material, below which the weights would follow chance."""
 TRAINED = (0.1, 0.3, 1.0, 3.0)
 """Weights of the directions in which the trained materials differ, beside 1 for the features that
@@ -178,7 +178,7 @@ def choose(scatters: Scatters, judged: DisturbedSweeps) -> ShapeRule | None:
     """
     means = scatters.space.means
     each = np.bincount(judged.labels, minlength=len(means))
-    if each.min() < FEWEST or not judged.copies:
+    if each.min() < FEWEST_JUDGED or not judged.copies:
         return None
     trial = _Trial(scatters, judged, scatters.weight_of_trained(judged))
     none = dict.fromkeys(scatters.by_kind, 0.0)

@@ -21,12 +21,11 @@ from palpate.core.errors import FormatError
 from palpate.core.types import Frames, digitized
 from palpate.sim import skin
 from palpate.sweeps import frame_ring
+from palpate_train.data.augment import NOISY
 from palpate_train.data.evaluation_sweeps import EvaluationSweeps, SimulatedScene
 
 Array = NDArray[Any]
 HUM_HZ = 50.0
-NOISY = 4.0
-"""Noise of a noisy taxel, in standard deviations of the set."""
 GAIN_LAW = 0.25
 """Spread of the gains at the severest shift of the grid: their logarithms are drawn evenly within
 this range each way."""

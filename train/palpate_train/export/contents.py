@@ -23,7 +23,7 @@ from palpate_train.models.methods import model_inputs
 from palpate_train.onnx_tools.graph_builder import run, run_output, slim
 
 Array = NDArray[Any]
-FEWEST = 5
+FEWEST_SWEEPS = 5
 """Number of training sweeps of a material below which that is the reason why none is recognised."""
 COARSEST = 8
 """Largest step to which golden sweeps are rounded, in usual changes of a number from frame to
@@ -182,6 +182,6 @@ def _why(sweeps: Dataset, label: int) -> str:
     of_it = sweeps.samples[sweeps.labels == label]
     if not np.ptp(of_it, axis=1).any():
         return "every taxel of its sweeps is constant; check the skin, and record it again"
-    if len(of_it) < FEWEST:
-        return f"there are {len(of_it)} of it; record {FEWEST} or more"
+    if len(of_it) < FEWEST_SWEEPS:
+        return f"there are {len(of_it)} of it; record {FEWEST_SWEEPS} or more"
     return "they look like others; record it at more positions, or leave it out with --only"
