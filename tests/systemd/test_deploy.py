@@ -63,18 +63,6 @@ def installed(site: hosts.Hosts, wheel: Path) -> str:
     return done.stdout
 
 
-@pytest.fixture
-def host(site: hosts.Hosts, installed: str) -> hosts.Host:
-    """The installed host."""
-    return site.hosts[0]
-
-
-@pytest.fixture
-def at(host: hosts.Host) -> tuple[str, str]:
-    """The options that name this host."""
-    return ("--host", f"{hosts.USER}@{host.address}:22")
-
-
 def changed(wheel: Path, folder: Path, name: str, text: str) -> Path:
     """Another release: the wheel with a new file, or with more text at the end of one."""
     made = folder / wheel.name
@@ -86,69 +74,101 @@ def changed(wheel: Path, folder: Path, name: str, text: str) -> Path:
     return made
 
 
-def release(host: hosts.Host) -> str:
-    """The release that the link leads to."""
-    return host.machine.get("readlink", "/opt/palpate")
+class Box:
+    """The installed host, as a person at the desktop uses it."""
+
+    def __init__(self, site: hosts.Hosts) -> None:
+        self.site, self.host = site, site.hosts[0]
+        self.machine, self.service = self.host.machine, self.host.service
+        self.at = ("--host", f"{hosts.USER}@{self.host.address}:22")
+        self.get = self.machine.get
+
+    def does(
+        self, command: str, *args: str | Path, code: int = 0
+    ) -> subprocess.CompletedProcess[str]:
+        """Run `install --wheel WHEEL ...` or `deploy BUNDLE ...` for it, which ends with `code`."""
+        words = (*self.at, *(["--wheel"] if command == "install" else []), *args)
+        done = self.site.desktop(command, *words)
+        assert done.returncode == code, done.stdout + done.stderr
+        return done
+
+    def release(self) -> str:
+        """The release that the link leads to."""
+        return self.get("readlink", "/opt/palpate")
+
+    def runs(self) -> tuple[str, str]:
+        """The release, and the number of the process."""
+        return self.release(), self.service["MainPID"]
+
+    def start_again(self) -> None:
+        """As after a power cut: systemd starts the release on the disk."""
+        if self.service["MainPID"] != "0":
+            kill = ("systemctl", "kill", "--kill-whom=main", "--signal=SIGKILL", "palpate")
+            done = self.machine.run(*kill)  # the delivery may just have stopped the process
+            assert done.returncode == 0 or "No main process" in done.stderr, done.stderr
+        self.get("systemctl", "daemon-reload")
+        self.get("systemctl", "--no-block", "restart", "palpate")
+        self.service.until("ActiveState", "active")
+
+    def listed(self) -> dict[str, str]:
+        """The roles of the box's bundles by sha256."""
+        who = ("setpriv", "--reuid=palpate", "--regid=palpate", "--clear-groups")
+        output = self.get(*who, PALPATE, "bundles", "--json")
+        return {entry["sha"]: entry["role"] for entry in json.loads(output)}
+
+    def serves(self) -> str:
+        """The id of the bundle that runs."""
+        end_s = time.monotonic() + WAIT_S
+        while (done := self.machine.run("cat", "/run/palpate/status.json")).returncode:
+            assert time.monotonic() < end_s, done.stderr
+            time.sleep(0.1)
+        return json.loads(done.stdout)["bundle"]
 
 
-def start_again(host: hosts.Host) -> None:
-    """As after a power cut: systemd starts the release on the disk."""
-    if host.service["MainPID"] != "0":
-        kill = ("systemctl", "kill", "--kill-whom=main", "--signal=SIGKILL", "palpate")
-        done = host.machine.run(*kill)  # the delivery may just have stopped the process
-        assert done.returncode == 0 or "No main process" in done.stderr, done.stderr
-    host.machine.get("systemctl", "daemon-reload")
-    host.machine.get("systemctl", "--no-block", "restart", "palpate")
-    host.service.until("ActiveState", "active")
+@pytest.fixture
+def box(site: hosts.Hosts, installed: str) -> Box:
+    """The installed host."""
+    return Box(site)
 
 
-def test_a_bare_host_is_installed_as_a_bare_user(host: hosts.Host, installed: str):
+def test_a_bare_host_is_installed_as_a_bare_user(box: Box, installed: str):
     """From a Debian without Python to an active service with the board's name."""
     assert re.fullmatch(r"robot@127\.0\.0\.1: \S+ is READY [0-9.]+ s .*\n", installed)
-    assert (host.service["ActiveState"], host.service["UnitFileState"]) == ("active", "enabled")
-    name = release(host)
-    assert host.machine.get("cat", "/opt/palpate/stamp") == name
-    assert name in host.machine.get("cat", f"/proc/{host.service['MainPID']}/maps")
-    assert host.machine.get("cat", "/etc/palpate/palpate.toml") == 'board = "rpi5"'
-    settings = host.machine.get("/usr/local/bin/palpate", "check", "--settings")
-    assert settings.count("# board-rpi5.toml") > 3
-    assert host.machine.get("stat", "-c", "%U %a", "/etc/palpate/allowed_signers") == "root 644"
-    assert host.machine.run("systemd-analyze", "verify", "palpate.service").stderr == ""
+    assert (box.service["ActiveState"], box.service["UnitFileState"]) == ("active", "enabled")
+    name, pid = box.runs()
+    assert box.get("cat", "/opt/palpate/stamp") == name
+    assert name in box.get("cat", f"/proc/{pid}/maps")
+    assert box.get("cat", "/etc/palpate/palpate.toml") == 'board = "rpi5"'
+    assert box.get("/usr/local/bin/palpate", "check", "--settings").count("# board-rpi5.toml") > 3
+    assert box.get("stat", "-c", "%U %a", "/etc/palpate/allowed_signers") == "root 644"
+    assert box.machine.run("systemd-analyze", "verify", "palpate.service").stderr == ""
     files = [f"/etc/palpate/watch/{one}" for one in ("token", "key.pem", "certificate.pem")]
-    owners = host.machine.get("stat", "-c", "%U:%G %a", *files).splitlines()
+    owners = box.get("stat", "-c", "%U:%G %a", *files).splitlines()
     assert set(owners) == {"root:palpate-watch 640"}
     off = ("palpate-watch", "palpate-bridge@tcp", "palpate-bridge@modbus")
-    enabled = host.machine.run("systemctl", "is-enabled", *off).stdout.split()
+    enabled = box.machine.run("systemctl", "is-enabled", *off).stdout.split()
     assert enabled == ["linked", "disabled", "disabled"]
-    assert host.machine.get("find", f"/home/{hosts.USER}", "-name", ".palpate*") == ""
+    assert box.get("find", f"/home/{hosts.USER}", "-name", ".palpate*") == ""
 
 
-def test_a_second_install_changes_nothing(
-    site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], wheel: Path
-):
+def test_a_second_install_changes_nothing(box: Box, wheel: Path):
     """The same command again: the process goes on, settings and signers stay."""
-    pid, name = host.service["MainPID"], release(host)
-    done = site.desktop(
-        "install", *at, "--wheel", wheel, "--board", "rpi5", "--signers", site.work / "signers"
-    )
-    assert done.returncode == 0
-    assert done.stdout.endswith(f"{name.removeprefix('palpate-')} runs already\n")
-    assert (host.service["MainPID"], release(host)) == (pid, name)
-    assert host.machine.get("cat", "/etc/palpate/palpate.toml") == 'board = "rpi5"'
+    before, signers = box.runs(), box.site.work / "signers"
+    done = box.does("install", wheel, "--board", "rpi5", "--signers", signers)
+    assert done.stdout.endswith(f"{before[0].removeprefix('palpate-')} runs already\n")
+    assert box.runs() == before
+    assert box.get("cat", "/etc/palpate/palpate.toml") == 'board = "rpi5"'
 
 
-def test_the_board_that_is_named_last_holds(
-    site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], wheel: Path
-):
+def test_the_board_that_is_named_last_holds(box: Box, wheel: Path):
     """It replaces a wrong board, other settings stay, and the service starts with it."""
-    file, pid = "/etc/palpate/palpate.toml", host.service["MainPID"]
-    host.machine.put(file, 'board = "rpi9"\n# mine\n')
-    done = site.desktop("install", *at, "--wheel", wheel, "--board", "rpi5")
-    assert done.returncode == 0, done.stdout
+    file, (_, pid) = "/etc/palpate/palpate.toml", box.runs()
+    box.machine.put(file, 'board = "rpi9"\n# mine\n')
+    done = box.does("install", wheel, "--board", "rpi5")
     assert f'board = "rpi5" stands in {file} now' in done.stderr
-    assert host.machine.get("cat", file) == 'board = "rpi5"\n# mine'
-    assert host.service["MainPID"] != pid
-    host.machine.put(file, 'board = "rpi5"\n')
+    assert box.get("cat", file) == 'board = "rpi5"\n# mine'
+    assert box.service["MainPID"] != pid
+    box.machine.put(file, 'board = "rpi5"\n')
 
 
 @pytest.mark.slow
@@ -162,16 +182,13 @@ def test_a_board_without_a_file_is_refused_before_any_box_is_asked():
     assert "rpi4, rpi5" in done.stderr
 
 
-def test_signers_are_never_overwritten(
-    site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], wheel: Path, tmp_path: Path
-):
+def test_signers_are_never_overwritten(box: Box, wheel: Path, tmp_path: Path):
     """Another signers' file is refused with a reason; the box keeps its own."""
     (tmp_path / "others").write_text(deliveries.line(deliveries.key(tmp_path)))
-    before = host.machine.get("cat", "/etc/palpate/allowed_signers")
-    done = site.desktop("install", *at, "--wheel", wheel, "--signers", tmp_path / "others")
-    assert done.returncode == 1
-    assert "/etc/palpate/allowed_signers differs" in done.stdout
-    assert host.machine.get("cat", "/etc/palpate/allowed_signers") == before
+    before = box.get("cat", "/etc/palpate/allowed_signers")
+    done = box.does("install", wheel, "--signers", tmp_path / "others", code=1)
+    assert "/etc/palpate/allowed_signers" in done.stdout
+    assert box.get("cat", "/etc/palpate/allowed_signers") == before
 
 
 def test_a_box_without_packages_and_mirror_is_refused(site: hosts.Hosts, wheel: Path):
@@ -186,25 +203,18 @@ def test_a_box_without_packages_and_mirror_is_refused(site: hosts.Hosts, wheel: 
     assert machine.get("ls", "/opt") == ""
 
 
-def test_what_a_person_put_there_stays(
-    site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], wheel: Path
-):
+def test_what_a_person_put_there_stays(box: Box, wheel: Path):
     """Their settings are kept; a file in the way ends it before anything else."""
-    settings, program = "/etc/palpate/skin.toml", "/usr/local/bin/palpate"
-    pid = host.service["MainPID"]
+    settings, program, before = "/etc/palpate/skin.toml", "/usr/local/bin/palpate", box.runs()
     for path in (settings, program):
-        host.machine.get("rm", path)
-        host.machine.put(path, "# mine\n")
-    done = site.desktop("install", *at, "--wheel", wheel)
-    assert done.returncode == 1
-    assert f"{program} is a file there" in done.stdout
-    host.machine.get("rm", program)
-    done = site.desktop("install", *at, "--wheel", wheel)
-    assert done.returncode == 0
-    assert f"{settings} stays as it is there" in done.stderr
-    assert host.machine.get("cat", settings) == "# mine"
-    assert host.service["MainPID"] == pid
-    host.machine.get("rm", settings)
+        box.get("rm", path)
+        box.machine.put(path, "# mine\n")
+    assert f"{program} is a file" in box.does("install", wheel, code=1).stdout
+    box.get("rm", program)
+    assert f"{settings} stays" in box.does("install", wheel).stderr
+    assert box.get("cat", settings) == "# mine"
+    assert box.runs() == before
+    box.get("rm", settings)
 
 
 @pytest.fixture(scope="session")
@@ -212,87 +222,75 @@ def upgraded(
     site: hosts.Hosts, installed: str, wheel: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> list[tuple[str, str]]:
     """Installs two more releases on the host; each with the output of the command."""
-    folder, outputs = tmp_path_factory.mktemp("releases"), [(release(site.hosts[0]), installed)]
-    at = ("--host", f"{hosts.USER}@{site.hosts[0].address}")
+    folder, box = tmp_path_factory.mktemp("releases"), Box(site)
+    outputs = [(box.release(), installed)]
     for i in range(2):
-        other = changed(wheel, folder, "palpate/more.py", f"# {i}\n")
-        done = site.desktop("install", *at, "--wheel", other)
-        outputs.append((release(site.hosts[0]), done.stdout + done.stderr))
+        done = box.does("install", changed(wheel, folder, "palpate/more.py", f"# {i}\n"))
+        outputs.append((box.release(), done.stdout + done.stderr))
     return outputs
 
 
-def test_an_upgrade_swaps_everything_at_once(host: hosts.Host, upgraded: list[tuple[str, str]]):
+def test_an_upgrade_swaps_everything_at_once(box: Box, upgraded: list[tuple[str, str]]):
     """Another release runs; the previous release is kept, older releases are removed."""
     releases = [name for name, _ in upgraded]
     assert len({*releases}) == 3
     for _, output in upgraded[1:]:
         assert re.search(r"is READY [0-9.]+ s .*, [0-9.]+ s without", output), output
-    there = host.machine.get("sh", "-c", "ls -d /opt/palpate-*").split()
+    there = box.get("sh", "-c", "ls -d /opt/palpate-*").split()
     assert there == sorted(f"/opt/{name}" for name in releases[1:])
-    assert host.machine.get("readlink", "/opt/palpate.previous") == releases[1]
+    assert box.get("readlink", "/opt/palpate.previous") == releases[1]
 
 
 def test_a_release_that_does_not_start_gives_way_to_the_old_one(
-    site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], wheel: Path, tmp_path: Path
+    box: Box, wheel: Path, tmp_path: Path
 ):
     """Self-test passed, no start: the link is swapped back, the old one classifies."""
-    before = release(host)
+    before = box.release()
     broken = changed(wheel, tmp_path, "palpate/service/systemd.py", "\nNotifier.turn = None\n")
-    done = site.desktop("install", *at, "--wheel", broken)
-    assert done.returncode == 1
-    assert "TypeError: 'NoneType' object is not callable" in done.stdout
+    done = box.does("install", broken, code=1)
+    assert "TypeError: 'NoneType'" in done.stdout
     assert done.stdout.endswith(f"; so {before} runs again\n")
-    assert (release(host), host.service["ActiveState"]) == (before, "active")
+    assert (box.release(), box.service["ActiveState"]) == (before, "active")
 
 
 def test_a_release_that_fails_its_self_test_is_never_swapped_in(
-    site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], wheel: Path, tmp_path: Path
+    box: Box, wheel: Path, tmp_path: Path
 ):
     """The process that classifies is not touched."""
-    before, pid = release(host), host.service["MainPID"]
-    fails = "\nraise OSError('not on this box')\n"
+    before, fails = box.runs(), "\nraise OSError('not on this box')\n"
     broken = changed(wheel, tmp_path, "palpate/inference/classifier.py", fails)
-    done = site.desktop("install", *at, "--wheel", broken)
-    assert done.returncode == 1
-    assert "FAILED: self-test: OSError: not on this box" in done.stdout
-    assert (release(host), host.service["MainPID"]) == (before, pid)
+    assert "self-test: OSError: not on" in box.does("install", broken, code=1).stdout
+    assert box.runs() == before
 
 
 @pytest.mark.parametrize(
     ("said", "after_s"), [("copying", 0.3), ("building", 0.5), ("building", 4.0)]
 )
 def test_an_install_that_is_cut_is_finished_by_the_next(
-    site: hosts.Hosts,
-    host: hosts.Host,
-    at: tuple[str, str],
-    wheel: Path,
-    tmp_path: Path,
-    said: str,
-    after_s: float,
+    box: Box, wheel: Path, tmp_path: Path, said: str, after_s: float
 ):
     """Cut during the copy or the build: the old release starts, a second call ends it."""
     new = changed(wheel, tmp_path, "palpate/more.py", f"# {said} {after_s}\n")
-    before = release(host)
-    site.cut("install", *at, "--wheel", new, words=said, after_s=after_s)
-    assert release(host) == before
-    start_again(host)
-    done = site.desktop("install", *at, "--wheel", new)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert release(host) != before
-    assert host.service["ActiveState"] == "active"
+    before = box.release()
+    box.site.cut("install", *box.at, "--wheel", new, words=said, after_s=after_s)
+    assert box.release() == before
+    box.start_again()
+    box.does("install", new)
+    assert box.release() != before
+    assert box.service["ActiveState"] == "active"
 
 
-def test_a_swap_that_is_cut_leaves_old_or_new(host: hosts.Host, upgraded: list[tuple[str, str]]):
+def test_a_swap_that_is_cut_leaves_old_or_new(box: Box, upgraded: list[tuple[str, str]]):
     """Dead before the N-th command, for each N: one release or the other, complete."""
-    new, old = release(host), host.machine.get("readlink", "/opt/palpate.previous")
+    new, old = box.release(), box.get("readlink", "/opt/palpate.previous")
     script = run_here(f"import install; print(install.swap('/opt/{old}', '{new}'))")
     found = []
     for n in range(1, 20):
         cut = f"n=0; trap 'n=$((n+1)); [ $n -lt {n} ] || kill -KILL $$' DEBUG\n{script}"
-        ended = host.machine.run("bash", "-c", cut).returncode
-        found.append(release(host))
-        start_again(host)
-        assert found[-1] in host.machine.get("cat", f"/proc/{host.service['MainPID']}/maps")
+        ended = box.machine.run("bash", "-c", cut).returncode
+        found.append(box.release())
+        box.start_again()
+        assert found[-1] in box.get("cat", f"/proc/{box.service['MainPID']}/maps")
         if ended == 0:
             break
     assert (found[0], found[-1]) == (new, old)
@@ -306,11 +304,12 @@ class Sender:
     def __init__(self, folder: Path, key: Path) -> None:
         self.folder, self.key, self.counter = folder, key, 0
 
-    def made(self, counter: int = 0, key: Path | None = None) -> Path:
-        """A bundle's folder."""
+    def made(self, counter: int = 0, key: Path | None = None) -> tuple[Path, str]:
+        """A bundle's folder, and the sha256 of its manifest."""
         self.counter += not counter
         folder = self.folder / f"{len([*self.folder.glob('*')])}"
-        return deliveries.put(folder, deliveries.files(counter or self.counter, key or self.key))
+        made = deliveries.put(folder, deliveries.files(counter or self.counter, key or self.key))
+        return made, hashlib.sha256((made / "manifest.json").read_bytes()).hexdigest()
 
 
 @pytest.fixture(scope="session")
@@ -319,61 +318,31 @@ def sender(site: hosts.Hosts, installed: str, tmp_path_factory: pytest.TempPathF
     return Sender(tmp_path_factory.mktemp("bundles"), site.work / "keys" / "key")
 
 
-def sha(folder: Path) -> str:
-    """The sha256 of a bundle's manifest."""
-    return hashlib.sha256((folder / "manifest.json").read_bytes()).hexdigest()
-
-
-def listed(host: hosts.Host) -> dict[str, str]:
-    """The roles of the box's bundles by sha256."""
-    who = ("setpriv", "--reuid=palpate", "--regid=palpate", "--clear-groups")
-    output = host.machine.get(*who, PALPATE, "bundles", "--json")
-    return {entry["sha"]: entry["role"] for entry in json.loads(output)}
-
-
-def serves(host: hosts.Host) -> str:
-    """The id of the bundle that runs."""
-    end_s = time.monotonic() + WAIT_S
-    while (done := host.machine.run("cat", "/run/palpate/status.json")).returncode:
-        assert time.monotonic() < end_s, done.stderr
-        time.sleep(0.1)
-    return json.loads(done.stdout)["bundle"]
-
-
-def test_a_bundle_is_delivered_and_runs_on_trial(
-    site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], sender: Sender, tmp_path: Path
-):
+def test_a_bundle_is_delivered_and_runs_on_trial(box: Box, sender: Sender, tmp_path: Path):
     """READY and on trial, no files left behind; a second delivery changes nothing."""
-    bundle = sender.made()
-    more = ("--signers", site.work / "signers", "--json", tmp_path / "report.json")
-    done = site.desktop("deploy", *at, bundle, *more)
-    assert done.returncode == 0, done.stdout + done.stderr
+    bundle, sha = sender.made()
+    more = ("--signers", box.site.work / "signers", "--json", tmp_path / "report.json")
+    done = box.does("deploy", bundle, *more)
     assert re.search(r"is READY [0-9.]+ s .* s without .*; on trial: ", done.stdout)
     (figures,) = json.loads((tmp_path / "report.json").read_text())["boxes"].values()
     assert figures["lost_s"] <= figures["ready_s"]
-    assert listed(host)[sha(bundle)] == "on trial"
-    assert serves(host) == sha(bundle)[:8]
-    left = host.machine.get("ls", "-A", "/var/lib/palpate/incoming", f"/home/{hosts.USER}")
+    assert (box.listed()[sha], box.serves()) == ("on trial", sha[:8])
+    left = box.get("ls", "-A", "/var/lib/palpate/incoming", f"/home/{hosts.USER}")
     assert ".palpate" not in left
-    pid = host.service["MainPID"]
-    done = site.desktop("deploy", *at, bundle)
-    assert (done.returncode, done.stdout.strip().endswith("runs already")) == (0, True)
-    assert host.service["MainPID"] == pid
+    before = box.runs()
+    assert box.does("deploy", bundle).stdout.strip().endswith("runs already")
+    assert box.runs() == before
 
 
-def test_a_bundle_with_an_unknown_key_is_refused(
-    site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], sender: Sender, tmp_path: Path
-):
+def test_a_bundle_with_an_unknown_key_is_refused(box: Box, sender: Sender, tmp_path: Path):
     """By the desktop if it has the signers, by the box always; the running program goes on."""
-    bundle = sender.made(99, deliveries.key(tmp_path))
-    before, pid = serves(host), host.service["MainPID"]
-    done = site.desktop("deploy", *at, bundle, "--signers", site.work / "signers")
-    assert (done.returncode, done.stdout) == (78, "")
-    done = site.desktop("deploy", *at, bundle)
-    assert done.returncode == 1
-    assert "FAILED: checking it there: bundle is signed by none of the signers" in done.stdout
-    assert (serves(host), host.service["MainPID"]) == (before, pid)
-    assert sha(bundle) not in listed(host)
+    bundle, sha = sender.made(99, deliveries.key(tmp_path))
+    before = box.serves(), box.runs()
+    done = box.does("deploy", bundle, "--signers", box.site.work / "signers", code=78)
+    assert done.stdout == ""
+    assert "by none of the signers" in box.does("deploy", bundle, code=1).stdout
+    assert (box.serves(), box.runs()) == before
+    assert sha not in box.listed()
 
 
 @pytest.mark.parametrize(
@@ -382,80 +351,62 @@ def test_a_bundle_with_an_unknown_key_is_refused(
     + [("checking", 0.3), ("restarting", 0.5)],
 )
 def test_a_delivery_that_is_cut_leaves_old_or_new(
-    site: hosts.Hosts,
-    host: hosts.Host,
-    at: tuple[str, str],
-    sender: Sender,
-    said: str,
-    after_s: float,
+    box: Box, sender: Sender, said: str, after_s: float
 ):
     """Cut at any time: the old bundle or the new; a second delivery finishes."""
-    bundle, before = sender.made(), serves(host)
-    site.cut("deploy", *at, bundle, "--verbose", words=said, after_s=after_s)
-    start_again(host)
-    assert serves(host) in (before, sha(bundle)[:8])
-    done = site.desktop("deploy", *at, bundle)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert serves(host) == sha(bundle)[:8]
+    (bundle, sha), before = sender.made(), box.serves()
+    box.site.cut("deploy", *box.at, bundle, "--verbose", words=said, after_s=after_s)
+    box.start_again()
+    assert box.serves() in (before, sha[:8])
+    box.does("deploy", bundle)
+    assert box.serves() == sha[:8]
 
 
-def test_without_a_skin_the_bundle_is_installed_and_ready_waits(
-    site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], sender: Sender
-):
+def test_without_a_skin_the_bundle_is_installed_and_ready_waits(box: Box, sender: Sender):
     """Reported well before the deadline, no failure of the bundle; then READY."""
-    host.machine.put("/opt/palpate/cable.py", CABLE)
-    host.service.configure(CABLED)
-    bundle = sender.made()
+    box.machine.put("/opt/palpate/cable.py", CABLE)
+    box.service.configure(CABLED)
+    bundle, sha = sender.made()
     try:
-        done = site.desktop("deploy", *at, bundle)
-        assert done.returncode == 0, done.stdout + done.stderr
-        assert "on trial" in done.stdout
-        assert "READY waits: skin absent: no skin 1209:7ac7 on USB" in done.stdout
-        host.machine.put("/run/skin", "")
-        host.service.until("ActiveState", "active")
-        assert serves(host) == sha(bundle)[:8]
+        said = box.does("deploy", bundle).stdout
+        assert "on trial" in said
+        assert "no skin 1209:7ac7" in said
+        box.machine.put("/run/skin", "")
+        box.service.until("ActiveState", "active")
+        assert box.serves() == sha[:8]
     finally:
-        host.service.configure(SIM)
-        start_again(host)
+        box.service.configure(SIM)
+        box.start_again()
 
 
-def test_a_candidate_is_delivered_beside(
-    site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], sender: Sender
-):
+def test_a_candidate_is_delivered_beside(box: Box, sender: Sender):
     """With --shadow the old bundle still answers."""
-    bundle, before = sender.made(), serves(host)
-    done = site.desktop("deploy", *at, bundle, "--shadow")
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert (listed(host)[sha(bundle)], serves(host)) == ("candidate", before)
+    (bundle, sha), before = sender.made(), box.serves()
+    box.does("deploy", bundle, "--shadow")
+    assert (box.listed()[sha], box.serves()) == ("candidate", before)
 
 
 def test_boxes_that_fail_do_not_stop_the_others(
-    site: hosts.Hosts, host: hosts.Host, sender: Sender, tmp_path: Path
+    site: hosts.Hosts, box: Box, sender: Sender, tmp_path: Path
 ):
     """No connection, no answer, a hang, no Palpate: each its reason, the good one READY."""
-    with socket.create_server(("127.0.0.1", 0)) as dumb, stalling(host) as hangs:
+    with socket.create_server(("127.0.0.1", 0)) as dumb, stalling(box.host) as hangs:
         shared = {"ssh_user": hosts.USER, "ssh_key": str(site.work / ".ssh/id_ed25519")}
         there = {"refuses": 1, "dumb": dumb.getsockname()[1], "hangs": hangs}
-        boxes = [
-            (name, {"ssh_hostname": "127.0.0.1", "ssh_port": port}) for name, port in there.items()
-        ]
-        boxes += [
-            (name, {"ssh_hostname": one.address})
-            for name, one in zip(("good", "bare"), site.hosts, strict=True)
-        ]
+        boxes = [(n, {"ssh_hostname": "127.0.0.1", "ssh_port": port}) for n, port in there.items()]
+        named = zip(("good", "bare"), site.hosts, strict=True)
+        boxes += [(name, {"ssh_hostname": one.address}) for name, one in named]
         (tmp_path / "fleet.py").write_text(f"boxes = ({boxes!r}, {shared!r})\n")
-        done = site.desktop(
-            "deploy", "--hosts", tmp_path / "fleet.py", sender.made(), "--limit", "40"
-        )
+        fleet = ("--hosts", tmp_path / "fleet.py", sender.made()[0], "--limit", "40")
+        done = site.desktop("deploy", *fleet)
     assert done.returncode == 1
     lines = dict(line.split(": ", 1) for line in done.stdout.splitlines() if ": " in line)
     assert "is READY" in lines["good"]
     assert lines["refuses"].startswith("FAILED: cannot be reached: Could not connect")
     assert lines["dumb"].startswith("FAILED: cannot be reached: SSH error")
-    assert "does not speak ssh" in lines["dumb"]
-    assert "no Palpate is installed there" in lines["bare"]
+    assert "no Palpate" in lines["bare"]
     assert lines["hangs"].startswith("FAILED: ")
-    assert "no answer within" in lines["hangs"] or "not done within 40 s" in lines["hangs"]
+    assert "no answer" in lines["hangs"] or "within 40 s" in lines["hangs"]
     assert done.stdout.splitlines()[-1] == "1 of 5 boxes done"
 
 
@@ -484,17 +435,13 @@ def stalling(host: hosts.Host) -> Iterator[int]:
         yield door.getsockname()[1]
 
 
-def test_a_user_who_needs_a_password_for_sudo_is_refused(
-    site: hosts.Hosts, host: hosts.Host, at: tuple[str, str], sender: Sender
-):
+def test_a_user_who_needs_a_password_for_sudo_is_refused(box: Box, sender: Sender):
     """At once and with a reason, instead of a prompt that nobody answers."""
-    host.machine.put("/etc/sudoers.d/user", f"{hosts.USER} ALL=(ALL) ALL\n")
+    box.machine.put("/etc/sudoers.d/user", f"{hosts.USER} ALL=(ALL) ALL\n")
     try:
-        done = site.desktop("deploy", *at, sender.made())
-        assert done.returncode == 1
-        assert "sudo: a password is required; let the user in without" in done.stdout
+        assert "sudo: a password" in box.does("deploy", sender.made()[0], code=1).stdout
     finally:
-        host.machine.put("/etc/sudoers.d/user", f"{hosts.USER} ALL=(ALL) NOPASSWD: ALL\n")
+        box.machine.put("/etc/sudoers.d/user", f"{hosts.USER} ALL=(ALL) NOPASSWD: ALL\n")
 
 
 @pytest.mark.parametrize(

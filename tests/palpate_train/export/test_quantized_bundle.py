@@ -8,6 +8,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -16,6 +17,7 @@ from onnx import numpy_helper
 
 from palpate.answer.objects import softmax
 from palpate.bundle import bundle
+from palpate.bundle.bundle import Manifest
 from palpate.cli.main import main as palpate
 from palpate.core import sweep_set
 from palpate.core.clock import SystemClock
@@ -70,11 +72,16 @@ def tight() -> Fit:
     return with_stages(close(), steps=60)
 
 
+def export(fit: Fit, target: Path, name: str = "easy", **more: Any) -> Manifest:
+    """Export it as version 1 of a commit; the manifest."""
+    return quantized_bundle.export(fit, target, name, "1", "0123abcd", **more)
+
+
 @pytest.fixture(scope="module")
 def packed(fitted: Fit, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The bundle of `fitted`."""
     target = tmp_path_factory.mktemp("export") / "bundle"
-    quantized_bundle.export(fitted, target, "easy", "1", "0123abcd")
+    export(fitted, target)
     return target
 
 
@@ -90,6 +97,11 @@ def shapes(model: onnx.ModelProto) -> list[list[int]]:
         [d.dim_value for d in v.type.tensor_type.shape.dim]
         for v in (*graph.input, *graph.value_info, *graph.output)
     ]
+
+
+def operators(folder: Path) -> set[str]:
+    """The operators of a bundle's graph."""
+    return {n.op_type for n in onnx.load(folder / bundle.MODEL).graph.node}
 
 
 def negated(fitted: Fit) -> Fit:
@@ -129,9 +141,8 @@ def test_the_int8_graph_computes_its_convolutions_in_int8(fitted: Fit, packed: P
         assert weight.dtype == np.int8
         assert 60 <= np.abs(weight.astype(int)).max() <= 64
         assert scale.shape == (len(weight),)
-        assert [n.op_type for n in model.graph.node if conv.output[0] in n.input] == [
-            "QuantizeLinear"
-        ]
+        (after,) = (n for n in model.graph.node if conv.output[0] in n.input)
+        assert after.op_type == "QuantizeLinear"
     run = session(model.SerializeToString())
     assert [(i.name, i.shape, i.type) for i in run.get_inputs()] == [
         ("sweep", [1, 64, 2, 2], "tensor(uint8)")
@@ -158,9 +169,8 @@ def test_a_bundle_passes_its_own_tests(fitted: Fit, packed: Path):
     assert it.bundle.golden_logits.argmax(1).tolist() == [0, 2]
     held = manifest.figures["held-out speed"]
     assert held["n"] == len(fitted.held)
-    assert held["accuracy"] + (held["wrong"] + held["unsure"] + held["unknown"]) / held[
-        "n"
-    ] == pytest.approx(1, abs=1e-4)
+    others = held["wrong"] + held["unsure"] + held["unknown"]
+    assert held["accuracy"] + others / held["n"] == pytest.approx(1, abs=1e-4)
     assert held["refused"] == 0
     assert manifest.figures["held-out speed, network alone"]["accuracy"] >= held["accuracy"]
     assert manifest.figures["held-out speed, by recording"]["n"] == len(fitted.held) / 2
@@ -171,26 +181,15 @@ def test_a_bundle_passes_its_own_tests(fitted: Fit, packed: Path):
     weakest = fitted.train.samples.mean(axis=1).max(axis=(1, 2)).min()
     assert manifest.thresholds.contact == pytest.approx(0.1 * weakest)
     assert manifest.thresholds.full_scale == 255
-    assert (manifest.labels, manifest.made["commit"], manifest.made["seed"]) == (
-        ("low", "middle", "high"),
-        "0123abcd",
-        1,
-    )
+    assert manifest.labels == ("low", "middle", "high")
+    assert (manifest.made["commit"], manifest.made["seed"]) == ("0123abcd", 1)
     assert np.mean(bundle_score.labels_of(it, easy(seed=5))[0] == easy(seed=5).labels) > 0.9
 
 
 def test_a_rule_for_moved_sweeps_needs_places(fitted: Fit, packed: Path, tmp_path: Path):
     """With the distance of the taxels the bundle has contact positions and a rule for displaced
     sweeps; without it the box could not recognise these, and the file has no arrays for them."""
-    quantized_bundle.export(
-        fitted,
-        tmp_path / "placed",
-        "easy",
-        "1",
-        "0123abcd",
-        pitch_mm=4.0,
-        asked=Asked(("displacement",)),
-    )
+    export(fitted, tmp_path / "placed", pitch_mm=4.0, asked=Asked(("displacement",)))
     placed, plain = bundle.load(tmp_path / "placed"), bundle.load(packed)
     assert placed.manifest.contact
     assert placed.manifest.displacement
@@ -204,9 +203,7 @@ def test_a_rule_for_moved_sweeps_needs_places(fitted: Fit, packed: Path, tmp_pat
 def test_rules_are_left_out_as_asked(fitted: Fit, tmp_path: Path):
     """Early answers are not in the graph, and nothing measures how well a material is known."""
     asked = Asked(left_out=("unknown", "early", "taxels"))
-    quantized_bundle.export(
-        fitted, tmp_path / "less", "easy", "1", "0123abcd", proven=False, asked=asked
-    )
+    export(fitted, tmp_path / "less", proven=False, asked=asked)
     less = bundle.load(tmp_path / "less")
     assert not set(present(less)) & set(asked.left_out)
     assert less.classes is None
@@ -236,7 +233,7 @@ def test_the_same_fit_gives_the_same_bytes(
     for made in (fitted, Fit.load(tmp_path / "fit.npz")):
         assert made.calibration
         assert made.contacts
-        quantized_bundle.export(made, tmp_path / "again", "easy", "1", "0123abcd")
+        export(made, tmp_path / "again")
         for file in (bundle.MANIFEST, bundle.MODEL, bundle.GOLDEN, bundle.MEANS):
             assert (tmp_path / "again" / file).read_bytes() == (packed / file).read_bytes(), file
     assert sorted(f.name for f in tmp_path.iterdir()) == ["again", "fit.npz"]
@@ -258,26 +255,11 @@ def test_scores_are_fused_by_recording(packed: Path):
 
 def test_a_head_that_says_otherwise_stays_in_float(fitted: Fit, tmp_path: Path):
     """int8 disagrees with a spoilt float head: the bundle is float, with the reason."""
-    made = quantized_bundle.export(negated(fitted), tmp_path / "bundle", "easy", "1", "")
+    made = export(negated(fitted), tmp_path / "bundle")
     why = made.made["float_because"]
-    assert re.match(
-        r"int8 loses \d+\.\d\d points on held-out sweeps, by float's own .*limit 0\.5", why
-    )
-    assert "QuantizeLinear" not in {
-        n.op_type for n in onnx.load(tmp_path / "bundle" / bundle.MODEL).graph.node
-    }
-    assert (
-        "float_because"
-        not in quantized_bundle.export(fitted, tmp_path / "bundle", "easy", "1", "").made
-    )
-
-
-def test_weights_that_are_no_numbers_are_refused(fitted: Fit, tmp_path: Path):
-    """A difference of nan is beyond every limit."""
-    with pytest.raises(ExportRefused, match="pytorch"):
-        quantized_bundle.export(
-            replace(fitted, weights=without_numbers(fitted)), tmp_path / "bundle", "easy", "1", ""
-        )
+    assert re.match(r"int8 loses \d+\.\d\d points .*limit 0\.5", why)
+    assert "QuantizeLinear" not in operators(tmp_path / "bundle")
+    assert "float_because" not in export(fitted, tmp_path / "bundle").made
 
 
 def test_stages_are_compared_with_pytorch_beside_any_feature(fitted: Fit):
@@ -392,12 +374,8 @@ def test_each_limit_is_where_it_stands(good: dict, bad: dict, message: str):
 
 def test_a_bundle_whose_sweeps_the_box_refuses_is_refused(fitted: Fit, tmp_path: Path):
     """Beyond the full scale they count as saturated, said before a robot meets it."""
-    refused = (
-        r"the box would refuse \d+ of \d+ held-out sweeps \(limit 5%\), by status: "
-        r"\d+ saturated\. .* --full-scale$"
-    )
-    with pytest.raises(ExportRefused, match=refused):
-        quantized_bundle.export(fitted, tmp_path / "bundle", "easy", "1", "", full_scale=60)
+    with pytest.raises(ExportRefused, match=r"\d+ saturated.*--full-scale$"):
+        export(fitted, tmp_path / "bundle", full_scale=60)
 
 
 def test_a_bundle_that_calls_too_many_sweeps_unknown_is_refused(
@@ -405,12 +383,8 @@ def test_a_bundle_that_calls_too_many_sweeps_unknown_is_refused(
 ):
     """The message has their number, the limit, and the distance beyond which a sweep is unknown."""
     monkeypatch.setattr(pack, "MOST_UNKNOWN", -0.5)
-    told = (
-        r"would call \d+ of \d+ held-out sweeps unknown \(limit -50%, squared distance "
-        r"\d[\d.]*\); record more positions"
-    )
-    with pytest.raises(ExportRefused, match=told):
-        quantized_bundle.export(fitted, tmp_path / "bundle", "easy", "1", "")
+    with pytest.raises(ExportRefused, match=r"\(limit -50%, .* \d[\d.]*\)"):
+        export(fitted, tmp_path / "bundle")
 
 
 def test_the_box_must_answer_as_export_did(fitted: Fit, packed: Path):
@@ -432,41 +406,35 @@ def test_a_material_never_recognised_is_refused(fitted: Fit):
 def test_a_bundle_is_replaced_whole_or_not_at_all(fitted: Fit, packed: Path, tmp_path: Path):
     """A refusal leaves the old bundle; a good export replaces it, no other folder."""
     target = tmp_path / "bundle"
-    quantized_bundle.export(fitted, target, "old", "1", "")
+    export(fitted, target, "old")
     (target / "stray").write_text("left over")
     before = (target / bundle.MANIFEST).read_bytes()
     with pytest.raises(ExportRefused):
-        quantized_bundle.export(
-            replace(fitted, weights=without_numbers(fitted)), target, "new", "2", ""
-        )
+        export(replace(fitted, weights=without_numbers(fitted)), target, "new")
     assert (target / bundle.MANIFEST).read_bytes() == before
-    quantized_bundle.export(fitted, target, "new", "2", "")
+    export(fitted, target, "new")
     assert bundle.load(target).manifest.name == "new"
     assert sorted(f.name for f in target.iterdir()) == sorted(
         [bundle.MANIFEST, bundle.MODEL, bundle.GOLDEN, bundle.MEANS, "card.md"]
     )
     (tmp_path / "letters").mkdir()
     with pytest.raises(ExportRefused, match="replaced"):
-        quantized_bundle.export(fitted, tmp_path / "letters", "new", "2", "")
+        export(fitted, tmp_path / "letters", "new")
     assert sorted(f.name for f in tmp_path.iterdir()) == ["bundle", "letters"]
 
 
-def test_a_target_that_cannot_be_written_is_named(fitted: Fit, tmp_path: Path):
-    """The target is in a file instead of a folder."""
+def test_what_cannot_be_written_is_refused(fitted: Fit, tmp_path: Path):
+    """A target in a file, weights that are no numbers, a label that cannot be sent."""
+    parts = {k: replace(getattr(fitted, k), materials=("a,b", "c", "d")) for k in ("train", "held")}
     (tmp_path / "file").write_text("")
-    with pytest.raises(ExportRefused, match="bundle"):
-        quantized_bundle.export(fitted, tmp_path / "file" / "bundle", "easy", "1", "")
-
-
-def test_a_label_that_cannot_be_sent_is_refused(fitted: Fit, tmp_path: Path):
-    """The check of the manifest fails before anything is written."""
-    named = replace(
-        fitted,
-        **{k: replace(getattr(fitted, k), materials=("a,b", "c", "d")) for k in ("train", "held")},
-    )
-    with pytest.raises(BundleError, match="'a,b'"):
-        quantized_bundle.export(named, tmp_path / "bundle", "easy", "1", "")
-    assert list(tmp_path.iterdir()) == []
+    for fit, where, error, why in (
+        (fitted, "file/bundle", ExportRefused, "bundle"),
+        (replace(fitted, weights=without_numbers(fitted)), "bundle", ExportRefused, "pytorch"),
+        (replace(fitted, **parts), "bundle", BundleError, "'a,b'"),
+    ):
+        with pytest.raises(error, match=why):
+            export(fit, tmp_path / where)
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 def test_the_default_bundle_is_what_the_box_needs():
@@ -500,14 +468,9 @@ def test_references_are_what_they_are_called(tmp_path: Path, caplog: pytest.LogC
             run.run(["logits"], {"sweep": np.full((1, 1500, 4, 4), 7, np.uint8)})[0]
         ).all()
         sizes[path.name] = path.stat().st_size
-    kinds = {
-        path.name: {n.op_type for n in onnx.load(path).graph.node}
-        for path in (tmp_path / "new").iterdir()
-    }
-    assert ["QuantizeLinear" in kinds[name] for name in ("fp32.onnx", "paper_int8.onnx")] == [
-        False,
-        True,
-    ]
+    for name, int8 in (("fp32.onnx", False), ("paper_int8.onnx", True)):
+        nodes = onnx.load(tmp_path / "new" / name).graph.node
+        assert ("QuantizeLinear" in {n.op_type for n in nodes}) == int8
     assert cost.macs(onnx.load(tmp_path / "new" / "fp32.onnx")) > 4e6
     assert 15_891_910 < sizes["paper_int8.onnx"] < 1.01 * 15_891_910
 
@@ -551,18 +514,16 @@ def test_a_fit_without_a_convolution_is_exported(tmp_path: Path):
     """Nothing in it is int8: both precisions are equal, the labels of box and fit agree, and no
     tensor is reported. A spoilt head is reported here as well."""
     made = recipe.fit(easy(), Run(1), recipe.Settings(steps=0, size=SIZES["bands"]))
-    quantized_bundle.export(made, tmp_path / "b", "easy", "1", "0123abcd")
+    export(made, tmp_path / "b")
     it = box(tmp_path / "b")
     assert it.self_test() < 1e-6
-    assert "QuantizeLinear" not in {
-        n.op_type for n in onnx.load(tmp_path / "b" / bundle.MODEL).graph.node
-    }
+    assert "QuantizeLinear" not in operators(tmp_path / "b")
     logits = parity.logits(quantized_bundle.graphs(made)[0], made.held.samples)
     assert [it.logits(x).argmax() for x in made.held.samples] == logits.argmax(1).tolist()
     result = it.bundle.manifest.figures["parity"]
     assert (result["agreement"], result["lost"]) == (1, 0)
     assert result["probability_difference"] < 1e-3
-    other = quantized_bundle.export(negated(made), tmp_path / "other", "easy", "1", "")
+    other = export(negated(made), tmp_path / "other")
     assert re.match(r"int8 loses \d+\.\d\d points .*record more", other.made["float_because"])
 
 
@@ -594,31 +555,19 @@ def test_fabrics_go_the_whole_way(tmp_path: Path, capsys: pytest.CaptureFixture[
         f"--split recording:0.7 --rest {tmp_path / 'rest.npz'} --out {tmp_path / 'fit.npz'}"
     ).split()
     assert main(["fit", *args]) == 0
-    assert (
-        main(f"export {tmp_path / 'fit.npz'} --out {tmp_path / 'b'} --name f --version 1".split())
-        == 0
-    )
+    more = f"--out {tmp_path / 'b'} --name f --version 1"
+    assert main(f"export {tmp_path / 'fit.npz'} {more}".split()) == 0
     it, rest = box(tmp_path / "b"), sets.load(str(tmp_path / "rest.npz"))
-    assert (it.bundle.format.dtype, it.bundle.format.rows, it.bundle.format.window) == (
-        "int16",
-        16,
-        128,
-    )
+    assert (it.bundle.format.rows, it.bundle.format.window) == (16, 128)
+    assert it.bundle.format.dtype == "int16"
     logits = np.stack([it.logits(counts) for counts in rest.samples])
     result = bundle_score.answers_to(it, rest, logits).figures(
         rest.labels, rest.group("recording"), "unseen"
     )
     assert result["unseen"]["accuracy"] > 0.9
     assert result["unseen, by recording"]["accuracy"] > 0.9
-    sentences = [
-        "demo",
-        "--sim",
-        f"replay:{tmp_path / 'rest.npz'}",
-        "--virtual",
-        "--sweeps",
-        str(len(rest)),
-    ]
-    assert palpate([*sentences, "--set", f"classifier.bundle={tmp_path / 'b'}"]) == 0
+    demo = f"demo --sim replay:{tmp_path / 'rest.npz'} --virtual --sweeps {len(rest)}"
+    assert palpate(f"{demo} --set classifier.bundle={tmp_path / 'b'}".split()) == 0
     out = capsys.readouterr().out
     right, total = (int(n) for n in re.search(r"all sweeps +(\d+) / (\d+)", out).groups())
     assert total == result["unseen"]["n"] == len(rest)
@@ -639,7 +588,7 @@ def test_a_fit_does_not_see_offsets(tmp_path: Path):
     offset = replace(whole, samples=(whole.samples - level).round().astype(np.uint8), labels=labels)
     try:
         made = with_stages(offset, steps=20)
-        manifest = quantized_bundle.export(made, tmp_path / "b", "offset", "1", "0123abcd")
+        manifest = export(made, tmp_path / "b")
     except ExportRefused:  # what was never learnt may not survive int8 either
         return
     assert manifest.figures["held-out recording"]["accuracy"] < 0.6
@@ -649,7 +598,7 @@ def test_display_names_are_in_manifest_and_card(fitted: Fit, tmp_path: Path):
     """Only those of the set's materials; the labels stay."""
     shown = {"low": "tief, 低い", "gone": "weg"}
     named = replace(fitted, train=replace(fitted.train, displays=shown))
-    quantized_bundle.export(named, tmp_path / "b", "easy", "1", "", proven=False)
+    export(named, tmp_path / "b", proven=False)
     manifest = bundle.load(tmp_path / "b").manifest
     assert manifest.labels == fitted.train.materials
     assert manifest.displays == {"low": "tief, 低い"}
