@@ -170,7 +170,7 @@ def test_the_installed_box_is_taught(host: hosts.Host):
         assert done.returncode == 0, done.stdout + done.stderr
     done = host.machine.run(*AS_BOX, "teach", *APART, "--use", "--by", "anna", limit_s=LONG_S)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "with metal, wood is installed, on trial" in done.stdout
+    assert "with metal, wood" in done.stdout
     words = " ".join((*APART, "--sim", "skin"))
     host.machine.put(
         "/run/systemd/system/palpate-teach.service.d/test.conf",
@@ -194,7 +194,7 @@ def test_a_box_without_a_bundle_for_its_skin_starts_in_teach_mode(host: hosts.Ho
     host.machine.get("systemctl", "daemon-reload")
     host.machine.get("systemctl", "--no-block", "restart", "palpate")
     end_s = time.monotonic() + 2 * WAIT_S
-    while not any("nothing taught yet: READY stays low" in one for one in host.service.log_lines()):
+    while not any("READY stays low" in one for one in host.service.log_lines()):
         assert time.monotonic() < end_s, host.service.journal()
         time.sleep(0.2)
     host.service.until("StatusText", r"skin (?!streaming).*")
@@ -225,7 +225,7 @@ def test_a_removed_package_leaves_settings_and_sweeps(host: hosts.Host):
     host.machine.get("mkdir", "-p", "/var/lib/palpate/sweeps")
     done = host.machine.run(*APT, "remove", "palpate", limit_s=LONG_S)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "sweeps and bundles stay in /var/lib/palpate, settings in /etc/palpate" in done.stdout
+    assert "/var/lib/palpate" in done.stdout
     assert host.machine.get("ls", "/opt") == ""
     for gone in ("/usr/local/bin/palpate", "/etc/systemd/system/palpate.service"):
         assert host.machine.run("test", "-L", gone).returncode

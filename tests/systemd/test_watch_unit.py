@@ -99,6 +99,6 @@ def test_without_a_token_it_does_not_start_on_the_network(machine: Machine, serv
     machine.until(f"systemctl is-failed -q {UNIT}")
     assert machine.shown(UNIT, "ExecMainStatus") == "78"
     journal = machine.get("journalctl", "-q", "-u", UNIT, "-o", "cat")
-    assert "/etc/palpate/watch/token cannot be read" in journal
-    assert "make install makes one" in journal
+    assert "/etc/palpate/watch/token" in journal
+    assert "make install" in journal
     machine.get("systemctl", "reset-failed", UNIT)

@@ -38,7 +38,7 @@ def test_limits_of_training_sweeps_are_told():
     assert manifest.displacement
     copies_mm = manifest.displacement.farthest_mm - packaged.contact.limit_mm
     assert copies_mm == pytest.approx(1.9, abs=0.4)  # of a pitch of 4 mm
-    assert "named up to" in fit_displacement.text(manifest)
+    assert "up to" in fit_displacement.text(manifest)
     assert "9 steps" in fit_early.text(packaged)
 
 

