@@ -16,66 +16,40 @@ def _difference(mean: float) -> Json:
 def _model(
     method: str, ms: float, accuracy: float | None, behind: float, why_not: str = ""
 ) -> Json:
-    return {
-        "method": method,
-        "ms": ms,
-        "kb": 100 * ms,
-        "mb": 57.0,
-        "why_not": why_not,
-        "used": {"ms": ms / 50},
-        "accuracy": None if accuracy is None else _accuracy(accuracy),
-        "behind": None if accuracy is None else _difference(behind),
+    known = accuracy is not None
+    cost = {"ms": ms, "kb": 100 * ms, "mb": 57.0, "used": {"ms": ms / 50}}
+    judged = {
+        "accuracy": _accuracy(accuracy) if known else None,
+        "behind": _difference(behind) if known else None,
     }
+    return {"method": method, "why_not": why_not} | cost | judged
 
 
-def _points(*points: tuple[str, float, float]) -> list[Json]:
-    return [
-        {
-            "name": name,
-            "share": 1.0,
-            "accuracy": _accuracy(mean),
-            "behind": _difference(behind),
-            "fine": behind <= 0.012,
-        }
+def _curve(kind: str, kept: str, *points: tuple[str, float, float], **more: Any) -> Json:
+    """The points of a reduction: name, accuracy, and loss."""
+    each = [
+        {"name": name, "share": 1.0, "accuracy": _accuracy(mean), "behind": _difference(behind)}
+        | {"fine": behind <= 0.012}
         for name, mean, behind in points
     ]
-
-
-def _curve(kind: str, points: list[Json], kept: str, **more: Any) -> Json:
-    return {
-        "kind": kind,
-        "points": points,
-        "kept": kept,
-        "set": f"set {kind} so",
-        "applied": False,
-    } | more
+    made = {"kind": kind, "points": each, "kept": kept, "set": f"set {kind} so", "applied": False}
+    return made | more
 
 
 def choice(**more: Any) -> Json:
     """Four sizes with all curves. They reach the target."""
+    window = ("all", 0.935, 0.0), ("0.5 s", 0.93, 0.005), ("0.2 s", 0.815, 0.12)
+    corners = [[0, 0], [0, 3], [3, 0], [3, 3]]
+    alike = [["metal", "plastic <smooth>"]]
     curves = [
-        _curve(
-            "window",
-            _points(("all", 0.935, 0.0), ("0.5 s", 0.93, 0.005), ("0.2 s", 0.815, 0.12)),
-            "0.5 s",
-            applied=True,
-        ),
-        _curve("rate", _points(("750 Hz", 0.935, 0.0), ("375 Hz", 0.875, 0.06)), "750 Hz"),
-        _curve(
-            "taxels",
-            _points(("16", 0.935, 0.0), ("4", 0.928, 0.007)),
-            "4",
-            taxels=[[0, 0], [0, 3], [3, 0], [3, 3]],
-        ),
-        _curve("bits", _points(("8", 0.935, 0.0), ("6", 0.932, 0.003)), "6"),
-        _curve(
-            "classes",
-            _points(("3", 0.935, 0.0), ("2", 0.965, 0.0)),
-            "3",
-            proposed=[["metal", "plastic <smooth>"]],
-        ),
+        _curve("window", "0.5 s", *window, applied=True),
+        _curve("rate", "750 Hz", ("750 Hz", 0.935, 0.0), ("375 Hz", 0.875, 0.06)),
+        _curve("taxels", "4", ("16", 0.935, 0.0), ("4", 0.928, 0.007), taxels=corners),
+        _curve("bits", "6", ("8", 0.935, 0.0), ("6", 0.932, 0.003)),
+        _curve("classes", "3", ("3", 0.935, 0.0), ("2", 0.965, 0.0), proposed=alike),
     ]
-    made = {
+    bundle = {"content": "relations at 3 scales, spectrum <i>", "kb": 12.0, "ms": 0.118, "mb": 57.0}
+    chosen = {
         "chosen": "pairs",
         "best": "64",
         "accuracy": _accuracy(0.935),
@@ -93,41 +67,24 @@ def choice(**more: Any) -> Json:
         "held_out": 960,
         "confused": [{"is": "metal", "named": "plastic <smooth>", "share": 0.115}],
         "less": curves,
-        "bundle": {
-            "content": "relations at 3 scales, spectrum <i>",
-            "kb": 12.0,
-            "ms": 0.118,
-            "mb": 57.0,
-            "used": {"ms": 0.014, "kb": 0.024},
-        },
+        "bundle": bundle | {"used": {"ms": 0.014, "kb": 0.024}},
+    }
+    run = {
         "command": "palpate-train fit --scene drawer.toml --seed 1 --out drawer.npz",
-        "set": "sim:T-REAL:1",
-        "digest": "7f7b49c7",
-        "sweeps": 480,
+        **{"set": "sim:T-REAL:1", "digest": "7f7b49c7", "sweeps": 480},
         "materials": ["metal", "plastic <smooth>", "foam"],
         "budget": {"ms": 50, "kb": 500, "slower": 3},
-        "reattached": True,
-        "seeds": [1],
-        "commit": "c0ffee",
-        "machine": "abacus",
+        **{"reattached": True, "seeds": [1], "commit": "c0ffee", "machine": "abacus"},
     }
-    return made | more
+    return chosen | run | more
 
 
 def missed() -> Json:
     """A single size that misses the target, with no groups that vary and no budget."""
-    alone = [_model("bands", 0.08, 0.512, 0.0)]
     return choice(
-        chosen="bands",
-        best="bands",
-        wanted=0.99,
-        accuracy=_accuracy(0.51),
-        rungs=alone,
-        smaller=None,
-        larger=None,
-        less=[],
-        honest=None,
-        confused=[],
+        **{"chosen": "bands", "best": "bands", "wanted": 0.99, "accuracy": _accuracy(0.51)},
+        rungs=[_model("bands", 0.08, 0.512, 0.0)],
+        **{"smaller": None, "larger": None, "less": [], "honest": None, "confused": []},
         bundle={"content": "spectrum", "kb": 12.0, "ms": 0.118, "mb": 57.0, "used": {}},
         budget={"slower": 1},
         groups=["recording"],

@@ -17,63 +17,24 @@ def hello(
     pid: int = 71, bundle: str = "9f3c2a1b", source: str = "usb", **other: Any
 ) -> dict[str, Any]:
     """The first line."""
-    alignment = {
-        "contact": 5.0,
-        "place": PLACE,
-        "unloaded": [[0.0] * 4] * 4,
-        "fingertip": "first-row",
-    }
-    return {
-        "type": "hello",
-        "schema": 1,
-        "version": "0.2.0",
-        "pid": pid,
-        "source": source,
-        "bundle": bundle,
-        "labels": list(LABELS),
-        "skin": "palpate",
-        "format": FORMAT,
-        "window_s": FRAMES / RATE_HZ,
-        "frames_hz": 20.0,
-        "alignment": alignment,
-        **other,
-    }
+    alignment = {"contact": 5.0, "place": PLACE, "unloaded": [[0.0] * 4] * 4}
+    made = {"type": "hello", "schema": 1, "version": "0.2.0", "pid": pid, "source": source}
+    made |= {"bundle": bundle, "labels": list(LABELS), "skin": "palpate", "format": FORMAT}
+    made |= {"window_s": FRAMES / RATE_HZ, "frames_hz": 20.0}
+    return made | {"alignment": alignment | {"fingertip": "first-row"}} | other
 
 
 def health(at_s: float, **other: Any) -> dict[str, Any]:
     """The state that the box sends each second."""
-    return {
-        "type": "health",
-        "time_ns": round(at_s * SECOND),
-        "since_ns": 0,
-        "skin": "streaming",
-        "trouble": "",
-        "streams": True,
-        "sweeping": False,
-        "ready": True,
-        "answered": round(at_s / 6),
-        "frames": round(at_s * RATE_HZ),
-        "lost_frames": 0,
-        "garbage_bytes": 0,
-        "enumerations": 1,
-        "dropped": 0,
-        "bundle": "9f3c2a1b",
-        "source": "usb",
-        "stale_frames": 0,
-        "overflows": 0,
-        "fifo_overflows": 0,
-        "glitches": 0,
-        "lost_edges": 0,
-        "storms": 0,
-        "loss_known": True,
-        "degraded": "",
-        "pid": 71,
-        "version": "0.2.0",
-        "model": "tubes 3, 6 labels",
-        "trial": "on trial: 12 of 20 sweeps",
-        "shadow": "",
-        **other,
-    }
+    time_ns, frames = round(at_s * SECOND), round(at_s * RATE_HZ)
+    made = {"type": "health", "time_ns": time_ns, "since_ns": 0, "skin": "streaming", "trouble": ""}
+    made |= {"streams": True, "sweeping": False, "ready": True, "answered": round(at_s / 6)}
+    made |= {"frames": frames, "lost_frames": 0, "garbage_bytes": 0, "enumerations": 1}
+    made |= {"dropped": 0, "bundle": "9f3c2a1b", "source": "usb"}
+    made |= dict.fromkeys(("stale_frames", "overflows", "fifo_overflows", "glitches"), 0)
+    made |= {"lost_edges": 0, "storms": 0, "loss_known": True, "degraded": "", "pid": 71}
+    made |= {"version": "0.2.0", "model": "tubes 3, 6 labels"}
+    return made | {"trial": "on trial: 12 of 20 sweeps", "shadow": ""} | other
 
 
 def state(skin: str = "streaming", trouble: str = "", *, sweeping: bool = False) -> dict[str, Any]:
@@ -89,26 +50,14 @@ def verdict(
     p = 0.962 if status == "ok" else 0.481
     scores = [p if name == label else (1 - p) / (len(LABELS) - 1) for name in LABELS]
     without = status not in ("ok", "unsure", "undecided")
-    return {
-        "type": "verdict",
-        "sweep": sweep,
-        "time_ns": round(at_s * SECOND),
-        "status": status,
-        "label": "" if without else label,
-        "probability": 0.0 if without else p,
-        "margin": 0.0 if without else p - (1 - p) / 5,
-        "scores": [] if without else scores,
-        "fused": 1,
-        "lost": 0,
-        "latency_ns": 1_200_000 + 10_000 * (sweep % 37),
-        "bundle": "9f3c2a1b",
-        "detail": "",
-        "share": 1.0,
-        "own": [] if without else scores,
-        "moved": "",
-        "after": 0,
-        **other,
-    }
+    made = {"type": "verdict", "sweep": sweep, "time_ns": round(at_s * SECOND), "status": status}
+    made |= {"label": "", "probability": 0.0, "margin": 0.0, "scores": [], "own": []}
+    if not without:
+        made |= {"label": label, "probability": p, "margin": p - (1 - p) / 5}
+        made |= {"scores": scores, "own": scores}
+    made |= {"fused": 1, "lost": 0, "latency_ns": 1_200_000 + 10_000 * (sweep % 37)}
+    made |= {"bundle": "9f3c2a1b", "detail": "", "share": 1.0, "moved": "", "after": 0}
+    return made | other
 
 
 def load(row: float, col: float, strength: float = 120.0) -> NDArray[np.float64]:
@@ -128,11 +77,5 @@ def sweep(number: int, hz: float = 55.0) -> dict[str, Any]:
     t = np.arange(FRAMES)[:, None, None] / RATE_HZ
     counts = load(1.5, 1.5) * (1 + 0.15 * np.sin(2 * np.pi * hz * t) * np.sin(2 * np.pi * 0.7 * t))
     data = np.clip(np.round(counts), 0, 255).astype(np.uint8)
-    return {
-        "type": "sweep",
-        "sweep": number,
-        "start_ns": 0,
-        "shape": list(data.shape),
-        "dtype": "uint8",
-        "data": b64encode(data.tobytes()).decode(),
-    }
+    made = {"type": "sweep", "sweep": number, "start_ns": 0, "shape": list(data.shape)}
+    return made | {"dtype": "uint8", "data": b64encode(data.tobytes()).decode()}

@@ -16,41 +16,20 @@ from palpate.service.feed import PERIOD_NS, FeedServer
 from palpate.sim import rig, skin
 from tests.factories.simulated_box import SECOND, numbered
 
+NOTHING = (
+    *("time_ns", "garbage_bytes", "dropped", "stale_frames", "overflows", "fifo_overflows"),
+    *("glitches", "lost_edges", "storms"),
+)
 HEALTH = Health(
-    time_ns=0,
-    skin="streaming",
-    trouble="",
-    streams=True,
-    sweeping=False,
-    answered=7,
-    frames=5_000_000,
-    lost_frames=3,
-    garbage_bytes=0,
-    enumerations=1,
-    dropped=0,
-    bundle="9f3c2a1b",
-    source="usb",
-    stale_frames=0,
-    overflows=0,
-    fifo_overflows=0,
-    glitches=0,
-    lost_edges=0,
-    storms=0,
-    ready=True,
+    **{"skin": "streaming", "trouble": "", "streams": True, "sweeping": False, "ready": True},
+    **{"answered": 7, "frames": 5_000_000, "lost_frames": 3, "enumerations": 1},
+    **{"bundle": "9f3c2a1b", "source": "usb"},
+    **dict.fromkeys(NOTHING, 0),
 )
 OK = Verdict(
-    sweep=7,
-    time_ns=0,
-    status=Status.OK,
-    label="plastic rough",
-    probability=0.987,
-    margin=0.9,
-    scores=np.array([0.987, 0.013]),
-    fused=1,
-    lost=0,
-    latency_ns=1_200_000,
-    bundle="9f3c2a1b",
-    displacement="moved 2 mm",
+    **{"sweep": 7, "time_ns": 0, "status": Status.OK, "label": "plastic rough"},
+    **{"probability": 0.987, "margin": 0.9, "scores": np.array([0.987, 0.013]), "fused": 1},
+    **{"lost": 0, "latency_ns": 1_200_000, "bundle": "9f3c2a1b", "displacement": "moved 2 mm"},
 )
 
 
@@ -104,13 +83,9 @@ class Offered:
         **facts: Any,
     ) -> None:
         self.path, self.clock = path, rig.VirtualClock()
-        known = {
-            "source": "usb",
-            "bundle": "9f3c2a1b",
-            "labels": ["plastic rough", "wood"],
-            "skin": "palpate",
-            **known,
-        }
+        labels = ["plastic rough", "wood"]
+        usual = {"source": "usb", "bundle": "9f3c2a1b", "labels": labels, "skin": "palpate"}
+        known = usual | known
         self.cost_ns = self._spent_ns = 0
         self.feed = FeedServer(path, format, known, self.clock, lambda: facts, self._spent)
 
