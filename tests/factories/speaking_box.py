@@ -35,23 +35,8 @@ def result(
     optional: Sequence[object] = (),
 ) -> bytes:
     """A RES sentence. optional: the fields after the detail."""
-    return sentence(
-        "RES",
-        sweep,
-        "9.500",
-        status,
-        label,
-        "0.900",
-        "0.800",
-        1,
-        0,
-        "1.25",
-        "9f3c2a1b",
-        "sim",
-        share,
-        detail,
-        *optional,
-    )
+    fields = (sweep, "9.500", status, label, "0.900", "0.800", 1, 0, "1.25", "9f3c2a1b", "sim")
+    return sentence("RES", *fields, share, detail, *optional)
 
 
 def finger(
@@ -64,16 +49,13 @@ def finger(
 
 def obeying(heard: Sentence) -> list[bytes]:
     """The answers of a box without faults: STOP ends a sweep, which is answered `ok`."""
-    fields: tuple[object, ...] = {"STATE": STREAMING, "ID": IDENTITY, "TARE": ("16 taxels",)}.get(
-        heard.kind, ()
-    )
+    known = {"STATE": STREAMING, "ID": IDENTITY, "TARE": ("16 taxels",)}
+    fields: tuple[object, ...] = known.get(heard.kind, ())
     if heard.kind == "LABEL":
         code = int(heard.fields[0])
         fields = (code, LABELS[code - 1], len(LABELS))
-    return [
-        sentence("ANS", heard.kind, "ok", *fields),
-        *([result(1)] if heard.kind == "STOP" else []),
-    ]
+    answer = sentence("ANS", heard.kind, "ok", *fields)
+    return [answer, result(1)] if heard.kind == "STOP" else [answer]
 
 
 class SpeakingBox:
@@ -125,9 +107,8 @@ class SpeakingBox:
     def wait_for(self, kind: str, timeout_s: float = 30) -> None:
         """Wait until a command has arrived."""
         with self._come:
-            assert self._come.wait_for(
-                lambda: any(s.kind == kind for s in self.heard), timeout_s
-            ), self.heard
+            came = self._come.wait_for(lambda: any(s.kind == kind for s in self.heard), timeout_s)
+            assert came, self.heard
 
     def _listen(self) -> None:
         rest = b""
@@ -137,10 +118,7 @@ class SpeakingBox:
                     continue
                 found, rest = sentences.parse(os.read(self._ends[0], 4096), rest)
                 for one in found:
-                    with (
-                        self._come
-                        # before the answer, because a test with the answer may read `heard`
-                    ):
+                    with self._come:  # before the answer: a test with that may read `heard`
                         self.heard.append(one)
                         self._come.notify_all()
                     for line in self.script(one):

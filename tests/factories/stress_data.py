@@ -33,33 +33,20 @@ def figures() -> dict[str, Any]:
     """Results of 100 sweeps and one seed. `quant` refused the set. The first method is the
     project's.
     """
-    methods = robustness.merge(
-        [
-            *(task(name, right) for name, right in METHODS.items()),
-            {"method": "quant", "seed": 1, "set": "x", "refused": "needs aeon"},
-        ]
-    )["methods"]
+    tasks = [task(name, right) for name, right in METHODS.items()]
+    refused = {"method": "quant", "seed": 1, "set": "x", "refused": "needs aeon"}
+    methods = robustness.merge([*tasks, refused])["methods"]
     box = robustness.merge([task(name, right) for name, right in BOX.items()])["methods"]
-    return {
-        "sets": ["sim:T-REAL:101:2"],
+    counted = {kind: {n: entry[kind] for n, entry in box.items()} for kind in ("curves", "pairs")}
+    bundle = {"name": "six", "version": "3", "id": "8933e0d5"}
+    made = {"set": "sim:T-REAL:1-6", "recipe": {"reattached": True}}
+    sets = {"sets": ["sim:T-REAL:101:2"], "train": "sim:T-REAL:1", "train_sweeps": 540}
+    sets |= {"train_digest": "aa11", "test": "sim:T-REAL:101:2", "test_sweeps": 100}
+    sets |= {"test_digest": "bb22", "attachments": 9, "format": "4x4 uint8 at 750 Hz, window 1500"}
+    return sets | {
         "methods": {name: methods[name] for name in (*METHODS, "quant")},
-        "box": {
-            "bundle": {"name": "six", "version": "3", "id": "8933e0d5"},
-            "made": {"set": "sim:T-REAL:1-6", "recipe": {"reattached": True}},
-            "curves": {name: entry["curves"] for name, entry in box.items()},
-            "pairs": {name: entry["pairs"] for name, entry in box.items()},
-        },
-        "train": "sim:T-REAL:1",
-        "train_sweeps": 540,
-        "train_digest": "aa11",
-        "test": "sim:T-REAL:101:2",
-        "test_sweeps": 100,
-        "test_digest": "bb22",
-        "attachments": 9,
-        "format": "4x4 uint8 at 750 Hz, window 1500",
-        "seeds": [1],
-        "commit": "c0ffee",
-        "machine": "abacus, 2 cores",
+        "box": {"bundle": bundle, "made": made} | counted,
+        **{"seeds": [1], "commit": "c0ffee", "machine": "abacus, 2 cores"},
     }
 
 
@@ -74,15 +61,8 @@ def task(name: str, right: dict[str, tuple[int, ...]]) -> dict[str, Any]:
         parts = [right[part] for part in key.split("+")]
         both = (parts[0][0], min(part[1] for part in parts) - 5 * ("dead" in key))
         pairs[key] = curve(key, title, "", [0.0, 1.0], both)
-    return {
-        "method": name,
-        "seed": 1,
-        "set": "sim:T-REAL:101:2",
-        "refused": "",
-        "total": 100,
-        "curves": curves,
-        "pairs": pairs,
-    }
+    made = {"method": name, "seed": 1, "set": "sim:T-REAL:101:2", "refused": "", "total": 100}
+    return made | {"curves": curves, "pairs": pairs}
 
 
 def curve(
