@@ -66,6 +66,7 @@ class TeachingSession(Observer):
         self._codes, self._base, self._trained = codes, base, trained
         self._fewest = 1 if base else FEWEST_TAUGHT
         self._learn, self._clock, self._say = learn, clock or SystemClock(), say
+        self._place = recording.about()["position"] or "1"  # of the first sweeps
         self._named: dict[str, None] = {}  # materials without a sweep so far, in order
         self._process: TeachingProcess | None = None
         self._using, self._stored = False, 0
@@ -209,6 +210,9 @@ class TeachingSession(Observer):
                 f"{MOST_NAMED} materials wait for a sweep; record one of them, or forget it"
             )
         self._named.setdefault(label)
+        now = self._recording.about()
+        if now["material"] not in ("", label) and now["position"].isdecimal():
+            self._recording.commands["POSITION"](self._place)  # each material begins there
         self._recording.commands["MATERIAL"](label)
         return [label, self.materials().get(label, 0)]
 

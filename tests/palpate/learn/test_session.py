@@ -272,6 +272,16 @@ def test_class_bits_that_are_too_few_are_said_before_recording(tmp_path):
     narrower.recording.close()
 
 
+def test_each_material_begins_at_the_first_place(taught: Taught):
+    """Another place is of the present material; named again, it stays where it is."""
+    places = []
+    for order in (("POSITION", "1"), ("TEACH", "cork"), ("NEXT", ""), ("TEACH", "pine")):
+        taught.order("TEACH", "cork")
+        taught.order(*order)
+        places.append(taught.recording.about()["position"])
+    assert places == ["1", "1", "2", "1"]
+
+
 def test_names_alone_fill_no_box(taught, monkeypatch):
     """Only so many materials wait for their first sweep; one with sweeps does not count."""
     monkeypatch.setattr(session, "MOST_NAMED", 2)

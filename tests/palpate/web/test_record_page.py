@@ -181,6 +181,22 @@ def test_start_and_stop(browser, recorded):
     assert not seen.errors
 
 
+@pytest.mark.parametrize("teaching", [False, True], ids=["record", "teach"])
+def test_without_a_material_nothing_is_started(browser: Any, tmp_path: Path, teaching: bool):
+    """The page asks for a name first, and Start can do nothing until there is one."""
+    start = "#sweep-button" if teaching else "#start"
+    with RecordedPage(tmp_path, Labels("", "1"), teaching=teaching) as one:
+        context = browser.new_context()
+        seen = BrowsedPage(context, one.page.server.address)
+        until(lambda: seen.text("#state") == "ready")
+        assert seen.page.get_attribute(start, "aria-disabled") == "true"
+        seen.page.keyboard.press("Space")
+        one.recording.commands["MATERIAL"]("wood")
+        seen.page.wait_for_selector(f"{start}:not([aria-disabled=true])")
+        assert "START" not in one.done
+        context.close()
+
+
 @pytest.mark.parametrize(
     ("width", "height", "scheme"), [(390, 844, "light"), (1024, 768, "dark"), (1400, 900, "light")]
 )

@@ -80,6 +80,7 @@ export function call(recording, nowNs) {
   const left = recording.due_ns ? Math.max(0, recording.due_ns - nowNs) / 1e9 : null;
   if (recording.sweeping) return ["Slide now", left === null ? "" : left.toFixed(1)];
   if (left !== null) return ["Next sweep in", `${Math.ceil(left)}`];
+  if (recording.commands.includes("START") && !recording.material) return ["Name a material", ""];
   return [recording.commands.includes("START") ? "Press Start, Space or the pedal" : `Waiting for ${recording.trigger}`, ""];
 }
 

@@ -25,7 +25,7 @@ function drawLabels() {
   }
   put("trigger", recording.trigger);
   byId("sweeps").hidden = !recording.commands.includes("START");
-  enable(byId("start"), live() && recording.ready);
+  enable(byId("start"), live() && recording.ready && Boolean(recording.material));
   enable(byId("stop"), live() && recording.sweeping);
 }
 

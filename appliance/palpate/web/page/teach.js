@@ -1,11 +1,11 @@
 /* The page of `palpate teach`: what to do next, the materials, what was learnt, and the bundle that is made of it. */
 
-import {byId, enable, fill, made, mark, put} from "./parts.js";
+import {ago, byId, enable, fill, made, mark, put} from "./parts.js";
 import {signal} from "./plots.js";
 import {drawHeader, lastPicture, live, ordered, run, seen, since} from "./recording.js";
 
 const STEPS = {start: "starting", features: "looking at the sweeps", heads: "learning", bundle: "checking"};
-let listed = "", ended = false;
+let listed = "", ended = false, usedMs = 0;
 
 function teach() { return seen.recording?.teach ?? null; }
 
@@ -88,9 +88,13 @@ function drawLearnt() {
   const many = Object.values(now?.materials ?? {}).filter((n) => n > 0).length;
   enable(byId("use"), live() && now && many >= now.fewest && !now.using);
   byId("using").hidden = !now?.using;
-  if (now?.using) {
-    byId("progress").value = now.using.done;
-    put("left", `${STEPS[now.using.step] ?? now.using.step}${now.using.left_s ? `, about ${Math.ceil(now.using.left_s)} s left` : ""}`);
+  if (!now?.using) usedMs = 0;
+  else {
+    if (!usedMs) usedMs = Date.now();
+    if (now.using.done > 0) byId("progress").value = now.using.done;
+    else byId("progress").removeAttribute("value"); // it moves, so that nobody takes it for dead
+    const left = now.using.left_s ? `, about ${Math.ceil(now.using.left_s)} s left` : "";
+    put("left", `${STEPS[now.using.step] ?? now.using.step}, for ${ago(Date.now() - usedMs)}${left}`);
   }
   byId("trouble").hidden = !now?.trouble;
   put("trouble", now?.trouble ?? "");
