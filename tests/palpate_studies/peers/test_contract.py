@@ -36,11 +36,15 @@ NETS = (
     *("paper-cnn", "paper-cnn-centred", "tactnet2", "recurrent", "ds-cnn", "lite"),
     "edge-spectral",
 )
-SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("st-hmp", "paper-cnn")]
+SLOW = [
+    pytest.param(name, marks=pytest.mark.slow) for name in ("st-hmp", "paper-cnn", "edge-spectral")
+]
 SLOW += [pytest.param(name, marks=COMPILED) for name in AEON[:2]]
 LONG = [pytest.param(name, marks=[*COMPILED, pytest.mark.thorough]) for name in ALONE]
-every = pytest.mark.parametrize("name", [*FEATURES, *DESKTOP, *SLOW, *LONG, *quick_first(NETS[1:])])
-with_graph = pytest.mark.parametrize("name", [*FEATURES, *SLOW, *quick_first(NETS[1:])])
+every = pytest.mark.parametrize(
+    "name", [*FEATURES, *DESKTOP, *SLOW, *LONG, *quick_first(NETS[1:-1])]
+)
+with_graph = pytest.mark.parametrize("name", [*FEATURES, *SLOW, *quick_first(NETS[1:-1])])
 
 
 @pytest.fixture(autouse=True)

@@ -228,6 +228,7 @@ def test_what_a_set_lacks_is_told_by_each_command_that_reads_it(
     assert ("ghost;" in err) == (not only)
 
 
+@pytest.mark.slow
 def test_a_material_of_one_recording_is_told_by_its_name(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):

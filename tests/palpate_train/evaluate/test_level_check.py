@@ -186,6 +186,7 @@ def test_counts_of_any_size_are_scaled():
     np.testing.assert_allclose(levels.std(axis=0), 1, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_large_sets_are_drawn_evenly():
     """About MOST_SWEEPS of many, of each material alike, and MOST_TAXELS of the taxels."""
     sweeps = leveled(True, each=200)

@@ -70,6 +70,7 @@ def test_scikit_learn_accepts_it():
     assert others <= {*UNEQUAL, "check_array_api_input"}
 
 
+@pytest.mark.slow
 def test_a_sweep_that_counts_nothing_changes_no_head(tmp_path: Path):
     """Sweeps with a wrong label and weight 0: the others are classified as without them, by a
     bundle too."""
@@ -123,6 +124,7 @@ def test_groups_are_left_out():
     assert found.tolist() == [1, 1, 1, 1]
 
 
+@pytest.mark.slow
 def test_a_bundle_answers_with_the_boxs_code(fitted: PalpateClassifier, tmp_path: Path):
     """save_bundle, library.load_bundle, predict; the card names the origin of the bundle."""
     manifest = fitted.save_bundle(tmp_path / "b", licence="CC-BY-4.0", proven=False)
@@ -218,6 +220,7 @@ def test_counts_are_the_same_however_they_are_given(fitted: PalpateClassifier, f
         assert made.samples.dtype.isnative
 
 
+@pytest.mark.slow
 def test_a_table_is_one_channel():
     """[n, time], of NumPy, pandas and polars, is [n, 1, time]."""
     x, one = SWEEPS[:, 0], small(grid=None)
@@ -310,6 +313,7 @@ def test_random_states(state: Any):
     assert seed == 3 if state == 3 else 0 <= seed < 2**31
 
 
+@pytest.mark.slow
 def test_several_groups_are_conditions():
     """As a dictionary or a table; `varies` says which of them will be new."""
     groups = {"speed": np.arange(48) % 4 * 10.0, "who": LABELS, "position": GROUPS}

@@ -18,6 +18,7 @@ from palpate_train.cli.main import main
 from palpate_train.data import sets
 from palpate_train.data.evaluation_sweeps import EvaluationSweeps
 from palpate_train.data.sets import Dataset
+from palpate_train.export import measure
 from palpate_train.metrics import bundle_score
 from palpate_train.reports import bundle_experiment, bundle_report
 from tests.factories import rendered
@@ -34,8 +35,9 @@ def sweeps() -> Dataset:
 
 @pytest.fixture(scope="module")
 def figures(sweeps: Dataset) -> dict:
-    """The figures of the packaged bundle. Two sweeps are corrupted."""
+    """The figures of the packaged bundle. Two sweeps are corrupted, and few are timed."""
     with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(measure.measure_all, "__defaults__", (2,))
         patched.setattr(EvaluationSweeps.of.__func__, "__defaults__", (2, 0))
         found = bundle_experiment.run(bundle.DEFAULT, sweeps, NOTHING)
     return found | {"command": "palpate-train report"}
