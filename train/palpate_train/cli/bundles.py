@@ -116,15 +116,17 @@ def run_score(args: argparse.Namespace) -> None:
     if args.json:
         options.writable_file(args.json, "--json", ".json")
     loaded, sweeps = bundle.load(args.bundle), options.load(args)
-    less = rules.without(loaded, args.left_out)
-    found = bundle_score.score(Classifier(loaded, SystemClock()), sweeps)
+    both = (loaded, rules.without(loaded, args.left_out)) if args.left_out else (loaded,)
+    found, *less = (bundle_score.score(Classifier(one, SystemClock()), sweeps) for one in both)
     seen = _seen(loaded.manifest, sweeps)
     if args.json:
-        put(args.json, (json.dumps(found.json() | {"trained_on": seen}, indent=1) + "\n").encode())
+        figures = found.json() | {"trained_on": seen}
+        if less:
+            figures["without"] = less[0].json() | {"rules": args.left_out}
+        put(args.json, (json.dumps(figures, indent=1) + "\n").encode())
     say(*found.text().split("\n"))
-    if args.left_out:
-        without = bundle_score.score(Classifier(less, SystemClock()), sweeps)
-        say(f"without {', '.join(args.left_out)}: {without.short()}; with: {found.short()}")
+    for one in less:
+        say(f"without {', '.join(args.left_out)}: {one.short()}; with: {found.short()}")
     if seen and seen["sweeps"]:
         say(
             f"warning: {seen['sweeps']} of {seen['of']} sweeps are the very ones that the bundle "
