@@ -25,9 +25,8 @@ LONG_S = 30.0
 
 def page_blocks(page: str, language: str) -> list[str]:
     """The code blocks in this language on a page in docs/robots."""
-    return re.findall(
-        rf"```{language}\n(.*?)```", (ROOT / "docs" / "robots" / page).read_text(), re.S
-    )
+    text = (ROOT / "docs" / "robots" / page).read_text()
+    return re.findall(rf"```{language}\n(.*?)```", text, re.S)
 
 
 def eventually(there: Callable[[], bool]) -> None:

@@ -10,11 +10,8 @@ from typing import Any
 import pytest
 
 BROWSERS = (
-    "chromium-headless-shell",
-    "chromium",
-    "chromium-browser",
-    "google-chrome",
-    "google-chrome-stable",
+    *("chromium-headless-shell", "chromium", "chromium-browser"),
+    *("google-chrome", "google-chrome-stable"),
 )
 WAIT_S = 60
 
@@ -22,16 +19,11 @@ WAIT_S = 60
 @contextmanager
 def launched() -> Iterator[Any]:
     """The system's browser, otherwise playwright's. Skips the test if there is none."""
-    api = pytest.importorskip(
-        "playwright.sync_api", reason="playwright is not installed (make test installs it)"
-    )
+    api = pytest.importorskip("playwright.sync_api", reason="make test installs playwright")
     with api.sync_playwright() as tool:
         path = next(filter(None, map(shutil.which, BROWSERS)), tool.chromium.executable_path)
         if not Path(path).exists():
-            pytest.skip(
-                "no browser: apt-get install chromium-headless-shell, "
-                "or playwright install chromium"
-            )
+            pytest.skip("no browser: apt-get install chromium-headless-shell")
         one = tool.chromium.launch(executable_path=path)
         yield one
         one.close()
@@ -88,10 +80,8 @@ class BrowsedPage:
 
     def legibility(self) -> tuple[int, list[tuple[str, float]]]:
         """The number of texts, and the texts with a contrast below 4.5 (WCAG 2.1, 1.4.3)."""
-        texts = [
-            (text, round(contrast(front, back), 2))
-            for text, front, back in self.page.evaluate(COLOURS)
-        ]
+        found = self.page.evaluate(COLOURS)
+        texts = [(text, round(contrast(front, back), 2)) for text, front, back in found]
         return len(texts), [(text, ratio) for text, ratio in texts if ratio < 4.5]
 
 

@@ -55,11 +55,8 @@ def changed(values: np.ndarray, rng: Random) -> np.ndarray:
     """The array with another number, other sizes or another type, or with an invalid label."""
     if values.dtype.kind == "U":
         text = rng.choice(("", "wood", "a,b", "x" * 25, "\0", "cork", "é", "$PPLP"))
-        return (
-            np.array(text)
-            if not values.ndim or rng.random() < 0.2
-            else np.array([text] * len(values))
-        )
+        alone = not values.ndim or rng.random() < 0.2
+        return np.array(text if alone else [text] * len(values))
     how = rng.random()
     if how < 0.5 and values.size:
         changed = values.copy()
@@ -71,10 +68,7 @@ def changed(values: np.ndarray, rng: Random) -> np.ndarray:
     if how < 0.75:
         shape = tuple(rng.choice((0, 1, n, n + 1)) for n in values.shape)
         return np.resize(values, shape) if values.size else np.zeros(shape, values.dtype)
+    kinds = "float64", "float32", "float16", "int64", "int8", "uint8", "complex64", "bool"
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the new type may not hold these numbers
-        return values.astype(
-            rng.choice(
-                ("float64", "float32", "float16", "int64", "int8", "uint8", "complex64", "bool")
-            )
-        )
+        return values.astype(rng.choice(kinds))

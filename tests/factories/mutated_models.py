@@ -5,6 +5,7 @@ readable file, which reaches the rules of the operators.
 """
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from random import Random
 from typing import Any
@@ -22,19 +23,7 @@ NUMBERS = (
     *(0, 1, -1, 2, 3, 4, 5, 7, 8, 9, 15, 16, 64, 255, 256, 1500, 10_000, 65_535, 65_536, 10**6),
     *(2**31 - 1, -(2**31), 2**31, 2**32, 2**40, 2**62, 2**63 - 1, -(2**63)),
 )
-FLOATS = (
-    0.0,
-    -0.0,
-    1.0,
-    -1.0,
-    1e-39,
-    1e-45,
-    1e38,
-    -1e38,
-    float("inf"),
-    float("-inf"),
-    float("nan"),
-)
+FLOATS = (0.0, -0.0, 1.0, -1.0, 1e-39, 1e-45, 1e38, -1e38, np.inf, -np.inf, np.nan)
 CHANGES = (1, 1, 1, 2, 3)
 """Numbers of changes; each entry is equally likely."""
 QUICK = ("L-knn", "L-svm", "st-hmp", "palpate-64")
@@ -69,10 +58,8 @@ def own_models(names: tuple[str, ...] = ()) -> list[Own]:
                 model = method.train(sweeps, given, 1).graph().SerializeToString()
             except FormatError:  # a peer that runs only in its own library
                 continue
-            manifest = Manifest(
-                name, "1", sweeps.format, method.input, sweeps.materials, Thresholds(1, 255), {}
-            )
-            found.append(Own(name, model, manifest))
+            given = (sweeps.format, method.input, sweeps.materials, Thresholds(1, 255), {})
+            found.append(Own(name, model, Manifest(name, "1", *given)))
     return found
 
 
@@ -84,14 +71,8 @@ def mutated(model: bytes, rng: Random, other: bytes) -> bytes:
         return model
     made, piece = onnx.load_from_string(model), onnx.load_from_string(other)
     for _ in range(rng.choice(CHANGES)):
-        try:
+        with suppress(ValueError, TypeError, IndexError):  # no such field, or no such number
             rng.choice(FIELDS)(made.graph, rng, piece.graph)
-        except (
-            ValueError,
-            TypeError,
-            IndexError,
-        ):  # the field is missing there, or refuses the number
-            continue
     if rng.random() < 0.05:
         made.opset_import[0].version = rng.choice((1, 7, 12, 13, 16, 18, 19, 21, 99))
     return bytes(made.SerializeToString())
@@ -128,14 +109,8 @@ def short(data: bytes, rng: Random, other: bytes) -> bytes:
 
 
 Graph = onnx.GraphProto
-BYTES: tuple[Callable[[bytes, Random, bytes], bytes], ...] = (
-    flip,
-    flip,
-    flip,
-    splice,
-    numbered,
-    short,
-)
+BYTES: tuple[Callable[[bytes, Random, bytes], bytes], ...]
+BYTES = (flip, flip, flip, splice, numbered, short)
 
 
 def setting(graph: Graph, rng: Random, other: Graph) -> None:
@@ -146,9 +121,8 @@ def setting(graph: Graph, rng: Random, other: Graph) -> None:
     elif attribute.type == onnx.AttributeProto.FLOAT:
         attribute.f = rng.choice(FLOATS)
     elif attribute.type == onnx.AttributeProto.STRING:
-        attribute.s = rng.choice(
-            (b"", b"NONE", b"SOFTMAX", b"mul", b"POLY", b"RBF", b"sqeuclidean")
-        )
+        words = b"", b"NONE", b"SOFTMAX", b"mul", b"POLY", b"RBF", b"sqeuclidean"
+        attribute.s = rng.choice(words)
     else:
         values = attribute.ints if attribute.type == onnx.AttributeProto.INTS else attribute.floats
         number = rng.choice(NUMBERS) if values is attribute.ints else rng.choice(FLOATS)
@@ -243,11 +217,8 @@ def form(graph: Graph, rng: Random, other: Graph) -> None:
     values, name = numpy_helper.to_array(held), held.name
     shape, kind = list(values.shape), values.dtype
     if rng.random() < 0.6:
-        _listed(
-            shape,
-            rng.choice([n for n in NUMBERS if n >= 0] if rng.random() < 0.5 else (1, 2, 3, 4, 6)),
-            rng,
-        )
+        sizes = [n for n in NUMBERS if n >= 0] if rng.random() < 0.5 else (1, 2, 3, 4, 6)
+        _listed(shape, rng.choice(sizes), rng)
     else:
         kind = np.dtype(rng.choice(("f4", "i1", "u1", "i2", "i4", "i8", "f8", "?")))
     if rng.random() < 0.7 and np.prod(shape, dtype=object) < 10**6:

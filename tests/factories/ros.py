@@ -23,29 +23,20 @@ def required() -> None:
     """Skip the test without ROS 2, or fail if PALPATE_ROS is set."""
     if not PYTHON.exists():
         if "PALPATE_ROS" in os.environ:
-            pytest.fail(
-                f"{PYTHON} is not there; python -m tests.campaigns ros installs it in build/ros"
-            )
+            pytest.fail(f"{PYTHON} is not there; python -m tests.campaigns ros installs it")
         pytest.skip("no ROS 2 here; python -m tests.campaigns ros installs it (255 MB)")
 
 
 def messages_required() -> None:
     """Fail if ROS 2 is installed without palpate_msgs."""
     package = PYTHON.parent.parent / "share" / "palpate_msgs" / "package.xml"
-    assert package.exists(), (
-        f"{package} is not there; python -m tests.campaigns ros builds palpate_msgs"
-    )
+    assert package.exists(), f"{package} is not there; python -m tests.campaigns ros builds it"
 
 
 def environment() -> dict[str, str]:
     """Variables for loopback only and a ROS domain of this process."""
-    domain = str(1 + os.getpid() % 100)
-    return {
-        **os.environ,
-        "PYTHONPATH": SOURCES,
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-        "ROS_DOMAIN_ID": domain,
-    }
+    here = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "PYTHONPATH": SOURCES}
+    return os.environ | here | {"ROS_DOMAIN_ID": str(1 + os.getpid() % 100)}
 
 
 class RosPeer:
@@ -98,11 +89,8 @@ def peer() -> Iterator[RosPeer]:
     """Run the second node."""
     script = ROOT / "tests" / "factories" / "ros_peer.py"
     command = [PYTHON, str(script)]
-    pipes: dict[str, Any] = {
-        "stdin": subprocess.PIPE,
-        "stdout": subprocess.PIPE,
-        "stderr": subprocess.DEVNULL,
-    }
+    pipes: dict[str, Any] = dict.fromkeys(("stdin", "stdout"), subprocess.PIPE)
+    pipes["stderr"] = subprocess.DEVNULL
     with subprocess.Popen(command, env=environment(), text=True, **pipes) as process:
         try:
             yield RosPeer(process)

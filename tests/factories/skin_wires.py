@@ -86,9 +86,8 @@ def papillarray(
     body = struct.pack("<H", sensors) + bytes(sensors)
     for k in range(sensors):
         body += struct.pack("<H", each) + bytes(each)
-        body += b"".join(
-            struct.pack("<H6f", 2, *row) for row in pillars[k * each : (k + 1) * each].tolist()
-        )
+        rows = pillars[k * each : (k + 1) * each].tolist()
+        body += b"".join(struct.pack("<H6f", 2, *row) for row in rows)
     table = 1 + 2 * 3
     content = bytes([1]) + struct.pack("<HBHB", 1, table, 3, table + len(clock)) + clock + body
     check = struct.pack("<H", sum(content) & 0xFFFF)

@@ -47,11 +47,8 @@ def window(z1: float, z2: float, format: SweepFormat = FORMAT) -> np.ndarray:
     ripple = np.where(np.arange(format.window) % 2, 1, -1)[:, None, None]
     normal = level + ripple
     shear = [0.1 * level + 2 * ripple] * (format.axes - 1)
-    return (
-        np.rint(np.stack([*shear, normal], axis=-1))
-        .reshape(-1, *format.shape)
-        .astype(format.numpy_type)
-    )
+    counts = np.rint(np.stack([*shear, normal], axis=-1)).reshape(-1, *format.shape)
+    return counts.astype(format.numpy_type)
 
 
 def sweep(
@@ -110,16 +107,12 @@ def model(
         nodes.append(node("Identity", ["logits"], [name]))
     value = onnx.helper.make_tensor_value_info
     kind = onnx.helper.np_dtype_to_tensor_dtype(format.numpy_type)
-    graph = onnx.helper.make_graph(
-        nodes,
-        "toy",
-        [value("sweep", kind, [1, format.window, *format.shape])],
-        [value(name, 1, shapes.get(name, [1, labels])) for name in outputs],
-        [array(values, name) for name, values in constants.items()],
-    )
-    made = onnx.helper.make_model(
-        graph, opset_imports=[onnx.helper.make_opsetid("", 18)], ir_version=9
-    )
+    given = value("sweep", kind, [1, format.window, *format.shape])
+    made = [value(name, 1, shapes.get(name, [1, labels])) for name in outputs]
+    held = [array(values, name) for name, values in constants.items()]
+    graph = onnx.helper.make_graph(nodes, "toy", [given], made, held)
+    opsets = [onnx.helper.make_opsetid("", 18)]
+    made = onnx.helper.make_model(graph, opset_imports=opsets, ir_version=9)
     return bytes(made.SerializeToString())
 
 
@@ -139,14 +132,9 @@ def npy(array: np.ndarray) -> bytes:
 
 def means(**changes: np.ndarray) -> dict[str, np.ndarray]:
     """The arrays of means.npz."""
-    bias = -(MEANS**2).sum(1) / 2
-    return {
-        "means": MEANS,
-        "bias": bias,
-        "sweeps": np.zeros(3, np.int64),
-        "spread": np.ones(3, np.float32),
-        "shapes": np.zeros((3, 0, 0), np.float16),
-    } | changes
+    made = {"means": MEANS, "bias": -(MEANS**2).sum(1) / 2, "sweeps": np.zeros(3, np.int64)}
+    made |= {"spread": np.ones(3, np.float32), "shapes": np.zeros((3, 0, 0), np.float16)}
+    return made | changes
 
 
 def early_arrays(steps: int = 3) -> dict[str, np.ndarray]:
