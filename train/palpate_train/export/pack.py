@@ -77,7 +77,7 @@ def pack(
         held_out, protocol = content.held_out, f"held-out {content.held_out_by}"
         figures = judge(packed, held_out, logits, protocol)
         chosen = fit_rules.from_answers(content, packed, proven, asked)
-        if present(chosen) != present(packed):
+        if set(present(packed)) - set(present(chosen)):
             figures = judge(chosen, held_out, logits, protocol)
         files |= {bundle.MEANS: means_file(chosen.classes)} if chosen.classes else {}
         if any(refused := Classifier(chosen, SystemClock()).refusals()):
