@@ -82,6 +82,13 @@ def test_a_rule_is_dropped_kept_or_forced(
     assert said.count("not needed") == len(out - set(asked.left_out))
 
 
+def test_a_rule_that_cannot_be_fitted_is_not_kept():
+    """The card does not claim it, although it was asked for."""
+    figures = {"hum": {"kept": False, "because": "absent"}}
+    made = packaged().manifest
+    assert "kept" not in rules.text(replace(made, figures={rules.FIGURES: figures}))
+
+
 def test_of_two_rules_that_do_the_same_one_stays(monkeypatch: pytest.MonkeyPatch):
     """Two rules refuse a rest; the trial keeps the second."""
 

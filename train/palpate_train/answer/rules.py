@@ -98,6 +98,8 @@ def text(manifest: Manifest) -> str:
 
 
 def _why(of: Mapping[str, Any]) -> str:
+    if of["because"] == "absent":
+        return "your recordings do not give one"
     if of["because"] == "asked":
         return "kept, as you asked" if of["kept"] else "left out, as you asked"
     if not of["kept"]:

@@ -160,6 +160,8 @@ def from_answers(content: Content, packed: Bundle, proven: bool, asked: Asked) -
             replace(of, manifest=found.written(of.manifest)) for of in (packed, judging)
         )
         left_out, figures = trial.decided(judging, content.held_out, seed, asked)
+        for name in set(asked.kept) - set(rules.present(packed)):
+            figures[name] = {"kept": False, "because": "absent"}
     for name in left_out:
         packed = RULES[name].without(packed)
     figures = {rules.FIGURES: figures} if figures else {}
