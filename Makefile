@@ -61,7 +61,7 @@ bundle: $(DESKTOP) ## train, quantize and pack the default bundle again
 	$(BIN)/palpate-train fit --set sim:T-REAL/level-blind:1-6 --seed 1 --reattached --steps 1200 \
 	  --out build/default.npz
 	$(BIN)/palpate-train export build/default.npz --out appliance/palpate/default_bundle --name default \
-	  --version 3
+	  --version 3 --with displacement
 
 bench: $(DESKTOP) ## measure this machine: docs/data/bench.json, and the tables of README and manual
 	$(BIN)/palpate check --bench --json docs/data/bench.json

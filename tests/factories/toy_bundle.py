@@ -26,7 +26,7 @@ from palpate.inference.classifier import Classifier
 FORMAT = SweepFormat(2, 2, 100.0, 20, "int16")
 THREE_AXES = replace(FORMAT, axes=3)
 MEANS = np.array([[0, 0], [6, 0], [0, 6]], np.float32)
-KNOWN = Known(limit=9.0, temperature=2.0)
+KNOWN = Known(strict=9.0, balanced=9.0, loose=9.0, temperature=2.0)
 DISPLACEMENT = DisplacementRule(limit=4.0, temperature=3.0, unsure=0.75)
 """Rule for displaced sweeps, with the arrays of `displaced_arrays`."""
 IN_PLACE = ContactPositions(1.0, (0.5,), (0.5,), 0.25)

@@ -28,7 +28,8 @@ UNDISTURBED: Mapping[str, float] = MappingProxyType({})
 KEPT = 16
 """Number of unknown sweeps that are remembered."""
 ALIKE = 0.5
-"""Largest distance of two sweeps of one unknown material, as a share of the limit of known ones. Of
+"""Largest distance of two sweeps of one unknown material, as a share of the loose limit of known
+ones. Of
 pairs of sweeps of one material 13 to 69 % are within it, of two materials at most 2 % (simulated
 skin, four pairs of materials left out). Two cottons of FabricSlide are not told apart."""
 
@@ -41,23 +42,36 @@ UNSURE = 0.5
 class Known:
     """Rule for unknown materials. Raises BundleError for a number out of range.
 
-    limit: largest squared distance from a sweep's embedding to the nearest class mean; beyond it
-    the material is unknown. temperature: divisor of the logits from class means. enrolled: least
-    probability of all enrolled labels together at which a sweep gets one of them; None without
-    enrolled labels.
+    strict, balanced, loose: largest squared distance from a sweep's embedding to the nearest class
+    mean, in rising order; beyond it the material is unknown. The box chooses one of them: a lower
+    limit gives fewer unknown materials a label, and fewer known ones theirs. temperature: divisor
+    of the logits from class means. enrolled: least probability of all enrolled labels together at
+    which a sweep gets one of them; None without enrolled labels.
     """
 
-    limit: float
+    strict: float
+    balanced: float
+    loose: float
     temperature: float
     enrolled: float | None = None
 
     def __post_init__(self) -> None:
         _checkpositive(self, "known")
+        if not self.strict <= self.balanced <= self.loose:
+            raise BundleError(
+                f"known has the limits {self.strict:.4g}, {self.balanced:.4g}, {self.loose:.4g}, "
+                "which must not fall; export the bundle again"
+            )
         if self.enrolled is not None and not UNSURE <= self.enrolled < 1:
             raise BundleError(
                 f"known.enrolled {self.enrolled!r} must be at least {UNSURE} and below 1; "
                 "export the bundle again"
             )
+
+    def growth(self, strangers: str) -> float:
+        """The limit of this name as a multiple of the balanced one. Limits of displaced and of
+        unfinished sweeps are balanced, and multiplied by it."""
+        return float(getattr(self, strangers)) / self.balanced
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,10 +79,10 @@ class DisplacementRule:
     """Rule for sweeps whose contact is displaced from `Manifest.contact`. Raises BundleError for a
     number out of range.
 
-    limit: as in Known, for the distances of displaced sweeps. temperature: divisor of logits that
-    are calibrated for sweeps without displacement. unsure: least probability for status ok; above 1
-    a single displaced sweep is never ok. farthest_mm: displacement from which on a sweep gets
-    no label, because no training copy is displaced as far; None if unknown.
+    limit: as Known.balanced, for the distances of displaced sweeps. temperature: divisor of logits
+    that are calibrated for sweeps without displacement. unsure: least probability for status ok;
+    above 1 a single displaced sweep is never ok. farthest_mm: displacement from which on a sweep
+    gets no label, because no training copy is displaced as far; None if unknown.
     """
 
     limit: float
@@ -225,7 +239,7 @@ class UnknownSweeps:
             numbers, others = zip(*self._sweeps, strict=True)
             apart = self._distances.apart(embedding, np.stack(others))
             nearest = int(apart.argmin())
-            if apart[nearest] <= ALIKE * self._distances.limit:
+            if apart[nearest] <= ALIKE * self._distances.loose:
                 alike = numbers[nearest]
         self._sweeps.append((sweep, embedding))
         return alike
@@ -233,6 +247,7 @@ class UnknownSweeps:
 
 class ClassDistances:
     """Computes distances and logits from a bundle's class means. labels: of the means, [K].
+    strangers: the limit of `known` that applies. loose: the loose one, for the same embedding.
 
     displacement: rule for sweeps whose contact is displaced. The distances are then computed in
     `classes.displaced`, where directions that a displacement changes have little weight, and all
@@ -246,9 +261,10 @@ class ClassDistances:
         labels: Sequence[str],
         displacement: DisplacementRule | None = None,
         disturbances: Disturbances | None = None,
+        strangers: str = "balanced",
     ) -> None:
         self._disturbances = disturbances or Disturbances()
-        self.labels, self.limit, self._temperature = labels, known.limit, known.temperature
+        self.labels, self.limit, self._temperature = labels, known.balanced, known.temperature
         self._means, self._turn = classes.means.astype(np.float64), np.eye(classes.means.shape[1])
         # the rest of the bias, since the squared distance already contains -|m|^2 / 2; logits that
         # are computed from distances do not suffer from the cancellation of large products
@@ -262,6 +278,8 @@ class ClassDistances:
                 classes.displaced.means.astype(np.float64),
                 classes.displaced.turn.astype(np.float64),
             )
+        self.loose = self.limit * known.growth("loose")
+        self.limit *= known.growth(strangers)
         self._shapes = shapes.astype(np.float64)
         n = classes.sweeps
         # a mean of n sweeps has variance 1 / n in every direction: another sweep has variance 1 + 1

@@ -154,7 +154,9 @@ class ClassifierConfig:
     object; 0 means no limit. conflict: consequence of a sweep that contradicts the sweeps fused
     before it: "new" begins another object, "refuse" answers `conflict`, "fuse" fuses all sweeps
     until NEW OBJECT, also after `max_sweeps`. object_s: longest pause between two sweeps of one
-    object, in seconds; 0 means no limit.
+    object, in seconds; 0 means no limit. strangers: the limit beyond which a material is `unknown`;
+    a strict one gives fewer untaught materials a label, and fewer taught ones theirs. The card of a
+    bundle has both shares for each.
     """
 
     bundle: str = ""
@@ -165,6 +167,7 @@ class ClassifierConfig:
     max_sweeps: int = number(5, 0, 1000)
     conflict: Literal["new", "refuse", "fuse"] = "new"
     object_s: float = number(60.0, 0.0, 86_400.0)
+    strangers: Literal["strict", "balanced", "loose"] = "balanced"
 
 
 @dataclass(frozen=True, slots=True)

@@ -52,14 +52,16 @@ def enrolled_labels(bundle: Bundle) -> EnrolledLabels:
     return EnrolledLabels(which, (known and known.enrolled) or 0.0)
 
 
-def class_distances(bundle: Bundle, *, displaced: bool = False) -> ClassDistances | None:
+def class_distances(
+    bundle: Bundle, strangers: str, *, displaced: bool = False
+) -> ClassDistances | None:
     """The distances of a bundle, None without class means; those for displaced contacts likewise
-    None without a rule for them."""
+    None without a rule for them. strangers: see ClassDistances."""
     m, classes = bundle.manifest, bundle.classes
     if not (m.known and classes) or (displaced and not m.displacement):
         return None
     rule = m.displacement if displaced else None
-    return ClassDistances(classes, m.known, m.labels, rule, m.disturbances)
+    return ClassDistances(classes, m.known, m.labels, rule, m.disturbances, strangers)
 
 
 class Classifier(Observer):
@@ -76,9 +78,10 @@ class Classifier(Observer):
 
     fusion: "product", "vote" (see `fuse`) or "none". min_probability: 0 means the bundle's
     thresholds.unsure. max_sweeps, conflict, object_s: as in ObjectRule; by default only NEW OBJECT
-    ends an object. slides: whether answers have the speed of the slide; without it they take less
-    time. Raises BundleError if onnxruntime refuses the model. `bundle.load` has compared its inputs
-    and outputs with the manifest.
+    ends an object. strangers: the limit of known materials, "strict", "balanced" or "loose".
+    slides: whether answers have the speed of the slide; without it they take less time. Raises
+    BundleError if onnxruntime refuses the model. `bundle.load` has compared its inputs and outputs
+    with the manifest.
 
     taxels: the broken taxels. As an observer of the loop it searches the stream for them; without a
     stream they are found in each window alone.
@@ -93,11 +96,12 @@ class Classifier(Observer):
         max_sweeps: int = 0,
         conflict: str = "fuse",
         object_s: float = 0.0,
+        strangers: str = "balanced",
         slides: bool = True,
     ) -> None:
         self.bundle = bundle
         self.min_probability = min_probability or bundle.manifest.thresholds.unsure
-        self._clock = clock
+        self.strangers, self._clock = strangers, clock
         self._objects = ObjectSweeps(
             bundle.manifest.labels,
             fusion,
@@ -107,7 +111,7 @@ class Classifier(Observer):
         m = bundle.manifest
         self.tare = m.tare
         self.taxels = TaxelWatch(m.format, m.thresholds, m.bridging, m.tare)
-        self._means = class_distances(bundle)
+        self._means = class_distances(bundle, strangers)
         self._outputs = ("logits", *("embedding",) * (self._means is not None))
         # early heads get a session of their own
         self._model = ModelRunner(bundle.model, *self._outputs)
@@ -117,7 +121,7 @@ class Classifier(Observer):
         self._measuring, self._judging = self._measures(slides), self._judges()
         network: list[Stage] = [NetworkStage(self, *self._outputs)]
         if self._means:
-            displaced = class_distances(bundle, displaced=True)
+            displaced = class_distances(bundle, strangers, displaced=True)
             network.append(KnownMaterial(self._means, displaced))
         self._stages = self.stages(*network)
 
@@ -163,6 +167,7 @@ class Classifier(Observer):
             "fuse": self._objects.fusion,
             "min_probability": self.min_probability,
             **entries(self._objects.rule),
+            "strangers": self.strangers,
         }
 
     @property

@@ -190,9 +190,9 @@ def _disagreement(means: ClassDistances, label: str, z: NDArray[np.float64]) -> 
     n, r = z.shape
     away = ((z - z.mean(axis=0)) ** 2).sum(axis=1)
     spread = away.sum() / max(1, n - 1)
-    if spread <= means.limit:
+    if spread <= means.loose:
         return ""
-    usual = f"those of a trained material {r}, limit {means.limit:.1f}"
+    usual = f"those of a trained material {r}, limit {means.loose:.1f}"
     return (
         f"the sweeps of {label!r} disagree: they lie {spread:.1f} from their mean (squared; {usual}"
         f"), number {away.argmax() + 1} most of all; take others"
@@ -205,7 +205,7 @@ def _closeness(means: ClassDistances, label: str, z: NDArray[np.float64]) -> str
     # minus the expected squared error of a mean of n sweeps
     to_old = means.distances(z.mean(axis=0)) - r / n
     k = int(to_old.argmin())
-    if to_old[k] >= min(means.limit, means.closest_pair()):
+    if to_old[k] >= min(means.loose, means.closest_pair()):
         return ""
-    close = f"squared distance {max(to_old[k], 0):.1f}, limit {means.limit:.1f}"
+    close = f"squared distance {max(to_old[k], 0):.1f}, limit {means.loose:.1f}"
     return f"{label!r} lies close to {means.labels[k]!r} ({close}) and will often be called that"

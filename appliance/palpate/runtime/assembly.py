@@ -244,7 +244,7 @@ def classifier(settings: Config, bundle: Bundle, clock: Clock) -> Classifier:
     chosen = settings.classifier
     return Classifier(
         *(bundle, clock, chosen.fuse, chosen.min_probability, chosen.max_sweeps),
-        *(chosen.conflict, chosen.object_s),
+        *(chosen.conflict, chosen.object_s, chosen.strangers),
     )
 
 

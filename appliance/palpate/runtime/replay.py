@@ -35,7 +35,10 @@ SAME, ALONE, DIFFERENT = "the same", "the same by itself", "DIFFERENT"
 """Outcomes of a comparison. SAME: the verdict is the same, bit for bit. ALONE: the scores of this
 sweep are the same, but earlier sweeps of its object are missing."""
 SILENT, OTHER, BROKEN = "no verdict to compare with", "of another bundle", "not readable"
-CHOICES = {name: get_args(get_type_hints(ClassifierConfig)[name]) for name in ("fuse", "conflict")}
+CHOICES = {
+    name: get_args(get_type_hints(ClassifierConfig)[name])
+    for name in ("fuse", "conflict", "strangers")
+}
 
 
 class OtherBundle(FormatError):
@@ -59,13 +62,14 @@ def replay(path: Path, settings: Config, bundle: Bundle, out: Callable[[str], ob
 @dataclass(frozen=True, slots=True)
 class ReplayRule:
     """The classifier's settings at the time of the sweep. The fields are the sidecar's keys. Raises
-    TypeError for an unknown fusion or conflict."""
+    TypeError for an unknown choice."""
 
     fuse: str
     min_probability: float
     max_sweeps: int
     conflict: str
     object_s: float
+    strangers: str
 
     def __post_init__(self) -> None:
         for name, known in CHOICES.items():

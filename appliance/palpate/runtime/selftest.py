@@ -22,7 +22,7 @@ from palpate.io.trigger import GpioTrigger
 from palpate.io.usb_sensor import fits
 from palpate.runtime.assembly import UNSIGNED, gpio
 
-UNPROVEN = "broken taxels are refused"
+UNPROVEN = "broken taxels are refused: export it again to measure how many can be bridged"
 """Text of a bundle without `bridging`."""
 UNCHECKED = "early answers do not detect unknown materials: export it again"
 """Text of a bundle with early answers, but without limits for them."""

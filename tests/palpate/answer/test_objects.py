@@ -269,7 +269,7 @@ def test_the_settings_reach_the_classifier(toy):
     assert (rule["conflict"], rule["object_s"], rule["max_sweeps"]) == ("refuse", 7.5, 3)
 
 
-@pytest.mark.parametrize("fusion", ["product", pytest.param("vote", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("fusion", ["product", "vote"])
 def test_an_object_without_end_takes_no_more_memory_or_time(toy, fusion):
     """After 2,000 sweeps of one object the fused sweeps are as small as after two, and the fused
     probabilities are those of all sweeps."""

@@ -327,10 +327,13 @@ def test_a_candidate_that_cannot_be_one_is_named(side, tmp_path, default_bundle)
         side()
 
 
-def test_a_broken_agreement_begins_anew(side, tmp_path, logged):
+@pytest.mark.parametrize(
+    "text", ["", "[]", '{"candidate": "x"}', '{"candidate": "x", "current": "y", "schema": 2}']
+)
+def test_a_broken_agreement_begins_anew(side, tmp_path, text, logged):
     """The log names the file, and the counts begin with this start."""
     (tmp_path / "shadow").mkdir()
-    (tmp_path / "shadow" / shadow.FILE).write_text("[]")
+    (tmp_path / "shadow" / shadow.FILE).write_text(text)
     pair = side()
     assert "cannot" in logged[0]
     assert pair.written().starts == 1

@@ -380,6 +380,25 @@ def test_a_disk_that_takes_no_note_runs_what_was_committed(box, monkeypatch, log
         box.store.rollback()
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{",
+        "[]",
+        '{"floor": 1}',
+        '{"standings": []}',
+        '{"standings": {"": []}}',
+        '{"standings": {"": {"starts": "many"}}}',
+    ],
+)
+def test_a_state_that_cannot_be_read_is_named(box, text):
+    """Its content is not guessed."""
+    box.installed(1)
+    Path(box.how.folder, "bundles.json").write_text(text)
+    with pytest.raises(BundleError, match=r"bundles\.json"):
+        box.start()
+
+
 @pytest.mark.slow
 @pytest.mark.thorough  # hundreds of altered bundles
 def test_no_altered_bundle_is_accepted(tmp_path):

@@ -314,7 +314,7 @@ def test_a_bundle_that_is_written_is_read_unchanged(tmp_path):
 
 EARLY = {"least": [0.9, 0.8, 2.0], "agree": 2}
 LIMITS = asdict(toy_bundle.LIMITS)
-KNOWN = {"limit": 9.0, "temperature": 2.0}
+KNOWN = {"strict": 4.0, "balanced": 9.0, "loose": 16.0, "temperature": 2.0}
 DISPLACEMENT = {"limit": 4.0, "temperature": 3.0, "unsure": 0.75}
 
 
@@ -345,11 +345,12 @@ def displaced(**changes: Any) -> dict[str, Any]:
         ({"early": [0.9]}, UNREAD),
         ({"early": EARLY | {"extra": 1}}, "extra"),
         ({"early": EARLY, "input": "L"}, "needs the whole window"),
-        ({"known": KNOWN | {"limit": 0}}, "known.limit 0 "),
-        ({"known": KNOWN | {"limit": float("inf")}}, "known.limit inf "),
+        ({"known": KNOWN | {"strict": 0}}, "known.strict 0 "),
+        ({"known": KNOWN | {"loose": float("inf")}}, "known.loose inf "),
+        ({"known": KNOWN | {"strict": 9.5}}, "must not fall"),
         ({"known": KNOWN | {"temperature": -1.0}}, "known.temperature -1.0 "),
         ({"known": KNOWN | {"temperature": None}}, "known.temperature None "),
-        ({"known": {"limit": 9.0}}, "temperature"),
+        ({"known": {"balanced": 9.0}}, "temperature"),
         ({"known": None}, "both `known` and"),
         *(({"schema": n}, f"schema {n} ") for n in (0, 2, 1.0, True)),
         ({"displacement": DISPLACEMENT}, "`displacement` without"),
@@ -456,6 +457,20 @@ def test_a_far_sweep_is_unknown(toy):
         assert (v.fused, len(v.scores)) == (0, 0)
     assert v.detail == "squared distance 9.25 from a, limit 9"
     assert it(sweep_of(np.zeros((20, 2, 2), np.int16))).status is Status.NO_CONTACT
+
+
+@pytest.mark.parametrize(
+    ("strangers", "known"), [("strict", 1), ("balanced", 2), ("loose", 3), (None, 2)]
+)
+def test_the_box_chooses_a_limit(toy: Bundle, strangers: str | None, known: int):
+    """Of sweeps ever farther from a mean a looser limit knows more. Without a choice the limit is
+    balanced."""
+    three = replace(toy_bundle.KNOWN, strict=4.0, loose=16.0)
+    made = replace(toy, manifest=replace(toy.manifest, known=three))
+    it = box(made, **{"strangers": strangers} if strangers else {})
+    far = [toy_bundle.sweep(x, 0) for x in (-1.5, -2.9, -3.9, -4.1)]
+    assert sum(it(sweep).status is not Status.UNKNOWN for sweep in far) == known
+    assert it.rule["strangers"] == (strangers or "balanced")
 
 
 def test_an_unknown_sweep_does_not_count_for_its_object(toy):

@@ -130,7 +130,7 @@ def any_material(made: Bundle, pattern: float | None) -> Classifier:
     m = made.manifest
     assert m.known
     assert m.sliding
-    known, sliding = replace(m.known, limit=1e9), replace(m.sliding, pattern=pattern)
+    known, sliding = replace(m.known, balanced=1e9, loose=1e9), replace(m.sliding, pattern=pattern)
     manifest = replace(m, known=known, sliding=sliding)
     return Classifier(replace(made, manifest=manifest), VirtualClock(), slides=False)
 

@@ -65,7 +65,6 @@ def test_materials_beyond_the_class_bits_are_refused_before_a_sweep(options, tmp
     assert not list((tmp_path / "store" / "sweeps").glob("*.npy"))
 
 
-@pytest.mark.slow
 def test_nothing_recorded_yet(options, capsys):
     """The reason, and no bundle."""
     code, text = said(options, capsys)

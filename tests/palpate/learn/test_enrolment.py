@@ -142,7 +142,7 @@ def test_one_sweep_is_enough_and_labels_add_up(old):
 def test_the_limit_keeps_as_many_sweeps_of_an_enrolled_label_as_of_a_trained_one(n):
     """In two dimensions a share 1 - exp(-limit / 2) is within the limit, around a known mean or the
     mean of n sweeps."""
-    rng, known = np.random.default_rng(1), replace(toy_bundle.KNOWN, limit=4.0)
+    rng, known = np.random.default_rng(1), replace(toy_bundle.KNOWN, strict=4.0, balanced=4.0)
     kept = []
     for _ in range(100):
         mean = rng.normal(size=(n, 2)).mean(axis=0)

@@ -59,9 +59,11 @@ def test_the_pause_grows_and_begins_anew(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_damaged_note_is_written_anew(tmp_path):
-    """The count of failures begins with the next."""
-    (tmp_path / last_failure.FILE).write_bytes(b"[]")
+@pytest.mark.parametrize("content", [b"", b"{", b"[]", b'{"why": 3}', b"\xff" * 99])
+def test_a_damaged_note_is_none(tmp_path, content):
+    """Whatever is in the file, it is ignored and written anew."""
+    (tmp_path / last_failure.FILE).write_bytes(content)
+    assert last_failure.read(tmp_path) is None
     assert failed(tmp_path, VirtualClock(), LineError("no chip")).failures == 1
 
 

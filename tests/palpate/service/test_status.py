@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from palpate import __version__
+from palpate.core.errors import ApplianceError, FormatError
 from palpate.core.health import Health
 from palpate.core.status import REASONS
 from palpate.core.types import Status
@@ -163,6 +164,20 @@ def test_a_program_that_has_ended_is_not_running(status_file):
         assert status.exit_code(status_file.read()) == 1
     status_file.file.stopping()
     assert not status_file.path.exists()
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", "{}", '{"schema": 2}', "[" * 100_000, '{"schema": 1, "pid": "x"}']
+)
+def test_a_file_of_another_form_is_named(status_file, text):
+    """A status of another version is an error, not a guess, and so is a folder at its path."""
+    status_file.path.write_text(text)
+    with pytest.raises(FormatError):
+        status_file.read()
+    status_file.path.unlink()
+    status_file.path.mkdir()
+    with pytest.raises(ApplianceError, match="cannot"):
+        status_file.read()
 
 
 def test_trouble_with_the_file_is_logged_once(tmp_path, logged):

@@ -13,7 +13,7 @@ import pytest
 from palpate.bundle.bundle import Bundle
 from palpate.core.config import SweepConfig
 from palpate.core.errors import ConfigError, FormatError
-from palpate.core.sweep_file import save
+from palpate.core.sweep_file import load, save
 from palpate.core.types import EPOCH_BITS, Edge, EdgeKind, Frames, Status, Sweep, Verdict
 from palpate.io import packets
 from palpate.io.robot_link import StdoutPort
@@ -22,6 +22,7 @@ from palpate.runtime.loop import Box, Pipeline
 from palpate.sim import devices, rig, script, skin
 from palpate.sweeps.capture import MOST_KEPT, CaptureWriter, Playback, RecordKind
 from palpate.sweeps.sweep_window import SweepCutter
+from tests.factories import toy_bundle
 from tests.factories.settings import load as load_settings
 from tests.factories.simulated_box import SECOND, OnSweep
 from tests.factories.skin_wires import WiredSkin, profile
@@ -171,6 +172,23 @@ def test_a_restart_keeps_the_capture_before(tmp_path, path, logged):
     assert path.stat().st_size == sizes[-1]
 
 
+@pytest.mark.parametrize(
+    ("content", "hint"),
+    [
+        (b"GIF89a", "not a capture"),
+        (b"PPLPCAP1\x02\x00\x00\x00{}", "head cannot be read"),
+        (b"PPLPCAP1\x05\x00\x00\x00{nope", "head cannot be read"),
+        (None, "cannot be read"),
+    ],
+)
+def test_other_files_are_named(path, content, hint):
+    """The error says that the file is not a capture, or is not there."""
+    if content:
+        path.write_bytes(content)
+    with pytest.raises(FormatError, match=hint):
+        Playback(path)
+
+
 def test_speed_and_force_are_part_of_a_capture(path):
     """Edges come back with them, and edges without them are written shorter."""
     plain, with_speed = Edge(EdgeKind.STOP, 5), Edge(EdgeKind.START, 6, 30.0)
@@ -210,6 +228,31 @@ def kept(n: int) -> Sweep:
     """Sweep number `n` of 40 frames."""
     frames = Frames(np.arange(40) + 5, np.arange(40), np.full((40, 4, 4), n, np.uint8))
     return Sweep(n, 7, 40, Status.OK, frames)
+
+
+@pytest.mark.parametrize(
+    ("name", "spoil"),
+    [
+        ("json", lambda text: None),
+        ("json", lambda text: b"{}"),
+        ("json", lambda text: b"3"),
+        ("json", lambda text: text.replace(b'"schema": 1', b'"schema": 7')),
+        ("json", lambda text: text.replace(b'"rows": 4', b'"rows": 3')),
+        ("npy", lambda data: b"nonsense"),
+        ("npy", lambda data: b""),
+        ("npy", lambda data: toy_bundle.npy(np.array([{}]))),
+    ],
+)
+def test_broken_recordings_are_named(tmp_path, name, spoil):
+    """A missing or broken sidecar, an unknown schema, another grid, a broken array, a pickle."""
+    save(tmp_path / "s.npy", kept(1), skin.FORMAT)
+    path = tmp_path / f"s.{name}"
+    if (spoiled := spoil(path.read_bytes())) is None:
+        path.unlink()
+    else:
+        path.write_bytes(spoiled)
+    with pytest.raises(FormatError, match=r"s\.(npy|json)"):
+        load(tmp_path / "s.npy")
 
 
 def test_a_name_that_cannot_be_taken_leaves_nothing(tmp_path):

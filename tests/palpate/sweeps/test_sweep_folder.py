@@ -21,7 +21,7 @@ from palpate.core.sweep_file import load, save
 from palpate.core.types import Status
 from palpate.sweeps import sweep_folder
 from palpate.sweeps.recording import Labels, RecordingSession
-from palpate.sweeps.sweep_folder import RecordedSweep, SweepFolder
+from palpate.sweeps.sweep_folder import FORGOTTEN, RecordedSweep, SweepFolder
 from tests.cuts.recording import SHORT, taken
 
 
@@ -147,6 +147,15 @@ def test_forget_and_discard_do_not_wait_for_the_card(
     assert any("No space left" in line and "'cork'" in line for line in logged)
     assert one.materials() == {}
     one.close()
+
+
+@pytest.mark.parametrize("content", ["", "[]", '{"cork": 3}', '{"cork": ["x"]}', "[" * 9999])
+def test_a_damaged_list_of_forgotten_sweeps_is_named(tmp_path, content):
+    """Nothing is taught by mistake, and the folder is free again."""
+    (tmp_path / FORGOTTEN).write_text(content)
+    for _ in range(2):
+        with pytest.raises(FormatError, match=FORGOTTEN):
+            SweepFolder(tmp_path, SHORT)
 
 
 def test_sweeps_of_another_folder_are_adopted(tmp_path):

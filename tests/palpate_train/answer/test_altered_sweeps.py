@@ -69,7 +69,7 @@ def test_held_out_copies_widen_shapes_and_set_the_limit():
     assert found is not None
     assert found.shapes[0].shape == (3, 2, 2)
     assert len(found.changes[0]) == len(found.disturbances.allowances) > 0
-    assert found.limit > 0
+    assert found.rule.limit > 0
     kept = np.mean([before <= after for before, after in found.figures["kept"].values()])
     assert kept > 0.7
     assert "altered sweeps: " in altered_sweeps.text({altered_sweeps.FIGURES: found.figures})

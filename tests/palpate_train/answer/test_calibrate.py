@@ -46,10 +46,12 @@ def test_a_disturbed_sweep_of_a_known_material_stays_known():
     )
     sturdy = fit_calibration(plain_inputs(*more, ~faulty, 1, faulty=faulty))
     shaken = x[known][:, -1] + NOISE / 2
-    kept = [np.mean(done.embedding.novelty(shaken) <= done.limit) for done in (plain, sturdy)]
+    kept = [
+        np.mean(done.embedding.novelty(shaken) <= done.limits.loose) for done in (plain, sturdy)
+    ]
     assert kept[0] < 0.3
     assert kept[1] > 0.8
-    assert np.mean(sturdy.embedding.novelty(x[~known][:, -1]) <= sturdy.limit) < 0.05
+    assert np.mean(sturdy.embedding.novelty(x[~known][:, -1]) <= sturdy.limits.loose) < 0.05
     np.testing.assert_array_equal(
         sturdy.weight * sturdy.temperature, plain.weight * plain.temperature
     )

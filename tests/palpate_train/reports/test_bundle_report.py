@@ -14,6 +14,7 @@ from palpate.bundle import bundle
 from palpate.bundle.bundle import Bundle
 from palpate.core.clock import SystemClock
 from palpate.inference.classifier import Classifier
+from palpate_train.answer.stranger_limits import COSTS
 from palpate_train.cli.main import main
 from palpate_train.data import sets
 from palpate_train.data.evaluation_sweeps import EvaluationSweeps
@@ -245,6 +246,8 @@ def test_the_page_shows_the_curve_and_materials_left_out(figures: dict, sweeps: 
     assert "5: 50.0 % [40.0, 60.0]; 16: 75.0 % [70.0, 80.0]" in text
     assert "sweeps of each" in page
     assert "wood 25.0 % 95.0 % 90.0 % [80.0, 100.0] 9 / 4" in text
+    assert "known sweeps answered" in page
+    assert all(f'classifier.strangers = "{limit}"' in text for limit in COSTS)
 
 
 @pytest.mark.slow

@@ -15,10 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.answer.disturbance import Disturbances, hum
-from palpate.answer.unknown import shaped_distances
 from palpate_train.answer import fit_disturbance
-from palpate_train.answer.calibrate import CalibrationInputs
-from palpate_train.answer.embedding import cross_fitted, limit
+from palpate_train.answer.calibrate import CalibrationInputs, Shapes, left_out
+from palpate_train.answer.embedding import Embedding
 from palpate_train.answer.fit_unknown import (
     DisturbedSweeps,
     Embed,
@@ -27,6 +26,7 @@ from palpate_train.answer.fit_unknown import (
     Space,
     choose,
 )
+from palpate_train.answer.stranger_limits import LeftOut
 from palpate_train.data.corruptions import TAXEL_FAULTS, Corruption, applicable
 from palpate_train.data.evaluation_sweeps import EvaluationSweeps
 from palpate_train.data.sets import Dataset
@@ -42,14 +42,13 @@ COPIES = 360
 class Widened:
     """Shapes of materials that alterations have widened.
 
-    shapes: float16 [K, r, r] of each embedding that was given. limit: of known materials, for these
-    shapes. rule: gave both. training: features of the training sweeps and of their altered copies,
-    without those whose disturbance the box notices. figures: for the manifest. disturbances:
-    likewise. changes: float16 [D, K, r] by these, of the class means of each embedding.
+    shapes: float16 [K, r, r] of each embedding that was given. rule: gave them. training: features
+    of the training sweeps and of their altered copies, without those whose disturbance the box
+    notices. figures: for the manifest. disturbances: likewise. changes: float16 [D, K, r] by these,
+    of the class means of each embedding.
     """
 
     shapes: tuple[NDArray[np.float16], ...]
-    limit: float
     rule: ShapeRule
     training: DisturbedSweeps
     figures: dict[str, Any]
@@ -85,7 +84,6 @@ def measure(
     allowed = fit_disturbance.fit(judged, *seen)
     return Widened(
         shapes,
-        rule.limit,
         rule,
         unnoticed,
         _figures(rule, judging) | {"disturbances": allowed.figures},
@@ -94,22 +92,25 @@ def measure(
     )
 
 
-def limit_of_conditions(found: Widened, given: CalibrationInputs) -> float:
-    """The limit for widened shapes, from sweeps judged by embeddings and shapes that did not see
-    their value of a condition; all conditions count."""
-    every, trained = [], len(found.training.labels)
-    for values in given.conditions.values():
-        distances = np.full(len(given.labels), np.nan)
-        for seen, judging, embedding, present in cross_fitted(
-            given.whole, given.labels, values, given.judged, given.fixed
-        ):
-            space = Space.of(embedding)
-            training = found.training.take(seen[:trained], present).seen_by(embedding)
-            shapes = found.rule.shapes(Scatters.of(training, space)).astype(np.float64)
-            away = embedding(given.whole[judging])[:, None] - space.means
-            distances[judging] = shaped_distances(away, shapes).min(axis=1)
-        every.append(distances)
-    return limit(np.concatenate(every))
+def left_out_in_turn(
+    found: Widened, given: CalibrationInputs, finished: Embedding
+) -> dict[str, LeftOut]:
+    """As calibrate.left_out_in_turn, with widened shapes."""
+    trained = len(found.training.labels)
+
+    def view(seen: Array, embedding: Embedding, present: Array) -> Shapes:
+        training = found.training.take(seen[:trained], present).seen_by(embedding)
+        scatters = Scatters.of(training, Space.of(embedding))
+
+        def shapes(of: Scatters) -> Array:
+            return found.rule.shapes(of).astype(np.float64)
+
+        return shapes(scatters), lambda k: shapes(scatters.without(k))
+
+    return {
+        name: left_out(given, values, given.judged, finished, view)
+        for name, values in given.conditions.items()
+    }
 
 
 def disturbed(

@@ -8,7 +8,7 @@ the condition under which these were taken.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
 from functools import cached_property
 from typing import Any, TypeVar
@@ -18,26 +18,45 @@ from numpy.typing import NDArray
 
 from palpate.answer.early import Early
 from palpate.answer.objects import LEAST_PROBABILITY, softmax
-from palpate.answer.unknown import UNSURE, Classes, DisplacementRule, Known
+from palpate.answer.unknown import (
+    UNSURE,
+    Classes,
+    DisplacementRule,
+    Known,
+    shaped_distances,
+)
 from palpate_train.answer import fit_displacement, fit_early
 from palpate_train.answer.embedding import (
     Embedding,
-    cross_fitted_distances,
+    cross_fitted,
     in_two_views,
-    limit,
     parts,
+    shapes_without,
 )
 from palpate_train.answer.fit_displacement import AugmentedCopies, DisplacementFit
 from palpate_train.answer.fit_early import EarlyRule, Heads
 from palpate_train.answer.heads import HeadData, HeadPart, HeadPlan, condition_values
+from palpate_train.answer.stranger_limits import (
+    LeftOut,
+    StrangerLimits,
+    answered,
+    limits,
+    nearest_other,
+)
 from palpate_train.metrics.answers import UNKNOWN, Answers
 from palpate_train.metrics.score import fuse
 from palpate_train.metrics.temperature import sufficient_temperature
 
 Array = NDArray[Any]
 Json = dict[str, Any]
+Shapes = tuple[Array, Callable[[int], Array]]
+"""Shapes [K, r, r] of an embedding's materials, and a function that gives those [K - 1, r, r]
+without a material."""
+View = Callable[[Array, Embedding, Array], Shapes]
+"""The sweeps that an embedding was fitted to (bool [N]), the embedding, the labels [K] of its means
+-> its shapes."""
 Part = TypeVar("Part", Embedding, Heads, "HeldOut")
-NUMBERS = ("temperature", "class_mean_temperature", "limit")
+NUMBERS = ("temperature", "class_mean_temperature")
 """Attributes of a Calibration that are numbers."""
 
 
@@ -76,9 +95,8 @@ class Calibration:
 
     weight [F, K], bias [K]: the head that names the material, divided by `temperature`.
     class_mean_temperature: of logits that the box computes from class means. steps: heads of the
-    early answers, with their temperatures. limit: largest squared distance of a known material.
-    displacement: for displaced contacts; None without copies. held: for each condition, the hardest
-    first.
+    early answers, with their temperatures. limits: of known materials. displacement: for displaced
+    contacts; None without copies. held: for each condition, the hardest first.
     """
 
     embedding: Embedding
@@ -88,7 +106,7 @@ class Calibration:
     class_mean_temperature: float
     steps: Heads
     rule: EarlyRule
-    limit: float
+    limits: StrangerLimits
     displacement: DisplacementFit | None
     held: Mapping[str, HeldOut]
 
@@ -105,7 +123,7 @@ class Calibration:
 
     def known(self) -> Known:
         """The entry `known` of a manifest."""
-        return Known(self.limit, self.class_mean_temperature)
+        return self.limits.known(self.class_mean_temperature)
 
     def displacement_rule(self) -> DisplacementRule | None:
         """The entry `displacement` of a manifest."""
@@ -131,6 +149,7 @@ class Calibration:
         """The rules and temperatures that the file of a fit keeps, for JSON."""
         return {name: getattr(self, name) for name in NUMBERS} | {
             "rule": asdict(self.rule),
+            "limits": asdict(self.limits),
             "conditions": list(self.held),
             "displacement": asdict(self.displacement.rule) if self.displacement else None,
         }
@@ -151,6 +170,7 @@ class Calibration:
             arrays["bias"],
             steps=part(Heads, "steps"),
             rule=EarlyRule(**figures["rule"] | {"early": early}),
+            limits=StrangerLimits(**figures["limits"]),
             displacement=displaced
             and DisplacementFit(part(Embedding, "displaced"), DisplacementRule(**displaced)),
             held={name: part(HeldOut, f"held {name}") for name in figures["conditions"]},
@@ -230,12 +250,12 @@ def fit_calibration(given: CalibrationInputs) -> Calibration:
     p = softmax(logits / temperatures[:, None])
     embedding, last = in_two_views(whole, labels, given.fixed), float(temperatures[-1])
     steps = fit_early.heads(embedding(given.prefixes), labels, int(labels.max()) + 1)
-    distances = {name: _distances(given, values) for name, values in given.conditions.items()}
-    beyond = limit(np.concatenate(list(distances.values())))
+    distances = left_out_in_turn(given, embedding)
+    beyond = limits(distances)
     held = {}
     for name, values in given.conditions.items():
         judging, named = _named(given, values)
-        known = distances[name][judging] <= beyond
+        known = distances[name].corrected()[0][judging] <= np.log(beyond.balanced)
         held[name] = HeldOut(judging, softmax(named / last), known)
     weight, bias = given.naming_head(np.ones(len(labels), bool))
     return Calibration(
@@ -247,15 +267,46 @@ def fit_calibration(given: CalibrationInputs) -> Calibration:
         steps.cooled(temperatures[:-1]),
         fit_early.find_rule(p, labels[numbers]),
         beyond,
-        _displacement(given, last),
+        _displacement(given, last, answered(beyond.figures)),
         held,
     )
 
 
-def _distances(given: CalibrationInputs, values: Array) -> Array:
-    """Novelty [N] of sweeps to embeddings that did not see their value of one condition."""
-    limiting = (given.judged | (given.fixed > 0)) & ~given.faulty
-    return cross_fitted_distances(given.whole, given.labels, values, limiting, given.fixed)
+def left_out(
+    given: CalibrationInputs, values: Array, judged: Array, finished: Embedding, view: View
+) -> LeftOut:
+    """Distances of the sweeps `judged` (bool [N]) by embeddings that did not see their value of a
+    condition (int [N]). finished: the embedding of all sweeps."""
+    x, labels = given.whole, given.labels
+    known, strangers, of_finished = (np.full(len(labels), np.nan) for _ in range(3))
+    parts = 0
+    for seen, numbers, embedding, present in cross_fitted(x, labels, values, judged, given.fixed):
+        shapes, without = view(seen, embedding, present)
+        z, means = embedding(x[numbers]), embedding.means.astype(np.float64)
+        known[numbers] = shaped_distances(z[:, None] - means, shapes).min(axis=1)
+        own = np.searchsorted(present, labels[numbers])
+        strangers[numbers] = nearest_other(z, own, means, without)
+        parts += 1
+    means = finished.means.astype(np.float64)
+    _, without = view(np.ones(len(labels), bool), finished, np.arange(len(means)))
+    of_finished[judged] = nearest_other(finished(x[judged]), labels[judged], means, without)
+    return LeftOut(known, strangers, of_finished, labels, values, parts)
+
+
+def left_out_in_turn(given: CalibrationInputs, finished: Embedding) -> dict[str, LeftOut]:
+    """`left_out` for each condition, with the shapes of the embeddings themselves."""
+    judged = (given.judged | (given.fixed > 0)) & ~given.faulty
+
+    def view(seen: Array, embedding: Embedding, present: Array) -> Shapes:
+        some = seen & np.isin(given.labels, present)
+        own = np.searchsorted(present, given.labels[some])
+        without = shapes_without(embedding, embedding(given.whole[some]), own)
+        return embedding.shapes.astype(np.float64), without
+
+    return {
+        name: left_out(given, values, judged, finished, view)
+        for name, values in given.conditions.items()
+    }
 
 
 def _named(given: CalibrationInputs, values: Array) -> tuple[Array, Array]:
@@ -287,13 +338,16 @@ def _prefix_logits(given: CalibrationInputs) -> tuple[Array, Array, float]:
     return logits, numbers, temperature
 
 
-def _displacement(given: CalibrationInputs, temperature: float) -> DisplacementFit | None:
-    """The rule for displaced contacts, by a head that did not see the groups of held sweeps."""
+def _displacement(
+    given: CalibrationInputs, temperature: float, kept: float
+) -> DisplacementFit | None:
+    """The rule for displaced contacts, by a head that did not see the groups of held sweeps. kept:
+    share of known copies within its limit."""
     copied = given.copied
     if not copied.held.any():
         return None
     weight, bias = given.naming_head(~np.isin(given.groups, given.groups[given.held]))
     logits = (copied.features[copied.held] @ weight + bias) / temperature
     return fit_displacement.fit(
-        given.whole, given.labels, given.groups, given.held, given.fixed, copied, logits
+        given.whole, given.labels, given.groups, given.held, given.fixed, copied, logits, kept
     )

@@ -8,7 +8,7 @@ the means.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -177,11 +177,34 @@ def in_two_views(features: Array, labels: Array, fixed: int = 0) -> Embedding:
         return z
     away = z(features) - z.means[labels]
     each = [away[labels == k] for k in range(len(z.means))]
+    return replace(z, shapes=_in_both(each, z.means, z.untrained).astype(np.float16))
+
+
+def _in_both(each: Sequence[Array], means: Array, untrained: Array) -> Array:
+    """The shapes [K, r, r] of `in_two_views` for differences from the means [K, r], [n, r] of each
+    material."""
     own = np.stack([own_scatter(sweeps) for sweeps in each])
-    shapes = shapes_of(within(own, z.untrained) + within(own, differing(z.means)))
+    shapes = shapes_of(within(own, untrained) + within(own, differing(means)))
     total = sum(float(((x @ w) ** 2).sum()) for x, w in zip(each, shapes, strict=True))
-    scale = np.sqrt(away.size / max(total, FLAT))
-    return replace(z, shapes=(scale * shapes).astype(np.float16))
+    scaled: Array = np.sqrt(sum(x.size for x in each) / max(total, FLAT)) * shapes
+    return scaled
+
+
+def shapes_without(embedding: Embedding, z: Array, labels: Array) -> Callable[[int], Array]:
+    """Gives the shapes [K - 1, r, r] of `in_two_views` without a material k. z: embeddings [n, r]
+    of the sweeps that the embedding was fitted to; labels: int [n]."""
+    means = embedding.means.astype(np.float64)
+    each = [z[labels == k] - mean for k, mean in enumerate(means)]
+
+    def without(k: int) -> Array:
+        others = np.delete(means, k, axis=0)
+        if embedding.shapes.shape[1]:
+            rest = [of for number, of in enumerate(each) if number != k]
+            return _in_both(rest, others, embedding.untrained)
+        view = differing(others)
+        return np.broadcast_to(view @ view.T, (len(others), *view.T.shape[1:] * 2))
+
+    return without
 
 
 def differing(means: Array) -> Array:

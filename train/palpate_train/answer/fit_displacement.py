@@ -20,6 +20,7 @@ from palpate.answer.objects import softmax
 from palpate.answer.unknown import Classes, DisplacedClasses, DisplacementRule
 from palpate.bundle.contents import Bundle
 from palpate.bundle.manifest import Manifest
+from palpate_train.answer import embedding
 from palpate_train.answer.embedding import Embedding, embed, limit
 from palpate_train.data.augment import Augmentation, augment
 from palpate_train.data.sets import Dataset
@@ -84,12 +85,14 @@ def fit(
     fixed: int,
     copied: AugmentedCopies,
     logits: Array,
+    kept: float = embedding.KEPT,
 ) -> DisplacementFit | None:
     """The rule for displaced sweeps; None without copies to fit it to and to judge it by.
 
     whole, labels, groups, held: features [N, F], int [N], int [N] and bool [N] as in
     CalibrationInputs. logits: [m, K] of the held-out copies, calibrated for contacts that are in
-    place, by a head that saw none of their groups.
+    place, by a head that saw none of their groups. kept: share of the held-out copies within the
+    limit of known materials.
     """
     fitted, judging = copied.take(~copied.held), copied.take(copied.held)
     if (
@@ -106,7 +109,7 @@ def fit(
 
     across, judge = turn(~held)
     novelty = judge.novelty(across(judging.features))
-    beyond = limit(novelty)
+    beyond = limit(novelty, kept)
     temperature = sufficient_temperature(logits, judging.labels, groups[judging.source])
     p = softmax(logits / temperature)
     wrong = (p.argmax(1) != judging.labels) & (novelty <= beyond)

@@ -95,12 +95,12 @@ def early_classes(z: Array, labels: Array) -> EarlyClasses:
     return EarlyClasses(means.astype(np.float32), shapes.astype(np.float16))
 
 
-def early_limits(classes: EarlyClasses, z: Array) -> tuple[float, ...]:
-    """The limits of each step that keep KEPT of sweeps of known materials, from embeddings z [n, D,
-    r] of sweeps that `classes` have not seen."""
+def early_limits(classes: EarlyClasses, z: Array, kept: float = KEPT) -> tuple[float, ...]:
+    """The limits of each step that keep KEPT of sweeps of known materials, or `kept` if that is
+    less, from embeddings z [n, D, r] of sweeps that `classes` have not seen."""
     distances = EarlyDistances(classes, (0.0,) * z.shape[1])
     nearest = np.stack([distances.nearest(sweep) for sweep in z])
-    return tuple(limit(step, KEPT) for step in nearest.T)
+    return tuple(limit(step, min(kept, KEPT)) for step in nearest.T)
 
 
 def heads(z: Array, labels: Array, classes: int) -> Heads:
@@ -223,12 +223,13 @@ def find_rule(probabilities: Array, labels: Array) -> EarlyRule:
 
 
 def measure(
-    model: onnx.ModelProto, train: Dataset, held_out: Dataset
+    model: onnx.ModelProto, train: Dataset, held_out: Dataset, kept: float
 ) -> tuple[EarlyClasses, tuple[float, ...]]:
     """The classes of unfinished sweeps and the limit of each step, from the output STEPS of
-    `model`. The limits are found on held-out sweeps."""
+    `model`. The limits are found on held-out sweeps. kept: share of known whole sweeps within
+    their limit; that of unfinished ones is not larger."""
     classes = early_classes(run_output(model, STEPS, train.samples), train.labels)
-    return classes, early_limits(classes, run_output(model, STEPS, held_out.samples))
+    return classes, early_limits(classes, run_output(model, STEPS, held_out.samples), kept)
 
 
 def text(manifest: Manifest) -> str:

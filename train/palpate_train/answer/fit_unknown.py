@@ -133,6 +133,12 @@ class Scatters:
         squares += trained * within(covariances, self.space.trained())
         return shapes_of(squares)
 
+    def without(self, k: int) -> Scatters:
+        """The scatter of the other materials than `k`."""
+        space = replace(self.space, means=np.delete(self.space.means, k, axis=0))
+        kinds = {kind: np.delete(of, k, axis=0) for kind, of in self.by_kind.items()}
+        return Scatters(space, np.delete(self.own, k, axis=0), kinds)
+
     def weight_of_trained(self, judged: DisturbedSweeps) -> float:
         """The one of TRAINED that tells `judged` sweeps of materials that are left out in turn best
         from the others (mean AUROC)."""

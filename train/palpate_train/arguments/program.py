@@ -61,8 +61,7 @@ class Program:
         try:
             with during_imports(self.name):
                 parser = self.parser(*words[:1])
-            with during_work():  # an option may import and print, as `evaluate --list` does
-                args = parser.parse_args(words or ["--help"])
+            args = parser.parse_args(words or ["--help"])
             args.words = words
             with during_imports(self.name):
                 from palpate_train.metrics import score  # here: it imports onnxruntime

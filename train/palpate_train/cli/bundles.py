@@ -25,6 +25,7 @@ from palpate_train.answer import (
     fit_slide,
     fit_taxels,
     rules,
+    stranger_limits,
 )
 from palpate_train.arguments import numbers, options
 from palpate_train.arguments.program import Add
@@ -73,6 +74,14 @@ def _add_export(export: argparse.ArgumentParser) -> None:
     export.add_argument(
         "--licence", default="", metavar="NAME", help="of the recordings, for card.md: CC-BY-4.0"
     )
+    export.add_argument(
+        "--stranger-cost",
+        type=numbers.above_zero("--stranger-cost"),
+        default=1.0,
+        metavar="N",
+        help="cost of an unknown material that gets a label, as a multiple of that of a known one "
+        "that gets none (1)",
+    )
 
 
 def _add_rules(command: argparse.ArgumentParser, option: str, into: str, what: str) -> None:
@@ -102,6 +111,7 @@ def run_export(args: argparse.Namespace) -> None:
     else:
         made = Fit.read(args.fit.name, arrays)
         made.about[pack.LICENCE] = args.licence
+        made.about[stranger_limits.COST] = args.stranger_cost
         manifest = quantized_bundle.export(made, *named, asked=asked)
     _print(manifest, args.out)
     rest = made.about.get("rest")
@@ -116,17 +126,15 @@ def run_score(args: argparse.Namespace) -> None:
     if args.json:
         options.writable_file(args.json, "--json", ".json")
     loaded, sweeps = bundle.load(args.bundle), options.load(args)
-    both = (loaded, rules.without(loaded, args.left_out)) if args.left_out else (loaded,)
-    found, *less = (bundle_score.score(Classifier(one, SystemClock()), sweeps) for one in both)
+    less = rules.without(loaded, args.left_out)
+    found = bundle_score.score(Classifier(loaded, SystemClock()), sweeps)
     seen = _seen(loaded.manifest, sweeps)
     if args.json:
-        figures = found.json() | {"trained_on": seen}
-        if less:
-            figures["without"] = less[0].json() | {"rules": args.left_out}
-        put(args.json, (json.dumps(figures, indent=1) + "\n").encode())
+        put(args.json, (json.dumps(found.json() | {"trained_on": seen}, indent=1) + "\n").encode())
     say(*found.text().split("\n"))
-    for one in less:
-        say(f"without {', '.join(args.left_out)}: {one.short()}; with: {found.short()}")
+    if args.left_out:
+        without = bundle_score.score(Classifier(less, SystemClock()), sweeps)
+        say(f"without {', '.join(args.left_out)}: {without.short()}; with: {found.short()}")
     if seen and seen["sweeps"]:
         say(
             f"warning: {seen['sweeps']} of {seen['of']} sweeps are the very ones that the bundle "
@@ -165,6 +173,7 @@ def _print(manifest: Manifest, out: Path) -> None:
     for line in formatting.figure_lines(manifest.figures):
         say(line)
     say(*fit_taxels.text(manifest).split("\n"))
+    say(*stranger_limits.lines(manifest.figures))
     if manifest.known:
         say(*altered_sweeps.text(manifest.figures).split("\n"))
     for part in (quantized_bundle, fit_early, fit_displacement, fit_slide, rules):

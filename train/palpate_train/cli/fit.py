@@ -15,6 +15,7 @@ from typing import Any
 from palpate.core.errors import FormatError
 from palpate.core.storage import put
 from palpate.core.text import say
+from palpate_train.answer import stranger_limits
 from palpate_train.arguments import numbers, options, scene_file
 from palpate_train.arguments.program import Add
 from palpate_train.data import extras, labels
@@ -382,6 +383,7 @@ def _print_held_out(made: Fit) -> None:
     if made.calibration:
         say(*formatting.figure_lines(figures := made.held_out_figures()))
         say(*_worst(made))
+        say(*stranger_limits.lines(figures))
         if len(conditions) > 1:
             mean = sum(figures[f"held-out {name}"]["accuracy"] for name in conditions)
             share = formatting.percent(mean / len(conditions))

@@ -88,7 +88,9 @@ def unknown(without: Sequence[Trained], materials: Sequence[str]) -> Json:
         held = [one for one in without if one[0].left_out == k]
         known = np.concatenate([case.known() for case, _ in held])
         # in units of the limit, because the limits of folds differ
-        scores = [done.embedding.novelty(case.new[:, -1]) / done.limit for case, done in held]
+        scores = [
+            done.embedding.novelty(case.new[:, -1]) / done.limits.balanced for case, done in held
+        ]
         found[materials[k]] = _detection(np.concatenate(scores), known, placements(held))
     mean = {
         name: round(float(np.mean([row[name] for row in found.values()])), 4)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from palpate.bundle.manifest import Manifest
-from palpate_train.answer import altered_sweeps, fit_taxels, rules
+from palpate_train.answer import altered_sweeps, fit_taxels, rules, stranger_limits
 from palpate_train.data.sets import Dataset, digest
 
 NAME = "card.md"
@@ -75,7 +75,7 @@ def _novelty(manifest: Manifest) -> Json | None:
         return None
     _, figure = _held_out(manifest)
     share = figure["unknown"] / figure["n"] if figure.get("n") and "unknown" in figure else None
-    return {"limit": manifest.known.limit, "known_called_unknown": share}
+    return {"limit": manifest.known.balanced, "known_called_unknown": share}
 
 
 def _sentences(manifest: Manifest, protocol: str, figure: Json) -> list[str]:
@@ -95,7 +95,10 @@ def _sentences(manifest: Manifest, protocol: str, figure: Json) -> list[str]:
     if judged := rules.text(manifest):
         lines += [judged, ""]
     if manifest.known:
-        lines += [altered_sweeps.text(manifest.figures), ""]
+        for limit in stranger_limits.COSTS:
+            if cost := stranger_limits.lines(manifest.figures, limit):
+                lines += [f'- `classifier.strangers = "{limit}"`: {"; ".join(cost)}']
+        lines += ["", altered_sweeps.text(manifest.figures), ""]
     else:
         lines += ["It cannot tell an unknown material: each gets the label of a known one.", ""]
     if manifest.format.dtype == "float32":

@@ -104,7 +104,7 @@ def _unknown(content: Content, sweeps: Dataset) -> Array:
         return np.zeros(len(sweeps), bool)
     means, shapes = (a.astype(np.float64) for a in (content.classes.means, content.classes.shapes))
     distances = shaped_distances(_embedded(content, sweeps.samples)[:, None] - means, shapes)
-    beyond: Array = distances.min(axis=1) > content.known.limit
+    beyond: Array = distances.min(axis=1) > content.known.balanced
     return beyond
 
 

@@ -17,11 +17,13 @@ from palpate.bundle import bundle
 from palpate.bundle.bundle import Bundle, Manifest
 from palpate_train.answer import (
     altered_sweeps,
+    calibrate,
     embedding,
     fit_early,
     fit_slide,
     fit_taxels,
     rules,
+    stranger_limits,
 )
 from palpate_train.answer.calibrate import Calibration, CalibrationInputs
 from palpate_train.answer.embedding import Embedding
@@ -29,6 +31,7 @@ from palpate_train.answer.fit_contact import Contacts
 from palpate_train.answer.fit_early import EarlyRule
 from palpate_train.answer.fit_unknown import Space
 from palpate_train.answer.rules import RULES, Asked
+from palpate_train.answer.stranger_limits import StrangerLimits
 from palpate_train.export import trial
 from palpate_train.export.bundle_graph import bundle_graph
 from palpate_train.export.contents import Content, files_of
@@ -54,13 +57,15 @@ def from_features(
     early = {"share": rule.share, "lost": rule.lost, "n": rule.n} if rule.early else rule.why
     figures = fit.held_out_figures()
     prefixes = fit.trunk(prefixes=True) if rule.early else None
-    content, given = replace(content, known=calibration.known()), calibration_inputs(fit)
+    given = calibration_inputs(fit)
     apart = _unseen(given, calibration)
-    found = _widened(fit, given, apart.embedding, calibration.embedding)
+    found = _widened(fit, apart.embedding, calibration.embedding)
     classes = [apart.classes(), calibration.classes()]
+    beyond = _limits(found, given, calibration.embedding, fit.about.get(stranger_limits.COST, 1.0))
+    content = replace(content, known=beyond.known(calibration.class_mean_temperature))
+    figures |= {stranger_limits.FIGURES: beyond.figures}
     if found:
-        known = replace(calibration.known(), limit=found.limit)
-        content = replace(content, known=known, disturbances=found.disturbances)
+        content = replace(content, disturbances=found.disturbances)
         wider = zip(classes, found.shapes, found.changes, strict=True)
         classes = [replace(of, shapes=shapes, changes=moved) for of, shapes, moved in wider]
         figures |= {altered_sweeps.FIGURES: found.figures}
@@ -81,7 +86,8 @@ def _early_checked(content: Content) -> Content:
     """`content` whose early answers need a known material."""
     if not (content.early and content.classes):
         return content
-    classes, limits = fit_early.measure(content.model, content.train, content.held_out)
+    kept = stranger_limits.answered(content.figures[stranger_limits.FIGURES])
+    classes, limits = fit_early.measure(content.model, content.train, content.held_out, kept)
     return replace(
         content,
         early=replace(content.early, limits=limits),
@@ -89,16 +95,28 @@ def _early_checked(content: Content) -> Content:
     )
 
 
-def _widened(
-    fit: Fit, given: CalibrationInputs, apart: Embedding, whole: Embedding
-) -> altered_sweeps.Widened | None:
-    """Shapes of known materials that know how altered sweeps differ, and their limit; see
-    altered_sweeps. apart: an embedding that did not see the held-out sweeps."""
+def _limits(
+    found: altered_sweeps.Widened | None,
+    given: CalibrationInputs,
+    whole: Embedding,
+    stranger_cost: float,
+) -> StrangerLimits:
+    """The limits of known materials, for the widened shapes if there are any."""
+    if found:
+        distances = altered_sweeps.left_out_in_turn(found, given, whole)
+    else:
+        distances = calibrate.left_out_in_turn(given, whole)
+    return stranger_limits.limits(distances, stranger_cost)
+
+
+def _widened(fit: Fit, apart: Embedding, whole: Embedding) -> altered_sweeps.Widened | None:
+    """Shapes of known materials that know how altered sweeps differ. apart: an embedding that did
+    not see the held-out sweeps."""
     trunk, spaces = fit.trunk(), map(Space.of, (apart, whole))
     seed = int(fit.about["seed"])
     contacts, shape = fit.contacts or Contacts.of(fit.train), fit.train.format.shape
     known = contacts.limit.known_tare()
-    found = altered_sweeps.measure(
+    return altered_sweeps.measure(
         lambda samples: run(trunk, samples),
         fit.train,
         fit.held,
@@ -106,7 +124,6 @@ def _widened(
         tare=np.array(known).reshape(shape) if known else np.zeros(shape),
         seed=seed,
     )
-    return found and replace(found, limit=altered_sweeps.limit_of_conditions(found, given))
 
 
 def _unseen(given: CalibrationInputs, calibration: Calibration) -> Calibration:

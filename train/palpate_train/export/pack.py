@@ -185,7 +185,7 @@ def judge(packed: bundle.Bundle, held_out: Dataset, logits: Array, protocol: str
         raise ExportRefused(
             f"the box would call {unknown.sum()} of {len(held_out)} held-out sweeps unknown (limit "
             f"{MOST_UNKNOWN:.0%}, "
-            f"squared distance {known.limit:.4g}); record more positions, so that it learns how "
+            f"squared distance {known.balanced:.4g}); record more positions, so that it learns how "
             "sweeps vary"
         )
     return answers.figures(held_out.labels, held_out.group("recording"), protocol)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core.names import MOST_LETTERS
+from palpate_train.answer import stranger_limits
 from palpate_train.data.sets import Dataset
 from palpate_train.reports import confusion_plot, formatting, html, provenance, sweep_plot
 from palpate_train.reports.formatting import level
@@ -23,6 +24,7 @@ from palpate_train.reports.plot_style import (
     set_ticks,
     single_axes,
     to_svg,
+    write,
 )
 
 Array = NDArray[Any]
@@ -64,6 +66,8 @@ def page(figures: Json, sweeps: Dataset) -> str:
         pictures["confusion"] = html.picture(confusion(figures))
     if len(figures.get("curve", ())) > 1:
         pictures["curve"] = html.picture(curve(figures["curve"]))
+    if "named" in (found := figures["figures"].get(stranger_limits.FIGURES, {})).get("strict", {}):
+        pictures["strangers"] = html.picture(strangers(found))
     return html.render(
         "bundle.html.j2",
         header=provenance.of(figures),
@@ -80,6 +84,10 @@ def page(figures: Json, sweeps: Dataset) -> str:
         corruption_head=CORRUPTIONS,
         corruptions=[_corruption(row) for row in figures["corruptions"]],
         foreign=[_foreign(*item) for item in figures["not_in_the_bundle"].items()],
+        stranger_costs={
+            limit: stranger_limits.lines(figures["figures"], limit)
+            for limit in stranger_limits.COSTS
+        },
         left_out_head=LEFT_OUT,
         left_out=_left_out(figures.get("left_out")),
         held_out=[
@@ -286,3 +294,22 @@ def curve(points: Sequence[Json]) -> str:
     axes.set_xlabel("training sweeps of each material", color=GREY, size=SMALL)
     axes.set_ylabel("classified correctly", color=GREY, size=SMALL)
     return to_svg(figure, "share classified correctly over the number of training sweeps")
+
+
+def strangers(found: Json) -> str:
+    """Share of unknown sweeps with a label over the share of known sweeps that are answered, with
+    the points of the three limits. found: figures of stranger_limits."""
+    figure, axes = single_axes(2.6, left=0.14, right=0.97, top=0.2, bottom=0.5)
+    axes.plot(*np.transpose(found["curve"]), color=ACCENT, linewidth=2)
+    for limit in stranger_limits.COSTS:
+        x, y = found[limit]["answered"][0], found[limit]["named"][0]
+        axes.plot(x, y, color=ACCENT, marker="o", markersize=5)
+        write(axes, x, y + 0.05, limit, GREY, SMALL, ha="right")
+    axes.set_xlim(stranger_limits.LEAST_KEPT, 1.005)
+    axes.set_ylim(0, 1.05)
+    axes.grid(color=FAINT, linewidth=0.6)
+    set_ticks(axes.yaxis, [0, 0.25, 0.5, 0.75, 1], percent=True)
+    set_ticks(axes.xaxis, [0.5, 0.6, 0.7, 0.8, 0.9, 1], percent=True)
+    axes.set_xlabel("known sweeps answered", color=GREY, size=SMALL)
+    axes.set_ylabel("unknown ones with a label", color=GREY, size=SMALL)
+    return to_svg(figure, "unknown sweeps with a label over known sweeps answered")

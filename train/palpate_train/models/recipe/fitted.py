@@ -21,6 +21,7 @@ from onnx import checker, shape_inference
 from palpate.core import storage
 from palpate.core.errors import BundleError, FormatError
 from palpate.core.sweep_set import read
+from palpate_train.answer import stranger_limits
 from palpate_train.answer.calibrate import Calibration, CalibrationInputs, fit_calibration
 from palpate_train.answer.fit_contact import Contacts
 from palpate_train.answer.fit_displacement import AugmentedCopies
@@ -117,9 +118,11 @@ class Fit:
 
     def held_out_figures(self) -> Json:
         """Figures of sweeps by heads that did not see their value of a condition, for each
-        condition, the hardest first, as a manifest holds them; none without a calibration."""
+        condition, the hardest first, as a manifest holds them, and what the limits of known
+        materials cost; none without a calibration."""
         figures: Json = {}
         if self.calibration:
+            figures[stranger_limits.FIGURES] = self.calibration.limits.figures
             labels = np.append(self.train.labels, self.held.labels)
             recordings = np.append(self.train.group("recording"), self.held.group("recording"))
             for name, held in self.calibration.held.items():

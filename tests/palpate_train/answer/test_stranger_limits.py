@@ -1,0 +1,142 @@
+"""Limits of known materials by the cost of two mistakes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from palpate.answer.unknown import Known
+from palpate.core.errors import BundleError, FormatError
+from palpate_train.answer import stranger_limits
+from palpate_train.answer.stranger_limits import COSTS, LeftOut, limits, nearest_other
+
+MATERIALS = 4
+
+
+def left_out(
+    n: int = 60, seed: int = 0, apart: float = 2.0, inflated: float = 0.0, parts: int = 5
+) -> LeftOut:
+    """Known and unknown sweeps of MATERIALS whose logarithms lie `apart`, both `inflated` against
+    the finished model."""
+    rng = np.random.default_rng(seed)
+    labels, values = np.arange(n) % MATERIALS, np.arange(n) // MATERIALS % parts
+    known, strangers = rng.normal(0.0, 0.5, (2, n))
+    return LeftOut(
+        np.exp(known + inflated),
+        np.exp(strangers + apart + inflated),
+        np.exp(strangers + apart),
+        labels,
+        values,
+        parts,
+    )
+
+
+@given(st.floats(0.01, 100), st.floats(1.01, 10), st.integers(0, 5))
+@settings(max_examples=30, deadline=None)
+def test_a_dearer_stranger_never_widens_a_limit(cost: float, times: float, seed: int):
+    """Each limit falls as the cost of a stranger rises, and the three are in order."""
+    sweeps = {"force": left_out(seed=seed, apart=1.0)}
+    cheap, dear = limits(sweeps, cost), limits(sweeps, cost * times)
+    for name in COSTS:
+        assert getattr(dear, name) <= getattr(cheap, name)
+    assert cheap.strict <= cheap.balanced <= cheap.loose
+
+
+def test_both_mistakes_are_rare_where_both_are_apart():
+    """Of materials that lie apart nearly all known sweeps are within the limit and few others."""
+    figures = limits({"force": left_out(400)}).figures
+    assert figures["balanced"]["answered"][0] > 0.93
+    assert figures["balanced"]["named"][0] < 0.07
+    assert not figures["guess"]
+
+
+@given(st.integers(2, 40), st.integers(0, 3))
+@settings(max_examples=20, deadline=None)
+def test_few_sweeps_promise_no_more_than_they_show(each: int, seed: int):
+    """Beyond the farthest of n known sweeps there is a share that shrinks with n, but is not 0."""
+    sweeps = left_out(each * MATERIALS, seed, parts=2)
+    logs = sweeps.corrected()[0]
+    by_material = [logs[sweeps.labels == k] for k in range(MATERIALS)]
+    kept = stranger_limits._share_below(np.array([logs.max()]), by_material)[0]
+    assert 0.5 < kept < 1
+
+
+@pytest.mark.parametrize("parts", [2, 3, 10])
+def test_a_cross_fit_is_corrected_for_what_it_lacks(parts: int):
+    """The limits for inflated distances are lower by all of the inflation with two parts, and by
+    less with more."""
+    inflated, plain = left_out(inflated=1.5, parts=parts), left_out(parts=parts)
+    known = [one.corrected()[0] for one in (inflated, plain)]
+    np.testing.assert_allclose(known[0] - known[1], 1.5 - 1.5 / (parts - 1), atol=1e-9)
+
+
+def test_half_of_the_known_sweeps_are_kept_at_any_cost():
+    """A stranger nearer than known sweeps, at a million times the cost, does not close the box."""
+    figures = limits({"force": left_out(200, apart=-3.0)}, 1e6).figures
+    assert figures["strict"]["answered"][0] >= 0.45
+
+
+def test_without_strangers_nearly_all_known_sweeps_are_within():
+    """Where no other material was left out, the three limits are one."""
+    sweeps = left_out()
+    none = np.full_like(sweeps.known, np.nan)
+    found = limits({"force": LeftOut(sweeps.known, none, none, sweeps.labels, sweeps.values, 5)})
+    assert found.strict == found.loose >= np.quantile(sweeps.known, 0.97)
+    assert "named" not in found.figures["balanced"]
+
+
+def test_all_conditions_count():
+    """A second condition under which known sweeps lie far widens the limit."""
+    near, far = left_out(), left_out(inflated=1.0, parts=20)
+    assert limits({"a": near, "b": far}).balanced > limits({"a": near}).balanced
+
+
+@pytest.mark.parametrize("cost", [0.0, -1.0, np.nan, np.inf])
+def test_no_cost_is_refused(cost: float):
+    """A cost is a number above 0."""
+    with pytest.raises(FormatError, match="cost"):
+        limits({"force": left_out()}, cost)
+
+
+@pytest.mark.parametrize("sweeps", [{}, {"force": np.nan}])
+def test_no_known_sweep_is_refused(sweeps: dict[str, float]):
+    """Without a known sweep there is no limit."""
+    none = {name: np.full(8, value) for name, value in sweeps.items()}
+    given = {k: LeftOut(v, v, v, np.zeros(8, int), np.zeros(8, int), 2) for k, v in none.items()}
+    with pytest.raises(FormatError, match="no known sweep"):
+        limits(given)
+
+
+def test_distances_of_zero_and_one_sweep_give_a_limit():
+    """Sweeps at their mean, and a single one, are finite."""
+    one = np.zeros(1)
+    found = limits({"force": LeftOut(one, one, one, one.astype(int), one.astype(int), 2)})
+    assert 0 < found.strict <= found.loose < np.inf
+
+
+def test_the_nearest_other_mean():
+    """A sweep's own mean does not count, and with one material there is no other."""
+    means = np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 5.0]])
+    found = nearest_other(means + 0.0, np.arange(3), means, lambda k: np.stack([np.eye(2)] * 2))
+    assert found.tolist() == [9.0, 9.0, 25.0]
+    assert np.isnan(nearest_other(means, np.zeros(3, int), means[:1], lambda k: means[:0])).all()
+
+
+def test_the_user_reads_both_shares():
+    """A line for known sweeps with the condition, a line for the others; a guess is called one."""
+    guess = left_out()
+    few = LeftOut(guess.known, guess.strangers, guess.finished, guess.labels % 2, guess.values, 5)
+    for sweeps, guessed in ((guess, False), (few, True)):
+        found = {stranger_limits.FIGURES: limits({"force": sweeps}).figures}
+        known, strangers = stranger_limits.lines(found)
+        assert "new force" in known
+        assert ("guess" in strangers) == guessed
+    assert stranger_limits.lines({}) == []
+
+
+def test_limits_that_fall_are_refused():
+    """A manifest whose strict limit is the widest is refused."""
+    with pytest.raises(BundleError, match="limits"):
+        Known(3.0, 2.0, 4.0, 1.0)
