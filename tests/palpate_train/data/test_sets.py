@@ -174,8 +174,8 @@ def test_select_takes_any_of_several_values():
         ("load=1", "'load'"),
         ("speed=", "''"),
         ("speed=1,fast", "'fast'"),
-        ("speed<=1,2", "group"),
-        ("material>=low", "group"),
+        ("speed<=1,2", "one number$"),
+        ("material>=low", "material holds names"),
         ("speed=9", "speed=9"),
         ("speed=1,9", "speed=9"),
         ("material=low,hihg", "material=hihg"),
@@ -184,7 +184,7 @@ def test_select_takes_any_of_several_values():
         ("force<=slow", "'slow'"),
         ("force<=5mN", "'5mN'"),
         ("force=0.7", "force=0.7"),
-        ("pace<=1", "group"),
+        ("pace<=1", "pace holds names"),
         ("pace=1", "pace=1"),
     ],
 )
@@ -366,7 +366,8 @@ def test_the_unloaded_skin_goes_with_its_sweeps(tmp_path: Path, name: str):
     s.save(tmp_path / name)
     again = sets.load(str(tmp_path / name))
     np.testing.assert_array_equal(again.unloaded, known)
-    assert sets.digest(again) == sets.digest(s) != sets.digest(easy(4))
+    others = easy(4), replace(s, unloaded=known + 0.1)
+    assert len({sets.digest(again), sets.digest(s), *map(sets.digest, others)}) == 3
     np.testing.assert_array_equal(
         s.select(["material=low,high"]).unloaded, np.delete(known, np.s_[4:8], 0)
     )
