@@ -19,32 +19,8 @@ Plain = Callable[[bytes], bytes]
 Mutator = Callable[[bytes, Random, Plain], bytes]
 
 ODD: tuple[Any, ...] = (
-    None,
-    True,
-    False,
-    0,
-    1,
-    -1,
-    2,
-    4,
-    4.0,
-    1500.0,
-    10**400,
-    1e-320,
-    float("nan"),
-    float("inf"),
-    "",
-    "a",
-    "\n",
-    "\ud800",
-    "x" * 300,
-    [],
-    {},
-    [[]],
-    {"a": {}},
-    "means.npz",
-    "raw",
-    "L",
+    *(None, True, False, 0, 1, -1, 2, 4, 4.0, 1500.0, 10**400, 1e-320, float("nan"), float("inf")),
+    *("", "a", "\n", "\ud800", "x" * 300, [], {}, [[]], {"a": {}}, "means.npz", "raw", "L"),
 )
 
 
@@ -62,9 +38,9 @@ def parts(split: Callable[[bytes], list[bytes]]) -> Mutator:
 
     def mutate(data: bytes, random: Random, plain: Plain) -> bytes:
         head, *pieces = split(data)
-        return (
-            head + rearranged(pieces, random) if pieces and random.random() < 0.5 else plain(data)
-        )
+        if pieces and random.random() < 0.5:
+            return head + rearranged(pieces, random)
+        return plain(data)
 
     return mutate
 
@@ -120,9 +96,8 @@ def trees(data: bytes, random: Random, plain: Plain) -> bytes:
         elif isinstance(branch, dict) and random.random() < 0.2:
             branch.pop(key, None)
         elif isinstance(branch, dict) or key < len(branch):
-            value = random.choice(
-                (random.choice(ODD), other.get(name) if isinstance(other, dict) else name)
-            )
+            known = other.get(name) if isinstance(other, dict) else name
+            value = random.choice((random.choice(ODD), known))
             branch[key] = value if value is not branch else None
     try:
         return json.dumps(tree).encode()
@@ -146,16 +121,14 @@ def headed(data: bytes, random: Random, plain: Plain) -> bytes:
 
 def frames(data: bytes, random: Random, plain: Plain) -> bytes:
     """Frames removed, repeated, moved or changed; most sums of PapillArray corrected."""
-    pieces = [
-        p for p in re.split(rb"(?=\xaa\x55|\x55\x66\x77\x88|\x9a\x00)|(?<=\n)|(?<=\r)", data) if p
-    ]
+    begins = rb"(?=\xaa\x55|\x55\x66\x77\x88|\x9a\x00)|(?<=\n)|(?<=\r)"
+    pieces = [p for p in re.split(begins, data) if p]
     data = rearranged(pieces, random) if len(pieces) > 1 and random.random() < 0.4 else plain(data)
 
     def seal(match: re.Match[bytes]) -> bytes:
         right = (sum(match[1]) & 0xFFFF).to_bytes(2, "little")
-        return (
-            match[0] if random.random() < 0.2 else match[0][:4] + match[1] + right + match[0][-4:]
-        )
+        sealed = match[0][:4] + match[1] + right + match[0][-4:]
+        return match[0] if random.random() < 0.2 else sealed
 
     return re.sub(rb"(?s)\x55\x66\x77\x88(.*?)..\xaa\xbb\xcc\xdd", seal, data)
 
@@ -172,16 +145,9 @@ def _places(tree: Any) -> Any:
 
 
 MUTATORS: dict[str, Mutator] = {
-    "unpack": packets,
-    "command": sentences,
-    "feed": tables,
-    "settings": tables,
-    "manifest": trees,
-    "enrolment": enrolments.mutated,
-    "recording": headed,
-    "capture": headed,
-    "profile": tables,
-    "import-text": tables,
-    "modbus": parts(far_sides.requests_of),
+    **{"unpack": packets, "command": sentences, "manifest": trees},
+    **dict.fromkeys(("feed", "settings", "profile", "import-text"), tables),
+    **dict.fromkeys(("recording", "capture"), headed),
+    **{"enrolment": enrolments.mutated, "modbus": parts(far_sides.requests_of)},
     **{f"skin-{name}": frames for name in GRIDS},
 }

@@ -44,28 +44,15 @@ def unpack() -> list[bytes]:
     axes = packets.pack(7, 9, np.arange(54, dtype=np.float32).reshape(2, 3, 3, 3))
     who = packets.pack_identity(packets.Identity(1, (1, 2, 3), "Palpate skin", "0042"))
     format = packets.pack_format(packets.SkinFormat(4, 4, "uint8", 750, 750, 6))
-    replies = packets.pack_reply(packets.Request.IDENTITY, who) + packets.pack_reply(
-        packets.Request.FORMAT, format
-    )
+    replies = packets.pack_reply(packets.Request.IDENTITY, who)
+    replies += packets.pack_reply(packets.Request.FORMAT, format)
     restarted = packets.pack(900_000, 5, frames[:1]) + packets.pack(0, 6, frames[1:2])
     swapped = sent[0] + sent[2] + sent[1] + sent[1]
     broken = sent[0][:60] + sent[1] + b"\x50" + sent[2][:-1] + b"\0" + sent[3]
     newer = packets.pack_reply(packets.Request.IDENTITY, b"\x09", version=9)
     largest = packets.pack(1, 2, np.zeros((packets.MAX_FRAMES, 4, 4), np.uint8))
-    return [
-        b"".join(sent),
-        largest,
-        swapped,
-        restarted,
-        replies,
-        newer + sent[0],
-        who,
-        format,
-        broken,
-        *others,
-        axes,
-        ENDLESS + sent[0],
-    ]
+    whole = [b"".join(sent), largest, swapped, restarted, replies, newer + sent[0], who, format]
+    return [*whole, broken, *others, axes, ENDLESS + sent[0]]
 
 
 def command() -> list[bytes]:
@@ -77,37 +64,20 @@ def command() -> list[bytes]:
     protocol = (ROOT / "firmware_config" / "PROTOCOL.md").read_text("utf-8")
     written = [s.encode() + b"\r\n" for s in re.findall(r"`(\$PPLP[^`]*)`", protocol)]
     by_hand = [b"PPLP," + name.encode() + b"\n" for name in robot_link.COMMANDS]
-    return [
-        b"".join(sealed),
-        b"".join(by_hand),
-        *sealed,
-        *written,
-        b"$PPLP,ID*00\r\n",
-        b"x" * 130 + b"\nPPLP,NEW\n",
-        b"PPLP START 30 1.5\n",
-    ]
+    others = b"$PPLP,ID*00\r\n", b"x" * 130 + b"\nPPLP,NEW\n", b"PPLP START 30 1.5\n"
+    return [b"".join(sealed), b"".join(by_hand), *sealed, *written, *others]
 
 
 def feed() -> list[bytes]:
     """Requests of a reader, the document's examples, and other lines."""
-    asked = [
-        json.dumps(one).encode()
-        for one in (*({"frames": hz} for hz in (0, 0.5, 20)), {"sweeps": True})
-    ]
+    requests = [{"frames": 0}, {"frames": 0.5}, {"frames": 20}, {"sweeps": True}]
+    asked = [json.dumps(one).encode() for one in requests]
     both = json.dumps({"frames": 5, "sweeps": False}).encode()
     protocol = (ROOT / "firmware_config" / "PROTOCOL.md").read_text("utf-8")
-    written = [
-        text.encode() + b"\n" for text in re.findall(r"`(\{[^`]*\})`", protocol) if "HZ" not in text
-    ]
-    wrong = [
-        b'{"frames": 21}\n',
-        b"{}\n",
-        b"[[\n",
-        b"x" * 1100,
-        b'{"frames": true}\n',
-        b'{"frames": NaN}\n',
-        b"\n",
-    ]
+    examples = re.findall(r"`(\{[^`]*\})`", protocol)
+    written = [text.encode() + b"\n" for text in examples if "HZ" not in text]
+    wrong = [b'{"frames": %s}\n' % value for value in (b"21", b"true", b"NaN")]
+    wrong += [b"{}\n", b"[[\n", b"x" * 1100, b"\n"]
     return [b"\n".join([*asked, both, b""]), both + b"\n", *written, *wrong]
 
 
@@ -141,9 +111,8 @@ def recording() -> list[bytes]:
     )
     for format in skins:
         taxels = np.arange(4 * format.channels).reshape(4, *format.shape).astype(format.numpy_type)
-        sweep = Sweep(
-            1, 0, 40_000_000, Status.OK, Frames(n, n, taxels), material="wood", session="a"
-        )
+        named = {"material": "wood", "session": "a"}
+        sweep = Sweep(1, 0, 40_000_000, Status.OK, Frames(n, n, taxels), **named)
         with TemporaryDirectory() as folder:
             path = Path(folder) / "sweep.npy"
             save(path, sweep, format)
@@ -197,10 +166,7 @@ FILES: Mapping[str, tuple[type, ...]] = {
     "capture": (SweepFormat,),
 }
 """Classes whose fields are the keys of a file."""
-MAGICS = {
-    "recording": [NPY, b"'descr': ", b"'shape': ", b"(4,)", b"'|O'"],
-    "capture": [MAGIC],
-}
+MAGICS = {"recording": [NPY, b"'descr': ", b"'shape': ", b"(4,)", b"'|O'"], "capture": [MAGIC]}
 
 
 def _settings() -> list[bytes]:
