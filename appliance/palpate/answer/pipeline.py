@@ -52,13 +52,13 @@ class Slide:
     """How the finger slid in a window.
 
     speed_mm_s: to three digits; None if it could not be measured, with the reason in `why`.
-    direction: of the finger, one of DIRECTIONS; "" without a speed. height: of the highest sum, in
-    standard deviations of a sum with random phases; 0 if nothing was computed. taxels_s: the speed
-    in taxels a second, 0 without one.
+    direction: of the finger, one of DIRECTIONS; None without a speed. height: of the highest sum,
+    in standard deviations of a sum with random phases; 0 if nothing was computed. taxels_s: the
+    speed in taxels a second, 0 without one.
     """
 
     speed_mm_s: float | None = None
-    direction: str = ""
+    direction: str | None = None
     height: float = 0.0
     why: str | None = None
     taxels_s: float = 0.0

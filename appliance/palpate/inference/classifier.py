@@ -348,7 +348,7 @@ class Classifier(Observer):
             speed_mm_s=sweep.speed_mm_s,
             force_n=sweep.force_n,
             measured_mm_s=context.slide.speed_mm_s,
-            direction=context.slide.direction or None,
+            direction=context.slide.direction,
         )
 
     def _detail(self, context: Context) -> str:

@@ -122,7 +122,7 @@ def test_a_skin_that_cannot_be_measured_says_why(format, pitch, why):
     meter = SlideMeter(format, pitch)
     found = meter(np.zeros((format.window, *format.shape), np.float32))
     assert why in meter.why
-    assert (found.speed_mm_s, found.direction, found.why) == (None, "", meter.why)
+    assert (found.speed_mm_s, found.direction, found.why) == (None, None, meter.why)
     assert meter.slowest_mm_s == meter.fastest_mm_s == 0
 
 
