@@ -9,6 +9,7 @@ soon as it is long enough for a line. Functions of raw counts; windows of one fo
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.answer.pipeline import Context
-from palpate.answer.window import TINY, Counts, Waves, Window, waves
+from palpate.answer.window import TINY, Counts, Waves, Window
 from palpate.core.types import SweepFormat, digitized, normal
 
 Array = NDArray[Any]
@@ -75,8 +76,8 @@ class HumFilter:
     """Finds and removes hum in windows of one format, unfinished ones included. hz: the frequencies
     of mains that a whole window shows; it may be too short or its rate too low for them."""
 
-    def __init__(self, format: SweepFormat) -> None:
-        self._rate_hz, self._type = format.rate_hz, format.numpy_type
+    def __init__(self, format: SweepFormat, least: float = math.inf) -> None:
+        self._rate_hz, self._type, self._least = format.rate_hz, format.numpy_type, least
         self._frames = format.window
         self._lines: dict[tuple[int, bool], HumLines] = {}  # by frames, and whether of a whole comb
         self.hz = tuple(sorted(set(self._of(format.window).mains.tolist())))
@@ -98,12 +99,17 @@ class HumFilter:
             return taxels, 0.0
         series = taxels.reshape(len(taxels), -1).astype(np.float64)
         series -= series.mean(axis=0)
-        every = self._comb(searched, int(found.argmax()), window, series.sum(axis=1))
+        common = series.sum(axis=1, keepdims=True).astype(np.float32)
+        every = self._comb(searched, int(found.argmax()), window, common)
         turns = 2 * np.pi / self._rate_hz * np.outer(np.arange(len(taxels)), every)
         waves = np.linalg.qr(np.concatenate([np.sin(turns), np.cos(turns)], axis=1))[0]
         hum = (waves @ (waves.T @ series)).reshape(taxels.shape)
         clean = digitized(taxels - hum, self._type)
         return clean, float(np.sqrt(2 * (normal(hum, 1) ** 2).mean()))
+
+    def apply(self, context: Context) -> None:
+        """Remove the hum that stands out by the filter's `least`."""
+        context.taxels, context.hum = self(context.window, self._least)
 
     def _of(self, frames: int, *, comb: bool = False) -> HumLines:
         """The lines of windows of this length: those that are searched, or all."""
@@ -118,7 +124,7 @@ class HumFilter:
         self, searched: HumLines, strongest: int, window: Window, common: Array
     ) -> list[float]:
         """The frequencies of the lines that the window has of a comb. strongest: number of the line
-        that was found. common: float64 [T], sum of all taxels."""
+        that was found. common: float32 [T, 1], sum of all taxels."""
         mains, order = searched.mains[strongest], searched.order[strongest]
         hz = self._refined(common, searched.hz[strongest], OFF_HZ * order)
         lines = self._of(len(window), comb=True)
@@ -148,10 +154,11 @@ class HumFilter:
         return found
 
     def _refined(self, common: Array, hz: float, off_hz: float) -> float:
-        """The frequency within `off_hz` of `hz` at which all taxels together, float64 [T], have
+        """The frequency within `off_hz` of `hz` at which all taxels together, float32 [T, 1], have
         most power: the highest of some frequencies, and the vertex of a parabola around it."""
         tried = hz + np.linspace(-off_hz, off_hz, STEPS)
-        power = np.log(np.abs(waves(tried, len(common), self._rate_hz) @ common) + TINY)
+        found = np.abs(Waves(tried, len(common), self._rate_hz)(common)[:, 0])
+        power = np.log(found + TINY, dtype=np.float64)
         top = int(power.argmax())
         if top in (0, STEPS - 1):
             return float(tried[top])
@@ -159,14 +166,3 @@ class HumFilter:
         bend = before - 2 * at + after
         shift = (before - after) / (2 * bend) if bend < 0 else 0.0
         return float(tried[top] + shift * (tried[1] - tried[0]))
-
-
-class RemoveHum:
-    """Removes hum that stands out by `least` from windows of one format."""
-
-    def __init__(self, format: SweepFormat, least: float) -> None:
-        self._filter, self._least = HumFilter(format), least
-
-    def apply(self, context: Context) -> None:
-        """Remove the hum."""
-        context.taxels, context.hum = self._filter(context.window, self._least)

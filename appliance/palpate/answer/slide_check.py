@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from palpate.answer.slide import CHANCE, NO_PATTERN, SlideMeter
 from palpate.answer.vibration import PARTS, SlideLimits, vibration
+from palpate.answer.window import Window
 from palpate.core.types import SweepFormat, normal
 
 FEW = 4
@@ -51,23 +52,21 @@ class SlideCheck:
     def __call__(self, taxels: NDArray[Any]) -> str | None:
         """The reason why a window of raw counts [T, R, C] or [T, R, C, A] is not a slide; None if
         it is one, or if that cannot be seen on this skin."""
-        load = np.abs(normal(taxels.mean(axis=0, dtype=np.float64) - self._tare, 0))
+        window = Window(taxels)
+        load = np.abs(normal(window.mean.reshape(self._tare.shape) - self._tare, 0))
         if self._contact is not None:
             if load.max() < self._contact:
                 return f"no contact: the strongest taxel has {load.max():.1f} raw counts"
             if (why := only_taxel(load, self._contact)) is not None:
                 return why
         if self._least is not None and len(taxels) >= 2 * PARTS:
-            rests = np.flatnonzero(vibration(taxels, self._tare) < self._least) + 1
+            rests = np.flatnonzero(vibration(window, self._tare) < self._least) + 1
             if len(rests):
                 where = " ".join(map(str, rests))
                 return f"the finger rests: hardly any vibration in part {where} of {PARTS}"
         if self._meter.why is not None:
             return None
-        slide = self._meter(taxels)
-        if slide.height < CHANCE:
-            return NO_SLIDE
-        return None
+        return NO_SLIDE if self._meter(window).height < CHANCE else None
 
 
 class SlidesAmong:

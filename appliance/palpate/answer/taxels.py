@@ -180,9 +180,10 @@ class Comparison:
 def surely_sound(measured: Window, bridging: Bridging) -> bool:
     """Whether all values change, and none is far noisier than the quietest: then `find` finds none,
     which takes longer."""
-    noise = measured.noise
-    quiet = max(float(noise.min()), bridging.quietest)
-    return measured.moving and measured.readable and bool(noise.max() <= bridging.noise * quiet)
+    quiet, loud = float(measured.noise.min()), float(measured.noise.max())
+    return (
+        measured.readable and quiet > 0 and loud <= bridging.noise * max(quiet, bridging.quietest)
+    )
 
 
 def find(

@@ -299,18 +299,13 @@ class ClassDistances:
         away *= np.sqrt(self._share)[:, None]
         return away.reshape(len(away), self._means.size).astype(np.float32)
 
-    def _away(self, embedding: NDArray[Any]) -> Array:
-        """Differences [..., K, r] of embeddings [..., r] from the class means."""
-        away: Array = (embedding @ self._turn)[..., None, :] - self._means
-        return away
-
     def distances(self, embedding: NDArray[Any]) -> Array:
         """Squared distances float64 [..., K] from embeddings [..., r] to the class means; no unit.
 
         The scatter is that of all materials together, so the nearest mean is the result of LDA.
         """
-        result: Array = (self._away(embedding) ** 2).sum(axis=-1)
-        return result
+        away: Array = (embedding @ self._turn)[..., None, :] - self._means
+        return np.asarray((away**2).sum(axis=-1))
 
     def logits(self, distances: Array) -> NDArray[np.float32]:
         """Logits [..., K] from `distances` [..., K], up to a term that is the same for all

@@ -3,7 +3,6 @@ once, and in float32. Pure functions of raw counts."""
 
 from __future__ import annotations
 
-import math
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -18,8 +17,6 @@ TRIPLES = 100
 change the result by less than a tenth."""
 TINY = 1e-30
 """Replaces 0 as a divisor, or where a logarithm is taken."""
-WIDE = 100
-"""Most frames in a row of an extreme."""
 
 
 class Window:
@@ -43,16 +40,12 @@ class Window:
         return self.taxels.reshape(len(self), -1)
 
     @cached_property
-    def first(self) -> NDArray[np.float32]:
-        """The first frame [V]."""
-        return np.asarray(self.series[0], np.float32)
-
-    @cached_property
     def values(self) -> NDArray[np.float32]:
         """Counts [T, V] above the first frame: squares of large counts would round small vibrations
         away. NaN throughout for a value that is not readable."""
-        first = self.first if self.readable else np.where(self.unreadable, np.nan, self.first)
-        return np.subtract(self.series, first, dtype=np.float32)
+        first = self.series[0]
+        first = first if self.readable else np.where(self.unreadable, np.nan, first)
+        return np.asarray(np.subtract(self.series, first, dtype=np.float32))
 
     @cached_property
     def counts(self) -> NDArray[np.float32]:
@@ -65,23 +58,17 @@ class Window:
     def mean(self) -> NDArray[np.float64]:
         """Mean raw counts [V]."""
         above = ones(len(self)).dot(self.values)  # of whole counts exact
-        return np.asarray(self.first + above / np.float64(len(self)))
+        return np.asarray(self.series[0] + above / np.float64(len(self)))
 
     @cached_property
     def highest(self) -> Array:
         """Highest raw counts [V]."""
-        return self._extreme(np.maximum)
+        return np.asarray(self.series.max(axis=0))
 
     @cached_property
     def lowest(self) -> Array:
         """Lowest raw counts [V]."""
-        return self._extreme(np.minimum)
-
-    def _extreme(self, of: np.ufunc) -> Array:
-        """In long rows of several frames, because numpy is slow with short ones."""
-        rows = self.series.reshape(len(self) // math.gcd(len(self), WIDE), -1)
-        extreme: Array = of.reduce(of.reduce(rows).reshape(-1, self.series.shape[1]))
-        return extreme
+        return np.asarray(self.series.min(axis=0))
 
     @property
     def still(self) -> NDArray[np.bool_]:
@@ -100,12 +87,7 @@ class Window:
     @cached_property
     def readable(self) -> bool:
         """Whether no value is unreadable."""
-        return self.taxels.dtype.kind != "f" or not self.unreadable.any()
-
-    @cached_property
-    def moving(self) -> bool:
-        """Whether all values certainly change; if not, `still` shows which do not."""
-        return bool(self.noise.min() > 0)
+        return self.series.dtype.kind != "f" or bool(np.abs(self.series).max() <= LARGEST_READING)
 
     @cached_property
     def noise(self) -> NDArray[np.float32]:
@@ -134,23 +116,18 @@ def ones(number: int) -> NDArray[np.float32]:
     return np.ones(number, np.float32)
 
 
-def waves(hz: Array, frames: int, rate_hz: float, trend: int = 0) -> NDArray[np.complex128]:
-    """Multiplies series [T, N] to give complex amplitudes [F, N] at `hz` [F], with a Hann window,
-    without a polynomial of degree `trend`, 0 or 1. Phases are those in the middle."""
-    time = np.arange(frames) - (frames - 1) / 2
-    turns: Array = np.exp(-2j * np.pi / rate_hz * hz[:, None] * time) * np.hanning(frames)
-    for power in range(trend + 1):
-        base = time**power / max(float(np.linalg.norm(time**power)), 1.0)
-        turns -= (turns @ base)[:, None] * base
-    return turns
-
-
 class Waves:
-    """Gives amplitudes complex64 [F, N] of series float32 [T, N], as `waves`. The real part of a
-    wave is even around the middle, the imaginary part odd, so half of it suffices."""
+    """Gives amplitudes complex64 [F, N] at `hz` [F] of series float32 [T, N], with a Hann window
+    and without a polynomial of degree `trend`, 0 or 1. Phases are those in the middle: around it
+    the real part of a wave is even and the imaginary part odd, so half of it suffices."""
 
     def __init__(self, hz: Array, frames: int, rate_hz: float, trend: int = 0) -> None:
-        half = waves(hz, frames, rate_hz, trend)[:, : (frames + 1) // 2]
+        time = np.arange(frames) - (frames - 1) / 2
+        turns: Array = np.exp(-2j * np.pi / rate_hz * hz[:, None] * time) * np.hanning(frames)
+        for power in range(trend + 1):
+            base = time**power / max(float(np.linalg.norm(time**power)), 1.0)
+            turns -= (turns @ base)[:, None] * base
+        half = turns[:, : (frames + 1) // 2]
         half[:, frames // 2 :] /= 2  # the frame in the middle is its own mirror image
         self._even, self._odd = half.real.astype(np.float32), half.imag.astype(np.float32)
 

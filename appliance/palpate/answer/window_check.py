@@ -109,7 +109,7 @@ def inspect(
         strongest = float(load[..., -1].max())
         return Finding(Status.NO_CONTACT, Remark(Reason.UNLOADED, {"counts": strongest}))
     full = _at_full_scale(window, limits.full_scale, shape)
-    if full is None and window.moving:
+    if full is None and window.noise.min() > 0:
         return Finding(Status.OK, mean=window.mean.reshape(tare.shape))
     full, still = np.zeros(shape) if full is None else full, window.still.reshape(shape)
     stuck = still & loaded & (full < 1)
@@ -147,12 +147,10 @@ def _at_full_scale(
     """Share of the frames at full scale, of `shape` [R, C, A]; on shear axes at its negative, too.
     None if there are none, as mostly: counting takes longer than all the rest."""
     series = window.series
-    lowered = shape[2] > 1 and window.lowest.reshape(shape)[..., :-1].min() <= -full_scale
-    if not lowered and series.max() < full_scale:
+    if series.max() < full_scale and (shape[2] == 1 or series.min() > -full_scale):
         return None
     full: NDArray[np.float64] = (series >= full_scale).mean(axis=0).reshape(shape)
-    if lowered:
-        full[..., :-1] += (series <= -full_scale).mean(axis=0).reshape(shape)[..., :-1]
+    full[..., :-1] += (series <= -full_scale).mean(axis=0).reshape(shape)[..., :-1]
     return full
 
 
@@ -170,13 +168,10 @@ def enclosed(loaded: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def inspect_readings(taxels: NDArray[Any]) -> Finding:
     """Check a window of an unknown skin: a taxel with a count that is not a number or impossibly
     large is dead."""
-    if taxels.dtype.kind != "f":
+    if (window := Window(taxels)).readable:
         return Finding(Status.OK)
     shape = (*taxels.shape[1:], 1)[:3]
-    unreadable = Window(taxels).unreadable.reshape(shape)
-    return (
-        Finding(Status.DEAD_TAXEL, _taxels(unreadable)) if unreadable.any() else Finding(Status.OK)
-    )
+    return Finding(Status.DEAD_TAXEL, _taxels(window.unreadable.reshape(shape)))
 
 
 def inspect_bare(taxels: NDArray[Any], unloaded: UnloadedSkin) -> Finding:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from palpate.answer import features
 from palpate.answer.contact import LocateContact, WithinReach
 from palpate.answer.disturbance import MeasureDisturbances, WasTried
-from palpate.answer.hum import RemoveHum
+from palpate.answer.hum import HumFilter
 from palpate.answer.objects import (
     Certain,
     EnrolledLabels,
@@ -117,7 +117,7 @@ class Classifier(Observer):
         self._model = ModelRunner(bundle.model, *self._outputs)
         self._cleaning: list[Stage] = [self.taxels]
         if m.disturbances and m.disturbances.hum:
-            self._cleaning.append(RemoveHum(m.format, m.disturbances.hum))
+            self._cleaning.append(HumFilter(m.format, m.disturbances.hum))
         self._measuring, self._judging = self._measures(slides), self._judges()
         network: list[Stage] = [NetworkStage(self, *self._outputs)]
         if self._means:
