@@ -129,7 +129,8 @@ class TcpServer:
         connection = writer.get_extra_info("socket")
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         for name, value in KEEPALIVE.items():
-            connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
+            if hasattr(socket, name):  # not on every desktop
+                connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
         # the default of the kernel is some megabytes
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER)
         peer = TcpPeer(reader, writer, now_s)

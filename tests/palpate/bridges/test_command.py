@@ -49,8 +49,8 @@ def test_ctrl_c_while_the_box_owes_an_answer(kind):
         told = bridge.stderr.readline()
         port = int(re.search(r"listening on 127.0.0.1:(\d+)", told)[1])
         with socket.create_connection(("127.0.0.1", port)) as client:
-            start = {"tcp": b"PPLP START\r\n", "modbus": bytes.fromhex("0001000000060105 0000ff00")}
-            client.sendall(start[kind])
+            coil = bytes.fromhex("000100000006010500000000 00010000000601050000ff00")  # 0, then 1
+            client.sendall({"tcp": b"PPLP START\r\n", "modbus": coil}[kind])
             assert select.select([far], [], [], 30)[0]
             bridge.send_signal(signal.SIGINT)
             rest = bridge.communicate(timeout=60)[1]
