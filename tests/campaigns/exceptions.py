@@ -217,12 +217,7 @@ def play(scene: str, model: bundle.Bundle, calls: ThrowingCalls) -> PlayedScene:
     ended: BaseException | None = None
     with ExitStack() as stack:
         box = assembly.box(
-            settings,
-            model,
-            simulated,
-            port,
-            stack,
-            observers=[throwing_observer(calls)],
+            settings, model, simulated, port, stack, observers=[throwing_observer(calls)]
         )
         edges = _stand_before(box, calls)
         try:

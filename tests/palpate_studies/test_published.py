@@ -27,10 +27,7 @@ def test_a_set_has_the_published_split(name: str):
     pytest.importorskip("aeon")
     s = published.load(f"aeon:{name}")
     first, second, classes, frames, channels = SIZES[name]
-    assert (s.samples.shape, s.samples.dtype) == (
-        (first + second, frames, channels, 1),
-        np.float32,
-    )
+    assert (s.samples.shape, s.samples.dtype) == ((first + second, frames, channels, 1), np.float32)
     assert len(s.materials) == classes == len(np.unique(s.labels))
     assert (s.rate_hz, s.source) == (100.0, f"aeon:{name}")
     ((train, test),) = Protocol("split:split=0->1").folds(s, 1)

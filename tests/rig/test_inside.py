@@ -24,10 +24,7 @@ CODE = (
 
 
 def test_the_contract_holds_on_a_real_kernel(
-    image: Image,
-    tmp_path: Path,
-    count: Count,
-    note: Note,
+    image: Image, tmp_path: Path, count: Count, note: Note
 ):
     """test_backends.py on xHCI, PL061 and a 16550; a part where time is short."""
     code = tmp_path / "code"

@@ -15,14 +15,7 @@ from palpate.core.clock import Clock
 from palpate.io import packets
 from tests.rig.cell import Cell
 from tests.rig.notes import HOW, Count, Note
-from tests.rig.sound import (
-    begin,
-    check_recovers,
-    not_wrong,
-    only_answer,
-    state,
-    until_state,
-)
+from tests.rig.sound import begin, check_recovers, not_wrong, only_answer, state, until_state
 
 Mangle = Callable[[bytes], bytes]
 

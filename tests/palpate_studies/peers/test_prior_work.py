@@ -188,11 +188,7 @@ def test_later_sweeps_correct_the_first():
 
 
 @pytest.mark.parametrize(
-    ("log_p", "sure", "hint"),
-    [
-        (np.zeros((0, 3)), 0.9, "one of"),
-        (np.zeros((2, 3)), 1.5, "1.5"),
-    ],
+    ("log_p", "sure", "hint"), [(np.zeros((0, 3)), 0.9, "one of"), (np.zeros((2, 3)), 1.5, "1.5")]
 )
 def test_what_cannot_be_explored_is_named(log_p: np.ndarray, sure: float, hint: str):
     """No sweep, and a certainty that is not a probability."""

@@ -216,16 +216,12 @@ def test_a_graph_without_tenths_has_no_early_heads(made):
     for model in (
         bundle_graph(done, trunk(FORMAT)),
         bundle_graph(
-            replace(done, rule=fit_early.EarlyRule(None, "why")),
-            trunk(FORMAT),
-            trunk(FORMAT, True),
+            replace(done, rule=fit_early.EarlyRule(None, "why")), trunk(FORMAT), trunk(FORMAT, True)
         ),
     ):
         assert [o.name for o in model.graph.output] == ["logits", "embedding"]
         assert np.allclose(
-            softmax(run(model, counts[:2])),
-            softmax(done.logits(x[:2, -1])),
-            atol=1e-3,
+            softmax(run(model, counts[:2])), softmax(done.logits(x[:2, -1])), atol=1e-3
         )
 
 

@@ -48,7 +48,7 @@ def test_the_command_splits_and_keeps_the_rest(tmp_path: Path, capsys: pytest.Ca
 @pytest.mark.parametrize(
     ("args", "message"),
     [
-        ("--set none.npz", r"none.npz"),
+        ("--set none.npz", "none.npz"),
         ("--set sim:T-LAB:1:1 --only force=1", "'force'"),
         ("--set sim:T-LAB:1:1 --split recording", "'recording'"),
         ("--set sim:T-LAB:1:1 --rest rest.npz", "--rest"),
@@ -59,8 +59,8 @@ def test_the_command_splits_and_keeps_the_rest(tmp_path: Path, capsys: pytest.Ca
         ("--set sim:T-LAB:1:1 --stretch -1", "--stretch -1"),
         ("--set sim:T-LAB:1:1 --out /proc/none/fit.npz", "cannot be written there"),
         ("--set sim:T-LAB:1:1 --out /", "--out / "),
-        ("--set sim:T-LAB:1:1 --out f.csv", r"f.csv"),
-        ("--set x.npz --split recording:0.5 --rest r.pdf", r"r.pdf"),
+        ("--set sim:T-LAB:1:1 --out f.csv", "f.csv"),
+        ("--set x.npz --split recording:0.5 --rest r.pdf", "r.pdf"),
         ("--set sim:T-LAB:1:1 --rename wood", "'wood'"),
         ("--set sim:T-LAB:1:1 --rename wod=oak", "'wod'"),
         ("--set sim:T-LAB:1:1 --rename wood=a --rename wood=b", "'a' and 'b'"),
@@ -106,22 +106,13 @@ def test_a_reader_that_closes_the_pipe_ends_the_command_quietly():
 @pytest.mark.parametrize(
     ("args", "message"),
     [
-        ("fit --set none --seed 1 --out /proc/none/b.npz", r"/proc/none/b.npz"),
+        ("fit --set none --seed 1 --out /proc/none/b.npz", "/proc/none/b.npz"),
         ("export none.npz --out /proc/none/b --name b --version 1", "/proc/none/b"),
         ("fit --set none --seed 1 --out b.npz --method magic", "'magic'"),
-        (
-            "fit --set none --seed 1 --out b.npz --method H-svm --size bands",
-            "--size",
-        ),
-        ("score none --set none.npz --json /proc/none/x.json", r"/proc/none/x.json"),
-        (
-            "evaluate --set none --protocol random:2 --method H-svm --jobs 0",
-            "--jobs 0",
-        ),
-        (
-            "evaluate --set none --protocol random:2 --method H-svm --effort 0",
-            "--effort 0",
-        ),
+        ("fit --set none --seed 1 --out b.npz --method H-svm --size bands", "--size"),
+        ("score none --set none.npz --json /proc/none/x.json", "/proc/none/x.json"),
+        ("evaluate --set none --protocol random:2 --method H-svm --jobs 0", "--jobs 0"),
+        ("evaluate --set none --protocol random:2 --method H-svm --effort 0", "--effort 0"),
         ("evaluate --set none --protocol random:2 --method magic", "'magic'"),
     ],
 )

@@ -248,11 +248,7 @@ def test_each_bad_text_gets_one_exact_line(tmp_path: Path, name: str):
     [
         ("npy", lambda p: np.save(p, np.zeros(9)), "holds float64 [9]"),
         ("npy", lambda p: np.save(p, np.array(["a"])), "holds <U1 [1]"),
-        (
-            "npy",
-            lambda p: np.save(p, np.array([{}]), allow_pickle=True),
-            "of Python",
-        ),
+        ("npy", lambda p: np.save(p, np.array([{}]), allow_pickle=True), "of Python"),
         ("npy", lambda p: p.write_bytes(b"\x93NUMPY"), "be read: "),
         ("npy", lambda p: np.save(p, np.zeros((20, 3, 3))), "[3, 3]"),
         ("npz", lambda p: p.write_bytes(b"PK\3\4"), "be read: "),

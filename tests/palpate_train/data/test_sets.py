@@ -55,10 +55,7 @@ NAN[4, 7, 1, 2] = np.nan
         ({"samples": np.zeros((6, 8, 2, 3, 9), np.uint8)}, "9 axes"),
         ({"samples": np.zeros((6, 8, 2, 3))}, r"astype\('float32'\)"),
         ({"samples": np.full((6, 8, 2, 3), -1)}, r"astype\('int16'\)"),
-        (
-            {"samples": np.ones((6, 8, 2, 3), bool)},
-            "bool; .*'uint8'",
-        ),
+        ({"samples": np.ones((6, 8, 2, 3), bool)}, "bool; .*'uint8'"),
         ({"samples": np.full((6, 8, 2, 3), 1 << 40)}, r"astype\('float32'\)"),
         ({"samples": np.full((6, 8, 2, 3), 1j)}, "complex128"),
         ({"samples": np.zeros((6, 8, 256, 1), np.uint8)}, "256 x 1 "),

@@ -49,7 +49,7 @@ def fitted() -> PalpateClassifier:
 
 UNEQUAL = {
     "check_sample_weight_equivalence_on_dense_data": "filters and copies are drawn for each sweep "
-    "of the set, also for one that counts 0 or twice",
+    "of the set, also for one that counts 0 or twice"
 }
 """Checks of scikit-learn that fail, with the reason."""
 

@@ -37,11 +37,7 @@ def test_of_a_large_set_sweeps_from_all_over_it_are_shown(monkeypatch: pytest.Mo
 
 @pytest.mark.parametrize(
     ("count", "numbers", "message"),
-    [
-        (0, None, "mine.npz"),
-        (12, range(5, 13), "0 to 11"),
-        (12, range(3), "holds 1 "),
-    ],
+    [(0, None, "mine.npz"), (12, range(5, 13), "0 to 11"), (12, range(3), "holds 1 ")],
 )
 def test_what_a_page_cannot_show_is_refused(
     count: int, numbers: range | None, message: str, monkeypatch: pytest.MonkeyPatch

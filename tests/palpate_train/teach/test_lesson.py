@@ -31,12 +31,7 @@ def test_sweeps_that_cannot_be_taught_are_left_out_and_counted(tmp_path: Path):
     sweeps(tmp_path, "b", first=7)
     lesson = Lesson.read(tmp_path)
     assert lesson.names == ("sweep-000001", "sweep-000002", "sweep-000007")
-    assert dict(lesson.left_out) == {
-        "no material": 1,
-        "gap": 1,
-        "damaged": 1,
-        "another format": 1,
-    }
+    assert dict(lesson.left_out) == {"no material": 1, "gap": 1, "damaged": 1, "another format": 1}
 
 
 def test_a_missing_position_is_a_place_of_its_own(tmp_path: Path):

@@ -81,13 +81,7 @@ def test_a_bundle_is_made_without_a_desktops_libraries(tmp_path: Path):
     assert lines[-1]["peak_mb"] < 700
 
 
-@pytest.mark.parametrize(
-    ("materials", "each", "why"),
-    [
-        (1, 6, "'high'"),
-        (3, 2, "'high' has 2"),
-    ],
-)
+@pytest.mark.parametrize(("materials", "each", "why"), [(1, 6, "'high'"), (3, 2, "'high' has 2")])
 def test_too_little_is_refused_with_the_remedy(tmp_path: Path, materials: int, each: int, why: str):
     """One material, or too few sweeps of one: no bundle, and the reason on a line."""
     sweeps = easy(each)
@@ -163,8 +157,7 @@ sys.exit(9 if "numpy" in sys.modules else code)
 
 
 @pytest.mark.parametrize(
-    ("free_mb", "limit_mb", "why"),
-    [(4000, 100, "100 MB"), (50, 768, "50 MB"), (50, 0, "50 MB")],
+    ("free_mb", "limit_mb", "why"), [(4000, 100, "100 MB"), (50, 768, "50 MB"), (50, 0, "50 MB")]
 )
 def test_too_little_memory_is_said_before_numpy_is_loaded(
     tmp_path: Path, free_mb: int, limit_mb: int, why: str

@@ -61,11 +61,7 @@ def test_a_set_under_the_cap_is_used_whole():
 
 @pytest.mark.parametrize(
     ("kilobytes", "limit", "advice"),
-    [
-        (1_000_000, "max", "1.0 GB"),
-        (9_000_000, "500000000", "0.4 GB"),
-        (100_000, "max", "0.1 GB"),
-    ],
+    [(1_000_000, "max", "1.0 GB"), (9_000_000, "500000000", "0.4 GB"), (100_000, "max", "0.1 GB")],
 )
 def test_what_cannot_be_held_is_told_before(
     kilobytes: int, limit: str, advice: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
