@@ -177,6 +177,19 @@ def test_no_test_imports_another():
 
 
 @pytest.mark.slow
+def test_heavy_libraries_are_imported_by_tests_that_run():
+    """Each process collects all tests, so a module of tests imports these in a `Later`."""
+    code = (
+        "import sys, pytest; "
+        "assert not pytest.main(['--collect-only', '-q', '-p', 'no:cacheprovider', 'tests']); "
+        "print([one for one in ('torch', 'sklearn', 'scipy', 'pandas') if one in sys.modules])"
+    )
+    how = {"capture_output": True, "text": True, "check": True, "cwd": ROOT}
+    done = subprocess.run([sys.executable, "-c", code], timeout=280, **how)
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
+@pytest.mark.slow
 def test_a_fresh_process_loads_nothing_of_the_desktop():
     """After a whole virtual run, PyTorch, scikit-learn, scipy and train are not in the process."""
     code = (

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 from palpate.answer.unknown import Known, shaped_distances
 from palpate.core.errors import FormatError
@@ -194,6 +193,8 @@ def _deviation(by_material: Sequence[Array]) -> float:
 
 def _share_below(grid: Array, by_material: Sequence[Array]) -> Array:
     """The smooth share of values below each value of `grid`, the mean of all materials."""
+    from scipy.special import ndtr
+
     wide, share = WIDTH * _deviation(by_material), np.zeros(len(grid))
     for of in by_material:
         steps = (grid[:, None] - of) / (wide * len(of) ** -0.2)
