@@ -28,6 +28,7 @@ from palpate.inference.session import session
 from palpate.sim import skin
 from palpate_studies import cost
 from palpate_studies.command import main as study
+from palpate_train.answer import rules, stranger_limits
 from palpate_train.answer.heads import HeadData
 from palpate_train.answer.rules import RULES, Asked, present
 from palpate_train.cli.main import main
@@ -478,16 +479,23 @@ def test_references_are_what_they_are_called(tmp_path: Path, caplog: pytest.LogC
 def test_the_command_exports_what_fit_wrote(
     fitted: Fit, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """It prints one line for each figure and each rule, then the size, at last the command to score
-    it; another file has the exit code of FormatError."""
+    """It prints one line for each figure and each rule, two for the cost of its limits, then the
+    size, at last the command to score it; another file has the exit code of FormatError."""
     fitted.save(tmp_path / "fit.npz")
     args = ["--out", str(tmp_path / "bundle"), "--name", "easy", "--version", "3"]
+    args += ["--stranger-cost", "2"]
     assert main(["export", str(tmp_path / "fit.npz"), *args]) == 0
     lines = capsys.readouterr().out.splitlines()
     lines = [line for line in lines if not line.startswith("  ")]  # each fault, each alteration
     ruled = [line for line in lines if line.startswith(tuple(r.what for r in RULES.values()))]
-    assert any("not needed" in line for line in ruled)
     lines = [line for line in lines if line not in ruled]
+    made = bundle.load(tmp_path / "bundle").manifest
+    cost = stranger_limits.lines(made.figures)
+    assert len(cost) == 2
+    assert set(cost) < set(lines)
+    assert made.made[stranger_limits.COST] == 2
+    assert len(ruled) == len(made.figures[rules.FIGURES])
+    lines = [line for line in lines if line not in cost]
     assert [line.split(":")[0] for line in lines] == [
         "held-out speed, as the box answers",
         "held-out speed, network alone",
