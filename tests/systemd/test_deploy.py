@@ -74,7 +74,7 @@ def changed(wheel: Path, folder: Path, name: str, text: str) -> Path:
     return made
 
 
-class Box:
+class DeployedBox:
     """The installed host, as a person at the desktop uses it."""
 
     def __init__(self, site: hosts.Hosts) -> None:
@@ -126,12 +126,12 @@ class Box:
 
 
 @pytest.fixture
-def box(site: hosts.Hosts, installed: str) -> Box:
+def box(site: hosts.Hosts, installed: str) -> DeployedBox:
     """The installed host."""
-    return Box(site)
+    return DeployedBox(site)
 
 
-def test_a_bare_host_is_installed_as_a_bare_user(box: Box, installed: str):
+def test_a_bare_host_is_installed_as_a_bare_user(box: DeployedBox, installed: str):
     """From a Debian without Python to an active service with the board's name."""
     assert re.fullmatch(r"robot@127\.0\.0\.1: \S+ is READY [0-9.]+ s .*\n", installed)
     assert (box.service["ActiveState"], box.service["UnitFileState"]) == ("active", "enabled")
@@ -151,7 +151,7 @@ def test_a_bare_host_is_installed_as_a_bare_user(box: Box, installed: str):
     assert box.get("find", f"/home/{hosts.USER}", "-name", ".palpate*") == ""
 
 
-def test_a_second_install_changes_nothing(box: Box, wheel: Path):
+def test_a_second_install_changes_nothing(box: DeployedBox, wheel: Path):
     """The same command again: the process goes on, settings and signers stay."""
     before, signers = box.runs(), box.site.work / "signers"
     done = box.does("install", wheel, "--board", "rpi5", "--signers", signers)
@@ -160,7 +160,7 @@ def test_a_second_install_changes_nothing(box: Box, wheel: Path):
     assert box.get("cat", "/etc/palpate/palpate.toml") == 'board = "rpi5"'
 
 
-def test_the_board_that_is_named_last_holds(box: Box, wheel: Path):
+def test_the_board_that_is_named_last_holds(box: DeployedBox, wheel: Path):
     """It replaces a wrong board, other settings stay, and the service starts with it."""
     file, (_, pid) = "/etc/palpate/palpate.toml", box.runs()
     box.machine.put(file, 'board = "rpi9"\n# mine\n')
@@ -182,7 +182,7 @@ def test_a_board_without_a_file_is_refused_before_any_box_is_asked():
     assert "rpi4, rpi5" in done.stderr
 
 
-def test_signers_are_never_overwritten(box: Box, wheel: Path, tmp_path: Path):
+def test_signers_are_never_overwritten(box: DeployedBox, wheel: Path, tmp_path: Path):
     """Another signers' file is refused with a reason; the box keeps its own."""
     (tmp_path / "others").write_text(deliveries.line(deliveries.key(tmp_path)))
     before = box.get("cat", "/etc/palpate/allowed_signers")
@@ -203,7 +203,7 @@ def test_a_box_without_packages_and_mirror_is_refused(site: hosts.Hosts, wheel: 
     assert machine.get("ls", "/opt") == ""
 
 
-def test_what_a_person_put_there_stays(box: Box, wheel: Path):
+def test_what_a_person_put_there_stays(box: DeployedBox, wheel: Path):
     """Their settings are kept; a file in the way ends it before anything else."""
     settings, program, before = "/etc/palpate/skin.toml", "/usr/local/bin/palpate", box.runs()
     for path in (settings, program):
@@ -222,7 +222,7 @@ def upgraded(
     site: hosts.Hosts, installed: str, wheel: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> list[tuple[str, str]]:
     """Installs two more releases on the host; each with the output of the command."""
-    folder, box = tmp_path_factory.mktemp("releases"), Box(site)
+    folder, box = tmp_path_factory.mktemp("releases"), DeployedBox(site)
     outputs = [(box.release(), installed)]
     for i in range(2):
         done = box.does("install", changed(wheel, folder, "palpate/more.py", f"# {i}\n"))
@@ -230,7 +230,7 @@ def upgraded(
     return outputs
 
 
-def test_an_upgrade_swaps_everything_at_once(box: Box, upgraded: list[tuple[str, str]]):
+def test_an_upgrade_swaps_everything_at_once(box: DeployedBox, upgraded: list[tuple[str, str]]):
     """Another release runs; the previous release is kept, older releases are removed."""
     releases = [name for name, _ in upgraded]
     assert len({*releases}) == 3
@@ -242,7 +242,7 @@ def test_an_upgrade_swaps_everything_at_once(box: Box, upgraded: list[tuple[str,
 
 
 def test_a_release_that_does_not_start_gives_way_to_the_old_one(
-    box: Box, wheel: Path, tmp_path: Path
+    box: DeployedBox, wheel: Path, tmp_path: Path
 ):
     """Self-test passed, no start: the link is swapped back, the old one classifies."""
     before = box.release()
@@ -254,7 +254,7 @@ def test_a_release_that_does_not_start_gives_way_to_the_old_one(
 
 
 def test_a_release_that_fails_its_self_test_is_never_swapped_in(
-    box: Box, wheel: Path, tmp_path: Path
+    box: DeployedBox, wheel: Path, tmp_path: Path
 ):
     """The process that classifies is not touched."""
     before, fails = box.runs(), "\nraise OSError('not on this box')\n"
@@ -267,7 +267,7 @@ def test_a_release_that_fails_its_self_test_is_never_swapped_in(
     ("said", "after_s"), [("copying", 0.3), ("building", 0.5), ("building", 4.0)]
 )
 def test_an_install_that_is_cut_is_finished_by_the_next(
-    box: Box, wheel: Path, tmp_path: Path, said: str, after_s: float
+    box: DeployedBox, wheel: Path, tmp_path: Path, said: str, after_s: float
 ):
     """Cut during the copy or the build: the old release starts, a second call ends it."""
     new = changed(wheel, tmp_path, "palpate/more.py", f"# {said} {after_s}\n")
@@ -280,7 +280,7 @@ def test_an_install_that_is_cut_is_finished_by_the_next(
     assert box.service["ActiveState"] == "active"
 
 
-def test_a_swap_that_is_cut_leaves_old_or_new(box: Box, upgraded: list[tuple[str, str]]):
+def test_a_swap_that_is_cut_leaves_old_or_new(box: DeployedBox, upgraded: list[tuple[str, str]]):
     """Dead before the N-th command, for each N: one release or the other, complete."""
     new, old = box.release(), box.get("readlink", "/opt/palpate.previous")
     script = run_here(f"import install; print(install.swap('/opt/{old}', '{new}'))")
@@ -318,7 +318,7 @@ def sender(site: hosts.Hosts, installed: str, tmp_path_factory: pytest.TempPathF
     return Sender(tmp_path_factory.mktemp("bundles"), site.work / "keys" / "key")
 
 
-def test_a_bundle_is_delivered_and_runs_on_trial(box: Box, sender: Sender, tmp_path: Path):
+def test_a_bundle_is_delivered_and_runs_on_trial(box: DeployedBox, sender: Sender, tmp_path: Path):
     """READY and on trial, no files left behind; a second delivery changes nothing."""
     bundle, sha = sender.made()
     more = ("--signers", box.site.work / "signers", "--json", tmp_path / "report.json")
@@ -334,7 +334,7 @@ def test_a_bundle_is_delivered_and_runs_on_trial(box: Box, sender: Sender, tmp_p
     assert box.runs() == before
 
 
-def test_a_bundle_with_an_unknown_key_is_refused(box: Box, sender: Sender, tmp_path: Path):
+def test_a_bundle_with_an_unknown_key_is_refused(box: DeployedBox, sender: Sender, tmp_path: Path):
     """By the desktop if it has the signers, by the box always; the running program goes on."""
     bundle, sha = sender.made(99, deliveries.key(tmp_path))
     before = box.serves(), box.runs()
@@ -351,7 +351,7 @@ def test_a_bundle_with_an_unknown_key_is_refused(box: Box, sender: Sender, tmp_p
     + [("checking", 0.3), ("restarting", 0.5)],
 )
 def test_a_delivery_that_is_cut_leaves_old_or_new(
-    box: Box, sender: Sender, said: str, after_s: float
+    box: DeployedBox, sender: Sender, said: str, after_s: float
 ):
     """Cut at any time: the old bundle or the new; a second delivery finishes."""
     (bundle, sha), before = sender.made(), box.serves()
@@ -362,7 +362,7 @@ def test_a_delivery_that_is_cut_leaves_old_or_new(
     assert box.serves() == sha[:8]
 
 
-def test_without_a_skin_the_bundle_is_installed_and_ready_waits(box: Box, sender: Sender):
+def test_without_a_skin_the_bundle_is_installed_and_ready_waits(box: DeployedBox, sender: Sender):
     """Reported well before the deadline, no failure of the bundle; then READY."""
     box.machine.put("/opt/palpate/cable.py", CABLE)
     box.service.configure(CABLED)
@@ -379,7 +379,7 @@ def test_without_a_skin_the_bundle_is_installed_and_ready_waits(box: Box, sender
         box.start_again()
 
 
-def test_a_candidate_is_delivered_beside(box: Box, sender: Sender):
+def test_a_candidate_is_delivered_beside(box: DeployedBox, sender: Sender):
     """With --shadow the old bundle still answers."""
     (bundle, sha), before = sender.made(), box.serves()
     box.does("deploy", bundle, "--shadow")
@@ -387,7 +387,7 @@ def test_a_candidate_is_delivered_beside(box: Box, sender: Sender):
 
 
 def test_boxes_that_fail_do_not_stop_the_others(
-    site: hosts.Hosts, box: Box, sender: Sender, tmp_path: Path
+    site: hosts.Hosts, box: DeployedBox, sender: Sender, tmp_path: Path
 ):
     """No connection, no answer, a hang, no Palpate: each its reason, the good one READY."""
     with socket.create_server(("127.0.0.1", 0)) as dumb, stalling(box.host) as hangs:
@@ -435,7 +435,7 @@ def stalling(host: hosts.Host) -> Iterator[int]:
         yield door.getsockname()[1]
 
 
-def test_a_user_who_needs_a_password_for_sudo_is_refused(box: Box, sender: Sender):
+def test_a_user_who_needs_a_password_for_sudo_is_refused(box: DeployedBox, sender: Sender):
     """At once and with a reason, instead of a prompt that nobody answers."""
     box.machine.put("/etc/sudoers.d/user", f"{hosts.USER} ALL=(ALL) ALL\n")
     try:

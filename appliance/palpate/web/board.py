@@ -18,7 +18,7 @@ from palpate.core.errors import FormatError
 from palpate.core.schema import typed
 from palpate.core.status import REASONS
 from palpate.core.types import SweepFormat
-from palpate.web.sweep_picture import Window, picture, window
+from palpate.web.sweep_picture import DrawnWindow, picture, window
 
 SHIFT = 5000
 """Verdicts in the list: eight hours with a sweep every six seconds."""
@@ -59,7 +59,7 @@ class PageBoard:
         self._minute: tuple[int, int, int] | None = (
             None  # time, frames and lost frames at the begin of the minute
         )
-        self._windows: OrderedDict[int, Window] = OrderedDict()
+        self._windows: OrderedDict[int, DrawnWindow] = OrderedDict()
         self._taken = 0
 
     def take(self, line: Mapping[str, Any]) -> None:

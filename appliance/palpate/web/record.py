@@ -25,7 +25,7 @@ from palpate.io.robot_link import Command
 from palpate.sweeps.recording import Labels
 from palpate.web.access import Access
 from palpate.web.server import PageServer
-from palpate.web.sweep_picture import Window, picture
+from palpate.web.sweep_picture import DrawnWindow, picture
 
 MOST_WAITING = 16
 """Most commands that wait for the loop; further commands are refused at once."""
@@ -157,8 +157,8 @@ class RecordPage(Observer):
             "commands": self._commands,
         }
         self._queue = CommandQueue()
-        self._window: Window | None = None
-        self._drawn: tuple[Window, dict[str, Any]] | None = None
+        self._window: DrawnWindow | None = None
+        self._drawn: tuple[DrawnWindow, dict[str, Any]] | None = None
         self._enumerations = 0
         self._state: tuple[object, ...] = ()
         self._state_ns = self._view_ns = clock.now_ns()
@@ -187,7 +187,7 @@ class RecordPage(Observer):
     def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
         """Show the result of a sweep, after the recording has stored it."""
         self._window = (
-            Window(sweep.id, self._rate_hz, sweep.frames.taxels) if len(sweep.frames) else None
+            DrawnWindow(sweep.id, self._rate_hz, sweep.frames.taxels) if len(sweep.frames) else None
         )
         self.server.publish(
             "sweep",

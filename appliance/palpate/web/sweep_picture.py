@@ -25,7 +25,7 @@ MOST_BYTES = 1 << 20
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Window:
+class DrawnWindow:
     """The window of a sweep. taxels: raw counts [T, R, C] or [T, R, C, A]."""
 
     sweep: int
@@ -33,7 +33,7 @@ class Window:
     taxels: NDArray[Any]
 
 
-def window(line: Mapping[str, Any], rate_hz: float) -> Window:
+def window(line: Mapping[str, Any], rate_hz: float) -> DrawnWindow:
     """The window in a `sweep` line. Raises ValueError, TypeError or KeyError for a malformed
     line."""
     dtype, shape, data = (
@@ -49,10 +49,10 @@ def window(line: Mapping[str, Any], rate_hz: float) -> Window:
     ):
         raise ValueError(f"a window of {shape} {dtype}")
     taxels = np.frombuffer(data, np.dtype(dtype).newbyteorder("<")).reshape(shape)
-    return Window(int(line["sweep"]), rate_hz, taxels)
+    return DrawnWindow(int(line["sweep"]), rate_hz, taxels)
 
 
-def picture(one: Window) -> dict[str, Any]:
+def picture(one: DrawnWindow) -> dict[str, Any]:
     """The content of the picture.
 
     taxels: name, lowest and highest count of each step in time, of the normal axis. spectrogram:

@@ -26,7 +26,7 @@ NUMBERS = (1 << EPOCH_BITS) - 1
 Alter = Callable[[wire.Packet, wire.Packet], tuple[int, int]]
 
 
-class Reading:
+class SensorReading:
     """The real driver on a simulated bus. states: since the first frame or trouble."""
 
     def __init__(
@@ -80,7 +80,7 @@ def check_content(frames: Frames, format: SweepFormat = FMT) -> None:
 def test_streams_without_loss(acm):
     """A healthy board, vendor class or CDC-ACM: every frame, its time correct to 1 ms. cdc_acm has
     the device at first; a board on a serial port gets DTR."""
-    reading = Reading(acm=acm)
+    reading = SensorReading(acm=acm)
     assert reading.bus.kernel_driver is acm
     frames = reading.seconds(5)
     assert not reading.bus.kernel_driver
@@ -97,7 +97,7 @@ def test_streams_without_loss(acm):
 
 def test_a_board_that_does_not_know_dtr_is_read(monkeypatch):
     """It stalls SET_CONTROL_LINE_STATE, and streams nevertheless."""
-    reading = Reading(acm=True)
+    reading = SensorReading(acm=True)
     right = reading.bus.ctrl_transfer
 
     def stalling(handle, kind, request, *rest):
@@ -125,7 +125,7 @@ def torn(rest: bytearray, rng: np.random.Generator) -> Callable[[bytes], bytes]:
 @pytest.mark.parametrize("how", ["torn", "empty"])
 def test_transfers_that_come_in_parts(how):
     """Parts are joined, zero-length packets change nothing: no frame is lost or counted."""
-    reading = Reading()
+    reading = SensorReading()
     if how == "torn":
         reading.bus.mangle = torn(bytearray(), np.random.default_rng(0))
     else:
@@ -146,7 +146,7 @@ def test_transfers_that_come_in_parts(how):
 )
 def test_other_formats(format, acm):
     """All values arrive at their indices; a box for another format names both sides."""
-    reading = Reading(format, acm=acm, seconds=600)
+    reading = SensorReading(format, acm=acm, seconds=600)
     frames = reading.seconds(1000 / format.rate_hz)
     assert (len(frames) > 900, reading.sensor.counters.lost_frames) == (True, 0)
     check_content(frames, format)
@@ -170,7 +170,7 @@ def test_other_formats(format, acm):
 )
 def test_failures_have_their_state_and_end(call, code, hint):
     """An errno at request or read: lost, with the reason; afterwards frames again."""
-    reading = Reading()
+    reading = SensorReading()
     reading.bus.errors[call] = code
     reading.seconds(1)
     assert reading.sensor.state == "lost"
@@ -199,7 +199,7 @@ ERRORS = (
 @pytest.mark.parametrize("number", range(2 * len(CALLS)))
 def test_no_error_of_a_usb_call_leaves_read(monkeypatch, number):
     """Whatever libusb raises is a state with its reason, until the error is over."""
-    reading = Reading()
+    reading = SensorReading()
     sensor = reading.sensor
     assert len(reading.seconds(0.5))
     call, error = CALLS[number % len(CALLS)], ERRORS[number % len(ERRORS)]
@@ -233,7 +233,7 @@ def test_no_error_of_a_usb_call_leaves_read(monkeypatch, number):
 )
 def test_a_serial_number_that_cannot_be_read(string, states):
     """Where it chooses the skin: a state with the reason, not absent, and the program goes on."""
-    reading = Reading(settings={"usb": "1209:7ac7:SIM0001"})
+    reading = SensorReading(settings={"usb": "1209:7ac7:SIM0001"})
     control = reading.bus.ctrl_transfer
 
     def spoken(handle, kind, request, value, index, data, ms):
@@ -268,7 +268,7 @@ def test_what_a_person_has_to_mend(monkeypatch, of, name, value, state, hint):
     """No library, a wrong firmware, a wrong setting: it is named."""
     if of:
         monkeypatch.setattr(of, name, value)
-    reading = Reading(acm=of is None, settings={} if of else {name: value})
+    reading = SensorReading(acm=of is None, settings={} if of else {name: value})
     reading.seconds(0.3)
     assert state in ("", reading.sensor.state)
     assert hint in str(reading.sensor.trouble)
@@ -277,7 +277,7 @@ def test_what_a_person_has_to_mend(monkeypatch, of, name, value, state, hint):
 @pytest.mark.parametrize("acm", [False, True])
 def test_a_board_that_answers_and_sends_no_frame(acm):
     """Only empty packets: silent, never streaming, until the first frame."""
-    reading = Reading(acm=acm)
+    reading = SensorReading(acm=acm)
     board = reading.bus.board
     take, board.take = board.take, lambda: (take(), b"")[1]
     reading.seconds(5)
@@ -291,7 +291,7 @@ def test_a_board_that_answers_and_sends_no_frame(acm):
 
 def test_overflow_loses_one_transfer():
     """A transfer larger than requested is lost and counted; streaming goes on."""
-    reading = Reading()
+    reading = SensorReading()
     reading.seconds(1)
     once = iter([bytes(100_000)])
     reading.bus.mangle = lambda data: next(once, data)
@@ -302,7 +302,7 @@ def test_overflow_loses_one_transfer():
 
 def test_a_host_that_pauses_too_long():
     """The FIFO overflows: the newest frames come, and gap and flag are counted."""
-    reading = Reading(fifo_frames=188)
+    reading = SensorReading(fifo_frames=188)
     reading.seconds(1)
     reading.pause(2)
     check_content(reading.seconds(1))
@@ -312,7 +312,7 @@ def test_a_host_that_pauses_too_long():
 
 def test_a_box_that_had_no_processor_does_not_call_the_skin_silent():
     """Pauses of the box are not silence; half a second without bytes is."""
-    reading = Reading(fifo_frames=6000)
+    reading = SensorReading(fifo_frames=6000)
     reading.seconds(1)
     bulk_read = reading.bus.bulk_read
 
@@ -334,7 +334,7 @@ def test_a_box_that_had_no_processor_does_not_call_the_skin_silent():
 
 def test_garbage_that_costs_time_is_silence():
     """`silent` after silence_ms, also if examining the bytes takes all the time."""
-    reading = Reading()
+    reading = SensorReading()
     reading.seconds(0.5)
     begun, sensor = reading.clock.now_ns(), reading.sensor
 
@@ -357,7 +357,7 @@ def test_garbage_that_costs_time_is_silence():
 @pytest.mark.parametrize("reply", [0, 1])
 def test_acm_board_whose_reply_never_ends(reply):
     """A reply that does not come, or comes a byte at a time, is given up after half a second."""
-    reading = Reading(acm=True)
+    reading = SensorReading(acm=True)
     reading.bus.bulk_write = lambda *args: 1
     reading.bus.bulk_read = lambda *args: (reading.pause(0.4), reply)[1]
     begun = reading.clock.now_ns()
@@ -368,7 +368,7 @@ def test_acm_board_whose_reply_never_ends(reply):
 
 def test_a_stalled_endpoint_is_cleared():
     """errno 32 is cleared, and the board streams again without being replugged."""
-    reading = Reading()
+    reading = SensorReading()
     reading.seconds(1)
     reading.bus.halted = True
     reading.seconds(1)
@@ -379,7 +379,7 @@ def test_a_stalled_endpoint_is_cleared():
 
 def test_frames_of_another_form_than_announced():
     """A skin that announces 4x4 and sends 2x2 is a mismatch, and its frames are not used."""
-    reading = Reading()
+    reading = SensorReading()
     reading.bus.mangle = lambda data: wire.pack(0, 0, np.zeros((1, 2, 2), np.uint8))
     assert len(reading.seconds(0.5)) == 0
     assert "mismatch" in reading.states
@@ -388,7 +388,7 @@ def test_frames_of_another_form_than_announced():
 @pytest.mark.parametrize("replugged", [True, False])
 def test_a_board_whose_clock_starts_anew(replugged):
     """After a replug or a crash of the firmware a new epoch begins, with right times."""
-    reading = Reading(first_seq=1_000_000)
+    reading = SensorReading(first_seq=1_000_000)
     now, simulated = reading.clock.now_ns(), reading.simulated
 
     def swap() -> None:
@@ -407,7 +407,7 @@ def test_a_board_whose_clock_starts_anew(replugged):
 
 def test_more_enumerations_than_a_number_holds():
     """The count of enumerations wraps, frames keep their order, and nothing overflows."""
-    reading = Reading()
+    reading = SensorReading()
     reading.sensor._stream._position = wire.StreamPosition(EPOCHS - 2)
     before = reading.seconds(0.2)
     reading.bus.unplug()
@@ -422,7 +422,7 @@ def test_more_enumerations_than_a_number_holds():
 def test_a_count_that_begins_anew_for_ever_is_a_mismatch():
     """Packets that restart the count again and again stop the stream. The number of an enumeration
     never overflows, however often it is reached."""
-    reading = Reading()
+    reading = SensorReading()
     reading.seconds(0.5)
     starts = (1 << 31, 1 << 30, 0, 3 << 30) * 10
     hostile = b"".join(wire.pack(seq, 0, numbered(1), 0) for seq in starts)
@@ -437,7 +437,7 @@ def test_a_count_that_begins_anew_for_ever_is_a_mismatch():
 @pytest.mark.parametrize("ahead", [1_000, 10_000, 1 << 30])
 def test_a_count_that_jumps(ahead):
     """A count ahead of the clock is a mismatch, not a loss, and the board is restarted."""
-    reading = Reading()
+    reading = SensorReading()
     reading.seconds(1)
     reading.alter(lambda p, first: (p.seq + ahead, p.t_us))
     reading.seconds(2)
@@ -471,7 +471,7 @@ WRONG_CLOCKS: dict[str, tuple[Alter, int]] = {
 )
 def test_a_clock_that_cannot_be_right(name, packet_frames):
     """Clock and count disagree: mismatch, no wrong time, and streaming again afterwards."""
-    reading = Reading(packet_frames=packet_frames)
+    reading = SensorReading(packet_frames=packet_frames)
     reading.seconds(3)
     reading.alter(*WRONG_CLOCKS[name])
     frames = reading.seconds(4)
@@ -492,7 +492,7 @@ def test_a_clock_that_is_only_bad(ppm, packet_frames):
     """500 ppm, wavering stamps, counters at their wrap, two seconds lost: nothing to refuse."""
     rng = np.random.default_rng(7)
     board = {"packet_frames": packet_frames, "ppm": ppm, "first_seq": COUNTS - 2000}
-    reading = Reading(**board, fifo_frames=300, settings={"read_bytes": 8192})
+    reading = SensorReading(**board, fifo_frames=300, settings={"read_bytes": 8192})
     shift = lambda: COUNTS - 5_000_000 + int(rng.integers(-600, 600))  # noqa: E731
     reading.alter(lambda p, first: (p.seq, p.t_us + shift()))
     reading.seconds(8)
@@ -509,7 +509,7 @@ def test_stamps_in_milliseconds(rate_hz, packet_frames):
     """Stamps up to 4 ms late, in whole ms, so that time seems to go back, are accepted."""
     rng, format = np.random.default_rng(8), SweepFormat(4, 4, rate_hz, 1500, "uint8")
     of = {"seconds": 60, "packet_frames": packet_frames, "settings": {"silence_ms": 2000}}
-    reading = Reading(format, **of)
+    reading = SensorReading(format, **of)
     late = lambda t_us: (t_us + int(rng.integers(0, 4000))) // 1000 * 1000  # noqa: E731
     reading.alter(lambda p, first: (p.seq, late(p.t_us)))
     frames = reading.seconds(8)
@@ -524,7 +524,7 @@ def test_windows_over_many_offsets(ppm):
     rng = np.random.default_rng(11)
     late_ms = (int(rng.integers(50, 200)) * (rng.random() < 0.01) for _ in iter(int, 1))
     latency = lambda: 150_000 + next(late_ms) * 1_000_000  # noqa: E731
-    reading = Reading(ppm=ppm, latency=latency, fifo_frames=3000, packet_frames=6)
+    reading = SensorReading(ppm=ppm, latency=latency, fifo_frames=3000, packet_frames=6)
     recorders = [SweepCutter(FMT, SweepConfig()) for _ in range(10)]
     begun, apart = reading.clock.now_ns(), []
     edges = [

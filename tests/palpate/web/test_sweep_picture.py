@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from palpate.web.sweep_picture import FINEST, MOST_TAXELS, Window, picture, window
+from palpate.web.sweep_picture import FINEST, MOST_TAXELS, DrawnWindow, picture, window
 from tests.factories import feed_lines
 
 
@@ -42,7 +42,7 @@ def test_a_vibration_stands_at_its_frequency():
 def test_no_peak_is_lost(frames):
     """Lowest and highest count of the whole sweep are in the lines, in at most FINEST steps."""
     counts = np.random.default_rng(frames).normal(100, 20, (frames, 2, 2)).astype("<f4")
-    shown = picture(Window(1, 750.0, counts))
+    shown = picture(DrawnWindow(1, 750.0, counts))
     assert [one["name"] for one in shown["taxels"]] == ["1.1", "1.2", "2.1", "2.2"]
     for i, one in enumerate(shown["taxels"]):
         assert len(one["low"]) == len(one["high"]) <= FINEST
@@ -57,7 +57,7 @@ def test_of_a_large_skin_the_most_loaded_taxels_are_drawn():
     counts = np.zeros((100, 12, 32, 3), np.int16)
     counts[:, 4:8, 10:14, 2] = 500
     counts[:, 0, 0, 0] = 9000  # shear, which is not drawn
-    shown = picture(Window(1, 100.0, counts))
+    shown = picture(DrawnWindow(1, 100.0, counts))
     assert len(shown["taxels"]) == MOST_TAXELS
     assert shown["of"] == 384
     assert [one["name"] for one in shown["taxels"]] == [
@@ -81,7 +81,7 @@ def _nan() -> NDArray[np.float32]:
 )
 def test_without_a_spectrogram_it_says_why(counts, rate_hz, why):
     """The lines are present and can be sent as JSON."""
-    shown = picture(Window(1, rate_hz, counts))
+    shown = picture(DrawnWindow(1, rate_hz, counts))
     assert why in shown["trouble"]
     assert shown["spectrogram"] == []
     assert len(json.loads(json.dumps(shown, allow_nan=False))["taxels"]) == 4

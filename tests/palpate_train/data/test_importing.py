@@ -16,7 +16,7 @@ from palpate.core.errors import FormatError
 from palpate_train.data import sets
 from palpate_train.data.file_names import NamePattern
 from palpate_train.data.import_plan import ImportPlan, Length
-from palpate_train.data.importing import Imported, LeftOut, import_folder
+from palpate_train.data.importing import Imported, LeftOutFile, import_folder
 from tests.factories.lab_files import write
 from tests.factories.later import Later
 
@@ -34,7 +34,7 @@ def plan(**changes: object) -> ImportPlan:
 
 def taken(folder: Path, **changes: object) -> Imported:
     """The imported sweeps; every file fits and is used."""
-    left_out: list[LeftOut] = []
+    left_out: list[LeftOutFile] = []
     made = import_folder(folder, plan(**changes), lambda line: None, left_out)
     assert left_out == []
     return made
@@ -42,7 +42,7 @@ def taken(folder: Path, **changes: object) -> Imported:
 
 def reasons(folder: Path, **changes: object) -> dict[str, str]:
     """Why files were left out, by name."""
-    left_out: list[LeftOut] = []
+    left_out: list[LeftOutFile] = []
     with suppress(FormatError):  # if no file could be imported
         import_folder(folder, plan(**changes), lambda line: None, left_out)
     return {one.name: one.why for one in left_out}
@@ -365,7 +365,7 @@ def test_a_missing_grid_ends_the_import_at_the_first_file(tmp_path: Path):
     """The other files are not read: they would need it, too."""
     text(tmp_path / "a_1.csv")
     (tmp_path / "b_2.csv").write_text("not read")
-    left_out: list[LeftOut] = []
+    left_out: list[LeftOutFile] = []
     with pytest.raises(FormatError, match="4 columns"):
         import_folder(tmp_path, plan(grid=""), lambda line: None, left_out)
     assert left_out == []

@@ -16,7 +16,7 @@ from palpate_train.arguments.program import Add
 from palpate_train.data import label_table, labels, lerobot, summary
 from palpate_train.data.file_names import EXAMPLE, FIELD, GROUP, NamePattern
 from palpate_train.data.import_plan import ImportPlan, Length
-from palpate_train.data.importing import Imported, LeftOut, Taken, import_folder
+from palpate_train.data.importing import Imported, LeftOutFile, Taken, import_folder
 
 SHOWN = 5
 """Largest number of files with a line each that were left out for the same reason."""
@@ -98,7 +98,7 @@ def run(args: argparse.Namespace) -> None:
     for option, endings in (("out", options.SET_FILES), ("report", ())):
         if path := getattr(args, option):
             options.writable_file(path, f"--{option}", *endings)
-    left_out: list[LeftOut] = []
+    left_out: list[LeftOutFile] = []
     taken: Sequence[Taken] = ()
     try:
         made = import_folder(args.folder, plan, options.Log(), left_out)
@@ -151,7 +151,7 @@ def _field(text: str) -> tuple[str, str]:
     return name, column
 
 
-def _left_out(left_out: Sequence[LeftOut]) -> list[str]:
+def _left_out(left_out: Sequence[LeftOutFile]) -> list[str]:
     """A line for each file; with the same reason, only for the first SHOWN files."""
     lines, reasons = [], Counter(one.why for one in left_out)
     seen: Counter[str] = Counter()
@@ -183,7 +183,7 @@ def _taken(made: Imported) -> list[str]:
     return [*lines, *(f"  {note}" for note in made.notes)]
 
 
-def _report(taken: Sequence[Taken], left_out: Sequence[LeftOut]) -> str:
+def _report(taken: Sequence[Taken], left_out: Sequence[LeftOutFile]) -> str:
     """A line for each file, in the order of their names."""
     lines = {one.name: f"left out: {one.why}" for one in left_out}
     for one in taken:

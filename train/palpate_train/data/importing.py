@@ -50,7 +50,7 @@ class Recording:
 
 
 @dataclass(frozen=True)
-class LeftOut:
+class LeftOutFile:
     """A file that was not imported. broken: its name matches the pattern, but it cannot be used."""
 
     name: str
@@ -58,7 +58,7 @@ class LeftOut:
     broken: bool = False
 
 
-Source = tuple[str, Fields, Callable[[], Table]] | LeftOut
+Source = tuple[str, Fields, Callable[[], Table]] | LeftOutFile
 """Name of a recording, its fields that are known already, and a function that reads it; or why it
 cannot be read."""
 
@@ -97,12 +97,12 @@ class Imported:
 
     sweeps: Dataset
     taken: Sequence[Taken]
-    left_out: Sequence[LeftOut]
+    left_out: Sequence[LeftOutFile]
     notes: Sequence[str]
 
 
 def import_folder(
-    folder: Path, plan: ImportPlan, log: Callable[[str], None], left_out: list[LeftOut]
+    folder: Path, plan: ImportPlan, log: Callable[[str], None], left_out: list[LeftOutFile]
 ) -> Imported:
     """Import all files in and below `folder` whose names match the pattern.
 
@@ -121,7 +121,7 @@ def import_folder(
     orders: dict[tuple[str, ...], tuple[str, ...]] = {}
     for source in sources:
         count += 1
-        if isinstance(source, LeftOut):
+        if isinstance(source, LeftOutFile):
             left_out.append(source)
             continue
         name, known, read = source
@@ -132,9 +132,9 @@ def import_folder(
         except frames.GridMissing as e:
             if not recordings:  # the other files would fail, too, after the time to read them
                 raise FormatError(f"{folder}: {name} {e}") from e
-            left_out.append(LeftOut(name, str(e), broken=True))
+            left_out.append(LeftOutFile(name, str(e), broken=True))
         except FormatError as e:
-            left_out.append(LeftOut(name, str(e), broken=True))
+            left_out.append(LeftOutFile(name, str(e), broken=True))
     if "material" not in plan.of_files and recordings:
         _name_materials(folder, [one.fields for one in recordings], plan)
     cuts, rate_hz = _cuts(recordings, plan, left_out)
@@ -152,7 +152,7 @@ def import_folder(
 
 
 def _named(
-    folder: Path, plan: ImportPlan, left_out: list[LeftOut]
+    folder: Path, plan: ImportPlan, left_out: list[LeftOutFile]
 ) -> dict[str, tuple[Path, Fields]]:
     """Path and fields of each file whose name matches the pattern, and which is in the table of
     labels if there is one, by its path below `folder`.
@@ -166,13 +166,13 @@ def _named(
     found: dict[str, tuple[Path, Fields]] = {}
     for name, path in paths.items():
         fields = _fields_of(name, plan)
-        if isinstance(fields, LeftOut):
+        if isinstance(fields, LeftOutFile):
             left_out.append(fields)
         else:
             found[name] = path, fields
     there = {*paths, *(path.name for path in paths.values())}
     left_out += [
-        LeftOut(name, "it is in the table of --labels, but not in the folder", broken=True)
+        LeftOutFile(name, "it is in the table of --labels, but not in the folder", broken=True)
         for name in plan.labels
         if name not in there
     ]
@@ -185,17 +185,17 @@ def _named(
     return found
 
 
-def _fields_of(name: str, plan: ImportPlan) -> Fields | LeftOut:
+def _fields_of(name: str, plan: ImportPlan) -> Fields | LeftOutFile:
     """The fields of a file by its path below the folder and the table of labels."""
     try:
         in_name = plan.pattern.read(name) if plan.pattern else {}
     except FormatError as e:
-        return LeftOut(name, str(e), broken=True)
+        return LeftOutFile(name, str(e), broken=True)
     if in_name is None:
-        return LeftOut(name, "its name does not match the pattern")
+        return LeftOutFile(name, "its name does not match the pattern")
     row = plan.labels.get(name, plan.labels.get(name.rpartition("/")[2], {}))
     if plan.labels and not row:
-        return LeftOut(name, "it is not in the table of --labels")
+        return LeftOutFile(name, "it is not in the table of --labels")
     return {**in_name, **row}
 
 
@@ -238,7 +238,7 @@ def _arrays(
     try:
         held = raw_files.arrays_of(path)
     except FormatError as e:
-        return (yield LeftOut(name, str(e), broken=True))
+        return (yield LeftOutFile(name, str(e), broken=True))
     matched = False
     for array in held:
         short = array if "/" in pattern.text else array.rpartition("/")[2]
@@ -246,7 +246,7 @@ def _arrays(
         try:
             found = pattern.read(short)
         except FormatError as e:
-            yield LeftOut(at, str(e), broken=True)
+            yield LeftOutFile(at, str(e), broken=True)
             continue
         if found is not None:
             matched, plan = True, replace(wanted, variable=array)
@@ -254,7 +254,7 @@ def _arrays(
     if not matched:
         listed = ", ".join(map(printable, held[:MOST_LISTED])) or "none"
         why = f"has no array of frames that matches --variable {pattern.text!r}; it holds {listed}"
-        yield LeftOut(name, why, broken=True)
+        yield LeftOutFile(name, why, broken=True)
 
 
 def _recordings(table: Table, name: str, known: Fields, plan: ImportPlan) -> list[Recording]:
@@ -290,7 +290,9 @@ def _check_order(
         )
 
 
-def _without_copies(cuts: Sequence[Cut], left_out: list[LeftOut]) -> tuple[list[Cut], list[str]]:
+def _without_copies(
+    cuts: Sequence[Cut], left_out: list[LeftOutFile]
+) -> tuple[list[Cut], list[str]]:
     """The windows without those of recordings that repeat the frames of another of their material.
 
     A copy under another material stays, with a remark: only the user knows which name is wrong.
@@ -304,7 +306,7 @@ def _without_copies(cuts: Sequence[Cut], left_out: list[LeftOut]) -> tuple[list[
         material = one.fields["material"]
         if material in same:
             why = f"holds the same frames as {same[material].name}, which counts once"
-            left_out.append(LeftOut(one.name, why))
+            left_out.append(LeftOutFile(one.name, why))
             continue
         warnings += [
             f"warning: {one.name} holds the same frames as {other.name}, of {name}: "
@@ -325,7 +327,7 @@ def _digest(counts: Array) -> bytes:
 
 
 def _cuts(
-    recordings: Sequence[Recording], plan: ImportPlan, left_out: list[LeftOut]
+    recordings: Sequence[Recording], plan: ImportPlan, left_out: list[LeftOutFile]
 ) -> tuple[list[Cut], float]:
     """The windows of each recording, and their common frame rate in Hz.
 
@@ -344,12 +346,12 @@ def _cuts(
             even = one.time_s is not None and sampling.runs(one.frames, one.time_s, rate_hz)
             cut = _cut(one, even or sampling.Runs((one.frames,)), rate_hz, plan)
         except FormatError as e:
-            left_out.append(LeftOut(one.name, str(e), broken=True))
+            left_out.append(LeftOutFile(one.name, str(e), broken=True))
             continue
         if len(cut.windows):
             cuts.append(cut)
         else:
-            left_out.append(LeftOut(one.name, cut.notes))
+            left_out.append(LeftOutFile(one.name, cut.notes))
     return cuts, rate_hz
 
 
@@ -386,7 +388,7 @@ def _windows(starts: Sequence[tuple[Array, int]], window: int) -> Array:
     return np.stack([part[start : start + window] for part, start in starts])
 
 
-def _common_type(cuts: Sequence[Cut], wanted: str, left_out: list[LeftOut]) -> tuple[str, str]:
+def _common_type(cuts: Sequence[Cut], wanted: str, left_out: list[LeftOutFile]) -> tuple[str, str]:
     """The data type of the set, and a sentence that gives the reason.
 
     It is `wanted` if given, else the type of all recordings, else the first of DATA_TYPES that
@@ -395,14 +397,14 @@ def _common_type(cuts: Sequence[Cut], wanted: str, left_out: list[LeftOut]) -> t
     if wanted:
         for cut in cuts:
             if why := number_types.why_not(cut.windows, wanted):
-                left_out.append(LeftOut(cut.recording.name, why, broken=True))
+                left_out.append(LeftOutFile(cut.recording.name, why, broken=True))
         return wanted, f"counts are {wanted}, as --dtype says"
     recorded = {cut.windows.dtype.name for cut in cuts}
     if len(recorded) == 1 and recorded <= set(DATA_TYPES):
         return recorded.pop(), "counts are as recorded"
     for cut in cuts:
         if all(reasons := [number_types.why_not(cut.windows, name) for name in DATA_TYPES]):
-            left_out.append(LeftOut(cut.recording.name, reasons[-1], broken=True))
+            left_out.append(LeftOutFile(cut.recording.name, reasons[-1], broken=True))
     out = {file.name for file in left_out}
     kept = [cut.windows for cut in cuts if cut.recording.name not in out]
     holds = (d for d in DATA_TYPES if not any(number_types.why_not(w, d) for w in kept))

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 from numpy.typing import NDArray
 
 from palpate.core.names import MOST_LETTERS
@@ -61,18 +62,11 @@ LEFT_OUT = [
 def page(figures: Json, sweeps: Dataset) -> str:
     """The page (HTML)."""
     figures = _displayed(figures)
-    pictures = {"calibration": html.picture(calibration(figures["calibration"]))}
-    if len(figures["labels"]) <= MOST_IN_MATRIX:
-        pictures["confusion"] = html.picture(confusion(figures))
-    if len(figures.get("curve", ())) > 1:
-        pictures["curve"] = html.picture(curve(figures["curve"]))
-    if "named" in (found := figures["figures"].get(stranger_limits.FIGURES, {})).get("strict", {}):
-        pictures["strangers"] = html.picture(strangers(found))
     return html.render(
         "bundle.html.j2",
         header=provenance.of(figures),
         f=figures,
-        pictures=pictures,
+        pictures=_pictures(figures),
         short=list(_in_short(figures)),
         right=[
             figures["classified_correctly"]["right"] / figures["classified_correctly"]["total"],
@@ -100,6 +94,18 @@ def page(figures: Json, sweeps: Dataset) -> str:
             for i in _examples(sweeps)
         ],
     )
+
+
+def _pictures(figures: Json) -> dict[str, Markup]:
+    """The pictures of the page by name; those that the figures allow."""
+    pictures = {"calibration": html.picture(calibration(figures["calibration"]))}
+    if len(figures["labels"]) <= MOST_IN_MATRIX:
+        pictures["confusion"] = html.picture(confusion(figures))
+    if len(figures.get("curve", ())) > 1:
+        pictures["curve"] = html.picture(curve(figures["curve"]))
+    if "named" in (found := figures["figures"].get(stranger_limits.FIGURES, {})).get("strict", {}):
+        pictures["strangers"] = html.picture(strangers(found))
+    return pictures
 
 
 def _displayed(figures: Json) -> Json:
