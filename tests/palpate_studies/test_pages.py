@@ -38,6 +38,7 @@ def name(path: Path) -> str:
     return str(path.relative_to(ROOT))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", HTML)
 def test_a_page_is_sound(drawn: Path, page: str):
     """Its tags close, no value is missing, it needs no other file, and its header is that of its
@@ -71,6 +72,7 @@ def facts(study: str) -> list[str]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("study", ["certainty", "stress", "stress-fabrics"])
 def test_a_page_shows_the_figures_of_its_results(drawn: Path, study: str):
     """Materials, shares, sums and origin."""

@@ -27,9 +27,8 @@ def tubes() -> Dataset:
     return sets.load("sim:T-REAL/level-blind:1:2")
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=() if name == "64" else pytest.mark.slow) for name in SIZES]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SIZES)
 def test_a_fit_contains_at_most_its_size(name: str):
     """Its trunk has no view that the size excludes, and it names sweeps at held-out positions."""
     size = SIZES[name]
