@@ -156,10 +156,11 @@ def test_skins_and_sets_that_show_no_modes(shape: tuple[int, ...]):
 
 @pytest.mark.slow
 def test_the_packaged_bundle_bridges_what_its_manifest_says():
-    """Dead taxels in new sweeps: none is refused, all are named as with a sound skin."""
+    """Dead taxels in new sweeps: none is refused, and at most one of twelve loses its label. The
+    limit of known materials is the loose one, so that it does not hide what bridging does."""
     packaged = bundle.load(bundle.DEFAULT)
     assert packaged.manifest.bridging
-    box = Classifier(packaged, SystemClock())
+    box = Classifier(packaged, SystemClock(), strangers="loose")
     test = EvaluationSweeps.of(sets.load("sim:T-REAL/level-blind:31:1"), 12)
     for place in range(16):
         mask = (np.arange(16) == place).reshape(1, 1, 4, 4)
