@@ -51,9 +51,8 @@ def _special(rng: Generator, world: skin.World) -> Iterator[Act]:
     first, second = over("metal"), over("wood")
     middle = min(first.stop + first.start, second.stop + second.start) // 2
     both = np.concatenate([first.frames[:middle], second.frames[middle:]])
-    half, unsure = "half of each", Status.UNSURE
     of_both = first.start, second.stop, "metal, then wood"
-    yield Act(both, *of_both, about=half, wanted=unsure)
+    yield Act(both, *of_both, about="half of each", wanted=Status.UNKNOWN)
     act = over("paper")
     gone, back = (round(act.start + share * (act.stop - act.start)) for share in UNPLUGGED)
     yield replace(

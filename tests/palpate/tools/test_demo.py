@@ -38,7 +38,7 @@ def test_demo_prints_plain_lines_without_a_terminal(capsys):
 @pytest.mark.slow
 def test_the_tour_has_each_special_sweep_with_its_right_answer(capsys):
     """A stuck taxel is bridged; an untaught material is unknown; a sweep over two materials is
-    unsure; a pulled cable is sensor-lost, and the next sweep is named again. If a new default
+    unknown; a pulled cable is sensor-lost, and the next sweep is named again. If a new default
     bundle is sure about two materials, tour.SEED has to be drawn again."""
     assert main(["demo", "--virtual"]) == 0
     out = capsys.readouterr().out
@@ -50,7 +50,7 @@ def test_the_tour_has_each_special_sweep_with_its_right_answer(capsys):
         ("foam", "foam", True),
         ("cork", "unknown", True),
         ("metal", "metal", True),
-        ("metal, then wood", "unsure", True),
+        ("metal, then wood", "unknown", True),
         ("paper", "sensor-lost", True),
         ("paper", "paper", True),
     ]

@@ -122,12 +122,12 @@ class Fit:
         materials cost; none without a calibration."""
         figures: Json = {}
         if self.calibration:
-            figures[stranger_limits.FIGURES] = self.calibration.limits.figures
             labels = np.append(self.train.labels, self.held.labels)
             recordings = np.append(self.train.group("recording"), self.held.group("recording"))
             for name, held in self.calibration.held.items():
                 of, at = held.numbers, recordings[held.numbers]
                 figures |= held.answers(at).figures(labels[of], at, f"held-out {name}")
+            figures[stranger_limits.FIGURES] = self.calibration.limits.figures
         return figures
 
     def worst_values(self) -> dict[str, tuple[Any, int, int, bool]]:
