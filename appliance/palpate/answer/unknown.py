@@ -29,9 +29,9 @@ KEPT = 16
 """Number of unknown sweeps that are remembered."""
 ALIKE = 0.5
 """Largest distance of two sweeps of one unknown material, as a share of the loose limit of known
-ones. Of
-pairs of sweeps of one material 13 to 69 % are within it, of two materials at most 2 % (simulated
-skin, four pairs of materials left out). Two cottons of FabricSlide are not told apart."""
+ones. Of pairs of sweeps of one material 13 to 69 % are within it, of two materials at most 2 %
+(simulated skin, four pairs of materials left out). It does not tell two cottons of FabricSlide
+apart."""
 
 
 UNSURE = 0.5

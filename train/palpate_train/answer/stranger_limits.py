@@ -81,8 +81,8 @@ class StrangerLimits:
     """strict, balanced, loose: the limits. figures: for a manifest, JSON: `under`, the conditions;
     `known` and `strangers`, numbers of sweeps; `guess`, whether too few materials were left out;
     for each limit the shares of known sweeps that are `answered` and of unknown ones that are
-    `named`, with their intervals; `curve`, the two shares for limits from
-    the lowest to the highest that may be chosen."""
+    `named`, with their intervals; `curve`, the two shares for limits from the lowest to the highest
+    that may be chosen."""
 
     strict: float
     balanced: float
