@@ -10,7 +10,7 @@ kept.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -40,12 +40,16 @@ MOVED = Augmentation(**dict.fromkeys(vars(Augmentation()), 0.0) | {"shift": 1.0,
 """Displaced by up to a row, as a skin that was put back."""
 
 
+SLIDES, ALTERED, DISPLACED, NONE = "slides", "altered", "displaced", "junk"
+"""Kinds of sweeps for the box; to junk no label is right."""
+
+
 @dataclass(frozen=True)
 class Given:
-    """Sweeps for the box. junk: no label is right. lost: frames of each that never arrived."""
+    """Sweeps for the box. kind: as above. lost: frames of each that never arrived."""
 
     sweeps: Dataset
-    junk: bool = False
+    kind: str
     lost: int = 0
 
 
@@ -53,8 +57,11 @@ class Given:
 class Counts:
     """Answers with status ok: the right ones, and the wrong ones, among them all to junk."""
 
-    right: int
-    wrong: int
+    right: int = 0
+    wrong: int = 0
+
+    def __add__(self, other: Counts) -> Counts:
+        return Counts(self.right + other.right, self.wrong + other.wrong)
 
 
 def decided(
@@ -75,8 +82,8 @@ def decided(
     tried = [name for name in present(judge) if RULES[name].tried and name not in asked.kept]
     if len(held_out) < EACH or len(np.unique(held_out.labels)) < 2 or not tried:
         return out, figures
-    given = list(_given(held_out, judge, seed))
-    n = sum(len(one.sweeps) for one in given if not one.junk)
+    given = list(sweeps_for(held_out, judge, seed))
+    n = sum(len(one.sweeps) for one in given if one.kind != NONE)
     now = _counted(judge, given)
     for name in tried:
         less = RULES[name].without(judge)
@@ -95,26 +102,26 @@ def decided(
     return out, figures
 
 
-def _given(held_out: Dataset, judge: Bundle, seed: int) -> Iterator[Given]:
-    """Some of the held-out sweeps, their altered copies, and junk."""
+def sweeps_for(held_out: Dataset, judge: Bundle, seed: int, each: int = EACH) -> Iterator[Given]:
+    """`each` of the held-out sweeps, and as many altered copies and junk of each kind."""
     every, rng = EvaluationSweeps(held_out), np.random.default_rng(seed)
-    yield Given(held_out.take(rng.permutation(len(held_out))[:EACH]))
+    yield Given(held_out.take(rng.permutation(len(held_out))[:each]), SLIDES)
     for corruption in applicable(every):
-        source = rng.permutation(len(held_out))[:EACH]
+        source = rng.permutation(len(held_out))[:each]
         samples, severity = altered_copies(corruption, every, source, seed)
         altered = replace(held_out.take(source), samples=samples)
         if corruption.name != "lost":
-            yield Given(altered)
+            yield Given(altered, ALTERED)
             continue
         for share in np.unique(severity):
             lost = round(share * held_out.format.window)
-            yield Given(altered.take(severity == share), lost=lost)
-    some = held_out.take(rng.permutation(len(held_out))[:EACH])
-    yield Given(_displaced(some, judge.manifest.tare, rng))
+            yield Given(altered.take(severity == share), ALTERED, lost)
+    some = held_out.take(rng.permutation(len(held_out))[:each])
+    yield Given(_displaced(some, judge.manifest.tare, rng), DISPLACED)
     for kind in JUNK:
-        samples = windows(kind, held_out, EACH, judge.manifest.tare, seed)
+        samples = windows(kind, held_out, each, judge.manifest.tare, seed)
         some = held_out.take(np.arange(len(samples)))
-        yield Given(replace(some, samples=samples), junk=True)
+        yield Given(replace(some, samples=samples), NONE)
 
 
 def _displaced(sweeps: Dataset, tare: Array, rng: Generator) -> Dataset:
@@ -128,12 +135,16 @@ def _displaced(sweeps: Dataset, tare: Array, rng: Generator) -> Dataset:
 
 
 def _counted(bundle: Bundle, given: list[Given]) -> Counts:
-    """The answers of the box with this bundle."""
-    box, right, wrong = Classifier(bundle, SystemClock(), slides=False), 0, 0
+    return sum(counted(bundle, given).values(), Counts())
+
+
+def counted(bundle: Bundle, given: Iterable[Given]) -> dict[str, Counts]:
+    """The answers of the box with this bundle, by the kind of the sweeps."""
+    box, found = Classifier(bundle, SystemClock(), slides=False), dict[str, Counts]()
     for one in given:
         for i, verdict in bundle_score.verdicts(box, one.sweeps, lost=one.lost):
             if verdict.status is Status.OK:
                 material = one.sweeps.materials[one.sweeps.labels[i]]
-                fits = not one.junk and verdict.label == material
-                right, wrong = right + fits, wrong + (not fits)
-    return Counts(right, wrong)
+                fits = one.kind != NONE and verdict.label == material
+                found[one.kind] = found.get(one.kind, Counts()) + Counts(fits, not fits)
+    return found

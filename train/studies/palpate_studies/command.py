@@ -34,6 +34,10 @@ PROGRAM = Program(
             "measure",
             "measure whether a displaced contact is flagged before accuracy is lost (simulated)",
         ),
+        "rules": (
+            "measure",
+            "measure what each rule of the answer buys and costs: a bundle without it (simulated)",
+        ),
         "references": ("measure", "write the models that palpate check --bench times"),
         "reports": ("publish", "make the project's results again: the stale ones, or some by name"),
         "pages": ("publish", "draw the pages of results, with their pictures"),

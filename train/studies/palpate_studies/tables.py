@@ -18,6 +18,7 @@ from palpate_studies import (
     matrix_table,
     quantities,
     recipe_page,
+    rules_table,
 )
 from palpate_studies.study import DATA, read, results_file
 from palpate_train.reports import provenance
@@ -85,6 +86,7 @@ TABLES: Sequence[tuple[str, str, str, Callable[[Any], str]]] = (
     (ALIGNMENT, "alignment", "alignment", contact_table.table),
     (RECIPE, "recipe", "recipe", recipe_page.table),
     (RECIPE, "loads", "recipe", recipe_page.loads),
+    ("docs/how-to/train.md", "rules", "rules", rules_table.table),
     (FABRICS, "matrix", "fabrics", matrix_table.headline),
     *(("docs/explanation/figures.md", *one) for one in quantities.TABLES),
 )

@@ -16,7 +16,15 @@ from palpate.core.clock import SystemClock
 from palpate.core.errors import FormatError
 from palpate.core.provenance import commit
 from palpate.inference.classifier import Classifier
-from palpate_studies import alignment, certainty, contact_table, references, stress
+from palpate_studies import (
+    alignment,
+    certainty,
+    contact_table,
+    references,
+    rules_study,
+    rules_table,
+    stress,
+)
 from palpate_studies.study import results_file, save
 from palpate_train.arguments import numbers, options
 from palpate_train.arguments.program import Add
@@ -48,6 +56,7 @@ def register(add: Add) -> None:
     _add_stress(add)
     _add_certainty(add)
     _add_alignment(add)
+    _add_rules(add)
     command = add("references", run_references)
     command.add_argument("--out", type=outputs.folder, required=True, metavar="DIR")
 
@@ -84,6 +93,32 @@ def _add_alignment(add: Add) -> None:
         "--hard", default="sim:T-HARD/level-blind:101-136:2", metavar="SET", help="a row ahead"
     )
     _add_out(command, "alignment")
+
+
+def _add_rules(add: Add) -> None:
+    command = add("rules", run_rules)
+    command.add_argument(
+        "--bundle", type=Path, default=bundle.DEFAULT, metavar="DIR", help="(the packaged one)"
+    )
+    command.add_argument("--set", default=STRESSED, metavar="SET", help=f"({STRESSED})")
+    command.add_argument("--moved", metavar="SET", help="slides at places that are displaced")
+    command.add_argument(
+        "--each",
+        type=numbers.whole("--each", 1),
+        default=48,
+        metavar="N",
+        help="sweeps of each alteration and each kind of junk (48)",
+    )
+    _add_out(command, "rules")
+
+
+def run_rules(args: argparse.Namespace) -> None:
+    """Measure, write the results, and print their table."""
+    moved = sets.load(args.moved) if args.moved else None
+    tested, log = sets.load(args.set), options.Log()
+    result = rules_study.results(bundle.load(args.bundle), tested, moved, args.each, log)
+    save(args.out, result)
+    print(rules_table.table(result))
 
 
 def _add_stress(add: Add) -> None:

@@ -1,0 +1,69 @@
+"""The study `rules`: the packaged bundle without each of its rules, on few sweeps."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from palpate.bundle import bundle
+from palpate_studies import rules_study, rules_table
+from palpate_studies.command import main
+from palpate_train.answer import rules
+from palpate_train.data import sets
+from palpate_train.export import trial
+
+SLIDES = "sim:T-REAL/level-blind:101:1"
+
+
+@pytest.fixture(scope="module")
+def few() -> dict[tuple[str, ...], dict]:
+    """The rows of a run on twelve slides, by what is left out."""
+    tested = sets.load(SLIDES)
+    tested = tested.take([i for i in range(len(tested)) if i % 9 in (0, 4)])
+    given = tested, None, 6, lambda line: None
+    found = rules_study.results(bundle.load(bundle.DEFAULT), *given)["rows"]
+    return {tuple(row["without"]): row for row in found}
+
+
+def test_each_rule_is_left_out_alone_and_in_pairs(few: dict[tuple[str, ...], dict]):
+    """All rows answer the same sweeps; lines of a pair are those of both, each module once."""
+    there = rules.present(bundle.load(bundle.DEFAULT))
+    pairs = [pair for pair in rules_study.PAIRS if set(pair) <= set(there)]
+    assert list(few) == [(), *((name,) for name in there), *pairs]
+    assert set(rules_study.MODULES) == set(rules.RULES)
+    (total,) = {json.dumps(row["total"]) for row in few.values()}
+    assert json.loads(total)["slides"] == 6
+    for row in few.values():
+        for kind, n in row["total"].items():
+            assert 0 <= row["right"][kind] + row["wrong"][kind] <= n
+        assert row["right"][trial.NONE] == 0 < row["ms"]
+    both = few["vibration", "slide"]["lines"]
+    assert few["slide",]["lines"] < both < few["slide",]["lines"] + few["vibration",]["lines"]
+
+
+def test_what_a_rule_is_for_is_seen_without_it(few: dict[tuple[str, ...], dict]):
+    """Broken taxels are refused without bridging; junk gets labels without a pattern."""
+    every = few[()]
+    assert few["taxels",]["right"]["altered"] < every["right"]["altered"]
+    assert few["slide",]["wrong"]["junk"] > every["wrong"]["junk"]
+    assert few["early",]["right"] == every["right"]
+
+
+def test_the_table_has_each_row(few: dict[tuple[str, ...], dict]):
+    """Its first row is that of all rules."""
+    lines = rules_table.table({"bundle": "abc", "rows": list(few.values())}).strip().splitlines()
+    rows = [line.split("|")[1].strip() for line in lines if line.startswith("|")][2:]
+    assert rows[0] == "(every rule)"
+    assert rows[1:] == [" and ".join(names) for names in list(few)[1:]]
+
+
+@pytest.mark.slow
+def test_the_command_writes_its_results(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """With slides of other places as displaced ones."""
+    out = tmp_path / "rules.json"
+    given = "--set", SLIDES, "--moved", "sim:T-HARD/level-blind:101:1", "--each", "1"
+    assert main(["rules", *given, "--out", str(out)]) == 0
+    found = json.loads(out.read_bytes())
+    assert found["sets"] == [SLIDES, "sim:T-HARD/level-blind:101:1"]
+    assert found["rows"][0]["total"]["displaced"] == 7
+    assert "| hum |" in capsys.readouterr().out

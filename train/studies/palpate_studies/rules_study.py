@@ -1,0 +1,95 @@
+"""The study `rules`: what each rule of the answer buys and costs, left out alone and in pairs."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from palpate.bundle.contents import Bundle
+from palpate.core.clock import SystemClock
+from palpate.inference.classifier import Classifier
+from palpate_train.answer import rules
+from palpate_train.data.sets import Dataset
+from palpate_train.export import trial
+from palpate_train.metrics import bundle_score
+from palpate_train.metrics.score import provenance
+
+Json = dict[str, Any]
+EVERY = "every rule"
+PAIRS = (
+    ("vibration", "slide"),
+    ("displacement", "disturbance"),
+    ("hum", "disturbance"),
+    ("unknown", "slide"),
+)
+"""Rules that refuse or mend some of the same sweeps."""
+TIMED = 200
+"""Number of answers whose processor time is measured, of the slides."""
+MODULES = {
+    "early": ("palpate.answer.early", "palpate_train.answer.fit_early"),
+    "disturbance": ("palpate.answer.disturbance", "palpate_train.answer.fit_disturbance"),
+    "displacement": ("palpate.answer.contact", "palpate_train.answer.fit_displacement"),
+    "vibration": ("palpate.answer.vibration", "palpate_train.answer.fit_slide"),
+    "slide": ("palpate.answer.slide", "palpate_train.answer.fit_slide"),
+    "hum": ("palpate.answer.hum", "palpate_train.answer.fit_hum"),
+    "taxels": ("palpate.answer.taxels", "palpate_train.answer.fit_taxels"),
+    "unknown": ("palpate.answer.unknown", "palpate_train.answer.fit_unknown"),
+}
+"""The modules of each rule, on the box and on the desktop."""
+
+
+def results(
+    bundle: Bundle, tested: Dataset, moved: Dataset | None, each: int, log: Callable[[str], None]
+) -> Json:
+    """The answers with all rules, and without each; see `rows`. moved: slides at other places, each
+    of which counts as displaced."""
+    given = list(trial.sweeps_for(tested, bundle, 1, each))
+    if moved is not None:
+        given.append(trial.Given(moved, trial.DISPLACED))
+    return {
+        "bundle": bundle.id,
+        "sets": [one.source for one in (tested, moved) if one],
+        "seeds": [1],
+        "rows": list(rows(bundle, given, log)),
+    } | provenance()
+
+
+def rows(bundle: Bundle, given: list[trial.Given], log: Callable[[str], None]) -> Iterator[Json]:
+    """For each rule that is left out, and each of PAIRS: `total`, `right` and `wrong` answers by
+    kind of sweep, processor time of an answer in milliseconds, and lines of its modules."""
+    there = rules.present(bundle)
+    alone: list[tuple[str, ...]] = [(), *((name,) for name in there)]
+    for names in alone + [pair for pair in PAIRS if set(pair) <= set(there)]:
+        log(f"without {' and '.join(names)}" if names else EVERY)
+        less = rules.without(bundle, names)
+        found = trial.counted(less, given)
+        total = {kind: 0 for kind in (trial.SLIDES, trial.ALTERED, trial.DISPLACED, trial.NONE)}
+        for one in given:
+            total[one.kind] += len(one.sweeps)
+        counts = {kind: found.get(kind, trial.Counts()) for kind in total}
+        yield {
+            "without": list(names),
+            "total": total,
+            "right": {kind: of.right for kind, of in counts.items()},
+            "wrong": {kind: of.wrong for kind, of in counts.items()},
+            "ms": round(_took(less, given[0].sweeps), 3),
+            "lines": sum(map(_lines, {m for name in names for m in MODULES[name]})),
+        }
+
+
+def _took(bundle: Bundle, sweeps: Dataset) -> float:
+    """Processor time of one answer, in milliseconds; the first answers do not count."""
+    box, took, number = Classifier(bundle, SystemClock(), slides=False), 0.0, 0
+    while number < TIMED:
+        begun = time.process_time()
+        for _ in bundle_score.verdicts(box, sweeps):
+            pass
+        took, number = time.process_time() - begun, number + len(sweeps)
+    return 1e3 * took / len(sweeps)
+
+
+def _lines(module: str) -> int:
+    return len(Path(str(import_module(module).__file__)).read_text().splitlines())
