@@ -55,7 +55,7 @@ def _loading(
             ["evaluate", "--list"],
             "numpy",
         ),  # while the program is imported
-        ("palpate-train", "palpate_train", ["evaluate", "--list"], "scipy"),  # while the command is
+        ("palpate-train", "palpate_train", ["evaluate", "--list"], "onnx"),  # while the command is
     ],
 )
 def test_ctrl_c_during_the_imports_is_one_line(program, module, argv, library, tmp_path):
