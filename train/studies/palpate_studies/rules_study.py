@@ -8,6 +8,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from palpate.bundle.contents import Bundle
 from palpate.core.clock import SystemClock
 from palpate.inference.classifier import Classifier
@@ -18,7 +20,6 @@ from palpate_train.metrics import bundle_score
 from palpate_train.metrics.score import provenance
 
 Json = dict[str, Any]
-EVERY = "every rule"
 PAIRS = (
     ("vibration", "slide"),
     ("displacement", "disturbance"),
@@ -26,8 +27,8 @@ PAIRS = (
     ("unknown", "slide"),
 )
 """Rules that refuse or mend some of the same sweeps."""
-TIMED = 200
-"""Number of answers whose processor time is measured, of the slides."""
+TURNS = 9
+"""Number of times that each bundle answers the slides while its processor time is taken."""
 MODULES = {
     "early": ("palpate.answer.early", "palpate_train.answer.fit_early"),
     "disturbance": ("palpate.answer.disturbance", "palpate_train.answer.fit_disturbance"),
@@ -62,33 +63,39 @@ def rows(bundle: Bundle, given: list[trial.Given], log: Callable[[str], None]) -
     kind of sweep, processor time of an answer in milliseconds, and lines of its modules."""
     there = rules.present(bundle)
     alone: list[tuple[str, ...]] = [(), *((name,) for name in there)]
-    for names in alone + [pair for pair in PAIRS if set(pair) <= set(there)]:
-        log(f"without {' and '.join(names)}" if names else EVERY)
-        less = rules.without(bundle, names)
-        found = trial.counted(less, given)
-        total = {kind: 0 for kind in (trial.SLIDES, trial.ALTERED, trial.DISPLACED, trial.NONE)}
-        for one in given:
-            total[one.kind] += len(one.sweeps)
+    every = alone + [pair for pair in PAIRS if set(pair) <= set(there)]
+    less = {names: rules.without(bundle, names) for names in every}
+    log("time")
+    took = _took(list(less.values()), given[0].sweeps)
+    total = dict.fromkeys((trial.SLIDES, trial.ALTERED, trial.DISPLACED, trial.NONE), 0)
+    for one in given:
+        total[one.kind] += len(one.sweeps)
+    for names, ms in zip(every, took, strict=True):
+        log(f"without {' and '.join(names)}" if names else "every rule")
+        found = trial.counted(less[names], given)
         counts = {kind: found.get(kind, trial.Counts()) for kind in total}
         yield {
             "without": list(names),
             "total": total,
             "right": {kind: of.right for kind, of in counts.items()},
             "wrong": {kind: of.wrong for kind, of in counts.items()},
-            "ms": round(_took(less, given[0].sweeps), 3),
+            "ms": ms,
             "lines": sum(map(_lines, {m for name in names for m in MODULES[name]})),
         }
 
 
-def _took(bundle: Bundle, sweeps: Dataset) -> float:
-    """Processor time of one answer, in milliseconds; the first answers do not count."""
-    box, took, number = Classifier(bundle, SystemClock(), slides=False), 0.0, 0
-    while number < TIMED:
-        begun = time.process_time()
-        for _ in bundle_score.verdicts(box, sweeps):
-            pass
-        took, number = time.process_time() - begun, number + len(sweeps)
-    return 1e3 * took / len(sweeps)
+def _took(bundles: list[Bundle], sweeps: Dataset) -> list[float]:
+    """Processor time of an answer of each bundle, in milliseconds: the median of TURNS, which the
+    bundles take in turns after a first one that does not count."""
+    boxes = [Classifier(bundle, SystemClock(), slides=False) for bundle in bundles]
+    took = np.empty((TURNS + 1, len(boxes)))
+    for turn in took:
+        for i, box in enumerate(boxes):
+            begun = time.process_time()
+            for _ in bundle_score.verdicts(box, sweeps):
+                pass
+            turn[i] = 1e3 * (time.process_time() - begun) / len(sweeps)
+    return [round(float(ms), 3) for ms in np.median(took[1:], axis=0)]
 
 
 def _lines(module: str) -> int:
