@@ -45,6 +45,7 @@ def page(path: Path) -> None:
         shown.board.take(feed_lines.hello(source="sim"))
         seen = opened(browser, shown, *SIZE)
         until(lambda: "16 taxels" in str(seen.page.get_attribute("#signal", "aria-label")))
+        seen.page.evaluate("Promise.all(document.getAnimations().map((one) => one.finished))")
         seen.page.screenshot(path=path)
     path.write_bytes(stamped(path.read_bytes(), INVENTED))
 
