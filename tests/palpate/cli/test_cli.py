@@ -384,6 +384,7 @@ def test_the_space_bar_in_a_real_terminal(tmp_path):
     ) as run:
         shown = b""
         for until, key in (
+            (b"Ctrl-C ends", b""),  # then it reads keys
             (b"streaming", b" "),
             (b"bar stops the sweep", b" "),
             (b"no answer, short", b"\x03"),
