@@ -188,6 +188,16 @@ def test_a_column_of_dates_gives_the_times():
         frames.frames(table, plan(grid="1x1", time="when:date", rate_hz=None))
 
 
+@pytest.mark.parametrize("form", ["{} sec", "{}s", "{} seconds"])
+def test_times_may_have_their_unit_behind_each(form: str):
+    """As MATLAB writes durations; another unit than that of --time is refused."""
+    table = text(("t", "a"), texts={0: [form.format(k / 100) for k in range(40)]})
+    _, time_s, _ = frames.frames(table, plan(grid="1x1", time="t:s", rate_hz=None))
+    np.testing.assert_allclose(time_s, np.arange(40) / 100)
+    with pytest.raises(FormatError, match="t holds text"):
+        frames.frames(table, plan(grid="1x1", time="t:ms", rate_hz=None))
+
+
 @pytest.mark.parametrize(
     "form",
     [
@@ -195,6 +205,8 @@ def test_a_column_of_dates_gives_the_times():
         "2026-01-31 12:59:{0:06.3f}Z",
         "31.01.2026 12:59:{0:06.3f}",
         "1/31/2026 12:59:{0:06.3f} PM",
+        "31-Jan-2026 12:59:{0:06.3f}",
+        "January 31, 2026 12:59:{0:06.3f} PM",
         "12:59:{0:06.3f}",
         "12:59:{1:02d},{2:03d}",
         "12:59:{1:02d}:{2:03d}",
@@ -209,7 +221,9 @@ def test_dates_of_other_forms_give_the_times(form: str):
     np.testing.assert_allclose(time_s, np.arange(40) / 4)
 
 
-@pytest.mark.parametrize("form", ["2026-01-{0} {1}", "{0}.1.2026 {1}", "2026/1/{0} {1}", "{1}"])
+@pytest.mark.parametrize(
+    "form", ["2026-01-{0} {1}", "{0}.1.2026 {1}", "{0}-Jan-2026 {1}", "Jan {0}, 2026 {1}", "{1}"]
+)
 def test_dates_go_on_at_midnight(form: str):
     """Days that change, and a clock that begins again."""
     clock = [(23, 59, 59), (0, 0, 0), (0, 0, 1)]

@@ -22,11 +22,22 @@ RANGE = re.compile(r"([1-9]\d*)(?:-([1-9]\d*))?")
 DAY = re.compile(r"(\d{4}-\d\d-\d\d|\d{1,2}[./]\d{1,2}[./]\d{2,4})[T ].*")
 """A date with a clock time; the first group is the day."""
 DAY_S = 86_400
+_NAMED = r"\d{1,2}[- ][A-Za-z]{3,9}[- ]\d{4}|[A-Za-z]{3,9} \d{1,2},? \d{4}"
 MOMENT = re.compile(
-    r"(?:(?P<day>\d{1,4}[-./]\d{1,2}[-./]\d{1,4})[T ]+)?(?P<hour>\d{1,2}):(?P<minute>\d\d)"
+    rf"(?:(?P<day>\d{{1,4}}[-./]\d{{1,2}}[-./]\d{{1,4}}|{_NAMED})[T ]+)?"
+    r"(?P<hour>\d{1,2}):(?P<minute>\d\d)"
     r"(?::(?P<second>\d\d(?:[.,]\d+|:\d{3})?))?\s?(?P<noon>[aApP][mM])?(?P<zone>Z|[+-]\d\d:?\d\d)?"
 )
 """A time of the day, perhaps with its date and zone."""
+MONTHS = ["jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec"]
+NAMED_DAY = re.compile(
+    r"(?:(?P<first>\d{1,2})[- ])?(?P<month>[A-Za-z]+)(?:[- ](?P<second>\d{1,2}),?)?"
+    r"[- ](?P<year>\d{4})"
+)
+"""A date whose month is an English word."""
+WITH_UNIT = re.compile(r"([-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)\s*(?P<unit>[a-zA-Z]+)")
+WORDS = {"s": "s", "sec": "s", "secs": "s", "seconds": "s", "ms": "ms", "msec": "ms", "us": "us"}
+"""Units of times behind each number, as tables of durations have them."""
 
 SQUARE = (
     "if MATLAB's h5write wrote it, rows and columns have changed places: give --axes "
@@ -160,6 +171,10 @@ def _times(values: Array, table: Table, plan: ImportPlan) -> tuple[int | None, A
     if unit == DATE:
         return at, _dates(name, table, at)
     if at in table.texts:
+        found = [WITH_UNIT.fullmatch(text.strip()) for text in table.texts[at]]
+        units = {one["unit"].lower() for one in found if one}
+        if None not in found and len(units) == 1 and WORDS.get(units.pop()) == unit:
+            return at, np.array([float(one[1]) for one in found if one]) * sampling.UNITS_S[unit]
         raise FormatError(
             f"column {name} holds text, such as {table.texts[at][0]!r}; "
             f"for dates with a clock time write --time {name}:{DATE}"
@@ -193,6 +208,7 @@ def _days(name: str, texts: Sequence[str]) -> Array:
     """The days [n] as numbers. Any form will do if the day does not change. Raises FormatError."""
     if len(set(texts)) == 1:
         return np.zeros(len(texts))
+    texts = [_numbered(text) for text in texts]
     iso = [re.sub(r"^(\d{1,2})\.(\d{1,2})\.(\d{4})$", r"\3-\2-\1", text) for text in texts]
     iso = [re.sub(r"-(\d)(?!\d)", r"-0\1", text.replace("/", "-")) for text in iso]
     try:
@@ -203,6 +219,15 @@ def _days(name: str, texts: Sequence[str]) -> Array:
             f"the day changes from {texts[0]!r} to {day!r} in column {name}; "
             "write days as 2026-01-31"
         ) from e
+
+
+def _numbered(day: str) -> str:
+    """A day whose month is a word, such as 01-May-2024 or May 1, 2024, as 2024-05-01."""
+    found = NAMED_DAY.fullmatch(day)
+    if not found or found["month"][:3].lower() not in MONTHS:
+        return day
+    month = MONTHS.index(found["month"][:3].lower()) + 1
+    return f"{found['year']}-{month:02d}-{int(found['first'] or found['second']):02d}"
 
 
 def _clock_s(parts: Mapping[str, str]) -> float:

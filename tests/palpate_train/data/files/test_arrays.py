@@ -139,6 +139,21 @@ def test_json_is_read(tmp_path: Path, content: bytes):
     assert found.notes == ("read up to line 41, which is cut off",) * cut
 
 
+def test_acquired_data_is_read(tmp_path: Path):
+    """Edge Impulse's format: sensors by name, the rate in a remark; a short frame is named."""
+    sensors = [{"name": name, "units": "N"} for name in "abcd"]
+    payload = {"interval_ms": 10, "sensors": sensors, "values": SKIN.tolist()}
+    (tmp_path / "a.json").write_text(json.dumps({"signature": "0", "payload": payload}))
+    found = raw_files.read(tmp_path / "a.json")
+    np.testing.assert_array_equal(found.values, SKIN)
+    assert found.columns == tuple("abcd")
+    assert "100 Hz" in found.notes[0]
+    payload["values"][4] = [1, 2]
+    (tmp_path / "a.json").write_text(json.dumps({"payload": payload}))
+    with pytest.raises(FormatError, match="entry 5"):
+        raw_files.read(tmp_path / "a.json")
+
+
 FRAMES = [{"t": k / 10, "skin": r} for k, r in enumerate(SKIN.tolist())]
 
 

@@ -148,6 +148,15 @@ def test_tdms_is_read(tmp_path: Path):
     assert found.columns == tuple("abcd")
     np.testing.assert_array_equal(found.values, SKIN)
     np.testing.assert_allclose(found.vectors["time"], TIMES)
+    slow = [nptdms.ChannelObject("skin", name, SKIN[:3, 0], step) for name in ("warm", "wet")]
+    for fast, others, name in ((channels, slow[:1], "c.tdms"), (channels[:2], slow, "d.tdms")):
+        with nptdms.TdmsWriter(tmp_path / name) as writer:
+            writer.write_segment([*fast, *others])
+    slower = raw_files.read(tmp_path / "c.tdms")
+    np.testing.assert_array_equal(slower.values, SKIN)
+    assert slower.notes[0].startswith("warm is left out")
+    with pytest.raises(FormatError, match="wet 3"):
+        raw_files.read(tmp_path / "d.tdms")
     with nptdms.TdmsWriter(tmp_path / "b.tdms") as writer:
         for group in ("one", "two"):
             writer.write_segment([nptdms.ChannelObject(group, "a", SKIN[:, 0])])
@@ -215,3 +224,11 @@ def test_recordings_of_ros_are_read(tmp_path: Path, kind: str, messages: str):
             raw_files.read(moved)
     else:
         np.testing.assert_array_equal(raw_files.read(moved).values, SKIN)
+
+
+def test_a_recording_that_was_cut_off_says_how_to_mend_it(tmp_path: Path):
+    """An MCAP without its end."""
+    (path,) = bag(tmp_path / "a", "mcap", "std_msgs/msg/Float32MultiArray").glob("*.mcap")
+    path.write_bytes(path.read_bytes()[:-20])
+    with pytest.raises(FormatError, match="mcap recover"):
+        raw_files.read(path)

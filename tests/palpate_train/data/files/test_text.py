@@ -191,6 +191,30 @@ def test_pandas_numbers_its_rows_and_columns():
     check_whole("\n".join([",0,1,2,3", *rows]), ("0", "1", "2", "3"))
 
 
+@pytest.mark.parametrize("first", [0, 1])
+def test_columns_may_be_named_by_numbers(first: int):
+    """A head of mats and insoles: a word, then 0 to N - 1 or 1 to N; never the first frame."""
+    names = [str(first + k) for k in range(3)]
+    check_whole(f"time,{','.join(names)}\n{BODY}", ("time", *names))
+    labels = "".join(f"cork,{line}\n" for line in ["1,2,3,4", *BODY.splitlines()])
+    assert len(read(labels).values) == len(ROWS) + 1  # all rows begin with a word
+
+
+@pytest.mark.parametrize("word", ["Mean", '"Max"', "std dev"])
+def test_rows_of_statistics_are_no_frames(word: str):
+    """A word where all frames have a number, above or below: left out, and said."""
+    row = f"{word},25.5,25.5,25.5\n"
+    for text in (HEAD + BODY + row + row, row + row + BODY, HEAD + row + BODY):
+        found = read(text)
+        np.testing.assert_array_equal(found.values, ROWS)
+        assert any(word.strip('"') in said for said in found.notes)
+
+
+def test_ranges_below_names_are_no_names():
+    """Numbers with their unit."""
+    check_whole("a,b,c,d\nRange=,10.000 V,5 mV,10 V\n" + BODY)
+
+
 def test_names_stand_on_the_last_line_before_the_numbers():
     """A remark with as many cells above it, and units below it, are not the names."""
     check_whole("Recorded,by,hand,today\n" + HEAD + BODY)

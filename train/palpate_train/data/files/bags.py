@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -27,6 +28,7 @@ PIXELS = {
 }  # fmt: skip
 """NumPy types of the pixels of an image with one channel, by the name of its encoding."""
 IMAGE = "Image"
+MCAP_END = b"\x89MCAP0\r\n"
 
 
 def read(path: Path, wanted: ReadPlan) -> Table:
@@ -39,6 +41,8 @@ def read(path: Path, wanted: ReadPlan) -> Table:
         source = path.parent
         if not (source / "metadata.yaml").exists():
             raise FormatError("lacks metadata.yaml beside it; run `ros2 bag reindex` on its folder")
+    if path.suffix.lower() == ".mcap" and not _has_end(path):
+        raise FormatError("has no end, as if it was cut off; `mcap recover` makes it whole")
     store = stores.get_typestore(stores.Stores.ROS2_JAZZY)
     with highlevel.AnyReader([source], default_typestore=store) as bag:
         topics: dict[str, list[Any]] = {}
@@ -55,6 +59,12 @@ def read(path: Path, wanted: ReadPlan) -> Table:
                 f"it holds {listed or 'nothing'}"
             )
         return _table(bag, topics[fitting[0]])
+
+
+def _has_end(path: Path) -> bool:
+    with path.open("rb") as file:
+        file.seek(-min(len(MCAP_END), path.stat().st_size), os.SEEK_END)
+        return file.read() == MCAP_END
 
 
 def _fitting(bag: Any, topics: dict[str, list[Any]]) -> list[str]:
@@ -80,7 +90,13 @@ def _table(bag: Any, connections: list[Any]) -> Table:
     stamps: list[float] = []
     names: list[str] = []
     for connection, at, raw in bag.messages(connections=connections):
-        found = dict(_numbers("", bag.deserialize(raw, connection.msgtype)))
+        try:
+            message = bag.deserialize(raw, connection.msgtype)
+        except KeyError as e:
+            raise FormatError(
+                f"holds no definition of {connection.msgtype}; record it as MCAP, which holds them"
+            ) from e
+        found = dict(_numbers("", message))
         stamp = [found.pop(f"{STAMP}.{part}", None) for part in ("sec", "nanosec")]
         if None not in stamp:
             stamps.append(float(np.asarray(stamp[0]) + 1e-9 * np.asarray(stamp[1])))

@@ -43,6 +43,8 @@ def _unwrapped(whole: dict[str, Any], wanted: ReadPlan) -> tuple[Any, list[str]]
     An object holds a list for each column, as pandas writes them in three ways, or one list of
     frames beside facts about them. Raises FormatError.
     """
+    if isinstance(inner := whole.get("payload"), dict) and "values" in inner:
+        return _acquired(inner)
     if {"columns", "data"} <= whole.keys() and isinstance(whole["columns"], list):
         return [dict(zip(whole["columns"], row, strict=True)) for row in whole["data"]], []
     if all(isinstance(v, dict) and _is_numbered(v) for v in whole.values()):
@@ -59,6 +61,20 @@ def _unwrapped(whole: dict[str, Any], wanted: ReadPlan) -> tuple[Any, list[str]]
     if len(set(lengths.values())) > 1:
         raise FormatError(f"its columns differ in length: {lengths}")
     return [dict(zip(whole, row, strict=True)) for row in zip(*whole.values(), strict=True)], []
+
+
+def _acquired(payload: dict[str, Any]) -> tuple[Any, list[str]]:
+    """The frames of Edge Impulse's data acquisition format, by the names of its sensors."""
+    names = [str(sensor["name"]) for sensor in payload["sensors"]]
+    rows = [row if isinstance(row, list) else [row] for row in payload["values"]]
+    wrong = next((k for k, row in enumerate(rows, 1) if len(row) != len(names)), 0)
+    if wrong:
+        raise FormatError(
+            f"entry {wrong} of its values has {len(rows[wrong - 1])} numbers, but there are "
+            f"{len(names)} sensors"
+        )
+    rate_hz = 1e3 / float(payload["interval_ms"])
+    return [dict(zip(names, row, strict=True)) for row in rows], [f"it was sent at {rate_hz:g} Hz"]
 
 
 def _is_numbered(column: dict[str, Any]) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -42,10 +43,16 @@ def _is_numeric(channel: Any) -> bool:
 def _table(group: Any) -> Table:
     kept = [c for c in group.channels() if _is_numeric(c) or (len(c) and c.dtype.kind in "OSUM")]
     lengths = {c.name: len(c) for c in kept}
-    if len(set(lengths.values())) > 1:
+    usual, of_all = Counter(lengths.values()).most_common(1)[0]
+    if 2 * of_all <= len(kept):
         raise FormatError(
-            f"its channels differ in length: {', '.join(f'{k} {n}' for k, n in lengths.items())}"
+            f"its channels differ in length: {', '.join(f'{k} {n}' for k, n in lengths.items())}; "
+            "save those of the skin as a group"
         )
+    notes = [
+        f"{k} is left out: it has {n} values, not {usual}" for k, n in lengths.items() if n != usual
+    ]
+    kept = [c for c in kept if len(c) == usual]
     columns: list[Array] = []
     texts: dict[int, list[str]] = {}
     for k, channel in enumerate(kept):
@@ -54,7 +61,7 @@ def _table(group: Any) -> Table:
             texts[k] = list(map(str, values))
             values = np.zeros(len(values), np.uint8)
         columns.append(values)
-    made = from_columns([c.name for c in kept], columns, texts)
+    made = from_columns([c.name for c in kept], columns, texts, notes)
     steps = {float(c.properties[STEP]) for c in kept if c.properties.get(STEP)}
     if len(steps) != 1:
         return made

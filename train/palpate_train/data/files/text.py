@@ -32,6 +32,8 @@ UNIT = re.compile(
     r"[\[(].*[\])]|[kmuµn]?(s|sec|V|N|A|Pa|g|m|T)|%|°C|bar|psi|counts?|raw|lsb|digits?|a\.?u\.?|-?",
     re.IGNORECASE,
 )
+QUANTITY = re.compile(r"[-+]?\d[\d.,]*\s*(?:[kmuµn]?(?:s|sec|V|N|A|Pa|g|m|Hz)|%)")
+"""A number with its unit, as in the rows of ranges below names."""
 SAMPLED = 200
 """Number of lines at the start and at the end that show the layout of a text."""
 CLEAR = 0.9
@@ -118,7 +120,8 @@ def table(
     kept = [(i, line) for i, line in numbered if line.strip()]
     layout = _layout(kept, delimiter)
     start, end = _body(kept, layout)
-    said = [*notes, *bare.notes, *_remarks(kept, start, end, layout)]
+    said = [*notes, *bare.notes, *_passed_over(kept[:start], layout)]
+    said += _remarks(kept, start, end, layout)
     rows = [  # a frame that begins with # is no comment
         (i, line)
         for i, line in kept[start:end]
@@ -230,7 +233,8 @@ def _body(kept: Sequence[Row], layout: Layout) -> tuple[int, int]:
             for k, (_, line) in enumerate(kept)
             if not _marked(line)
             and layout.is_frame(line)
-            and not _counts_columns(layout.cells(line))
+            and not _counts_columns(layout.cells(line), layout)
+            and not _is_summary(layout.cells(line), layout)
         ),
         len(kept),
     )
@@ -242,9 +246,22 @@ def _body(kept: Sequence[Row], layout: Layout) -> tuple[int, int]:
     return start, end
 
 
-def _counts_columns(found: Sequence[str]) -> bool:
-    """Whether a line is the head that pandas writes for nameless columns: ,0,1,2,3."""
-    return [cell.strip() for cell in found] == ["", *map(str, range(len(found) - 1))]
+def _counts_columns(found: Sequence[str], layout: Layout) -> bool:
+    """Whether a line is a head that counts its columns: time,1,2,3, or ,0,1,2,3 of pandas. If the
+    frames begin with a word, too, it is a frame."""
+    first, *others = (cell.strip().strip("\"'") for cell in found)
+    counted = others in (
+        [str(i + first_number) for i in range(len(others))] for first_number in (0, 1)
+    )
+    return counted and (not first or _is_summary(found, layout))
+
+
+def _is_summary(found: Sequence[str], layout: Layout) -> bool:
+    """Whether a line beside the frames begins with a word where all frames have a number, such as
+    Mean, SD, Min or Max."""
+    first = found[0].strip().strip("\"'")
+    word = first[:1].isalpha() and not is_number(first) and first.lower() not in MISSING
+    return word and 0 not in layout.text_columns and layout.wide > 1
 
 
 def _is_footer(line: str, layout: Layout, last: bool) -> bool:
@@ -253,9 +270,24 @@ def _is_footer(line: str, layout: Layout, last: bool) -> bool:
         return len(layout.cells(line)) != layout.wide or not layout.is_frame(line)
     found = _trimmed(layout.cells(line))
     given = [is_number(cell) for cell in found]
+    if len(found) == layout.wide and all(given[1:]) and _is_summary(found, layout):
+        return True
     if len(found) < layout.wide and (last or not all(given)):
         return True
     return len(found) != layout.wide and not any(given)
+
+
+def _passed_over(before: Sequence[Row], layout: Layout) -> list[str]:
+    """A remark on rows of numbers before the frames that begin with a word."""
+    found = [(i, layout.cells(line)) for i, line in before if not _marked(line)]
+    rows = [
+        (i, cells[0])
+        for i, cells in found
+        if len(cells) == layout.wide
+        and all(map(is_number, cells[1:]))
+        and not _counts_columns(cells, layout)
+    ]
+    return [f"line {i}, {excerpt(word.strip())}, is passed over" for i, word in rows]
 
 
 def _remarks(kept: Sequence[Row], start: int, end: int, layout: Layout) -> list[str]:
@@ -282,6 +314,7 @@ def _heads(lines: Sequence[str], before: Sequence[Row], layout: Layout) -> tuple
             ]
             heads = [h[:-1] if len(h) == wide + 1 and not h[-1] else h for h in heads]
             heads = [h for h in heads if len(h) == wide and not all(map(is_number, h))]
+            heads = [h for h in heads if not all(map(QUANTITY.fullmatch, h[1:]))] or heads
             if named := [h for h in heads if not all(map(UNIT.fullmatch, h))] or heads:
                 return tuple(map(normal, named[-1]))
     return ()
