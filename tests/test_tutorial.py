@@ -20,7 +20,7 @@ COMMAND = re.compile(r"(?m)^    ((?:python|palpate|palpate-train) .*)$")
 SHOWN = (
     "162 files in build/recordings, materials: metal, wood, paper, plastic rough",
     "time,s0,s1,s2,s3,s4,s5,s6,s7,s8,s9,s10,s11,s12,s13,s14,s15",
-    "95 % interval, by position (2)",
+    "classified correctly: 36 of 36: 100.0 % [90.4, 100.0], 95 % interval, by position (2)",
 )
 """Lines of the page that do not depend on the machine."""
 MINUTES = 15

@@ -7,6 +7,7 @@ the caller knows the consequences.
 
 from __future__ import annotations
 
+import fcntl
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -124,6 +125,16 @@ def folder(target: Path) -> Iterator[Path]:
         else:
             new.rename(target)
         sync(target.parent)
+
+
+def locked(opened: int) -> bool:
+    """Take the lock of an open file or folder, which its end or that of the process gives back;
+    False while another program has it."""
+    try:
+        fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
 
 
 def sync(path: Path) -> None:

@@ -19,7 +19,6 @@ So a reader that reads first the link and then the state needs no lock. A writer
 
 from __future__ import annotations
 
-import fcntl
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping
@@ -391,7 +390,7 @@ class Store:
                     "...)"
                 )
             end_ns = self._clock.now_ns() + round(wait_s * 1e9)
-            while not _try_lock(folder):
+            while not storage.locked(folder):
                 if self._clock.now_ns() >= end_ns:
                     raise ApplianceError(
                         f"{self.folder} is in use by another command; try again when that has ended"
@@ -400,11 +399,3 @@ class Store:
             yield self.state
         finally:
             os.close(folder)
-
-
-def _try_lock(folder: int) -> bool:
-    try:
-        fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True

@@ -6,7 +6,6 @@ fits all sweeps.
 
 from __future__ import annotations
 
-import fcntl
 import os
 import shutil
 import sys
@@ -17,6 +16,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from palpate.bundle import bundle
+from palpate.core import storage
 from palpate.core.clock import Clock
 from palpate.core.config import Config
 from palpate.core.errors import ApplianceError, BundleError, ConfigError
@@ -66,7 +66,7 @@ def install(settings: Config, store: Store, by: str, clock: Clock, tell: Tell) -
     if running := base(store, sweep_folder.last_format(sweeps)):
         return _into(settings, store, running, key, tell)
     key.check(TAUGHT)
-    with _scratch(Path(settings.store.folder)) as scratch:
+    with _scratch(store) as scratch:
         out = scratch / "bundle"
         day = time.strftime("%Y-%m-%d %H:%M", time.gmtime())
         options = ("--out", str(out), "--version", version(store), "--by", by, "--at", day)
@@ -78,17 +78,15 @@ def install(settings: Config, store: Store, by: str, clock: Clock, tell: Tell) -
 
 
 @contextmanager
-def _scratch(store: Path) -> Iterator[Path]:
+def _scratch(store: Store) -> Iterator[Path]:
     """A new folder in the store for one process that teaches. Raises TeachingFailed while another
     has it."""
-    folder = store / "teaching"
-    store.mkdir(parents=True, exist_ok=True)
-    lock = os.open(store / ".teaching", os.O_RDONLY | os.O_CREAT, 0o600)
+    folder, bundles = store.folder / "teaching", store.bundles.folder
+    bundles.mkdir(parents=True, exist_ok=True)
+    lock = os.open(bundles, os.O_RDONLY | os.O_DIRECTORY)  # the store locks its own folder
     try:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as e:
-            raise TeachingFailed("another bundle is being made here; wait until it is there") from e
+        if not storage.locked(lock):
+            raise TeachingFailed("another bundle is being made here; wait until it is there")
         shutil.rmtree(folder, ignore_errors=True)  # of a process that a power cut ended
         try:
             yield folder

@@ -7,7 +7,7 @@ a person has forgotten, beside the sweeps themselves.
 
 from __future__ import annotations
 
-import fcntl
+import errno
 import json
 import os
 import re
@@ -250,11 +250,9 @@ class SweepFolder:
         os.close(self._lock)
 
     def _take(self) -> None:
-        try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as e:
+        if not storage.locked(self._lock):
             why = "another program keeps sweeps there"
-            raise BlockingIOError(e.errno, why, str(self.folder)) from e
+            raise BlockingIOError(errno.EWOULDBLOCK, why, str(self.folder))
         names = [name for path in self.folder.iterdir() if (name := _KEPT.fullmatch(path.name))]
         # an unfinished sweep was never reported as stored, but its number is not used again; nor
         # are forgotten numbers, in a folder that a person has emptied

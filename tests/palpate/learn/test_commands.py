@@ -134,4 +134,4 @@ def test_recorded_sweeps_become_the_bundle_of_the_box(options, tmp_path, capsys)
     assert running.bundle.manifest.taught.startswith("taught here by anna, 20")
     assert install.version(assembly.store(settings)) == "2"
     left = {path.name for path in (tmp_path / "store").iterdir()}
-    assert left - {".teaching"} == {"sweeps", "bundles", "bundles.json", "current"}
+    assert left == {"sweeps", "bundles", "bundles.json", "current"}

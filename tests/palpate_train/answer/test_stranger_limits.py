@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -27,6 +29,7 @@ def left_out(
         np.exp(known + inflated),
         np.exp(strangers + apart + inflated),
         np.exp(strangers + apart),
+        np.exp(known - 3),
         labels,
         values,
         parts,
@@ -82,7 +85,7 @@ def test_without_strangers_nearly_all_known_sweeps_are_within():
     """Where no other material was left out, the three limits are one."""
     sweeps = left_out()
     none = np.full_like(sweeps.known, np.nan)
-    found = limits({"force": LeftOut(sweeps.known, none, none, sweeps.labels, sweeps.values, 5)})
+    found = limits({"force": replace(sweeps, strangers=none, finished=none)})
     assert found.strict == found.loose >= np.quantile(sweeps.known, 0.97)
     assert "named" not in found.figures["balanced"]
 
@@ -91,6 +94,16 @@ def test_all_conditions_count():
     """A second condition under which known sweeps lie far widens the limit."""
     near, far = left_out(), left_out(inflated=1.0, parts=20)
     assert limits({"a": near, "b": far}).balanced > limits({"a": near}).balanced
+
+
+def test_a_new_sweep_is_not_nearer_than_a_learned_one():
+    """However much a cross-fit of two parts inflates distances, the limit lets in what the finished
+    model has learned from; where it scatters less than that, nothing changes."""
+    inflated = left_out(inflated=2.0, parts=2)
+    far = replace(inflated, learned=inflated.known * 0.8)
+    assert np.mean(far.learned <= limits({"force": far}).loose) > 0.98
+    assert np.mean(far.learned <= limits({"force": inflated}).loose) < 0.5
+    assert (far.corrected()[0] >= np.log(far.learned)).all()
 
 
 @pytest.mark.parametrize("cost", [0.0, -1.0, np.nan, np.inf])
@@ -104,7 +117,7 @@ def test_no_cost_is_refused(cost: float):
 def test_no_known_sweep_is_refused(sweeps: dict[str, float]):
     """Without a known sweep there is no limit."""
     none = {name: np.full(8, value) for name, value in sweeps.items()}
-    given = {k: LeftOut(v, v, v, np.zeros(8, int), np.zeros(8, int), 2) for k, v in none.items()}
+    given = {k: LeftOut(v, v, v, v, np.zeros(8, int), np.zeros(8, int), 2) for k, v in none.items()}
     with pytest.raises(FormatError, match="no known sweep"):
         limits(given)
 
@@ -112,7 +125,7 @@ def test_no_known_sweep_is_refused(sweeps: dict[str, float]):
 def test_distances_of_zero_and_one_sweep_give_a_limit():
     """Sweeps at their mean, and a single one, are finite."""
     one = np.zeros(1)
-    found = limits({"force": LeftOut(one, one, one, one.astype(int), one.astype(int), 2)})
+    found = limits({"force": LeftOut(one, one, one, one, one.astype(int), one.astype(int), 2)})
     assert 0 < found.strict <= found.loose < np.inf
 
 
@@ -127,7 +140,7 @@ def test_the_nearest_other_mean():
 def test_the_user_reads_both_shares():
     """A line for known sweeps with the condition, a line for the others; a guess is called one."""
     guess = left_out()
-    few = LeftOut(guess.known, guess.strangers, guess.finished, guess.labels % 2, guess.values, 5)
+    few = replace(guess, labels=guess.labels % 2)
     for sweeps, guessed in ((guess, False), (few, True)):
         found = {stranger_limits.FIGURES: limits({"force": sweeps}).figures}
         known, strangers = stranger_limits.lines(found)

@@ -287,10 +287,12 @@ def left_out(
         own = np.searchsorted(present, labels[numbers])
         strangers[numbers] = nearest_other(z, own, means, without)
         parts += 1
-    means = finished.means.astype(np.float64)
-    _, without = view(np.ones(len(labels), bool), finished, np.arange(len(means)))
-    of_finished[judged] = nearest_other(finished(x[judged]), labels[judged], means, without)
-    return LeftOut(known, strangers, of_finished, labels, values, parts)
+    z, means = finished(x[judged]), finished.means.astype(np.float64)
+    shapes, without = view(np.ones(len(labels), bool), finished, np.arange(len(means)))
+    of_finished[judged] = nearest_other(z, labels[judged], means, without)
+    learned = np.full(len(labels), np.nan)
+    learned[judged] = shaped_distances(z[:, None] - means, shapes).min(axis=1)
+    return LeftOut(known, strangers, of_finished, learned, labels, values, parts)
 
 
 def left_out_in_turn(given: CalibrationInputs, finished: Embedding) -> dict[str, LeftOut]:

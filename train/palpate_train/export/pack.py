@@ -26,6 +26,7 @@ from palpate.core import provenance, storage
 from palpate.core.clock import SystemClock
 from palpate.inference.classifier import Classifier
 from palpate_train.answer.rules import ALL, Asked, present
+from palpate_train.answer.stranger_limits import MOST_UNKNOWN
 from palpate_train.data import extras, repeats
 from palpate_train.data.readers import counted
 from palpate_train.data.sets import Dataset
@@ -37,10 +38,9 @@ from palpate_train.models.methods import model_inputs
 from palpate_train.onnx_tools.graph_builder import run
 
 Array = NDArray[Any]
-MOST_REFUSED, MOST_UNKNOWN = 0.05, 0.15
-"""Largest shares of held-out sweeps that the box may refuse (because of stuck taxels, for
-instance), and call unknown. Its limit makes it call about 5 % unknown; more means that thresholds
-or limit do not fit."""
+MOST_REFUSED = 0.05
+"""Largest share of held-out sweeps that the box may refuse, because of stuck taxels, for instance;
+more means that thresholds do not fit."""
 RUNTIME = "0.2.0"
 """The first version of the box that reads such a manifest."""
 LICENCE = "licence"

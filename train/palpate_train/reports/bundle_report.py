@@ -311,7 +311,7 @@ def strangers(found: Json) -> str:
         x, y = found[limit]["answered"][0], found[limit]["named"][0]
         axes.plot(x, y, color=ACCENT, marker="o", markersize=5)
         write(axes, x, y + 0.05, limit, GREY, SMALL, ha="right")
-    axes.set_xlim(stranger_limits.LEAST_KEPT, 1.005)
+    axes.set_xlim(stranger_limits.LEAST_KEPT["strict"], 1.005)
     axes.set_ylim(0, 1.05)
     axes.grid(color=FAINT, linewidth=0.6)
     set_ticks(axes.yaxis, [0, 0.25, 0.5, 0.75, 1], percent=True)
