@@ -1,10 +1,13 @@
-"""A small trunk as an ONNX graph."""
+"""Small trunks as ONNX graphs."""
+
+from collections.abc import Callable
 
 import numpy as np
 import onnx
 
 from palpate.core.types import SweepFormat
-from palpate_train.onnx_tools.graph_builder import TENSOR, GraphBuilder
+from palpate_train.models.recipe.architectures import PREFIXES
+from palpate_train.onnx_tools.graph_builder import TENSOR, GraphBuilder, run
 
 FORMAT = SweepFormat(2, 2, 100.0, 163, "int16")
 
@@ -35,3 +38,15 @@ def trunk(format: SweepFormat, prefixes: bool = False) -> onnx.ModelProto:
     return onnx.helper.make_model(
         graph, opset_imports=[onnx.helper.make_opsetid("", 17)], ir_version=8
     )
+
+
+def view(
+    format: SweepFormat, nodes: Callable[..., str], size: int, samples: np.ndarray, prefixes: bool
+) -> np.ndarray:
+    """The features [n, size] of raw counts, or [n, PREFIXES, size], by a graph of one view alone.
+    nodes: takes the graph, its counts [1, T, M] and the factors of taxels; gives the features."""
+    g, shape = GraphBuilder(), (PREFIXES, size) if prefixes else (size,)
+    raw = g("Reshape", "sweep", g.constant([1, format.window, format.channels], "int64"))
+    found = nodes(g, raw, g.constant(np.ones((1, 1, format.channels))))
+    g("Reshape", found, g.constant([1, *shape], "int64"), output="features")
+    return run(g.model(format, "features", *shape), samples)

@@ -97,8 +97,8 @@ def test_all_conditions_count():
 
 
 def test_a_new_sweep_is_not_nearer_than_a_learned_one():
-    """However much a cross-fit of two parts inflates distances, the limit lets in what the finished
-    model has learned from; where it scatters less than that, nothing changes."""
+    """A cross-fit of two parts inflates distances. The limit still contains nearly all sweeps of
+    the finished model's training, where these lie far."""
     inflated = left_out(inflated=2.0, parts=2)
     far = replace(inflated, learned=inflated.known * 0.8)
     assert np.mean(far.learned <= limits({"force": far}).loose) > 0.98

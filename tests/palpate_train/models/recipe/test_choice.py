@@ -104,8 +104,8 @@ def test_what_lies_in_another_group_is_not_chosen():
 
 @pytest.mark.parametrize(("slow", "joins"), [(NOISE, True), (TRAP, False)])
 def test_slow_waves_join_unless_they_harm(slow: tuple[int, ...], joins: bool):
-    """They count as much as all other discriminants together. Noise does no harm and joins; what
-    misleads in two of three groups does not."""
+    """They count as much as all other discriminants together. Noise does no harm and joins; a trap
+    that misleads two of three groups stays out."""
     given, parts = known(600)
     rng, x = np.random.default_rng(1), given.features.copy()
     x[:, GOOD] += 0.8 * rng.standard_normal((600, 2))

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from palpate_train.models.methods import Log
 from palpate_train.models.recipe import choice, relations
 from palpate_train.models.recipe.architectures import PREFIXES
 from palpate_train.models.recipe.choice import Candidates, HeldOutScores, ScoredPlan
-from palpate_train.onnx_tools.graph_builder import GraphBuilder, run
+from tests.factories.trunk import view
 
 SCALE = 0.05
 SLOW = replace(skin.FORMAT, window=128, rows=16, cols=1, dtype="int16")
@@ -32,14 +33,12 @@ LARGE = replace(skin.FORMAT, window=40, rows=16, cols=32)
 
 
 def features(format: SweepFormat, samples: np.ndarray, used: int, prefixes: bool) -> np.ndarray:
-    """The relations of raw counts, by a graph that has nothing else."""
-    g, rows, size = GraphBuilder(), PREFIXES if prefixes else 1, used * relations.each(format)
-    raw = g("Reshape", "sweep", g.constant([1, format.window, format.channels], "int64"))
-    full = g.constant(np.ones((1, 1, format.channels)))
-    found = relations.nodes(g, raw, full, format, SCALE, used, prefixes)
-    shape = (rows, size) if prefixes else (size,)
-    g("Reshape", found, g.constant([1, *shape], "int64"), output="features")
-    return run(g.model(format, "features", *shape), samples)
+    """The relations of raw counts."""
+
+    def nodes(*given: Any) -> str:
+        return relations.nodes(*given, format, SCALE, used, prefixes)
+
+    return view(format, nodes, used * relations.each(format), samples, prefixes)
 
 
 def expected(x: np.ndarray, used: int, end: int, hop: int) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from palpate.core.types import SweepFormat
 from palpate.sim import skin
 from palpate_train.models.recipe import slow, spectrum
 from palpate_train.models.recipe.architectures import MAINS_HZ, PREFIXES
-from palpate_train.onnx_tools.graph_builder import GraphBuilder, run
+from tests.factories.trunk import view
 
 SCALE = 0.05
 FORMATS = [
@@ -24,14 +25,12 @@ forms = pytest.mark.parametrize("format", FORMATS, ids=str)
 
 
 def features(format: SweepFormat, samples: np.ndarray, prefixes: bool = False) -> np.ndarray:
-    """The slow waves of raw counts, by a graph that has nothing else."""
-    g, size = GraphBuilder(), slow.count(format)
-    raw = g("Reshape", "sweep", g.constant([1, format.window, format.channels], "int64"))
-    full = g.constant(np.ones((1, 1, format.channels)))
-    found = slow.nodes(g, raw, full, format, SCALE, MAINS_HZ, prefixes)
-    shape = (PREFIXES, size) if prefixes else (size,)
-    g("Reshape", found, g.constant([1, *shape], "int64"), output="features")
-    return run(g.model(format, "features", *shape), samples)
+    """The slow waves of raw counts."""
+
+    def nodes(*given: Any) -> str:
+        return slow.nodes(*given, format, SCALE, MAINS_HZ, prefixes)
+
+    return view(format, nodes, slow.count(format), samples, prefixes)
 
 
 def walks(format: SweepFormat) -> np.ndarray:

@@ -215,6 +215,10 @@ def _share(line: str, delimiter: str | None) -> float:
     return sum(map(is_number, found)) / max(len(found), 1)
 
 
+def _bare(cell: str) -> str:
+    return cell.strip().strip("\"'")
+
+
 def _trimmed(found: list[str]) -> list[str]:
     return found[:-1] if len(found) > 1 and not found[-1].strip() else found
 
@@ -249,17 +253,15 @@ def _body(kept: Sequence[Row], layout: Layout) -> tuple[int, int]:
 def _counts_columns(found: Sequence[str], layout: Layout) -> bool:
     """Whether a line is a head that counts its columns: time,1,2,3, or ,0,1,2,3 of pandas. If the
     frames begin with a word, too, it is a frame."""
-    first, *others = (cell.strip().strip("\"'") for cell in found)
-    counted = others in (
-        [str(i + first_number) for i in range(len(others))] for first_number in (0, 1)
-    )
+    first, *others = map(_bare, found)
+    counted = others in ([str(k + i) for i in range(len(others))] for k in (0, 1))
     return counted and (not first or _is_summary(found, layout))
 
 
 def _is_summary(found: Sequence[str], layout: Layout) -> bool:
     """Whether a line beside the frames begins with a word where all frames have a number, such as
     Mean, SD, Min or Max."""
-    first = found[0].strip().strip("\"'")
+    first = _bare(found[0])
     word = first[:1].isalpha() and not is_number(first) and first.lower() not in MISSING
     return word and 0 not in layout.text_columns and layout.wide > 1
 
@@ -309,9 +311,7 @@ def _heads(lines: Sequence[str], before: Sequence[Row], layout: Layout) -> tuple
     others = [line for _, line in before if not _marked(line)]
     for wide in (layout.wide, layout.wide - 1):
         for group in (others, comments):
-            heads = [
-                [c.strip().strip("\"'") for c in cells(line, layout.delimiter)] for line in group
-            ]
+            heads = [list(map(_bare, cells(line, layout.delimiter))) for line in group]
             heads = [h[:-1] if len(h) == wide + 1 and not h[-1] else h for h in heads]
             heads = [h for h in heads if len(h) == wide and not all(map(is_number, h))]
             heads = [h for h in heads if not all(map(QUANTITY.fullmatch, h[1:]))] or heads
