@@ -13,7 +13,8 @@ import pytest
 
 from palpate.cli.main import main
 from palpate.core import storage
-from palpate.core.config import load
+from palpate.core.config import StoreConfig, load
+from palpate.deployment.store import Store
 from palpate.learn import install
 from palpate.runtime import assembly
 from tests.cuts.teaching import at_once
@@ -60,13 +61,14 @@ def full(act: Callable[..., Any], count: list[int], at: int) -> Callable[..., An
 def test_two_that_teach_at_once_share_no_folder(tmp_path):
     """The second is refused while the first has it; what a power cut left is cleared."""
     (tmp_path / "teaching" / "old").mkdir(parents=True)
-    with install._scratch(tmp_path) as first:
+    place = Store(StoreConfig(folder=str(tmp_path)), prove=lambda bundle: None)
+    with install._scratch(place) as first:
         assert not first.exists()
         (first / "bundle").mkdir(parents=True)
-        with pytest.raises(install.TeachingFailed), install._scratch(tmp_path):
+        with pytest.raises(install.TeachingFailed), install._scratch(place):
             pass
         assert (first / "bundle").exists()
-    with install._scratch(tmp_path) as second:
+    with install._scratch(place) as second:
         assert not second.exists()
 
 
