@@ -20,7 +20,8 @@ COMMAND = re.compile(r"(?m)^    ((?:python|palpate|palpate-train) .*)$")
 SHOWN = (
     "162 files in build/recordings, materials: metal, wood, paper, plastic rough",
     "time,s0,s1,s2,s3,s4,s5,s6,s7,s8,s9,s10,s11,s12,s13,s14,s15",
-    "classified correctly: 36 of 36: 100.0 % [90.4, 100.0], 95 % interval, by position (2)",
+    "classified correctly: 31 of 36: 86.1 % [71.3, 94.4], 95 % interval, by position (2)",
+    "classified correctly: 35 of 36: 97.2 % [85.8, 100.0], 95 % interval, by position (2)",
 )
 """Lines of the page that do not depend on the machine."""
 MINUTES = 15
@@ -75,8 +76,8 @@ def test_the_commands_of_the_tutorial_run(tmp_path: Path):
     }
     commands = COMMAND.findall(PAGE.read_text("utf-8"))
     assert [shlex.split(command)[:2][-1] for command in commands] == [
-        *("docs/tutorials/csv_sweeps.py", "import", "fit", "export", "score", "demo"),
-        *("report", "watch"),
+        *("docs/tutorials/csv_sweeps.py", "import", "fit", "export", "score", "export"),
+        *("score", "demo", "report", "watch"),
     ]
     output = ""
     begun = time.monotonic()

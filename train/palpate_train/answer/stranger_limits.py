@@ -31,10 +31,12 @@ On two simulated worlds and three materials, left out with a third of the positi
 98 and 99.7 % of known sweeps, and give 1, 2 and 7 % of unknown ones a label."""
 MOST_UNKNOWN = 0.15
 """Largest share of held-out sweeps that a bundle may call unknown: export refuses it else."""
-LEAST_KEPT = {"strict": 0.5, "balanced": 1 - MOST_UNKNOWN, "loose": 1 - MOST_UNKNOWN}
+LEAST_KEPT = {"strict": 0.5, "balanced": 0.9, "loose": 0.9}
 MOST_KEPT = 0.995
 """Least share of known sweeps within each limit, and the largest, at any cost. A box that refuses
-more is of no use; a wider limit only lets strangers in."""
+more is of no use; a wider limit only lets strangers in. Few positions say little about the next
+one: of 15 splits of six simulated positions the balanced limit keeps 93 % on average, 67 % in the
+worst; with a least share of 0.85 90 and 61 %."""
 STEPS, DRAWN = 500, 12
 """Numbers of limits that are compared, and that a manifest has shares for."""
 WIDTH = 1.06
