@@ -32,6 +32,10 @@ MACHINES = {
 }
 """Name: (architecture, name of the processor in qemu). The Pi 5 has 8-bit dot products; the Pi 4
 does not.
+
+qemu 7.2, Debian 12's, takes another register for xmm4 as the index of a gather of AVX2
+(gitlab.com/qemu-project/qemu/-/issues/2474), and ends with signal 11; processors do not. numpy
+gathers so for strided float32 in np.maximum and np.minimum, and for products of strided complex64.
 """
 PYTHON = f"python{sys.version_info.major}.{sys.version_info.minor}"
 PACKAGES = (f"{PYTHON}-minimal", f"lib{PYTHON}-stdlib", "libstdc++6")

@@ -162,8 +162,9 @@ class SlideMeter:
             counts = _busiest(counts.reshape(-1, *window.taxels.shape[1:3]), self._shape)
         # four times as fast as sum(axis=1)
         summed = np.einsum("tev->tv", counts.reshape(self._frames, self._each, -1))
-        spectra = self._waves(summed).T.copy()
-        power = np.vecdot(spectra, spectra).real
+        # real and imaginary parts in one row: qemu 7.2 cannot run np.maximum on every other number
+        parts = self._waves(summed).T.copy().view(np.float32)
+        power = np.vecdot(parts, parts)
         if not math.isfinite(power.max()):
             power[~np.isfinite(power)] = 0
         silent = power <= SILENT * power.max()
@@ -171,13 +172,13 @@ class SlideMeter:
         if heard < LEAST_TAXELS:
             return None
         if heard < len(power):
-            spectra[silent] = 0
+            parts[silent] = 0
         median = np.sort(power)[len(power) - heard + heard // 2]
-        spectra *= 1 / np.sqrt(np.maximum(power, median))[:, None]
-        common = np.add.reduce(spectra)
-        shares = np.vecdot(common, spectra).real / max(np.vecdot(common, common).real, TINY)
-        spectra -= shares[:, None] * common
-        return spectra
+        parts *= 1 / np.sqrt(np.maximum(power, median))[:, None]
+        common = np.add.reduce(parts)
+        shares = parts @ common / max(float(common @ common), TINY)
+        parts -= shares[:, None] * common
+        return parts.view(np.complex64)
 
     def _heights(self, spectra: Array) -> Array:
         """Heights [2, 2, V + 1] of the sums for slides towards higher and lower numbers, along rows
