@@ -290,3 +290,17 @@ def test_an_option_that_cannot_be_read_is_named(changes: dict, why: str):
     with pytest.raises(FormatError) as e:
         plan(**changes)
     assert why in str(e.value)
+
+
+@pytest.mark.parametrize(("late", "refused"), [(0.0, False), (0.004, False), (0.02, True)])
+def test_a_taxel_with_other_times_is_refused(late: float, refused: bool):
+    """Each taxel may have a time of its own under the same name, if it is the frame's."""
+    t = np.arange(40) / 100
+    values = np.stack([t, 3 * t, t + late, 5 * t], axis=1)
+    table = Table(values, ("X[s]", "S0", "X[s]", "S1"))
+    asked = plan(time="1:s", rate_hz=None, columns="2,4", grid="1x2")
+    if refused:
+        with pytest.raises(FormatError, match="column 3"):
+            frames.frames(table, asked)
+    else:
+        np.testing.assert_array_equal(frames.frames(table, asked)[0][:, 0], values[:, [1, 3]])

@@ -98,6 +98,54 @@ def test_a_feature_is_named_where_several_are_tactile(
     assert imported(folder, *MATERIAL, "--variable", "observation.tactile") == 0
 
 
+FIVE = COUNTS.reshape(4, 60, 6)[:, :, :5].repeat(4, axis=2) + np.arange(20)
+"""Rows of five frames of a 2x2 skin each."""
+
+
+def of_windows(folder: Path, rows: np.ndarray, name: str = "tactile") -> Path:
+    """A set whose rows [episode, row, frame, taxel] hold several frames each."""
+    pa, parquet = (pytest.importorskip(one) for one in ("pyarrow", "pyarrow.parquet"))
+    data_set(folder, "v2.1")
+    info = json.loads((folder / "meta/info.json").read_text())
+    del info["features"]["observation.tactile"]
+    info["features"][name] = {"dtype": "float32", "shape": list(rows.shape[2:]), "names": None}
+    (folder / "meta/info.json").write_text(json.dumps(info))
+    for k, path in enumerate(sorted(folder.glob("data/*/*.parquet"))):
+        table = parquet.read_table(path).append_column(name, pa.array(rows[k].tolist()))
+        parquet.write_table(table, path)
+    return folder
+
+
+@pytest.mark.parametrize("name", ["tactile", "tactile_window", "skin.history"])
+def test_a_row_can_hold_several_frames(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+):
+    """Their grid says so, and the rate follows; without it the shape is asked for, or said."""
+    rows = FIVE.reshape(4, 60, 5, 4)
+    folder = of_windows(tmp_path / "set", rows, name)
+    asked = imported(folder, *MATERIAL) == 65
+    out = capsys.readouterr()
+    assert "[5, 4]" in (out.err if asked else out.out)
+    assert asked == (name != "tactile")
+    assert imported(folder, *MATERIAL, "--grid", "2x2") == 0
+    made = sets.load(str(tmp_path / "s.npz"))
+    assert (made.format.rate_hz, made.samples.shape) == (150, (4, 20, 2, 2))
+    whole = rows.reshape(4, 300, 2, 2)
+    np.testing.assert_array_equal(made.samples, whole[:, 140:160])
+    assert imported(folder, *MATERIAL, "--grid", "5x4") == 0
+    assert sets.load(str(tmp_path / "s.npz")).format.rate_hz == 30
+
+
+def test_rows_that_repeat_frames_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """A history of five frames in which one is new is not five times as fast."""
+    series = FIVE.reshape(4, 300, 4)
+    rows = np.stack([series[:, k : k + 5] for k in range(60)], axis=1)
+    folder = of_windows(tmp_path / "set", rows)
+    assert imported(folder, *MATERIAL, "--grid", "2x2") == 65
+    assert "--columns 17-20" in capsys.readouterr().err
+    assert imported(folder, *MATERIAL, "--grid", "2x2", "--columns", "17-20") == 0
+
+
 def test_an_episode_that_lacks_a_frame_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):

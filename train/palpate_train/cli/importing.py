@@ -123,7 +123,7 @@ def _plan(args: argparse.Namespace) -> ImportPlan:
     rate, table = args.rate, label_table.read(args.labels) if args.labels else {}
     labelled = next(iter(table.values()), {})
     if not (args.pattern or args.time or rate) and lerobot.is_data_set(args.folder):
-        rate = lerobot.rate_hz(args.folder)
+        rate = lerobot.rate_hz(args.folder, args.variable, "" if args.columns else args.grid)
     return ImportPlan(
         NamePattern(args.pattern, (*fields, *in_variable, *labelled)) if args.pattern else None,
         args.grid,

@@ -265,9 +265,27 @@ def _taxels(values: Array, table: Table, plan: ImportPlan, time_column: int | No
         others += [*table.texts, -1 if time_column is None else time_column]
         numbers = [i for i in range(wide) if i not in others]
     _check_numbers(table, numbers)
+    if time_column is not None:
+        _check_own_times(values, table, time_column, numbers)
     if len(numbers) != want:
         raise FormatError(_mismatch(len(numbers), len(values), plan, time_column))
     return values[:, numbers].reshape(len(values), *shape)
+
+
+def _check_own_times(values: Array, table: Table, at: int, taxels: Sequence[int]) -> None:
+    """Raise FormatError if a taxel has a time of its own, under the name of the time column `at`,
+    which differs from it by more than half a frame."""
+    if not table.columns or not table.columns[at] or at in table.texts:
+        return
+    time = values[:, at]
+    for i in taxels:
+        if i and i - 1 != at and table.columns[i - 1] == table.columns[at]:
+            apart = np.abs(values[:, i - 1] - time).max()
+            if not apart <= np.median(np.abs(np.diff(time))) / 2:
+                raise FormatError(
+                    f"column {i} holds other times than column {at + 1}, by up to {apart:g}; "
+                    "export all channels at the same times"
+                )
 
 
 def _mismatch(count: int, rows: int, plan: ImportPlan, time_column: int | None) -> str:

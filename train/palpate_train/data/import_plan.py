@@ -20,6 +20,17 @@ DATE = "date"
 """The unit of times that are written as dates."""
 
 
+def grid_shape(grid: str) -> tuple[int, ...]:
+    """Rows, columns, and axes if there are several, of a --grid; () without one. Raises
+    FormatError."""
+    if grid and not GRID.fullmatch(grid):
+        raise FormatError(
+            f"--grid {grid} cannot be read; write ROWSxCOLUMNS or ROWSxCOLUMNSxAXES: 4x4, 4x4x3"
+        )
+    sizes = tuple(map(int, grid.split("x"))) if grid else ()
+    return sizes[:2] if sizes[2:] == (1,) else sizes
+
+
 @dataclass(frozen=True)
 class Length:
     """A length of time, in seconds, milliseconds or frames. option: its name in error messages.
@@ -86,11 +97,7 @@ class ImportPlan:
     labels: LabelTable = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.grid and not GRID.fullmatch(self.grid):
-            raise FormatError(
-                f"--grid {self.grid} cannot be read; "
-                "write ROWSxCOLUMNS or ROWSxCOLUMNSxAXES: 4x4, 4x4x3"
-            )
+        _ = self.shape
         if not self.time and not self.rate_hz:
             raise FormatError(
                 "the frame rate is not known; give --rate HZ, or --time COLUMN:UNIT if a column "
@@ -143,8 +150,7 @@ class ImportPlan:
     @property
     def shape(self) -> tuple[int, ...]:
         """Rows, columns, and axes if there are several; () without --grid."""
-        rows_columns_axes = tuple(map(int, self.grid.split("x"))) if self.grid else ()
-        return rows_columns_axes[:2] if rows_columns_axes[2:] == (1,) else rows_columns_axes
+        return grid_shape(self.grid)
 
     @property
     def order(self) -> tuple[str, ...]:

@@ -112,9 +112,9 @@ def import_folder(
     """
     sources: Iterator[Source]
     if plan.pattern is None and lerobot.is_data_set(folder):
-        plan = lerobot.with_grid(folder, plan)
+        plan, remark = lerobot.with_grid(folder, plan)
         episodes = lerobot.episodes(folder, plan)
-        sources = ((name, {}, partial(replace, table)) for name, table in episodes)
+        sources = ((name, {}, partial(replace, table, notes=remark)) for name, table in episodes)
     else:
         sources = _files(_named(folder, plan, left_out), plan, log)
     recordings, count = [], 0

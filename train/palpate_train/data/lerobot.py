@@ -1,24 +1,26 @@
 """Reads the tactile columns of a LeRobot data set: each episode is a recording.
 
 Layout of versions 2.0 to 3.0: meta/info.json with `fps` and `features`, data/chunk-*/*.parquet with
-a row for each frame, the texts of tasks in meta/tasks.jsonl or meta/tasks.parquet.
+a row for each frame, the texts of tasks in meta/tasks.jsonl or meta/tasks.parquet. A row of a fast
+skin may hold the frames since the row before, along the first axis of its feature.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from palpate.core.errors import FormatError
 from palpate_train.data.extras import library
 from palpate_train.data.files import json_lines, parquet
 from palpate_train.data.files.table import ReadPlan, Table, from_columns
-from palpate_train.data.import_plan import ImportPlan
+from palpate_train.data.import_plan import ImportPlan, grid_shape
 
 INFO = Path("meta", "info.json")
 TASKS = (Path("meta", "tasks.jsonl"), Path("meta", "tasks.parquet"))
@@ -27,6 +29,8 @@ EPISODE, FRAME, TASK, TASK_INDEX, TIME = (
 )  # fmt: skip
 TACTILE = ("tactile", "touch", "taxel", "skin")
 """What the names of tactile features contain. LeRobot prescribes no name."""
+SEVERAL = ("window", "history", "buffer", "stack", "sequence", "frames", "steps")
+"""What the names of features and axes contain if a row holds several frames."""
 PICTURES = ("video", "image", "string")
 
 
@@ -35,20 +39,36 @@ def is_data_set(folder: Path) -> bool:
     return (folder / INFO).is_file()
 
 
-def rate_hz(folder: Path) -> float:
-    """The frame rate of a data set. Raises FormatError."""
+def rate_hz(folder: Path, variable: str = "", grid: str = "") -> float:
+    """The frame rate of a data set, several times its rate of rows if a row holds several frames.
+    Raises FormatError."""
     rate = _info(folder).get("fps")
     if not isinstance(rate, int | float) or rate <= 0:
         raise FormatError(f"{folder / INFO}: fps is {rate!r}; give the frame rate with --rate")
-    return float(rate)
+    return float(rate) * _frames_of_a_row(_feature(folder, variable)[1], grid)
 
 
-def with_grid(folder: Path, plan: ImportPlan) -> ImportPlan:
-    """The plan with the grid that the tactile feature states, if the plan has none."""
-    _, shape = _feature(folder, plan)
+def with_grid(folder: Path, plan: ImportPlan) -> tuple[ImportPlan, tuple[str, ...]]:
+    """The plan with the grid that the tactile feature states, if the plan has none, and a remark on
+    it. Raises FormatError if its first axis seems to be time."""
+    name, shape = _feature(folder, plan.variable)
     if plan.grid or len(shape) not in (2, 3):
-        return plan
-    return replace(plan, grid="x".join(map(str, shape)))
+        return plan, ()
+    sizes, grid = list(shape), "x".join(map(str, shape))
+    other = f"if a row holds {shape[0]} frames, give the grid of one with --grid ROWSxCOLUMNS"
+    about = f"{name} {_info(folder)['features'][name].get('names') or ''}".lower()
+    if any(word in about for word in SEVERAL):
+        raise FormatError(
+            f"{folder}: {name} has the shape {sizes}; {other}, or --grid {grid} if all are taxels"
+        )
+    return replace(plan, grid=grid), (f"{name} {sizes} is taken as {grid} taxels; {other}",)
+
+
+def _frames_of_a_row(shape: tuple[int, ...], grid: str) -> int:
+    """The number of frames in a row of a feature, as the grid of one frame shows."""
+    taxels = int(np.prod(grid_shape(grid))) if grid else 0
+    several = len(shape) > 1 and shape[0] > 1 and int(np.prod(shape[1:])) == taxels
+    return shape[0] if several else 1
 
 
 def episodes(folder: Path, plan: ImportPlan) -> Iterator[tuple[str, Table]]:
@@ -59,7 +79,8 @@ def episodes(folder: Path, plan: ImportPlan) -> Iterator[tuple[str, Table]]:
     lacks a frame.
     """
     arrow = library("pyarrow", "a LeRobot data set")
-    name, _ = _feature(folder, plan)
+    name, shape = _feature(folder, plan.variable)
+    each = 1 if plan.columns else _frames_of_a_row(shape, plan.grid)
     tasks = _tasks(folder)
     paths = sorted(folder.glob("data/**/*.parquet"))
     if not paths:
@@ -75,7 +96,7 @@ def episodes(folder: Path, plan: ImportPlan) -> Iterator[tuple[str, Table]]:
             if (np.diff(numbers[FRAME][inside]) != 1).any():
                 raise FormatError(f"{path}: episode {episode} lacks a frame; fetch the whole set")
             rows = content.filter(arrow.array(inside))
-            yield f"episode {episode}", _table(rows, name, tasks, plan.fields.values())
+            yield f"episode {episode}", _table(rows, (name, each), tasks, plan.fields.values())
 
 
 def _info(folder: Path) -> Mapping[str, Any]:
@@ -88,19 +109,19 @@ def _info(folder: Path) -> Mapping[str, Any]:
     return info
 
 
-def _feature(folder: Path, plan: ImportPlan) -> tuple[str, tuple[int, ...]]:
-    """Name and shape of the tactile feature: the only one with a name of TACTILE, or
-    `plan.variable`."""
+def _feature(folder: Path, variable: str) -> tuple[str, tuple[int, ...]]:
+    """Name and shape of the tactile feature: `variable`, or the only one with a name of
+    TACTILE."""
     features = {
         name: about
         for name, about in _info(folder)["features"].items()
         if about.get("dtype") not in PICTURES
     }
-    if plan.variable and plan.variable in features:
-        found = [plan.variable]
+    if variable and variable in features:
+        found = [variable]
     else:
         found = [n for n in features if any(word in n.lower() for word in TACTILE)]
-    if len(found) != 1 or (plan.variable and found != [plan.variable]):
+    if len(found) != 1 or (variable and found != [variable]):
         listed = ", ".join(f"{n} {about.get('shape')}" for n, about in features.items())
         raise FormatError(
             f"{folder}: holds {len(found)} tactile features; name one with --variable: "
@@ -124,25 +145,45 @@ def _tasks(folder: Path) -> dict[int, str]:
     return dict(zip(numbers, map(str, content.column(text_column).to_pylist()), strict=True))
 
 
-def _table(rows: Any, name: str, tasks: Mapping[int, str], fields: Any) -> Table:
-    """The table of an episode."""
+def _table(
+    rows: Any, feature: tuple[str, int], tasks: Mapping[int, str], fields: Collection[str]
+) -> Table:
+    """The table of an episode. feature: its name, and the frames of a row."""
+    name, each = feature
     found = parquet.numbers(rows.column(name), name)
     if found is None:
         raise FormatError(f"{name} does not hold numbers; name a feature that does")
-    flat = found.reshape(len(found), -1)
+    flat = _apart(name, found.reshape(len(found), -1), each)
     names = [f"{name}.{k}" for k in range(flat.shape[1])]
     columns, texts = list(flat.T), {}
     for field in dict.fromkeys([TASK, *fields]):
         if field == TASK and TASK_INDEX in rows.column_names:
             numbers = rows.column(TASK_INDEX).to_pylist()
-            texts[len(names)] = [tasks.get(k, str(k)) for k in numbers]
+            given = [tasks.get(k, str(k)) for k in numbers]
         elif field in rows.column_names:
-            texts[len(names)] = [str(value) for value in rows.column(field).to_pylist()]
+            given = [str(value) for value in rows.column(field).to_pylist()]
         else:
             continue
+        texts[len(names)] = [text for text in given for _ in range(each)]
         names.append(field)
         columns.append(np.zeros(len(flat), np.uint8))
     made = from_columns(names, columns, texts)
-    time = np.asarray(rows.column(TIME).to_numpy()) if TIME in rows.column_names else None
-    vectors = {} if time is None else {TIME: time.astype(np.float64)}
+    timed = TIME in rows.column_names and each == 1
+    time = np.asarray(rows.column(TIME).to_numpy(), np.float64) if timed else None
+    vectors = {} if time is None else {TIME: time}
     return Table(made.values, made.columns, vectors, tuple(vectors), texts)
+
+
+def _apart(name: str, rows: NDArray[Any], each: int) -> NDArray[Any]:
+    """Rows [n, each * taxels] as frames [n * each, taxels]. Raises FormatError if a row repeats
+    frames of the row before."""
+    frames = rows.reshape(len(rows), each, -1)
+    for new in range(1, each):
+        repeated = np.array_equal(frames[1:, : each - new], frames[:-1, new:])
+        if repeated and (frames[1:] != frames[:-1]).any():
+            first = rows.shape[1] - frames.shape[2] + 1
+            raise FormatError(
+                f"{name}: each row repeats {each - new} of its {each} frames; "
+                f"take the last one with --columns {first}-{rows.shape[1]}, at the rate of the rows"
+            )
+    return frames.reshape(len(rows) * each, -1)

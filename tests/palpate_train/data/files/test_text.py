@@ -272,3 +272,13 @@ def test_blanks_and_decimal_commas_go_together():
         read("1_000,2\n1,2\n1,2\n").faults[0]
         == "line 1, column 1 is '1_000', which is not a number"
     )
+
+
+@pytest.mark.parametrize("empty", [1, 2])
+def test_empty_cells_of_a_channel_that_ended_are_not_cut_off(empty: int):
+    """A slower channel, perhaps with times of its own, ends earlier than the taxels."""
+    more = "".join(f",{k}" for k in range(empty))
+    rows = [line + (more if k < 5 else "," * empty) for k, line in enumerate(BODY.splitlines())]
+    found = read("\n".join(rows))
+    assert found.values.shape == (len(ROWS), 4 + empty)
+    assert found.notes == ()

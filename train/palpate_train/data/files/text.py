@@ -189,11 +189,16 @@ def _layout(kept: Sequence[Row], delimiter: str) -> Layout:
     ways = (delimiter,) if delimiter else DELIMITERS
     shares = {way: sum(_share(line, way) for line in sample) for way in ways}
     best = next(way for way, share in shares.items() if share >= CLEAR * max(shares.values()))
-    found = [_trimmed(cells(line, best)) for line in sample if _share(line, best)]
+    found = [cells(line, best) for line in sample if _share(line, best)]
     if not found:
         raise FormatError("holds no line of numbers")
     counts = Counter(map(len, found))
     wide = max(counts, key=lambda n: (counts[n], n))
+    # the last column may be empty in most lines, but not in all
+    if not any(len(row) == wide and row[-1].strip() for row in found):
+        found = list(map(_trimmed, found))
+        counts = Counter(map(len, found))
+        wide = max(counts, key=lambda n: (counts[n], n))
     lines = [row for row in found if len(row) == wide][-SAMPLED:]
     words = frozenset(
         i
@@ -245,7 +250,7 @@ def _body(kept: Sequence[Row], layout: Layout) -> tuple[int, int]:
     if start == len(kept):
         raise FormatError("holds no line of numbers")
     end = len(kept)
-    while end > start + 1 and _is_footer(kept[end - 1][1], layout, end == len(kept)):
+    while end > start + 1 and _is_footer(kept[end - 2 : end], layout, end == len(kept)):
         end -= 1
     return start, end
 
@@ -266,11 +271,16 @@ def _is_summary(found: Sequence[str], layout: Layout) -> bool:
     return word and 0 not in layout.text_columns and layout.wide > 1
 
 
-def _is_footer(line: str, layout: Layout, last: bool) -> bool:
-    """Whether a line after the frames is text, a comment or, as the last one, cut off."""
+def _is_footer(pair: Sequence[Row], layout: Layout, last: bool) -> bool:
+    """Whether the second of two lines after the frames is text, a comment or, as the last one, cut
+    off. Cells that are empty in both belong to a slower channel that has ended."""
+    (_, above), (_, line) = pair
     if _marked(line):
         return len(layout.cells(line)) != layout.wide or not layout.is_frame(line)
-    found = _trimmed(layout.cells(line))
+    whole, before = layout.cells(line), layout.cells(above)
+    if len(whole) == len(before) == layout.wide and not (before[-1] + whole[-1]).strip():
+        return not layout.is_frame(line)
+    found = _trimmed(whole)
     given = [is_number(cell) for cell in found]
     if len(found) == layout.wide and all(given[1:]) and _is_summary(found, layout):
         return True
