@@ -188,6 +188,20 @@ OPTIONS: Mapping[str, tuple[str, dict[str, Any]]] = {
     "folder": _option("folder", "folder of the bundle", type=Path, metavar="DIR"),
     "candidate": _flag("--shadow", "as the candidate of `run --shadow` instead"),
     "other-skin": _flag("--other-skin", "even if another skin streams"),
+    "profile": _option("name", "name of the profile", metavar="NAME"),
+    "needed-port": _option(
+        "--port", "serial port of the skin", dest="skin_port", metavar="PATH", required=True
+    ),
+    "baud": _option(
+        "--baud", "its speed (default: common speeds in turn)", type=_count, metavar="N"
+    ),
+    "grid": _option("--grid", "rows and columns (default: the squarest)", metavar="RxC"),
+    "profiles": _option(
+        "--out",
+        "folder of the profile (default: /etc/palpate/skins)",
+        type=outputs.folder,
+        metavar="DIR",
+    ),
     "write": _flag("--write", "with --port: also ask the skin, and send start commands"),
     "seconds": _option(
         "--seconds",

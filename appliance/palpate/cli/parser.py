@@ -68,6 +68,11 @@ _SKINS = {
         "cli.skin_commands.run_detect",
         "port write",
     ),
+    "new": CommandEntry(
+        "write a profile for the lines of numbers that a skin sends",
+        "cli.skin_commands.run_new",
+        "profile needed-port baud grid profiles",
+    ),
     "check": CommandEntry(
         "compare the skin with PROTOCOL.md part by part, or its bytes with its profile",
         "cli.skin_commands.run_check",
@@ -142,7 +147,7 @@ GROUPS: Mapping[str, Mapping[str, CommandEntry]] = {
         ),
     },
     "devices": {
-        "skin": CommandEntry("list, detect, check, show or align skins", "", "", _SKINS),
+        "skin": CommandEntry("list, detect, describe, check, show or align skins", "", "", _SKINS),
         "bridge": CommandEntry(
             "pass answers on to other machines of the cell: TCP, Modbus TCP, ROS 2",
             "bridges.command.run",

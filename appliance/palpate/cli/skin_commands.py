@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING
 
 from palpate.cli.common import load_bundle, load_settings, local_page
 from palpate.cli.devices import open_any, open_devices
+from palpate.core import storage
 from palpate.core.clock import SystemClock
-from palpate.core.config import Config
+from palpate.core.config import Config, SkinConfig
 from palpate.core.devices import Devices
-from palpate.core.errors import BundleError, ConfigError, SensorError
+from palpate.core.errors import BundleError, ConfigError, SensorError, SensorMismatch
 from palpate.core.interrupts import StopFlag
 from palpate.core.log import log
+from palpate.core.text import shown
 from palpate.io import serial_port, skin_profile, skins
 from palpate.io.serial_port import PortInfo
 from palpate.io.skin_profile import DEFAULT, SkinProfile
@@ -134,6 +136,38 @@ def _listen(ports: list[PortInfo], settings: Config, write: bool) -> int:
             print(one.proposal, flush=True)
         fitting += bool(one.profile)
     return fitting
+
+
+def run_new(args: argparse.Namespace) -> int:
+    """Write a profile for the lines of numbers at a port. Raises ConfigError for a name or a grid
+    that cannot be used, and SensorMismatch for other bytes."""
+    from palpate.io.serial_link import SerialLink
+    from palpate.tools import skin_detect, skin_text
+
+    if not skin_profile.NAME.fullmatch(args.name):
+        raise ConfigError(f"{shown(args.name)} is no name of a profile; use a-z, 0-9 and -")
+    path = (args.out or skins.OWN) / f"{args.name}.toml"
+    if path.exists():
+        raise ConfigError(f"{path} exists; take another name, or delete it")
+    asked = SkinProfile(codec="text", about="lines", source="lines")
+    wire = skin_profile.adapted(asked, SkinConfig(grid=args.grid or ""))
+    clock, port = SystemClock(), args.skin_port
+    log.info(f"listening at {port}")
+    text, sample = skin_detect.propose(
+        port,
+        {},
+        lambda path, baud: SerialLink(path, baud, clock),
+        clock,
+        (wire.rows, wire.cols) if args.grid else None,
+        (args.baud,) if args.baud else skin_detect.BAUDS,
+    )
+    if not text:
+        line = skin_text.odd_line(sample.data)
+        what = repr(line) if line else f"{len(sample.data)} bytes, and no text"
+        raise SensorMismatch(f"{port} sends {what}; {skin_detect.LINES}; check --grid and --baud")
+    storage.put(path, f"{text}\n".encode(), parents=True, mode=0o644)
+    print(f"{text}\n{path} is written; check it with `palpate skin check --skin {path}`")
+    return 0
 
 
 def _profiles(settings: Config) -> Iterator[tuple[str, SkinProfile | ConfigError]]:

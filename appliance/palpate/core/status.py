@@ -64,6 +64,7 @@ class Reason(StrEnum):
     ANOTHER_OBJECT = "another-object"
     REST_NEEDED = "rest-needed"
     UNCHECKED = "unchecked"
+    STILL = "still"
     NOT_A_SLIDE = "not-a-slide"
 
 
@@ -82,6 +83,7 @@ DETAILS: Mapping[Reason, str] = MappingProxyType(
         Reason.ANOTHER_OBJECT: "another object: {label} after {before}",
         Reason.REST_NEEDED: "the rest of the sweep is needed",
         Reason.UNCHECKED: "contact not checked: the skin was not both touched and let go so far",
+        Reason.STILL: "no taxel changes: check the cable",
         Reason.NOT_A_SLIDE: "{why}",
     }
 )

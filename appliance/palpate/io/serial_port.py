@@ -13,7 +13,14 @@ from typing import Any
 
 import serial
 
+from palpate.core.errors import ConfigError
 from palpate.core.text import printable
+
+if not hasattr(serial, "Serial"):  # the package "serial" hides pyserial, which has the same module
+    raise ConfigError(
+        "the package serial is installed in place of pyserial; run `pip uninstall serial`, then"
+        " `pip install --force-reinstall pyserial`"
+    )
 
 PSEUDO_TERMINALS = range(136, 144)
 """Major device numbers of pseudo-terminals."""

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from palpate.answer.slide_check import only_taxel
 from palpate.answer.unloaded import UnloadedTracker
+from palpate.answer.window import Window
 from palpate.answer.window_check import Finding, inspect_bare, inspect_readings
 from palpate.core.clock import Clock
 from palpate.core.errors import ApplianceError
@@ -24,6 +25,7 @@ from palpate.core.types import EPOCH_BITS, Frames, Status, Sweep, SweepFormat, V
 MEASURED = "level", "noise"
 """The entry `unloaded` of a sidecar: level and noise of the unloaded skin."""
 UNCHECKED = Finding(Status.RECORDED, Remark(Reason.UNCHECKED))
+STILL = Finding(Status.STUCK_TAXEL, Remark(Reason.STILL))
 
 
 class SweepCheck(Observer):
@@ -76,7 +78,9 @@ class SweepCheck(Observer):
     def _checked(self, taxels: NDArray[Any]) -> Finding:
         if not (self._unloaded.skin and self._unloaded.certain):
             readings = inspect_readings(taxels)
-            return UNCHECKED if readings.status is Status.OK else readings
+            if readings.status is not Status.OK:
+                return readings
+            return STILL if len(taxels) > 1 and Window(taxels).still.all() else UNCHECKED
         finding = inspect_bare(taxels, self._unloaded.skin)
         return Finding(Status.RECORDED) if finding.status is Status.OK else finding
 

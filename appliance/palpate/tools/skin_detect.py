@@ -31,7 +31,16 @@ FEWEST_FRAMES = 4
 """Number of frames that cannot be chance."""
 SAME_RATE = 0.02
 """Relative difference of rates that needs no setting."""
+BAUDS = (115200, 9600, 57600, 250000, 500000, 1000000, 2000000)
+"""Speeds at which sketches print lines of numbers."""
 OpenPort = Callable[[str, int], BytePort]
+
+
+LINES = (
+    "let it print equal lines of numbers; if it waits for a command, describe it with `start`, as"
+    " matrix.toml explains"
+)
+"""The remedy for text that is no lines of numbers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,9 +143,28 @@ def _on_port(
         told = f'{known}{who}; set skin.link = "serial", skin.port = "{port.path}"'
         yield PortFinding(port, DEFAULT, told)
         return
-    proposal = next(filter(None, map(_proposed, heard.items())), "")
-    most = max(len(one.data) for one in heard.values())
-    yield PortFinding(port, "", known + _nothing(most, others, write, bool(proposal)), proposal)
+    proposal, sample = propose(port.path, heard, open_port, clock)
+    yield PortFinding(port, "", known + _nothing(sample, others, write, bool(proposal)), proposal)
+
+
+def propose(
+    path: str,
+    heard: dict[int, HeardBytes],
+    open_port: OpenPort,
+    clock: Clock,
+    grid: tuple[int, int] | None = None,
+    bauds: Iterable[int] = BAUDS,
+) -> tuple[str, HeardBytes]:
+    """The text of a profile for the lines of numbers at a port, "" without one; and what it sends.
+    heard: by speed so far; `bauds` follow until one gives text. Raises SensorError."""
+    for baud in dict.fromkeys((*heard, *bauds)):
+        if baud not in heard:
+            if heard and not any(one.reads for one in heard.values()):
+                break  # silent at any speed
+            heard[baud] = listen(path, baud, None, open_port, clock, LISTEN_S)
+        if heard[baud].reads and skin_text.is_text(heard[baud].data):
+            return _proposed(baud, heard[baud], grid), heard[baud]
+    return "", max(heard.values(), key=lambda one: len(one.data))
 
 
 def listen(
@@ -224,27 +252,30 @@ def _asked(path: str, open_port: OpenPort, clock: Clock) -> str:
         port.close()
 
 
-def _proposed(heard: tuple[int, HeardBytes]) -> str:
+def _proposed(baud: int, sample: HeardBytes, grid: tuple[int, int] | None) -> str:
     """The text of a profile for lines of numbers at a speed, "" for other bytes."""
-    baud, sample = heard
     times = [t_ns for _, t_ns in sample.reads]
     if len(times) < 2 or times[-1] == times[0]:
         return ""
-    text = skin_text.proposed(sample.data, (times[-1] - times[0]) / 1e9)
+    text = skin_text.proposed(sample.data, (times[-1] - times[0]) / 1e9, grid)
     return f"{text}baud = {baud}" if text else ""
 
 
-def _nothing(heard: int, profiles: Mapping[str, SkinProfile], write: bool, proposed: bool) -> str:
+def _nothing(
+    heard: HeardBytes, profiles: Mapping[str, SkinProfile], write: bool, proposed: bool
+) -> str:
     """The reason why no profile fits, and the remedy."""
     if proposed:
         return (
-            "sends lines of numbers; write what follows to /etc/palpate/skins/NAME.toml, correct"
-            " rows and cols there, and check it with `palpate skin check --skin NAME`"
+            "sends lines of numbers; `palpate skin new NAME --port PATH --grid ROWSxCOLUMNS` writes"
+            " what follows, and `palpate skin check --skin NAME` checks it"
         )
-    if heard:
+    if line := skin_text.odd_line(heard.data):
+        return f"sends {line!r}; {LINES}"
+    if heard.data:
         return (
-            f"sends {heard} bytes, but no frames of a profile; try skin.grid, or copy matrix.toml,"
-            " describe the frames there and check it with `palpate skin check`"
+            f"sends {len(heard.data)} bytes, but no frames of a profile; try skin.grid, or copy"
+            " matrix.toml, describe the frames there and check it with `palpate skin check`"
         )
     if write:
         return "sends nothing and answers nothing"

@@ -20,7 +20,9 @@ SPAN_S = 2.0
 SHOWN_S = 0.1
 """Length of the signal whose mean is shown as load."""
 STUCK_S = 5.0
-"""A taxel with one value for this long is stuck. If all taxels have one value, none is named."""
+"""A taxel with one value for this long is stuck."""
+ALL = "all taxels; touch the skin, or check its cable"
+"""What is shown as stuck if no taxel changes: an unloaded skin may have no noise."""
 MOVED = 10.0
 """The skin counts as touched once half of its taxels have moved this many times their noise."""
 DEAD = 0.1
@@ -39,8 +41,8 @@ class LiveView:
     remedy. shape: rows, columns, axes. load: mean of the last SHOWN_S minus the lowest since the
     start, [axes][rows][columns] in raw counts; empty before the first frame. full: the strongest
     load on the scale. rate_hz: measured, None without frames. noise: [axes][rows][columns] in raw
-    counts. stuck, dead, saturated: names of taxels. frames, lost: since the start; lost is None if
-    it cannot be known. unit: of load and noise, "" for raw counts.
+    counts. stuck, dead, saturated: names of taxels, or ALL. frames, lost: since the start; lost is
+    None if it cannot be known. unit: of load and noise, "" for raw counts.
     """
 
     number: int
@@ -164,7 +166,7 @@ class SkinMonitor:
             "full": self._full,
             "noise": _nested(noise),
             "rate_hz": (len(self._t_ns) - 1) * 1e9 / passed_ns if passed_ns > 0 else None,
-            "stuck": self._names(stuck),
+            "stuck": (ALL,) if stuck.all() else self._names(stuck),
             "dead": self._names(dead & ~stuck),
             "saturated": self._names(self._saturated()),
         }
@@ -175,8 +177,7 @@ class SkinMonitor:
         return np.asarray(np.sqrt((np.diff(self._taxels, axis=0) ** 2).mean(axis=0) / 2))
 
     def _stuck(self) -> NDArray[np.bool_]:
-        still = self._t_ns[-1] - self._changed_ns >= STUCK_S * 1e9
-        return np.asarray(still & ~still.all())
+        return np.asarray(self._t_ns[-1] - self._changed_ns >= STUCK_S * 1e9)
 
     def _dead(self, noise: NDArray[np.float64]) -> NDArray[np.bool_]:
         moved, middle = self._highest - self._lowest, (0, 1)

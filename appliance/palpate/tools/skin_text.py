@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.io.skin_codecs.text import closes, split
+from palpate.io.skin_codecs.text import as_float, closes, split
 
 LEAST_LINES = 8
 LEAST_SHARE = 0.8
@@ -17,23 +18,26 @@ LEAST_SHARE = 0.8
 LEAST_STRAIGHT = 0.85
 """Share of the variance of a column that a straight line explains if it is a time or a count."""
 
+LEAST_HZ = 5.0
+"""A skin sends more frames a second than this."""
+SHOWN = 60
+"""Characters of a line that are shown in a message."""
+
+_CONTROL = re.compile(rb"[^\t\n\r\x1b\x20-\x7e\x80-\xff]")
+_COLOUR = re.compile(rb"\x1b\[[0-9;]*m")
+"""What log lines begin and end with on a terminal."""
+
 Line = tuple[list[bytes], str]
 """Numbers of a line, and the text around them."""
 
 
-def proposed(data: bytes, seconds: float) -> str:
+def proposed(data: bytes, seconds: float, grid: tuple[int, int] | None = None) -> str:
     """The text of a profile for lines of numbers, to be checked by a person; "" if the bytes are no
-    such lines. seconds: the time in which they came. The number of values in a frame shows in the
-    lines, the grid does not: it is the squarest."""
-    if not data.isascii() or b"\0" in data:
+    such lines, or do not have this grid. seconds: the time in which they came. The number of values
+    in a frame shows in the lines, the grid does not: without one, it is the squarest."""
+    if not is_text(data):
         return ""
-    end = "\n" if b"\n" in data else "\r"
-    decimal = "," if b"," in data and (b";" in data or b"\t" in data) else "."
-    lines: list[Line] = []
-    for line in data.split(end.encode())[1:-1]:
-        lines.append(split(line, decimal))
-        if closes(line):
-            lines.append(([], ""))
+    lines, decimal, end = _divided(data)
     forms = Counter((len(words), around) for words, around in lines if words)
     if forms.total() < LEAST_LINES:
         return ""
@@ -41,10 +45,15 @@ def proposed(data: bytes, seconds: float) -> str:
     if often < LEAST_SHARE * forms.total():
         return ""
     alike = [words if (len(words), text) == (width, around) else None for words, text in lines]
-    height = _height(alike)
-    table = np.array([[_number(word) for word in words] for words in alike if words is not None])
-    skipped = [] if height > 1 else _rising(table)
-    rows, cols = (height, width) if height > 1 else _grid(width - len(skipped))
+    table = np.array([[as_float(word) for word in words] for words in alike if words is not None])
+    height, skipped = _height(alike), _rising(table)
+    # a text that comes after every few frames parts them as it would part rows
+    if grid != (height, width) if grid else often / height / seconds < LEAST_HZ:
+        height = 1
+    skipped = skipped if height == 1 else []
+    rows, cols = (height, width) if height > 1 else grid or _grid(width - len(skipped))
+    if rows * cols != (width - len(skipped)) * height:
+        return ""
     keys: dict[str, Any] = {
         "about": f"{rows} x {cols} taxels",
         "source": "lines that the skin sent",
@@ -60,6 +69,39 @@ def proposed(data: bytes, seconds: float) -> str:
         "rate_hz": round(often / height / seconds, 1),
     }
     return "".join(f"{name} = {json.dumps(value)}\n" for name, value in keys.items())
+
+
+def is_text(data: bytes) -> bool:
+    """Whether bytes are text: another speed, or a binary skin, gives others."""
+    cut = 4  # at both ends, within a character
+    return not _CONTROL.search(data) and data.decode("utf-8", "replace").count("\ufffd") <= cut
+
+
+def _divided(data: bytes) -> tuple[list[Line], str, str]:
+    """The whole lines of a text, its decimal sign and what ends a line. A line without words comes
+    after each list of lists."""
+    end = "\n" if b"\n" in data else "\r"
+    sent = data.split(end.encode())[1:-1]
+    parted = sum(b"," in line and (b";" in line or b"\t" in line) for line in sent)
+    decimal = "," if 2 * parted > len(sent) else "."
+    lines: list[Line] = []
+    for line in sent:
+        lines.append(split(line, decimal))
+        if closes(line):
+            lines.append(([], ""))
+    return lines, decimal, end
+
+
+def odd_line(data: bytes) -> str:
+    """A line of a text that is not of the commonest form, "" for other bytes."""
+    lines = [_COLOUR.sub(b"", line).strip() for line in data.splitlines() if line.strip()]
+    lines = lines[1:-1] or lines
+    if not is_text(data) or not lines:
+        return ""
+    forms = [(len(words), around) for words, around in map(split, lines)]
+    usual = Counter(forms).most_common(1)[0][0]
+    odd = [line for line, form in zip(lines, forms, strict=True) if form != usual]
+    return (odd or lines)[0][:SHOWN].decode("utf-8", "replace")
 
 
 def _height(alike: list[list[bytes] | None]) -> int:
@@ -87,7 +129,3 @@ def _grid(values: int) -> tuple[int, int]:
     """Rows and columns of the squarest grid."""
     rows = max(n for n in range(1, int(values**0.5) + 1) if values % n == 0)
     return rows, values // rows
-
-
-def _number(word: bytes) -> float:
-    return float("nan") if word.lower() == b"null" else float(word)

@@ -128,6 +128,9 @@ TEXT = SkinProfile(about="a", source="s", codec="text", lines="frames", number="
     [
         ({}, b"[1, -2.5, 3e2, nan]"),
         ({}, b"((1 -2.5) (3e2 nan))"),
+        ({}, b"1,-2.5,300,ovf"),
+        ({}, b"1,-2.5,300,-inf"),
+        ({"around": "S#:S#:S#:S#:"}, b"S1:1 S2:-2.5 S3:300 S4:OVF"),
         ({"skip_columns": (0,)}, b"65538,1,-2.5,300,nan"),
         ({"skip_columns": (0, 5)}, b"7\t1\t-2.5\t300\tnan\t9"),
         ({"around": "S#:S#:S#:S#:"}, b"S1:1 S2:-2.5 S3:300 S4:nan"),

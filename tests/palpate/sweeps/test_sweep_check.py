@@ -142,6 +142,19 @@ def test_an_impossible_reading_is_no_good_sweep():
     assert (verdict.status, verdict.detail) == (Status.DEAD_TAXEL, "taxel 3.2")
 
 
+@pytest.mark.parametrize("level", [0, 77, 255])
+def test_a_skin_on_which_no_taxel_changes_is_no_good_sweep(level: int):
+    """A loose cable, before the skin was seen with and without contact; a single taxel that moves
+    is enough to count it."""
+    check = SweepCheck(skin.FORMAT, rig.VirtualClock())
+    taxels = np.full((1500, 4, 4), level, np.uint8)
+    stream(check, taxels)
+    verdict = check(sweep(taxels))
+    assert (verdict.status, "cable" in verdict.detail) == (Status.STUCK_TAXEL, True)
+    taxels[700, 2, 1] ^= 1
+    assert check(sweep(taxels)).status is Status.RECORDED
+
+
 def test_while_the_box_is_taught_a_sweep_must_be_a_slide():
     """One loaded taxel is named; what else a slide is, the given check says. A fault of the skin
     comes first, and without a check everything is recorded."""

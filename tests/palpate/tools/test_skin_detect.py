@@ -4,6 +4,9 @@ nothing is written to a port unasked."""
 from __future__ import annotations
 
 import os
+import re
+import subprocess
+import sys
 
 import pytest
 
@@ -135,3 +138,101 @@ def test_the_commands(capsys, tmp_path, monkeypatch):
     (tmp_path / "skins" / "broken.toml").write_text("rows = 0\n")
     assert main(["skin", "list", "--config-dir", str(tmp_path)]) == 1
     assert "255" in capsys.readouterr().out
+
+
+LOG = b"\x1b[0;32mI (%d) wifi: pm start, type: 1\x1b[0m\n"
+
+
+def numbers(i: int, wide: int = 16) -> bytes:
+    """A line of numbers."""
+    return (",".join(str(100 + (i * i + k) % 97) for k in range(wide)) + "\n").encode()
+
+
+@pytest.mark.parametrize(
+    ("sent", "grid", "rows"),
+    [
+        (numbers, None, "4 x 4"),
+        (lambda i: LOG % i * (i % 50 == 3) + numbers(i), None, "4 x 4"),
+        (lambda i: LOG % i * (i % 50 == 3) + numbers(i), (4, 4), "4 x 4"),
+        (lambda i: LOG % i * (i % 4 == 3) + numbers(i), (2, 8), "2 x 8"),
+        (lambda i: b"Frame %d\n" % i + b"".join(numbers(i + k) for k in range(8)), None, "8 x 16"),
+        (lambda i: b"\n" + b"".join(numbers(i + k) for k in range(4)), (4, 16), "4 x 16"),
+        (numbers, (3, 4), ""),
+        (lambda i: bytes([200, i % 256]) * 20, None, ""),
+    ],
+)
+def test_lines_of_numbers_are_described(sent, grid, rows):
+    """Log lines between frames are passed over; the text before each frame of rows is not."""
+    clock = VirtualClock()
+    port = WirePort(clock, sent, 1e7)
+    text, _ = skin_detect.propose("/dev/a", {}, port.open, clock, grid)
+    assert text.startswith(f'about = "{rows} taxels' if rows else "")
+    assert bool(text) == bool(rows)
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [
+        "Press any key\r\n",
+        "Press any key: ",
+        "Start? \n\n",
+        "Dr\u00fccken!\n",
+        "\x1b[1mOK\x1b[0m\n",
+    ],
+)
+def test_other_text_is_shown(sent):
+    """A prompt, with or without the end of a line, that comes again while nobody answers."""
+    clock = VirtualClock()
+    found = found_on(WirePort(clock, lambda i: sent.encode(), 1e9), clock)
+    assert found.profile == ""
+    assert re.search(r"\w+", sent.replace("\x1b[1m", ""))[0] in found.detail
+
+
+@pytest.mark.parametrize("baud", [9600, 57600, 250000, 500000])
+def test_other_speeds_are_tried_until_one_gives_text(baud):
+    """Most sketches begin with 9600; another speed gives bytes that are no text."""
+    clock = VirtualClock()
+    ports = {
+        right: WirePort(clock, (lambda i: bytes([200] * 9), numbers)[right], 1e7)
+        for right in (False, True)
+    }
+    text, _ = skin_detect.propose("/dev/a", {}, lambda p, b: ports[b == baud].open(p, b), clock)
+    assert f"baud = {baud}" in text
+
+
+@pytest.mark.parametrize(("sent", "code"), [(numbers, 0), (lambda i: b"Press any key\n", 69)])
+def test_a_profile_is_written(capsys, tmp_path, monkeypatch, sent, code):
+    """It can be loaded; a name or a grid that is not allowed, and a file that exists, are refused
+    before the port is opened."""
+    clock = VirtualClock()
+    opened = lambda path, baud, clock: WirePort(clock, sent, 1e7).open(path, baud)  # noqa: E731
+    monkeypatch.setattr("palpate.io.serial_link.SerialLink", opened)
+    monkeypatch.setattr("palpate.cli.skin_commands.SystemClock", lambda: clock)
+    words = ["skin", "new", "mine", "--port", "/dev/a", "--out", str(tmp_path), "--grid"]
+    assert main([*words, "4x4"]) == code
+    told = capsys.readouterr()
+    if code:
+        assert "Press any key" in told.err
+        assert not list(tmp_path.iterdir())
+        return
+    made = skin_profile.load(str(tmp_path / "mine.toml"), [])
+    assert (made.rows, made.cols, made.baud) == (4, 4, 115200)
+    assert main([*words, "4x4"]) == 78
+    assert main([*words[:2], "../a", *words[3:], "4x4"]) == 78
+    assert main([*words[:2], "b", *words[3:], "4"]) == 78
+
+
+def test_another_package_in_place_of_pyserial(tmp_path):
+    """PyPI's serial has the same module; the message gives the commands."""
+    (tmp_path / "serial").mkdir()
+    (tmp_path / "serial" / "__init__.py").write_text("__version__ = '0'\n")
+    ended = subprocess.run(
+        [sys.executable, "-m", "palpate", "skin", "list"],
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert ended.returncode == 78
+    assert "pip uninstall serial" in ended.stderr
+    assert "Traceback" not in ended.stderr

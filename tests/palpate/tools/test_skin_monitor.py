@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from palpate.core.types import Frames, SweepFormat
+from palpate.tools import skin_monitor
 from palpate.tools.skin_monitor import STUCK_S, LiveView, SkinMonitor, line
 
 RATE = 100
@@ -54,7 +55,8 @@ ENDS = at(signal(1), ((ALL, 1, 1), 255), ((ALL, 0, 0), 0))
     [
         (at(signal(LONG), ((ALL, 0, 3), 255)), "float32", "stuck", ("1.4",)),
         (at(signal(4), ((ALL, 0, 3), 255)), "float32", "stuck", ()),
-        (np.full((1000, 3, 4), 7.0), "float32", "stuck", ()),
+        (np.full((1000, 3, 4), 7.0), "float32", "stuck", (skin_monitor.ALL,)),
+        (np.full((4, 3, 4), 7.0), "float32", "stuck", ()),
         (at(signal(LONG, (2, 2, 3)), ((ALL, 1, 0, 2), 0)), "float32", "stuck", ("2.1 axis 3",)),
         (LEFT_OUT, "float32", "dead", ("3.2",)),
         (signal(6), "float32", "dead", ()),
@@ -64,7 +66,8 @@ ENDS = at(signal(1), ((ALL, 1, 1), 255), ((ALL, 0, 0), 0))
 )
 def test_faulty_taxels_are_named(taxels, dtype, kind, names):
     """One value for seconds while others move, no load while others are touched, and a count at
-    the end of its type. Where all stand still nothing says which is stuck."""
+    the end of its type. Where all stand still, that is
+    said."""
     found = monitor(taxels, dtype)
     assert found[kind] == names
     axes = taxels.shape[3:] or (1,)

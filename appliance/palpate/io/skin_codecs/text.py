@@ -24,13 +24,18 @@ _BETWEEN = {
     ),
 }
 _WHOLE = re.compile(rb"[+-]?[0-9]{1,9}")
-_DECIMAL = re.compile(rb"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?|(?i:nan|null)")
+_NUMBER = (
+    rb"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?"
+    rb"|[+-]?(?i:nan|null|inf|infinity|ovf)"
+)
+"""A number, or what firmware prints for a taxel that gave none, such as Arduino's ovf."""
+_DECIMAL = re.compile(_NUMBER)
 _STAMP = re.compile(
     rb"(?:[0-9]{4}-[0-9]{2}-[0-9]{2}[T ])?[0-9]{2}:[0-9]{2}:[0-9]{2}(?:[.,][0-9]+)?Z?"
 )
 """The time of day, as terminals and loggers put it before a line."""
 _AMONG = re.compile(
-    rb"(?<![\w.])(?:[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?|(?i:nan|null))"
+    rb"(?<![\w.])(?:" + _NUMBER + rb")"
     rb"(?![0-9.]|[A-Za-z]*[0-9_]|\w*[\"']?\s*[:=])"
 )
 """A number among other text, perhaps with its unit. Digits in a name, or before a colon or an
@@ -124,7 +129,7 @@ def _numbers(profile: SkinProfile, line: bytes, most: int) -> tuple[NDArray[Any]
             words = [word for i, word in enumerate(words) if i not in _positions(skip)]
     words = words[: most + 1]
     if profile.number == "float32":
-        numbers = np.array([float(_NULL.get(word, word)) for word in words])
+        numbers = np.array([as_float(word) for word in words])
         large = np.flatnonzero(np.abs(numbers) > _MOST_FLOAT)
         if len(large):
             return None, _unfit(words[large[0]], "float32", "check the skin's firmware")
@@ -136,7 +141,9 @@ def _numbers(profile: SkinProfile, line: bytes, most: int) -> tuple[NDArray[Any]
     return np.array([int(word) for word in words], profile.number), ""
 
 
-_NULL = {b"null": b"nan", b"NULL": b"nan", b"Null": b"nan"}
+def as_float(word: bytes) -> float:
+    """The value of a number in a line, NaN for a taxel that gave none."""
+    return float(word) if any(48 <= one < 58 for one in word) else np.nan
 
 
 @lru_cache(4)
