@@ -155,7 +155,7 @@ def propose(
     grid: tuple[int, int] | None = None,
     bauds: Iterable[int] = BAUDS,
 ) -> tuple[str, HeardBytes]:
-    """The text of a profile for the lines of numbers at a port, "" without one; and what it sends.
+    """The text of a profile for the lines of numbers at a port, or "", and all bytes heard there.
     heard: by speed so far; `bauds` follow until one gives text. Raises SensorError."""
     for baud in dict.fromkeys((*heard, *bauds)):
         if baud not in heard:

@@ -32,9 +32,9 @@ Line = tuple[list[bytes], str]
 
 
 def proposed(data: bytes, seconds: float, grid: tuple[int, int] | None = None) -> str:
-    """The text of a profile for lines of numbers, to be checked by a person; "" if the bytes are no
-    such lines, or do not have this grid. seconds: the time in which they came. The number of values
-    in a frame shows in the lines, the grid does not: without one, it is the squarest."""
+    """The text of a profile for lines of numbers, to be checked by a person; empty if the bytes
+    are no such lines or do not have this grid. seconds: the time in which they came. The number of
+    values in a frame shows in the lines, the grid does not: without one, it is the squarest."""
     if not is_text(data):
         return ""
     lines, decimal, end = _divided(data)
@@ -78,8 +78,8 @@ def is_text(data: bytes) -> bool:
 
 
 def _divided(data: bytes) -> tuple[list[Line], str, str]:
-    """The whole lines of a text, its decimal sign and what ends a line. A line without words comes
-    after each list of lists."""
+    """The whole lines of a text, its decimal sign and the sign between its lines. A line without
+    words comes after each list of lists."""
     end = "\n" if b"\n" in data else "\r"
     sent = data.split(end.encode())[1:-1]
     parted = sum(b"," in line and (b";" in line or b"\t" in line) for line in sent)
@@ -93,7 +93,7 @@ def _divided(data: bytes) -> tuple[list[Line], str, str]:
 
 
 def odd_line(data: bytes) -> str:
-    """A line of a text that is not of the commonest form, "" for other bytes."""
+    """A line of a text that is not of the commonest form; empty for other bytes."""
     lines = [_COLOUR.sub(b"", line).strip() for line in data.splitlines() if line.strip()]
     lines = lines[1:-1] or lines
     if not is_text(data) or not lines:
