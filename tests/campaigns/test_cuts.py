@@ -62,6 +62,35 @@ def wrong(points: list[CrashPoint]) -> list[str]:
     return [f"{p.step}, {p.how} before {p.call}: {text}" for p in points for text in p.wrong]
 
 
+DIED = "7 +++ killed by SIGKILL +++"
+
+
+@pytest.mark.parametrize(
+    ("lines", "found"),
+    [
+        (["7 fsync(3) = 0", '7 unlink("\\x61") = -1 ENOENT (No such file)', DIED], [0, -1]),
+        (["7 fsync(3 <unfinished ...>", "8 fsync(4) = 0", "7 <... fsync resumed>) = 5"], [0, 5]),
+        (["7 fsync(3 <unfinished ...>", "8 fsync(4) = 0", DIED], [0, None]),
+        (["7 fsync(3 <unfinished ...>) = ?", DIED], [None]),
+        (["7 ???() = ?", DIED], []),
+        (["7 ???( <unfinished ...>", "8 fsync(4) = 0", DIED], [0]),
+        (["7 ???( <unfinished ...>", "8 fsync(4) = 0", "7 <... ??? resumed>) = ?", DIED], [0]),
+        (["7 ???() = 0"], None),
+        (["7 ???( <unfinished ...>", "7 <... ??? resumed>) = 3"], None),
+        (["strace: it stopped"], None),
+    ],
+)
+def test_lines_of_strace_become_calls(lines: list[str], found: list[int | None] | None):
+    """Results in the order of the ends, None for a call in which the process was killed. A thread
+    that was killed before the name of its call was seen has not made this call; a call without a
+    name that did end, or another line, is not taken for nothing."""
+    if found is None:
+        with pytest.raises(NotFollowed):
+            list(calls._calls(lines, "/"))
+    else:
+        assert [call.result for call in calls._calls(lines, "/")] == found
+
+
 def test_what_is_not_synced_may_be_there_or_not(play: Makes):
     """A new file: no name, or a name with none, half or all of its content."""
     played = play("a = open(f / 'a', 'wb', 0); a.write(b'1234'); os.fsync(a.fileno())")

@@ -26,10 +26,13 @@ MOST_BYTES = 1 << 24
 """Largest number of bytes of a write that strace prints."""
 DEADLINE_S = 900
 """Longest time of a command, also on a machine with much other work."""
-LINE = re.compile(r"(\d+) +(\w+)\((.*)\) += (-?\d+|\?)(?:[ <].*)?")
-END = re.compile(r"\d+ +(?:\+\+\+ .* \+\+\+|\?\?\?\(\) += \?)")
-"""The end of a thread. ???: on a busy machine it was killed before strace could read its call."""
-CUT, RESUMED = " <unfinished ...>", re.compile(r"(\d+) +<\.\.\. \w+ resumed>(.*)")
+LINE = re.compile(r"(\d+) +(\w+|\?+)\((.*)\) += (-?\d+|\?)(?:[ <].*)?")
+END = re.compile(r"\d+ +\+\+\+ .* \+\+\+")
+"""The end of a thread."""
+UNSEEN = "?"
+"""Beginning of the name of a call whose thread was killed before strace could read the name, as
+happens on a busy machine."""
+CUT, RESUMED = " <unfinished ...>", re.compile(r"(\d+) +<\.\.\. (?:\w+|\?+) resumed>(.*)")
 STRING = re.compile(r'"((?:\\x[0-9a-f]{2})*)"(\.\.\.)?')
 DESCRIPTOR = re.compile(r"(AT_FDCWD|\d+)<((?:\\x[0-9a-f]{2})*)>")
 
@@ -122,10 +125,11 @@ def output(call: SystemCall) -> str:
 
 
 def _calls(lines: list[str], folder: str) -> Iterator[SystemCall]:
-    """The calls in the order of their ends; last those in which the process was killed."""
+    """The calls in the order of their ends; last those in which the process was killed. A call
+    whose name was not seen is left out: it has not ended. Raises NotFollowed."""
     counts: Counter[tuple[str, str]] = Counter()
     ranks: dict[str, int] = {}
-    parsed = [_parsed(line) for line in _joined(lines)]
+    parsed = [call for call in map(_parsed, _joined(lines)) if not call[1].startswith(UNSEEN)]
     # a thread may run before the call that began it ends
     begun = {
         result: thread
@@ -149,7 +153,7 @@ def _calls(lines: list[str], folder: str) -> Iterator[SystemCall]:
 def _parsed(line: str) -> tuple[str, str, str, str]:
     """Thread, name, arguments and result of a call. Raises NotFollowed."""
     found = LINE.fullmatch(line)
-    if not found:
+    if not found or (found[2].startswith(UNSEEN) and found[4] != "?"):
         raise NotFollowed(f"strace says {line[:200]!r}")
     thread, name, words, result = found.groups()
     return thread, name, words, result
