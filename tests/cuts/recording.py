@@ -2,13 +2,16 @@
 and a judge of losses beyond the sweep in progress.
 
 `python -m tests.cuts.recording WAY FOLDER SESSION` is such a program: it continues in the folder,
-prints the sentences to the robot, and names the sweep that it is asked to discard.
+prints the sentences to the robot, and names the sweep that it is asked to discard and the material
+that it is asked to forget.
 """
 
 import os
 import re
 import sys
+from collections import Counter
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
 
@@ -18,30 +21,36 @@ from palpate.core import storage
 from palpate.core.clock import SystemClock
 from palpate.core.disk_thread import AtOnce, DiskThread, DiskWork
 from palpate.core.errors import FormatError
+from palpate.core.sentences import Reply
 from palpate.core.sweep_file import load
 from palpate.core.types import Frames, Status, Sweep, SweepFormat, Verdict
 from palpate.sim import skin
 from palpate.sweeps.recording import Labels, RecordingSession
+from palpate.sweeps.sweep_folder import taught
 from tests.cuts.scene import CutScene, Found, SceneStep
 
 SHORT = SweepFormat(4, 4, 750, 40, "uint8")
 """Format of the sweeps of all programs except the box's."""
 THREAD = "in a thread"
 """The way of the box: it writes beside the loop."""
+MATERIAL = "plastic rough"
+"""The material of all sweeps."""
 KEPT = "kept/sweeps"
 """Folder below that of the scene; it does not exist at first, so the program that makes it must
 sync it too."""
 HEARD = re.compile(
     r",REC,(?P<id>\d+),stored,(?:[^,]*,){3}(?P<session>[^,]*),(?P<name>sweep-\d+)|"
-    r"^(?P<how>discard\w+) (?P<gone>\S+)",
+    r"^(?P<how>discard\w+) (?P<gone>\S+)|"
+    r"^(?P<forgot>forgot)",
     re.MULTILINE,
 )
 Files = Mapping[Path, bytes]
 
 
 def record(way: str, folder: Path, session: str) -> None:
-    """Record two sweeps, discard the second, record a third. way: how the files are written."""
-    storage.put_all = WAYS[way]
+    """Record two sweeps, discard the second, record a third, forget the material. way: how the
+    files are written."""
+    storage.put_all = lambda files, **how: WAYS[way](files)
     disk = DiskThread() if way == THREAD else AtOnce()
     running = recording(
         folder, SHORT, session, lambda line: print(line.decode().strip(), flush=True), disk
@@ -50,12 +59,22 @@ def record(way: str, folder: Path, session: str) -> None:
     running.sweep(*taken(2, SHORT), {})
     disk.settle()
     print(f"discarding {max(folder.glob('*.npy')).stem}", flush=True)
-    print(f"discarded {running.commands['DISCARD']('')[-1]}", flush=True)
+    print(f"discarded {_fields(running.commands['DISCARD'](''), disk)[-1]}", flush=True)
     running.sweep(*taken(3, SHORT), {})
     disk.settle()
+    _fields(running.forget(MATERIAL), disk)
+    print("forgot", flush=True)
     if running.stored != 2:
         sys.exit(f"{running.stored} sweeps are stored instead of 2")
     running.close()
+
+
+def _fields(reply: Reply, disk: DiskWork) -> list[object]:
+    """The fields of a reply, as soon as the box would send them."""
+    if isinstance(reply, Future):
+        disk.settle()
+        return reply.result(0)
+    return reply
 
 
 def recording(
@@ -66,7 +85,7 @@ def recording(
     disk: DiskWork | None = None,
 ) -> RecordingSession:
     """The observer of the box that records sweeps."""
-    labels = Labels("plastic rough", "1", session)
+    labels = Labels(MATERIAL, "1", session)
     return RecordingSession(folder, format, labels, SystemClock(), say, disk=disk)
 
 
@@ -121,7 +140,7 @@ def judge(format: SweepFormat, found: Found) -> list[str]:
     """Faults of the sweeps of this format that were found, and of the next run in their folder."""
     folder = found.folder / KEPT
     wrong, there = read(folder)
-    owed, gone = reported(found.heard)
+    owed, gone, forgotten = reported(found.heard)
     for name, which in owed.items():
         if there.get(name) != which:
             wrong.append(f"{name}, {which} was stored, and {there.get(name, 'nothing')} is there")
@@ -130,6 +149,11 @@ def judge(format: SweepFormat, found: Found) -> list[str]:
         for name, which in gone.items()
         if there.get(name) == which
     ]
+    try:
+        learnt = {one.path.stem for one in taught(folder, Counter())}
+    except FormatError as e:
+        return [*wrong, str(e)]
+    wrong += [f"{name} was forgotten and is taught" for name in sorted(learnt & forgotten)]
     return wrong or _goes_on(folder, format)
 
 
@@ -146,19 +170,23 @@ def read(folder: Path) -> tuple[list[str], dict[str, str]]:
     return wrong, there
 
 
-def reported(output: str) -> tuple[dict[str, str], dict[str, str]]:
-    """Session and number of the stored sweeps, and of the discarded; in neither meanwhile."""
+def reported(output: str) -> tuple[dict[str, str], dict[str, str], set[str]]:
+    """Session and number of the stored sweeps, and of the discarded; in neither meanwhile. The
+    forgotten sweeps."""
     owed: dict[str, str] = {}
     gone: dict[str, str] = {}
+    forgotten: set[str] = set()
     leaving = ""
     for heard in HEARD.finditer(output):
         if heard["name"]:
             owed[heard["name"]] = f"{heard['session']} {heard['id']}"
+        elif heard["forgot"]:
+            forgotten |= owed.keys()
         elif heard["how"] == "discarding":
             leaving = owed.pop(heard["gone"])
         else:
             gone[heard["gone"]] = leaving
-    return owed, gone
+    return owed, gone, forgotten
 
 
 def _goes_on(folder: Path, format: SweepFormat) -> list[str]:

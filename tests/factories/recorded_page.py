@@ -11,6 +11,8 @@ import numpy as np
 
 from palpate.core.clock import SystemClock
 from palpate.core.config import TriggerConfig
+from palpate.core.disk_thread import DiskWork
+from palpate.core.sentences import Reply
 from palpate.core.types import Frames, Status, Sweep, Verdict
 from palpate.io.robot_link import Command
 from palpate.sim import skin
@@ -67,12 +69,13 @@ class RecordedPage:
         target: int = 3,
         access: Access | None = None,
         *,
+        disk: DiskWork | None = None,
         teaching: bool = False,
     ) -> None:
         clock = SystemClock()
         self.health, self.sweeps = HEALTH._replace(bundle="", source="sim"), 0
         self.recording = RecordingSession(
-            folder, skin.FORMAT, labels, clock, lambda line: None, target
+            folder, skin.FORMAT, labels, clock, lambda line: None, target, disk
         )
         self.done: list[str] = []
         self.more: dict[str, Any] = {}  # further content of the page
@@ -90,7 +93,7 @@ class RecordedPage:
         self._lock, self._ended = threading.Lock(), threading.Event()
         self._going = threading.Thread(target=self._go)
 
-    def obey(self, command: Command) -> list[object]:
+    def obey(self, command: Command) -> Reply:
         """Carry out a command of the recording. START and STOP change only the state."""
         self.done.append(command.line)
         if command.name in ("START", "STOP"):

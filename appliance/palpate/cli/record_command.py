@@ -22,6 +22,7 @@ from palpate.core.errors import ConfigError, SensorError
 from palpate.core.interrupts import StopFlag
 from palpate.core.log import log
 from palpate.core.observer import Facts, Observer
+from palpate.core.sentences import Reply
 from palpate.core.types import Sweep, SweepFormat, Verdict
 from palpate.io import skin_profile, skins
 from palpate.io.robot_link import Command, Port
@@ -48,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
             folder, format, labels, devices.clock, _sentences(port), args.target, disk
         )
         stack.callback(recording.close)
-        obey: Callable[[Command], list[object]] = lambda command: box.obey(command)  # noqa: E731
+        obey: Callable[[Command], Reply] = lambda command: box.obey(command)  # noqa: E731
         talk = recording.about, obey, recording.names.label
         pages = page(args.web, settings, format, devices, *talk)
         _announce(format, folder)
@@ -123,7 +124,7 @@ def page(
     format: SweepFormat,
     devices: Devices,
     about: Callable[[], Mapping[str, Any]],
-    obey: Callable[[Command], list[object]],
+    obey: Callable[[Command], Reply],
     named: Callable[[str], str],
     *,
     teaching: bool = False,

@@ -146,7 +146,7 @@ def _forget(settings: Config, material: str) -> int:
     Labels(material=material)
     with _sweeps(settings) as folder:
         own = [n for n, about in folder.sidecars() if about.get("material") == material]
-        folder.forget(material, own)()
+        folder.forget(material, own)
     print(f"{material}: its sweeps so far are no longer taught; they stay in {folder.folder}")
     return 0
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import reduce
 from operator import xor
@@ -18,6 +19,12 @@ MAX_LINE = 128
 """Longest sentence or command, in characters."""
 SHORT_LINE = 80
 """Longest sentence in the short form, with its end: strings of RAPID hold 80 characters."""
+Reply = list[object] | Future[list[object]]
+"""The fields of the answer to a command. A future if the command is not done yet: it gets them, or
+an exception, in the loop's thread."""
+CommandHandler = Callable[[str], Reply]
+"""Carries out a command: its text -> the reply. Raises ApplianceError with the reason for a
+refusal."""
 UNSAFE = re.compile(r"[^ -~]|[$*,!\\~^]")
 """Characters that no field may contain."""
 _PATTERN = re.compile(

@@ -19,6 +19,7 @@ from palpate.core.errors import ApplianceError
 from palpate.core.interrupts import StopFlag
 from palpate.core.names import TypedNames
 from palpate.core.observer import Facts, Observer
+from palpate.core.sentences import CommandHandler, Reply
 from palpate.core.types import SweepFormat
 from palpate.io.robot_link import Command, Port
 from palpate.io.verdict_lines import check_bits
@@ -27,7 +28,7 @@ from palpate.learn.enrolment import slide_check
 from palpate.learn.hand_over import HandOver
 from palpate.learn.session import Teacher, TeachingSession, refuse_trained
 from palpate.runtime import assembly
-from palpate.runtime.loop import Box, CommandHandler
+from palpate.runtime.loop import Box
 from palpate.service.systemd import Notifier
 from palpate.sweeps.capture import CaptureWriter
 from palpate.sweeps.recording import Labels, RecordingSession
@@ -101,7 +102,7 @@ class TeachingProgram:
     def about(self) -> dict[str, Any]:
         return self._phase.about() | {"good": self.lesson.good}
 
-    def obey(self, command: Command) -> list[object]:
+    def obey(self, command: Command) -> Reply:
         """Carry out an order of the page, in the loop's thread."""
         return self._phase.obey(command)
 
@@ -138,7 +139,7 @@ class Phase:
     box: Box
     orders: Mapping[str, CommandHandler]
 
-    def obey(self, command: Command) -> list[object]:
+    def obey(self, command: Command) -> Reply:
         own = self.orders.get(command.name)
         return own(command.text) if own else self.box.obey(command)
 

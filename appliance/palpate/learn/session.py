@@ -8,6 +8,7 @@ bundle in service as they are.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from palpate.core.clock import Clock, SystemClock
@@ -16,7 +17,7 @@ from palpate.core.errors import ApplianceError, ConfigError
 from palpate.core.health import Health
 from palpate.core.log import log
 from palpate.core.observer import Observer
-from palpate.core.sentences import sentence
+from palpate.core.sentences import CommandHandler, Reply, sentence
 from palpate.core.types import Sweep, Verdict
 from palpate.io.verdict_lines import check_bits
 from palpate.learn.process import News, TeachingProcess, learning
@@ -69,7 +70,7 @@ class TeachingSession(Observer):
         self._place = recording.about()["position"] or "1"  # of the first sweeps
         self._named: dict[str, None] = {}  # materials without a sweep so far, in order
         self._process: TeachingProcess | None = None
-        self._using, self._stored = False, 0
+        self._using, self._seen = False, self._kept
         self._due_ns: int | None = self._clock.now_ns()
         self._learnt: News | None = None
         self._step: News | None = None
@@ -79,7 +80,7 @@ class TeachingSession(Observer):
         self.taught: News | None = None
         self.recording_commands = {**recording.commands, "MATERIAL": self._material}
         """Those of the recording, which here refuse what TEACH refuses."""
-        self.commands: Mapping[str, Callable[[str], list[object]]] = {
+        self.commands: Mapping[str, CommandHandler] = {
             "TEACH": self._teach,
             "USE": self._use,
             "FORGET": self._forget,
@@ -113,6 +114,11 @@ class TeachingSession(Observer):
         counts = {name: n for name, n in counts.items() if name not in self._trained}
         return dict.fromkeys(self._named, 0) | counts
 
+    @property
+    def _kept(self) -> tuple[int, int | None]:
+        """Another pair after each sweep that was stored or discarded."""
+        return self._recording.stored, self._recording.last
+
     def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
         """Tell the robot of a sweep that is not taught; the recording tells a person."""
         if verdict.status.faulty:
@@ -143,8 +149,8 @@ class TeachingSession(Observer):
 
     def turn(self, health: Health) -> None:
         """Take the news of the process, and begin an assessment that is due."""
-        if self._recording.stored != self._stored:
-            self._stored = self._recording.stored
+        if self._seen != self._kept:
+            self._seen = self._kept
             self._due_ns = self._clock.now_ns() + PAUSE_NS
         if self._process:
             for one in self._process.news():
@@ -216,7 +222,7 @@ class TeachingSession(Observer):
         self._recording.commands["MATERIAL"](label)
         return [label, self.materials().get(label, 0)]
 
-    def _material(self, label: str) -> list[object]:
+    def _material(self, label: str) -> Reply:
         self.admit(*filter(None, [label.strip()]))
         return self._recording.commands["MATERIAL"](label)
 
@@ -224,6 +230,7 @@ class TeachingSession(Observer):
         """Begin to teach all sweeps; returns the number of materials and of sweeps."""
         if self._using:
             raise ApplianceError("a bundle is being made already; wait for TCH")
+        self._recording.refuse_while_changing()
         held = {name: n for name, n in self.materials().items() if n}
         if len(held) < self._fewest:
             why = "teach one" if self._base else "a model tells at least two apart: teach another"
@@ -235,7 +242,7 @@ class TeachingSession(Observer):
         self._begin(self._learn(self.by), using=True)
         return [len(held), sum(held.values())]
 
-    def _forget(self, label: str) -> list[object]:
+    def _forget(self, label: str) -> Reply:
         """Teach a material no longer; returns it and the number of its sweeps."""
         label = label.strip()
         number = self.materials().get(label)
@@ -245,7 +252,10 @@ class TeachingSession(Observer):
             )
         if self._using:
             raise ApplianceError("a bundle is being made; forget it afterwards")
-        self._recording.forget(label)
+        return self._recording.forget(label, partial(self._forgotten, label, number))
+
+    def _forgotten(self, label: str, number: int) -> list[object]:
+        """A material is forgotten. Returns the fields of the reply."""
         self._named.pop(label, None)
         self._trouble = self._too_many()
         self._due_ns = self._clock.now_ns()

@@ -19,6 +19,7 @@ from palpate.core.devices import Devices
 from palpate.core.errors import ApplianceError, ConfigError, FormatError
 from palpate.core.log import in_journal, log
 from palpate.core.observer import Observer
+from palpate.core.sentences import CommandHandler
 from palpate.core.types import SweepFormat
 from palpate.deployment.sandbox import run_limited
 from palpate.deployment.signed import SignedBundle
@@ -39,7 +40,7 @@ from palpate.io.lineless_triggers import (
 from palpate.io.robot_link import Port, SerialSink, StdoutPort
 from palpate.io.trigger import GpioTrigger, Trigger
 from palpate.io.verdict_lines import LineSink, check_bits
-from palpate.runtime.loop import Answerer, Box, CommandHandler, Panel, Pipeline
+from palpate.runtime.loop import Answerer, Box, Panel, Pipeline
 from palpate.sweeps.capture import CaptureWriter
 from palpate.sweeps.sweep_check import SweepCheck
 from palpate.sweeps.sweep_window import SweepCutter

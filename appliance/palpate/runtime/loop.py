@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Protocol
@@ -19,7 +20,7 @@ from palpate.core.errors import ApplianceError, ModelError
 from palpate.core.health import Health
 from palpate.core.log import TroubleLog, log
 from palpate.core.observer import Observer
-from palpate.core.sentences import sentence
+from palpate.core.sentences import CommandHandler, Reply, sentence
 from palpate.core.types import Edge, Status, Sweep, SweepFormat, Verdict, entries
 from palpate.inference.early_exit import EarlyExit
 from palpate.io.robot_link import Command, Port
@@ -34,9 +35,6 @@ FAILURES, SOUND = 3, 20
 is started again, and the end counts against a bundle on trial."""
 EVENTS = ("frames", "edges", "command", "answered", "sweep", "turn", "stopping")
 """The methods of an Observer."""
-
-CommandHandler = Callable[[str], list[object]]
-"""Carries out a command: its text -> the fields of its answer, or an ApplianceError."""
 
 
 class Panel(Protocol):
@@ -118,6 +116,7 @@ class Box:
         self.answered = 0
         self._unanswered: deque[Sweep] = deque()  # cut, but not sent yet
         self._asked: deque[Command] = deque()  # commands that were not carried out yet
+        self._owed: list[tuple[str, Future[list[object]]]] = []  # commands without an answer yet
         self._edges: list[Edge] = []  # edges that the cutter has not taken yet
         self._failures, self._sound, self._failure = 0, 0, ""
         self._sensor, self._trigger = pipeline.sensor, pipeline.trigger
@@ -371,22 +370,37 @@ class Box:
         return [f"{h.time_ns / 1e9:.3f}", h.skin, int(h.sweeping), *counts, *_last_fields(h)]
 
     def _obey_asked(self) -> None:
+        """Carry out the commands, and answer those that are done: also those of earlier turns."""
+        self._say_owed()
         while self._port and self._asked:
-            self._port.say(self._answer_to(self._asked.popleft()))
+            command = self._asked.popleft()
+            self._owed.append((command.name, self._begun(command)))
+            self._say_owed()
 
-    def _answer_to(self, command: Command) -> bytes:
-        """Carry out a command; returns its ANS sentence."""
-        if command.error:
-            return sentence("ANS", command.name, "error", command.error)
+    def _say_owed(self) -> None:
+        for owed in [owed for owed in self._owed if owed[1].done()]:
+            self._owed.remove(owed)
+            if self._port:
+                self._port.say(_answer(*owed))
+
+    def _begun(self, command: Command) -> Future[list[object]]:
+        """Carry out a command of the serial line."""
+        reply: Future[list[object]] = Future()
         try:
-            return sentence("ANS", command.name, "ok", *self.obey(command))
+            if command.error:
+                raise ApplianceError(command.error)
+            fields = self.obey(command)
         except Exception as e:  # also one that nobody expected: the robot waits for an answer
-            return sentence("ANS", command.name, "error", str(e) or type(e).__name__)
+            reply.set_exception(e)
+            return reply
+        if isinstance(fields, Future):
+            return fields
+        reply.set_result(fields)
+        return reply
 
-    def obey(self, command: Command) -> list[object]:
-        """Carry out a command of any origin; returns the fields of its answer. To be called between
-        two turns or in an observer's `turn`. Raises ApplianceError with the reason for a
-        refusal."""
+    def obey(self, command: Command) -> Reply:
+        """Carry out a command of any origin. To be called between two turns or in an observer's
+        `turn`. Raises ApplianceError with the reason for a refusal."""
         self._notify("command", self._turn_ns, command.line)
         if command.name in self._commands:
             return self._commands[command.name](command.text)
@@ -431,6 +445,13 @@ def _succeeds(what: str, act: Callable[[], object]) -> bool:
         log.error(f"{what}: {type(e).__name__}: {e}")
         return False
     return True
+
+
+def _answer(name: str, reply: Future[list[object]]) -> bytes:
+    """The ANS sentence to a command that is done."""
+    if e := reply.exception():
+        return sentence("ANS", name, "error", str(e) or type(e).__name__)
+    return sentence("ANS", name, "ok", *reply.result())
 
 
 def _last_fields(h: Health) -> list[object]:

@@ -10,6 +10,7 @@ import errno
 import os
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -21,7 +22,7 @@ from palpate.core.errors import ApplianceError, ConfigError, TemporaryError, pas
 from palpate.core.log import TroubleLog, log
 from palpate.core.names import LABEL, TypedNames
 from palpate.core.observer import Observer
-from palpate.core.sentences import sentence
+from palpate.core.sentences import CommandHandler, Reply, sentence
 from palpate.core.types import Status, Sweep, SweepFormat, Verdict, entries
 from palpate.service.systemd import words
 from palpate.sweeps.progress import RecordingProgress
@@ -92,9 +93,10 @@ class RecordingSession(Observer):
         self._labels = deque([(0, labels)], MOST_CHANGES)
         self._answered = False
         self._stored: list[int] = []
+        self._changes = 0  # DISCARD and FORGET that are not on the disk yet
         self._last: dict[str, Any] | None = None
         self._log = TroubleLog("record")
-        self.commands: Mapping[str, Callable[[str], list[object]]] = {
+        self.commands: Mapping[str, CommandHandler] = {
             "MATERIAL": partial(self._change, "material"),
             "POSITION": partial(self._change, "position"),
             "SESSION": partial(self._change, "session"),
@@ -105,6 +107,11 @@ class RecordingSession(Observer):
     @property
     def stored(self) -> int:
         return len(self._stored)
+
+    @property
+    def last(self) -> int | None:
+        """The number in the folder of the last stored sweep of this run."""
+        return self._stored[-1] if self._stored else None
 
     @property
     def folder(self) -> Path:
@@ -120,48 +127,61 @@ class RecordingSession(Observer):
         kept = (labels.material for _, labels in sorted(self._counted.items()) if labels.material)
         return dict(Counter(kept))
 
+    def refuse_while_changing(self) -> None:
+        """Raises ApplianceError while DISCARD or FORGET is not on the disk yet."""
+        if self._changes:
+            raise ApplianceError("DISCARD or FORGET is under way; wait for its answer")
+
     def leave_out(self, number: int) -> None:
         """Count a stored sweep no longer: it is discarded, forgotten or no slide."""
         if labels := self._counted.pop(number, None):
             self._progress.add(labels.material, labels.position, -1)
 
-    def forget(self, material: str) -> None:
+    def forget(self, material: str, done: Callable[[], list[object]] = list) -> Reply:
         """Learn no longer from the sweeps of a material so far, those that are still being written
-        included; they stay in the folder. Raises ApplianceError."""
+        included; they stay in the folder. done: called when that is on the disk; returns the fields
+        of the reply. Raises ApplianceError."""
         held = [n for n, labels in self._counted.items() if labels.material == material]
         waiting = [n for n, label in self._writing.items() if label == material]
-        before = self._folder.forgotten
-        write = self._folder.forget(material, [*held, *waiting])
-        try:
-            self._beside(write, f"that {material!r} is forgotten is not kept", "make room")
-        except ApplianceError:
-            self._folder.forgotten = before
-            raise
-        for number in held:
-            self.leave_out(number)
+        numbers = *held, *waiting
 
-    def _beside(self, work: Callable[[], None], what: str, advice: str) -> None:
-        """Do work on the disk beside the loop, which a sync would halt for seconds. Raises
-        ApplianceError if it fails at once; a later failure is logged, and until the next start
-        what was asked for holds all the same."""
+        def forgotten() -> list[object]:
+            for number in numbers:
+                self.leave_out(number)
+            return done()
 
-        def tried() -> OSError | None:
+        write = partial(self._folder.forget, material, numbers)
+        return self._beside(write, forgotten, f"{material!r} cannot be forgotten", "make room")
+
+    def _beside(
+        self, work: Callable[[], None], done: Callable[[], list[object]], what: str, advice: str
+    ) -> Reply:
+        """Do work on the disk beside the loop, which a sync would halt for seconds, and then `done`
+        for the reply: what the box has answered must survive a loss of power. Raises
+        ApplianceError if it fails at once."""
+        reply: Future[list[object]] = Future()
+
+        def tried() -> Exception | None:
             try:
                 work()
-            except OSError as e:
+            except Exception as e:  # also one that nobody expected: somebody waits for the reply
                 return e
             return None
 
-        def done(e: OSError | None) -> None:
+        def end(e: Exception | None) -> None:
+            self._changes -= 1
             if e:
-                log.warning(f"record: {what}: {e.strerror}; {advice}, and repeat it")
-                failed.append(e)
+                why = f"{what}: {getattr(e, 'strerror', None) or e}; {advice}"
+                log.warning(f"record: {why}, and repeat it")
+                reply.set_exception(ApplianceError(why))
+            else:
+                reply.set_result(done())
 
-        failed: list[OSError] = []
-        if not self._disk(tried, done):
+        self._changes += 1
+        if not self._disk(tried, end):
+            self._changes -= 1
             raise ApplianceError(f"{what}: too much waits for the disk; try again")
-        if failed:
-            raise ApplianceError(f"{what}: {failed[0].strerror}; {advice}")
+        return reply.result() if reply.done() else reply
 
     def about(self) -> dict[str, Any]:
         """The progress of the recording, for JSON.
@@ -179,7 +199,7 @@ class RecordingSession(Observer):
             "target": self._progress.target,
             "missing": self._progress.missing(),
             "last": self._last,
-            "discard": self._stored[-1] - self._folder.run if self._stored else None,
+            "discard": None if self.last is None else self.last - self._folder.run,
         }
 
     def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
@@ -288,21 +308,25 @@ class RecordingSession(Observer):
             raise ApplianceError(f"position {position!r} has no next; begin with PPLP POSITION 1")
         return self._change("position", str(int(position) + 1).zfill(len(position)))
 
-    def _discard(self, which: str) -> list[object]:
+    def _discard(self, which: str) -> Reply:
         """Remove the last stored sweep of this run; returns its number, the number of sweeps left,
         and its file name. which: the expected number, so that a later sweep is not removed by
         mistake; "" for any."""
         if self._writing:
             raise ApplianceError("a sweep is still being written; wait for its REC sentence")
-        if not self._stored:
+        self.refuse_while_changing()
+        if (number := self.last) is None:
             raise ApplianceError("no sweep of this run is left to discard; record one first")
-        number = self._stored[-1]
         shown = number - self._folder.run
         if which and which != str(shown):
             raise ApplianceError(f"the last stored sweep is {shown}, not {which}; look at it first")
         remove = partial(self._folder.remove, number, reserve=True)
-        self._beside(remove, f"sweep {shown} cannot be discarded", "look at the disk")
-        self._stored.pop()
+        gone = partial(self._discarded, number, shown)
+        return self._beside(remove, gone, f"sweep {shown} cannot be discarded", "look at the disk")
+
+    def _discarded(self, number: int, shown: int) -> list[object]:
+        """A sweep is off the disk. Returns the fields of the reply."""
+        self._stored.remove(number)
         self.leave_out(number)
         if self._last and self._last["sweep"] == shown:
             self._last["outcome"] = "discarded"

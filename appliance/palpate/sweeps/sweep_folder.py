@@ -12,7 +12,7 @@ import json
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -225,13 +225,11 @@ class SweepFolder:
         storage.sync(self.folder)
         self.numbers.remove(number)
 
-    def forget(self, material: str, numbers: Iterable[int]) -> Callable[[], None]:
-        """Learn from these sweeps no longer; they may still wait. Returns what writes that to the
-        disk, which raises OSError."""
-        of_it = {*self.forgotten.get(material, ()), *numbers}
-        self.forgotten = new = self.forgotten | {material: sorted(of_it)}
-        text = (json.dumps(new, indent=1) + "\n").encode()
-        return lambda: storage.put(self.folder / FORGOTTEN, text)
+    def forget(self, material: str, numbers: Iterable[int]) -> None:
+        """Learn from these sweeps no longer; they may still wait. Raises OSError."""
+        new = self.forgotten | {material: sorted({*self.forgotten.get(material, ()), *numbers})}
+        storage.put(self.folder / FORGOTTEN, (json.dumps(new, indent=1) + "\n").encode())
+        self.forgotten = new
 
     def sidecars(self) -> Iterator[tuple[int, dict[str, Any]]]:
         """Number and sidecar of each sweep with a readable one, in order."""
@@ -263,6 +261,7 @@ class SweepFolder:
         for name in names:
             if name[3] or (name[2] == DISCARDED and int(name[1]) < self.run):
                 (self.folder / name[0]).unlink()
+        (self.folder / (FORGOTTEN + storage.PART)).unlink(missing_ok=True)
 
 
 def _make(folder: Path) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
+from functools import partial
 from queue import Empty, Full, Queue
 from typing import Any, Self
 
@@ -19,6 +20,7 @@ from palpate.core.config import TriggerConfig
 from palpate.core.errors import ApplianceError, FormatError, NoAnswer
 from palpate.core.health import Health
 from palpate.core.observer import Observer
+from palpate.core.sentences import Reply
 from palpate.core.status import REASONS
 from palpate.core.types import Frames, Sweep, SweepFormat, Verdict
 from palpate.io.robot_link import Command
@@ -44,8 +46,8 @@ TRIGGERS = {
 
 STATE = ("skin", "trouble", "sweeping", "ready", "due_ns", "frames")
 """Facts of the box that the page shows; a change of any but the last is shown at once."""
-Obey = Callable[[Command], list[object]]
-"""Carries out a command and returns the fields of its answer. Raises ApplianceError."""
+Obey = Callable[[Command], Reply]
+"""Carries out a command. Raises ApplianceError."""
 
 
 def order(body: bytes, allowed: Sequence[str], named: Callable[[str], str] = str.strip) -> Command:
@@ -106,15 +108,27 @@ class CommandQueue:
             return False
         command, answer = waiting
         try:
-            answer.set_result(obey(command))
+            reply = obey(command)
         except ApplianceError as e:
             answer.set_exception(e)
+            return True
+        if isinstance(reply, Future):
+            reply.add_done_callback(partial(_pass_on, answer))
+        else:
+            answer.set_result(reply)
         return True
 
     def refuse(self) -> None:
         """Refuse all commands that wait."""
         while self.carry_out(_ended):
             pass
+
+
+def _pass_on(answer: Future[list[object]], reply: Future[list[object]]) -> None:
+    if e := reply.exception():
+        answer.set_exception(e)
+    else:
+        answer.set_result(reply.result())
 
 
 def _ended(_: Command) -> list[object]:
@@ -208,8 +222,7 @@ class RecordPage(Observer):
 
     def turn(self, health: Health) -> None:
         """Carry out a command, and show the changes."""
-        if self._queue.carry_out(self._obey):
-            self._state = ()
+        self._queue.carry_out(self._obey)
         now_ns = self._clock.now_ns()
         if health.enumerations != self._enumerations:
             self._enumerations = health.enumerations
@@ -232,7 +245,12 @@ class RecordPage(Observer):
             self.server.show(self._tracker.view(health.skin, health.trouble))
 
     def _ordered(self, body: bytes) -> Future[list[object]]:
-        return self._queue.put(order(body, self._commands, self._named))
+        answer = self._queue.put(order(body, self._commands, self._named))
+        answer.add_done_callback(self._show_soon)
+        return answer
+
+    def _show_soon(self, _: object) -> None:
+        self._state = ()
 
     def _shown(self, which: str) -> dict[str, Any] | None:
         """The picture of the last sweep, if it has this number. It is computed once."""

@@ -15,7 +15,9 @@ import pytest
 
 from palpate.core.clock import SystemClock
 from palpate.core.config import TeachConfig
+from palpate.core.disk_thread import DiskWork
 from palpate.core.errors import ApplianceError, ConfigError
+from palpate.core.sentences import Reply
 from palpate.core.types import Status
 from palpate.learn import process, session
 from palpate.learn.process import TeachingProcess
@@ -23,6 +25,7 @@ from palpate.learn.session import Teacher, TeachingSession
 from palpate.sim import skin
 from palpate.sweeps.recording import Labels, RecordingSession
 from tests.factories.feeds import HEALTH, OK, cut
+from tests.factories.slow_disk import SlowDisk
 
 WAIT_S = 120
 
@@ -45,11 +48,12 @@ TAUGHT = {"type": "taught", "text": "bundle 1234 is installed", "labels": ["cork
 class Taught:
     """A recording with its session; `learn` and `assess` are the commands of its processes."""
 
-    def __init__(self, folder: Path, codes: int = 0) -> None:
+    def __init__(self, folder: Path, codes: int = 0, disk: DiskWork | None = None) -> None:
         self.folder, self.said, self.number = folder, [], 0
         self.learn, self.assess = printed(TAUGHT), printed(ASSESSED)
         self.recording = RecordingSession(
-            folder / "sweeps", skin.FORMAT, Labels(), SystemClock(), self.said.append, 3
+            *(folder / "sweeps", skin.FORMAT, Labels(), SystemClock(), self.said.append, 3),
+            disk=disk,
         )
         self.session = TeachingSession(
             self.recording,
@@ -59,7 +63,7 @@ class Taught:
             codes=codes,
         )
 
-    def order(self, name: str, text: str = "") -> list[object]:
+    def order(self, name: str, text: str = "") -> Reply:
         """Carry out a command."""
         return {**self.session.recording_commands, **self.session.commands}[name](text)
 
@@ -309,6 +313,35 @@ def test_a_forgotten_material_is_gone_and_its_sweeps_stay(taught):
     again = Taught(taught.folder)
     taught.recording = again.recording  # for the end of the test
     assert again.session.materials() == {"pine": 2, "cork": 1}
+
+
+def test_use_does_not_overtake_what_the_disk_still_has_to_do(tmp_path):
+    """Its process would read a forgotten material or a discarded sweep in the folder."""
+    disk = SlowDisk()
+    one = Taught(tmp_path, disk=disk)
+    for material in ("cork", "pine", "felt"):
+        one.sweeps(material, 2)
+    disk.settle()
+    for order, answer in (("FORGET", ["cork", 2]), ("DISCARD", [6, 5, "sweep-000006"])):
+        reply = one.order(order, "cork" * (order == "FORGET"))
+        with pytest.raises(ApplianceError, match="answer"):
+            one.order("USE")
+        disk.settle()
+        assert reply.result(0) == answer
+    assert one.order("USE") == [2, 3]
+    one.session.close()
+    one.recording.close()
+
+
+def test_a_sweep_in_place_of_a_discarded_one_is_assessed(taught):
+    """Also if both happen in one turn, and there are as many sweeps as before."""
+    taught.sweeps("cork", 2)
+    taught.sweeps("pine", 2)
+    taught.until(lambda about: not about["assessing"])
+    taught.order("DISCARD")
+    taught.sweeps("pine", 1)
+    taught.session.turn(HEALTH)
+    assert taught.session.about()["assessing"]
 
 
 def test_a_discarded_sweep_is_not_taught(taught):

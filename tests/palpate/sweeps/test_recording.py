@@ -28,7 +28,8 @@ from palpate_train.data import readers, sets
 from tests.factories import toy_bundle
 from tests.factories.feeds import FeedPeer
 from tests.factories.recorded_page import RecordedPage
-from tests.factories.simulated_box import Rigged
+from tests.factories.simulated_box import SETTLE_S, Rigged
+from tests.factories.slow_disk import SlowDisk
 
 WOOD, NONE = Labels("wood"), Labels()
 Recorded = Callable[..., Rigged]
@@ -303,6 +304,32 @@ def test_discard_takes_the_last_and_then_the_one_before(tmp_path):
     assert names(tmp_path) == pairs(1, 7)
 
 
+def test_an_answer_that_waits_for_the_disk_holds_up_no_other(rigged, tmp_path):
+    """DISCARD is answered once its sweep is off the disk, also when the program ends. Others
+    are answered meanwhile."""
+    simulated, disk = simulated_tubes(4, 2), SlowDisk()
+    recording = RecordingSession(
+        tmp_path, skin.FORMAT, WOOD, simulated.clock, lambda line: None, disk=disk
+    )
+    box = rigged(simulated, observers=[disk, recording], commands=recording.commands)
+
+    def discarding(sweep: int) -> None:
+        box.until(lambda: box.box.answered == sweep)
+        disk.settle()
+        os.write(box.far_end, b"$PPLP,DISCARD\r\n")
+        assert ",ANS,NEW,ok" in box.ask("$PPLP,NEW")
+        assert (tmp_path / f"sweep-{sweep:06d}.npy").exists()
+
+    discarding(1)
+    disk.settle()
+    box.until(lambda: any(",ANS,DISCARD,ok,1,0,sweep-000001*" in line for line in box.heard))
+    assert names(tmp_path) == ["sweep-000001.discarded"]
+    discarding(2)
+    box.box.run(lambda: True)
+    box.listen(SETTLE_S)
+    assert any(",ANS,DISCARD,ok,2,0,sweep-000002*" in line for line in box.heard)
+
+
 def test_discard_of_the_sweep_that_was_seen(tmp_path):
     """With a number, DISCARD removes the last stored sweep only if it has this number, and never a
     later sweep."""
@@ -415,7 +442,8 @@ def test_a_later_run_writes_nothing_over(tmp_path):
     first.recording.close()
     before = content(tmp_path)
     (tmp_path / "sweep-000002.json").write_text("{}")
-    for left in ("sweep-000003.json.part", "sweep-000003.npy.part", "mine.part"):
+    unfinished = "sweep-000003.json.part", "sweep-000003.npy.part", "forgotten.part"
+    for left in (*unfinished, "mine.part"):
         (tmp_path / left).write_bytes(b"half")
     assert Desk(tmp_path).sweep(1)[6] == "sweep-000004"
     after = content(tmp_path)

@@ -2,50 +2,25 @@
 
 from __future__ import annotations
 
-import errno
 import io
 import json
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 from zlib import crc32
 
 import numpy as np
 import pytest
 
 from palpate.core.clock import SystemClock
-from palpate.core.errors import FormatError
+from palpate.core.errors import ApplianceError, FormatError
 from palpate.core.sweep_file import load, save
 from palpate.core.types import Status
 from palpate.sweeps import sweep_folder
 from palpate.sweeps.recording import Labels, RecordingSession
 from palpate.sweeps.sweep_folder import FORGOTTEN, RecordedSweep, SweepFolder
 from tests.cuts.recording import SHORT, taken
-
-
-def full(*given: object) -> None:
-    """A disk without room."""
-    raise OSError(errno.ENOSPC, "No space left on device")
-
-
-class SlowDisk:
-    """A disk that writes when a test says so."""
-
-    def __init__(self) -> None:
-        self._work: list[tuple[Callable[[], Any], Callable[[Any], object]]] = []
-
-    def __call__(self, work: Callable[[], Any], done: Callable[[Any], object]) -> bool:
-        self._work.append((work, done))
-        return True
-
-    def settle(self) -> bool:
-        """Write all."""
-        while self._work:
-            work, done = self._work.pop(0)
-            done(work())
-        return True
+from tests.factories.slow_disk import SlowDisk, full
 
 
 def recording(folder: Path, disk: SlowDisk | None = None) -> RecordingSession:
@@ -78,7 +53,7 @@ def test_each_state_of_a_sweep(tmp_path):
     for name in ("sweep-000007.npy", "notes.npy"):
         (tmp_path / name).write_bytes(b"half")
     folder = SweepFolder(tmp_path, None)
-    folder.forget("felt", [5])()
+    folder.forget("felt", [5])
     folder.close()
     reasons = "gap", "early", "no material", "forgotten", "no-contact", "damaged"
     assert learnt(tmp_path) == ([1], dict.fromkeys(reasons, 1))
@@ -119,33 +94,39 @@ def test_a_sweep_that_waits_for_the_card_is_forgotten_too(tmp_path):
     again.close()
 
 
-def test_forget_and_discard_do_not_wait_for_the_card(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, logged: list[str]
+def test_forget_and_discard_are_answered_once_the_card_has_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """Their answers come at once and hold; the disk follows in order, also where it fails: then the
-    log says so, and it can be repeated."""
+    """They do not wait for the card, and nothing is said or counted before. A failure is the answer
+    and changes nothing; another DISCARD meanwhile is refused."""
     disk = SlowDisk()
     one = recording(tmp_path, disk)
     put(one, 1, 2)
     disk.settle()
-    one.forget("cork")
-    assert one.materials() == {}
-    assert not (tmp_path / "forgotten").exists()
+    forgotten = one.forget("cork")
+    assert (forgotten.done(), one.materials()) == (False, {"cork": 2})
+    disk.settle()
+    assert (forgotten.result(0), one.materials()) == ([], {})
     put(one, 3)
     disk.settle()
     assert learnt(tmp_path) == ([3], {"forgotten": 2})
-    assert one.commands["DISCARD"]("3")[0] == 3
-    assert one.materials() == {}
-    assert (tmp_path / "sweep-000003.npy").exists()
+    gone = one.commands["DISCARD"]("3")
+    with pytest.raises(ApplianceError, match="DISCARD"):
+        one.commands["DISCARD"]("")
+    assert (gone.done(), one.about()["last"]["outcome"]) == (False, "stored")
     disk.settle()
+    assert gone.result(0) == [3, 2, "sweep-000003"]
     assert not (tmp_path / "sweep-000003.npy").exists()
     put(one, 4)
     disk.settle()
     monkeypatch.setattr(sweep_folder.storage, "put", full)
-    one.forget("cork")
-    disk.settle()
-    assert any("No space left" in line and "'cork'" in line for line in logged)
-    assert one.materials() == {}
+    monkeypatch.setattr(sweep_folder.storage, "sync", full)
+    for ask in (one.forget, one.commands["DISCARD"]):
+        reply = ask("cork" if ask == one.forget else "4")
+        disk.settle()
+        with pytest.raises(ApplianceError, match="No space left"):
+            reply.result(0)
+    assert (one.materials(), one.about()["discard"]) == ({"cork": 1}, 4)
     one.close()
 
 

@@ -24,6 +24,7 @@ from palpate.core.sweep_file import sidecar
 from palpate.core.types import Status
 from palpate.io.robot_link import Command
 from palpate.sim import skin
+from palpate.sweeps import sweep_folder
 from palpate.sweeps.recording import Labels, RecordingSession
 from palpate.web import record, server
 from palpate.web.access import Access
@@ -33,6 +34,7 @@ from tests.factories.browser import WAIT_S, until
 from tests.factories.page_client import EventReader, PageAddress, ask, port, status
 from tests.factories.recorded_page import KIND, RecordedPage, key_of, ordered
 from tests.factories.simulated_box import idle_devices
+from tests.factories.slow_disk import SlowDisk, full
 
 ALLOWED = ("MATERIAL", "POSITION", "SESSION", "NEXT", "DISCARD")
 WOOD = {"command": "MATERIAL", "text": "wood"}
@@ -317,6 +319,30 @@ def test_a_loop_that_is_late(recorded, monkeypatch, under_way, why):
         turn.join()
     recorded.turn()
     assert recorded.done == []
+
+
+@pytest.mark.parametrize(("works", "answer"), [(True, 200), (False, 409)])
+def test_an_answer_that_waits_for_the_disk_reaches_the_page(tmp_path, monkeypatch, works, answer):
+    """Once the disk has done it or failed; then the next turn shows the change."""
+    monkeypatch.setattr(server, "DONE_S", 60.0)  # a busy machine is slow, too
+    disk = SlowDisk()
+    one = RecordedPage(tmp_path, Labels("metal"), disk=disk)
+    with one.page:
+        one.sweep()
+        disk.settle()
+        asking = Asking(one, {"command": "DISCARD"})
+        until(lambda: waiting(one) == 1)
+        one.turn()
+        assert asking.answers == []
+        assert one.page._state != ()
+        if not works:
+            monkeypatch.setattr(sweep_folder.storage, "sync", full)
+        disk.settle()
+        assert asking.finished() == [answer]
+        assert one.page._state == ()
+    said = b'[1, 0, "sweep-000001"]' if works else b"No space left"
+    assert said in asking.answers[0]
+    one.recording.close()
 
 
 def test_a_sweep_is_drawn_once(recorded, monkeypatch):
