@@ -28,7 +28,7 @@ from palpate_train.data import readers, sets
 from tests.factories import toy_bundle
 from tests.factories.feeds import FeedPeer
 from tests.factories.recorded_page import RecordedPage
-from tests.factories.simulated_box import SETTLE_S, Rigged
+from tests.factories.simulated_box import SETTLE_S, Rigged, numbered
 from tests.factories.slow_disk import SlowDisk
 
 WOOD, NONE = Labels("wood"), Labels()
@@ -196,7 +196,7 @@ def test_a_recording_is_a_set_to_train_on(recorded, tmp_path):
 def test_speed_and_force_reach_sidecar_feed_and_set(rigged, tmp_path):
     """Two sweeps by command with `palpate record`: the values are in each sidecar, in the feed's
     verdict, and are groups of the set."""
-    acts = [rig.Act(np.zeros((20 * 750, 4, 4), np.uint8), 10**7, 10**7 + 1, "")]
+    acts = [rig.Act(numbered(20 * 750), 10**7, 10**7 + 1, "")]
     simulated = devices.build(skin.FORMAT, acts, rig.VirtualClock(), "sim")
     session = RecordingSession(tmp_path, skin.FORMAT, WOOD, simulated.clock, lambda line: None)
     feed = FeedServer(tmp_path / "feed.sock", skin.FORMAT, {}, simulated.clock)
