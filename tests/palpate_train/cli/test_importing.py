@@ -309,3 +309,9 @@ def test_tables_of_labels_that_cannot_be_read(
     given = ("--rate", "100", "--grid", "2x2", "--out", str(tmp_path / "a.npz"))
     assert main(["import", str(tmp_path), "--labels", str(tmp_path / "labels.csv"), *given]) == 65
     assert why in capsys.readouterr().err
+
+
+def test_the_folder_comes_before_the_options(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """A file, or a name without a folder, is the first thing that is wrong."""
+    assert main(["import", str(tmp_path / "none"), "--out", str(tmp_path / "s.npz")]) == 65
+    assert "not a folder" in capsys.readouterr().err

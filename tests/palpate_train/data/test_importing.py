@@ -220,7 +220,7 @@ GOOD = "1,2,3,4\n" * 20
 BAD = {
     "empty": (b"", "no line of numbers"),
     "words": (b"time,a,b\nnone,of,these\n", "no line of numbers"),
-    "noise": (bytes(range(256)) * 9, "no line of numbers"),
+    "noise": (bytes(range(256)) * 9, "is not a text"),
     "short line": (b"1,2,3,4\n1,2,3\n" + GOOD.encode(), "line 2 has 3 columns"),
     "word": (b"a,b,c,d\n" + GOOD.encode() + b"1,2,x,4\n", "line 22, column 3 is 'x'"),
     "hole": (GOOD.encode() + b"1,,3,4\n", "line 21, column 2 is ''"),
@@ -478,3 +478,36 @@ def test_a_square_grid_of_hdf5_may_have_its_axes_reversed(tmp_path: Path):
     turned = taken(tmp_path, grid="4x4", axes="frame,column,row")
     assert "h5write" not in turned.taken[0].notes
     np.testing.assert_array_equal(turned.sweeps.samples[0], plain.sweeps.samples[0].swapaxes(1, 2))
+
+
+@pytest.mark.parametrize("name", ["FELT_1.CSV", "felt_1.Csv"])
+def test_capitals_are_given_as_the_reason(tmp_path: Path, name: str):
+    """A pattern with other capitals than a file leaves it out as broken; alone, it is the error."""
+    asked = {"pattern": NamePattern("{material}_{trial:d}.csv")}
+    text(tmp_path / name)
+    with pytest.raises(FormatError, match="capitals"):
+        taken(tmp_path, **asked)
+    text(tmp_path / "cork_1.csv", COUNTS + 1)
+    assert "capitals" in reasons(tmp_path, **asked)[name]
+
+
+def test_what_recorders_write_beside_is_passed_over(tmp_path: Path):
+    """metadata.yaml of ROS is no recording, whatever the pattern is."""
+    text(tmp_path / "cork_1.csv")
+    (tmp_path / "metadata.yaml").write_text("rosbag2_bagfile_information:\n")
+    assert len(taken(tmp_path).taken) == 1
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        bytes(range(256)) * 9,
+        b"RIFF\x24\x08\x00\x00WAVEfmt \x10\x00\x00\x00" + b"\x01\x02" * 900,
+        np.arange(2000, dtype="<f4").tobytes(),
+        b"1,2,3,4\n" * 20 + bytes([1, 2, 3]) * 99,
+    ],
+)
+def test_an_unknown_binary_file_is_not_read_as_a_text(tmp_path: Path, content: bytes):
+    """Whatever its suffix is: digits occur in any bytes."""
+    (tmp_path / "cork_1.csv").write_bytes(content)
+    assert "not a text" in reasons(tmp_path)["cork_1.csv"]

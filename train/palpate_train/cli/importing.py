@@ -16,7 +16,7 @@ from palpate_train.arguments.program import Add
 from palpate_train.data import label_table, labels, lerobot, summary
 from palpate_train.data.file_names import EXAMPLE, FIELD, GROUP, NamePattern
 from palpate_train.data.import_plan import ImportPlan, Length
-from palpate_train.data.importing import Imported, LeftOutFile, Taken, import_folder
+from palpate_train.data.importing import Imported, LeftOutFile, Taken, check_folder, import_folder
 
 SHOWN = 5
 """Largest number of files with a line each that were left out for the same reason."""
@@ -94,6 +94,7 @@ def run(args: argparse.Namespace) -> None:
 
     Raises FormatError at the end if a file was broken.
     """
+    check_folder(args.folder)
     plan = _plan(args)
     for option, endings in (("out", options.SET_FILES), ("report", ())):
         if path := getattr(args, option):

@@ -82,9 +82,11 @@ class NamePattern:
     def read(self, path: str) -> dict[str, str] | None:
         """The fields of a path, or None if it does not match the pattern.
 
-        Raises FormatError if it matches in several ways.
+        Raises FormatError if it matches in several ways, or but for capitals.
         """
         short, long = (re.fullmatch(self._expression(how), normal(path)) for how in ("+?", "+"))
+        if not short and re.fullmatch(self._expression("+"), normal(path), re.IGNORECASE):
+            raise FormatError("its name has other capitals than the pattern; write both alike")
         if not (short and long):
             return None
         if short.groups() != long.groups():

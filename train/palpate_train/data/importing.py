@@ -110,6 +110,7 @@ def import_folder(
     even after an error. Raises FormatError if the box cannot send a material's name, or if no file
     remains.
     """
+    check_folder(folder)
     sources: Iterator[Source]
     if plan.pattern is None and lerobot.is_data_set(folder):
         plan, remark = lerobot.with_grid(folder, plan)
@@ -151,6 +152,13 @@ def import_folder(
     return Imported(sweeps, taken, left_out, [about, *warnings, *notes])
 
 
+def check_folder(folder: Path) -> None:
+    """Raise FormatError for a folder that cannot be read."""
+    if not folder.is_dir():
+        raise FormatError(f"{folder} is not a folder; name the folder that holds the recordings")
+    readers.check_folder(folder)
+
+
 def _named(
     folder: Path, plan: ImportPlan, left_out: list[LeftOutFile]
 ) -> dict[str, tuple[Path, Fields]]:
@@ -159,9 +167,6 @@ def _named(
 
     Materials have their new names. Files that only systems and editors read are passed over.
     """
-    if not folder.is_dir():
-        raise FormatError(f"{folder} is not a folder; name the folder that holds the recordings")
-    readers.check_folder(folder)
     paths = {normal(p.relative_to(folder).as_posix()): p for p in readers.files_below(folder)}
     found: dict[str, tuple[Path, Fields]] = {}
     for name, path in paths.items():
@@ -179,6 +184,8 @@ def _named(
     if not found:
         first = f"the first file is {next(iter(paths))!r}" if paths else "it holds no files"
         pattern = f"matches --pattern {plan.pattern.text!r}" if plan.pattern else "is there"
+        why = next((one.why for one in left_out if one.broken), "")
+        first += f": {why}" if paths and why else ""
         raise FormatError(f"{folder}: no file {pattern}; {first}")
     if "material" in plan.of_files:
         _name_materials(folder, [fields for _, fields in found.values()], plan)

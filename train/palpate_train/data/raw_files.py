@@ -85,6 +85,7 @@ MAGIC = {
     b"\x89MCAP": "a recording of ROS 2; give it the suffix .mcap",
     b"#ROSBAG": "a recording of ROS 1; give it the suffix .bag",
     b"SQLite format 3": "a database; a recording of ROS 2 has the suffix .db3",
+    b"RRF": "a recording of Rerun; query it with rerun.dataframe, and save the table as Parquet",
     b"TDSm": "a TDMS file; give it the suffix .tdms",
     b"\x93NUMPY": "an array of NumPy; give it the suffix .npy",
     b"Octave-1": "in Octave's binary format; save it with -hdf5, -v7 or as text",

@@ -38,6 +38,9 @@ SAMPLED = 200
 """Number of lines at the start and at the end that show the layout of a text."""
 CLEAR = 0.9
 """A sign separates the columns if the share of numbers between it is this part of the largest."""
+HEAD = 4096
+"""Number of bytes at the start that show whether a file is a text."""
+_CONTROL = re.compile(rb"[^\t\n\f\r\x1a\x1b\x20-\xff]")
 LVM = "LabVIEW Measurement"
 LVM_END = "***End_of_Header***"
 Row = tuple[int, str]
@@ -48,8 +51,9 @@ def decoded(data: bytes) -> tuple[str, list[str]]:
     notes: list[str] = []
     if wide := _wide(data):
         return data.decode(wide, "replace").lstrip("\ufeff"), notes
-    if data[:400].count(0) > len(data[:400]) // 3:
-        raise FormatError("is not a text; save it as UTF-8")
+    head = data[:HEAD].rstrip(b"\0")
+    if len(_CONTROL.findall(head)) * 100 > len(head):
+        raise FormatError("is not a text, and of no known kind; export it as CSV, HDF5 or .npy")
     whole = data.rstrip(b"\0\x1a")
     if lost := len(data) - len(whole):
         notes.append(f"read up to {lost} bytes NUL at its end")
