@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import pytest
 from palpate.core.errors import FormatError
 from palpate_train.data import frames, raw_files
 from palpate_train.data.file_names import NamePattern
-from palpate_train.data.files.table import Table
+from palpate_train.data.files.table import ReadPlan, Table
 from palpate_train.data.import_plan import ImportPlan, Length
 from tests.factories.later import Later
 
@@ -304,3 +305,36 @@ def test_a_taxel_with_other_times_is_refused(late: float, refused: bool):
             frames.frames(table, asked)
     else:
         np.testing.assert_array_equal(frames.frames(table, asked)[0][:, 0], values[:, [1, 3]])
+
+
+def test_facts_about_a_recording_are_fields(tmp_path: Path):
+    """Attributes and single values of HDF5, from the file down to the array, as robomimic keeps
+    them. No link is followed. JSON has facts beside its frames."""
+    x = cube(2, 2, 40)
+    with h5py.File(tmp_path / "other.h5", "w") as other:
+        other["secret"] = "far"
+    with h5py.File(tmp_path / "a.hdf5", "w") as file:
+        file.attrs["material"], file.attrs["session"] = "cork", 3
+        for k in range(2):
+            file[f"data/demo_{k}/obs/skin"] = x + k
+        file["data/demo_1"].attrs["material"] = b"felt"
+        file["data/demo_0/operator"] = "Ada"
+        file["data/demo_0/secret"] = h5py.ExternalLink(str(tmp_path / "other.h5"), "/secret")
+    asked = {"material": "material", "session": "session"}
+    for k, name in enumerate(("cork", "felt")):
+        path = f"data/demo_{k}/obs/skin"
+        table = raw_files.read(tmp_path / "a.hdf5", ReadPlan(path, fields=("material",)))
+        ((part, found),) = frames.fields(table, asked, 40)
+        assert (part, found) == (slice(0, 40), {"material": name, "session": "3"})
+        assert ("operator" in table.facts) == (k == 0)
+        assert "secret" not in table.facts
+        with pytest.raises(FormatError, match="'task'"):
+            frames.fields(table, {"material": "task"}, 40)
+    lines = {"material": "wood", "rate": 100, "frames": x.reshape(40, 4).tolist()}
+    (tmp_path / "a.json").write_text(json.dumps(lines))
+    table = raw_files.read(tmp_path / "a.json")
+    assert frames.fields(table, {"material": "material"}, 40)[0][1] == {"material": "wood"}
+    counts, _, _ = frames.frames(
+        table, plan(pattern=None, grid="2x2", fields={"material": "material"})
+    )
+    np.testing.assert_array_equal(counts, x)

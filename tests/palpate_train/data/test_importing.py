@@ -492,7 +492,7 @@ def test_capitals_are_given_as_the_reason(tmp_path: Path, name: str):
 
 
 def test_what_recorders_write_beside_is_passed_over(tmp_path: Path):
-    """metadata.yaml of ROS is no recording, whatever the pattern is."""
+    """metadata.yaml of ROS is not read as a recording."""
     text(tmp_path / "cork_1.csv")
     (tmp_path / "metadata.yaml").write_text("rosbag2_bagfile_information:\n")
     assert len(taken(tmp_path).taken) == 1

@@ -137,7 +137,7 @@ def test_a_row_can_hold_several_frames(
 
 
 def test_rows_that_repeat_frames_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """A history of five frames in which one is new is not five times as fast."""
+    """Each row repeats four of its five frames: the skin is not five times as fast."""
     series = FIVE.reshape(4, 300, 4)
     rows = np.stack([series[:, k : k + 5] for k in range(60)], axis=1)
     folder = of_windows(tmp_path / "set", rows)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core.errors import FormatError
+from palpate.core.text import printable
 from palpate.core.types import LARGEST_READING
 from palpate_train.data import sampling
 from palpate_train.data.files.table import Table, normal
@@ -260,7 +261,8 @@ def _taxels(values: Array, table: Table, plan: ImportPlan, time_column: int | No
     if plan.columns:
         numbers = column_numbers(plan.columns, table.columns, wide, "--columns")
     else:
-        fields = plan.fields.values() if table.columns else ()
+        asked = plan.fields.values() if table.columns else ()
+        fields = [one for one in asked if not _is_fact(table, one)]
         others = [column_numbers(one, table.columns, wide, "--field", 1)[0] for one in fields]
         others += [*table.texts, -1 if time_column is None else time_column]
         numbers = [i for i in range(wide) if i not in others]
@@ -367,16 +369,27 @@ def _named(name: str, names: Sequence[str], option: str) -> int:
     return where[0]
 
 
+def _is_fact(table: Table, name: str) -> bool:
+    """Whether --field means a fact about the whole recording. A column of the name comes first."""
+    return normal(name) in table.facts and normal(name) not in table.columns
+
+
 def fields(
     table: Table, given: Mapping[str, str], count: int
 ) -> list[tuple[slice, dict[str, str]]]:
     """The parts of a table within which the columns `given` by field do not change, and the fields
-    of each part. Of a date with a clock time, the day counts. Raises FormatError for an empty
-    cell."""
+    of each part. A fact holds for all frames. Of a date with a clock time, the day counts.
+    Raises FormatError for an empty cell."""
     if not given:
         return [(slice(0, count), {})]
     columns: dict[str, list[str]] = {}
     for name, column in given.items():
+        if _is_fact(table, column):
+            columns[name] = [table.facts[normal(column)]] * count
+            continue
+        if not table.columns and table.facts:
+            listed = ", ".join(map(printable, table.facts))
+            raise FormatError(f"--field: there is no fact {column!r}; it has {listed}")
         (at,) = column_numbers(column, table.columns, len(table.columns), "--field", 1)
         _check_numbers(table, [] if at in table.texts else [at])
         texts = (

@@ -110,14 +110,7 @@ def import_folder(
     even after an error. Raises FormatError if the box cannot send a material's name, or if no file
     remains.
     """
-    check_folder(folder)
-    sources: Iterator[Source]
-    if plan.pattern is None and lerobot.is_data_set(folder):
-        plan, remark = lerobot.with_grid(folder, plan)
-        episodes = lerobot.episodes(folder, plan)
-        sources = ((name, {}, partial(replace, table, notes=remark)) for name, table in episodes)
-    else:
-        sources = _files(_named(folder, plan, left_out), plan, log)
+    plan, sources = _sources(folder, plan, log, left_out)
     recordings, count = [], 0
     orders: dict[tuple[str, ...], tuple[str, ...]] = {}
     for source in sources:
@@ -150,6 +143,18 @@ def import_folder(
     taken = [cut.counted() for cut in cuts]
     sweeps, notes = _set(folder, cuts, rate_hz, dtype, plan)
     return Imported(sweeps, taken, left_out, [about, *warnings, *notes])
+
+
+def _sources(
+    folder: Path, plan: ImportPlan, log: Callable[[str], None], left_out: list[LeftOutFile]
+) -> tuple[ImportPlan, Iterator[Source]]:
+    """What can be read of a folder, and the plan with the grid that a LeRobot data set states."""
+    check_folder(folder)
+    if plan.pattern is not None or not lerobot.is_data_set(folder):
+        return plan, _files(_named(folder, plan, left_out), plan, log)
+    plan, remark = lerobot.with_grid(folder, plan)
+    episodes = lerobot.episodes(folder, plan)
+    return plan, ((name, {}, partial(replace, table, notes=remark)) for name, table in episodes)
 
 
 def check_folder(folder: Path) -> None:
@@ -228,7 +233,12 @@ def _files(
 ) -> Iterator[Source]:
     """The files of a folder; each is read when it is its turn."""
     progress = Progress(len(named), log)
-    wanted = ReadPlan(plan.variable, plan.time.rpartition(":")[0], plan.decimal)
+    wanted = ReadPlan(
+        plan.variable,
+        plan.time.rpartition(":")[0],
+        plan.decimal,
+        fields=tuple(map(normal, plan.fields.values())),
+    )
     for name, (path, fields) in named.items():
         progress.begin(name)
         if plan.variables is None:

@@ -43,8 +43,8 @@ FRAMES = (
 """Suffixes of files that hold the frames of one recording. importing.py makes a set of a folder of
 such files."""
 JUNK = ("__MACOSX", "Thumbs.db", "desktop.ini", "Icon\r", "metadata.yaml")
-"""Names of files and folders that systems and recorders leave beside recordings. Names that begin with . or ~$
-are passed over too."""
+"""Names of files and folders that systems and recorders leave beside recordings. Names that begin
+with . or ~$ are passed over too."""
 IMPORT = "palpate-train import {} makes a set of such files"
 
 

@@ -1,6 +1,7 @@
 """Formats that a library reads: spreadsheets, Parquet, TDMS, recordings of ROS."""
 
 import sys
+from collections.abc import Sequence
 from decimal import Decimal
 from pathlib import Path
 from typing import Any
@@ -164,8 +165,11 @@ def test_tdms_is_read(tmp_path: Path):
         raw_files.read(tmp_path / "b.tdms")
 
 
-def bag(path: Path, kind: str, messages: str = "sensor_msgs/msg/Image") -> Path:
-    """A recording of ROS with a topic of the skin, a topic of texts and one of large images."""
+def bag(
+    path: Path, kind: str, messages: str = "sensor_msgs/msg/Image", notes: Sequence[str] = ()
+) -> Path:
+    """A recording of ROS with a topic of the skin, a topic of texts and one of large images.
+    notes: the texts, "" for none."""
     rosbags = pytest.importorskip("rosbags.rosbag2")
     rosbag1 = pytest.importorskip("rosbags.rosbag1")
     from rosbags.typesys import Stores, get_typestore
@@ -194,7 +198,9 @@ def bag(path: Path, kind: str, messages: str = "sensor_msgs/msg/Image") -> Path:
             else:
                 layout = types["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
                 one = types[messages](layout=layout, data=row.astype(np.float32))
-            sent = {"/skin": one, "/note": types["std_msgs/msg/String"]("here")}
+            sent = {"/skin": one}
+            if note := notes[k] if notes else "here":
+                sent = {"/note": types["std_msgs/msg/String"](note), **sent}
             if k < 2:
                 sent["/camera"] = image(head, 400, 640, "rgb8", 0, 1920, np.zeros(768000, np.uint8))
             for topic, message in sent.items():
@@ -232,3 +238,32 @@ def test_a_recording_that_was_cut_off_says_how_to_mend_it(tmp_path: Path):
     path.write_bytes(path.read_bytes()[:-20])
     with pytest.raises(FormatError, match="mcap recover"):
         raw_files.read(path)
+
+
+LABELS = ["wood"] * 15 + ["felt"] * 25
+
+
+@pytest.mark.parametrize("kind", ["bag", "mcap", "db3"])
+@pytest.mark.parametrize("late", [0, 5])
+def test_a_topic_of_texts_gives_labels(tmp_path: Path, kind: str, late: int):
+    """The last text before a frame is its label; frames before the first text are left out."""
+    name = tmp_path / ("a.bag" if kind == "bag" else "a")
+    path = bag(
+        name,
+        kind,
+        "std_msgs/msg/Float32MultiArray",
+        [
+            "",
+        ]
+        * late
+        + LABELS[late:],
+    )
+    if kind != "bag":
+        (path,) = path.glob(f"*.{kind}")
+    found = raw_files.read(path, ReadPlan(fields=("/note",)))
+    assert found.texts[4] == LABELS[late:]
+    np.testing.assert_array_equal(found.values[:, :4], SKIN[late:])
+    np.testing.assert_allclose(found.vectors["received"], TIMES[late:])
+    assert len(found.notes) == (late > 0)
+    with pytest.raises(FormatError, match="/skin"):
+        raw_files.read(path, ReadPlan("/skin", fields=("/skin",)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -58,7 +58,8 @@ def read(path: Path, wanted: ReadPlan) -> Table:
                 f"holds {len(fitting)} topics of frames; name one with --variable: "
                 f"it holds {listed or 'nothing'}"
             )
-        return _table(bag, topics[fitting[0]])
+        labels = {name: topics[name] for name in wanted.fields if name in topics}
+        return _table(bag, topics[fitting[0]], labels)
 
 
 def _has_end(path: Path) -> bool:
@@ -83,8 +84,9 @@ def _fitting(bag: Any, topics: dict[str, list[Any]]) -> list[str]:
     return found
 
 
-def _table(bag: Any, connections: list[Any]) -> Table:
-    """The messages of one topic as frames."""
+def _table(bag: Any, connections: list[Any], labels: Mapping[str, list[Any]]) -> Table:
+    """The messages of one topic as frames. labels: topics of texts by name; the last text before a
+    frame is its text."""
     rows: list[Array] = []
     received: list[int] = []
     stamps: list[float] = []
@@ -118,8 +120,44 @@ def _table(bag: Any, connections: list[Any]) -> Table:
     times = {RECEIVED: 1e-9 * (np.array(received) - received[0])}
     if len(stamps) == len(rows) and any(stamps):
         times[TIME] = np.array(stamps) - stamps[0]
-    table = from_columns(names, list(np.stack(rows).T), {})
-    return replace(table, vectors=times, beside=tuple(times))
+    texts = {name: _labels(bag, name, labels[name], received) for name in labels}
+    return _labelled(names, np.stack(rows), times, texts)
+
+
+def _labelled(
+    names: Sequence[str],
+    rows: Array,
+    times: Mapping[str, Array],
+    texts: Mapping[str, tuple[list[str], int]],
+) -> Table:
+    """The table from the first frame on that has all labels."""
+    first = max((before for _, before in texts.values()), default=0)
+    said = [f"{first} frames before the first label are left out"] * (first > 0)
+    columns = [*rows[first:].T, *(np.zeros(len(rows) - first, np.uint8) for _ in texts)]
+    of_columns = {len(names) + k: text[first:] for k, (text, _) in enumerate(texts.values())}
+    table = from_columns([*names, *texts], columns, of_columns, said)
+    vectors = {name: values[first:] for name, values in times.items()}
+    return replace(table, vectors=vectors, beside=tuple(vectors))
+
+
+def _labels(
+    bag: Any, topic: str, connections: list[Any], received: Sequence[int]
+) -> tuple[list[str], int]:
+    """The last text of a topic at each time of `received`, and the number of times before the first
+    text. Raises FormatError for messages without a text or a number in `data`."""
+    at: list[int] = []
+    texts: list[str] = []
+    for connection, t_ns, raw in bag.messages(connections=connections):
+        value = getattr(bag.deserialize(raw, connection.msgtype), "data", None)
+        if not isinstance(value, str | int | float):
+            raise FormatError(f"{topic} holds {connection.msgtype}; --field needs std_msgs/String")
+        at.append(t_ns)
+        texts.append(str(value))
+    which = np.searchsorted(at, received, side="right") - 1
+    before = int((which < 0).sum())
+    if before == len(received):
+        raise FormatError(f"{topic} says nothing before the last frame; say labels earlier")
+    return [texts[k] if k >= 0 else "" for k in which], before
 
 
 def _numbers(name: str, value: Any) -> Iterator[tuple[str, Any]]:

@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 
 from palpate_train.data.files import octave
-from palpate_train.data.files.table import Array, Entry, ReadPlan, Table, chosen
+from palpate_train.data.files.table import Array, Entry, ReadPlan, Table, chosen, normal
 from palpate_train.data.readers import array_in
 
 CLASS = "MATLAB_class"
@@ -42,7 +42,42 @@ def read(path: Path, wanted: ReadPlan) -> Table:
     with h5py.File(path, "r") as file:
         table = chosen(entries(file), wanted)
         saved = file.visititems(lambda name, one: {CLASS, OCTAVE} & set(one.attrs) or None)
-        return replace(table, reversible=not saved)
+        facts = _facts(file, wanted.variable) if wanted.fields else {}
+        return replace(table, reversible=not saved, facts=facts)
+
+
+def _facts(file: h5py.File, name: str) -> dict[str, str]:
+    """The attributes and single values of the file, of the groups around the array `name` and of
+    that array; the nearest counts."""
+    found: dict[str, str] = {}
+    at: Any = file
+    for part in ("", *filter(None, name.split("/"))):
+        if part and not _holds(at, part):
+            break
+        at = at[part] if part else at
+        inside = [k for k in at if _holds(at, k)] if isinstance(at, h5py.Group) else []
+        single = {k: array_in(at, k) for k in inside if _is_single(at[k])}
+        said = {**single, **at.attrs}
+        found |= {normal(k): _said(v) for k, v in said.items() if np.ndim(v) == 0}
+    return found
+
+
+def _holds(group: Any, name: str) -> bool:
+    """Whether a group holds this member itself: a link may lead to another file."""
+    link = group.get(name, getlink=True) if isinstance(group, h5py.Group) else None
+    return isinstance(link, h5py.HardLink)
+
+
+def _is_single(one: Any) -> bool:
+    return isinstance(one, h5py.Dataset) and one.shape == ()
+
+
+def _said(value: Any) -> str:
+    """A single value as a text."""
+    value = value.item() if isinstance(value, np.generic | np.ndarray) else value
+    if isinstance(value, bytes):
+        return value.decode("utf-8", "replace")
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def entries(file: h5py.File, matlab: bool = False) -> Mapping[str, Entry]:

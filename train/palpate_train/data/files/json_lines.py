@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from palpate.core.errors import FormatError
-from palpate_train.data.files.table import Array, ReadPlan, Table, excerpt, from_columns
+from palpate_train.data.files.table import Array, ReadPlan, Table, excerpt, from_columns, normal
 from palpate_train.data.files.text import decoded, lines_of
 
 SUFFIXES = (".jsonl", ".ndjson", ".json", ".jsonlines")
@@ -19,8 +19,9 @@ SUFFIXES = (".jsonl", ".ndjson", ".json", ".jsonlines")
 def read(data: bytes, wanted: ReadPlan) -> Table:
     """The frames in a text of JSON. Raises FormatError that names the line and the key."""
     text, notes = decoded(data)
-    whole = _whole(text)
+    whole, facts = _whole(text), dict[str, str]()
     if isinstance(whole, dict):
+        facts = {normal(k): str(v) for k, v in whole.items() if isinstance(v, str | int | float)}
         whole, said = _unwrapped(whole, wanted)
         notes += said
     if isinstance(whole, list) and whole and isinstance(whole[0], list | dict):
@@ -34,7 +35,7 @@ def read(data: bytes, wanted: ReadPlan) -> Table:
     while len(frames) > 2 and frames[0][1].keys() != frames[1][1].keys() == frames[2][1].keys():
         notes = [*notes, f"{what} {frames[0][0]} is passed over: it has other keys"]
         frames = frames[1:]
-    return _table(frames, what, notes)
+    return replace(_table(frames, what, notes), facts=facts)
 
 
 def _unwrapped(whole: dict[str, Any], wanted: ReadPlan) -> tuple[Any, list[str]]:

@@ -31,12 +31,14 @@ LONGEST = 40
 class ReadPlan:
     """What to read from a file. variable: the array, sheet, group or topic. time: the name of the
     times. decimal: the decimal sign of text, "" if the text must show it. names_only: read no
-    array, only the names of those that hold frames."""
+    array, only the names of those that hold frames. fields: what --field asks for: columns, facts
+    or topics of text."""
 
     variable: str = ""
     time: str = ""
     decimal: str = ""
     names_only: bool = False
+    fields: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +50,8 @@ class Table:
     the values, such as times, by name. beside: names of vectors, or with names_only of
     arrays of frames, that were not read. texts: text
     columns, one text for each frame, by column number from 0. faults: for each other column with a
-    cell that is not a number, a message about the first. notes: remarks.
+    cell that is not a number, a message about the first. notes: remarks. facts: texts about the
+    whole recording by name, such as attributes.
     reversible: whether a program may have reversed the axes, and the file does not show it.
     """
 
@@ -60,6 +63,7 @@ class Table:
     faults: Mapping[int, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     reversible: bool = False
+    facts: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

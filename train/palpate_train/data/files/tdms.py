@@ -33,7 +33,9 @@ def read(path: Path, wanted: ReadPlan) -> Table:
                 f"holds {len(groups)} groups with numbers, {', '.join(groups) or 'none'}; "
                 "name one with --variable"
             )
-        return _table(groups[name or next(iter(groups))])
+        group = groups[name or next(iter(groups))]
+        facts = {normal(k): str(v) for k, v in {**file.properties, **group.properties}.items()}
+        return replace(_table(group), facts=facts)
 
 
 def _is_numeric(channel: Any) -> bool:
