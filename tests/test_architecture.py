@@ -38,6 +38,7 @@ ALLOWED = {"palpate", "numpy", "onnxruntime", "usb", "gpiod", "serial", "_sha2",
 """What the box may import; the last two are Python's own, from 3.12 on and before."""
 EXTRAS = {
     "web": {"tornado"},
+    "bridges/mqtt.py": {"paho"},
     "bridges/ros.py": {"rclpy", "rcl_interfaces", "diagnostic_msgs", "sensor_msgs", "std_srvs"},
     "bridges/ros_action.py": {"rclpy", "palpate_msgs"},
 }

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from palpate.bridges import command
-from palpate.bridges.options import add_arguments
+from palpate.bridges.options import PORTS, add_arguments
 from palpate.bridges.server import StopEvent
 from tests.factories.paths import ROOT
 
@@ -40,16 +40,20 @@ def eventually(there: Callable[[], bool]) -> None:
 
 @contextmanager
 def bridge(kind: str, *options: str | Path) -> Iterator[tuple[str, int]]:
-    """Run a bridge in a thread, ten times as fast as a process; yields its address."""
+    """Run a bridge in a thread, ten times as fast as a process; yields its address, ("", 0) of a
+    bridge that does not listen."""
+    listen = ("--listen", "127.0.0.1:0") if kind in PORTS else ()
     parser = argparse.ArgumentParser("bridge")
     add_arguments(parser)
-    args = parser.parse_args([kind, "--listen", "127.0.0.1:0", *map(str, options)])
+    args = parser.parse_args([kind, *listen, *map(str, options)])
     there: Future[tuple[str, int]] = Future()
     ended, ends = Future[int](), []
 
     def stop_event() -> StopEvent:
         stop, loop = StopEvent(), asyncio.get_running_loop()
         ends.append(lambda: loop.call_soon_threadsafe(stop.end, 0))
+        if not listen:
+            there.set_result(("", 0))
         return stop
 
     def work() -> None:

@@ -12,9 +12,10 @@ from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 
-from palpate.bridges.options import LINKS, MOST, PORTS, add_arguments
+from palpate.bridges.options import FEED_KINDS, LINKS, MOST, PORTS, add_arguments
 from palpate.bridges.server import TcpServer, address, stop_event, until
 from palpate.bridges.source import FeedSource, LineSource, LinkPort
+from palpate.client.box import Heard
 from palpate.client.feed import Feed
 from palpate.client.line import Line, open_port
 from palpate.core import config, sentences
@@ -27,12 +28,14 @@ from palpate.core.sentences import MOST_FINGERS, Sentence
 from palpate.core.text import printable
 
 EVERY_S = 1.0
+OF_BROKER = ("broker", "login", "ca", "name")
+"""Options of the MQTT bridge, and settings of the same names."""
 
 
 def settle(kind: str, args: argparse.Namespace, settings: Config) -> None:
     """Fill in missing options from the settings of the box. Raises ConfigError if the settings give
     the bridge no serial line."""
-    if args.listen is None:
+    if kind in PORTS and args.listen is None:
         args.listen = f"{settings.bridge.address}:{PORTS[kind]}"
     args.allow_writes = args.allow_writes or settings.bridge.allow_writes
     if kind == "tcp":
@@ -41,10 +44,10 @@ def settle(kind: str, args: argparse.Namespace, settings: Config) -> None:
         return
     if settings.serial.port == LINKS[kind]:
         args.link = Path(LINKS[kind])
-    elif kind == "modbus" and settings.store.feed and not args.allow_writes:
+    elif kind in FEED_KINDS and settings.store.feed and not args.allow_writes:
         args.feed = str(settings.store.feed)
     else:
-        why = " and the feed is read-only" if kind == "modbus" else ""
+        why = " and the feed is read-only" if kind in FEED_KINDS else ""
         raise ConfigError(
             f'serial.port = "{settings.serial.port}" is not a serial line for this bridge{why}; '
             "set serial.port = "
@@ -59,10 +62,19 @@ Served = tuple[TcpServer, str, Callable[[], Awaitable[None]], Callable[[], None]
 def _modbus(args: argparse.Namespace) -> Served:
     from palpate.bridges.modbus import ModbusBridge
 
-    source = FeedSource(args.feed) if args.feed else LineSource(*_port(args), baud=args.baud)
+    source = _source(args)
     bridge = ModbusBridge(source, SystemClock(), writes=args.allow_writes)
     work = partial(asyncio.to_thread, source.refresh)
     return TcpServer(bridge.serve, args.most), source.name, work, source.close
+
+
+def _source(
+    args: argparse.Namespace, heard: Callable[[Heard], None] | None = None
+) -> FeedSource | LineSource:
+    """The box at its feed or at its serial line."""
+    if args.feed:
+        return FeedSource(args.feed, heard=heard)
+    return LineSource(*_port(args), baud=args.baud, heard=heard)
 
 
 def _tcp(args: argparse.Namespace) -> Served:
@@ -111,6 +123,41 @@ def run_server(args: argparse.Namespace, made: Callable[[argparse.Namespace], Se
     codes: list[int] = []
     retried(lambda: codes.append(asyncio.run(serve())), SystemClock())
     return codes[-1]
+
+
+def run_mqtt(args: argparse.Namespace) -> int:
+    """`palpate bridge mqtt`, until SIGTERM. Raises ConfigError without paho or a broker."""
+    try:
+        from palpate.bridges import mqtt, mqtt_options
+    except ImportError as e:
+        raise ConfigError(
+            f"the MQTT client is not installed ({e}); pip install 'palpate[mqtt]'"
+        ) from e
+    settings = config.load(None)
+    settle("mqtt", args, settings)
+    given = {name: getattr(args, name) or getattr(settings.bridge, name) for name in OF_BROKER}
+    broker = mqtt_options.broker(given["broker"], given["login"], given["ca"])
+    name = mqtt_options.box_name(given["name"])
+
+    async def serve() -> int:
+        stop = stop_event()
+        _warn(args)
+        bridge = mqtt.MqttBridge(
+            *(broker, name, partial(_source, args), SystemClock(), stop.is_set),
+            writes=args.allow_writes,
+        )
+        says = "are passed on" if args.allow_writes else "are refused (--allow-writes)"
+        log.info(f"mqtt: box at {bridge.source.name}, topics palpate/{name}; commands {says}")
+        try:
+            await asyncio.gather(
+                until(stop, EVERY_S, partial(asyncio.to_thread, bridge.session)),
+                until(stop, EVERY_S, partial(asyncio.to_thread, bridge.source.refresh)),
+            )
+        finally:
+            bridge.close()
+        return stop.code
+
+    return asyncio.run(serve())
 
 
 def run_ros(args: argparse.Namespace) -> int:
@@ -191,6 +238,7 @@ def run_fuse(args: argparse.Namespace) -> int:
 RUNS: dict[str, Callable[[argparse.Namespace], int]] = {
     "tcp": partial(run_server, made=_tcp),
     "modbus": partial(run_server, made=_modbus),
+    "mqtt": run_mqtt,
     "ros": run_ros,
     "fuse": run_fuse,
 }

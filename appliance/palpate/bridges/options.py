@@ -12,12 +12,15 @@ FEED, BAUD = str(StoreConfig().feed), SerialConfig().baud
 MOST = 16
 """Default for the largest number of connections."""
 PORTS = {"tcp": 1503, "modbus": 1502}
-LINKS = {"tcp": "/run/palpate-tcp/line", "modbus": "/run/palpate-modbus/line"}
+LINKS = {kind: f"/run/palpate-{kind}/line" for kind in ("tcp", "modbus", "mqtt")}
 """Values of `serial.port` for a bridge on the box itself: the link that the bridge makes. Their
 folders belong to palpate-bridge@.service."""
+FEED_KINDS = ("modbus", "mqtt")
+"""Bridges that can read the feed, as long as nobody commands."""
 TEXTS = {
     "tcp": "the sentences of the serial line on a TCP port",
     "modbus": "the box as a Modbus TCP server",
+    "mqtt": "the box at an MQTT broker, with Home Assistant's discovery",
     "ros": "the box as a ROS 2 node",
     "fuse": "the answers of several fingers, each with a unit of its own, as those of one hand",
 }
@@ -41,7 +44,9 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
             add("--port", metavar="PORT", help="the serial line to the robot (serial.port)")
         else:
             _add_ways(one, kind)
-            _add_server(one, kind)
+            text = "peers may start, stop, tare and abort, even if bridge.allow_writes is false"
+            one.add_argument("--allow-writes", action="store_true", help=text)
+            _add_broker(one) if kind == "mqtt" else _add_server(one, kind)
 
 
 def _add_ways(one: argparse.ArgumentParser, kind: str) -> None:
@@ -52,7 +57,7 @@ def _add_ways(one: argparse.ArgumentParser, kind: str) -> None:
     text = f"on the box: make the link PATH; default if serial.port is {LINKS[kind]}"
     way.add_argument("--link", type=Path, metavar="PATH", help=text)
     one.set_defaults(feed=None)
-    if kind == "modbus":
+    if kind in FEED_KINDS:
         text = f"on the box: read the feed at PATH (default {FEED})"
         way.add_argument("--feed", nargs="?", const=FEED, metavar="PATH", help=text)
 
@@ -60,13 +65,21 @@ def _add_ways(one: argparse.ArgumentParser, kind: str) -> None:
 def _add_server(one: argparse.ArgumentParser, kind: str) -> None:
     text = f"default: bridge.address of the settings, and port {PORTS[kind]}"
     one.add_argument("--listen", metavar="HOST:PORT", help=text)
-    text = "peers may start, stop, tare and abort, even if bridge.allow_writes is false"
-    one.add_argument("--allow-writes", action="store_true", help=text)
     if kind == "tcp":
         text = "sentences of at most 80 characters, without their last fields (bridge.short)"
         one.add_argument("--short", action="store_true", help=text)
     text = f"most connections at a time (default {MOST})"
     one.add_argument("--most", type=_number, default=MOST, metavar="N", help=text)
+
+
+def _add_broker(one: argparse.ArgumentParser) -> None:
+    for name, metavar, text in (
+        ("broker", "URL", "mqtt://HOST:PORT, or mqtts://HOST:PORT for TLS (bridge.broker)"),
+        ("login", "FILE", "user on its first line, password on its second (bridge.login)"),
+        ("ca", "FILE", "certificates to trust; default: those of the system (bridge.ca)"),
+        ("name", "NAME", "of the box, in topics; default: of the computer (bridge.name)"),
+    ):
+        one.add_argument(f"--{name}", metavar=metavar, help=text)
 
 
 def _number(text: str) -> int:

@@ -243,13 +243,20 @@ class BridgeConfig:
     address: where it listens, at the port of its kind. allow_writes: whether peers may start, stop,
     tare and abort. A bridge has no password. short: sentences of at most 80 characters on TCP, for
     controllers whose strings hold no more. fingers: units whose answers `palpate bridge fuse`
-    fuses and sends on serial.port, separated by spaces, as in "left right".
+    fuses and sends on serial.port, separated by spaces, as in "left right". broker: of
+    `palpate bridge mqtt`, as mqtt://HOST:PORT or mqtts://HOST:PORT. login: file with its user and
+    password, on a line each. ca: file with the certificates that it trusts; "": the system's. name:
+    of the box in MQTT's topics; "": the computer's.
     """
 
     address: str = "127.0.0.1"
     allow_writes: bool = False
     short: bool = False
     fingers: str = ""
+    broker: str = "mqtt://127.0.0.1:1883"
+    login: str = ""
+    ca: str = ""
+    name: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,17 +15,21 @@ FIRST_S, MOST_S, STEP_S = 1.0, 60.0, 0.2
 
 
 def retried(
-    make: Callable[[], Made], clock: Clock, stopped: Callable[[], bool] = lambda: False
+    make: Callable[[], Made],
+    clock: Clock,
+    stopped: Callable[[], bool] = lambda: False,
+    *,
+    always: bool = False,
 ) -> Made:
     """`make()`; a service tries again with a growing pause as long as an address cannot be used.
     After a power cut the address may come later than the service. Raises AddressError in a
-    terminal, where a person reads it, and once `stopped()`."""
+    terminal, where a person reads it (not if `always`), and once `stopped()`."""
     pause_s = FIRST_S
     while True:
         try:
             return make()
         except AddressError as e:
-            if stopped() or not in_journal():
+            if stopped() or not (always or in_journal()):
                 raise
             if pause_s == FIRST_S:
                 log.warning(f"{e}; trying again, with a pause of up to {MOST_S:g} s")

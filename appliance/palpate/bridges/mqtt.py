@@ -1,0 +1,359 @@
+"""The box at an MQTT broker: verdicts, state and Home Assistant's discovery (docs/robots/mqtt.md).
+
+Each connection has a client object of its own: paho keeps unsent messages, so the same object
+would send them after a reconnection, and we would send our copy. Everything runs in one thread; the
+news of the box comes in another and wakes it.
+"""
+
+from __future__ import annotations
+
+import json
+import select
+import socket
+import ssl
+import threading
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from itertools import islice
+from typing import Any
+
+from paho.mqtt import client as paho
+from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.properties import Properties
+from paho.mqtt.reasoncodes import ReasonCode
+
+from palpate import __version__
+from palpate.bridges.mqtt_options import Broker
+from palpate.bridges.source import COMMANDS, BoxView, Source
+from palpate.client.answers import Answer
+from palpate.client.box import Heard
+from palpate.core import wall_clock
+from palpate.core.clock import Clock
+from palpate.core.errors import AddressError, ApplianceError
+from palpate.core.log import SparseLog, log
+from palpate.core.retry import retried
+
+KEPT = 1000
+"""Verdicts that wait for the broker; then the oldest is dropped and counted."""
+FLYING = 20
+"""Verdicts that the broker has not acknowledged, at most; the others wait here, in order."""
+LATE_NS = 1_000_000_000
+"""A verdict that is sent so long after it was heard is marked late."""
+KEEPALIVE_S = 20
+"""The broker sends the last will if it hears nothing for half as long again."""
+CONNECT_S = 5.0
+TICK_S = 0.5
+"""Longest time between two looks at the state of the box and at the end of the program."""
+MOST_BYTES = 1024
+"""Largest packet that the broker may send: commands are short."""
+PACE_NS = 5_000_000
+"""Pause after each command, so that a flood leaves the other programs of the computer their
+share."""
+WITH_WILL = ReasonCode(PacketTypes.DISCONNECT, "Disconnect with will message")
+BROKEN = (OSError, ValueError, TypeError, LookupError, AttributeError)
+"""What paho raises for packets that are none, and for a connection that is not to be had."""
+PERCENT = {"unit_of_measurement": "%", "state_class": "measurement"}
+QUIET = ("finger", "fingers", "time_s", "source", "missed", "share")
+"""Fields of an answer that a verdict leaves out, or has in another form."""
+
+
+ENTITIES: tuple[tuple[str, str, str, Mapping[str, str]], ...] = (
+    ("verdict", "verdict", "value_json.material or value_json.status", {}),
+    ("probability", "verdict", "(100 * value_json.probability) | round(1)", PERCENT),
+    ("status", "verdict", "value_json.status", {}),
+    ("reason", "verdict", "(value_json.reason | string)[:255]", {}),
+    ("ready", "state", "'ON' if value_json.ready else 'OFF'", {"platform": "binary_sensor"}),
+    ("skin", "state", "value_json.skin", {}),
+    ("bundle", "state", "value_json.bundle", {}),
+    ("sweeps", "state", "value_json.answered", {"state_class": "total_increasing"}),
+)
+"""What Home Assistant shows: its name, the topic, the expression for its value (a state has at most
+255 characters), and other fields."""
+
+
+def discovery(name: str, *, writes: bool) -> dict[str, Any]:
+    """Home Assistant's discovery of the whole device in one message. name: of the box. writes: with
+    a button for each command."""
+    base, box = f"palpate/{name}", f"palpate_{name}"
+    parts: dict[str, dict[str, Any]] = {}
+    for key, topic, value, more in ENTITIES:
+        parts[key] = {"platform": "sensor", "unique_id": f"{box}_{key}", "name": key.capitalize()}
+        parts[key] |= {"state_topic": f"{base}/{topic}", "value_template": f"{{{{ {value} }}}}"}
+        parts[key] |= more
+    parts["verdict"]["json_attributes_topic"] = f"{base}/verdict"
+    for command in COMMANDS if writes else ():
+        button = {"platform": "button", "unique_id": f"{box}_{command.lower()}"}
+        button |= {"name": command.capitalize(), "command_topic": f"{base}/command"}
+        parts[command.lower()] = button | {"payload_press": command}
+    about = {"name": f"Palpate {name}", "manufacturer": "Palpate", "sw_version": __version__}
+    return {
+        "device": {"identifiers": [box], **about},
+        "origin": {"name": "palpate", "sw_version": __version__},
+        "availability_topic": f"{base}/status",
+        "qos": 1,
+        "components": parts,
+    }
+
+
+def state(view: BoxView, dropped: int) -> dict[str, Any]:
+    """The content of the topic state. dropped: verdicts that the broker will not get."""
+    fields: dict[str, Any] = {"ready": False, "skin": "", "bundle": view.bundle, "answered": 0}
+    if one := view.state:
+        fields |= {"ready": one.ready, "skin": one.skin, "sweeping": one.sweeping}
+        fields |= {"bundle": one.bundle, "answered": one.answered, "degraded": one.degraded}
+        fields |= {"lost_frames": one.lost_frames, "source": one.source}
+    return fields | {"missed": view.missed, "dropped": dropped}
+
+
+def verdict(answer: Answer) -> dict[str, Any]:
+    """The content of the topic verdict, without `late`. `material` is the label if it can be
+    used, else ""."""
+    fields = {name: value for name, value in asdict(answer).items() if name not in QUIET}
+    fields |= {"material": answer.label if answer.known else "", "early": answer.early}
+    fields |= {"reason": "" if answer.known else answer.what_to_do}
+    fingers = {one.finger: {"status": one.status, "label": one.label} for one in answer.fingers}
+    return fields | ({"fingers": fingers} if fingers else {})
+
+
+@dataclass(frozen=True, slots=True)
+class Waiting:
+    """A verdict that the broker has not acknowledged. number: counts all verdicts."""
+
+    number: int
+    heard_ns: int
+    fields: Mapping[str, Any]
+
+
+class MqttBridge:
+    """Publishes the news of `source(heard)` at the broker, and takes commands if `writes`.
+
+    name: of the box, in topics. stopped: whether the program is to end.
+    """
+
+    def __init__(
+        self,
+        broker: Broker,
+        name: str,
+        source: Callable[[Callable[[Heard], None]], Source],
+        clock: Clock,
+        stopped: Callable[[], bool],
+        *,
+        writes: bool,
+    ) -> None:
+        self.dropped = 0
+        self._broker, self._name, self._base = broker, name, f"palpate/{name}"
+        self._clock, self._stopped, self._writes = clock, stopped, writes
+        self._log = SparseLog(clock.now_ns)
+        self._lock = threading.Lock()
+        self._waiting: deque[Waiting] = deque(maxlen=KEPT)
+        self._heard = self._next = 0  # verdicts so far; number of the next to send
+        self._flying: dict[int, int] = {}  # message id -> number of its verdict
+        self._said: dict[str, str] = {}  # what the retained topics hold
+        self._refused = ""
+        self._there = False
+        self._replies: deque[str] = deque(maxlen=FLYING)
+        self._commanding = threading.Lock()
+        self._woken, self._wakes = socket.socketpair()
+        for end in (self._woken, self._wakes):
+            end.setblocking(False)
+        self.source = source(self._take)
+
+    def close(self) -> None:
+        """Close the connection to the box."""
+        self.source.close()
+        self._woken.close()
+        self._wakes.close()
+
+    def _take(self, news: Heard) -> None:
+        """News of the box, in the thread that reads it."""
+        if isinstance(news, Answer):
+            # both clocks now: the box's own time may be of another computer
+            fields = {"time": wall_clock.date(), **verdict(news)}
+            with self._lock:
+                self.dropped += len(self._waiting) == KEPT
+                self._waiting.append(Waiting(self._heard, self._clock.now_ns(), fields))
+                self._heard += 1
+        self._wake()
+
+    def _wake(self) -> None:
+        try:
+            self._wakes.send(b".")
+        except OSError:  # full, so it wakes anyway; or closed
+            return
+
+    def session(self) -> None:
+        """One connection, from the first try to its loss or the end of the program."""
+        try:
+            client = retried(self._connect, self._clock, self._stopped, always=True)
+        except AddressError:
+            if self._stopped():
+                return
+            raise
+        log.info(f"mqtt: connected to {self._broker}")
+        self._next, self._said = 0, {}
+        self._flying.clear()
+        try:
+            self._greet(client)
+            while self._there and not self._stopped():
+                self._publish(client)
+                self._turn(client)
+            if self._there:  # the will tells everybody
+                client.disconnect(WITH_WILL)
+                self._turn(client)
+        except BROKEN as e:
+            self._refused = f"a packet that cannot be read ({type(e).__name__})"
+        finally:
+            _end(client)
+        if not self._stopped():
+            why = f": {self._refused}" if self._refused else ""
+            log.warning(f"mqtt: {self._broker} has ended the connection{why}; connecting again")
+
+    def _connect(self) -> paho.Client:
+        """A client that the broker has accepted. Raises AddressError."""
+        client = self._client()
+        self._there, self._refused = False, ""
+        end_ns = self._clock.now_ns() + round(CONNECT_S * 1e9)
+        properties = Properties(PacketTypes.CONNECT)
+        properties.MaximumPacketSize = MOST_BYTES
+        try:
+            client.connect(
+                *(self._broker.host, self._broker.port, KEEPALIVE_S),
+                clean_start=True,
+                properties=properties,
+            )
+            while not self._there and not self._refused and self._clock.now_ns() < end_ns:
+                self._turn(client)
+                if client.socket() is None:
+                    self._refused = self._refused or "it has closed the connection"
+        except BROKEN as e:
+            self._refused = str(getattr(e, "strerror", None) or e).lower() or type(e).__name__
+        if self._there:
+            return client
+        _end(client)
+        raise AddressError(
+            f"broker {self._broker}: {self._refused or f'no answer within {CONNECT_S:g} s'}; check "
+            "its address, --login and --ca, and whether it speaks MQTT 5"
+        )
+
+    def _client(self) -> paho.Client:
+        client = paho.Client(
+            CallbackAPIVersion.VERSION2,
+            client_id=f"palpate-{self._name}",
+            protocol=paho.MQTTv5,
+            reconnect_on_failure=False,
+        )
+        client.connect_timeout = CONNECT_S
+        if self._broker.user:
+            client.username_pw_set(self._broker.user, self._broker.password)
+        if self._broker.tls:
+            client.tls_set_context(ssl.create_default_context(cafile=self._broker.ca or None))
+        client.will_set(f"{self._base}/status", "offline", qos=1, retain=True)
+        client.on_connect = self._connected
+        client.on_disconnect = self._disconnected
+        client.on_publish = self._acknowledged
+        client.on_message = self._command
+        return client
+
+    def _connected(self, client: Any, data: Any, flags: Any, why: ReasonCode, more: Any) -> None:
+        self._there = not why.is_failure
+        self._refused = str(why).lower() if why.is_failure else ""
+
+    def _disconnected(self, client: Any, data: Any, flags: Any, why: Any, more: Any) -> None:
+        self._there = False
+        if flags.is_disconnect_packet_from_server:
+            self._refused = str(why).lower()
+            if why == ReasonCode(PacketTypes.DISCONNECT, "Session taken over"):
+                self._refused += f" by another box {self._name}: give each box its own --name"
+
+    def _acknowledged(self, client: Any, data: Any, mid: int, why: ReasonCode, more: Any) -> None:
+        if why.is_failure:
+            self._log.warning(f"mqtt: {self._broker} refuses a message: {why}; see its rules")
+        done = self._flying.pop(mid, None)
+        with self._lock:
+            while done is not None and self._waiting and self._waiting[0].number <= done:
+                self._waiting.popleft()
+
+    def _greet(self, client: paho.Client) -> None:
+        config = json.dumps(discovery(self._name, writes=self._writes))
+        client.publish(f"homeassistant/device/palpate_{self._name}/config", config, 1, retain=True)
+        if self._writes:  # each at most once: a late START would be a wrong one
+            client.subscribe(f"{self._base}/command", qos=0)
+
+    def _publish(self, client: paho.Client) -> None:
+        """Send new verdicts, state and replies."""
+        now_ns = self._clock.now_ns()
+        view = self.source.view()
+        self._say(client, "status", "online" if view.alive(now_ns) else "offline")
+        with self._lock:
+            first = self._waiting[0].number if self._waiting else self._heard
+            self._next = max(self._next, first)
+            at = self._next - first
+            due = [*islice(self._waiting, at, at + FLYING - len(self._flying))]
+        for one in due:
+            text = json.dumps({**one.fields, "late": now_ns - one.heard_ns > LATE_NS})
+            sent = client.publish(f"{self._base}/verdict", text, qos=1, retain=True)
+            self._flying[sent.mid], self._next = one.number, one.number + 1
+        self._say(client, "state", json.dumps(state(view, self.dropped)))
+        while self._replies:
+            client.publish(f"{self._base}/reply", self._replies.popleft(), qos=1)
+
+    def _say(self, client: paho.Client, topic: str, text: str) -> None:
+        """Publish the content of a retained topic if it has changed."""
+        if self._said.get(topic) != text:
+            self._said[topic] = text
+            client.publish(f"{self._base}/{topic}", text, qos=1, retain=True)
+
+    def _turn(self, client: paho.Client) -> None:
+        """Wait for the broker or for news, and read and write. Raises BROKEN."""
+        line = client.socket()
+        if line is None:
+            self._there = False
+            return
+        more = isinstance(line, ssl.SSLSocket) and line.pending() > 0
+        writes = [line] if client.want_write() else []
+        ready = select.select([line, self._woken], writes, [], 0 if more else TICK_S)
+        if self._woken in ready[0]:
+            self._woken.recv(4096)
+        code = MQTTErrorCode.MQTT_ERR_SUCCESS
+        if more or line in ready[0]:
+            code = client.loop_read()
+        if not code and line in ready[1]:
+            code = client.loop_write()
+        if code or client.loop_misc():
+            self._there = False
+
+    def _command(self, client: Any, data: Any, message: paho.MQTTMessage) -> None:
+        """Begin a command; its reply comes later."""
+        self._clock.sleep_until(self._clock.now_ns() + PACE_NS)
+        name = message.payload[:16].decode("ascii", "replace").strip()
+        if message.retain or not self._writes:
+            return
+        if name not in COMMANDS:
+            self._reply(name, f"error: not a command; use {', '.join(COMMANDS)}")
+        elif not self._commanding.acquire(blocking=False):
+            self._reply(name, "error: another command is under way; send it again")
+        else:
+            threading.Thread(target=self._carry_out, args=(name,), daemon=True).start()
+
+    def _carry_out(self, name: str) -> None:
+        try:
+            said = self.source.send(name)
+        except ApplianceError as e:
+            self._log.warning(f"mqtt: {name}: {e}")
+            said = f"error: {e}"
+        finally:
+            self._commanding.release()
+        self._reply(name, said)
+
+    def _reply(self, name: str, said: str) -> None:
+        self._replies.append(json.dumps({"command": name, "reply": said}))
+        self._wake()
+
+
+def _end(client: paho.Client) -> None:
+    """Close the connection at once; without DISCONNECT the broker sends the will."""
+    line = client.socket()
+    if line is not None:
+        line.close()

@@ -1,0 +1,254 @@
+"""The MQTT bridge at Debian's mosquitto, seen by mosquitto_sub; and brokers that refuse, break off,
+or send what is no MQTT."""
+
+from __future__ import annotations
+
+import json
+import socket
+import subprocess
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from palpate.bridges.mqtt_options import box_name, broker
+from palpate.bridges.source import COMMANDS
+from palpate.core import retry
+from palpate.core.errors import ConfigError
+from tests.factories.bridges import LONG_S, bridge, eventually
+from tests.factories.brokers import Mosquitto, Subscriber, free_port, required
+from tests.factories.speaking_box import SpeakingBox, result, state
+
+mqtt = pytest.importorskip("palpate.bridges.mqtt", reason="palpate[mqtt] is not installed")
+pytestmark = pytest.mark.usefixtures("hurried")
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[Mosquitto]:
+    """A broker for everybody."""
+    required()
+    with Mosquitto(tmp_path) as one:
+        yield one
+
+
+@pytest.fixture(autouse=True)
+def soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pauses of hundredths of a second between two tries."""
+    monkeypatch.setattr(retry, "FIRST_S", 0.02)
+    monkeypatch.setattr(retry, "MOST_S", 0.05)
+
+
+def options(server: Mosquitto, box: SpeakingBox, *more: str) -> tuple[str, ...]:
+    """The options of a bridge from the box to the broker."""
+    return ("--port", str(box.path), "--broker", server.url, "--name", "b1", *more)
+
+
+def online(box: SpeakingBox, one: Subscriber) -> None:
+    """Wait until the box is heard through the bridge, which opens the line in its own time."""
+    eventually(lambda: box.say(state()) or one.last("b1/status") == "online")
+
+
+@pytest.mark.slow
+def test_another_client_reads_the_verdict(server, box):
+    """mosquitto_sub gets verdict, state and status, and the same retained ones later."""
+    with Subscriber(server.port, "palpate/#") as one, bridge("mqtt", *options(server, box)):
+        online(box, one)
+        box.say(result(7, label="paper"), state(answered=1))
+        eventually(lambda: one.last("/verdict") and '"answered": 1' in one.last("/state"))
+        fields = json.loads(one.last("/verdict"))
+        wanted = {"sweep": 7, "status": "ok", "label": "paper", "material": "paper"}
+        assert fields | wanted | {"probability": 0.9, "late": False} == fields
+        assert json.loads(one.last("/state"))["ready"] is True
+        assert one.last("/status") == "online"
+        with Subscriber(server.port, "palpate/#") as later:
+            for topic in ("/status", "/verdict", "/state"):
+                eventually(lambda topic=topic: later.last(topic) == one.last(topic))
+
+
+@pytest.mark.slow
+def test_nothing_is_lost_while_the_broker_is_away(server, box, monkeypatch):
+    """The newest verdicts come in order after the broker is back, marked late; older ones are
+    counted. The verdict after them is not late."""
+    monkeypatch.setattr(mqtt, "KEPT", 50)
+    monkeypatch.setattr(mqtt, "LATE_NS", 200_000_000)
+    with bridge("mqtt", *options(server, box)):
+        with Subscriber(server.port) as before:
+            online(box, before)
+        server.stop()
+        for number in range(1, 61):
+            box.say(result(number))
+        threading.Event().wait(0.5)
+        server.start()
+        with Subscriber(server.port) as one:
+            eventually(lambda: '"dropped": 10' in one.last("/state"))
+            box.say(state(), result(61))
+            eventually(lambda: one.all("/verdict")[-1:] and one.all("/verdict")[-1]["sweep"] == 61)
+            # what was sent before this client subscribed, only the retained one is left of
+            found = {each["sweep"]: each["late"] for each in one.all("/verdict")}
+            assert [*found] == sorted(found)
+            assert not found.pop(61)
+            assert all(found.values())
+
+
+@pytest.mark.slow
+def test_the_backlog_is_complete(server, box):
+    """A subscriber whose session outlives the pause of the broker gets all 200 verdicts, each at
+    least once, in order."""
+    with Subscriber(server.port, kept=True) as one, bridge("mqtt", *options(server, box)):
+        online(box, one)
+        server.stop()
+        for number in range(1, 201):
+            box.say(result(number))
+        server.start()
+        eventually(lambda: one.last("/verdict") and one.all("/verdict")[-1]["sweep"] == 200)
+        assert [*dict.fromkeys(e["sweep"] for e in one.all("/verdict"))] == [*range(1, 201)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ending", ["stopped", "box"])
+def test_the_status_when_it_ends(server, box, ending):
+    """offline, retained: when the bridge ends, and when the box is not heard."""
+    with Subscriber(server.port) as one:
+        with bridge("mqtt", *options(server, box)):
+            online(box, one)
+            if ending == "box":
+                eventually(lambda: one.last("/status") == "offline")
+        eventually(lambda: one.last("/status") == "offline")
+        said = [text for name, text in one.messages if name.endswith("/status")]
+        assert "online" in said[: said.index("offline", said.index("online"))]
+
+
+@pytest.mark.slow
+def test_commands_only_where_they_are_allowed(server, box):
+    """Without --allow-writes nothing is subscribed to; with it each command reaches the box, and a
+    retained or an unknown one does not."""
+    with Subscriber(server.port) as one:
+        with bridge("mqtt", *options(server, box)):
+            online(box, one)
+            one.publish("palpate/b1/command", "START")
+        assert "START" not in [each.kind for each in box.heard]
+        one.publish("palpate/b1/command", "TARE", retain=True)
+        with bridge("mqtt", *options(server, box, "--allow-writes")):
+            eventually(lambda: one.last("b1/status") == "offline")
+            online(box, one)
+            for number, command in enumerate(("NEW", "START", "FORMAT", "STOP"), 1):
+                one.publish("palpate/b1/command", command)
+                eventually(lambda number=number: len(one.all("/reply")) == number)
+    assert [e.kind for e in box.heard if e.kind in COMMANDS] == ["NEW", "START", "STOP"]
+    assert ["error" in each["reply"] for each in one.all("/reply")] == [False, False, True, False]
+
+
+@pytest.mark.slow
+def test_a_flood_of_commands(server, box):
+    """Verdicts go on, and every command is carried out or refused."""
+    with Subscriber(server.port) as one, bridge("mqtt", *options(server, box, "--allow-writes")):
+        online(box, one)
+        one.publish("palpate/b1/command", *["x" * 900] * 300)
+        box.say(result(9))
+        eventually(lambda: one.all("/verdict")[-1:] and one.all("/verdict")[-1]["sweep"] == 9)
+        eventually(lambda: one.all("/reply") != [])
+        assert all("error" in each["reply"] for each in one.all("/reply"))
+
+
+@pytest.mark.slow
+def test_login_and_a_wrong_one(tmp_path, box, caplog):
+    """A broker with passwords: the right one is taken; a wrong one is refused, with a reason, and
+    tried again."""
+    required()
+    users = tmp_path / "users"
+    subprocess.run(
+        ["mosquitto_passwd", "-b", "-c", users, "box", "s3cret"], check=True, timeout=LONG_S
+    )
+    login = tmp_path / "login"
+    login.touch(0o600)
+    with Mosquitto(tmp_path, f"password_file {users}", anonymous=False) as server:
+        login.write_text("box\nnot-s3cret\n")
+        with bridge("mqtt", *options(server, box, "--login", str(login))):
+            eventually(lambda: "not authorized" in caplog.text)
+        login.write_text("box\ns3cret\n")
+        with bridge("mqtt", *options(server, box, "--login", str(login))):
+            eventually(lambda: "connected to" in caplog.text)
+    assert "s3cret" not in caplog.text
+
+
+@pytest.mark.parametrize("speech", [b"", b"HTTP/1.1 400\r\n\r\n", b"\x20\x03\x00\x00\x00\xff" * 9])
+def test_no_broker_at_the_address(box, caplog, speech):
+    """Something else answers, or closes: a reason is logged, the bridge goes on, and ends when
+    asked."""
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        ending = threading.Event()
+        other.settimeout(0.1)
+
+        def serve() -> None:
+            while not ending.is_set():
+                try:
+                    connection, _ = other.accept()
+                except TimeoutError:
+                    continue
+                with connection:
+                    connection.sendall(speech)
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        try:
+            url = f"mqtt://127.0.0.1:{other.getsockname()[1]}"
+            with bridge("mqtt", "--port", str(box.path), "--broker", url):
+                eventually(lambda: "broker 127.0.0.1" in caplog.text or "ended" in caplog.text)
+                assert "Traceback" not in caplog.text
+        finally:
+            ending.set()
+            thread.join(LONG_S)
+
+
+@pytest.mark.parametrize(
+    "url", ["127.0.0.1", "http://x", "mqtt://", "mqtt://u:p@x", "mqtt://x/y", "mqtt://x:99999"]
+)
+def test_addresses_that_are_none(url):
+    """Each is refused; a password in it is not repeated."""
+    with pytest.raises(ConfigError) as refused:
+        broker(url, "", "")
+    assert "u:p" not in str(refused.value)
+
+
+def test_login_files(tmp_path):
+    """A file that all may read, or without two lines, is refused; so is a CA that is missing."""
+    file = tmp_path / "login"
+    file.write_text("a\nb\n")
+    file.chmod(0o604)
+    with pytest.raises(ConfigError, match="chmod"):
+        broker("mqtt://x", str(file), "")
+    file.chmod(0o600)
+    assert broker("mqtts://x", str(file), "").user == "a"
+    assert broker("mqtts://x", "", "").port == 8883
+    file.write_text("a")
+    with pytest.raises(ConfigError, match="two lines"):
+        broker("mqtt://x", str(file), "")
+    with pytest.raises(ConfigError, match="PEM"):
+        broker("mqtts://x", "", str(tmp_path / "none"))
+    with pytest.raises(ConfigError, match="a/b"):
+        box_name("a/b")
+    assert box_name("")
+
+
+def test_discovery_has_what_home_assistant_asks_for():
+    """Each entity has a platform, an id of its own, and a topic; buttons only with writes."""
+    read, written = (mqtt.discovery("b1", writes=writes) for writes in (False, True))
+    for found in (read, written):
+        ids = [each["unique_id"] for each in found["components"].values()]
+        assert len({*ids}) == len(ids)
+        assert found["origin"]["name"]
+        assert found["device"]["identifiers"]
+        for each in found["components"].values():
+            topic = "command_topic" if each["platform"] == "button" else "state_topic"
+            assert each[topic].startswith("palpate/b1/")
+    pressed = {e["payload_press"] for e in written["components"].values() if "payload_press" in e}
+    assert pressed == {*COMMANDS}
+    assert not [e for e in read["components"].values() if e["platform"] == "button"]
+
+
+def test_nobody_listens_at_the_port(box, caplog):
+    """A warning says where, and the bridge goes on trying."""
+    with bridge("mqtt", "--port", str(box.path), "--broker", f"mqtt://127.0.0.1:{free_port()}"):
+        eventually(lambda: "refused" in caplog.text)
+        assert "--login" in caplog.text
