@@ -41,6 +41,9 @@ PATHS = {
     "systemd/palpate-teach.path": "/etc/systemd/system/palpate-teach.path",
     "systemd/palpate-teach.service": "/etc/systemd/system/palpate-teach.service",
     "systemd/palpate-bridge@.service": "/etc/systemd/system/palpate-bridge@.service",
+    "systemd/palpate-memory.conf": (
+        "/etc/systemd/system/palpate-bridge@memory.service.d/palpate-memory.conf"
+    ),
     "systemd/palpate.sysusers": "/usr/lib/sysusers.d/palpate.conf",
     "systemd/palpate.tmpfiles": "/usr/lib/tmpfiles.d/palpate.conf",
     "firmware_config/70-palpate.rules": "/etc/udev/rules.d/70-palpate.rules",

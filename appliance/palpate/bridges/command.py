@@ -235,10 +235,36 @@ def run_fuse(args: argparse.Namespace) -> int:
             line.close()
 
 
+def run_memory(args: argparse.Namespace) -> int:
+    """`palpate bridge memory`, until SIGTERM. Raises TemporaryError if the file is not to be had,
+    ConfigError without a feed."""
+    from palpate.bridges.memory import MemoryBridge
+    from palpate.client.verdicts import VerdictFile
+
+    settings = config.load(None)
+    path = args.feed or settings.store.feed
+    if not path:
+        raise ConfigError('store.runtime = "" turns the feed off; set it to a folder')
+    memory = MemoryBridge(
+        Feed(path), VerdictFile(args.file or Path(settings.bridge.memory)), SystemClock()
+    )
+
+    async def serve() -> int:
+        stop = stop_event()
+        await until(stop, 0, partial(asyncio.to_thread, memory.work))
+        return stop.code
+
+    try:
+        return asyncio.run(serve())
+    finally:
+        memory.close()
+
+
 RUNS: dict[str, Callable[[argparse.Namespace], int]] = {
     "tcp": partial(run_server, made=_tcp),
     "modbus": partial(run_server, made=_modbus),
     "mqtt": run_mqtt,
+    "memory": run_memory,
     "ros": run_ros,
     "fuse": run_fuse,
 }

@@ -21,6 +21,7 @@ TEXTS = {
     "tcp": "the sentences of the serial line on a TCP port",
     "modbus": "the box as a Modbus TCP server",
     "mqtt": "the box at an MQTT broker, with Home Assistant's discovery",
+    "memory": "every verdict of 90 days in a file, for palpate status --since",
     "ros": "the box as a ROS 2 node",
     "fuse": "the answers of several fingers, each with a unit of its own, as those of one hand",
 }
@@ -35,6 +36,10 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         if kind == "ros":
             text = "parameters and names of ROS; the last option"
             add("--ros-args", nargs=argparse.REMAINDER, default=[], metavar="...", help=text)
+            continue
+        if kind == "memory":
+            add("--feed", metavar="PATH", help="the box's feed (store.runtime)")
+            add("--file", type=Path, metavar="FILE", help="SQLite (bridge.memory)")
             continue
         text = f"baud rate of the serial line (default {BAUD})"
         add("--baud", type=int, default=BAUD, metavar="N", help=text)

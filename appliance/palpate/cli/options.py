@@ -32,6 +32,14 @@ def _seconds(text: str, least: float = 1.0) -> float:
     return seconds
 
 
+def _span(text: str) -> float:
+    """Seconds of a number of minutes, hours or days."""
+    unit = {"m": 60.0, "h": 3600.0, "d": 86400.0}.get(text[-1:])
+    if unit is None or not text[:-1].isdecimal() or len(text) > 6:
+        raise argparse.ArgumentTypeError(f"{text} is not a time; use 30m, 8h or 30d")
+    return int(text[:-1]) * unit
+
+
 def _option(name: str, help: str, **how: Any) -> tuple[str, dict[str, Any]]:
     return name, {"help": help, **how}
 
@@ -119,6 +127,13 @@ OPTIONS: Mapping[str, tuple[str, dict[str, Any]]] = {
     ),
     "acts": _option("--acts", argparse.SUPPRESS, type=Path, metavar="FILE"),
     "json": _flag("--json", "print it as JSON", default=argparse.SUPPRESS),
+    "since": _option(
+        "--since",
+        "what the verdicts of this time were, such as 8h or 30d (palpate bridge memory)",
+        type=_span,
+        default=None,
+        metavar="SPAN",
+    ),
     "feed": _flag("--json", "the feed's lines as they are (PROTOCOL.md, part 4)"),
     "watch-page": _web(f"as a page; {_OPEN}"),
     "record-page": _web(f"also as a page, on which the labels are set; {_OPEN}"),

@@ -20,6 +20,8 @@ def run(args: argparse.Namespace) -> int:
     """Print the state of the service; 69 if it waits for the skin, 1 if it does not run."""
     from palpate.core import settings_files
 
+    if args.since is not None:
+        return show_since(args)
     folder = settings_files.runtime(
         settings_files.read(args.board, args.set, folder=args.config_dir)
     )
@@ -29,6 +31,28 @@ def run(args: argparse.Namespace) -> int:
             " service"
         )
     return show(str(folder), as_json=args.json)
+
+
+def show_since(args: argparse.Namespace) -> int:
+    """Print how often each status and label came since then, or all verdicts as JSON. Raises
+    FeedError."""
+    import json
+    from pathlib import Path
+
+    from palpate.cli.common import load_settings
+    from palpate.client import verdicts
+    from palpate.core import wall_clock
+
+    path = Path(load_settings(args).bridge.memory)
+    from_s = wall_clock.seconds() - args.since
+    if args.json:
+        print(json.dumps([*verdicts.since(path, from_s)], indent=1))
+        return 0
+    found = verdicts.counts(path, from_s)
+    print(f"{sum(found.values())} sweeps since {wall_clock.of(from_s)}")
+    for (word, label), n in found.items():
+        print(f"{n:8}  {word:<12}  {label}".rstrip())
+    return 0
 
 
 def show(folder: str = runtime_folder.RUNTIME, *, as_json: bool) -> int:

@@ -246,7 +246,7 @@ class BridgeConfig:
     fuses and sends on serial.port, separated by spaces, as in "left right". broker: of
     `palpate bridge mqtt`, as mqtt://HOST:PORT or mqtts://HOST:PORT. login: file with its user and
     password, on a line each. ca: file with the certificates that it trusts; "": the system's. name:
-    of the box in MQTT's topics; "": the computer's.
+    of the box in MQTT's topics; "": the computer's. memory: file of `palpate bridge memory`.
     """
 
     address: str = "127.0.0.1"
@@ -257,6 +257,7 @@ class BridgeConfig:
     login: str = ""
     ca: str = ""
     name: str = ""
+    memory: str = "/var/lib/palpate-memory/verdicts.db"
 
 
 @dataclass(frozen=True, slots=True)

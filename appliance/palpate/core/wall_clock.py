@@ -4,6 +4,16 @@ is decided by it: times that are compared come from `clock`."""
 from datetime import UTC, datetime
 
 
+def seconds() -> float:
+    """Seconds since 1970."""
+    return datetime.now(UTC).timestamp()
+
+
 def date() -> str:
     """Date and time in UTC, to the second: "2026-11-26T09:05:00+00:00"."""
     return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def of(at_s: float) -> str:
+    """Seconds since 1970 as a date and time of this computer's zone, to the second."""
+    return datetime.fromtimestamp(at_s).astimezone().isoformat(" ", "seconds")

@@ -1,0 +1,57 @@
+"""Writes every verdict of the feed into a file of verdicts (client/verdicts.py)."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections import deque
+from collections.abc import Mapping
+from typing import Any
+
+from palpate.client.feed import Feed
+from palpate.client.verdicts import VerdictFile
+from palpate.core import wall_clock
+from palpate.core.clock import Clock
+from palpate.core.log import SparseLog
+
+READ_S = 0.5
+KEPT = 1000
+"""Verdicts that wait for a disk that is full or busy; then the oldest is lost."""
+
+
+class MemoryBridge:
+    """Takes the verdicts of `feed`, and writes them to `file`. clock: of the feed's time stamps."""
+
+    def __init__(self, feed: Feed, file: VerdictFile, clock: Clock) -> None:
+        self._feed, self._file, self._clock = feed, file, clock
+        self._waiting: deque[tuple[float, Mapping[str, Any]]] = deque(maxlen=KEPT)
+        self._log = SparseLog(clock.now_ns)
+
+    def close(self) -> None:
+        """Close both."""
+        self._feed.close()
+        self._file.close()
+
+    def work(self) -> None:
+        """Wait for a line of the feed for up to READ_S, and write what is there."""
+        line = self._feed.read(READ_S)
+        if line and line["type"] == "lost":
+            self._log.warning(f"memory: {line.get('lines')} lines of the feed were lost")
+        if line and line["type"] == "verdict":
+            try:
+                age_s = (self._clock.now_ns() - line["time_ns"]) / 1e9
+                found = {**line, "latency_ms": line["latency_ns"] / 1e6}
+            except (KeyError, TypeError) as e:  # of a later version
+                self._log.warning(f"memory: a verdict is left out ({e!r}); update this bridge")
+                return
+            self._waiting.append((wall_clock.seconds() - age_s, found))
+        try:
+            while self._waiting:
+                self._file.add(*self._waiting[0])
+                self._waiting.popleft()
+        except sqlite3.OperationalError as e:
+            self._log.warning(
+                f"memory: {e}; {len(self._waiting)} verdicts wait, make room on the disk"
+            )
+        except sqlite3.Error as e:
+            self._waiting.popleft()
+            self._log.warning(f"memory: a verdict is left out ({e}); update this bridge")

@@ -1,0 +1,140 @@
+"""Every verdict of the last 90 days in an SQLite file, which outlives restarts and power cuts.
+
+One process writes (`palpate bridge memory`), any number read. Each verdict is on the disk before
+the next is taken; the loop of the box knows nothing of it.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator, Mapping
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+from palpate.core.errors import FeedError, TemporaryError
+from palpate.core.log import log
+
+DAYS, MOST_MIB = 90, 64
+"""Older verdicts are deleted, and the oldest of a larger file."""
+DAY_S = 86_400
+EVERY = 100
+"""Verdicts between two looks at age and size."""
+WAIT_S = 10.0
+"""Longest wait for another program that has the file open."""
+COLUMNS = {
+    "at": "REAL NOT NULL",
+    "sweep": "INTEGER NOT NULL",
+    "status": "TEXT NOT NULL",
+    "label": "TEXT NOT NULL",
+    "probability": "REAL",
+    "margin": "REAL",
+    "fused": "INTEGER",
+    "lost": "INTEGER",
+    "latency_ms": "REAL",
+    "bundle": "TEXT",
+    "detail": "TEXT",
+}
+"""Columns after `number`, which counts on over restarts. at: seconds since 1970, of this computer's
+clock. STRICT: SQLite would take a number of a wrong kind as bytes, which count as 0."""
+
+
+class VerdictFile:
+    """The file at `path`, for its one writer. A file that is damaged is moved aside. Raises
+    TemporaryError if it cannot be opened."""
+
+    def __init__(self, path: Path, *, most_mib: float = MOST_MIB) -> None:
+        self._path, self._most, self._since = path, most_mib * (1 << 20), 0
+        try:
+            self._db = self._open()
+        except sqlite3.OperationalError as e:
+            raise TemporaryError(f"{path}: {e}; name a file in a folder of your own") from e
+        except sqlite3.DatabaseError as e:
+            aside = path.with_suffix(".damaged")
+            log.warning(f"{path}: {e}; it is kept as {aside}, and a new one begins")
+            path.rename(aside)
+            for end in ("-wal", "-shm"):
+                path.with_name(path.name + end).unlink(missing_ok=True)
+            self._db = self._open()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._db.close()
+
+    def add(self, at_s: float, verdict: Mapping[str, Any]) -> None:
+        """Write a verdict. at_s: seconds since 1970. Raises sqlite3.Error, such as for a full
+        disk."""
+        values = [at_s, *(verdict.get(name) for name in COLUMNS if name != "at")]
+        names, marks = ", ".join(COLUMNS), ", ".join("?" * len(COLUMNS))
+        with self._db:
+            self._db.execute(f"INSERT INTO verdicts ({names}) VALUES ({marks})", values)
+        self._since += 1
+        if self._since >= EVERY:
+            self._since = 0
+            self.trim(at_s)
+
+    def trim(self, now_s: float) -> None:
+        """Delete what is too old or too much."""
+        with self._db:
+            self._db.execute("DELETE FROM verdicts WHERE at < ?", [now_s - DAYS * DAY_S])
+            if self._size() > self._most:
+                tenth = "SELECT min(number) + (max(number) - min(number)) / 10 FROM verdicts"
+                self._db.execute(f"DELETE FROM verdicts WHERE number <= ({tenth})")
+
+    def _size(self) -> int:
+        """Bytes of the pages in use."""
+        pages, free, size = (
+            int(self._db.execute(f"PRAGMA {name}").fetchone()[0])
+            for name in ("page_count", "freelist_count", "page_size")
+        )
+        return (pages - free) * size
+
+    def _open(self) -> sqlite3.Connection:
+        """Raises sqlite3.DatabaseError."""
+        db = sqlite3.connect(self._path, timeout=WAIT_S)
+        try:
+            db.execute("PRAGMA journal_mode = WAL")
+            db.execute("PRAGMA synchronous = FULL")
+            db.execute(f"PRAGMA journal_size_limit = {4 << 20}")
+            columns = ", ".join(f"{name} {kind}" for name, kind in COLUMNS.items())
+            number = "number INTEGER PRIMARY KEY AUTOINCREMENT"
+            with db:
+                db.execute(f"CREATE TABLE IF NOT EXISTS verdicts ({number}, {columns}) STRICT")
+                db.execute("CREATE INDEX IF NOT EXISTS by_time ON verdicts (at)")
+            if (found := db.execute("PRAGMA quick_check").fetchone()[0]) != "ok":
+                raise sqlite3.DatabaseError(str(found))
+        except BaseException:
+            db.close()
+            raise
+        return db
+
+
+def since(path: Path, from_s: float) -> Iterator[dict[str, Any]]:
+    """The verdicts since this time, in order. Raises FeedError if the file cannot be read."""
+    query = f"SELECT number, {', '.join(COLUMNS)} FROM verdicts WHERE at >= ? ORDER BY number"
+    for row in _rows(path, query, [from_s]):
+        yield dict(zip(("number", *COLUMNS), row, strict=True))
+
+
+def counts(path: Path, from_s: float) -> dict[tuple[str, str], int]:
+    """The number of verdicts since this time by status and label. Raises FeedError."""
+    query = "SELECT status, label, count(*) FROM verdicts WHERE at >= ? GROUP BY 1, 2 ORDER BY 1, 2"
+    return {(status, label): n for status, label, n in _rows(path, query, [from_s])}
+
+
+def _rows(path: Path, query: str, values: list[float]) -> list[tuple[Any, ...]]:
+    # after a clean end only `immutable` reads a file in a folder of another user
+    ways = ("mode=ro", "mode=ro&immutable=1")
+    why: object = "there is no such file"
+    for way in ways if path.exists() else ():
+        try:
+            with closing(
+                sqlite3.connect(f"{path.absolute().as_uri()}?{way}", timeout=WAIT_S, uri=True)
+            ) as db:
+                return db.execute(query, values).fetchall()
+        except sqlite3.Error as e:
+            why = e
+    raise FeedError(
+        f"{path}: {why}; verdicts are kept while palpate-bridge@memory runs (systemctl enable --now"
+        " palpate-bridge@memory), for members of group palpate"
+    )

@@ -1,0 +1,158 @@
+"""The file of verdicts: what a killed writer leaves, limits, damage, readers beside its writer."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from palpate.bridges.memory import MemoryBridge
+from palpate.cli.main import main
+from palpate.client.feed import Feed
+from palpate.client.verdicts import DAY_S, DAYS, VerdictFile, counts, since
+from palpate.core.clock import SystemClock
+from palpate.core.errors import FeedError, TemporaryError
+from tests.factories import feed_lines
+from tests.factories.paths import ROOT
+
+NOW = 1_800_000_000.0
+
+
+def verdict(sweep: int, status: str = "ok", label: str = "wood") -> dict:
+    """A verdict as the bridge writes it."""
+    return {**feed_lines.verdict(sweep, 1.0, label, status), "latency_ms": 1.2}
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    """A file that is not there yet."""
+    return tmp_path / "verdicts.db"
+
+
+@pytest.mark.slow
+def test_what_is_written_is_read(path):
+    """Rows and counts, also beside the writer; numbers go on after a restart."""
+    for start in (1, 3):
+        file = VerdictFile(path)
+        for sweep in (start, start + 1):
+            file.add(NOW + sweep, verdict(sweep, "ok" if sweep < 4 else "unknown"))
+        beside = [*since(path, NOW)]
+        file.close()
+    assert [(row["number"], row["sweep"]) for row in beside] == [(n, n) for n in (1, 2, 3, 4)]
+    assert [*since(path, NOW)] == beside
+    assert counts(path, NOW) == {("ok", "wood"): 3, ("unknown", ""): 1}
+    assert len([*since(path, NOW + 3)]) == 2
+    assert {type(row["probability"]) for row in beside} == {float}
+
+
+@pytest.mark.slow
+def test_a_killed_writer_loses_nothing(path):
+    """SIGKILL at any moment: all verdicts that were written are there, and the file is sound."""
+    code = (
+        "import sys; from pathlib import Path; from palpate.client.verdicts import VerdictFile; "
+        "file = VerdictFile(Path(sys.argv[1])); one = dict(sweep=1, status='ok', label='wood')\n"
+        "for n in range(10**6): file.add(n, one | {'sweep': n}); print(n, flush=True)"
+    )
+    words = [sys.executable, "-c", code, str(path)]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True, cwd=ROOT) as writer:
+        assert writer.stdout
+        last = [int(writer.stdout.readline()) for _ in range(60)][-1]
+        writer.send_signal(signal.SIGKILL)
+        last = max([last, *map(int, writer.stdout.read().split())])
+    VerdictFile(path).close()
+    assert [row["sweep"] for row in since(path, -1)][: last + 1] == [*range(last + 1)]
+
+
+@pytest.mark.slow
+def test_the_oldest_goes_first(path):
+    """Verdicts of more than 90 days are deleted; a file above its limit loses its oldest tenth."""
+    file = VerdictFile(path, most_mib=0.05)
+    for n in range(10):
+        file.add(NOW - (DAYS + 1) * DAY_S, verdict(n))
+    file.trim(NOW)
+    assert counts(path, 0) == {}
+    for n in range(1000):
+        file.add(NOW + n, verdict(n))
+    kept = [row["sweep"] for row in since(path, 0)]
+    assert kept[-1] == 999
+    assert kept == [*range(kept[0], 1000)]
+    assert 0 < len(kept) < 900
+    file.close()
+
+
+def test_a_damaged_file_is_moved_aside(path, caplog):
+    """What is no database is kept beside, and a new file begins."""
+    path.write_bytes(os.urandom(8192))
+    file = VerdictFile(path)
+    file.add(NOW, verdict(1))
+    file.close()
+    assert len([*since(path, 0)]) == 1
+    assert path.with_suffix(".damaged").stat().st_size == 8192
+    assert "damaged" in caplog.text
+
+
+def test_wrong_kinds_are_refused(path):
+    """A text or NaN for a number is refused or missing, never stored as bytes."""
+    file = VerdictFile(path)
+    with pytest.raises(sqlite3.Error):
+        file.add(NOW, verdict(1) | {"probability": "high"})
+    file.add(NOW, verdict(2) | {"probability": math.nan})
+    assert [row["probability"] for row in since(path, 0)] == [None]
+    file.close()
+
+
+def test_no_file(path, tmp_path):
+    """A reader says which unit writes it; a writer, that the folder is missing."""
+    with pytest.raises(FeedError, match="palpate-bridge@memory"):
+        counts(path, 0)
+    with pytest.raises(TemporaryError, match="none"):
+        VerdictFile(tmp_path / "none" / "x.db")
+
+
+class ScriptedFeed(Feed):
+    """A feed of these lines."""
+
+    def __init__(self, *lines: dict) -> None:
+        super().__init__("/nonexistent")
+        self.left = [*lines]
+
+    def read(self, timeout_s: float = 1.0) -> dict | None:
+        """The next of them."""
+        return self.left.pop(0) if self.left else None
+
+
+def test_the_bridge_writes_verdicts_alone(path, caplog):
+    """Other lines are passed over, a line of a later version is left out with a warning."""
+    now_s = time.monotonic()
+    lines = [feed_lines.hello(), feed_lines.health(1.0), feed_lines.verdict(1, now_s - 5)]
+    lines += [{"type": "verdict"}, feed_lines.verdict(2, now_s)]
+    bridge = MemoryBridge(ScriptedFeed(*lines), VerdictFile(path), SystemClock())
+    for _ in range(6):
+        bridge.work()
+    bridge.close()
+    first, second = since(path, 0)
+    assert (first["sweep"], second["sweep"]) == (1, 2)
+    assert 4 < second["at"] - first["at"] < 6
+    assert "left out" in caplog.text
+
+
+def test_status_since(path, capsys):
+    """The command counts, and gives rows as JSON; a wrong time ends with exit code 2."""
+    file = VerdictFile(path)
+    file.add(time.time(), verdict(1))
+    file.add(time.time() - 7200, verdict(2))
+    file.close()
+    words = ["status", "--set", f"bridge.memory={path}", "--since"]
+    assert main([*words, "1h"]) == 0
+    assert "1 sweeps since" in capsys.readouterr().out
+    assert main([*words, "1d", "--json"]) == 0
+    assert capsys.readouterr().out.count('"sweep"') == 2
+    with pytest.raises(SystemExit):
+        main([*words, "yesterday"])
