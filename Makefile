@@ -58,7 +58,7 @@ lint: $(TOOLS) ## check style, imports between packages, prose, and types (mypy 
 
 bundle: $(DESKTOP) ## train, quantize and pack the default bundle again
 	@mkdir -p build
-	$(BIN)/palpate-train fit --set sim:T-REAL/level-blind:1-6 --seed 1 --reattached --steps 1200 \
+	$(BIN)/palpate-train fit --set sim:T-REAL/level-blind:1-6 --seed 1 --reattached --stages 1200 \
 	  --out build/default.npz
 	$(BIN)/palpate-train export build/default.npz --out appliance/palpate/default_bundle --name default \
 	  --version 3 --with displacement

@@ -77,7 +77,7 @@ def main(arguments: list[str]) -> None:
     """Print the table."""
     parser = argparse.ArgumentParser("python -m tests.campaigns fit-memory")
     parser.add_argument("--windows", nargs="+", type=int, default=WINDOWS)
-    parser.add_argument("fit", nargs="*", default=["--steps", "0"], help="options of fit")
+    parser.add_argument("fit", nargs="*", default=[], help="options of fit")
     args = parser.parse_args(arguments)
     print("windows  set MB  mapped  held MB  beside the set  CPU s")
     before = 0.0

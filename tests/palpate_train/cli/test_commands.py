@@ -27,7 +27,7 @@ def test_the_command_splits_and_keeps_the_rest(tmp_path: Path, capsys: pytest.Ca
     """fit writes the sweeps that it did not train on as a set. Recordings stay whole, and training,
     held-out and written sweeps together are the whole set."""
     easy(20, pieces=2).save(tmp_path / "easy.npz")
-    args = f"fit --set {tmp_path / 'easy.npz'} --seed 1 --steps 4 --only speed<=2".split()
+    args = f"fit --set {tmp_path / 'easy.npz'} --seed 1 --stages 4 --only speed<=2".split()
     args += (
         f"--split recording:0.7 --rest {tmp_path / 'rest.npz'} --out {tmp_path / 'new' / 'fit.npz'}"
     ).split()
@@ -53,8 +53,8 @@ def test_the_command_splits_and_keeps_the_rest(tmp_path: Path, capsys: pytest.Ca
         ("--set sim:T-LAB:1:1 --split recording", "'recording'"),
         ("--set sim:T-LAB:1:1 --rest rest.npz", "--rest"),
         ("--set sim:T-LAB:1:1 --seed -1", "number from 0"),
-        ("--set sim:T-LAB:1:1 --steps -1", "--steps -1"),
-        ("--set sim:T-LAB:1:1 --steps x", "--steps x"),
+        ("--set sim:T-LAB:1:1 --stages -1", "--stages -1"),
+        ("--set sim:T-LAB:1:1 --stages x", "--stages x"),
         ("--set sim:T-LAB:1:1 --row-shift 3", "0 to 1"),
         ("--set sim:T-LAB:1:1 --stretch -1", "--stretch -1"),
         ("--set sim:T-LAB:1:1 --out /proc/none/fit.npz", "cannot be written there"),
@@ -227,7 +227,7 @@ def test_a_material_of_one_recording_is_told_by_its_name(
     args = ["--set", str(few(tmp_path)), "--only", "material=low,high"]
     why = "split by 'recording' leaves one sweep of 'high'; record more of it"
     fit = str(tmp_path / "fit.npz")
-    assert main(["fit", *args, "--seed", "1", "--steps", "0", "--out", fit]) == 0
+    assert main(["fit", *args, "--seed", "1", "--out", fit]) == 0
     assert (
         f"nothing was held out that could judge the model, so export will refuse it: few.npz: {why}"
         in capsys.readouterr().out
@@ -287,7 +287,7 @@ def test_a_fit_names_groups_of_one_value(tmp_path: Path, capsys: pytest.CaptureF
     tubes = replace(tubes, groups=tubes.groups | {"direction": np.zeros(len(tubes), int)})
     source = tmp_path / "set.npz"
     tubes.save(source)
-    words = "--seed 1 --steps 0 --size bands --out"
+    words = "--seed 1 --size bands --out"
     assert main(["fit", "--set", str(source), *words.split(), str(tmp_path / "fit.npz")]) == 0
     told = [line for line in capsys.readouterr().out.splitlines() if "expect less" in line]
     assert told == [

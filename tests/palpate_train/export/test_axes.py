@@ -24,7 +24,7 @@ from tests.factories.simulated_box import Rigged
     "size",
     [
         pytest.param((), id="chosen", marks=pytest.mark.thorough),
-        pytest.param(("--size", "stages", "--steps", "60"), id="stages"),
+        pytest.param(("--size", "stages", "--stages", "60"), id="stages"),
     ],
 )
 def test_from_a_set_to_the_answers_of_the_box(
@@ -38,9 +38,8 @@ def test_from_a_set_to_the_answers_of_the_box(
     axis."""
     sheared().save(tmp_path / "set.npz")
     fit, out = str(tmp_path / "fit.npz"), tmp_path / "bundle"
-    steps = size or ("--steps", "0")
     assert (
-        main(["fit", "--set", str(tmp_path / "set.npz"), "--seed", "1", "--out", fit, *steps]) == 0
+        main(["fit", "--set", str(tmp_path / "set.npz"), "--seed", "1", "--out", fit, *size]) == 0
     )
     export = f"export {fit} --out {out} --name sheared --version 1 --full-scale 2047".split()
     assert main([*export, "--pitch-mm", str(PITCH_MM)]) == 0

@@ -558,7 +558,7 @@ def test_fabrics_go_the_whole_way(tmp_path: Path, capsys: pytest.CaptureFixture[
     over the USB wire into sentences, with materials in turn, so that nearly each is another object;
     as many are right as by the classifier itself."""
     path = Path(os.environ["PALPATE_DATA"]) / "fabricslide" / "fabricslide.npz"
-    args = f"--set {path} --only direction=0 --only force<=180 --seed 1 --steps 300".split()
+    args = f"--set {path} --only direction=0 --only force<=180 --seed 1 --stages 300".split()
     args += (
         f"--split recording:0.7 --rest {tmp_path / 'rest.npz'} --out {tmp_path / 'fit.npz'}"
     ).split()

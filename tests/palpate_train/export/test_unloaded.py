@@ -64,7 +64,7 @@ def folder(rigged: Callable[..., Rigged], tmp_path: Path) -> Path:
 def exported(source: Path, out: Path) -> bundle.Bundle:
     """The bundle of a set, by command."""
     fit = str(out.with_suffix(".npz"))
-    assert main(["fit", "--set", str(source), "--seed", "1", "--steps", "0", "--out", fit]) == 0
+    assert main(["fit", "--set", str(source), "--seed", "1", "--out", fit]) == 0
     assert (
         main(["export", fit, "--out", str(out), "--name", "x", "--version", "1", "--pitch-mm", "4"])
         == 0

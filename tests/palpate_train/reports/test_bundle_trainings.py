@@ -96,7 +96,7 @@ def test_the_report_of_a_fit_is_that_of_its_bundle(
     """Two commands lead from a fit to its page, with a curve."""
     tones(12).save(tmp_path / "t.npz")
     fit, page = tmp_path / "mine.npz", tmp_path / "r.html"
-    assert main(f"fit --set {tmp_path / 't.npz'} --seed 1 --steps 0 --out {fit}".split()) == 0
+    assert main(f"fit --set {tmp_path / 't.npz'} --seed 1 --out {fit}".split()) == 0
     assert f"palpate-train report {fit} --set " in capsys.readouterr().out.splitlines()[-1]
     tones(4, noise=1.5).save(tmp_path / "test.npz")
     named = f"report {fit} --set {tmp_path / 'test.npz'} --out {page} --jobs 1".split()

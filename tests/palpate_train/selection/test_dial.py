@@ -351,7 +351,7 @@ def command(folder: Path, *more: str) -> list[str]:
     skin().save(folder / "skin.npz")
     (folder / "scene.toml").write_text('set = ["skin.npz"]\nbudget-ms = 1000\nslower = 3\n')
     scene, out = folder / "scene.toml", folder / "mine.npz"
-    return ["fit", "--scene", str(scene), "--seed", "1", "--steps", "0", "--out", str(out), *more]
+    return ["fit", "--scene", str(scene), "--seed", "1", "--out", str(out), *more]
 
 
 @pytest.fixture

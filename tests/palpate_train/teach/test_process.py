@@ -192,17 +192,3 @@ def test_imports_that_spin_are_ended_by_the_kernel(tmp_path: Path):
         time.sleep(0.05)
     assert found[-1]["type"] == "error"
     assert "processor" in found[-1]["text"]
-
-
-def test_up_to_twenty_sweeps_the_desktop_makes_the_same_model():
-    """Below 25 sweeps of each, `palpate-train fit` makes the taught model, bit for bit."""
-    sweeps = easy(20)
-    plain = replace(sweeps, groups={"recording": np.arange(len(sweeps))})
-    assert recipe.Settings().steps > 0
-    default, taught = (
-        recipe.fit(plain, Run(0), recipe.Settings(**steps)) for steps in ({}, {"steps": 0})
-    )
-    assert default.weights.keys() == taught.weights.keys()
-    for name, values in taught.weights.items():
-        np.testing.assert_array_equal(default.weights[name], values, err_msg=name)
-    assert default.plan == taught.plan

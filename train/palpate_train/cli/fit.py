@@ -41,7 +41,7 @@ from palpate_train.selection.dial import Budget, SizeWish
 Json = dict[str, Any]
 MAINS = (50, 60)
 """Frequencies of the mains in Hz: public grids have no others."""
-STEPS, MOST = recipe.Settings().steps, memory.MOST_SWEEPS
+STEPS, MOST = recipe.STAGE_STEPS, memory.MOST_SWEEPS
 
 
 def register(add: Add) -> None:
@@ -132,10 +132,15 @@ def _add_use(command: argparse.ArgumentParser) -> None:
 def _add_dial(command: argparse.ArgumentParser) -> None:
     """Options for the size of the model."""
     command.add_argument(
-        "--steps",
-        type=numbers.whole("--steps", 0),
-        default=STEPS,
-        help=f"training steps of the stages (default {STEPS}; 0 for none)",
+        "--stages",
+        type=numbers.whole("--stages", 1),
+        nargs="?",
+        const=STEPS,
+        default=0,
+        metavar="STEPS",
+        dest="steps",
+        help=f"train stages, too ({STEPS} steps), and let them join where held-out sweeps show a "
+        "gain; takes most of the time",
     )
     command.add_argument(
         "--size",
@@ -194,8 +199,6 @@ def run_fit(args: argparse.Namespace) -> None:
     if args.method:
         _fit_method(args, sweeps)
         return
-    if args.steps and not extras.installed("torch"):
-        say(f"no trained stages, which need torch: {extras.advice('torch')}, or --steps 0")
     memory.check(sweeps, min(len(sweeps), args.most_sweeps))
     made, change, unfinished = _fitted(args, sweeps)
     if args.rest and rest:
@@ -253,6 +256,10 @@ def _check(args: argparse.Namespace) -> None:
             raise FormatError(f"--{option} is of our recipe; leave it out with --method")
     if args.rest and not args.split:
         raise FormatError("--rest needs --split; without it nothing is left over")
+    if args.size == "stages" and not args.steps:
+        raise FormatError("--size stages needs --stages; without them it is --size pairs")
+    if args.steps and not extras.installed("torch"):
+        raise FormatError(f"--stages needs torch; {extras.advice('torch')}, or leave it out")
     if args.slower and not args.budget_ms:
         raise FormatError("--slower needs --budget-ms; without a limit of time it changes nothing")
     for option, endings in (("out", (".npz",)), ("rest", options.SET_FILES)):
@@ -293,7 +300,7 @@ def _chosen(
     with extras.needed_for("the page with the reasons for a size"):
         from palpate_train.reports import selection_report
     budget = Budget(args.budget_ms or math.inf, args.budget_kb or math.inf, args.slower or 1.0)
-    sizes = (args.size,) if args.size else tuple(dial.FAMILY)
+    sizes = (args.size,) if args.size else dial.sizes(stages=args.steps > 0)
     wish = SizeWish(budget, args.accuracy or 0.0, sizes)
     choice = dial.choose(sweeps, run, settings, wish)
     less, change = reduction_curves.curves(choice, args.reduce or ())

@@ -78,7 +78,7 @@ class PalpateClassifier(
         group: str = "position",
         reattached: bool = False,
         mains_hz: float = 50.0,
-        steps: int = 600,
+        steps: int = 0,
         size: str | None = None,
         random_state: int | np.random.RandomState | None = 0,
         varies: Sequence[str] = (),

@@ -40,6 +40,12 @@ FAMILY: Mapping[str, ModelSize] = {**SIZES, ALL: UNLIMITED}
 """All sizes by name."""
 
 
+def sizes(stages: bool) -> tuple[str, ...]:
+    """The names of the sizes to choose from. Without trained stages the size of that name is
+    another."""
+    return tuple(name for name in FAMILY if stages or name != "stages")
+
+
 class NothingFits(ApplianceError):
     """No size is within the budget, or none can be packed."""
 

@@ -27,7 +27,7 @@ def assess(lesson: Lesson) -> Assessment:
     """Judge a model of the materials that have two sweeps or more. Raises FormatError if fewer than
     two materials have."""
     lesson = lesson.repeated()
-    settings = recipe.Settings(steps=0, most=len(lesson.sweeps))
+    settings = recipe.Settings(most=len(lesson.sweeps))
     setup = recipe.Setup.of(lesson.sweeps, Run(0), settings)
     fixed = setup.fixed
     choice = recipe.judge(recipe.candidates(fixed, setup), fixed, setup)

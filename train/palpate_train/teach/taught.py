@@ -1,4 +1,4 @@
-"""From a lesson to a bundle: the fit of `palpate-train fit --steps 0`, and the export with all its
+"""From a lesson to a bundle: the fit of `palpate-train fit`, and the export with all its
 checks."""
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def teach(lesson: Lesson, out: Path, version: str, about: dict[str, Any], tell: 
             "more of each material, or forget it"
         )
     sweeps.require_materials()
-    setup = recipe.Setup.of(sweeps, Run(0), recipe.Settings(steps=0))
+    setup = recipe.Setup.of(sweeps, Run(0), recipe.Settings())
     times.begin("features")
     _ = setup.fixed  # computed here, for the time of this step
     times.begin("heads")

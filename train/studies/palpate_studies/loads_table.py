@@ -73,7 +73,7 @@ def _row(
 
 def _fit(sweeps: Dataset, loads: bool) -> Fit:
     size = replace(UNLIMITED, loads=loads)
-    return recipe.fit(sweeps, Run(SEED), Settings(steps=0, size=size, use=REATTACHED))
+    return recipe.fit(sweeps, Run(SEED), Settings(size=size, use=REATTACHED))
 
 
 def answers(made: Fit, test: Dataset) -> Json:

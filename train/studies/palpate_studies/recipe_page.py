@@ -42,7 +42,7 @@ VIEWS = {
     "stages": (
         "log mean responses of three trained convolutions",
         "patterns that no fixed filter has",
-        "from 25 sweeps of each material on, unless accuracy is worse",
+        "with `--stages`, from 25 sweeps of each material on, unless accuracy is worse",
     ),
 }
 """Features, purpose and condition of each view."""

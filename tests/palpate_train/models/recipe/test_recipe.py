@@ -61,7 +61,7 @@ def fitted_by_command(folder: Path, *options: str) -> Fit:
     """The fit of the easy set by `palpate-train fit`, without stages."""
     easy().save(folder / "easy.npz")
     out = folder / "fit.npz"
-    words = f"fit --set {folder / 'easy.npz'} --seed 1 --steps 0 --out {out}".split()
+    words = f"fit --set {folder / 'easy.npz'} --seed 1 --out {out}".split()
     assert main([*words, *options]) == 0
     return Fit.load(out)
 
@@ -225,7 +225,7 @@ def test_an_interrupted_fit_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
     def fitted(name: str, seed: int = 1) -> Fit | None:
         out = tmp_path / f"{name}.npz"
-        args = f"--set {tmp_path / 'easy.npz'} --seed {seed} --steps 12 --out {out}".split()
+        args = f"--set {tmp_path / 'easy.npz'} --seed {seed} --stages 12 --out {out}".split()
         assert main(["fit", *args]) == (0 if stop < 0 else INTERRUPTED)
         return Fit.load(out) if stop < 0 else None
 
@@ -266,7 +266,7 @@ def test_filters_need_no_pytorch(tmp_path: Path):
         "builtins.__import__ = gone\n"
         "from palpate_train.cli.main import main\n"
         f"sweeps, fit, bundle = {[str(tmp_path / name) for name in ('easy.npz', 'f.npz', 'b')]}\n"
-        "code = main(['fit', '--set', sweeps, '--seed', '1', '--steps', '0', '--out', fit])\n"
+        "code = main(['fit', '--set', sweeps, '--seed', '1', '--out', fit])\n"
         "args = ['--out', bundle, '--name', 'b', '--version', '1']\n"
         "sys.exit(code or main(['export', fit, *args]))"
     )

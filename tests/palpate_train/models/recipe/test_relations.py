@@ -135,7 +135,7 @@ def test_the_box_opens_a_bundle_with_relations(
 
     monkeypatch.setattr(choice, "choose", related)
     known, fit, out = "sim:T-REAL/level-blind:1:2", str(tmp_path / "fit.npz"), tmp_path / "bundle"
-    assert main(["fit", "--set", known, "--seed", "1", "--steps", "0", "--out", fit]) == 0
+    assert main(["fit", "--set", known, "--seed", "1", "--out", fit]) == 0
     assert main(["export", fit, "--out", str(out), "--name", "woven", "--version", "1"]) == 0
     unseen = sets.load("sim:T-REAL/level-blind:2:1")
     box = Classifier(bundle.load(out), SystemClock())

@@ -59,31 +59,34 @@ def train(
 
 def methods(effort: Effort = FULL_EFFORT) -> tuple[Method, ...]:
     """`palpate`, its sizes, and the same for a skin that is taken off and put back."""
-    steps = round(recipe.Settings().steps * effort.share)
-    settings = recipe.Settings(max(steps, 2) if effort.share else 0, use=effort.use)
+    settings = recipe.Settings(use=effort.use)
     special = "" if effort.use == AS_RECORDED else repr(effort.use)
+    steps = max(round(recipe.STAGE_STEPS * effort.share), 2)
 
     def method(name: str, about: str, settings: recipe.Settings) -> Method:
-        trains = f"{settings.steps} iterations of stages" if settings.size.stages else ""
+        trains = f"{settings.steps} iterations of stages" if settings.steps else ""
         trains += f"{', ' * bool(trains and special)}{special}"
         return Method(name, about, "raw", partial(train, settings=settings), effort=trains)
 
     sizes = (
-        method(f"{SHIPPED}-{name}", f"{size.about} at most", replace(settings, size=size))
+        method(
+            f"{SHIPPED}-{name}",
+            f"{size.about} at most",
+            replace(settings, size=size, steps=steps if name == "stages" else 0),
+        )
         for name, size in SIZES.items()
     )
     return (
         *sizes,
         method(
             SHIPPED,
-            "filters, spectrum, relations and trained stages, as held-out groups of the training "
+            "filters, spectrum, relations and slow waves, as held-out groups of the training "
             "sweeps ask for",
             settings,
         ),
         method(
             PACKAGED,
-            "as palpate, but all heads see augmented copies, as of a skin put back, and filters "
-            "join stages only where that is better",
+            "as palpate, but all heads see augmented copies, as of a skin put back",
             replace(settings, use=replace(effort.use, reattached=True)),
         ),
     )
