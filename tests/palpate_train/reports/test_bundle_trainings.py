@@ -27,16 +27,29 @@ def where(folder: Path) -> Where:
 
 @pytest.mark.slow
 def test_the_curve_rises_with_sweeps_to_all_of_them(tmp_path: Path):
-    """Points at 5, 10 and all 16 of each; each tests all, and more is as good here."""
+    """Points at 2, 4, 8 and all 16 of each; each tests all, and more is as good here."""
     made = {"method": "static-svm"}
     test = easy(30, seed=5)
     found = bundle_trainings.run(made, easy(16), test, where(tmp_path), NOTHING)
-    assert [p["each"] for p in found["curve"]] == [5, 10, 16]
+    assert [p["each"] for p in found["curve"]] == [2, 4, 8, 16]
     assert {p["n"] for p in found["curve"]} == {len(test)}
     assert all(p["low"] <= p["share"] <= p["high"] for p in found["curve"])
     assert found["trained"]["method"] == "static-svm"
     assert "left_out" not in found  # an SVM knows no novelty
     assert found["why_not"]
+
+
+@pytest.mark.parametrize(
+    ("errors", "gain"),
+    [((0.4, 0.2, 0.1), 0.05), ((0.1, 0.1, 0.1), 0), ((0.1, 0.2, 0.3), 0), ((0.0, 0.0, 0.0), 0)],
+)
+def test_what_twice_as_many_sweeps_bring(errors: tuple[float, ...], gain: float):
+    """An error that halves at each doubling halves once more; one that stays or rises brings
+    nothing. The interval holds the gain."""
+    points = [{"each": 2.0**i, "share": 1 - e, "n": 1000} for i, e in enumerate(errors)]
+    found, low, high = bundle_trainings.doubled(points)
+    assert found == pytest.approx(gain, abs=0.001)
+    assert low <= found <= high
 
 
 @pytest.mark.slow
@@ -103,7 +116,7 @@ def test_the_report_of_a_fit_is_that_of_its_bundle(
     assert main([*named, "--cache", str(tmp_path / "cache")]) == 0
     text = PageReader(page.read_text()).text
     assert "mine 1: " in text
-    assert "training on 5, 10, 20" in text
+    assert "training on 2, 4, 8" in text
     assert "gets a known label" in text
     assert isinstance(Fit.load(fit), Fit)
     assert main(["report", str(tmp_path / "t.npz"), *named[2:]]) == FormatError.exit_code
