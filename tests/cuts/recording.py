@@ -44,12 +44,14 @@ HEARD = re.compile(
     r"^(?P<forgot>forgot)",
     re.MULTILINE,
 )
+RENAMED = "oak"
+"""The later name of the material."""
 Files = Mapping[Path, bytes]
 
 
 def record(way: str, folder: Path, session: str) -> None:
-    """Record two sweeps, discard the second, record a third, forget the material. way: how the
-    files are written."""
+    """Record two sweeps, discard the second, record a third, rename and forget the material. way:
+    how the files are written."""
     storage.put_all = lambda files, **how: WAYS[way](files)
     disk = DiskThread() if way == THREAD else AtOnce()
     running = recording(
@@ -62,7 +64,9 @@ def record(way: str, folder: Path, session: str) -> None:
     print(f"discarded {_fields(running.commands['DISCARD'](''), disk)[-1]}", flush=True)
     running.sweep(*taken(3, SHORT), {})
     disk.settle()
-    _fields(running.forget(MATERIAL), disk)
+    _fields(running.commands["RENAME"](f"{MATERIAL},{RENAMED}"), disk)
+    print(f"renamed {session}", flush=True)
+    _fields(running.forget(RENAMED), disk)
     print("forgot", flush=True)
     if running.stored != 2:
         sys.exit(f"{running.stored} sweeps are stored instead of 2")
@@ -154,6 +158,12 @@ def judge(format: SweepFormat, found: Found) -> list[str]:
     except FormatError as e:
         return [*wrong, str(e)]
     wrong += [f"{name} was forgotten and is taught" for name in sorted(learnt & forgotten)]
+    renamed = re.findall(r"^renamed (\S+)", found.heard, re.MULTILINE)
+    wrong += [
+        f"{name}, {which} was renamed and is still {MATERIAL}"
+        for name, which in there.items()
+        if which.split()[0] in renamed and load(folder / f"{name}.npy")[0].material != RENAMED
+    ]
     return wrong or _goes_on(folder, format)
 
 

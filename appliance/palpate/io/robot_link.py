@@ -28,9 +28,15 @@ from palpate.io import serial_port
 
 COMMANDS = (
     *("ID", "STATE", "TEST", "LABEL", "TARE", "NEW", "ABORT", "START", "STOP"),
-    *("MATERIAL", "POSITION", "SESSION", "NEXT", "DISCARD", "TEACH", "USE", "FORGET"),
+    *("MATERIAL", "POSITION", "SESSION", "NEXT", "DISCARD", "MOVE", "RENAME", "UNDO"),
+    *("TEACH", "USE", "FORGET"),
 )
-TEXT_COMMANDS = ("LABEL", "MATERIAL", "POSITION", "SESSION", "TEACH", "FORGET")
+PAIRS = ("MOVE", "RENAME")
+"""The commands with two texts: a sweep or a material, and the name of a material."""
+TEXT_COMMANDS = (
+    *("LABEL", "MATERIAL", "POSITION", "SESSION", "TEACH", "FORGET"),
+    *PAIRS,
+)
 """The commands that need a text after a comma. START may have one: speed and force of the slide."""
 MOST_REFUSED, REFUSAL_NS = 8, 1_000_000_000
 """After so many bad lines without a command, one in this time is answered. A line that echoes with
@@ -99,7 +105,8 @@ def command(name: str, text: str | None = None) -> Command:
     """The command `name` with its text, or a Command with an `error`."""
     if name == "START":  # its trigger checks the values, and its error quotes the bad one
         return Command(name, text or "")
-    if name not in COMMANDS or UNSAFE.search(text or ""):
+    field = (text or "").replace(",", "", name in PAIRS)  # of these the first comma parts two
+    if name not in COMMANDS or UNSAFE.search(field):
         return Command(name, error=f"unknown command; known are {' '.join(COMMANDS)}")
     if (name in TEXT_COMMANDS) != (text is not None):
         form = f"{TALKER} {name}" + " TEXT" * (name in TEXT_COMMANDS)

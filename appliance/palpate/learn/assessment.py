@@ -112,7 +112,7 @@ class Assessment:
         """What to record next, or that it is enough."""
         suspects, pair, low = self.suspects(), self.inseparable(), self.interval[0]
         if suspects:
-            return f"look at it first: {suspects[0].text}; discard it if that is so"
+            return f"look at it first: {suspects[0].text}; move or discard it if that is so"
         if pair:
             one, other = (self.materials[k] for k in pair)
             return (

@@ -8,7 +8,9 @@ bundle in service as they are.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Future
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from palpate.core.clock import Clock, SystemClock
@@ -22,6 +24,7 @@ from palpate.core.types import Sweep, Verdict
 from palpate.io.verdict_lines import check_bits
 from palpate.learn.process import News, TeachingProcess, learning
 from palpate.sweeps.recording import Labels, RecordingSession
+from palpate.sweeps.sweep_folder import number_of
 
 FEWEST_TAUGHT = 2
 """Fewest sweeps of a material that can be assessed, and fewest such materials."""
@@ -78,7 +81,9 @@ class TeachingSession(Observer):
         self._refused: set[int] = set()
         self.by = "the serial line"
         self.taught: News | None = None
-        self.recording_commands = {**recording.commands, "MATERIAL": self._material}
+        moves: dict[str, CommandHandler]
+        moves = {name: partial(self._move, name) for name in ("MOVE", "RENAME", "UNDO")}
+        self.recording_commands = {**recording.commands, "MATERIAL": self._material, **moves}
         """Those of the recording, which here refuse what TEACH refuses."""
         self.commands: Mapping[str, CommandHandler] = {
             "TEACH": self._teach,
@@ -127,13 +132,14 @@ class TeachingSession(Observer):
     def _refuse(self, text: str) -> None:
         self._say(sentence("TCH", "refused", text))
 
-    def admit(self, *labels: str) -> None:
+    def admit(self, *labels: str, renamed: str = "") -> None:
         """Raises ConfigError for a material that the delivered bundle was trained on, and if the
-        class bits cannot hold these materials beside those of before. A box without class bits
-        admits any number."""
+        class bits cannot hold these materials beside those of before, without the renamed one. A
+        box without class bits admits any number."""
         refuse_trained(self._trained, labels)
         if self._codes:
             wanted = dict.fromkeys((*self._base, *self.materials(), *labels))
+            wanted.pop(renamed, None)
             for name in self._recording.forgotten - self.materials().keys() - {*labels}:
                 if name not in self._trained:
                     wanted.pop(name, None)
@@ -226,6 +232,37 @@ class TeachingSession(Observer):
         self.admit(*filter(None, [label.strip()]))
         return self._recording.commands["MATERIAL"](label)
 
+    def _move(self, command: str, text: str) -> Reply:
+        """Move a sweep, rename a material or undo that; the sweeps are then assessed again."""
+        if self._using:
+            raise ApplianceError("a bundle is being made; move sweeps afterwards")
+        what, _, label = (part.strip() for part in text.partition(","))
+        if command == "UNDO":
+            what, label = self._recording.undoes
+        renamed = "" if command == "MOVE" else what
+        refuse_trained(self._trained, [renamed])
+        self.admit(*filter(None, [label]), renamed=renamed)
+        reply = self._recording.commands[command](text)
+        if isinstance(reply, Future):
+            reply.add_done_callback(partial(self._moved_later, what, label))
+        else:
+            self._moved(what, label)
+        return reply
+
+    def _moved_later(self, what: str, label: str, reply: Future[list[object]]) -> None:
+        if not reply.exception():
+            self._moved(what, label)
+
+    def _moved(self, what: str, label: str) -> None:
+        """Sweeps have another material. what: the number of one, or the former name of all."""
+        if what in self._named:
+            self._named = {label if name == what else name: None for name in self._named}
+        if self._learnt:
+            suspects = self._learnt.get("suspects", ())
+            kept = [one for one in suspects if what not in _about(one)]
+            self._learnt = {**self._learnt, "suspects": kept}
+        self._due_ns = self._clock.now_ns() + PAUSE_NS
+
     def _use(self, _: str) -> list[object]:
         """Begin to teach all sweeps; returns the number of materials and of sweeps."""
         if self._using:
@@ -260,6 +297,12 @@ class TeachingSession(Observer):
         self._trouble = self._too_many()
         self._due_ns = self._clock.now_ns()
         return [label, number]
+
+
+def _about(suspect: Mapping[str, Any]) -> tuple[str, ...]:
+    """The number of its file and the materials of a suspect, as commands have them."""
+    number = str(number_of(Path(f"{suspect['sweep']}.npy")))
+    return number, str(suspect["material"]), str(suspect["looks_like"])
 
 
 class Teacher(Observer):

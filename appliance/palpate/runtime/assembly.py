@@ -190,8 +190,8 @@ def _trigger(
         if not ordered and (port is None or isinstance(port, StdoutPort)):
             raise ConfigError(
                 'trigger.mode = "serial" takes START and STOP from the serial line, but '
-                "serial.port is not set; set it, or use --trigger key, or the page of palpate "
-                "record --web"
+                "serial.port is not set; set it, or trigger.mode to key, or use the page of "
+                "palpate record --web"
             )
         return CommandTrigger(devices.clock, devices.commanded)
     if config.mode == "key":
@@ -207,8 +207,9 @@ def _trigger(
     missing = next((k for k in ("start", "stop") if not getattr(config, k)), None)
     if missing == "start" or (missing and config.mode == "two-lines"):
         raise ConfigError(
-            f"trigger.{missing} has no GPIO line, so no sweep can be cut; choose a board with "
-            "--board, or a trigger without lines: --trigger serial, key or timed"
+            f"trigger.{missing} has no GPIO line, so no sweep can be cut; set trigger.mode "
+            "to serial, key or timed, which need no lines (here --trigger serial), or choose a "
+            "board with --board"
         )
     return stack.enter_context(GpioTrigger(config, gpio(devices)))
 

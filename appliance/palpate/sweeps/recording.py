@@ -93,7 +93,8 @@ class RecordingSession(Observer):
         self._labels = deque([(0, labels)], MOST_CHANGES)
         self._answered = False
         self._stored: list[int] = []
-        self._changes = 0  # DISCARD and FORGET that are not on the disk yet
+        self._changes = 0  # DISCARD, FORGET, MOVE … that are not on the disk yet
+        self._undo: list[_Moved] = []
         self._last: dict[str, Any] | None = None
         self._log = TroubleLog("record")
         self.commands: Mapping[str, CommandHandler] = {
@@ -102,6 +103,9 @@ class RecordingSession(Observer):
             "SESSION": partial(self._change, "session"),
             "NEXT": self._next,
             "DISCARD": self._discard,
+            "MOVE": self._move,
+            "RENAME": self._rename,
+            "UNDO": self._undone,
         }
 
     @property
@@ -122,15 +126,22 @@ class RecordingSession(Observer):
         """Materials that were forgotten, also if sweeps of them were recorded again."""
         return {*self._folder.forgotten}
 
+    @property
+    def undoes(self) -> tuple[str, str]:
+        """The name that UNDO would take away, and the former name; ("", "") if it undoes none."""
+        return self._undo[-1].names if self._undo else ("", "")
+
     def materials(self) -> dict[str, int]:
         """The number of sweeps in the folder of each material, without forgotten ones."""
         kept = (labels.material for _, labels in sorted(self._counted.items()) if labels.material)
         return dict(Counter(kept))
 
     def refuse_while_changing(self) -> None:
-        """Raises ApplianceError while DISCARD or FORGET is not on the disk yet."""
+        """Raises ApplianceError while such a change is not on the disk yet."""
         if self._changes:
-            raise ApplianceError("DISCARD or FORGET is under way; wait for its answer")
+            raise ApplianceError(
+                "DISCARD, FORGET, MOVE, RENAME or UNDO is under way; wait for its answer"
+            )
 
     def leave_out(self, number: int) -> None:
         """Count a stored sweep no longer: it is discarded, forgotten or no slide."""
@@ -188,8 +199,9 @@ class RecordingSession(Observer):
 
         It has the present labels, the display names of materials by label, the number of sweeps of
         this run, the count and the wanted number of each material and position, the missing sweeps
-        in words, the outcome of the last sweep as in REC, and the number of the sweep that DISCARD
-        would remove (None: no sweep).
+        in words, the outcome of the last sweep as in REC, the number of the sweep that DISCARD
+        would remove (None: no sweep), number and material of the last sweep that MOVE can move
+        (None: no sweep), and what UNDO would undo ("": nothing).
         """
         return {
             **entries(self._labels[-1][1]),
@@ -200,7 +212,13 @@ class RecordingSession(Observer):
             "missing": self._progress.missing(),
             "last": self._last,
             "discard": None if self.last is None else self.last - self._folder.run,
+            "newest": self._newest(),
+            "undo": self._undo[-1].what if self._undo else "",
         }
+
+    def _newest(self) -> list[object] | None:
+        labels = self._counted.get(-1 if self.last is None else self.last)
+        return [self.last, labels.material] if labels else None
 
     def sweep(self, sweep: Sweep, verdict: Verdict, circumstances: Mapping[str, Any]) -> None:
         """Write the sweep if it has a window, and report the outcome in a REC sentence."""
@@ -331,6 +349,97 @@ class RecordingSession(Observer):
         if self._last and self._last["sweep"] == shown:
             self._last["outcome"] = "discarded"
         return [shown, self.stored, self._folder.path(number).stem]
+
+    def _move(self, text: str) -> Reply:
+        """Move a sweep to another material; returns both. text: the number of its file, the
+        material."""
+        which, _, label = (part.strip() for part in text.partition(","))
+        number = int(which) if which.isascii() and which.isdecimal() else -1
+        if number not in self._counted:
+            raise ApplianceError(
+                f"no sweep {which!r} is counted; take a number of a file, such as PPLP MOVE 7,wood"
+            )
+        moved = _Moved(f"sweep {number} to {label}", {number: self._counted[number].material})
+
+        def done() -> list[object]:
+            self._undo.append(moved)
+            return [number, label]
+
+        return self._relabel({number: _material(label)}, done)
+
+    def _rename(self, text: str) -> Reply:
+        """Give a material another name, also for sweeps to come; returns the name and the number
+        of its sweeps. text: the old name, the new name."""
+        old, _, new = (part.strip() for part in text.partition(","))
+        numbers = [n for n, labels in self._counted.items() if labels.material == old]
+        if not old or (not numbers and self._labels[-1][1].material != old):
+            raise ApplianceError(f"no sweep is of {old!r}; name a material that was recorded")
+        moved = _Moved(f"{old} to {new}", dict.fromkeys(numbers, old), (new, old))
+
+        def done() -> list[object]:
+            self._undo.append(moved)
+            return [new, self.materials().get(new, 0)]
+
+        reply = self._relabel(dict.fromkeys(numbers, _material(new)), done)
+        self._call(old, new)
+        return reply
+
+    def _undone(self, _: str) -> Reply:
+        """Undo the last MOVE or RENAME of this run; returns what it was."""
+        if not self._undo:
+            raise ApplianceError("nothing was moved in this run; use MOVE or RENAME first")
+        last = self._undo[-1]
+
+        def done() -> list[object]:
+            self._undo.pop()
+            return [last.what]
+
+        back = {n: label for n, label in last.before.items() if n in self._counted}
+        reply = self._relabel(back, done)
+        self._call(*last.names)
+        return reply
+
+    def _relabel(self, materials: Mapping[int, str], done: Callable[[], list[object]]) -> Reply:
+        """Move counted sweeps to materials; `done` gives the reply. Raises ApplianceError."""
+        if self._writing:
+            raise ApplianceError("a sweep is still being written; wait for its REC sentence")
+        self.refuse_while_changing()
+
+        def moved() -> list[object]:
+            for number, label in materials.items():
+                if labels := self._counted.get(number):
+                    self.leave_out(number)
+                    self._count(number, replace(labels, material=label), "")
+                if self._last and self._last["sweep"] == number - self._folder.run:
+                    self._last = self._last | {"material": label}
+            return done()
+
+        write = partial(self._folder.relabel, materials, dict(self.names.displays))
+        return self._beside(write, moved, "the other material is not kept", "look at the disk")
+
+    def _call(self, old: str, new: str) -> None:
+        """Sweeps of one material that are not answered yet are of the other."""
+        if old != new:
+            for i, (t_ns, labels) in enumerate(self._labels):
+                if labels.material == old:
+                    self._labels[i] = t_ns, replace(labels, material=new)
+
+
+@dataclass(frozen=True, slots=True)
+class _Moved:
+    """What UNDO undoes: in words, the materials of the sweeps before, and the name of a renamed
+    material with its former name."""
+
+    what: str
+    before: Mapping[int, str]
+    names: tuple[str, str] = ("", "")
+
+
+def _material(label: str) -> str:
+    """The label of a sweep that is moved. Raises ApplianceError without one."""
+    if not label.strip():
+        raise ApplianceError("MOVE and RENAME need a material, such as PPLP RENAME cork,oak")
+    return Labels(material=label.strip()).material
 
 
 def _labels(about: Mapping[str, Any]) -> Labels:

@@ -225,6 +225,16 @@ class SweepFolder:
         storage.sync(self.folder)
         self.numbers.remove(number)
 
+    def relabel(self, materials: Mapping[int, str], displays: Mapping[str, str]) -> None:
+        """Move sweeps to other materials, by number. displays: of materials that have one. Only
+        sidecars are replaced, each at once, so a power cut leaves each sweep with its old or its
+        new material. Raises OSError, and FormatError for a damaged sidecar."""
+        for number, material in materials.items():
+            path = self.path(number)
+            about = sidecar(path) | {"material": material, "display": displays.get(material)}
+            held = {name: value for name, value in about.items() if value is not None}
+            storage.put(path.with_suffix(".json"), json.dumps(held, indent=1).encode())
+
     def forget(self, material: str, numbers: Iterable[int]) -> None:
         """Learn from these sweeps no longer; they may still wait. Raises OSError."""
         new = self.forgotten | {material: sorted({*self.forgotten.get(material, ()), *numbers})}

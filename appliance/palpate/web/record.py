@@ -23,7 +23,7 @@ from palpate.core.observer import Observer
 from palpate.core.sentences import Reply
 from palpate.core.status import REASONS
 from palpate.core.types import Frames, Sweep, SweepFormat, Verdict
-from palpate.io.robot_link import Command
+from palpate.io.robot_link import PAIRS, Command
 from palpate.sweeps.recording import Labels
 from palpate.web.access import Access
 from palpate.web.server import PageServer
@@ -73,6 +73,9 @@ def order(body: bytes, allowed: Sequence[str], named: Callable[[str], str] = str
         field = "material" if name in MATERIALS else name.lower()
         text = named(text) if field == "material" else text
         Labels(**{field: text})  # before a capture records the order
+    elif name in PAIRS:
+        what, _, typed = text.partition(",")
+        text = f"{what},{Labels(named(typed.strip())).material}"
     elif text and not (name == "DISCARD" and text.isascii() and text.isdecimal()):
         raise FormatError(
             f"{name} takes no text, but for DISCARD the number of a sweep; leave it out"
@@ -162,7 +165,15 @@ class RecordPage(Observer):
         self._tracker = ContactTracker(Expected(format, unit=unit), source)
         self._rate_hz = format.rate_hz
         by_page = ("START", "STOP") if trigger.mode == "serial" else ()
-        self._commands = (*LABELS, "NEXT", "DISCARD", *by_page, *(TEACHING if teaching else ()))
+        self._commands = (
+            *LABELS,
+            "NEXT",
+            "DISCARD",
+            *PAIRS,
+            "UNDO",
+            *by_page,
+            *(TEACHING if teaching else ()),
+        )
         self._known = {
             "source": source,
             "format": str(format),

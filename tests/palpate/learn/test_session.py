@@ -375,3 +375,42 @@ def test_a_box_without_the_extra_says_what_to_install(monkeypatch):
     monkeypatch.setattr(process, "find_spec", lambda name: None if name == "scipy" else name)
     with pytest.raises(ConfigError, match="needs"):
         process.check_installed()
+
+
+def test_a_mislabelled_sweep_is_moved_and_the_sweeps_are_assessed_again(taught):
+    """Its suspicion goes at once; materials without a sweep are renamed, too; while a bundle is
+    made, sweeps stay."""
+    suspect = {"sweep": "sweep-000002", "material": "cork", "looks_like": "pine"}
+    other = suspect | {"sweep": "sweep-000001"}
+    taught.assess = printed(ASSESSED | {"suspects": [other, suspect]})
+    taught.sweeps("cork", 3)
+    taught.sweeps("pine", 2)
+    taught.until(lambda about: about["learnt"])
+    taught.assess = printed(ASSESSED | {"suspects": []})
+    taught.order("MOVE", "2,pine")
+    assert taught.session.about()["learnt"]["suspects"] == [other]
+    assert taught.session.materials() == {"cork": 2, "pine": 3}
+    taught.until(lambda about: about["learnt"]["suspects"] == [])
+    taught.order("TEACH", "elm")
+    taught.order("RENAME", "elm,oak")
+    taught.order("UNDO")
+    taught.order("RENAME", "elm,ash")
+    assert taught.session.materials() == {"ash": 0, "cork": 2, "pine": 3}
+    taught.order("RENAME", "cork,oak")
+    taught.order("UNDO")
+    assert taught.session.materials() == {"ash": 0, "cork": 2, "pine": 3}
+    taught.order("USE")
+    with pytest.raises(ApplianceError):
+        taught.order("MOVE", "1,pine")
+
+
+def test_a_renamed_material_needs_no_further_code(tmp_path):
+    """Where the class bits have no code left, a material can still be renamed."""
+    one = Taught(tmp_path, codes=4)
+    one.sweeps("cork", 1)
+    one.sweeps("pine", 1)
+    one.order("TEACH", "elm")
+    with pytest.raises(ConfigError):
+        one.order("MOVE", "1,oak")
+    assert one.order("RENAME", "cork,oak") == ["oak", 1]
+    one.recording.close()

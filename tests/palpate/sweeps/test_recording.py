@@ -343,6 +343,44 @@ def test_discard_of_the_sweep_that_was_seen(tmp_path):
     assert names(tmp_path) == [*pairs(1), "sweep-000002.discarded"]
 
 
+def test_a_sweep_is_moved_a_material_renamed_and_that_undone(tmp_path):
+    """Counts, sidecars, the last sweep and sweeps to come follow; UNDO takes back one after the
+    other, without sweeps that are gone; a display name comes and goes with its material."""
+    desk = Desk(tmp_path)
+    for n in (1, 2, 3):
+        desk.sweep(n)
+    desk.recording.names.label("Eiche, geölt")
+    assert desk.do("MOVE", "3,Eiche geoelt") == [3, "Eiche geoelt"]
+    assert desk.do("RENAME", "wood,oak") == ["oak", 2]
+    about = desk.recording.about()
+    assert (about["material"], about["newest"]) == ("oak", [3, "Eiche geoelt"])
+    assert about["last"]["material"] == "Eiche geoelt"
+
+    def found() -> list[tuple[object, object]]:
+        kept = [sidecar(path) for path in sorted(tmp_path.glob("*.npy"))]
+        return [(one["material"], one.get("display")) for one in kept]
+
+    assert found() == [("oak", None)] * 2 + [("Eiche geoelt", "Eiche, geölt")]
+    assert desk.recording.materials() == {"oak": 2, "Eiche geoelt": 1}
+    assert desk.do("UNDO") == ["wood to oak"]
+    assert desk.sweep(4)[3] == "wood"
+    desk.do("DISCARD")
+    desk.do("DISCARD")
+    desk.do("UNDO")
+    assert found() == [("wood", None)] * 2
+    assert desk.recording.materials() == {"wood": 2}
+    assert desk.recording.about()["undo"] == ""
+    again = Desk(tmp_path / "b")
+    for name, text in (("MOVE", "1,wood"), ("MOVE", "x"), ("RENAME", "cork,oak"), ("UNDO", "")):
+        with pytest.raises(ApplianceError):
+            again.do(name, text)
+    with pytest.raises(ApplianceError, match="need"):
+        desk.do("RENAME", "wood,")
+    with pytest.raises(ConfigError):
+        desk.do("MOVE", "1,-wood")
+    assert found() == [("wood", None)] * 2
+
+
 @pytest.mark.parametrize("earlier", [0, 2])
 def test_what_became_of_the_last_sweep_is_kept(tmp_path, earlier):
     """For displays of the recording: the outcome as in REC, and the sweep that DISCARD would

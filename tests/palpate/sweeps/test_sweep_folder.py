@@ -94,6 +94,47 @@ def test_a_sweep_that_waits_for_the_card_is_forgotten_too(tmp_path):
     again.close()
 
 
+def test_a_sweep_that_cannot_be_moved_keeps_its_material(tmp_path, monkeypatch):
+    """On a full disk, while a sweep waits for the card, and of a damaged sidecar."""
+    disk = SlowDisk()
+    one = recording(tmp_path, disk)
+    put(one, 1)
+    with pytest.raises(ApplianceError):
+        one.commands["RENAME"]("cork,oak")
+    disk.settle()
+    one.close()
+    one = recording(tmp_path)
+    with monkeypatch.context() as patched:
+        patched.setattr(sweep_folder.storage, "put", full)
+        with pytest.raises(ApplianceError, match="No space left"):
+            one.commands["MOVE"]("1,oak")
+    assert one.materials() == {"cork": 1}
+    assert load(tmp_path / "sweep-000001.npy")[0].material == "cork"
+    (tmp_path / "sweep-000001.json").write_text("{")
+    with pytest.raises(ApplianceError):
+        one.commands["MOVE"]("1,oak")
+    assert one.materials() == {"cork": 1}
+    one.close()
+
+
+def test_a_sweep_that_comes_while_its_material_is_renamed_has_the_new_name(tmp_path):
+    """The answer waits for the card; until then nothing else is moved."""
+    disk = SlowDisk()
+    one = recording(tmp_path, disk)
+    put(one, 1)
+    disk.settle()
+    reply = one.commands["RENAME"]("cork,oak")
+    put(one, 2)
+    assert not reply.done()
+    with pytest.raises(ApplianceError):
+        one.commands["MOVE"]("1,elm")
+    disk.settle()
+    assert reply.result()[0] == "oak"
+    assert one.materials() == {"oak": 2}
+    assert [one.sweep.material for one in sweep_folder.taught(tmp_path, Counter())] == ["oak"] * 2
+    one.close()
+
+
 def test_forget_and_discard_are_answered_once_the_card_has_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

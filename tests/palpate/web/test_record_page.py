@@ -17,7 +17,7 @@ from palpate.sweeps.recording import Labels
 from palpate.web.access import Access
 from tests.factories.browser import BrowsedPage, until
 from tests.factories.page_client import port
-from tests.factories.recorded_page import RecordedPage
+from tests.factories.recorded_page import TAUGHT, RecordedPage
 
 pytestmark = pytest.mark.slow
 
@@ -100,14 +100,14 @@ def test_the_last_sweep_with_its_checks(browser, recorded):
 def test_labels_are_set_with_the_keyboard(browser, recorded, tmp_path):
     """Tab reaches every control, Enter sets the labels, and the stored sweep has them."""
     seen, stops = opened(browser, recorded), []
-    for _ in range(11):
+    for _ in range(12):
         seen.page.keyboard.press("Tab")
         stops.append(
             seen.page.evaluate("document.activeElement.id || document.activeElement.textContent")
         )
         outline = seen.page.evaluate("getComputedStyle(document.activeElement).outlineWidth")
         assert float(outline.removesuffix("px")) >= 2
-    controls = ["start", "stop", "material", "position", "session", "set", "next"]
+    controls = ["start", "stop", "material", "position", "session", "set", "next", "rename"]
     assert stops == [*controls, "4 of 3", "3 of 3", "1 of 3", "0 of 3"]
     seen.page.focus("#material")
     seen.page.keyboard.press("Control+A")
@@ -311,6 +311,55 @@ def test_everything_on_it_has_a_role_and_a_name(browser, recorded):
     assert seen.page.get_attribute("#said", "role") == "status"
     assert seen.page.get_attribute("#now", "aria-live") == "polite"
     assert json.dumps(seen.requests).count(".js") == 7
+
+
+PRESS = ":not([aria-disabled=true])"
+
+
+def test_a_sweep_with_the_wrong_material_is_moved(browser: Any, recorded: RecordedPage):
+    """Its right material is set, then one press; a material gets another name; Undo takes back the
+    last of these."""
+    seen = opened(browser, recorded)
+    recorded.sweep()
+    until(lambda: seen.text("#outcome").startswith("wood at 1, stored"))
+    assert not seen.page.is_visible("#move")
+    assert not seen.page.is_visible("#undo")
+    seen.page.click("#counts button >> nth=0")  # metal at 1
+    seen.page.click(f"#move{PRESS}")
+    until(lambda: seen.text("#outcome").startswith("metal at 1, stored"))
+    assert recorded.recording.materials() == {"metal": 8, "wood": 1}
+    assert not seen.page.is_visible("#move")
+    seen.page.fill("#material", "Eiche, geölt")
+    seen.page.click(f"#rename{PRESS}")
+    until(lambda: seen.text("#now") == "Eiche, geölt at 1")
+    assert recorded.recording.materials() == {"Eiche geoelt": 8, "wood": 1}
+    for left in ({"metal": 8, "wood": 1}, {"metal": 7, "wood": 2}):
+        seen.page.click(f"#undo{PRESS}")
+        until(lambda left=left: recorded.recording.materials() == left)
+    until(lambda: not seen.page.is_visible("#undo"))
+    assert not seen.errors
+
+
+def test_a_sweep_that_looks_like_another_material_is_moved(browser: Any, tmp_path: Path):
+    """One press on the page that teaches; there is no button to a material that is not taught."""
+    with RecordedPage(tmp_path, Labels("metal", "1"), teaching=True) as one:
+        number = one.sweep()
+        suspect = {"sweep": f"sweep-{number:06d}", "looks_like": "wood", "text": "like wood"}
+        suspects = [suspect, suspect | {"looks_like": "felt", "text": "like felt"}]
+        learnt = {"accuracy": 0.9, "low": 0.8, "high": 1, "text": "", "advice": ""}
+        held = {**TAUGHT["teach"], "materials": {"metal": 1, "wood": 0}}
+        one.more = {"teach": held | {"learnt": learnt | {"suspects": suspects}}}
+        seen = BrowsedPage(browser.new_context(), one.page.server.address)
+        until(lambda: seen.page.locator("#suspects li").count() == 2)
+        assert seen.page.locator("#suspects button").count() == 1
+        seen.page.click("#suspects button")
+        until(lambda: one.recording.materials() == {"wood": 1})
+        seen.page.fill("#name", "iron")
+        seen.page.click(f"#rename{PRESS}")
+        until(lambda: one.recording.about()["material"] == "iron")
+        assert seen.page.input_value("#name") == ""
+        assert not seen.errors
+        seen.page.context.close()
 
 
 OLDER = """

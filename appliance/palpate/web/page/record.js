@@ -2,7 +2,7 @@
 
 import {byId, enable, fill, made, mark, put} from "./parts.js";
 import {signal, spectrogram} from "./plots.js";
-import {drawHeader, lastPicture, live, ordered, run, seen, since} from "./recording.js";
+import {drawHeader, drawMoves, lastPicture, live, ordered, run, seen, since} from "./recording.js";
 import {SkinPicture} from "./skin.js";
 
 const FIELDS = ["material", "position", "session"], SKIN = new SkinPicture(document.querySelector(".skin"));
@@ -24,6 +24,7 @@ function drawLabels() {
     drawn[name] = value;
   }
   put("trigger", recording.trigger);
+  drawMoves(shown, byId("material").value.trim());
   byId("sweeps").hidden = !recording.commands.includes("START");
   enable(byId("start"), live() && recording.ready && Boolean(recording.material));
   enable(byId("stop"), live() && recording.sweeping);
@@ -135,6 +136,9 @@ const PRESSED = {
   next: () => send([["NEXT", "", "next position"]]),
   start: () => send([["START", "", "started"]]),
   stop: () => send([["STOP", "", "stopped"]]),
+  move: () => send([["MOVE", `${seen.recording.newest[0]},${seen.recording.material}`, "moved"]]),
+  rename: () => send([["RENAME", `${seen.recording.material},${byId("material").value.trim()}`, "renamed"]]),
+  undo: () => send([["UNDO", "", "undone"]]),
   discard: () => send([["DISCARD", `${seen.recording.discard}`, `sweep ${seen.recording.discard} discarded`]]),
 };
 
@@ -146,6 +150,7 @@ byId("record").addEventListener("click", (event) => {
   if (!material) return PRESSED[button.id]();
   send([["MATERIAL", material, "", "material"], ["POSITION", position, `now ${named(material, position)}`, "position"]]);
 });
+byId("fields").addEventListener("input", () => { seen.dirty = true; });
 byId("fields").addEventListener("keydown", (event) => { if (event.key === "Enter" && live()) setLabels(); });
 
 function press() {

@@ -1,7 +1,7 @@
 /* What the pages of palpate record and palpate teach share: their events, the head, the call, the last sweep and orders. */
 
 import {listen} from "./events.js";
-import {ago, byId, call, frame, listenToPedal, order, put} from "./parts.js";
+import {ago, byId, call, enable, frame, listenToPedal, order, put} from "./parts.js";
 
 /* key, recording, last: events of these names, as appliance/palpate/web/record.py sends them. picture: of the last sweep.
    finished: the person has ended the program, so that no connection is no fault. dirty: something is to be drawn. */
@@ -33,6 +33,19 @@ export function drawHeader() {
   frame({state, fine: live() && recording.skin === "streaming", source: recording?.source, why});
   byId("format").hidden = !recording;
   if (recording) put("format", recording.format);
+}
+
+/* The buttons of a sweep with the wrong material, and of a material with the wrong name. typed: a new name. */
+export function drawMoves(shown, typed) {
+  const {recording} = seen, {newest, material, undo} = recording;
+  byId("move").hidden = !newest || !material || newest[1] === material;
+  put("move", newest ? `Move sweep ${recording.discard} to ${shown(material)}` : "Move");
+  put("rename", material ? `Rename ${shown(material)}` : "Rename");
+  enable(byId("move"), live());
+  enable(byId("rename"), live() && Boolean(material && typed) && typed !== shown(material));
+  byId("undo").hidden = !undo;
+  put("undo", `Undo: ${undo}`);
+  enable(byId("undo"), live());
 }
 
 function drawCall(wanted) {

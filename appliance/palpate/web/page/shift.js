@@ -98,7 +98,7 @@ function row(one) {
   made("span", "id number", one.sweep, made_row);
   const what = made("span", "what", "", made_row);
   if (one.status !== "ok") mark(made("span", "chip", "", what), one.status);
-  what.append(one.name || (WORDS[one.status] ?? ["", one.reason])[1]);
+  what.append(one.name || (WORDS[one.status] ?? ["", "", one.reason])[2]); // the chip says the rest
   if (!one.label) what.title = one.reason;
   made("span", "number", one.label ? percent(one.probability) : "", made_row);
   made("span", "ms number", one.label ? `${(one.latency_ns / 1e6).toFixed(1)} ms` : "", made_row);

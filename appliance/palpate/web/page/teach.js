@@ -2,7 +2,7 @@
 
 import {ago, byId, enable, fill, made, mark, put} from "./parts.js";
 import {signal} from "./plots.js";
-import {drawHeader, lastPicture, live, ordered, run, seen, since} from "./recording.js";
+import {drawHeader, drawMoves, lastPicture, live, ordered, run, seen, since} from "./recording.js";
 
 const STEPS = {start: "starting", features: "looking at the sweeps", heads: "learning", bundle: "checking"};
 let listed = "", ended = false, usedMs = 0;
@@ -30,7 +30,8 @@ function drawTask() {
   byId("sweep-button").hidden = !byPage();
   put("sweep-button", recording.sweeping ? "Stop" : "Start");
   enable(byId("sweep-button"), live() && recording.skin === "streaming" && (trying || Boolean(name)));
-  for (const id of ["discard", "skip", "place"]) byId(id).hidden = Boolean(trying);
+  for (const id of ["discard", "move", "skip", "place", "rename", "undo"]) byId(id).hidden = Boolean(trying);
+  if (!trying) drawMoves(shown, byId("name").value.trim());
   enable(byId("discard"), live() && recording.discard != null);
   put("discard", recording.discard == null ? "Discard" : `Discard sweep ${recording.discard}`);
   enable(byId("skip"), live() && now && Object.keys(now.materials).length > 1);
@@ -77,10 +78,16 @@ function drawLearnt() {
     put("learnt", "");
     put("advice", "");
   }
-  const suspects = [...(learnt?.no_slides ?? []), ...(learnt?.suspects ?? [])].map((one) => one.text);
-  if (byId("suspects").dataset.text !== suspects.join()) {
-    byId("suspects").dataset.text = suspects.join();
-    fill(byId("suspects"), ...suspects.map((text) => made("li", "", text)));
+  const suspects = [...(learnt?.no_slides ?? []), ...(learnt?.suspects ?? [])], text = JSON.stringify(suspects);
+  if (byId("suspects").dataset.text !== text) {
+    byId("suspects").dataset.text = text;
+    fill(byId("suspects"), ...suspects.map((one) => {
+      const row = made("li", "", one.text);
+      if (now.materials[one.looks_like] === undefined) return row;
+      const button = made("button", "", `Move to ${shown(one.looks_like)}`, row);
+      Object.assign(button, {type: "button"}).dataset.move = `${Number(one.sweep.split("-")[1])},${one.looks_like}`;
+      return row;
+    }));
   }
   byId("use").hidden = Boolean(trying);
   byId("done").hidden = !trying;
@@ -159,6 +166,9 @@ const PRESSED = {
   discard: () => send("DISCARD", `${seen.recording.discard}`),
   skip,
   place: () => send("NEXT"),
+  move: () => send("MOVE", `${seen.recording.newest[0]},${seen.recording.material}`),
+  rename,
+  undo: () => send("UNDO"),
   use: () => send("USE"),
   done: finish,
 };
@@ -166,12 +176,17 @@ const PRESSED = {
 byId("teach").addEventListener("click", (event) => {
   const button = event.target.closest("button");
   if (!button || button.id === "add-button" || button.getAttribute("aria-disabled") === "true") return;
-  const {material, forget} = button.dataset;
-  if (material) send("TEACH", material);
+  const {material, forget, move} = button.dataset;
+  if (move) send("MOVE", move);
+  else if (material) send("TEACH", material);
   else if (forget) send("FORGET", forget);
   else PRESSED[button.id]();
   if (!forget) button.blur(); // so that the pedal's Enter starts a sweep
 });
+async function rename() {
+  const name = byId("name").value.trim();
+  if (!(await send("RENAME", `${seen.recording.material},${name}`)) && byId("name").value.trim() === name) byId("name").value = "";
+}
 async function add() {
   const name = byId("name").value.trim();
   if (!live()) return put("said", "no connection yet: add it again when the page has one");
@@ -181,6 +196,7 @@ async function add() {
   }
 }
 byId("add-button").addEventListener("click", add);
+byId("name").addEventListener("input", () => { seen.dirty = true; });
 byId("name").addEventListener("keydown", (event) => { if (event.key === "Enter") add(); });
 function press() {
   if (byPage() && byId("sweep-button").getAttribute("aria-disabled") === "false") PRESSED["sweep-button"]();

@@ -72,7 +72,7 @@ function answer(verdict, windowS, next, now) {
     verdict.fused > 1 ? `${verdict.fused} sweeps of one object` : "", verdict.share < 1 ? `early, at ${percent(verdict.share)} of the window` : ""];
   return {tone, status: named && !verdict.moved ? "ok" : status, words: named ? verdict.name : words, advice, next, of: of(verdict, now),
     small: more.filter(Boolean).join(", "), moved: verdict.moved,
-    detail: [verdict.detail === verdict.moved ? "" : verdict.detail, verdict.reason].filter(Boolean).join("; ")};
+    detail: [verdict.detail === verdict.moved ? "" : verdict.detail, verdict.reason].filter(Boolean).join("; "), named};
 }
 
 export function drawCard(shown) {
@@ -80,7 +80,7 @@ export function drawCard(shown) {
   one.dataset.tone = shown.tone;
   byId("sign").firstElementChild.setAttribute("d", SIGNS[shown.tone]);
   mark(byId("status"), shown.status);
-  byId("status").hidden = !shown.status;
+  byId("status").hidden = !shown.named; // the words say the same where there is no label
   put("which", shown.of ?? "");
   if (label.textContent !== shown.words) {
     label.style.setProperty("--wide", widest(shown.words).toFixed(2));
