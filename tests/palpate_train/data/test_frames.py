@@ -189,13 +189,14 @@ def test_a_column_of_dates_gives_the_times():
         frames.frames(table, plan(grid="1x1", time="when:date", rate_hz=None))
 
 
-@pytest.mark.parametrize("form", ["{} sec", "{}s", "{} seconds"])
+@pytest.mark.parametrize("form", ["{} sec", "{}s", "{} seconds", "{} \u00b5s", "{}nsec"])
 def test_times_may_have_their_unit_behind_each(form: str):
     """As MATLAB writes durations; another unit than that of --time is refused."""
     table = text(("t", "a"), texts={0: [form.format(k / 100) for k in range(40)]})
-    _, time_s, _ = frames.frames(table, plan(grid="1x1", time="t:s", rate_hz=None))
-    np.testing.assert_allclose(time_s, np.arange(40) / 100)
-    with pytest.raises(FormatError, match="t holds text"):
+    unit = {"\u00b5": "us", "n": "ns"}.get(form.strip("{} ")[0], "s")
+    _, time_s, _ = frames.frames(table, plan(grid="1x1", time=f"t:{unit}", rate_hz=None))
+    np.testing.assert_allclose(time_s / frames.sampling.UNITS_S[unit], np.arange(40) / 100)
+    with pytest.raises(FormatError, match=f"--time t:{unit}"):
         frames.frames(table, plan(grid="1x1", time="t:ms", rate_hz=None))
 
 
@@ -211,6 +212,15 @@ def test_times_may_have_their_unit_behind_each(form: str):
         "12:59:{0:06.3f}",
         "12:59:{1:02d},{2:03d}",
         "12:59:{1:02d}:{2:03d}",
+        "12:59:{1:02d}:{2:03d}000",
+        "Sat, 31 Jan 2026 12:59:{0:06.3f}",
+        "Sat Jan 31 12:59:{0:06.3f} 2026",
+        "31-Jan-26 12:59:{0:06.3f}",
+        "31. Januar 2026 12:59:{0:06.3f}",
+        "2026-01-31, 12:59:{0:06.3f} UTC",
+        "2026-01-31_12:59:{0:06.3f}",
+        "20260131T1259{0:06.3f}Z",
+        "20260131_1259{1:02d}_{2:03d}",
     ],
 )
 def test_dates_of_other_forms_give_the_times(form: str):

@@ -23,21 +23,28 @@ RANGE = re.compile(r"([1-9]\d*)(?:-([1-9]\d*))?")
 DAY = re.compile(r"(\d{4}-\d\d-\d\d|\d{1,2}[./]\d{1,2}[./]\d{2,4})[T ].*")
 """A date with a clock time; the first group is the day."""
 DAY_S = 86_400
-_NAMED = r"\d{1,2}[- ][A-Za-z]{3,9}[- ]\d{4}|[A-Za-z]{3,9} \d{1,2},? \d{4}"
+_NAMED = r"\d{1,2}\.?[- ][^\W\d_]{3,9}\.?[- ]\d{2,4}|[A-Za-z]{3,9} \d{1,2}(?:,? \d{4})?"
 MOMENT = re.compile(
-    rf"(?:(?P<day>\d{{1,4}}[-./]\d{{1,2}}[-./]\d{{1,4}}|{_NAMED})[T ]+)?"
+    r"(?:(?:[A-Z][a-z]{1,8},? )?"
+    rf"(?P<day>\d{{1,4}}[-./]\d{{1,2}}[-./]\d{{1,4}}|{_NAMED})[T ,_-]+)?"
     r"(?P<hour>\d{1,2}):(?P<minute>\d\d)"
-    r"(?::(?P<second>\d\d(?:[.,]\d+|:\d{3})?))?\s?(?P<noon>[aApP][mM])?(?P<zone>Z|[+-]\d\d:?\d\d)?"
+    r"(?::(?P<second>\d\d(?:[.,]\d+|:\d{3}(?:\d{3})?)?))?\s?(?P<noon>[aApP][mM])?"
+    r"\s?(?P<zone>Z|UTC|GMT|[+-]\d\d:?\d\d)?(?P<year> \d{4})?"
 )
-"""A time of the day, perhaps with its date and zone."""
+"""A time of the day, perhaps with its date and zone; the year may stand at the end."""
+COMPACT = re.compile(r"(\d{4})(\d\d)(\d\d)[T_ -](\d\d)(\d\d)(\d\d)(?:[._,](\d+))?(Z?)")
+"""The same in digits alone."""
 MONTHS = ["jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec"]
 NAMED_DAY = re.compile(
     r"(?:(?P<first>\d{1,2})[- ])?(?P<month>[A-Za-z]+)(?:[- ](?P<second>\d{1,2}),?)?"
-    r"[- ](?P<year>\d{4})"
+    r"[- ](?P<year>\d{4}|\d\d)"
 )
 """A date whose month is an English word."""
-WITH_UNIT = re.compile(r"([-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)\s*(?P<unit>[a-zA-Z]+)")
-WORDS = {"s": "s", "sec": "s", "secs": "s", "seconds": "s", "ms": "ms", "msec": "ms", "us": "us"}
+WITH_UNIT = re.compile(r"([-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)\s*(?P<unit>[^\W\d_]+)")
+WORDS = {
+    "s": "s", "sec": "s", "secs": "s", "second": "s", "seconds": "s", "ms": "ms", "msec": "ms",
+    "us": "us", "usec": "us", "\u00b5s": "us", "\u03bcs": "us", "ns": "ns", "nsec": "ns",
+}  # fmt: skip
 """Units of times behind each number, as tables of durations have them."""
 
 SQUARE = (
@@ -173,9 +180,11 @@ def _times(values: Array, table: Table, plan: ImportPlan) -> tuple[int | None, A
         return at, _dates(name, table, at)
     if at in table.texts:
         found = [WITH_UNIT.fullmatch(text.strip()) for text in table.texts[at]]
-        units = {one["unit"].lower() for one in found if one}
-        if None not in found and len(units) == 1 and WORDS.get(units.pop()) == unit:
+        units = {WORDS.get(one["unit"].lower(), "") if one else "" for one in found}
+        if units == {unit}:
             return at, np.array([float(one[1]) for one in found if one]) * sampling.UNITS_S[unit]
+        if len(units) == 1 and (other := units.pop()):
+            raise FormatError(f"column {name} holds times in {other}; write --time {name}:{other}")
         raise FormatError(
             f"column {name} holds text, such as {table.texts[at][0]!r}; "
             f"for dates with a clock time write --time {name}:{DATE}"
@@ -189,7 +198,8 @@ def _dates(name: str, table: Table, at: int) -> Array:
     Raises FormatError."""
     if at not in table.texts:
         raise FormatError(f"column {name} holds numbers, not dates; name their unit")
-    found = [MOMENT.fullmatch(text.strip()) for text in table.texts[at]]
+    texts = [COMPACT.sub(_apart, text.strip()) for text in table.texts[at]]
+    found = [MOMENT.fullmatch(text) for text in texts]
     if None in found:
         k = found.index(None)
         raise FormatError(
@@ -197,12 +207,18 @@ def _dates(name: str, table: Table, at: int) -> Array:
             "2026-01-31 12:00:00.5"
         )
     parts = [one.groupdict("") for one in found if one]
-    days = _days(name, [one["day"] for one in parts])
+    days = _days(name, [one["day"] + one["year"] for one in parts])
     clock = np.array([_clock_s(one) for one in parts])
     if not any(one["day"] for one in parts):  # times of the day begin again at midnight
         days = np.cumsum(np.diff(clock, prepend=clock[0]) < -DAY_S / 2)
     times: Array = (days - days[0]) * DAY_S + clock - clock[0]
     return times
+
+
+def _apart(found: re.Match[str]) -> str:
+    """A time of COMPACT with the usual signs between its parts."""
+    year, month, day, hour, minute, second, fraction, zone = found.groups("")
+    return f"{year}-{month}-{day} {hour}:{minute}:{second}.{fraction or 0}{zone}"
 
 
 def _days(name: str, texts: Sequence[str]) -> Array:
@@ -228,7 +244,7 @@ def _numbered(day: str) -> str:
     if not found or found["month"][:3].lower() not in MONTHS:
         return day
     month = MONTHS.index(found["month"][:3].lower()) + 1
-    return f"{found['year']}-{month:02d}-{int(found['first'] or found['second']):02d}"
+    return f"{found['year']:0>4}-{month:02d}-{int(found['first'] or found['second']):02d}"
 
 
 def _clock_s(parts: Mapping[str, str]) -> float:
@@ -364,7 +380,7 @@ def _named(name: str, names: Sequence[str], option: str) -> int:
     ):
         raise FormatError(
             f"{option}: {name!r} is the name of column {where[0] + 1} and the number of another; "
-            f"give the range {where[0] + 1}-{where[0] + 1}, or rename the columns"
+            f"write {where[0] + 1}-{where[0] + 1} for the first, {name}-{name} for the other"
         )
     return where[0]
 

@@ -48,6 +48,7 @@ DAMAGED = (
     *UNREADABLE, OSError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error, csv.Error,
 )  # fmt: skip
 """Exceptions that NumPy, h5py and Python's own libraries raise for damaged files."""
+AGAIN = "if it was cut off, copy or record it again"
 REMEDIES = {
     (
         ".pkl",
@@ -100,7 +101,7 @@ def read(path: Path, wanted: ReadPlan | None = None) -> Table:
     try:
         return _read(path, wanted or ReadPlan())
     except DAMAGED as e:
-        raise FormatError(f"cannot be read: {' '.join(str(e).split())}") from e
+        raise FormatError(f"cannot be read: {' '.join(str(e).split())}; {AGAIN}") from e
 
 
 def arrays_of(path: Path) -> tuple[str, ...]:
@@ -121,7 +122,8 @@ def _read(path: Path, wanted: ReadPlan) -> Table:
         except FormatError:
             raise
         except Exception as e:  # libraries raise errors of any type for damaged files
-            raise FormatError(f"cannot be read: {' '.join(str(e).split()) or repr(e)}") from e
+            why = " ".join(str(e).split()) or repr(e)
+            raise FormatError(f"cannot be read: {why}; {AGAIN}") from e
     if reader:
         return reader(path, wanted)
     if remedy := next((why for suffixes, why in REMEDIES.items() if suffix in suffixes), ""):

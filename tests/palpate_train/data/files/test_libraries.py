@@ -233,11 +233,16 @@ def test_recordings_of_ros_are_read(tmp_path: Path, kind: str, messages: str):
 
 
 def test_a_recording_that_was_cut_off_says_how_to_mend_it(tmp_path: Path):
-    """An MCAP without its end."""
-    (path,) = bag(tmp_path / "a", "mcap", "std_msgs/msg/Float32MultiArray").glob("*.mcap")
-    path.write_bytes(path.read_bytes()[:-20])
-    with pytest.raises(FormatError, match="mcap recover"):
-        raw_files.read(path)
+    """A file without its end, in each format of ROS."""
+    for kind, mends in {"mcap": "mcap recover", "bag": "reindex", "db3": "recover"}.items():
+        path = bag(tmp_path / f"a.{kind}", kind, "std_msgs/msg/Float32MultiArray")
+        path = next(path.glob(f"*.{kind}"), path)
+        content = path.read_bytes()
+        for kept in (len(content) // 2, len(content) - 20):
+            path.write_bytes(content[:kept])
+            with pytest.raises(FormatError, match="cut off") as e:
+                raw_files.read(path)
+            assert mends in str(e.value) or kind == "db3"
 
 
 LABELS = ["wood"] * 15 + ["felt"] * 25

@@ -200,7 +200,7 @@ def test_columns_may_be_named_by_numbers(first: int):
     assert len(read(labels).values) == len(ROWS) + 1  # all rows begin with a word
 
 
-@pytest.mark.parametrize("word", ["Mean", '"Max"', "std dev"])
+@pytest.mark.parametrize("word", ["Mean", '"Max"', "std dev", "2\u03c3", "95 % CI", "1st quartile"])
 def test_rows_of_statistics_are_no_frames(word: str):
     """A word where all frames have a number, above or below: left out, and said."""
     row = f"{word},25.5,25.5,25.5\n"
@@ -211,8 +211,32 @@ def test_rows_of_statistics_are_no_frames(word: str):
 
 
 def test_ranges_below_names_are_no_names():
-    """Numbers with their unit."""
+    """Numbers with their unit; gains, types and spans repeat, as names do not."""
     check_whole("a,b,c,d\nRange=,10.000 V,5 mV,10 V\n" + BODY)
+    for cell in ("x10", "uint8", "0 to 5 V", "-10-10 V", "5.0"):
+        check_whole(f"a,b,c,d\ns,{cell},{cell},{cell}\n" + BODY)
+
+
+WIDE = [[7 * r + c * c for c in range(16)] for r in range(1, 31)]
+
+
+@pytest.mark.parametrize("count", [range(16), range(1, 17), range(17, 33)])
+@pytest.mark.parametrize("form", ["{}", "{:02d}", "{}.0", '"{}"'])
+@pytest.mark.parametrize(
+    ("word", "before"), [("time", "1.5,"), ("label", "cork,"), ("", "3,"), (None, "")]
+)
+def test_many_numbers_that_count_are_no_frame(count, form, word, before):
+    """Columns of a mat named by numbers, beside times, labels or nothing at all; a frame that
+    begins like all others stays."""
+    if word is None and (count[0] > 1 or form != "{}"):
+        return  # all are numbers: only 0 or 1 can be meant as the first column
+    rows = [before + ",".join(map(str, row)) for row in WIDE]
+    head = ",".join([*([word] if word is not None else []), *map(form.format, count)])
+    found = read("\n".join([head, *rows]))
+    assert len(found.values) == len(WIDE)
+    np.testing.assert_array_equal(found.values[:, -16:], WIDE)
+    if word == "label":
+        assert len(read("\n".join([head.replace("label", "cork"), *rows])).values) == 31
 
 
 def test_names_stand_on_the_last_line_before_the_numbers():

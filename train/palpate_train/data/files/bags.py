@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,8 @@ PIXELS = {
 }  # fmt: skip
 """NumPy types of the pixels of an image with one channel, by the name of its encoding."""
 IMAGE = "Image"
+MENDED = {".bag": "`rosbag reindex`", ".db3": "`sqlite3 FILE .recover`"}
+"""What makes a recording whole that was cut off, beside `mcap recover`."""
 MCAP_END = b"\x89MCAP0\r\n"
 
 
@@ -44,7 +47,7 @@ def read(path: Path, wanted: ReadPlan) -> Table:
     if path.suffix.lower() == ".mcap" and not _has_end(path):
         raise FormatError("has no end, as if it was cut off; `mcap recover` makes it whole")
     store = stores.get_typestore(stores.Stores.ROS2_JAZZY)
-    with highlevel.AnyReader([source], default_typestore=store) as bag:
+    with _opened(highlevel, source, store, MENDED.get(path.suffix.lower(), "")) as bag:
         topics: dict[str, list[Any]] = {}
         for connection in bag.connections:
             topics.setdefault(normal(connection.topic), []).append(connection)
@@ -60,6 +63,20 @@ def read(path: Path, wanted: ReadPlan) -> Table:
             )
         labels = {name: topics[name] for name in wanted.fields if name in topics}
         return _table(bag, topics[fitting[0]], labels)
+
+
+@contextmanager
+def _opened(highlevel: Any, source: Path, store: Any, mends: str) -> Iterator[Any]:
+    """The open recording. Raises FormatError if it was cut off."""
+    with ExitStack() as stack:
+        try:
+            reader = highlevel.AnyReader([source], default_typestore=store)
+            bag = stack.enter_context(reader)
+        except Exception as e:  # its readers raise errors of several types for damaged files
+            if not mends:
+                raise
+            raise FormatError(f"may be cut off ({e}); {mends} makes it whole") from e
+        yield bag
 
 
 def _has_end(path: Path) -> bool:

@@ -34,6 +34,8 @@ UNIT = re.compile(
 )
 QUANTITY = re.compile(r"[-+]?\d[\d.,]*\s*(?:[kmuµn]?(?:s|sec|V|N|A|Pa|g|m|Hz)|%)")
 """A number with its unit, as in the rows of ranges below names."""
+LEAST_COUNTED = 8
+"""From more numbers 1, 2, 3 ... on a line is no frame, whatever the frames are like."""
 SAMPLED = 200
 """Number of lines at the start and at the end that show the layout of a text."""
 CLEAR = 0.9
@@ -246,7 +248,7 @@ def _body(kept: Sequence[Row], layout: Layout) -> tuple[int, int]:
             for k, (_, line) in enumerate(kept)
             if not _marked(line)
             and layout.is_frame(line)
-            and not _counts_columns(layout.cells(line), layout)
+            and not _counts_columns(kept[k : k + 2], layout)
             and not _is_summary(layout.cells(line), layout)
         ),
         len(kept),
@@ -259,19 +261,32 @@ def _body(kept: Sequence[Row], layout: Layout) -> tuple[int, int]:
     return start, end
 
 
-def _counts_columns(found: Sequence[str], layout: Layout) -> bool:
-    """Whether a line is a head that counts its columns: time,1,2,3, or ,0,1,2,3 of pandas. If the
-    frames begin with a word, too, it is a frame."""
-    first, *others = map(_bare, found)
-    counted = others in ([str(k + i) for i in range(len(others))] for k in (0, 1))
-    return counted and (not first or _is_summary(found, layout))
+def _counts_columns(lines: Sequence[Row], layout: Layout) -> bool:
+    """Whether the first of two lines is a head that counts its columns: time,1,2,3, or ,0,1,2,3 of
+    pandas. Without a word, or if all frames begin with one, it has LEAST_COUNTED numbers. If the
+    line below begins alike, it is a frame."""
+    first, below = (list(map(_bare, layout.cells(line))) for _, line in (lines[0], lines[-1]))
+    long, starts = layout.wide > LEAST_COUNTED, ("0", "1")
+    if is_number(first[0]):
+        return long and first[0] in starts and _is_count(first) and first != below
+    clear = long or (0 not in layout.text_columns and first[1] in starts)
+    return clear and _is_count(first[1:]) and first[0] != below[0]
+
+
+def _is_count(found: Sequence[str]) -> bool:
+    """Whether cells are numbers that rise by one each."""
+    if not found or not all(map(is_number, found)):
+        return False
+    counts = [float(plain(cell, ".")) for cell in found]
+    return counts == [counts[0] + k for k in range(len(counts))]
 
 
 def _is_summary(found: Sequence[str], layout: Layout) -> bool:
     """Whether a line beside the frames begins with a word where all frames have a number, such as
     Mean, SD, Min or Max."""
-    first = _bare(found[0])
-    word = first[:1].isalpha() and not is_number(first) and first.lower() not in MISSING
+    first = _bare(found[0]).lstrip("#%/ ")
+    word = any(map(str.isalpha, first)) and not is_number(first) and first.lower() not in MISSING
+    word = word and not SHEET_ERROR.match(found[0].strip())
     return word and 0 not in layout.text_columns and layout.wide > 1
 
 
@@ -279,7 +294,7 @@ def _is_footer(pair: Sequence[Row], layout: Layout, last: bool) -> bool:
     """Whether the second of two lines after the frames is text, a comment or, as the last one, cut
     off. Cells that are empty in both belong to a slower channel that has ended."""
     (_, above), (_, line) = pair
-    if _marked(line):
+    if _marked(line) and not _is_summary(layout.cells(line), layout):
         return len(layout.cells(line)) != layout.wide or not layout.is_frame(line)
     whole, before = layout.cells(line), layout.cells(above)
     if len(whole) == len(before) == layout.wide and not (before[-1] + whole[-1]).strip():
@@ -294,14 +309,14 @@ def _is_footer(pair: Sequence[Row], layout: Layout, last: bool) -> bool:
 
 
 def _passed_over(before: Sequence[Row], layout: Layout) -> list[str]:
-    """A remark on rows of numbers before the frames that begin with a word."""
+    """A remark on rows of numbers before the frames, unless these are names."""
     found = [(i, layout.cells(line)) for i, line in before if not _marked(line)]
     rows = [
         (i, cells[0])
         for i, cells in found
         if len(cells) == layout.wide
         and all(map(is_number, cells[1:]))
-        and not _counts_columns(cells, layout)
+        and (is_number(cells[0]) or not _is_count(cells[1:]))
     ]
     return [f"line {i}, {excerpt(word.strip())}, is passed over" for i, word in rows]
 
@@ -329,7 +344,9 @@ def _heads(lines: Sequence[str], before: Sequence[Row], layout: Layout) -> tuple
             heads = [h[:-1] if len(h) == wide + 1 and not h[-1] else h for h in heads]
             heads = [h for h in heads if len(h) == wide and not all(map(is_number, h))]
             heads = [h for h in heads if not all(map(QUANTITY.fullmatch, h[1:]))] or heads
-            if named := [h for h in heads if not all(map(UNIT.fullmatch, h))] or heads:
+            heads = [h for h in heads if not all(map(UNIT.fullmatch, h))] or heads
+            # ranges, gains and types repeat
+            if named := [h for h in heads if len({*h}) == len(h)] or heads:
                 return tuple(map(normal, named[-1]))
     return ()
 
