@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,7 @@ from palpate_train.models import methods
 from palpate_train.reports.plot_style import SVG
 from tests.factories.development_data import SERIES, case, entry, figures, timed, times
 from tests.factories.page_reader import PageReader
+from tests.factories.paths import ROOT
 from tests.factories.study_pages import committed
 from tests.factories.sweep_sets import tones
 
@@ -130,6 +132,14 @@ def test_a_chart_outside_of_a_page_needs_no_style_sheet():
     assert "var(" not in plain
     assert "<style" not in plain
     assert "var(--accent" in development_report.front(figures())
+
+
+def test_the_picture_of_the_readme_names_at_most_seven_methods():
+    """The line of our family, what ships, and the methods that a stranger would take otherwise."""
+    named = re.findall(r">([^<>]+) \d+\.\d<", (ROOT / "docs/front.svg").read_text("utf-8"))
+    assert {"ships", "Palpate", "MiniRocket", "MultiRocket-Hydra"} <= {*named}
+    assert len({*named}) <= 7
+    assert max(Counter(named).values()) <= 2  # once in each panel
 
 
 def test_names_do_not_collide():

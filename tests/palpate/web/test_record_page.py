@@ -362,6 +362,51 @@ def test_a_sweep_that_looks_like_another_material_is_moved(browser: Any, tmp_pat
         seen.page.context.close()
 
 
+COVERED = """() => {
+  const seen = [...document.querySelectorAll("button, input, h2, #what, #now, #call")]
+    .filter((e) => e.checkVisibility()).map((e) => [e, e.getBoundingClientRect()]);
+  const meet = (p, q) => Math.min(p.right, q.right) - Math.max(p.left, q.left) > 1
+    && Math.min(p.bottom, q.bottom) - Math.max(p.top, q.top) > 1;
+  return seen.flatMap(([a, p], i) => seen.slice(i + 1).filter(([, q]) => meet(p, q))
+    .map(([b]) => `${a.id} on ${b.id}`));
+}"""
+"""Pairs of controls and titles that lie on each other."""
+SMALL = """() => [...document.querySelectorAll("button, input")].filter((e) => e.checkVisibility())
+  .filter((e) => e.getBoundingClientRect().height < 40).map((e) => e.id)"""
+"""Controls that a finger misses."""
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize(("width", "height"), SIZES)
+@pytest.mark.parametrize("teaching", [False, True])
+def test_a_person_sees_each_control_of_a_page(
+    browser: Any, tmp_path: Path, width: int, height: int, scheme: str, teaching: bool
+):
+    """With a sweep that can be moved and one moved back, nothing lies on another thing, is cut, is
+    too faint or too small for a finger."""
+    with RecordedPage(tmp_path, Labels("metal", "1"), teaching=teaching) as one:
+        number = one.sweep()
+        suspect = {"sweep": f"sweep-{number:06d}", "looks_like": "wood", "text": "like wood"}
+        learnt = {"accuracy": 0.9, "low": 0.8, "high": 1, "text": "so it is", "advice": "look"}
+        held = {**TAUGHT["teach"], "materials": {"metal": 1, "wood": 3}}
+        if teaching:
+            one.more = {"teach": held | {"learnt": learnt | {"suspects": [suspect]}}}
+        size = {"width": width, "height": height}
+        context = browser.new_context(viewport=size, color_scheme=scheme)
+        seen = BrowsedPage(context, one.page.server.address)
+        for order in (("MOVE", f"{number},wood"), ("MATERIAL", "metal")):
+            one.recording.commands[order[0]](order[1])
+        for where in ("#move", "#undo", "#rename"):
+            until(lambda where=where: seen.page.is_visible(where))
+        assert seen.page.evaluate(COVERED) == []
+        assert seen.page.evaluate(SMALL) == []
+        assert seen.page.evaluate(CUT) == []
+        assert seen.legibility()[1] == []
+        assert seen.page.evaluate("document.documentElement.scrollWidth") <= width
+        assert not seen.errors
+        context.close()
+
+
 OLDER = """
 for (const [of, name] of [[Array.prototype, "at"], [Element.prototype, "replaceChildren"],
   [String.prototype, "replaceAll"], [AbortSignal, "timeout"], [Object, "hasOwn"]]) delete of[name];

@@ -50,24 +50,32 @@ SPAN = 0.22
 LETTERS = 74
 """Most letters of a line of small text."""
 KEY = "━ Pareto front of all forms   ● int8   ■ float   ◯ ships"
+FEW_KEY = "━ our family, from small to large   ◯ ships   ● int8   ■ float"
+FEW = (PACKAGED, OURS[0], "minirocket", "multirocket-hydra", "ds-cnn", "paper-cnn-centred", "quant")
+"""The methods of README's picture; the page has all."""
+FEW_NAMES = {PACKAGED: "ships", OURS[0]: "Palpate"}
 
 
 def speed(panels: Sequence[ChartPanel], machine: str, plain: bool = False) -> str:
     """Mean accuracy over the time of a sweep: a panel for each kind of tests, on one axis.
 
-    machine: processor and threads, in words. plain: in fixed colours, for a viewer of Markdown.
+    machine: processor and threads, in words. plain: in fixed colours, for a viewer of Markdown, and
+    with the methods of FEW alone.
     """
     spots = [spot.ms for panel in panels for spot in panel.spots]
     ends = min(spots) / 1.7, max(spots) * 1.7
-    said = (_below(panels), _gaps(panels), machine)
-    lines = [KEY, *(line for text in said for line in textwrap.wrap(text, LETTERS))]
+    said = ("" if plain else _below(panels), _gaps(panels, plain), machine)
+    lines = [
+        FEW_KEY if plain else KEY,
+        *(line for text in said for line in textwrap.wrap(text, LETTERS)),
+    ]
     each, below = HEAD + HEIGHT + FOOT, 0.17 * len(lines) + 0.08
     height = each * len(panels) + below
     figure = Figure((WIDTH, height), dpi=72)
     for number, panel in enumerate(panels):
         top = height - each * number - HEAD
         axes = add_axes(figure, 0.11, 0.97, top / height, (top - HEIGHT) / height)
-        _panel(axes, panel, ends)
+        _panel(axes, panel, ends, plain)
     for number, line in enumerate(reversed(lines)):
         figure.text(0.012, (0.07 + 0.17 * number) / height, line, color=GREY, size=SMALL)
     return to_svg(figure, "; ".join(f"{panel.kind}: {finding(panel)}" for panel in panels), plain)
@@ -84,23 +92,25 @@ def _below(panels: Sequence[ChartPanel]) -> str:
     return f"▾ less than the axis shows ({'; '.join(parts)})" if parts else ""
 
 
-def _label(spot: Spot) -> str:
-    return f"{short_name(spot.method)} {100 * spot.mean:.1f}"
+def _label(spot: Spot, few: bool = False) -> str:
+    name = FEW_NAMES.get(spot.method) if few else None
+    return f"{name or short_name(spot.method)} {100 * spot.mean:.1f}"
 
 
-def _gaps(panels: Sequence[ChartPanel]) -> str:
+def _gaps(panels: Sequence[ChartPanel], few: bool) -> str:
     """The hollow marks: methods that were not run in every test, with the number of their tests."""
     parts = []
     for panel in panels:
         count = len(panel.cases)
-        those = [f"{short_name(name)} {count - n}" for name, n in panel.lacking().items()]
+        lacking = {m: n for m, n in panel.lacking().items() if m in FEW or not few}
+        those = [f"{short_name(name)} {count - n}" for name, n in lacking.items()]
         if those:
             parts.append(f"{panel.kind}: {' · '.join(those)} of {count}")
     return f"Hollow: not run in all tests ({'; '.join(parts)})" if parts else ""
 
 
-def _panel(axes: Axes, panel: ChartPanel, ends: tuple[float, float]) -> None:
-    """One panel with its finding as title."""
+def _panel(axes: Axes, panel: ChartPanel, ends: tuple[float, float], few: bool) -> None:
+    """One panel with its finding as title. few: the methods of FEW alone."""
     low, high = _ends(panel)
     room = 0.09 * max(high - low, 0.02)
     axes.set_xscale("log")
@@ -121,9 +131,10 @@ def _panel(axes: Axes, panel: ChartPanel, ends: tuple[float, float]) -> None:
     corners = [(x, y) for a, b in pairwise(front) for x, y in (a, (b[0], a[1]))]
     stairs = [*corners, *front[-1:], *((ends[1], y) for _, y in front[-1:])]
     line = [(spot.ms, spot.mean) for spot in panel.line]
+    stairs = [] if few else stairs  # without the dots at its corners it says nothing
     for path, shade, width in ((stairs, BLACK, 1.1), (line, ACCENT, 1.8)):
         axes.plot([x for x, _ in path], [y for _, y in path], color=shade, linewidth=width)
-    label_places.write(axes, list(_marks(axes, panel)), _between(line) + _between(stairs))
+    label_places.write(axes, list(_marks(axes, panel, few)), _between(line) + _between(stairs))
 
 
 def _ends(panel: ChartPanel) -> tuple[float, float]:
@@ -132,16 +143,17 @@ def _ends(panel: ChartPanel) -> tuple[float, float]:
     return max(min(means), max(means) - SPAN), max(means)
 
 
-def _marks(axes: Axes, panel: ChartPanel) -> Iterator[Label]:
+def _marks(axes: Axes, panel: ChartPanel, few: bool) -> Iterator[Label]:
     """Draw the spots; yield their names, the most important first. All forms of a method have the
     same name."""
     names: dict[str, str] = {}
     shown = [s for s in panel.spots if not (s.method in OURS and s.form) or s in panel.front]
+    shown = [s for s in shown if s.method in FEW and not s.form] if few else shown
     bottom, _ = _ends(panel)
     for spot in shown:
         y, mark = max(spot.mean, bottom), MARKERS[spot.precision]
         mark = "v" if spot.mean < bottom else mark
-        shade = _shade(panel, spot)
+        shade = _shade(panel, spot, few)
         face = WHITE if spot.lacks else shade
         look: dict[str, Any] = {"markeredgecolor": shade, "markerfacecolor": face, "clip_on": False}
         axes.plot(spot.ms, y, mark, markersize=5.5, zorder=4, **look)
@@ -149,12 +161,12 @@ def _marks(axes: Axes, panel: ChartPanel) -> Iterator[Label]:
             axes.plot(spot.ms, y, **RING)
     order = sorted(shown, key=lambda s: (s.method != PACKAGED, s not in panel.front, -s.mean))
     for spot in order:
-        text = "" if spot.mean < bottom else names.setdefault(spot.method, _label(spot))
-        yield spot.ms, max(spot.mean, bottom), text, _shade(panel, spot), spot.method in OURS
+        text = "" if spot.mean < bottom else names.setdefault(spot.method, _label(spot, few))
+        yield spot.ms, max(spot.mean, bottom), text, _shade(panel, spot, few), spot.method in OURS
 
 
-def _shade(panel: ChartPanel, spot: Spot) -> str:
-    return ACCENT if spot.method in OURS else BLACK if spot in panel.front else GREY
+def _shade(panel: ChartPanel, spot: Spot, few: bool) -> str:
+    return ACCENT if spot.method in OURS else BLACK if spot in panel.front and not few else GREY
 
 
 def _between(line: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:

@@ -20,7 +20,7 @@ FAR = 15
 """From this distance on a stroke joins name and mark."""
 SIDES = {"left": 0.0, "center": 0.5, "right": 1.0}
 """The side of a name at which its mark is."""
-LETTER = 0.53
+LETTER = 0.6
 """Width of a letter, as a share of its size."""
 MARK = 4.0
 """Half the width of a mark, in units."""
