@@ -172,6 +172,25 @@ def test_login_and_a_wrong_one(tmp_path, box, caplog):
     assert "s3cret" not in caplog.text
 
 
+@pytest.mark.slow
+def test_tls(tmp_path, box, caplog):
+    """With the broker's certificate in --ca the bridge connects; without it, the certificate is
+    refused."""
+    required()
+    certificate, key = tmp_path / "certificate.pem", tmp_path / "key.pem"
+    words = ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256"]
+    words += ["-nodes", "-days", "2", "-subj", "/CN=broker", "-keyout", str(key)]
+    words += ["-addext", "subjectAltName=IP:127.0.0.1", "-out", str(certificate)]
+    subprocess.run(words, check=True, timeout=LONG_S, capture_output=True)
+    with Mosquitto(tmp_path, f"certfile {certificate}", f"keyfile {key}") as server:
+        secure = ("--port", str(box.path), "--broker", server.url.replace("mqtt:", "mqtts:"))
+        with bridge("mqtt", *secure):
+            eventually(lambda: "certificate verify failed" in caplog.text)
+        assert "connected to" not in caplog.text
+        with bridge("mqtt", *secure, "--ca", str(certificate)):
+            eventually(lambda: "connected to" in caplog.text)
+
+
 @pytest.mark.parametrize("speech", [b"", b"HTTP/1.1 400\r\n\r\n", b"\x20\x03\x00\x00\x00\xff" * 9])
 def test_no_broker_at_the_address(box, caplog, speech):
     """Something else answers, or closes: a reason is logged, the bridge goes on, and ends when
