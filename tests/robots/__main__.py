@@ -8,8 +8,10 @@ with other work: chrt -f 10 python -m tests.robots.
 
 import argparse
 import json
+import math
 import os
 import platform
+import re
 import subprocess
 import sys
 import tempfile
@@ -36,6 +38,7 @@ from palpate.runtime import assembly
 from palpate.sim import devices, script
 from tests.factories import ros
 from tests.factories.bridges import bridge
+from tests.factories.brokers import Mosquitto, Subscriber
 from tests.factories.paths import NO_SITE, ROOT
 from tests.robots import page
 
@@ -72,6 +75,7 @@ class Times:
             ("tcp", "B"),
             ("feed", "A"),
             ("modbus", "A"),
+            ("mqtt", "A"),
             ("ros", "A"),
         }
         return there and min(map(len, self._there.values())) >= sweeps
@@ -131,6 +135,31 @@ def noting(seen: Seen) -> Callable[[Answer | BoxState], None]:
     return lambda news: seen(news.sweep) if isinstance(news, Answer) else None
 
 
+def published(seen: Seen) -> Callable[[str, str], None]:
+    """A listener for the subscriber."""
+    return lambda topic, text: (
+        seen(json.loads(text)["sweep"]) if topic.endswith("/verdict") else None
+    )
+
+
+def memory_mib() -> dict[str, float]:
+    """Resident memory of each bridge as a process of its own, in MiB, without a box."""
+    found = {}
+    with tempfile.TemporaryDirectory() as folder, Mosquitto(Path(folder)) as broker:
+        for kind, options in {
+            "tcp": ("--link", f"{folder}/line", "--listen", "127.0.0.1:0"),
+            "modbus": ("--feed", f"{folder}/feed", "--listen", "127.0.0.1:0"),
+            "mqtt": ("--feed", f"{folder}/feed", "--broker", broker.url),
+        }.items():
+            words = [sys.executable, "-m", "palpate.bridges", kind, *options]
+            with subprocess.Popen(words, cwd=ROOT, stderr=subprocess.DEVNULL) as process:
+                threading.Event().wait(5)
+                status = Path(f"/proc/{process.pid}/status").read_text()
+                found[kind] = round(int(re.search(r"VmRSS:\s+(\d+)", status)[1]) / 1024, 1)
+                process.terminate()
+    return found
+
+
 def lines_ms(sweeps: int) -> list[float]:
     """From a verdict to RESULT VALID on simulated lines: the delay of the program."""
     current = bundle.load(bundle.DEFAULT)
@@ -169,6 +198,11 @@ def run(sweeps: int) -> dict[str, list[float]]:
         for name, port in (("A", folder / "line"), ("B", folder / "tcp")):
             stack.enter_context(box(str(port), feeds[name]))
         modbus = stack.enter_context(bridge("modbus", "--feed", feeds["A"]))
+        broker = stack.enter_context(Mosquitto(folder))
+        stack.enter_context(
+            Subscriber(broker.port, "palpate/#", published(times.seen("mqtt", "A")))
+        )
+        stack.enter_context(bridge("mqtt", "--feed", feeds["A"], "--broker", broker.url))
         stack.enter_context(ros.bridge("-p", f"feed:={feeds['A']}"))
         peer = stack.enter_context(ros.peer())
         stack.callback(ending.set)
@@ -192,7 +226,12 @@ def main() -> int:
     ros.required()
     found = {"lines": lines_ms(args.sweeps), **run(args.sweeps)}
     figures = {
-        name: {"n": len(ms), "median_ms": round(median(ms), 2), "longest_ms": round(max(ms), 2)}
+        name: {
+            "n": len(ms),
+            "median_ms": round(median(ms), 2),
+            "p99_ms": round(sorted(ms)[math.ceil(0.99 * len(ms)) - 1], 2),
+            "longest_ms": round(max(ms), 2),
+        }
         for name, ms in found.items()
     }
     policy = {os.SCHED_FIFO: "FIFO", os.SCHED_OTHER: "other"}.get(
@@ -200,6 +239,7 @@ def main() -> int:
     )
     about = {
         "connections": figures,
+        "memory_mib": memory_mib(),
         "poll_ms": 1000 * POLL_S,
         "scheduler": policy,
         "load": os.getloadavg()[0],

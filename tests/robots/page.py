@@ -13,18 +13,19 @@ NAMES = {
     "tcp": "`bridge tcp` behind the serial line, Python client on loopback",
     "feed": "feed, a program on the box",
     "modbus": "`bridge modbus` on the feed, pymodbus's client that reads every {poll:g} ms",
+    "mqtt": "`bridge mqtt` on the feed, mosquitto, mosquitto_sub on loopback",
     "ros": "`bridge ros` on the feed, another node on loopback",
 }
 
 
 def table(found: Mapping[str, Any]) -> str:
     """The table of the measurements in Markdown."""
-    rows = ["| connection | median | longest | answers |", "|---|---|---|---|"]
+    rows = ["| connection | median | p99 | longest | answers |", "|---|---|---|---|---|"]
     for name, text in NAMES.items():
         one = found["connections"][name]
         rows.append(
             f"| {text.format(poll=found['poll_ms'])} | {one['median_ms']} ms "
-            f"| {one['longest_ms']} ms | {one['n']} |"
+            f"| {one['p99_ms']} ms | {one['longest_ms']} ms | {one['n']} |"
         )
     wire = len(SENTENCE) * BITS / BAUD * 1000
     return "\n".join(
@@ -38,6 +39,10 @@ def table(found: Mapping[str, Any]) -> str:
             f"takes {wire:.1f} ms more; networks add their own time.",
             "",
             *rows,
+            "",
+            "Resident memory of a bridge: "
+            + ", ".join(f"{kind} {mib} MiB" for kind, mib in found["memory_mib"].items())
+            + ".",
         ]
     )
 
