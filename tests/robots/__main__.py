@@ -248,7 +248,7 @@ def main() -> int:
         "commit": commit(),
     }
     RESULTS.write_text(json.dumps(about, indent=1) + "\n")
-    page.write(RESULTS.with_name("README.md"), "latency", page.table(about))
+    page.write(ROOT / "docs" / "robots" / "README.md", "latency", page.table(about))
     print(json.dumps(figures, indent=1))
     return 0
 

@@ -37,8 +37,9 @@ from palpate.core.retry import retried
 
 KEPT = 1000
 """Verdicts that wait for the broker; then the oldest is dropped and counted."""
-FLYING = 20
-"""Verdicts that the broker has not acknowledged, at most; the others wait here, in order."""
+FLYING = 16
+"""Messages that the broker has not acknowledged, at most; the others wait here, in order. paho
+would let more wait without a bound, verdicts behind all else; brokers may allow no more than 20."""
 LATE_NS = 1_000_000_000
 """A verdict that is sent so long after it was heard is marked late."""
 KEEPALIVE_S = 20
@@ -149,7 +150,7 @@ class MqttBridge:
         self._lock = threading.Lock()
         self._waiting: deque[Waiting] = deque(maxlen=KEPT)
         self._heard = self._next = 0  # verdicts so far; number of the next to send
-        self._flying: dict[int, int] = {}  # message id -> number of its verdict
+        self._flying: dict[int, int] = {}  # message id -> number of its verdict, -1 for another
         self._said: dict[str, str] = {}  # what the retained topics hold
         self._refused = ""
         self._there = False
@@ -290,20 +291,21 @@ class MqttBridge:
             first = self._waiting[0].number if self._waiting else self._heard
             self._next = max(self._next, first)
             at = self._next - first
-            due = [*islice(self._waiting, at, at + FLYING - len(self._flying))]
+            due = [*islice(self._waiting, at, at + max(0, FLYING - len(self._flying)))]
         for one in due:
             text = json.dumps({**one.fields, "late": now_ns - one.heard_ns > LATE_NS})
             sent = client.publish(f"{self._base}/verdict", text, qos=1, retain=True)
             self._flying[sent.mid], self._next = one.number, one.number + 1
         self._say(client, "state", json.dumps(state(view, self.dropped)))
-        while self._replies:
-            client.publish(f"{self._base}/reply", self._replies.popleft(), qos=1)
+        while self._replies and not client.want_write():
+            client.publish(f"{self._base}/reply", self._replies.popleft(), qos=0)
 
     def _say(self, client: paho.Client, topic: str, text: str) -> None:
         """Publish the content of a retained topic if it has changed."""
-        if self._said.get(topic) != text:
+        if self._said.get(topic) != text and len(self._flying) < FLYING:
             self._said[topic] = text
-            client.publish(f"{self._base}/{topic}", text, qos=1, retain=True)
+            sent = client.publish(f"{self._base}/{topic}", text, qos=1, retain=True)
+            self._flying[sent.mid] = -1
 
     def _turn(self, client: paho.Client) -> None:
         """Wait for the broker or for news, and read and write. Raises BROKEN."""
