@@ -1,5 +1,5 @@
-"""The MQTT bridge at Debian's mosquitto, seen by mosquitto_sub; and brokers that refuse, break off,
-or send what is no MQTT."""
+"""The MQTT bridge at Debian's mosquitto, seen by mosquitto_sub; and brokers that refuse, close, or
+send other bytes than MQTT."""
 
 from __future__ import annotations
 
@@ -141,8 +141,8 @@ def test_commands_only_where_they_are_allowed(server, box):
 
 @pytest.mark.slow
 def test_a_flood_of_commands(server, box):
-    """A verdict does not wait behind 3,000 commands that are none, each of which is refused: the
-    last command, a good one, has not come through yet."""
+    """A verdict does not wait behind 3,000 refused commands: it comes before the last command has
+    reached the box."""
     with Subscriber(server.port) as one, bridge("mqtt", *options(server, box, "--allow-writes")):
         online(box, one)
         one.publish("palpate/b1/command", *["x" * 900] * 3000, "NEW")

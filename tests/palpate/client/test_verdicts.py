@@ -1,4 +1,4 @@
-"""The file of verdicts: what a killed writer leaves, limits, damage, readers beside its writer."""
+"""The file of verdicts: a killed writer, limits, damage, and readers during writing."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def path(tmp_path: Path) -> Path:
 
 @pytest.mark.slow
 def test_what_is_written_is_read(path):
-    """Rows and counts, also beside the writer; numbers go on after a restart."""
+    """Rows and counts, also during writing; numbers go on after a restart."""
     for start in (1, 3):
         file = VerdictFile(path)
         for sweep in (start, start + 1):
@@ -88,7 +88,7 @@ def test_the_oldest_goes_first(path):
 
 
 def test_a_damaged_file_is_moved_aside(path, caplog):
-    """What is no database is kept beside, and a new file begins."""
+    """A file with other bytes is kept under another name, and a new file begins."""
     path.write_bytes(os.urandom(8192))
     file = VerdictFile(path)
     file.add(NOW, verdict(1))
