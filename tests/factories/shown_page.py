@@ -17,7 +17,7 @@ class Shown:
     """A page whose lines of the feed a test writes. Within its `with` block browsers learn twice a
     second whether there is a box, as with the command, however slow the machine is."""
 
-    def __init__(self, access: Access) -> None:
+    def __init__(self, access: Access, finger: str = "") -> None:
         self.server = PageServer(
             "watch.html",
             access,
@@ -25,7 +25,7 @@ class Shown:
             KEPT,
             {"sweep": self._sweep},
         )
-        self.board = PageBoard(self._publish)
+        self.board = PageBoard(self._publish, finger)
         self._box: object = None
         self._ended = threading.Event()
         self._beating = threading.Thread(target=self._beat)

@@ -59,7 +59,8 @@ def run_watch(args: argparse.Namespace) -> int:
         from palpate.web.web import PageWatcher
 
         access = Access.configured(settings.watch, args.web)
-        watcher = retried(lambda: PageWatcher(str(socket), access, clock.now_ns), clock, stopped)
+        given = str(socket), access, clock.now_ns, args.unit or ""
+        watcher = retried(lambda: PageWatcher(*given), clock, stopped)
         log.info(f"page: {watcher.server.address}")
         watcher.run(stopped)
         return stopped.exit_code

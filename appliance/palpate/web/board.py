@@ -40,15 +40,15 @@ Publish = Callable[[str, object], None]
 class PageBoard:
     """Turns lines of the feed into events, by their type.
 
-    hello: with the `names` of its labels for people. health, state: unchanged. box: whether there
-    is a feed. verdict: with rounded `scores`, the `name` of its label, the `reason` for a sweep
-    without a label. minute: frames and lost frames of
+    hello: with the `names` of its labels for people, and its `finger`, "" for the only one.
+    health, state: unchanged. box: whether there is a feed. verdict: with rounded `scores`, the
+    `name` of its label, the `reason` for a sweep without a label. minute: frames and lost frames of
     the last minute. signal: a sweep's window is available. view: see alignment.view. note: another
     bundle or program.
     """
 
-    def __init__(self, publish: Publish) -> None:
-        self._publish = publish
+    def __init__(self, publish: Publish, finger: str = "") -> None:
+        self._publish, self._finger = publish, finger
         self._hello: dict[str, Any] = {}
         self._before: dict[str, Any] = {}  # the previous hello, until the restart was noted
         self._names: dict[str, str] = {}  # of labels, for people
@@ -93,6 +93,7 @@ class PageBoard:
         displays = {str(k): str(v) for k, v in (line.get("displays") or {}).items()}
         hello = dict(line) | {"pid": int(line["pid"]), "labels": list(map(str, line["labels"]))}
         hello |= {"names": [displays.get(label, label) for label in hello["labels"]]}
+        hello |= {"finger": self._finger}
         self._names = dict(zip(hello["labels"], hello["names"], strict=True))
         self._before, self._hello, self._tracker, self._minute = self._hello, hello, tracker, None
         self._publish("hello", hello)

@@ -21,14 +21,17 @@ browsers see that this program runs."""
 
 class PageWatcher:
     """The page of `palpate watch --web` at `access`, for the feed at `path`. now_ns: the clock of
-    the box's time stamps. Raises ConfigError if the address cannot be used."""
+    the box's time stamps. finger: the unit of several fingers, "" for a box with one. Raises
+    ConfigError if the address cannot be used."""
 
-    def __init__(self, path: str, access: Access, now_ns: Callable[[], int]) -> None:
+    def __init__(
+        self, path: str, access: Access, now_ns: Callable[[], int], finger: str = ""
+    ) -> None:
         self.feed = Feed(path, sweeps=True)
         self.server = PageServer(
             "watch.html", access, now_ns, KEPT, {"sweep": lambda which: self.board.sweep(which)}
         )
-        self.board = PageBoard(self.server.publish)
+        self.board = PageBoard(self.server.publish, finger)
         self._frames = False
         self._log = TroubleLog(
             "feed", "the page shows the box as away", end="feed: it is read", known=False

@@ -121,6 +121,7 @@ function drawSkin() {
   const {view} = known;
   if (!view) return;
   SKIN.show(view, known.hello?.unit);
+  put("skin-title", known.hello?.finger ? `Skin of ${known.hello.finger}` : "Skin");
   const axes = known.hello?.format.axes > 1 ? "; the axis along the normal" : "";
   put("contact", `${unit()} above the lowest seen${axes}`);
   for (const one of document.querySelectorAll(".key")) {
