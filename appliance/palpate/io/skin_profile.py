@@ -123,7 +123,8 @@ class SkinProfile:
     sequence_order, checksum_order: of these, "" for byte_order.
 
     "text": lines: content of a line. skip_columns: numbers of a line that are ignored, counted from
-    0. around: the characters of a line without its numbers, separators and brackets. decimal: the
+    0. prefix: the beginning of all lines of numbers; others are passed over. around: the
+    characters of a line without its numbers, separators and brackets. decimal: the
     decimal mark. line_end: the character that ends a line.
 
     number: type of a number on the wire. values: numbers of one taxel there. take: indices of those
@@ -157,6 +158,7 @@ class SkinProfile:
     checksum_order: Literal["", "little", "big"] = ""
     lines: Literal["rows", "frames"] = "rows"
     skip_columns: tuple[int, ...] = _several("positions of numbers such as [0]", _is_column)
+    prefix: str = _text(64)
     around: str = _text(16384)
     decimal: Literal[".", ","] = "."
     line_end: Literal["\n", "\r"] = "\n"
@@ -232,7 +234,7 @@ _OF_CODEC = {
         *("marker", "trailer", "skip_before", "skip_after", "sequence", "sequence_at"),
         *("sequence_order", "checksum", "checksum_from", "checksum_order"),
     ),
-    "text": ("skip_columns", "around", "decimal", "line_end"),
+    "text": ("skip_columns", "prefix", "around", "decimal", "line_end"),
 }
 """Keys that belong to one codec."""
 _VALUES = {"papillarray": (6, "float32"), "xela-can": (3, "uint16"), "robotiq-tsf": (1, "uint16")}
@@ -246,6 +248,8 @@ def _contradiction(p: SkinProfile) -> str:
     for codec, names in _OF_CODEC.items():
         if codec != p.codec and (wrong := [n for n in names if getattr(p, n) != _KEYS[n].default]):
             return f'only codec = "{codec}" has {" and ".join(wrong)}; remove it from "{p.codec}"'
+    if p.prefix and p.lines == "rows":
+        return f'prefix = "{p.prefix}" needs a frame on each line; set lines = "frames"'
     if why := _outside(p):
         return why
     if p.codec != "fixed" and p.number in wire_numbers.WIDE:

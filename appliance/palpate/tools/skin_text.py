@@ -32,8 +32,8 @@ Line = tuple[list[bytes], str]
 
 
 def proposed(data: bytes, seconds: float, grid: tuple[int, int] | None = None) -> str:
-    """The text of a profile for lines of numbers, to be checked by a person; empty if the bytes
-    are no such lines or do not have this grid. seconds: the time in which they came. The number of
+    """The text of a profile for lines of numbers, to be checked by a person; "" for bytes
+    of another kind or grid. seconds: the time in which they came. The number of
     values in a frame shows in the lines, the grid does not: without one, it is the squarest."""
     if not is_text(data):
         return ""

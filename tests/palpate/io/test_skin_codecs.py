@@ -175,6 +175,22 @@ def test_the_value_that_does_not_fit_is_named(number, line, misfit):
     assert misfit in found.misfit
 
 
+def test_only_lines_with_the_prefix_are_read():
+    """Most lines of a firmware may be something else: they are neither frames nor garbage, so no
+    frame counts as lost. A wanted line whose beginning is damaged is garbage."""
+    p = replace(TEXT, cols=4, prefix="P:")
+    other, wanted = b"T: 21.5\nL,1,2,3,4\n\n" * 5, b"P:1,2,3,4\n"
+    found = decoded(p, (other + wanted) * 4)
+    assert (len(found), found.garbage, found.size) == (4, 0, len(wanted))
+    assert found.skipped.tolist() == [0] * 4
+    assert found.ends.tolist() == [(k + 1) * len(other + wanted) for k in range(4)]
+    glued = b"T: 21.5P:1,2,3,4\n"
+    assert decoded(p, wanted + glued + wanted).skipped.tolist() == [0, len(glued)]
+    assert len(decoded(p, b"P:1,2,3,4P:1,2,3,4\n" + wanted)) == 1
+    with pytest.raises(ConfigError, match="prefix"):
+        replace(p, lines="rows")
+
+
 def test_rows_between_other_lines():
     """A line of other text, or the end of a printed array, ends a frame of several lines."""
     p = replace(TEXT, lines="rows", rows=2, cols=2)

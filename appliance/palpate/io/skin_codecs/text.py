@@ -52,7 +52,7 @@ _SHOWN = 40
 def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
     """Numbers between separators, brackets, and the text that the profile names. A line is a frame,
     or a row of a frame that a shorter line ends."""
-    data, mark = rest.data + new, profile.line_end.encode()
+    data, mark, prefix = rest.data + new, profile.line_end.encode(), profile.prefix.encode()
     per_line = profile.cols * profile.values * (profile.rows if profile.lines == "frames" else 1)
     lines = 1 if profile.lines == "frames" else profile.rows
     numbers: list[NDArray[Any]] = []
@@ -63,6 +63,9 @@ def decode(profile: SkinProfile, rest: Rest, new: bytes) -> Decoded:
     broken, misfit = False, ""
     while (end := data.find(mark, at)) >= 0:
         line, at = data[at:end], end + 1
+        if prefix and prefix not in line:
+            begun = at  # another line, which is no garbage
+            continue
         row, why = _numbers(profile, line, per_line)
         misfit = why or misfit
         if row is not None and len(row) == per_line:
@@ -117,6 +120,9 @@ def _numbers(profile: SkinProfile, line: bytes, most: int) -> tuple[NDArray[Any]
     """The numbers of a line, and its fault; None if it contains anything else, or a
     number outside the range of its type. A line with more than `most` is cut after most + 1."""
     skip = profile.skip_columns
+    line, begins = _behind(profile.prefix, line)
+    if not begins:
+        return None, ""
     words = line.translate(_BETWEEN[profile.decimal]).split()
     if profile.around or not all(map(_DECIMAL.fullmatch, words)):
         words, around = split(line, profile.decimal)
@@ -139,6 +145,12 @@ def _numbers(profile: SkinProfile, line: bytes, most: int) -> tuple[NDArray[Any]
         if not _WHOLE.fullmatch(word) or not limits.min <= int(word) <= limits.max:
             return None, _unfit(word, profile.number, wider)
     return np.array([int(word) for word in words], profile.number), ""
+
+
+def _behind(prefix: str, line: bytes) -> tuple[bytes, bool]:
+    """The line behind its prefix, and whether it begins with it."""
+    bare = line.lstrip() if prefix else line
+    return bare.removeprefix(prefix.encode()), bare.startswith(prefix.encode())
 
 
 def as_float(word: bytes) -> float:
