@@ -6,7 +6,8 @@ delivered bundle (materials.py).
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -50,7 +51,8 @@ class Assessment:
     without a sweep was trained before. files: names of the sweeps' files, without suffix. named:
     float [N, K], the share of each sweep's judgements that are each material. chances: float
     [N, K], mean probabilities. left_out: the groups that were left out. clusters: int [N], sweeps
-    that succeed or fail together; None if each is on its own.
+    that succeed or fail together; None if each is on its own. others: for things that were not
+    taught, in words, the share that would get a label and their number; empty if not measured.
     """
 
     materials: tuple[str, ...]
@@ -61,6 +63,7 @@ class Assessment:
     left_out: tuple[str, ...] = ("recording",)
     clusters: Array | None = None
     no_slides: tuple[NoSlide, ...] = ()
+    others: Mapping[str, tuple[float, int]] = field(default_factory=dict)
 
     @property
     def right(self) -> Array:
@@ -143,6 +146,7 @@ class Assessment:
             "materials": {name: n for name, n in held if n},
             "left_out": list(self.left_out),
             "confused": [*(self.materials[k] for k in pair), round(between, 1)] if pair else None,
+            "others": {name: [*found] for name, found in self.others.items()},
             "no_slides": [asdict(one) for one in self.no_slides],
             "suspects": [asdict(one) | {"text": one.text} for one in self.suspects()],
             "advice": self.advice(),
@@ -160,6 +164,8 @@ class Assessment:
         if pair := self.confused():
             one, other = (self.materials[k] for k in pair)
             said += f"; most often confused: {one} and {other}"
+        for what, (share, n) in self.others.items():
+            said += f"; of {n} {what} {100 * share:.0f} % would get a label"
         return said
 
     def _counts(self) -> Array:

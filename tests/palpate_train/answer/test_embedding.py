@@ -198,3 +198,13 @@ def test_untrained_features_are_selected_and_not_multiplied():
     few = embedding.embed(x, y, 18)
     assert few.selected == 0
     assert few.projection.shape == (20, 20)
+
+
+def test_two_sweeps_of_each_material_do_not_make_the_next_infinitely_far():
+    """The next sweep lies within some hundred times the mean of the learned ones, not 10^9 times:
+    two sweeps alone show no noise of their covariance."""
+    rng = np.random.default_rng(3)
+    means, labels = 5 * rng.standard_normal((3, 200)), np.repeat(np.arange(3), 2)
+    learned, new = (means[labels] + rng.standard_normal((6, 200)) for _ in range(2))
+    found = embedding.embed(learned, labels, fixed=20)
+    assert np.median(found.novelty(new)) < 300 * found.means.shape[1]

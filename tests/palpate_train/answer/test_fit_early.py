@@ -250,3 +250,10 @@ def test_the_heads_are_scikit_learns_shrinkage_lda(materials: int, each: int):
     if materials == 2:
         logits = logits[:, 1] - logits[:, 0]
     np.testing.assert_allclose(logits, wanted, rtol=1e-5, atol=1e-4)
+
+
+def test_a_rule_needs_limits_that_its_held_out_sweeps_can_carry():
+    """With too few of them there is a reason against early answers, which says their number."""
+    assert fit_early.no_limits(fit_early.MIN_SWEEPS) == ""
+    few = fit_early.MIN_SWEEPS - 1
+    assert f"{few} sweeps" in fit_early.no_limits(few)

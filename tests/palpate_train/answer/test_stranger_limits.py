@@ -153,3 +153,20 @@ def test_limits_that_fall_are_refused():
     """A manifest whose strict limit is the widest is refused."""
     with pytest.raises(BundleError, match="limits"):
         Known(3.0, 2.0, 4.0, 1.0)
+
+
+@pytest.mark.parametrize("name", ["strict", "balanced"])
+def test_junk_between_known_and_unknown_materials_narrows_a_limit(name: str):
+    """Where no unknown material is near, junk that is nearer decides; known sweeps stay within."""
+    sweeps, rng = {"force": left_out(400, apart=12.0)}, np.random.default_rng(1)
+    alone = limits(sweeps)
+    beside = limits(sweeps, junk={"rests": np.exp(rng.normal(2.5, 0.3, 60))})
+    assert getattr(beside, name) < getattr(alone, name)
+    assert beside.figures[name]["answered"][0] > 0.9
+
+
+def test_junk_does_not_close_the_box():
+    """Junk that is nearer than known sweeps leaves most of these within the balanced limit."""
+    junk = {"mixed": np.full(60, np.exp(-4.0))}
+    found = limits({"force": left_out(400)}, 1e6, junk)
+    assert found.figures["balanced"]["answered"][0] >= 0.75

@@ -44,6 +44,20 @@ def test_easy_materials_are_enough():
     assert "42 sweeps" in found.text()
 
 
+@pytest.mark.slow
+def test_the_assessment_says_what_else_would_get_a_label():
+    """Junk and materials that are left out, with the share that would be named and their number; of
+    two sweeps of each material no bundle can be made, so nothing is said."""
+    found = assess(lesson(easy(8)))
+    assert len(found.others) == 2
+    for share, n in found.others.values():
+        assert 0 <= share <= 1
+        assert n >= 24
+        assert f"of {n} " in found.text()
+    assert [*found.json()["others"].values()] == [[*of] for of in found.others.values()]
+    assert not assess(lesson(easy(2))).others
+
+
 def test_few_sweeps_are_not_enough_however_right_they_are():
     """Nine right answers show little; the material with the fewest sweeps comes first."""
     found = answers(sure(0, 0, 0, 0, 1, 1, 1, 2, 2), [0, 0, 0, 0, 1, 1, 1, 2, 2])

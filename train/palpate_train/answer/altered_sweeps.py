@@ -19,6 +19,7 @@ from palpate_train.answer import fit_disturbance
 from palpate_train.answer.calibrate import CalibrationInputs, Shapes, left_out
 from palpate_train.answer.embedding import Embedding
 from palpate_train.answer.fit_unknown import (
+    FEWEST_JUDGED,
     DisturbedSweeps,
     Embed,
     Scatters,
@@ -54,6 +55,12 @@ class Widened:
     figures: dict[str, Any]
     disturbances: Disturbances
     changes: tuple[NDArray[np.float16], ...]
+
+
+def few(held_out: Dataset) -> bool:
+    """Whether too few sweeps of a material were held out to judge weights."""
+    each = np.bincount(held_out.labels, minlength=len(held_out.materials))
+    return bool(each.min() < FEWEST_JUDGED)
 
 
 def measure(

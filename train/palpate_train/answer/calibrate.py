@@ -9,7 +9,7 @@ the condition under which these were taken.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
 from typing import Any, TypeVar
 
@@ -189,10 +189,11 @@ class CalibrationInputs:
     staged: whether there are such stages; if not, all sweeps judge. fixed: number of features, the
     last ones, that were not trained (see `embed`). If there are any, most of a distance lies
     in them; then all sweeps decide the limit, because more positions make it depend less on chance.
-    copied: augmented copies. faulty: bool [N], copies with
-    FAULTS; the embedding and its limit see them, the heads do not. plan: of the head that names the
-    material; None for one discriminant of all features. weights: [N], how much each sweep counts
-    for that head; None if all count alike, as they do for the embedding.
+    copied: augmented copies. faulty: bool [N], copies with FAULTS; the embedding and its limit see
+    them, the heads do not. junk: features [m, F] of windows of each kind of junk, where sweeps are
+    too few to show where other things lie. plan: of the head that names the material; None for one
+    discriminant of all features. weights: [N], how much each sweep counts for that head; None if
+    all count alike, as they do for the embedding.
     """
 
     prefixes: Array
@@ -205,6 +206,7 @@ class CalibrationInputs:
     faulty: Array
     plan: HeadPlan | None = None
     weights: Array | None = None
+    junk: Mapping[str, Array] = field(default_factory=dict)
 
     @property
     def groups(self) -> Array:
@@ -251,7 +253,7 @@ def fit_calibration(given: CalibrationInputs) -> Calibration:
     embedding, last = in_two_views(whole, labels, given.fixed), float(temperatures[-1])
     steps = fit_early.heads(embedding(given.prefixes), labels, int(labels.max()) + 1)
     distances = left_out_in_turn(given, embedding)
-    beyond = limits(distances)
+    beyond = limits(distances, junk=junk_distances(given, embedding))
     held = {}
     for name, values in given.conditions.items():
         judging, named = _named(given, values)
@@ -309,6 +311,11 @@ def left_out_in_turn(given: CalibrationInputs, finished: Embedding) -> dict[str,
         name: left_out(given, values, judged, finished, view)
         for name, values in given.conditions.items()
     }
+
+
+def junk_distances(given: CalibrationInputs, finished: Embedding) -> dict[str, Array]:
+    """Distances of junk, by kind, to the nearest mean of the finished model."""
+    return {kind: finished.novelty(features) for kind, features in given.junk.items()}
 
 
 def _named(given: CalibrationInputs, values: Array) -> tuple[Array, Array]:

@@ -27,6 +27,9 @@ KEPT = 0.995
 network computes (docs/decisions/0005)."""
 PARTS = 10
 """Largest number of parts of the groups; each part is judged by a fit to the others."""
+FEW_SHARE = 1.5
+"""Least shrinkage of the scatter of n sweeps of a material, times n - 1. By Ledoit and Wolf's
+formula two sweeps have no noise, so without this every new sweep would lie infinitely far away."""
 FLAT = 1e-9
 """Least variance of a direction, relative to that of the widest direction: a silent channel stays
 finite."""
@@ -289,13 +292,14 @@ class _Whitening:
 def _whitening(x: Array, labels: Array) -> _Whitening:
     """The whitening for the covariance of LinearDiscriminantAnalysis(shrinkage="auto"): Ledoit and
     Wolf's covariance of each material's features [n, F] at the same spread, averaged by the number
-    of sweeps."""
+    of sweeps. Few sweeps are shrunk by FEW_SHARE at least."""
     diagonal, rows = np.zeros(x.shape[1]), []
     for label in np.unique(labels):
         own = x[labels == label]
         away, spread = centred(own)
         z = away / spread
         share, mean = shrinkage(z, z @ z.T if len(z) < len(spread) else z.T @ z)
+        share = max(share, min(1.0, FEW_SHARE / max(len(z) - 1, 1)))
         diagonal += len(own) / len(x) * share * mean * spread**2
         rows.append(np.sqrt((1 - share) / len(x)) * z * spread)
     root = np.sqrt(np.maximum(diagonal, max(FLAT * float(diagonal.max()), FLAT)))

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -37,6 +38,10 @@ MOST_KEPT = 0.995
 more is of no use; a wider limit only lets strangers in. Few positions say little about the next
 one: of 15 splits of six simulated positions the balanced limit keeps 93 % on average, 67 % in the
 worst; with a least share of 0.85 90 and 61 %."""
+LEAST_BY_JUNK = LEAST_KEPT | {"balanced": 0.85}
+"""The same where junk decides, too: few sweeps, whose cross-fits lie farther away than a new sweep
+lies from the finished model."""
+NO_JUNK: Mapping[str, Array] = MappingProxyType({})
 STEPS, DRAWN = 500, 12
 """Numbers of limits that are compared, and that a manifest has shares for."""
 WIDTH = 1.06
@@ -125,8 +130,15 @@ class _Sweeps:
         return [round(float(right.mean()), 4), *interval(right, self.clusters)]
 
 
-def limits(left_out: Mapping[str, LeftOut], stranger_cost: float = 1.0) -> StrangerLimits:
+def limits(
+    left_out: Mapping[str, LeftOut],
+    stranger_cost: float = 1.0,
+    junk: Mapping[str, Array] = NO_JUNK,
+) -> StrangerLimits:
     """The limits of the least expected cost, over sweeps of all conditions, by their names.
+
+    junk: squared distances [m] of windows without a slide over one material, by kind. A label for
+    one costs as much as one for an unknown material.
 
     Each material has the same weight. Densities have smooth tails, so that a few sweeps promise
     nothing that they do not show. Without unknown sweeps the limits keep MOST_KEPT.
@@ -145,10 +157,12 @@ def limits(left_out: Mapping[str, LeftOut], stranger_cost: float = 1.0) -> Stran
     every = np.concatenate([known.logs, strangers.logs])
     grid = np.linspace(every.min() - reach, every.max() + reach, STEPS)
     kept, named = (_share_below(grid, one.by_material) for one in (known, strangers))
+    made = [_log(distances) for distances in junk.values()]
+    wrong, least_kept = named + _share_below(grid, made), LEAST_BY_JUNK if made else LEAST_KEPT
     most, chosen = int(np.argmax(kept >= MOST_KEPT)), {}
     for name, cost in COSTS.items():
-        cheapest = _cheapest(kept, named, stranger_cost * cost)
-        least = int(np.argmax(kept >= LEAST_KEPT[name]))
+        cheapest = _cheapest(kept, wrong, stranger_cost * cost)
+        least = int(np.argmax(kept >= least_kept[name]))
         chosen[name] = float(np.exp(grid[np.clip(cheapest, least, most)]))
     spread = np.linspace(np.argmax(kept >= LEAST_KEPT["strict"]), most, DRAWN).round().astype(int)
     figures: dict[str, Any] = {

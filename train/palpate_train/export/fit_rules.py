@@ -51,17 +51,19 @@ def from_features(
         return content
     if "early" in left_out:
         calibration = replace(calibration, rule=EarlyRule(None, "left out"))
+    elif why := fit_early.no_limits(len(content.held_out)):
+        calibration = replace(calibration, rule=EarlyRule(None, why))
     if not (fit.contacts and fit.contacts.positions(pitch_mm)):
         calibration = replace(calibration, displacement=None)
     rule = calibration.rule
     early = {"share": rule.share, "lost": rule.lost, "n": rule.n} if rule.early else rule.why
     figures = fit.held_out_figures()
     prefixes = fit.trunk(prefixes=True) if rule.early else None
-    given = calibration_inputs(fit)
+    given = fit.given or calibration_inputs(fit)
     apart = _unseen(given, calibration)
     found = _widened(fit, apart.embedding, calibration.embedding)
     classes = [apart.classes(), calibration.classes()]
-    beyond = _limits(found, given, calibration.embedding, fit.about.get(stranger_limits.COST, 1.0))
+    beyond = _limits(found, given, calibration.embedding, fit)
     content = replace(content, known=beyond.known(calibration.class_mean_temperature))
     figures |= {stranger_limits.FIGURES: beyond.figures}
     if found:
@@ -99,29 +101,30 @@ def _limits(
     found: altered_sweeps.Widened | None,
     given: CalibrationInputs,
     whole: Embedding,
-    stranger_cost: float,
+    fit: Fit,
 ) -> StrangerLimits:
     """The limits of known materials, for the widened shapes if there are any."""
+    cost = fit.about.get(stranger_limits.COST, 1.0)
     if found:
         distances = altered_sweeps.left_out_in_turn(found, given, whole)
-    else:
-        distances = calibrate.left_out_in_turn(given, whole)
-    return stranger_limits.limits(distances, stranger_cost)
+        return stranger_limits.limits(distances, cost)
+    distances = calibrate.left_out_in_turn(given, whole)
+    return stranger_limits.limits(distances, cost, calibrate.junk_distances(given, whole))
 
 
 def _widened(fit: Fit, apart: Embedding, whole: Embedding) -> altered_sweeps.Widened | None:
     """Shapes of known materials that know how altered sweeps differ. apart: an embedding that did
     not see the held-out sweeps."""
+    if altered_sweeps.few(fit.held):
+        return None
     trunk, spaces = fit.trunk(), map(Space.of, (apart, whole))
     seed = int(fit.about["seed"])
-    contacts, shape = fit.contacts or Contacts.of(fit.train), fit.train.format.shape
-    known = contacts.limit.known_tare()
     return altered_sweeps.measure(
         lambda samples: run(trunk, samples),
         fit.train,
         fit.held,
         *spaces,
-        tare=np.array(known).reshape(shape) if known else np.zeros(shape),
+        tare=fit.tare,
         seed=seed,
     )
 

@@ -118,9 +118,14 @@ def sweeps_for(held_out: Dataset, judge: Bundle, seed: int, each: int = EACH) ->
             yield Given(altered.take(severity == share), ALTERED, lost)
     some = held_out.take(rng.permutation(len(held_out))[:each])
     yield Given(_displaced(some, judge.manifest.tare, rng), DISPLACED)
+    yield from junk_for(held_out, judge, seed, each)
+
+
+def junk_for(sweeps: Dataset, judge: Bundle, seed: int, each: int = EACH) -> Iterator[Given]:
+    """At most `each` windows of each kind of junk, made of these sweeps."""
     for kind in JUNK:
-        samples = windows(kind, held_out, each, judge.manifest.tare, seed)
-        some = held_out.take(np.arange(len(samples)))
+        samples = windows(kind, sweeps, each, judge.manifest.tare, seed)
+        some = sweeps.take(np.arange(len(samples)))
         yield Given(replace(some, samples=samples), NONE)
 
 

@@ -2,23 +2,33 @@
 
 Each part of the sweeps is left out in turn: places, sessions or objects if there are several of
 them, else single sweeps. The candidates of the recipe are compared on the same parts, so accuracy
-is slightly too high.
+is slightly too high. A bundle of all sweeps answers junk that is made of them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.answer.objects import softmax
+from palpate.bundle import bundle
+from palpate.core.errors import ApplianceError
 from palpate.learn.assessment import Assessment
+from palpate_train.answer import stranger_limits
 from palpate_train.data.run import Run
 from palpate_train.data.splitters import InnerPart, recording_parts
+from palpate_train.export import quantized_bundle, trial
 from palpate_train.models.recipe import recipe
+from palpate_train.models.recipe.fitted import Fit
 from palpate_train.teach.lesson import Lesson
+from palpate_train.teach.taught import NAME
 
 Array = NDArray[Any]
 
@@ -37,7 +47,27 @@ def assess(lesson: Lesson) -> Assessment:
         parts = recording_parts(lesson.sweeps)
         scores = setup.scores(fixed.data, parts)
         chosen = scores.score(chosen.plan.parts)
-    return judged(lesson, parts, softmax(chosen.logits[scores.own]))
+    found = judged(lesson, parts, softmax(chosen.logits[scores.own]))
+    trunk, plan = recipe.pruned(fixed.trunk, None, choice.chosen.plan)
+    return replace(found, others=others(recipe.finish(trunk, plan, choice, setup)))
+
+
+def others(fit: Fit) -> dict[str, tuple[float, int]]:
+    """For things that were not taught, in words, the share to which the box would give a label, and
+    their number. Empty if the sweeps do not suffice for a bundle."""
+    told = dict[str, tuple[float, int]]()
+    with suppress(ApplianceError), TemporaryDirectory() as folder:
+        out = Path(folder) / NAME
+        manifest = quantized_bundle.export(fit, out, NAME, "1", "", proven=False)
+        made = bundle.load(out)
+        given = list(trial.junk_for(fit.train, made, fit.about["seed"]))
+        n = sum(len(one.sweeps) for one in given)
+        wrong = sum(found.wrong for found in trial.counted(made, given).values())
+        told["windows without a slide over one material"] = wrong / n, n
+        found = manifest.figures[stranger_limits.FIGURES]
+        if named := found["balanced"].get("named"):
+            told["sweeps of materials that were left out"] = named[0], found["strangers"]
+    return told
 
 
 def judged(lesson: Lesson, parts: Sequence[InnerPart], p: Array) -> Assessment:

@@ -21,12 +21,14 @@ from onnx import checker, shape_inference
 from palpate.core import storage
 from palpate.core.errors import BundleError, FormatError
 from palpate.core.sweep_set import read
-from palpate_train.answer import stranger_limits
+from palpate_train.answer import altered_sweeps, stranger_limits
 from palpate_train.answer.calibrate import Calibration, CalibrationInputs, fit_calibration
 from palpate_train.answer.fit_contact import Contacts
 from palpate_train.answer.fit_displacement import AugmentedCopies
 from palpate_train.answer.heads import HeadPlan
+from palpate_train.answer.stranger_limits import NO_JUNK
 from palpate_train.data.augment import COPIES, Augmentation, copies
+from palpate_train.data.junk import JUNK, windows
 from palpate_train.data.sets import OWN_NUMBERS, Dataset
 from palpate_train.data.splitters import WEIGHT
 from palpate_train.metrics.answers import outcomes
@@ -39,8 +41,11 @@ from palpate_train.onnx_tools.graph_builder import run, with_head
 Array = NDArray[Any]
 Json = dict[str, Any]
 WHAT = "a fit (made by palpate-train fit)"
-HELD_COPIES_SEED, FAULTS_SEED = 1, 2
-"""Added to a fit's seed for the copies of its held-out sweeps, and for the copies with faults."""
+HELD_COPIES_SEED, FAULTS_SEED, JUNK_SEED = 1, 2, 3
+"""Added to a fit's seed for the copies of its held-out sweeps, for the copies with faults, and for
+junk."""
+JUNK_EACH = 12
+"""Windows of each kind of junk that help to find the limits of known materials."""
 FAULTS = Augmentation(
     displaced=0.0,
     gain=0.1,
@@ -70,6 +75,7 @@ class Fit:
     the held-out sweeps. about: JSON, how the fit was made and validated. plan: fits the heads
     again, before a temperature. calibration: of the int8 trunk if there is one; None if the sweeps
     do not suffice, with the reason in `uncalibrated`. contacts: None until the fit is `finished`.
+    given: what the calibration was fitted to, kept for export where it is small; not in the file.
     """
 
     weights: dict[str, Array]
@@ -83,6 +89,7 @@ class Fit:
     calibration: Calibration | None = None
     uncalibrated: str = ""
     contacts: Contacts | None = None
+    given: CalibrationInputs | None = None
 
     @property
     def bands(self) -> int:
@@ -106,11 +113,18 @@ class Fit:
         """The same fit with its float trunk and float head instead of those in int8; not
         calibrated yet."""
         head = {f"int8.{name}": self.weights[f"head.{name}"] for name in ("weight", "bias")}
-        return replace(self, weights=self.weights | head, ranges=None, calibration=None)
+        return replace(self, weights=self.weights | head, ranges=None, calibration=None, given=None)
 
     def int8_head(self) -> tuple[Array, Array]:
         """Weight [K, F] and bias [K] of the int8 trunk's head, the temperature folded in."""
         return self.weights["int8.weight"], self.weights["int8.bias"]
+
+    @property
+    def tare(self) -> Array:
+        """Counts of the unloaded skin in the shape of a frame, 0 if unknown."""
+        contacts, shape = self.contacts or Contacts.of(self.train), self.train.format.shape
+        known = contacts.limit.known_tare()
+        return np.array(known).reshape(shape) if known else np.zeros(shape)
 
     def values(self, group: str) -> Array:
         """The values of a group among all sweeps."""
@@ -251,12 +265,13 @@ def named(arrays: Mapping[str, Array], prefix: str) -> dict[str, Array]:
 
 def finished(fit: Fit) -> Fit:
     """`fit` with its contacts, and with its calibration if there are sweeps to judge it by."""
-    contacts = fit.contacts or Contacts.of(fit.train)
+    fit = replace(fit, contacts=fit.contacts or Contacts.of(fit.train), calibration=None)
     try:
-        calibration = fit_calibration(calibration_inputs(fit))
+        given = calibration_inputs(fit)
+        calibration = fit_calibration(given)
     except FormatError as e:  # nothing was held out, or of too few groups
-        return replace(fit, contacts=contacts, calibration=None, uncalibrated=str(e))
-    return replace(fit, contacts=contacts, calibration=calibration)
+        return replace(fit, uncalibrated=str(e))
+    return replace(fit, calibration=calibration, given=given if given.junk else None)
 
 
 def calibration_inputs(fit: Fit) -> CalibrationInputs:
@@ -285,7 +300,19 @@ def calibration_inputs(fit: Fit) -> CalibrationInputs:
         role == 2,
         fit.plan,
         np.concatenate([s.groups[WEIGHT] for s in of_all]) if WEIGHT in train.groups else None,
+        _junk(fit),
     )
+
+
+def _junk(fit: Fit) -> Mapping[str, Array]:
+    """Features of junk by kind; none where held-out sweeps suffice to judge altered ones."""
+    if not altered_sweeps.few(fit.held):
+        return NO_JUNK
+    trunk, tare, seed = fit.trunk(), fit.tare, fit.about["seed"]
+    return {
+        kind: run(trunk, windows(kind, fit.train, JUNK_EACH, tare, seed + JUNK_SEED))
+        for kind in JUNK
+    }
 
 
 def _augmented_copies(fit: Fit) -> AugmentedCopies:
