@@ -46,8 +46,7 @@ def test_easy_materials_are_enough():
 
 @pytest.mark.slow
 def test_the_assessment_says_what_else_would_get_a_label():
-    """Junk and materials that are left out, with the share that would be named and their number; of
-    two sweeps of each material no bundle can be made, so nothing is said."""
+    """Junk and materials that are left out, with the share that would be named and their number."""
     found = assess(lesson(easy(8)))
     assert len(found.others) == 2
     for share, n in found.others.values():
@@ -55,7 +54,6 @@ def test_the_assessment_says_what_else_would_get_a_label():
         assert n >= 24
         assert f"of {n} " in found.text()
     assert [*found.json()["others"].values()] == [[*of] for of in found.others.values()]
-    assert not assess(lesson(easy(2))).others
 
 
 def test_few_sweeps_are_not_enough_however_right_they_are():

@@ -48,15 +48,17 @@ def assess(lesson: Lesson) -> Assessment:
         scores = setup.scores(fixed.data, parts)
         chosen = scores.score(chosen.plan.parts)
     found = judged(lesson, parts, softmax(chosen.logits[scores.own]))
-    trunk, plan = recipe.pruned(fixed.trunk, None, choice.chosen.plan)
-    return replace(found, others=others(recipe.finish(trunk, plan, choice, setup)))
+    with suppress(ApplianceError):  # too few sweeps for a bundle
+        trunk, plan = recipe.pruned(fixed.trunk, None, choice.chosen.plan)
+        found = replace(found, others=others(recipe.finish(trunk, plan, choice, setup)))
+    return found
 
 
 def others(fit: Fit) -> dict[str, tuple[float, int]]:
     """For things that were not taught, in words, the share to which the box would give a label, and
-    their number. Empty if the sweeps do not suffice for a bundle."""
+    their number. Raises FormatError or ExportRefused if the sweeps do not suffice for a bundle."""
     told = dict[str, tuple[float, int]]()
-    with suppress(ApplianceError), TemporaryDirectory() as folder:
+    with TemporaryDirectory() as folder:
         out = Path(folder) / NAME
         manifest = quantized_bundle.export(fit, out, NAME, "1", "", proven=False)
         made = bundle.load(out)
@@ -64,8 +66,8 @@ def others(fit: Fit) -> dict[str, tuple[float, int]]:
         n = sum(len(one.sweeps) for one in given)
         wrong = sum(found.wrong for found in trial.counted(made, given).values())
         told["windows without a slide over one material"] = wrong / n, n
-        found = manifest.figures[stranger_limits.FIGURES]
-        if named := found["balanced"].get("named"):
+        found = manifest.figures.get(stranger_limits.FIGURES, {})
+        if named := found.get("balanced", {}).get("named"):
             told["sweeps of materials that were left out"] = named[0], found["strangers"]
     return told
 
