@@ -56,6 +56,14 @@ def test_sound_taxels_that_are_constant_are_noticed():
     assert fit_taxels.learned(sweeps).still
 
 
+def test_few_sweeps_search_few_places(tmp_path: Path):
+    """No more taxels than sweeps are tried, but as many as may be broken."""
+    test = EvaluationSweeps.of(windows("a", "b"), 2, 0)
+    rule = fit_taxels.learned(test.sweeps)
+    bench = fit_taxels._Bench.of(bundle.load(toy(tmp_path)), rule, test, test, 0)
+    assert len(bench.places()) == fit_taxels.MOST
+
+
 def test_a_bundle_that_needs_one_taxel_tolerates_none(tmp_path: Path):
     """The toy knows "b" from taxel 1.1 alone; a row or a column may hold it as well."""
     loaded, sweeps = bundle.load(toy(tmp_path)), windows("a", "b", "c")
