@@ -223,8 +223,8 @@ def find_rule(probabilities: Array, labels: Array) -> EarlyRule:
 
 
 def no_limits(held_out: int) -> str:
-    """Why there is no limit of known materials at each step, "" if there is one: a share of so many
-    held-out sweeps decides it. Without these limits the box would answer early to anything."""
+    """The reason against limits of known materials at each step, "" for enough held-out sweeps.
+    Without these limits the box would answer early to anything."""
     if held_out >= MIN_SWEEPS:
         return ""
     return f"{held_out} sweeps were held out, and its limits need {MIN_SWEEPS}; record more"

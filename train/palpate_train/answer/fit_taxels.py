@@ -43,8 +43,8 @@ costs what it costs without bridging, so it does not decide the number."""
 MOST = 8
 """Largest number of broken taxels that is tried, and at most a quarter of all."""
 CANDIDATES = 32
-"""Taxels among which the worst places are searched: those with the strongest signal. There are no
-more of them than sweeps that judge, which would find others by chance, but at least MOST."""
+"""Taxels among which the worst places are searched: those with the strongest signal. Few
+sweeps would find more of them by chance, so there are MOST, or as many as sweeps."""
 SEARCHED, JUDGED = 40, 240
 """Number of sweeps that find the worst places, and that judge the answers there."""
 MODES, MOST_VALUES = 2, 256

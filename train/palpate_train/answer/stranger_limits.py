@@ -39,8 +39,8 @@ more is of no use; a wider limit only lets strangers in. Few positions say littl
 one: of 15 splits of six simulated positions the balanced limit keeps 93 % on average, 67 % in the
 worst; with a least share of 0.85 90 and 61 %."""
 LEAST_BY_JUNK = LEAST_KEPT | {"balanced": 0.85}
-"""The same where junk decides, too: few sweeps, whose cross-fits lie farther away than a new sweep
-lies from the finished model."""
+"""The same with junk, for few sweeps. Their cross-fits are farther away than new sweeps of the
+finished model."""
 NO_JUNK: Mapping[str, Array] = MappingProxyType({})
 STEPS, DRAWN = 500, 12
 """Numbers of limits that are compared, and that a manifest has shares for."""

@@ -75,7 +75,7 @@ class Fit:
     the held-out sweeps. about: JSON, how the fit was made and validated. plan: fits the heads
     again, before a temperature. calibration: of the int8 trunk if there is one; None if the sweeps
     do not suffice, with the reason in `uncalibrated`. contacts: None until the fit is `finished`.
-    given: what the calibration was fitted to, kept for export where it is small; not in the file.
+    given: inputs of the calibration, kept for export if there are few sweeps; not in the file.
     """
 
     weights: dict[str, Array]
