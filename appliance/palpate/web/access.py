@@ -49,7 +49,7 @@ class Access:
                 " network, then host names"
             ) from e
         if local:
-            return cls(port, address)
+            return cls(port, address, tuple(names))
         folder = Path(settings.folder)
         return cls(
             port,

@@ -376,6 +376,13 @@ def test_wrong_tokens_are_slowed_and_logged_once(tmp_path, monkeypatch, logged):
     assert line.startswith("<4>page: wrong token from 127.0.0.1")
 
 
+def test_a_proxy_on_this_machine_may_pass_names_on():
+    """The names of watch.address are answered on the loopback address too, and no others."""
+    access = Access.configured(WatchConfig(address="127.0.0.1 cell-7.plant.example"), 0)
+    assert access.is_host("Cell-7.plant.example:443", "127.0.0.1")
+    assert not access.is_host("evil.example", "127.0.0.1")
+
+
 def test_beyond_this_machine_token_and_certificate_must_be_there(tmp_path, monkeypatch):
     """Missing, broken and unreadable files are named; an invalid address is refused."""
     network, token = WatchConfig(address="0.0.0.0", folder=str(tmp_path)), tmp_path / "token"
