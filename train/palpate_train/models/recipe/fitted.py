@@ -21,7 +21,7 @@ from onnx import checker, shape_inference
 from palpate.core import storage
 from palpate.core.errors import BundleError, FormatError
 from palpate.core.sweep_set import read
-from palpate_train.answer import altered_sweeps, stranger_limits
+from palpate_train.answer import stranger_limits
 from palpate_train.answer.calibrate import Calibration, CalibrationInputs, fit_calibration
 from palpate_train.answer.fit_contact import Contacts
 from palpate_train.answer.fit_displacement import AugmentedCopies
@@ -44,8 +44,10 @@ WHAT = "a fit (made by palpate-train fit)"
 HELD_COPIES_SEED, FAULTS_SEED, JUNK_SEED = 1, 2, 3
 """Added to a fit's seed for the copies of its held-out sweeps, for the copies with faults, and for
 junk."""
-JUNK_EACH = 12
-"""Windows of each kind of junk that help to find the limits of known materials."""
+JUNK_EACH, MOST_BY_JUNK = 12, 10
+"""Windows of each kind of junk that help to find the limits of known materials, and the largest
+number of sweeps of a material that need them. More sweeps show by themselves where unknown
+materials lie, and junk would only make the limit narrower for known ones."""
 FAULTS = Augmentation(
     displaced=0.0,
     gain=0.1,
@@ -305,8 +307,9 @@ def calibration_inputs(fit: Fit) -> CalibrationInputs:
 
 
 def _junk(fit: Fit) -> Mapping[str, Array]:
-    """Features of junk by kind; none where held-out sweeps suffice to judge altered ones."""
-    if not altered_sweeps.few(fit.held):
+    """Features of junk by kind; none where sweeps suffice without."""
+    every = np.append(fit.train.labels, fit.held.labels)
+    if np.bincount(every).min() > MOST_BY_JUNK:
         return NO_JUNK
     trunk, tare, seed = fit.trunk(), fit.tare, fit.about["seed"]
     return {
