@@ -94,11 +94,11 @@ def run(args: argparse.Namespace) -> None:
 
     Raises FormatError at the end if a file was broken.
     """
-    check_folder(args.folder)
-    plan = _plan(args)
     for option, endings in (("out", options.SET_FILES), ("report", ())):
         if path := getattr(args, option):
             options.writable_file(path, f"--{option}", *endings)
+    check_folder(args.folder)
+    plan = _plan(args)
     left_out: list[LeftOutFile] = []
     taken: Sequence[Taken] = ()
     try:
