@@ -29,8 +29,12 @@ PIXELS = {
 }  # fmt: skip
 """NumPy types of the pixels of an image with one channel, by the name of its encoding."""
 IMAGE = "Image"
-MENDED = {".bag": "`rosbag reindex`", ".db3": "`sqlite3 FILE .recover`"}
-"""What makes a recording whole that was cut off, beside `mcap recover`."""
+MENDED = {
+    ".bag": "`rosbag reindex`",
+    ".db3": "`sqlite3 FILE .recover`",
+    ".mcap": "`mcap recover`",
+}
+"""What makes a recording whole that was cut off."""
 MCAP_END = b"\x89MCAP0\r\n"
 
 
@@ -44,10 +48,11 @@ def read(path: Path, wanted: ReadPlan) -> Table:
         source = path.parent
         if not (source / "metadata.yaml").exists():
             raise FormatError("lacks metadata.yaml beside it; run `ros2 bag reindex` on its folder")
-    if path.suffix.lower() == ".mcap" and not _has_end(path):
-        raise FormatError("has no end, as if it was cut off; `mcap recover` makes it whole")
+    kind = path.suffix.lower()
+    if not WHOLE.get(kind, lambda _: True)(path):
+        raise FormatError(f"has no end, as if it was cut off; {MENDED[kind]} makes it whole")
     store = stores.get_typestore(stores.Stores.ROS2_JAZZY)
-    with _opened(highlevel, source, store, MENDED.get(path.suffix.lower(), "")) as bag:
+    with _opened(highlevel, source, store, MENDED.get(kind, "")) as bag:
         topics: dict[str, list[Any]] = {}
         for connection in bag.connections:
             topics.setdefault(normal(connection.topic), []).append(connection)
@@ -83,6 +88,24 @@ def _has_end(path: Path) -> bool:
     with path.open("rb") as file:
         file.seek(-min(len(MCAP_END), path.stat().st_size), os.SEEK_END)
         return file.read() == MCAP_END
+
+
+def _has_all_pages(path: Path) -> bool:
+    """Whether an SQLite file is as long as its header says (sqlite.org/fileformat2.html, 1.3).
+    Some versions of SQLite read a short file as if zeros followed."""
+    with path.open("rb") as file:
+        header = file.read(100)
+    if len(header) < 100:
+        return False
+    page, change, pages, valid_for = (
+        int.from_bytes(header[at : at + n], "big") for at, n in ((16, 2), (24, 4), (28, 4), (92, 4))
+    )
+    size = pages * (65536 if page == 1 else page)
+    return change != valid_for or path.stat().st_size >= size
+
+
+WHOLE = {".mcap": _has_end, ".db3": _has_all_pages}
+"""Whether a recording has its end, by the ending of its name, for formats that tell it."""
 
 
 def _fitting(bag: Any, topics: dict[str, list[Any]]) -> list[str]:
