@@ -329,4 +329,7 @@ class Teacher(Observer):
 
     @property
     def _complete(self) -> bool:
-        return not self._label or self._session.materials()[self._label] >= self._wanted
+        if not self._label:
+            return True
+        held = self._session.materials().get(self._label)  # None: forgotten, or renamed
+        return held is None or held >= self._wanted

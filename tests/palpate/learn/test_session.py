@@ -370,6 +370,16 @@ def test_the_teacher_leads_from_material_to_material(taught):
     assert teacher.done
 
 
+@pytest.mark.parametrize("order", [("FORGET", "cork"), ("RENAME", "cork,oak")])
+def test_the_teacher_goes_on_from_a_material_that_is_gone(taught, order: tuple[str, str]):
+    """A label that a person has forgotten or renamed holds up none of the others."""
+    teacher = Teacher(taught.session, ["cork", "pine"], 2)
+    teacher.turn(HEALTH)
+    taught.order(*order)
+    teacher.turn(HEALTH)
+    assert taught.recording.about()["material"] == "pine"
+
+
 def test_a_box_without_the_extra_says_what_to_install(monkeypatch):
     """Before a person records anything."""
     monkeypatch.setattr(process, "find_spec", lambda name: None if name == "scipy" else name)
