@@ -242,12 +242,9 @@ def run_memory(args: argparse.Namespace) -> int:
     from palpate.client.verdicts import VerdictFile
 
     settings = config.load(None)
-    path = args.feed or settings.store.feed
-    if not path:
-        raise ConfigError('store.runtime = "" turns the feed off; set it to a folder')
-    memory = MemoryBridge(
-        Feed(path), VerdictFile(args.file or Path(settings.bridge.memory)), SystemClock()
-    )
+    feed = Feed(args.feed or settings.store.needed_feed())
+    file = VerdictFile(args.file or Path(settings.bridge.memory))
+    memory = MemoryBridge(feed, file, SystemClock())
 
     async def serve() -> int:
         stop = stop_event()

@@ -9,7 +9,6 @@ import sys
 from palpate.cli.common import load_bundle, load_settings
 from palpate.core import config
 from palpate.core.clock import SystemClock
-from palpate.core.errors import ConfigError
 from palpate.core.interrupts import StopFlag, during_imports
 from palpate.core.log import TroubleLog, log
 from palpate.core.retry import retried
@@ -51,9 +50,7 @@ def run_replay(args: argparse.Namespace) -> int:
 def run_watch(args: argparse.Namespace) -> int:
     """Show the running box until Ctrl-C or SIGTERM."""
     settings, clock = load_settings(args), SystemClock()
-    socket, stopped = settings.store.feed, StopFlag()
-    if not socket:
-        raise ConfigError('store.runtime = "" turns the feed off; set it to a folder to watch')
+    socket, stopped = settings.store.needed_feed(), StopFlag()
     if args.web is not None:
         from palpate.web.access import Access
         from palpate.web.web import PageWatcher

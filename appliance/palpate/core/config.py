@@ -213,6 +213,12 @@ class StoreConfig:
     def feed(self) -> Path | None:
         return Path(self.runtime) / FEED if self.runtime else None
 
+    def needed_feed(self) -> Path:
+        """The feed, for programs that read it. Raises ConfigError if it is off."""
+        if not self.feed:
+            raise ConfigError('store.runtime = "" turns the feed off; set it to a folder')
+        return self.feed
+
 
 @dataclass(frozen=True, slots=True)
 class WatchConfig:
