@@ -146,7 +146,7 @@ def test_loads_that_no_fit_chose_have_no_figures(monkeypatch: pytest.MonkeyPatch
 def test_answers_are_those_of_the_box(monkeypatch: pytest.MonkeyPatch):
     """A fit without loads, and the box's answers to its own sweeps: most are right."""
     tubes = sets.load("sim:T-REAL:1").select(["position<=2"])
-    made = recipe.fit(tubes, Run(1), Settings(steps=0, size=replace(UNLIMITED, loads=False)))
+    made = recipe.fit(tubes, Run(1), Settings(size=replace(UNLIMITED, loads=False)))
     assert not made.architecture.loads
     found = loads_table.answers(made, tubes)
     assert found["label"].mean() > 0.95

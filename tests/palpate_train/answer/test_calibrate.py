@@ -61,7 +61,7 @@ def test_a_disturbed_sweep_of_a_known_material_stays_known():
 @pytest.mark.slow
 def test_disturbed_sweeps_are_of_those_that_were_trained_on():
     """One in ten has a changed copy of its material and group; no copy judges."""
-    fit = recipe.fit(easy(16), Run(1), recipe.Settings(steps=0))
+    fit = recipe.fit(easy(16), Run(1), recipe.Settings())
     given = calibration_inputs(fit)
     prefixes, labels, groups, held, faulty = (
         given.prefixes,

@@ -521,7 +521,7 @@ def test_the_command_exports_what_fit_wrote(
 def test_a_fit_without_a_convolution_is_exported(tmp_path: Path):
     """Nothing in it is int8: both precisions are equal, the labels of box and fit agree, and no
     tensor is reported. A spoilt head is reported here as well."""
-    made = recipe.fit(easy(), Run(1), recipe.Settings(steps=0, size=SIZES["bands"]))
+    made = recipe.fit(easy(), Run(1), recipe.Settings(size=SIZES["bands"]))
     export(made, tmp_path / "b")
     it = box(tmp_path / "b")
     assert it.self_test() < 1e-6

@@ -92,7 +92,7 @@ def test_materials_are_matched_by_name():
 def test_a_fit_gives_back_all_its_sweeps():
     """The training sweeps come first, then the held-out ones, with their groups."""
     whole = easy(20)
-    made = recipe.fit(whole, Run(1), recipe.Settings(0))
+    made = recipe.fit(whole, Run(1), recipe.Settings())
     again = bundle_trainings.whole(made)
     assert len(again) == len(whole)
     np.testing.assert_array_equal(

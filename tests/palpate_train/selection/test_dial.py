@@ -34,7 +34,7 @@ from palpate_train.selection.dial import (
 )
 from palpate_train.selection.reduction_curves import ReducedFits
 
-CLOSED = Settings(steps=0)
+CLOSED = Settings()
 CLUSTERS = np.repeat(np.arange(8), 12)
 """Eight places of twelve sweeps."""
 

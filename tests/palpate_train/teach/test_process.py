@@ -75,7 +75,7 @@ def test_a_bundle_is_made_without_a_desktops_libraries(tmp_path: Path):
     box = Classifier(made, SystemClock())
     box.self_test()
     lesson = Lesson.read(tmp_path / "sweeps")
-    fit = recipe.fit(lesson.sweeps, Run(0), recipe.Settings(steps=0))
+    fit = recipe.fit(lesson.sweeps, Run(0), recipe.Settings())
     assert made.manifest.made["chosen"] == fit.about["chosen"]
     assert made.manifest.known
     assert lines[-1]["peak_mb"] < 700

@@ -36,7 +36,7 @@ def peak(sweeps: Dataset) -> int:
     """The largest number of bytes that a fit to USED of these sweeps allocates beside them."""
     tracemalloc.start()
     try:
-        recipe.fit(sweeps, Run(1), Settings(steps=0, most=USED))
+        recipe.fit(sweeps, Run(1), Settings(most=USED))
         return tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
@@ -55,8 +55,8 @@ def test_memory_does_not_grow_with_the_set():
 def test_a_set_under_the_cap_is_used_whole():
     """Its results do not change with the cap."""
     s = easy(4)
-    assert len(recipe.Setup.of(s, Run(1), Settings(steps=0)).sweeps) == len(s)
-    assert len(recipe.Setup.of(s, Run(1), Settings(steps=0, most=6)).sweeps) == 6
+    assert len(recipe.Setup.of(s, Run(1), Settings()).sweeps) == len(s)
+    assert len(recipe.Setup.of(s, Run(1), Settings(most=6)).sweeps) == 6
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,7 @@ from tests.factories.sweep_sets import easy
 checkpoint = Later("palpate_train.models.checkpoint")
 stages = Later("palpate_train.models.recipe.stages")
 
-CLOSED = Settings(steps=0)
+CLOSED = Settings()
 INTERRUPTED = 130
 
 

@@ -32,7 +32,7 @@ def tubes() -> Dataset:
 def test_a_fit_contains_at_most_its_size(name: str):
     """Its trunk has no view that the size excludes, and it names sweeps at held-out positions."""
     size = SIZES[name]
-    made = recipe.fit(tubes(), Run(1), recipe.Settings(steps=0, size=size, calibrate=False))
+    made = recipe.fit(tubes(), Run(1), recipe.Settings(size=size, calibrate=False))
     found = made.architecture
     filters = len(bank.Bank.of(made.weights).free) if found.pools else 0
     assert size.filters is None or filters <= size.filters
@@ -74,7 +74,7 @@ def test_filters_of_a_size_are_spread_evenly_over_each_kind():
 def test_a_size_without_filters_needs_windows_with_a_spectrum():
     """The error says what to do; a size with filters can be fitted."""
     short = replace(tubes(), samples=tubes().samples[:, 700:730])
-    settings = recipe.Settings(steps=0, calibrate=False)
+    settings = recipe.Settings(calibrate=False)
     with pytest.raises(FormatError, match="30 frames"):
         recipe.fit(short, Run(1), replace(settings, size=SIZES["bands"]))
     assert recipe.fit(short, Run(1), replace(settings, size=SIZES["64"])).architecture.pools
@@ -92,7 +92,7 @@ def test_each_size_is_a_method():
 @pytest.mark.slow
 def test_a_fit_of_the_spectrum_alone_survives_its_file(tmp_path: Path):
     """Nothing in its graph is int8, both precisions agree, an easy set is learned."""
-    made = recipe.fit(easy(), Run(1), recipe.Settings(steps=0, size=SIZES["bands"]))
+    made = recipe.fit(easy(), Run(1), recipe.Settings(size=SIZES["bands"]))
     assert (made.architecture, made.bands) == (replace(recipe.FIXED, spectrum=True), 5)
     assert sorted(made.weights) == ["head.bias", "head.weight", "int8.bias", "int8.weight"]
     made.save(tmp_path / "fit.npz")

@@ -209,7 +209,7 @@ def test_a_window_too_short_has_no_spectrum():
     """With fewer than four frames in a tenth there are no bands, and a fit has no spectrum."""
     short = replace(easy(12), samples=easy(12).samples[:, :39])
     assert spectrum.count(short.format) == 0
-    settings = recipe.Settings(steps=0, calibrate=False)
+    settings = recipe.Settings(calibrate=False)
     made = recipe.fit(short, Run(1), replace(settings, size=SIZES["64"]))
     assert (made.architecture.spectrum, made.bands) == (False, 0)
     assert made.architecture.pools
