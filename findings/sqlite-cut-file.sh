@@ -1,4 +1,4 @@
-#!/bin/sh
+#!/bin/bash
 # Library: apsw 3.46.1.0, which brings SQLite 3.46.1 (the same with apsw 3.40.0.0, SQLite 3.40.0).
 # Behaviour: a database that lost less than its last page is opened and read without an error. All rows
 #   come; what the lost bytes held reads as zeros. Only `PRAGMA integrity_check` notices it.
@@ -8,7 +8,7 @@
 # Where a user meets it: a ROS 2 bag (.db3) that was copied from a robot whose card was full, or while it
 #   was recorded: the last messages are partly zeros, and nothing says so. The header tells the right
 #   length (page size at byte 16 times number of pages at byte 28), which a reader has to compare.
-set -eu
+set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 python3 -m venv "$folder/venv"
