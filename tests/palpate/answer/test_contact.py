@@ -2,44 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from palpate.answer.contact import ContactPositions, advice, centre, displacement, fill_dead_taxels
-from palpate.bundle.bundle import Manifest
-from palpate.core.errors import BundleError
-from palpate.core.sentences import MAX_LINE
-from palpate.core.types import Status, Verdict
-from palpate.io.robot_link import result
 from palpate.sim import skin
 from tests.factories.contacts import MIDDLE, TARE, counts, patch
 
 NAN, INF = float("nan"), float("inf")
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        *(("pitch_mm", value) for value in (0.0, NAN, "4", 1e7)),
-        *(("limit_mm", value) for value in (-1.0, INF, True)),
-        *(("rows_mm", value) for value in ((6.0, -1e7), (), (6.0, NAN), [6.0, 6.4])),
-        *(("cols_mm", value) for value in ((6.0, None), (6.0,))),
-    ],
-)
-def test_a_place_that_makes_no_sense_is_refused(name, value):
-    """Values that are not numbers, not finite, too many or not in pairs."""
-    with pytest.raises(BundleError, match=name):
-        replace(MIDDLE, **{name: value})
-    with pytest.raises(BundleError, match="1000"):
-        replace(MIDDLE, rows_mm=(6.0,) * 1001, cols_mm=(6.0,) * 1001)
-
-
-def test_a_place_goes_through_the_manifest(default_bundle):
-    """Written as JSON and read again it is the same."""
-    manifest = replace(default_bundle.manifest, contact=MIDDLE)
-    assert Manifest.parse(manifest.json()).contact == MIDDLE
 
 
 @pytest.mark.parametrize("at", [(1.5, 1.5), (1.0, 2.0), (1.8, 1.4), (2.0, 1.0)])
@@ -139,12 +109,3 @@ def test_the_nearest_position_counts():
     assert two.offset((3.1, 0.0)) == pytest.approx((0.2, 0.0))
     assert two.within((0.3, -0.4))
     assert not two.within((0.3, -0.41))
-
-
-def test_a_sentence_keeps_what_matters_most_of_the_advice():
-    """If a RES sentence is cut at 128 characters, the larger direction is still in it."""
-    detail = f"moved {advice((-12.5, 11.5), (4, 4))}"
-    own = (12345, 10**14, Status.OK, "plastic rough", 0.98, 0.96, np.array([0.98, 0.02]), 1, 0)
-    line = result(Verdict(*own, 400_000, "9f3c2a1b", detail), "usb")
-    assert len(line) <= MAX_LINE
-    assert b"moved 12.5 mm too far towards row 1" in line

@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from palpate.answer.load_modes import LoadModes
-from palpate.answer.taxels import Bridging, bridged
-from palpate.bundle import bundle
-from palpate.bundle.manifest import Manifest
-from palpate.core.errors import BundleError
-from tests.factories import toy_bundle
+from palpate.answer.taxels import bridged
 
 SPREAD = np.array([4.0, 8.0, 2.0, 6.0, 1.0, 5.0])
 TILT = np.array([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0])
@@ -56,35 +50,3 @@ def test_filled_counts_stay_in_the_range_of_their_type():
     """A load above 255 becomes 255."""
     taxels = np.full((3, 3, 2), 250, np.uint8)
     assert bridged(taxels, np.eye(3, 2, dtype=bool), np.zeros((3, 2)), LOADS).max() == 255
-
-
-@pytest.mark.parametrize(
-    ("change", "why"),
-    [
-        ({"modes": ()}, "has 0 modes"),
-        ({"modes": LOADS.modes * 5}, "has 10 modes"),
-        ({"modes": ((1.0, 2.0),)}, "as many values"),
-        ({"rest": 0.0}, "`rest` above 0"),
-        ({"rest": float("nan")}, "`rest` above 0"),
-        ({"mean": (float("inf"),) * 6}, "finite"),
-        ({"modes": ((1e300,) * 6,)}, "finite"),
-    ],
-)
-def test_values_that_cannot_be_computed_with_are_refused(change, why):
-    """The error has the wrong field."""
-    with pytest.raises(BundleError, match=why):
-        replace(LOADS, **change)
-
-
-def test_a_manifest_holds_them_or_none(tmp_path):
-    """A bundle may have none; loads of another skin are refused."""
-    rule = Bridging(1, False, False, 4.0, 2.0, False)
-    toy = bundle.load(toy_bundle.put(tmp_path / "toy", toy_bundle.files())).manifest
-    manifest = replace(toy, bridging=rule)
-    assert Manifest.parse(manifest.json()) == manifest
-    n = manifest.format.channels
-    loads = LoadModes((1.0,) * n, ((2.0,) * n,), 0.5)
-    told = replace(manifest, bridging=replace(rule, loads=loads))
-    assert Manifest.parse(told.json()) == told
-    with pytest.raises(BundleError, match=f"6 loads .* for {n}"):
-        Manifest.parse(replace(manifest, bridging=replace(rule, loads=LOADS)).json())

@@ -177,15 +177,6 @@ def test_an_enrolled_label_moves_as_the_others_do_on_average(tmp_path):
     assert answer(now, lost(20, 14.7)).label == "new"
 
 
-@pytest.mark.parametrize("tried", [None, 0.5])
-def test_a_manifest_holds_what_was_tried(tmp_path, tried):
-    """It is read as it was written."""
-    first, *others = ALLOWED.allowances
-    allowed = replace(ALLOWED, allowances=(replace(first, tried=tried), *others))
-    text = replace(disturbed(tmp_path).manifest, disturbances=allowed).json()
-    assert bundle.Manifest.parse(text).disturbances == allowed
-
-
 def test_hum_is_removed_and_said(tmp_path):
     """A sweep with hum gets the answer of a sweep without it, unless the bundle removes none."""
     given, clean = disturbed(tmp_path, format=HUMMING), toy_bundle.sweep(6, 0, format=HUMMING)
@@ -282,13 +273,6 @@ def test_a_bundle_with_incomplete_checks_is_refused(tmp_path, more, why):
         early_toy(tmp_path, **more)
 
 
-@pytest.mark.parametrize("limits", [(4.0,), (4.0, 0.0, 4.0), (4.0, "4", 4.0)])
-def test_limits_out_of_range_are_refused(limits):
-    """Too few limits, 0, and text."""
-    with pytest.raises(BundleError, match=r"early\.limits"):
-        Early((0.6, 0.6, 0.6), 2, limits)
-
-
 @pytest.mark.parametrize(
     ("farthest_mm", "status"), [(None, Status.OK), (0.5, Status.OK), (0.3, Status.UNKNOWN)]
 )
@@ -304,9 +288,3 @@ def test_a_contact_is_named_up_to_the_farthest_displacement(tmp_path, farthest_m
     assert (exit_of(made)(elsewhere(half(0, 0))) is not None) == (status is Status.OK)
     assert ("up to 0.3" in verdict.detail) == (status is Status.UNKNOWN)
     assert answer(made, toy_bundle.sweep(0, 0)).status is Status.OK
-
-
-def test_the_farthest_displacement_is_a_length():
-    """0 is out of range."""
-    with pytest.raises(BundleError, match="farthest_mm"):
-        replace(toy_bundle.DISPLACEMENT, farthest_mm=0)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from palpate.answer.vibration import SlideLimits, vibration
-from palpate.core.errors import BundleError
 
 TARE = np.full((2, 2), 20.0)
 
@@ -47,10 +46,3 @@ def test_a_constant_part_rests_and_numbers_that_are_none_do_not():
     broken = window(4, 4, 4)
     broken[50] = np.nan
     assert limits.resting(vibration(broken, TARE, 3), 0) == []
-
-
-@pytest.mark.parametrize("least", [(math.inf,), (math.nan, -1.0), ("-5",)])
-def test_limits_that_are_not_numbers_are_refused(least):
-    """Infinity, NaN and text."""
-    with pytest.raises(BundleError, match=r"sliding\.least"):
-        SlideLimits(least)

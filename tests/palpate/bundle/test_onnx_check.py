@@ -3,18 +3,13 @@ reason, and what passes does no harm."""
 
 from __future__ import annotations
 
-import os
-import signal
 from dataclasses import replace
-from random import Random
-from typing import Any
 
 import pytest
 
 from tests.factories import toy_bundle
 
 pytest.importorskip("onnx", reason="onnx comes with the desktop's tools (make test)")
-import numpy as np
 
 from palpate.answer.early import Early
 from palpate.bundle import bundle
@@ -172,29 +167,3 @@ def test_fuzzed_models_neither_hang_nor_kill(enrolled, count, ran, owns, monkeyp
     assert record["done"] == count
     assert record["finds"] == []
     assert record["outcomes"]["ran"] >= ran
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("how", ["dies", "hangs", "swells"])
-def test_the_campaign_would_tell(how, owns, monkeypatch):
-    """A child that dies, hangs or takes too much memory is reported with its number, and the next
-    model is tried."""
-
-    def run(opened: Any, rng: Random) -> None:
-        if how == "dies":
-            os.kill(os.getpid(), signal.SIGKILL)
-        if how == "hangs":
-            signal.pause()
-        np.ones(400 << 20, np.uint8)
-
-    monkeypatch.setattr(hostile_fuzz, "run", run)
-    monkeypatch.setattr(hostile_fuzz, "trial", lambda model: None)
-    if how == "hangs":  # the others end by themselves, a busy machine in its own time
-        monkeypatch.setattr(hostile_fuzz, "DEADLINE_S", 2)
-    fuzz = hostile_fuzz.Fuzz(owns, 1)
-    monkeypatch.setattr(
-        hostile_fuzz.Fuzz, "model", lambda self, number: (owns[0].model, owns[0], Random(1))
-    )
-    told = list(fuzz.results(7, 2))
-    wanted = {"dies": "died (-9)", "hangs": "hung", "swells": "no memory"}[how]
-    assert [(t["number"], t["outcome"]) for t in told] == [(7, wanted), (8, wanted)]

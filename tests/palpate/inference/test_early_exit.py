@@ -3,7 +3,6 @@ failure."""
 
 from __future__ import annotations
 
-import io
 import itertools
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,7 +19,6 @@ from palpate.cli.main import main
 from palpate.client.answers import Answer
 from palpate.core.config import SweepConfig
 from palpate.core.errors import BundleError
-from palpate.core.sweep_file import load, save
 from palpate.core.types import Frames, Status, Sweep, SweepFormat, Verdict
 from palpate.inference.classifier import Classifier
 from palpate.inference.early_exit import EarlyExit
@@ -30,7 +28,6 @@ from palpate.runtime.loop import Box, Pipeline
 from palpate.sim import devices, gpio, rig, script, skin
 from palpate.sweeps.capture import CaptureWriter, Playback
 from palpate.sweeps.sweep_window import SweepCutter
-from palpate.tools import demo
 from tests.factories.settings import load as load_settings
 from tests.factories.simulated_box import SECOND, SETTLE_S, OnSweep, Rigged
 
@@ -459,22 +456,6 @@ def test_a_capture_gives_the_same_answers(rigged, tmp_path, packet_frames):
     assert counts == want
 
 
-def test_a_kept_sweep_gives_the_same_answer(rigged, tmp_path):
-    """The frames of an early answer are kept; replayed they give the same answer with the same
-    scores."""
-    box = rigged(simulated_slides(slid(-10, 60)), SETS, toy())
-    (verdict,) = all_of(box)
-    save(tmp_path / "sweep-000001.npy", box.kept[0], FMT)
-    sweep, format = load(tmp_path / "sweep-000001.npy")
-    assert (format, len(sweep.frames), sweep.share) == (FMT, 40, 0.4)
-    assert round((sweep.stop_ns - sweep.start_ns) / FMT.period_ns) == LEAD + 39
-    again = EarlyExit(Classifier(toy(), rig.VirtualClock()))(sweep)
-    assert again is not None
-    assert summary([again]) == summary([verdict])
-    assert again.scores.tobytes() == verdict.scores.tobytes()
-    assert EarlyExit(Classifier(toy((0.99,) * STEPS), rig.VirtualClock()))(sweep) is None
-
-
 def recorded(path: Path, windows: np.ndarray) -> Path:
     """A set of sweeps of "left", as `palpate run --sim` takes it."""
     labels, materials = [0] * len(windows), ["left", "right"]
@@ -510,19 +491,6 @@ def test_the_command_replays_what_it_decided(tmp_path, capsys):
     assert printed("replay", capture) == first
     kept = sorted((tmp_path / "black-box").glob("*.npy"))
     assert [printed("replay", str(path))[0] for path in kept] == first
-
-
-@pytest.mark.parametrize(("counts", "early"), [((60, 10), 1), ((10, 10), 0)])
-def test_the_demo_shows_what_it_saves(rigged, counts, early):
-    """The share of an early answer, and the mean touch time below; neither without early
-    answers."""
-    simulated = simulated_slides(*map(slid, counts))
-    box, out, played = rigged(simulated, SETS, toy()), io.StringIO(), simulated.robot.played
-    demo.Demo(played, box.far_end, out, ("left", "right"), raw=False).run(box.box, 2, lambda: False)
-    assert out.getvalue().count("after 20%") == early
-    mean = np.mean([(a.stop - a.start) / 100 for a in played])
-    assert (f"{mean:.2f} s mean, {early} of 2" in out.getvalue()) == bool(early)
-    assert ("touch" in out.getvalue()) == bool(early)
 
 
 def test_a_set_is_played_so_that_early_answers_see_it(tmp_path):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from typing import Any
 
@@ -10,8 +9,7 @@ import numpy as np
 import pytest
 
 from palpate.answer.slide import SpeedRange
-from palpate.bundle.bundle import Bundle, Manifest
-from palpate.core.errors import BundleError
+from palpate.bundle.bundle import Bundle
 from palpate.core.types import Frames, Status, Sweep, Verdict
 from palpate.inference.classifier import Classifier
 from palpate.sim import skin
@@ -109,28 +107,3 @@ def test_other_answers_do_not_report_it(default_bundle):
     assert [v.detail for v in found] == [""] * 3
     assert [v.status for v in found] == [Status.OK, Status.UNSURE, Status.UNSURE]
     assert all(v.measured_mm_s for v in found)
-
-
-def test_a_manifest_may_state_the_speeds(default_bundle):
-    """It is read as it was written."""
-    manifest = trained(default_bundle).manifest
-    assert json.loads(manifest.json())["speeds"] == {"least_mm_s": 28.0, "most_mm_s": 33.0}
-    assert Manifest.parse(manifest.json()) == manifest
-
-
-@pytest.mark.parametrize(
-    ("speeds", "hint"),
-    [
-        ({"least_mm_s": 0, "most_mm_s": 33}, r"\[0, 33\]"),
-        ({"least_mm_s": 34, "most_mm_s": 33}, r"\[34, 33\]"),
-        ({"least_mm_s": 28, "most_mm_s": 2e6}, r"1e\+06"),
-        ({"least_mm_s": True, "most_mm_s": 33}, r"\[True, 33\]"),
-        ({"least_mm_s": 28}, "manifest"),
-        ([28, 33], "manifest"),
-    ],
-)
-def test_wrong_speeds_are_named(default_bundle, speeds, hint):
-    """Numbers out of range and other types are refused with the value."""
-    content = json.loads(default_bundle.manifest.json()) | {"speeds": speeds}
-    with pytest.raises(BundleError, match=hint):
-        Manifest.parse(json.dumps(content).encode())

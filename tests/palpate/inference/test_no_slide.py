@@ -14,7 +14,6 @@ from palpate.answer.early import Early
 from palpate.answer.vibration import SlideLimits
 from palpate.bundle import bundle
 from palpate.bundle.bundle import Bundle
-from palpate.core.errors import BundleError
 from palpate.core.types import Frames, Status, Sweep
 from palpate.inference.classifier import Classifier
 from palpate.inference.early_exit import EarlyExit
@@ -88,18 +87,6 @@ def test_no_early_answer_to_a_finger_that_rests(toy):
     assert early(half(resting(0, 0, 2, 4))) is None
 
 
-def test_more_limits_than_labels_are_refused(toy):
-    """Four limits for three labels."""
-    with pytest.raises(BundleError, match=r"4 .* 3 "):
-        replace(toy.manifest, sliding=SlideLimits((LEAST,) * 4))
-
-
-def test_the_manifest_keeps_the_limits(toy):
-    """It is read as it was written."""
-    manifest = toy.manifest
-    assert bundle.Manifest.parse(manifest.json()) == manifest
-
-
 @pytest.fixture(scope="module")
 def packaged() -> Bundle:
     """The packaged bundle, whose training sweeps all show a pattern that passes."""
@@ -148,10 +135,3 @@ def test_a_whole_window_without_a_pattern_is_no_slide(packaged):
         verdict = box(own)
         assert (verdict.status, verdict.label) == (Status.NO_SLIDE, "")
         assert verdict.detail.startswith("no pattern passes from taxel to taxel")
-
-
-@pytest.mark.parametrize("pattern", [0.0, -1.0, math.inf, math.nan])
-def test_a_limit_of_patterns_out_of_range_is_refused(pattern):
-    """It is a number above 0."""
-    with pytest.raises(BundleError, match=r"sliding\.pattern"):
-        SlideLimits((), pattern)
