@@ -44,6 +44,9 @@ PATHS = {
     "systemd/palpate-memory.conf": (
         "/etc/systemd/system/palpate-bridge@memory.service.d/palpate-memory.conf"
     ),
+    "systemd/palpate-opcua.conf": (
+        "/etc/systemd/system/palpate-bridge@opcua.service.d/palpate-opcua.conf"
+    ),
     "systemd/palpate.sysusers": "/usr/lib/sysusers.d/palpate.conf",
     "systemd/palpate.tmpfiles": "/usr/lib/tmpfiles.d/palpate.conf",
     "firmware_config/70-palpate.rules": "/etc/udev/rules.d/70-palpate.rules",

@@ -20,6 +20,8 @@ ENTRY = re.compile(
 )
 OF_DEBIAN = ("python3", "libusb-1.0-0", "openssh-client")
 """Packages of Debian that the box needs; their licences are in /usr/share/doc."""
+KNOWN = {"wait-for2": "Apache-2.0"}
+"""Licences of packages that are not installed for every version of Python."""
 
 
 def components(lock: str) -> list[dict[str, Any]]:
@@ -43,6 +45,8 @@ def components(lock: str) -> list[dict[str, Any]]:
 def licence(name: str) -> str:
     """The licence that an installed package states. Raises SystemExit if it is not installed, or
     states none."""
+    if name in KNOWN:
+        return KNOWN[name]
     try:
         about = metadata.metadata(name)
     except metadata.PackageNotFoundError:

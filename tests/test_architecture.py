@@ -39,6 +39,9 @@ ALLOWED = {"palpate", "numpy", "onnxruntime", "usb", "gpiod", "serial", "_sha2",
 EXTRAS = {
     "web": {"tornado"},
     "bridges/mqtt.py": {"paho"},
+    "bridges/opcua.py": {"asyncua"},
+    "bridges/opcua_model.py": {"asyncua"},
+    "bridges/opcua_security.py": {"asyncua", "cryptography"},
     "bridges/ros.py": {"rclpy", "rcl_interfaces", "diagnostic_msgs", "sensor_msgs", "std_srvs"},
     "bridges/ros_action.py": {"rclpy", "palpate_msgs"},
 }

@@ -12,8 +12,8 @@ from packaging.utils import canonicalize_name
 from tests.factories.paths import ROOT
 
 LOCKS = {
-    "appliance/requirements.lock": ("page", "mqtt"),
-    "appliance/teach.lock": ("page", "mqtt", "teach"),
+    "appliance/requirements.lock": ("page", "mqtt", "opcua", "found"),
+    "appliance/teach.lock": ("page", "mqtt", "opcua", "found", "teach"),
     "systemd/build.lock": (),
     "systemd/fleet.lock": ("deploy",),
     "train/desktop.lock": ("train", "reports"),

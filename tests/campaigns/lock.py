@@ -13,8 +13,8 @@ BOX, TEACH = "appliance/requirements.lock", "appliance/teach.lock"
 TOOLS = "tests/tools.lock"
 BUILD = "setuptools>=77"
 LOCKS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    BOX: (("-e .[page,mqtt]",), ()),
-    TEACH: (("-e .[page,mqtt,teach]",), (BOX,)),
+    BOX: (("-e .[page,mqtt,opcua,found]",), ()),
+    TEACH: (("-e .[page,mqtt,opcua,found,teach]",), (BOX,)),
     TOOLS: (("-e .[dev]", "-e train[reports,peers,dask,files]", BUILD), (BOX, TEACH)),
     "systemd/build.lock": ((BUILD,), (TOOLS,)),
     "systemd/fleet.lock": (("-e .[deploy]",), (TOOLS,)),

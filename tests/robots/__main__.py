@@ -23,6 +23,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from statistics import median
 
+from asyncua.sync import Client
 from pymodbus.client import ModbusTcpClient
 
 from palpate.bridges.modbus import ADDRESSES
@@ -76,6 +77,7 @@ class Times:
             ("feed", "A"),
             ("modbus", "A"),
             ("mqtt", "A"),
+            ("opcua", "A"),
             ("ros", "A"),
         }
         return there and min(map(len, self._there.values())) >= sweeps
@@ -142,6 +144,27 @@ def published(seen: Seen) -> Callable[[str, str], None]:
     )
 
 
+class Subscription:
+    """Notes each result that the OPC UA subscription brings."""
+
+    def __init__(self, seen: Seen) -> None:
+        self._seen = seen
+
+    def datachange_notification(self, node: object, value: str | None, data: object) -> None:
+        """Called by the library's client."""
+        if value:
+            self._seen(int(value.rpartition("-")[2]))
+
+
+@contextmanager
+def subscribed(address: tuple[str, int], seen: Seen) -> Iterator[None]:
+    """An OPC UA client with a subscription to the last result, without a publishing interval."""
+    with Client(f"opc.tcp://{address[0]}:{address[1]}/", timeout=60) as client:
+        at = client.create_subscription(0, Subscription(seen))
+        at.subscribe_data_change(client.get_node("ns=2;s=LastResult.ResultId"))
+        yield
+
+
 def memory_mib() -> dict[str, float]:
     """Resident memory of each bridge as a process of its own, in MiB, without a box."""
     found = {}
@@ -150,10 +173,14 @@ def memory_mib() -> dict[str, float]:
             "tcp": ("--link", f"{folder}/line", "--listen", "127.0.0.1:0"),
             "modbus": ("--feed", f"{folder}/feed", "--listen", "127.0.0.1:0"),
             "mqtt": ("--feed", f"{folder}/feed", "--broker", broker.url),
+            "opcua": (
+                *("--feed", f"{folder}/feed", "--listen", "127.0.0.1:0"),
+                *("--folder", f"{folder}/opcua", "--anonymous"),
+            ),
         }.items():
             words = [sys.executable, "-m", "palpate.bridges", kind, *options]
             with subprocess.Popen(words, cwd=ROOT, stderr=subprocess.DEVNULL) as process:
-                threading.Event().wait(5)
+                threading.Event().wait(30 if kind == "opcua" else 5)
                 status = Path(f"/proc/{process.pid}/status").read_text()
                 found[kind] = round(int(re.search(r"VmRSS:\s+(\d+)", status)[1]) / 1024, 1)
                 process.terminate()
@@ -203,6 +230,12 @@ def run(sweeps: int) -> dict[str, list[float]]:
             Subscriber(broker.port, "palpate/#", published(times.seen("mqtt", "A")))
         )
         stack.enter_context(bridge("mqtt", "--feed", feeds["A"], "--broker", broker.url))
+        opcua = stack.enter_context(
+            bridge(
+                *("opcua", "--feed", feeds["A"], "--anonymous", "--folder", folder / "opcua"),
+            )
+        )
+        stack.enter_context(subscribed(opcua, times.seen("opcua", "A")))
         stack.enter_context(ros.bridge("-p", f"feed:={feeds['A']}"))
         peer = stack.enter_context(ros.peer())
         stack.callback(ending.set)

@@ -14,6 +14,7 @@ NAMES = {
     "feed": "feed, a program on the box",
     "modbus": "`bridge modbus` on the feed, pymodbus's client that reads every {poll:g} ms",
     "mqtt": "`bridge mqtt` on the feed, mosquitto, mosquitto_sub on loopback",
+    "opcua": "`bridge opcua` on the feed, asyncua's client on loopback, told at once",
     "ros": "`bridge ros` on the feed, another node on loopback",
 }
 

@@ -10,7 +10,7 @@ from collections.abc import Awaitable, Callable, Sequence
 from functools import partial
 from ipaddress import ip_address
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from palpate.bridges.options import FEED_KINDS, LINKS, MOST, PORTS, add_arguments
 from palpate.bridges.server import TcpServer, address, stop_event, until
@@ -55,7 +55,18 @@ def settle(kind: str, args: argparse.Namespace, settings: Config) -> None:
         )
 
 
-Served = tuple[TcpServer, str, Callable[[], Awaitable[None]], Callable[[], None]]
+class BridgeServer(Protocol):
+    """A server."""
+
+    address: tuple[str, int]
+
+    async def open(self, host: str, port: int) -> None:
+        """Listen. Raises AddressError or ConfigError."""
+
+
+Served = tuple[
+    BridgeServer, str, Callable[[], Awaitable[None]], Callable[[], Awaitable[None] | None]
+]
 """A bridge as a server: itself, the name of the box, its work once a second, and what closes it."""
 
 
@@ -85,6 +96,25 @@ def _tcp(args: argparse.Namespace) -> Served:
     options = {"writes": args.allow_writes, "short": args.short, "most": args.most}
     bridge = TcpBridge(name, opener, **options, loop=loop)
     return bridge.server, name, partial(asyncio.sleep, 0), bridge.close
+
+
+def _opcua(args: argparse.Namespace) -> Served:
+    try:
+        from palpate.bridges.mqtt_options import box_name
+        from palpate.bridges.opcua import Offer, OpcuaBridge
+    except ImportError as e:
+        raise ConfigError(
+            f"the OPC UA server is not installed ({e}); pip install 'palpate[opcua]'"
+        ) from e
+    settings = config.load(None).bridge
+    offer = Offer(
+        *(args.folder or Path(settings.opcua), Path(settings.memory)),
+        *(box_name(args.name or settings.name), args.most),
+        writes=args.allow_writes,
+        anonymous=args.anonymous or settings.anonymous,
+    )
+    bridge = OpcuaBridge(partial(_source, args), SystemClock(), offer)
+    return bridge, bridge.source.name, bridge.work, bridge.close
 
 
 def _warn(args: argparse.Namespace) -> None:
@@ -117,7 +147,8 @@ def run_server(args: argparse.Namespace, made: Callable[[argparse.Namespace], Se
             _say(args, server, box)
             await until(stop, EVERY_S, work)
         finally:
-            close()
+            if ending := close():
+                await ending
         return stop.code
 
     codes: list[int] = []
@@ -260,6 +291,7 @@ def run_memory(args: argparse.Namespace) -> int:
 RUNS: dict[str, Callable[[argparse.Namespace], int]] = {
     "tcp": partial(run_server, made=_tcp),
     "modbus": partial(run_server, made=_modbus),
+    "opcua": partial(run_server, made=_opcua),
     "mqtt": run_mqtt,
     "memory": run_memory,
     "ros": run_ros,
@@ -272,13 +304,13 @@ def run(args: argparse.Namespace) -> int:
     return RUNS[args.kind](args)
 
 
-def _say(args: argparse.Namespace, server: TcpServer, box: str) -> None:
+def _say(args: argparse.Namespace, server: BridgeServer, box: str) -> None:
     at = f"{args.kind}: listening on {':'.join(map(str, server.address))}, box at {box}"
     if not args.allow_writes:
         log.info(f"{at}; commands are refused (--allow-writes)")
         return
     log.info(f"{at}; commands are passed on")
-    if not ip_address(server.address[0]).is_loopback:
+    if args.kind != "opcua" and not ip_address(server.address[0]).is_loopback:
         log.warning(f"{args.kind}: whoever reaches it can command the box: keep it in the cell")
 
 

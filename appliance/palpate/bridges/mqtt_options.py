@@ -55,17 +55,16 @@ def read_login(path: Path) -> tuple[str, str]:
     try:
         if path.stat().st_mode & 0o007:
             raise ConfigError(
-                f"--login {path}: everybody may read the password; chmod o= {path}, and give it to "
+                f"{path}: everybody may read the password; chmod o= {path}, and give it to "
                 "the bridge's user"
             )
         lines = path.read_text("utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as e:
         why = str(getattr(e, "strerror", None) or "not a text").lower()
-        raise ConfigError(f"--login {path}: {why}; name a file with user and password") from e
+        raise ConfigError(f"{path}: {why}; name a file with user and password") from e
     if len(lines) < 2 or not lines[0]:
         raise ConfigError(
-            f"--login {path}: it needs two lines; put the user on the first, the password on the "
-            "second"
+            f"{path}: it needs two lines; put the user on the first, the password on the second"
         )
     return lines[0], lines[1]
 

@@ -11,15 +11,16 @@ from palpate.core.config import SerialConfig, StoreConfig
 FEED, BAUD = str(StoreConfig().feed), SerialConfig().baud
 MOST = 16
 """Default for the largest number of connections."""
-PORTS = {"tcp": 1503, "modbus": 1502}
-LINKS = {kind: f"/run/palpate-{kind}/line" for kind in ("tcp", "modbus", "mqtt")}
+PORTS = {"tcp": 1503, "modbus": 1502, "opcua": 4840}
+LINKS = {kind: f"/run/palpate-{kind}/line" for kind in ("tcp", "modbus", "mqtt", "opcua")}
 """Values of `serial.port` for a bridge on the box itself: the link that the bridge makes. Their
 folders belong to palpate-bridge@.service."""
-FEED_KINDS = ("modbus", "mqtt")
+FEED_KINDS = ("modbus", "mqtt", "opcua")
 """Bridges that can read the feed, as long as nobody commands."""
 TEXTS = {
     "tcp": "the sentences of the serial line on a TCP port",
     "modbus": "the box as a Modbus TCP server",
+    "opcua": "the box as an OPC UA server",
     "mqtt": "the box at an MQTT broker, with Home Assistant's discovery",
     "memory": "every verdict of 90 days in a file, for palpate status --since",
     "ros": "the box as a ROS 2 node",
@@ -73,6 +74,13 @@ def _add_server(one: argparse.ArgumentParser, kind: str) -> None:
     if kind == "tcp":
         text = "sentences of at most 80 characters, without their last fields (bridge.short)"
         one.add_argument("--short", action="store_true", help=text)
+    if kind == "opcua":
+        text = "its certificate, and `login`: user on one line, password on the next (bridge.opcua)"
+        one.add_argument("--folder", type=Path, metavar="DIR", help=text)
+        text = "everybody may read, also without encryption (bridge.anonymous)"
+        one.add_argument("--anonymous", action="store_true", help=text)
+        text = "of the box; default: of the computer (bridge.name)"
+        one.add_argument("--name", metavar="NAME", help=text)
     text = f"most connections at a time (default {MOST})"
     one.add_argument("--most", type=_number, default=MOST, metavar="N", help=text)
 

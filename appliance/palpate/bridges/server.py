@@ -101,11 +101,7 @@ class TcpServer:
         try:
             server = await asyncio.start_server(self._connected, host, port, limit=8192, backlog=64)
         except (OSError, OverflowError, ValueError) as e:
-            why = str(getattr(e, "strerror", None) or e).lower()
-            passing = isinstance(e, OSError) and not isinstance(e, PermissionError)
-            raise (AddressError if passing else ConfigError)(
-                f"--listen {host}:{port}: {why}; name an address of this machine and a free port"
-            ) from e
+            raise not_listening(host, port, e) from e
         self.address = server.sockets[0].getsockname()[:2]
 
     def _make_room(self, now_s: float) -> bool:
@@ -173,6 +169,15 @@ async def until(stop: asyncio.Event, every_s: float, work: Callable[[], Awaitabl
             async with asyncio.timeout(every_s):
                 await stop.wait()
     log.info("stopped")
+
+
+def not_listening(host: str, port: int, e: Exception) -> ConfigError:
+    """The error for an address where this program cannot listen."""
+    why = str(getattr(e, "strerror", None) or e).lower()
+    passing = isinstance(e, OSError) and not isinstance(e, PermissionError)
+    return (AddressError if passing else ConfigError)(
+        f"--listen {host}:{port}: {why}; name an address of this machine and a free port"
+    )
 
 
 def address(text: str) -> tuple[str, int]:

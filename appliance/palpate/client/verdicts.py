@@ -109,10 +109,12 @@ class VerdictFile:
         return db
 
 
-def since(path: Path, from_s: float) -> Iterator[dict[str, Any]]:
-    """The verdicts since this time, in order. Raises FeedError if the file cannot be read."""
-    query = f"SELECT number, {', '.join(COLUMNS)} FROM verdicts WHERE at >= ? ORDER BY number"
-    for row in _rows(path, query, [from_s]):
+def since(path: Path, from_s: float, most: int = -1) -> Iterator[dict[str, Any]]:
+    """The first `most` verdicts since this time, in order; -1: all. Raises FeedError if the file
+    cannot be read."""
+    columns = f"number, {', '.join(COLUMNS)}"
+    query = f"SELECT {columns} FROM verdicts WHERE at >= ? ORDER BY number LIMIT ?"
+    for row in _rows(path, query, [from_s, most]):
         yield dict(zip(("number", *COLUMNS), row, strict=True))
 
 

@@ -252,7 +252,9 @@ class BridgeConfig:
     fuses and sends on serial.port, separated by spaces, as in "left right". broker: of
     `palpate bridge mqtt`, as mqtt://HOST:PORT or mqtts://HOST:PORT. login: file with its user and
     password, on a line each. ca: file with the certificates that it trusts; "": the system's. name:
-    of the box in MQTT's topics; "": the computer's. memory: file of `palpate bridge memory`.
+    of the box in the network; "": the computer's. memory: file of `palpate bridge memory`. opcua:
+    folder of `palpate bridge opcua` for its certificate and `login`, a file as for MQTT. anonymous:
+    whether everybody may read there.
     """
 
     address: str = "127.0.0.1"
@@ -264,6 +266,8 @@ class BridgeConfig:
     ca: str = ""
     name: str = ""
     memory: str = "/var/lib/palpate-memory/verdicts.db"
+    opcua: str = "/var/lib/palpate-opcua"
+    anonymous: bool = False
 
 
 @dataclass(frozen=True, slots=True)

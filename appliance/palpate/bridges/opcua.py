@@ -1,0 +1,287 @@
+"""The box as an OPC UA server (docs/robots/opcua.md)."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections import deque
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from asyncua import Server, ua
+from asyncua.common.node import Node
+from asyncua.server.event_generator import EventGenerator
+
+from palpate import __version__
+from palpate.bridges.mqtt_options import read_login
+from palpate.bridges.opcua_model import (
+    CODES,
+    KINDS,
+    METHODS,
+    REPLY,
+    RESULT,
+    VARIABLES,
+    argument,
+    numbers,
+    result,
+    state,
+)
+from palpate.bridges.opcua_security import Login, hide_open_endpoint, limit, own_certificate
+from palpate.bridges.server import CLOSE_S, not_listening
+from palpate.bridges.source import BoxView, Source
+from palpate.client import verdicts
+from palpate.client.answers import Answer
+from palpate.client.box import Heard
+from palpate.core import wall_clock
+from palpate.core.clock import Clock
+from palpate.core.errors import ApplianceError, CommandRefused, ConfigError, FeedError
+from palpate.core.log import SparseLog
+
+URI = "urn:palpate:box"
+"""Namespace of the nodes. A node's identifier is its path, the same on every box."""
+KEPT = 1000
+"""Results that wait to be written, and results that GetResults has without a file of verdicts."""
+MOST_RESULTS = 100
+"""Results of one call of GetResults."""
+
+
+@dataclass(frozen=True, slots=True)
+class Offer:
+    """folder: of the certificate and of `login`, user and password. memory: file of verdicts, if
+    there is one. name: of the box. most: connections at a time."""
+
+    folder: Path
+    memory: Path
+    name: str
+    most: int
+    writes: bool
+    anonymous: bool
+
+
+class OpcuaBridge:
+    """Serves the news of `source(heard)`; `open` it in the loop where it was made."""
+
+    def __init__(
+        self, source: Callable[[Callable[[Heard], None]], Source], clock: Clock, offer: Offer
+    ) -> None:
+        login = offer.folder / "login"
+        user, password = read_login(login) if login.exists() else ("", "")
+        if not user and not offer.anonymous:
+            raise ConfigError(
+                f"{login}: there is no such file; put a user on its first line and a password on "
+                "its second, or let everybody read with --anonymous"
+            )
+        self.address = ("", 0)
+        self._clock, self._offer, self._began_s = clock, offer, wall_clock.seconds()
+        self._log = SparseLog(clock.now_ns)
+        self._loop = asyncio.get_running_loop()
+        self._news: deque[tuple[float, Answer]] = deque(maxlen=KEPT)
+        self._ring: deque[dict[str, Any]] = deque(maxlen=KEPT)
+        self._come, self._commanding = asyncio.Event(), asyncio.Lock()
+        self._result: dict[str, Any] = {}
+        self._at_s: float | None = None
+        self._said: dict[str, tuple[Any, int]] = {}
+        self._sweeping = False
+        self._start_s: float | None = None
+        self._nodes: dict[str, Node] = {}
+        users = Login(user, password, clock, anonymous=offer.anonymous)
+        self._server, self._users = Server(user_manager=users), bool(user)
+        self._event: EventGenerator | None = None
+        self._writing: asyncio.Task[None] | None = None
+        self.source = source(self._take)
+
+    async def close(self) -> None:
+        """End all connections."""
+        with suppress(TimeoutError):
+            async with asyncio.timeout(CLOSE_S):  # peers that do not read their rest
+                await self._server.stop()
+        await asyncio.to_thread(self.source.close)
+
+    async def work(self) -> None:
+        """Look at the box; to be called about once a second. Raises what ended the writing."""
+        await asyncio.to_thread(self.source.refresh)
+        self._come.set()
+        if self._writing and self._writing.done():
+            self._writing.result()
+
+    async def open(self, host: str, port: int) -> None:
+        """Make the nodes and listen. Raises AddressError or ConfigError as TcpServer does."""
+        server, uri = self._server, f"{URI}:{self._offer.name}"
+        certificate, key = own_certificate(self._offer.folder, uri, host)
+        await server.init()
+        await server.set_application_uri(uri)
+        server.set_server_name(f"Palpate {self._offer.name}")
+        about = "Palpate", f"Palpate {self._offer.name}", __version__, ""
+        await server.set_build_info(URI, *about, wall_clock.utc())
+        await server.load_certificate(certificate, "der")
+        await server.load_private_key(key, format="pem")
+        offer = self._offer
+        limit(server, offer.most, users=self._users, anonymous=offer.anonymous)
+        await self._add_variables(await server.register_namespace(URI))
+        await self._add_methods(await server.get_namespace_index(URI))
+        server.set_endpoint(f"opc.tcp://{f'[{host}]' if ':' in host else host}:{port}/")
+        server.socket_address = host, port
+        try:
+            await server.start()
+        except (OSError, OverflowError, ValueError) as e:
+            raise not_listening(host, port, e) from e
+        if not offer.anonymous:
+            hide_open_endpoint(server)
+        assert server.bserver
+        self.address = server.bserver.hostname, server.bserver.port
+        self._come.set()
+        self._writing = asyncio.create_task(self._write_all())
+
+    async def _add_variables(self, at: int) -> None:
+        """Add the variables and the objects that hold them. at: index of the namespace."""
+        top = ua.NodeId("Palpate", at)
+        nodes = {"": await self._server.nodes.objects.add_object(top, f"{at}:Palpate")}
+        for path, kind in VARIABLES.items():
+            for end in [i for i, letter in enumerate(path) if letter == "."]:
+                if path[:end] not in nodes:
+                    above = nodes[path[:end].rpartition(".")[0]]
+                    name = path[:end].rpartition(".")[2]
+                    nodes[path[:end]] = await above.add_object(
+                        ua.NodeId(path[:end], at), f"{at}:{name}"
+                    )
+            above, name = nodes[path.rpartition(".")[0]], path.rpartition(".")[2]
+            add = above.add_property if name == "Number" else above.add_variable
+            start = ua.get_default_value(kind)
+            nodes[path] = await add(ua.NodeId(path, at), f"{at}:{name}", start, kind)
+        self._nodes = nodes
+
+    async def _add_methods(self, at: int) -> None:
+        nodes = self._nodes
+        text, date, count = (ua.ObjectIds.String, ua.ObjectIds.UtcTime, ua.ObjectIds.UInt32)
+        since = [argument("Since", date), argument("Most", count)]
+        await nodes["LastResult"].add_method(
+            *(ua.NodeId("LastResult.GetResults", at), f"{at}:GetResults", self._get_results),
+            *(since, [argument("Results", text, rank=1)]),
+        )
+        for method, (command, tops) in METHODS.items() if self._offer.writes else ():
+            await nodes["VisionStateMachine"].add_method(
+                *(
+                    ua.NodeId(f"VisionStateMachine.{method}", at),
+                    f"{at}:{method}",
+                    partial(self._command, command, tops),
+                ),
+                *([argument(name, ua.ObjectIds.Float) for name in tops], []),
+            )
+        told = await self._server.create_custom_event_type(
+            at, "ResultReadyEventType", properties=[*RESULT.items()]
+        )
+        self._event = await self._server.get_event_generator(told)
+
+    def _take(self, news: Heard) -> None:
+        """News of the box, in the thread that reads it."""
+        with suppress(RuntimeError):  # the program has ended
+            self._loop.call_soon_threadsafe(self._hear, wall_clock.seconds(), news)
+
+    def _hear(self, at_s: float, news: Heard) -> None:
+        if isinstance(news, Answer):
+            self._news.append((at_s, news))
+        elif news.sweeping != self._sweeping:
+            self._sweeping = news.sweeping
+            self._start_s = at_s if news.sweeping else self._start_s
+        self._come.set()
+
+    async def _write_all(self) -> None:
+        """Write the news as they come."""
+        while await self._come.wait():
+            self._come.clear()
+            view = self.source.view()
+            alive = view.alive(self._clock.now_ns())
+            while self._news:
+                await self._write_result(*self._news.popleft(), view)
+            silent = CODES.BadNoCommunication
+            await self._write(state(view), 0 if alive else silent, None)
+            none = 0 if self._result else CODES.BadWaitingForInitialData
+            of_result = self._result or dict.fromkeys(RESULT)
+            await self._write(
+                {f"LastResult.{name}": value for name, value in of_result.items()},
+                none if alive else silent,
+                self._at_s,
+            )
+
+    async def _write_result(self, at_s: float, answer: Answer, view: BoxView) -> None:
+        """Write a result, and send its event. at_s: when it was heard."""
+        self._at_s = at_s
+        self._result = result(answer, view, at_s, self._start_s)
+        self._start_s = None
+        row = {name: getattr(answer, name) for name in verdicts.COLUMNS if name != "at"}
+        self._ring.append({"at": at_s, **row})
+        told = {f"LastResult.{name}": value for name, value in self._result.items()}
+        await self._write(told, 0, at_s)
+        if self._event:
+            for name, value in self._result.items():
+                setattr(self._event.event, name, value)
+            await self._event.trigger(
+                wall_clock.utc(at_s), f"{answer.sweep}: {answer.status} {answer.label}"
+            )
+
+    async def _write(self, values: Mapping[str, Any], code: int, at_s: float | None) -> None:
+        """Write the values that differ from the last ones. code: the quality; bad without a box, so
+        that no old value looks new. at_s: when the box said it, None for now."""
+        for path, value in values.items():
+            if self._said.get(path) == (value, code):
+                continue
+            self._said[path] = value, code
+            kind = VARIABLES[path]
+            quality = code or (CODES.BadNoData if value is None else 0)
+            now = wall_clock.utc()
+            told = ua.DataValue(
+                Value=ua.Variant(value, kind) if not quality else ua.Variant(),
+                StatusCode=ua.StatusCode(quality),
+                SourceTimestamp=now if at_s is None else wall_clock.utc(at_s),
+                ServerTimestamp=now,
+            )
+            await self._server.write_attribute_value(self._nodes[path].nodeid, told)
+
+    async def _command(
+        self, command: str, tops: Mapping[str, float], parent: Any, *given: ua.Variant
+    ) -> ua.StatusCode | ua.CallMethodResult:
+        """A method of METHODS."""
+        values = numbers(given, tops)
+        if isinstance(values, ua.CallMethodResult):
+            return values
+        if self._commanding.locked():
+            return ua.StatusCode(CODES.BadTooManyOperations)
+        slide = dict(zip(("speed_mm_s", "force_n"), values, strict=False))
+        slide = {name: value for name, value in slide.items() if value}
+        code = 0
+        async with self._commanding:
+            try:
+                said = await asyncio.to_thread(self.source.send, command, **slide)
+            except ApplianceError as e:
+                refused = isinstance(e, CommandRefused)
+                code = CODES.BadInvalidState if refused else CODES.BadNoCommunication
+                said = f"error: {e}"
+                self._log.warning(f"opcua: {command}: {e}")
+            await self._write({REPLY: f"{command}: {said}"}, 0, None)
+        return ua.StatusCode(code)
+
+    async def _get_results(self, parent: Any, *given: ua.Variant) -> Any:
+        """The method GetResults: results since a time as JSON, oldest first."""
+        if len(given) != 2 or given[0].VariantType is not KINDS.DateTime:
+            return ua.StatusCode(CODES.BadInvalidArgument)
+        most = numbers(given[1:], {"Most": 2**32})
+        if isinstance(most, ua.CallMethodResult):
+            return most
+        from_s = wall_clock.seconds_of(given[0].Value)
+        wanted = min(round(most[0]) or MOST_RESULTS, MOST_RESULTS)
+        rows = await asyncio.to_thread(self._rows, from_s, wanted)
+        return [ua.Variant([json.dumps(row) for row in rows], KINDS.String, is_array=True)]
+
+    def _rows(self, from_s: float, most: int) -> list[Mapping[str, Any]]:
+        """From the ring if it goes back so far, else from the file of verdicts."""
+        ring = [*self._ring]
+        first_s = ring[0]["at"] if len(ring) == KEPT else self._began_s
+        if from_s < first_s:
+            with suppress(FeedError):
+                return [*verdicts.since(self._offer.memory, from_s, most)]
+        return [*islice((row for row in ring if row["at"] >= from_s), most)]
