@@ -1,4 +1,4 @@
-"""Commands that make the token and the certificate for the network access of the page of `palpate
+"""Commands that make the tokens and the certificate for the network access of the page of `palpate
 watch --web`, if they are missing."""
 
 from __future__ import annotations
@@ -10,7 +10,8 @@ install renews it."""
 
 
 def make(folder: str = FOLDER, group: str = "palpate-watch") -> str:
-    """Commands for root that make token, key.pem and certificate.pem, readable by root and `group`.
+    """Commands for root that make the token of each role, key.pem and certificate.pem, readable by
+    root and `group`.
 
     The certificate is valid for this machine's host name, also in multicast DNS, for localhost, and
     for the present addresses of the machine. It signs nothing but itself.
@@ -22,7 +23,9 @@ put() {{
   chgrp {group} {folder}/$1.new && chmod 640 {folder}/$1.new && sync -f {folder}/$1.new \\
     && mv {folder}/$1.new {folder}/$1
 }}
-if [ ! -s {folder}/token ]; then openssl rand -hex 16 > {folder}/token.new && put token; fi
+for one in token-look token-operate token-teach; do
+  if [ ! -s {folder}/$one ]; then openssl rand -hex 16 > {folder}/$one.new && put $one; fi
+done
 if ! openssl x509 -checkend {RENEWED_DAYS * 86400} -noout -in {folder}/certificate.pem \\
   > /dev/null 2>&1; then
   name=$(hostname); names="DNS:$name,DNS:${{name%%.*}}.local,DNS:localhost,IP:127.0.0.1"

@@ -1,29 +1,39 @@
 """The page of `palpate watch --web` without a box: a test writes the lines of its feed."""
 
 import threading
+from datetime import datetime, timedelta
+from pathlib import Path
 from typing import Any, Self
 
 from palpate.web.access import Access
 from palpate.web.board import KEPT, PageBoard
-from palpate.web.server import PageServer
+from palpate.web.history import History
+from palpate.web.server import Answer, PageServer
 from tests.factories import feed_lines
 from tests.factories.browser import BrowsedPage, until
 
 NOW_S = 400.0
 """The box's clock when a page is opened."""
+NO_FILE = Path("/nowhere/verdicts.db")
+
+
+def four_hours_ago() -> str:
+    """When the shift began."""
+    return f"{datetime.now().astimezone() - timedelta(hours=4):%H:%M}"
 
 
 class Shown:
     """A page whose lines of the feed a test writes. Within its `with` block browsers learn twice a
     second whether there is a box, as with the command, however slow the machine is."""
 
-    def __init__(self, access: Access, finger: str = "") -> None:
+    def __init__(self, access: Access, finger: str = "", memory: Path = NO_FILE) -> None:
+        self.history, self.boxes = History(memory, four_hours_ago()), list[dict[str, str]]()
         self.server = PageServer(
             "watch.html",
             access,
             lambda: round(NOW_S * feed_lines.SECOND),
             KEPT,
-            {"sweep": self._sweep},
+            self._answers(),
         )
         self.board = PageBoard(self._publish, finger)
         self._box: object = None
@@ -50,8 +60,17 @@ class Shown:
             if self._box:
                 self.server.publish("box", self._box)
 
-    def _sweep(self, which: str) -> dict[str, Any] | None:
-        return self.board.sweep(which)
+    def _answers(self) -> dict[str, Answer]:
+        """The answers of `palpate watch`. History comes from the file `memory`."""
+        answers: dict[str, Answer] = {"sweep": lambda which: self.board.sweep(which)}
+        answers |= {"boxes": lambda which: self.boxes}
+        return answers | {"history": self.history.counted, "verdicts": self.history.rows}
+
+    def take(self, line: dict[str, Any]) -> None:
+        """A line of the feed, for board and history."""
+        self.board.take(line)
+        if line["type"] == "verdict":
+            self.history.take(line, round(NOW_S * feed_lines.SECOND))
 
     def shift(self) -> None:
         """A box at work: forty sweeps, one of them `moved`, some without a label, the signals of
@@ -62,7 +81,7 @@ class Shown:
             moved = "moved 2.2 mm too far towards row 1" if number == 29 else ""
             label = feed_lines.LABELS[number % 6]
             self.board.take(feed_lines.health(9.0 * number, lost_frames=3 * (number > 20)))
-            self.board.take(feed_lines.verdict(number, 9.0 * number, label, status, moved=moved))
+            self.take(feed_lines.verdict(number, 9.0 * number, label, status, moved=moved))
             self.board.take(feed_lines.sweep(number))
         for i in range(40):
             strength = 0 if i < 20 else 120
@@ -74,7 +93,8 @@ def opened(
 ) -> BrowsedPage:
     """The page in a browser, with all of the shift."""
     seen = BrowsedPage(
-        browser.new_context(viewport={"width": width, "height": height}), shown.server.address
+        browser.new_context(viewport={"width": width, "height": height}),
+        shown.server.address + "/#watch",
     )
     until(lambda: seen.page.locator(".row").count() == rows)
     return seen

@@ -142,7 +142,7 @@ def test_a_bare_host_is_installed_as_a_bare_user(box: DeployedBox, installed: st
     assert box.get("/usr/local/bin/palpate", "check", "--settings").count("# board-rpi5.toml") > 3
     assert box.get("stat", "-c", "%U %a", "/etc/palpate/allowed_signers") == "root 644"
     assert box.machine.run("systemd-analyze", "verify", "palpate.service").stderr == ""
-    files = [f"/etc/palpate/watch/{one}" for one in ("token", "key.pem", "certificate.pem")]
+    files = [f"/etc/palpate/watch/{one}" for one in ("token-look", "key.pem", "certificate.pem")]
     owners = box.get("stat", "-c", "%U:%G %a", *files).splitlines()
     assert set(owners) == {"root:palpate-watch 640"}
     off = ("palpate-watch", "palpate-bridge@tcp", "palpate-bridge@modbus")

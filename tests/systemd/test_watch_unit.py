@@ -20,7 +20,7 @@ end = time.monotonic() + 20
 while socket.socket().connect_ex(("127.0.0.1", 8137)) and time.monotonic() < end:
     time.sleep(0.1)
 trusts = ssl.create_default_context(cafile="/etc/palpate/watch/certificate.pem")
-token = open("/etc/palpate/watch/token").read().strip()
+token = open("/etc/palpate/watch/token-look").read().strip()
 key = {"Authorization": f"Bearer {token}"}
 request = urllib.request.Request("https://127.0.0.1:8137/events", headers=key)
 with urllib.request.urlopen(request, context=trusts, timeout=20) as answer:
@@ -80,7 +80,7 @@ def test_it_goes_on_without_the_service(page: Machine, service: Service):
 
 def test_the_token_is_for_root_and_the_page_alone(page: Machine):
     """Nobody else reads token, key or feed; the page reads no file of the service."""
-    for name in ("token", "key.pem", "certificate.pem"):
+    for name in ("token-look", "token-teach", "key.pem", "certificate.pem"):
         path = f"/etc/palpate/watch/{name}"
         assert page.get("stat", "-c", "%U:%G %a", path) == "root:palpate-watch 640"
         assert page.run(*NOBODY, "cat", path).returncode != 0

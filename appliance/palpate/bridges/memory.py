@@ -8,8 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from palpate.client.feed import Feed
-from palpate.client.verdicts import VerdictFile
-from palpate.core import wall_clock
+from palpate.client.verdicts import VerdictFile, dated
 from palpate.core.clock import Clock
 from palpate.core.log import SparseLog
 
@@ -38,12 +37,11 @@ class MemoryBridge:
             self._log.warning(f"memory: {line.get('lines')} lines of the feed were lost")
         if line and line["type"] == "verdict":
             try:
-                age_s = (self._clock.now_ns() - line["time_ns"]) / 1e9
-                found = {**line, "latency_ms": line["latency_ns"] / 1e6}
+                found = dated(line, self._clock.now_ns())
             except (KeyError, TypeError) as e:  # of a later version
                 self._log.warning(f"memory: a verdict is left out ({e!r}); update this bridge")
                 return
-            self._waiting.append((wall_clock.seconds() - age_s, found))
+            self._waiting.append(found)
         try:
             while self._waiting:
                 self._file.add(*self._waiting[0])

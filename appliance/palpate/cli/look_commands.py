@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from pathlib import Path
 
 from palpate.cli.common import load_bundle, load_settings
 from palpate.core import config
@@ -53,10 +54,12 @@ def run_watch(args: argparse.Namespace) -> int:
     socket, stopped = settings.store.needed_feed(), StopFlag()
     if args.web is not None:
         from palpate.web.access import Access
+        from palpate.web.history import History
         from palpate.web.web import PageWatcher
 
         access = Access.configured(settings.watch, args.web)
-        given = str(socket), access, clock.now_ns, args.unit or ""
+        history = History(Path(settings.bridge.memory), settings.watch.shifts)
+        given = str(socket), access, clock.now_ns, history, args.unit or ""
         watcher = retried(lambda: PageWatcher(*given), clock, stopped)
         log.info(f"page: {watcher.server.address}")
         watcher.run(stopped)

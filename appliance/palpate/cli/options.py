@@ -11,7 +11,8 @@ from typing import Any
 from palpate.core import outputs
 
 WEB_PORT, TEACH_PORT = 8137, 8138
-"""Default ports of pages. Both pages can be served side by side."""
+"""Default ports of the pages of `palpate watch`; and of `palpate record` or `palpate teach`, which
+run beside it."""
 NO_SETTINGS: Mapping[str, Any] = {"board": None, "set": [], "config_dir": None, "unit": ""}
 """The options of `add_settings` where none is given."""
 
@@ -136,7 +137,7 @@ OPTIONS: Mapping[str, tuple[str, dict[str, Any]]] = {
     ),
     "feed": _flag("--json", "the feed's lines as they are (PROTOCOL.md, part 4)"),
     "watch-page": _web(f"as a page; {_OPEN}"),
-    "record-page": _web(f"also as a page, on which the labels are set; {_OPEN}"),
+    "record-page": _web(f"also as a page, on which the labels are set; {_OPEN}", TEACH_PORT),
     "teach-page": _web("also as a page, for a person at the robot", TEACH_PORT),
     "local-page": _web("also as a page on localhost"),
     "file": _option("file", "the capture, sweep or folder", type=Path, metavar="FILE"),

@@ -12,6 +12,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+from palpate.core import wall_clock
 from palpate.core.errors import FeedError, TemporaryError
 from palpate.core.log import log
 
@@ -22,6 +23,8 @@ EVERY = 100
 """Verdicts between two looks at age and size."""
 WAIT_S = 10.0
 """Longest wait for another program that has the file open."""
+PART = 1000
+"""Verdicts that are read at once."""
 COLUMNS = {
     "at": "REAL NOT NULL",
     "sweep": "INTEGER NOT NULL",
@@ -40,13 +43,13 @@ clock. STRICT: SQLite would take a number of a wrong kind as bytes, which count 
 
 
 class VerdictFile:
-    """The file at `path`, for its one writer. A file that is damaged is moved aside. Raises
-    TemporaryError if it cannot be opened."""
+    """The file at `path`, ":memory:" for none, for its one writer. A file that is damaged is moved
+    aside. db: to read with the functions below. Raises TemporaryError if it cannot be opened."""
 
     def __init__(self, path: Path, *, most_mib: float = MOST_MIB) -> None:
         self._path, self._most, self._since = path, most_mib * (1 << 20), 0
         try:
-            self._db = self._open()
+            self.db = self._open()
         except sqlite3.OperationalError as e:
             raise TemporaryError(f"{path}: {e}; name a file in a folder of your own") from e
         except sqlite3.DatabaseError as e:
@@ -55,19 +58,19 @@ class VerdictFile:
             path.rename(aside)
             for end in ("-wal", "-shm"):
                 path.with_name(path.name + end).unlink(missing_ok=True)
-            self._db = self._open()
+            self.db = self._open()
 
     def close(self) -> None:
         """Close the file."""
-        self._db.close()
+        self.db.close()
 
     def add(self, at_s: float, verdict: Mapping[str, Any]) -> None:
         """Write a verdict. at_s: seconds since 1970. Raises sqlite3.Error, such as for a full
         disk."""
         values = [at_s, *(verdict.get(name) for name in COLUMNS if name != "at")]
         names, marks = ", ".join(COLUMNS), ", ".join("?" * len(COLUMNS))
-        with self._db:
-            self._db.execute(f"INSERT INTO verdicts ({names}) VALUES ({marks})", values)
+        with self.db:
+            self.db.execute(f"INSERT INTO verdicts ({names}) VALUES ({marks})", values)
         self._since += 1
         if self._since >= EVERY:
             self._since = 0
@@ -75,23 +78,23 @@ class VerdictFile:
 
     def trim(self, now_s: float) -> None:
         """Delete what is too old or too much."""
-        with self._db:
-            self._db.execute("DELETE FROM verdicts WHERE at < ?", [now_s - DAYS * DAY_S])
+        with self.db:
+            self.db.execute("DELETE FROM verdicts WHERE at < ?", [now_s - DAYS * DAY_S])
             if self._size() > self._most:
                 tenth = "SELECT min(number) + (max(number) - min(number)) / 10 FROM verdicts"
-                self._db.execute(f"DELETE FROM verdicts WHERE number <= ({tenth})")
+                self.db.execute(f"DELETE FROM verdicts WHERE number <= ({tenth})")
 
     def _size(self) -> int:
         """Bytes of the pages in use."""
         pages, free, size = (
-            int(self._db.execute(f"PRAGMA {name}").fetchone()[0])
+            int(self.db.execute(f"PRAGMA {name}").fetchone()[0])
             for name in ("page_count", "freelist_count", "page_size")
         )
         return (pages - free) * size
 
     def _open(self) -> sqlite3.Connection:
         """Raises sqlite3.DatabaseError."""
-        db = sqlite3.connect(self._path, timeout=WAIT_S)
+        db = sqlite3.connect(self._path, timeout=WAIT_S, check_same_thread=False)
         try:
             db.execute("PRAGMA journal_mode = WAL")
             db.execute("PRAGMA synchronous = FULL")
@@ -109,34 +112,61 @@ class VerdictFile:
         return db
 
 
-def since(path: Path, from_s: float, most: int = -1) -> Iterator[dict[str, Any]]:
+Source = Path | sqlite3.Connection
+"""A file of verdicts, or one that is open in this process."""
+
+
+def dated(line: Mapping[str, Any], now_ns: int) -> tuple[float, dict[str, Any]]:
+    """When the verdict of a line of the feed was given, in seconds since 1970, and its columns.
+    now_ns: by the clock of the feed. Raises KeyError or TypeError for a line of a later version."""
+    age_s = (now_ns - line["time_ns"]) / 1e9
+    return wall_clock.seconds() - age_s, {**line, "latency_ms": line["latency_ns"] / 1e6}
+
+
+def since(source: Source, from_s: float, most: int = -1) -> Iterator[dict[str, Any]]:
     """The first `most` verdicts since this time, in order; -1: all. Raises FeedError if the file
     cannot be read."""
-    columns = f"number, {', '.join(COLUMNS)}"
-    query = f"SELECT {columns} FROM verdicts WHERE at >= ? ORDER BY number LIMIT ?"
-    for row in _rows(path, query, [from_s, most]):
-        yield dict(zip(("number", *COLUMNS), row, strict=True))
+    # +at: by number, so that each part goes on where the last one ended
+    where = f"number > ? AND +at >= ? ORDER BY number LIMIT {PART}"
+    query, last = f"SELECT number, {', '.join(COLUMNS)} FROM verdicts WHERE {where}", 0
+    while rows := _rows(source, query, [last, from_s]):
+        for row in rows:
+            if most == 0:
+                return
+            most -= 1
+            yield dict(zip(("number", *COLUMNS), row, strict=True))
+        last = rows[-1][0]
 
 
-def counts(path: Path, from_s: float) -> dict[tuple[str, str], int]:
+def counts(source: Source, from_s: float) -> dict[tuple[str, str], int]:
     """The number of verdicts since this time by status and label. Raises FeedError."""
     query = "SELECT status, label, count(*) FROM verdicts WHERE at >= ? GROUP BY 1, 2 ORDER BY 1, 2"
-    return {(status, label): n for status, label, n in _rows(path, query, [from_s])}
+    return {(status, label): n for status, label, n in _rows(source, query, [from_s])}
 
 
-def _rows(path: Path, query: str, values: list[float]) -> list[tuple[Any, ...]]:
+def trend(source: Source, from_s: float, width_s: float) -> list[tuple[int, int, int, int]]:
+    """For each span of width_s since this time with verdicts: its index, and the number of all
+    verdicts, of unsure ones and of unknown ones. Raises FeedError."""
+    sums = "count(*), sum(status = 'unsure'), sum(status = 'unknown')"
+    span = f"SELECT CAST((at - ?) / ? AS INTEGER), {sums} FROM verdicts"
+    return _rows(source, f"{span} WHERE at >= ? GROUP BY 1 ORDER BY 1", [from_s, width_s, from_s])
+
+
+def _rows(source: Source, query: str, values: list[float]) -> list[tuple[Any, ...]]:
+    if isinstance(source, sqlite3.Connection):
+        return source.execute(query, values).fetchall()
     # after a clean end only `immutable` reads a file in a folder of another user
     ways = ("mode=ro", "mode=ro&immutable=1")
     why: object = "there is no such file"
-    for way in ways if path.exists() else ():
+    for way in ways if source.exists() else ():
         try:
             with closing(
-                sqlite3.connect(f"{path.absolute().as_uri()}?{way}", timeout=WAIT_S, uri=True)
+                sqlite3.connect(f"{source.absolute().as_uri()}?{way}", timeout=WAIT_S, uri=True)
             ) as db:
                 return db.execute(query, values).fetchall()
         except sqlite3.Error as e:
             why = e
     raise FeedError(
-        f"{path}: {why}; verdicts are kept while palpate-bridge@memory runs (systemctl enable --now"
-        " palpate-bridge@memory), for members of group palpate"
+        f"{source}: {why}; verdicts are kept while palpate-bridge@memory runs (systemctl enable"
+        " --now palpate-bridge@memory), for members of group palpate"
     )

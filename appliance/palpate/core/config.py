@@ -223,11 +223,12 @@ class StoreConfig:
 @dataclass(frozen=True, slots=True)
 class WatchConfig:
     """The page of `palpate watch --web`. address: where it listens, then further host names by
-    which browsers may ask for it, separated by spaces. Addresses beyond this machine need token and
-    certificate."""
+    which browsers may ask for it, separated by spaces. Addresses beyond this machine need tokens
+    and certificate. shifts: when shifts begin, for the count of a shift."""
 
     address: str = "127.0.0.1"
-    folder: str = fixed("/etc/palpate/watch")  # token, certificate.pem and key.pem
+    shifts: str = "06:00 14:00 22:00"
+    folder: str = fixed("/etc/palpate/watch")  # token-ROLE, certificate.pem and key.pem
 
 
 @dataclass(frozen=True, slots=True)

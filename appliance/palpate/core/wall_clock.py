@@ -1,7 +1,7 @@
 """The wall clock, for dates that people read. A box without a network may have a wrong one. Nothing
 is decided by it: times that are compared come from `clock`."""
 
-from datetime import UTC, datetime
+from datetime import UTC, datetime, time, timedelta
 
 
 def seconds() -> float:
@@ -24,6 +24,18 @@ def seconds_of(date: datetime) -> float:
     return (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()
 
 
-def of(at_s: float) -> str:
+def of(at_s: float, to: str = "seconds") -> str:
     """Seconds since 1970 as a date and time of this computer's zone, to the second."""
-    return datetime.fromtimestamp(at_s).astimezone().isoformat(" ", "seconds")
+    return datetime.fromtimestamp(at_s).astimezone().isoformat(" ", to)
+
+
+def last_s(times: str, days: int = 0) -> float:
+    """When the last of these times of day was, such as "06:00 14:00", in this computer's zone, less
+    a number of days; in seconds since 1970. Raises ValueError for other texts."""
+    now = datetime.now().astimezone()
+    begins = [now.replace(hour=0, minute=0, second=0, microsecond=0)]
+    if times.split():
+        found = [time.fromisoformat(one) for one in times.split()]
+        begins = [begins[0].replace(hour=one.hour, minute=one.minute) for one in found]
+    day = timedelta(days=1)
+    return (max(one if one <= now else one - day for one in begins) - days * day).timestamp()

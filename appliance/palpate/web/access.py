@@ -1,4 +1,4 @@
-"""Access to a page: its address, the host names that browsers may use, token and certificate."""
+"""Access to a page: its address, the host names that browsers may use, tokens and certificate."""
 
 from __future__ import annotations
 
@@ -18,28 +18,31 @@ NAMES = ("localhost", HERE, "[::1]")
 rebinding)."""
 LEAST_TOKEN, MOST_TOKEN = 16, 256
 """Least and most characters of a token."""
+ROLES = ("look", "operate", "teach")
+"""What a browser may do, each with what stands before it: see everything; record sweeps; teach."""
 
 
 @dataclass(frozen=True, slots=True)
 class Access:
     """Address of a page, and the browsers that may read it.
 
-    port: 0 for any free port. names: further host names that browsers may use. token: the secret of
-    a browser, "" if none is needed. certificate, key: PEM files of TLS; None serves without TLS.
+    port: 0 for any free port. names: further host names that browsers may use. tokens: the secret
+    of each of ROLES, empty if none is needed. certificate, key: PEM files of TLS; None serves
+    without TLS.
     """
 
     port: int
     address: str = HERE
     names: tuple[str, ...] = ()
-    token: str = ""
+    tokens: tuple[str, ...] = ()
     certificate: Path | None = None
     key: Path | None = None
 
     @classmethod
     def configured(cls, settings: WatchConfig, port: int, *, secret: bool = True) -> Access:
-        """The access of the settings. An address beyond this machine needs token and certificate.
-        secret: read the token; without it the access only tells its address. Raises ConfigError if
-        they cannot be used."""
+        """The access of the settings. An address beyond this machine needs tokens and certificate.
+        secret: read the tokens; without them the access only tells its address. Raises ConfigError
+        if they cannot be used."""
         address, *names = settings.address.lower().split() or [""]
         try:
             local = ipaddress.ip_address(address).is_loopback
@@ -55,7 +58,7 @@ class Access:
             port,
             address,
             (*_own_names(), *names),
-            _token(folder / "token") if secret else "",
+            tuple(_token(folder / f"token-{role}") for role in ROLES) if secret else (),
             folder / "certificate.pem",
             folder / "key.pem",
         )
@@ -89,10 +92,12 @@ class Access:
         own = f"[{own}]" if ":" in own else own
         return bool(name) and name.lower() in (*NAMES, *self.names, own)
 
-    def admits(self, given: str) -> bool:
-        """Whether `given` is the token, or no token is needed. All wrong tokens take the same
-        time."""
-        return not self.token or hmac.compare_digest(given.encode(), self.token.encode())
+    def role(self, given: str) -> str:
+        """The role of a browser with the token `given`: the last where none is needed, "" for a
+        wrong token. All wrong tokens take the same time."""
+        fits = [hmac.compare_digest(given.encode(), one.encode()) for one in self.tokens]
+        allowed = [role for role, fit in zip(ROLES, fits, strict=False) if fit]
+        return allowed[-1] if allowed else "" if self.tokens else ROLES[-1]
 
 
 def _own_names() -> tuple[str, ...]:

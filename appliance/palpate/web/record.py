@@ -25,7 +25,7 @@ from palpate.core.status import REASONS
 from palpate.core.types import Frames, Sweep, SweepFormat, Verdict
 from palpate.io.robot_link import PAIRS, Command
 from palpate.sweeps.recording import Labels
-from palpate.web.access import Access
+from palpate.web.access import ROLES, Access
 from palpate.web.server import PageServer
 from palpate.web.sweep_picture import DrawnWindow, picture
 
@@ -255,8 +255,13 @@ class RecordPage(Observer):
             self._view_ns = now_ns
             self.server.show(self._tracker.view(health.skin, health.trouble))
 
-    def _ordered(self, body: bytes) -> Future[list[object]]:
-        answer = self._queue.put(order(body, self._commands, self._named))
+    def _ordered(self, body: bytes, role: str) -> Future[list[object]]:
+        command = order(body, self._commands, self._named)
+        needed = "teach" if command.name in TEACHING else "operate"
+        if ROLES.index(role) < ROLES.index(needed):
+            may = f"{command.name} is not for the role {role}"
+            raise ApplianceError(f"{may}; open enter.html, and give the token of {needed}")
+        answer = self._queue.put(command)
         answer.add_done_callback(self._show_soon)
         return answer
 

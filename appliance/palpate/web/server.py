@@ -16,8 +16,9 @@ import logging
 import secrets
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
+from contextlib import suppress
 from heapq import merge
 from pathlib import Path
 from typing import Any, Protocol, Self
@@ -27,7 +28,7 @@ from palpate.core.errors import AddressError, ApplianceError, ConfigError, Forma
 from palpate.core.log import TroubleLog
 from palpate.core.status import WORDS
 from palpate.web import local_users
-from palpate.web.access import Access
+from palpate.web.access import ROLES, Access
 
 try:
     from tornado.httpserver import HTTPServer
@@ -42,13 +43,14 @@ except ImportError as e:
 
 FOLDER = Path(__file__).with_name("page")
 KINDS = {
+    ".svg": "image/svg+xml",
     ".html": "text/html; charset=utf-8",
     ".css": "text/css; charset=utf-8",
     ".js": "text/javascript; charset=utf-8",
 }
 HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
-    "connect-src 'self'; img-src data:; base-uri 'none'; form-action 'none'; "
+    "connect-src 'self'; img-src 'self'; base-uri 'none'; form-action 'none'; "
     "frame-ancestors 'none'",
     "Cache-Control": "no-store",
     "X-Content-Type-Options": "nosniff",
@@ -79,12 +81,15 @@ KEY = "X-Palpate-Key"
 """Header with the key of an order. The page gets the key with its events; another site cannot read
 it."""
 DAY = 86_400
+ENTRANCE = ("/enter.html", "/enter.js", "/old.js", "/page.css", "/logo.svg")
+"""Files for a browser without a token; none of them is secret."""
 
 Answer = Callable[[str], object | None]
-"""The content for JSON by the last part of a path; None for an unknown path."""
-Orders = Callable[[bytes], Future[Any]]
-"""Takes an order without waiting. Its future gives the answer for JSON, or an ApplianceError if the
-order is refused."""
+"""The content for JSON by the last part of a path, or an iterator of parts of a CSV file; None for
+an unknown path. It may wait for the disk."""
+Orders = Callable[[bytes, str], Future[Any]]
+"""Takes an order of a browser with this role (access.ROLES) without waiting. Its future gives the
+answer for JSON, or an ApplianceError if the order is refused."""
 
 
 class State(Protocol):
@@ -153,6 +158,7 @@ class PageServer:
         self.wrong = TroubleLog("page")
         self.files = page_files()
         self.files["/"] = self.files[f"/{name}"]
+        self.reading = asyncio.Lock()  # one answer at a time, in one more thread
         self._stop = asyncio.Event()
         self.server: LimitedServer | None = None
         try:
@@ -306,7 +312,8 @@ class _Handler(RequestHandler):
             raise HTTPError(421, reason=f"this name is {why}")
         scheme, _, given = request.headers.get("Authorization", "").partition(" ")
         given = given if scheme == "Bearer" else self.get_cookie(COOKIE, "") or ""
-        if access.admits(given):
+        self.role = access.role(given)
+        if self.role:
             self._admit(stream)
             return
         if given:
@@ -324,7 +331,7 @@ class _Handler(RequestHandler):
         server = self.page.server
         if not (stream and stream.socket and server) or stream in server.admitted:
             return
-        if not self.page.access.token:
+        if not self.page.access.tokens:
             peer, own = stream.socket.getpeername()[:2], stream.socket.getsockname()[:2]
             if not local_users.may_see(local_users.owner(peer, own)):
                 raise HTTPError(403, reason=f"only for root and group {local_users.GROUP}")
@@ -341,10 +348,11 @@ class FileHandler(_Handler):
 
     def get(self) -> None:
         """Answer with a file, or with 404."""
-        if self.request.path == "/enter" and self.page.access.token:  # the token was right
+        tokens = self.page.access.tokens
+        if self.request.path == "/enter" and tokens:  # the token was right
             self.set_cookie(
                 COOKIE,
-                self.page.access.token,
+                tokens[ROLES.index(self.role)],
                 path="/",
                 secure=True,
                 httponly=True,
@@ -358,9 +366,9 @@ class FileHandler(_Handler):
         self._send(self.request.path)
 
     def write_error(self, status_code: int, **kwargs: Any) -> None:
-        """Let a browser without a token enter it. Style and script of this page are not secret."""
+        """Let a browser without a token enter it."""
         path = "/enter.html" if self.request.path == "/" else self.request.path
-        if status_code == 401 and path in ("/enter.html", "/enter.js", "/old.js", "/page.css"):
+        if status_code == 401 and path in ENTRANCE:
             self.set_status(401 if path == "/enter.html" else 200)
             self._send(path)
             self.finish()
@@ -376,14 +384,30 @@ class FileHandler(_Handler):
 class AnswerHandler(_Handler):
     """Content that is computed on request."""
 
-    def get(self, name: str, which: str) -> None:
-        """Answer with JSON, or with 404."""
+    async def get(self, name: str, which: str) -> None:
+        """Answer with JSON, with a CSV file, or with 404."""
         answer = self.page.answers.get(name)
-        content = answer(which) if answer else None
+        content = await self._apart(answer, which) if answer else None
         if content is None:
             raise HTTPError(404)
+        if isinstance(content, Iterator):
+            return await self._file(content, f"palpate-{name}.csv")
         self.set_header("Content-Type", "application/json")
         self.finish(json.dumps(content, allow_nan=False, separators=(",", ":")))
+
+    async def _apart(self, act: Callable[..., Any], *given: object) -> Any:
+        """What `act` gives in another thread: a slow disk keeps no stream of events waiting."""
+        async with self.page.reading:
+            return await asyncio.to_thread(act, *given)
+
+    async def _file(self, parts: Iterator[str], name: str) -> None:
+        """Send parts as fast as the browser takes them."""
+        self.set_header("Content-Type", "text/csv; charset=utf-8")
+        self.set_header("Content-Disposition", f'attachment; filename="{name}"')
+        with suppress(StreamClosedError):
+            while part := await self._apart(next, parts, ""):
+                self.write(part)
+                await self.flush()
 
 
 class OrderHandler(_Handler):
@@ -427,7 +451,7 @@ class OrderHandler(_Handler):
         """The result of an order. Raises ApplianceError if it is refused; NoAnswer if it is not
         carried out in time."""
         assert self.page.orders
-        order = self.page.orders(self.request.body)
+        order = self.page.orders(self.request.body, self.role)
         try:
             async with asyncio.timeout(DONE_S):
                 return await asyncio.shield(asyncio.wrap_future(order))
@@ -448,12 +472,14 @@ class EventsHandler(_Handler):
         page, queue = self.page, asyncio.Queue[bytes](MOST_WAITING)
         self.set_header("Content-Type", "text/event-stream")
         self.set_header("X-Accel-Buffering", "no")  # or nginx keeps events until they are 4 kB
-        now = f"event: now\ndata: {page.now_ns()}\n\n".encode()
+        now = f"event: now\ndata: {page.now_ns()}\n\n"
+        if page.orders:
+            now += f"event: role\ndata: {json.dumps(self.role)}\n\n"
         missed = page.events.since(self.get_query_argument("last", ""))
         page.queues.add(queue)
         self._queue = queue
         try:
-            self.write(b"".join([now, *missed]))
+            self.write(b"".join([now.encode(), *missed]))
             await self.flush()
             while queue in page.queues:
                 self.write(await queue.get())

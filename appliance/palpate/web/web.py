@@ -1,16 +1,17 @@
-"""`palpate watch --web`: reads the feed, and keeps the page up to date. The page shows a missing
-box as away until its feed is back."""
+"""`palpate watch --web`: reads the feed, and keeps the pages up to date: start, watch, align and
+history. They show a missing box as away until its feed is back."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 
 from palpate.client.feed import Feed
 from palpate.core.errors import FormatError
 from palpate.core.log import TroubleLog
 from palpate.web.access import Access
 from palpate.web.board import KEPT, PageBoard
-from palpate.web.server import PageServer
+from palpate.web.history import History
+from palpate.web.server import Answer, PageServer
 
 FRAMES_HZ = 20.0
 """Frames per second while a browser is connected: alignment averages the last third of a second."""
@@ -19,18 +20,31 @@ READ_S = 0.5
 browsers see that this program runs."""
 
 
+Found = Callable[[], Sequence[Mapping[str, str]]]
+"""Other boxes of the site, each with `name` and `address` of its page. It does not wait."""
+
+
 class PageWatcher:
-    """The page of `palpate watch --web` at `access`, for the feed at `path`. now_ns: the clock of
-    the box's time stamps. finger: the unit of several fingers, "" for a box with one. Raises
-    ConfigError if the address cannot be used."""
+    """The pages of `palpate watch --web` at `access`, for the feed at `path`. now_ns: the clock of
+    the box's time stamps. finger: the unit of several fingers, "" for a box with one. found: lists
+    other boxes. Raises ConfigError if the address cannot be used."""
 
     def __init__(
-        self, path: str, access: Access, now_ns: Callable[[], int], finger: str = ""
+        self,
+        path: str,
+        access: Access,
+        now_ns: Callable[[], int],
+        history: History,
+        finger: str = "",
+        found: Found = tuple,
     ) -> None:
-        self.feed = Feed(path, sweeps=True)
-        self.server = PageServer(
-            "watch.html", access, now_ns, KEPT, {"sweep": lambda which: self.board.sweep(which)}
-        )
+        self.feed, self.history, self._now_ns = Feed(path, sweeps=True), history, now_ns
+        answers: dict[str, Answer] = {
+            "sweep": lambda which: self.board.sweep(which),
+            "boxes": lambda which: list(found()),
+        }
+        answers |= {"history": history.counted, "verdicts": history.rows}
+        self.server = PageServer("watch.html", access, now_ns, KEPT, answers)
         self.board = PageBoard(self.server.publish, finger)
         self._frames = False
         self._log = TroubleLog(
@@ -51,6 +65,8 @@ class PageWatcher:
         if line:
             try:
                 self.board.take(line)
+                if line["type"] == "verdict":
+                    self.history.take(line, self._now_ns())
             except FormatError as e:
                 self.feed.close()
                 trouble = str(e)

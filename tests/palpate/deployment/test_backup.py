@@ -20,7 +20,7 @@ SAVED = {
     "etc/palpate/palpate.toml": 'board = "rpi5"\n',
     "etc/palpate/allowed_signers": "anna ssh-ed25519 AAAA\n",
     "etc/palpate/enrolment/key": "private",
-    "etc/palpate/watch/token": "1234",
+    "etc/palpate/watch/token-look": "1234",
     "var/lib/palpate/bundles.json": "{}",
     f"var/lib/palpate/bundles/{SHA}/manifest.json": "manifest",
     "var/lib/palpate/sweeps/sweep-000001.npy": "counts",

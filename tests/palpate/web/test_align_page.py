@@ -175,14 +175,16 @@ def circles(seen: BrowsedPage, which: str) -> list[dict[str, float]]:
     )
 
 
-FILES = {"data:,", "/", "/page.css", "/events"} | {
+FILES = {"/", "/page.css", "/logo.svg", "/events"} | {
     f"/{name}.js"
     for name in [
         "old",
         "tablet",
         "verdict",
         "statuses",
-        "shift",
+        "sweeps",
+        "history",
+        "start",
         "watch",
         "events",
         "parts",

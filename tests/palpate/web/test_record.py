@@ -20,6 +20,7 @@ from palpate.cli.main import main
 from palpate.core.clock import SystemClock
 from palpate.core.config import TriggerConfig
 from palpate.core.errors import ApplianceError, ConfigError, FormatError
+from palpate.core.sentences import Reply
 from palpate.core.sweep_file import sidecar
 from palpate.core.types import Status
 from palpate.io.robot_link import Command
@@ -27,7 +28,7 @@ from palpate.sim import skin
 from palpate.sweeps import sweep_folder
 from palpate.sweeps.recording import Labels, RecordingSession
 from palpate.web import record, server
-from palpate.web.access import Access
+from palpate.web.access import ROLES, Access
 from palpate.web.record import MOST_WAITING, RecordPage, order
 from palpate.web.server import PageServer
 from tests.factories.browser import WAIT_S, until
@@ -224,6 +225,28 @@ REFUSED: list[tuple[int, dict[str, str | None]]] = [
     (415, {"Content_Type": "text/plain"}),
     (415, {"Content_Type": "application/x-www-form-urlencoded"}),
 ]
+
+
+class Obedient(RecordedPage):
+    """Notes each command, and does nothing."""
+
+    def obey(self, command: Command) -> Reply:
+        self.done.append(command.line)
+        return []
+
+
+def test_a_role_has_its_orders_and_those_of_the_roles_before(tmp_path):
+    """The role look gives no order, and operate gives none of teaching. A refused order does not
+    reach the loop."""
+    tokens = tuple(f"{role}0123456789abcdef" for role in ROLES)
+    with Obedient(tmp_path, Labels(), access=Access(0, tokens=tokens), teaching=True) as one:
+        for asked, codes in (("START", (409, 200, 200)), ("USE", (409, 409, 200))):
+            for token, code in zip(tokens, codes, strict=True):
+                bearer = {"Authorization": f"Bearer {token}"}
+                answer = ordered(one.page.server, one.page.server.key, {"command": asked}, **bearer)
+                assert status(answer) == code, (asked, token)
+        assert status(ordered(one.page.server, one.page.server.key, {"command": "START"})) == 401
+        assert one.done == ["START", "START", "USE"]
 
 
 def test_an_order_of_another_site_is_refused(recorded):

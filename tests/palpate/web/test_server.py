@@ -16,7 +16,7 @@ import pytest
 from palpate.core.config import WatchConfig
 from palpate.core.errors import ConfigError
 from palpate.web import server
-from palpate.web.access import Access
+from palpate.web.access import ROLES, Access
 from palpate.web.server import MOST_HEAD, MOST_OPEN, MOST_WAITING, EventLog, PageServer
 from tests.factories.browser import WAIT_S, until
 from tests.factories.install_scripts import page_secrets
@@ -42,10 +42,10 @@ def page() -> Iterator[PageServer]:
 def guarded(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[tuple[PageServer, str, ssl.SSLContext]]:
-    """A page on the network as `make install` sets it up, its token, and its TLS context."""
+    """A page on the network as `make install` sets it up, a token, and its TLS context."""
     page_secrets(folder)
     settings = WatchConfig(address="0.0.0.0 localhost", folder=str(folder))
-    token = (folder / "token").read_text().strip()
+    token = (folder / "token-look").read_text().strip()
     with PageServer("watch.html", Access.configured(settings, 0), now_ns) as one:
         one.publish("view", {"number": 1})
         trusts = ssl.create_default_context(cafile=folder / "certificate.pem")
@@ -327,7 +327,7 @@ def test_on_the_network_it_takes_a_token(tmp_path, monkeypatch):
         answer = ask(page, tls=trusts)
         assert status(answer) == 401
         assert b'"enter.js"' in answer
-        for path, code in {"/enter.js": 200, "/old.js": 200, "/page.css": 200}.items():
+        for path, code in {"/enter.js": 200, "/old.js": 200, "/logo.svg": 200}.items():
             assert status(ask(page, path, tls=trusts)) == code
         for path in ("/events", "/watch.js", "/watch.html", "/sweep/1", "/enter", "/nothing"):
             assert status(ask(page, path, tls=trusts)) == 401
@@ -341,6 +341,18 @@ def test_on_the_network_it_takes_a_token(tmp_path, monkeypatch):
         assert b'"watch.js"' in answer
         assert status(ask(page, host="evil.example", **by_header)) == 421
         assert status(ask(page, host=f"{socket.gethostname()}:1", **by_header)) == 200
+
+
+def test_each_token_gives_its_role(tmp_path, monkeypatch):
+    """Also by the cookie that it brings; a browser of this machine has the last one."""
+    with guarded(tmp_path, monkeypatch) as (page, _, trusts):
+        for role in ROLES:
+            token = (tmp_path / f"token-{role}").read_text().strip()
+            answer = ask(page, "/enter", more=f"Authorization: Bearer {token}\r\n", tls=trusts)
+            assert f"__Host-palpate={token};".encode() in answer
+            assert page.access.role(token) == role
+        assert page.access.role("x") == page.access.role("") == ""
+    assert Access(0).role("") == ROLES[-1]
 
 
 def test_plain_http_is_not_answered_on_the_network(tmp_path, monkeypatch):
@@ -385,7 +397,10 @@ def test_a_proxy_on_this_machine_may_pass_names_on():
 
 def test_beyond_this_machine_token_and_certificate_must_be_there(tmp_path, monkeypatch):
     """Missing, broken and unreadable files are named; an invalid address is refused."""
-    network, token = WatchConfig(address="0.0.0.0", folder=str(tmp_path)), tmp_path / "token"
+    network = WatchConfig(address="0.0.0.0", folder=str(tmp_path))
+    for role in ROLES[1:]:
+        (tmp_path / f"token-{role}").write_text(f"{role}0123456789abcdef")
+    token = tmp_path / "token-look"
     with pytest.raises(ConfigError, match="cannot"):
         Access.configured(network, 0)
     for text in ("short", "x" * 300, "with spaces in the middle", "ö" * 20):

@@ -5,14 +5,16 @@ from __future__ import annotations
 
 import csv
 import io
-import re
+import time
 from collections.abc import Callable, Iterator
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from palpate.client.verdicts import VerdictFile
 from palpate.web.access import Access
 from tests.factories import feed_lines
 from tests.factories.browser import BrowsedPage, until
@@ -118,7 +120,7 @@ def test_each_state_is_told_from_two_metres(browser, shown, width, height, schem
     what to do stands beside it. All text can be read (WCAG 2.1, 1.4.3), on the whole screen too."""
     size = {"width": width, "height": height}
     context = browser.new_context(viewport=size, color_scheme=scheme)
-    seen = BrowsedPage(context, shown.server.address)
+    seen = BrowsedPage(context, shown.server.address + "/#watch")
     until(lambda: seen.page.locator(".row").count() == 40)
     looks = {tone: set() for tone in ("good", "warn", "bad", "away", "plain")}
     for act, *told in STATES:
@@ -181,17 +183,17 @@ def test_the_whole_screen_has_the_verdict_alone(browser, shown):
     """With a key or the button; the way back is the same key, or Escape."""
     seen = opened(browser, shown)
     seen.page.keyboard.press("f")
-    until(lambda: not seen.page.is_visible("#history"))
+    until(lambda: not seen.page.is_visible("#latest"))
     box = seen.page.locator("#verdict").bounding_box()
     assert box["width"] * box["height"] > 0.8 * 1024 * 768
     assert seen.page.is_visible("#state")
     assert seen.page.get_attribute("#full", "aria-pressed") == "true"
     seen.page.keyboard.press("Escape")
-    until(lambda: seen.page.is_visible("#history"))
+    until(lambda: seen.page.is_visible("#latest"))
     seen.page.click("#full")
-    until(lambda: not seen.page.is_visible("#history"))
+    until(lambda: not seen.page.is_visible("#latest"))
     seen.page.click("#full")
-    until(lambda: seen.page.is_visible("#history"))
+    until(lambda: seen.page.is_visible("#latest"))
 
 
 DEVICE = """() => {
@@ -214,7 +216,7 @@ def test_a_tablet_stays_awake_and_sounds_on_a_refusal(browser, shown):
     """The screen is kept on; if wanted, a refusal sounds once, an answer not."""
     context = browser.new_context()
     context.add_init_script(f"({DEVICE})()")
-    seen = BrowsedPage(context, shown.server.address)
+    seen = BrowsedPage(context, shown.server.address + "/#watch")
     until(lambda: seen.page.locator(".row").count() == 40)
     until(lambda: seen.page.evaluate("window.locks") == 1)
     assert "screen" in seen.text("#awake")
@@ -250,17 +252,17 @@ def test_keys_lead_to_views_and_history(browser, shown):
     seen.page.keyboard.press("Control+a")
     assert seen.page.is_visible("#watch")
     seen.page.click("summary:text('keys')")
-    assert seen.page.locator("#keys dt").all_text_contents() == list("ftwalhs")
+    assert seen.page.locator("#keys dt").all_text_contents() == list("ftwaplhs")
 
 
 def test_the_shift_is_counted_and_saved(browser, shown):
-    """A sentence, a table, and a CSV file with each sweep and its time on the wall."""
-    shown.board.take(verdict(41, 395.0, "=1+1", detail='a "word", and more'))
-    seen = opened(browser, shown, rows=41)
-    assert re.match(
-        r"41 sweeps since \d\d:\d\d:\d\d: 37 named \(90.2 %\), 2 not sure, 2 without a material",
-        seen.text("#counted"),
-    )
+    """A sentence, a table, and a CSV file with each sweep and its time on the wall, also of what
+    came after the page was opened."""
+    seen = opened(browser, shown)
+    shown.take(verdict(41, 395.0, "=1+1", detail='a "word", and more'))
+    until(lambda: seen.text("#tally-counted").startswith("41 sweeps since "))
+    assert ": 37 named (90.2 %), 2 not sure, 2 without" in seen.text("#tally-counted")
+    assert "palpate-bridge@memory" in seen.text("#tally-kept")
     lines = [one.split("\t") for one in seen.text("#tally table").splitlines()]
     assert lines[0] == ["material", "ok", "unsure", "all"]
     assert ["foam", "2", "2", "4"] in lines
@@ -268,16 +270,59 @@ def test_the_shift_is_counted_and_saved(browser, shown):
     assert sum(int(line[-1]) for line in lines[1:]) == 41
     with seen.page.expect_download() as download:
         seen.page.keyboard.press("s")
-    assert re.fullmatch(r"palpate-\d{4}-\d\d-\d\d-\d{4}\.csv", download.value.suggested_filename)
     text = Path(download.value.path()).read_bytes().decode()
     rows = list(csv.DictReader(io.StringIO(text, newline="")))
-    assert len(rows) == 41
-    assert [rows[0][name] for name in ("sweep", "status", "material")] == ["1", "ok", "wood"]
-    assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}[+-]\d\d:\d\d", rows[0]["time"])
+    assert [row["number"] for row in rows] == [str(n) for n in range(1, 42)]
+    assert [rows[0][name] for name in ("sweep", "status", "label")] == ["1", "ok", "wood"]
+    assert datetime.fromisoformat(rows[0]["time"]).tzinfo
     assert rows[10]["status"] == "gap"
-    assert rows[10]["material"] == rows[10]["probability"] == ""
-    assert rows[40]["material"] == "'=1+1"
+    assert rows[40]["label"] == "'=1+1"
     assert rows[40]["detail"] == 'a "word", and more'
+
+
+def test_history_goes_on_after_a_restart(browser, tmp_path):
+    """The page counts the verdicts of the file, and leaves out those before the period."""
+    now = time.time()
+    for start, ages_h in ((1, (40 * 24, 24 * 20, 24 * 10)), (4, (0.02, 0.01))):
+        file = VerdictFile(tmp_path / "verdicts.db")
+        for i, age_h in enumerate(ages_h):
+            file.add(now - 3600 * age_h, verdict(start + i, 1.0, "wood", "unsure"))
+        file.close()
+    with Shown(Access(0), memory=tmp_path / "verdicts.db") as one:
+        one.shift()
+        seen = BrowsedPage(browser.new_context(), one.server.address + "/#history")
+        for period, counted in (("0", "2"), ("30", "4")):
+            seen.page.click(f"[data-period='{period}']")
+            until(lambda counted=counted: seen.text("#past-counted").startswith(f"{counted} sw"))
+            until(lambda: seen.text("#trend-said").startswith("unsure 100.0 %"))
+        assert seen.text("#past-kept") == ""
+        with seen.page.expect_download() as download:
+            seen.page.click("#rows-file")
+        rows = list(csv.DictReader(Path(download.value.path()).read_text().splitlines()))
+        assert [row["number"] for row in rows] == ["2", "3", "4", "5"]
+        assert not seen.errors
+
+
+def test_the_start_leads_to_each_page(browser, shown):
+    """It has links to the views, to other boxes, and to the page of teaching while that runs. It
+    makes no link of an address that would run a script."""
+    evil, cell = "javascript:alert(1)", "https://cell-7.local:8137/"
+    shown.boxes += [{"name": "evil", "address": evil}, {"name": "cell-7", "address": cell}]
+    seen = BrowsedPage(browser.new_context(), shown.server.address)
+    until(lambda: "palpate, streaming" in seen.text("#there"))
+    until(lambda: seen.text("#start-history").startswith("40 sweeps"))
+    until(lambda: seen.page.locator("#boxes a").count() == 1)
+    assert seen.page.get_attribute("#boxes a", "href") == cell
+    for view in ("watch", "align", "history"):
+        seen.page.click(f"#start [href='#{view}']")
+        until(lambda view=view: seen.page.is_visible(f"main#{view}"))
+        seen.page.click("#home-link")
+        until(lambda: seen.page.is_visible("main#start"))
+    assert seen.page.get_attribute("#start-teach", "href") is None
+    shown.board.take(feed_lines.health(NOW_S, teach={"materials": {}}, recording={}))
+    until(lambda: (seen.page.get_attribute("#start-teach", "href") or "").endswith(":8138/"))
+    assert seen.page.get_attribute("#start-record", "href") is None
+    assert not seen.errors
 
 
 @pytest.mark.parametrize(("width", "height"), SIZES)
@@ -287,12 +332,12 @@ def test_long_names_and_many_materials_are_not_cut(browser, shown, width, height
     shown.board.take(feed_lines.hello(labels=names))
     for i, name in enumerate(names):
         scores = [0.9 if j == i else 0.004 for j in range(26)]
-        shown.board.take(verdict(41 + i, 395.0, name) | {"label": name, "scores": scores})
+        shown.take(verdict(41 + i, 395.0, name) | {"label": name, "scores": scores})
     seen = opened(browser, shown, width, height, rows=66)
     assert seen.page.locator("#scores li").count() == 6
     seen.page.click("#more")
     until(lambda: seen.page.locator("#scores li").count() == 26)
-    assert seen.page.locator("#tally tbody tr").count() == 26 + 6 + 2
+    until(lambda: seen.page.locator("#tally tbody tr").count() == 26 + 6 + 2)
     wide = seen.page.evaluate(
         "() => [...document.querySelectorAll('.row, .row *, #scores *, #tally *, #label')]"
         ".filter((e) => getComputedStyle(e).display !== 'inline')"

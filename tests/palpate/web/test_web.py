@@ -18,11 +18,13 @@ import pytest
 
 from palpate.core.clock import SystemClock
 from palpate.web.access import Access
+from palpate.web.history import History
 from palpate.web.web import FRAMES_HZ, PageWatcher
 from tests.factories import feed_lines
 from tests.factories.browser import WAIT_S, until
 from tests.factories.feeds import HEALTH, OK, Offered, cut, frames
 from tests.factories.page_client import EventReader, PageAddress, ask, status
+from tests.factories.shown_page import four_hours_ago
 
 pytestmark = pytest.mark.usefixtures("hurried")
 
@@ -36,7 +38,8 @@ def path(tmp_path: Path) -> Path:
 @pytest.fixture
 def watcher(path: Path) -> Iterator[PageWatcher]:
     """Watches the feed at `path`; the test takes its steps."""
-    one = PageWatcher(str(path), Access(0), SystemClock().now_ns)
+    history = History(path.with_name("verdicts.db"), four_hours_ago())
+    one = PageWatcher(str(path), Access(0), SystemClock().now_ns, history)
     with one.server, one.feed:
         yield one
 
@@ -71,6 +74,8 @@ def test_what_the_box_does_comes_to_the_page(watcher, path):
     assert heard(watcher, offered, "health", reader)["answered"] == 7
     offered.feed.answered(OK)
     assert heard(watcher, offered, "verdict", reader)["scores"] == [0.987, 0.013]
+    counted = json.loads(ask(watcher.server, "/history/90").partition(b"\r\n\r\n")[2])
+    assert sum(n for _, _, n in counted["counts"]) == 1
     offered.feed.sweep(cut(), OK, {})
     number = heard(watcher, offered, "signal", reader)["number"]
     picture = json.loads(ask(watcher.server, f"/sweep/{number}").partition(b"\r\n\r\n")[2])

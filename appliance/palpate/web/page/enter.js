@@ -21,7 +21,7 @@ async function enter(token) {
 document.getElementById("go").addEventListener("click", () => enter(field.value.trim()));
 field.addEventListener("keydown", (event) => { if (event.key === "Enter") enter(field.value.trim()); });
 const given = location.hash.slice(1);
-if (given) {
+if (given.length >= 16) { // a shorter one is a view
   history.replaceState(null, "", location.pathname);
   enter(given);
 }

@@ -7,6 +7,15 @@ const ORDER_MS = 10_000;
 
 document.documentElement.setAttribute("data-runs", "yes"); // see old.js
 
+/* How often each value is there, and the values, the most frequent first. */
+export function counted(values) {
+  const counts = new Map();
+  for (const one of values) counts.set(one, (counts.get(one) ?? 0) + 1);
+  return counts;
+}
+
+export function common(counts) { return [...counts.keys()].sort((a, b) => counts.get(b) - counts.get(a) || a.localeCompare(b)); }
+
 export const byId = (id) => document.getElementById(id);
 
 export function last(values) { return values[values.length - 1]; }

@@ -1,5 +1,6 @@
 /* Pictures of numbers on a canvas: a sweep's signal and spectrogram, latency and loss over time. */
 
+import {count} from "./parts.js";
 import {shades} from "./skin.js";
 
 const LEFT = 48, BOTTOM = 20, TOP = 22, RIGHT = 6;
@@ -55,6 +56,7 @@ function empty(canvas, text) {
   paper.font = "14px system-ui, sans-serif";
   paper.fillText(text, LEFT + w / 2, TOP + h / 2);
   canvas.setAttribute("aria-label", text);
+  return text;
 }
 
 /* picture: of appliance/palpate/web/sweep_picture.py, or null; why: what is said without one. unit: of its numbers. */
@@ -109,4 +111,26 @@ export function course(canvas, points, {bars = false, clock, nothing}) {
       else paper.fillRect(x(at) - 1.5, y(value) - 1.5, 3, 3);
     }
   }
+}
+
+/* spans: [index, all, unsure, unknown] of verdicts.trend; of: its from_s, to_s and span_s. label: a time in ms for the axis. What it
+   shows, in words. */
+export function trend(canvas, spans, of, label) {
+  const sum = (k) => spans.reduce((all, span) => all + span[k], 0), all = sum(1);
+  if (!all) return empty(canvas, "no sweep yet");
+  const [paper, w, h] = begin(canvas), whole = Math.max(1, Math.ceil((of.to_s - of.from_s) / of.span_s)), dx = w / whole;
+  const share = ([, n, unsure, unknown]) => 100 * (unsure + unknown) / n, most = Math.min(100, round(Math.max(5, ...spans.map(share))));
+  axes(paper, w, h, 0, most, "% of the sweeps", "", [label(1000 * of.from_s), label(1000 * of.to_s)]);
+  for (const [i, n, unsure, unknown] of spans) {
+    let y = TOP + h;
+    for (const [part, colour] of [[unknown, "--heat"], [unsure, "--off"]]) {
+      const up = (h * 100 * part) / n / most;
+      paper.fillStyle = css(colour);
+      paper.fillRect(LEFT + i * dx + 1, y - up, Math.max(1, dx - 2), up);
+      y -= up;
+    }
+    paper.fillStyle = css("--grey");
+    paper.fillRect(LEFT + i * dx + 1, TOP + h - 1, Math.max(1, dx - 2), 2); // sweeps were made
+  }
+  return `unsure ${(100 * sum(2) / all).toFixed(1)} %, unknown ${(100 * sum(3) / all).toFixed(1)} % of ${count(all)} sweeps`;
 }

@@ -2,7 +2,7 @@
 
 import {byId, enable, fill, made, mark, put} from "./parts.js";
 import {signal, spectrogram} from "./plots.js";
-import {drawHeader, drawMoves, lastPicture, live, ordered, run, seen, since} from "./recording.js";
+import {drawHeader, drawMoves, lastPicture, live, may, ordered, run, seen, since} from "./recording.js";
 import {SkinPicture} from "./skin.js";
 
 const FIELDS = ["material", "position", "session"], SKIN = new SkinPicture(document.querySelector(".skin"));
@@ -15,7 +15,7 @@ function named(material, position) { return material ? shown(material) + (positi
 
 function drawLabels() {
   const {recording} = seen;
-  for (const id of ["set", "next"]) enable(byId(id), live());
+  for (const id of ["set", "next"]) enable(byId(id), may());
   if (!recording) return;
   put("now", named(recording.material, recording.position));
   for (const name of FIELDS) { // what a person has typed and not set yet stays
@@ -26,8 +26,8 @@ function drawLabels() {
   put("trigger", recording.trigger);
   drawMoves(shown, byId("material").value.trim());
   byId("sweeps").hidden = !recording.commands.includes("START");
-  enable(byId("start"), live() && recording.ready && Boolean(recording.material));
-  enable(byId("stop"), live() && recording.sweeping);
+  enable(byId("start"), may() && recording.ready && Boolean(recording.material));
+  enable(byId("stop"), may() && recording.sweeping);
 }
 
 function sorted(values) { return [...new Set(values)].sort((a, b) => a.localeCompare(b, "en", {numeric: true})); }
@@ -62,7 +62,7 @@ function drawCounts() {
     field.className = n >= target ? "done" : "";
     field.setAttribute("aria-label", `${named(m, p)}: ${text}`);
     field.setAttribute("aria-pressed", m === material && p === position);
-    enable(field, live());
+    enable(field, may());
   }
   put("missing", recording.missing);
 }
@@ -77,7 +77,7 @@ function outcome(sweep) {
 
 function drawSweep() {
   const {recording, last} = seen, which = recording?.discard ?? null;
-  enable(byId("discard"), live() && which !== null);
+  enable(byId("discard"), may() && which !== null);
   put("discard", which === null ? "Discard" : `Discard sweep ${which}`);
   byId("status").hidden = !last;
   if (!last) {
@@ -151,7 +151,7 @@ byId("record").addEventListener("click", (event) => {
   send([["MATERIAL", material, "", "material"], ["POSITION", position, `now ${named(material, position)}`, "position"]]);
 });
 byId("fields").addEventListener("input", () => { seen.dirty = true; });
-byId("fields").addEventListener("keydown", (event) => { if (event.key === "Enter" && live()) setLabels(); });
+byId("fields").addEventListener("keydown", (event) => { if (event.key === "Enter" && may()) setLabels(); });
 
 function press() {
   const button = byId(seen.recording?.sweeping ? "stop" : "start");

@@ -5,12 +5,15 @@ import {ago, byId, call, enable, frame, listenToPedal, order, put} from "./parts
 
 /* key, recording, last: events of these names, as appliance/palpate/web/record.py sends them. picture: of the last sweep.
    finished: the person has ended the program, so that no connection is no fault. dirty: something is to be drawn. */
-export const seen = {finished: false, key: "", recording: null, last: null, picture: null, reached: null, answers: true, wallMs: 0, dirty: true};
+export const seen = {finished: false, key: "", role: "", recording: null, last: null, picture: null, reached: null, answers: true, wallMs: 0, dirty: true};
 let program = "", ordering = false;
 
 function begin() { Object.assign(seen, {finished: false, key: "", recording: null, last: null}); }
 
 export function live() { return seen.reached === true && seen.recording !== null; }
+
+/* Whether this browser's token allows orders: those of a recording, or those of teaching too. */
+export function may(role = "operate") { return live() && (seen.role === "teach" || seen.role === role); }
 
 /* How long ago something was, by the box's clock. */
 export function since(ns) { return `${ago(Date.now() - seen.wallMs - ns / 1e6)} ago`; }
@@ -31,9 +34,14 @@ export function drawHeader() {
   const state = seen.finished ? "finished" : !reached ? "no connection" : !recording ? "waiting" : recording.skin !== "streaming" ? `skin ${recording.skin}`
     : recording.sweeping ? "sweeping" : recording.ready ? "ready" : "not ready";
   frame({state, fine: live() && recording.skin === "streaming", source: recording?.source, why});
+  put("role", {look: "look only", operate: "operate"}[seen.role] ?? "");
+  byId("role").hidden = !byId("role").textContent;
   byId("format").hidden = !recording;
   if (recording) put("format", recording.format);
 }
+
+/* The start page on the same machine. */
+export function startAddress() { return `${location.protocol}//${location.hostname}:8137/`; }
 
 /* The buttons of a sweep with the wrong material, and of a material with the wrong name. typed: a new name. */
 export function drawMoves(shown, typed) {
@@ -41,11 +49,11 @@ export function drawMoves(shown, typed) {
   byId("move").hidden = !newest || !material || newest[1] === material;
   put("move", newest ? `Move sweep ${recording.discard} to ${shown(material)}` : "Move");
   put("rename", material ? `Rename ${shown(material)}` : "Rename");
-  enable(byId("move"), live());
-  enable(byId("rename"), live() && Boolean(material && typed) && typed !== shown(material));
+  enable(byId("move"), may());
+  enable(byId("rename"), may() && Boolean(material && typed) && typed !== shown(material));
   byId("undo").hidden = !undo;
   put("undo", `Undo: ${undo}`);
-  enable(byId("undo"), live());
+  enable(byId("undo"), may());
 }
 
 function drawCall(wanted) {
@@ -88,10 +96,12 @@ export async function ordered(act) {
 /* name: of the program. draw: draws all. wanted: whether the call is shown. pedal: a press of it. heard: further events. */
 export function run({name, draw, wanted, pedal, heard = {}}) {
   program = name;
+  if (location.port === "8138") byId("home-link").href = startAddress();
   listen({
     begin,
     now(ns) { seen.wallMs = Date.now() - ns / 1e6; },
     key(one) { seen.key = one; },
+    role(one) { Object.assign(seen, {role: one, dirty: true}); },
     recording(one) { Object.assign(seen, {recording: one, dirty: true}); },
     sweep(one) { Object.assign(seen, {last: one, dirty: true}); },
     ...heard,

@@ -2,7 +2,7 @@
 
 import {ago, byId, enable, fill, made, mark, put} from "./parts.js";
 import {signal} from "./plots.js";
-import {drawHeader, drawMoves, lastPicture, live, ordered, run, seen, since} from "./recording.js";
+import {drawHeader, drawMoves, lastPicture, live, may, ordered, run, seen, since, startAddress} from "./recording.js";
 
 const STEPS = {start: "starting", features: "looking at the sweeps", heads: "learning", bundle: "checking"};
 let listed = "", ended = false, usedMs = 0;
@@ -16,7 +16,7 @@ function byPage() { return seen.recording?.commands.includes("START"); }
 
 function drawTask() {
   const {recording, last} = seen;
-  enable(byId("add-button"), live());
+  enable(byId("add-button"), may("teach"));
   if (!recording) return;
   const trying = recording.trying, now = teach(), name = recording.material;
   if (trying) {
@@ -29,20 +29,20 @@ function drawTask() {
   }
   byId("sweep-button").hidden = !byPage();
   put("sweep-button", recording.sweeping ? "Stop" : "Start");
-  enable(byId("sweep-button"), live() && recording.skin === "streaming" && (trying || Boolean(name)));
+  enable(byId("sweep-button"), may() && recording.skin === "streaming" && (trying || Boolean(name)));
   for (const id of ["discard", "move", "skip", "place", "rename", "undo"]) byId(id).hidden = Boolean(trying);
   if (!trying) drawMoves(shown, byId("name").value.trim());
-  enable(byId("discard"), live() && recording.discard != null);
+  enable(byId("discard"), may() && recording.discard != null);
   put("discard", recording.discard == null ? "Discard" : `Discard sweep ${recording.discard}`);
-  enable(byId("skip"), live() && now && Object.keys(now.materials).length > 1);
-  enable(byId("place"), live() && Boolean(name));
+  enable(byId("skip"), may("teach") && now && Object.keys(now.materials).length > 1);
+  enable(byId("place"), may() && Boolean(name));
   put("place", recording.position ? `Another place (now ${recording.position})` : "Another place");
 }
 
 function drawMaterials() {
   const {recording} = seen;
   const held = teach()?.materials ?? Object.fromEntries((recording?.trying?.labels ?? []).map((name) => [name, null]));
-  const content = JSON.stringify([held, recording?.displays, recording?.material, Boolean(recording?.trying), live()]);
+  const content = JSON.stringify([held, recording?.displays, recording?.material, Boolean(recording?.trying), may("teach")]);
   if (content === listed) return;
   listed = content;
   fill(byId("materials"), ...Object.entries(held).map(([name, n]) => {
@@ -50,13 +50,13 @@ function drawMaterials() {
     pick.type = "button";
     pick.dataset.material = name;
     pick.setAttribute("aria-pressed", `${!recording.trying && name === recording.material}`);
-    enable(pick, live());
+    enable(pick, may("teach"));
     if (n !== null) {
       const forget = made("button", "forget", "Forget", row);
       forget.type = "button";
       forget.dataset.forget = name;
       forget.setAttribute("aria-label", `Forget ${shown(name)}`);
-      enable(forget, live());
+      enable(forget, may("teach"));
     }
     return row;
   }));
@@ -91,9 +91,9 @@ function drawLearnt() {
   }
   byId("use").hidden = Boolean(trying);
   byId("done").hidden = !trying;
-  enable(byId("done"), live());
+  enable(byId("done"), may("teach"));
   const many = Object.values(now?.materials ?? {}).filter((n) => n > 0).length;
-  enable(byId("use"), live() && now && many >= now.fewest && !now.using);
+  enable(byId("use"), may("teach") && now && many >= now.fewest && !now.using);
   byId("using").hidden = !now?.using;
   if (!now?.using) usedMs = 0;
   else {
@@ -130,7 +130,7 @@ function drawEnd() {
   put("count", "The box works for the robot now");
   for (const one of document.querySelectorAll("#task .buttons, #teach > :not(#task)")) one.hidden = true;
   byId("watched").hidden = location.port !== "8138";
-  byId("to-watch").href = `${location.protocol}//${location.hostname}:8137/`;
+  byId("to-watch").href = `${startAddress()}#watch`;
 }
 
 function draw() {

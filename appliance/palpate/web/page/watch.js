@@ -1,14 +1,17 @@
-/* The page beside the robot: the box's last verdict first, then the skin, the sweep, the shift, and the box itself. */
+/* The pages of palpate watch: the start; beside the robot the last verdict first, then the skin, the sweep, the shift, and the box
+   itself; the alignment of the skin; the history. */
 
 import {listen} from "./events.js";
 import {ago, byId, clock, count, figure, fill, frame, last, made, percent, put} from "./parts.js";
 import {course, signal, spectrogram} from "./plots.js";
-import {drawShift, key, listenToShift, save} from "./shift.js";
+import {drawHistory, drawShift, listenToHistory, save} from "./history.js";
 import {SkinPicture, wayBack} from "./skin.js";
+import {drawStart} from "./start.js";
+import {drawSweeps, key, listenToSweeps} from "./sweeps.js";
 import {listenToTablet, play} from "./tablet.js";
 import {card, drawCard, skin} from "./verdict.js";
 
-const SPOKEN_MS = 3000, KEPT = 5000, PICTURES = 20, SCORES = 6;
+const VIEWS = ["start", "watch", "align", "history"], SPOKEN_MS = 3000, KEPT = 5000, PICTURES = 20, SCORES = 6;
 const SKIN = new SkinPicture(document.createElement("div"));
 let known; // what the box has said; see begin()
 let reached = null, answers = true, wallMs = 0, dirty = true, spokenAt = -Infinity, allScores = false;
@@ -68,18 +71,26 @@ function trouble() {
   return "";
 }
 
-/* Which view is shown: the box at work, or the skin alone to align it; `palpate skin align` has the second only. */
-function sees(view) { return view === (!known.box && known.view ? "align" : location.hash === "#align" ? "align" : "watch"); }
+/* Which view is shown; `palpate skin align` has that of alignment only. */
+function sees(view) {
+  const asked = location.hash.slice(1);
+  return view === (!known.box && known.view ? "align" : VIEWS.includes(asked) ? asked : "start");
+}
 
 function choose() {
   const aligning = sees("align");
-  document.body.dataset.view = aligning ? "align" : "watch";
-  byId("watch").hidden = aligning;
-  byId("align").hidden = !aligning;
-  for (const id of ["views", "device"]) byId(id).hidden = !known.box;
+  for (const view of VIEWS) {
+    byId(view).hidden = !sees(view);
+    if (sees(view)) document.body.dataset.view = view;
+  }
+  byId("views").hidden = !known.box;
+  if (known.box) byId("home-link").setAttribute("href", "#start");
+  byId("device").hidden = !known.box || !sees("watch");
   put("title", known.box || !known.view ? "Palpate" : "Align the skin");
-  for (const link of byId("views").children) link.toggleAttribute("aria-current", (link.hash === "#align") === aligning);
-  for (const link of byId("views").querySelectorAll("[aria-current]")) link.setAttribute("aria-current", "page");
+  for (const link of byId("views").children) {
+    if (sees(link.hash.slice(1))) link.setAttribute("aria-current", "page");
+    else link.removeAttribute("aria-current");
+  }
   const place = document.querySelector(aligning ? "#align .skin" : "#watch .skin");
   if (SKIN.parent !== place) {
     place.append(...SKIN.parent.childNodes);
@@ -124,7 +135,7 @@ function drawSkin() {
   put("skin-title", known.hello?.finger ? `Skin of ${known.hello.finger}` : "Skin");
   const axes = known.hello?.format.axes > 1 ? "; the axis along the normal" : "";
   put("contact", `${unit()} above the lowest seen${axes}`);
-  for (const one of document.querySelectorAll(".key")) {
+  for (const one of document.querySelectorAll(".key:not(.kinds)")) {
     one.hidden = !view.shape || view.state === "no-skin";
     for (const name of ["t", "h"]) one.querySelector(`.${name}`).hidden = !view.contact;
   }
@@ -256,8 +267,12 @@ function draw() {
   drawHeader();
   drawSkin();
   if (sees("align")) return drawWords();
+  const verdict = last(known.verdicts), heardAt = verdict ? verdict.at : 0;
+  if (sees("history")) return drawHistory(heardAt, shownAs, again);
   drawVerdict();
-  drawShift(known, looked(), again);
+  if (sees("start")) return known.box && drawStart(known, byId("label").textContent, heardAt, again);
+  drawShift(heardAt, shownAs, again);
+  drawSweeps(known, looked(), again);
   drawSweep();
   drawCourse();
   drawFacts();
@@ -282,14 +297,17 @@ listen(Object.fromEntries(Object.entries(HEARD).map(([name, act]) => [name, (con
 
 function again() { dirty = true; }
 
+/* A label by the name that people read. */
+function shownAs(label) { return known.hello?.names[known.hello.labels.indexOf(label)] ?? label; }
+
 function go(view) { return () => { if (known.box) location.hash = view; }; }
 
-listenToShift(select, again);
+listenToSweeps(select, again);
+listenToHistory(again);
 listenToTablet({
-  w: ["watch", go("watch")], a: ["align", go("align")], l: ["the latest sweep", () => select(null)],
-  h: ["history; then arrows, Home and End choose a sweep", () => byId("rows").focus()], s: ["save all sweeps as CSV", () => save(known.verdicts)],
+  w: ["watch", go("watch")], a: ["align", go("align")], p: ["history", go("history")], l: ["the latest sweep", () => select(null)],
+  h: ["latest sweeps; then arrows, Home and End choose one", () => byId("rows").focus()], s: ["save the sweeps as CSV", save],
 });
-byId("save").addEventListener("click", () => save(known.verdicts));
 byId("more").addEventListener("click", () => {
   allScores = !allScores;
   again();
