@@ -26,13 +26,13 @@ from palpate.bundle import bundle
 from palpate.core.types import Sweep
 from palpate.io.robot_link import SerialSink
 from palpate.runtime import assembly
-from palpate.sim import devices, rig, script, skin
+from palpate.sim import devices
 from palpate.tools import pseudo_terminal
 from tests.factories import browser as browsers
 from tests.factories import log_lines
 from tests.factories.paths import ROOT
 from tests.factories.settings import load as load_settings
-from tests.factories.simulated_box import OnSweep, Rigged
+from tests.factories.simulated_box import OnSweep, Rigged, tubes
 
 LIMIT_S = 300
 """Longest time of a test, as in pyproject.toml. One takes seconds, on a busy machine a minute."""
@@ -103,9 +103,7 @@ def rigged(default_bundle: bundle.Bundle) -> Iterator[Callable[..., Rigged]]:
             commands=None,
             capture=None,
         ) -> Rigged:
-            simulated = simulated or devices.build(
-                skin.FORMAT, script.tubes(1), rig.VirtualClock(), "sim"
-            )
+            simulated = simulated or tubes(1)
             settings = load_settings(sets)
             far_end, name = stack.enter_context(pseudo_terminal.pair())
             port = SerialSink(

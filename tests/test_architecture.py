@@ -205,13 +205,18 @@ def test_a_fresh_process_loads_nothing_of_the_desktop():
     assert run(sys.executable, "-c", code, cwd=ROOT).splitlines()[-1] == "[]"
 
 
-def test_the_simulator_is_not_loaded_unless_named():
-    """`palpate check --settings` and everything it imports leave palpate.sim alone."""
-    code = (
-        "import sys; from palpate.__main__ import main; main(['check', '--settings']); "
-        "print([m for m in sys.modules if '.sim' in m])"
-    )
-    assert run(sys.executable, "-c", code, cwd=ROOT).splitlines()[-1] == "[]"
+@pytest.mark.parametrize(
+    ("code", "absent"),
+    [
+        ("from palpate.__main__ import main; main(['check', '--settings'])", "palpate.sim"),
+        ("import palpate.cli.parser", "asyncio palpate.bridges.server"),
+        ("import palpate.client.feed", "numpy serial usb onnxruntime"),
+    ],
+)
+def test_what_is_not_needed_is_not_loaded(code, absent):
+    """The simulator unless it is named, a bridge for its options, the line for the feed."""
+    code += f"; import sys; print({{*{absent.split()}}} & {{*sys.modules}})"
+    assert run(sys.executable, "-c", code, cwd=ROOT).splitlines()[-1] == "set()"
 
 
 def test_onnxruntime_starts_no_thread_of_its_own():

@@ -4,7 +4,7 @@ port.
 
 import os
 import select
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,7 +14,7 @@ from palpate.core.observer import Observer
 from palpate.core.types import Sweep, SweepFormat, Verdict
 from palpate.io.robot_link import SerialSink
 from palpate.runtime.loop import Box
-from palpate.sim import devices, rig, skin
+from palpate.sim import devices, rig, script, skin
 
 SECOND = 1_000_000_000
 SETTLE_S = 0.02
@@ -39,6 +39,16 @@ def idle_devices(
         format, simulated.robot, simulated.clock, **{"packet_frames": 4} | board
     )
     return simulated
+
+
+def played(acts: Iterable[rig.Act], format: SweepFormat = skin.FORMAT) -> devices.SimDevices:
+    """Simulated devices on which a robot plays these acts."""
+    return devices.build(format, acts, rig.VirtualClock(), "sim")
+
+
+def tubes(seed: int, n: int | None = None, **more: str) -> devices.SimDevices:
+    """Simulated devices whose robot sweeps over `n` tubes."""
+    return played(script.tubes(seed, n, **more))
 
 
 class OnSweep(Observer):

@@ -9,6 +9,7 @@ import io
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from palpate.answer.pipeline import Context, Stage
 from palpate.answer.unknown import DisplacementRule, Known
 from palpate.bundle import bundle
 from palpate.bundle.bundle import Bundle, Manifest, Thresholds
-from palpate.core.types import Frames, Status, Sweep, SweepFormat
+from palpate.core.types import EPOCH_BITS, Frames, Status, Sweep, SweepFormat
 from palpate.inference.classifier import Classifier
 
 FORMAT = SweepFormat(2, 2, 100.0, 20, "int16")
@@ -55,8 +56,19 @@ def sweep(
     z1: float, z2: float, number: int = 1, object: int = 0, format: SweepFormat = FORMAT
 ) -> Sweep:
     """A valid sweep with this embedding."""
-    n = np.arange(format.window)
-    return Sweep(number, 0, 0, Status.OK, Frames(n, n, window(z1, z2, format)), object=object)
+    frames = frames_of(window(z1, z2, format))
+    return Sweep(number, 0, 0, Status.OK, frames, object=object)
+
+
+def sweep_of(taxels: np.ndarray, **more: Any) -> Sweep:
+    """A valid sweep with this window."""
+    return Sweep(1, 0, 0, Status.OK, frames_of(taxels), **more)
+
+
+def frames_of(taxels: np.ndarray, epoch: int = 0) -> Frames:
+    """Frames with these counts, numbered from 0."""
+    n = np.arange(len(taxels))
+    return Frames(n, n + (epoch << EPOCH_BITS), taxels)
 
 
 def model(

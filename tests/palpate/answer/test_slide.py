@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from palpate.answer.slide import DIRECTIONS, LEAST_HEIGHT, SlideMeter
+from palpate.answer.slide import DIRECTIONS, LEAST_HEIGHT, NO_PATTERN, SlideMeter
 from palpate.core.types import SweepFormat
 from palpate.sim import skin
 
@@ -132,12 +132,11 @@ def test_windows_without_a_slide_say_why():
     still = np.full((1500, 4, 4), 9, np.uint8)
     two = still.copy()
     two[:, 0, :2] = rng.integers(0, 99, (1500, 2))
-    changing = "the counts of fewer than 3 taxels change"
-    assert [meter(taxels).why for taxels in (still, two)] == [changing] * 2
+    assert all("fewer than 3 taxels" in meter(taxels).why for taxels in (still, two))
     resting = skin.sweep("foam", skin.Placement(), rng, rest_s=2.0, slide_s=0.1)[:1500]
     for taxels in (rng.integers(0, 255, (1500, 4, 4)), resting, skin.idle(1500, rng)):
         found = meter(taxels)
-        assert found.why == "no pattern passes from taxel to taxel"
+        assert found.why == NO_PATTERN
         assert found.speed_mm_s is None
         assert 0 < found.height < LEAST_HEIGHT
 
@@ -154,7 +153,7 @@ def test_speeds_beyond_the_limits_are_not_guessed():
     ]
     assert [slide.speed_mm_s for slide in found] == [None] * 3
     assert [slide.why for slide in found] == [
-        "no pattern passes from taxel to taxel",
+        NO_PATTERN,
         "slower than 8 mm/s",
         "faster than 400 mm/s",
     ]
@@ -164,7 +163,7 @@ def test_a_pattern_of_one_wavelength_fits_several_speeds():
     """A wave looks the same a whole wavelength further, so its lag is ambiguous."""
     found = SlideMeter(FORMAT, PITCH_MM)(passed(FORMAT, 30.0, wave_mm=(2.5, 3.2)))
     assert found.speed_mm_s is None
-    assert found.why == "the pattern fits several speeds"
+    assert "several" in found.why
 
 
 def test_slow_frames_are_enough_where_the_lag_is_longer():

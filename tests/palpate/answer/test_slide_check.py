@@ -10,12 +10,13 @@ from palpate.answer.slide_check import MANY, SlideCheck, SlidesAmong
 from palpate.bundle import bundle
 from palpate.bundle.bundle import Bundle
 from palpate.core.errors import FormatError
-from palpate.core.types import Frames, Status, Sweep, SweepFormat
+from palpate.core.types import Status, SweepFormat
 from palpate.inference.classifier import Classifier
 from palpate.learn import enrolment
 from palpate.sim import skin
 from palpate.sim.rig import VirtualClock
 from tests.campaigns.junk import KINDS, window
+from tests.factories import toy_bundle
 
 JUNK = [
     *("finger rests", "rests, noise", "rests, common noise", "rests, 50 Hz hum", "rests, clicks"),
@@ -75,8 +76,7 @@ def test_a_sweep_that_is_answered_can_be_taught(model):
         for amplitude in range(0, 60, 4):
             noise = rng.normal(0, amplitude, slide.shape)
             taxels = (slide + noise).round().clip(0, 255).astype(np.uint8)
-            frames = Frames(np.arange(len(taxels)), np.arange(len(taxels)), taxels)
-            answer = run(Sweep(1, 0, 1, Status.OK, frames)).status
+            answer = run(toy_bundle.sweep_of(taxels)).status
             known = meter(taxels).height
             weak += CHANCE <= known < LEAST_HEIGHT
             if answer is Status.OK or CHANCE <= known < LEAST_HEIGHT:

@@ -12,11 +12,12 @@ import pytest
 from palpate.answer.early import Early
 from palpate.answer.taxels import CERTAIN, SOUND, Bridging, TaxelWatch
 from palpate.bundle import bundle
-from palpate.core.types import EPOCH_BITS, Frames, Status, Sweep
+from palpate.core.types import Status
 from palpate.inference.classifier import Classifier
 from palpate.inference.early_exit import EarlyExit
 from palpate.sim.rig import VirtualClock
 from tests.factories import toy_bundle
+from tests.factories.toy_bundle import frames_of, sweep_of
 
 FORMAT = replace(toy_bundle.FORMAT, rows=4, cols=4, window=100)
 RULE = Bridging(taxels=2, row=True, column=False, noise=4.0, quietest=2.0, still=False)
@@ -41,16 +42,11 @@ def watch() -> TaxelWatch:
     return TaxelWatch(FORMAT, toy_bundle.LIMITS, RULE, np.zeros(FORMAT.shape))
 
 
-def frames(taxels: np.ndarray, epoch: int = 0) -> Frames:
-    n = np.arange(len(taxels))
-    return Frames(n, n + (epoch << EPOCH_BITS), taxels)
-
-
 def seen(watch: TaxelWatch, *stretches: np.ndarray, times: int = 1, epoch: int = 0) -> str:
     """The broken taxels after these stretches of the stream."""
     for _ in range(times):
         for taxels in stretches:
-            watch.put(frames(taxels, epoch), np.zeros((4, 4)))
+            watch.put(frames_of(taxels, epoch), np.zeros((4, 4)))
     return watch.broken.text if watch.broken else ""
 
 
@@ -71,10 +67,6 @@ CLIPPED = broken(SIX, count=GOOD.max() + 20)
 """An amplifier holds six taxels at its highest count."""
 
 
-def sweep(taxels: np.ndarray, share: float = 1.0) -> Sweep:
-    return Sweep(1, 0, 0, Status.OK, frames(taxels), share=share)
-
-
 @pytest.mark.parametrize(
     ("taxels", "degraded"),
     [
@@ -89,7 +81,7 @@ def test_a_broken_taxel_is_bridged_and_named(run, taxels, degraded):
     """The answer is ok, and the recorded sweep stays as it was. Taxel 1.1 carries the material of
     the toy; its neighbour 1.2 does not, so that the bridged load is that of material a."""
     before = taxels.copy()
-    verdict = run(sweep(taxels))
+    verdict = run(sweep_of(taxels))
     assert (verdict.status, verdict.label) == (Status.OK, "a")
     assert (verdict.degraded, verdict.detail) == (degraded, f"degraded: {degraded}")
     assert verdict.as_dict()["degraded"] == degraded
@@ -102,14 +94,14 @@ def test_clipped_taxels_are_answered_as_far_as_the_bundle_tolerates(run, tmp_pat
     few = made(tmp_path)
     limits = replace(few.manifest.thresholds, saturated=0.5)
     many = replace(few, manifest=replace(few.manifest, thresholds=limits))
-    refused = run(sweep(CLIPPED))
+    refused = run(sweep_of(CLIPPED))
     assert refused.status is Status.SATURATED
     assert "2.2 2.3 2.4" in refused.detail
     tolerant = Classifier(many, VirtualClock())
-    verdict = tolerant(sweep(CLIPPED))
+    verdict = tolerant(sweep_of(CLIPPED))
     assert (verdict.status, verdict.label, verdict.degraded) == (Status.OK, "a", "")
-    assert verdict.detail == "38% of the counts at full scale"
-    assert tolerant(sweep(broken(SIX, count=3))).status is Status.DEAD_TAXEL
+    assert verdict.detail.startswith("38% ")
+    assert tolerant(sweep_of(broken(SIX, count=3))).status is Status.DEAD_TAXEL
 
 
 @pytest.mark.parametrize(
@@ -122,7 +114,7 @@ def test_clipped_taxels_are_answered_as_far_as_the_bundle_tolerates(run, tmp_pat
 )
 def test_more_silent_taxels_than_are_proven_are_refused(run, place, count, status, detail):
     """The status and the places are those of a box that bridges nothing."""
-    verdict = run(sweep(broken(place, count=count)))
+    verdict = run(sweep_of(broken(place, count=count)))
     assert (verdict.status, verdict.label, verdict.detail) == (status, "", detail)
     assert verdict.degraded == ""
 
@@ -132,10 +124,10 @@ def test_more_noisy_taxels_than_are_proven_reach_the_network(run):
     noise = np.rint(30 * np.random.default_rng(0).standard_normal((100, 3))).astype(np.int16)
     taxels = GOOD.copy()
     taxels[:, [1, 2, 3], [1, 3, 0]] += noise
-    verdict = run(sweep(taxels))
+    verdict = run(sweep_of(taxels))
     assert (verdict.status, verdict.degraded) == (Status.OK, "")
     taxels[:, 1, 2] = 0
-    assert run(sweep(taxels)).degraded == "silent taxel 2.3"
+    assert run(sweep_of(taxels)).degraded == "silent taxel 2.3"
 
 
 @pytest.mark.parametrize(
@@ -144,8 +136,8 @@ def test_more_noisy_taxels_than_are_proven_reach_the_network(run):
 def test_a_bundle_without_the_figure_bridges_nothing(tmp_path, taxels, status):
     """A dead taxel is refused, a noisy one reaches the network, and the stream changes nothing."""
     bare = Classifier(made(tmp_path, None), VirtualClock())
-    bare.frames(frames(taxels))
-    verdict = bare(sweep(taxels))
+    bare.frames(frames_of(taxels))
+    verdict = bare(sweep_of(taxels))
     assert (verdict.status, verdict.degraded, bare.degraded) == (status, "", "")
 
 
@@ -153,26 +145,26 @@ def test_a_bridged_window_without_contact_is_refused(run):
     """A single stuck taxel does not count as contact."""
     taxels = np.where(np.arange(100) % 2, 5, 0)[:, None, None] * np.ones((4, 4))
     taxels[:, 2, 2] = 90
-    assert run(sweep(taxels.astype(np.int16))).status is Status.NO_CONTACT
+    assert run(sweep_of(taxels.astype(np.int16))).status is Status.NO_CONTACT
 
 
 def test_the_place_of_the_contact_is_computed_from_bridged_taxels(tmp_path):
     """A dead taxel at the edge would move the centre of the contact."""
     at = replace(toy_bundle.IN_PLACE, rows_mm=(1.5,), cols_mm=(1.5,), limit_mm=0.05)
     dead = broken(np.s_[:, 3, 3])
-    assert Classifier(made(tmp_path, contact=at), VirtualClock())(sweep(dead)).displacement == ""
+    assert Classifier(made(tmp_path, contact=at), VirtualClock())(sweep_of(dead)).displacement == ""
     dead[::2, 3, 3] = 1  # neither constant nor loaded
-    assert Classifier(made(tmp_path, None, contact=at), VirtualClock())(sweep(dead)).displacement
+    assert Classifier(made(tmp_path, None, contact=at), VirtualClock())(sweep_of(dead)).displacement
 
 
 def test_an_early_answer_bridges_too(tmp_path):
     """The answer has the taxel; with too many broken taxels the rest of the sweep is needed."""
     outputs, rule = ("logits", "embedding", "early"), Early((0.5,) * 3, 1)
     early = EarlyExit(Classifier(made(tmp_path, early=rule, outputs=outputs), VirtualClock()))
-    verdict = early(sweep(BAD[:75], 0.75))
+    verdict = early(sweep_of(BAD[:75], share=0.75))
     assert verdict
     assert (verdict.status, verdict.degraded) == (Status.OK, "silent taxel 2.2")
-    assert early(sweep(broken(FOUR)[:75], 0.75)) is None
+    assert early(sweep_of(broken(FOUR)[:75], share=0.75)) is None
 
 
 @pytest.mark.parametrize("kind", ["silent", "noisy"])
@@ -215,7 +207,7 @@ def test_too_many_taxels_over_the_stream_are_refused(run):
     broken taxels."""
     assert "broken" not in run.about()
     for _ in range(CERTAIN):
-        run.frames(frames(broken(FOUR)))
+        run.frames(frames_of(broken(FOUR)))
     assert run.degraded == "silent taxel 2.2 2.3 3.2 3.3"
-    assert run(sweep(GOOD)).status is Status.STUCK_TAXEL
+    assert run(sweep_of(GOOD)).status is Status.STUCK_TAXEL
     assert run.about()["broken"][0][1] == [False, True, True, False]

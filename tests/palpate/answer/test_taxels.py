@@ -221,19 +221,6 @@ def test_the_number_that_may_be_bridged(place, allowed):
         assert not RULE.allows(only)  # nothing would be left to bridge it with
 
 
-@pytest.mark.parametrize(
-    ("rule", "text"),
-    [
-        (RULE, "3 broken taxels or one row or one column"),
-        (replace(RULE, column=False), "3 broken taxels or one row"),
-        (replace(RULE, taxels=0, row=False, column=False), "no broken taxel"),
-    ],
-)
-def test_the_rule_in_words(rule, text):
-    """`check` and `export` print it."""
-    assert rule.text.endswith(text)
-
-
 def test_broken_taxels_in_words_and_in_a_file():
     """Both kinds; a taxel that is silent is not called noisy, too. Lists of another shape are
     refused."""

@@ -183,7 +183,7 @@ def test_hum_is_removed_and_said(tmp_path):
     noisy = np.rint(clean.frames.taxels + HUM).astype(np.int16)
     humming = replace(clean, frames=replace(clean.frames, taxels=noisy))
     verdict = answer(given, humming)
-    assert (verdict.label, verdict.detail) == ("b", "hum of 5.1 counts removed")
+    assert (verdict.label, "5.1 counts" in verdict.detail) == ("b", True)
     assert answer(given, clean).detail == ""
     kept = answer(disturbed(tmp_path, replace(ALLOWED, hum=None), format=HUMMING), humming)
     assert (kept.label, kept.detail) == ("b", "")

@@ -112,7 +112,7 @@ def test_three_axes_have_colours(plugin):
     assert image[0, [0, 3]].tolist() == [[0, 128, 255], [0, 255, 0]]
     assert image[9, 3].tolist() == [128, 128, 0]
     assert touch.values()["taxel_1_2_2"] == 9
-    with pytest.raises(ValueError, match=r"a frame of \(1, 2\) instead of \(1, 2, 3\)"):
+    with pytest.raises(ValueError, match=r"\(1, 2\) .*\(1, 2, 3\)"):
         touch.take({"type": "frame", "taxels": [[1, 2]]})
 
 

@@ -382,19 +382,3 @@ def test_it_ends_with_the_service_manager(box):
         with socket.create_connection(("127.0.0.1", port), timeout=LONG_S):
             process.send_signal(signal.SIGTERM)
             assert process.wait(LONG_S) == 0
-
-
-@pytest.mark.parametrize(
-    ("loaded", "absent"),
-    [
-        (
-            "palpate.bridges.command, palpate.bridges.modbus, palpate.bridges.tcp",
-            "numpy onnxruntime usb gpiod",
-        ),
-        ("palpate.cli.parser", "asyncio palpate.bridges.server"),
-    ],
-)
-def test_bridges_load_little(loaded, absent):
-    """All of a bridge without numpy and the model; the options alone load nothing of a bridge."""
-    code = f"import sys, {loaded}; sys.exit(bool({{*'{absent}'.split()}} & {{*sys.modules}}))"
-    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, timeout=120).returncode == 0

@@ -29,7 +29,7 @@ from palpate.core import config, runtime_folder, storage
 from palpate.core.clock import SystemClock
 from palpate.core.devices import Devices
 from palpate.core.errors import BundleError, ConfigError, FormatError, LineError, SensorError
-from palpate.core.types import Frames, Status, Sweep
+from palpate.core.types import Status
 from palpate.inference.classifier import Classifier
 from palpate.io import packets
 from palpate.sim import skin
@@ -186,9 +186,8 @@ def test_the_sequential_test_is_configured(tmp_path, capsys, default_bundle):
     """classifier.min_probability and classifier.max_sweeps reach the classifier, in `run` and in
     `replay`."""
     box, known = Classifier(default_bundle, SystemClock()), []
-    for i, counts in enumerate(skin.sweep_set("T-REAL", 2000, 2)[0]):
-        n = np.arange(len(counts))
-        verdict = box(Sweep(i, 0, 0, Status.OK, Frames(n, n, counts)))
+    for counts in skin.sweep_set("T-REAL", 2000, 2)[0]:
+        verdict = box(toy_bundle.sweep_of(counts))
         known += [(verdict.probability, counts)] if verdict.status is Status.OK else []
     probability, counts = min(known, key=lambda one: one[0])
     assert probability < 0.9999, "take more sweeps, so that one is less sure"

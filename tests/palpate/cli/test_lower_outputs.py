@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
 
 import pytest
 
 from palpate.cli import lower_outputs
 from palpate.core import config
 from palpate.sim import gpio, rig
-from tests.factories.paths import ROOT
 
 
 @pytest.fixture
@@ -68,20 +65,3 @@ def test_what_cannot_be_lowered_is_said(chip, args, code, message, capsys):
     assert error.count("\n") == 1
     assert re.search(message, error)
     assert chip.requests == [request]
-
-
-def test_it_is_quick_as_it_loads_little():
-    """A process of its own imports neither numpy nor onnxruntime."""
-    code = (
-        "import sys; from palpate.cli import lower_outputs; lower_outputs.main([]);"
-        "print({'numpy', 'onnxruntime', 'usb', 'serial'} & set(sys.modules))"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=120,
-    )
-    assert done.stdout == "set()\n"

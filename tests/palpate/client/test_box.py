@@ -4,8 +4,6 @@ against the real program."""
 from __future__ import annotations
 
 import select
-import subprocess
-import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -21,7 +19,7 @@ from palpate.core.clock import SystemClock
 from palpate.core.errors import ApplianceError, CommandRefused, FormatError, LinkLost, NoAnswer
 from palpate.core.sentences import sentence
 from palpate.core.status import Status
-from tests.factories.paths import ROOT
+from tests.factories.bridges import eventually
 from tests.factories.speaking_box import LABELS, SpeakingBox, finger, obeying, result, state
 
 pytestmark = pytest.mark.usefixtures("hurried")
@@ -313,15 +311,6 @@ def test_commands_of_several_threads_do_not_mix(speaking, box):
     assert (names, states) == (["mine"] * 8, ["streaming"] * 8)
 
 
-def eventually(there: Callable[[], bool]) -> None:
-    """Wait for an event of another thread; fails if it never comes."""
-    for _ in range(3000):
-        if there():
-            return
-        threading.Event().wait(0.01)
-    pytest.fail("it did not come")
-
-
 def accepted(server: socket) -> socket | None:
     """The next connection, None where none has come yet."""
     return server.accept()[0] if select.select([server], [], [], 0.1)[0] else None
@@ -360,17 +349,3 @@ def test_a_socket_in_place_of_a_port():
             assert box.result(LONG_S).sweep == 2
             silent.close()
             third.close()
-
-
-def test_the_client_needs_pyserial_alone():
-    """A fresh process that imports it has loaded neither numpy nor onnxruntime, and nothing of the
-    box but core."""
-    code = (
-        "import sys; import palpate.client.box; names = set(sys.modules);"
-        "print(sorted({n.split('.')[0] for n in names} & {'numpy', 'onnxruntime', 'usb', 'gpiod', "
-        "'serial'}),"
-        "sorted({n.split('.')[1] for n in names if n.startswith('palpate.')}))"
-    )
-    words = [sys.executable, "-c", code]
-    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True, timeout=120)
-    assert done.stdout.strip() == "['serial'] ['client', 'core']"

@@ -157,17 +157,6 @@ def test_a_box_is_read_and_its_reason_is_kept(tmp_path):
     offered.feed.stopping()
 
 
-def test_a_reader_loads_no_numpy():
-    """Nothing but Python's own modules and a little of the box."""
-    code = (
-        "import sys, palpate.client.feed;"
-        "print({'numpy', 'serial', 'usb', 'onnxruntime'} & set(sys.modules))"
-    )
-    words = [sys.executable, "-c", code]
-    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True, timeout=120)
-    assert done.stdout.strip() == "set()"
-
-
 @contextmanager
 def running(path: Path) -> Iterator[subprocess.Popen]:
     """`palpate run` on a simulated skin, with its feed at `path`; killed at the end."""

@@ -123,10 +123,8 @@ def test_a_sweep_on_which_they_differ_is_kept_with_both_verdicts(side):
     written = pair.written()
     assert (written.compared, written.agreed, written.kept) == (1, 0, 1)
     assert written.pairs == {"a": {"b": 1}}
-    assert written.lines(pair.folder)[1:] == [
-        "  a -> b: 1",
-        f"  1 of these are kept in {pair.folder}",
-    ]
+    counted, kept = written.lines(pair.folder)[1:]
+    assert (counted, str(pair.folder) in kept) == ("  a -> b: 1", True)
 
 
 def test_nothing_is_written_while_a_sweep_is_open(side, monkeypatch):
@@ -306,9 +304,7 @@ def test_a_full_disk_costs_the_record_alone(side, monkeypatch, logged):
     pair.judge(*(toy_bundle.sweep(0, 0, i) for i in range(1, 5)))
     pair.shadow.stopping()
     assert pair.shadow.agreement.compared == 4
-    assert [line.split(": ")[2] for line in logged] == [
-        "No space left on device; make room there; classifying goes on"
-    ]
+    assert ["No space left" in line for line in logged] == [True]
 
 
 def test_a_candidate_that_cannot_be_one_is_named(side, tmp_path, default_bundle):

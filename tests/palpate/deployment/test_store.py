@@ -121,7 +121,7 @@ def test_the_table_says_what_a_person_wants_to_know(box, logged):
     lines = bundle_commands.lines(bundle_commands.entries(box.store))
     assert [line.split()[0] for line in lines] == ["role", "on", "previous", "kept"]
     assert f"on trial  {two[:8]}  tubes 7" in lines[1]
-    assert re.search(r"anna@lab .* 1 of 3, 0 of 5 .* 0 of 600", lines[1])
+    assert re.search(r"anna.* 1 of 3, 0 of 5.*600", lines[1])
     assert one[:8] in lines[2]
     logged.clear()
     assert [box.start() for _ in range(MOST_STARTS + 1)] == [two, two, one, one]

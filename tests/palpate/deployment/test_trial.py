@@ -19,9 +19,9 @@ from palpate.core.types import Status, Verdict
 from palpate.deployment.state import MOST_STARTS, Standing
 from palpate.deployment.store import Store
 from palpate.deployment.trial import Trial
-from palpate.sim import devices, rig, script, skin
 from tests.factories import deliveries, feeds
 from tests.factories.deliveries import Delivery
+from tests.factories.simulated_box import tubes
 
 pytestmark = deliveries.NEEDED
 SECOND = 1_000_000_000
@@ -289,7 +289,7 @@ def test_a_bundle_that_is_no_longer_current_is_not_committed(box):
 def test_a_box_at_work_commits(box, rigged):
     """On the simulated box: five sweeps of the simulated robot, each with its answer."""
     trial = box.tried()
-    simulated = devices.build(skin.FORMAT, script.tubes(1), rig.VirtualClock(), "sim")
+    simulated = tubes(1)
     running = rigged(simulated, model=bundle.load(box.store.bundles.at(box.two)), observers=[trial])
     running.until(lambda: running.box.answered >= 5 and not trial.text)
     assert box.standing.committed

@@ -6,6 +6,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import re
 import shutil
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -21,20 +22,14 @@ from palpate.answer.objects import fuse, softmax
 from palpate.bundle import bundle
 from palpate.bundle.bundle import Bundle
 from palpate.core.errors import BundleError
-from palpate.core.types import Frames, Status, Sweep, SweepFormat
+from palpate.core.types import Status, Sweep, SweepFormat
 from palpate.inference.classifier import Classifier
 from palpate.sim.rig import VirtualClock
 from tests.factories import toy_bundle
-from tests.factories.toy_bundle import told
+from tests.factories.toy_bundle import sweep_of, told
 
 WITH_EARLY = (*toy_bundle.OUTPUTS, "early")
 THIRD_ENROLLED = {"arrays": toy_bundle.means(sweeps=np.array([0, 0, 5])), "labels": 2}
-
-
-def sweep_of(taxels: np.ndarray, **more: Any) -> Sweep:
-    """A sweep with this window."""
-    n = np.arange(len(taxels))
-    return Sweep(1, 0, 0, Status.OK, Frames(n, n, taxels), **more)
 
 
 def box(of: Bundle, *more: Any, **rule: Any) -> Classifier:
@@ -166,7 +161,7 @@ def test_features_go_through_the_same_runtime():
     made = bundle.from_files(of_features(weights), "here")
     want = features.compute("L", made.golden[0], 750.0) @ weights
     assert box(made).logits(made.golden[0]) == pytest.approx(want, rel=1e-5)
-    with pytest.raises(BundleError, match=r"float32 \[1, 4\], .*\[1, 3\]"):
+    with pytest.raises(BundleError, match=r"\[1, 4\], .*\[1, 3\]"):
         bundle.from_files(of_features(np.ones((4, 6))), "here")
 
 
@@ -299,17 +294,6 @@ def test_optional_rules_may_be_missing(folder):
     read = bundle.load(folder)
     assert (read.manifest.early, read.manifest.known) == (None, None)
     assert (read.classes, read.enrolled) == (None, {})
-
-
-def test_a_bundle_that_is_written_is_read_unchanged(tmp_path):
-    """With early heads and class means."""
-    rule = Early((0.9, 0.8, 2.0), 2)
-    new = toy_bundle.load(tmp_path / "toy", early=rule, outputs=WITH_EARLY)
-    assert bundle.Manifest.parse(new.manifest.json()) == new.manifest
-    m = new.manifest
-    assert (m.schema, m.early, m.known) == (1, rule, toy_bundle.KNOWN)
-    assert new.classes
-    assert new.classes.means.tolist() == toy_bundle.MEANS.tolist()
 
 
 EARLY = {"least": [0.9, 0.8, 2.0], "agree": 2}
@@ -455,7 +439,7 @@ def test_a_far_sweep_is_unknown(toy):
     for v in (it(toy_bundle.sweep(6, 6)), it(toy_bundle.sweep(-3, -0.5))):
         assert (v.status, v.label, v.probability, v.margin) == (Status.UNKNOWN, "", 0, 0)
         assert (v.fused, len(v.scores)) == (0, 0)
-    assert v.detail == "squared distance 9.25 from a, limit 9"
+    assert re.search(r" 9\.25 from a.* 9$", v.detail)
     assert it(sweep_of(np.zeros((20, 2, 2), np.int16))).status is Status.NO_CONTACT
 
 
@@ -497,7 +481,7 @@ def test_a_model_that_gives_no_number_is_unknown(tmp_path):
     with np.errstate(invalid="ignore"):
         v = it(far)
     assert (v.status, v.label, v.probability) == (Status.UNKNOWN, "", 0)
-    assert v.detail == "the model gives no number"
+    assert v.detail.endswith("no number")
     assert it(toy_bundle.sweep(0, 0, object=1, format=format)).fused == 1
 
 
@@ -563,13 +547,6 @@ def test_what_is_not_ok_need_not_count(toy):
     v = it.verdict(it.unfinished(half, told(it, np.array([0.9, 0.1, 0.0]))))
     assert (v.status, v.label, v.fused, v.share) == (Status.OK, "a", 3, 0.5)
     assert it(borderline(object=1)).fused == 4
-
-
-def test_early_logits(tmp_path):
-    """One row a step."""
-    it = toy_bundle.load(tmp_path / "toy", early=Early((0.9,) * 3, 1), outputs=WITH_EARLY)
-    (rows,) = box(it).outputs(toy_bundle.window(1, 0), "early")
-    assert rows.tolist() == pytest.approx(np.outer([1, 2, 3], [0, -6, -9]), abs=1e-4)
 
 
 def test_an_enrolled_label_changes_all_logits(tmp_path):

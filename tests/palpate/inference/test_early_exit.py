@@ -18,8 +18,7 @@ from palpate.bundle.bundle import Bundle, Manifest, Thresholds
 from palpate.cli.main import main
 from palpate.client.answers import Answer
 from palpate.core.config import SweepConfig
-from palpate.core.errors import BundleError
-from palpate.core.types import Frames, Status, Sweep, SweepFormat, Verdict
+from palpate.core.types import SweepFormat, Verdict
 from palpate.inference.classifier import Classifier
 from palpate.inference.early_exit import EarlyExit
 from palpate.io.robot_link import StdoutPort
@@ -30,6 +29,7 @@ from palpate.sweeps.capture import CaptureWriter, Playback
 from palpate.sweeps.sweep_window import SweepCutter
 from tests.factories.settings import load as load_settings
 from tests.factories.simulated_box import SECOND, SETTLE_S, OnSweep, Rigged
+from tests.factories.toy_bundle import sweep_of
 
 onnx = pytest.importorskip("onnx", reason="onnx comes with the desktop's tools (make test)")
 helper = onnx.helper
@@ -303,9 +303,9 @@ def test_a_taxel_that_moves_late_is_no_fault(rigged):
 
 def test_a_tare_counts():
     """With a tare as high as the load neither the early nor the whole sweep has contact."""
-    classifier, n = Classifier(toy(), rig.VirtualClock()), np.arange(20)
+    classifier = Classifier(toy(), rig.VirtualClock())
     decider = EarlyExit(classifier)
-    sweep = Sweep(1, 0, 0, Status.OK, Frames(n, n, slid(60)[:20]), share=0.2)
+    sweep = sweep_of(slid(60)[:20], share=0.2)
     assert decider(sweep) is not None
     classifier.tare = np.full((2, 2), 200.0)
     assert decider(sweep) is None
@@ -396,12 +396,6 @@ def test_without_ok_the_sweep_goes_on(rigged):
     verdicts = all_of(rigged(simulated, (*SETS, "classifier.min_probability=0.99"), toy()))
     found = [(str(v.status), v.fused, v.share) for v in verdicts]
     assert found == [("unsure", 1, 1.0), ("ok", 2, 0.2)]
-
-
-def test_a_bundle_without_heads_says_so(rigged):
-    """At start, with the bundle and the setting."""
-    with pytest.raises(BundleError, match=r"1 .*classifier\.early"):
-        rigged(simulated_slides(slid(60)), SETS, toy(early=False))
 
 
 class Ticking(rig.VirtualClock):
@@ -553,9 +547,8 @@ def test_hum_costs_hardly_an_early_answer(default_bundle, hz):
         for label, window in slides:
             hummed = (window + counts * np.reshape(wave, (-1, 1, 1))).round().clip(0, 255)
             for step in range(1, early.steps + 1):
-                n = np.arange(150 * step)
-                frames = Frames(n, n, hummed[: len(n)].astype(np.uint8))
-                if verdict := early(Sweep(1, 0, 0, Status.OK, frames, share=step / 10)):
+                taxels = hummed[: 150 * step].astype(np.uint8)
+                if verdict := early(sweep_of(taxels, share=step / 10)):
                     given.append(verdict.label == label)
                     break
         return given

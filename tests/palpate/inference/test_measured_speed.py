@@ -14,9 +14,10 @@ from palpate.core.types import Frames, Status, Sweep, Verdict
 from palpate.inference.classifier import Classifier
 from palpate.sim import skin
 from palpate.sim.rig import VirtualClock
-from tests.factories.toy_bundle import told
+from tests.factories.toy_bundle import sweep_of, told
 
 FAST = "slid at 60 mm/s, trained 28 to 33"
+NO_NUMBER = "the model gives no number"
 NOTHING = np.full(6, np.nan)
 """Probabilities of a model that gives no number: the sweep is unknown."""
 
@@ -25,8 +26,7 @@ def slid(speed: float = 2.0, material: str = "plastic rough", **more: Any) -> Sw
     """A sweep at a multiple of 30 mm/s, towards row 4."""
     world = replace(skin.LEVEL_BLIND, speed=speed)
     window = skin.window(material, skin.Placement(), np.random.default_rng(5), world)
-    n = np.arange(len(window))
-    return Sweep(1, 0, 0, Status.OK, Frames(n, n, window), **more)
+    return sweep_of(window, **more)
 
 
 def trained(of: Bundle, **changes: Any) -> Bundle:
@@ -62,11 +62,11 @@ def test_a_verdict_without_a_measured_slide_has_no_such_fields(default_bundle):
     """A bundle without a pitch, a finger that rests, an early answer, a refused sweep."""
     bare = replace(default_bundle.manifest, contact=None, displacement=None)
     resting = skin.sweep("wood", skin.Placement(), np.random.default_rng(1), rest_s=2, slide_s=0.1)
-    n, half = np.arange(1500), slid(share=0.5)
+    half = slid(share=0.5)
     cut = Frames(*(getattr(half.frames, name)[:750] for name in ("t_ns", "seq", "taxels")))
     found = [
         box(replace(default_bundle, manifest=bare))(slid()),
-        box(default_bundle)(Sweep(1, 0, 0, Status.OK, Frames(n, n, resting[:1500]))),
+        box(default_bundle)(sweep_of(resting[:1500])),
         concluded(box(default_bundle), replace(half, frames=cut), np.eye(6)[0]),
         box(default_bundle)(replace(slid(), status=Status.GAP)),
     ]
@@ -86,13 +86,13 @@ def test_a_uncertain_answer_reports_a_speed_outside_of_training(default_bundle):
     assert [(v.status, v.detail) for v in found] == [
         (Status.UNSURE, FAST),
         (Status.UNDECIDED, FAST),
-        (Status.UNKNOWN, f"{FAST}; the model gives no number"),
+        (Status.UNKNOWN, f"{FAST}; {NO_NUMBER}"),
     ]
     place = default_bundle.manifest.contact
     assert place
     far = replace(place, rows_mm=(0.0,), cols_mm=(0.0,))
     v = concluded(box(trained(default_bundle, contact=far)), slid(), NOTHING)
-    assert v.detail == f"{v.displacement}; {FAST}; the model gives no number"
+    assert v.detail == f"{v.displacement}; {FAST}; {NO_NUMBER}"
     assert v.displacement.startswith("moved")
 
 

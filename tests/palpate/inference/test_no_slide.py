@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,15 +12,17 @@ import pytest
 
 from palpate.answer.disturbance import Allowance, Disturbances
 from palpate.answer.early import Early
+from palpate.answer.slide import NO_PATTERN
 from palpate.answer.vibration import SlideLimits
 from palpate.bundle import bundle
 from palpate.bundle.bundle import Bundle
-from palpate.core.types import Frames, Status, Sweep
+from palpate.core.types import Status, Sweep
 from palpate.inference.classifier import Classifier
 from palpate.inference.early_exit import EarlyExit
 from palpate.sim import skin
 from palpate.sim.rig import VirtualClock
 from tests.factories import toy_bundle
+from tests.factories.toy_bundle import sweep_of
 
 LEAST = math.log(1 / 200)
 """Half of the vibration of "a", whose counts swing by 1 around 100."""
@@ -47,7 +50,7 @@ def test_a_rest_is_answered_no_slide(toy):
     box = Classifier(toy, VirtualClock(), max_sweeps=3)
     verdict = box(replace(resting(0, 0, 10, 14), object=1))
     assert (verdict.status, verdict.label) == (Status.NO_SLIDE, "")
-    assert verdict.detail == "hardly any vibration in part 6 7 of 10, less than a gives"
+    assert re.search(r" 6 7 of 10, .* a ", verdict.detail)
     after = box(replace(toy_bundle.sweep(0, 0), object=1))
     assert (after.status, after.fused) == (Status.OK, 1)
 
@@ -96,12 +99,6 @@ def packaged() -> Bundle:
     return made
 
 
-def swept(taxels: np.ndarray) -> Sweep:
-    """A valid sweep with this window."""
-    n = np.arange(len(taxels))
-    return Sweep(1, 0, 0, Status.OK, Frames(n, n, taxels))
-
-
 def mixed(number: int) -> tuple[Sweep, Sweep]:
     """A slide over foam, and a window whose taxels come from slides of their own: the spectra and
     loads of foam without a pattern that passes."""
@@ -109,7 +106,7 @@ def mixed(number: int) -> tuple[Sweep, Sweep]:
     places = skin.placements("T-REAL", number)
     slides = [skin.window("foam", places[0], rng, skin.LEVEL_BLIND) for _ in range(16)]
     own = np.stack([slides[i].reshape(-1, 16)[:, i] for i in range(16)], axis=1)
-    return swept(slides[0]), swept(own.reshape(slides[0].shape))
+    return sweep_of(slides[0]), sweep_of(own.reshape(slides[0].shape))
 
 
 def any_material(made: Bundle, pattern: float | None) -> Classifier:
@@ -134,4 +131,4 @@ def test_a_whole_window_without_a_pattern_is_no_slide(packaged):
         assert unlimited(own).label
         verdict = box(own)
         assert (verdict.status, verdict.label) == (Status.NO_SLIDE, "")
-        assert verdict.detail.startswith("no pattern passes from taxel to taxel")
+        assert verdict.detail.startswith(NO_PATTERN)

@@ -18,7 +18,6 @@ from palpate.inference import session
 from palpate.inference.classifier import Classifier
 from palpate.inference.early_exit import EarlyExit
 from palpate.inference.session import ModelRunner
-from palpate.learn.enrolment import enrol
 from palpate.sim.rig import VirtualClock
 from tests.factories import toy_bundle
 
@@ -88,16 +87,6 @@ def test_answers_are_the_same_with_early_heads_and_without(default_bundle):
         for it in (plain, early):
             assert it.logits(window).tobytes() == want["logits"].tobytes()
             assert it.outputs(window, "embedding")[0].tobytes() == want["embedding"].tobytes()
-
-
-def test_an_enrolled_bundle_runs_without_the_early_heads(default_bundle, opened):
-    """The bundle keeps the delivered model. Its heads, which do not have the label, are not
-    computed."""
-    new = enrol(default_bundle, "cork", default_bundle.golden[:1]).bundle
-    assert new.model == default_bundle.model
-    del opened[:]
-    Classifier(new, VirtualClock()).self_test()
-    assert opened == [["logits", "embedding"]]
 
 
 def test_an_output_that_the_model_does_not_give(tmp_path):

@@ -18,8 +18,8 @@ from palpate.core.errors import ApplianceError, ConfigError, PortError
 from palpate.core.sentences import MAX_LINE, sentence
 from palpate.core.types import Edge, EdgeKind, Status, Verdict
 from palpate.io.lineless_triggers import AnswerWatch, CommandTrigger, KeyTrigger, TimedTrigger
-from palpate.sim import devices, rig, script, skin
-from tests.factories.simulated_box import SECOND, idle_devices
+from palpate.sim import devices, rig, skin
+from tests.factories.simulated_box import SECOND, idle_devices, tubes
 
 START, STOP = EdgeKind.START, EdgeKind.STOP
 
@@ -144,12 +144,8 @@ def test_the_space_bar_starts_and_stops(terminal):
         os.write(far, b"  ")
         assert kinds(trigger.edges(9)) == [STOP, START]
         assert trigger.edges(10) == []
-    assert said == [
-        "the space bar starts a sweep and stops it; Ctrl-C ends",
-        "start: the space bar stops the sweep",
-        "stop",
-        "start: the space bar stops the sweep",
-    ]
+    assert [line.split(":")[0] for line in said[1:]] == ["start", "stop", "start"]
+    assert "Ctrl-C" in said[0]
 
 
 def test_after_an_answer_the_space_bar_starts(terminal):
@@ -289,7 +285,7 @@ def test_a_box_that_could_not_sweep_does_not_start(rigged, sets, hint, monkeypat
 @pytest.mark.parametrize("name", ["START", "STOP"])
 def test_commands_of_another_trigger_are_refused(rigged, name):
     """With lines, START and STOP are answered by an error that names the setting."""
-    box = rigged(devices.build(skin.FORMAT, script.tubes(1, 1), rig.VirtualClock(), "sim"))
+    box = rigged(tubes(1, 1))
     box.seconds(0.5)
     answer = box.ask(f"$PPLP,{name}")
     assert f",{name},error," in answer

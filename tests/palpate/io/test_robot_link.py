@@ -41,12 +41,6 @@ def verdict(label: str = "plastic rough", status: Status = Status.OK, detail: st
     return Verdict(7, 5_021_384_000_000, *told)
 
 
-def test_a_late_answer_says_how_late():
-    """The latency is in milliseconds, to a hundredth."""
-    line = result(replace(verdict(), latency_ns=123_456_789_000), "usb")
-    assert b",123456.79," in line
-
-
 def test_result_is_the_documents_example():
     """The code writes the RES sentence of PROTOCOL.md."""
     line = result(verdict(), "usb").decode().strip()
@@ -187,17 +181,6 @@ def test_a_port_that_is_not_there_and_comes(tmp_path):
         assert sink.trouble == ""
         assert os.read(far, 4096) == result(verdict(), "sim")
         sink.close()
-
-
-def test_a_port_that_another_program_holds():
-    """A second program on the port: the error is in `trouble`, not raised."""
-    with pseudo_terminal.pair() as (_, name):
-        first, second = sink_on(name), sink_on(name)
-        first.commands()
-        second.commands()
-        # root may open a port that is held exclusively (TIOCEXCL), so flock has to detect it
-        assert "program" in second.trouble
-        first.close()
 
 
 def is_shut(port: int) -> bool:

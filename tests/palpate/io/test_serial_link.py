@@ -222,7 +222,7 @@ def test_a_port_that_cannot_be_opened(code, kind, hint):
 @pytest.mark.parametrize("path", ["/dev/null", "/etc/passwd", "/tmp"])
 def test_a_file_that_is_not_a_serial_port(path):
     """The message says so and names the option, with the real pyserial."""
-    with pytest.raises(SensorLost, match=f"{path} is not a serial port; correct --port"):
+    with pytest.raises(SensorLost, match=f"{path} is not .*--port"):
         SerialLink(path, 115200, CLOCK)
 
 

@@ -286,7 +286,8 @@ def test_papillarray_of_two_sensors():
     found = decoded(replace(profile("papillarray"), rows=6), data)
     assert found.taxels[0].tolist() == grid[..., :3].tolist()
     wrong = decoded(profile("papillarray"), data)
-    assert (len(wrong), wrong.wrong) == (0, "it sends 18 pillars, its profile says 3x3")
+    assert len(wrong) == 0
+    assert "18 pillars" in wrong.wrong
 
 
 def test_xela_byte_by_byte():
@@ -303,7 +304,7 @@ def test_xela_byte_by_byte():
     assert (len(found), found.skipped.tolist()) == (1, [len(lines[0])])
     assert len(decoded(p, lines[1] + lines[0])) == 0
     more = b"".join(b"t71%d80000010002000300\r" % k for k in range(6))
-    assert decoded(p, more).wrong == "it sends taxels beyond 1x2"
+    assert "beyond 1x2" in decoded(p, more).wrong
     assert not decoded(p, more[: -len(more) // 6]).wrong  # may be another node
 
 

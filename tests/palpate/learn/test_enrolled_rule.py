@@ -12,7 +12,7 @@ import pytest
 from palpate.answer.objects import EnrolledLabels, softmax
 from palpate.answer.unknown import ClassDistances
 from palpate.bundle.bundle import Bundle
-from palpate.core.types import Frames, Status, Sweep
+from palpate.core.types import Status
 from palpate.inference.classifier import Classifier
 from palpate.learn import enrolment, materials
 from palpate.sim.rig import VirtualClock
@@ -169,8 +169,7 @@ def test_left_out_sweeps_are_answered_as_the_box_would(new, tmp_path):
     for i, one in enumerate(sweeps):
         without = enrolment.enrol(old, "felt", np.delete(sweeps, i, axis=0)).bundle
         box = Classifier(without, VirtualClock())
-        n = np.arange(len(one))
-        verdict = box(Sweep(1, 0, 0, Status.OK, Frames(n, n, one)))
+        verdict = box(toy_bundle.sweep_of(one))
         assert answers[i] == verdict.label
         assert found.chances[i] == pytest.approx(verdict.own, abs=1e-6)
     assert answers == ["felt"] * 4 + ["b"]

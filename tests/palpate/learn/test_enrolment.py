@@ -91,12 +91,6 @@ def test_the_new_bundle_runs(old, tmp_path):
     assert it(toy_bundle.sweep(-30, 0)).status is Status.UNKNOWN
 
 
-def test_same_sweeps_same_bytes(old):
-    """The files depend on neither clock nor random numbers."""
-    one, other = (enrolment.enrol(old, "felt", counts(*FELT)).file for _ in range(2))
-    assert one == other
-
-
 def test_a_material_that_scatters_is_kept(old):
     """Its spread is computed from its sweeps and one assumed sweep at the trained distance: (2 + 4
     * 9) / (2 * 4)."""

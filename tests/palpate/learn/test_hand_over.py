@@ -107,4 +107,4 @@ def test_a_box_without_the_libraries_has_no_page(monkeypatch):
         patched.setattr(process, "find_spec", lambda name: None)
         assert "palpate_train" in teach_command.page_address(settings)
     monkeypatch.setattr(teach_command, "find_spec", lambda name: None)
-    assert teach_command.page_address(settings) == "no page (pages need palpate[page])"
+    assert "palpate[page]" in teach_command.page_address(settings)

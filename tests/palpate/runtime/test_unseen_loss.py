@@ -5,14 +5,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import numpy as np
 import pytest
 
 from palpate.core.observer import Observer
-from palpate.core.sentences import MAX_LINE
-from palpate.core.types import Frames, Status, Verdict
+from palpate.core.types import Frames
 from palpate.io import skins
-from palpate.io.robot_link import result
 from palpate.io.skin_profile import from_json
 from palpate.service import status
 from palpate.sim import devices, skin
@@ -82,15 +79,6 @@ def test_a_board_that_counts_says_nothing_of_it(rigged):
     box = rigged(idle_devices())
     assert len(swept(box).split(",")) == 15
     assert box.box.health.loss_known
-
-
-def test_the_detail_gives_way():
-    """In a sentence that is too long the detail is cut, not the field."""
-    own = (99999, 10**15, Status.UNDECIDED, "x" * 24, 0.5, 0.1, np.empty(0), 1, 0, 10**9)
-    line = result(Verdict(*own, "9f3c2a1b", "moved far " * 10), "replay", loss_known=False)
-    assert len(line) <= MAX_LINE
-    assert line.rpartition(b"*")[0].endswith(b",1")
-    assert b"moved far" in line
 
 
 @pytest.mark.parametrize("pause_s", [0.0, 0.4])

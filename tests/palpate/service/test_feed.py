@@ -32,9 +32,9 @@ from palpate.service.feed import (
     FeedServer,
 )
 from palpate.service.feed_reader import HEARD_BYTES, QUEUE_BYTES, FeedRequest, requests
-from palpate.sim import devices, rig, script, skin
+from palpate.sim import skin
 from tests.factories.feeds import HEALTH, OK, FeedPeer, Offered, cut, frames
-from tests.factories.simulated_box import SECOND
+from tests.factories.simulated_box import SECOND, tubes
 
 Offering = Callable[..., Offered]
 Lines = list[dict[str, Any]]
@@ -554,7 +554,7 @@ def test_without_readers_nothing_is_written_as_text(offered, monkeypatch):
 def test_a_running_box_offers_its_verdicts_frames_and_sweeps(rigged, tmp_path):
     """On simulated devices: the verdicts that the robot gets, frames, and the windows that the box
     has cut."""
-    simulated = devices.build(skin.FORMAT, script.tubes(1), rig.VirtualClock(), "sim")
+    simulated = tubes(1)
     path = tmp_path / "feed.sock"
     feed = FeedServer(path, skin.FORMAT, {"source": "sim"}, simulated.clock, spent_ns=lambda: 0)
     box = rigged(simulated, observers=[feed])

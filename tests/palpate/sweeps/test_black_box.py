@@ -14,11 +14,11 @@ import pytest
 
 from palpate.core.sweep_file import sidecar
 from palpate.core.types import Frames, Status, Sweep, Verdict
-from palpate.sim import devices, rig, script, skin
+from palpate.sim import skin
 from palpate.sweeps import sweep_folder
 from palpate.sweeps.black_box import BlackBox
 from tests.factories import toy_bundle
-from tests.factories.simulated_box import OnSweep, Rigged
+from tests.factories.simulated_box import OnSweep, Rigged, tubes
 
 
 def box(folder: Path, most: int = 3) -> BlackBox:
@@ -143,7 +143,7 @@ def test_a_folder_that_cannot_be_used_yet(tmp_path, logged):
 
 def test_on_the_whole_box_answers_go_out_first(rigged, tmp_path):
     """The sentence is sent before any access to the disk, and the sweep is stored."""
-    simulated = devices.build(skin.FORMAT, script.tubes(1, 2), rig.VirtualClock(), "sim")
+    simulated = tubes(1, 2)
     made: Rigged
     black = BlackBox(tmp_path, skin.FORMAT, 1)
     heard_before: list[int] = []

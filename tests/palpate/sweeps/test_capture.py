@@ -24,7 +24,7 @@ from palpate.sweeps.capture import MOST_KEPT, CaptureWriter, Playback, RecordKin
 from palpate.sweeps.sweep_window import SweepCutter
 from tests.factories import toy_bundle
 from tests.factories.settings import load as load_settings
-from tests.factories.simulated_box import SECOND, OnSweep
+from tests.factories.simulated_box import SECOND, OnSweep, tubes
 from tests.factories.skin_wires import WiredSkin, profile
 
 
@@ -40,11 +40,6 @@ def played(path: Path, model: Bundle) -> tuple[list[Verdict], list[Sweep]]:
     while not play.finished:
         verdicts += box.step()
     return verdicts, sweeps
-
-
-def simulated_tubes(seed: int, n: int, **more: str) -> devices.SimDevices:
-    """Simulated devices that sweep over `n` tubes."""
-    return devices.build(skin.FORMAT, script.tubes(seed, n, **more), rig.VirtualClock(), "sim")
 
 
 def all_values(v: Verdict) -> tuple[object, ...]:
@@ -119,7 +114,7 @@ def test_a_capture_gives_the_same_verdicts_bit_for_bit(rigged, default_bundle, p
 def test_commands_are_part_of_a_capture(rigged, default_bundle, path):
     """NEW and ABORT affect later sweeps, so they are captured: replayed sweeps are fused and end as
     before."""
-    simulated = simulated_tubes(1014, 5, only="wood")
+    simulated = tubes(1014, 5, only="wood")
     capture = CaptureWriter(path, skin.FORMAT)
     box = rigged(simulated, capture=capture)
     first = box.until(lambda: box.box.answered == 1)
@@ -137,7 +132,7 @@ def test_commands_are_part_of_a_capture(rigged, default_bundle, path):
 def test_a_capture_of_a_skin_that_sent_another_format(rigged, default_bundle, path):
     """After packets of another grid in the stream the sweep is `sensor-lost`, live and in the
     replay. After a power cut within a record, all earlier records are played."""
-    simulated = simulated_tubes(1015, 2)
+    simulated = tubes(1015, 2)
     count = itertools.count()
     other = packets.pack(0, 0, np.zeros((1, 2, 2), np.uint8))
     simulated.backend.mangle = lambda data: other if next(count) == 200 else data

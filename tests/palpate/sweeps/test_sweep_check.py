@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 from palpate.core.errors import ApplianceError
-from palpate.core.types import EPOCH_BITS, Frames, Status, Sweep, SweepFormat
-from palpate.sim import devices, rig, script, skin
+from palpate.core.types import Status, SweepFormat
+from palpate.sim import devices, rig, skin
 from palpate.sweeps.sweep_check import SweepCheck
-from tests.factories.simulated_box import Rigged
+from tests.factories.simulated_box import Rigged, tubes
+from tests.factories.simulated_box import played as played_acts
+from tests.factories.toy_bundle import frames_of, sweep_of
 
 RATE = round(skin.FORMAT.rate_hz)
 Make = Callable[..., Rigged]
@@ -41,26 +43,18 @@ def lifted(seconds: float = 1) -> np.ndarray:
 
 def recording(rigged: Make, *acts: rig.Act) -> Rigged:
     """A box that records and plays these sweeps."""
-    simulated = devices.build(skin.FORMAT, acts, rig.VirtualClock(), "sim")
-    return rigged(simulated, commands={})
+    return rigged(played_acts(acts), commands={})
 
 
 def stream(check: SweepCheck, *parts: np.ndarray, epoch: int = 0) -> None:
     """The stream of the skin has these frames."""
     for part in parts:
-        n = np.arange(len(part))
-        check.frames(Frames(n, n + (epoch << EPOCH_BITS), part))
-
-
-def sweep(taxels: np.ndarray) -> Sweep:
-    """A valid sweep with this window."""
-    n = np.arange(len(taxels))
-    return Sweep(1, 0, 0, Status.OK, Frames(n, n, taxels))
+        check.frames(frames_of(part, epoch))
 
 
 def test_good_sweeps_are_recorded(rigged):
     """The answer has no label, bundle or class code, and the robot gets RESULT VALID."""
-    simulated = devices.build(skin.FORMAT, script.tubes(1, 6), rig.VirtualClock(), "sim")
+    simulated = tubes(1, 6)
     box = rigged(simulated, commands={})
     verdicts = box.until(lambda: simulated.finished(box.box.answered))
     assert [v.status for v in verdicts] == [Status.RECORDED] * 6
@@ -128,7 +122,7 @@ def test_another_skin_is_judged_by_itself():
     assert check.about()["unloaded"] is not None
     stream(check, slide(), epoch=1)
     assert check.about()["unloaded"] is None
-    assert "checked" in check(sweep(slide()[:1500])).detail
+    assert "checked" in check(sweep_of(slide()[:1500])).detail
 
 
 def test_an_impossible_reading_is_no_good_sweep():
@@ -136,9 +130,9 @@ def test_an_impossible_reading_is_no_good_sweep():
     format = SweepFormat(4, 4, 100.0, 50, "float32")
     taxels = np.random.default_rng(0).normal(100, 3, (50, 4, 4)).astype(np.float32)
     check = SweepCheck(format, rig.VirtualClock())
-    assert check(sweep(taxels)).status is Status.RECORDED
+    assert check(sweep_of(taxels)).status is Status.RECORDED
     taxels[30, 2, 1] = 1e20
-    verdict = check(sweep(taxels))
+    verdict = check(sweep_of(taxels))
     assert (verdict.status, verdict.detail) == (Status.DEAD_TAXEL, "taxel 3.2")
 
 
@@ -149,10 +143,10 @@ def test_a_skin_on_which_no_taxel_changes_is_no_good_sweep(level: int):
     check = SweepCheck(skin.FORMAT, rig.VirtualClock())
     taxels = np.full((1500, 4, 4), level, np.uint8)
     stream(check, taxels)
-    verdict = check(sweep(taxels))
+    verdict = check(sweep_of(taxels))
     assert (verdict.status, "cable" in verdict.detail) == (Status.STUCK_TAXEL, True)
     taxels[700, 2, 1] ^= 1
-    assert check(sweep(taxels)).status is Status.RECORDED
+    assert check(sweep_of(taxels)).status is Status.RECORDED
 
 
 def test_while_the_box_is_taught_a_sweep_must_be_a_slide():
@@ -166,7 +160,7 @@ def test_while_the_box_is_taught_a_sweep_must_be_a_slide():
     def answers(given: Callable[[np.ndarray], str] | None) -> list[tuple[Status, str]]:
         check = SweepCheck(skin.FORMAT, rig.VirtualClock(), given)
         stream(check, off, on)
-        verdicts = [check(sweep(taxels)) for taxels in (one, resting, sliding, broken)]
+        verdicts = [check(sweep_of(taxels)) for taxels in (one, resting, sliding, broken)]
         return [(v.status, v.detail) for v in verdicts]
 
     dead = (Status.DEAD_TAXEL, "taxel 2.2")

@@ -40,8 +40,8 @@ def test_only_ok_with_the_right_label_counts():
     table = "".join(score.table()[1:])
     assert re.findall(r"\d+ / \d+", table) == ["0 / 1", "2 / 3", "2 / 4"]
     assert "[15.0, 85.0]" in table
-    assert score.touch(750.0) == "2.00 s mean, 1 of 4 answered early"
-    assert score.latency() == "1.50 ms median, 1.50 ms worst"
+    assert re.match(r"2\.00 s .*1 of 4", score.touch(750.0))
+    assert score.latency().count("1.50 ms") == 2
 
 
 def test_an_object_counts_by_its_last_answer():
@@ -50,7 +50,7 @@ def test_an_object_counts_by_its_last_answer():
     for new, label in ((True, "paper"), (False, "wood"), (True, "paper")):
         score.add(act("wood", new_object=new), answer(1, label))
     assert score.objects == [True, False]
-    assert score.table()[-1].startswith("  all objects         1 / 2     50.0 % [")
+    assert score.table()[-1].split()[:6] == ["all", "objects", "1", "/", "2", "50.0"]
 
 
 def test_a_material_that_the_bundle_does_not_know_is_unknown_at_best():

