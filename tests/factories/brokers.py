@@ -9,6 +9,7 @@ import socket
 import subprocess
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Self
 
@@ -70,6 +71,35 @@ class Mosquitto:
     def _listens(self) -> bool:
         with socket.socket() as probe:
             return probe.connect_ex(("127.0.0.1", self.port)) == 0
+
+
+class Flood:
+    """Publishes these texts with QoS 0 as fast as mosquitto_pub can. sent: texts so far."""
+
+    def __init__(self, port: int, topic: str, texts: list[str]) -> None:
+        self.sent, self._ending = 0, threading.Event()
+        self._block = "".join(f"{text}\n" for text in texts * 50)
+        self._count = 50 * len(texts)
+        words = ["mosquitto_pub", "-h", "127.0.0.1", "-p", str(port), "-t", topic, "-l"]
+        self._process = subprocess.Popen(words, stdin=subprocess.PIPE, text=True)
+        self._thread = threading.Thread(target=self._send, daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *reason: object) -> None:
+        self._ending.set()
+        self._process.kill()
+        self._process.wait(LONG_S)
+        self._thread.join(LONG_S)
+
+    def _send(self) -> None:
+        assert self._process.stdin
+        with suppress(OSError):  # it has ended
+            while not self._ending.is_set():
+                self._process.stdin.write(self._block)
+                self.sent += self._count
 
 
 class Subscriber:

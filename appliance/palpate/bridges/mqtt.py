@@ -8,13 +8,14 @@ news of the box comes in another and wakes it.
 from __future__ import annotations
 
 import json
+import math
 import select
 import socket
 import ssl
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import islice
 from typing import Any
 
@@ -24,9 +25,9 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
 
-from palpate import __version__
+from palpate.bridges.mqtt_content import discovery, state, verdict
 from palpate.bridges.mqtt_options import Broker
-from palpate.bridges.source import COMMANDS, BoxView, Source
+from palpate.bridges.source import COMMANDS, Source
 from palpate.client.answers import Answer
 from palpate.client.box import Heard
 from palpate.core import wall_clock
@@ -49,73 +50,16 @@ TICK_S = 0.5
 """Longest time between two looks at the state of the box and at the end of the program."""
 MOST_BYTES = 1024
 """Largest packet that the broker may send: commands are short."""
-PACE_NS = 5_000_000
-"""Pause after each command, so that a flood leaves the other programs of the computer their
-share."""
+MOST_COMMANDS, PAUSE_NS = 50, 2_000_000_000
+"""Commands in a second. After more the bridge asks the broker for no commands for this time: it
+would read them in place of the acknowledgements that verdicts wait for."""
+BUFFER = 16 * 1024
+"""Bytes that wait to be read; behind more of them, acknowledgements would come seconds late."""
+AT_ONCE = 64
+"""Packets that are read before verdicts are looked at again."""
 WITH_WILL = ReasonCode(PacketTypes.DISCONNECT, "Disconnect with will message")
 BROKEN = (OSError, ValueError, TypeError, LookupError, AttributeError)
 """What paho raises for packets that are none, and for a connection that is not to be had."""
-PERCENT = {"unit_of_measurement": "%", "state_class": "measurement"}
-QUIET = ("finger", "fingers", "time_s", "source", "missed", "share")
-"""Fields of an answer that a verdict leaves out, or has in another form."""
-
-
-ENTITIES: tuple[tuple[str, str, str, Mapping[str, str]], ...] = (
-    ("verdict", "verdict", "value_json.material or value_json.status", {}),
-    ("probability", "verdict", "(100 * value_json.probability) | round(1)", PERCENT),
-    ("status", "verdict", "value_json.status", {}),
-    ("reason", "verdict", "(value_json.reason | string)[:255]", {}),
-    ("ready", "state", "'ON' if value_json.ready else 'OFF'", {"platform": "binary_sensor"}),
-    ("skin", "state", "value_json.skin", {}),
-    ("bundle", "state", "value_json.bundle", {}),
-    ("sweeps", "state", "value_json.answered", {"state_class": "total_increasing"}),
-)
-"""What Home Assistant shows: its name, the topic, the expression for its value (a state has at most
-255 characters), and other fields."""
-
-
-def discovery(name: str, *, writes: bool) -> dict[str, Any]:
-    """Home Assistant's discovery of the whole device in one message. name: of the box. writes: with
-    a button for each command."""
-    base, box = f"palpate/{name}", f"palpate_{name}"
-    parts: dict[str, dict[str, Any]] = {}
-    for key, topic, value, more in ENTITIES:
-        parts[key] = {"platform": "sensor", "unique_id": f"{box}_{key}", "name": key.capitalize()}
-        parts[key] |= {"state_topic": f"{base}/{topic}", "value_template": f"{{{{ {value} }}}}"}
-        parts[key] |= more
-    parts["verdict"]["json_attributes_topic"] = f"{base}/verdict"
-    for command in COMMANDS if writes else ():
-        button = {"platform": "button", "unique_id": f"{box}_{command.lower()}"}
-        button |= {"name": command.capitalize(), "command_topic": f"{base}/command"}
-        parts[command.lower()] = button | {"payload_press": command}
-    about = {"name": f"Palpate {name}", "manufacturer": "Palpate", "sw_version": __version__}
-    return {
-        "device": {"identifiers": [box], **about},
-        "origin": {"name": "palpate", "sw_version": __version__},
-        "availability_topic": f"{base}/status",
-        "qos": 1,
-        "components": parts,
-    }
-
-
-def state(view: BoxView, dropped: int) -> dict[str, Any]:
-    """The content of the topic state. dropped: verdicts that the broker will not get."""
-    fields: dict[str, Any] = {"ready": False, "skin": "", "bundle": view.bundle, "answered": 0}
-    if one := view.state:
-        fields |= {"ready": one.ready, "skin": one.skin, "sweeping": one.sweeping}
-        fields |= {"bundle": one.bundle, "answered": one.answered, "degraded": one.degraded}
-        fields |= {"lost_frames": one.lost_frames, "source": one.source}
-    return fields | {"missed": view.missed, "dropped": dropped}
-
-
-def verdict(answer: Answer) -> dict[str, Any]:
-    """The content of the topic verdict, without `late`. `material` is the label if it can be
-    used, else ""."""
-    fields = {name: value for name, value in asdict(answer).items() if name not in QUIET}
-    fields |= {"material": answer.label if answer.known else "", "early": answer.early}
-    fields |= {"reason": "" if answer.known else answer.what_to_do}
-    fingers = {one.finger: {"status": one.status, "label": one.label} for one in answer.fingers}
-    return fields | ({"fingers": fingers} if fingers else {})
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,6 +100,8 @@ class MqttBridge:
         self._there = False
         self._replies: deque[str] = deque(maxlen=FLYING)
         self._commanding = threading.Lock()
+        self._second_ns = self._commands = 0  # begin of a second, and the commands in it
+        self._deaf_ns: float = 0  # until then commands are left out; 0: they are heard
         self._woken, self._wakes = socket.socketpair()
         for end in (self._woken, self._wakes):
             end.setblocking(False)
@@ -193,7 +139,7 @@ class MqttBridge:
                 return
             raise
         log.info(f"mqtt: connected to {self._broker}")
-        self._next, self._said = 0, {}
+        self._next, self._said, self._deaf_ns = 0, {}, 0
         self._flying.clear()
         try:
             self._greet(client)
@@ -224,6 +170,8 @@ class MqttBridge:
                 clean_start=True,
                 properties=properties,
             )
+            line: Any = client.socket()
+            line.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER)
             while not self._there and not self._refused and self._clock.now_ns() < end_ns:
                 self._turn(client)
                 if client.socket() is None:
@@ -255,6 +203,7 @@ class MqttBridge:
         client.on_disconnect = self._disconnected
         client.on_publish = self._acknowledged
         client.on_message = self._command
+        client.on_unsubscribe = self._deaf
         return client
 
     def _connected(self, client: Any, data: Any, flags: Any, why: ReasonCode, more: Any) -> None:
@@ -279,6 +228,9 @@ class MqttBridge:
     def _greet(self, client: paho.Client) -> None:
         config = json.dumps(discovery(self._name, writes=self._writes))
         client.publish(f"homeassistant/device/palpate_{self._name}/config", config, 1, retain=True)
+        self._listen(client)
+
+    def _listen(self, client: paho.Client) -> None:
         if self._writes:  # each at most once: a late START would be a wrong one
             client.subscribe(f"{self._base}/command", qos=0)
 
@@ -297,6 +249,9 @@ class MqttBridge:
             sent = client.publish(f"{self._base}/verdict", text, qos=1, retain=True)
             self._flying[sent.mid], self._next = one.number, one.number + 1
         self._say(client, "state", json.dumps(state(view, self.dropped)))
+        if self._deaf_ns and now_ns >= self._deaf_ns:
+            self._deaf_ns = 0
+            self._listen(client)
         while self._replies and not client.want_write():
             client.publish(f"{self._base}/reply", self._replies.popleft(), qos=0)
 
@@ -319,8 +274,10 @@ class MqttBridge:
         if self._woken in ready[0]:
             self._woken.recv(4096)
         code = MQTTErrorCode.MQTT_ERR_SUCCESS
-        if more or line in ready[0]:
+        for _ in range(AT_ONCE if more or line in ready[0] else 0):
             code = client.loop_read()
+            if code or not select.select([line], [], [], 0)[0]:
+                break
         if not code and line in ready[1]:
             code = client.loop_write()
         if code or client.loop_misc():
@@ -328,7 +285,8 @@ class MqttBridge:
 
     def _command(self, client: Any, data: Any, message: paho.MQTTMessage) -> None:
         """Begin a command; its reply comes later."""
-        self._clock.sleep_until(self._clock.now_ns() + PACE_NS)
+        if self._deaf_ns or self._flooded(client):
+            return
         name = message.payload[:16].decode("ascii", "replace").strip()
         if message.retain or not self._writes:
             return
@@ -338,6 +296,23 @@ class MqttBridge:
             self._reply(name, "error: another command is under way; send it again")
         else:
             threading.Thread(target=self._carry_out, args=(name,), daemon=True).start()
+
+    def _flooded(self, client: paho.Client) -> bool:
+        """Count a command; after too many, ask the broker for no more."""
+        now_ns = self._clock.now_ns()
+        if now_ns - self._second_ns > 1_000_000_000:
+            self._second_ns, self._commands = now_ns, 0
+        self._commands += 1
+        if self._commands <= MOST_COMMANDS:
+            return False
+        self._deaf_ns = math.inf  # until the broker has stopped
+        client.unsubscribe(f"{self._base}/command")
+        self._reply("", f"error: over {MOST_COMMANDS} commands in a second; pause for some seconds")
+        self._log.warning("mqtt: a flood of commands; none is heard for some seconds")
+        return True
+
+    def _deaf(self, client: Any, data: Any, mid: int, why: Any, more: Any) -> None:
+        self._deaf_ns = self._clock.now_ns() + PAUSE_NS
 
     def _carry_out(self, name: str) -> None:
         try:
