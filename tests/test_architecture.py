@@ -39,6 +39,7 @@ ALLOWED = {"palpate", "numpy", "onnxruntime", "usb", "gpiod", "serial", "_sha2",
 EXTRAS = {
     "web": {"tornado"},
     "bridges/mqtt.py": {"paho"},
+    "service/network.py": {"zeroconf"},
     "bridges/opcua.py": {"asyncua"},
     "bridges/opcua_model.py": {"asyncua"},
     "bridges/opcua_security.py": {"asyncua", "cryptography"},

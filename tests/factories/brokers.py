@@ -73,7 +73,7 @@ class Mosquitto:
             return probe.connect_ex(("127.0.0.1", self.port)) == 0
 
 
-class Flood:
+class TopicFlood:
     """Publishes these texts with QoS 0 as fast as mosquitto_pub can. sent: texts so far."""
 
     def __init__(self, port: int, topic: str, texts: list[str]) -> None:

@@ -26,6 +26,7 @@ from palpate.core.log import log, to_stderr
 from palpate.core.retry import retried
 from palpate.core.sentences import MOST_FINGERS, Sentence
 from palpate.core.text import printable
+from palpate.service import network
 
 EVERY_S = 1.0
 OF_BROKER = ("broker", "login", "ca", "name")
@@ -135,18 +136,22 @@ def _port(args: argparse.Namespace) -> tuple[str, Callable[[], Any]]:
 
 def run_server(args: argparse.Namespace, made: Callable[[argparse.Namespace], Served]) -> int:
     """`palpate bridge modbus|tcp`, until SIGTERM."""
-    settle(args.kind, args, config.load(None))
+    settings = config.load(None)
+    settle(args.kind, args, settings)
     host, port = address(args.listen)
 
     async def serve() -> int:
-        stop = stop_event()
+        stop, ends = stop_event(), list[Callable[[], None]]()
         _warn(args)
         server, box, work, close = made(args)
         try:
             await server.open(host, port)
             _say(args, server, box)
+            ends.append(network.announce(args.kind, *server.address, settings.bridge.name))
             await until(stop, EVERY_S, work)
         finally:
+            for end in ends:
+                await asyncio.to_thread(end)
             if ending := close():
                 await ending
         return stop.code

@@ -31,7 +31,7 @@ class MemoryBridge:
         self._file.close()
 
     def work(self) -> None:
-        """Wait for a line of the feed for up to READ_S, and write what is there."""
+        """Wait for a line of the feed for up to READ_S, and write all verdicts that wait."""
         line = self._feed.read(READ_S)
         if line and line["type"] == "lost":
             self._log.warning(f"memory: {line.get('lines')} lines of the feed were lost")

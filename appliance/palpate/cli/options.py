@@ -128,6 +128,7 @@ OPTIONS: Mapping[str, tuple[str, dict[str, Any]]] = {
     ),
     "acts": _option("--acts", argparse.SUPPRESS, type=Path, metavar="FILE"),
     "json": _flag("--json", "print it as JSON", default=argparse.SUPPRESS),
+    "network": _flag("--network", "what is open on which box of this network (zeroconf)"),
     "since": _option(
         "--since",
         "what the verdicts of this time were, such as 8h or 30d (palpate bridge memory)",

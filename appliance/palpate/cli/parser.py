@@ -111,7 +111,7 @@ GROUPS: Mapping[str, Mapping[str, CommandEntry]] = {
         "status": CommandEntry(
             "show the state of the service, and its last verdicts",
             "cli.status_command.run",
-            "json since",
+            "json since network",
         ),
         "watch": CommandEntry(
             "show the running box live: a line a verdict, or a page",

@@ -20,6 +20,8 @@ def run(args: argparse.Namespace) -> int:
     """Print the state of the service; 69 if it waits for the skin, 1 if it does not run."""
     from palpate.core import settings_files
 
+    if args.network:
+        return show_network(as_json=args.json)
     if args.since is not None:
         return show_since(args)
     folder = settings_files.runtime(
@@ -52,6 +54,22 @@ def show_since(args: argparse.Namespace) -> int:
     print(f"{sum(found.values())} sweeps since {wall_clock.of(from_s)}")
     for (word, label), n in found.items():
         print(f"{n:8}  {word:<12}  {label}".rstrip())
+    return 0
+
+
+def show_network(*, as_json: bool) -> int:
+    """Print the open ports of the boxes of this network. Raises ConfigError without zeroconf."""
+    import json
+    from dataclasses import asdict
+
+    from palpate.core.clock import SystemClock
+    from palpate.service import network
+
+    there = network.found(SystemClock())
+    if as_json:
+        print(json.dumps([asdict(each) for each in there], indent=1))
+    for each in there if not as_json else ():
+        print(f"{each.box:<24}  {each.kind:<8}  {each.host}:{each.port}")
     return 0
 
 

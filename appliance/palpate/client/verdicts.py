@@ -77,7 +77,7 @@ class VerdictFile:
             self.trim(at_s)
 
     def trim(self, now_s: float) -> None:
-        """Delete what is too old or too much."""
+        """Delete old verdicts, and the oldest of a file that is too large."""
         with self.db:
             self.db.execute("DELETE FROM verdicts WHERE at < ?", [now_s - DAYS * DAY_S])
             if self._size() > self._most:

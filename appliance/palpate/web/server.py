@@ -27,6 +27,7 @@ from weakref import WeakSet
 from palpate.core.errors import AddressError, ApplianceError, ConfigError, FormatError, NoAnswer
 from palpate.core.log import TroubleLog
 from palpate.core.status import WORDS
+from palpate.service.network import announce
 from palpate.web import local_users
 from palpate.web.access import ROLES, Access
 
@@ -183,9 +184,11 @@ class PageServer:
             target=self._loop.run_until_complete, args=(self._serve(),), daemon=True
         )
         self._thread.start()
+        self._unannounce = announce("page", *self._sockets[0].getsockname()[:2])
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._unannounce()
         self._loop.call_soon_threadsafe(self._stop.set)
         self._thread.join()
         self._loop.close()

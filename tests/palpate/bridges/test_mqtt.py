@@ -17,7 +17,7 @@ from palpate.bridges.source import COMMANDS
 from palpate.core import retry
 from palpate.core.errors import ConfigError
 from tests.factories.bridges import LONG_S, bridge, eventually
-from tests.factories.brokers import Flood, Mosquitto, Subscriber, free_port, required
+from tests.factories.brokers import Mosquitto, Subscriber, TopicFlood, free_port, required
 from tests.factories.speaking_box import SpeakingBox, result, state
 
 mqtt = pytest.importorskip("palpate.bridges.mqtt", reason="palpate[mqtt] is not installed")
@@ -147,7 +147,7 @@ def test_a_flood_of_commands(server, box, monkeypatch):
     monkeypatch.setattr(mqtt, "PAUSE_NS", 200_000_000)
     with Subscriber(server.port) as one, bridge("mqtt", *options(server, box, "--allow-writes")):
         online(box, one)
-        flooding = Flood(server.port, "palpate/b1/command", ["TARE", "x" * 900])
+        flooding = TopicFlood(server.port, "palpate/b1/command", ["TARE", "x" * 900])
         with flooding:
             for number in range(1, 21):
                 box.say(state(), result(number))

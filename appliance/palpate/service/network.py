@@ -1,0 +1,123 @@
+"""Boxes find each other on the network (mDNS, DNS-SD): each open port is announced, and
+`palpate status --network` lists all of it.
+
+The address of the network interface makes names unique: two boxes of one name, or cloned from one
+card, would else answer for each other. A port of this machine alone is not announced.
+"""
+
+from __future__ import annotations
+
+import re
+import socket
+import threading
+import uuid
+from collections.abc import Callable
+from dataclasses import dataclass
+from hashlib import sha256
+from ipaddress import ip_address
+from typing import Any
+
+from palpate import __version__
+from palpate.core.clock import Clock
+from palpate.core.errors import ConfigError
+from palpate.core.log import log
+
+TYPE = "_palpate._tcp.local."
+LISTEN_S = 2.0
+"""How long `found` waits for answers."""
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Reachable:
+    """An open port of a box: its kind (`page`, `tcp`, `modbus`, `opcua`) and address."""
+
+    box: str
+    kind: str
+    host: str
+    port: int
+
+
+def box_id() -> str:
+    """A short name of this computer, which no other has: from the address of its interface."""
+    return sha256(uuid.getnode().to_bytes(6, "big")).hexdigest()[:6]
+
+
+def local(host: str) -> bool:
+    """Whether an address is reached from this machine alone."""
+    return ip_address(host).is_loopback
+
+
+def announce(kind: str, host: str, port: int, name: str = "") -> Callable[[], None]:
+    """Announce a port that is open, in a thread of its own; returns a function that ends it.
+
+    name: of the box, "" for the computer's. Nothing is announced of an address of this machine
+    alone, or without zeroconf.
+    """
+    if local(host):
+        return lambda: None
+    try:
+        import zeroconf
+    except ImportError:
+        log.info(f"{kind}: not announced; pip install 'palpate[found]'")
+        return lambda: None
+    own = box_id()
+    box = re.sub(r"[^A-Za-z0-9-]", "-", name or socket.gethostname())[:32]
+    ended, opened = threading.Event(), []
+
+    def work() -> None:
+        try:
+            every = ip_address(host).is_unspecified
+            one = zeroconf.Zeroconf(zeroconf.InterfaceChoice.All if every else [host])
+            opened.append(one)
+            hosts = zeroconf.get_all_addresses() if every else [host]
+            one.register_service(_info(f"{box}-{own}", kind, hosts, port), allow_name_change=True)
+        except (OSError, zeroconf.Error) as e:
+            log.warning(f"{kind}: not announced ({e}); give its address to the clients")
+        ended.wait()
+        for each in opened:
+            each.close()
+
+    thread = threading.Thread(target=work, daemon=True, name="palpate-announce")
+    thread.start()
+
+    def end() -> None:
+        ended.set()
+        thread.join(LISTEN_S)
+
+    return end
+
+
+def _info(box: str, kind: str, hosts: list[str], port: int) -> Any:
+    import zeroconf
+
+    return zeroconf.ServiceInfo(
+        *(TYPE, f"{box} {kind}.{TYPE}", port),
+        parsed_addresses=[host for host in hosts if not local(host)],
+        properties={"kind": kind, "version": __version__},
+        server=f"palpate-{box}.local.",
+    )
+
+
+def found(clock: Clock, interfaces: list[str] | None = None) -> list[Reachable]:
+    """The announced ports on the networks of these addresses, None: of all. Takes LISTEN_S. Raises
+    ConfigError without zeroconf."""
+    try:
+        import zeroconf
+    except ImportError as e:
+        raise ConfigError(f"{e}; pip install 'palpate[found]'") from e
+    names: set[str] = set()
+
+    def heard(zeroconf: Any, service_type: str, name: str, state_change: Any) -> None:
+        names.add(name)
+
+    there = []
+    with zeroconf.Zeroconf(interfaces or zeroconf.InterfaceChoice.All) as one:
+        zeroconf.ServiceBrowser(one, TYPE, handlers=[heard])
+        clock.sleep_until(clock.now_ns() + round(LISTEN_S * 1e9))
+        for name in sorted(names):
+            info = one.get_service_info(TYPE, name, timeout=500)
+            if info is None:  # it has just ended
+                continue
+            box, kind = name.partition(" ")[0], str(info.decoded_properties.get("kind"))
+            there += [Reachable(box, kind, h, info.port or 0) for h in info.parsed_addresses()]
+    return sorted(there)
